@@ -48,7 +48,7 @@ _HOMES = {
     "Tracker": "fgtrack.pipeline.live",
     "TracksAt": "fgtrack.pipeline.live",
     "TruthState": "fgtrack.core.types",
-    "TuneReport": "fgtrack.calibration.tune_report",
+    "TuneReport": "fgtrack.calibration.tune_space",
     "UpdateRecord": "fgtrack.core.types",
     "UpdateResult": "fgtrack.estimation.base",
     "UpdateStatus": "fgtrack.estimation.base",
@@ -83,7 +83,7 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.calibration.study import Study as Study
     from fgtrack.calibration.study import study as study
     from fgtrack.calibration.tune import tune as tune
-    from fgtrack.calibration.tune_report import TuneReport as TuneReport
+    from fgtrack.calibration.tune_space import TuneReport as TuneReport
     from fgtrack.core.errors import CallError as CallError
     from fgtrack.core.errors import DataError as DataError
     from fgtrack.core.errors import FgtrackError as FgtrackError

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from fgtrack.calibration.arrivals import FEWEST, Arrivals, arrivals_of, overtaken
+from fgtrack.calibration.arrivals import FEWEST, Arrivals, arrivals_of, beyond_lags, overtaken, window_findings
 from fgtrack.calibration.clock_offsets import OffsetReport, estimate_offsets
 from fgtrack.calibration.clocks import (
     bias_findings,
@@ -14,13 +14,11 @@ from fgtrack.calibration.clocks import (
     stamp_findings,
 )
 from fgtrack.calibration.finding import Finding, milliseconds, percent
-from fgtrack.calibration.noise import noise_findings
-from fgtrack.calibration.outcome import Outcome, harm, objection
+from fgtrack.calibration.outcome import Outcome, harm, noise_findings, objection
 from fgtrack.calibration.page import Advice
 from fgtrack.calibration.trial import TRIAL_S, beginning, suspicions
 from fgtrack.calibration.tune import tuned
 from fgtrack.calibration.tune_space import TuneRules
-from fgtrack.calibration.windows import beyond_lags, window_findings
 from fgtrack.core.diagnostic import EGO
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds

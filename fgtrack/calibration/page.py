@@ -5,10 +5,9 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from textwrap import wrap
 
-from fgtrack.calibration.arrivals import Arrivals
+from fgtrack.calibration.arrivals import Arrivals, BeyondLag
 from fgtrack.calibration.finding import Finding
 from fgtrack.calibration.outcome import Outcome
-from fgtrack.calibration.windows import BeyondLag
 from fgtrack.evaluation.tables import NO_VALUE, Column, Record, Table, Tables, Value, short
 from fgtrack.pipeline.config import Config
 

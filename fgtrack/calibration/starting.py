@@ -1,26 +1,227 @@
-"""A starting configuration for a recording that nobody has configured: what its parts probably are, and why."""
+"""A starting configuration for a recording without one: its topics or tables, what each probably is, and why."""
 
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import fields
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import chain, islice
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from ruamel.yaml import YAML
 
-from fgtrack.calibration.parts import Part, table_parts, topic_parts
 from fgtrack.calibration.trial import beginning, suspicions
-from fgtrack.core.errors import CallError, FgtrackError
+from fgtrack.core.errors import CallError, DataError, FgtrackError
+from fgtrack.core.types import DESCRIBING, MEASURABLE, STATE_NAMES
+from fgtrack.io.adapters import ADAPTERS
+from fgtrack.io.adapters.ego import ODOMETRY
+from fgtrack.io.adapters.fields import fields_of
 from fgtrack.io.adapters.native import NATIVE_ADAPTERS
-from fgtrack.io.config import CsvInput, CsvTable, InputConfig, TopicInput
-from fgtrack.io.info import InputInfo, describe
+from fgtrack.io.adapters.tables import headers, rows
+from fgtrack.io.config import CsvInput, CsvTable, Field, InputConfig, TopicInput
+from fgtrack.io.guess import Guess, agreeing_with_motion, guesses, time_unit, words_of
+from fgtrack.io.info import OTHER_CLOCK_S, InputInfo, TopicInfo, describe
 from fgtrack.io.output import new_file
 from fgtrack.io.ros.bag import Bag
 from fgtrack.io.source import input_kind, open_input
+from fgtrack.models.sensors import Filter
 from fgtrack.pipeline.assumptions.assumed import Assumed, assumed, departures
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import validate
 
-__all__ = ["starting_config", "write_starting"]
+__all__ = ["Part", "starting_config", "table_parts", "topic_parts", "write_starting"]
+
+_ROWS, _MESSAGES, _FEW = 20_000, 20, 8  # that are looked at: of a table, of a topic; texts that tell rows apart
+_EGO = frozenset(("ego", "own", "ownship", "host", "self"))
+_TRUTH = frozenset(("truth", "gt", "groundtruth", "label", "labels", "reference", "cars", "opponent", "target", "npc"))
+_GENERAL = frozenset(
+    ("perception", "detections", "detection", "objects", "object", "tracks", "track", "list", "sensing", "data", "csv")
+)
+_OTHER_PACKAGES = ("sensor_msgs", "tf2_msgs", "visualization_msgs", "rcl_interfaces", "rosgraph_msgs", "std_msgs")
+_POSITIONS = ({"x_m", "y_m"}, {"range_m", "bearing_rad"}, {"bearing_rad"})
+_NEEDED = {"ego": {"x_m", "y_m", "yaw_rad", "speed_mps"}, "truth": {"x_m", "y_m"}}
+
+
+@dataclass(frozen=True)
+class Part:
+    """A topic or a table and what it is taken as."""
+
+    role: str
+    """`ego`, `truth`, or the name of a sensor."""
+    item: TopicInput | CsvTable
+    reasons: Mapping[str, str]
+    """By component."""
+    notes: tuple[str, ...] = ()
+    """Fields that nothing is taken from, and settings to look at."""
+
+    @property
+    def label(self) -> str:
+        """Name of the topic or file."""
+        return self.item.topic if isinstance(self.item, TopicInput) else self.item.file or "the file"
+
+
+def topic_parts(bag: Bag, topics: Sequence[TopicInfo]) -> tuple[list[Part], list[str]]:
+    """Parts among the topics of a recording, the likeliest ego first, and a line for each other topic."""
+    parts: list[Part] = []
+    left: list[str] = []
+    for topic in topics:
+        words = set(words_of(topic.name))
+        is_truth = bool(words & _TRUTH and not words & _EGO)
+        has_clock = topic.delay is None or abs(topic.delay.p50_s) < OTHER_CLOCK_S
+        item = TopicInput(topic.name, stamp_from="message" if has_clock else "receipt")
+        reasons = {"stamp_from": "its stamps are of another clock than the recorder's, or not set"}
+        problem = next((one.problem for one in bag.topics if (one.name, one.type) == (topic.name, topic.type)), None)
+        if problem is not None or not topic.count:
+            left.append(f"{topic.name} ({topic.type}): {problem or 'no messages'}")
+        elif topic.type == ODOMETRY:
+            parts.append(Part("truth" if is_truth else "ego", item, reasons))
+        elif topic.type in ADAPTERS:
+            parts.append(Part("truth" if is_truth else _sensor_name(topic.name, parts), item, reasons))
+        elif topic.type.startswith(_OTHER_PACKAGES):
+            left.append(f"{topic.name} ({topic.type})")
+        else:
+            part, why = _mapped(bag, item, topic.type, _sensor_name(topic.name, parts))
+            if part is not None:
+                parts.append(replace(part, reasons={**reasons, **part.reasons}))
+            else:
+                left.append(f"{topic.name} ({topic.type}): {why}")
+    parts.sort(key=lambda part: (part.role != "ego", not set(words_of(part.label)) & _EGO))
+    return parts, left
+
+
+def _mapped(bag: Bag, item: TopicInput, type_name: str, sensor: str) -> tuple[Part | None, str]:
+    """The guess for a topic of an unknown type; without one a line of what is in it."""
+    try:
+        messages = [one.data for one in islice(bag.messages({item.topic}), _MESSAGES) if one.type == type_name]
+    except DataError as error:
+        return None, str(error)
+    found = [fields_of(message) for message in messages]
+    lists: dict[str, list[Mapping[str, Any]]] = {}
+    for path, items in chain.from_iterable(each.items() for _, each in found):
+        lists.setdefault(path, []).extend(fields_of(one)[0] for one in items)
+    lists[""] = [values for values, _ in found]  # the message itself, the last choice
+    for path, samples in lists.items():
+        values = _columns(samples)
+        own = guesses(values)
+        if not any(wanted <= own.keys() for wanted in _POSITIONS):
+            continue
+        is_ego = not path and _NEEDED["ego"] <= own.keys() and bool(set(words_of(item.topic)) & _EGO)
+        known = STATE_NAMES if is_ego else (*MEASURABLE, *DESCRIBING, "object_id")
+        used = {key: one for key, one in own.items() if key in known}
+        fields = {**({"objects": path} if path else {}), **{key: one.path for key, one in used.items()}}
+        reasons = {"objects": "the list in the message", **{key: one.reason for key, one in used.items()}}
+        part = Part("ego" if is_ego else sensor, replace(item, fields=fields), reasons, _unused(values, used))
+        if path or is_ego:
+            return part, ""
+        if "range_m" in own:
+            return replace(
+                part, notes=(*part.notes, "one object per message: set scan_s to put those of a scan together")
+            ), ""
+        mapping = ", ".join(f"{key}: {one.path}" for key, one in used.items())
+        return None, f"one pose per message: the ego, truth or one object; fields: {{{mapping}}}"
+    return None, f"no position among {_spreads(_columns(lists[''])) or 'its fields'}"
+
+
+def _columns(samples: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:
+    """Numbers by name; none of a text."""
+    names = dict.fromkeys(name for one in samples for name in one)
+    return {name: [float(one[name]) for one in samples if not isinstance(one.get(name), str | None)] for name in names}
+
+
+def _sensor_name(text: str, parts: Sequence[Part]) -> str:
+    words = words_of(text)
+    name = "_".join([word for word in words if word not in _GENERAL] or words) or "sensor"
+    taken = {part.role for part in parts} | {"ego", "truth"}
+    return name if name not in taken else next(f"{name}_{k}" for k in range(2, 200) if f"{name}_{k}" not in taken)
+
+
+def table_parts(recording: Path) -> tuple[list[Part], list[str]]:
+    """Parts of a CSV file or of those in a folder, and a line for each other table. Raises `DataError` as `rows`."""
+    parts: list[Part] = []
+    left: list[str] = []
+    for file, columns in headers(recording).items():
+        cells = [one.values for one in islice(rows(file), 1, _ROWS)]
+        for value, column, group in _groups(columns, cells):
+            part, why = _table(file, recording, [name for name in columns if name != column], group, value)
+            if part is None:
+                left.append(why)
+                continue
+            if column is not None:
+                part = replace(part, item=replace(part.item, filters={column: Filter(one_of=(value,))}))
+            role = part.role if part.role in ("ego", "truth") else _sensor_name(part.role, parts)
+            parts.append(replace(part, role=role))
+    return parts, left
+
+
+def _groups(
+    columns: Sequence[str], cells: Sequence[Mapping[str, str]]
+) -> Iterator[tuple[str, str | None, list[Mapping[str, str]]]]:
+    """Rows that belong together: all, or by a column of few texts that says of what they are."""
+    for column in columns:
+        texts = {one[column] for one in cells}
+        if 1 < len(texts) <= _FEW and any(set(words_of(text)) & _EGO for text in texts):
+            for text in sorted(texts):
+                yield text, column, [one for one in cells if one[column] == text]
+            return
+    yield "", None, list(cells)
+
+
+def _table(
+    file: Path, recording: Path, columns: Sequence[str], cells: Sequence[Mapping[str, str]], kind: str
+) -> tuple[Part | None, str]:
+    """The guess for the rows of a table, or a line of what is in it."""
+    values = {name: [_number(one[name]) for one in cells] for name in columns if any(one[name] for one in cells)}
+    own = guesses({name: [value for value in found if math.isfinite(value)] for name, found in values.items()})
+    words = set(words_of(kind or file.stem))
+    is_truth, is_ego = bool(words & _TRUTH and not words & _EGO), bool(words & _EGO)
+    is_ego |= not (is_truth or kind or "object_id" in own) and _NEEDED["ego"] <= own.keys()
+    role = "ego" if is_ego else "truth" if is_truth else kind or file.stem
+    if "stamp" not in own:
+        return None, f"{file.name}: no column of times among {_spreads(values)}"
+    column = str(own["stamp"].path)
+    unit, why = time_unit(column, [value for value in values[column] if math.isfinite(value)])
+    if is_ego:
+        own = agreeing_with_motion(own, {name: np.array(found) for name, found in values.items()}, unit)
+    missing = _NEEDED.get(role, set()) - own.keys()
+    if missing or not any(wanted <= own.keys() for wanted in _POSITIONS):
+        return None, f"{file.name}: no column for {', '.join(sorted(missing)) or 'a position'} among {_spreads(values)}"
+    known = ("stamp", "receipt", *(STATE_NAMES if role in ("ego", "truth") else (*MEASURABLE, *DESCRIBING)))
+    used = {key: one for key, one in own.items() if key in known or (key == "object_id" and not is_ego)}
+    named = {str(own[key].path) for key in ("x_m", "y_m") if key in own and role not in ("ego", "truth")}
+    in_map = bool(named) and all(set(words_of(name)) & {"east", "easting", "north", "northing"} for name in named)
+    table = CsvTable(
+        {key: one.path for key, one in used.items()},
+        file.name if recording.is_dir() else None,
+        unit,  # type: ignore[arg-type]  # a name of NS_PER_UNIT
+        frame="map" if in_map else None,
+    )
+    reasons = {**{key: one.reason for key, one in used.items()}, "time_unit": why, "frame": "east and north"}
+    return Part(role, table, reasons, _unused(values, used)), ""
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _unused(values: Mapping[str, Sequence[float]], used: Mapping[str, Guess]) -> tuple[str, ...]:
+    """Return a note on the fields or columns that are not `used`; none without any."""
+    paths = [one.path.path if isinstance(one.path, Field) else one.path for one in used.values()]
+    names = {name for path in paths for name in ([path] if isinstance(path, str) else path)}
+    rest = {name: found for name, found in values.items() if name not in names}
+    return (f"not used: {_spreads(rest)}",) if rest else ()
+
+
+def _spreads(values: Mapping[str, Sequence[float]]) -> str:
+    found = []
+    for name, samples in values.items():
+        finite = [value for value in samples if math.isfinite(value)]
+        found.append(f"{name} ({min(finite):.4g} to {max(finite):.4g})" if finite else name)
+    return ", ".join(found)
+
 
 _MARK = "(fgtrack info --write)"
 _TRIAL_NS = 5_000_000_000

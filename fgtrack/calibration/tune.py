@@ -9,8 +9,18 @@ from pathlib import Path
 import numpy as np
 
 from fgtrack.calibration.tune_measurements import recorded
-from fgtrack.calibration.tune_report import HeldOut, InnovationFit, Known, SensorNoise, TunedParameter, TuneReport
-from fgtrack.calibration.tune_space import ConfigNoise, TuneRules, for_tuning, widened
+from fgtrack.calibration.tune_space import (
+    ConfigNoise,
+    HeldOut,
+    InnovationFit,
+    Known,
+    SensorNoise,
+    TunedParameter,
+    TuneReport,
+    TuneRules,
+    for_tuning,
+    widened,
+)
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import BoolArray, FloatArray, Message
 from fgtrack.estimation.likelihood.contaminated import outlier_share

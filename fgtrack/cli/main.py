@@ -59,12 +59,14 @@ class _LazyCommands(TyperGroup):
             raise DataError(f"{error.filename or 'an output'}: output pipe closed") from error
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        name, command, rest = super().resolve_command(ctx, args)
-        if name is not None:
-            single = typer.Typer(**_STYLE)
-            single.command(name)(getattr(import_module(f"fgtrack.cli.{COMMANDS[name]}"), name))
-            command = typer.main.get_command(single)
-        return name, command, rest
+        name, _, rest = super().resolve_command(ctx, args)
+        return name, None if name is None else _command(name), rest
+
+
+def _command(name: str) -> Any:  # Any: Typer does not export the type of its commands
+    single = typer.Typer(**_STYLE)
+    single.command(name)(getattr(import_module(f"fgtrack.cli.{COMMANDS[name]}"), name))
+    return typer.main.get_command(single)
 
 
 app = typer.Typer(

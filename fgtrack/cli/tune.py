@@ -8,10 +8,9 @@ from typing import Annotated
 
 import typer
 
-from fgtrack.calibration.noise import noise_fits
+from fgtrack.calibration.outcome import noise_fits
 from fgtrack.calibration.tune import tuned
-from fgtrack.calibration.tune_report import HeldOut, TunedParameter, TuneReport
-from fgtrack.calibration.tune_space import TuneRules
+from fgtrack.calibration.tune_space import HeldOut, TunedParameter, TuneReport, TuneRules
 from fgtrack.cli.arguments import ConfigFile, FormOption, Json, Overwrite, PitMap, Settings, TrackMap
 from fgtrack.cli.show import chosen_form, progress, say, show
 from fgtrack.core.errors import DataError

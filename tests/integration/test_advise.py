@@ -10,8 +10,7 @@ import pytest
 
 import fgtrack
 from fgtrack.calibration import advise as advise_module
-from fgtrack.calibration.arrivals import Arrivals
-from fgtrack.calibration.windows import window_findings
+from fgtrack.calibration.arrivals import Arrivals, window_findings
 from fgtrack.cli.main import run as run_command
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.evaluation.metrics import evaluate

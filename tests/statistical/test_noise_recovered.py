@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fgtrack.calibration.tune import tuned
-from fgtrack.calibration.tune_report import TuneReport
+from fgtrack.calibration.tune_space import TuneReport
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message

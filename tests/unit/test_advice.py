@@ -9,8 +9,7 @@ import pytest
 from fgtrack.calibration.arrivals import Arrivals
 from fgtrack.calibration.clock_offsets import OffsetReport, SensorOffset
 from fgtrack.calibration.clocks import clock_findings, clock_verdicts, stamp_findings
-from fgtrack.calibration.noise import NoiseFit
-from fgtrack.calibration.outcome import Outcome, harm
+from fgtrack.calibration.outcome import NoiseFit, Outcome, harm
 from fgtrack.evaluation.intervals import Estimate
 from fgtrack.evaluation.metrics import ObjectMetrics
 
