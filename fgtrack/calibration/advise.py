@@ -176,7 +176,7 @@ class _Adviser:
             config=self._config,
             arrivals=tuple(seen.values()),
             overtaken=shares,
-            beyond=tuple(beyond_lags(timed)),
+            beyond=beyond_lags(timed),
             before=old,
             after=new,
             broken=broken,

@@ -14,7 +14,7 @@ from fgtrack.core.types import DetectionList, EgoState, FloatArray, IntArray, Me
 from fgtrack.pipeline.config import Config
 from fgtrack.tracking.existence import ExistenceRules
 
-__all__ = ["FEWEST", "Arrivals", "BeyondLag", "arrivals_of", "beyond_lags", "overtaken", "window_findings"]
+__all__ = ["FEWEST", "Arrivals", "arrivals_of", "beyond_lags", "overtaken", "window_findings"]
 
 FEWEST = 20
 """Messages of which something can be said."""
@@ -140,21 +140,12 @@ _LONGEST_STORAGE_S = 60.0
 _LISTS = 3.0  # of the slowest sensor that a window, and a track, should outlive
 
 
-@dataclass(frozen=True)
-class BeyondLag:
-    """What a window of one length would not hold."""
-
-    lag_s: float
-    share: Mapping[str, float]
-    """Of the detections of each sensor."""
-
-
-def beyond_lags(arrivals: Sequence[Arrivals]) -> list[BeyondLag]:
-    """Shares beyond each lag, up to the first that holds everything."""
-    rows = []
+def beyond_lags(arrivals: Sequence[Arrivals]) -> dict[float, dict[str, float]]:
+    """Return shares of the detections of each sensor beyond each lag in s, up to the first that holds everything."""
+    rows: dict[float, dict[str, float]] = {}
     for lag_s in _LAGS_S:
-        rows.append(BeyondLag(lag_s, {one.name: one.beyond(lag_s) for one in arrivals}))
-        if not any(rows[-1].share.values()):
+        rows[lag_s] = {one.name: one.beyond(lag_s) for one in arrivals}
+        if not any(rows[lag_s].values()):
             break
     return rows
 

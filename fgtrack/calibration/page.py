@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from textwrap import wrap
 
-from fgtrack.calibration.arrivals import Arrivals, BeyondLag
+from fgtrack.calibration.arrivals import Arrivals
 from fgtrack.calibration.finding import Finding
 from fgtrack.calibration.outcome import Outcome
 from fgtrack.evaluation.tables import NO_VALUE, Column, Record, Table, Tables, Value, short
@@ -39,7 +39,8 @@ class Advice:
     arrivals: tuple[Arrivals, ...] = field(repr=False)
     """Of the sensors that are used, with the stamps that the advice gives them."""
     overtaken: Mapping[str, float] = field(repr=False)
-    beyond: tuple[BeyondLag, ...] = field(repr=False)
+    beyond: Mapping[float, Mapping[str, float]] = field(repr=False)
+    """Share of the detections of each sensor that are later than a window of so many seconds."""
     before: Outcome | None = field(repr=False)
     """What the configuration makes of the recording; None where nothing can be tracked."""
     after: Outcome | None = field(repr=False)
@@ -105,7 +106,9 @@ class Advice:
 
     def _beyond(self) -> Table:
         shares = {f"{one.name}_share": one.name for one in self.arrivals}
-        records = [{"lag_s": row.lag_s} | {key: row.share[name] for key, name in shares.items()} for row in self.beyond]
+        records = [
+            {"lag_s": lag_s} | {key: row[name] for key, name in shares.items()} for lag_s, row in self.beyond.items()
+        ]
         columns = [Column("lag [s]", "lag_s", text=str)]
         columns += [Column(name, cell_of=partial(_share, key)) for key, name in shares.items()]
         return Table("Detections that are later than a window or limit [%]", records, columns, ("lag_s",))

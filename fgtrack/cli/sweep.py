@@ -32,7 +32,6 @@ from fgtrack.pipeline.sweep import (
     SWEEP_TABLE,
     Cell,
     Scalar,
-    Scores,
     Sweep,
 )
 from fgtrack.pipeline.sweep_plan import load_plan
@@ -139,11 +138,11 @@ def _summarise(table: SweepTable, out: Path, form: Form | None, everything: bool
         say(f"\nevery metric: --all, or {out / SUMMARY_TABLE}")
 
 
-def score(run: Run) -> Scores:
-    """All scalars of the metrics of `run`, by path."""
+def score(run: Run) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
+    """Return all scalars of the metrics of `run` by path, and its wall times."""
     scalars = {name: value for name, value in _scalars(evaluate(run).as_dict(), "") if name not in _NAMES}
     times = {name: value for name, value in scalars.items() if name.startswith(_TIMES)}
-    return Scores({name: value for name, value in scalars.items() if name not in times}, times)
+    return {name: value for name, value in scalars.items() if name not in times}, times
 
 
 def _scalars(value: object, path: str) -> Iterator[tuple[str, Scalar]]:

@@ -51,18 +51,9 @@ _logger = logging.getLogger(__name__)
 Scalar = str | bool | int | float | None
 
 
-@dataclass(frozen=True)
-class Scores:
-    """Numbers of a run, by column."""
-
-    values: Mapping[str, Scalar]
-    """Metrics: the same wherever and whenever the run is made."""
-    times: Mapping[str, Scalar]
-    """Wall times."""
-
-
-#: Judges a run. A function of a module, so that other processes find it.
-Score = Callable[[Run], Scores]
+#: Returns metrics of a run, the same wherever and whenever it is made, and wall times, both by column. A function of a
+#: module, so that other processes find it.
+Score = Callable[[Run], tuple[Mapping[str, Scalar], Mapping[str, Scalar]]]
 
 
 @dataclass(frozen=True)
@@ -71,8 +62,9 @@ class Cell:
 
     estimator: str
     values: Mapping[str, Scalar]
-    """See `Scores`."""
+    """Metrics."""
     times: Mapping[str, Scalar]
+    """Wall times."""
     error: str | None = None
     """Why there is no result, in a line."""
 
@@ -255,11 +247,11 @@ def _cell(messages: Sequence[Message], config: Config, score: Score, source_s: f
         if broken is not None:
             raise DataError(broken)
         replayed = time.perf_counter()
-        scores = score(run)
+        values, score_times = score(run)
     except (Exception, SystemExit) as error:  # as in `run_job`
         return Cell(config.estimator, {}, {}, _reason(error))
     times = {"source_s": source_s, "replay_s": replayed - started, "score_s": time.perf_counter() - replayed}
-    return Cell(config.estimator, scores.values, {**times, **scores.times})
+    return Cell(config.estimator, values, {**times, **score_times})
 
 
 def _reason(error: BaseException) -> str:

@@ -20,7 +20,7 @@ from fgtrack.cli.sweep import score, swept
 from fgtrack.io.run import Run
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.load import load
-from fgtrack.pipeline.sweep import Scores, Sweep
+from fgtrack.pipeline.sweep import Sweep
 from fgtrack.pipeline.sweep_plan import load_plan
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.simulate import simulate
@@ -235,10 +235,10 @@ def test_a_dask_cluster_gives_the_same_bytes(smoke: Path, done: Path, tmp_path: 
     assert (out / "sweep.csv").read_bytes() == (done / "sweep.csv").read_bytes()
 
 
-def surroundings(run: Run) -> Scores:
+def surroundings(run: Run) -> tuple[dict, dict]:
     """What a process of the pool finds."""
     deaf = signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
-    return Scores({"threads": os.environ.get("OMP_NUM_THREADS"), "deaf": int(deaf)}, {"pid": os.getpid()})
+    return {"threads": os.environ.get("OMP_NUM_THREADS"), "deaf": int(deaf)}, {"pid": os.getpid()}
 
 
 @pytest.mark.slow
@@ -300,10 +300,10 @@ def test_a_bad_cell_is_tried_again(tmp_path: Path, capsys: pytest.CaptureFixture
         assert "jobs: 1, each of 1 estimators; to do: 1" in capsys.readouterr().out
 
 
-def deadly(run: Run) -> Scores:
+def deadly(run: Run) -> tuple[dict, dict]:
     """Dies of the backward-forward EKF with a gate of 3 m."""
     scores = score(run)
-    if run.meta["estimator"] == "ekf-backward-forward" and scores.values["options.gate_m"] == 3.0:
+    if run.meta["estimator"] == "ekf-backward-forward" and scores[0]["options.gate_m"] == 3.0:
         os.kill(os.getpid(), signal.SIGKILL)
     return scores
 

@@ -5,7 +5,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from fgtrack.core.types import DetectionList
-from fgtrack.pipeline.assumptions.revisits import Revisits
+from fgtrack.pipeline.assumptions.revisits import Revisits, positions_m
 
 REPORTS_SHARE = 0.75
 """Share of lists with one object from which on a sensor reports objects one by one, if none of its lists is empty."""
@@ -30,13 +30,9 @@ class ListStatistics:
         """Count a list."""
         self.num_objects[len(message.objects)] += 1
         self.revisits.add(message)
-        for one in message.objects:
-            x_m, y_m = one.x_m, one.y_m
-            if (x_m is None or y_m is None) and one.range_m is not None and one.bearing_rad is not None:
-                x_m, y_m = one.range_m * math.cos(one.bearing_rad), one.range_m * math.sin(one.bearing_rad)
-            if x_m is not None and y_m is not None:
-                self.low_m = min(self.low_m[0], x_m), min(self.low_m[1], y_m)
-                self.high_m = max(self.high_m[0], x_m), max(self.high_m[1], y_m)
+        for x_m, y_m in positions_m(message):
+            self.low_m = min(self.low_m[0], x_m), min(self.low_m[1], y_m)
+            self.high_m = max(self.high_m[0], x_m), max(self.high_m[1], y_m)
 
     @property
     def scans(self) -> bool:

@@ -14,7 +14,7 @@ from fgtrack.core.types import DetectionList, FloatArray
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.pipeline.config import NOISE_HZ, ClockConfig, Config, FilterConfig, MotionConfig
 
-__all__ = ["Revisits", "for_slow_revisits"]
+__all__ = ["Revisits", "for_slow_revisits", "positions_m"]
 
 #: No vehicle is faster than an airliner [m/s], and no position of one is worse than this [m].
 _FASTEST_MPS, _POSITION_M = 300.0, 10.0
@@ -40,7 +40,7 @@ class Revisits:
         """Learn from a list; those of a sensor come in order of receipt."""
         if len(self.times_s) >= _MOST:
             return
-        found_m = np.array(list(_positions_m(message)), dtype=np.float64).reshape(-1, 2)
+        found_m = np.array(list(positions_m(message)), dtype=np.float64).reshape(-1, 2)
         oldest_ns = message.stamp_ns - round(_MEMORY_S * 1e9)
         while self._recent and self._recent[0][0] < oldest_ns:
             self._recent.popleft()
@@ -87,7 +87,8 @@ def for_slow_revisits(config: Config, revisits: Iterable[Revisits]) -> tuple[dic
     return open_ones, reason
 
 
-def _positions_m(message: DetectionList) -> Iterator[tuple[float, float]]:
+def positions_m(message: DetectionList) -> Iterator[tuple[float, float]]:
+    """Yield x and y of the detections that have a position, in the frame of their list."""
     for one in message.objects:
         if one.x_m is not None and one.y_m is not None:
             yield one.x_m, one.y_m
