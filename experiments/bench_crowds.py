@@ -23,7 +23,7 @@ from fgtrack.models.motion import CTRV
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
-from fgtrack.tracking.merge import ConnectedMerge
+from fgtrack.tracking.detections import ConnectedMerge
 from fgtrack.tracking.preprocess import Candidate
 
 START_NS = 1_600_000_000 * NS_PER_S

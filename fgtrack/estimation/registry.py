@@ -35,7 +35,7 @@ ESTIMATORS = Registry(
             "ekf-replay": "fgtrack.estimation.filters.replay:ReplayEkf",
             "iekf-replay": "fgtrack.estimation.filters.iekf:IekfReplay",
             "imm-replay": "fgtrack.estimation.filters.imm:ImmReplay",
-            "iplf-replay": "fgtrack.estimation.filters.iplf:IplfReplay",
+            "iplf-replay": "fgtrack.estimation.filters.ukf:IplfReplay",
             "smoother": "fgtrack.estimation.smoothing.gtsam.smoothers:smoother",
             "smoother-batch": "fgtrack.estimation.smoothing.gtsam.smoothers:smoother_batch",
             "smoother-banded": "fgtrack.estimation.smoothing.banded:smoother_banded",

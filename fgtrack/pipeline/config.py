@@ -21,9 +21,9 @@ from fgtrack.pipeline.load import dump, load, plain, with_settings
 from fgtrack.sim.settings import settings
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.birth import FixedBirth, MeasuredBirth
+from fgtrack.tracking.detections import ConnectedMerge, NoMerge
 from fgtrack.tracking.existence import ExistenceRules
 from fgtrack.tracking.lifecycle import LifecycleRules
-from fgtrack.tracking.merge import ConnectedMerge, NoMerge
 from fgtrack.tracking.objects import ObjectRules
 from fgtrack.tracking.published import NeighbourhoodMerge, UngatedEuclidean
 

@@ -1,17 +1,22 @@
-"""The detections of one batch in the map frame, as arrays."""
+"""The detections of one batch in the map frame, as arrays: errors of the pose in them, and merging."""
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from operator import attrgetter
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
-from fgtrack.core.geometry import Real, rotations, wrap_angles
-from fgtrack.core.linalg import congruence
+from fgtrack.core.geometry import Real, circular_mean, rotations, wrap_angles
+from fgtrack.core.linalg import congruence, symmetrise
 from fgtrack.core.types import MEASURABLE, BoolArray, Detection, FloatArray, Frame, IntArray
-from fgtrack.models.measurement import COMPONENTS, MIN_RANGE_M, SensorPose
+from fgtrack.models.measurement import ANGULAR, COMPONENTS, MIN_RANGE_M, MeasurementModel, SensorPose
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.inbox import Batch, own_covariance
 
@@ -167,3 +172,96 @@ def _turned(R: FloatArray, yaws_rad: FloatArray) -> FloatArray:
     turns[:, places, places] = 1.0
     turns[:, :2, :2] = rotations(yaws_rad)
     return congruence(turns, R)
+
+
+class PoseError(NamedTuple):
+    """The error e of a sensor pose in the innovation z - h(x, pose) = ... + G e of a detection.
+
+    e is the estimated pose minus the true one, of x, y, yaw, vx and vy of the sensor, the same for all detections of a
+    batch. It enters z where the detection was placed in the map by the pose, and h where it is relative to the sensor.
+    """
+
+    covariance: FloatArray
+    """Covariance of e, shape (5, 5)."""
+    placement: FloatArray
+    """Derivative of z by the pose, shape (k, 5), or (m, k, 5) of many detections."""
+    R: FloatArray
+    """Covariance of the detection itself, without e, shape (k, k) or (m, k, k)."""
+
+    def gain(self, model: MeasurementModel, pose: SensorPose, x: FloatArray) -> FloatArray:
+        """G at the states `x` (..., n) of the object, shape (..., k, 5), or (k, 5) where it is the same at all."""
+        return self.placement - model.pose_jacobian(x, pose) if model.relative else self.placement
+
+    def noise(self, model: MeasurementModel, pose: SensorPose, x: FloatArray) -> FloatArray:
+        """R + G P_e G' at the states `x` (..., n), shape (..., k, k), or (k, k) where it is the same at all."""
+        return self.R + symmetrise(congruence(self.gain(model, pose, x), self.covariance))
+
+
+def placement(components: tuple[str, ...], offsets_m: FloatArray, assumed: tuple[str, ...] = ()) -> FloatArray:
+    """Derivative, shape (..., k, 5), of detections that a pose placed in the map, by its x, y, yaw, vx and vy.
+
+    `offsets_m` (..., 2) is where they lie in the map, seen from the pose. What is `assumed`, as a heading from the map,
+    was not turned by the pose; a speed is over ground, whatever the ego does.
+    """
+    D = np.zeros((*offsets_m.shape[:-1], len(components), 5))
+    for row, name in enumerate(components):
+        if name == "x_m":
+            D[..., row, 0], D[..., row, 2] = 1.0, -offsets_m[..., 1]
+        elif name == "y_m":
+            D[..., row, 1], D[..., row, 2] = 1.0, offsets_m[..., 0]
+        elif name == "yaw_rad" and name not in assumed:
+            D[..., row, 2] = 1.0
+    return D
+
+
+class Merge(ABC):
+    """Finds detections of one list that are the same object, and averages them."""
+
+    @abstractmethod
+    def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
+        """Members of all groups of `points_m` (n, 2), by the point that leads it; one alone is a group of its own."""
+
+    def mean(self, name: str, values: FloatArray) -> float:
+        """Average of component `name`; of angles on the circle."""
+        return circular_mean(values) if name in ANGULAR else float(values.sum() / len(values))
+
+
+@dataclass(frozen=True)
+class NoMerge(Merge):
+    """Every detection stands for itself."""
+
+    kind: Literal["none"] = "none"
+
+    def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
+        """See `Merge.groups`."""
+        return {i: (i,) for i in range(len(points_m))}
+
+
+@dataclass(frozen=True)
+class ConnectedMerge(Merge):
+    """Joins detections that are linked by steps of at most a distance."""
+
+    distance_m: float
+    """Detections at most this far apart are linked."""
+    kind: Literal["connected"] = "connected"
+
+    def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
+        """See `Merge.groups`; in the order of their first members, which lead."""
+        labels = _linked(points_m, self.distance_m)
+        if labels is None:
+            return NoMerge().groups(points_m)
+        members: dict[int, list[int]] = {}
+        for index, label in enumerate(labels.tolist()):
+            members.setdefault(label, []).append(index)
+        return {group[0]: tuple(group) for group in members.values()}
+
+
+def _linked(points_m: FloatArray, distance_m: float) -> IntArray | None:
+    """Labels of `points_m` (n, 2), equal for those that steps of at most `distance_m` link; None without a link."""
+    if len(points_m) < 2:
+        return None
+    pairs = cKDTree(points_m).query_pairs(distance_m, output_type="ndarray")
+    if not len(pairs):
+        return None
+    links = coo_array((np.ones(len(pairs), dtype=np.int8), pairs.T), shape=(len(points_m),) * 2)
+    return np.asarray(connected_components(links, directed=False)[1])

@@ -11,7 +11,7 @@ from fgtrack.core.linalg import kernels, symmetrise
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, StatesAt
 from fgtrack.estimation.filters.ekf import linearised
-from fgtrack.tracking.pose_error import PoseError
+from fgtrack.tracking.detections import PoseError
 from fgtrack.tracking.preprocess import Candidate
 
 MOST_NEAR = 128

@@ -31,17 +31,18 @@ from fgtrack.tracking.detections import (
     RANGE,
     YAW,
     MapDetections,
+    Merge,
+    PoseError,
     X,
     common,
     covariances,
     in_map_frame,
     move_back,
+    placement,
     take_map_yaw,
 )
 from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.inbox import Batch, record
-from fgtrack.tracking.merge import Merge
-from fgtrack.tracking.pose_error import PoseError, placement
 
 _FAR_M = 1e6
 _NO_AREAS = ExclusionAreas(())

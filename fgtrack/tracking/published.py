@@ -13,11 +13,11 @@ from fgtrack.estimation.base import StatesAt
 from fgtrack.estimation.filters.published import published_yaw
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Assignment, assigned_densely
+from fgtrack.tracking.detections import Merge
 from fgtrack.tracking.ego import EgoPose, EgoSource, EgoStd
 from fgtrack.tracking.gating import euclidean_distances
 from fgtrack.tracking.inbox import Batch, is_bounded, is_covariance, record, records
 from fgtrack.tracking.lifecycle import CountingLifecycle, Life, MatchedDetection, Scan
-from fgtrack.tracking.merge import Merge
 from fgtrack.tracking.objects import Apart
 from fgtrack.tracking.preprocess import Candidate, Preprocess
 from fgtrack.tracking.tracker import Tracker, TrackerParts

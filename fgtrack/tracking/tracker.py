@@ -31,11 +31,11 @@ from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Assignment, Association
 from fgtrack.tracking.birth import Birth, in_any_direction
 from fgtrack.tracking.ego import EgoPose, EgoSource
+from fgtrack.tracking.guarded_bank import faults
 from fgtrack.tracking.inbox import Batch, Inbox, record
 from fgtrack.tracking.lifecycle import Lifecycle, MatchedDetection, Scan
 from fgtrack.tracking.objects import ObjectRules, Objects
 from fgtrack.tracking.preprocess import Candidate, Preprocess
-from fgtrack.tracking.soundness import faults
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,9 @@ from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.road import OpenSpace
 from fgtrack.models.sensors import Mount, RobustLoss, SensorModel
 from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY
+from fgtrack.tracking.detections import NoMerge
 from fgtrack.tracking.ego import EgoTrajectory
 from fgtrack.tracking.inbox import Batch
-from fgtrack.tracking.merge import NoMerge
 from fgtrack.tracking.preprocess import Preprocess
 
 _START_NS = NS_PER_S

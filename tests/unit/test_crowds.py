@@ -14,8 +14,8 @@ from fgtrack.models.measurement import SensorPose
 from fgtrack.tracking import association as associations
 from fgtrack.tracking import gating
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis, assigned, assigned_densely
+from fgtrack.tracking.detections import ConnectedMerge
 from fgtrack.tracking.gating import Pairs, euclidean_distances, grouped, innovations
-from fgtrack.tracking.merge import ConnectedMerge
 from fgtrack.tracking.preprocess import Candidate
 
 MB = 1e6

@@ -10,9 +10,8 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.filters.iekf import IekfRecursion, negative_log_posterior
-from fgtrack.estimation.filters.iplf import IplfRecursion
 from fgtrack.estimation.filters.recursion import EkfRecursion
-from fgtrack.estimation.filters.ukf import UkfRecursion
+from fgtrack.estimation.filters.ukf import IplfRecursion, UkfRecursion
 from fgtrack.estimation.registry import estimator
 from fgtrack.models.motion import CTRV, CV
 from fgtrack.models.sensors import RobustLoss

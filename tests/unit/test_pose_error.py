@@ -16,8 +16,8 @@ from fgtrack.models.correlated_errors import whole_error, with_correlated_errors
 from fgtrack.models.motion import CTRV, CV, MotionModel
 from fgtrack.models.road import OpenSpace, Road
 from fgtrack.models.sensors import Correlation, Mount, SensorModel
+from fgtrack.tracking.detections import ConnectedMerge, NoMerge
 from fgtrack.tracking.ego import EgoPose
-from fgtrack.tracking.merge import ConnectedMerge, NoMerge
 from fgtrack.tracking.preprocess import Candidate, Preprocess
 
 MOUNT = Mount(2.0, 1.0, 0.7)

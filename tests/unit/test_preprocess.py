@@ -12,8 +12,8 @@ from fgtrack.core.types import Detection, Disposition, Frame
 from fgtrack.models.motion import CTRV
 from fgtrack.models.road import OpenSpace, Road
 from fgtrack.models.sensors import Mount, SensorModel
+from fgtrack.tracking.detections import ConnectedMerge, Merge, NoMerge
 from fgtrack.tracking.ego import EgoPose
-from fgtrack.tracking.merge import ConnectedMerge, Merge, NoMerge
 from fgtrack.tracking.preprocess import Candidate, Preprocess
 from fgtrack.tracking.published import NeighbourhoodMerge
 

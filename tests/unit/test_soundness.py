@@ -10,7 +10,7 @@ from fgtrack.estimation.base import Measurement, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import Failure
 from fgtrack.estimation.present import PresentStates
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
-from fgtrack.tracking.soundness import Divergence, faults
+from fgtrack.tracking.guarded_bank import Divergence, faults
 
 MOTIONS = (CTRV(), CTRA(), CV())
 

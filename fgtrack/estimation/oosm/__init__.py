@@ -6,14 +6,9 @@ counted in steps. The methods differ in their estimate of the state at tau; most
 
 from fgtrack.estimation.oosm.asd import AccumulatedStateDensity
 from fgtrack.estimation.oosm.buffers import DelayedHorizon, ReorderBuffer
+from fgtrack.estimation.oosm.crossing import A1, B1, Al1, Bl1, C, FixedPoint, Larsen, RtsCrossCovariance
 from fgtrack.estimation.oosm.forward import CovarianceIntersection, Fpfd, determinant, trace
-from fgtrack.estimation.oosm.larsen import Larsen
-from fgtrack.estimation.oosm.one_step import Al1, Bl1
-from fgtrack.estimation.oosm.policies import AsCurrent, Drop
-from fgtrack.estimation.oosm.retrodiction import A1, B1, C
-from fgtrack.estimation.oosm.rewind_forget import RewindForget
-from fgtrack.estimation.oosm.rts import RtsCrossCovariance
-from fgtrack.estimation.oosm.zlz import FixedPoint
+from fgtrack.estimation.oosm.late import AsCurrent, Drop, RewindForget
 
 __all__ = [
     "A1",

@@ -1,16 +1,14 @@
-"""EKFs that step through what arrives in sequence, and differ in what they do with a late measurement."""
+"""EKFs that step through what arrives in sequence: ignore late measurements, take them as current, or rewind."""
 
 from abc import abstractmethod
+from dataclasses import replace
 
-import numpy as np
-
-from fgtrack.core.types import FloatArray, TrackState
+from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import OneCorrection
 from fgtrack.estimation.filters.propagation import track_state
 from fgtrack.estimation.filters.windowed import WindowedFilter
-from fgtrack.estimation.oosm.crossing import Past, fuse_across
 from fgtrack.estimation.oosm.history import History
 from fgtrack.models.motion import MotionModel
 
@@ -58,29 +56,48 @@ class LateEkf(WindowedFilter):
         """
 
 
-class CrossingEkf(LateEkf):
-    """A `LateEkf` that corrects the present through its cross-covariance with the past (see `fuse_across`).
+class Drop(LateEkf):
+    """Ignore a late measurement: it is `too_old`.
 
-    The corrected present enters the history with an equivalent measurement there (see `History.absorb`), so a second
-    late measurement finds the state that the first one made. What lies between the first one's stamp and the present
-    keeps the state it had.
+    The floor of every comparison ("neglect" in the Sensor Fusion and Tracking Toolbox of MathWorks).
+
+    Exact for: nothing; but consistent, for what is left is in sequence.
+    """
+
+    def _fuse_late(self, measurement: Measurement) -> None:
+        """Nothing."""
+
+
+class AsCurrent(LateEkf):
+    """Take a late measurement as if it had been made at the newest stamp fused.
+
+    What a filter without stamps does (no source): x+ = x_k + K (z - h(x_k)). The object has moved on by speed times
+    lag since, which the covariance leaves out.
+
+    Exact for: nothing; overconfident.
     """
 
     def _fuse_late(self, measurement: Measurement) -> OneCorrection:
-        now = self._history.newest
-        past = self._past(measurement.stamp_ns)
-        result = fuse_across(now.mean, now.covariance, past, measurement)
-        np.linalg.cholesky(result.covariance)  # an approximate cross-covariance may take away more than there is
-        self._history.absorb(result.mean, result.covariance)
+        return self._fuse_next(replace(measurement, stamp_ns=self._newest_ns))
+
+
+class RewindForget(LateEkf):
+    """Update at the late stamp, and forget what was fused after it.
+
+    Karle, Fent, Huch, Sauerbeck and Lienkamp, Multi-modal sensor fusion and object tracking for autonomous racing, IEEE
+    Transactions on Intelligent Vehicles, 2023, section III-G: x_1 = f(x_{tau|tau}), P_1 = F P_{tau|tau} F' + Q from tau
+    to now. Here at the stamp itself; `fgtrack.estimation.filters.backward_forward` has the paper's time grid.
+
+    Exact for: nothing. For what it keeps it is the filter in order of stamps, so it stays consistent, but all
+    measurements between the late stamp and the present are lost.
+    """
+
+    def _fuse_next(self, measurement: Measurement) -> OneCorrection:
+        place = self._history.left(measurement.stamp_ns)
+        step, result = self._history.stepped(place, measurement)
+        self._history.forget_after(place)
+        self._history.append(step)
         return result
 
-    @abstractmethod
-    def _past(self, stamp_ns: int) -> Past:
-        """What is known of the state at `stamp_ns`, and its cross-covariance with the present."""
-
-    def _predicted(self, stamp_ns: int) -> tuple[int, FloatArray, FloatArray, FloatArray]:
-        """Place m of the last step before `stamp_ns`; x_{tau|m}, P_{tau|m} and F(m + 1, tau)."""
-        place = self._history.left(stamp_ns)
-        mean, covariance = self._history.predicted(place, stamp_ns)
-        after = self._history.steps[place + 1]
-        return place, mean, covariance, self._history.transition(mean, stamp_ns, after.stamp_ns)
+    def _fuse_late(self, measurement: Measurement) -> OneCorrection:
+        return self._fuse_next(measurement)
