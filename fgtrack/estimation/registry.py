@@ -220,11 +220,6 @@ def motion_model(name: str, parameters: Mapping[str, Any]) -> MotionModel:
     return model
 
 
-def works_together(factory: Factory) -> bool:
-    """True if the estimators of several objects are made as one, by other code than those of a single object."""
-    return Claims.of(factory).bank or factory is ReplayEkf
-
-
 def _made_bank(name: str, factory: Factory, motion: MotionModel, lag_s: float, options: Mapping[str, Any]) -> TrackBank:
     bank: TrackBank = _checked(name, _made(ESTIMATORS, name, factory, motion, lag_s, **options), TrackBank)
     return bank

@@ -68,8 +68,9 @@ class GatedEuclidean:
         self, gates_m: float | FloatArray, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None
     ) -> Assignment:
         """Return the assignment with other gates; `gates_m` broadcasts to (candidates, tracks)."""
-        pairs = _near(candidates, states, float(np.max(gates_m, initial=0.0)), apart)
-        if isinstance(gates_m, np.ndarray):
+        is_one = isinstance(gates_m, float)
+        pairs = _near(candidates, states, gates_m if is_one else float(np.max(gates_m, initial=0.0)), apart)
+        if not is_one:
             limits_m = np.broadcast_to(gates_m, (len(candidates), len(states.means)))
             pairs = pairs.at(pairs.values <= limits_m[pairs.rows, pairs.columns])
         suspects = set[int]()

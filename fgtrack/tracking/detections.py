@@ -67,11 +67,11 @@ class MapDetections(NamedTuple):
 def in_map_frame(batch: Batch, sensor: SensorModel, pose: SensorPose) -> MapDetections:
     """The detections of `batch`, what `sensor` measures of them, seen from `pose`."""
     detections = [batch.message.objects[index] for index in batch.indices]
-    values = np.full((len(detections), len(COMPONENTS)), np.nan)
+    values = np.empty((len(detections), len(COMPONENTS)))
+    values[:, len(MEASURABLE) :] = np.nan
     if detections:
         values[:, : len(MEASURABLE)] = [_VALUES(detection) for detection in detections]
-    for column in _unmeasured(tuple(sensor.std)):
-        values[:, column] = np.nan
+    values[:, _unmeasured(tuple(sensor.std))] = np.nan
     if batch.frame != "map":
         if "yaw_rad" in sensor.std:
             values[:, YAW] = wrap_angles(values[:, YAW] + pose.yaw_rad)
@@ -146,9 +146,9 @@ def common(kinds: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
 
 
 @cache
-def _unmeasured(names: tuple[str, ...]) -> tuple[int, ...]:
+def _unmeasured(names: tuple[str, ...]) -> list[int]:
     """Columns of what is not among `names`."""
-    return tuple(column for column, name in enumerate(MEASURABLE) if name not in names)
+    return [column for column, name in enumerate(MEASURABLE) if name not in names]
 
 
 def _move_to_map(points_m: FloatArray, pose: SensorPose) -> None:

@@ -88,7 +88,7 @@ def near(candidates: Sequence[Candidate], means: FloatArray, reach_m: float | Fl
     """
     points = _positions_m(candidates)
     if len(points) * len(means) <= _DENSE:
-        distances = euclidean_distances(candidates, means)
+        distances = _distances(points, candidates, means)
         rows, columns = (distances <= reach_m).nonzero()
         return Pairs(rows, columns, distances[rows, columns])
     placed = np.flatnonzero(~np.isnan(points[:, 0]))
@@ -111,7 +111,11 @@ def near(candidates: Sequence[Candidate], means: FloatArray, reach_m: float | Fl
 
 def euclidean_distances(candidates: Sequence[Candidate], means: FloatArray) -> FloatArray:
     """Distances of all pairs as those of `near`, shape (candidates, tracks)."""
-    offsets = _positions_m(candidates)[:, None] - means[:, :2]
+    return _distances(_positions_m(candidates), candidates, means)
+
+
+def _distances(points: FloatArray, candidates: Sequence[Candidate], means: FloatArray) -> FloatArray:
+    offsets = points[:, None] - means[:, :2]
     distances = np.sqrt(np.vecdot(offsets, offsets))
     for row, candidate in enumerate(candidates):
         if candidate.position_m is None:

@@ -1,5 +1,6 @@
 """A bank that outlives the failures of its estimators: a track that fails ends, is counted, and may be born again."""
 
+import math
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import TypeVar
@@ -64,9 +65,9 @@ class GuardedBank:
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`; states that are not finite are left out."""
         states = self._ask(lambda bank: _states_at(bank, stamp_ns))
-        finite = are_finite(states.means, states.covariances)
-        if finite.all():
+        if math.isfinite(states.means.sum() + states.covariances.sum()):
             return states
+        finite = are_finite(states.means, states.covariances)
         track_ids = tuple(track_id for track_id, kept in zip(states.track_ids, finite, strict=True) if kept)
         return StatesAt(track_ids, states.means[finite], states.covariances[finite])
 

@@ -191,8 +191,10 @@ class QueueInbox:
             return records(message, Disposition.DUPLICATE)
         ended: list[UpdateRecord] = []
         kept: dict[int, list[int]] = {} if message.objects else {message.stamp_ns: []}
-        for index, stamp_ns in enumerate(stamps(message, sensor)):
-            refusal = self._refusal(message, sensor, stamp_ns) if usable[index] else Disposition.INVALID
+        stamps_ns = stamps(message, sensor)
+        refusals = {stamp_ns: self._refusal(message, sensor, stamp_ns) for stamp_ns in set(stamps_ns)}
+        for index, stamp_ns in enumerate(stamps_ns):
+            refusal = refusals[stamp_ns] if usable[index] else Disposition.INVALID
             if refusal is None:
                 kept.setdefault(stamp_ns, []).append(index)
             else:

@@ -233,11 +233,13 @@ class Preprocess:
         models, white = self._models(names, R, view)
         whole, errors = white, self._pose_errors(names, models[0], points_m, white, assumes, view)
         if errors is not None:
-            x = np.zeros((len(groups), self._motion.dim))
-            if bearings:
-                x[:, :2] = [_far_along(bearing_rad, pose) for bearing_rad in z[:, names.index("bearing_rad")].tolist()]
-            else:
+            x = points_m
+            if models[0].relative:
+                x = np.zeros((len(groups), self._motion.dim))
                 x[:, :2] = points_m
+                if bearings:
+                    bearings_rad = z[:, names.index("bearing_rad")].tolist()
+                    x[:, :2] = [_far_along(bearing_rad, pose) for bearing_rad in bearings_rad]
             whole = errors.noise(models[0], pose, x)
             R = R + (whole - white)
         spreads: Iterable[FloatArray | None]

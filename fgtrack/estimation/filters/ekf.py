@@ -101,15 +101,6 @@ class Correction(NamedTuple):
     fused: BoolArray
     """True where S was positive definite and the posterior is finite, shape (m,)."""
 
-    def rows(self) -> "list[OneCorrection | None]":
-        """Results one by one; None where a measurement could not be fused."""
-        numbers = zip(self.nis.tolist(), self.weight.tolist(), self.fused.tolist(), strict=True)
-        arrays = zip(self.mean, self.covariance, self.innovation, self.S, strict=True)
-        return [
-            OneCorrection(x, P, y, nis, weight, S) if fused else None
-            for (x, P, y, S), (nis, weight, fused) in zip(arrays, numbers, strict=True)
-        ]
-
 
 class OneCorrection(NamedTuple):
     """Result of `correct_one`."""
@@ -219,10 +210,12 @@ def updated_one(
 
     Raises `numpy.linalg.LinAlgError` for one that cannot be fused.
     """
-    [found] = correct_with_innovation(mean[None], covariance[None], y[None], H, R[None], measured, [loss]).rows()
-    if found is None:
+    x, P, y, nis, w, S, fused = correct_with_innovation(
+        mean[None], covariance[None], y[None], H, R[None], measured, [loss]
+    )
+    if not fused[0]:
         raise np.linalg.LinAlgError("innovation covariance not positive definite, or posterior not finite")
-    return found
+    return OneCorrection(x[0], P[0], y[0], float(nis[0]), float(w[0]), S[0])
 
 
 def correct_one(mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:

@@ -171,7 +171,8 @@ class ReplayBank(ObjectBank[ReplayEkf]):
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`."""
-        inside = [i for i, one in self._estimators.items() if self._window_start_ns(i, one) <= stamp_ns]
+        known = self._estimators if stamp_ns >= self._start_ns else self._estimators.keys() - self._chains.keys()
+        inside = [i for i, one in self._estimators.items() if i in known and one.window_ns[0] <= stamp_ns]
         return StatesAt(tuple(inside), *self._ahead(inside, [stamp_ns] * len(inside)))
 
     def present(self) -> list[TrackState]:
@@ -187,9 +188,10 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         found = dict[int, UpdateResult]()
         alike: dict[tuple[int, tuple[str, ...]], list[int]] = {}
         for place, track_id in enumerate(track_ids):
-            if stamp_ns < self._window_start_ns(track_id, self._estimators[track_id]):
+            in_chain = track_id in self._chains
+            if stamp_ns < self._estimators[track_id].window_ns[0] or (in_chain and stamp_ns < self._start_ns):
                 found[track_id] = UpdateResult(UpdateStatus.TOO_OLD)
-            elif track_id in self._chains and _is_plain(seen[place]):
+            elif in_chain and _is_plain(seen[place]):
                 alike.setdefault((id(seen[place].model), seen[place].assumed), []).append(place)
         for places in alike.values():
             found |= self._fused(stamp_ns, [track_ids[place] for place in places], [seen[place] for place in places])
@@ -213,10 +215,6 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         if track_id in self._chains:
             self._free.append(self._chains.pop(track_id).row)
         super().remove(track_id)
-
-    def _window_start_ns(self, track_id: int, one: ReplayEkf) -> int:
-        start_ns = one.window_ns[0]
-        return max(start_ns, self._start_ns) if track_id in self._chains else start_ns
 
     def _fused(self, stamp_ns: int, track_ids: Sequence[int], seen: Sequence[Measurement]) -> dict[int, UpdateResult]:
         """Outcomes, by track, of measurements of the same that could be fused."""

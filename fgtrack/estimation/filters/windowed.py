@@ -55,10 +55,11 @@ class WindowedFilter(ABC):
 
     def moved_on(self, stamp_ns: int) -> UpdateStatus:
         """Status of a measurement that was fused; the window moves on."""
-        status = UpdateStatus.OUT_OF_SEQUENCE if stamp_ns < self._newest_ns else UpdateStatus.IN_SEQUENCE
-        self._newest_ns = max(self._newest_ns, stamp_ns)
-        self.advance(self._newest_ns)
-        return status
+        if stamp_ns < self._newest_ns:
+            return UpdateStatus.OUT_OF_SEQUENCE
+        self._newest_ns = stamp_ns
+        self.advance(stamp_ns)
+        return UpdateStatus.IN_SEQUENCE
 
     @abstractmethod
     def _fuse(self, measurement: Measurement) -> OneCorrection | None:
