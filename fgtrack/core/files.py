@@ -9,7 +9,7 @@ from typing import BinaryIO
 
 from fgtrack.core.errors import DataError
 
-__all__ = ["open_file", "open_text", "read_head", "read_whole"]
+__all__ = ["open_file", "open_text", "read_whole"]
 
 _MEGABYTE = 1_000_000
 
@@ -32,15 +32,6 @@ def open_file(path: Path) -> BinaryIO:
 def open_text(path: Path, encoding: str = "utf-8", newline: str | None = None) -> TextIOWrapper:
     """`path` opened for reading text; raises as `open_file`."""
     return TextIOWrapper(open_file(path), encoding=encoding, newline=newline)
-
-
-def read_head(path: Path, num_bytes: int) -> bytes:
-    """The first `num_bytes` of `path`, or as many as it has; nothing where it is no file or cannot be read."""
-    try:
-        with open_file(path) as file:
-            return file.read(num_bytes)
-    except OSError:
-        return b""
 
 
 def read_whole(path: Path, largest_mb: float) -> bytes:

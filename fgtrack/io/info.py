@@ -3,7 +3,7 @@
 import math
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -85,16 +85,10 @@ def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
     times: dict[_Key, _Times] = defaultdict(_Times)
     read = _read_bag if kind == "recording" else _read_messages
     used, notes, problem = read(path, config, times)
-    topics = tuple(
-        TopicInfo(
-            *(*key, times[key].count, times[key].rate_hz(), times[key].delay()),
-            used_as=used.get(key),
-            note=notes.get(key),
-        )
-        for key in sorted(times)
-    )
-    start_ns = min((item.first_ns for item in times.values() if item.count), default=None)
-    end_ns = max((item.last_ns for item in times.values() if item.count), default=0)
+    topics = tuple(times[key].topic(key, used.get(key), notes.get(key)) for key in sorted(times))
+    spans = [span for item in times.values() for span in item.spans()]
+    start_ns = min((first for _, first, _ in spans), default=None)
+    end_ns = max((last for _, _, last in spans), default=0)
     duration_s = 0.0 if start_ns is None else seconds(end_ns - start_ns)
     found = [one for (name, _), item in sorted(times.items()) for one in item.cautions(name)]
     if start_ns is not None and not found and (text := wrong_unit(2, start_ns, end_ns)):
@@ -106,65 +100,51 @@ _Key = tuple[str, str]  # name and type of a topic
 _Found = tuple[dict[_Key, str], dict[_Key, str | None], str | None]  # uses, notes, what is wrong with the input
 
 
+@dataclass
 class _Times:
     """Receipts, delays and angles of one topic."""
 
-    def __init__(self) -> None:
-        self.receipts_ns: dict[int | None, list[int]] = defaultdict(list)  # by object, of truth
-        self.delays_ns: list[int] = []
-        self._angles: dict[str, tuple[float, float]] = {}  # from the least to the most
-        self._same: tuple[int | None, int] = (None, 0)
-
-    @property
-    def count(self) -> int:
-        return sum(map(len, self.receipts_ns.values()))
-
-    @property
-    def first_ns(self) -> int:
-        return min(map(min, self.receipts_ns.values()))
-
-    @property
-    def last_ns(self) -> int:
-        return max(map(max, self.receipts_ns.values()))
+    receipts_ns: dict[int | None, list[int]] = field(default_factory=lambda: defaultdict(list))
+    """By object, of truth."""
+    delays_ns: list[int] = field(default_factory=list)
+    angles: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Least and largest by name."""
+    newest: tuple[int | None, int] = (None, 0)
+    """Newest stamp, and number of messages of it in a row before the newest."""
 
     def add(self, receipt_ns: int, stamp_ns: int | None, object_id: int | None = None) -> None:
         self.receipts_ns[object_id].append(receipt_ns)
         if stamp_ns is not None:
             self.delays_ns.append(receipt_ns - stamp_ns)
 
-    def at_this_stamp(self, stamp_ns: int | None) -> int:
-        """Number of messages of `stamp_ns` in a row before this one: of truth they are of as many other objects."""
-        self._same = (stamp_ns, self._same[1] + 1) if stamp_ns == self._same[0] else (stamp_ns, 0)
-        return self._same[1]
-
     def add_angles(self, one: EgoState | TruthState | Detection) -> None:
         for name in ANGULAR:
             value = getattr(one, name, None)
             if value is not None and math.isfinite(value):
-                least, most = self._angles.get(name, (value, value))
-                self._angles[name] = min(least, value), max(most, value)
+                least, most = self.angles.get(name, (value, value))
+                self.angles[name] = min(least, value), max(most, value)
 
-    def rate_hz(self) -> float | None:
-        """Mean rate of one object, where there are several."""
-        spans_s = [seconds(max(found) - min(found)) for found in self.receipts_ns.values()]
-        intervals = self.count - len(spans_s)
-        return intervals / sum(spans_s) if sum(spans_s) > 0.0 else None
+    def spans(self) -> list[tuple[int, int, int]]:
+        """Number, first and last of the receipts of every object."""
+        return [(len(found), min(found), max(found)) for found in self.receipts_ns.values()]
+
+    def topic(self, key: _Key, used_as: str | None, note: str | None) -> TopicInfo:
+        count = sum(number for number, _, _ in self.spans())
+        length_s = sum(seconds(last - first) for _, first, last in self.spans())
+        rate_hz = (count - len(self.receipts_ns)) / length_s if length_s > 0.0 else None
+        return TopicInfo(*key, count, rate_hz, self.delay(), used_as, note)
 
     def cautions(self, name: str) -> Iterator[Diagnostic]:
-        for found in self.receipts_ns.values():
-            if (text := wrong_unit(len(found), min(found), max(found))) is not None:
-                yield Diagnostic(name, text)
-                break
-        for angle, (least, most) in self._angles.items():
-            if (caution := in_degrees(name, angle, least, most)) is not None:
-                yield caution
+        texts = (wrong_unit(*span) for span in self.spans())
+        yield from [Diagnostic(name, text) for text in texts if text is not None][:1]
+        found = (in_degrees(name, angle, *span) for angle, span in self.angles.items())
+        yield from (one for one in found if one is not None)
 
     def delay(self) -> DelayInfo | None:
         if not self.delays_ns:
             return None
         delays_s = np.array(self.delays_ns) * 1e-9
-        p50, p90 = np.quantile(delays_s, [0.5, 0.9]).tolist()
-        return DelayInfo(float(delays_s.mean()), p50, p90, float(delays_s.max()))
+        return DelayInfo(float(delays_s.mean()), *np.quantile(delays_s, [0.5, 0.9, 1.0]).tolist())
 
 
 def _read_bag(path: Path, config: InputConfig | None, times: dict[_Key, _Times]) -> _Found:
@@ -181,7 +161,9 @@ def _read_bag(path: Path, config: InputConfig | None, times: dict[_Key, _Times])
     try:
         for topic, log_ns, stamp_ns in bag.stamps():
             found = times[topic.name, topic.type]
-            found.add(log_ns, stamp_ns, found.at_this_stamp(stamp_ns) if topic.type == TRUTH else None)
+            found.newest = (stamp_ns, found.newest[1] + 1) if stamp_ns == found.newest[0] else (stamp_ns, 0)
+            # true states of one stamp are of as many objects
+            found.add(log_ns, stamp_ns, found.newest[1] if topic.type == TRUTH else None)
     except TruncatedInput as error:
         problem = str(error)
     return used, {(topic.name, topic.type): _note(topic, times) for topic in bag.topics}, problem
