@@ -7,8 +7,6 @@ __all__ = ["equal_ones"]
 
 def equal_ones(items: Sequence[Hashable]) -> list[list[int]]:
     """Positions of equal `items`, ascending, in the order of the first of each."""
-    if len(set(items)) == 1:
-        return [list(range(len(items)))]
     groups: dict[Hashable, list[int]] = {}
     for position, item in enumerate(items):
         groups.setdefault(item, []).append(position)

@@ -104,11 +104,6 @@ class View(NamedTuple):
         return math.atan2(aside, ahead)
 
 
-def read_views(oxts: Path, calibration: Path) -> list[View]:
-    """What is known of the ego at every frame; raises `DataError` where the files are not those of the data set."""
-    return _views(oxts, _calibration(calibration))
-
-
 def _calibration(file: Path) -> Calibration:
     matrices: dict[str, FloatArray] = {}
     for number, line in enumerate(lines(file), 1):
@@ -120,7 +115,9 @@ def _calibration(file: Path) -> Calibration:
     try:
         rectified_from_camera = np.eye(4)
         rectified_from_camera[:3, :3] = matrices["R_rect"].reshape(3, 3)
-        camera_from_velodyne, velodyne_from_imu = (_rigid(matrices[name]) for name in ("Tr_velo_cam", "Tr_imu_velo"))
+        camera_from_velodyne, velodyne_from_imu = (
+            np.vstack([matrices[name].reshape(3, 4), [0.0, 0.0, 0.0, 1.0]]) for name in ("Tr_velo_cam", "Tr_imu_velo")
+        )
         projection = matrices["P2"].reshape(3, 4)
     except (KeyError, ValueError) as error:
         raise DataError(f"{file}: is no calibration of the data set ({error!r})") from error
@@ -131,11 +128,9 @@ def _calibration(file: Path) -> Calibration:
     return calibration
 
 
-def _rigid(values: FloatArray) -> FloatArray:
-    return np.vstack([values.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
-
-
-def _views(file: Path, calibration: Calibration) -> list[View]:
+def read_views(file: Path, calibration_file: Path) -> list[View]:
+    """Ego at every frame of the `oxts` file; raises `DataError` where the files are not those of the data set."""
+    calibration = _calibration(calibration_file)
     views: list[View] = []
     origin_m, scale = np.zeros(2), 1.0
     for number, line in enumerate(lines(file), 1):

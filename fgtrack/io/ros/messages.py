@@ -85,20 +85,23 @@ class MessageFactory:
     def odometry(self, state: EgoState) -> RosMessage:
         """`nav_msgs/Odometry` in the frame `map`."""
         pose, twist = _odometry_covariances(state)
+        linear, angular = self._vector(state.speed_mps), self._vector(z=state.yaw_rate_radps)
         return self._make(
             ODOMETRY,
             header=self._header(state.stamp_ns, "map"),
             child_frame_id=_FRAME_IDS["ego"],
             pose=self._with_covariance("Pose", self._pose(state.x_m, state.y_m, state.yaw_rad), pose),
-            twist=self._with_covariance("Twist", self._twist(state.speed_mps, state.yaw_rate_radps), twist),
+            twist=self._with_covariance(
+                "Twist", self._make("geometry_msgs/msg/Twist", linear=linear, angular=angular), twist
+            ),
         )
 
     def detection3d_array(self, message: DetectionList) -> RosMessage:
         """`vision_msgs/Detection3DArray` of the objects that have a position."""
         return self._make(
             DETECTION3D_ARRAY,
-            header=self._list_header(message),
-            detections=[self._detection3d(item) for item in message.objects if _has_position(item)],
+            header=self._header(message.stamp_ns, _FRAME_IDS.get(message.frame, message.sensor)),
+            detections=[self._detection3d(item) for item in message.objects if None not in (item.x_m, item.y_m)],
         )
 
     def pose_array(self, states: list[TruthState]) -> RosMessage:
@@ -119,15 +122,13 @@ class MessageFactory:
         stamp = self._make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
         return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
 
-    def _list_header(self, message: DetectionList) -> RosMessage:
-        return self._header(message.stamp_ns, _FRAME_IDS.get(message.frame, message.sensor))
-
     def _detection(self, item: Detection) -> RosMessage:
         given = {name: _or_nothing(name, getattr(item, name)) for name in DETECTION_OPTIONAL}
         return self._make("fgtrack_msgs/msg/Detection", present=presence(item, DETECTION_OPTIONAL), **given)
 
     def _detection3d(self, item: Detection) -> RosMessage:
         pose = self._pose(item.x_m, item.y_m, item.yaw_rad)
+        size = self._vector(item.length_m, item.width_m, item.height_m)
         results = []
         if (covariance := _full_covariance(item)) is not None:
             hypothesis = self._make("vision_msgs/msg/ObjectHypothesis", class_id=item.class_name or "", score=1.0)
@@ -139,15 +140,12 @@ class MessageFactory:
             "vision_msgs/msg/Detection3D",
             header=self._header(item.stamp_ns or 0, ""),
             results=results,
-            bbox=self._make("vision_msgs/msg/BoundingBox3D", center=pose, size=self._size(item)),
+            bbox=self._make("vision_msgs/msg/BoundingBox3D", center=pose, size=size),
             id="" if item.object_id is None else str(item.object_id),
         )
 
-    def _vector(self, x: float, y: float, z: float = 0.0) -> RosMessage:
-        return self._make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
-
-    def _size(self, item: Detection) -> RosMessage:
-        return self._vector(item.length_m or 0.0, item.width_m or 0.0, item.height_m or 0.0)
+    def _vector(self, x: float | None = None, y: float | None = None, z: float | None = None) -> RosMessage:
+        return self._make("geometry_msgs/msg/Vector3", x=x or 0.0, y=y or 0.0, z=z or 0.0)
 
     def _pose(self, x_m: float | None, y_m: float | None, yaw_rad: float | None) -> RosMessage:
         """A pose; an unknown yaw is the quaternion of norm 0, one that is not finite is not a number."""
@@ -158,13 +156,6 @@ class MessageFactory:
             "geometry_msgs/msg/Pose",
             position=self._make("geometry_msgs/msg/Point", x=x_m, y=y_m, z=0.0),
             orientation=self._make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=z, w=w),
-        )
-
-    def _twist(self, speed_mps: float | None, yaw_rate_radps: float) -> RosMessage:
-        return self._make(
-            "geometry_msgs/msg/Twist",
-            linear=self._vector(speed_mps or 0.0, 0.0),
-            angular=self._vector(0.0, 0.0, yaw_rate_radps),
         )
 
     def _with_covariance(self, kind: str, value: RosMessage, covariance: FloatArray | None) -> RosMessage:
@@ -178,10 +169,6 @@ def _or_nothing(name: str, value: RosMessage) -> RosMessage:
     if name in LISTS:
         return np.array(value or (), dtype=np.float64)
     return value if value is not None else "" if name in TEXTS else 0
-
-
-def _has_position(item: Detection) -> bool:
-    return item.x_m is not None and item.y_m is not None
 
 
 def _odometry_covariances(state: EgoState) -> tuple[FloatArray, FloatArray] | tuple[None, None]:

@@ -180,10 +180,8 @@ class Run:
         save_run(Path(path), self.tables, self.config_text, meta, overwrite)
 
 
-@lru_cache(maxsize=64)
-def _parsed(text: str) -> Any:
-    """The YAML values of `text`. Cached: parsing takes longer than evaluating a run of 20 s, and sweeps repeat it."""
-    return safe_yaml(text)
+_parsed = lru_cache(maxsize=64)(safe_yaml)
+"""YAML values of a text. Cached: parsing takes longer than evaluating a run of 20 s, and sweeps repeat it."""
 
 
 def load_run(path: Path | str) -> Run:

@@ -47,15 +47,15 @@ def rows(
     yield "updates", [_update_row(report.tick, update) for update in report.updates]
     tracked = {track.track_id for track in report.tracks}
     kept = [row for row in report.smoothed if row.lag_s is None or row.track_id in tracked]
-    yield "lagged", [_lagged_row(tick, row) for row in kept if row.lag_s is not None]
+    lagged = [row for row in kept if row.lag_s is not None]
+    yield "lagged", [(*tick, row.lag_s, row.track_id, row.state.stamp_ns, *_state_cells(row.state)) for row in lagged]
     yield "smoothed", smoothed_rows(row for row in kept if row.lag_s in (None, smoothed_lag_s))
     yield "timing", [(*tick, process_ns, len(report.tracks), num_detections)]
 
 
 def _track_row(tick: tuple[int, int], track: TrackReport) -> Row:
-    mean, covariance = _state_cells(track.state)
-    ids = (track.state.stamp_ns, track.track_id, track.status.value)
-    return (*tick, *ids, *mean, track.num_measured, *covariance)
+    cells, ids = _state_cells(track.state), (track.state.stamp_ns, track.track_id, track.status.value)
+    return (*tick, *ids, *cells[: len(STATE_NAMES)], track.num_measured, *cells[len(STATE_NAMES) :])
 
 
 def _update_row(tick: int, update: UpdateRecord) -> Row:
@@ -63,19 +63,12 @@ def _update_row(tick: int, update: UpdateRecord) -> Row:
     return (*ids, update.track_id, update.nis, *map(update.innovation.get, MEASURABLE))
 
 
-def _lagged_row(tick: tuple[int, int], row: SmoothedReport) -> Row:
-    mean, covariance = _state_cells(row.state)
-    return (*tick, row.lag_s, row.track_id, row.state.stamp_ns, *mean, *covariance)
-
-
 def smoothed_rows(reports: Iterable[SmoothedReport]) -> list[Row]:
     """Rows of `smoothed`."""
-    found = []
-    for row in reports:
-        mean, covariance = _state_cells(row.state)
-        kind = "final" if row.lag_s is None else "lagged"
-        found.append((row.track_id, row.state.stamp_ns, kind, *mean, *covariance))
-    return found
+    return [
+        (row.track_id, row.state.stamp_ns, "final" if row.lag_s is None else "lagged", *_state_cells(row.state))
+        for row in reports
+    ]
 
 
 def ignored_row(truth: TruthState) -> Row:
@@ -127,11 +120,11 @@ def _quoted(name: Cell) -> Cell:
     return '"' + name.replace('"', '""') + '"' if set(name) & set(',"\r\n') else name
 
 
-def _state_cells(state: TrackState) -> tuple[Row, Row]:
+def _state_cells(state: TrackState) -> Row:
     """Mean and upper triangle of the covariance; None where the model has no such state."""
     mean = state.mean.tolist()
     entries: list[Cell] = [*state.covariance.ravel().tolist(), None]
-    return (*mean, *(None,) * (len(STATE_NAMES) - len(mean))), _upper_triangle(len(mean))(entries)
+    return (*mean, *(None,) * (len(STATE_NAMES) - len(mean)), *_upper_triangle(len(mean))(entries))
 
 
 @lru_cache
