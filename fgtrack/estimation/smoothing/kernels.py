@@ -35,14 +35,15 @@ def multiply(A: FloatArray, B: FloatArray, result: FloatArray) -> None:
 
 
 @inlined
-def add_multiplied(A: FloatArray, B: FloatArray, result: FloatArray) -> None:
-    """Add A B', which is symmetric, to the first n columns of `result`: the lower triangle, and the mirror of that."""
+def add_congruence(A: FloatArray, P: FloatArray, AP: FloatArray, result: FloatArray) -> None:
+    """Add A P A', which is symmetric, to the first n columns of `result`, and write A P."""
+    multiply(A, P, AP)
     n = A.shape[0]
     for i in range(n):
         for j in range(i + 1):
             value = result[i, j]
             for k in range(n):
-                value += A[i, k] * B[j, k]
+                value += AP[i, k] * A[j, k]
             result[i, j] = result[j, i] = value
 
 
@@ -89,8 +90,7 @@ def _predict(left: FloatArray, segment: FloatArray, origin: FloatArray, moved: F
         ahead[i, n] = mean
         for j in range(i + 1):
             ahead[i, j] = 0.5 * (segment[i, n + j] + segment[j, n + i])
-    multiply(segment, left, moved)
-    add_multiplied(moved, segment, ahead)
+    add_congruence(segment, left, moved, ahead)
 
 
 @inlined
@@ -121,10 +121,8 @@ def _condition(
             E[i, j] = value
             C[i, j] = 0.0
         back[i, n] = mean
-    multiply(E, left, work)
-    add_multiplied(work, E, C)
-    multiply(back, Q, work)
-    add_multiplied(work, back, C)
+    for weights, covariance in ((E, left), (back, Q)):
+        add_congruence(weights, covariance, work, C)
     return True
 
 
@@ -154,8 +152,7 @@ def _correct(
             for j in range(n):
                 E[i, j] = (1.0 if i == j else 0.0) - gain[i] * rows[k, j]
                 state[i, j] = gain[i] * gain[j]
-        multiply(E, P, work)
-        add_multiplied(work, E, state)
+        add_congruence(E, P, work, state)
 
 
 @njit(
@@ -298,8 +295,7 @@ def smoothed(
                 continue
             later = numbers[track, index + 1]
             copy(C[at], P[at])
-            multiply(back[at], P[later], work)
-            add_multiplied(work, back[at], P[at])
+            add_congruence(back[at], P[later], work, P[at])
             if index < first[track]:  # behind the window
                 for i in range(n):
                     value = back[at, i, n]
@@ -336,9 +332,8 @@ def interpolate(
     Lambda, by_right, work = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
     for t in range(len(mean)):
         for attempt in range(2):
-            multiply(F2[t], Q1[t], gain)
             copy(Q2[t], S)
-            add_multiplied(gain, F2[t], S)
+            add_congruence(F2[t], Q1[t], gain, S)
             if solve(S, gain):
                 break
             if attempt == 1:
@@ -358,12 +353,10 @@ def interpolate(
         for i in range(n):
             for j in range(n):
                 by_right[i, j] += Psi[i, j]
-        multiply(by_right, P[t], work)
+        copy(P[t], S)
         for i in range(n):
             for j in range(n):
                 P[t, i, j] = 0.0
-        add_multiplied(work, by_right, P[t])
-        for weights, noise in ((Lambda, C[t]), (E, Q1[t]), (Psi, Q2[t])):
-            multiply(weights, noise, work)
-            add_multiplied(work, weights, P[t])
+        for weights, covariance in ((by_right, S), (Lambda, C[t]), (E, Q1[t]), (Psi, Q2[t])):
+            add_congruence(weights, covariance, work, P[t])
     return True
