@@ -251,6 +251,17 @@ def confirmed(tracks: Table) -> BoolArray:
     return np.asarray(tracks["status"] != TrackStatus.TENTATIVE.value)
 
 
+def published_rows(tracks: Table, ticks: IntArray, track_ids: IntArray) -> IntArray:
+    """Row of `tracks` of each of these ticks and tracks, shape (n,); -1 where there is none."""
+    if not tracks.num_rows:
+        return np.full(len(ticks), -1)
+    step = 1 + max(int(tracks["track_id"].max()), int(track_ids.max(initial=0)))
+    keys, wanted = tracks["tick"] * step + tracks["track_id"], ticks * step + track_ids
+    order = np.argsort(keys)
+    rows = order[np.searchsorted(keys[order], wanted).clip(max=len(keys) - 1)]
+    return np.where(keys[rows] == wanted, rows, -1)
+
+
 def recorded(run: Run, stamps_ns: IntArray) -> BoolArray:
     """True for those of `stamps_ns` between the first and the last stamp of the truth, shape (n,)."""
     truth_ns = run.tables["truth"]["stamp_ns"]

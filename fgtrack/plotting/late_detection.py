@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import tee
 from pathlib import Path
 from typing import NamedTuple, Unpack
@@ -11,8 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fgtrack.core.errors import CallError, DataError
-from fgtrack.core.time import nanoseconds, seconds
-from fgtrack.core.types import FUSED, DetectionList, Disposition, FloatArray, Message
+from fgtrack.core.time import NS_PER_S, nanoseconds
+from fgtrack.core.types import FUSED, DetectionList, Disposition, Message
+from fgtrack.evaluation.matching import published_rows
 from fgtrack.evaluation.runs import EvaluatedRun, by_recording
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run import Run, load_run
@@ -230,25 +230,18 @@ def _late_detections(run: Run) -> dict[Arrival, _Late]:
     _, group, sizes = np.unique(pairs[used], axis=0, return_inverse=True, return_counts=True)
     alone = np.zeros(len(used), dtype=bool)
     alone[used] = sizes[group.reshape(-1)] == 1
-    rows = {key: row for row, key in enumerate(zip(tracks["tick"].tolist(), tracks["track_id"].tolist(), strict=True))}
-    states, motion = np.stack([tracks[name] for name in _STATE], axis=-1), CTRV()
-    found: dict[Arrival, _Late] = {}
-    for update in np.flatnonzero(alone & (updates["disposition"] == Disposition.OUT_OF_SEQUENCE)).tolist():
-        tick, track_id = pairs[update].tolist()
-        row, before = rows.get((tick, track_id)), rows.get((tick - 1, track_id))
-        if row is None or before is None or tracks["num_measured"][row] < _SETTLED:
-            continue
-        now_ns, at_m = tracks["now_ns"][[row]], states[row, :2]
-        predicted_m = motion.predict(states[before], seconds(int(now_ns[0] - tracks["now_ns"][before])))[:2]
-        true_m = [path.at(now_ns)[0, :2] for path in paths]
-        true_m = [each for each in true_m if np.isfinite(each).all()]
-        nearest_m = min(true_m, key=partial(_distance_m, at_m), default=None)
-        errors_m = [np.nan] * 2 if nearest_m is None else [_distance_m(each, nearest_m) for each in (predicted_m, at_m)]
-        numbers = (int(updates[name][update]) for name in ("stamp_ns", "receipt_ns", "index"))
-        moved_m = _distance_m(at_m, predicted_m)
-        found[Arrival(str(updates["sensor"][update]), *numbers)] = _Late(track_id, moved_m, *errors_m)
-    return found
-
-
-def _distance_m(one_m: FloatArray, other_m: FloatArray) -> float:
-    return float(np.hypot(*(one_m - other_m)))
+    late = np.flatnonzero(alone & (updates["disposition"] == Disposition.OUT_OF_SEQUENCE))
+    rows, before = (published_rows(tracks, pairs[late, 0] - back, pairs[late, 1]) for back in (0, 1))
+    known = (rows >= 0) & (before >= 0) & (tracks["num_measured"][rows] >= _SETTLED)
+    late, rows, before = late[known], rows[known], before[known]
+    states, now_ns = np.stack([tracks[name] for name in _STATE], axis=-1), tracks["now_ns"][rows]
+    dt_s = (now_ns - tracks["now_ns"][before]) / NS_PER_S
+    at_m, predicted_m = states[rows, :2], CTRV().predict(states[before], dt_s)[:, :2]
+    true_m = np.stack([path.at(now_ns)[:, :2] for path in paths] or [np.full_like(at_m, np.nan)], axis=1)
+    apart_m = np.linalg.norm(true_m - at_m[:, None], axis=-1)
+    nearest_m = true_m[np.arange(len(late)), np.where(np.isnan(apart_m), np.inf, apart_m).argmin(axis=1)]
+    ends_m = ((at_m, predicted_m), (predicted_m, nearest_m), (at_m, nearest_m))
+    lengths_m = [np.linalg.norm(one - other, axis=-1).tolist() for one, other in ends_m]
+    columns = (updates[name][late].tolist() for name in ("sensor", "stamp_ns", "receipt_ns", "index"))
+    keys = (Arrival(*key) for key in zip(*columns, strict=True))
+    return dict(zip(keys, map(_Late, pairs[late, 1].tolist(), *lengths_m), strict=True))

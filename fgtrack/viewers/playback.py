@@ -157,16 +157,9 @@ class _Recording:
         """Detections in order of receipt: stamp, sensor, fate (0 unused, 1 used, 2 late), place, their track then."""
         table, updates, where, rows = run.tables["detections"], run.tables["updates"], placed(run), update_rows(run)
         sensors, sensor = np.unique(table["sensor"], return_inverse=True)
-        ends_m: dict[Any, Any] = dict(track_positions(run))  # Any: NaN for the others
-        track_m = np.full((len(rows), 2), math.nan)
-        fate = np.zeros(len(rows), dtype=np.int64)
-        for k, row in enumerate(rows.tolist()):
-            if row >= 0:
-                name = updates["disposition"][row]
-                fate[k] = 2 if name in LATE else int(name in USED)
-                track_m[k] = ends_m.get(
-                    (int(updates["tick"][row]), int(updates["track_id"][row])), (math.nan, math.nan)
-                )
+        outcome = np.append(updates["disposition"].astype(np.str_), "")[rows]  # row -1 is of none
+        fate = np.isin(outcome, USED).astype(np.int64) + np.isin(outcome, LATE)
+        track_m = track_positions(run, rows)
         order = np.argsort(table["receipt_ns"], kind="stable")
         order = order[np.isfinite(self.seconds(table["receipt_ns"][order]))]
         return {

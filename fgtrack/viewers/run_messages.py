@@ -215,7 +215,7 @@ def _detection_messages(run: Run, look: Look) -> Iterator[Messages]:
     lists = [(key, list(rows)) for key, rows in groupby(order, key=keys.__getitem__)]
     names = np.unique(table["sensor"]).tolist()
     colours = {name: rgba(SENSORS[k % len(SENSORS)]) for k, name in enumerate(names)}
-    ends_m, became = track_positions(run), update_rows(run)
+    ends_m = track_positions(run, update_rows(run)).tolist()
 
     def scenes(topic: str, shape: Callable[[int, Colour], Shape | None], is_sparse: bool) -> Messages:
         for (receipt_ns, sensor, stamp_ns), rows in lists:
@@ -229,9 +229,8 @@ def _detection_messages(run: Run, look: Look) -> Iterator[Messages]:
 
     def arrival(row: int, colour: Colour) -> Shape | None:
         receipt_ns, _, stamp_ns = keys[row]
-        start_m, update = where.position_m[row].tolist(), became[row]
-        end_m = ends_m.get((int(updates["tick"][update]), int(updates["track_id"][update]))) if update >= 0 else None
-        if fates[row] not in FUSED or end_m is None or receipt_ns <= stamp_ns or not math.isfinite(sum(start_m)):
+        start_m, end_m = where.position_m[row].tolist(), ends_m[row]
+        if fates[row] not in FUSED or receipt_ns <= stamp_ns or not math.isfinite(sum(start_m) + sum(end_m)):
             return None
         ahead_m = end_m[0] - start_m[0], end_m[1] - start_m[1]
         colour = (*colour[:3], 1.0 if fates[row] in LATE else 0.3)

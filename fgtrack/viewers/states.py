@@ -8,6 +8,7 @@ from scipy.special import chdtri
 
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.evaluation.matching import published_rows
 from fgtrack.io.run import Run, Table
 
 #: Length, width and height of the box of an object of unknown size: those of a racing car.
@@ -34,12 +35,15 @@ def located(table: Table) -> Table:
     return table.where(np.isfinite(table["x_m"]) & np.isfinite(table["y_m"]))
 
 
-def track_positions(run: Run) -> dict[tuple[int, int], tuple[float, float]]:
-    """Positions of the tracks by tick and track id."""
-    rows = zip(
-        *(located(run.tables["tracks"])[name].tolist() for name in ("tick", "track_id", "x_m", "y_m")), strict=True
-    )
-    return {(tick, track_id): (x_m, y_m) for tick, track_id, x_m, y_m in rows}
+def track_positions(run: Run, update_rows: IntArray) -> FloatArray:
+    """Position of the track of each of these rows of updates.csv at its tick, shape (n, 2); NaN for row -1."""
+    tracks, updates = run.tables["tracks"], run.tables["updates"]
+    known = np.flatnonzero(update_rows >= 0)
+    ticks, ids = (updates[name][update_rows[known]] for name in ("tick", "track_id"))
+    rows, found = published_rows(tracks, ticks, ids), np.full((len(update_rows), 2), np.nan)
+    positions_m = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
+    found[known[rows >= 0]] = positions_m[rows[rows >= 0]]
+    return found
 
 
 def final_ns(run: Run, final: Table) -> IntArray:

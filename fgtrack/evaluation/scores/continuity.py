@@ -4,9 +4,9 @@ import numpy as np
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FUSED, LATE, FloatArray, IntArray
-from fgtrack.evaluation.matching import Matching, confirmed
+from fgtrack.evaluation.matching import Matching, confirmed, published_rows
 from fgtrack.evaluation.truth import true_paths
-from fgtrack.io.run import NO_TRACK, Run, Table
+from fgtrack.io.run import NO_TRACK, Run
 
 _SHORTEST_ABSENCE_NS = NS_PER_S
 
@@ -56,7 +56,7 @@ def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
     count, tracks, updates = len(matching.object_ids), run.tables["tracks"], run.tables["updates"]
     fused = np.isin(updates["disposition"], [name.value for name in FUSED])
     updates = updates.where(fused & (updates["track_id"] != NO_TRACK))
-    rows = _published(tracks, updates)
+    rows = published_rows(tracks, updates["tick"], updates["track_id"])
     stamps_ns, rows = updates["stamp_ns"][rows >= 0], rows[rows >= 0]
     xy = np.stack([tracks["x_m"][rows], tracks["y_m"][rows]], axis=-1)
     paths = true_paths(run.tables["truth"])
@@ -88,15 +88,3 @@ def tracked_visits(matching: Matching) -> int:
         comes = np.diff(matching.now_ns[ticks], prepend=-_SHORTEST_ABSENCE_NS) >= _SHORTEST_ABSENCE_NS
         count += len(np.unique(np.cumsum(comes)[has_track[ticks]]))
     return count
-
-
-def _published(tracks: Table, updates: Table) -> IntArray:
-    """The row of `tracks` with tick and track of each of `updates`, shape (updates,); -1 where there is none."""
-    if not tracks.num_rows:
-        return np.full(updates.num_rows, -1)
-    step = 1 + max(int(tracks["track_id"].max()), int(updates["track_id"].max(initial=0)))
-    keys = tracks["tick"] * step + tracks["track_id"]
-    wanted = updates["tick"] * step + updates["track_id"]
-    order = np.argsort(keys)
-    rows = order[np.searchsorted(keys[order], wanted).clip(max=len(keys) - 1)]
-    return np.where(keys[rows] == wanted, rows, -1)
