@@ -4,7 +4,6 @@ import json
 import math
 import shutil
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ from rosbags.interfaces import ConnectionExtRosbag2, QosDurability
 from rosbags.rosbag2 import Reader
 
 from fgtrack.cli.main import run as command
-from fgtrack.core.errors import DataError
 from fgtrack.core.types import (
     Detection,
     DetectionList,
@@ -29,9 +27,8 @@ from fgtrack.core.types import (
 from fgtrack.io.ros.bag import Bag, BagMessage
 from fgtrack.io.run import Run, RunWriter, Table, load_run
 from fgtrack.pipeline.shipped import shipped_folder
-from fgtrack.viewers.export import export, viewer_messages
-from fgtrack.viewers.foxglove import values, write_foxglove
-from fgtrack.viewers.ros2 import write_ros2
+from fgtrack.viewers.export import viewer_messages
+from fgtrack.viewers.foxglove import values
 from fgtrack.viewers.shapes import Scene, Shape, ViewerMessage
 
 Times = Counter[tuple[int, int]]
@@ -239,25 +236,6 @@ def test_foxglove_gets_what_the_shapes_say(by_hand: Path) -> None:
     assert {"track_id", "nis"} & set(next(values(topics["/outcomes"][1]))[1]) == set()
 
 
-def test_a_bag_shows_a_run_made_by_hand(by_hand: Path, tmp_path: Path) -> None:
-    export([by_hand], tmp_path / "bag", ros2=True)
-    found = read_bag(tmp_path / "bag")
-    [arrow] = found["/arrivals/markers"][0].data.markers
-    assert (arrow.pose.position.x, arrow.pose.position.y, arrow.scale.x) == pytest.approx((98.0, 60.0, 8.0))
-    assert arrow.header.stamp.sec * 10**9 + arrow.header.stamp.nanosec == STAMP_NS
-    assert found["/arrivals/markers"][0].log_ns == RECEIPT_NS
-    first, second = (one.data.markers for one in found["/ellipses/markers"])
-    assert [(one.scale.x, one.scale.y) for one in first] == [pytest.approx((8.0, 4.0)), pytest.approx((12.0, 2.0))]
-    assert [(one.ns, one.action) for one in second] == [("track 5", 0), ("track 4", 2)]
-    track = found["/tracks"][0].data.detections[0]
-    assert track.id == "4"
-    assert np.diag(track.results[0].pose.covariance.reshape(6, 6)).tolist() == [4.0, 1.0, 0.0, 0.0, 0.0, 0.01]
-    odometry = found["/ego/odometry"][0].data
-    assert (odometry.header.frame_id, odometry.child_frame_id) == ("map", "base_link")
-    [transform] = found["/tf"][0].data.transforms
-    assert transform.transform.rotation.z == pytest.approx(math.sin(math.pi / 4))
-
-
 def test_a_bag_has_the_messages_and_times_of_the_run(bag: dict[str, list[BagMessage]], smoothed: Run) -> None:
     def stamp_ns(message: BagMessage) -> int:
         header = message.data.header
@@ -293,23 +271,6 @@ def test_what_is_sent_once_reaches_those_who_listen_later(bag: dict[str, list[Ba
                 lasting.add(connection.topic)
     assert lasting == {"/map/markers", "/ego/markers"}
     assert all(len(bag[topic]) == 1 for topic in lasting)
-
-
-@pytest.mark.parametrize(("name", "write"), [("x.mcap", write_foxglove), ("x.mcap", write_ros2), ("bag", write_ros2)])
-def test_an_export_that_fails_leaves_nothing(
-    smoothed: Run, tmp_path: Path, name: str, write: Callable[..., object]
-) -> None:
-    def broken() -> Iterator[ViewerMessage]:
-        for count, message in enumerate(viewer_messages({"run": smoothed})[0]):
-            if count == 500:
-                raise DataError("a row is damaged")
-            yield message
-
-    with pytest.raises(DataError, match="a row is damaged"):
-        write(tmp_path / name, broken(), {})
-    with pytest.raises(DataError, match=r"-5 ns lies"):
-        write(tmp_path / name, [ViewerMessage(-5, 5, "/tracks", Scene())], {})
-    assert not list(tmp_path.iterdir())
 
 
 # Several runs, and runs of which something is missing

@@ -9,11 +9,11 @@ import pytest
 from evaluation_runs import ROUND, WEST, update, write_run
 from scipy.stats import chi2
 
-from fgtrack.core.types import MEASURABLE, Disposition, UpdateRecord
+from fgtrack.core.types import Disposition, UpdateRecord
 from fgtrack.evaluation.matching import Matching, match
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.scores.consistency import normalised_squares, state_nees
-from fgtrack.evaluation.scores.innovations import FEWEST, LAGS, Autocorrelation, autocorrelations
+from fgtrack.evaluation.scores.innovations import FEWEST, Autocorrelation
 from fgtrack.evaluation.scores.statistics import ChiSquareMean
 from fgtrack.io.run import COVARIANCE_COLUMNS, Run, Table
 
@@ -144,31 +144,6 @@ def test_tracks_do_not_run_into_each_other(tmp_path: Path) -> None:
     found = whiteness(run)
     assert (found.tracks, found.count) == (2, 70)
     assert found.lag1 == pytest.approx(-(39 * 2 + 29 * 18) / (40 * 2 + 30 * 18))
-
-
-def test_white_innovations_stay_inside_their_bands_whatever_their_covariance() -> None:
-    """Long and thin ellipses that turn, and grow threefold."""
-    rng = np.random.default_rng(11)
-    tracks, n = 200, 200
-    turn = np.linspace(0.0, 3.0, n)
-    c, s = np.cos(turn), np.sin(turn)
-    nu = rng.normal(size=(tracks, n, 2)) * np.array([5.0, 0.5]) * np.linspace(1.0, 3.0, n)[:, None]
-    nu = np.stack([c * nu[..., 0] - s * nu[..., 1], s * nu[..., 0] + c * nu[..., 1]], axis=-1)
-
-    def found(track_ids: list[int]) -> Autocorrelation:
-        values = nu[track_ids].reshape(-1, 2)
-        updates = {f"res_{name}": np.full(len(values), np.nan) for name in MEASURABLE}
-        updates |= {"res_x_m": values[:, 0], "res_y_m": values[:, 1], "track_id": np.repeat(track_ids, n)}
-        return autocorrelations(Table(updates))["position_m"]
-
-    every, alone = found(list(range(tracks))), [found([k]) for k in range(tracks)]
-    # 4 standard deviations of a share of 5 % and of a deviation, and half as much again: lags are not independent
-    assert every.share_outside == pytest.approx(0.05, abs=6.0 * math.sqrt(0.05 * 0.95 / (tracks * LAGS)))
-    assert every.share_outside == pytest.approx(np.mean([one.share_outside for one in alone]))
-    band = math.sqrt(np.mean([one.lag1_band**2 for one in alone]))
-    assert 1.96 * np.std([one.lag1 for one in alone]) == pytest.approx(band, rel=6.0 / math.sqrt(2 * tracks))
-    assert every.lag1_band == pytest.approx(band / math.sqrt(tracks), rel=0.1)
-    assert abs(every.lag1) < 2.0 * every.lag1_band
 
 
 def test_correlated_and_biased_innovations_leave_their_bands(tmp_path: Path) -> None:

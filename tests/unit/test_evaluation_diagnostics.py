@@ -63,14 +63,6 @@ def test_what_most_detections_of_a_sensor_ended_in_is_told_with_a_cure(
     assert str(again).startswith("lidar: 3 of 3")
 
 
-def test_detections_that_fail_without_an_ego_are_the_trouble_of_the_ego_alone(tmp_path: Path) -> None:
-    failed = [update(sensor, tick=k, disposition=Disposition.FAILED) for k in range(5) for sensor in ("lidar", "radar")]
-    (found,) = diagnostics(run_of(tmp_path / "run", failed))
-    assert found.about == "ego"
-    assert "nothing in its frame can be placed (5 of 5 of lidar, 5 of 5 of radar" in found.text
-    assert found.settings == {}
-
-
 def test_too_old_names_the_limit_that_was_passed(tmp_path: Path) -> None:
     late = [update(tick=k, disposition=Disposition.TOO_OLD, delay_ns=3_500_000_000) for k in range(5)]
     (by_sensor,) = diagnostics(run_of(tmp_path / "a", late))
@@ -80,15 +72,6 @@ def test_too_old_names_the_limit_that_was_passed(tmp_path: Path) -> None:
     unlimited = CONFIG.replace("{max_delay_s: 0.4}", "{}")
     (by_storage,) = diagnostics(run_of(tmp_path / "c", late, unlimited, FILTER))
     assert "older than the window (filter.storage_s 3 s)" in by_storage.text
-
-
-def test_what_drop_ignores_is_not_blamed_on_the_window(tmp_path: Path) -> None:
-    run = run_of(tmp_path / "run", lists(Disposition.TOO_OLD, 5), effective=FILTER)
-    (dropped,) = diagnostics(replace(run, meta={**run.meta, "estimator": "drop"}))
-    assert dropped.text.startswith("5 of 5 too_old: median delay 0.15 s, and `drop` ignores by design")
-    assert "raise" not in dropped.text
-    (young,) = diagnostics(run)
-    assert "within the window (filter.storage_s 3 s): no track is as old" in young.text
 
 
 def test_stamps_that_nobody_set_and_a_window_shorter_than_a_period_are_told(tmp_path: Path) -> None:

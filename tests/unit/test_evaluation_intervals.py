@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from scipy.special import stdtrit
 from scipy.stats import ttest_rel
 
 from fgtrack.core.types import FloatArray
@@ -75,28 +74,9 @@ def test_without_correlation_the_standard_error_is_the_textbook_one() -> None:
     assert (found.high - found.low) / 2.0 == pytest.approx(1.97 * values.std() / 20.0, rel=0.15)
 
 
-def test_with_few_blocks_the_interval_is_that_of_a_mean_of_few() -> None:
-    values = np.linspace(0.0, 1.0, 90)
-    found = within_run(np.stack([values, np.ones(90)], axis=-1), mean, np.random.default_rng(4))
-    means = [np.roll(values, -start)[:30].mean() for start in range(90)]  # of all blocks, a third of the run long
-    error = math.sqrt(np.var(means) / 3.0) * math.sqrt(3.0 / 2.0)
-    assert (found.high - found.low) / 2.0 == pytest.approx(stdtrit(2.0, 0.975) * error, rel=0.1)
-    assert found.count == 3
-
-
 def test_sums_are_those_of_each_stamp_without_what_is_not_known() -> None:
     samples = np.array([[1.0, 10.0], [2.0, np.nan], [4.0, 40.0], [8.0, 80.0]])
     assert by_stamp(np.array([7, 7, 3, 7]), samples).tolist() == [[4.0, 40.0, 1.0], [9.0, 90.0, 2.0]]
-
-
-def test_a_faster_tick_rate_changes_the_interval_little() -> None:
-    slow = correlated(np.random.default_rng(6), 300, 0.7) ** 2
-    widths = []
-    for repeats in (1, 10):
-        ticks = np.stack([np.repeat(slow, repeats), np.ones(300 * repeats)], axis=-1)
-        found = within_run(ticks, mean, np.random.default_rng(7))
-        widths.append(found.high - found.low)
-    assert widths[1] == pytest.approx(widths[0], rel=0.1)
 
 
 def test_blocks_grow_with_the_correlation_as_the_rule_says() -> None:

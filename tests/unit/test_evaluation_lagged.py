@@ -11,7 +11,6 @@ from fgtrack.core.types import SmoothedReport
 from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.scores.lagged import WINDOW, LagMetrics, lag_metrics
 from fgtrack.io.run import Run
-from fgtrack.plotting.plot import lag
 
 TICKS = range(20)
 STEPS = {0.1: 5, 0.2: 10}  # ticks that a lag is long
@@ -33,11 +32,6 @@ def smoothed_run(folder: Path) -> Run:
     truth = [*WEST.truth(TICKS), *ROUND.truth(TICKS)]
     meta = {"estimator": "smoother"}
     return write_run(folder, tracks, truth=truth, smoothed=smoothed, smoothed_lag_s=0.1, meta=meta)
-
-
-def filter_run(folder: Path) -> Run:
-    tracks = [[WEST.track(k, 1, along_m=3.0, speed_mps=1.0)] for k in TICKS]
-    return write_run(folder, tracks, truth=WEST.truth(TICKS), meta={"estimator": "ekf-replay"})
 
 
 def lagged_of(run: Run) -> dict[object, LagMetrics]:
@@ -118,30 +112,3 @@ def test_nees_weighs_the_error_with_the_covariance(tmp_path: Path) -> None:
 
 
 # --- figure
-
-
-def test_the_figure_has_a_line_per_run_and_a_level_one_for_a_filter(tmp_path: Path) -> None:
-    figure = lag([smoothed_run(tmp_path / "smoother"), filter_run(tmp_path / "ekf-replay")])
-    (position,) = figure.axes
-    (speed,) = lag(
-        [smoothed_run(tmp_path / "2" / "smoother"), filter_run(tmp_path / "2" / "ekf-replay")], "speed_mps"
-    ).axes
-    assert (position.get_ylabel(), speed.get_ylabel()) == ("position RMSE [m]", "speed RMSE [m/s]")
-    assert speed.get_xlabel() == "lag of the output [s]"
-    legend = position.get_legend()
-    assert legend is not None
-    assert [text.get_text() for text in legend.get_texts()] == [
-        "smoother",
-        "ekf-replay (no lag)",
-        "present, at the same stamps",
-    ]
-    lines = {str(line.get_label()): line for line in speed.lines}
-    assert np.asarray(lines["smoother"].get_xdata()).tolist() == [0.0, 0.1, 0.2]
-    assert np.asarray(lines["smoother"].get_ydata()).tolist() == pytest.approx([4.0, 2.0, 1.0])
-    (present,) = (line for line in speed.lines if line.get_linestyle() == ":" and len(line.get_xdata()))
-    assert np.asarray(present.get_ydata()).tolist() == pytest.approx([4.0] * 3)
-    assert set(np.asarray(lines["ekf-replay (no lag)"].get_ydata()).tolist()) == {1.0}
-    for axes in (position, speed):
-        low, high = axes.get_ylim()
-        assert low == 0.0
-        assert high > max(float(np.max(np.asarray(line.get_ydata()))) for line in axes.lines if len(line.get_xdata()))

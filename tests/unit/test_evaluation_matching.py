@@ -33,12 +33,6 @@ def test_truth_between_two_stamps_is_a_curve_that_a_turning_car_drives() -> None
     assert between[2:] == pytest.approx((yaw_rad, speed_mps))
 
 
-def test_yaw_is_interpolated_the_shorter_way_round() -> None:
-    path = path_of((0.0, 0.0, 3.0, 1.0), (1.0, 0.0, -3.0, 1.0))
-    middle = path.at(np.array([START_NS + S_NS // 2]))[0, 2]
-    assert abs(middle) == pytest.approx(math.pi)
-
-
 def test_truth_at_its_own_stamps_is_the_recorded_state_to_the_bit() -> None:
     states = [(0.1, 0.7, 0.3, 9.1), (1e3 / 3, 2.0, math.nan, 9.3), (7.7, 3.1, -3.1, math.nan)]
     path = path_of(*states)
@@ -58,17 +52,6 @@ def test_the_ego_and_rows_without_position_are_no_true_objects(tmp_path: Path) -
     lost = TruthState(START_NS, START_NS, 5, math.nan, 0.0)
     run = write_run(tmp_path / "run", truth=[*ego.truth(range(3)), *WEST.truth(range(3)), lost])
     assert [path.object_id for path in true_paths(run.tables["truth"])] == [7]
-
-
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_truth_beyond_all_distances_is_none(tmp_path: Path) -> None:
-    """As a detection there; a speed that is none leaves the position."""
-    far = [TruthState(START_NS + each * S_NS, START_NS, 5, 1e308 * (-1.0) ** each, 0.0) for each in range(4)]
-    fast = dataclasses.replace(WEST.truth(range(1))[0], object_id=6, speed_mps=-1e300)
-    run = write_run(tmp_path / "run", truth=[*far, fast, *WEST.truth(range(3))])
-    odd, usual = true_paths(run.tables["truth"])
-    assert (odd.object_id, usual.object_id) == (6, 7)
-    assert np.isnan(odd.at(np.array([fast.stamp_ns]))[0, 3])
 
 
 def test_truth_in_any_order_is_one_path_and_its_last_word_counts(tmp_path: Path) -> None:

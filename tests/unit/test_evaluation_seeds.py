@@ -112,16 +112,6 @@ def test_few_points_are_shown_in_full_under_the_labels_of_their_axes() -> None:
     assert max(map(len, str(table).splitlines())) <= 100
 
 
-def test_of_many_points_it_is_shown_how_often_who_is_best() -> None:
-    rows = [
-        row
-        for k in range(30)
-        for row in rows_of({"a": noisy(k, 0.4), "b": noisy(k, 0.4 if k < 10 else 0.5)}, delay_s=str(k))
-    ]
-    (table,) = shown_tables(seed_comparisons(rows, ("delay_s",)), ("delay_s",))
-    assert table.data.to_numpy().tolist() == [["a", 20, 10, 0], ["b", 0, 10, 20]]
-
-
 def test_a_summary_has_mean_and_standard_error_of_each_point_and_estimator() -> None:
     values = {"a": [0.4, 0.5, 0.6, 0.5], "b": [0.9, 1.0, 1.1, 1.0]}
     cells = {"late": "much", "delay": '{"kind": "none"}'}

@@ -11,14 +11,10 @@ from evaluation_runs import START_NS, TICK_NS, update
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import EgoState, TickReport, TrackReport, TrackState, TrackStatus, TruthState
-from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.tables.compare import compare
 from fgtrack.evaluation.truth import ego_states, true_paths, visible
 from fgtrack.io.run import Run, RunWriter, load_run
-from fgtrack.pipeline.replay import replay_in_memory
-from fgtrack.pipeline.shipped import read_config, read_scenario
-from fgtrack.sim.simulate import simulate
 
 #: Front RADAR: 90 degrees, 100 m; LiDAR: all around, 50 m ahead, 20 m behind, mounted 2 m ahead of the frame.
 CONFIG = """
@@ -129,33 +125,3 @@ def test_the_path_of_the_ego_is_linear_between_its_stamps_in_any_order_and_turns
     assert poses[:, 0].tolist() == pytest.approx([0.0, 0.0, 1.0, 2.0, 2.0])
     assert poses[2, 2] == pytest.approx(math.pi)
     assert np.isnan(ego_states(load_run(tmp_path / "run").tables["ego"].where(np.zeros(4, bool)), np.array([0]))).all()
-
-
-def test_the_shipped_configuration_sees_what_the_sensors_of_the_default_scenario_see() -> None:
-    """Simulated sensors that never miss: what they detect is in sight, and what is in sight they detect."""
-    scenario = read_scenario("default", duration_s=12.0)
-    perfect = [
-        replace(
-            sensor,
-            **dict.fromkeys(("outlier_probability", "split_probability", "jitter_s"), 0.0),
-            detection_probability=1.0,
-            std=dict.fromkeys(sensor.std, 0.0),
-            clutter=replace(sensor.clutter, mean_per_scan=0.0),
-            drop_outs=(),
-        )
-        for sensor in scenario.sensors
-    ]
-    messages = simulate(replace(scenario, sensors=tuple(perfect)), np.random.default_rng(1))
-    run, _ = replay_in_memory(messages, read_config("smoother", track_map="oval", estimator="ekf-replay"))
-    paths = true_paths(run.tables["truth"])
-    matching = match(run)
-    assert matching is not None
-    for sensor in perfect:
-        scans = [message for message in messages if getattr(message, "sensor", "") == sensor.name]
-        stamps_ns = np.array([scan.stamp_ns for scan in scans])
-        counts = [len(scan.objects) for scan in scans]
-        only = run.with_tables(updates=run.tables["updates"].where(run.tables["updates"]["sensor"] == sensor.name))
-        found, is_known = visible(only, paths, stamps_ns)
-        assert is_known
-        assert (found.sum(axis=1) == counts).mean() > 0.97, sensor.name  # they may differ at the edges of the view
-        assert 0 < found.sum() < found.size

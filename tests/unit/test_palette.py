@@ -2,9 +2,7 @@
 
 import pytest
 
-from fgtrack.evaluation.palette import PALETTE, SENSORS, distinct_colours, look, looks
-
-COMMON = ("smoother", "ekf-replay", "ekf-backward-forward", "drop")
+from fgtrack.evaluation.palette import PALETTE, SENSORS, look, looks
 
 
 def luminance(colour: str) -> float:
@@ -25,9 +23,3 @@ def test_runs_of_one_estimator_share_the_colour_and_differ_by_the_line() -> None
     found = looks(["smoother"] * 4)
     assert {one.colour for one in found} == {look("smoother").colour}
     assert len({one.line for one in found}) == 4
-
-
-def test_without_lines_further_runs_of_an_estimator_take_free_colours() -> None:
-    found = distinct_colours(["drop", "smoother", "smoother"])
-    assert found[:2] == [look("drop").colour, look("smoother").colour]
-    assert len(set(found)) == 3

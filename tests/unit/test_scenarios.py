@@ -1,7 +1,5 @@
 """The committed scenarios and the built-in one, which is a picture of the data of Karle et al. 2023, section III-H."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,6 @@ from fgtrack.core.types import DetectionList, FloatArray, Message, TruthState
 from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.sim.simulate import simulate
 
-CONFIGS = Path(__file__).parents[2] / "configs"
 EGO_ID = -1
 
 

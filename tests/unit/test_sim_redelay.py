@@ -1,6 +1,5 @@
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +22,6 @@ from fgtrack.sim.delays import (
 )
 from fgtrack.sim.redelay import OTHERS, SensorDelays, redelay
 
-SCENARIOS = Path(__file__).resolve().parents[2] / "configs/scenarios"
 MS = 1_000_000
 LATE = SensorDelays(UniformDelay(0.0, 0.4))
 DRIVE = drive(200)
@@ -57,12 +55,6 @@ def test_messages_come_in_order_of_the_new_receipt_and_none_is_lost_or_changed(
     old, new = ([replace(m, receipt_ns=0) for m in ms if isinstance(m, DetectionList)] for ms in (messages, found))
     assert sorted(exact(new)) == sorted(exact(old))
     assert all(0 <= m.receipt_ns - m.stamp_ns <= 400 * MS for m in found if isinstance(m, DetectionList))
-
-
-@given(messages=message_lists())
-def test_without_any_sensor_named_everything_stays_to_the_bit(messages: list[Message]) -> None:
-    assert exact(redelayed(messages)) == exact(messages)
-    assert exact(list(redelay(lambda: messages, {OTHERS: SensorDelays()}, np.random.default_rng(0)))) == exact(messages)
 
 
 def test_drawn_delays_follow_their_model_in_the_order_of_the_stamps() -> None:
@@ -122,22 +114,6 @@ def test_at_the_same_receipt_what_keeps_it_comes_first_then_sensor_by_sensor() -
 
 
 # Memory and damage
-
-
-@pytest.mark.parametrize(("delay_s", "most"), [(0.16, 3), (0.0, 25)])
-def test_no_more_messages_wait_than_the_delays_need(delay_s: float, most: int) -> None:
-    # 100 ms later than recorded: two or three lists of the lidar wait. 60 ms earlier: all others wait, 340 a second.
-    num_read = 0
-
-    def read() -> Iterator[Message]:
-        nonlocal num_read
-        for message in DRIVE:
-            num_read += 1
-            yield message
-
-    result = redelay(read, {"lidar": SensorDelays(ConstantDelay(delay_s))}, np.random.default_rng(0))
-    num_read = 0
-    assert most / 2 < max(num_read - given for given, _ in enumerate(result, 1)) <= most
 
 
 def broken(count: int, error: DataError) -> Iterator[Message]:

@@ -151,26 +151,6 @@ def test_clutter_is_poisson_in_number_and_uniform_over_the_field_of_view() -> No
     assert stats.kstest(z[:, 1], stats.uniform(-0.6, 1.2).cdf).pvalue > ALPHA
 
 
-def test_clutter_on_the_track_lies_on_the_track_and_seems_to_drive() -> None:
-    oval = make_oval()
-    start = oval.position(np.array([0.0]), np.array([0.0]))[0]
-    ego = np.tile([*start, 0.5, 60.0, 0.0, 0.0], (2000, 1))
-    sensor = SimulatedSensor(
-        "radar",
-        {**NO_NOISE, "yaw_rad": 0.0, "speed_mps": 0.0},
-        clutter=Clutter(0.8, region="track", speed_mps=(10.0, 80.0)),
-    )
-    scans = Scanner(sensor, ego, 0.0).scans(np.random.default_rng(0), [], oval)
-    z = np.array([[d.x_m, d.y_m, d.yaw_rad, d.speed_mps] for ds in scans for d in ds], dtype=float)
-    assert stats.poisson(0.8 * 2000).cdf(len(z)) < 1.0 - ALPHA  # some lie behind the range limit
-    assert len(z) > 0.9 * 0.8 * 2000
-    c, s = math.cos(0.5), math.sin(0.5)
-    points = start + np.stack([c * z[:, 0] - s * z[:, 1], s * z[:, 0] + c * z[:, 1]], axis=1)
-    assert not oval.outside(points, 1e-6, 1e-6).any()
-    np.testing.assert_allclose(z[:, 2] + 0.5, oval.heading(points), atol=1e-9)
-    assert stats.kstest(z[:, 3], stats.uniform(10.0, 70.0).cdf).pvalue > ALPHA
-
-
 # Times and settings
 
 

@@ -1,5 +1,4 @@
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,14 +8,11 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.pipeline.shipped import read_scenario
-from fgtrack.sim.delays import ConstantDelay, GammaDelay, NoDelay
+from fgtrack.sim.delays import NoDelay
 from fgtrack.sim.scenario import EgoMessages, Scenario
 from fgtrack.sim.sensor import Clutter, SimulatedSensor
 from fgtrack.sim.simulate import simulate
 from fgtrack.sim.vehicles import DrawnVehicle, TrackVehicle
-
-ROOT = Path(__file__).resolve().parents[2]
-
 
 DEFAULT = read_scenario("default")
 SHORT = replace(DEFAULT, duration_s=5.0)
@@ -108,18 +104,6 @@ def test_a_scan_that_saw_nothing_is_sent_and_a_silent_sensor_sends_nothing() -> 
     assert all(scan.objects == () for scan in scans)
     times = [(scan.stamp_ns - SHORT.start_ns) / NS_PER_S for scan in scans]
     assert times == [k / 10 for k in range(51) if not 10 <= k < 20]
-
-
-def test_another_delay_leaves_stamps_and_detections_as_they_were() -> None:
-    def without_receipts(scenario: Scenario) -> list[tuple[object, ...]]:
-        messages = [m for m in run(scenario) if isinstance(m, DetectionList)]
-        return sorted((m.sensor, m.stamp_ns, m.objects) for m in messages)
-
-    late = tuple(replace(sensor, delay=ConstantDelay(0.5)) for sensor in SHORT.sensors)
-    gone = {"duration_s": 5.0}
-    assert without_receipts(replace(SHORT, sensors=late)) == without_receipts(SHORT)
-    assert without_receipts(replace(read_scenario("no_delay"), **gone)) == without_receipts(SHORT)  # type: ignore[arg-type]
-    assert all(isinstance(sensor.delay, GammaDelay) for sensor in SHORT.sensors)
 
 
 def test_equal_receipts_are_ordered_truth_ego_sensors() -> None:

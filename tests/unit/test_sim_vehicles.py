@@ -9,7 +9,7 @@ from fgtrack.core.types import ACCEL, SPEED, YAW, YAW_RATE
 from fgtrack.models.motion import CTRV
 from fgtrack.models.oval import make_oval
 from fgtrack.models.path import Path
-from fgtrack.sim.vehicles import DrawnVehicle, LaneChange, TrackTrajectory, TrackVehicle, drawn
+from fgtrack.sim.vehicles import DrawnVehicle, LaneChange, TrackVehicle, drawn
 
 OVAL = make_oval()
 PATH = Path.through(OVAL.table[:, :2])
@@ -39,23 +39,6 @@ def test_yaw_is_the_direction_of_travel_and_the_rates_are_derivatives(times: lis
     atol = 0.5 * jump * 75.0**2 * 5.0 + 1e-3
     assert atol < 0.1
     np.testing.assert_allclose(now[:, ACCEL], (ahead[:, SPEED] - behind[:, SPEED]) / (2.0 * h), atol=atol)
-
-
-def test_a_speed_profile_goes_through_its_knots_and_is_constant_outside() -> None:
-    vehicle = TrackVehicle(arc_m=0.0, speed=((5.0, 60.0), (10.0, 70.0)))
-    trajectory = vehicle.trajectory(PATH)
-    speed = trajectory.states(np.array([0.0, 4.0, 5.0, 7.5, 10.0, 50.0]))[:, SPEED]
-    np.testing.assert_allclose(speed, [60.0, 60.0, 60.0, 65.0, 70.0, 70.0], rtol=1e-5)
-    s = OVAL.frenet(trajectory.states(np.array([0.0, 4.0]))[:, :2])[0]
-    np.testing.assert_allclose(s, [0.0, 240.0], atol=1e-3)
-
-
-def test_a_lane_change_ends_at_its_target_without_a_step() -> None:
-    times = np.linspace(0.0, 40.0, 4001)
-    lateral = OVAL.frenet(TrackTrajectory(BUSY, PATH).states(times)[:, :2])[1]
-    for time_s, expected in ((0.0, -4.0), (1.0, -4.0), (4.0, 4.0), (6.0, 0.0), (25.0, 0.0), (31.0, -5.0)):
-        assert lateral[round(time_s * 100.0)] == pytest.approx(expected, abs=5e-3)
-    assert np.abs(np.diff(lateral)).max() < 0.08
 
 
 def test_a_drawn_vehicle_without_noise_drives_the_exact_arc() -> None:
