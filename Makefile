@@ -19,7 +19,10 @@ DOCS := $(TEST) $(VENV)/.docs
 demo: $(RUN)
 	@$(BIN)/fgtrack demo -o out/demo --overwrite
 
+# Importing compiles what numba has not kept yet; in two halves, else each worker would do all of it.
 test: $(TEST)
+	@$(BIN)/python -c 'import fgtrack.estimation.kernels.replay, fgtrack.estimation.kernels.euler' & \
+	    $(BIN)/python -c 'import fgtrack.estimation.smoothing.node_kernels, fgtrack.tracking.kernels'; wait
 	$(BIN)/python -m pytest -n auto $(BY_FILE)
 
 # The tests marked slow, and the others with many more random examples.

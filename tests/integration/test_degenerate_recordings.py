@@ -117,12 +117,3 @@ def test_offsets_and_advice_say_what_can_be_known(kind: str, command: str, tmp_p
     code, out, err = called([command, str(path)], capsys)
     assert code == 0, err
     assert "nan" not in out
-
-
-@pytest.mark.slow
-def test_advice_on_noise_that_has_no_maximum_leaves_it(tmp_path: Path, capsys: Capture) -> None:
-    path = tmp_path / "drive.jsonl"
-    write_stream(path, [one for one in KINDS["all alike"][0]() if getattr(one, "sensor", "lidar") == "lidar"])
-    code, out, err = called(["advise", str(path), "--tune"], capsys)
-    assert code == 0, err
-    assert NOISELESS in " ".join(out.split())

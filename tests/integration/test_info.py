@@ -3,7 +3,7 @@ from support.messages import START_NS, drive, shared
 
 from fgtrack.cli.main import run
 from fgtrack.core.errors import DataError
-from fgtrack.core.types import DetectionList, EgoState, TruthState
+from fgtrack.core.types import DetectionList, EgoState
 from fgtrack.io.config import InputConfig, TopicInput
 from fgtrack.io.info import describe
 from fgtrack.io.ros.bag_writer import write_bag
@@ -47,15 +47,6 @@ def test_a_stream_is_described_by_its_sensors_up_to_the_break(tmp_path):
     assert topics["radar"].count == 10
     assert topics["radar"].used_as == "detections radar"
     assert topics["ego"].delay.max_s == 0.0
-
-
-def test_the_rate_of_truth_is_that_of_an_object(tmp_path):
-    truth = [TruthState(k * 100_000_000, k * 100_000_000, own_id, 0.0, 0.0) for k in range(11) for own_id in range(3)]
-    write_stream(tmp_path / "a.jsonl", truth)
-    (topic,) = describe(tmp_path / "a.jsonl").topics
-    assert (topic.count, topic.rate_hz) == (33, pytest.approx(10.0))
-    write_bag(tmp_path / "bag", truth)
-    assert by_name(describe(tmp_path / "bag"))["/fgtrack/truth"].rate_hz == pytest.approx(10.0)
 
 
 def test_times_and_angles_in_another_unit_are_pointed_out(tmp_path):

@@ -10,7 +10,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import DetectionList, TruthState
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.io.config import Field, Filter, InputConfig, TopicInput
+from fgtrack.io.config import Filter, InputConfig, TopicInput
 from fgtrack.io.ros.messages import ODOMETRY, MessageFactory
 from fgtrack.io.ros.typestore import build_typestore
 from fgtrack.io.source import open_input
@@ -116,29 +116,6 @@ def test_the_tracks_of_a_cycle_are_one_scan(recording):
     first = scans[0].objects[0]
     assert first.bearing_rad == pytest.approx(math.atan2(3.0, 58.0), abs=0.03)
     assert scans[0].receipt_ns == START_NS + DELAY_NS + 3_000_000
-
-
-def test_the_same_by_fields_filters_and_stamps_from_the_receipt(recording):
-    fields = {
-        "range_m": "range",
-        "bearing_rad": Field("angle", scale=-1.0, degrees=True),
-        "range_rate_mps": "range_rate",
-        "object_id": "id",
-        "width_m": "width",
-    }
-    topic = "/vehicle_1/radar_front/esr_track"
-    filters = {"status": Filter(min=1.0)}
-    by_fields = TopicInput(topic, fields=fields, filters=filters, frame="sensor", scan_s=0.02)
-    found = lists(recording, InputConfig(detections={"radar_front": by_fields}))
-    assert found == lists(recording, InputConfig(detections={"radar_front": TopicInput(topic, scan_s=0.02)}))
-    near = TopicInput(topic, filters={"range_m": Filter(max=45.0)})
-    found = lists(recording, InputConfig(detections={"radar_front": near}))
-    assert sum(len(item.objects) for item in found) == 80
-    assert [each for item in found for each in item.left_out] == ["filters.range_m"] * 80
-    late = TopicInput(topic, stamp_from="receipt")
-    found = lists(recording, InputConfig(detections={"radar_front": late}))
-    assert len(found) == 320
-    assert all(item.stamp_ns == item.receipt_ns for item in found)
 
 
 def test_topics_of_truth_are_an_object_each(recording):

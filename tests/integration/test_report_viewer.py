@@ -9,7 +9,10 @@ from support.chromium import CHROMIUM, Browser, chromium
 import fgtrack
 from fgtrack.cli.main import run as command
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed (apt-get install chromium)")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed (apt-get install chromium)"),
+]
 
 NAMES = ("ekf-replay", "smoother")
 

@@ -191,18 +191,6 @@ def test_what_a_plug_in_estimator_does_wrong_is_not_published_and_counted(
     assert len(np.unique(run.tables["tracks"]["track_id"][near])) <= 4, "the other car is hardly disturbed"
 
 
-@pytest.mark.parametrize("wrong", [*STATES, "state raises"])
-def test_a_track_that_fails_at_once_ends_and_the_run_says_when_and_why(
-    sabotaged: Callable[[str], Config], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wrong: str
-) -> None:
-    monkeypatch.setattr(Sabotaged, "healthy", 0)
-    run = run_of(sabotaged(wrong), tmp_path)
-    check_published(run)
-    assert check_told(run)[Failure.TRACK_ENDED] > 0
-    assert {one["failure"] for one in run.meta["ended_by_failure"]} == {KINDS[wrong]}
-    assert (run.tables["tracks"]["x_m"] < BETWEEN_M).all()
-
-
 def test_a_healthy_estimator_fails_nowhere_and_compare_says_so_in_full(
     sabotaged: Callable[[str], Config], tmp_path: Path
 ) -> None:

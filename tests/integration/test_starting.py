@@ -80,20 +80,6 @@ def test_tables_of_another_program_are_written_read_and_replayed(foreign, tmp_pa
     assert "warning" not in capsys.readouterr().err.replace("map: there is none", "")
 
 
-def test_what_is_there_is_kept_and_a_configuration_beside_it_refused(foreign, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.yaml").write_text("estimator: smoother\n")
-    for words, complaint in (
-        (["--write", "mine.yaml"], "mine.yaml: already exists"),
-        (["--write", "new.yaml", "-c", "smoother"], "--write, -c: a starting configuration is made from the recording"),
-        (["--write", "drive/ego.csv"], "drive/ego.csv"),
-        (["--write", "drive/x.yaml"], "lies in the input"),
-    ):
-        assert run(["info", "drive", *words]) == 2
-        assert complaint in capsys.readouterr().err
-    assert (tmp_path / "mine.yaml").read_text() == "estimator: smoother\n"
-
-
 def test_one_table_of_several_things_is_told_apart_by_a_column(tmp_path):
     rows = [["ms", "kind", "pos: x", "pos #y", "yaw", "v"]]
     for k in range(40):

@@ -292,14 +292,6 @@ vary:
     assert re.match(rf"fgtrack: error: .*errors\.csv: 5 bad cells, the first: {first}", said[0])
 
 
-def test_a_bad_cell_is_tried_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    sweep = write_sweep(tmp_path, "duration_s: 1.0\nestimators: [ekf-replay]\nset: {scenario.map: track.csv}\n")
-    call = ["sweep", str(sweep), "-o", str(tmp_path / "out"), "--jobs", "1"]
-    for _ in range(2):
-        assert run(call) == 1
-        assert "jobs: 1, each of 1 estimators; to do: 1" in capsys.readouterr().out
-
-
 def deadly(run: Run) -> tuple[dict, dict]:
     """Dies of the backward-forward EKF with a gate of 3 m."""
     scores = score(run)
@@ -323,13 +315,6 @@ vary: {evaluation.gate_m: [5.0, 3.0, 4.0]}
     bad = rows(tmp_path / "out/errors.csv")
     assert [(row["evaluation.gate_m"], row["estimator"]) for row in bad] == [("3.0", "ekf-backward-forward")]
     assert "the process that ran it died" in bad[0]["error"]
-
-
-def test_metrics_that_do_not_exist_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = "duration_s: 0.5\nestimators: [ekf-replay]\nmetrics: [num_tracks, truth.positon]\n"
-    assert run(["sweep", str(write_sweep(tmp_path, text)), "-o", str(tmp_path / "out"), "--jobs", "1"]) == 1
-    assert "metrics: no column fits truth.positon" in capsys.readouterr().err
-    assert list(rows(tmp_path / "out/sweep.csv")[0]) == ["seed", "estimator", "num_tracks"]
 
 
 # --- going on

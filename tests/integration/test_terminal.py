@@ -61,24 +61,6 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def check(lines: Sequence[str], width: int) -> None:
-    """No row is wrapped or cut, and every run has its name in every table that has a row for it."""
-    assert max(map(len, lines)) <= width
-    assert "…" not in "".join(lines)
-    text = "\n".join(lines)
-    for title in ("Differences of runs", "Tracking", "Error against lag", "Dispositions"):
-        (_, table) = text.split(f"\n\n{title}")
-        rows = [line.split() for line in table.split("\n\n")[0].splitlines()]
-        for name in ESTIMATORS:
-            assert any(name in row for row in rows), (title, name)
-
-
-def test_the_demo_shows_every_name_in_80_columns(demo: Path) -> None:
-    lines = (demo / "shown.txt").read_text(encoding="utf-8").splitlines()
-    check([line for line in lines if str(demo) not in line], 80)  # a path is as long as it is
-    assert any("--all" in line for line in lines)
-
-
 def test_the_demo_goes_from_scenario_to_report(demo: Path) -> None:
     assert (demo / "recording/metadata.yaml").exists()
     assert {path.name for path in (demo / "runs").iterdir()} == set(ESTIMATORS)

@@ -135,11 +135,3 @@ def test_two_cars_that_meet_are_as_many_tracks_with_every_estimator(
     name: str, towards_deg: float, seed: int, settings: str
 ) -> None:
     counts(name, towards_deg, seed, settings, FEW, apart=1)
-
-
-@pytest.mark.parametrize("estimator", ["ekf-replay", "ekf-backward-forward"])
-def test_a_filter_that_does_not_seek_the_direction_loses_them_again_and_again(estimator: str) -> None:
-    """The cause: without a map it starts at yaw 0, is linearised there, and runs away from its object."""
-    sent = messages(MEETINGS["through one another, 30 degrees"], 150.0, 1)
-    assert confirmed(sent, estimator, **{**MERGE, "initiation": {"method": "one-point"}}) > 10
-    assert confirmed(sent, estimator, **MERGE) <= 3

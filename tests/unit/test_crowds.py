@@ -122,21 +122,6 @@ def test_detections_and_tracks_all_in_one_place_are_not_all_compared(
     assert len(found[0].pairs) > 2_500
 
 
-@pytest.mark.parametrize(
-    "association", [GatedEuclidean(gate_m=5.0), GatedEuclidean(gate_m=5.0, max_nis=400.0), GatedMahalanobis()]
-)
-@pytest.mark.parametrize("side_m", [100.0])
-def test_memory_grows_with_the_detections_and_not_with_detections_times_tracks(
-    association: GatedEuclidean | GatedMahalanobis, side_m: float
-) -> None:
-    """20,000 detections and 500 tracks: a matrix of one number for each pair has 80 MB."""
-    rng = np.random.default_rng(0)
-    candidates = [candidate(x, y) for x, y in rng.uniform(0.0, side_m, size=(20_000, 2)).tolist()]
-    tracks = states([(x, y) for x, y in rng.uniform(0.0, side_m, size=(500, 2)).tolist()])
-    peak = peak_bytes(lambda: association(candidates, tracks))
-    assert peak < 60 * MB, f"{peak / MB:.0f} MB"
-
-
 # --- merge
 
 
