@@ -181,6 +181,9 @@ def test_pages_named_in_the_code_exist() -> None:
 def test_files_named_on_the_pages_for_developers_exist(page: str) -> None:
     for name in re.findall(r"`((?:fgtrack|tests|docs|\.ci)/[\w/.]*|CHANGELOG\.md)`", prose(Path(page))):
         assert (ROOT / name).exists(), f"{page}: {name} does not exist"
+    for file, test in re.findall(r"^\| [^|]+ \| `(.+)` \| `(.+)` \|$", prose(Path(page)), re.MULTILINE):
+        assert (ROOT / "fgtrack" / file).exists(), f"{page}: {file} does not exist"
+        assert (ROOT / "tests" / test).exists(), f"{page}: {test} does not exist"
 
 
 # Commands
