@@ -1,7 +1,6 @@
 import pytest
 from support.messages import START_NS, drive, shared
 
-from fgtrack.cli.main import run
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import DetectionList, EgoState
 from fgtrack.io.config import InputConfig, TopicInput
@@ -89,13 +88,3 @@ def test_stamps_of_another_clock_are_pointed_out():
     topic = by_name(describe(shared("data/bags/nav2_turtlebot.mcap")))["/odom"]
     assert topic.count == 2639
     assert "another clock" in topic.note
-
-
-def test_a_pipe_is_as_wide_as_columns_says(tmp_path, monkeypatch, capsys):
-    write_bag(tmp_path / "bag", drive())
-    for columns, widest in ((None, 120), ("80", 80)):
-        monkeypatch.delenv("COLUMNS", raising=False) if columns is None else monkeypatch.setenv("COLUMNS", columns)
-        monkeypatch.chdir(tmp_path)
-        assert run(["info", "bag"]) == 0
-        longest = max(map(len, capsys.readouterr().out.splitlines()))
-        assert widest - 40 < longest <= widest

@@ -5,7 +5,7 @@ import pytest
 from support.paper import paper
 from support.tracking import START_NS, message
 
-from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.errors import DataError
 from fgtrack.core.types import Detection, EgoState
 from fgtrack.io.config import InputConfig, TopicInput
 from fgtrack.io.recording import write_recording
@@ -86,16 +86,6 @@ def test_messages_without_any_configuration_are_tracked() -> None:
     assert run.tracks["x_m"][newest].to_numpy() == pytest.approx([39.0], abs=0.5)
     assert run.tracks["speed_mps"][newest].to_numpy() == pytest.approx([10.0], abs=1.0)
     assert run.tracks["status"][newest].tolist() == ["confirmed"]
-
-
-def test_more_sensors_than_anyone_has_are_refused() -> None:
-    sensors = {f"radar{k}": SensorModel(std={"x_m": 1.0, "y_m": 1.0}) for k in range(101)}
-    with pytest.raises(ValueError, match=r"^sensors: 101 of them, at most 100"):
-        Config(sensors=sensors)
-    lists = [message(POINT, sensor=name) for name in sensors]
-    with pytest.raises(CallError, match=r"^input: 101 sensors with those of the recording, at most 100"):
-        assumed(Config(), source_of(lambda: lists))
-    assert len(assumed(Config(), source_of(lambda: lists[1:])).config.sensors) == 100
 
 
 def test_what_was_assumed_is_a_configuration_that_assumes_nothing_and_says_why(tmp_path) -> None:

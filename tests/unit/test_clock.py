@@ -51,11 +51,6 @@ def test_without_a_period_every_receipt_is_a_tick() -> None:
     assert told(message_ticks(messages)) == [(5, [5, 5]), (7, [7, 7]), (9, [9])]
 
 
-@pytest.mark.parametrize("ticks", [lambda m: node_ticks(m, 50.0), message_ticks])
-def test_without_messages_there_are_no_ticks(ticks) -> None:
-    assert list(ticks([])) == []
-
-
 @pytest.mark.parametrize(
     ("settings", "stamp_ms", "own_ms"),
     [

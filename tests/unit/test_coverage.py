@@ -79,10 +79,6 @@ def test_few_detections_show_nothing() -> None:
     assert (nothing.measured, nothing.rate_hz, nothing.num_lists) == (frozenset(), None, 1)
 
 
-def test_clutter_alone_shows_nothing() -> None:
-    assert coverage(lists(seen(0.0, 1e-9, clutter=0.2))).field_of_view_rad is None
-
-
 def test_detections_in_the_map_are_seen_from_the_ego() -> None:
     def pose(k):
         return 20.0 * 0.05 * k, -100.0, 2.0 + 0.01 * k

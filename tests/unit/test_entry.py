@@ -76,9 +76,3 @@ def test_an_interrupt_after_the_end_changes_nothing() -> None:
     done = run(WHILE_LEAVING)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("fgtrack ")
-
-
-def test_it_runs_the_command_line() -> None:
-    done = subprocess.run([sys.executable, "-m", "fgtrack", "--version"], capture_output=True, text=True)
-    assert done.returncode == 0
-    assert done.stdout.startswith("fgtrack ")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState, ObjectReport, TickReport, TruthState
+from fgtrack.core.types import Detection, DetectionList, EgoState, TickReport, TruthState
 from fgtrack.pipeline.live import Tracker
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.shipped import read_config, read_scenario
@@ -115,15 +115,6 @@ def test_what_is_no_time_is_refused_at_once_and_changes_nothing(now_ns: object) 
     assert tracker.tick(np.int64(NOW_NS + 1)).tick == first.tick + 1
 
 
-@pytest.mark.parametrize("frame", ["nonsense", None, 5, []])
-def test_a_list_in_a_frame_that_does_not_exist_is_invalid(frame: object) -> None:
-    tracker = Tracker.from_config("smoother")
-    odd = DetectionList("radar", NOW_NS, NOW_NS, [Detection(x_m=5.0, y_m=0.0)], frame)  # type: ignore[arg-type]  # the same
-    tracker.receive(odd)
-    assert [one.disposition for one in tracker.tick(NOW_NS).updates] == [Disposition.INVALID]
-    assert tracker.refused == {"message cannot be read (DataError)": 1}
-
-
 @pytest.mark.parametrize(
     ("wrong", "reason"),
     [
@@ -157,26 +148,6 @@ def test_a_covariance_may_be_a_list_or_an_array(given: Any) -> None:
         found.append(track.covariance)
     np.testing.assert_array_equal(*found)
     assert found[0][1, 1] == pytest.approx(0.2)
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_a_description_that_is_not_finite_is_none(bad: float) -> None:
-    """One score of NaN made a track immortal, one length its size NaN for good, and a filter let it pass."""
-    sensor = {"score": {"even": 0.5, "scale": 0.2}, "filters": {"score": {"min": 0.5}}}
-    rules = {"lifecycle": {"kind": "existence"}, **{f"sensors.radar.{key}": value for key, value in sensor.items()}}
-    tracker = Tracker.from_config("open_space", estimator="ekf-replay", set=rules)
-    for k in range(60):
-        at_ns = NOW_NS + 100 * k * MS
-        tracker.receive(EgoState(at_ns, at_ns, 0.0, 0.0, 0.0, 0.0))
-        far = Detection(300.0, 300.0, score=bad)
-        near = Detection(10.0 + k, 1.0, score=0.9, length_m=bad if k == 3 else 4.5, height_m=bad)
-        tracker.receive(DetectionList("radar", at_ns, at_ns, [far, near] if k < 20 else [far], "map"))
-        report = tracker.tick(at_ns)
-        if k == 19:
-            [track] = report.tracks
-            assert track.object == ObjectReport(length_m=pytest.approx(4.5))
-    assert report.tracks == ()
-    assert tracker.counts["radar"]["out_of_bounds"] == 60
 
 
 def test_reports_and_configurations_pickle_copy_and_turn_into_dicts() -> None:
