@@ -37,7 +37,7 @@ from fgtrack.tracking.ego import MAX_EXTRAPOLATION_S
 __all__ = ["advice_on", "advise"]
 
 TRACKED_S = 300.0
-"""So much of a recording is tracked, to judge clocks and noise; delays are those of all of it."""
+"""Length of the beginning that is tracked, to judge clocks and noise; delays are those of the whole recording."""
 TUNED_S = 60.0
 """Noise is fitted to so much of it."""
 _TUNE_RULES = TuneRules(train_share=1.0, max_rounds=3, max_observations=1500)  # the replay judges the result
@@ -70,7 +70,7 @@ def advise(
     config
         Name of a shipped configuration, path of a YAML file, or a `Config`; None for the defaults.
     map, pit_map
-        CSV files of the track and of the pit lane, or `oval`; in place of those of the configuration.
+        CSV files of the track and of the pit lane, or `oval`; instead of those of the configuration.
     set
         Values of single settings: `{"smoother.lag_s": 3.0}`.
     reference
@@ -135,7 +135,7 @@ class _Adviser:
         if self._assumed.assumptions:
             text = f"not configured: {'. '.join(self._assumed.lines())}."
             self._findings.append(Finding("assumed", "sensors", 35.0, text))
-        self._take(self._strangers())
+        self._take(self._unknown_sensors())
         before = self._config
         sensors = [name for name in self._arrivals if name != EGO and name not in before.ignore_sensors]
         if not sensors:
@@ -158,7 +158,7 @@ class _Adviser:
         self._on_step("tracking", 0.6 * work)
         run = self._run(self._config)
         if run is not None:
-            self._take(self._cautions(run))
+            self._take(self._diagnostics(run))
         self._withdraw_harm(before)
         run = self._run(self._config)
         if run is not None and not self._is_useless:
@@ -210,31 +210,31 @@ class _Adviser:
 
     @property
     def _is_useless(self) -> bool:
-        """Whether something is wrong that no setting mends: nothing else can be judged then."""
+        """True if something is wrong that no setting corrects: nothing else can be judged then."""
         return any(one.weight >= _USELESS and not one.settings for one in self._findings)
 
-    def _strangers(self) -> Iterator[Finding]:
+    def _unknown_sensors(self) -> Iterator[Finding]:
         """Sensors of the recording that the configuration does not know."""
         known = {*self._config.sensors, *self._config.ignore_sensors, EGO}
-        strangers = [name for name in self._arrivals if name not in known]
-        if not strangers:
+        unknown = [name for name in self._arrivals if name not in known]
+        if not unknown:
             return
-        measured = dict.fromkeys(strangers, "nothing")
+        measured = dict.fromkeys(unknown, "nothing")
         for message in self._messages:
-            if isinstance(message, DetectionList) and message.sensor in strangers and message.objects:
+            if isinstance(message, DetectionList) and message.sensor in unknown and message.objects:
                 measured[message.sensor] = ", ".join(message.objects[0].measured)
         has = "; ".join(f"{name}: {components}" for name, components in measured.items())
-        text = f"no model of {', '.join(strangers)} ({has}): give sensors.NAME.std, or leave them out."
-        ignored = sorted({*self._config.ignore_sensors, *strangers})
+        text = f"no model of {', '.join(unknown)} ({has}): give sensors.NAME.std, or leave them out."
+        ignored = sorted({*self._config.ignore_sensors, *unknown})
         yield Finding("model", "sensors", 98.0, text, {"ignore_sensors": ignored})
 
     def _misread(self) -> Iterator[Finding]:
-        """What is suspicious in how the first seconds are read."""
+        """Yield suspicions in how the first seconds are read."""
         for one in suspicions(list(beginning(self._messages, nanoseconds(TRIAL_S))), self._config):
             yield Finding("input", one.about, 94.0 if one.spoils else 45.0, f"{one.text}.", one.settings)
 
-    def _cautions(self, run: Run) -> Iterator[Finding]:
-        """What a run with the settings warns of, but of sensors whose trouble is known."""
+    def _diagnostics(self, run: Run) -> Iterator[Finding]:
+        """Yield the diagnostics of a run with the settings, except of sensors with a known problem."""
         known = {one.about for one in self._findings if one.weight >= _USELESS}
         for one in diagnostics(run):
             if one.about not in known:
@@ -326,7 +326,7 @@ class _Adviser:
 
     @property
     def _kept(self) -> str:
-        """What to do where no noise is fitted: what is wrong besides noise comes first."""
+        """Instruction where no noise is fitted: what is wrong besides noise comes first."""
         first = [one for one in self._findings if one.weight > _FIRST and not one.settings and one.kind != "noise"]
         if not first:
             return "Keep the configured noise."
@@ -361,7 +361,7 @@ class _Adviser:
         return replay_in_memory(kept, config)
 
     def _fine(self, seen: Mapping[str, Arrivals], outcome: Outcome | None) -> Iterator[str]:
-        """What was looked at and is fine."""
+        """Yield the checks that found nothing."""
         wrong = {(one.kind, one.about) for one in self._findings}
         kinds = {kind for kind, _ in wrong}
         ego = self._arrivals.get(EGO)

@@ -57,17 +57,17 @@ class Arrivals:
 
     @property
     def has_stamps(self) -> bool:
-        """Whether its stamps say anything: not all of them are 0, and the clock is that of the receipts."""
+        """True if its stamps are usable: not all of them are 0, and the clock is that of the receipts."""
         return bool(self.stamps_ns.any()) and not self.is_other_clock
 
     @property
     def is_other_clock(self) -> bool:
-        """Whether stamps and receipts are of clocks that have nothing to do with each other."""
+        """True if stamps and receipts are of unrelated clocks."""
         return bool(self.stamps_ns.any()) and abs(float(np.median(self.delays_s))) > 3600.0
 
     @property
     def is_receipt(self) -> bool:
-        """Whether every stamp is the receipt."""
+        """True if every stamp is the receipt."""
         return bool(np.all(np.abs(self.receipts_ns - self.stamps_ns) <= 1000))
 
     def quantile_s(self, share: float) -> float:
@@ -160,8 +160,8 @@ def window_findings(arrivals: Sequence[Arrivals], config: Config) -> Iterator[Fi
                 f"{percent(one.beyond(limit_s))} of its detections come later than max_delay_s {limit_s:g} s allows "
                 f"and are refused; 99.9 % come within {milliseconds(most_s)}."
             )
-            mend = {f"sensors.{one.name}.max_delay_s": nice_above(_SPARE * most_s)}
-            yield Finding("window", one.name, 50.0 + 40.0 * one.beyond(limit_s), text, mend)
+            settings = {f"sensors.{one.name}.max_delay_s": nice_above(_SPARE * most_s)}
+            yield Finding("window", one.name, 50.0 + 40.0 * one.beyond(limit_s), text, settings)
         elif limit_s is not None:
             most_s = min(most_s, limit_s)
         needed_s = max(needed_s, most_s)
@@ -171,7 +171,7 @@ def window_findings(arrivals: Sequence[Arrivals], config: Config) -> Iterator[Fi
 
 def _window(arrivals: Sequence[Arrivals], config: Config, needed_s: float) -> Iterator[Finding]:
     found = config.effective
-    told = f"{found.lag_key} {found.lag_s:g} s is shorter than"
+    shorter = f"{found.lag_key} {found.lag_s:g} s is shorter than"
     slowest = max(arrivals, key=lambda one: one.period_s or 0.0, default=None)
     if slowest is None:
         return
@@ -179,12 +179,12 @@ def _window(arrivals: Sequence[Arrivals], config: Config, needed_s: float) -> It
     if needed_s > found.reach_s:
         worst = max(arrivals, key=lambda one: one.beyond(found.reach_s))
         lost = worst.beyond(found.reach_s)
-        text = f"{told} the delays: {percent(lost)} of the detections of {worst.name} fall beyond it."
+        text = f"{shorter} the delays: {percent(lost)} of the detections of {worst.name} fall beyond it."
         value = min(nice_above(_SPARE * max(needed_s, _LISTS * period_s)), _LONGEST_STORAGE_S)
         yield Finding("window", "window", 50.0 + 40.0 * lost, text, {found.lag_key: value})
     elif found.lag_s < period_s:
         text = (
-            f"{told} the time between two lists of {slowest.name}, {period_s:.3g} s: nothing of it is ever smoothed "
+            f"{shorter} the time between two lists of {slowest.name}, {period_s:.3g} s: nothing of it is ever smoothed "
             "together."
         )
         yield Finding("window", "window", 55.0, text, {found.lag_key: nice_above(_LISTS * period_s)})

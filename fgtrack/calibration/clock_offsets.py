@@ -10,7 +10,7 @@ is that of the truth, or a smoothing spline through the detections of a referenc
 two sensors counts. With truth a constant bias is found as well: along and across the motion of the object, where the
 sensor sees another part of it than the truth means, or of the ego, where the origin of its detections is not the
 configured one, the one that leaves the smaller residuals. Where the velocity hardly changes, bias and offset cannot be
-told apart, and the offset is not known.
+distinguished, and the offset is not known.
 
 The standard deviation of d is that of the jackknife over stretches of time, so it includes time-correlated errors
 (Bell, McCaffrey, Survey Methodology 28, 2002). Few stretches determine the two apart, those with a bend or an
@@ -52,7 +52,7 @@ _ROUNDS = 10
 _HUBER = 1.5
 _LARGEST_STEP_S, _REACH_S = 0.2, 1.0
 _BIAS_STDS, _SMALLEST_BIAS_M = 4.0, 0.2  # a bias that is no chance, and that a calibration would find
-_SURE = 0.995  # an offset is believed where 0 is outside of the 99 % interval of Student's t ...
+_SURE = 0.995  # an offset is accepted where 0 is outside of the 99 % interval of Student's t ...
 _SMALLEST_OFFSET_S = 0.01  # ... if it matters
 _LARGEST_HALF_S = 0.05  # an interval that is wider leaves an offset unknown
 RECEIPT_S = 1e-5

@@ -1,4 +1,4 @@
-"""What stamps are worth: zeros, other clocks, the future, jumps, drifts, offsets of clocks and of positions."""
+"""Validity of stamps: zeros, other clocks, the future, jumps, drifts, offsets of clocks and of positions."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,7 +30,7 @@ _DRIFT_BINS, _DRIFT_S, _DRIFT_STDS, _DRIFT_FIT = 10, 0.01, 5.0, 0.8
 
 
 def stamp_findings(one: Arrivals) -> Iterator[Finding]:
-    """What the stamps and receipts of one sensor, or of the ego, show by themselves."""
+    """Yield the problems of the stamps and receipts of one sensor, or of the ego."""
     name, receipt = one.name, {} if one.name == EGO else {f"sensors.{one.name}.stamp_from": "receipt"}
     if not one.stamps_ns.any():
         if name != EGO:  # of the ego it is a suspicion of what is read
@@ -128,7 +128,7 @@ def _drift(one: Arrivals) -> tuple[float, float, float] | None:
 
 @dataclass(frozen=True)
 class ClockVerdict:
-    """What is known of the clock of one sensor; `str` says it, what bounds it and what is missing."""
+    """Clock of one sensor; `str` gives the offset, its bound, and what is missing to know more."""
 
     sensor: str
     offset_s: float | None

@@ -1,4 +1,4 @@
-"""One thing that is wrong with a recording or with its configuration, and what mends it."""
+"""One problem of a recording or of its configuration, and the settings that correct it."""
 
 import math
 from collections.abc import Mapping
@@ -14,18 +14,18 @@ class Finding:
     """A sentence or two with numbers, and settings; `str` tells all of it."""
 
     kind: str
-    """What it is about: `input`, `model`, `clock`, `late`, `loss`, `window`, `ego`, `noise`, `tune`, `track`."""
+    """Subject: `input`, `model`, `clock`, `late`, `loss`, `window`, `ego`, `noise`, `tune`, `track`."""
     about: str
     """Sensor, `ego`, or what else."""
     weight: float
     """Importance: above 80 the run is useless without the change, below 30 it is good to know."""
     text: str
     settings: Mapping[str, object] = field(default_factory=dict)
-    """Values of keys of the configuration that mend it; empty where no setting does."""
+    """Values of keys of the configuration that correct it; empty where no setting does."""
 
     def __str__(self) -> str:
-        mend = ", ".join(f"{key}: {_written(value)}" for key, value in self.settings.items())
-        return f"{self.about}: {self.text}{f' Set {mend}.' if mend else ''}"
+        settings = ", ".join(f"{key}: {_written(value)}" for key, value in self.settings.items())
+        return f"{self.about}: {self.text}{f' Set {settings}.' if settings else ''}"
 
 
 def _written(value: object) -> str:

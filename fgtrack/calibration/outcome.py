@@ -27,7 +27,7 @@ from fgtrack.io.run import Run
 
 __all__ = ["NoiseFit", "Outcome", "harm", "noise_findings", "noise_fits", "objection"]
 
-_SMALLEST = 1e-3  # ratio of NIS that is told from one that is smaller
+_SMALLEST = 1e-3  # ratio of NIS below which ratios are the same
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class NoiseFit:
 
     @property
     def lasts(self) -> bool:
-        """Whether its innovations resemble the one before."""
+        """True if its innovations are correlated in time."""
         return self.lag1 is not None and self.lag1 > CORRELATED
 
     @property
@@ -58,7 +58,7 @@ class NoiseFit:
 
 
 def noise_fits(run: Run) -> list[NoiseFit]:
-    """Of every sensor with innovations."""
+    """Return the fits of every sensor with innovations."""
     updates, dof = run.tables["updates"], num_measured(run.tables["updates"])
     fits = []
     for sensor in np.unique(updates["sensor"]).tolist():
@@ -110,7 +110,7 @@ _POSITION_DOF = 2.0
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a configuration makes of a recording."""
+    """Quality of a run in a few numbers."""
 
     births: int
     """Beginnings of tracks."""

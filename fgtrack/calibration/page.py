@@ -27,22 +27,22 @@ class Change:
 
 @dataclass(frozen=True)
 class Advice:
-    """What is wrong with a recording and its configuration; `str` shows it as a page of plain sentences."""
+    """Problems of a recording and its configuration; `str` shows them as a page of plain sentences."""
 
     recording: str
     findings: tuple[Finding, ...]
     """The most important first."""
     fine: tuple[str, ...]
-    """What nothing was found of."""
+    """Checks without a finding."""
     config: Config = field(repr=False)
     """The configuration with these changes; with noise fitted to the recording where that was asked for."""
     arrivals: tuple[Arrivals, ...] = field(repr=False)
-    """Of the sensors that are used, with the stamps that the advice gives them."""
+    """Arrivals of the sensors that are used, with the stamps that the advice gives them."""
     overtaken: Mapping[str, float] = field(repr=False)
     beyond: Mapping[float, Mapping[str, float]] = field(repr=False)
     """Share of the detections of each sensor that are later than a window of so many seconds."""
     before: Outcome | None = field(repr=False)
-    """What the configuration makes of the recording; None where nothing can be tracked."""
+    """Outcome of a replay with the configuration; None where nothing can be tracked."""
     after: Outcome | None = field(repr=False)
     """The same with these changes."""
     broken: str | None
@@ -125,7 +125,7 @@ class Advice:
         }
 
     def comments(self) -> list[str]:
-        """Why each setting is changed, and what no setting mends."""
+        """Return the reason of each changed setting, and what no setting corrects."""
         lines = [line for one in self.changes for line in _wrapped(f"{one.key} = {one.value}: {one.why}")]
         if not self.changes:
             lines = ["Nothing is changed."]

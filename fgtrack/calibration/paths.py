@@ -1,4 +1,4 @@
-"""Where things were at any time: the ego, the objects of a recording, and what a track saw of them."""
+"""Positions over time: of the ego, of the objects of a recording, and of the detections of a track."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence

@@ -276,7 +276,7 @@ def _contents(found: InputInfo) -> Iterator[str]:
 
 
 def _parts(recording: Path) -> tuple[InputInfo, list[Part], list[str]]:
-    """What is in the recording, its parts with a guess, and what nothing is guessed of."""
+    """Return the contents of the recording, its parts with a guess, and a line for each other part."""
     try:
         found = describe(recording)
     except CallError:

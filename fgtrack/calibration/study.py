@@ -81,7 +81,7 @@ def _tracks(one: EvaluatedRun) -> str:
 
 
 def _to_do(runs: Sequence[EvaluatedRun], tables: Tables, advice: Advice | None) -> str:
-    """What comes first: a defect of the recording or its settings, else the choice of a method."""
+    """Return what comes first: a defect of the recording or its settings, else the choice of a method."""
     open_findings = [] if advice is None else [one for one in advice.findings if not one.settings]
     found = [str(one) for one in open_findings if one.weight >= _IMPORTANT] or [
         str(one) for one in diagnostics(runs[0].run)

@@ -26,14 +26,14 @@ _FAR_M, _NEARER = 250.0, 0.3  # what is so far, and so much nearer in another fr
 
 @dataclass(frozen=True)
 class Trial:
-    """What came out."""
+    """Result of a trial."""
 
     duration_s: float
-    """How much of the input was tried."""
+    """Length of the input that was tried."""
     samples: Mapping[str, str]
-    """What the first message of everything was read as, by `ego`, `truth` and the names of sensors."""
+    """Contents of the first message of everything as read, by `ego`, `truth` and the names of sensors."""
     suspicions: tuple[Diagnostic, ...]
-    """What is probably wrong with the configuration, each with its cure."""
+    """Probable errors of the configuration, each with its cure."""
     run: Run | None
     """The dry run; None where nothing could be tracked."""
     problem: str | None
@@ -67,7 +67,7 @@ def beginning(messages: Iterable[Message], duration_ns: int) -> Iterator[Message
 
 
 def suspicions(messages: Sequence[Message], config: Config) -> Iterator[Diagnostic]:
-    """What is probably wrong with how `messages` are read, with what to do."""
+    """Yield probable errors in how `messages` are read, with the cure."""
     egos = [message for message in messages if isinstance(message, EgoState)]
     truth = [message for message in messages if isinstance(message, TruthState)]
     lists: dict[str, list[DetectionList]] = {}
@@ -106,7 +106,7 @@ def _degrees(name: str, states: Sequence[EgoState | TruthState | Detection]) -> 
 
 
 def _frames(name: str, lists: Sequence[DetectionList], egos: Sequence[EgoState]) -> Iterator[Diagnostic]:
-    """Whether positions are far from where their frame puts them, and near in the other one."""
+    """Yield an error where positions are far away in their frame, and near in the other one."""
     points = [
         (each.stamp_ns, item.x_m, item.y_m)
         for each in lists
@@ -150,18 +150,18 @@ def _samples(messages: Sequence[Message]) -> dict[str, str]:
         match message:
             case DetectionList() if message.objects:
                 name, of = f"{message.sensor} (in the frame {message.frame})", message.objects[0]
-                text = _told(of, (*MEASURABLE, *DESCRIBING, "object_id"))
+                text = _values(of, (*MEASURABLE, *DESCRIBING, "object_id"))
             case EgoState():
-                name, text = "ego", _told(message, ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps"))
+                name, text = "ego", _values(message, ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps"))
             case TruthState() if not message.ignored:
-                name, text = "truth", _told(message, ("object_id", "x_m", "y_m", "yaw_rad", "speed_mps"))
+                name, text = "truth", _values(message, ("object_id", "x_m", "y_m", "yaw_rad", "speed_mps"))
             case _:
                 continue
         found.setdefault(name, text)
     return found
 
 
-def _told(message: Message | Detection, names: Sequence[str]) -> str:
+def _values(message: Message | Detection, names: Sequence[str]) -> str:
     values = ((name, getattr(message, name)) for name in names)
     return ", ".join(
         f"{name} {value:.6g}" if isinstance(value, float) else f"{name} {value}"

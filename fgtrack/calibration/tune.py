@@ -75,7 +75,7 @@ def tune(
     config
         Name of a shipped configuration, path of a YAML file, or a `Config`; None for the defaults.
     map, pit_map
-        CSV files of the track and of the pit lane, or `oval`; in place of those of the configuration.
+        CSV files of the track and of the pit lane, or `oval`; instead of those of the configuration.
     set
         Values of single settings: `{"motion.kind": "ctra"}`.
     keep
@@ -101,7 +101,7 @@ def tuned(
     rules: TuneRules | None = None,
     on_step: Callable[[str], None] = lambda text: None,
 ) -> TuneReport:
-    """`tune` of messages in receipt order, by name of their recording; `on_step` is told what comes next."""
+    """`tune` of messages in receipt order, by name of their recording; `on_step` gets the name of each step."""
     rules = rules or TuneRules()
     recordings = [_Recording.read(name, source.messages()) for name, source in sources.items()]
     together = replace(
@@ -220,7 +220,7 @@ class _Tuning:
             start = np.where(endless, self._configured, values)
 
     def _free(self, problem: Problem) -> BoolArray:
-        """Which parameters have enough measurements, a maximum, and can be told from others."""
+        """Which parameters have enough measurements, a maximum, and can be distinguished from others."""
         often = problem.counts() >= self._rules.min_count
         free = np.asarray(often & ~self._lasting & ~self._kept & ~self._endless)
         if not free[[bool(name) for _, name in self._space.names]].any():
@@ -259,7 +259,7 @@ class _Tuning:
         return reached[0][1], optima
 
     def _found(self, problem: Problem, start: FloatArray) -> _Found:
-        """The maximum; in place of what is not known there, what is configured, or what is nearest to it.
+        """The maximum; instead of what is not known there, what is configured, or what is nearest to it.
 
         The rest is not fitted again: it would make up for what was put there, and with the yaw's noise too large the
         yaw rate's comes out too small. Nor would its standard errors hold, which are those of all parameters together.
@@ -310,7 +310,7 @@ class _Tuning:
         splits: Sequence[int],
         runs_before: Sequence[Run],
     ) -> HeldOut | None:
-        """How the noise fitted to the first part does in the rest; None where nothing counts there."""
+        """Return the performance in the rest of noise fitted to the first part; None where nothing counts there."""
         rest = [replace(one, from_ns=at_ns) for tracks, at_ns in zip(series, splits, strict=True) for one in tracks]
         before = trained.copy()  # shares of outliers are not configured: they are the same in both
         configured = np.array([bool(name) for _, name in self._space.names])

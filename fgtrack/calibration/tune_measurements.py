@@ -133,7 +133,7 @@ class _RecordingBank(GuardedBank):
         self._fused: dict[int, list[Observation]] = {}
 
     def series(self) -> list[Series]:
-        """What each track has fused, by rising stamp, in order of birth."""
+        """Return the fused measurements of each track, by rising stamp, in order of birth."""
         return [
             Series(start, sorted(self._fused[track_id], key=lambda one: one.measurement.stamp_ns))
             for track_id, start in self._starts.items()

@@ -24,7 +24,7 @@ _MAX_SHARE = 0.9999
 
 @dataclass(frozen=True)
 class ConfigNoise:
-    """What of a configuration is tuned.
+    """Tuned parameters of a configuration.
 
     Process noise, and the standard deviation of every component of every sensor; where its errors are correlated in
     time, the share that lasts instead, but not how long. Of a plug-in's motion model those
@@ -95,7 +95,7 @@ class ConfigNoise:
 
     @property
     def _correlations(self) -> dict[str, Correlation]:
-        """Those of the sensors whose errors last, by sensor."""
+        """Time-correlated errors by sensor."""
         found = {name: sensor.correlation for name, sensor in self.config.used_sensors.items()}
         return {name: one for name, one in found.items() if one is not None}
 
@@ -156,7 +156,7 @@ class TuneRules:
     """Part of the time of each recording, from its start, that the noise which is judged is fitted to; 1: no part is
     left to judge it by."""
     max_rounds: int = 4
-    """How often detections are associated at most."""
+    """Largest number of associations."""
     settled: float = 0.2
     """Rounds end where no parameter moves by more than this share of its standard deviation."""
     min_observations: int = 20
@@ -230,26 +230,26 @@ class TunedParameter:
 
     @property
     def identifiable(self) -> bool:
-        """Whether it is known: `yes`."""
+        """True if it is known: `yes`."""
         return self.known == "yes"
 
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """What else was found of one sensor."""
+    """Measurements and outliers of one sensor."""
 
     sensor: str
     count: int
     """Innovations that counted."""
     own_covariance: int
-    """Those of detections with a covariance of their own, to which the standard deviations do not apply."""
+    """Innovations of detections with a covariance of their own, to which the standard deviations do not apply."""
     outlier_share: float | None
     """Share of measurements with larger errors; None where nothing counted."""
 
 
 @dataclass(frozen=True)
 class InnovationFit:
-    """How innovations of one component compare with their covariance, on time held out."""
+    """Innovations of one component against their covariance, on time held out."""
 
     sensor: str
     component: str
@@ -276,7 +276,7 @@ class HeldOut:
     """With the noise fitted to the rest."""
     innovations: tuple[InnovationFit, ...]
     from_ns: tuple[int, ...]
-    """Where it begins in each recording."""
+    """Stamp at which it begins in each recording."""
     runs_before: tuple[Run, ...] = field(repr=False)
     """Runs with the configured noise, of the estimator `ekf-replay`, one for each recording."""
     runs_after: tuple[Run, ...] = field(repr=False)
@@ -302,11 +302,11 @@ class TuneReport:
     num_mixed: int
     """Measurements that were left out, because most of those around them are outliers; see `without_mixed`."""
     rounds: int
-    """How often detections were associated."""
+    """Number of associations."""
     optima: int
     """Different maxima of the likelihood found from several starts; the highest one is reported."""
     settled: bool
-    """Whether another association would have changed nothing any more."""
+    """True if another association would have changed nothing any more."""
     broken: Mapping[str, str]
     """Why a recording broke off, by its name; what came before was used."""
 

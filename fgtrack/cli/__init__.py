@@ -1,4 +1,4 @@
-"""The command line: one thin module per command; the only place that prints and exits."""
+"""The command line: thin modules, one for each kind of command; the only place that prints and exits."""
 
 import os
 

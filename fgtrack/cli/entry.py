@@ -31,7 +31,7 @@ def watch() -> None:
 
 
 def interrupted() -> bool:
-    """Whether an interrupt has come since `watch`."""
+    """True if an interrupt has come since `watch`."""
     return bool(_came)
 
 

@@ -1,4 +1,4 @@
-"""What commands show: tables on stdout, progress on stderr where that is a terminal."""
+"""Output of commands: tables on stdout, progress on stderr where that is a terminal."""
 
 import json
 import os

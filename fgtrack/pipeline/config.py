@@ -284,17 +284,19 @@ class Config:
             if ESTIMATORS.resolve(name) != name:
                 raise ValueError(f"options: {name!r} is now {ESTIMATORS.resolve(name)!r}")
         for key, named in (("detections", self.input.detections), ("csv.detections", self.input.csv.detections)):
-            strangers = set(named) - set(self.sensors) - set(self.ignore_sensors)
-            if strangers and self.sensors:
-                raise ValueError(f"input.{key}: {sorted(strangers)[0]!r} has no model under sensors")
+            unknown = set(named) - set(self.sensors) - set(self.ignore_sensors)
+            if unknown and self.sensors:
+                raise ValueError(f"input.{key}: {sorted(unknown)[0]!r} has no model under sensors")
         if self.motion.kind != "ctrv_euler" and {"noise_per_step", "saturated_yaw"} & set(self.defects):
             raise ValueError("defects: noise_per_step and saturated_yaw are of motion.kind ctrv_euler")
-        erring = [name for name, sensor in self.sensors.items() if sensor.correlation is not None]
-        if erring and self.motion.kind == "ctrv_euler":
-            raise ValueError(f"sensors.{erring[0]}.correlation: needs motion.kind ctrv, ctra or cv")
-        curved = [name for name, sensor in self.sensors.items() if sensor.curvature_from_map_std_radpm is not None]
-        if curved and "yaw_rate_radps" not in self.motion.model().state_names:
-            key = f"sensors.{curved[0]}.curvature_from_map_std_radpm"
+        coloured = [name for name, sensor in self.sensors.items() if sensor.correlation is not None]
+        if coloured and self.motion.kind == "ctrv_euler":
+            raise ValueError(f"sensors.{coloured[0]}.correlation: needs motion.kind ctrv, ctra or cv")
+        with_curvature = [
+            name for name, sensor in self.sensors.items() if sensor.curvature_from_map_std_radpm is not None
+        ]
+        if with_curvature and "yaw_rate_radps" not in self.motion.model().state_names:
+            key = f"sensors.{with_curvature[0]}.curvature_from_map_std_radpm"
             raise ValueError(
                 f"{key}: needs a motion model with a yaw rate, as ctrv or ctra, and not {self.motion.kind}"
             )

@@ -1,4 +1,4 @@
-"""Whether the clock of the ego's stamps is still the one that a recording began with."""
+"""Jumps of the clock of the ego's stamps."""
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import seconds

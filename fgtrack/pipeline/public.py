@@ -45,9 +45,9 @@ def replay(
     config
         Name of a shipped configuration, path of a YAML file, or a `Config`; None for the defaults.
     map, pit_map
-        CSV files of the track and of the pit lane, or `oval`; in place of those of the configuration.
+        CSV files of the track and of the pit lane, or `oval`; instead of those of the configuration.
     estimator
-        Name of the estimator, in place of that of the configuration.
+        Name of the estimator, instead of that of the configuration.
     set
         Values of single settings: `{"smoother.lag_s": 3.0}`.
     out
@@ -128,7 +128,7 @@ def simulate(
     seed
         Of the random generator; the same seed gives the same bits.
     duration_s
-        Length, in place of the scenario's.
+        Length, instead of the scenario's.
     out
         Stream (`.jsonl`, `.jsonl.gz`), else a rosbag2 folder; None gives the messages.
     storage

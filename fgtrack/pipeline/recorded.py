@@ -1,4 +1,4 @@
-"""What a recording carries of a configuration, so that it is replayed as it was made."""
+"""Settings that a recording carries, so that it is replayed as it was made."""
 
 import logging
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RecordedSensor:
-    """What is known of a sensor, by the keys of `sensors.NAME`; None of what is not."""
+    """Settings of a sensor by the keys of `sensors.NAME`; None of what is not recorded."""
 
     mount: Mount | None = None
     field_of_view_rad: float | None = None
@@ -53,7 +53,7 @@ _RECORDED = TypeAdapter(Recorded | None, config=ConfigDict(allow_inf_nan=False))
 
 
 def recorded(source: InputSource) -> Recorded:
-    """What `source` carries of a configuration; a warning is logged where that is not valid.
+    """Return the settings that `source` carries; a warning is logged where that is not valid.
 
     A track whose file is not there is left out, with a warning as well.
     """
@@ -74,7 +74,7 @@ def recorded(source: InputSource) -> Recorded:
 
 
 def recorded_of(scenario: Scenario) -> dict[str, Any]:  # Any: plain values, as the header of a stream has them
-    """What a recording of `scenario` carries of a configuration."""
+    """Return the settings that a recording of `scenario` carries."""
     sensors = {
         one.name: RecordedSensor(
             None if one.mount == Mount() else one.mount, one.field_of_view_rad, one.max_range_m, one.max_range_behind_m

@@ -1,4 +1,4 @@
-"""What a replay assumes where the configuration leaves it open: what a recording carries, and what it shows."""
+"""Assumptions of a replay where the configuration leaves a setting open: what a recording carries and shows."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -27,7 +27,7 @@ from fgtrack.tracking.existence import ExistenceRules
 
 __all__ = ["ASSUMED_STD", "Assumed", "Assumption", "assumed", "departures", "is_open", "source_of"]
 
-#: Standard deviations of a sensor of which nothing is known: a detector of cars by LiDAR or RADAR.
+#: Standard deviations of a sensor that nothing specifies: a detector of cars by LiDAR or RADAR.
 ASSUMED_STD = {
     "x_m": 1.0,
     "y_m": 1.0,
@@ -127,7 +127,7 @@ class Assumed:
         return "\n".join([*lines, text.getvalue()])
 
     def lines(self) -> list[str]:
-        """What was assumed in words: a line for each sensor, and one for the rest."""
+        """Return the assumptions in words: a line for each sensor, and one for the rest."""
         found: dict[str, dict[str, list[str]]] = {}
         for one in self.assumptions:
             path = self._path(one.key)
@@ -239,7 +239,7 @@ def _with_claim(config: Config, seen: Mapping[str, Coverage], found: list[Assump
 
 
 def _out_of_view_s(config: Config, seen: Mapping[str, Coverage]) -> tuple[float, str]:
-    """How long a track lives that no sensor can see, and why.
+    """Return how long a track lives that no sensor can see, and the reason.
 
     Where one sensor alone gives positions nothing else sees what has left its view: the first list that could not show
     it ends it. Else it may come into the view of another one, and outlives two lists of the slowest sensor.

@@ -1,4 +1,4 @@
-"""Where a sensor detects: its field of view, its range and its rate, estimated from a recording."""
+"""Coverage of a sensor: its field of view, its range and its rate, estimated from a recording."""
 
 import math
 from array import array
@@ -29,7 +29,7 @@ _AXES_RAD, _AXIS_TOLERANCE_RAD = math.pi / 4.0, 0.15
 
 @dataclass(frozen=True)
 class Coverage:
-    """How often and where a sensor detects, over a recording."""
+    """Rate, field of view and range of a sensor, estimated from a recording."""
 
     measured: frozenset[str]
     """Components that its detections hold."""
@@ -44,11 +44,11 @@ class Coverage:
     range_m: float | None = None
     """Up to where it detects; None where it measures no range, or too seldom."""
     persistence: Persistence | None = None
-    """How its detections persist from list to list; None where too few do."""
+    """Persistence of its detections from list to list; None where too few do."""
     disagreement_m: float | None = None
     """Least standard deviation of its positions against those of another sensor; None where none sees the same."""
     boxes: bool = False
-    """Whether its detections have a length and a width."""
+    """True if its detections have a length and a width."""
     area_m2: float | None = None
     """Area over which its detections with a range are spread, at least that of the narrowest sector up to there."""
 
@@ -105,11 +105,11 @@ class _Detections:
     num_detections: int = 0
     boxes: bool = False
     receipts_s: "array[float]" = field(default_factory=lambda: array("d"))
-    """Of every list."""
+    """Receipt of every list, in s."""
     stamps_s: "array[float]" = field(default_factory=lambda: array("d"))
-    """Of every list."""
+    """Stamp of every list, in s."""
     rows: "array[float]" = field(default_factory=lambda: array("d"))
-    """Of every detection with a bearing: number of its list, stamp, x, y (of a bearing alone those of a unit vector),
+    """Rows of detections with a bearing: number of its list, stamp, x, y (of a bearing alone those of a unit vector),
     whether it has a range, score (NaN without one)."""
     frames: set[str] = field(default_factory=set)
 
@@ -130,7 +130,7 @@ class _Detections:
                 self.rows.extend((number, stamp_s, x_m, y_m, has_range, score))
 
     def coverage(self, path: FloatArray, mount: Mount | None) -> Coverage:
-        """What they give, with the ego's `path`: times, x, y and yaw, shape (n, 4)."""
+        """Return the coverage, with the ego's `path`: times, x, y and yaw, shape (n, 4)."""
         receipts_s = np.array(self.receipts_s)
         span_s = float(np.ptp(receipts_s))
         rate_hz = (len(receipts_s) - 1) / span_s if span_s > 0.0 else None

@@ -1,4 +1,4 @@
-"""What the lists of a sensor hold: whether they are scans, and how dense clutter can be at most."""
+"""Statistics of the lists of a sensor: scans or single reports, and the largest density of clutter."""
 
 import math
 from collections import Counter
@@ -24,7 +24,7 @@ class ListStatistics:
     high_m: tuple[float, float] = (-math.inf, -math.inf)
     """Largest x and y."""
     revisits: Revisits = field(default_factory=Revisits)
-    """How often an object is measured."""
+    """Intervals at which an object is measured."""
 
     def add(self, message: DetectionList) -> None:
         """Count a list."""

@@ -1,4 +1,4 @@
-"""How detections persist from list to list: detection probability, clutter and score of a sensor, without tracks."""
+"""Persistence of detections from list to list: detection probability, clutter and score of a sensor, without tracks."""
 
 import math
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ _PROBABILITY = (0.1, 0.9)
 
 @dataclass(frozen=True)
 class Persistence:
-    """What triples of detections in three successive lists show of a sensor.
+    """Detection probability, clutter and scores of a sensor, from triples of detections in three successive lists.
 
     Three detections on a line at constant speed are of one object. How often the fourth list continues the line is the
     detection probability; detections in no triple, beyond those that misses explain, are clutter.

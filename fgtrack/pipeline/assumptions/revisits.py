@@ -1,4 +1,4 @@
-"""How often the objects of a recording are measured, and what is assumed of their motion where that is seldom."""
+"""Revisit intervals of objects, and the motion that is assumed where they are long."""
 
 import math
 from collections import deque
