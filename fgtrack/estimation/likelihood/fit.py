@@ -96,10 +96,6 @@ class Likelihood:
         found[..., self._free] = np.exp(logs)
         return found
 
-    def terms(self, logs: FloatArray) -> FloatArray:
-        """Log-likelihood of each innovation that counts, shape (b, N), at rows of free logarithms (b, f)."""
-        return self._innovations.evaluate(self.values(logs)).log_likelihoods
-
     def totals(self, values: FloatArray) -> FloatArray:
         """Log-likelihood of everything that counts, shape (b,), at rows of all parameters (b, p)."""
         return np.asarray(self._innovations.evaluate(values).log_likelihoods.sum(axis=1))
@@ -196,7 +192,7 @@ class Likelihood:
         first, second = np.triu_indices(f)
         rows = np.concatenate([logs[None], logs + one, logs - one])
         rows = np.concatenate([rows, logs + one[first] + one[second], logs - one[first] - one[second]])
-        total = np.concatenate([self.terms(part).sum(axis=1) for part in np.array_split(rows, -(-len(rows) // 24))])
+        total = np.concatenate([self.totals(self.values(part)) for part in np.array_split(rows, -(-len(rows) // 24))])
         middle, up, down = total[0], total[1 : f + 1], total[f + 1 : 2 * f + 1]
         both_up, both_down = np.split(total[2 * f + 1 :], 2)
         mixed = both_up - up[first] - up[second] + 2.0 * middle - down[first] - down[second] + both_down
