@@ -102,8 +102,8 @@ def test_the_shipped_configuration_tracks_both_opponents(recording):
     run = replay(recording, "racecar")
     found = evaluate(run).multi_object
     assert found is not None
-    assert found.clear.mota > 0.8
-    assert found.clear.id_switches == 0
+    assert found.clear["mota"] > 0.8
+    assert found.clear["id_switches"] == 0
     assert set(np.unique(run.truth["object_id"]).tolist()) == {2, 3}
     assert np.median(run.updates["receipt_ns"] - run.updates["stamp_ns"]) == pytest.approx(DELAY_NS, abs=3e6)
 
