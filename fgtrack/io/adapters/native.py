@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 from dataclasses import fields
+from functools import cache
+from typing import Any
 
 from fgtrack.core.types import (
     DESCRIBING,
@@ -33,11 +35,17 @@ def presence(value: Detection | TruthState, names: tuple[str, ...]) -> int:
 
 
 def _given(message: RosMessage) -> dict[str, RosMessage]:
-    """The fields behind `present` that were given; their order is that of the recording, whatever wrote it."""
-    names = [field.name for field in fields(message)]
-    optional = names[names.index("present") + 1 :]
-    given = {name: getattr(message, name) for bit, name in enumerate(optional) if message.present >> bit & 1}
+    """Fields behind `present` that were given."""
+    optional, present = _optional(type(message)), message.present
+    given = {name: getattr(message, name) for bit, name in enumerate(optional) if present >> bit & 1}
     return {name: _numbers(name, value) if name in LISTS else value for name, value in given.items()}
+
+
+@cache
+def _optional(kind: type[Any]) -> tuple[str, ...]:
+    """Names behind `present`; their order is that of the recording, whatever wrote it."""
+    names = [field.name for field in fields(kind)]
+    return tuple(names[names.index("present") + 1 :])
 
 
 def _numbers(name: str, values: RosMessage) -> tuple[float, ...]:

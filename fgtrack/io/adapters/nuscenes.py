@@ -36,7 +36,7 @@ __all__ = ["FORMAT", "read_scene"]
 _RESULTS = re.compile(rb'\s*\{\s*"(meta|results)"\s*:')
 _A_LIST, _OF_RESULTS = re.compile(r"\s*\["), re.compile(r'.*?"results"\s*:\s*\{', re.DOTALL)
 _BETWEEN = re.compile(r"[\s,:]*")
-_LARGEST_MB = 1500.0
+_LARGEST_MB = 2000.0
 _NS_PER_US = 1000
 _CATEGORIES = {
     "movable_object.barrier": "barrier",
