@@ -123,7 +123,7 @@ def validated_detection(item: Detection) -> Detection:
 def _check_fields(item: Message | Detection) -> None:
     for name, (holds, expected), is_optional in _FIELDS[type(item)]:
         value = getattr(item, name)
-        if not (holds(value) or (value is None and is_optional)):
+        if not (is_optional if value is None else holds(value)):
             raise _invalid(name, expected, value)
 
 
@@ -138,7 +138,7 @@ def _is_flag(value: object) -> bool:
 def _is_number(value: object) -> bool:
     if type(value) is int:
         return value.bit_length() <= 1000
-    return isinstance(value, (float, np.floating, np.integer))
+    return type(value) is float or isinstance(value, (float, np.floating, np.integer))
 
 
 def _is_name(value: object) -> bool:
