@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import fields
 from functools import cache
-from typing import Any
 
 from fgtrack.core.types import (
     DESCRIBING,
@@ -36,13 +35,14 @@ def presence(value: Detection | TruthState, names: tuple[str, ...]) -> int:
 
 def _given(message: RosMessage) -> dict[str, RosMessage]:
     """Fields behind `present` that were given."""
-    optional, present = _optional(type(message)), message.present
+    kind: RosMessage = type(message)
+    optional, present = _optional(kind), message.present
     given = {name: getattr(message, name) for bit, name in enumerate(optional) if present >> bit & 1}
     return {name: _numbers(name, value) if name in LISTS else value for name, value in given.items()}
 
 
 @cache
-def _optional(kind: type[Any]) -> tuple[str, ...]:
+def _optional(kind: RosMessage) -> tuple[str, ...]:
     """Names behind `present`; their order is that of the recording, whatever wrote it."""
     names = [field.name for field in fields(kind)]
     return tuple(names[names.index("present") + 1 :])
