@@ -1,4 +1,4 @@
-"""What the tracker asks of an estimator."""
+"""The protocols of estimators and their banks."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -126,7 +126,7 @@ class Measurement:
 
 
 class UpdateStatus(StrEnum):
-    """How an estimator took a measurement; the values are dispositions."""
+    """Outcome of a measurement in an estimator; the values are dispositions."""
 
     IN_SEQUENCE = "in_sequence"
     OUT_OF_SEQUENCE = "out_of_sequence"
@@ -155,7 +155,7 @@ KNOWN_YAW_STD_RAD = 0.1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Start:
-    """What is known of a new object at its first stamp, with standard deviations.
+    """State of a new object at its first stamp, with standard deviations.
 
     Raises `CallError` for a value that is no number, not finite or beyond 10^18, a negative standard deviation, a wrong
     shape, and a stamp that is no integer.

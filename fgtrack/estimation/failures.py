@@ -1,4 +1,4 @@
-"""What went wrong inside estimators, and what was done about it: the counters that all of them share."""
+"""Counters of failures inside estimators and of their treatment."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -74,7 +74,7 @@ class Failures:
     ended: list[EndedTrack] = field(default_factory=list)
     """Tracks that failures have ended, the first hundred."""
     first: str | None = None
-    """What the first failure said, in a line."""
+    """Message of the first failure, in a line."""
     last: str | None = None
     """Traceback, or line, of the newest one."""
 
@@ -97,7 +97,7 @@ class Failures:
         self.first = self.first or " ".join(line.split())
 
     def as_meta(self) -> dict[str, object]:
-        """What meta.json says: every kind, zeros included."""
+        """Counts as in meta.json: every kind, zeros included."""
         return {
             "failures": {failure.value: self.counts[failure] for failure in Failure},
             "first_failure": self.first,

@@ -62,7 +62,7 @@ class Hypotheses:
 
     @property
     def estimators(self) -> list[Estimator]:
-        """Those of the hypotheses that are left."""
+        """Estimators of the remaining hypotheses."""
         return [each.estimator for each in self._alive]
 
     @property
@@ -143,8 +143,8 @@ Wanted = int | Sequence[Start]
 
 
 def hypotheses(motion: MotionModel, start: Start, wanted: Wanted, make: Callable[[Start], Estimator]) -> Estimator:
-    """What `make` gives for `start`, or `Hypotheses`: one for each of the `wanted` starts, or of so many headings where
-    the start has none and `motion` needs one.
+    """Return what `make` gives for `start`, or `Hypotheses`: one for each of the `wanted` starts, or of so many
+    headings where the start has none and `motion` needs one.
 
     Raises `CallError` for starts of different stamps, and for a number below 1.
     """

@@ -72,7 +72,7 @@ Factory = Callable[..., Any]  # Any: an estimator or a bank, see the module
 
 @dataclass(frozen=True)
 class Claims:
-    """What an estimator claims, in attributes of its class or function; a missing one is the default."""
+    """Claims of an estimator, in attributes of its class or function; a missing one is the default."""
 
     exact: str = ""
     """For which late measurements a linear model gives the dense joint posterior of all accepted ones; empty for none.
@@ -95,7 +95,7 @@ class Claims:
     """True if it weighs other motion models beside the one that it is given: what it predicts, and what it estimates in
     sequence, is then not what that model alone would give."""
     held_s: float = 0.0
-    """How long a measurement waits before it counts."""
+    """Time that a measurement waits before it counts."""
     initiates: bool = False
     """True if it finds an unknown direction of travel by itself, and takes `initiation` as an option. Another one is
     made again, along its first positions, until their direction is certain (see `Initiated`)."""
@@ -112,7 +112,7 @@ class Claims:
 
     @classmethod
     def of(cls, factory: Factory) -> "Claims":
-        """What `factory` says."""
+        """Claims of `factory`."""
         return cls(**{f.name: getattr(factory, f.name) for f in fields(cls) if hasattr(factory, f.name)})
 
 

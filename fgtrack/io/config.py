@@ -1,4 +1,4 @@
-"""What of an input is read: topics of a recording that hold the ego, detections and truth, parts of a data set."""
+"""Parts of an input that are read: topics with ego, detections and truth, files of a data set."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ class Field:
     offset: float = 0.0
     """Added to the scaled number, in its unit: a compass heading in degrees is a yaw by `scale: -1, offset: 90`."""
     degrees: bool = False
-    """Whether the result is in degrees and has to be radians."""
+    """True if the result is in degrees and has to be radians."""
 
     def value(self, raw: float) -> float:
         """The converted number."""
@@ -65,7 +65,7 @@ class TopicInput:
     """`receipt`: the stamp is the receipt, where the driver sets none or one of another clock; the delay is then
     unknown and taken as 0."""
     object_id: int | str | None = None
-    """Of truth with one object per topic: its id. By default its place in the list of topics."""
+    """Id of the object, of truth with one object per topic. By default the index in the list of topics."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class CsvTable:
 
 @dataclass(frozen=True)
 class CsvInput:
-    """What the columns of CSV files are."""
+    """Columns of CSV files."""
 
     ego: CsvTable | None = None
     """The ego: `x_m`, `y_m`, `yaw_rad` and `speed_mps` must be there."""
@@ -102,7 +102,7 @@ class CsvInput:
 
 @dataclass(frozen=True)
 class KittiInput:
-    """What is read of a folder of the KITTI tracking data set."""
+    """Parts of a folder of the KITTI tracking data set that are read."""
 
     sequence: int | str | None = None
     """The sequence, where the input is a folder of several: `6` or `0006`."""
@@ -119,7 +119,7 @@ class KittiInput:
 
 @dataclass(frozen=True)
 class NuscenesInput:
-    """What is read of results in the form of nuScenes."""
+    """Parts of results in the form of nuScenes that are read."""
 
     scene: str | None = None
     """Name or token of the scene, where the results are of several: `scene-0061`."""

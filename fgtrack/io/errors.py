@@ -8,11 +8,11 @@ from fgtrack.core.types import Message
 
 _MEGABYTE = 1_000_000
 LARGEST_BYTES = 128 * _MEGABYTE
-"""Of a chunk, a message or a line, where nothing else is said."""
+"""Largest chunk, message or line, where nothing else is said."""
 MOST_OBJECTS = 100_000
 """In a list, where nothing else is said."""
 MOST_SENSORS = 100
-"""Of a recording or a configuration. Each is a row of figures and tables, and 30 lines of a run folder."""
+"""Most sensors of a recording or a configuration. Each is a row of figures and tables, and 30 lines of a run folder."""
 
 
 def one_line(error: BaseException) -> str:

@@ -1,4 +1,4 @@
-"""What the fields of unknown tables and messages hold, guessed from their names and values."""
+"""Guesses of the fields of unknown tables and messages, from their names and values."""
 
 import math
 import re

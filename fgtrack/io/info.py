@@ -1,4 +1,4 @@
-"""What is in an input: its topics or sensors with counts, rates and delays."""
+"""Contents of an input: its topics or sensors with counts, rates and delays."""
 
 import math
 from collections import defaultdict
@@ -48,14 +48,14 @@ class TopicInfo:
     delay: DelayInfo | None
     """None where the type has no header."""
     used_as: str | None
-    """What a replay with the configuration takes it as."""
+    """Its use in a replay with the configuration."""
     note: str | None
     """Why it cannot be decoded, what is odd, or what a configuration could name it as."""
 
 
 @dataclass(frozen=True)
 class InputInfo:
-    """What `fgtrack info` shows."""
+    """Contents of an input, as `fgtrack info` shows them."""
 
     path: Path
     kind: str
@@ -71,7 +71,7 @@ class InputInfo:
 
 
 def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
-    """What is in the input at `path`, and what a replay with `config` would make of it.
+    """Return the contents of the input at `path`, and their use in a replay with `config`.
 
     Raises
     ------

@@ -43,13 +43,13 @@ class FileFormat:
     """A format of inputs: a file or a folder with messages in receipt order."""
 
     description: str
-    """What such an input is, for messages: `an fgtrack stream (.jsonl)`."""
+    """Name of the format, for messages: `an fgtrack stream (.jsonl)`."""
     recognises: Callable[[Path], bool]
-    """Whether an existing file that is not empty, or a folder, is one, by its content; may raise `OSError`."""
+    """True if an existing file that is not empty, or a folder, is one, by its content; may raise `OSError`."""
     open: Callable[[Path, InputConfig], Callable[[], Iterator[Message]]]
     """Opens the input at a path: gives what `InputSource.messages` is, and raises as `open_input`."""
     settings: Callable[[Path], Mapping[str, object]] = lambda path: {}
-    """What the input at a path carries of a configuration, as `InputSource.settings`."""
+    """Settings that the input at a path carries, as `InputSource.settings`."""
     end_ns: Callable[[Path], int | None] = lambda path: None
     """About the receipt of the last message, as `InputSource.end_ns`; errors of any kind mean None."""
     validates: bool = False
@@ -120,7 +120,7 @@ def file_format(name: str) -> FileFormat:
 
 
 def _recognises(name: str, form: FileFormat, path: Path) -> bool:
-    """Whether `path` is of this format; a plug-in that fails says nothing of it, but for a warning."""
+    """True if `path` is of this format; False, with a warning, where a plug-in fails."""
     try:
         with ADAPTERS.blamed(name, f"cannot look at {path}"):
             return bool(form.recognises(path))

@@ -94,7 +94,7 @@ def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
 
 
 def _settings(path: Path) -> Mapping[str, object]:
-    """What the header carries of a configuration."""
+    """Settings in the header."""
     found = read_header(path).get(SETTINGS)
     return found if isinstance(found, dict) else {}
 

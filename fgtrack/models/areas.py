@@ -32,7 +32,7 @@ class ExclusionAreas:
     """Polygons in the map."""
 
     polygons_m: tuple[tuple[FloatArray, ...], ...]
-    """Of each its rings of corners, (m, 2) each: the outline, and holes in it."""
+    """Rings of corners of each area, (m, 2) each: the outline, and holes in it."""
 
     @classmethod
     def read(cls, paths: Iterable[str | Path]) -> Self:
@@ -64,7 +64,7 @@ class ExclusionAreas:
         return cls(tuple(polygons))
 
     def contain(self, points_m: FloatArray) -> BoolArray:
-        """Whether each of `points_m`, shape (n, 2), lies in one of the areas, shape (n,); one that is NaN in none."""
+        """True for each of `points_m`, shape (n, 2), that lies in one of the areas, shape (n,); False for NaN."""
         inside = np.zeros(len(points_m), dtype=bool)
         for rings in self.polygons_m:
             low, high = rings[0].min(axis=0), rings[0].max(axis=0)

@@ -32,7 +32,7 @@ class CorrelatedErrors(MotionModel):
     """
 
     base: MotionModel
-    """How the object moves."""
+    """Motion model of the object."""
     times_s: tuple[tuple[str, float], ...]
     """Name `sensor.component` and correlation time T of every error, in the order of the state behind `base`."""
 

@@ -46,7 +46,7 @@ _AT_ORIGIN = SensorPose()
 
 @dataclass(frozen=True)
 class MeasurementModel:
-    """What is measured of a state, z = h(x, pose) + noise; `measurement_model` gives a shared one.
+    """Measurement of a state, z = h(x, pose) + noise; `measurement_model` gives a shared one.
 
     A state may have more entries than `state_names`; the Jacobian is as wide as the state that it is given.
     Raises `CallError` when a component is unknown, repeated or out of order, or the state is of another kind.

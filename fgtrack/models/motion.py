@@ -38,7 +38,7 @@ class Transition(NamedTuple):
 
 
 class MotionModel(ABC):
-    """How an object moves between two stamps, and how uncertain that is.
+    """Motion of an object between two stamps, and its uncertainty.
 
     A model has `state_names`, `predict`, `jacobian` and `process_noise`; everything else follows from them. One that
     computes these three in one go overrides `transition`, which is what estimators call.

@@ -18,7 +18,7 @@ from fgtrack.models.track_map import TrackMap
 __all__ = ["ARC_S", "ArcPredictor", "Predictor", "RailPredictor"]
 
 ARC_S = 0.2
-"""How long `RailPredictor` follows the arc before it follows the track."""
+"""Time for which `RailPredictor` follows the arc before it follows the track."""
 
 
 class Predictor(Protocol):

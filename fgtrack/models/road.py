@@ -1,4 +1,4 @@
-"""What the map says about a place: the heading of the traffic, its curvature, and whether an object can be there."""
+"""The map at a position: the heading of the traffic, its curvature, and whether an object can be there."""
 
 from dataclasses import dataclass
 from typing import Protocol

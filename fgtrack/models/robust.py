@@ -1,4 +1,4 @@
-"""What a measurement counts under a robust loss: the M-estimators' weights of iteratively reweighted least squares.
+"""Weight of a measurement under a robust loss: the M-estimators' weights of iteratively reweighted least squares.
 
 The weight at a whitened residual of length d is rho'(d) / d of the loss rho, which begins as d^2 / 2; c is the width.
 Names and forms are those of GTSAM's `noiseModel.mEstimator`. All weights begin at 1 and never grow with d, so each
@@ -50,7 +50,7 @@ _LOSSES: Mapping[str, Callable[[float, float], tuple[float, float]]] = {
 
 
 def weight(loss: RobustLoss, distance: float) -> float:
-    """What a measurement counts under `loss`, 1 for all of it, at a whitened residual of length `distance`.
+    """Weight of a measurement under `loss`, 1 at most, at a whitened residual of length `distance`.
 
     Never less than `LEAST_WEIGHT`, which stands for a distance without bounds, too.
     """

@@ -1,4 +1,4 @@
-"""What a sensor measures, how well, how late, and how its detections count for the life of a track."""
+"""Sensors: measured quantities, noise, delay limits, and the weight of detections in the life of a track."""
 
 import math
 from collections.abc import Mapping
@@ -72,7 +72,7 @@ class RobustLoss:
 
 @dataclass(frozen=True)
 class Correlation:
-    """How the errors of an object's successive detections resemble each other."""
+    """Correlation between the errors of an object's successive detections."""
 
     share: float = 0.8
     """Share of the variance that lasts; the rest is new in every detection."""
@@ -86,12 +86,12 @@ class Correlation:
 
 @dataclass(frozen=True)
 class Score:
-    """What the score of a detection says: log p(score | object) / p(score | clutter) = (score - even) / scale."""
+    """Likelihood ratio of a detection's score: log p(score | object) / p(score | clutter) = (score - even) / scale."""
 
     even: float
     """A score that objects and clutter have equally often."""
     scale: float
-    """What more of it makes an object e times more probable."""
+    """Increase of the score that makes an object e times more probable."""
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.even):
@@ -126,14 +126,14 @@ class SensorModel:
     counter_init: int = 3
     """Status counter of a track that this sensor gave birth to."""
     counter_add: int = 1
-    """What a match with this sensor adds to the status counter."""
+    """Increment of the status counter by a match with this sensor."""
     ages: Literal["always", "short_range", "long_range", "never"] = "always"
     """At which range a track that this sensor does not see loses one count."""
     stamp_from: Literal["message", "object", "objects_mean", "receipt"] = "message"
     """A detection's stamp: the list's, its own where it carries one, the mean of those that do, or the receipt, where
     the driver sets none or one of another clock."""
     clock_offset_s: float = 0.0
-    """How far its stamps are ahead of the time at which it sensed; taken off before anything else is done. With
+    """Advance of its stamps over the time at which it sensed; subtracted before anything else is done. With
     `stamp_from: receipt` its latency. `fgtrack advise` and `fgtrack offsets` find it."""
     message_covariance: bool = True
     """Use a detection's own covariance where the message carries one."""
@@ -143,10 +143,10 @@ class SensorModel:
     """Which detections are used, by anything that they say: `{score: {min: 0.5}, class_name: {one_of: [car]}}`. The
     others are out of bounds."""
     view_range_m: float | None = None
-    """How far it sees, where that is less than `max_range_m`; for existence and evaluation, no detection is out of
+    """Range of sight, where that is less than `max_range_m`; for existence and evaluation, no detection is out of
     bounds by it."""
     max_range_behind_m: float | None = None
-    """How far it sees in the half behind it, where that is less; for existence and evaluation."""
+    """Range of sight in the half behind it, where that is less; for existence and evaluation."""
     field_of_view_rad: float | None = None
     """Full angle that it sees, centred on its axis; for existence and evaluation, as these ranges. null: in a replay
     that of the recording, or where it detects in it, if no range is given either; else all around."""
@@ -165,10 +165,10 @@ class SensorModel:
     clutter_per_m2: float = 1e-4
     """False detections in a list for each square metre (`lifecycle.kind: existence`)."""
     score: Score | None = None
-    """What the score of a detection says of the existence of its object; null: nothing."""
+    """Evidence of the score of a detection for the existence of its object; null: none."""
     near_side_m: float = 0.0
-    """How much nearer than its reference point the sensor sees an object, along the line of sight: the near side of a
-    hull or a car. Positions are moved away from the sensor by it."""
+    """Distance by which the sensor sees an object nearer than its reference point, along the line of sight: the near
+    side of a hull or a car. Positions are moved away from the sensor by it."""
     mount: Mount | None = None
     """Pose of the sensor in the ego's detection frame; null: in a replay that of the recording, else the origin."""
     correlation: Correlation | None = None
@@ -263,7 +263,7 @@ class SensorModel:
         return self.std["x_m"] == self.std["y_m"] and growth.get("x_m", 0.0) == growth.get("y_m", 0.0)
 
     def growth(self, components: tuple[str, ...], range_m: FloatArray) -> FloatArray | None:
-        """What the variances of `components` are larger at `range_m` (m,) than in `noise`, shape (m, k).
+        """Increase of the variances of `components` at `range_m` (m,) over those in `noise`, shape (m, k).
 
         None where nothing grows; 0 at a range that is not known (NaN).
         """

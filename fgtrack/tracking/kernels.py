@@ -32,7 +32,7 @@ def innovations(
 
 @njit("int64[::1](float64[:, ::1], float64[:, :, ::1], float64[::1], float64)")
 def faults(means: FloatArray, covariances: FloatArray, most: FloatArray, rounding: float) -> IntArray:
-    """What is wrong with states (m, n) and (m, n, n), shape (m,): not finite, larger than `most`, no covariance."""
+    """Fault of each state (m, n) and (m, n, n), shape (m,): not finite, larger than `most`, invalid covariance."""
     m, n = means.shape
     found, C, none = np.zeros(m, np.int64), np.empty((n, n)), np.empty((n, 0))
     for i in range(m):

@@ -95,7 +95,7 @@ class Correction(NamedTuple):
     nis: FloatArray
     """Normalised innovation squared, shape (m,)."""
     weight: FloatArray
-    """What each measurement counted under its loss, shape (m,); 1 for all of it."""
+    """Weight of each measurement under its loss, shape (m,); 1 at most."""
     S: FloatArray
     """Covariances of the innovations, shape (m, k, k), before any loss."""
     fused: BoolArray
@@ -114,7 +114,7 @@ class OneCorrection(NamedTuple):
     nis: float
     """Normalised innovation squared."""
     weight: float = 1.0
-    """What the measurement counted under its loss; 1 for all of it."""
+    """Weight of the measurement under its loss; 1 at most."""
     S: FloatArray | None = None
     """Covariance of the innovation, shape (k, k), before any loss."""
 

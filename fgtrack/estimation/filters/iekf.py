@@ -121,7 +121,7 @@ def largest_move(step: FloatArray, covariance: FloatArray) -> float:
 def negative_log_posterior(
     off: FloatArray, P: FloatArray, residual: FloatArray, R: FloatArray, loss: RobustLoss | None
 ) -> float:
-    """What an update minimises, but for a constant: half of off' P^-1 off, and the loss of the whitened residual.
+    """Cost that an update minimises, but for a constant: half of off' P^-1 off, and the loss of the whitened residual.
 
     `off` (n,) is the way from the prior, whose covariance is P (n, n); `residual` (k,) that of the measurement there,
     with R (k, k). Raises `numpy.linalg.LinAlgError` for a singular P or R.

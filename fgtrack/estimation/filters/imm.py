@@ -215,7 +215,7 @@ class ImmReplay(ReplayingFilter):
 
     @property
     def probabilities(self) -> FloatArray:
-        """How probable `motion` and the other model are after the newest measurement, shape (m,)."""
+        """Probabilities of `motion` and the other model after the newest measurement, shape (m,)."""
         return _mixture(self.steps[-1]).probabilities.copy()
 
 
@@ -243,7 +243,7 @@ def _weighed(probabilities: FloatArray, log_likelihoods: Sequence[float]) -> Flo
 
 
 def _log_likelihood(found: OneCorrection, measurement: Measurement) -> float:
-    """Of the innovation by one model, under the loss of the measurement, without what all models share."""
+    """Log-likelihood of the innovation by one model, under the loss of the measurement, without common terms."""
     if found.S is None or not np.isfinite(found.S).all():
         raise np.linalg.LinAlgError("an innovation without a finite covariance")
     distance = math.sqrt(max(float(mahalanobis_squared(found.innovation, found.S)), 0.0))

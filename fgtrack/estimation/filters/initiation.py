@@ -17,7 +17,7 @@ from fgtrack.models.measurement import measured_position
 from fgtrack.models.motion import MotionModel
 
 Initiation = Literal["one-point", "two-point", "regression"]
-"""How the direction of travel of a new object is found where neither map nor sensor gives one.
+"""Methods to find the direction of travel of a new object where neither map nor sensor gives one.
 
 - `one-point`: it is not sought: the state starts at yaw 0 with a wide standard deviation.
 - `two-point`: from the first two positions (Bar-Shalom, Li and Kirubarajan 2001, section 5.5.3).
@@ -61,11 +61,11 @@ class Line(NamedTuple):
     position_m: FloatArray
     velocity_mps: FloatArray
     covariance: FloatArray
-    """Of the velocity, shape (2, 2)."""
+    """Covariance of the velocity, shape (2, 2)."""
 
     @property
     def certainty(self) -> float:
-        """How many standard deviations the velocity is from zero."""
+        """Distance of the velocity from zero, in standard deviations."""
         return math.sqrt(self.velocity_mps @ psd_solve(self.covariance, self.velocity_mps))
 
 
@@ -113,7 +113,7 @@ def straight_line(fixes: Iterable[Fix]) -> Line:
 
 @dataclass(frozen=True)
 class Search:
-    """How long a smoother begins again from a straight line through the first positions of an object.
+    """Time for which a smoother begins again from a straight line through the first positions of an object.
 
     A state that started with an unknown heading was linearised at a wrong one; from there the solver may not find the
     right one. A value: `next_line` gives the line and another search.

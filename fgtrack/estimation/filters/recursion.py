@@ -1,4 +1,4 @@
-"""What a recursive filter does with a state: predict it, and correct it by a measurement."""
+"""Recursions of filters: the prediction of a state, and its correction by a measurement."""
 
 from dataclasses import dataclass
 
@@ -25,7 +25,7 @@ class Step:
     predicted: Prediction
     """The state before it, predicted from the step before."""
     search: TrackInitiation | None = None
-    """What had been measured up to here, where the direction of travel was sought."""
+    """Measurements up to here, where the direction of travel was sought."""
 
     @property
     def along(self) -> bool:

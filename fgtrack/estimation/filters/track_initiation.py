@@ -48,7 +48,7 @@ class _Link(NamedTuple):
 
 @dataclass(frozen=True)
 class TrackInitiation:
-    """What has been measured of a new object while its direction of travel is sought, in order of the stamps.
+    """Measurements of a new object while its direction of travel is sought, in order of the stamps.
 
     A value: `with_measurement` gives another one, so a filter may keep one at each step and go back to it.
     """
@@ -192,7 +192,7 @@ class TrackInitiation:
 
 
 def initiated(motion: MotionModel, start: Start, method: str, make: Callable[[Start], Estimator]) -> Estimator:
-    """What `make` gives for `start`, by itself or as `Initiated`. Raises `CallError` for an unknown `method`."""
+    """Return what `make` gives for `start`, by itself or as `Initiated`. Raises `CallError` for an unknown `method`."""
     search = TrackInitiation.of(motion, start, checked_initiation(method))
     return make(start) if search is None else Initiated(search, make)
 

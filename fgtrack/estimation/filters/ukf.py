@@ -78,7 +78,7 @@ def measurement_regression(measurement: Measurement, mean: FloatArray, covarianc
 
 @cache
 def _difference(model: MeasurementModel) -> Callable[[FloatArray, FloatArray], FloatArray]:
-    """What differs between measurements, angles in their range, but for entries of the state."""
+    """Difference of measurements, angles in their range, but for entries of the state."""
     direct = np.array([k for k, name in enumerate(model.components) if name in model.state_names], dtype=np.int64)
 
     def difference(z: FloatArray, centre: FloatArray) -> FloatArray:
@@ -190,7 +190,7 @@ class IplfRecursion(UkfRecursion):
         R: FloatArray,
         x: FloatArray,
     ) -> float:
-        """What a step lowers: the negative logarithm of the posterior at a state `x` (n,) of `spread` (n, n)."""
+        """Cost that a step lowers: the negative logarithm of the posterior at a state `x` (n,) of `spread` (n, n)."""
         z = measurement_regression(measurement, x, spread).mean
         residual = measurement.model.residual(measurement.z, z)
         return negative_log_posterior(x - prior[0], prior[1], residual, R, measurement.loss)

@@ -1,4 +1,4 @@
-"""What the filters of one object share: a window behind the newest stamp, and the outcome of a measurement."""
+"""Base of the filters of one object: a window behind the newest stamp, and the outcome of a measurement."""
 
 from abc import ABC, abstractmethod
 

@@ -19,7 +19,7 @@ from fgtrack.estimation.likelihood.series import Series
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How the likelihood is maximised."""
+    """Settings of the maximisation of the likelihood."""
 
     prior_log_std: float = 3.0
     """A parameter is a factor exp(3) from where it starts with one standard deviation: weak, but it keeps what the data
@@ -59,7 +59,7 @@ class FitSettings:
 
 
 class _Evaluated(NamedTuple):
-    """What is minimised, at one place."""
+    """Value and derivatives of the cost at one point."""
 
     logs: FloatArray
     objective: float
@@ -101,7 +101,7 @@ class Likelihood:
         return np.asarray(self._innovations.evaluate(values).log_likelihoods.sum(axis=1))
 
     def objective(self, logs: FloatArray) -> float:
-        """What is minimised: minus the log-likelihood, and the weak prior."""
+        """Cost: minus the log-likelihood, and the weak prior."""
         return self._evaluated(logs).objective
 
     def gradient(self, logs: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""What was measured of one object, with the noise of each measurement in parts: what is sought, and what is not."""
+"""Measurements of one object, with the noise of each in parts: fitted, and not fitted."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -66,7 +66,7 @@ class CrossingEkf(LateEkf):
 
     @abstractmethod
     def _past(self, stamp_ns: int) -> Past:
-        """What is known of the state at `stamp_ns`, and its cross-covariance with the present."""
+        """Estimate of the state at `stamp_ns`, and its cross-covariance with the present."""
 
     def _predicted(self, stamp_ns: int) -> tuple[int, FloatArray, FloatArray, FloatArray]:
         """Place m of the last step before `stamp_ns`; x_{tau|m}, P_{tau|m} and F(m + 1, tau)."""

@@ -1,4 +1,4 @@
-"""What a filter remembers of its steps, so that a late measurement can be fused without replaying them."""
+"""History of the steps of a filter, so that a late measurement can be fused without replaying them."""
 
 import bisect
 from dataclasses import dataclass

@@ -74,7 +74,7 @@ class SmootherBank:
         self._first_ns: IntArray = np.zeros(0, dtype=np.int64)
         self._initiation = checked_initiation(initiation)
         self._searches: dict[int, Search] = {}
-        """Of the tracks whose direction is sought, by row."""
+        """Initiations of the tracks whose direction is sought, by row."""
         self._known: dict[int, _Known] = {}
         """By stamp, until something changes."""
         self._known_times: IntArray | None = None

@@ -67,7 +67,7 @@ class Nodes:
         self.rows = np.zeros((size, _FEW_COMPONENTS, n + 1))
         """Measurements: G and y of y = G (x - x0) + N(0, I); unused rows are 0."""
         self.num_rows: IntArray = np.zeros(size, dtype=np.int64)
-        """How many of `rows` are used."""
+        """Number of `rows` in use."""
         self.predicted, self.filtered = (np.zeros((size, n, n + 1)) for _ in range(2))
         """Covariances and means relative to x0, before and after the node's own measurements."""
         self.back, self.C = np.zeros((size, n, n + 1)), np.zeros((size, n, n))
@@ -79,7 +79,7 @@ class Nodes:
         self.terms: dict[int, list[MeasurementTerm]] = {}
         """Measurements of each node."""
         self.order = self.first, self.count, self.numbers
-        """What all loops over the windows need."""
+        """Arguments of all loops over the windows."""
 
     def located(self, tracks: IntArray, stamps_ns: IntArray) -> tuple[IntArray, IntArray, FloatArray, FloatArray, int]:
         """Return index and number of the node after each of `stamps_ns`, or of the last one, with the times around it.

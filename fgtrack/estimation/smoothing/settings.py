@@ -25,10 +25,10 @@ class SmootherSettings:
     lag_s: float = 1.0
     """Length of the window behind the newest stamp of the track, or the clock."""
     late: Literal["fuse", "drop", "raise"] = "fuse"
-    """What becomes of a detection older than the window: fused exactly through what the window has marginalised
+    """Treatment of a detection older than the window: fused exactly through what the window has marginalised
     (counted as `beyond_window`), dropped (`too_old`), or an error."""
     ring_s: float = 2.0
-    """How far behind the window `fuse` reaches; older detections are `too_old`."""
+    """Reach of `fuse` behind the window; older detections are `too_old`."""
     relinearise: Mapping[str, float] = field(default_factory=_RELINEARISE.copy)
     """An entry of the state that moved further than this from its linearisation point is relinearised: at half of it
     when it is about to leave the window, at a quarter when it is solved again anyway; see `thresholds` for entries that
@@ -52,7 +52,7 @@ class SmootherSettings:
 
     @property
     def behind_s(self) -> float:
-        """How far behind the window detections are still fused."""
+        """Reach behind the window within which detections are still fused."""
         return self.ring_s if self.late == "fuse" else 0.0
 
     @classmethod

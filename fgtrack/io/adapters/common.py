@@ -1,4 +1,4 @@
-"""What the adapters share: headers, quaternions, speeds and covariances of ROS messages."""
+"""Common parts of the adapters: headers, quaternions, speeds and covariances of ROS messages."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,7 +22,7 @@ MAP_FRAMES = frozenset({"map", "world", "odom"})
 
 @dataclass(frozen=True, slots=True)
 class ObjectList:
-    """What an adapter reads from one message."""
+    """Content of one message, as an adapter reads it."""
 
     stamp_ns: int | None
     """None where the message has no stamp; then it is the receipt."""

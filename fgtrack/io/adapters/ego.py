@@ -46,6 +46,6 @@ def _covariance(message: RosMessage) -> tuple[float, ...] | None:
 
 
 def _is_known(covariance: FloatArray) -> bool:
-    """Whether all is finite and every variance in use: ROS says "not known" by 0 or -1, many drivers by 1e3 or more."""
+    """True if all is finite and every variance is in use: "unknown" is 0 or -1 in ROS, 1e3 or more in many drivers."""
     variances = np.diag(covariance)
     return bool(np.isfinite(covariance).all() and (variances > 0.0).all() and (variances < _UNKNOWN).all())

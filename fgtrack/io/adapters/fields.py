@@ -15,10 +15,10 @@ from fgtrack.io.config import Field, FieldPath, Path
 from fgtrack.models.measurement import ANGULAR
 
 OBJECT_FIELDS = frozenset({"objects", "stamp", "object_stamp", "object_id", *MEASURABLE, *DESCRIBING})
-"""What the `fields` of an object list may name: `objects` is the path of the list, `stamp` that of the
+"""Names in the `fields` of an object list: `objects` is the path of the list, `stamp` that of the
 message's time (default `header.stamp`); the others are paths in one object."""
 EGO_FIELDS = frozenset({"stamp", "in_pit", *STATE_NAMES})
-"""What the `fields` of the ego may name."""
+"""Names in the `fields` of the ego."""
 
 _MOST_NAMES = 12  # of fields that a message about a wrong path lists
 
@@ -60,7 +60,7 @@ def ego_by_fields(message: RosMessage, fields: Mapping[str, FieldPath], receipt_
 
 
 def value_at(message: RosMessage, path: str) -> RosMessage:
-    """What `path` leads to: attributes, or places in a list, with dots between. Raises `FieldError`."""
+    """Return the value at `path`: attributes, or indices of a list, with dots between. Raises `FieldError`."""
     value = message
     for part in path.split("."):
         try:

@@ -126,7 +126,7 @@ def _located(path: Path, named: int | str | None = None) -> tuple[Path, str]:
 
 
 def is_sequence(path: Path) -> bool:
-    """Whether `path` is a folder of the data set, or a file of its `oxts/`."""
+    """True if `path` is a folder of the data set, or a file of its `oxts/`."""
     folder = path.parent.parent if path.is_file() and path.parent.name == _OXTS else path
     return (folder / _OXTS).is_dir() and (folder / _CALIB).is_dir()
 
@@ -249,7 +249,7 @@ def _frame(rows: Rows) -> Frame:
 
 
 def _read(rows: list[Row], parse: Callable[[list[str]], _Parsed | None]) -> Iterator[_Parsed]:
-    """What `parse` makes of the fields of `rows`, without what it leaves out."""
+    """Results of `parse` for the fields of `rows`, without what it leaves out."""
     for row in rows:
         try:
             with np.errstate(all="ignore"):  # of what is not finite: the tracker counts it

@@ -21,7 +21,7 @@ _EARTH_RADIUS_M = 6_378_137.0
 
 
 class Calibration(NamedTuple):
-    """How camera 2 and the frame of labels and detections stand in the frame of the inertial unit."""
+    """Poses of camera 2 and of the frame of labels and detections in the frame of the inertial unit."""
 
     projection: FloatArray
     """Image point, homogeneous, from a point in the rectified frame of camera 0, shape (3, 4)."""

@@ -246,7 +246,7 @@ def _number(cells: Cells, path: FieldPath, name: str) -> float | None:
 
 
 def _typed(text: str) -> float | str:
-    """What a filter compares: a number where it is one."""
+    """Value that a filter compares: a number where it is one."""
     try:
         return float(text)
     except ValueError:

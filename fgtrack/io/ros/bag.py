@@ -149,7 +149,7 @@ class Bag:
             yield files
 
     def _break_off(self, files: list[BagFile]) -> str | None:
-        """How the first file that is not whole breaks off."""
+        """Reason why the first file that is not whole breaks off."""
         broken = [f"{file.path} {file.break_off}" for file in files if file.break_off]
         empty = [f"{path} is empty" for path in self._parts.files if path.stat().st_size == 0]
         return next(iter(broken + empty), None)
@@ -176,7 +176,7 @@ class Bag:
 
 
 def is_bag(path: Path) -> bool:
-    """Whether the folder `path` holds a rosbag2 recording, or the file `path` starts as one."""
+    """True if the folder `path` holds a rosbag2 recording, or the file `path` starts as one."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file() or bool(bags_in(path))
     return storage_of(path) is not None

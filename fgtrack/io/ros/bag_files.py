@@ -85,7 +85,7 @@ def parts_of(path: Path) -> Parts:
 
 
 def settings_of(path: Path) -> Mapping[str, object]:
-    """What the recording at `path` carries of a configuration: nothing without a metadata.yaml that has it."""
+    """Settings that the recording at `path` carries: none without a metadata.yaml that has them."""
     if not (path / METADATA).is_file():
         return {}
     try:

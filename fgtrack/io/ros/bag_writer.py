@@ -87,7 +87,7 @@ def check_bag(path: Path, overwrite: bool) -> None:
 
 
 def is_recording(path: Path) -> bool:
-    """Whether `path` is a folder of what its metadata.yaml lists, and of nothing else."""
+    """True if `path` is a folder of what its metadata.yaml lists, and of nothing else."""
     if not (path / METADATA).is_file():
         return False
     try:

@@ -165,7 +165,7 @@ class MessageFactory:
 
 
 def _or_nothing(name: str, value: RosMessage) -> RosMessage:
-    """What the field `name` holds of `value`, which may be None."""
+    """Return the field `name` of `value`, which may be None."""
     if name in LISTS:
         return np.array(value or (), dtype=np.float64)
     return value if value is not None else "" if name in TEXTS else 0

@@ -30,7 +30,7 @@ from fgtrack.io.ros.bag_files import settings_of
 from fgtrack.io.source import FileFormat
 
 DETECTION_FIELDS = frozenset({*MEASURABLE, *DESCRIBING, "object_id"})
-"""What a filter may go by, whatever the type of the message."""
+"""Fields that a filter may use, whatever the type of the message."""
 
 #: Keys of a topic that say something of one role only.
 _KEYS = {
@@ -45,7 +45,7 @@ Convert = Callable[[RosMessage, int], Iterator[Message]]
 
 @dataclass(frozen=True)
 class TopicUse:
-    """What a replay makes of one topic."""
+    """Use of one topic in a replay."""
 
     topic: BagTopic
     role: str
@@ -55,7 +55,7 @@ class TopicUse:
 
 
 def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
-    """What the topics of `bag` are, as `config` names them.
+    """Return the uses of the topics of `bag`, as `config` names them.
 
     A recording that fgtrack wrote is recognised by its message types; `config` takes precedence where it names a
     topic of the recording.
@@ -248,7 +248,7 @@ def _detections(topic: BagTopic, item: TopicInput, sensor: str) -> Convert:
 
 
 def _truths(topic: BagTopic, item: TopicInput, number: int, topics: int) -> Convert:
-    """Of several topics each has one object, which is known by the place of its topic if it has no other id."""
+    """Return the adapter of truth; each of several topics has one object, its index is the id if there is no other."""
     if topic.type == TRUTH and item.fields is None and item.object_id is None and not item.filters:
         return _native(topic.type)
     if topics == 1 and item.object_id is None:

@@ -34,7 +34,7 @@ _LONGEST_TEXT = 200_000
 _LONGEST_NAME = 255
 _MOST_MEMBERS = 2_000
 _MOST_VALUES = 4_000
-"""Of a type with all its parts: arrays of texts and messages become code for each element."""
+"""Most values of a type with all its parts: arrays of texts and messages become code for each element."""
 _LONGEST_ARRAY = 1_000_000
 _INTEGERS = range(-(1 << 63), 1 << 64)
 _TYPE_NAME = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*)+", re.ASCII)

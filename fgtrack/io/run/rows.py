@@ -129,7 +129,7 @@ def _state_cells(state: TrackState) -> Row:
 
 @lru_cache
 def _upper_triangle(size: int) -> Callable[[list[Cell]], Row]:
-    """What picks the cells of the covariance of `size` states from its entries, row by row, and a None behind them."""
+    """Return a function that picks the cells of the covariance of `size` states, row by row, and a final None."""
     kept = range(len(COVARIANCE_STATES))
     places = [i * size + j if j < size else -1 for i in kept for j in kept[i:]]
     picked: Callable[[list[Cell]], Any] = itemgetter(*places)  # Any: a tuple, as there are several places

@@ -1,4 +1,4 @@
-"""What is used of the meta.json and config.yaml of a run, and its type; other keys may hold anything."""
+"""Keys of the meta.json and config.yaml of a run that are used, and their types; other keys may hold anything."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -19,16 +19,16 @@ _Counts = Mapping[str, Mapping[str, int]]
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """How tracks are paired with true objects, and which metrics are computed."""
+    """Pairing of tracks with true objects, and the metrics that are computed."""
 
     gate_m: float = 5.0
     """Largest distance of a track from its true object. The default is the tracker's own association distance, a
     car's length (more for ships): a track farther off is not updated by its object any more. It bounds the errors,
     so compare at one gate."""
     confirmed_only: bool = True
-    """Whether tentative tracks are left out: by counting, those measured less than `lifecycle.confirm_count` times."""
+    """True to leave out tentative tracks: by counting, those measured less than `lifecycle.confirm_count` times."""
     multi_object: bool = True
-    """Whether GOSPA, CLEAR, IDF1 and HOTA are computed."""
+    """True to compute GOSPA, CLEAR, IDF1 and HOTA."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.gate_m <= LARGEST:

@@ -1,4 +1,4 @@
-"""What takes a run as it goes: rows of the tables, counts of the dispositions, the meta data."""
+"""Sinks of a run: rows of the tables, counts of the dispositions, the meta data."""
 
 from abc import ABC, abstractmethod
 from collections import Counter

@@ -19,7 +19,7 @@ from fgtrack.io.run.schema import COLUMNS, NO_TRACK, OPTIONAL_TABLES, RUN_FORMAT
 from fgtrack.io.run.sink import RunSink
 
 LARGEST_META_MB = 16.0
-"""Of meta.json and config.yaml, which have some kB."""
+"""Largest meta.json and config.yaml, which have some kB."""
 _META, _OLD_META, _STAGE = "meta.json", "meta.json.part", "new.part"
 _FILES = (*(f"{table}.csv" for table in COLUMNS), "metrics.json", "config.yaml", _META)
 

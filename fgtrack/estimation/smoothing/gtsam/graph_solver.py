@@ -1,4 +1,4 @@
-"""What the solvers on gtsam share: states and covariances that are read from the factor graph of each window."""
+"""Base of the solvers on gtsam: states and covariances that are read from the factor graph of each window."""
 
 from abc import abstractmethod
 from typing import ClassVar
