@@ -11,8 +11,6 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray
 
-__all__ = ["add_product_transposed", "inlined", "njit", "product", "solve"]
-
 
 # Any: numba has no types.
 def njit(signature: str) -> Callable[[Callable[..., Any]], Any]:
@@ -29,15 +27,25 @@ def njit(signature: str) -> Callable[[Callable[..., Any]], Any]:
 
 #: Decorator of functions that only compiled ones call.
 inlined = numba.njit(error_model="numpy")
+#: Decorator of those with one caller, which are compiled as a part of it: alone they would be compiled twice.
+merged = numba.njit(error_model="numpy", inline="always")
+
+
+@inlined
+def copy(source: FloatArray, found: FloatArray) -> None:
+    """Fill the matrix `found` from the first rows and columns of `source`."""
+    for i in range(found.shape[0]):
+        for j in range(found.shape[1]):
+            found[i, j] = source[i, j]
 
 
 @inlined
 def product(A: FloatArray, B: FloatArray, found: FloatArray) -> None:
-    """Write A B."""
-    for i in range(A.shape[0]):
-        for j in range(B.shape[1]):
+    """Write A B; further columns of A and B than meet or fit are left out."""
+    for i in range(found.shape[0]):
+        for j in range(found.shape[1]):
             value = 0.0
-            for k in range(A.shape[1]):
+            for k in range(min(A.shape[1], B.shape[0])):
                 value += A[i, k] * B[k, j]
             found[i, j] = value
 
@@ -54,20 +62,35 @@ def add_product_transposed(A: FloatArray, B: FloatArray, found: FloatArray) -> N
 
 
 @inlined
-def solve(S: FloatArray, columns: FloatArray) -> bool:
-    """Overwrite columns by S^-1 columns and S by its Cholesky factor; False unless S is positive definite."""
-    n = S.shape[0]
+def add_congruence(A: FloatArray, P: FloatArray, AP: FloatArray, found: FloatArray) -> None:
+    """Add A P A' to `found`, and write A P."""
+    product(A, P, AP)
+    add_product_transposed(AP, A, found)
+
+
+@inlined
+def cholesky(S: FloatArray, n: int, L: FloatArray) -> bool:
+    """Write the lower Cholesky factor of the first n rows and columns to L, which may be S; False if there is none."""
     for i in range(n):
         for j in range(i + 1):
             value = S[i, j]
             for k in range(j):
-                value -= S[i, k] * S[j, k]
+                value -= L[i, k] * L[j, k]
             if j < i:
-                S[i, j] = value / S[j, j]
+                L[i, j] = value / L[j, j]
             elif value > 0.0:
-                S[i, i] = np.sqrt(value)
+                L[i, i] = np.sqrt(value)
             else:
                 return False
+    return True
+
+
+@inlined
+def solve(S: FloatArray, columns: FloatArray) -> bool:
+    """Overwrite columns by S^-1 columns and S by its Cholesky factor; False unless S is positive definite."""
+    n = S.shape[0]
+    if not cholesky(S, n, S):
+        return False
     for c in range(columns.shape[1]):
         for i in range(n):
             for k in range(i):

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import add_product_transposed, inlined, njit, product
+from fgtrack.core.compiled import add_product_transposed, inlined, merged, njit, product
 from fgtrack.core.types import FloatArray
 
 #: Kinds of motion: constant turn rate and velocity (or acceleration), constant velocity.
@@ -29,7 +29,7 @@ _SERIES = np.array(
 )
 
 
-@inlined
+@merged
 def _position_gradient(R: float, yaw_rate: float, speed: float, accel: float, gradient: FloatArray) -> None:
     """Write the derivatives (4, 2) of the position by yaw, speed, yaw rate and acceleration a time R before.
 
@@ -52,7 +52,7 @@ def _position_gradient(R: float, yaw_rate: float, speed: float, accel: float, gr
         gradient[j, 0], gradient[j, 1] = -gradient[j, 1], gradient[j, 0]
 
 
-@inlined
+@merged
 def _short_arc(x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray) -> None:
     """Write mean, F and Q after a turn of at most `MAX_TURN_RAD`."""
     n = len(x)
@@ -98,7 +98,7 @@ def _short_arc(x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F
         Q[k, k + 2] = Q[k + 2, k] = 0.5 * q * t * t
 
 
-@inlined
+@merged
 def _line(x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray) -> None:
     """Write mean, F and Q of constant velocity, state x, y, vx, vy: q [[t^3/3, t^2/2], [t^2/2, t]] on each axis."""
     for i in range(4):

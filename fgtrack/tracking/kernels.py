@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import njit, solve
+from fgtrack.core.compiled import cholesky, njit
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.kernels.kalman import innovate
 
@@ -21,10 +21,10 @@ def innovations(
     """
     m, k = y.shape
     nis, logdet, every = np.empty(m), np.zeros(m), np.arange(k)
-    S, HP, none = np.empty((k, k)), np.empty((k, P.shape[1])), np.empty((k, 0))
+    S, HP = np.empty((k, k)), np.empty((k, P.shape[1]))
     for i in range(m):
         nis[i] = innovate(P[tracks[i]], y[i], H[min(i, len(H) - 1)], R[i], every, S, HP)
-        solve(S, none)
+        cholesky(S, k, S)
         for a in range(k):
             logdet[i] += 2.0 * math.log(S[a, a])
     return nis, logdet
@@ -34,7 +34,7 @@ def innovations(
 def faults(means: FloatArray, covariances: FloatArray, most: FloatArray, rounding: float) -> IntArray:
     """Fault of each state (m, n) and (m, n, n), shape (m,): not finite, larger than `most`, invalid covariance."""
     m, n = means.shape
-    found, C, none = np.zeros(m, np.int64), np.empty((n, n)), np.empty((n, 0))
+    found, C = np.zeros(m, np.int64), np.empty((n, n))
     for i in range(m):
         P, total, small, sound = covariances[i], 0.0, True, True
         for a in range(n):
@@ -50,6 +50,6 @@ def faults(means: FloatArray, covariances: FloatArray, most: FloatArray, roundin
             found[i] = NOT_FINITE
         elif not small:
             found[i] = OUT_OF_BOUNDS
-        elif not (sound and solve(C, none)):
+        elif not (sound and cholesky(C, n, C)):
             found[i] = NOT_DEFINITE
     return found

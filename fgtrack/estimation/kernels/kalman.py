@@ -2,17 +2,10 @@
 
 import numpy as np
 
-from fgtrack.core.compiled import add_product_transposed, inlined, njit, product, solve
+from fgtrack.core.compiled import add_congruence, copy, inlined, njit, product, solve
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 
 _VECTORS, _MATRICES = "float64[:, ::1]", "float64[:, :, ::1]"
-
-
-@inlined
-def predict_one(F: FloatArray, P: FloatArray, found: FloatArray, cross: FloatArray) -> None:
-    """Let Q in `found` be F P F' + Q, and write the cross-covariance F P."""
-    product(F, P, cross)
-    add_product_transposed(cross, F, found)
 
 
 @inlined
@@ -21,11 +14,8 @@ def innovate(
 ) -> float:
     """Write S = H P H' + R and S^-1 H P, and return the NIS of the entries `measured`; NaN where S has no root."""
     k, nis = len(y), 0.0
-    for a in range(k):
-        for b in range(k):
-            S[a, b] = R[a, b]
-    product(H, P, HP)
-    add_product_transposed(HP, H, S)
+    copy(R, S)
+    add_congruence(H, P, HP, S)
     for whole in range(2):
         d, n = (k, len(P)) if whole else (len(measured), 1)
         factor, columns = np.empty((d, d)), np.empty((d, n))
@@ -62,14 +52,12 @@ def correct_one(mean: FloatArray, P: FloatArray, y: FloatArray, H: FloatArray, R
     for a in range(n):
         for b in range(n):
             A[a, b] = (1.0 if a == b else 0.0) - A[a, b]
-    product(A, P, AP)
-    product(gain, R, KR)
-    add_product_transposed(AP, A, found)
-    add_product_transposed(KR, gain, found)
+    add_congruence(A, P, AP, found)
+    add_congruence(gain, R, KR, found)
+    copy(found, P)
     for a in range(n):
         for b in range(n):
-            P[a, b] = found[a, b]
-            total += abs(found[a, b])
+            total += abs(P[a, b])
     return total < np.inf
 
 
@@ -78,7 +66,7 @@ def predict(F: FloatArray, P: FloatArray, Q: FloatArray) -> tuple[FloatArray, Fl
     """Covariances F P F' + Q and cross-covariances F P, shapes (m, n, n)."""
     cross, found = np.empty(P.shape), Q.copy()
     for i in range(len(P)):
-        predict_one(F[i], P[i], found[i], cross[i])
+        add_congruence(F[i], P[i], cross[i], found[i])
     return found, cross
 
 

@@ -9,10 +9,10 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import add_product_transposed, inlined, njit, product, solve
+from fgtrack.core.compiled import add_congruence, add_product_transposed, copy, inlined, njit, product, solve
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.estimation.kernels.kalman import correct_one, innovate, predict_one
+from fgtrack.estimation.kernels.kalman import correct_one, innovate
 from fgtrack.models.transitions import ARC, transition
 
 _YAW = 2
@@ -25,14 +25,6 @@ def _wrapped(angle_rad: float) -> float:
         return angle_rad
     wrapped = math.pi - np.mod(math.pi - angle_rad, 2.0 * math.pi)
     return math.pi if wrapped <= -math.pi else wrapped
-
-
-@inlined
-def _copy(source: FloatArray, found: FloatArray) -> None:
-    """Fill the matrix `found` from `source`, which may be larger."""
-    for i in range(found.shape[0]):
-        for j in range(found.shape[1]):
-            found[i, j] = source[i, j]
 
 
 @inlined
@@ -49,7 +41,7 @@ def _ahead(
     """Write mean, covariance and cross-covariance after a time: f(x), F P F' + Q and F P."""
     F = np.empty(P.shape)
     transition(motion, x, late_ns / NS_PER_S, density, mean, F, covariance)
-    predict_one(F, P, covariance, cross)
+    add_congruence(F, P, cross, covariance)
 
 
 @inlined
@@ -92,12 +84,12 @@ def _retrodict(
         if late_ns == 0:  # the same state
             continue
         if j:
-            _copy(before[after : after + 1], ahead)
-            _copy(before_P[after], ahead_P)
-            _copy(cross[after], gain)
+            copy(before[after : after + 1], ahead)
+            copy(before_P[after], ahead_P)
+            copy(cross[after], gain)
         else:
             _ahead(motion, density, before[new], before_P[new], late_ns, ahead[0], ahead_P, gain)
-        _copy(ahead_P, root)
+        copy(ahead_P, root)
         if not solve(root, gain):
             return False
         for a in range(n):
@@ -108,7 +100,7 @@ def _retrodict(
         if wraps:
             shift[_YAW] = _wrapped(shift[_YAW])
         product(C, root, CD)
-        _copy(covariance[left] if j else before_P[new], P)
+        copy(covariance[left] if j else before_P[new], P)
         add_product_transposed(CD, C, P)
         for a in range(n):
             x[a] = mean[left, a] if j else before[new, a]
@@ -139,9 +131,9 @@ def _step(
     k, n = len(z), mean.shape[1]
     for a in range(n):
         mean[slot, a] = before[slot, a]
-    _copy(before_P[slot], covariance[slot])
+    copy(before_P[slot], covariance[slot])
     y, H, S, own, K = np.empty(k), np.empty((k, n)), np.empty((k, k)), np.empty((k, k)), np.empty((k, n))
-    _copy(R, own)
+    copy(R, own)
     _innovation(before[slot], z, columns, motion == ARC, y, H)
     nis = innovate(before_P[slot], y, H, own, columns[:0], S, K)
     if np.isnan(nis) or not correct_one(mean[slot], covariance[slot], y, H, own, K):
@@ -212,9 +204,9 @@ def fuse(
                 newest = slots[count]
                 for a in range(n):
                     x[a] = before[t, new, a] if place == count else mean[t, newest, a]
-                _copy(before_P[t, new] if place == count else covariance[t, newest], P)
+                copy(before_P[t, new] if place == count else covariance[t, newest], P)
                 ok = _retrodict(motion, density, slots[place + 1 : count + 1], new, *steps, x, P)
-                _copy(new_R[i], own)
+                copy(new_R[i], own)
                 _innovation(x, new_z[i], new_columns, motion == ARC, y[i], H)
                 nis[i] = innovate(P, y[i], H, own, measured, S[i], K)
                 ok = ok and not np.isnan(nis[i])

@@ -9,7 +9,7 @@ All arrays are contiguous, and blocks are copied entry by entry: numba compiles 
 
 import numpy as np
 
-from fgtrack.core.compiled import inlined, njit, solve
+from fgtrack.core.compiled import add_congruence, copy, inlined, njit, product, solve
 from fgtrack.core.types import FloatArray, IntArray
 
 #: Where a measurement leaves less than this of a variance, the short form of its update keeps too few digits.
@@ -20,56 +20,6 @@ LEAVING_SHARE = 0.5
 SOLVED_SHARE = 0.25
 TRACKS, ORDER, VECTORS, MATRICES = "int64[::1]", "int64[:, ::1]", "float64[:, ::1]", "float64[:, :, ::1]"
 _WINDOWS = f"{TRACKS}, {TRACKS}, {ORDER}"  # first, count, numbers
-
-
-@inlined
-def multiply(A: FloatArray, B: FloatArray, result: FloatArray) -> None:
-    """Write A B, of the first n columns of each."""
-    n = A.shape[0]
-    for i in range(n):
-        for j in range(n):
-            value = 0.0
-            for k in range(n):
-                value += A[i, k] * B[k, j]
-            result[i, j] = value
-
-
-@inlined
-def add_congruence(A: FloatArray, P: FloatArray, AP: FloatArray, result: FloatArray) -> None:
-    """Add A P A', which is symmetric, to the first n columns of `result`, and write A P."""
-    multiply(A, P, AP)
-    n = A.shape[0]
-    for i in range(n):
-        for j in range(i + 1):
-            value = result[i, j]
-            for k in range(n):
-                value += AP[i, k] * A[j, k]
-            result[i, j] = result[j, i] = value
-
-
-@inlined
-def copy(source: FloatArray, result: FloatArray) -> None:
-    """Copy the first columns of `source` to `result`."""
-    for i in range(result.shape[0]):
-        for j in range(result.shape[1]):
-            result[i, j] = source[i, j]
-
-
-@inlined
-def cholesky(matrix: FloatArray, n: int, L: FloatArray) -> bool:
-    """Write the lower Cholesky factor of the leading n rows and columns to `L`; False if there is none."""
-    for i in range(n):
-        for j in range(i + 1):
-            value = matrix[i, j]
-            for m in range(j):
-                value -= L[i, m] * L[j, m]
-            if i > j:
-                L[i, j] = value / L[j, j]
-            elif value > 0.0:
-                L[i, i] = np.sqrt(value)
-            else:
-                return False
-    return True
 
 
 @inlined
@@ -343,13 +293,13 @@ def interpolate(
         for i in range(n):
             for j in range(n):
                 Psi[i, j] = gain[j, i]
-        multiply(Psi, F2[t], E)
+        product(Psi, F2[t], E)
         for i in range(n):
             for j in range(n):
                 E[i, j] = (1.0 if i == j else 0.0) - E[i, j]
                 mean[t, i] += Psi[i, j] * (right[t, j] - ahead[t, j])
-        multiply(E, F1[t], Lambda)
-        multiply(Lambda, A[t], by_right)
+        product(E, F1[t], Lambda)
+        product(Lambda, A[t], by_right)
         for i in range(n):
             for j in range(n):
                 by_right[i, j] += Psi[i, j]

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from fgtrack.core.compiled import inlined, njit
+from fgtrack.core.compiled import cholesky, inlined, njit
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.estimation.smoothing.kernels import MATRICES, ORDER, TRACKS, VECTORS, cholesky, regularise
+from fgtrack.estimation.smoothing.kernels import MATRICES, ORDER, TRACKS, VECTORS, regularise
 
 
 @inlined
