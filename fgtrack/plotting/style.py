@@ -13,7 +13,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.backends.backend_pdf import PdfPages
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.text import Text
@@ -173,6 +173,8 @@ def broken_line(stamps_ns: IntArray, x: FloatArray, y: FloatArray, step_ns: floa
 
 def save_pages(figures: Iterable[Figure], file: BinaryIO) -> None:
     """Write `figures` as the pages of one PDF, without date and version."""
+    from matplotlib.backends.backend_pdf import PdfPages
+
     with PdfPages(file, metadata=dict(FORMATS["pdf"])) as pages:
         for figure in figures:
             pages.savefig(figure)
@@ -180,13 +182,15 @@ def save_pages(figures: Iterable[Figure], file: BinaryIO) -> None:
 
 def png(figure: Figure, dpi: float = 150.0) -> bytes:
     """`figure` as a small PNG of 256 colours, without date and version."""
-    drawn, small = io.BytesIO(), io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=dpi, metadata=dict(FORMATS["png"]))
-    with Image.open(drawn) as picture:
-        made_by = PngInfo()
-        made_by.add_text("Creator", _MARK)
-        few = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
-        few.save(small, "PNG", optimize=True, pnginfo=made_by)
+    canvas: Any = FigureCanvasAgg(figure)  # Any: matplotlib has no types for it
+    before, small, made_by = figure.dpi, io.BytesIO(), PngInfo()
+    figure.set_dpi(dpi)
+    canvas.draw()
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba()))
+    figure.set_dpi(before)
+    made_by.add_text("Creator", _MARK)
+    few = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
+    few.save(small, "PNG", optimize=True, pnginfo=made_by)
     return small.getvalue()
 
 
