@@ -189,8 +189,8 @@ def png(figure: Figure, dpi: float = 150.0) -> bytes:
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba()))
     figure.set_dpi(before)
     made_by.add_text("Creator", _MARK)
-    few = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
-    few.save(small, "PNG", optimize=True, pnginfo=made_by)
+    few = picture.convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    few.save(small, "PNG", pnginfo=made_by)
     return small.getvalue()
 
 
