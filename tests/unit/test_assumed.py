@@ -1,6 +1,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from support.paper import paper
 from support.tracking import START_NS, message
@@ -226,7 +227,38 @@ def test_where_sensors_disagree_about_a_hull_a_track_claims_what_is_near() -> No
     found = assumed(Config(), source_of(hull))
     assert found.config.association.claim_m == pytest.approx(3.0 * 8.0 / 1.18, abs=1.5)
     assert "nothing begins within" in found.lines()[-1]
+    for sensor in found.config.sensors.values():  # half of the variance each, nearly all of it an offset that lasts
+        assert sensor.std["x_m"] == sensor.std["y_m"] == pytest.approx(8.0 / 1.18 / math.sqrt(2.0), rel=0.1)
+        assert sensor.correlation.share == pytest.approx(1.0 - 1.0 / sensor.std["x_m"] ** 2, abs=0.01)
     assert assumed(Config(), source_of(forward)).config.association.claim_m == 0.0
+
+
+def test_errors_that_differ_from_list_to_list_are_no_offset() -> None:
+    rng = np.random.default_rng(0)
+
+    def noisy():
+        for one in forward():
+            yield one
+            if getattr(one, "objects", ()):
+                x_m, y_m = one.objects[0].x_m + 2.0 * rng.normal(), one.objects[0].y_m + 2.0 * rng.normal()
+                yield replace(one, sensor="lidar", objects=[Detection(x_m=x_m, y_m=y_m)])
+
+    assert assumed(Config(), source_of(noisy)).config.sensors["lidar"].correlation is None
+
+
+def test_windows_hold_two_lists_of_the_slowest_sensor() -> None:
+    def seldom():
+        every = 0
+        for one in forward():
+            yield one
+            if getattr(one, "objects", ()):
+                every += 1
+                if every % 30 == 0:
+                    yield replace(one, sensor="slow")
+
+    config = assumed(Config(), source_of(seldom)).config
+    assert config.smoother.lag_s >= 2.0
+    assert config.filter.storage_s == config.smoother.lag_s + config.smoother.ring_s
 
 
 def test_boxes_are_taken_to_be_more_exact_than_points() -> None:

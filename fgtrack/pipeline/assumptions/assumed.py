@@ -13,13 +13,14 @@ from ruamel.yaml.comments import CommentedMap
 
 from fgtrack.core.errors import CallError, DataError, printable
 from fgtrack.core.types import MEASURABLE, DetectionList, Message
+from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.io.errors import MOST_SENSORS
 from fgtrack.io.source import InputSource
-from fgtrack.models.sensors import Mount, Score, SensorModel
+from fgtrack.models.sensors import Correlation, Mount, Score, SensorModel
 from fgtrack.pipeline.assumptions.coverage import Coverage, coverages
 from fgtrack.pipeline.assumptions.list_statistics import ListStatistics
 from fgtrack.pipeline.assumptions.revisits import for_slow_revisits
-from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.config import Config, FilterConfig
 from fgtrack.pipeline.load import plain
 from fgtrack.pipeline.recorded import RecordedSensor, recorded
 from fgtrack.tracking.association import GatedMahalanobis
@@ -45,6 +46,11 @@ _LISTS_OUT_OF_VIEW = 2.5
 _LEAST_CLUTTER = 0.05
 """False detections of a list that can never be excluded."""
 
+_TWO_LISTS = "two lists of the slowest sensor"
+_LEAST_SHARE, _OFFSET_S = 0.5, 30.0
+"""Share of time-correlated errors below which they are not modelled, and their correlation time: the offset of what a
+sensor sees of a hull changes with its aspect, within tens of seconds."""
+
 RECORDED, USUAL = "recorded", "usual of a detector of cars by LiDAR or RADAR"
 USUAL_BOX = "usual of boxes that a detector fits to cars"
 _UNPLACED = "gives no position, and bearings from an unknown mount err by more than the tracks"
@@ -59,11 +65,14 @@ def _mounted(value: Mapping[str, float]) -> str:
 #: Settings in words, by the last name of their keys.
 _WORDS: Mapping[str, Callable[[Any], str]] = {  # Any: of the key
     "std": lambda std: f"standard deviations {', '.join(f'{name} {one:g}' for name, one in std.items())}",
+    "correlation": "{0[share]:.0%} of the variance lasts for some {0[time_s]:g} s".format,
     "detection_probability": "detection probability {:g}".format,
     "clutter_per_m2": "clutter {:g} per m2".format,
     "score": "score {0[even]:g} as often of objects as of clutter, e times per {0[scale]:g}".format,
     "scan": lambda _: "reports objects one by one",
     "out_of_view_s": "tracks out of view end after {:g} s".format,
+    "lag_s": "smoothers keep {:g} s".format,
+    "storage_s": "filters keep {:g} s".format,
     "claim_m": "nothing begins within {:g} m of a track".format,
     "ignore_sensors": lambda names: f"{', '.join(names)} left out",
     "field_of_view_rad": lambda rad: "sees all around" if rad >= math.tau else f"sees {math.degrees(rad):.0f} degrees",
@@ -190,10 +199,12 @@ def assumed(config: Config, source: InputSource) -> Assumed:
                 found += more
                 sensors[name] = _with_recorded(name, sensor, carried.sensors.get(name, RecordedSensor()), found)
             config = _with_claim(config, covered, found)
+            _with_offsets(sensors, covered, found)
             unplaced = [name for name, one in sensors.items() if not one.gives_position and one.mount is None]
             if unplaced and any(one.gives_position for one in sensors.values()):
                 config = replace(config, ignore_sensors=(*config.ignore_sensors, *unplaced))
                 found.append(Assumption("ignore_sensors", list(config.ignore_sensors), _UNPLACED))
+            config = _with_windows(config, covered, found)
         for name, sensor in sensors.items():
             if sensor.scan and not sensor.is_view_given and name in covered:
                 seen = replace(covered[name], persistence=None) if named else covered[name]
@@ -238,6 +249,42 @@ def _with_claim(config: Config, seen: Mapping[str, Coverage], found: list[Assump
     return replace(config, association=replace(rules, claim_m=claim_m))
 
 
+def _with_windows(config: Config, covered: Mapping[str, Coverage], found: list[Assumption]) -> Config:
+    """`config` with windows that hold two lists of the slowest sensor that takes part."""
+    rates_hz = [one.rate_hz for name, one in covered.items() if one.rate_hz and name not in config.ignore_sensors]
+    lag_s = float(math.ceil(2.0 / min(rates_hz, default=math.inf)))
+    if lag_s <= config.smoother.lag_s or config.smoother != SmootherSettings() or config.filter != FilterConfig():
+        return config
+    storage_s = lag_s + config.smoother.ring_s
+    found.append(Assumption("smoother.lag_s", lag_s, _TWO_LISTS))
+    found.append(Assumption("filter.storage_s", storage_s, _TWO_LISTS))
+    smoother, storage = replace(config.smoother, lag_s=lag_s), replace(config.filter, storage_s=storage_s)
+    return replace(config, smoother=smoother, filter=storage)
+
+
+def _with_offsets(sensors: dict[str, SensorModel], covered: Mapping[str, Coverage], found: list[Assumption]) -> None:
+    """Give `sensors` time-correlated errors where they disagree by more than errors that differ from list to list.
+
+    Of two sensors each has half of the variance, beside its own errors e: s^2 = e^2 + max(d^2 / 2 - e^2, 0).
+    """
+    for name, one in covered.items():
+        sensor = sensors[name]
+        if one.disagreement_m is None or one.persistence is None or not {"x_m", "y_m"} <= sensor.std.keys():
+            continue
+        own_m = max(sensor.std["x_m"], one.persistence.std_m)
+        std_m = float(f"{one.disagreement_m / math.sqrt(2.0):.2g}")
+        share = round(1.0 - (own_m / std_m) ** 2, 2)
+        if share < _LEAST_SHARE:
+            continue
+        reason = f"it and another sensor disagree by {one.disagreement_m:.2g} m on each axis, as on large hulls"
+        sensors[name] = replace(
+            sensor, std={**sensor.std, "x_m": std_m, "y_m": std_m}, correlation=Correlation(share, _OFFSET_S)
+        )
+        found[:] = [each for each in found if each.key != f"sensors.{name}.std"]
+        found.append(Assumption(f"sensors.{name}.std", sensors[name].std, reason))
+        found.append(Assumption(f"sensors.{name}.correlation", {"share": share, "time_s": _OFFSET_S}, reason))
+
+
 def _out_of_view_s(config: Config, seen: Mapping[str, Coverage]) -> tuple[float, str]:
     """Return how long a track lives that no sensor can see, and the reason.
 
@@ -249,7 +296,7 @@ def _out_of_view_s(config: Config, seen: Mapping[str, Coverage]) -> tuple[float,
     if len(placing) == 1 and placing[0] in periods_s:
         return 0.5 * periods_s[placing[0]], "no other sensor gives positions, half its period"
     slow_s = _LISTS_OUT_OF_VIEW * max(periods_s.values(), default=0.0)
-    return max(ExistenceRules.out_of_view_s, slow_s), "two lists of the slowest sensor"
+    return max(ExistenceRules.out_of_view_s, slow_s), _TWO_LISTS
 
 
 def _with_coverage(name: str, sensor: SensorModel, seen: Coverage, found: list[Assumption]) -> SensorModel:

@@ -54,6 +54,8 @@ class Persistence:
     """Range beyond which most triples do not go on, so that clutter outweighs objects; None where they do at any."""
     lines: FloatArray
     """Stamp, position and velocity at the end of each triple, shape (n, 5)."""
+    std_m: float = 0.0
+    """Standard deviation of a detection, per axis, of errors that differ from list to list."""
 
     @property
     def num_triples(self) -> int:
@@ -136,7 +138,7 @@ def persistence(
         near = _near_clutter_per_m2(trees, [_of_clutter(one, score_model, odds) for one in scores])
     max_range_m = _max_range_m(np.array(found_ranges_m)[in_triple], of_object[in_triple] / probability**2)
     ends = [(stamps_s[k + 1], *line[0], *line[1]) for k, line in compress(lines, in_triple) if line is not None]
-    return Persistence(probability, clutter, near, score_model, max_range_m, np.array(ends))
+    return Persistence(probability, clutter, near, score_model, max_range_m, np.array(ends), scale)
 
 
 def _max_range_m(ranges_m: FloatArray, objects: FloatArray) -> float | None:
