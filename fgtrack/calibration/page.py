@@ -2,13 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from textwrap import wrap
 
 from fgtrack.calibration.arrivals import Arrivals
 from fgtrack.calibration.finding import Finding
 from fgtrack.calibration.outcome import Outcome
-from fgtrack.evaluation.tables import NO_VALUE, Column, Record, Table, Tables, Value, short
+from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
 from fgtrack.pipeline.config import Config
 
 __all__ = ["Advice", "Change"]
@@ -110,7 +109,7 @@ class Advice:
             {"lag_s": lag_s} | {key: row[name] for key, name in shares.items()} for lag_s, row in self.beyond.items()
         ]
         columns = [Column("lag [s]", "lag_s", text=str)]
-        columns += [Column(name, cell_of=partial(_share, key)) for key, name in shares.items()]
+        columns += [Column(name, [key], scale=100.0) for key, name in shares.items()]
         return Table("Detections that are later than a window or limit [%]", records, columns, ("lag_s",))
 
     def as_dict(self) -> dict[str, object]:
@@ -139,7 +138,3 @@ def _wrapped(text: str) -> list[str]:
 
 def _whole(value: Value) -> str:
     return f"{value:.0f}" if abs(float(value)) < 3.6e6 else NO_VALUE
-
-
-def _share(key: str, record: Record) -> str:
-    return short(100.0 * record[key])

@@ -41,7 +41,7 @@ def compare(
             except FgtrackError as error:
                 warn(f"{error}; the tables are complete without it")
     show(tables.in_full() if everything else tables, form)
-    if form is None and tables.has_more and not everything:
+    if form is None and not everything:
         say("\nevery table and column: --all")
 
 

@@ -15,9 +15,9 @@ from fgtrack.core.errors import CallError, one_line
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.tables.seeds import (
     SweepTable,
+    difference_table,
     read_sweep,
     seed_comparisons,
-    shown_tables,
     summary_table,
     to_csv,
 )
@@ -37,7 +37,7 @@ from fgtrack.pipeline.sweep import (
 from fgtrack.pipeline.sweep_plan import load_plan
 
 #: Wall times among the metrics, and what follows from them; they have a table of their own.
-_TIMES = ("time_per_", "deadlines.")
+_TIMES = "time_per_"
 _NAMES = ("name", "estimator")
 
 
@@ -129,12 +129,12 @@ def _summarise(table: SweepTable, out: Path, form: Form | None, everything: bool
     write_file(out / PAIRED_TABLE, to_csv(contests, table.axes))
     summary = summary_table(table, contests)
     write_file(out / SUMMARY_TABLE, summary.to_csv())
-    if form is None:
-        for shown in shown_tables(contests, table.axes):
-            show(shown, form)
-            say(f"all points and metrics: {out / PAIRED_TABLE}")
+    differences = difference_table(contests, table.axes)
+    if form is None and differences.records:
+        show(differences, form)
+        say(f"all metrics: {out / PAIRED_TABLE}")
     show(summary.in_full() if everything else summary, form)
-    if form is None and summary.has_more and not everything:
+    if form is None and not everything:
         say(f"\nevery metric: --all, or {out / SUMMARY_TABLE}")
 
 

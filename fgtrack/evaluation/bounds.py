@@ -19,39 +19,27 @@ from fgtrack.models.motion import MotionModel
 
 @dataclass(frozen=True)
 class ScheduledMeasurement:
-    """A measurement that will be made: its value does not matter for a bound.
-
-    Attributes
-    ----------
-    stamp_ns, receipt_ns
-        Times of sensing and of arrival.
-    model, R, pose
-        Measurement model, covariance, shape (k, k), and pose of the sensor.
-    """
+    """A measurement that will be made: its value does not matter for a bound."""
 
     stamp_ns: int
     receipt_ns: int
+    """Times of sensing and of arrival."""
     model: MeasurementModel
     R: FloatArray
+    """Covariance, shape (k, k)."""
     pose: SensorPose = field(default_factory=SensorPose)
+    """Pose of the sensor."""
 
 
 class Bounds(NamedTuple):
-    """Lower bounds of the covariance of the present state at m times, shape (m, n, n) each.
-
-    Attributes
-    ----------
-    in_time
-        If everything arrived when it was sensed.
-    arrived
-        From what has arrived, each at its own stamp.
-    dropped
-        From what has arrived, without what came later than something sensed after it.
-    """
+    """Lower bounds of the covariance of the present state at m times, shape (m, n, n) each."""
 
     in_time: FloatArray
+    """If everything arrived when it was sensed."""
     arrived: FloatArray
+    """From what has arrived, each at its own stamp."""
     dropped: FloatArray
+    """From what has arrived, without what came later than something sensed after it."""
 
 
 _NEVER_NS = np.iinfo(np.int64).max

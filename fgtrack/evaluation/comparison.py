@@ -33,46 +33,28 @@ _SEED = 20040101  # of the bootstrap: the same runs give the same intervals
 
 @dataclass(frozen=True)
 class Entry:
-    """A run or an estimator, compared in one quantity.
-
-    Attributes
-    ----------
-    name
-        Of the run, or of the estimator.
-    value
-        Of the quantity.
-    worse_by
-        Difference to the best; None of the best itself.
-    standing
-        `tie` where the interval of the difference to the best contains 0; `best` only without any tie.
-    """
+    """A run or an estimator, compared in one quantity."""
 
     name: str
     value: float
     worse_by: Estimate | None
+    """Difference to the best; None of the best itself."""
     standing: Literal["best", "tie", "worse"]
+    """`tie` where the interval of the difference to the best contains 0; `best` only without any tie."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Runs of one recording.
-
-    Attributes
-    ----------
-    runs
-        Labels.
-    samples
-        Objects and stamps at which all runs have a paired track.
-    most_samples
-        Those of the run with most of them.
-    quantities
-        By name, with the unit in it, the entries from the best to the worst; those that all runs have.
-    """
+    """Runs of one recording."""
 
     runs: tuple[str, ...]
+    """Labels."""
     samples: int
+    """Objects and stamps at which all runs have a paired track."""
     most_samples: int
+    """Those of the run with most of them."""
     quantities: Mapping[str, tuple[Entry, ...]]
+    """By name, with the unit in it, the entries from the best to the worst; those that all runs have."""
 
 
 def comparisons(runs: Sequence[EvaluatedRun]) -> list[Comparison]:
@@ -128,19 +110,13 @@ def entry_columns(heading: str, name: str = "value") -> list[Column]:
 
 
 class Paired(NamedTuple):
-    """Sums by which runs of one recording are compared.
-
-    Attributes
-    ----------
-    samples, most_samples
-        See `Comparison`.
-    sums
-        By quantity: of every stamp the sum of each run, and in the last column the count, shape (n, runs + 1).
-    """
+    """Sums by which runs of one recording are compared."""
 
     samples: int
     most_samples: int
+    """See `Comparison`."""
     sums: Mapping[str, FloatArray]
+    """By quantity: of every stamp the sum of each run, and in the last column the count, shape (n, runs + 1)."""
 
 
 def paired_sums(group: Sequence[EvaluatedRun]) -> Paired:

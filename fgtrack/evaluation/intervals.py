@@ -28,20 +28,13 @@ Statistic = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number and its 95 % confidence interval; NaN where it is not known.
-
-    Attributes
-    ----------
-    mean, low, high
-        The number and the ends of its interval.
-    count
-        Independent samples that it rests on: seeds, or blocks of a run.
-    """
+    """A number and its 95 % confidence interval; NaN where it is not known."""
 
     mean: float
     low: float
     high: float
     count: int
+    """Independent samples: seeds, or blocks of a run."""
 
     @property
     def is_significant(self) -> bool:

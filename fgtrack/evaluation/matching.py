@@ -17,45 +17,29 @@ NO_OBJECT = -1
 
 @dataclass(frozen=True)
 class Matching:
-    """Pairs of track rows and true objects, which are numbered by rising id, without the ego.
-
-    Attributes
-    ----------
-    object_ids
-        Ids of the objects.
-    tracks
-        The evaluated rows of tracks.csv: r rows while truth was recorded.
-    object_index
-        Object that each row is paired with, shape (r,); `NO_OBJECT` without one.
-    true_states
-        x, y, yaw, speed, yaw rate of that object at the row's stamp, shape (r, 5); NaN without one.
-    distances_m
-        Distance of each row from every object at the row's stamp, shape (r, objects); NaN where it is not known.
-    now_ns
-        Time of every tick, shape (ticks,).
-    tick_index
-        Index of each row's tick, shape (r,).
-    present
-        True where there is truth at the tick's `now_ns`, shape (ticks, objects).
-    track_ids
-        Track paired with each object, shape (ticks, objects); `NO_TRACK` without one.
-    in_sight
-        True where some sensor could see the object, shape (ticks, objects), see `visible`.
-    is_sight_known
-        True if the sensors and the ego's path are known; else every object counts as visible.
-    """
+    """Pairs of track rows and true objects, which are numbered by rising id, without the ego."""
 
     object_ids: tuple[int, ...]
     tracks: Table
+    """The evaluated rows of tracks.csv: r rows while truth was recorded."""
     object_index: IntArray
+    """Object that each row is paired with, shape (r,); `NO_OBJECT` without one."""
     true_states: FloatArray
+    """x, y, yaw, speed, yaw rate of that object at the row's stamp, shape (r, 5); NaN without one."""
     distances_m: FloatArray
+    """Distance of each row from every object at the row's stamp, shape (r, objects); NaN where unknown."""
     now_ns: IntArray
+    """Time of every tick, shape (ticks,)."""
     tick_index: IntArray
+    """Index of each row's tick, shape (r,)."""
     present: BoolArray
+    """True where there is truth at the tick's `now_ns`, shape (ticks, objects)."""
     track_ids: IntArray
+    """Track paired with each object, shape (ticks, objects); `NO_TRACK` without one."""
     in_sight: BoolArray
+    """True where some sensor could see the object, shape (ticks, objects), see `visible`."""
     is_sight_known: bool
+    """True if the sensors and the ego's path are known; else every object counts as visible."""
 
     @property
     def paired(self) -> BoolArray:
@@ -65,27 +49,18 @@ class Matching:
 
 @dataclass(frozen=True)
 class Scenes:
-    """Tracks and true objects at t ticks; r rows of tracks by rising tick.
-
-    Attributes
-    ----------
-    tick_index
-        Tick of each row, shape (r,), rising.
-    track_ids
-        Shape (r,).
-    distances_m
-        Distance of each row from every object, shape (r, objects); infinite where the object is not present.
-    present
-        True where an object is present, shape (t, objects).
-    in_sight
-        True where it is present and some sensor could see it, shape (t, objects).
-    """
+    """Tracks and true objects at t ticks; r rows of tracks by rising tick."""
 
     tick_index: IntArray
+    """Tick of each row, shape (r,), rising."""
     track_ids: IntArray
+    """Shape (r,)."""
     distances_m: FloatArray
+    """Distance of each row from every object, shape (r, objects); infinite where the object is not present."""
     present: BoolArray
+    """True where an object is present, shape (t, objects)."""
     in_sight: BoolArray
+    """True where it is present and some sensor could see it, shape (t, objects)."""
 
     @property
     def num_ticks(self) -> int:
@@ -104,20 +79,14 @@ class Scenes:
 
 @dataclass(frozen=True)
 class TrackErrors:
-    """Track minus truth of the p paired rows.
-
-    Attributes
-    ----------
-    stamps_ns, object_index, track_ids
-        Of each row, shape (p,).
-    values
-        By name of `ERROR_NAMES`, each of shape (p,); NaN where the truth has no value.
-    """
+    """Track minus truth of the p paired rows."""
 
     stamps_ns: IntArray
     object_index: IntArray
     track_ids: IntArray
+    """Of each row, shape (p,)."""
     values: Mapping[str, FloatArray]
+    """By name of `ERROR_NAMES`, each of shape (p,); NaN where the truth has no value."""
 
 
 #: Distance; along and across the true heading (left positive); yaw in (-pi, pi]; speed.

@@ -13,7 +13,6 @@ from fgtrack.evaluation.diagnostics import excluded_lines
 from fgtrack.evaluation.matching import ERROR_NAMES, Matching, confirmed, match, scenes, track_errors
 from fgtrack.evaluation.scores.consistency import Consistency, consistency
 from fgtrack.evaluation.scores.continuity import breaks, late_switches, switches, times_to_confirm, tracked_visits
-from fgtrack.evaluation.scores.deadlines import Deadlines
 from fgtrack.evaluation.scores.innovations import (
     RESIDUAL_NAMES,
     local_innovations,
@@ -36,39 +35,26 @@ LATE_SWITCH_S = 0.5
 
 @dataclass(frozen=True)
 class ObjectMetrics:
-    """Metrics of one true object, or of all of them together.
-
-    Attributes
-    ----------
-    errors
-        Track minus truth, by name of `ERROR_NAMES`; `position_m` is the distance.
-    ticks_present
-        Ticks at which there is truth.
-    ticks_tracked
-        Ticks among them at which a track was paired.
-    breaks
-        Times that tracking went on after a loss, or with another track.
-    id_switches
-        Times that it went on with another track than the last one.
-    late_id_switches
-        Those that follow on an out-of-sequence update, see `late_switches`.
-    time_to_confirm_s
-        From the first detection to the first confirmed track, a sample for each object, see `times_to_confirm`.
-    ticks_in_sight
-        Ticks at which there is truth and some sensor could see it, see `visible`.
-    ticks_tracked_in_sight
-        Ticks among them at which a track was paired.
-    """
+    """Metrics of one true object, or of all of them together."""
 
     errors: Mapping[str, Moments]
+    """Track minus truth, by name of `ERROR_NAMES`; `position_m` is the distance."""
     ticks_present: int = 0
+    """Ticks at which there is truth."""
     ticks_tracked: int = 0
+    """Ticks among them at which a track was paired."""
     breaks: int = 0
+    """Times that tracking went on after a loss, or with another track."""
     id_switches: int = 0
+    """Times that it went on with another track than the last one."""
     late_id_switches: int = 0
+    """Those that follow on an out-of-sequence update, see `late_switches`."""
     time_to_confirm_s: Moments = field(default_factory=Moments)
+    """From the first detection to the first confirmed track, a sample for each object, see `times_to_confirm`."""
     ticks_in_sight: int = 0
+    """Ticks at which there is truth and some sensor could see it, see `visible`."""
     ticks_tracked_in_sight: int = 0
+    """Ticks among them at which a track was paired."""
 
     @property
     def tracked_share(self) -> float:
@@ -93,27 +79,18 @@ class ObjectMetrics:
 
 @dataclass(frozen=True)
 class TruthMetrics:
-    """Metrics that need truth.
-
-    Attributes
-    ----------
-    objects
-        By object id.
-    judged_tracks
-        Tracks with an evaluated row.
-    false_tracks
-        Those of them paired in less than `FALSE_TRACK_SHARE` of their rows.
-    tracked_objects
-        True objects that a confirmed track was ever paired with.
-    tracked_visits
-        Times that one came into sight and was tracked there: TP of the precision, see `tracked_visits`.
-    """
+    """Metrics that need truth."""
 
     objects: Mapping[int, ObjectMetrics]
+    """By object id."""
     judged_tracks: int
+    """Tracks with an evaluated row."""
     false_tracks: int
+    """Those of them paired in less than `FALSE_TRACK_SHARE` of their rows."""
     tracked_objects: int
+    """True objects that a confirmed track was ever paired with."""
     tracked_visits: int
+    """Times that one came into sight and was tracked there: TP of the precision, see `tracked_visits`."""
 
     @property
     def overall(self) -> ObjectMetrics:
@@ -123,27 +100,18 @@ class TruthMetrics:
 
 @dataclass(frozen=True)
 class SensorMetrics:
-    """Dispositions and innovations of one sensor.
-
-    Attributes
-    ----------
-    dispositions
-        Detections by disposition; every disposition is there.
-    delay_s
-        Receipt minus stamp of the messages that held a detection.
-    residuals
-        Innovations by name of `RESIDUAL_NAMES`, those that occur.
-    nis
-        Normalised innovation squared.
-    nis_dof
-        Number of measured components of the updates with a NIS: a consistent filter has this mean NIS.
-    """
+    """Dispositions and innovations of one sensor."""
 
     dispositions: Mapping[str, int]
+    """Detections by disposition, zeros included."""
     delay_s: Distribution
+    """Receipt minus stamp of the messages that held a detection."""
     residuals: Mapping[str, Moments]
+    """Innovations by name of `RESIDUAL_NAMES`, those that occur."""
     nis: Moments
+    """Normalised innovation squared."""
     nis_dof: Moments
+    """Number of measured components of the updates with a NIS: a consistent filter has this mean NIS."""
 
     @property
     def detections(self) -> int:
@@ -153,57 +121,36 @@ class SensorMetrics:
 
 @dataclass(frozen=True)
 class Metrics:
-    """All metrics of one run.
-
-    Attributes
-    ----------
-    name
-        Name of the run folder; empty for a run in memory.
-    estimator
-        Name of the estimator.
-    options
-        Settings of the evaluation.
-    num_tracks, num_confirmed
-        Distinct ids in tracks.csv, and those that were `confirmed`.
-    sensors
-        By sensor.
-    residuals
-        Innovations of all sensors and confirmed tracks, by name of `LOCAL_NAMES`: table I of Karle et al. 2023.
-    time_per_tick_s, time_per_detection_s
-        Wall time of the ticks with a detection, and the same per detection received; NaN without any.
-    consistency, deadlines
-        Normalised squares of errors and innovations; computing time against the clock.
-    truth
-        None for a run without truth.
-    lagged
-        Present, lagged and final states, see `lag_metrics`.
-    multi_object
-        None for a run without truth, and where the options exclude it.
-    predictions
-        Errors of predictions by predictor and horizon, see `prediction_errors`; empty without truth.
-    failures
-        Failures inside the estimator by kind, zeros included; empty of runs that did not count them.
-    left_out
-        Lines on the detections that settings excluded.
-    """
+    """All metrics of one run."""
 
     name: str
+    """Name of the run folder; empty for a run in memory."""
     estimator: str
     options: EvaluationConfig
     num_tracks: int
+    """Distinct ids in tracks.csv."""
     num_confirmed: int
+    """Those of them that were `confirmed`."""
     sensors: Mapping[str, SensorMetrics]
     residuals: Mapping[str, Moments]
+    """Innovations of all sensors and confirmed tracks, by name of `LOCAL_NAMES`: table I of Karle et al. 2023."""
     time_per_tick_s: Distribution
+    """Wall time of the ticks with a detection."""
     time_per_detection_s: float
+    """The same per detection received; NaN without any."""
     consistency: Consistency
-    deadlines: Deadlines
     truth: TruthMetrics | None = None
+    """None for a run without truth."""
     lagged: tuple[LagMetrics, ...] = ()
+    """Present, lagged and final states, see `lag_metrics`."""
     multi_object: MultiObjectMetrics | None = None
+    """None for a run without truth, and where the options exclude it."""
     predictions: Mapping[str, Mapping[str, PredictionErrors]] = field(default_factory=dict)
+    """Errors of predictions by predictor and horizon, see `prediction_errors`; empty without truth."""
     failures: Mapping[str, int] = field(default_factory=dict)
+    """Failures inside the estimator by kind, zeros included; empty of runs that did not count them."""
     left_out: tuple[str, ...] = ()
+    """Lines on the detections that settings excluded."""
 
     @property
     def precision(self) -> float:
@@ -224,7 +171,7 @@ class Metrics:
 
 
 def evaluate(run: Run, truth: Mapping[str, Any] | None = None, options: EvaluationConfig | None = None) -> Metrics:
-    """Metrics of `run`; without truth, those that need none.
+    """Return the metrics of `run`; without truth, those that need none.
 
     Parameters
     ----------
@@ -243,7 +190,7 @@ def evaluate(run: Run, truth: Mapping[str, Any] | None = None, options: Evaluati
 
 
 def evaluate_matched(run: Run, matching: Matching | None, options: EvaluationConfig) -> Metrics:
-    """Metrics of `run`, whose `match` by these `options` is known."""
+    """Return the metrics of `run`, whose `match` by these `options` is known."""
     tracks, timing = run.tables["tracks"], run.tables["timing"]
     busy = timing["num_detections"] > 0
     scored = scenes(run, matching) if matching is not None and options.multi_object else None
@@ -259,7 +206,6 @@ def evaluate_matched(run: Run, matching: Matching | None, options: EvaluationCon
         time_per_tick_s=Distribution.of(time_s),
         time_per_detection_s=float(time_s.sum() / detections.sum()) if len(time_s) else math.nan,
         consistency=consistency(run, matching),
-        deadlines=Deadlines.of(run),
         truth=None if matching is None else _truth_metrics(run, matching, options),
         lagged=lag_metrics(run, matching),
         multi_object=None if scored is None else multi_object_metrics(scored, options.gate_m),

@@ -19,17 +19,10 @@ from fgtrack.io.run import EvaluationConfig, Run, Table, is_run_folder, load_run
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedRun:
-    """A run and its evaluation, computed when it is first used.
-
-    Attributes
-    ----------
-    label
-        Name among the runs that it is shown with.
-    run
-        The run.
-    """
+    """A run and its evaluation, computed when it is first used."""
 
     label: str
+    """Name among the runs that it is shown with."""
     run: Run
 
     @cached_property

@@ -26,21 +26,13 @@ _GAP_PERIODS = 5
 
 @dataclass(frozen=True)
 class TruePath:
-    """Truth of one object.
-
-    Attributes
-    ----------
-    object_id
-        Its id.
-    stamps_ns
-        Distinct, in rising order, shape (n,).
-    states
-        x, y, yaw, speed, yaw rate there, shape (n, 5); NaN where the truth has no value.
-    """
+    """Truth of one object."""
 
     object_id: int
     stamps_ns: IntArray
+    """Distinct, in rising order, shape (n,)."""
     states: FloatArray
+    """x, y, yaw, speed, yaw rate there, shape (n, 5); NaN where the truth has no value."""
 
     def at(self, stamps_ns: IntArray) -> FloatArray:
         """States at `stamps_ns`, shape (m,); shape (m, 5), NaN where there is no truth.

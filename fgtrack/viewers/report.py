@@ -104,7 +104,7 @@ def _page(runs: Sequence[EvaluatedRun], tables: Tables, pictures: Iterable[tuple
         "Assumptions": _list(head.assumptions),
         "Advice": _list(head.advice),
         "Tables": "".join(
-            _wide(printable(table.title), table.to_html()) + _list(table.shown_notes(), "soft")
+            _wide(printable(table.title), table.to_html()) + _list(table.shown_notes, "soft")
             for table in tables.in_full().tables.values()
             if table.records
         ),
@@ -154,8 +154,8 @@ def _list(lines: Iterable[str], kind: str = "") -> str:
 
 def _grid(title: str, names: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A table of texts."""
-    lines = (f"<tr>{''.join(html_cell('td', text, True) for text in row)}</tr>\n" for row in rows)
-    head = "".join(html_cell("th", name, True) for name in names)
+    lines = (f"<tr>{''.join(html_cell('td', escape(text), True) for text in row)}</tr>\n" for row in rows)
+    head = "".join(html_cell("th", escape(name), True) for name in names)
     return _wide(title, f"<thead><tr>{head}</tr></thead>\n<tbody>\n{''.join(lines)}</tbody>\n")
 
 

@@ -152,14 +152,13 @@ def test_the_table_has_all_numbers_and_marks_best_tie_and_worse(trio: list[Run])
     assert np.isnan(mine["worse_by"][0])
     assert mine["low"][2] < mine["worse_by"][2] < mine["high"][2]
     assert mine["blocks"][2] > 20
-    shown = compare(trio[:2]).tables["differences"].shown()[2]
-    assert shown.bold[:2] == [True, False]
-    assert [cell[-2:] for cell in shown.cells[:2]] == [" +", "  "]
+    cells = [row[2] for row in compare(trio[:2]).tables["differences"].rows(bold="<{}>")]
+    assert [cell[-3:] for cell in cells[:2]] == [" +>", "6  "]
 
 
 def test_a_value_of_the_other_tables_is_bold_only_where_no_run_ties_with_it(trio: list[Run]) -> None:
     def bold(runs: list[Run]) -> list[bool]:
-        return list(compare(runs).tables["tracking"].shown()[1].bold)
+        return [row[1].startswith("<") for row in compare(runs).tables["tracking"].rows(bold="<{}>")]
 
     assert bold(trio) == [False, False, False]
     tables = compare(trio[:2])

@@ -13,7 +13,6 @@ from fgtrack.core.types import Disposition, EgoState, TickReport
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.runs import evaluated
 from fgtrack.evaluation.scores.innovations import local_innovations
-from fgtrack.evaluation.tables.compare import compare
 from fgtrack.io.run import Run, RunWriter, load_run
 from fgtrack.models.oval import make_oval
 
@@ -101,5 +100,3 @@ def test_the_tables_of_the_paper(tmp_path: Path) -> None:
     assert radar["distance_median_m"] == pytest.approx(math.hypot(32.0, 3.0))
     assert sensors["detections_median"]["lidar"] == 149.0
     assert tables["latency"][["num_ticks", "time_per_tick_mean_s"]].values.tolist() == [[150, pytest.approx(0.002)]]
-    (row,) = compare(run).tables["predictions"].plain()
-    assert (row["predictor"], row["fde_1s_m"], row["fde_5s_m"]) == ("arc", pytest.approx(2.0), None)

@@ -11,8 +11,8 @@ from fgtrack.evaluation.intervals import paired
 from fgtrack.evaluation.tables.seeds import (
     SeedComparison,
     SweepTable,
+    difference_table,
     seed_comparisons,
-    shown_tables,
     summary_table,
     to_csv,
 )
@@ -105,9 +105,9 @@ def test_every_point_is_a_contest_and_csv_gives_the_numbers_back() -> None:
 def test_few_points_are_shown_in_full_under_the_labels_of_their_axes() -> None:
     cells = {"late": "much", "sensors.radar.delay": '{"kind": "constant"}', "association.gate_m": "5.0"}
     rows = rows_of({"a": noisy(1, 0.4), "b": noisy(2, 0.5)}, **cells)
-    (table,) = shown_tables(seed_comparisons(rows, tuple(cells)), tuple(cells))
+    table = difference_table(seed_comparisons(rows, tuple(cells)), tuple(cells))
     assert table.data["point"].tolist() == ["much, 5.0"] * 2
-    assert table.shown()[0].heading == "late,\ngate_m"
+    assert table.columns[0].heading == "late,\ngate_m"
     assert table.data["standing"].tolist() == ["best", "worse"]
     assert max(map(len, str(table).splitlines())) <= 100
 

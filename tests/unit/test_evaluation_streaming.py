@@ -8,10 +8,9 @@ import pytest
 from evaluation_runs import ROUND, WEST, write_run
 
 from fgtrack.evaluation.runs import EvaluatedRun
-from fgtrack.evaluation.scores.deadlines import Deadlines
 from fgtrack.evaluation.tables import Tables
 from fgtrack.evaluation.tables.compare import compare
-from fgtrack.evaluation.tables.streaming import ASKED, PREDICTED, READY, streamed
+from fgtrack.evaluation.tables.streaming import ASKED, PREDICTED, READY, streaming_errors
 from fgtrack.io.run import Run
 
 MS = 1_000_000
@@ -34,26 +33,26 @@ def rmse(tables: Tables, judged: str) -> dict[str, float]:
 
 
 def test_what_took_30_ms_is_judged_30_ms_later(tmp_path: Path) -> None:
-    found = streamed(EvaluatedRun("a", made(tmp_path / "run", [30, 0])))
+    found = streaming_errors(EvaluatedRun("a", made(tmp_path / "run", [30, 0])))
     assert found[ASKED] == pytest.approx(0.0, abs=1e-6)
     assert found[READY][:3].tolist() == pytest.approx([20.0 * 0.03, 20.0 * 0.01, 0.0], abs=1e-6)
 
 
 def test_a_user_who_predicts_pays_for_what_its_speed_does_not_tell(tmp_path: Path) -> None:
-    straight = streamed(EvaluatedRun("a", made(tmp_path / "run", [10], speed_mps=3.0)))
+    straight = streaming_errors(EvaluatedRun("a", made(tmp_path / "run", [10], speed_mps=3.0)))
     assert straight[READY] == pytest.approx(0.2, abs=1e-6)
     assert straight[PREDICTED] == pytest.approx(0.03, abs=1e-6)
     truth = ROUND.truth(range(-1, 100))
     tracks = [[ROUND.track(tick, 1)] for tick in TICKS]
     run = write_run(tmp_path / "round", tracks, truth=truth, process_ns=[19 * MS] * len(TICKS))
-    turning = streamed(EvaluatedRun("b", run))
+    turning = streaming_errors(EvaluatedRun("b", run))
     expected_m = 0.5 * 30.0 * 0.5 * 0.019**2  # half of v omega t^2
     assert turning[PREDICTED] == pytest.approx(expected_m, rel=0.05)
 
 
 def test_a_track_without_yaw_and_speed_stays_where_it_was_published(tmp_path: Path) -> None:
     run = made(tmp_path / "run", [10], yaw_rad=np.nan, speed_mps=np.nan)
-    found = streamed(EvaluatedRun("a", run))
+    found = streaming_errors(EvaluatedRun("a", run))
     np.testing.assert_array_equal(found[PREDICTED], found[READY])
 
 
@@ -109,19 +108,10 @@ def test_without_truth_there_is_the_load_alone(tmp_path: Path) -> None:
     assert (len(tables["streaming"]), len(tables["load"])) == (0, 1)
 
 
-def test_deadlines_and_load_come_from_the_times_and_the_node_period(tmp_path: Path) -> None:
-    found = Deadlines.of(made(tmp_path / "run", [50, 10, 10, 0]))
-    assert (found.period_s, found.ticks, found.misses) == (0.02, 60, 3)
-    line = "slower than real time, on a machine that may have been busy (ticks late): "
-    missing, keeping = made(tmp_path / "late", [50, 10, 10, 0]), made(tmp_path / "timely", [1])
-    assert f"{line}late (smoother) 3/60" in compare(missing, keeping).tables["tracking"].notes
-    assert not any("real time" in note for note in compare(keeping).tables["tracking"].notes)
-    assert found.load == pytest.approx(0.07 / (59 * 0.02))
-    assert found.latest_s == pytest.approx(0.05)
-
-
-@pytest.mark.parametrize("config", ["", "clock: {node_hz: null}\n"])
-def test_without_a_period_there_are_no_deadlines(config: str, tmp_path: Path) -> None:
-    run = made(tmp_path / "run", [50], config)
-    assert not Deadlines.of(run).are_known
-    assert not any("deadlines" in note for note in compare(run).tables["tracking"].notes)
+@pytest.mark.parametrize(("config", "late"), [(AT_50_HZ, [3, 60]), ("clock: {node_hz: null}\n", [None, None])])
+def test_late_ticks_and_load_come_from_the_times_and_the_node_period(
+    config: str, late: list[int | None], tmp_path: Path
+) -> None:
+    (row,) = compare(made(tmp_path / "run", [50, 10, 10, 0], config), streaming=True).tables["load"].plain()
+    assert [row["deadline_misses"], row["ticks"]] == late
+    assert (row["load"], row["ready_after_max_s"]) == pytest.approx((0.07 / (59 * 0.02), 0.05))

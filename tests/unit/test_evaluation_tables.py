@@ -36,7 +36,6 @@ TABLES = {
     **{f"residuals_{sensor}": ("run",) for sensor in SENSORS},
     "dispositions": ("run", "sensor"),
     "failures": ("run",),
-    "predictions": ("run", "predictor"),
 }
 
 
@@ -68,9 +67,8 @@ def tables(runs: dict[str, Run]) -> Tables:
 
 def rows_of(tables: Tables, name: str) -> list[str]:
     """Rows as they are shown in full."""
-    return [
-        " ".join(cells) for cells in zip(*(one.cells for one in tables.tables[name].in_full().shown()), strict=True)
-    ]
+    table = tables.tables[name].in_full()
+    return [" ".join(column.cell(record) for column in table.columns) for record in table.records]
 
 
 def evaluated(label: str, run: Run, metrics: Metrics) -> EvaluatedRun:
@@ -121,8 +119,8 @@ def test_markdown_and_latex_have_a_cell_for_every_column(tables: Tables, name: s
     table = tables.tables[name].in_full()
     lines = [line for line in table.to_markdown().splitlines() if line.startswith("|")]
     head, _, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    assert len(head) == len(table.columns) - sum(column.when == "few" for column in table.columns)
-    shown = [list(cells) for cells in zip(*(column.cells for column in table.shown()), strict=True)]
+    assert len(head) == len(table.columns)
+    shown = [[column.cell(record) for column in table.columns] for record in table.records]
     assert [row[1:] for row in rows] == [row[1:] for row in shown]
     assert [row[0] for row in rows if row[0]] == list(dict.fromkeys(row[0] for row in shown))
     lines = table.to_latex().splitlines()
@@ -133,7 +131,7 @@ def test_markdown_and_latex_have_a_cell_for_every_column(tables: Tables, name: s
 
 
 def test_special_characters_are_escaped_and_names_are_neither_cells_links_nor_elements() -> None:
-    names = ["50%_a&b|c", r"{x}^\~#$", "1 ± 2 <3", r"a\|b", "<img src=x>", "[x](javascript:y)", "*z", "[bold]q"]
+    names = ["50%_a&b|c", r"{x}^\~#$", "1 ± 2 <3", r"a\|b", "<img src=x>", "[x](javascript:y)", "[bold]q"]
     table = Table("<a_b>", [{"run": name} for name in names], [Column("run", left=True)], notes=["<n>"])
     latex = table.to_latex().splitlines()
     assert latex[7:10] == [
@@ -141,7 +139,6 @@ def test_special_characters_are_escaped_and_names_are_neither_cells_links_nor_el
         r"\{x\}\textasciicircum{}\textbackslash{}\textasciitilde{}\#\$ \\",
         r"1 $\pm$ 2 $<$3 \\",
     ]
-    assert [line[:3] for line in latex[12:14]] == ["{}[", "{}*"]
     assert table.to_markdown().splitlines()[0] == r"### \<a_b>"
     assert table.to_markdown().splitlines()[4:] == [
         r"| 50%_a&b\|c |",
@@ -150,7 +147,6 @@ def test_special_characters_are_escaped_and_names_are_neither_cells_links_nor_el
         r"| a\\\|b |",
         r"| \<img src=x> |",
         r"| [x]\(javascript:y) |",
-        "| *z |",
         "| [bold]q |",
         "",
         r"- \<n>",
@@ -164,8 +160,7 @@ def test_special_characters_are_escaped_and_names_are_neither_cells_links_nor_el
 def test_a_column_has_several_numbers_in_a_cell_and_a_dash_for_none() -> None:
     records = [{"p50_s": 0.00123, "p99_s": 0.0156}, {}, {"p50_s": math.nan, "p99_s": 2.0}]
     table = Table("times", records, [Column("ms/\ntick", "p50_s p99_s", "{}/{}", 1e3)])
-    (shown,) = table.shown()
-    assert shown.cells == ["1.23/15.6", "-", "-/2000"]
+    assert table.rows() == [["1.23/15.6"], ["-"], ["-/2000"]]
     np.testing.assert_array_equal(table.data["p99_s"], [0.0156, math.nan, 2.0])
     assert table.to_csv() == "p50_s,p99_s\n0.00123,0.0156\n,\n,2.0\n"
     assert "| ms/tick |" in table.to_markdown()
@@ -181,7 +176,6 @@ def test_few_tables_columns_and_rows_are_shown_unless_all_are_asked_for(tables: 
     assert "across" in tables.in_full().to_markdown()
     assert "across" in tables.to_csv() == tables.in_full().to_csv(), "files with all digits have everything"
     assert tables.to_dict() == tables.in_full().to_dict()
-    assert (tables.has_more, tables.in_full().has_more) == (True, False)
     assert list(tables[["lag", "failures"]]) == ["lag", "failures"]
     assert "Failures" in str(tables[["failures"]])
     assert str(tables.tables["lag"]) in few
@@ -211,15 +205,6 @@ def test_columns_that_do_not_fit_stand_below() -> None:
     ]
 
 
-def test_a_number_and_its_unit_stay_on_one_line() -> None:
-    tables = Tables({}, verdict=("b is worse by 0.14 m (0.1 to 0.2), which is 52 % of it.",))
-    for width in range(12, 60):
-        lines = printed(tables, width).splitlines()
-        assert max(map(len, lines)) <= width
-        assert any("0.14 m" in line for line in lines)
-        assert any("52 %" in line for line in lines)
-
-
 def test_the_best_value_is_bold_in_every_form_that_has_bold() -> None:
     value = Column("value", bold=lambda record: record["value"] < 2.0)
     table = Table("errors", [{"run": "a", "value": 1.0}, {"run": "b", "value": 2.0}], [Column("run", left=True), value])
@@ -229,16 +214,14 @@ def test_the_best_value_is_bold_in_every_form_that_has_bold() -> None:
     console = Console(width=80, file=io.StringIO(), force_terminal=True, color_system="standard")
     with console.capture() as capture:
         console.print(table)
-    assert "\x1b[1m 1.00" in capture.get()
-    assert "\x1b[1m 2.00" not in capture.get()
+    assert "\x1b[1m1.00" in capture.get()
+    assert "\x1b[1m2.00" not in capture.get()
 
 
 def test_the_verdict_stands_first_in_every_form(tables: Tables) -> None:
     for text in (str(tables), tables.to_markdown(), tables.to_latex()):
         assert text.lstrip("-% ").startswith(tables.verdict[0].split(" (")[0])
     assert tables._repr_html_().startswith("<ul><li>")
-    assert repr(tables).splitlines()[0] == "Tables"
-    assert set(repr(tables).splitlines()[-1].strip().split(", ")) == set(TABLES)
 
 
 @pytest.mark.parametrize(
@@ -263,12 +246,12 @@ def test_numbers_have_three_or_two_significant_digits_and_few_decimals(value: fl
 
 def test_the_tracking_table_has_errors_continuity_and_times(tables: Tables, runs: dict[str, Run]) -> None:
     # position: 4 rows at 0.5 m, 4 at 0; along 0.3, across 0.4; tracked %, breaks/switches, false, precision
-    assert rows_of(tables, "tracking")[2] == "smoother 0.354 0.212 0.283 0.000 0.000 100 0/0 0 1.00 2/2 1.00/1.00"
+    assert rows_of(tables, "tracking")[2] == "smoother 0.354 0.212 0.283 0.000 0.000 0.125 100 0/0 0 1.00 2/2 1.00/1.00"
     row = tables["tracking"].loc[2]
     assert row["position_rmse_m"] == pytest.approx(math.sqrt(0.125))
     assert (row["tracked_share"], row["num_tracks"], row["time_per_tick_p50_s"]) == (1.0, 2, 0.001)
-    headings = [column.heading.split("\n")[-1] for column in tables.tables["tracking"].in_full().shown()]
-    assert headings[1:7] == ["[m]", "[m]", "[m]", "[rad]", "[m/s]", "[%]"]
+    headings = [column.heading.split("\n")[-1] for column in tables.tables["tracking"].columns]
+    assert headings[1:8] == ["[m]", "[m]", "[m]", "[rad]", "[m/s]", "pos.", "[%]"]
     metrics = evaluate(runs["smoother"])
     assert metrics.truth is not None
     west = replace(metrics.truth.objects[7], breaks=3, id_switches=2, late_id_switches=1)
@@ -298,22 +281,13 @@ def test_the_multi_object_table_has_gospa_scores_switches_and_the_time_to_confir
     assert (table["mota"][0], table["assa"][0]) == pytest.approx((-0.125, 7 / 19))
 
 
-def test_the_lag_table_shows_the_gain_of_waiting_at_eight_lags_at_most(tables: Tables, runs: dict[str, Run]) -> None:
+def test_the_lag_table_shows_the_gain_of_waiting(tables: Tables) -> None:
     assert rows_of(tables, "lag")[2:] == [
         "smoother 0 8 0.354 - - 0.000 - 0.000 - 0.125",
         "smoother window 2 0.100 80.0 - 0.000 - 0.000 - 0.010",  # too short for an interval
     ]
     assert tables["lag"]["lag"].tolist() == ["0", "0", "0", "window"]
     np.testing.assert_array_equal(tables["lag"]["lag_s"], [0.0, 0.0, 0.0, math.nan])
-    metrics = evaluate(runs["smoother"])
-    present, final = metrics.lagged
-    lags = tuple(replace(final, lag_s=k / 10) for k in range(1, 21))
-    many = compare(evaluated("a", runs["smoother"], replace(metrics, lagged=(present, *lags, final)))).tables["lag"]
-    assert many.data["lag"].tolist() == ["0", "0.1", "0.4", "0.6", "0.9", "1.2", "1.5", "1.7", "2", "window"]
-    assert [any("metrics.json has all" in note for note in each.notes) for each in (many, tables.tables["lag"])] == [
-        True,
-        False,
-    ]
 
 
 def test_the_consistency_table_has_means_bands_and_whiteness(tmp_path: Path) -> None:
@@ -336,7 +310,10 @@ def test_residuals_have_moments_nis_and_delay_and_dispositions_add_up(tables: Ta
     assert rows_of(tables, radar)[2] == "smoother -1.00 ± 0.000 -2.00 ± 0.000 -123 ± 0.000 3.00 3.00 62.0/62.0"
     assert tables[lidar]["x_mean_m"].tolist() == [-0.5] * 3  # not shown beside along and across, but there
     table = tables["dispositions"]
-    assert rows_of(tables, "dispositions")[-2:] == ["smoother lidar_cluster 1 1 2", "smoother radar_long_range 0 1 1"]
+    assert rows_of(tables, "dispositions")[-2:] == [
+        "smoother lidar_cluster 2 0 0 1 1 2",
+        "smoother radar_long_range 1 0 0 0 1 1",
+    ]
     assert tables.tables["dispositions"].notes[0].startswith("no detection was out of sequence or beyond window or too")
     assert sum(int(table[name.value].sum()) for name in Disposition) == table["detections"].sum() == 9
     assert (table["fused"] + table["merged"] + table["refused"] == table["detections"]).all()
@@ -355,9 +332,8 @@ def test_failures_are_shown_by_kind_where_there_are_any(tmp_path: Path, tables: 
     run = write_run(tmp_path / "run", [[WEST.track(0, 1)]], meta={"failures": failures})
     found = compare({"run": run})
     assert (found.tables["failures"].is_detail, tables.tables["failures"].is_detail) == (False, True)
-    assert rows_of(found, "failures") == ["run 2 2"]
+    assert rows_of(found, "failures") == ["run 2 0 2"]
     assert found["failures"]["update_failed"].tolist() == [0]
-    assert "none: update failed" in str(found)
 
 
 def test_runs_without_truth_or_detections_have_no_errors_and_no_empty_tables(
@@ -365,12 +341,12 @@ def test_runs_without_truth_or_detections_have_no_errors_and_no_empty_tables(
 ) -> None:
     without = a_run(tmp_path / "without", "smoother", truth=False)
     alone = compare({"a": without})
-    headings = [column.heading for column in alone.tables["tracking"].in_full().shown()]
+    headings = [column.heading for column in alone.tables["tracking"].columns]
     assert headings == ["run", "tracks all/\nconfirmed", "ms/tick\np50/p99"]
     assert "position_rmse_m" not in alone["tracking"]
     assert alone["consistency"]["of"].tolist() == [f"NIS {sensor}" for sensor in SENSORS]
-    assert not any(text in str(alone) for text in ("Error against lag", "Multi-object", "Predictions"))
-    assert rows_of(compare({"a": without, "b": runs["smoother"]}), "tracking")[0] == f"a{' -' * 9} 2/2 1.00/1.00"
+    assert not any(text in str(alone) for text in ("Error against lag", "Multi-object"))
+    assert rows_of(compare({"a": without, "b": runs["smoother"]}), "tracking")[0] == f"a{' -' * 10} 2/2 1.00/1.00"
     empty = compare(write_run(tmp_path / "run", [[]]))
     assert "Tracking" in str(empty)
     assert "Dispositions" not in str(empty)

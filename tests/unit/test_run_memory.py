@@ -29,7 +29,7 @@ from fgtrack.sim.simulate import simulate
 #: Columns and entries that no two runs share: wall times.
 TIMES = ("process_ns",)
 UNSHARED = ("wall_s",)
-NAMES_AND_TIMES = ("name", "time_", "deadlines")
+NAMES_AND_TIMES = ("name", "time_")
 
 
 def assert_same(memory: Run, written: Run) -> None:

@@ -27,26 +27,18 @@ class Consistency:
 
     The bands are those of independent samples. Innovations of a consistent estimator are independent, errors along a
     run are not: a single run may leave the band of its NEES, see `position_nees_interval`.
-
-    Attributes
-    ----------
-    position_nees
-        Of the present position; empty without truth.
-    state_nees
-        Of the present x, y, yaw, speed and yaw rate; without the yaw rate where truth or the model has none.
-    nis
-        By sensor.
-    autocorrelation
-        By sensor and innovation, see `autocorrelations`.
-    position_nees_interval
-        Mean of `position_nees` with the interval of correlated errors, see `mean_square`.
     """
 
     position_nees: ChiSquareMean
+    """Of the present position; empty without truth."""
     state_nees: ChiSquareMean
+    """Of the present x, y, yaw, speed and yaw rate; without the yaw rate where truth or the model has none."""
     nis: Mapping[str, ChiSquareMean]
+    """By sensor."""
     autocorrelation: Mapping[str, Mapping[str, Autocorrelation]]
+    """By sensor and innovation, see `autocorrelations`."""
     position_nees_interval: Estimate = UNKNOWN
+    """Mean of `position_nees` with the interval of correlated errors, see `mean_square`."""
 
 
 def consistency(run: Run, matching: Matching | None) -> Consistency:

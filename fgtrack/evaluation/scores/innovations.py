@@ -34,24 +34,17 @@ _GROUPS: Mapping[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Autocorrelation:
-    """Autocorrelation of the innovations of one sensor, over all tracks that have at least `FEWEST` of them.
-
-    Attributes
-    ----------
-    tracks, count
-        Number of these tracks and of their innovations.
-    lag1, lag1_band
-        Normalised autocorrelation at lag 1, between -1 and 1 and 0 on average for white innovations, and the half-width
-        of its 95 % interval for white innovations.
-    share_outside
-        Share of the tracks and lags 1 to `LAGS` outside their own bands; 0.05 on average for white innovations.
-    """
+    """Autocorrelation of the innovations of one sensor, over all tracks that have at least `FEWEST` of them."""
 
     tracks: int
     count: int
+    """Number of these tracks and of their innovations."""
     lag1: float
+    """Normalised autocorrelation at lag 1, between -1 and 1 and 0 on average for white innovations."""
     lag1_band: float
+    """Half-width of its 95 % interval for white innovations."""
     share_outside: float
+    """Share of the tracks and lags 1 to `LAGS` outside their own bands; 0.05 on average for white innovations."""
 
 
 def moments_of(name: str, values: FloatArray) -> Moments:

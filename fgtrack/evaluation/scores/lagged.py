@@ -27,26 +27,18 @@ class LagMetrics:
     """The states of one lag, and the present states of the same tracks at the same stamps.
 
     Both are compared with the same truth, so their difference is the gain of waiting.
-
-    Attributes
-    ----------
-    lag_s
-        0 for the present states, `WINDOW` for the final ones.
-    errors
-        State minus truth at the state's own stamp, by name of `ERROR_NAMES`; `position_m` is the distance.
-    position_nees
-        Normalised error squared of x and y: a consistent estimator has a mean of 2.
-    present_errors
-        Those of the present states that were published for these stamps.
-    position_reduction
-        Relative reduction of the position RMSE against the present states, with its interval.
     """
 
     lag_s: float | Literal["window"]
+    """0 for the present states, `WINDOW` for the final ones."""
     errors: Mapping[str, Moments]
+    """State minus truth at the state's own stamp, by name of `ERROR_NAMES`; `position_m` is the distance."""
     position_nees: Moments
+    """Normalised error squared of x and y: a consistent estimator has a mean of 2."""
     present_errors: Mapping[str, Moments]
+    """Those of the present states that were published for these stamps."""
     position_reduction: Estimate = UNKNOWN
+    """Relative reduction of the position RMSE against the present states, with its interval."""
 
     @property
     def is_lagged(self) -> bool:

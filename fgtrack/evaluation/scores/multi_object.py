@@ -36,20 +36,13 @@ AT_GATE = 0.5
 
 
 class GospaParts(NamedTuple):
-    """Squared parts at every tick, shape (t,) each; they add up to the square of GOSPA.
-
-    Attributes
-    ----------
-    localisation_m2, missed_m2, false_m2
-        Of the pairs, the missed objects and the false tracks.
-    out_of_sight_m2
-        The part of `missed_m2` that no sensor could see.
-    """
+    """Squared parts at every tick, shape (t,) each; they add up to the square of GOSPA."""
 
     localisation_m2: FloatArray
     missed_m2: FloatArray
     false_m2: FloatArray
     out_of_sight_m2: FloatArray
+    """The part of `missed_m2` that no sensor could see."""
 
     @property
     def total_m2(self) -> FloatArray:
@@ -61,28 +54,19 @@ class GospaParts(NamedTuple):
 class MultiObjectMetrics:
     """Scores over the ticks at which truth is recorded; NaN where there is nothing to score.
 
-    Attributes
-    ----------
-    gospa
-        Cut-off distance `c_m`, number of `ticks`, mean `mean_m` and root mean square `rms_m` over them, mean squared
-        parts `localisation_m2`, `missed_m2` and `false_m2`, the root mean square `in_sight_rms_m` without the missed
-        objects that no sensor could see, and the mean squared part `out_of_sight_m2` of these.
-    clear
-        `mota`, the mean distance `motp_m` of the pairs, and sums over the ticks: `pairs` (TP), `misses` (FN),
-        `false_positives` (FP) and `id_switches` (pairs with another track than the object's last one, IDSW).
-    identity
-        Every object is given one track for the whole run, so that most of the pairs are right: the share `idp` of the
-        track rows that are at their object, the share `idr` of the objects at their track, the harmonic mean `idf1`.
-    hota
-        Means over the bounds 0.05, 0.1, ..., 0.95 of the similarity: `deta` = pairs / (pairs + misses + false
-        positives), `assa` the same for the track and the object of a pair, averaged over the pairs, and `hota`, the
-        mean of sqrt(DetA AssA).
+    Identity gives every object one track for the whole run, so that most of the pairs are right.
     """
 
     gospa: Mapping[str, float]
+    """Cut-off distance `c_m`, `ticks`, `mean_m` and root mean square `rms_m` over them, mean squared parts
+    `localisation_m2`, `missed_m2`, `false_m2` and `out_of_sight_m2`, and `in_sight_rms_m` without the last one."""
     clear: Mapping[str, float]
+    """`mota`, mean distance `motp_m` of the pairs, `pairs` (TP), `misses` (FN), `false_positives` (FP), `id_switches`
+    (pairs with another track than the object's last one, IDSW)."""
     identity: Mapping[str, float]
+    """`idp`, share of the track rows that are at their object, `idr`, of the objects at their track, and `idf1`."""
     hota: Mapping[str, float]
+    """Means over the bounds 0.05, 0.1, ..., 0.95 of the similarity: `deta`, `assa` and `hota`."""
 
 
 def multi_object_metrics(scenes: Scenes, gate_m: float) -> MultiObjectMetrics:

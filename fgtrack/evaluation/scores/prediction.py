@@ -23,35 +23,23 @@ _PERIOD_NS = NS_PER_S // 10  # of the published node's predictions
 
 @dataclass(frozen=True)
 class PredictionErrors:
-    """Distances of predicted and true positions, of the predictions whose truth is known up to the horizon.
-
-    Attributes
-    ----------
-    final_m
-        At the horizon: the mean is the final displacement error, FDE.
-    average_m
-        Of each prediction the mean over every 0.1 s until then: the mean is the average displacement error, ADE.
-    """
+    """Distances of predicted and true positions, of the predictions whose truth is known up to the horizon."""
 
     final_m: Moments
+    """At the horizon: the mean is the final displacement error, FDE."""
     average_m: Moments
+    """Of each prediction the mean over every 0.1 s until then: the mean is the average displacement error, ADE."""
 
 
 @dataclass(frozen=True)
 class Displacements:
-    """Distances of predicted from true positions, ten times a second and for every tenth of a second ahead.
-
-    Attributes
-    ----------
-    stamps_ns, object_index
-        Stamp and object of the states that are predicted, shape (n,).
-    distances_m
-        By predictor, up to the last of `HORIZONS_S`, shape (n, m); NaN where the truth is not known.
-    """
+    """Distances of predicted from true positions, ten times a second and for every tenth of a second ahead."""
 
     stamps_ns: IntArray
     object_index: IntArray
+    """Stamp and object of the states that are predicted, shape (n,)."""
     distances_m: Mapping[str, FloatArray]
+    """By predictor, up to the last of `HORIZONS_S`, shape (n, m); NaN where the truth is not known."""
 
     def at(self, horizon_s: float, predictor: str = "arc") -> FloatArray:
         """Distances `horizon_s` ahead, shape (n,)."""

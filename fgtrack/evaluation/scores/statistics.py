@@ -16,19 +16,12 @@ NORMAL_95 = 1.959963984540054
 
 @dataclass(frozen=True)
 class Moments:
-    """Moments of a sample; those of two samples add up to those of both together.
-
-    Attributes
-    ----------
-    count, mean
-        Size and mean of the sample.
-    squares
-        Sum of squared deviations from the mean.
-    """
+    """Moments of a sample; those of two samples add up to those of both together."""
 
     count: int = 0
     mean: float = math.nan
     squares: float = 0.0
+    """Sum of squared deviations from the mean."""
 
     @classmethod
     def of(cls, values: FloatArray) -> Self:
@@ -97,19 +90,12 @@ class Distribution:
 
 @dataclass(frozen=True)
 class ChiSquareMean:
-    """Mean of independent normalised squares (NEES, NIS).
-
-    Attributes
-    ----------
-    count, mean
-        Size and mean of the sample.
-    dof
-        Mean of the degrees of freedom: the expected value of `mean`.
-    """
+    """Mean of independent normalised squares (NEES, NIS)."""
 
     count: int = 0
     mean: float = math.nan
     dof: float = math.nan
+    """Mean of the degrees of freedom: the expected value of `mean`."""
 
     @classmethod
     def of(cls, values: FloatArray, dof: IntArray) -> Self:

@@ -1,18 +1,17 @@
-"""Tables: records of numbers in SI units, and how people read them on a terminal, in Markdown and in LaTeX."""
+"""Tables: records of numbers in SI units, printed on a terminal, as Markdown, LaTeX, HTML and CSV."""
 
 import csv
 import io
 import math
-import re
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
-from typing import Any, Literal, TypeVar, overload
+from typing import Any, overload
 
 from rich.box import SIMPLE_HEAD
-from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderResult
+from rich.markup import escape as rich_escape
 from rich.table import Table as Grid
 from rich.text import Text
 
@@ -20,7 +19,6 @@ from fgtrack.core.errors import printable, printable_lines
 
 Value = str | int | float
 Record = Mapping[str, Any]  # Any: text, integers, floats, None
-Cell = TypeVar("Cell")
 DataFrame = Any  # pandas, which is untyped and imported where it is used
 
 NO_VALUE = "-"
@@ -28,16 +26,17 @@ PERCENT = 100.0
 MS = 1e3
 
 _WIDTH = 120  # of a table as text
-_LONG = 40  # characters of a cell that may be broken
-_MOST_SENTENCES = 10  # of the verdict in a repr
-_MARKDOWN = {"\\": r"\\", "|": r"\|", "<": r"\<"}
-_LATEX = {char: f"\\{char}" for char in "&%$#_{}"} | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-_LATEX |= {"\\": r"\textbackslash{}", "±": r"$\pm$", "<": r"$<$", ">": r"$>$"}
-_QUANTITY = re.compile(r"(\d) (%|mm?|m/s|rad|s)(?=\W|$)")
+_LONG = 40  # characters of an HTML cell that may be broken
+_MARKDOWN = str.maketrans({"\\": r"\\", "|": r"\|", "<": r"\<"})
+_LATEX = str.maketrans(
+    {char: f"\\{char}" for char in "&%$#_{}"}
+    | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"}
+    | {"±": r"$\pm$", "<": r"$<$", ">": r"$>$"}
+)
 
 
 def short(value: Value, digits: int = 3, most_decimals: int = 3) -> str:
-    """`value` with three significant digits, integers and text in full; a dash for NaN."""
+    """Return `value` with three significant digits, integers and text in full; a dash for NaN."""
     if not isinstance(value, float):
         return str(value)
     if not math.isfinite(value):
@@ -49,7 +48,7 @@ def short(value: Value, digits: int = 3, most_decimals: int = 3) -> str:
 
 
 def two_digits(value: Value) -> str:
-    """`value` with two significant digits and at most five decimals, integers in full; a dash for NaN."""
+    """Return `value` with two significant digits and at most five decimals, integers in full; a dash for NaN."""
     text = short(value, 2, 5)
     return "0" if text == "0.00000" else text
 
@@ -63,65 +62,56 @@ class Column:
     heading
         Lines, with the unit.
     names
-        Keys of the numbers, separated by spaces; by default the heading.
+        Keys of the numbers, as a sequence or separated by spaces; by default the heading.
     form
-        How their texts become the cell.
+        Format of the cell, with a field for each number.
     scale
-        What is shown is as many times the number.
+        Factor of the numbers shown.
     text
-        The text of a number.
+        Text of a number.
     left
         True for text, which is aligned left. The leading columns of text name the rows.
-    when
-        `few`: unless the table is shown in full; `full`: only then.
+    is_extra
+        True if the column is shown only where the table is shown in full.
     bold
         True for the records whose cell is bold.
     note
         A line below the table where the column is shown.
-    cell_of
-        The cell of a record, instead of all this.
     """
 
     heading: str
-    names: str = ""
+    names: str | Sequence[str] = ""
     form: str = "{}"
     scale: float = 1.0
     text: Callable[[Value], str] = short
     left: bool = False
-    when: Literal["always", "few", "full"] = "always"
+    is_extra: bool = False
     bold: Callable[[Record], bool] = lambda record: False
     note: str = ""
-    cell_of: Callable[[Record], str] | None = None
 
     def cell(self, record: Record) -> str:
-        """Text of the numbers of `record`; a dash where none is known."""
-        if self.cell_of is not None:
-            return self.cell_of(record)
-        values = [record.get(name) for name in (self.names or self.heading).split()]
+        """Text of the numbers of `record`; a dash without any."""
+        names = self.names or self.heading
+        values = [record.get(name) for name in (names.split() if isinstance(names, str) else names)]
         texts = [
             NO_VALUE if value is None else self.text(value * self.scale if isinstance(value, float) else value)
             for value in values
         ]
-        return self.form.format(*texts) if set(texts) - {NO_VALUE} else NO_VALUE
+        return printable(self.form.format(*texts) if set(texts) - {NO_VALUE} else NO_VALUE)
+
+    @property
+    def line(self) -> str:
+        """The heading in one line."""
+        return printable(self.heading.replace("-\n", "").replace("/\n", "/").replace("\n", " "))
 
 
 RUN = Column("run", left=True)
 
 
 def named(name: str, moment: str) -> str:
-    """`name` of a quantity with the `moment` before its unit: position_rmse_m."""
+    """Return `name` of a quantity with the `moment` before its unit: position_rmse_m."""
     quantity, _, unit = name.rpartition("_")
     return f"{quantity}_{moment}_{unit}"
-
-
-@dataclass(frozen=True)
-class Shown:
-    """A column as text."""
-
-    heading: str
-    cells: Sequence[str]
-    bold: Sequence[bool]
-    left: bool
 
 
 @dataclass(frozen=True)
@@ -135,7 +125,7 @@ class Table:
     records
         Rows: numbers by name with their units; a name that is missing, None and NaN are no value.
     columns
-        What is shown.
+        Columns shown.
     keys
         Names that identify a row; the first is the run.
     notes
@@ -144,8 +134,6 @@ class Table:
         True for a table that is shown only where a comparison is shown in full.
     is_main
         True for the records that are shown unless the table is shown in full.
-    is_full
-        True if all columns and records are shown.
     """
 
     title: str
@@ -155,17 +143,11 @@ class Table:
     notes: Sequence[str] = ()
     is_detail: bool = False
     is_main: Callable[[Record], bool] = lambda record: True
-    is_full: bool = False
 
     def in_full(self) -> "Table":
-        """The same table with all columns and records shown."""
-        return replace(self, is_full=True)
-
-    @property
-    def has_more(self) -> bool:
-        """True if there is more than what is shown."""
-        hidden = any(column.when == "full" for column in self.columns) or not all(map(self.is_main, self.records))
-        return hidden and not self.is_full
+        """Return the table with all columns and records shown."""
+        columns = [replace(column, is_extra=False) for column in self.columns]
+        return Table(self.title, self.records, columns, self.keys, self.notes)
 
     @property
     def names(self) -> list[str]:
@@ -180,84 +162,114 @@ class Table:
         return pd.DataFrame([dict(record) for record in self.records], columns=self.names)
 
     def plain(self) -> list[dict[str, Value | None]]:
-        """Records as JSON values: None where there is no value."""
+        """Return the records as JSON values: None where there is no value."""
         return [{name: _plain(record.get(name)) for name in self.names} for record in self.records]
 
     def to_csv(self) -> str:
-        """All numbers with all digits; an empty cell where there is no value."""
+        """Return all numbers with all digits; an empty cell where there is no value."""
         return csv_text([self.names, *(record.values() for record in self.plain())])
 
-    def to_markdown(self) -> str:
-        """Shown columns and records as a table of GitHub Markdown under a heading, the notes below."""
-        shown = self.shown()
-        head = [_markdown(_one_line(column.heading)) for column in shown]
-        rows = _rows(shown, lambda cell, bold: f"**{_markdown(cell.strip())}**" if bold else _markdown(cell))
-        rule = [":---" if column.left else "---:" for column in shown]
-        lines = [
-            f"### {_markdown(printable(self.title))}",
-            "",
-            *(f"| {' | '.join(row)} |" for row in (head, rule, *rows)),
-            "",
+    @property
+    def shown(self) -> list[Column]:
+        """Columns shown."""
+        return [column for column in self.columns if not column.is_extra]
+
+    @property
+    def shown_notes(self) -> list[str]:
+        """Notes of the columns shown, and of the table."""
+        of_columns = (column.note for column in self.shown if column.note)
+        return list(dict.fromkeys(map(printable, (*of_columns, *self.notes))))
+
+    def rows(self, text: Callable[[str], str] = str, bold: str = "{}") -> list[list[str]]:
+        """Return the cells shown, each as `text` of it, `bold` ones in that format; a first cell that repeats is empty.
+
+        A row has an entry for each of `shown`.
+        """
+        rows = [
+            [
+                bold.format(text(column.cell(record))) if column.bold(record) else text(column.cell(record))
+                for column in self.shown
+            ]
+            for record in self.records
+            if self.is_main(record)
         ]
-        return "\n".join(
-            [*lines, *(f"- {_markdown(note)}" for note in self.shown_notes()), *([""] if self.shown_notes() else [])]
-        )
+        for row, before in zip(rows[:0:-1], rows[-2::-1], strict=True):
+            if row[0] == before[0]:
+                row[0] = ""
+        return rows
+
+    def to_markdown(self) -> str:
+        """Return the columns and records shown as a table of GitHub Markdown under a heading, the notes below."""
+        head = [_markdown(column.line) for column in self.shown]
+        rule = [":---" if column.left else "---:" for column in self.shown]
+        rows = [f"| {' | '.join(row)} |" for row in (head, rule, *self.rows(_markdown, "**{}**"))]
+        notes = [f"- {_markdown(note)}" for note in self.shown_notes]
+        return "\n".join([f"### {_markdown(printable(self.title))}", "", *rows, "", *notes, *([""] if notes else [])])
 
     def to_latex(self) -> str:
-        """Shown columns and records as a table environment with the rules of package booktabs; notes as comments."""
-        shown = self.shown()
-        head = [_latex(_one_line(column.heading)) for column in shown]
-        rows = _rows(shown, lambda cell, bold: f"\\textbf{{{_latex(cell)}}}" if bold else _latex(cell))
-        body = [f"{'{}' if row[0][:1] in ('[', '*') else ''}{' & '.join(row)} \\\\" for row in rows]  # no option of \\
-        spec = "".join("l" if column.left else "r" for column in shown)
-        begin = [r"\begin{table}", r"\centering", f"\\caption{{{_latex(printable(self.title))}}}"]
-        begin += [f"\\begin{{tabular}}{{{spec}}}", r"\toprule", f"{' & '.join(head)} \\\\", r"\midrule"]
-        end = [r"\bottomrule", r"\end{tabular}", *(f"% {note}" for note in self.shown_notes()), r"\end{table}", ""]
-        return "\n".join([*begin, *body, *end])
-
-    def _repr_html_(self) -> str:
-        notes = "".join(f"<li>{escape(note)}</li>" for note in self.shown_notes())
-        caption = f"<caption>{escape(printable(self.title))}</caption>"
-        return f"<table>{caption}{self.to_html()}</table>" + f"<ul>{notes}</ul>" * bool(notes)
+        """Return a table environment with the rules of package booktabs; notes as comments."""
+        rows = [f"{' & '.join(row)} \\\\" for row in self.rows(_latex, r"\textbf{{{}}}")]
+        return "\n".join(
+            [
+                *(r"\begin{table}", r"\centering", f"\\caption{{{_latex(printable(self.title))}}}"),
+                f"\\begin{{tabular}}{{{''.join('l' if column.left else 'r' for column in self.shown)}}}",
+                *(r"\toprule", f"{' & '.join(_latex(column.line) for column in self.shown)} \\\\", r"\midrule"),
+                *(*rows, r"\bottomrule", r"\end{tabular}"),
+                *(*(f"% {note}" for note in self.shown_notes), r"\end{table}", ""),
+            ]
+        )
 
     def to_html(self) -> str:
-        """Head and body of an HTML table of the shown columns and records."""
-        shown = self.shown()
-        head = [html_cell("th", column.heading, column.left) for column in shown]
-        lines = []
-        for row in _rows(shown, lambda cell, bold: (cell, bold)):
-            cells = (html_cell("td", cell, one.left, bold) for one, (cell, bold) in zip(shown, row, strict=True))
-            lines.append(f"<tr>{''.join(cells)}</tr>\n")
-        return f"<thead><tr>{''.join(head)}</tr></thead>\n<tbody>\n{''.join(lines)}</tbody>\n"
+        """Return head and body of an HTML table of the columns and records shown."""
+        head = [html_cell("th", escape(printable_lines(column.heading)), column.left) for column in self.shown]
+        rows = [
+            "".join(html_cell("td", cell, column.left) for column, cell in zip(self.shown, row, strict=True))
+            for row in self.rows(escape, "<b>{}</b>")
+        ]
+        body = "".join(f"<tr>{row}</tr>\n" for row in rows)
+        return f"<thead><tr>{''.join(head)}</tr></thead>\n<tbody>\n{body}</tbody>\n"
+
+    def _repr_html_(self) -> str:
+        notes = "".join(f"<li>{escape(note)}</li>" for note in self.shown_notes)
+        return f"<table><caption>{escape(printable(self.title))}</caption>{self.to_html()}</table><ul>{notes}</ul>"
 
     def __str__(self) -> str:
         return _text(self)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         yield Text(f"\n{printable(self.title)}")
-        yield from _grids(self.shown(), options.max_width)
-        yield from map(Text, self.shown_notes())
+        yield from self._grids(options.max_width)
+        yield from map(Text, self.shown_notes)
 
-    def _visible(self) -> list[Column]:
-        return [column for column in self.columns if column.when != ("few" if self.is_full else "full")]
-
-    def shown(self) -> list[Shown]:
-        """The columns as text."""
-        records = [record for record in self.records if self.is_full or self.is_main(record)]
-        return [
-            Shown(
-                printable_lines(column.heading),
-                [printable(column.cell(record)) for record in records],
-                [column.bold(record) for record in records],
-                column.left,
-            )
-            for column in self._visible()
+    def _grids(self, width: int) -> Iterator[Grid | Text]:
+        """Grids of at most `width`: columns without room stand in further ones below, with the names of the rows."""
+        shown = self.shown
+        rows = [[Text.from_markup(cell, emoji=False) for cell in row] for row in self.rows(rich_escape, "[bold]{}[/]")]
+        heads = [Text(printable_lines(column.heading)) for column in shown]
+        sizes = [
+            2
+            + max(line.cell_len for text in (head, *(row[k] for row in rows)) for line in text.split(allow_blank=True))
+            for k, head in enumerate(heads)
         ]
-
-    def shown_notes(self) -> list[str]:
-        """Notes of the columns that are shown, and of the table."""
-        of_columns = (column.note for column in self._visible() if column.note)
-        return list(dict.fromkeys(map(printable, (*of_columns, *self.notes))))
+        num_names = next((k for k, column in enumerate(shown) if not column.left), len(shown))
+        names = list(range(num_names))
+        free = width + 1 - min(sum(sizes[:num_names]), width // 2)  # longer names are broken
+        parts: list[list[int]] = [[]]
+        for k in range(num_names, len(shown)):
+            if parts[-1] and sum(sizes[each] for each in (*parts[-1], k)) > free:
+                parts.append([])
+            parts[-1].append(k)
+        for number, part in enumerate(parts):
+            if number:
+                yield Text("continued:")
+            grid = Grid(box=SIMPLE_HEAD, show_edge=False, padding=(0, 0, 0, 1), header_style="")
+            for k in (*names, *part):
+                left = shown[k].left
+                justify: Any = "left" if left else "right"  # Any: rich has a Literal
+                grid.add_column(heads[k], justify=justify, vertical="bottom", no_wrap=not left, overflow="fold")
+            for row in rows:
+                grid.add_row(*(row[k] for k in (*names, *part)))
+            yield grid
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -274,24 +286,15 @@ class Tables(Mapping[str, DataFrame]):
         JSON values beside the tables.
     verdict
         Sentences that summarise the tables.
-    is_full
-        True if all tables are shown, with all columns and records.
     """
 
     tables: Mapping[str, Table]
     details: Mapping[str, Any] = field(default_factory=dict)  # Any: JSON values
     verdict: tuple[str, ...] = ()
-    is_full: bool = False
 
     def in_full(self) -> "Tables":
-        """The same tables, all of them shown with all columns and records."""
-        return replace(self, tables={name: table.in_full() for name, table in self.tables.items()}, is_full=True)
-
-    @property
-    def has_more(self) -> bool:
-        """True if there is more than what is shown."""
-        filled = [table for table in self.tables.values() if table.records]
-        return not self.is_full and any(table.is_detail or table.has_more for table in filled)
+        """Return the tables, all of them shown with all columns and records."""
+        return replace(self, tables={name: table.in_full() for name, table in self.tables.items()})
 
     @overload
     def __getitem__(self, name: str) -> DataFrame: ...
@@ -301,7 +304,7 @@ class Tables(Mapping[str, DataFrame]):
 
     def __getitem__(self, name: str | list[str]) -> DataFrame:
         if isinstance(name, list):
-            return Tables({one: self.tables[one].in_full() for one in name}, is_full=True)
+            return Tables({each: self.tables[each].in_full() for each in name})
         return self.tables[name].data
 
     def __iter__(self) -> Iterator[str]:
@@ -314,12 +317,7 @@ class Tables(Mapping[str, DataFrame]):
         return _text(self)
 
     def __repr__(self) -> str:
-        lines = [
-            "Tables",
-            *self.verdict[:_MOST_SENTENCES],
-            ", ".join(k for k, table in self.tables.items() if table.records),
-        ]
-        return "\n  ".join(lines)
+        return f"Tables({', '.join(self.tables)})"
 
     def _repr_html_(self) -> str:
         verdict = "".join(f"<li>{escape(printable(line))}</li>" for line in self.verdict)
@@ -330,17 +328,17 @@ class Tables(Mapping[str, DataFrame]):
         yield from self._filled()
 
     def to_markdown(self) -> str:
-        """Verdict and tables, as far as they are shown."""
+        """Return verdict and tables, as far as they are shown."""
         verdict = "".join(f"- {_markdown(printable(line))}\n" for line in self.verdict)
         return f"{verdict}\n" * bool(verdict) + "\n".join(table.to_markdown() for table in self._filled())
 
     def to_latex(self) -> str:
-        """Tables, as far as they are shown, the verdict as comments."""
+        """Return the tables, as far as they are shown, the verdict as comments."""
         verdict = "".join(f"% {printable(line)}\n" for line in self.verdict)
         return verdict + "\n".join(table.to_latex() for table in self._filled())
 
     def to_csv(self) -> str:
-        """All numbers, one in a row of five columns: table, run, part (sensor, lag), quantity, value."""
+        """Return all numbers, one in a row of five columns: table, run, part (sensor, lag), quantity, value."""
         rows: list[Sequence[Value | None]] = [("table", "run", "part", "quantity", "value")]
         for name, table in self.tables.items():
             for record in table.plain():
@@ -349,20 +347,35 @@ class Tables(Mapping[str, DataFrame]):
         return csv_text(rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON values: the verdict, the details, and the tables as lists of records."""
+        """Return JSON values: the verdict, the details, and the tables as lists of records."""
         tables = {name: table.plain() for name, table in self.tables.items()}
         return {"verdict": list(self.verdict), **self.details, "tables": tables}
 
     def _filled(self) -> list[Table]:
-        return [table for table in self.tables.values() if table.records and (self.is_full or not table.is_detail)]
+        return [table for table in self.tables.values() if table.records and not table.is_detail]
 
 
 def bulleted(sentences: Iterable[str], width: int) -> Iterator[Text]:
-    """Sentences, each behind a dash, wrapped between words; a number and its unit stay together."""
+    """Return the lines of sentences, each behind a dash, wrapped between words."""
     for sentence in sentences:
-        kept = _QUANTITY.sub("\\1\u00a0\\2", printable(sentence))
-        for line in textwrap.wrap(kept, width, initial_indent="- ", subsequent_indent="  ", break_on_hyphens=False):
-            yield Text(line.replace("\u00a0", " "))
+        lines = textwrap.wrap(
+            printable(sentence), width, initial_indent="- ", subsequent_indent="  ", break_on_hyphens=False
+        )
+        yield from map(Text, lines)
+
+
+def html_cell(tag: str, content: str, is_left: bool) -> str:
+    """Return a cell of an HTML table with escaped `content`; of class `long` where it may be broken."""
+    kind = " ".join(["left"] * is_left + ["long"] * (len(content) > _LONG))
+    lines = content.replace("\n", "<br>")
+    return f'<{tag} class="{kind}">{lines}</{tag}>' if kind else f"<{tag}>{lines}</{tag}>"
+
+
+def csv_text(rows: Iterable[Iterable[Value | None]]) -> str:
+    """Return rows as CSV; None and NaN are empty cells."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(map(_plain, row) for row in rows)
+    return text.getvalue()
 
 
 def _text(shown: Table | Tables) -> str:
@@ -372,67 +385,14 @@ def _text(shown: Table | Tables) -> str:
     return capture.get().removesuffix("\n")
 
 
-def html_cell(tag: str, text: str, is_left: bool, is_bold: bool = False) -> str:
-    """A cell of an HTML table; of class `long` where it may be broken."""
-    content = escape(text).replace("\n", "<br>")
-    kinds = " ".join(name for name, has in (("left", is_left), ("long", len(text) > _LONG)) if has)
-    kind = f' class="{kinds}"' if kinds else ""
-    return f"<{tag}{kind}>{f'<b>{content}</b>' if is_bold else content}</{tag}>"
-
-
-def _rows(shown: Sequence[Shown], form: Callable[[str, bool], Cell]) -> Iterator[list[Cell]]:
-    """Rows in a `form` of text and whether it is bold; the first cell only where it changes."""
-    for k, first in enumerate(shown[0].cells):
-        repeated = k > 0 and shown[0].cells[k - 1] == first
-        yield [form("" if repeated and column is shown[0] else column.cells[k], column.bold[k]) for column in shown]
-
-
-def _one_line(heading: str) -> str:
-    return heading.replace("-\n", "").replace("/\n", "/").replace("\n", " ")
-
-
-def _grids(shown: Sequence[Shown], width: int) -> Iterator[Grid | Text]:
-    """Tables of at most `width`: columns without room beside the names stand in further ones below, with the names.
-
-    Names that take more than half of the width are broken.
-    """
-    widths = [2 + max(map(cell_len, (*one.heading.split("\n"), *one.cells))) for one in shown]
-    num_names = next((k for k, one in enumerate(shown) if not one.left), len(shown))
-    parts, free = [list(range(num_names))], width + 1 - min(sum(widths[:num_names]), width // 2)
-    for k in range(num_names, len(shown)):
-        used = sum(widths[each] for each in parts[-1][num_names:])
-        if used and used + widths[k] > free:
-            parts.append(list(range(num_names)))
-        parts[-1].append(k)
-    rows = list(_rows(shown, lambda cell, bold: Text(cell, "bold" if bold else "")))
-    for part in parts:
-        if part is not parts[0]:
-            yield Text("continued:")
-        grid = Grid(box=SIMPLE_HEAD, show_edge=False, padding=(0, 0, 0, 1), header_style="")
-        for k in part:
-            justify: Literal["left", "right"] = "left" if shown[k].left else "right"
-            heading = Text(shown[k].heading)
-            grid.add_column(heading, justify=justify, vertical="bottom", no_wrap=not shown[k].left, overflow="fold")
-        for row in rows:
-            grid.add_row(*(row[k] for k in part))
-        yield grid
-
-
 def _markdown(text: str) -> str:
-    """`text` without what Markdown, or HTML in it, would make of names: cells, elements, links."""
-    return "".join(_MARKDOWN.get(char, char) for char in text).replace("](", r"]\(")
+    """Return `text` without anything that Markdown, or HTML in it, would interpret: cells, elements, links."""
+    return text.translate(_MARKDOWN).replace("](", r"]\(")
 
 
 def _latex(text: str) -> str:
-    return "".join(_LATEX.get(char, char) for char in text)
+    return text.translate(_LATEX)
 
 
 def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def csv_text(rows: Iterable[Iterable[Value | None]]) -> str:
-    """Rows as CSV; None and NaN are empty cells."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(map(_plain, row) for row in rows)
-    return text.getvalue()

@@ -19,11 +19,10 @@ from fgtrack.evaluation.intervals import UNKNOWN
 from fgtrack.evaluation.metrics import FALSE_TRACK_SHARE, Metrics, ObjectMetrics, TruthMetrics
 from fgtrack.evaluation.runs import OneRun, evaluated
 from fgtrack.evaluation.scores.innovations import FEWEST, LAGS, RESIDUAL_NAMES, Autocorrelation
-from fgtrack.evaluation.scores.lagged import WINDOW, LagMetrics
+from fgtrack.evaluation.scores.lagged import WINDOW
 from fgtrack.evaluation.scores.multi_object import MultiObjectMetrics
-from fgtrack.evaluation.scores.prediction import HORIZONS_S
 from fgtrack.evaluation.scores.statistics import ChiSquareMean
-from fgtrack.evaluation.tables import MS, NO_VALUE, PERCENT, RUN, Column, Record, Table, Tables, Value, named
+from fgtrack.evaluation.tables import MS, PERCENT, RUN, Column, Record, Table, Tables, named
 from fgtrack.evaluation.tables.streaming import streaming_tables
 from fgtrack.evaluation.tables.verdict import verdict
 
@@ -49,12 +48,11 @@ _MAIN_QUANTITIES = ("position_rmse_m", "gospa_in_sight_rms_m")
 _GOSPA = "gospa_in_sight_rms_m"
 _UNITS = {"m": "m", "rad": "rad", "mps": "m/s"}
 _COMMON_SHARE = 0.9  # of the samples that all runs have in common; below it a note counts them
-_MOST_LAGS, _FEW_LAGS = 8, 3
 
 
 def compare(*runs: OneRun | Iterable[OneRun] | Mapping[str, OneRun], streaming: bool = False) -> Tables:
-    """Metrics of `runs` in comparison: the `verdict`, and tables `differences`, `tracking`, `multi_object`, `lag`,
-    `consistency`, `dispositions`, `failures`, `residuals_SENSOR` of every sensor, and `predictions`.
+    """Return the metrics of `runs` in comparison: the `verdict`, and tables `differences`, `tracking`, `multi_object`,
+    `lag`, `consistency`, `dispositions`, `failures`, and `residuals_SENSOR` of every sensor.
 
     Runs of the same recording are compared sample by sample. A path is a run folder, or a folder that holds run
     folders; a mapping gives runs labels. With `streaming` a table of that name evaluates what was published when it was
@@ -81,7 +79,6 @@ def compare(*runs: OneRun | Iterable[OneRun] | Mapping[str, OneRun], streaming: 
         **{f"residuals_{name}": _residuals(name, metrics) for one in metrics.values() for name in one.sensors},
         "dispositions": _dispositions(metrics),
         "failures": _failures(metrics),
-        "predictions": _predictions(metrics),
     }
     sentences = verdict(metrics, compared)
     if streaming:
@@ -127,63 +124,29 @@ def _tracking(metrics: Mapping[str, Metrics], compared: Sequence[Comparison], no
         for label, one in metrics.items()
     ]
     truth = [
-        *(
-            Column(heading, rmse, bold=_is_best(compared, rmse), when="always" if name == "position_m" else "full")
-            for name, heading in _ERRORS.items()
-            for rmse in [named(name, "rmse")]
-        ),
-        Column(
-            "NEES\npos.",
-            "position_nees",
-            when="few",
-            bold=_is_best(compared, POSITION_NEES),
-            note="NEES: mean of the position's; 2 if the covariances fit",
-        ),
-        Column(
-            "tracked\n[%]",
-            "tracked_share_in_sight",
-            scale=PERCENT,
-            note="tracked: share of the ticks at which some sensor could see the object",
-        ),
-        Column(
-            "breaks/\nswitches",
-            "breaks id_switches",
-            "{}/{}",
-            note="breaks: resumed after a loss or with another track; switches: the latter",
-        ),
-        Column(
-            "false\ntracks",
-            "false_tracks",
-            note=f"false: paired with a true object in less than {FALSE_TRACK_SHARE:.0%} of its life",
-        ),
-        Column(
-            "preci-\nsion",
-            "precision",
-            text=_two_decimals,
-            when="full",
-            note="precision: true objects tracked / tracks that were confirmed",
-        ),
+        Column(heading, rmse, bold=_is_best(compared, rmse), is_extra=name != "position_m")
+        for name, heading in _ERRORS.items()
+        for rmse in [named(name, "rmse")]
     ]
+    nees, tracked = "NEES: mean of the position's; 2 if consistent", "tracked: share of the ticks in sight of a sensor"
+    breaks = "breaks: resumed after a loss or with another track; switches: the latter"
+    false = f"false: paired with a true object in less than {FALSE_TRACK_SHARE:.0%} of its life"
+    precision = "precision: true objects tracked / tracks that were confirmed"
+    truth += [
+        Column("NEES\npos.", "position_nees", bold=_is_best(compared, POSITION_NEES), note=nees),
+        Column("tracked\n[%]", "tracked_share_in_sight", scale=PERCENT, note=tracked),
+        Column("breaks/\nswitches", "breaks id_switches", "{}/{}", note=breaks),
+        Column("false\ntracks", "false_tracks", note=false),
+        Column("preci-\nsion", "precision", is_extra=True, note=precision),
+    ]
+    confirmed = "confirmed: published as more than tentative at some tick"
     columns = [
         RUN,
         *(truth if with_truth else ()),
-        Column(
-            "tracks all/\nconfirmed",
-            "num_tracks num_confirmed",
-            "{}/{}",
-            when="full" if with_truth else "always",
-            note="confirmed: published as more than tentative at some tick",
-        ),
+        Column("tracks all/\nconfirmed", "num_tracks num_confirmed", "{}/{}", is_extra=with_truth, note=confirmed),
         Column("ms/tick\np50/p99", "time_per_tick_p50_s time_per_tick_p99_s", "{}/{}", MS),
     ]
     own = [BEST_NOTE] if any(column.bold(record) for column in truth for record in records) else []
-    late = [
-        f"{label} {one.deadlines.misses}/{one.deadlines.ticks}"
-        for label, one in metrics.items()
-        if one.deadlines.are_known and one.deadlines.misses
-    ]
-    if late:
-        own.append(f"slower than real time, on a machine that may have been busy (ticks late): {', '.join(late)}")
     title = "Tracking" + (" (errors: RMSE against truth)" if with_truth else "")
     return Table(title, records, columns, notes=[*own, *notes])
 
@@ -256,31 +219,28 @@ def _lag(metrics: Mapping[str, Metrics]) -> Table:
     """A row for each run and lag, where any run has lagged or final states: errors, and how waiting lowers them."""
     records = []
     for label, one in metrics.items():
-        few = _some_lags(one.lagged, _FEW_LAGS)
-        for lag in _some_lags(one.lagged, _MOST_LAGS):
-            is_window, is_present = lag.lag_s == WINDOW, lag.lag_s == 0.0
+        for lag in one.lagged:
+            is_window = lag.lag_s == WINDOW
             numbers: dict[str, Any] = {"lag": lag.lag_s if is_window else f"{lag.lag_s:g}"}
             numbers |= {"lag_s": None if is_window else lag.lag_s, "num_states": lag.errors["position_m"].count}
             for name in ("position_m", "speed_mps", "yaw_rad"):
-                gain = math.nan if is_present else lag.gain(name)
+                gain = math.nan if lag.lag_s == 0.0 else lag.gain(name)
                 numbers |= {named(name, "rmse"): lag.errors[name].rmse, f"{name.rpartition('_')[0]}_reduction": gain}
             ends = {"low": lag.position_reduction.low, "high": lag.position_reduction.high}
             numbers |= {f"position_reduction_{end}": value for end, value in ends.items()}
-            record = {"run": label, **numbers, "position_nees": lag.position_nees.mean}
-            records.append((record, lag in few))
-    main = [record for record, is_main in records if is_main]
+            records.append({"run": label, **numbers, "position_nees": lag.position_nees.mean})
     interval = "position_reduction_low position_reduction_high"
     columns = [
         RUN,
         Column("lag\n[s]", "lag"),
-        Column("states", "num_states", when="full"),
+        Column("states", "num_states", is_extra=True),
         Column(_ERRORS["position_m"], "position_rmse_m"),
         Column("below\n[%]", "position_reduction", scale=PERCENT),
         Column("95 %\ninterval", interval, "{} to {}", PERCENT),
-        Column(_ERRORS["speed_mps"], "speed_rmse_mps", when="full"),
-        Column("below\n[%]", "speed_reduction", scale=PERCENT, when="full"),
-        Column(_ERRORS["yaw_rad"], "yaw_rmse_rad", when="full"),
-        Column("below\n[%]", "yaw_reduction", scale=PERCENT, when="full"),
+        Column(_ERRORS["speed_mps"], "speed_rmse_mps", is_extra=True),
+        Column("below\n[%]", "speed_reduction", scale=PERCENT, is_extra=True),
+        Column(_ERRORS["yaw_rad"], "yaw_rmse_rad", is_extra=True),
+        Column("below\n[%]", "yaw_reduction", scale=PERCENT, is_extra=True),
         Column("NEES\npos.", "position_nees"),
     ]
     notes = [
@@ -288,19 +248,8 @@ def _lag(metrics: Mapping[str, Metrics]) -> Table:
         "below: reduction against the present states of the same tracks and stamps",
         "NEES: of the position; 2 if consistent",
     ]
-    if any(len(_some_lags(one.lagged, _MOST_LAGS)) < len(one.lagged) for one in metrics.values()):
-        notes.append(f"{_MOST_LAGS} lags of a run are shown at most, metrics.json has all")
-    found = [record for record, _ in records] if any(len(one.lagged) > 1 for one in metrics.values()) else []
-    title = "Error against lag (RMSE against truth)"
-    return Table(title, found, columns, ("run", "lag"), notes, is_main=lambda record: record in main)
-
-
-def _some_lags(lagged: Sequence[LagMetrics], most: int) -> list[LagMetrics]:
-    """The present and the final states, and of the lags between them at most so many that are evenly spread."""
-    lags = [entry for entry in lagged if entry.lag_s not in (0.0, WINDOW)]
-    if len(lags) > most:
-        lags = [lags[round(k * (len(lags) - 1) / (most - 1))] for k in range(most)]
-    return [entry for entry in lagged if entry.lag_s in (0.0, WINDOW) or entry in lags]
+    records = records if any(len(one.lagged) > 1 for one in metrics.values()) else []
+    return Table("Error against lag (RMSE against truth)", records, columns, ("run", "lag"), notes)
 
 
 def _consistency(metrics: Mapping[str, Metrics]) -> Table:
@@ -386,11 +335,14 @@ def _dispositions(metrics: Mapping[str, Metrics]) -> Table:
     columns = [
         RUN,
         Column("sensor", left=True),
-        Column("fused", when="few", note="fused: also those that started a track"),
-        Column("late", when="few", note="late: of the fused ones, those out of sequence"),
-        Column("merged", when="few", note="merged: with another detection of their list"),
-        Column("refused", when="few"),
-        *(Column(k.value.replace("_", "\n"), k.value, when="full") for k in Disposition if k not in absent),
+        Column("fused", note="fused: also those that started a track"),
+        Column("late", note="late: of the fused ones, those out of sequence"),
+        Column("refused"),
+        *(
+            Column(kind.value.replace("_", "\n"), kind.value, is_extra=kind != Disposition.MERGED)
+            for kind in Disposition
+            if kind not in absent
+        ),
         Column("sum", "detections"),
     ]
     notes = [f"no detection was {' or '.join(kind.value.replace('_', ' ') for kind in absent)}"] if absent else []
@@ -401,37 +353,16 @@ def _dispositions(metrics: Mapping[str, Metrics]) -> Table:
 
 def _failures(metrics: Mapping[str, Metrics]) -> Table:
     """A row for each run that counted its failures; without any failure it is a detail."""
-    records = [
+    records: list[dict[str, Any]] = [
         {"run": label, **{kind.replace(" ", "_"): count for kind, count in one.failures.items()}}
         | {"failures": sum(one.failures.values())}
         for label, one in metrics.items()
         if one.failures
     ]
-    kinds = list(dict.fromkeys(kind for one in metrics.values() for kind in one.failures))
-    absent = [kind for kind in kinds if not any(one.failures.get(kind) for one in metrics.values())]
-    columns = [RUN, *(Column(kind.replace(" ", "\n"), kind.replace(" ", "_")) for kind in kinds if kind not in absent)]
-    columns.append(Column("sum", "failures"))
-    notes = [f"none: {', '.join(absent)}"] if absent else []
-    return Table("Failures inside the estimator", records, columns, notes=notes, is_detail=len(absent) == len(kinds))
-
-
-def _predictions(metrics: Mapping[str, Metrics]) -> Table:
-    """A row for each run and predictor: FDE and ADE at every horizon."""
-    records = []
-    for label, one in metrics.items():
-        for predictor, horizons in one.predictions.items():
-            record: dict[str, Any] = {"run": label, "predictor": predictor}
-            record["count"] = next(iter(horizons.values())).final_m.count
-            for name, errors in horizons.items():
-                record |= {f"fde_{name}_m": errors.final_m.mean, f"ade_{name}_m": errors.average_m.mean}
-            records.append(record)
-    columns = [RUN, Column("along", "predictor", left=True), Column("predic-\ntions", "count")]
-    columns += [Column(f"{s:g} s [m]\nFDE/ADE", f"fde_{s:g}s_m ade_{s:g}s_m", "{}/{}") for s in HORIZONS_S]
-    notes = [
-        "FDE: mean distance from the truth at that time ahead; ADE: the same, averaged up to it",
-        "arc: constant turn rate and speed; rail: the same for 0.2 s, then along the track",
-    ]
-    return Table("Predictions from the published states", records, columns, ("run", "predictor"), notes, is_detail=True)
+    kinds = dict.fromkeys(kind for one in metrics.values() for kind in one.failures)
+    columns = [RUN, *(Column(kind.replace(" ", "\n"), kind.replace(" ", "_")) for kind in kinds)]
+    is_detail = not any(record["failures"] for record in records)
+    return Table("Failures inside the estimator", records, [*columns, Column("sum", "failures")], is_detail=is_detail)
 
 
 def _is_best(compared: Sequence[Comparison], quantity: str) -> Callable[[Record], bool]:
@@ -439,7 +370,3 @@ def _is_best(compared: Sequence[Comparison], quantity: str) -> Callable[[Record]
     first = [entries[0] for one in compared if (entries := one.quantities.get(quantity))]
     best = {entry.name for entry in first if entry.standing == "best"}
     return lambda record: record["run"] in best
-
-
-def _two_decimals(value: Value) -> str:
-    return f"{value:.2f}" if math.isfinite(float(value)) else NO_VALUE

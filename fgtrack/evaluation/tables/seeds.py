@@ -3,7 +3,6 @@
 import csv
 import math
 import re
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -49,47 +48,31 @@ _MAIN: Mapping[str, str] = {
 }
 _SHARES = ("truth.overall.tracked_share_in_sight",)
 _INTERVALS = "t intervals of paired differences over seeds; tie with the best: 0 is inside"
-_MOST_ROWS = 40
 
 
 @dataclass(frozen=True)
 class PointMean:
-    """A metric of one estimator at one point of the grid.
-
-    Attributes
-    ----------
-    point
-        Cells of the axes.
-    estimator
-        Name.
-    mean, standard_error
-        Over the seeds; the error of one seed is NaN.
-    seeds
-        Seeds with a value.
-    """
+    """Mean and standard error over the seeds of a metric, of one estimator at one point of the grid."""
 
     point: tuple[str, ...]
+    """Cells of the axes."""
     estimator: str
     mean: float
     standard_error: float
+    """NaN of one seed."""
     seeds: int
+    """Seeds with a value."""
 
 
 @dataclass(frozen=True)
 class SweepTable:
-    """The rows of sweep.csv.
-
-    Attributes
-    ----------
-    axes, metrics
-        Columns that make a point of the grid, and those of the metrics.
-    rows
-        Cells by column.
-    """
+    """The rows of sweep.csv."""
 
     axes: tuple[str, ...]
+    """Columns that make a point of the grid."""
     metrics: tuple[str, ...]
     rows: Sequence[Mapping[str, str]]
+    """Cells by column."""
 
     @property
     def shown_axes(self) -> tuple[str, ...]:
@@ -99,15 +82,10 @@ class SweepTable:
         return tuple(varying[k] for k in distinguishing(points, len(varying)))
 
     def means(self, metric: str, axes: Sequence[str] | None = None) -> list[PointMean]:
-        """Mean and standard error of `metric` at every point and of every estimator, in the order of the table.
+        """Return the means of `metric` at every point and of every estimator, in the order of the table.
 
-        `axes` are those that make a point, by default `shown_axes`. Cells that are empty or not finite are ignored; a
-        point without any number is left out.
-
-        Raises
-        ------
-        CallError
-            There is no such metric.
+        `axes` are those that make a point, by default `shown_axes`. Cells that are empty or not finite are ignored.
+        Raises `CallError` if there is no such metric.
         """
         if metric not in self.metrics:
             hint = did_you_mean(metric, self.metrics) or f", there are {', '.join(self.metrics[:5])} ..."
@@ -127,28 +105,19 @@ class SweepTable:
 
 @dataclass(frozen=True)
 class SeedComparison:
-    """The estimators in one metric at one point of the grid.
-
-    Attributes
-    ----------
-    point
-        Cells of the axes.
-    metric
-        Column.
-    seeds
-        Seeds that all estimators have a value of.
-    entries
-        From the best estimator to the worst; the values are means over the seeds.
-    """
+    """The estimators in one metric at one point of the grid."""
 
     point: tuple[str, ...]
+    """Cells of the axes."""
     metric: str
     seeds: int
+    """Seeds that all estimators have a value of."""
     entries: tuple[Entry, ...]
+    """From the best estimator to the worst; the values are means over the seeds."""
 
 
 def read_sweep(folder: Path | str) -> SweepTable:
-    """The table of the sweep in `folder`.
+    """Return the table of the sweep in `folder`.
 
     Raises
     ------
@@ -193,14 +162,9 @@ def number(cell: str) -> float:
 
 
 def seed_comparisons(rows: Sequence[Mapping[str, str]], axes: Sequence[str]) -> list[SeedComparison]:
-    """A comparison for every metric with a better and a worse, and every point with several estimators.
+    """Return a comparison for every metric with a better and a worse, and every point with several estimators.
 
-    Parameters
-    ----------
-    rows
-        Those of sweep.csv, by column.
-    axes
-        Columns that make a point.
+    `rows` are those of sweep.csv, by column; `axes` the columns that make a point.
     """
     points: dict[tuple[str, ...], list[Mapping[str, str]]] = {}
     for row in rows:
@@ -211,47 +175,34 @@ def seed_comparisons(rows: Sequence[Mapping[str, str]], axes: Sequence[str]) -> 
 
 
 def to_csv(compared: Sequence[SeedComparison], axes: Sequence[str]) -> str:
-    """A row for every comparison and estimator; floats with all digits, an empty cell for NaN."""
-    rows: list[list[Any]] = [
-        [*axes, "metric", "estimator", "seeds", "mean", "worse_by", "low", "high", "standing"],
-    ]
+    """Return a row for every comparison and estimator; floats with all digits, an empty cell for NaN."""
+    numbers = ("value", "worse_by", "low", "high")
+    rows: list[list[Any]] = [[*axes, "metric", "estimator", "seeds", "mean", *numbers[1:], "standing"]]
     for one in compared:
         for entry in one.entries:
             record = entry_record(entry)
-            numbers = [record[name] for name in ("value", "worse_by", "low", "high")]
-            rows.append([*one.point, one.metric, entry.name, one.seeds, *numbers, entry.standing])
+            values = [record[name] for name in numbers]
+            rows.append([*one.point, one.metric, entry.name, one.seeds, *values, entry.standing])
     return csv_text(rows)
 
 
-def shown_tables(compared: Sequence[SeedComparison], axes: Sequence[str]) -> list[Table]:
-    """The first metric of `compared` for people: every point of a few, else the number of points at which each is best.
-
-    Empty where no point has several seeds.
-    """
-    mine = [one for one in compared if one.metric == compared[0].metric]
-    if not any(one.seeds > 1 for one in mine):
-        return []
-    metric, shown = mine[0].metric, distinguishing((one.point for one in mine), len(axes))
+def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) -> Table:
+    """Return the first metric of `compared` at every point of several seeds."""
+    mine = [one for one in compared if one.metric == compared[0].metric and one.seeds > 1]
+    shown = distinguishing((one.point for one in mine), len(axes))
     records = [
         {"point": ", ".join(one.point[k] for k in shown), "seeds": one.seeds, **entry_record(entry, "mean")}
         for one in mine
         for entry in one.entries
     ]
-    estimator = Column("estimator", "run", left=True)
-    if len(records) <= _MOST_ROWS:
-        columns = [Column(_axis_names(shown, axes), "point", left=True), estimator, *entry_columns("mean", "mean")]
-        columns.append(Column("seeds"))
-        return [Table(metric, records, columns, ("point", "run"), [_INTERVALS, "+: best; =: ties with the best"])]
-    counts = Counter((record["run"], record["standing"]) for record in records)
-    names = dict.fromkeys(record["run"] for record in records)
-    standings = ("best", "tie", "worse")
-    records = [{"run": name, **{standing: counts[name, standing] for standing in standings}} for name in names]
-    title = f"{metric}: points at which each estimator is best, of {len(mine)}"
-    return [Table(title, records, [estimator, *map(Column, standings)], notes=[_INTERVALS])]
+    columns = [Column(_axis_names(shown, axes), "point", left=True), Column("estimator", "run", left=True)]
+    columns += [*entry_columns("mean", "mean"), Column("seeds")]
+    notes = [_INTERVALS, "+: best; =: ties with the best"]
+    return Table(mine[0].metric if mine else "", records, columns, ("point", "run"), notes)
 
 
 def summary_table(sweep: SweepTable, compared: Sequence[SeedComparison]) -> Table:
-    """Mean and standard error over the seeds of every metric, a row for each point and estimator; few metrics first.
+    """Return mean and standard error over the seeds of every metric, a row for each point and estimator.
 
     The best value at a point is bold where `compared`, those of the sweep, have no tie.
     """
@@ -267,30 +218,22 @@ def summary_table(sweep: SweepTable, compared: Sequence[SeedComparison]) -> Tabl
     records = []
     for point, estimator in rows:
         record: dict[str, Any] = {**dict(zip(sweep.axes, point, strict=True)), "estimator": estimator}
-        mine = {metric: values[point, estimator, metric] for metric in metrics if (point, estimator, metric) in values}
         for metric in metrics:
-            one = mine.get(metric)
+            one = values.get((point, estimator, metric))
             record[metric], record[f"{metric}.standard_error"] = (one.mean, one.standard_error) if one else (None, None)
-        records.append(record | {"seeds": max((one.seeds for one in mine.values()), default=0)})
-
-    def point_text(record: Record) -> str:
-        return ", ".join(record[sweep.axes[k]] for k in shown)
+        seeds = [values[key].seeds for metric in metrics if (key := (point, estimator, metric)) in values]
+        records.append(record | {"seeds": max(seeds, default=0)})
 
     def is_best(metric: str) -> Callable[[Record], bool]:
         return lambda record: (tuple(record[axis] for axis in sweep.axes), record["estimator"], metric) in best
 
-    columns = [Column(_axis_names(shown, sweep.axes), cell_of=point_text, left=True), Column("estimator", left=True)]
+    form = ", ".join(["{}"] * len(shown))
+    columns = [Column(_axis_names(shown, sweep.axes), [sweep.axes[k] for k in shown], form, left=True)]
+    columns.append(Column("estimator", left=True))
     for name in metrics:
-        columns.append(
-            Column(
-                _MAIN.get(name) or re.sub(r"\.(?!\d)", "\n", name),
-                f"{name} {name}.standard_error",
-                "{} ± {}",
-                PERCENT if name in _SHARES else 1.0,
-                bold=is_best(name),
-                when="always" if name in main else "full",
-            )
-        )
+        heading = _MAIN.get(name) or re.sub(r"\.(?!\d)", "\n", name)
+        both, scale = (name, f"{name}.standard_error"), PERCENT if name in _SHARES else 1.0
+        columns.append(Column(heading, both, "{} ± {}", scale, bold=is_best(name), is_extra=name not in main))
     notes = ["± standard error of the mean over the seeds"]
     if any((*row, metric) in best for row in rows for metric in main):
         notes.append("bold: the best estimator of its point in this, with 95 % confidence")

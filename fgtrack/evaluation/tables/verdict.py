@@ -11,7 +11,6 @@ from fgtrack.evaluation.scores.lagged import WINDOW
 from fgtrack.evaluation.scores.statistics import ChiSquareMean
 from fgtrack.evaluation.tables import PERCENT, short, two_digits
 
-_MOST_NAMED = 3
 _POSITION = "position_rmse_m"
 
 
@@ -48,9 +47,9 @@ def verdict(metrics: Mapping[str, Metrics], compared: Sequence[Comparison]) -> t
             else "Not all runs are of the same recording with truth (or they are evaluated by different settings): "
             "only those that are can be ranked by their differences."
         )
-    groups = [[entry.name for entry in one.quantities.get(_POSITION, ())] or list(one.runs) for one in compared]
-    for labels in (*groups, *([label] for label in alone)):
-        sentences += _noise({label: metrics[label] for label in labels})
+    best = [one.quantities[_POSITION][0].name if _POSITION in one.quantities else one.runs[0] for one in compared]
+    for label in (*best, *alone):
+        sentences += _noise(label, metrics[label])
     for label, one in metrics.items():
         lags = [lag for lag in one.lagged if lag.is_lagged and lag.lag_s != WINDOW and lag.position_reduction.is_known]
         parts = [f"{lag.lag_s:g} s by {_percent(lag.position_reduction)}" for lag in (*lags[:1], *lags[1:][-1:])]
@@ -70,10 +69,8 @@ def who_is_best(entries: Sequence[Entry], when: str) -> str:
         first = f"{_listed([best.name, *(one.name for one in ties)])} tie {when} ({value}, {difference})"
     else:
         first = f"{best.name} is best {when} ({value})"
-    most = _MOST_NAMED if len(worse) > _MOST_NAMED + 1 else len(worse)
-    named = [f"{entry.name} is {_metres(entry, ' worse')}" for entry in worse[:most]]
-    named += [f"{len(worse) - most} more are worse"] if len(worse) > most else []
-    return f"{'; '.join([first, *([', '.join(named)] if named else [])])}."
+    named = ", ".join(f"{entry.name} is {_metres(entry, ' worse')}" for entry in worse)
+    return f"{first}; {named}." if named else f"{first}."
 
 
 def _metres(entry: Entry, what: str = "") -> str:
@@ -87,13 +84,13 @@ def _metres(entry: Entry, what: str = "") -> str:
     return f"{amount} ({low} to {high})" if what else f"{amount}, 95 % interval {low} to {high}"
 
 
-def _noise(metrics: Mapping[str, Metrics]) -> Iterator[str]:
-    """Fit of the covariances of the first run, the best one, to the errors; the others whose do not fit."""
-    (label, *others), squares = metrics, {label: list(_squares(one)) for label, one in metrics.items()}
-    found, far = squares[label], [one for one in squares[label] if is_far_off(one.square)]
-    off = [one for one in far if not one.may_be_chance]
+def _noise(label: str, one: Metrics) -> Iterator[str]:
+    """Fit of the covariances of a run, the best one, to the errors."""
+    squares = list(_squares(one))
+    far = [square for square in squares if is_far_off(square.square)]
+    off = [square for square in far if not square.may_be_chance]
     if off:
-        small = [one.square.mean > one.square.dof for one in off]
+        small = [each.square.mean > each.square.dof for each in off]
         size = "too small" if all(small) else "partly too small, partly too large" if any(small) else "too large"
         yield (
             f"The configured noise is {size} (judged by {label}): {', '.join(map(str, off))}. "
@@ -102,22 +99,8 @@ def _noise(metrics: Mapping[str, Metrics]) -> Iterator[str]:
         )
     elif far:
         yield f"Too short a run to tell if the noise fits (judged by {label}): {', '.join(map(str, far))}."
-    elif found:
-        yield f"The noise fits (judged by {label}): {', '.join(map(str, found))}."
-        wrong = {k: [one for one in squares[k] if is_far_off(one.square) and not one.may_be_chance] for k in others}
-        runs = [name for name, those in wrong.items() if those]
-        if runs:
-            yield f"Not so of {_listed(runs)}: {_ranges([one for name in runs for one in wrong[name]])}."
-
-
-def _ranges(squares: Sequence[_Square]) -> str:
-    """The names of `squares`, each with its lowest and highest mean."""
-    texts = []
-    for name in dict.fromkeys(one.name for one in squares):
-        mine = [one.square for one in squares if one.name == name]
-        means = dict.fromkeys(short(end(one.mean for one in mine)) for end in (min, max))
-        texts.append(f"{name} {' to '.join(means)} (expected {mine[0].dof:.3g})")
-    return ", ".join(texts)
+    elif squares:
+        yield f"The noise fits (judged by {label}): {', '.join(map(str, squares))}."
 
 
 def _squares(one: Metrics) -> Iterator[_Square]:
