@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from fgtrack.pipeline.assumptions.persistence import Persistence, disagreement_m, persistence
+from fgtrack.pipeline.assumptions.persistence import Lists, Persistence, disagreement_m, persistence
 
 
 def cars(
@@ -71,11 +71,17 @@ def test_beyond_some_range_what_comes_back_twice_does_not_go_on() -> None:
     assert far.max_range_m < 3000.0
 
 
+@pytest.mark.parametrize("missed", [0.0, 0.6])
 @pytest.mark.parametrize(("aside_m", "expected_m"), [(0.5, 0.4), (6.0, 5.1), (300.0, None)])
-def test_sensors_disagree_by_how_far_they_see_an_object_apart(aside_m: float, expected_m: float | None) -> None:
+def test_sensors_disagree_by_how_far_they_see_an_object_apart(
+    aside_m: float, expected_m: float | None, missed: float
+) -> None:
     found = cars(0.9, 0.0)
     assert found is not None
     stamps_s, state = found.lines[:, 0], found.lines[:, 1:3]
-    points_m = [state[stamps_s == one] + aside_m for one in stamps_s]
-    seen_m = disagreement_m(found, stamps_s, points_m)
-    assert seen_m == (None if expected_m is None else pytest.approx(1.41 * aside_m / 1.18, rel=0.1))
+    # A neighbour 57 m off, of which one sensor sees all, and the other misses some of both.
+    own = [np.concatenate([state[stamps_s == one], state[stamps_s == one] + 40.0]) for one in stamps_s]
+    rng = np.random.default_rng(0)
+    other = [each[rng.random(len(each)) >= missed] + aside_m for each in own]
+    measured_m = disagreement_m(found, Lists(stamps_s, own), Lists(stamps_s, other))
+    assert measured_m == (None if expected_m is None else pytest.approx(1.41 * aside_m / 1.18, rel=0.1))

@@ -11,7 +11,7 @@ from fgtrack.core.geometry import wrap_angle, wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, Detection, DetectionList, EgoState, FloatArray, IntArray, Message
 from fgtrack.models.sensors import Mount
-from fgtrack.pipeline.assumptions.persistence import Persistence, disagreement_m, persistence
+from fgtrack.pipeline.assumptions.persistence import Lists, Persistence, disagreement_m, persistence
 
 __all__ = ["Coverage", "coverages"]
 
@@ -89,10 +89,13 @@ def coverages(messages: Iterable[Message], mounts: Mapping[str, Mount] | None = 
     path = path[np.argsort(path[:, 0], kind="stable")]
     path[:, 3] = np.unwrap(path[:, 3])
     seen = {name: one.coverage(path, (mounts or {}).get(name)) for name, one in sorted(found.items())}
-    lists = {name: found[name].lists(path) for name, one in seen.items() if one.persistence is not None}
-    for name, (stamps_s, (points_m,)) in lists.items():
-        known = [one.persistence for other, one in seen.items() if other != name and one.persistence is not None]
-        apart_m = [m for one in known if (m := disagreement_m(one, stamps_s, points_m)) is not None]
+    measured = {name: one.persistence for name, one in seen.items() if one.persistence is not None}
+    lists = {
+        name: Lists(stamps_s, points_m) for name in measured for stamps_s, (points_m,) in [found[name].lists(path)]
+    }
+    for name, own in lists.items():
+        pairs = [(measured[other], lists[other], own) for other in lists if other != name]
+        apart_m = [m for each in pairs if (m := disagreement_m(*each)) is not None]
         seen[name] = replace(seen[name], disagreement_m=min(apart_m, default=None))
     return seen
 

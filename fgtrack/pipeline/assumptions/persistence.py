@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import compress, pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
@@ -13,7 +14,7 @@ from scipy.special import expit, log_expit
 from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.models.sensors import Score
 
-__all__ = ["Persistence", "disagreement_m", "persistence"]
+__all__ = ["Lists", "Persistence", "disagreement_m", "persistence"]
 
 _FASTEST_MPS = 90.0
 _LARGEST_ERROR_M = 3.0
@@ -30,6 +31,15 @@ _Line = tuple[FloatArray, FloatArray]
 """Position and velocity, shape (2,) each."""
 _PROBABILITY = (0.1, 0.9)
 """Bounds of the detection probability: what hides an object hides it from several lists in a row."""
+
+
+class Lists(NamedTuple):
+    """Positions in the lists of a sensor, in a frame that does not turn."""
+
+    stamps_s: FloatArray
+    """Rising, shape (n,)."""
+    points_m: Sequence[FloatArray]
+    """Shape (m, 2) each."""
 
 
 @dataclass(frozen=True)
@@ -63,22 +73,34 @@ class Persistence:
         return len(self.lines)
 
 
-def disagreement_m(one: Persistence, stamps_s: FloatArray, points_m: Sequence[FloatArray]) -> float | None:
+def disagreement_m(one: Persistence, own: Lists, other: Lists) -> float | None:
     """Standard deviation, per axis, of where another sensor sees the objects of `one`, in its lists; None if unknown.
 
     It shows what a sensor alone does not: errors that last, as on an object that is larger than what it sees of it.
-    Both see the same objects only if detections are nearer to where these are than to places beside them.
+    Two detections are of one object if each is the nearest to the other: its neighbour is nearest where it is missed.
+    Both sensors see the same objects only if detections are nearer to where these are than to places beside them.
+
+    Parameters
+    ----------
+    own, other
+        Lists of the sensor of `one`, and of the other sensor.
     """
     distances_m, beside_m = [], []
     for stamp_s, *state in one.lines.tolist():
-        k = int(np.argmin(np.abs(stamps_s - stamp_s)))
-        if len(points_m[k]):
-            at_m = np.array(state[:2]) + (stamps_s[k] - stamp_s) * np.array(state[2:])
-            distances_m.append(np.hypot(*(points_m[k] - at_m).T).min())
-            beside_m.append(np.hypot(*(points_m[k] - at_m - _BESIDE_M).T).min())
+        k = int(np.argmin(np.abs(other.stamps_s - stamp_s)))
+        at_m = np.array(state[:2])
+        points_m = other.points_m[k] - (other.stamps_s[k] - stamp_s) * np.array(state[2:])
+        if not len(points_m):
+            continue
+        nearest_m = points_m[np.argmin(np.hypot(*(points_m - at_m).T))]
+        rivals_m = own.points_m[int(np.searchsorted(own.stamps_s, stamp_s))]
+        if np.hypot(*(rivals_m - nearest_m).T).min() < np.hypot(*(at_m - nearest_m)):
+            continue
+        distances_m.append(np.hypot(*(nearest_m - at_m)))
+        beside_m.append(np.hypot(*(points_m - at_m - _BESIDE_M).T).min())
     if len(distances_m) < _FEWEST:
         return None
-    scale_m = _scale(np.array(distances_m))
+    scale_m = _scale(np.array(distances_m), 0.25)
     return scale_m if scale_m < 0.5 * _scale(np.array(beside_m)) else None
 
 
@@ -198,11 +220,14 @@ def _best(
     return float(distances_m[best]) / math.sqrt(1.0 + ratio**2 + (1.0 + ratio) ** 2), (end_m, velocity_mps)
 
 
-def _scale(misfits: FloatArray) -> float:
-    """Scale of the Rayleigh distribution of the small misfits: their median, without the outliers."""
+def _scale(misfits: FloatArray, start: float = 0.5) -> float:
+    """Scale of the Rayleigh distribution of the small misfits: their median, without the outliers.
+
+    `start` is a quantile that is not one of the outliers.
+    """
     if not len(misfits):
         return 0.0
-    scale = float(np.median(misfits)) / math.sqrt(2.0 * math.log(2.0))
+    scale = float(np.quantile(misfits, start)) / math.sqrt(-2.0 * math.log(1.0 - start))
     for _ in range(30):
         scale = float(np.median(misfits[misfits <= _CORE * scale])) / math.sqrt(2.0 * math.log(2.0))
     return scale
