@@ -64,10 +64,10 @@ def export(
         _export_kitti(runs, kitti, out, overwrite)
         return
     with progress("export"):
-        exported = written(runs, out, ros2=ros2, overwrite=overwrite)
-    for note in exported.notes:
+        counts, notes = written(runs, out, ros2=ros2, overwrite=overwrite)
+    for note in notes:
         logging.getLogger(__name__).warning(note)
-    say(f"{out}: {sum(exported.counts.values())} messages on {len(exported.counts)} topics")
+    say(f"{out}: {sum(counts.values())} messages on {len(counts)} topics")
     if not ros2:
         say(f"layout to import: {shipped_folder() / 'foxglove_layout.json'}")
 

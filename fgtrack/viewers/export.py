@@ -1,38 +1,34 @@
 """Runs into a file that a viewer opens."""
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from heapq import merge
 from pathlib import Path
 
-from fgtrack.core.errors import CallError, printable
+from fgtrack.core.errors import CallError
 from fgtrack.evaluation.palette import distinct_colours
 from fgtrack.evaluation.roads import excluded_lines, roads
 from fgtrack.evaluation.runs import Runs, evaluated, run_folders, same_recording
-from fgtrack.io.output import check_apart
-from fgtrack.io.ros.bag_writer import token
+from fgtrack.io.output import check_apart, check_output
+from fgtrack.io.ros.bag_writer import check_bag, token
 from fgtrack.io.run import Run
-from fgtrack.viewers.ros2 import check_ros2, write_ros2
+from fgtrack.viewers.ros2 import write_ros2
 from fgtrack.viewers.run_messages import Look, ego_messages, map_messages, run_messages, truth_messages
 from fgtrack.viewers.shapes import ViewerMessage
 from fgtrack.viewers.states import start_ns
 
 
-@dataclass(frozen=True)
-class Exported:
-    """Number of messages written, and notes on contents that could not be shown."""
-
-    counts: Mapping[str, int]
-    """Messages by topic."""
-    notes: tuple[str, ...]
-    """Contents that could not be shown, a line each."""
-
-
-def export(runs: Runs, out: Path, *, ros2: bool = False, overwrite: bool = False) -> Exported:
+def export(runs: Runs, out: Path, *, ros2: bool = False, overwrite: bool = False) -> tuple[dict[str, int], list[str]]:
     """Write `runs` of one recording to `out`: an MCAP file for Foxglove, or with `ros2` a rosbag2 recording.
 
     Log times are those at which something was known (receipt, tick), publish times and header stamps those that it is
     about. Several runs stand side by side, the topics of each below its name.
+
+    Returns
+    -------
+    counts
+        Messages by topic.
+    notes
+        Contents that could not be shown, a line each.
 
     Raises
     ------
@@ -42,21 +38,20 @@ def export(runs: Runs, out: Path, *, ros2: bool = False, overwrite: bool = False
     DataError
         A run or its map is damaged, or a time does not fit into the file.
     """
-    check, write = (check_ros2, write_ros2) if ros2 else _foxglove()
-    check(out, overwrite)
+    write = write_ros2
+    if not ros2:
+        try:
+            from fgtrack.viewers.foxglove import write_foxglove as write
+        except ModuleNotFoundError as error:
+            text = "foxglove-sdk is not installed: `pip install foxglove-sdk`, or export with --ros2"
+            raise CallError(text) from error
+        if out.suffix != ".mcap":
+            raise CallError(f"{out}: viewers recognise such a file by its name, let it end in .mcap")
+    (check_output if out.suffix == ".mcap" else check_bag)(out, overwrite)
     every = evaluated(runs)
     check_apart(out, run_folders(every))
-    named = {one.label: one.run for one in every}
-    messages, notes = viewer_messages(named)
-    return Exported(write(out, messages, _metadata(named), overwrite), tuple(notes))
-
-
-def _foxglove() -> tuple[Callable[..., None], Callable[..., dict[str, int]]]:
-    try:
-        from fgtrack.viewers.foxglove import check_foxglove, write_foxglove
-    except ModuleNotFoundError as error:
-        raise CallError("foxglove-sdk is not installed: `pip install foxglove-sdk`, or export with --ros2") from error
-    return check_foxglove, write_foxglove
+    messages, notes = viewer_messages({one.label: one.run for one in every})
+    return write(out, messages, overwrite), notes
 
 
 def viewer_messages(runs: Mapping[str, Run]) -> tuple[Iterator[ViewerMessage], list[str]]:
@@ -88,18 +83,3 @@ def _looks(runs: Mapping[str, Run]) -> list[Look]:
         names.append(token(label) if token(label) not in names else f"{token(label)}_{len(names) + 1}")
     colours = distinct_colours([str(run.meta.get("estimator", "")) for run in runs.values()])
     return [Look(f"/{name}", colour) for name, colour in zip(names, colours, strict=True)]
-
-
-def _metadata(runs: Mapping[str, Run]) -> dict[str, dict[str, str]]:
-    """Records of the file, by their names: origin and digest of each run."""
-    records = {}
-    for name, run in runs.items():
-        facts = {
-            "estimator": run.meta.get("estimator", ""),
-            "input": (run.meta.get("input") or {}).get("path", ""),
-            "digest": run.meta.get("digest", ""),
-            "fgtrack": (run.meta.get("versions") or {}).get("fgtrack", ""),
-        }
-        record = "fgtrack" if len(runs) == 1 else f"fgtrack {name}"
-        records[printable(record)] = {key: printable(str(value)) for key, value in facts.items()}
-    return records

@@ -3,17 +3,17 @@
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from foxglove import messages as sdk
 from mcap.writer import Writer
 
-from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import EgoState
-from fgtrack.io.output import check_output, new_file
+from fgtrack.io.output import new_file
 from fgtrack.viewers.shapes import Entity, Point, Scene, Shape, ViewerMessage
 
 _LONGEST_HEAD_M = 1.5
@@ -30,51 +30,33 @@ _OUTCOME = {
 }
 
 
-def check_foxglove(path: Path, overwrite: bool) -> None:
-    """Raise `CallError` where `write_foxglove` would before the first message."""
-    if path.suffix != ".mcap":
-        raise CallError(f"{path}: viewers recognise such a file by its name, let it end in .mcap")
-    check_output(path, overwrite)
-
-
-def write_foxglove(
-    path: Path,
-    messages: Iterable[ViewerMessage],
-    metadata: Mapping[str, Mapping[str, str]],
-    overwrite: bool = False,
-) -> dict[str, int]:
+def write_foxglove(path: Path, messages: Iterable[ViewerMessage], overwrite: bool = False) -> dict[str, int]:
     """Write `messages`, in the order of their log times, to the MCAP file `path`; return their number by topic.
 
-    The file appears when it is complete. The same messages give the same bytes. `metadata` are records of the file by
-    name.
+    The file appears when it is complete. The same messages give the same bytes.
 
     Raises
     ------
     CallError
-        The name does not end in `.mcap`, something is at `path`, or it cannot be written.
+        Something is at `path`, or it cannot be written.
     DataError
         The disk is full, or a time lies before 1970.
     """
-    check_foxglove(path, overwrite)
     channels: dict[str, int] = {}
     counts: Counter[str] = Counter()
     with new_file(path, overwrite) as file:
         writer = Writer(file)
         writer.start(library="fgtrack")
-        for name, entries in metadata.items():
-            writer.add_metadata(name, dict(entries))
         for message in messages:
-            if min(message.log_ns, message.stamp_ns) < 0:
-                early_ns = min(message.log_ns, message.stamp_ns)
+            if (early_ns := min(message.log_ns, message.stamp_ns)) < 0:
                 raise DataError(f"the time {early_ns} ns lies before 1970, which no MCAP file holds")
             for topic, value in values(message):
                 is_own = isinstance(value, dict)
                 if topic not in channels:
-                    name, encoding, schema = (
-                        ("fgtrack.Outcome", "jsonschema", json.dumps(_OUTCOME).encode())
-                        if is_own
-                        else ((found := value.get_schema()).name, found.encoding, found.data)
-                    )
+                    name, encoding, schema = "fgtrack.Outcome", "jsonschema", json.dumps(_OUTCOME).encode()
+                    if not is_own:
+                        given = value.get_schema()
+                        name, encoding, schema = given.name, given.encoding, given.data
                     schema_id = writer.register_schema(name, encoding, schema)
                     channels[topic] = writer.register_channel(topic, "json" if is_own else "protobuf", schema_id)
                 data = json.dumps(value, allow_nan=False).encode() if is_own else value.encode()
@@ -94,15 +76,11 @@ def values(message: ViewerMessage) -> Iterator[tuple[str, Any]]:  # Any: message
         removed = [sdk.SceneEntityDeletion(timestamp=time, id=name) for name in content.removed]
         yield topic, sdk.SceneUpdate(deletions=removed, entities=entities)
     elif isinstance(content, EgoState):
-        pose = (content.x_m, content.y_m), 0.0, content.yaw_rad
-        position, turn = _vector(*pose[0]), _turn(pose[2])
-        yield (
-            "/tf",
-            sdk.FrameTransform(
-                timestamp=time, parent_frame_id="map", child_frame_id="ego", translation=position, rotation=turn
-            ),
-        )
-        yield f"{topic}/pose", sdk.PoseInFrame(timestamp=time, frame_id="map", pose=_pose(*pose))
+        position, turn = _vector(content.x_m, content.y_m), _turn(content.yaw_rad)
+        frames = {"parent_frame_id": "map", "child_frame_id": "ego"}
+        yield "/tf", sdk.FrameTransform(timestamp=time, translation=position, rotation=turn, **frames)
+        pose = sdk.Pose(position=position, orientation=turn)
+        yield f"{topic}/pose", sdk.PoseInFrame(timestamp=time, frame_id="map", pose=pose)
     elif isinstance(content, tuple):
         poses = [_pose((one.x_m or 0.0, one.y_m or 0.0), 0.0, one.yaw_rad or 0.0) for one in content]
         yield f"{topic}/poses", sdk.PosesInFrame(timestamp=time, frame_id="map", poses=poses)
@@ -137,17 +115,11 @@ def _primitive(shape: Shape) -> Any:  # Any: primitives share no type
     match shape.kind:
         case "arrow":
             head_m = min(_LONGEST_HEAD_M, 0.4 * length_m)
-            return sdk.ArrowPrimitive(
-                shaft_length=length_m - head_m,
-                shaft_diameter=width_m,
-                head_length=head_m,
-                head_diameter=2.5 * width_m,
-                **common,
-            )
+            common |= {"shaft_length": length_m - head_m, "shaft_diameter": width_m}
+            return sdk.ArrowPrimitive(head_length=head_m, head_diameter=2.5 * width_m, **common)
         case "line":
-            return sdk.LinePrimitive(
-                thickness=length_m, points=[sdk.Point3(x=x, y=y) for x, y in shape.points_m], **common
-            )
+            points = [sdk.Point3(x=x, y=y) for x, y in shape.points_m]
+            return sdk.LinePrimitive(thickness=length_m, points=points, **common)
         case "text":
             return sdk.TextPrimitive(text=shape.text, font_size=letter_m, billboard=True, **common)
         case "cylinder":

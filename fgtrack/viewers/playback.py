@@ -51,7 +51,7 @@ def playback(runs: Sequence[EvaluatedRun], moment: Moment | None = None) -> tupl
             {"label": one.label, "recording": index, **recording.run(one, notes, MOST_ROWS // len(runs))}
             for one in runs
             for index, recording in enumerate(recordings)
-            if any(one is other for other in recording.runs)
+            if one in recording.runs
         ],
     }, list(notes)
 
@@ -68,11 +68,8 @@ class _Recording:
     def of(cls, runs: Sequence[EvaluatedRun]) -> "_Recording":
         """Return the recording of `runs`; its origin is near the middle of all that is drawn, in whole metres."""
         origin_m = np.zeros(2)
-        for table in (
-            runs[0].run.tables["ego"],
-            runs[0].run.tables["truth"],
-            *(one.run.tables["tracks"] for one in runs),
-        ):
+        first = runs[0].run.tables
+        for table in (first["ego"], first["truth"], *(one.run.tables["tracks"] for one in runs)):
             if (drawn := located(table)).num_rows:
                 origin_m = np.rint([0.5 * (drawn[name].min() + drawn[name].max()) for name in ("x_m", "y_m")])
                 break

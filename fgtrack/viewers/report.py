@@ -29,7 +29,7 @@ _PNG_SIZE = slice(16, 24)  # of its header
 
 @dataclass(frozen=True)
 class ReportHead:
-    """First part of a report: verdict, assumptions, advice, and the moment that the viewer shows first."""
+    """First part of a report."""
 
     sentences: Sequence[str] = ()
     """Its verdict; empty for that of the comparison."""
@@ -50,25 +50,10 @@ def write_report(
     head: ReportHead,
     overwrite: bool,
 ) -> int:
-    """Write the report of `runs` into the file `out`, and return its size in bytes.
+    """Write the report of `runs` into the HTML file `out`, and return its size in bytes.
 
-    Verdict, warnings, viewer and three figures are open, the rest is folded. The same runs and figures give the same
-    bytes.
-
-    Parameters
-    ----------
-    runs
-        Runs under their labels.
-    tables
-        Their comparison.
-    pictures
-        Figures as PNG by name, in the order in which they are shown.
-    out
-        HTML file.
-    head
-        How the page begins.
-    overwrite
-        True to replace a file.
+    Verdict, warnings, viewer and three figures are open, the rest is folded. The same runs and `pictures` (PNG by
+    name, in the order in which they are shown) give the same bytes.
 
     Raises
     ------
@@ -92,32 +77,29 @@ def _page(runs: Sequence[EvaluatedRun], tables: Tables, pictures: Iterable[tuple
     figures = {name: _figure(name, picture) for name, picture in pictures}
     first = [next((name for name in figures if name.startswith(kind)), "") for kind in _FIRST]
     first = list(dict.fromkeys(name for name in (*first, *figures) if name))[:_MOST_OPEN]
+    verdict = _list(head.sentences or tables.verdict)
+    more = _list(warnings[_MOST_WARNINGS:])
+    shown = [table for table in tables.in_full().tables.values() if table.records]
     open_parts = {
-        "Verdict": _list(head.sentences or tables.verdict)
-        or "<p>Nothing to evaluate: no errors and no innovations.</p>",
-        "Warnings": _list(warnings[:_MOST_WARNINGS], "warnings")
-        + _folded("More warnings", _list(warnings[_MOST_WARNINGS:])),
+        "Verdict": verdict or "<p>Nothing to evaluate: no errors and no innovations.</p>",
+        "Warnings": _list(warnings[:_MOST_WARNINGS], "warnings") + _folded("More warnings", more),
         "Viewer": _template("viewer.html"),
         "Figures": _figures(text for name, text in figures.items() if name in first),
     }
     folded_parts = {
         "Assumptions": _list(head.assumptions),
         "Advice": _list(head.advice),
-        "Tables": "".join(
-            _wide(printable(table.title), table.to_html()) + _list(table.shown_notes, "soft")
-            for table in tables.in_full().tables.values()
-            if table.records
-        ),
+        "Tables": "".join(_wide(one.title, one.to_html()) + _list(one.shown_notes, "soft") for one in shown),
         "More figures": _figures(text for name, text in figures.items() if name not in first),
         "Configuration": _configuration(runs),
         "Runs": _grid("What they were made of", _FACTS, [_facts(one) for one in runs]),
     }
     sections = [
-        f'<section id="{_anchor(name)}">\n<h2>{name}</h2>\n{content}</section>\n'
+        f'<section id="part-{name.lower()}">\n<h2>{name}</h2>\n{content}</section>\n'
         for name, content in open_parts.items()
         if content
     ]
-    sections += [_folded(name, content, _anchor(name)) for name, content in folded_parts.items()]
+    sections += [_folded(name, content) for name, content in folded_parts.items()]
     labels = ", ".join(one.label for one in runs)
     contents = {
         "version": escape(fgtrack.__version__),
@@ -132,18 +114,14 @@ def _page(runs: Sequence[EvaluatedRun], tables: Tables, pictures: Iterable[tuple
     return re.sub(r"\{\{(\w+)\}\}", lambda found: contents[found[1]], _template("page.html"))
 
 
-def _folded(title: str, content: str, name: str = "") -> str:
+def _folded(title: str, content: str) -> str:
     """Content behind a line that opens it; nothing without content."""
-    anchor = f' id="{name}"' if name else ""
-    return f"<details{anchor}><summary>{title}</summary>\n{content}</details>\n" if content else ""
+    anchor = f"part-{title.lower().replace(' ', '-')}"
+    return f'<details id="{anchor}"><summary>{title}</summary>\n{content}</details>\n' if content else ""
 
 
 def _template(name: str) -> str:
     return (files(__package__) / "page" / name).read_text(encoding="utf-8")
-
-
-def _anchor(name: str) -> str:
-    return f"part-{name.lower().replace(' ', '-')}"
 
 
 def _list(lines: Iterable[str], kind: str = "") -> str:
@@ -161,11 +139,9 @@ def _grid(title: str, names: Sequence[str], rows: Iterable[Sequence[str]]) -> st
 
 def _wide(title: str, content: str) -> str:
     """A table that scrolls sideways where the page is narrower."""
-    name = escape(title)
-    return (
-        f'<h3>{name}</h3>\n<div class="wide" tabindex="0" role="region" aria-label="{name}">'
-        f"<table>\n{content}</table></div>\n"
-    )
+    name = escape(printable(title))
+    region = f'<div class="wide" tabindex="0" role="region" aria-label="{name}">'
+    return f"<h3>{name}</h3>\n{region}<table>\n{content}</table></div>\n"
 
 
 def _figures(texts: Iterable[str]) -> str:
@@ -190,8 +166,6 @@ def _configuration(runs: Sequence[EvaluatedRun]) -> str:
     rows = [[key, *(one.get(key, _NONE) for one in settings.values())] for key in keys]
     rows = [row for row in rows if len(set(row[1:])) > 1]
     text = _grid("Where the runs differ", ("key", *settings), rows) if rows else ""
-    if len(runs) > 1 and not rows:
-        text = "<p>All runs have the same configuration.</p>\n"
     for one in runs:
         config = f"<pre>{escape(one.run.config_text)}</pre>"
         text += f"<details><summary>{escape(one.label)}: config.yaml</summary>{config}</details>\n"
@@ -199,7 +173,7 @@ def _configuration(runs: Sequence[EvaluatedRun]) -> str:
 
 
 def flattened(config: Mapping[str, Any], above: str = "") -> dict[str, str]:
-    """Values of `config` as text, by the path of their key (`smoother.lag_s`)."""
+    """Return the values of `config` as text, by the path of their key (`smoother.lag_s`)."""
     flat: dict[str, str] = {}
     for key, value in config.items():
         if isinstance(value, Mapping) and value:
@@ -215,7 +189,6 @@ _FACTS = ("run", "estimator", "recording", "detections", "time [s]", "versions",
 def _facts(one: EvaluatedRun) -> list[str]:
     """Label, estimator, recording, detections, time [s], versions and digest of a run, in the order of `_FACTS`."""
     meta = one.run.meta
-    versions: Mapping[str, Any] = meta.get("versions") or {}
     wall_s = meta.get("wall_s")
     end = "" if meta.get("complete", True) else " (did not finish)"
     return [
@@ -224,6 +197,6 @@ def _facts(one: EvaluatedRun) -> list[str]:
         str((meta.get("input") or {}).get("path", _NONE)) + end,
         str(meta.get("detections_received", _NONE)),
         f"{wall_s:.1f}" if isinstance(wall_s, int | float) else _NONE,
-        ", ".join(f"{name} {version}" for name, version in versions.items()),
+        ", ".join(f"{name} {version}" for name, version in (meta.get("versions") or {}).items()),
         str(meta.get("digest", _NONE)),
     ]

@@ -1,10 +1,9 @@
 """Writes what shows a run as a rosbag2 recording of standard messages, for RViz and whatever reads ROS."""
 
-import json
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,8 @@ from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import DetectionList, EgoState
 from fgtrack.io.adapters.common import RosMessage
 from fgtrack.io.errors import one_line
-from fgtrack.io.output import check_output, new_file, new_folder, write_error
-from fgtrack.io.ros.bag_writer import RECORDING, check_bag, is_recording
+from fgtrack.io.output import new_file, new_folder, write_error
+from fgtrack.io.ros.bag_writer import RECORDING, is_recording
 from fgtrack.io.ros.messages import MARKER_ARRAY, TRANSFORMS, MessageFactory
 from fgtrack.viewers.shapes import Entity, Scene, Shape, ViewerMessage
 
@@ -29,35 +28,21 @@ _ADD, _DELETE = 0, 2
 _FOREVER = QosTime(0, 0)
 
 
-def check_ros2(path: Path, overwrite: bool) -> None:
-    """Raise `CallError` where `write_ros2` would for what is at `path`."""
-    if path.suffix == ".mcap":
-        check_output(path, overwrite)
-    else:
-        check_bag(path, overwrite)
-
-
-def write_ros2(
-    path: Path,
-    messages: Iterable[ViewerMessage],
-    metadata: Mapping[str, Mapping[str, str]],
-    overwrite: bool = False,
-) -> dict[str, int]:
+def write_ros2(path: Path, messages: Iterable[ViewerMessage], overwrite: bool = False) -> dict[str, int]:
     """Write `messages`, in the order of their log times, as a rosbag2 recording; return their number by topic.
 
     `path` becomes a rosbag2 folder, or its MCAP file alone where the name ends in `.mcap`. It appears when it is
-    complete. `metadata` is its custom data. Outcomes have no standard message and are left out. Raises as `write_bag`.
+    complete. Outcomes have no standard message and are left out. Raises as `write_bag`.
     """
-    check_ros2(path, overwrite)
     try:
         if path.suffix != ".mcap":
             with new_folder(path, overwrite, is_recording, RECORDING) as folder:
-                return _write(folder, messages, metadata)
+                return _write(folder, messages)
         with (
             new_file(path, overwrite) as file,
             tempfile.TemporaryDirectory(".part", f"{path.name}.", path.parent) as part,
         ):
-            counts = _write(Path(part) / path.stem, messages, metadata)
+            counts = _write(Path(part) / path.stem, messages)
             with (Path(part) / path.stem / f"{path.stem}.mcap").open("rb") as written:
                 shutil.copyfileobj(written, file)
             return counts
@@ -69,16 +54,12 @@ def write_ros2(
         raise DataError(f"{path}: cannot be written ({one_line(error)})") from error
 
 
-def _write(
-    folder: Path, messages: Iterable[ViewerMessage], metadata: Mapping[str, Mapping[str, str]]
-) -> dict[str, int]:
+def _write(folder: Path, messages: Iterable[ViewerMessage]) -> dict[str, int]:
     factory = _MarkerFactory()
     connections: dict[str, Connection] = {}
     counts: Counter[str] = Counter()
     bag = Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
     bag.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-    for name, entries in metadata.items():
-        bag.set_custom_data(name, json.dumps(entries))
     with bag:
         for message in messages:
             if not 0 <= message.log_ns < _LATEST_NS:
@@ -106,15 +87,13 @@ class _MarkerFactory(MessageFactory):
     def __init__(self) -> None:
         super().__init__()
         self._shown: dict[tuple[str, str], int] = {}
-        image = self._make(
-            "sensor_msgs/msg/CompressedImage", header=self._header(0, ""), format="", data=np.zeros(0, dtype=np.uint8)
-        )
-        mesh = self._make("visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, dtype=np.uint8))
+        nothing = np.zeros(0, dtype=np.uint8)
+        image = self._make("sensor_msgs/msg/CompressedImage", header=self._header(0, ""), format="", data=nothing)
         self._unused: dict[str, Any] = {  # Any: fields of a marker
             **dict.fromkeys(("texture_resource", "mesh_resource"), ""),
             **{name: [] for name in ("colors", "uv_coordinates")},
             "texture": image,
-            "mesh_file": mesh,
+            "mesh_file": self._make("visualization_msgs/msg/MeshFile", filename="", data=nothing),
             "mesh_use_embedded_materials": False,
         }
 
@@ -133,28 +112,23 @@ class _MarkerFactory(MessageFactory):
 
     def _transforms(self, ego: EgoState) -> RosMessage:
         """`tf2_msgs/TFMessage` with the pose of the ego in the map."""
-        pose = self._pose(ego.x_m, ego.y_m, ego.yaw_rad)
-        transform = self._make(
-            "geometry_msgs/msg/Transform", translation=self._vector(ego.x_m, ego.y_m), rotation=pose.orientation
-        )
-        stamped = self._make(
-            "geometry_msgs/msg/TransformStamped",
-            header=self._header(ego.stamp_ns, "map"),
-            child_frame_id=_FRAME_IDS["ego"],
-            transform=transform,
-        )
+        turn, way = self._pose(ego.x_m, ego.y_m, ego.yaw_rad).orientation, self._vector(ego.x_m, ego.y_m)
+        transform = self._make("geometry_msgs/msg/Transform", translation=way, rotation=turn)
+        frames = {"header": self._header(ego.stamp_ns, "map"), "child_frame_id": _FRAME_IDS["ego"]}
+        stamped = self._make("geometry_msgs/msg/TransformStamped", **frames, transform=transform)
         return self._make(TRANSFORMS, transforms=[stamped])
 
     def _markers(self, topic: str, stamp_ns: int, entity: Entity) -> list[RosMessage]:
         """A namespace with a marker for each shape; markers that it had before beyond these are removed."""
+        shapes = [*entity.shapes]
         before = self._shown.get((topic, entity.name), 0)
-        self._shown[topic, entity.name] = len(entity.shapes)
+        self._shown[topic, entity.name] = len(shapes)
+        shapes += [Shape("sphere", (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))] * (before - len(shapes))
         header, lifetime_ns = self._header(stamp_ns, _FRAME_IDS[entity.frame]), nanoseconds(entity.lifetime_s or 0.0)
         sec, nanosec = divmod(lifetime_ns, NS_PER_S)
         lifetime = self._make("builtin_interfaces/msg/Duration", sec=sec, nanosec=nanosec)
-        empty = Shape("sphere", (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         markers = []
-        for number, shape in enumerate([*entity.shapes, *[empty] * (before - len(entity.shapes))]):
+        for number, shape in enumerate(shapes):
             pose = self._pose(*shape.at_m, shape.yaw_rad)
             pose.position.z = shape.height_m
             marker = self._make(

@@ -1,10 +1,11 @@
 """Messages that show a run: map, ego, truth, tracks and how sure they are, their corrected past, detections."""
 
 import math
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ from fgtrack.viewers.states import NOMINAL_SIZE_M, ellipses, final_ns, groups, l
 
 Messages = Iterator[ViewerMessage]
 
+_OBJECT = ("track_id", "length_m", "width_m", "height_m", "class_name")
+
 _WHITE, _GREY = (1.0, 1.0, 1.0, 1.0), (0.55, 0.55, 0.55, 0.9)
 _OPACITY = {"tentative": 0.15, "coasting": 0.3}
 _CONFIRMED = 0.5  # so that ellipses and arrows in the box are seen
@@ -31,7 +34,7 @@ _MAP_LINE_M, _TRACK_LINE_M = 0.3, 0.35
 _DEVIATIONS = 2.0  # of an ellipse
 _SHOWN_S = 0.5  # of a list that no later one of its sensor replaces
 _DOT_M, _BEARING_M = 1.0, 150.0
-_PART, _TRAIL_S = 20, 10.0  # states of a line of final states, which is sent with each of them; how long it is shown
+_TRAIL, _TRAIL_S = 50, 10.0  # final states of the line through the last of them; how long it is shown
 _USED = (*FUSED, Disposition.MERGED)
 
 
@@ -56,16 +59,15 @@ def rgba(text: str, opacity: float = 1.0) -> Colour:
 
 def map_messages(maps: dict[str, TrackMap], excluded: Sequence[FloatArray], at_ns: int) -> Messages:
     """Bounds and reference line of each road, and the outlines of exclusion areas, once."""
+    opacities = {name: zip(road_lines(road), (0.9, 0.9, 0.3), strict=True) for name, road in maps.items()}
+    opacities["excluded"] = zip(excluded, [0.6] * len(excluded), strict=True)
     entities = [
         Entity(name, tuple(_line(points.tolist(), _MAP_LINE_M, (*_GREY[:3], alpha)) for points, alpha in lines))
-        for name, road in maps.items()
-        if (lines := list(zip(road_lines(road), (0.9, 0.9, 0.3), strict=True)))
+        for name, lines in opacities.items()
     ]
-    if excluded:
-        rings = tuple(_line(points.tolist(), _MAP_LINE_M, (*_GREY[:3], 0.6)) for points in excluded)
-        entities.append(Entity("excluded", rings))
-    if entities:
-        yield ViewerMessage(at_ns, at_ns, "/map", Scene(tuple(entities), latched=True))
+    shown = tuple(one for one in entities if one.shapes)
+    if shown:
+        yield ViewerMessage(at_ns, at_ns, "/map", Scene(shown, latched=True))
 
 
 def ego_messages(ego: Table, at_ns: int) -> Messages:
@@ -112,14 +114,13 @@ def _track_messages(run: Run, look: Look) -> Iterator[Messages]:
     tracks = located(run.tables["tracks"])
     states, axes = _states(tracks, run.tables["objects"]), ellipses(tracks, _DEVIATIONS).tolist()
     facts = list(_rows(tracks, "track_id", "status", "speed_mps", "num_measured"))
-    rows_at = dict(groups(tracks["now_ns"]))
-    ticks_ns = sorted({*run.tables["timing"]["now_ns"].tolist(), *rows_at})
+    rows_at = dict.fromkeys(run.tables["timing"]["now_ns"].tolist(), np.zeros(0, dtype=np.int64))
+    rows_at |= dict(groups(tracks["now_ns"]))
 
     def steps(entity: Callable[[int], Entity | None]) -> Iterator[tuple[int, int, list[Entity]]]:
-        for now_ns in ticks_ns:
-            rows = rows_at.get(now_ns, np.zeros(0, dtype=np.int64))
+        for now_ns, rows in sorted(rows_at.items(), key=itemgetter(0)):
             entities = [one for row in rows.tolist() if (one := entity(row)) is not None]
-            yield now_ns, int(tracks["stamp_ns"][rows].max(initial=0)) if len(rows) else now_ns, entities
+            yield now_ns, int(tracks["stamp_ns"][rows].max()) if len(rows) else now_ns, entities
 
     def box(row: int) -> Entity:
         track_id, status, speed_mps, num_measured = facts[row]
@@ -133,7 +134,6 @@ def _track_messages(run: Run, look: Look) -> Iterator[Messages]:
             turned_rad = yaw_rad if speed_mps > 0.0 else yaw_rad + math.pi
             shapes.append(_arrow(at_m, turned_rad, abs(speed_mps) * _SPEED_ARROW_S, 0.25, look.of_track(track_id)))
         details = {"status": status, "speed": f"{speed_mps:.2f} m/s", "measured": str(num_measured)}
-        details |= {"class": state.class_name} if state.class_name else {}
         return Entity(f"track {track_id}", tuple(shapes), facts=details)
 
     def patch(row: int) -> Entity | None:
@@ -150,56 +150,49 @@ def _track_messages(run: Run, look: Look) -> Iterator[Messages]:
 
 def _past_messages(run: Run, look: Look) -> Messages:
     """At every tick the past of each track as known then: a line through its lagged states to the present one."""
-    lagged, tracks = (
-        located(run.tables["lagged"].where(run.tables["lagged"]["lag_s"] > 0.0)),
-        located(run.tables["tracks"]),
-    )
-    present = {(now_ns, track_id): (x_m, y_m) for now_ns, track_id, x_m, y_m in _rows(tracks, *_NOW)}
-    past = list(_rows(lagged, *_NOW))
+    lagged, present = located(run.tables["lagged"]), located(run.tables["tracks"])
+    lagged = lagged.where(lagged["lag_s"] > 0.0)
+    present = present.where(np.isin(present["now_ns"], lagged["now_ns"]))
+    names = ("now_ns", "track_id", "stamp_ns", "x_m", "y_m")
+    states = Table({name: np.concatenate([lagged[name], present[name]]) for name in names})
+    order = np.lexsort((states["stamp_ns"], states["track_id"]))
+    states = Table({name: column[order] for name, column in states.items()})
+    points_m = np.stack([states["x_m"], states["y_m"]], axis=-1)
 
     def steps() -> Iterator[tuple[int, int, list[Entity]]]:
-        for now_ns, rows in groups(lagged["now_ns"]):
-            lines: defaultdict[int, list[Point]] = defaultdict(list)
-            for row in rows[np.argsort(lagged["stamp_ns"][rows], kind="stable")].tolist():
-                lines[past[row][1]].append(past[row][2:])
-            for track_id, points_m in lines.items():
-                points_m += [present[now_ns, track_id]] if (now_ns, track_id) in present else []
-            entities = [
-                Entity(f"track {track_id}", (_line(points_m, _TRACK_LINE_M, look.of_track(track_id)),))
-                for track_id, points_m in sorted(lines.items())
-                if len(points_m) > 1
-            ]
-            yield now_ns, now_ns, entities
+        for now_ns, rows in groups(states["now_ns"]):
+            lines = {track_id: rows[mine] for track_id, mine in groups(states["track_id"][rows])}
+            yield now_ns, now_ns, [_trail(look, k, points_m[mine], 1.0) for k, mine in lines.items() if len(mine) > 1]
 
     return _scenes(f"{look.prefix}/past", steps())
 
 
-_NOW = ("now_ns", "track_id", "x_m", "y_m")
-
-
 def _final_messages(run: Run, look: Look) -> Iterator[Messages]:
-    """Final states as soon as nothing can change them any more, and lines through those of the last seconds."""
+    """Final states as soon as nothing can change them any more, and lines through the last of them."""
     final = located(run.tables["smoothed"].where(run.tables["smoothed"]["kind"] == "final"))
     states, known_ns, topic = _states(final, run.tables["objects"]), final_ns(run, final), f"{look.prefix}/smoothed"
 
     def trails() -> Messages:
-        lines: defaultdict[int, list[Point]] = defaultdict(list)
+        lines: defaultdict[int, deque[Point]] = defaultdict(lambda: deque(maxlen=_TRAIL))
         for log_ns, rows in groups(known_ns):
             rows = rows[np.argsort(final["stamp_ns"][rows], kind="stable")]
-            for row in rows.tolist():
-                lines[int(final["track_id"][row])].append(_point(states[row]))
-            entities = []
-            for track_id in np.unique(final["track_id"][rows]).tolist():
-                part = max((len(lines[track_id]) - 2) // _PART, 0)  # parts have a point in common: no gaps
-                points_m = lines[track_id][part * _PART :]
-                line = _line(points_m, _TRACK_LINE_M, look.of_track(track_id, 0.7))
-                if len(points_m) > 1:
-                    entities.append(Entity(f"track {track_id} part {part}", (line,), _TRAIL_S))
+            ids = final["track_id"][rows].tolist()
+            for row, track_id in zip(rows.tolist(), ids, strict=True):
+                lines[track_id].append(_point(states[row]))
+            entities = tuple(_trail(look, k, lines[k], 0.7, _TRAIL_S) for k in sorted(set(ids)) if len(lines[k]) > 1)
             if entities:
-                yield ViewerMessage(log_ns, int(final["stamp_ns"][rows[-1]]), topic, Scene(tuple(entities)))
+                yield ViewerMessage(log_ns, int(final["stamp_ns"][rows[-1]]), topic, Scene(entities))
 
     yield trails()
     yield _objects(topic, known_ns, final["stamp_ns"], states)
+
+
+def _trail(
+    look: Look, track_id: int, points_m: Iterable[Sequence[float]], opacity: float, lifetime_s: float | None = None
+) -> Entity:
+    """A line through states of a track."""
+    line = _line(points_m, _TRACK_LINE_M, look.of_track(track_id, opacity))
+    return Entity(f"track {track_id}", (line,), lifetime_s)
 
 
 def _detection_messages(run: Run, look: Look) -> Iterator[Messages]:
@@ -208,14 +201,14 @@ def _detection_messages(run: Run, look: Look) -> Iterator[Messages]:
     An arrow leads from where a detection was sensed to where its track is at the tick that fused it. It is strong where
     the detection came out of sequence, and faint where it did not.
     """
-    table, updates, where = run.tables["detections"], run.tables["updates"], placed(run)
-    fates = [updates["disposition"][row] if row >= 0 else "" for row in update_rows(run).tolist()]
+    table, updates, where, update_of = run.tables["detections"], run.tables["updates"], placed(run), update_rows(run)
+    fates = [updates["disposition"][row] if row >= 0 else "" for row in update_of.tolist()]
     keys = list(_rows(table, "receipt_ns", "sensor", "stamp_ns"))
     order = sorted(range(len(keys)), key=keys.__getitem__)
     lists = [(key, list(rows)) for key, rows in groupby(order, key=keys.__getitem__)]
     names = np.unique(table["sensor"]).tolist()
     colours = {name: rgba(SENSORS[k % len(SENSORS)]) for k, name in enumerate(names)}
-    ends_m = track_positions(run, update_rows(run)).tolist()
+    positions_m, ends_m = where.position_m.tolist(), track_positions(run, update_of).tolist()
 
     def scenes(topic: str, shape: Callable[[int, Colour], Shape | None], is_sparse: bool) -> Messages:
         for (receipt_ns, sensor, stamp_ns), rows in lists:
@@ -229,19 +222,21 @@ def _detection_messages(run: Run, look: Look) -> Iterator[Messages]:
 
     def arrival(row: int, colour: Colour) -> Shape | None:
         receipt_ns, _, stamp_ns = keys[row]
-        start_m, end_m = where.position_m[row].tolist(), ends_m[row]
-        if fates[row] not in FUSED or receipt_ns <= stamp_ns or not math.isfinite(sum(start_m) + sum(end_m)):
+        (x_m, y_m), (end_x_m, end_y_m) = positions_m[row], ends_m[row]
+        length_m = math.hypot(end_x_m - x_m, end_y_m - y_m)  # NaN without a position or a track
+        if fates[row] not in FUSED or receipt_ns <= stamp_ns or not length_m > 0.0:
             return None
-        ahead_m = end_m[0] - start_m[0], end_m[1] - start_m[1]
         colour = (*colour[:3], 1.0 if fates[row] in LATE else 0.3)
-        length_m = math.hypot(*ahead_m)
-        return _arrow(tuple(start_m), math.atan2(ahead_m[1], ahead_m[0]), length_m, 0.3, colour) if length_m else None
+        return _arrow((x_m, y_m), math.atan2(end_y_m - y_m, end_x_m - x_m), length_m, 0.3, colour)
 
     def objects() -> Messages:
         for (receipt_ns, sensor, stamp_ns), rows in lists:
-            shown = [row for row in rows if np.isfinite(where.position_m[row]).all()]
-            poses = zip(where.position_m[shown].tolist(), where.yaw_rad[shown].tolist(), strict=True)
-            states = tuple(Detection(x_m, y_m, _known(yaw_rad)) for (x_m, y_m), yaw_rad in poses)
+            states = tuple(
+                Detection(x_m, y_m, _known(float(where.yaw_rad[row])))
+                for row in rows
+                for x_m, y_m in [positions_m[row]]
+                if math.isfinite(x_m + y_m)
+            )
             yield ViewerMessage(receipt_ns, stamp_ns, f"{look.prefix}/detections/{token(sensor)}", states)
 
     yield scenes("detections", mark, is_sparse=False)
@@ -265,16 +260,10 @@ def _outcome_messages(run: Run, look: Look) -> Messages:
     """Rows of `updates.csv` at their receipts."""
     names = ("receipt_ns", "stamp_ns", "sensor", "index", "disposition", "track_id", "nis")
     for receipt_ns, stamp_ns, sensor, index, disposition, track_id, nis in sorted(
-        _rows(run.tables["updates"], *names), key=lambda row: row[0]
+        _rows(run.tables["updates"], *names), key=itemgetter(0)
     ):
-        values = {
-            "sensor": sensor,
-            "index": index,
-            "disposition": disposition,
-            "track_id": None if track_id == NO_TRACK else track_id,
-            "delay_s": seconds(receipt_ns - stamp_ns),
-            "nis": _known(nis),
-        }
+        values = {"sensor": sensor, "index": index, "disposition": disposition, "nis": _known(nis)}
+        values |= {"track_id": None if track_id == NO_TRACK else track_id, "delay_s": seconds(receipt_ns - stamp_ns)}
         yield ViewerMessage(receipt_ns, stamp_ns, f"{look.prefix}/outcomes", values)
 
 
@@ -299,28 +288,17 @@ def _states(states: Table, objects: Table) -> list[Detection]:
     """Pose of each row with its covariance, and class and size of its track, where known."""
     described = {
         track_id: Detection(
-            length_m=_known(length_m), width_m=_known(width_m), height_m=_known(height_m), class_name=name or None
+            length_m=_known(length_m), width_m=_known(width_m), height_m=_known(height_m), class_name=name
         )
-        for track_id, length_m, width_m, height_m, name in _rows(
-            objects, "track_id", "length_m", "width_m", "height_m", "class_name"
-        )
+        for track_id, length_m, width_m, height_m, name in _rows(objects, *_OBJECT)
     }
     names = ("p_x_x", "p_x_y", "p_x_yaw", "p_x_y", "p_y_y", "p_y_yaw", "p_x_yaw", "p_y_yaw", "p_yaw_yaw")
-    covariances = np.stack([states[name] for name in names], axis=-1)
-    known = (np.isfinite(covariances).all(axis=1) & np.isfinite(states["yaw_rad"])).tolist()
-    return [
-        replace(
-            described.get(track_id, Detection()),
-            x_m=x_m,
-            y_m=y_m,
-            yaw_rad=_known(yaw_rad),
-            covariance=tuple(covariance) if has_covariance else None,
-            object_id=track_id,
-        )
-        for (x_m, y_m, yaw_rad, track_id), covariance, has_covariance in zip(
-            _rows(states, "x_m", "y_m", "yaw_rad", "track_id"), covariances.tolist(), known, strict=True
-        )
-    ]
+    found = []
+    for x_m, y_m, yaw_rad, track_id, *covariance in _rows(states, "x_m", "y_m", "yaw_rad", "track_id", *names):
+        P = tuple(covariance) if math.isfinite(yaw_rad + sum(covariance)) else None
+        pose = {"x_m": x_m, "y_m": y_m, "yaw_rad": _known(yaw_rad), "covariance": P, "object_id": track_id}
+        found.append(replace(described.get(track_id, Detection()), **pose))
+    return found
 
 
 def _rows(table: Table, *names: str) -> Iterator[tuple[Any, ...]]:  # Any: values of a row
@@ -349,5 +327,5 @@ def _arrow(tail_m: Point, yaw_rad: float, length_m: float, width_m: float, colou
     return Shape("arrow", colour, (length_m, width_m, width_m), tail_m, width_m, yaw_rad)
 
 
-def _line(points_m: Sequence[Sequence[float]], width_m: float, colour: Colour) -> Shape:
+def _line(points_m: Iterable[Sequence[float]], width_m: float, colour: Colour) -> Shape:
     return Shape("line", colour, (width_m, 0.0, 0.0), points_m=[(x_m, y_m) for x_m, y_m in points_m])
