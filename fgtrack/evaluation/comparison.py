@@ -139,7 +139,7 @@ def paired_sums(group: Sequence[EvaluatedRun]) -> Paired:
 def common_samples(
     objects: Sequence[IntArray], stamps_ns: Sequence[IntArray]
 ) -> tuple[list[int], IntArray, list[IntArray]]:
-    """Samples of several runs at the same object and stamp.
+    """Return the samples of several runs at the same object and stamp.
 
     Returns
     -------
@@ -189,16 +189,14 @@ def _comparison(group: Sequence[EvaluatedRun]) -> Comparison:
 def _gospa_sums(group: Sequence[EvaluatedRun]) -> FloatArray:
     """Squared GOSPA of the visible objects of every run, and 1, at the ticks that all have.
 
-    Visible is what a sensor of any run could see, so that all are measured alike; runs without a known field of view
-    are left out of that, unless none has one.
+    Objects that a sensor of any run could see are visible, so that all runs are measured alike.
     """
     matchings = [one.matching for one in group if one.matching is not None]
     ticks_ns = [one.now_ns[recorded(each.run, one.now_ns)] for each, one in zip(group, matchings, strict=True)]
     common_ns = functools.reduce(np.intersect1d, ticks_ns)
     rows = [np.searchsorted(one, common_ns) for one in ticks_ns]
     there = [scenes(one.run, matching) for one, matching in zip(group, matchings, strict=True)]
-    asked = [k for k, matching in enumerate(matchings) if matching.is_sight_known] or list(range(len(group)))
-    seen = np.any([there[k].in_sight[rows[k]] for k in asked], axis=0)
+    seen = np.any([scene.in_sight[mine] for scene, mine in zip(there, rows, strict=True)], axis=0)
     columns = []
     for one, scene, mine in zip(group, there, rows, strict=True):
         in_sight = scene.in_sight.copy()

@@ -9,12 +9,13 @@ import numpy as np
 from scipy.special import chdtri
 
 from fgtrack.core.diagnostic import EGO, Diagnostic, in_degrees
-from fgtrack.core.time import NS_PER_S, wrong_unit
+from fgtrack.core.geometry import cartesian
+from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.matching import confirmed
 from fgtrack.evaluation.scores.innovations import autocorrelations, num_measured
 from fgtrack.evaluation.scores.statistics import ChiSquareMean
-from fgtrack.io.run import Run, Table, digest
+from fgtrack.io.run import Run, Table
 from fgtrack.models.measurement import ANGULAR
 from fgtrack.models.road import OPEN_SPACE
 
@@ -56,34 +57,24 @@ _NAME_EGO = "name its topic in the configuration (`fgtrack info` lists the topic
 
 @dataclass(frozen=True)
 class Fragmentation:
-    """Lifetimes and breaks of the tracks of a run that were ever confirmed: without truth.
-
-    Attributes
-    ----------
-    lifetimes_s
-        From birth to end, shape (tracks,).
-    breaks
-        Tracks that begin where and when another one ends, within the distance that the object can have travelled.
-    """
+    """Lifetimes and breaks of the tracks of a run that were ever confirmed: without truth."""
 
     lifetimes_s: FloatArray
+    """From birth to end, shape (tracks,)."""
     breaks: int
+    """Tracks that begin where and when another one ends, within the distance that the object can have travelled."""
 
     @classmethod
     def of(cls, run: Run) -> "Fragmentation":
         """Return the fragmentation of `run`."""
         tracks = run.tables["tracks"]
         ids = np.unique(tracks["track_id"][confirmed(tracks)])
-        rows = np.flatnonzero(np.isin(tracks["track_id"], ids))
-        rows = rows[np.argsort(tracks["track_id"][rows], kind="stable")]
-        births, ends = (
-            rows[np.searchsorted(tracks["track_id"][rows], ids)],
-            rows[np.searchsorted(tracks["track_id"][rows], ids, "right") - 1],
-        )
+        order = np.argsort(tracks["track_id"], kind="stable")
+        births, ends = (np.searchsorted(tracks["track_id"][order], ids, side) for side in ("left", "right"))
+        births, ends = order[births], order[ends - 1]
         born_s, ended_s = ((tracks["now_ns"][each] - tracks["now_ns"][:1]) / NS_PER_S for each in (births, ends))
-        positions_m = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
-        yaw_rad, speed_mps = tracks["yaw_rad"][ends], tracks["speed_mps"][ends]
-        velocities_mps = speed_mps[:, None] * np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], axis=-1)
+        positions_m, speed_mps = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1), tracks["speed_mps"][ends]
+        velocities_mps = cartesian(np.stack([tracks["yaw_rad"][ends], speed_mps], axis=-1))
         free, breaks = np.ones(len(ids), dtype=bool), 0
         for k in np.argsort(born_s, kind="stable").tolist():
             gap_s = born_s[k] - ended_s
@@ -105,7 +96,7 @@ class Fragmentation:
 
 def diagnostics(run: Run) -> list[Diagnostic]:
     """Defects of `run`, as far as its files show them."""
-    found = (_changed, _clocks, _angles, _ego, _map, _unused, _window, _failures, _fragmentation)
+    found = (_stamps, _angles, _ego, _map, _unused, _window, _failures, _fragmentation)
     return [one for of_kind in found for one in of_kind(run)]
 
 
@@ -192,13 +183,7 @@ def _advise(run: Run, options: str = "") -> str:
     return f"fgtrack advise{named}{options}"
 
 
-def _changed(run: Run) -> Iterator[Diagnostic]:
-    """Files of a finished run that differ from those that it has written."""
-    if run.path is not None and run.meta.get("complete") and digest(run.path) != run.meta.get("digest"):
-        yield Diagnostic("tracks.csv or updates.csv", "changed since the run: the digest is another; repeat the run")
-
-
-def _clocks(run: Run) -> Iterator[Diagnostic]:
+def _stamps(run: Run) -> Iterator[Diagnostic]:
     updates = run.tables["updates"]
     for sensor, mine in _by_sensor(updates):
         if (updates["stamp_ns"][mine] == 0).all():
@@ -207,48 +192,43 @@ def _clocks(run: Run) -> Iterator[Diagnostic]:
                 f"`stamp_from: receipt` on its topic, or sensors.{sensor}.stamp_from, takes the receipt for the stamp"
             )
             yield Diagnostic(sensor, text, {f"sensors.{sensor}.stamp_from": "receipt"})
-        receipts_ns = np.unique(updates["receipt_ns"][mine])
-        if unit := wrong_unit(len(receipts_ns), int(receipts_ns[0]), int(receipts_ns[-1])):
-            yield Diagnostic(sensor, unit)
 
 
 def _angles(run: Run) -> Iterator[Diagnostic]:
     """Angles that were recorded in degrees and read as radians."""
-    ego, detections = run.tables["ego"], run.tables["detections"]
-    by_sensor = ((sensor, detections, mine) for sensor, mine in _by_sensor(detections))
-    for about, table, mine in [(EGO, ego, slice(None)), *by_sensor]:
+    detections = run.tables["detections"]
+    by_sensor = ((sensor, detections.where(mine)) for sensor, mine in _by_sensor(detections))
+    for about, table in [(EGO, run.tables["ego"]), *by_sensor]:
         for name in ANGULAR:
-            values = table[name][mine] if name in table else np.empty(0)
-            finite = values[np.isfinite(values)]
-            found = in_degrees(about, name, float(finite.min(initial=0.0)), float(finite.max(initial=0.0)))
-            yield from () if found is None else (found,)
+            finite = [value for value in table.get(name, np.empty(0)).tolist() if math.isfinite(value)]
+            if found := in_degrees(about, name, min(finite, default=0.0), max(finite, default=0.0)):
+                yield found
 
 
 def _ego(run: Run) -> Iterator[Diagnostic]:
     """No ego where it is needed, or reasons for which more than half of its states were refused."""
     failed = [f"{count} of {total} of {sensor}" for sensor, name, count, total in _mostly(run) if name == "failed"]
     num_states = run.tables["ego"].num_rows
-    if num_states:
-        if jumps := run.meta.get("ego_jumps"):
-            times = "once" if jumps == 1 else f"{jumps} times"
-            text = (
-                f"its position jumps {times}, as where a clock is set or a localisation is reinitialised: what is seen "
-                "from it is misplaced there, cut the recording in parts"
-            )
-            yield Diagnostic(EGO, text)
-        for reason, count in dict(run.meta.get("ego_refused") or {}).items():
-            if 2 * count > num_states:
-                text = f"{count} of {num_states} states not used, {reason}: look at the clock of its driver"
-                yield Diagnostic(EGO, text)
-    elif failed:
+    if not num_states and failed:
         text = f"no state was received, so nothing in its frame can be placed ({', '.join(failed)} failed)"
         yield Diagnostic(EGO, f"{text}: {_NAME_EGO}")
-    elif _ego_speeds_births(run):
+    elif not num_states and _ego_speeds_births(run):
         text = (
             "no state was received, so new objects are assumed to stand still, and what the sensors could see is not "
             f"known: {_NAME_EGO}, or set birth.ego_speed_factor to 0"
         )
         yield Diagnostic(EGO, text, _STANDING)
+    if jumps := run.meta.get("ego_jumps"):
+        times = "once" if jumps == 1 else f"{jumps} times"
+        text = (
+            f"its position jumps {times}, as where a clock is set or a localisation is reinitialised: detections are "
+            "misplaced there, cut the recording in parts"
+        )
+        yield Diagnostic(EGO, text)
+    for reason, count in dict(run.meta.get("ego_refused") or {}).items():
+        if 2 * count > num_states:
+            text = f"{count} of {num_states} states not used, {reason}: look at the clock of its driver"
+            yield Diagnostic(EGO, text)
 
 
 def _map(run: Run) -> Iterator[Diagnostic]:
@@ -301,11 +281,6 @@ def _too_old(run: Run, sensor: str) -> str:
     window, lag_s = _reported_window(run)
     if delay_s > lag_s:
         return f"median delay {delay_s:.3g} s, older than {window}: raise it, or correct the clock"
-    if run.meta.get("estimator") == "drop":
-        return (
-            f"median delay {delay_s:.3g} s, and `drop` ignores by design what is older than the newest detection that "
-            "a track has fused, whatever the window: use an estimator that fuses it, such as ekf-replay"
-        )
     return (
         f"median delay {delay_s:.3g} s, within {window}: no track is as old as these detections, check births, gate "
         "and clock"
@@ -327,12 +302,10 @@ def _failures(run: Run) -> Iterator[Diagnostic]:
     """Failures inside the estimator."""
     counts = {kind: n for kind, n in dict(run.meta.get("failures") or {}).items() if n and kind != _NO_FAILURE}
     if counts:
-        first = run.meta.get("first_failure")
-        cure = "these tracks are less accurate; look at the noise and the starts, or take another estimator"
-        if set(counts) == {"diverged"}:
-            cure = "measurements in a row contradicted a track: look at NIS by sensor, clocks and noise"
-        text = f"failures: {', '.join(f'{n} {kind}' for kind, n in counts.items())}"
-        yield Diagnostic("estimator", f"{text}{f' (the first one: {first})' if first else ''}: {cure}")
+        first = f" (the first one: {run.meta['first_failure']})" if run.meta.get("first_failure") else ""
+        cure = "these tracks are less accurate; look at NIS by sensor, noise, clocks and starts"
+        text = f"failures: {', '.join(f'{n} {kind}' for kind, n in counts.items())}{first}: {cure}"
+        yield Diagnostic("estimator", text)
 
 
 def _fragmentation(run: Run) -> Iterator[Diagnostic]:
@@ -361,11 +334,10 @@ def _fragmentation(run: Run) -> Iterator[Diagnostic]:
 
 
 def _reported_window(run: Run) -> tuple[str, float]:
-    """The window with the key that sets its length, and its length; runs of older versions do not report them."""
-    found = run.meta.get("effective") or {}
-    if "lag_key" not in found:
-        return "the window", np.inf
-    return f"the window ({found['lag_key']} {found['lag_s']:g} s)", float(found["lag_s"])
+    """The window with the key that sets its length, and its length; infinite where a run does not report it."""
+    window = run.meta.get("effective") or {}
+    lag_s = float(window.get("lag_s", np.inf))
+    return f"the window ({window.get('lag_key')} {lag_s:g} s)", lag_s
 
 
 def _section(run: Run, name: str) -> Mapping[str, Any]:

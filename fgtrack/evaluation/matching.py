@@ -38,8 +38,6 @@ class Matching:
     """Track paired with each object, shape (ticks, objects); `NO_TRACK` without one."""
     in_sight: BoolArray
     """True where some sensor could see the object, shape (ticks, objects), see `visible`."""
-    is_sight_known: bool
-    """True if the sensors and the ego's path are known; else every object counts as visible."""
 
     @property
     def paired(self) -> BoolArray:
@@ -96,11 +94,9 @@ ERROR_NAMES = ("position_m", "along_m", "across_m", "yaw_rad", "speed_mps")
 def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
     """Pair the tracks of `run` to its true objects at every tick; None for a run without truth.
 
-    `options` are by default those of its configuration. Tracks of ignored objects and in ignored regions are left out.
-
-    As CLEAR does (Bernardin and Stiefelhagen 2008): a pair of the tick before stays while it lies inside the
-    gate, the rest is assigned by the Hungarian method, first as many pairs as possible, then the least sum of
-    distances. Ticks are those of timing.csv, so ticks without any track count as well.
+    `options` are by default those of its configuration. As CLEAR does (Bernardin and Stiefelhagen 2008): a pair of the
+    tick before stays while it lies inside the gate, the rest is assigned by the Hungarian method, first as many pairs
+    as possible, then the least sum of distances. Tracks of ignored objects and in ignored regions are left out.
     """
     options = options or run.evaluation
     paths = true_paths(run.tables["truth"])
@@ -118,7 +114,6 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
     track_ids[tick_index[paired], object_index[paired]] = tracks["track_id"][paired]
     true_states = np.full((tracks.num_rows, len(TRUE_STATE)), np.nan)
     true_states[paired] = candidates[paired, object_index[paired]]
-    in_sight, is_known = visible(run, paths, timing["now_ns"])
     return Matching(
         object_ids=tuple(path.object_id for path in paths),
         tracks=tracks,
@@ -129,8 +124,7 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
         tick_index=tick_index,
         present=np.stack([np.isfinite(path.at(timing["now_ns"])[:, 0]) for path in paths], axis=-1),
         track_ids=track_ids,
-        in_sight=in_sight,
-        is_sight_known=is_known,
+        in_sight=visible(run, paths, timing["now_ns"]),
     )
 
 

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.types import MEASURABLE, IntArray
+from fgtrack.core.types import MEASURABLE
 from fgtrack.evaluation.matching import Matching, match
 from fgtrack.evaluation.metrics import Metrics, evaluate_matched
-from fgtrack.io.run import EvaluationConfig, Run, Table, is_run_folder, load_run
+from fgtrack.io.run import EvaluationConfig, Run, is_run_folder, load_run
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ Runs = OneRun | Mapping[str, OneRun] | Iterable[OneRun | Iterable[OneRun] | Mapp
 
 
 def evaluated(runs: Runs) -> list[EvaluatedRun]:
-    """Runs under labels of their own; a path is a run folder, or a folder that holds some; a mapping gives labels.
+    """Return runs under labels of their own; a path is a run folder, or a folder of them; a mapping gives labels.
 
     Runs of a folder come by name; they may be one folder deeper, as in that of `fgtrack demo`.
 
@@ -58,26 +58,19 @@ def evaluated(runs: Runs) -> list[EvaluatedRun]:
         A run folder is damaged.
     """
     every = [one for entry in _several(runs) for one in _several(entry)]
+    if all(isinstance(one, EvaluatedRun) for one in every):
+        return every
+    read: list[Run] = []
     for one in every:
         if not isinstance(one, OneRun):
             raise CallError(f"runs: must be runs or paths of run folders, there is a {type(one).__name__}")
-    if all(isinstance(one, EvaluatedRun) for one in every):
-        return every
-    plain = [one.run if isinstance(one, EvaluatedRun) else one for one in every]
-    read = [found for one in plain for found in ([one] if isinstance(one, Run) else _read(Path(one)))]
+        plain = one.run if isinstance(one, EvaluatedRun) else one
+        read += [plain] if isinstance(plain, Run) else _read(Path(plain))
     return [EvaluatedRun(label, run) for label, run in labelled(read).items()]
 
 
 def one_evaluated(run: OneRun) -> EvaluatedRun:
-    """The one run that `run` stands for.
-
-    Raises
-    ------
-    CallError
-        It is a folder that holds several.
-    DataError
-        A run folder is damaged.
-    """
+    """Return the one run in `run`; raises as `evaluated`, and `CallError` for a folder that holds several."""
     every = evaluated(run)
     if len(every) > 1:
         raise CallError(f"{run}: holds {len(every)} runs, name one of them")
@@ -85,22 +78,14 @@ def one_evaluated(run: OneRun) -> EvaluatedRun:
 
 
 def run_folders(runs: Iterable[EvaluatedRun]) -> list[Path]:
-    """The folders of `runs`, of those that have one."""
+    """Return the folders of `runs`, of those that have one."""
     return [one.run.path for one in runs if one.run.path is not None]
 
 
 def start_ns(runs: Sequence[EvaluatedRun]) -> int:
-    """Time of the first tick of `runs`; 0 without one."""
-    return min((int(ns[0]) for ns in map(_ticks_ns, runs) if len(ns)), default=0)
-
-
-def starts_ns(runs: Sequence[EvaluatedRun]) -> dict[str, int]:
-    """Start of the recording of each run, by label: the first tick of it and of those that ran at the same time."""
-    ends = {one.label: (int(ns[0]), int(ns[-1])) if len(ns) else (0, 0) for one in runs for ns in [_ticks_ns(one)]}
-    return {
-        label: min(first for first, last in ends.values() if first <= end and last >= begin)
-        for label, (begin, end) in ends.items()
-    }
+    """Return the time of the first tick of `runs`; 0 without one."""
+    ticks_ns = [one.run.tables["timing"]["now_ns"] for one in runs]
+    return min((int(ns[0]) for ns in ticks_ns if len(ns)), default=0)
 
 
 def labelled(runs: Sequence[Run]) -> dict[str, Run]:
@@ -158,11 +143,15 @@ def by_recording(runs: Sequence[EvaluatedRun]) -> list[list[EvaluatedRun]]:
 
 
 def recordings_warning(runs: Sequence[EvaluatedRun]) -> list[str]:
-    """A line where `runs` are of different recordings, with their names; empty otherwise."""
+    """Return a line where `runs` are of different recordings, with their names; empty otherwise."""
     groups = by_recording(runs)
-    texts = [f"{', '.join(one.label for one in group)} ({_source(group[0].run)})" for group in groups]
-    what = f"the runs are of {len(groups)} recordings, so their numbers cannot be compared across them"
-    return [f"{what}: {'; '.join(texts)}"] if len(groups) > 1 else []
+    inputs = [group[0].run.meta.get("input") or {} for group in groups]
+    texts = [
+        f"{', '.join(one.label for one in group)} ({source.get('path') or 'messages in memory'})"
+        for group, source in zip(groups, inputs, strict=True)
+    ]
+    text = f"the runs are of {len(groups)} recordings, so their numbers cannot be compared across them"
+    return [f"{text}: {'; '.join(texts)}"] if len(groups) > 1 else []
 
 
 def _several(given: Any) -> list[Any]:  # Any: what a user gives
@@ -181,35 +170,15 @@ def _read(path: Path) -> list[Run]:
     raise CallError(f"{path}: no run folder, make one with `fgtrack replay`")
 
 
-def _ticks_ns(one: EvaluatedRun) -> IntArray:
-    return one.run.tables["timing"]["now_ns"]
-
-
 def _same_detections(one: Run, other: Run, sensor: str) -> bool:
-    """True if the detections of a sensor are the same, in the order of the stamps or of the receipts."""
-    runs = (one, other)
-    updates = [run.tables["updates"].where(run.tables["updates"]["sensor"] == sensor) for run in runs]
-    tables = [run.tables["detections"].where(run.tables["detections"]["sensor"] == sensor) for run in runs]
-    same = [k for k in ("stamp_ns", "receipt_ns") if np.array_equal(np.sort(updates[0][k]), np.sort(updates[1][k]))]
-    known = all(table.num_rows for table in tables)
-    return any(not known or _same_values(tables, time) for time in same)
-
-
-def _same_values(tables: Sequence[Table], time: str) -> bool:
-    """True if two sensors measured the same in the order of `time`, as far as both have values."""
-    if tables[0].num_rows != tables[1].num_rows:
+    """True if the detections of a sensor have the same stamps or receipts, and the same values where both have any."""
+    (updates, others), (values, other_values) = (
+        [run.tables[name].where(run.tables[name]["sensor"] == sensor) for run in (one, other)]
+        for name in ("updates", "detections")
+    )
+    if not any(np.array_equal(np.sort(updates[name]), np.sort(others[name])) for name in ("stamp_ns", "receipt_ns")):
         return False
-    orders = [np.lexsort((table["index"], table[time])) for table in tables]
-    for name in MEASURABLE:
-        a, b = (table[name][order] for table, order in zip(tables, orders, strict=True))
-        if (np.isfinite(a) & np.isfinite(b) & (a != b)).any():
-            return False
-    return True
-
-
-def _source(run: Run) -> str:
-    source = run.meta.get("input") or {}
-    words = [str(source["path"])] if source.get("path") else []
-    if run.meta.get("messages_received"):
-        words.append(f"{run.meta['messages_received']} messages")
-    return ", ".join(words) or f"{run.tables['updates'].num_rows} detections"
+    known = values.num_rows and other_values.num_rows
+    return not known or all(
+        np.array_equal(np.sort(values[name]), np.sort(other_values[name]), equal_nan=True) for name in MEASURABLE
+    )

@@ -1,9 +1,7 @@
 """True objects as functions of time, their visibility to the sensors, and what of them is not evaluated."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -105,20 +103,18 @@ def in_ignored_regions(run: Run, stamps_ns: IntArray, points_m: FloatArray) -> B
     for stamp_ns, text in zip(regions["stamp_ns"], regions["outline_m"], strict=True):
         rows = np.flatnonzero((nearest_ns == stamp_ns) & ~inside)
         try:
-            corners = np.array(text.split(), dtype=np.float64).reshape(-1, 2)
+            inside[rows] = in_polygon(points_m[rows], np.array(text.split(), dtype=np.float64).reshape(-1, 2))
         except ValueError as error:
             raise DataError(f"{run.path}: ignored.csv holds a bad outline ({error}), repeat the run") from error
-        inside[rows] = in_polygon(points_m[rows], corners)
     return inside
 
 
-def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> tuple[BoolArray, bool]:
+def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> BoolArray:
     """True where an object of `paths` is in range and in the field of view of a sensor at `now_ns`, shape (n, objects).
 
     The sensors are those that the run had detections of, as its configuration describes them, from the pose of the ego
-    that ego.csv gives (linear between its stamps). Nothing hides an object. Where the ego's path, a sensor or its range
-    and field of view are not known, every object counts as visible, and the second value is false; an object without
-    truth is not visible.
+    that ego.csv gives (linear between its stamps), without occlusion. Where the ego's path or a sensor is not known,
+    every object counts as visible; an object without truth is not visible.
 
     Raises
     ------
@@ -129,13 +125,12 @@ def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> tuple[Bool
     present = np.asarray(np.isfinite(positions_m).all(axis=-1))
     sensors, poses = _sensors(run), ego_states(run.tables["ego"], now_ns)[:, :3]
     if np.isnan(poses).all() or not sensors:
-        return present, False
+        return present
     ego = run.config.get("ego") or {}
     origin_m = (float(ego.get("detection_origin_x_m", 0.0)), float(ego.get("detection_origin_y_m", 0.0)))
     positions_m[~present] = 0.0
     poses = np.broadcast_to(poses[:, None], (*present.shape, 3))
-    seen = np.any([sensor.sees(positions_m, poses, origin_m) for sensor in sensors], axis=0)
-    return present & seen, all(map(_is_limited, sensors))
+    return np.asarray(present & np.any([sensor.sees(positions_m, poses, origin_m) for sensor in sensors], axis=0))
 
 
 def ego_states(ego: Table, stamps_ns: IntArray) -> FloatArray:
@@ -163,22 +158,14 @@ def _hermite(a: FloatArray, b: FloatArray, u: FloatArray, h_s: FloatArray) -> Fl
     return np.asarray(from_a + from_b)
 
 
-def _is_limited(sensor: SensorModel) -> bool:
-    limits_m = (sensor.max_range_m, sensor.view_range_m, sensor.max_range_behind_m)
-    return any(limit_m is not None for limit_m in limits_m) or (sensor.field_of_view_rad or math.tau) < math.tau
-
-
-@cache
-def _models() -> TypeAdapter[dict[str, SensorModel]]:
-    return TypeAdapter(dict[str, SensorModel])
-
-
 def _sensors(run: Run) -> list[SensorModel]:
     """Models of the sensors that occur in the run; empty where one has none."""
     configured: Mapping[str, Any] = run.config.get("sensors") or {}
     names = np.unique(run.tables["updates"]["sensor"]).tolist()
     try:
-        models = _models().validate_python({name: configured[name] for name in names if name in configured})
+        models = TypeAdapter(dict[str, SensorModel]).validate_python(
+            {name: configured[name] for name in names if name in configured}
+        )
     except ValidationError as error:
         (first, *_) = error.errors()
         key = ".".join(map(str, first["loc"]))

@@ -13,7 +13,7 @@ from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.matching import track_errors
 from fgtrack.evaluation.palette import Look
-from fgtrack.evaluation.runs import EvaluatedRun, Runs, evaluated, starts_ns
+from fgtrack.evaluation.runs import EvaluatedRun, Runs, by_recording, evaluated, start_ns
 from fgtrack.evaluation.scores.lagged import final_errors
 from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.plotting.paper import Paper, Sheet, styled
@@ -91,7 +91,8 @@ def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> 
 
 def _curves(runs: Sequence[EvaluatedRun], object_id: int | None) -> list[_Curve]:
     """Errors of the present states of every run, then of the final ones of those that have them."""
-    first_ns, styles = starts_ns(runs), run_looks(runs)
+    styles = run_looks(runs)
+    first_ns = {one.label: start_ns(group) for group in by_recording(runs) for one in group}
     present: list[_Curve] = []
     final: list[_Curve] = []
     for one in runs:

@@ -59,14 +59,14 @@ def test_without_a_common_sensor_the_ego_decides() -> None:
 def test_runs_of_different_recordings_are_told_by_name(tmp_path: Path) -> None:
     def write(name: str, car: object) -> Path:
         rows = car.truth(range(4))  # type: ignore[attr-defined]
-        meta = {"estimator": "smoother", "input": {"path": f"{name}.mcap"}, "messages_received": 7}
+        meta = {"estimator": "smoother", "input": {"path": f"{name}.mcap"}}
         return write_run(tmp_path / name, updates={0: [update()]}, truth=rows, meta=meta).path or tmp_path
 
     runs = evaluated([write("a", WEST), write("b", ROUND), write("c", WEST)])
     assert [[one.label[:1] for one in group] for group in by_recording(runs)] == [["a", "c"], ["b"]]
     (line,) = recordings_warning(runs)
     assert line.startswith("the runs are of 2 recordings")
-    assert "a.mcap, 7 messages" in line
+    assert "c (smoother) (a.mcap)" in line
     assert "b (smoother) (b.mcap" in line
     assert recordings_warning(runs[::2]) == []
 
