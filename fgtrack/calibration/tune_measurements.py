@@ -1,4 +1,4 @@
-"""The measurements that a tracker gives to each of its tracks, taken from a replay in memory."""
+"""The measurements of each track of a replay in memory, with their noise in parts."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -14,7 +14,6 @@ from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, Upd
 from fgtrack.estimation.failures import Failures
 from fgtrack.estimation.likelihood.series import Observation, Series, positive_part
 from fgtrack.io.run import Run
-from fgtrack.models.correlated_errors import whole_error
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_bank
 from fgtrack.pipeline.config import Config
@@ -31,7 +30,7 @@ from fgtrack.tracking.tracker import TrackerParts
 def recorded(
     messages: Iterable[Message], config: Config, origin: str = "", gate_stds: float = 0.0
 ) -> tuple[list[Series], Run]:
-    """The series of all tracks, and the run. Raises as `replay`.
+    """Return the series of all tracks, and the run.
 
     A gate in metres is opened to `gate_stds` standard deviations of the position of each detection.
     """
@@ -67,19 +66,19 @@ class _OpenedGate:
         return replace(self.association, max_distance_m=limit_m)(candidates, states, apart)
 
     def _stds_m(self, candidate: Candidate, means: FloatArray) -> FloatArray:
-        """Largest standard deviation of the position; of a bearing alone, across the line of sight at each track."""
+        """Return the largest standard deviation of the position; of a bearing alone, across the line of sight."""
         if candidate.position_covariance is not None:
             return np.full(len(means), math.sqrt(np.linalg.eigvalsh(candidate.position_covariance)[-1]))
         measurement = candidate.measurement
         if "bearing_rad" not in measurement.model.components:
             return np.zeros(len(means))
-        place = measurement.model.components.index("bearing_rad")
+        k = measurement.model.components.index("bearing_rad")
         away_m = np.hypot(means[:, 0] - measurement.pose.x_m, means[:, 1] - measurement.pose.y_m)
-        return np.asarray(away_m * math.sqrt(measurement.R[place, place]))
+        return np.asarray(away_m * math.sqrt(measurement.R[k, k]))
 
 
 class _WatchedPreprocess(Preprocess):
-    """Another `Preprocess`; remembers what the measurements of the newest batch are made of."""
+    """A `Preprocess` that keeps the origin of the noise of the newest batch."""
 
     def __init__(self, watched: Preprocess) -> None:
         self._watched = watched
@@ -100,27 +99,25 @@ class _WatchedPreprocess(Preprocess):
         return candidates, records
 
     def observation(self, measurement: Measurement) -> Observation:
-        """A measurement of the newest batch with its noise in parts."""
+        """Return a measurement of the newest batch with its noise in parts."""
         assert self._sensor is not None  # a batch is preprocessed before anything of it is fused
         name, sensor = self._sensor
         return observation(name, sensor, measurement, self._own[id(measurement)])
 
 
 def observation(name: str, sensor: SensorModel, measurement: Measurement, own: bool) -> Observation:
-    """`measurement` of the sensor `name`, whose detections came with a covariance of their `own` or did not."""
+    """Return `measurement` of the sensor `name`; its noise is fixed if it is its `own`, or time-correlated."""
     components = measurement.model.components
-    measured = tuple(place for place, component in enumerate(components) if component in sensor.std)
-    assumed = tuple(place for place in range(len(components)) if place not in measured)
-    R = whole_error(measurement.model, measurement.R)[np.ix_(measured, measured)]
-    T = np.eye(len(measured))
-    if own:
-        R = measurement.R[np.ix_(measured, measured)]
+    measured = tuple(i for i, component in enumerate(components) if component in sensor.std)
+    assumed = tuple(i for i in range(len(components)) if i not in measured)
+    R, T = measurement.R[np.ix_(measured, measured)], np.eye(len(measured))
+    if own or sensor.correlation is not None:
         return Observation(name, measurement, measured, assumed, T, R, np.zeros_like(R))
     if "x_m" in components:
         (x_m, y_m), pose = measurement.z[:2].tolist(), measurement.pose
         T[:2, :2] = rotation(math.atan2(y_m - pose.y_m, x_m - pose.x_m))
-    known = congruence(T, np.diag([sensor.std[components[place]] ** 2 for place in measured]))
-    return Observation(name, measurement, measured, assumed, T, np.zeros_like(R), positive_part(R - known))
+    modelled = congruence(T, np.diag([sensor.std[components[i]] ** 2 for i in measured]))
+    return Observation(name, measurement, measured, assumed, T, np.zeros_like(R), positive_part(R - modelled))
 
 
 class _RecordingBank(GuardedBank):

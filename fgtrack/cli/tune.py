@@ -96,8 +96,8 @@ def _sensors(report: TuneReport) -> list[str]:
         if one.outlier_share is not None:
             lines.append(f"{one.sensor}: {one.count} measurements, {100.0 * one.outlier_share:.1f} % outliers")
         if one.own_covariance:
-            lines.append(f"{one.sensor}: {one.own_covariance} measurements have a covariance of their own; it stays")
-    runs = () if report.held_out is None else report.held_out.runs_after
+            lines.append(f"{one.sensor}: {one.own_covariance} measurements have a covariance of their own, which stays")
+    runs = () if report.held_out is None else report.held_out.runs
     lines += [
         f"{one.sensor}: innovations still correlated in time (autocorrelation {one.lag1:.2f}): so are errors, of it or "
         "of the sensor that is trusted more, and white noise is too small for them"

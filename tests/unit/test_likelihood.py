@@ -11,15 +11,15 @@ from scipy.stats import multivariate_normal
 from fgtrack.calibration.tune_measurements import observation
 from fgtrack.calibration.tune_space import ConfigNoise
 from fgtrack.core.geometry import rotation, wrap_angle
+from fgtrack.core.linalg import mahalanobis_squared
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.likelihood import contaminated
 from fgtrack.estimation.likelihood.fit import FitSettings, Problem
-from fgtrack.estimation.likelihood.mixed import without_mixed
 from fgtrack.estimation.likelihood.noise import NoiseSpace
-from fgtrack.estimation.likelihood.reference import filtered
+from fgtrack.estimation.likelihood.reference import filtered, without_mixed
 from fgtrack.estimation.likelihood.series import Observation, Series
 from fgtrack.models.correlated_errors import split_error
 from fgtrack.models.measurement import SensorPose, measurement_model
@@ -177,7 +177,9 @@ def test_a_nonlinear_model_is_linearised_about_the_filter() -> None:
     problem = Problem([replace(track, observations=seen)], TURNING, values, EVERYTHING)
     likelihood = problem.likelihood(values, np.ones(10, dtype=bool))
     steps = filtered(problem.series[0], TURNING, values)
-    assert likelihood.totals(values[None])[0] == pytest.approx(sum(step.log_likelihood for step in steps), abs=1e-8)
+    assert likelihood.totals(values[None])[0] == pytest.approx(
+        sum(step.update.log_likelihood for step in steps), abs=1e-8
+    )
 
 
 def turning(seed: int, num: int) -> tuple[FloatArray, Series]:
@@ -205,12 +207,12 @@ def test_a_track_of_unknown_direction_is_linearised_along_its_first_positions() 
     assert abs(wrap_angle(steps[opened.num_initial].after[2] - 2.5)) < 0.3
     counted = [step for place, step in enumerate(steps) if FitSettings().counts(opened, place)]
     assert len(counted) > 150
-    assert np.mean([step.nis for step in counted]) == pytest.approx(2.0, abs=0.4)
+    assert np.mean([mahalanobis_squared(one.y, one.update.S) for one in counted]) == pytest.approx(2.0, abs=0.4)
     assert track.initiated(TURNING.motion_model(values), "one-point") is track
     likelihood = Problem([opened], TURNING, values, EVERYTHING).likelihood(values, np.ones(10, dtype=bool))
     place = opened.num_initial
     assert likelihood.totals(values[None])[0] == pytest.approx(
-        sum(step.log_likelihood for step in steps[place:]), abs=1e-8
+        sum(step.update.log_likelihood for step in steps[place:]), abs=1e-8
     )
 
 
@@ -225,7 +227,7 @@ def test_innovations_count_from_where_the_direction_is_known() -> None:
     assert 1.0 <= since_s < 1.05
 
 
-def test_errors_that_last_are_parameters_too() -> None:
+def test_time_correlated_errors_are_in_the_state_and_their_noise_is_fixed() -> None:
     """In a linear model the likelihood at any parameters is that of a filter with these."""
     noise = ConfigNoise(
         read_config(
@@ -251,20 +253,17 @@ def test_errors_that_last_are_parameters_too() -> None:
         erring, white = split_error(one.sensor, sensor, plain, R, model.state_names)
         measurement = replace(one.measurement, model=erring, R=white, pose=pose)
         seen.append(observation(one.sensor, sensor, measurement, own=False))
-        assert seen[-1].foreign == pytest.approx(np.zeros((2, 2)), abs=1e-9)
+        assert seen[-1].tuned == (one.sensor != "lidar")
     problem = Problem([Series(START, seen)], noise.space, noise.values, EVERYTHING)
     likelihood = problem.likelihood(noise.values, np.ones(len(noise.values), dtype=bool))
     rows = noise.values * np.exp(0.4 * rng.standard_normal((3, len(noise.values))))
     rows[:, -3:] = 1e-60
-    expected = [sum(step.log_likelihood for step in filtered(problem.series[0], noise.space, row)) for row in rows]
+    expected = [
+        sum(step.update.log_likelihood for step in filtered(problem.series[0], noise.space, row)) for row in rows
+    ]
     assert likelihood.totals(rows) == pytest.approx(expected, abs=1e-7)
-    assert "sensors.lidar.correlation.time_s" not in noise.keys
-    tuned = noise.config_with(rows[0]).sensors["lidar"].correlation
-    assert tuned is not None
-    shown, errors = noise.shown(rows[0], np.full(len(rows[0]), 0.1))
-    place = noise.keys.index("sensors.lidar.correlation.share")
-    assert tuned.share == pytest.approx(shown[place], rel=1e-3)
-    assert errors[place] == pytest.approx(0.1 * (1.0 - shown[place]))
+    counts = dict(zip(noise.keys, problem.counts().tolist(), strict=True))
+    assert (counts["sensors.lidar.std.x_m"], counts["sensors.radar.std.x_m"]) == (0, 20)
 
 
 def test_noise_that_grows_with_range_is_not_laid_to_the_standard_deviations() -> None:

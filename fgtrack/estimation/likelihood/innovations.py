@@ -20,7 +20,6 @@ from fgtrack.estimation.likelihood.contaminated import update
 from fgtrack.estimation.likelihood.noise import NoiseSpace
 from fgtrack.estimation.likelihood.reference import Step
 from fgtrack.estimation.likelihood.series import Series
-from fgtrack.models.correlated_errors import ColouredNoiseMeasurement
 
 
 class Evaluation(NamedTuple):
@@ -47,53 +46,46 @@ class Innovations:
     ) -> None:
         """`steps`: those of `filtered` along each of the `series` at `values`, shape (p,).
 
-        `counts`: whether the observation at a place of a series has a part in the likelihood; every one moves the
-        state.
+        `counts`: True if observation k of a series has a part in the likelihood; every one moves the state.
         """
         self._space = space
         motion = space.motion_model(values)
         self._start = np.array([initial_state(motion, one.start)[1] for one in series])
         shape = max(map(len, steps)), len(series)
         d = max(len(step.y) for track in steps for step in track)
-        a = max(len(step.assumed_innovation) for track in steps for step in track)
-        n = motion.dim
-        names = {name: place for place, name in enumerate(space.names)}
-        none = len(names)  # a last column of zeros
-        self._there: BoolArray = np.zeros(shape, dtype=np.bool_)
+        a = max(len(step.assumed[0]) for track in steps for step in track)
+        n, columns = motion.dim, {name: column for column, name in enumerate(space.names)}
+        none = len(columns)  # a last column of zeros
         self.counted: BoolArray = np.zeros(shape, dtype=np.bool_)
-        """Which steps have a part in the likelihood, shape (k, t)."""
+        """True for steps that have a part in the likelihood, shape (k, t)."""
         self.since_start_s = np.zeros(shape)
         """Time of each step since the first state, shape (k, t)."""
-        self._since_s = np.zeros(shape)
+        self._since_s = np.full(shape, np.nan)
         self._about, self._offset = np.zeros((*shape, n)), np.zeros((*shape, n))
         self._predicted, self._after = np.zeros((*shape, n)), np.zeros((*shape, n))
         self._y, self._H = np.zeros((*shape, d)), np.zeros((*shape, d, n))
-        self._axes = np.zeros((*shape, d, d))
-        self._own, self._foreign = np.zeros((*shape, d, d)), np.broadcast_to(np.eye(d), (*shape, d, d)).copy()
+        self._axes, self._own = np.zeros((*shape, d, d)), np.zeros((*shape, d, d))
+        self._foreign = np.broadcast_to(np.eye(d), (*shape, d, d)).copy()
         self._std: IntArray = np.full((*shape, d), none)
         self._odds: IntArray = np.full(shape, none)
-        self._lasting: IntArray = np.full(shape, none)
-        self._errors = np.zeros((*shape, d, n))  # 1 where an error that lasts is in the state
         self._padding = np.full(shape, d)
-        self._assumed_innovation, self._assumed_jacobian = np.zeros((*shape, a)), np.zeros((*shape, a, n))
-        self._assumed_covariance = np.broadcast_to(np.eye(a), (*shape, a, a)).copy()
+        self._assumed = np.zeros((*shape, a)), np.zeros((*shape, a, n)), np.zeros((*shape, a, a))
+        self._assumed[2][:] = np.eye(a)
         for t, (track, one) in enumerate(zip(steps, series, strict=True)):
             for k, step in enumerate(track):
                 self.counted[k, t] = counts(one, k)
                 self.since_start_s[k, t] = seconds(step.observation.measurement.stamp_ns - one.start.stamp_ns)
-                self._set(k, t, step, names)
-        fixed = 1.0 - self._errors.any(axis=-2, keepdims=True)
-        self._H_fixed = self._H * fixed
-        self._any_lasts: bool = np.any(self._errors).item()
+                self._set(k, t, step, columns)
+        self._there = np.isfinite(self._since_s)
+        self._since_s = np.where(self._there, self._since_s, 0.0)
         self._F = motion.jacobian(self._about, self._since_s)
         self._parts = space.noise_parts(self._about, self._since_s)
-        self._has_assumed: list[bool] = np.any(self._assumed_jacobian, axis=(1, 2, 3)).tolist()
+        self._has_assumed: list[bool] = np.any(self._assumed[1], axis=(1, 2, 3)).tolist()
 
-    def _set(self, k: int, t: int, step: Step, names: Mapping[tuple[str, str], int]) -> None:
-        """Step k of series t; `names` are the places of the parameters."""
+    def _set(self, k: int, t: int, step: Step, columns: Mapping[tuple[str, str], int]) -> None:
+        """Set step k of series t; `columns` are those of the parameters."""
         observation, size = step.observation, len(step.y)
-        model, sensor = observation.measurement.model, observation.sensor
-        self._there[k, t] = True
+        sensor, names = observation.sensor, observation.measurement.model.components
         self._since_s[k, t] = step.since_s
         self._about[k, t], self._offset[k, t] = step.about, step.before - step.about
         self._predicted[k, t], self._after[k, t] = step.predicted, step.after
@@ -101,64 +93,51 @@ class Innovations:
         self._foreign[k, t, :size, :size] = observation.foreign
         if observation.tuned:
             self._axes[k, t, :size, :size] = observation.axes
-            if isinstance(model, ColouredNoiseMeasurement):
-                self._lasting[k, t] = names[sensor, "share"]
-                self._errors[k, t, range(size), model.columns] = 1.0
-            self._std[k, t, :size] = [names[sensor, model.components[place]] for place in observation.measured]
+            self._std[k, t, :size] = [columns[sensor, names[i]] for i in observation.measured]
         self._own[k, t, :size, :size] = observation.own
-        self._odds[k, t] = names[sensor, ""]
+        self._odds[k, t] = columns[sensor, ""]
         self._padding[k, t] -= size
-        size = len(step.assumed_innovation)
-        self._assumed_innovation[k, t, :size] = step.assumed_innovation
-        self._assumed_jacobian[k, t, :size] = step.assumed_jacobian
-        self._assumed_covariance[k, t, :size, :size] = step.assumed_covariance
+        y, H, R = step.assumed
+        self._assumed[0][k, t, : len(y)], self._assumed[1][k, t, : len(y)] = y, H
+        self._assumed[2][k, t, : len(y), : len(y)] = R
 
     def evaluate(self, values: FloatArray) -> Evaluation:
-        """The N innovations that count, at each row of `values`, (b, p)."""
+        """Return the N innovations that count, at each row of `values`, (b, p)."""
         num_steps, num_series = self._there.shape
         b, n = len(values), self._about.shape[-1]
         extended = np.concatenate([values, np.zeros((b, 1))], axis=1)
         d = self._y.shape[-1]
-        found = np.empty((num_steps, b, num_series))
+        log_likelihoods = np.empty((num_steps, b, num_series))
         ys, Ss = np.empty((num_steps, b, num_series, d)), np.empty((num_steps, b, num_series, d, d))
         x = np.zeros((b, num_series, n))
         P = np.broadcast_to(self._start, (b, *self._start.shape))
-        span = max(1, int(1e6 / (b * num_series * n * n)))
+        size = max(1, int(1e6 / (b * num_series * n * n)))
         for k in range(num_steps):
-            if k % span == 0:  # as many steps at once as fit into the cache
-                block = slice(k, k + span)
+            j = k % size
+            if j == 0:  # as many steps at once as fit into the cache
+                block = slice(k, k + size)
                 F, drift, Q = self._transitions(values, block)
-                stds = extended[:, self._std[block]]
-                rooted = self._axes[block] * stds[..., None, :]
-                lasting = extended[:, self._lasting[block]][..., None, None]
-                R = rooted @ rooted.mT / (1.0 + lasting) + self._own[block]
-                if self._any_lasts:
-                    gain = np.sqrt(lasting / (1.0 + lasting)) * rooted @ self._axes[block].mT
-                    H_all = self._H_fixed[block] + gain @ self._errors[block]
+                rooted = self._axes[block] * extended[:, self._std[block]][..., None, :]
+                R = rooted @ rooted.mT + self._own[block]
                 odds = extended[:, self._odds[block]]
-            j = k % span
             x = (F[:, j] @ x[..., None])[..., 0] + drift[:, j]
             P = propagated(F[:, j], P, Q[:, j])
             H = self._H[k]
             y = self._y[k] - (H @ x[..., None])[..., 0]
-            if self._any_lasts:
-                H = H_all[:, j]
-                at = x + self._predicted[k]
-                y = self._y[k] - (H @ at[..., None] - self._H[k] @ self._predicted[k][..., None])[..., 0]
             one = update(P, H, y, R[:, j], self._foreign[k], odds[:, j])
             x, P = x + one.step, one.covariance
-            found[k], ys[k], Ss[k] = one.log_likelihood, y, one.S
+            log_likelihoods[k], ys[k], Ss[k] = one.log_likelihood, y, one.S
             if self._has_assumed[k]:
-                H, R_assumed = self._assumed_jacobian[k], self._assumed_covariance[k]
+                y, H, R_assumed = (array[k] for array in self._assumed)
                 K, _ = kalman_gain(P, np.broadcast_to(H, (b, *H.shape)), R_assumed)
-                x = x + (K @ (self._assumed_innovation[k] - (H @ x[..., None])[..., 0])[..., None])[..., 0]
+                x = x + (K @ (y - (H @ x[..., None])[..., 0])[..., None])[..., 0]
                 P = joseph(P, K, H, R_assumed)
             x = x + (self._predicted[k] - self._after[k])
-        found += 0.5 * math.log(math.tau) * self._padding[:, None]
-        return Evaluation(*(array.swapaxes(0, 1)[:, self.counted] for array in (found, ys, Ss)))
+        log_likelihoods += 0.5 * math.log(math.tau) * self._padding[:, None]
+        return Evaluation(*(array.swapaxes(0, 1)[:, self.counted] for array in (log_likelihoods, ys, Ss)))
 
     def _transitions(self, values: FloatArray, block: slice) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """F, the change of the prediction against that of the reference, and Q of a block of steps, for each row.
+        """Return F, the change of the prediction against that of the reference, and Q of a block of steps, by row.
 
         White noise changes Q alone: then the first two have one row for all.
         """

@@ -1,4 +1,4 @@
-"""Which standard deviations are sought, and what they make of motion and measurements."""
+"""The standard deviations of a fit, and the motion model with them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from fgtrack.models.motion import MotionModel, WhiteNoise
 class NoiseSpace:
     """The parameters in one vector: noise of the motion, then of each sensor, then the share of its outliers.
 
-    All are positive. The share of an error that lasts is given by its odds, share / (1 - share).
+    All are positive.
     """
 
     motion_names: tuple[str, ...]
@@ -23,19 +23,13 @@ class NoiseSpace:
     deviations."""
     sensors: Mapping[str, tuple[str, ...]]
     """Components by sensor."""
-    lasting: tuple[str, ...] = ()
-    """Sensors whose errors are correlated in time."""
 
     @property
     def names(self) -> tuple[tuple[str, str], ...]:
-        """(sensor, component) of each standard deviation.
-
-        ("", name) for the motion, (sensor, "share") for what lasts of its errors, (sensor, "") for its outliers.
-        """
+        """(sensor, component) of each standard deviation; ("", name) for the motion, (sensor, "") for outliers."""
         motion = [("", name) for name in self.motion_names]
         stds = [(sensor, name) for sensor, components in self.sensors.items() for name in components]
-        shares = [(sensor, "share") for sensor in self.lasting]
-        return (*motion, *stds, *shares, *((sensor, "") for sensor in self.sensors))
+        return (*motion, *stds, *((sensor, "") for sensor in self.sensors))
 
     @property
     def num_motion(self) -> int:

@@ -26,19 +26,19 @@ class Observation:
     sensor: str
     measurement: Measurement
     measured: tuple[int, ...]
-    """Places of the d components that were measured."""
+    """Indices of the d components that were measured."""
     assumed: tuple[int, ...]
-    """Places of the others."""
+    """Indices of the others."""
     axes: FloatArray
     """T, shape (d, d): the axes of the sensor's standard deviations, seen from those of the measurement."""
     own: FloatArray
-    """Covariance that the detection came with, shape (d, d); 0 where the standard deviations hold."""
+    """Covariance to which the standard deviations do not apply, as that of the detection, shape (d, d); else 0."""
     foreign: FloatArray
     """Covariance of errors that are not the sensor's, as those of the ego pose, shape (d, d)."""
 
     @property
     def tuned(self) -> bool:
-        """True if the standard deviations of the sensor hold for it."""
+        """True if the standard deviations of the sensor apply."""
         return not self.own.any()
 
 
@@ -56,7 +56,7 @@ class Series:
     """States (n,) of a nominal trajectory at the start and at each of the first observations, about which these are
     linearised; empty where the filter is linearised at its own estimates from the start."""
     mixed: frozenset[int] = frozenset()
-    """Places of observations whose innovations have no part in the likelihood either; see `without_mixed`."""
+    """Indices of observations whose innovations have no part in the likelihood either; see `without_mixed`."""
 
     @property
     def num_initial(self) -> int:
@@ -69,7 +69,7 @@ class Series:
         return self.observations[self.num_initial - 1].measurement.stamp_ns if self.nominal else self.start.stamp_ns
 
     def initiated(self, motion: MotionModel, method: Initiation) -> "Series":
-        """With a nominal trajectory along the first positions, where `start` does not know the direction of travel.
+        """Return it with a nominal trajectory along the first positions, where `start` has no direction of travel.
 
         As in the tracker (see `TrackInitiation`): an EKF that starts in a wrong direction takes many seconds to turn,
         in which its innovations say nothing of the noise. Unchanged where no line leads through the positions.
@@ -98,6 +98,6 @@ class Series:
 
 
 def positive_part(matrix: FloatArray) -> FloatArray:
-    """The nearest positive semidefinite matrix to a symmetric `matrix`, shape (k, k)."""
+    """Return the nearest positive semidefinite matrix to a symmetric `matrix`, shape (k, k)."""
     values, vectors = np.linalg.eigh(symmetrise(matrix))
     return symmetrise(congruence(vectors, np.diag(np.maximum(values, 0.0))))
