@@ -29,7 +29,6 @@ def figure(
     runs: Annotated[list[Path], typer.Argument(help="Run folders, folders of run folders, or one sweep folder.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the pictures, or one .pdf.")],
     form: Annotated[Literal["png", "svg", "pdf"], typer.Option("--format", help="Format of the pictures.")] = "png",
-    track: Annotated[int | None, typer.Option(help="Track of the close-up, in the first run.")] = None,
     stamp: Annotated[float | None, typer.Option(help="Stamp of the close-up: s after the first tick.")] = None,
     width: Annotated[
         str | None,
@@ -55,7 +54,7 @@ def figure(
     paper = _paper(width, font, style)
     picture = out if one_file else out / f"figure.{form}"  # what else is in the folder stays
     with progress("draw"):
-        first, plans, missing = _of_sweep(runs, track, stamp) or _of_runs(runs, picture, track, stamp, paper)
+        first, plans, missing = _of_sweep(runs, stamp) or _of_runs(runs, picture, stamp, paper)
         named = chain(first, drawn(plans, every, **paper))
         if one_file:
             with new_file(out, overwrite) as file:
@@ -84,27 +83,27 @@ def _paper(width: str | None, font: str | None, style: str | None) -> Paper:
 _Figures = tuple[list[tuple[str, Figure]], list[Planned], DataError | None]  # the close-up, the others, why it is none
 
 
-def _of_sweep(folders: Sequence[Path], track: int | None, stamp: float | None) -> _Figures | None:
+def _of_sweep(folders: Sequence[Path], stamp: float | None) -> _Figures | None:
     """The figures of a sweep; None where `folders` are none."""
     sweeps = [folder for folder in folders if is_sweep(folder)]
     if not sweeps:
         return None
     if len(folders) > 1:
         raise CallError(f"{sweeps[0]}: is a sweep, which is drawn by itself: name it alone")
-    if track is not None or stamp is not None:
-        raise CallError(f"{sweeps[0]}: is a sweep, --track and --stamp choose a late detection of a run")
+    if stamp is not None:
+        raise CallError(f"{sweeps[0]}: is a sweep, --stamp chooses a late detection of a run")
     return [], planned_sweep(read_sweep(sweeps[0])), None
 
 
-def _of_runs(folders: Sequence[Path], out: Path, track: int | None, stamp: float | None, paper: Paper) -> _Figures:
+def _of_runs(folders: Sequence[Path], out: Path, stamp: float | None, paper: Paper) -> _Figures:
     found = evaluated(folders)
     check_apart(out, run_folders(found))
     if stamp is not None and not abs(stamp) <= LARGEST:
         raise CallError(f"--stamp {stamp}: is no time after the first tick, up to {LARGEST:g} s")
     stamp_ns = None if stamp is None else start_ns(found) + nanoseconds(stamp)
-    first, late = drawn_close_up(found, track, stamp_ns, **paper)
+    first, late = drawn_close_up(found, stamp_ns, **paper)
     missing = late if isinstance(late, DataError) else None
-    if missing is not None and (track is not None or stamp is not None):
+    if missing is not None and stamp is not None:
         raise missing
     return first, planned(found), missing
 

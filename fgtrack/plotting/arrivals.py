@@ -44,12 +44,7 @@ def arrivals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
 
     A line that crosses another was overtaken: it is out of sequence. The part shown is that in which the most
     detections were fused out of sequence; the fastest sensor sends twenty lists in it. Colours are the outcomes of the
-    detections.
-
-    Raises
-    ------
-    DataError
-        The run has no detections.
+    detections. Raises `DataError` if the run has no detections.
     """
     one = one_evaluated(run)
     updates = one.run.tables["updates"]

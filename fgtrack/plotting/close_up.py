@@ -74,19 +74,8 @@ def close_up(runs: Runs, close_ups: Sequence[CloseUp], **paper: Unpack[Paper]) -
     and after it. In a column of a paper all errors are in one plot. Without truth the estimate of the first run
     afterwards takes its role.
 
-    Parameters
-    ----------
-    runs
-        The runs.
-    close_ups
-        That of each run, of the same detection: `fgtrack.close_ups`.
-    **paper
-        `width`, `font`, `style`, `ax`.
-
-    Raises
-    ------
-    CallError
-        They are not as many, or of different detections.
+    `close_ups` are those of each run, of the same detection: `fgtrack.close_ups`. Raises `CallError` if they are not as
+    many, or of different detections.
     """
     every = evaluated(runs)
     if len(every) != len(close_ups) or len({one.arrival for one in close_ups}) != 1:

@@ -36,12 +36,7 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
 
     A consistent estimator is inside of the band at 95 % of the ticks, and around the expected value; above it the
     covariance is too small, below it too large. A dot is the NIS of a detection, the line the mean of several in a row
-    and the band that of this mean.
-
-    Raises
-    ------
-    DataError
-        The run has neither truth of its tracks nor innovations.
+    and the band that of this mean. Raises `DataError` if the run has neither truth of its tracks nor innovations.
     """
     one = one_evaluated(run)
     panels = _panels(one)
@@ -52,30 +47,29 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     sensors = np.unique(one.run.tables["updates"]["sensor"]).tolist()
     first_ns = start_ns([one])
     for axes, (name, (stamps_ns, values, dof)) in zip(rows, panels.items(), strict=True):
-        time_s = (stamps_ns - first_ns) / NS_PER_S
+        since_ns = stamps_ns - first_ns
         if name == _NEES:
-            distinct_ns, index, count = np.unique(stamps_ns, return_inverse=True, return_counts=True)
+            at_ns, index, count = np.unique(since_ns, return_inverse=True, return_counts=True)
             mean, mean_dof = (np.bincount(index, each) / count for each in (values, dof))
-            low, high = chi_square_band(mean_dof * count, count)
-            text = _summary("position", values, dof, (mean >= low) & (mean <= high), "ticks")
-            _draw(axes, distinct_ns, first_ns, mean, (low, high), mean_dof, run_looks([one])[one.label].colour, text)
+            band = chi_square_band(mean_dof * count, count)
+            colour = run_looks([one])[one.label].colour
+            text = _summary("position", values, dof, (mean >= band[0]) & (mean <= band[1]), "ticks")
         else:
             sensor = name.removeprefix("NIS of ")
             colour = sensor_colour(sensors.index(sensor))
             low, high = chi_square_band(dof.astype(np.float64), np.ones(len(dof), dtype=np.int64))
-            text = _summary(sensor, values, dof, (values >= low) & (values <= high), "detections")
             length = min(max(_SHORTEST, min(_LONGEST, len(values) // _WINDOWS)), len(values))
-            order = np.argsort(stamps_ns, kind="stable")
-            since_ns = stamps_ns[order] - first_ns
-            middle_ns, mean, mean_dof = (_means(each, length) for each in (since_ns, values[order], dof[order]))
-            band = chi_square_band(mean_dof * length, np.full(len(mean), length))
-            axes.plot(time_s, values, ".", ms=3.0, mew=0, color=colour, alpha=0.5, rasterized=True)
+            text = _summary(sensor, values, dof, (values >= low) & (values <= high), "detections")
             text += f"; line: mean of {length}"
-            _draw(axes, first_ns + middle_ns.astype(np.int64), first_ns, mean, band, mean_dof, colour, text)
+            order = np.argsort(since_ns, kind="stable")
+            middle_ns, mean, mean_dof = (_means(each[order], length) for each in (since_ns, values, dof))
+            at_ns, band = middle_ns.astype(np.int64), chi_square_band(mean_dof * length, np.full(len(mean), length))
+            axes.plot(since_ns / NS_PER_S, values, ".", ms=3.0, mew=0, color=colour, alpha=0.5, rasterized=True)
+        _draw(axes, at_ns, mean, band, mean_dof, colour, text)
+        shown = values[values > 0.0]  # the axis is logarithmic
+        if name != _NEES and len(shown):
             bottom, top = axes.get_ylim()
-            shown = values[values > 0.0]  # the axis is logarithmic
-            if len(shown):
-                axes.set_ylim(min(bottom, np.quantile(shown, 0.05)), max(top, np.quantile(shown, 0.99)))
+            axes.set_ylim(min(bottom, np.quantile(shown, 0.05)), max(top, np.quantile(shown, 0.99)))
         axes.set_ylabel(name.replace(" of ", " of\n").replace("_", " "))
         if axes is rows[0]:
             axes.fill_between([], [], color=GREY, alpha=0.25, lw=0, label="95 % band")
@@ -114,17 +108,16 @@ def has_squares(one: EvaluatedRun) -> bool:
 
 def _draw(
     axes: Axes,
-    stamps_ns: IntArray,
-    first_ns: int,
+    since_ns: IntArray,
     mean: FloatArray,
     band: tuple[FloatArray, FloatArray],
     expected: FloatArray,
     colour: str,
     text: str,
 ) -> None:
-    step_ns, time_s = usual_step_ns(stamps_ns), (stamps_ns - first_ns) / NS_PER_S
-    x_s, y = broken_line(stamps_ns, time_s, mean, step_ns)
-    low, high, middle = (broken_line(stamps_ns, time_s, each, step_ns)[1] for each in (*band, expected))
+    step_ns, time_s = usual_step_ns(since_ns), since_ns / NS_PER_S
+    x_s, y = broken_line(since_ns, time_s, mean, step_ns)
+    low, high, middle = (broken_line(since_ns, time_s, each, step_ns)[1] for each in (*band, expected))
     axes.fill_between(x_s, low, high, color=GREY, alpha=0.25, lw=0)
     axes.plot(x_s, y, color=colour, lw=1.1, label=text)
     axes.plot(x_s, middle, color="black", lw=0.9, ls="--")

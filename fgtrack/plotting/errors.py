@@ -46,21 +46,9 @@ def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> 
 
     The present states are solid or dashed, the final states of a smoother dotted. Each point is the root mean square
     over a sixtieth of the time shown. Lines are broken where nothing was tracked; quantities that the truth does not
-    hold are left out.
+    hold are left out. Without `object_id` the figure is of the only object, or all together.
 
-    Parameters
-    ----------
-    runs
-        One run or several.
-    object_id
-        The true object; without it the only one, or all together.
-    **paper
-        `width`, `font`, `style`, `ax`.
-
-    Raises
-    ------
-    DataError
-        No run has truth, or none of this object.
+    Raises `DataError` if no run has truth, or none of this object.
     """
     every = [one for one in evaluated(runs) if one.matching is not None]
     known = sorted({k for one in every if one.matching for k in one.matching.object_ids})
@@ -138,21 +126,8 @@ def lag(runs: Runs, quantity: str = "position_m", **paper: Unpack[Paper]) -> Fig
     """RMSE against the lag, a line for each run; level where a run has no lagged states.
 
     Of a track that ended there are no lagged states of its last moments, so the thin dotted line shows the present
-    states of the same tracks at the same stamps: the distance between the two is what waiting brings.
-
-    Parameters
-    ----------
-    runs
-        One run or several.
-    quantity
-        `position_m`, `speed_mps` or `yaw_rad`.
-    **paper
-        `width`, `font`, `style`, `ax`.
-
-    Raises
-    ------
-    DataError
-        No run has truth of this quantity.
+    states of the same tracks at the same stamps: the distance between the two is what waiting brings. `quantity` is
+    `position_m`, `speed_mps` or `yaw_rad`; raises `DataError` if no run has truth of it.
     """
     every = evaluated(runs)
     if quantity not in _QUANTITIES or not any(

@@ -33,9 +33,7 @@ _SETTLED = 20  # measurements of a track before which it moves for want of a goo
 _EARLY_S = 20.0  # what the choice is restricted to: the recording is replayed up to the detection for every run
 
 
-def close_ups(
-    runs: Sequence[Run | Path | str], track_id: int | None = None, stamp_ns: int | None = None
-) -> list[CloseUp]:
+def close_ups(runs: Sequence[Run | Path | str], stamp_ns: int | None = None) -> list[CloseUp]:
     """Return one late detection in slow motion, in each of `runs`: its track before and after it was fused.
 
     The detection is a typical one of those that lower the error of the first run's present, see `chosen`; `rule` of
@@ -46,8 +44,8 @@ def close_ups(
     ----------
     runs
         Runs of one recording, or their folders.
-    track_id, stamp_ns
-        Choose among the detections of one track of the first run, or the one with the nearest stamp.
+    stamp_ns
+        Choose the detection with the stamp nearest to this one.
 
     Raises
     ------
@@ -57,7 +55,7 @@ def close_ups(
         The first run fused no such detection, a run did not fuse it, or a recording is not there any more.
     """
     read = [run if isinstance(run, Run) else load_run(Path(run)) for run in runs]
-    arrival, rule = chosen(read, track_id, stamp_ns)
+    arrival, rule = chosen(read, stamp_ns)
     recordings = [(run.recording, run.config.get("input")) for run in read]
     same = recordings.count(recordings[0]) == len(read)
     recorded = tee(_recorded(read[0]), len(read)) if same else map(_recorded, read)  # a recording is read once
@@ -65,7 +63,7 @@ def close_ups(
 
 
 def drawn_close_up(
-    runs: Sequence[EvaluatedRun], track_id: int | None = None, stamp_ns: int | None = None, **paper: Unpack[Paper]
+    runs: Sequence[EvaluatedRun], stamp_ns: int | None = None, **paper: Unpack[Paper]
 ) -> tuple[list[tuple[str, Figure]], CloseUp | DataError]:
     """Return the named figure of `close_ups` and the first of these; no figure and the error where there is none.
 
@@ -73,7 +71,7 @@ def drawn_close_up(
     """
     same = by_recording(runs)[0]
     try:
-        found = close_ups([one.run for one in same], track_id, stamp_ns)
+        found = close_ups([one.run for one in same], stamp_ns)
     except DataError as error:
         return [], error
     return [("close_up", figure_of(same, found, **paper))], found[0]
@@ -93,18 +91,9 @@ def _recorded(run: Run) -> Iterator[Message]:
 def close_up_of(run: Run, arrival: Arrival, messages: Iterable[Message] | None = None) -> CloseUp:
     """Return the track of `run` that fused `arrival`, before and after: its recording is replayed up to there.
 
-    What came with the same tick before the list is processed first, by itself; what came after it is left out.
-
-    Parameters
-    ----------
-    messages
-        Those of the recording, where they have been read; None to read them.
-
-    Raises
-    ------
-    DataError
-        The recording, or a file that the configuration names, is not there any more; or it does not hold the
-        detection; or no track fused it.
+    `messages` are by default read from it. What came with the same tick before the list is processed first, by itself;
+    what came after it is left out. Raises `DataError` if the recording or a file that the configuration names is not
+    there any more, the recording does not hold the detection, or no track fused it.
     """
     try:
         config = validate(Config, run.config, str(run.config_path))
@@ -163,40 +152,21 @@ class _Late(NamedTuple):
     after_m: float
 
 
-def chosen(runs: Sequence[Run], track_id: int | None = None, stamp_ns: int | None = None) -> tuple[Arrival, str]:
+def chosen(runs: Sequence[Run], stamp_ns: int | None = None) -> tuple[Arrival, str]:
     """Return a typical out-of-sequence detection that every run fused, and a sentence with the rule of the choice.
 
     Of those that lower the error of the first run's present, it is the one with errors nearest to their root mean
     squares: before it in the first run, after it in all of them; nearest is the largest of the ratios. It is one of
     the first 20 s where there is any. Without truth it is the one that moves the present by the median. Ticks at which
-    a track fused several detections, and tracks with fewer than twenty, are left out.
-
-    Parameters
-    ----------
-    runs
-        Runs of one recording.
-    track_id
-        Only detections that this track of the first run fused; None for any.
-    stamp_ns
-        Choose the detection with the stamp nearest to this one instead.
-
-    Raises
-    ------
-    DataError
-        The runs have no such detection.
+    a track fused several detections, and tracks with fewer than twenty, are left out. With `stamp_ns` it is the one
+    with the nearest stamp. Raises `DataError` if there is none.
     """
     first, *others = (_late_detections(run) for run in runs)
-    common = [
-        one
-        for one in first
-        if all(one in other for other in others) and (track_id is None or first[one].track_id == track_id)
-    ]
+    common = [one for one in first if all(one in other for other in others)]
     if not common:
-        where, of = runs[0].path or "the run", "" if track_id is None else f" of track {track_id}"
-        if track_id is not None and track_id not in runs[0].tables["tracks"]["track_id"]:
-            raise DataError(f"{where}: has no track {track_id}")
         raise DataError(
-            f"{where}: no late detection{of} was fused by itself after {_SETTLED} others, so there is no close-up"
+            f"{runs[0].path or 'the run'}: no late detection was fused by itself after {_SETTLED} others, so there is "
+            "no close-up"
         )
     if stamp_ns is not None:
         return min(common, key=lambda one: abs(one.stamp_ns - stamp_ns)), "Chosen by its stamp."

@@ -78,13 +78,7 @@ class Paper(TypedDict, total=False):
 
 
 def inches(width: float | str) -> float:
-    """Return a width in inches.
-
-    Raises
-    ------
-    CallError
-        Not a width between 1.5 and 40 inches.
-    """
+    """Return a width in inches. Raises `CallError` if it is not a width between 1.5 and 40 inches."""
     text = str(width).strip()
     found = re.fullmatch(r"([0-9]+\.?[0-9]*|\.[0-9]+)\s*(in|cm|mm|pt|)", text)
     value = float(found[1]) * _UNITS_IN[found[2] or "in"] if found else math.nan
@@ -114,10 +108,7 @@ def is_column(paper: Mapping[str, Any]) -> bool:
 def settings(paper: Mapping[str, Any]) -> Any:  # Any: keys of rcParams are a Literal of all names
     """Return the rcParams of a figure on `paper`: the user's own, else those of fgtrack; then its style and font.
 
-    Raises
-    ------
-    CallError
-        The width, the style or the font is not usable.
+    Raises `CallError` if the width, the style or the font is not usable.
     """
     wanted = {**_STYLE, **(_COLUMN if is_column(paper) else {})}
     current: Any = mpl.rcParams

@@ -32,12 +32,8 @@ _DENSITIES = {"m": "1/m", "rad": "1/rad", "mps": "s/m"}
 def residuals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     """Residuals (innovations) per sensor, a row per component: over time, and how they are distributed.
 
-    Bins and axes cover the bulk of every sensor's residuals; the legend counts those outside.
-
-    Raises
-    ------
-    DataError
-        The run has no innovations.
+    Bins and axes cover the bulk of every sensor's residuals; the legend counts those outside. Raises `DataError` if the
+    run has no innovations.
     """
     one = one_evaluated(run)
     values, updates = innovations.residuals(one.run), one.run.tables["updates"]
@@ -66,14 +62,11 @@ def residuals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
             over_time.plot(time_s[mine], sample, ".", ms=3.0, alpha=0.6, mew=0, color=sensor_colour(k), label=label)
             density = np.histogram(sample, bins)[0] / (len(sample) * np.diff(bins))
             histogram.stairs(density, bins, orientation="horizontal", color=sensor_colour(k), lw=1.4)
-        over_time.set_ylim(low, high)
-        over_time.set_ylabel(_RESIDUALS[name])
-        histogram.set_xlabel(f"density [{_DENSITIES[name.rpartition('_')[2]]}]")
-        histogram.set_ylim(low, high)
+        over_time.set(ylim=(low, high), ylabel=_RESIDUALS[name], xlabel="time [s]" if name == names[-1] else "")
+        histogram.set(ylim=(low, high), xlabel=f"density [{_DENSITIES[name.rpartition('_')[2]]}]")
         histogram.tick_params(labelleft=False)
         over_time.sharex(rows[0][0])
         over_time.tick_params(labelbottom=name == names[-1])
-        over_time.set_xlabel("time [s]" if name == names[-1] else "")
         legend_above(over_time, 2.0 / 3.0, markerscale=3.0)
     sheet.title(titled(one.label, "innovations (measured minus predicted)"))
     return sheet.figure

@@ -197,10 +197,7 @@ def png(figure: Figure, dpi: float = 150.0) -> bytes:
 def save(figure: Figure, path: Path | str) -> Path:
     """Write `figure` as PNG, SVG or PDF, by the suffix, without date and version: equal figures, equal files.
 
-    Raises
-    ------
-    CallError
-        The suffix is none of these, or the file cannot be written.
+    Raises `CallError` if the suffix is none of these, or the file cannot be written.
     """
     path = Path(path)
     form = path.suffix.lower().removeprefix(".")

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -78,8 +78,6 @@ def sweep(
         The sweep or its folder.
     metric
         Column of sweep.csv.
-    **paper
-        `width`, `font`, `style`, `ax`.
 
     Raises
     ------
@@ -111,18 +109,10 @@ def sweep(
             mine = [one for one in means if one.estimator == estimator and tuple(one.point[k] for k in rest) == point]
             at = np.array([ticks[one.point[across] if names else ""] for one in mine])
             order = np.argsort(at, kind="stable")
-            axes.errorbar(
-                at[order] + _DODGE * width * (k - (len(estimators) - 1) / 2.0),  # so that bars do not hide each other
-                np.array([one.mean for one in mine])[order],
-                half_widths(mine)[order],
-                color=its.colour,
-                ls=its.line if are_numbers[across] else "none",
-                marker=its.marker,
-                ms=4,
-                lw=1.2,
-                capsize=3.0,
-                label=estimator if mine else "",
-            )
+            at = at[order] + _DODGE * width * (k - (len(estimators) - 1) / 2.0)  # so that bars do not hide each other
+            mean, line = np.array([one.mean for one in mine])[order], its.line if are_numbers[across] else "none"
+            given: dict[str, Any] = {"color": its.colour, "ls": line, "marker": its.marker, "ms": 4, "lw": 1.2}
+            axes.errorbar(at, mean, half_widths(mine)[order], capsize=3.0, label=estimator if mine else "", **given)
         axes.set_title("\n".join(f"{words(names[k])}: {c}" for k, c in zip(rest, point, strict=True)), loc="left")
         if metric in _EXPECTED:
             axes.axhline(_EXPECTED[metric], color="black", lw=0.9, ls="--", label="expected")
@@ -157,13 +147,8 @@ def sweep(
 def error_against_delay(table: SweepTable | Path | str | None = None, **paper: Unpack[Paper]) -> Figure:
     """Position error against the mean delay of a sensor, with 95 % intervals: what each method makes of late data.
 
-    Parameters
-    ----------
-    table
-        A sweep (or its folder) over delays alone, in seconds. By default the result of the shipped sweep
-        `error_against_delay`: a car, a LiDAR that is late and a RADAR, ten seeds; nothing is replayed.
-    **paper
-        `width`, `font`, `style`, `ax`.
+    `table` is a sweep (or its folder) over delays alone, in seconds; by default the result of the shipped sweep
+    `error_against_delay`: a car, a LiDAR that is late and a RADAR, ten seeds; nothing is replayed.
 
     Raises
     ------
@@ -188,18 +173,18 @@ def error_against_delay(table: SweepTable | Path | str | None = None, **paper: U
         (metric, name) for metric in (_POSITION, *waits) for name in dict.fromkeys(one.estimator for one in means)
     ]
     for metric, name in curves:
-        mine = [one for one in table.means(metric) if one.estimator == name]
+        mine = sorted(
+            (one for one in table.means(metric) if one.estimator == name), key=lambda one: number(one.point[0])
+        )
         if not mine:
             continue
-        mine.sort(key=lambda one: number(one.point[0]))
         delay_ms = np.array([1e3 * number(one.point[0]) for one in mine])
         mean, half, its = np.array([one.mean for one in mine]), half_widths(mine), look(name)
-        wait = (
-            "" if metric == _POSITION else f", output {metric.removeprefix('lagged.').partition('.errors')[0]} s later"
-        )
-        line, marker = (":", ".") if wait else (its.line, its.marker)
+        line, marker, label = its.line, its.marker, name
+        if metric != _POSITION:
+            line, marker, label = ":", ".", f"{name}, {metric_words(metric).partition(', ')[2]}"
         axes.fill_between(delay_ms, mean - half, mean + half, color=its.colour, alpha=0.18, lw=0)
-        axes.plot(delay_ms, mean, ls=line, marker=marker, ms=4, lw=1.6, color=its.colour, label=f"{name}{wait}")
+        axes.plot(delay_ms, mean, ls=line, marker=marker, ms=4, lw=1.6, color=its.colour, label=label)
     axes.set(
         xlabel=f"{words(table.shown_axes[0]).partition(' [')[0]}, mean [ms]",
         ylabel="position RMSE [m]",

@@ -22,10 +22,7 @@ _MS = 1e3
 def delays(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     """Share of the messages that has arrived against the delay from stamp to receipt, a line for each sensor.
 
-    Raises
-    ------
-    DataError
-        The run has no detections.
+    Raises `DataError` if the run has no detections.
     """
     one = one_evaluated(run)
     if not one.run.tables["updates"].num_rows:
@@ -36,7 +33,6 @@ def delays(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         spread = Distribution.of(_MS * delay_s)
         label = f"{sensor}: mean {spread.mean:.0f} ms, 90 % within {spread.p90:.0f} ms, all within {spread.max:.0f} ms"
         axes.ecdf(_MS * delay_s, color=sensor_colour(k), lw=1.6, label=label)
-        axes.plot(spread.p90, 0.9, "o", ms=4, color=sensor_colour(k))
     axes.set(xlabel="delay from stamp to receipt [ms]", ylabel="share of the messages received")
     axes.margins(x=0.02)
     legend_above(axes)
@@ -45,7 +41,7 @@ def delays(run: OneRun, **paper: Unpack[Paper]) -> Figure:
 
 
 def sensor_delays(run: Run) -> dict[str, tuple[IntArray, FloatArray]]:
-    """Receipt in ns and delay in s of the messages of every sensor, see `message_delays`."""
+    """Return receipt in ns and delay in s of the messages of every sensor, see `message_delays`."""
     sensors = run.tables["updates"]["sensor"]
     return {name: message_delays(run.tables["updates"].where(sensors == name)) for name in np.unique(sensors).tolist()}
 
@@ -54,10 +50,7 @@ def sensor_delays(run: Run) -> dict[str, tuple[IntArray, FloatArray]]:
 def timing(runs: Runs, **paper: Unpack[Paper]) -> Figure:
     """Share of the ticks with detections that are done within a wall time, a line for each run.
 
-    Raises
-    ------
-    DataError
-        No run has a tick with detections.
+    Raises `DataError` if no run has a tick with detections.
     """
     every = evaluated(runs)
     if not any((one.run.tables["timing"]["num_detections"] > 0).any() for one in every):

@@ -138,7 +138,7 @@ def test_the_command_draws_it_and_goes_on_without_a_recording(
         assert "no close-up:" in capsys.readouterr().out
         assert not (tmp_path / "rest/close_up.png").exists()
         assert (tmp_path / "rest/timing.png").exists()
-        assert command(["figure", runs[0], "-o", str(tmp_path / "none"), "--track", "0"]) == 1
+        assert command(["figure", runs[0], "-o", str(tmp_path / "none"), "--stamp", "4"]) == 1
         assert "recording of the run is not there" in capsys.readouterr().err
     finally:
         (tmp_path / "drive.jsonl").rename(folder / "drive.jsonl")

@@ -34,7 +34,6 @@ EXPECTED: dict[str, tuple[bool, set[str], list[str]]] = {
             "object 8, truth",
             "object 8, track",
             "paired with no object",
-            "close-up",
         ],
     ),
     "residuals": (
@@ -215,10 +214,10 @@ def circle_map(path: Path) -> Path:
 
 def test_the_map_shows_the_bounds_of_the_track(tmp_path: Path) -> None:
     run = a_run(tmp_path / "run", config_text=f"map:\n  track: {circle_map(tmp_path / 'map.csv')}\n")
-    axes, _ = plot.map(run).axes
+    (axes,) = plot.map(run).axes
     radii = [float(np.hypot(*np.asarray(line.get_data())).mean()) for line in axes.lines[:2]]
     assert radii == pytest.approx([292.5, 307.5], abs=0.5)
-    west, west_track, *_, wrong, _ = [line.get_color() for line in axes.lines[2:]]
+    west, west_track, *_, wrong = [line.get_color() for line in axes.lines[2:]]
     assert west == west_track != wrong == WRONG
 
 
