@@ -13,7 +13,7 @@ from fgtrack.core.geometry import cartesian
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.matching import confirmed
-from fgtrack.evaluation.scores.innovations import autocorrelations, num_measured
+from fgtrack.evaluation.scores.innovations import autocorrelation, num_measured
 from fgtrack.evaluation.scores.statistics import ChiSquareMean
 from fgtrack.io.run import Run, Table
 from fgtrack.models.measurement import ANGULAR
@@ -119,14 +119,13 @@ def noise_diagnostics(run: Run) -> list[Diagnostic]:
 
 
 def innovation_lag1(run: Run, sensor: str) -> float | None:
-    """Autocorrelation of the position innovations of a sensor at lag 1; None where no track has enough of them.
+    """Return the autocorrelation of the innovations of a sensor at lag 1; near 0 where white and the noise is tuned.
 
-    It is near 0 where its errors are white and the noise is consistent. Of a sensor without positions it is that of the
-    first component.
+    None where no track has enough of them.
     """
     updates = run.tables["updates"]
-    first = next(iter(autocorrelations(updates.where(updates["sensor"] == sensor)).values()), None)
-    return None if first is None else first.lag1
+    white = autocorrelation(updates.where(updates["sensor"] == sensor))
+    return None if white is None else white.lag1
 
 
 def misfits(run: Run) -> Iterator[tuple[str, ChiSquareMean]]:

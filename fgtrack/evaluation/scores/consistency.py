@@ -8,7 +8,7 @@ import numpy as np
 from fgtrack.core.types import YAW, FloatArray, IntArray
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, mean_square
 from fgtrack.evaluation.matching import Matching, state_errors
-from fgtrack.evaluation.scores.innovations import Autocorrelation, autocorrelations, num_measured
+from fgtrack.evaluation.scores.innovations import Autocorrelation, autocorrelation, num_measured
 from fgtrack.evaluation.scores.statistics import ChiSquareMean
 from fgtrack.evaluation.truth import TRUE_STATE
 from fgtrack.io.run import Run, Table
@@ -35,8 +35,8 @@ class Consistency:
     """Of the present x, y, yaw, speed and yaw rate; without the yaw rate where truth or the model has none."""
     nis: Mapping[str, ChiSquareMean]
     """By sensor."""
-    autocorrelation: Mapping[str, Mapping[str, Autocorrelation]]
-    """By sensor and innovation, see `autocorrelations`."""
+    autocorrelation: Mapping[str, Autocorrelation | None]
+    """By sensor."""
     position_nees_interval: Estimate = UNKNOWN
     """Mean of `position_nees` with the interval of correlated errors, see `mean_square`."""
 
@@ -50,7 +50,7 @@ def consistency(run: Run, matching: Matching | None) -> Consistency:
         position_nees=ChiSquareMean(),
         state_nees=ChiSquareMean(),
         nis={name: ChiSquareMean.of(updates["nis"][mine], measured[mine]) for name, mine in sensors.items()},
-        autocorrelation={name: autocorrelations(updates.where(mine)) for name, mine in sensors.items()},
+        autocorrelation={name: autocorrelation(updates.where(mine)) for name, mine in sensors.items()},
     )
     if matching is None or not matching.paired.any():
         return found

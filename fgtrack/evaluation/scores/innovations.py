@@ -19,32 +19,20 @@ from fgtrack.models.measurement import ANGULAR
 RESIDUAL_NAMES = ("along_m", "across_m", *MEASURABLE)
 #: Residuals of table I of Karle et al. 2023: x_loc, y_loc, psi and v.
 LOCAL_NAMES = ("along_m", "across_m", "yaw_rad", "speed_mps")
-LAGS = 10
-"""Highest lag examined."""
 FEWEST = 20
 """A track with fewer innovations of the sensor is left out: the band is that of a large sample."""
 
 _TRACK_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps")
-#: Innovations that are taken together, as a vector; the others are scalars.
-_GROUPS: Mapping[str, tuple[str, ...]] = {
-    "position_m": ("x_m", "y_m"),
-    **{name: (name,) for name in MEASURABLE if name not in ("x_m", "y_m")},
-}
 
 
 @dataclass(frozen=True)
 class Autocorrelation:
-    """Autocorrelation of the innovations of one sensor, over all tracks that have at least `FEWEST` of them."""
+    """Autocorrelation of the innovations of one sensor at lag 1, of the tracks with at least `FEWEST` of them."""
 
-    tracks: int
-    count: int
-    """Number of these tracks and of their innovations."""
     lag1: float
-    """Normalised autocorrelation at lag 1, between -1 and 1 and 0 on average for white innovations."""
+    """Normalised: between -1 and 1, and 0 on average for white innovations."""
     lag1_band: float
     """Half-width of its 95 % interval for white innovations."""
-    share_outside: float
-    """Share of the tracks and lags 1 to `LAGS` outside their own bands; 0.05 on average for white innovations."""
 
 
 def moments_of(name: str, values: FloatArray) -> Moments:
@@ -99,37 +87,33 @@ def message_delays(updates: Table) -> tuple[IntArray, FloatArray]:
     return messages[:, 0], (messages[:, 0] - messages[:, 1]) / NS_PER_S
 
 
-def autocorrelations(updates: Table) -> dict[str, Autocorrelation]:
-    """Autocorrelation of the innovations in `updates` of one sensor: of the position and of every other component.
+def autocorrelation(updates: Table) -> Autocorrelation | None:
+    """Return the autocorrelation of the innovations in `updates` of one sensor; None where no track has enough of them.
 
-    Along a track, in the order of processing, the innovations nu of n updates have at lag l the normalised
-    autocorrelation
+    It is that of the positions, of a sensor without them that of the first component. Along a track, in the order of
+    processing, the innovations nu of n updates have at lag 1 the normalised autocorrelation
 
-        rho(l) = sum_k nu(k)' nu(k + l) / sum_k nu(k)' nu(k).
+        rho = sum_k nu(k)' nu(k + 1) / sum_k nu(k)' nu(k).
 
     Without correlation the products of the numerator have mean 0 and do not depend on each other, so its variance is
-    the sum of their squares: the band is 1.96 sqrt(sum_k (nu(k)' nu(k + l))^2) / sum_k nu(k)' nu(k), whatever
+    the sum of their squares: the band is 1.96 sqrt(sum_k (nu(k)' nu(k + 1))^2) / sum_k nu(k)' nu(k), whatever
     becomes of the covariance of the innovations along the track. Where that is constant and nu a number, this is the
     1.96 / sqrt(n) of Bar-Shalom, Li, Kirubarajan 2001, section 5.4.
     """
-    found = {}
-    for group, names in _GROUPS.items():
+    for names in (("x_m", "y_m"), *((name,) for name in MEASURABLE if name not in ("x_m", "y_m"))):
         innovations = np.stack([updates[f"res_{name}"] for name in names], axis=-1)
         known = np.isfinite(innovations).all(axis=1) & (updates["track_id"] != NO_TRACK)
-        ids = updates["track_id"][known]
-        tracks, counts = np.unique(ids, return_counts=True)
-        enough = counts >= FEWEST
-        sums = np.array([_sums(innovations[known][ids == track_id]) for track_id in tracks[enough].tolist()])
-        if len(sums) and sums[:, 0, 0].all():
-            energy, numerators, deviations = sums[:, 0, 0], sums[:, 0, 1:], np.sqrt(sums[:, 1, 1:])
-            found[group] = Autocorrelation(
-                tracks=len(sums),
-                count=int(counts[enough].sum()),
-                lag1=float(numerators[:, 0].sum() / energy.sum()),
-                lag1_band=NORMAL_95 * math.sqrt(np.square(deviations[:, 0]).sum()) / float(energy.sum()),
-                share_outside=float((np.abs(numerators) > NORMAL_95 * deviations).mean()),
-            )
-    return found
+        ids, counts = np.unique(updates["track_id"][known], return_counts=True)
+        energy = product = square = 0.0
+        for track_id in ids[counts >= FEWEST].tolist():
+            nu = innovations[known & (updates["track_id"] == track_id)]
+            products = np.einsum("ni,ni->n", nu[:-1], nu[1:])
+            energy += float(np.square(nu).sum())
+            product += float(products.sum())
+            square += float(np.square(products).sum())
+        if energy > 0.0:
+            return Autocorrelation(product / energy, NORMAL_95 * math.sqrt(square) / energy)
+    return None
 
 
 def track_states(run: Run, wanted: BoolArray) -> FloatArray:
@@ -152,11 +136,3 @@ def track_states(run: Run, wanted: BoolArray) -> FloatArray:
             values = tracks[name][rows]
             states[mine, column] = np.interp(asked, known, np.unwrap(values) if name in ANGULAR else values)
     return states
-
-
-def _sums(innovations: FloatArray) -> FloatArray:
-    """Sums over k of nu(k)' nu(k + l) and of its square at the lags l = 0, 1, ..., `LAGS`, shape (2, `LAGS` + 1)."""
-    padded = np.concatenate([innovations, np.zeros((LAGS, innovations.shape[1]))])
-    later = np.lib.stride_tricks.sliding_window_view(padded, LAGS + 1, axis=0)
-    products = np.einsum("ni,nil->nl", innovations, later)
-    return np.stack([products.sum(axis=0), np.square(products).sum(axis=0)])

@@ -97,32 +97,29 @@ def _final(run: Run) -> Table:
 def _with_truth(run: Run, matching: Matching, states: Table) -> tuple[Table, FloatArray, IntArray]:
     """Return those of `states` that belong to an object, its true states there, shape (n, 5), and their track rows."""
     rows = _rows_at(matching, states)
-    alive = rows != _NO_ROW
-    states, rows = states.where(alive), rows[alive]
     truth = np.full((len(rows), len(TRUE_STATE)), np.nan)
     for index, path in enumerate(true_paths(run.tables["truth"])):
-        mine = matching.object_index[rows] == index
+        mine = (rows != _NO_ROW) & (matching.object_index[rows] == index)
         truth[mine] = path.at(states["stamp_ns"][mine])
-    known = np.isfinite(truth[:, 0]) & np.isfinite(states["x_m"])  # the truth of a row without a pair is not known
+    known = np.isfinite(truth[:, 0]) & np.isfinite(states["x_m"])
     return states.where(known), truth[known], rows[known]
 
 
 def _rows_at(matching: Matching, states: Table) -> IntArray:
-    """The row of each state's track that is nearest in stamp, shape (n,); `_NO_ROW` outside of its life."""
-    found = np.full(states.num_rows, _NO_ROW)
-    tracks, track_ids = matching.tracks, states["track_id"]
+    """Row of each state's track that is nearest in stamp, shape (n,); `_NO_ROW` outside of its life."""
+    nearest, tracks = np.full(states.num_rows, _NO_ROW), matching.tracks
     order = np.lexsort((tracks["stamp_ns"], tracks["track_id"]))
     ids = tracks["track_id"][order]
-    for track_id in np.intersect1d(track_ids, ids).tolist():
+    for track_id in np.intersect1d(states["track_id"], ids).tolist():
         rows = order[slice(*np.searchsorted(ids, (track_id, track_id + 1)).tolist())]
-        mine = np.flatnonzero(track_ids == track_id)
-        stamps_ns, wanted_ns = tracks["stamp_ns"][rows], states["stamp_ns"][mine]
-        right = np.searchsorted(stamps_ns, wanted_ns).clip(max=len(rows) - 1)
+        stamps_ns = tracks["stamp_ns"][rows]
+        alive = (states["stamp_ns"] >= stamps_ns[0]) & (states["stamp_ns"] <= stamps_ns[-1])
+        mine = np.flatnonzero((states["track_id"] == track_id) & alive)
+        wanted_ns = states["stamp_ns"][mine]
+        right = np.searchsorted(stamps_ns, wanted_ns)
         left = (right - 1).clip(min=0)
-        nearest = np.where(wanted_ns - stamps_ns[left] < stamps_ns[right] - wanted_ns, left, right)
-        alive = (wanted_ns >= stamps_ns[0]) & (wanted_ns <= stamps_ns[-1])
-        found[mine[alive]] = rows[nearest[alive]]
-    return found
+        nearest[mine] = rows[np.where(wanted_ns - stamps_ns[left] < stamps_ns[right] - wanted_ns, left, right)]
+    return nearest
 
 
 def _moments(errors: Mapping[str, FloatArray]) -> dict[str, Moments]:

@@ -229,10 +229,6 @@ class Table:
         body = "".join(f"<tr>{row}</tr>\n" for row in rows)
         return f"<thead><tr>{''.join(head)}</tr></thead>\n<tbody>\n{body}</tbody>\n"
 
-    def _repr_html_(self) -> str:
-        notes = "".join(f"<li>{escape(note)}</li>" for note in self.shown_notes)
-        return f"<table><caption>{escape(printable(self.title))}</caption>{self.to_html()}</table><ul>{notes}</ul>"
-
     def __str__(self) -> str:
         return _text(self)
 
@@ -318,10 +314,6 @@ class Tables(Mapping[str, DataFrame]):
 
     def __repr__(self) -> str:
         return f"Tables({', '.join(self.tables)})"
-
-    def _repr_html_(self) -> str:
-        verdict = "".join(f"<li>{escape(printable(line))}</li>" for line in self.verdict)
-        return f"<ul>{verdict}</ul>" * bool(verdict) + "".join(table._repr_html_() for table in self._filled())
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         yield from bulleted(self.verdict, options.max_width)

@@ -18,10 +18,9 @@ from fgtrack.evaluation.diagnostics import USED
 from fgtrack.evaluation.intervals import UNKNOWN
 from fgtrack.evaluation.metrics import FALSE_TRACK_SHARE, Metrics, ObjectMetrics, TruthMetrics
 from fgtrack.evaluation.runs import OneRun, evaluated
-from fgtrack.evaluation.scores.innovations import FEWEST, LAGS, RESIDUAL_NAMES, Autocorrelation
+from fgtrack.evaluation.scores.innovations import FEWEST, RESIDUAL_NAMES
 from fgtrack.evaluation.scores.lagged import WINDOW
 from fgtrack.evaluation.scores.multi_object import MultiObjectMetrics
-from fgtrack.evaluation.scores.statistics import ChiSquareMean
 from fgtrack.evaluation.tables import MS, PERCENT, RUN, Column, Record, Table, Tables, named
 from fgtrack.evaluation.tables.streaming import streaming_tables
 from fgtrack.evaluation.tables.verdict import verdict
@@ -256,19 +255,14 @@ def _consistency(metrics: Mapping[str, Metrics]) -> Table:
     """A row for each run and normalised square: NEES of the present states, NIS and whiteness of every sensor."""
     records = []
     for label, one in metrics.items():
-        found = one.consistency
-        squares: dict[str, tuple[ChiSquareMean, Autocorrelation | None]] = {
-            "NEES position": (found.position_nees, None),
-            "NEES state": (found.state_nees, None),
-        }
-        for sensor, nis in found.nis.items():
-            squares[f"NIS {sensor}"] = nis, next(iter(found.autocorrelation[sensor].values()), None)
-        for name, (square, white) in squares.items():
+        of = one.consistency
+        squares = {"NEES position": of.position_nees, "NEES state": of.state_nees}
+        squares |= {f"NIS {sensor}": nis for sensor, nis in of.nis.items()}
+        for name, square in squares.items():
             record: dict[str, Any] = {"run": label, "of": name, "num_samples": square.count, "mean": square.mean}
             record |= {"expected": square.dof, "band_low": square.band[0], "band_high": square.band[1]}
-            if white is not None:
-                record |= {"lag1_correlation": white.lag1, "lag1_band": white.lag1_band}
-                record["share_outside"] = white.share_outside
+            white = of.autocorrelation.get(name.removeprefix("NIS "))
+            record |= {} if white is None else {"lag1_correlation": white.lag1, "lag1_band": white.lag1_band}
             records += [record] if square.count else []
     columns = [
         RUN,
@@ -278,13 +272,11 @@ def _consistency(metrics: Mapping[str, Metrics]) -> Table:
         Column("expected"),
         Column("95 % band", "band_low band_high", "{} to {}"),
         Column("correlation\nat lag 1", "lag1_correlation lag1_band", "{} ± {}"),
-        Column("outside\n[%]", "share_outside", scale=PERCENT),
     ]
     notes = [
         "band: of the mean of independent samples; errors along one run are correlated,",
         "so the NEES of a single run may leave it (average over several runs)",
         f"correlation: of innovations, tracks with {FEWEST}+ of them; ± 95 % band if white",
-        f"outside: share of tracks and lags 1 to {LAGS} outside their bands; 5 if white",
     ]
     title = "Consistency (mean NEES and NIS, and their expected values)"
     return Table(title, records, columns, ("run", "of"), notes, is_detail=True)
