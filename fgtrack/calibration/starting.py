@@ -141,7 +141,7 @@ def table_parts(recording: Path) -> tuple[list[Part], list[str]]:
     parts: list[Part] = []
     left: list[str] = []
     for file, columns in headers(recording).items():
-        cells = [one.values for one in islice(rows(file), 1, _ROWS)]
+        cells = [cells for _, cells in islice(rows(file), 1, _ROWS)]
         for value, column, group in _groups(columns, cells):
             part, why = _table(file, recording, [name for name in columns if name != column], group, value)
             if part is None:

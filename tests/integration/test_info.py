@@ -55,7 +55,7 @@ def test_times_and_angles_in_another_unit_are_pointed_out(tmp_path):
     seconds = [EgoState(1_700_000_000 + k // 100, 1_700_000_000 + k // 100, k, 0.0, 67.0, 1.0) for k in range(900)]
     write_stream(tmp_path / "s.jsonl", seconds)
     by_time, by_angle = map(str, describe(tmp_path / "s.jsonl").cautions)
-    assert by_time.startswith("ego: 900 times within 8e-09 s, which no sensor sends: they are not in nanoseconds, they")
+    assert by_time.startswith("ego: 900 times within 8e-09 s, which no sensor sends: they are not in ns, they")
     assert by_time.endswith("look like s since 1970")
     assert by_angle.startswith("ego: yaw_rad goes up to 67: degrees?")
     clocks = [EgoState(0, 0, 0.0, 0.0, 0.0, 0.0), DetectionList("radar", START_NS, START_NS, ())]

@@ -7,10 +7,9 @@ import pytest
 
 from fgtrack.core.types import Detection
 from fgtrack.io.adapters import ADAPTERS
-from fgtrack.io.adapters.common import yaw_rad
+from fgtrack.io.adapters.common import object_id, yaw_rad
 from fgtrack.io.adapters.ego import ego_from_odometry
 from fgtrack.io.adapters.fields import FieldError, ego_by_fields, objects_by_fields
-from fgtrack.io.adapters.ids import object_id
 from fgtrack.io.config import Field, Filter
 
 
@@ -339,13 +338,13 @@ def test_what_describes_an_object_is_read_by_paths_and_places_in_lists():
     }
     (found,) = objects_by_fields(item, fields).objects
     assert found == Detection(class_name="bus", score=0.7, length_m=12.0, width_m=2.5, object_id=object_id("bus-12"))
-    with pytest.raises(FieldError, match=r"results\.1\.name: leads nowhere, there is no '1'"):
+    with pytest.raises(FieldError, match=r"results\.1\.name: there is no '1'"):
         objects_by_fields(item, {"class_name": "results.1.name"})
 
 
 def test_a_wrong_path_names_what_there_is():
     item = Detection(x_m=1.0)
-    with pytest.raises(FieldError, match=r"x: leads nowhere, there is no 'x', but x_m, y_m, yaw_rad, .*\.\.\."):
+    with pytest.raises(FieldError, match=r"x: there is no 'x', but x_m, y_m, yaw_rad, "):
         objects_by_fields(item, {"x_m": "x"})
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
-from fgtrack.io.adapters.ids import object_id
+from fgtrack.io.adapters.common import object_id
 from fgtrack.io.adapters.nuscenes import _motion
 from fgtrack.io.config import InputConfig, NuscenesInput
 from fgtrack.io.source import input_kind, open_input

@@ -9,7 +9,7 @@ from support.messages import drive, exact
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
-from fgtrack.io.adapters.ids import object_id
+from fgtrack.io.adapters.common import object_id
 from fgtrack.io.config import CsvInput, CsvTable, Field, Filter, InputConfig
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.source import input_kind, open_input
@@ -24,7 +24,7 @@ RADAR_TEXT = "t,seen,x,y\n1.0,1.1,30,2\n1.0,1.1,40,-2\n1.05,1.15,31,2\n"
 
 def write(folder: Path, **files: str) -> Path:
     for name, text in files.items():
-        (folder / f"{name}.csv").write_text(text)
+        (folder / f"{name}.csv").write_text(text, errors="surrogateescape")
     return folder
 
 
@@ -148,14 +148,15 @@ def test_a_drive_survives_csv_to_the_bit(tmp_path):
     ("text", "complaint"),
     [
         ("t,seen,x\n1,1,2\n", r"radar\.csv:1: has no column 'y', but t, seen, x"),
-        ("t,seen,x,y,x\n", r"radar\.csv:1: has the column 'x' twice"),
-        (RADAR_TEXT + "2,2,far,1\n", r"radar\.csv:5: x: 'far' is no number"),
+        ("t,seen,x,y,x\n", r"radar\.csv:1: has a column twice: t, seen, x, y, x"),
+        (RADAR_TEXT + "2,2,far,1\n", r"radar\.csv:5: x: 'far' is not a number"),
         (RADAR_TEXT + "noon,2,1,1\n", r"radar\.csv:5: t: 'noon' is not a time"),
         (RADAR_TEXT + "1e999999999,2,1,1\n", r"radar\.csv:5: t: '1e999999999' is not a time"),
         (RADAR_TEXT + "nan,2,1,1\n", r"radar\.csv:5: t: 'nan' is not a time"),
         (RADAR_TEXT + "1e15,2,1,1\n", r"radar\.csv:5: t: 1e15 s is beyond the year 2096: set `time_unit: us`"),
         (RADAR_TEXT + "2,2,1\n", r"radar\.csv:5: has 3 cells, the header has 4"),
-        (RADAR_TEXT + '2,2,"' + "1" * 200_000 + '",1\n', r"radar\.csv:5: is no CSV"),
+        (RADAR_TEXT + '2,2,"' + "1" * 200_000 + '",1\n', r"radar\.csv:5: is not CSV"),
+        (RADAR_TEXT + "2,2,\udcff,1\n", r"radar\.csv:5: x: '.' is not a number"),
         ("", r"radar\.csv:1: has no column 't'"),
     ],
 )
@@ -180,13 +181,13 @@ def test_a_damaged_file_is_one_line_and_what_is_before_it_is_replayed(tmp_path, 
         (
             "ns",
             [f"{1_700_000_000 + 0.05 * k:.2f}" for k in range(30)],
-            r"radar\.csv:2: t: 1700000000\.00 .*`time_unit: s`",
+            r"radar\.csv:2: t: .*look like s since 1970: change `time_unit`",
         ),
-        ("ms", [f"{1_700_000_000 + 0.05 * k:.2f}" for k in range(30)], r"radar\.csv:2: t: .*set `time_unit: s`"),
+        ("ms", [f"{1_700_000_000 + 0.05 * k:.2f}" for k in range(30)], r"radar\.csv:2: t: .*look like s since"),
         (
             "ns",
             [f"{0.05 * k:.2f}" for k in range(100)],
-            r"radar\.csv:2: t: 0\.00 .*change `time_unit` \(input\.csv\.detec",
+            r"radar\.csv:2: t: .*change `time_unit` \(input\.csv\.detec",
         ),
         ("s", [f"{1_700_000_000_000 + 50 * k}" for k in range(30)], r"radar\.csv:2: t: .*2096: set `time_unit: ms`"),
         ("us", [f"{1_700_000_000_000_000_000 + 50 * k}" for k in range(3)], r"radar\.csv:2: t: .*set `time_unit: ns`"),
@@ -216,17 +217,14 @@ def test_an_angle_of_many_turns_is_not_wrapped_as_it_may_be_in_degrees(tmp_path)
     assert (north, south) == pytest.approx((math.radians(80.0), math.radians(160.0)))
 
 
-def test_a_byte_that_is_no_text_is_one_line(tmp_path):
-    (tmp_path / "radar.csv").write_bytes(RADAR_TEXT.encode() + b"2,2,\xff,1\n")
-    with pytest.raises(DataError, match=r"radar\.csv: is no UTF-8 text"):
-        messages(tmp_path, detections={"radar": RADAR})
-
-
 @pytest.mark.parametrize(
     ("tables", "complaint"),
     [
         ({}, r"name its columns in input\.csv: radar\.csv has t, seen, x, y"),
-        ({"ego": CsvTable({"stamp": "t"}, "radar.csv")}, r"input\.csv\.ego\.columns: must name x_m"),
+        (
+            {"ego": CsvTable({"stamp": "t"}, "radar.csv")},
+            r"input\.csv\.ego\.columns: must name speed_mps, x_m, y_m, yaw_rad",
+        ),
         (
             {"detections": {"radar": CsvTable({"x_m": "x"}, "radar.csv")}},
             r"input\.csv\.detections\.radar.*must name stamp",
@@ -236,15 +234,7 @@ def test_a_byte_that_is_no_text_is_one_line(tmp_path):
             "unknown column 'speed', known",
         ),
         ({"detections": {"radar": CsvTable({"stamp": "t", "score": "x"}, "radar.csv")}}, "must name what is measured"),
-        (
-            {"detections": {"radar": CsvTable({"stamp": ["t", "x"], "x_m": "x"}, "radar.csv")}},
-            "the name of one column is needed",
-        ),
         ({"detections": {"radar": CsvTable({"stamp": "t", "x_m": "x"})}}, "is a folder, so .* must name its file"),
-        (
-            {"detections": {"radar": CsvTable({"stamp": "t", "x_m": "x"}, "lidar.csv")}},
-            r"lidar\.csv: there is no such file",
-        ),
     ],
 )
 def test_a_mapping_that_does_not_fit_is_one_line(tmp_path, tables, complaint):

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from hashlib import blake2b
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from fgtrack.core.types import MEASURABLE, Detection, FloatArray, Frame
 
 #: Places of x, y and the rotation about z in a covariance of ROS.
 PLANAR = [0, 1, 5]
+
+_INT64 = range(-(1 << 63), 1 << 63)
 
 # A message is known by its attributes only: its class is made when a recording is read.
 RosMessage = Any
@@ -38,6 +41,17 @@ def split(found: Iterable[Detection | str]) -> tuple[tuple[Detection, ...], tupl
     every = tuple(found)
     left_out = tuple(one for one in every if isinstance(one, str))
     return tuple(one for one in every if not isinstance(one, str)), left_out
+
+
+def object_id(value: object) -> int | None:
+    """`value` as an id: an integer, or its text, as it is; of other text a reproducible number; None of an empty text.
+
+    Numbers are below 2^53, so that a table of floats holds them; a thousand names clash once in 5e8 data sets.
+    """
+    text = str(value).strip()
+    if text.removeprefix("-").isdecimal() and text.isascii() and len(text) < 20 and int(text) in _INT64:
+        return int(text)
+    return int.from_bytes(blake2b(text.encode(errors="replace"), digest_size=6).digest(), "big") if text else None
 
 
 def stamp_ns(time: RosMessage) -> int:

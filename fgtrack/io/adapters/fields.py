@@ -1,7 +1,8 @@
-"""Messages of any type, read by the paths that the configuration gives to their fields."""
+"""Mapped fields: components of messages and tables, read by the paths that the configuration gives them."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -9,54 +10,107 @@ import numpy as np
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import DESCRIBING, MEASURABLE, STATE_NAMES, Detection, EgoState
-from fgtrack.io.adapters.common import ObjectList, RosMessage, frame_of, stamp_ns, yaw_rad
-from fgtrack.io.adapters.ids import object_id
-from fgtrack.io.config import Field, FieldPath, Path
+from fgtrack.io.adapters.common import ObjectList, RosMessage, frame_of, object_id, stamp_ns, yaw_rad
+from fgtrack.io.config import Field, FieldPath
 from fgtrack.models.measurement import ANGULAR
 
-OBJECT_FIELDS = frozenset({"objects", "stamp", "object_stamp", "object_id", *MEASURABLE, *DESCRIBING})
+COMPONENTS = ("object_id", *MEASURABLE, *DESCRIBING)
+"""Mapped components of a detection."""
+OBJECT_FIELDS = frozenset({"objects", "stamp", "object_stamp", *COMPONENTS})
 """Names in the `fields` of an object list: `objects` is the path of the list, `stamp` that of the
 message's time (default `header.stamp`); the others are paths in one object."""
 EGO_FIELDS = frozenset({"stamp", "in_pit", *STATE_NAMES})
 """Names in the `fields` of the ego."""
 
-_MOST_NAMES = 12  # of fields that a message about a wrong path lists
+#: Conversions of the components that are not numbers.
+_CONVERSIONS: Mapping[str, Callable[[Any], Any]] = {"object_id": object_id, "class_name": str, "in_pit": bool}
 
 
 class FieldError(Exception):
-    """A path does not lead to what is needed; the reader of the recording adds where."""
+    """A path does not lead to a valid value; the reader of the recording adds where."""
+
+
+def mapped(
+    fields: Mapping[str, FieldPath], names: Iterable[str], read: Callable[[str], Any]
+) -> dict[str, Any]:  # Any: a value as recorded, and as `EgoState`, `Detection` and `TruthState` take it
+    """Values of those of `names` that `fields` maps, by name; `read` gives the recorded value at a path, or None."""
+    values: dict[str, Any] = {}
+    for name in names:
+        if name in _CONVERSIONS and name in fields:
+            value = read(single_path(fields[name]))
+            values[name] = None if value is None else _CONVERSIONS[name](value)
+        elif name in fields:
+            values[name] = _number(fields[name], name, read)
+    return values
+
+
+def paths_of(path: FieldPath) -> list[str]:
+    """The recorded fields that a component is read from."""
+    path = path.path if isinstance(path, Field) else path
+    return [path] if isinstance(path, str) else list(path)
+
+
+def single_path(path: FieldPath) -> str:
+    """The recorded field of a component that is not a number. Raises `FieldError` for a vector."""
+    paths = paths_of(path)
+    if len(paths) != 1:
+        raise FieldError(f"{paths}: the name of one field is needed, not several")
+    return paths[0]
+
+
+def _number(path: FieldPath, name: str, read: Callable[[str], Any]) -> float | None:
+    """Number at `path`, converted; an angle in degrees or with an offset is wrapped.
+
+    More than 1.5 turns of radians stay as they are: they may be degrees, which wrapping would hide.
+    """
+    numbers = [_float(read(each), each) for each in paths_of(path)]
+    present = [value for value in numbers if value is not None]
+    if len(present) < len(numbers):
+        return None
+    raw = present[0] if len(present) == 1 else math.hypot(*present)
+    if not isinstance(path, Field):
+        return raw
+    value = path.value(raw)
+    wraps = path.degrees or (path.offset != 0.0 and abs(value) <= 3.0 * math.pi)
+    return wrap_angle(value) if wraps and name in ANGULAR and math.isfinite(value) else value
+
+
+def _float(value: Any, path: str) -> float | None:
+    if hasattr(value, "w"):  # a quaternion
+        yaw = yaw_rad(value)
+        return math.nan if yaw is None else yaw
+    try:
+        return None if value is None else float(value)
+    except (TypeError, ValueError) as error:
+        raise FieldError(f"{path}: {str(value)[:40]!r} is not a number") from error
 
 
 def objects_by_fields(message: RosMessage, fields: Mapping[str, FieldPath]) -> ObjectList:
     """Object list of `message`; without `objects` in `fields` the message itself is the one object."""
-    objects = tuple(_object(item, fields) for item in items_by_fields(message, fields))
-    header = getattr(message, "header", None)
-    return ObjectList(_message_stamp(message, fields), None if header is None else frame_of(header), objects)
+    objects = []
+    for item in items_by_fields(message, fields):
+        stamp = _time(item, fields["object_stamp"]) if "object_stamp" in fields else None
+        objects.append(Detection(**mapped(fields, COMPONENTS, partial(value_at, item)), stamp_ns=stamp))
+    frame = frame_of(message.header) if hasattr(message, "header") else None
+    return ObjectList(_message_stamp(message, fields), frame, tuple(objects))
 
 
 def items_by_fields(message: RosMessage, fields: Mapping[str, FieldPath]) -> list[RosMessage]:
     """The objects of `message` as they are in it, in the order of `objects_by_fields`."""
-    path = fields.get("objects")
-    if path is None:
+    if "objects" not in fields:
         return [message]
-    found = value_at(message, _single(path))
-    if not isinstance(found, list | tuple):  # numbers in a row are no objects, nor are the letters of a text
+    path = single_path(fields["objects"])
+    items = value_at(message, path)
+    if not isinstance(items, list | tuple):
         raise FieldError(f"{path}: is not a list of objects")
-    return list(found)
+    return list(items)
 
 
 def ego_by_fields(message: RosMessage, fields: Mapping[str, FieldPath], receipt_ns: int) -> EgoState:
     """The ego's state; `x_m`, `y_m`, `yaw_rad` and `speed_mps` must be among `fields`."""
     stamp = _message_stamp(message, fields)
-    values = {name: _number(message, path, name) for name, path in fields.items() if name in STATE_NAMES}
-    in_pit = value_at(message, _single(fields["in_pit"])) if "in_pit" in fields else None
-    return EgoState(
-        receipt_ns if stamp is None else stamp,
-        receipt_ns,
-        **values,
-        in_pit=None if in_pit is None else bool(in_pit),
-        covariance=None,
-    )
+    values = mapped(fields, (*STATE_NAMES, "in_pit"), partial(value_at, message))
+    return EgoState(receipt_ns if stamp is None else stamp, receipt_ns, **values)
 
 
 def value_at(message: RosMessage, path: str) -> RosMessage:
@@ -66,83 +120,20 @@ def value_at(message: RosMessage, path: str) -> RosMessage:
         try:
             value = value[int(part)] if part.isdigit() else getattr(value, part)
         except (AttributeError, LookupError, TypeError) as error:
-            raise FieldError(f"{path}: leads nowhere, there is no {part!r}{_known(value)}") from error
+            names = [name for name in getattr(value, "__dataclass_fields__", ()) if not name.startswith("_")]
+            raise FieldError(f"{path}: there is no {part!r}, but {', '.join(names) or 'no fields'}") from error
     return value
-
-
-def _known(value: RosMessage) -> str:
-    names = [name for name in getattr(value, "__dataclass_fields__", ()) if not name.startswith("_")]
-    shown = ", ".join(names[:_MOST_NAMES]) + (", ..." if len(names) > _MOST_NAMES else "")
-    return f", but {shown}" if names else ""
-
-
-def _object(item: RosMessage, fields: Mapping[str, FieldPath]) -> Detection:
-    values: dict[str, Any] = {
-        name: _number(item, fields[name], name)
-        for name in (*MEASURABLE, *DESCRIBING)
-        if name in fields and name != "class_name"
-    }
-    return Detection(
-        **values,
-        class_name=_text(item, _single(fields["class_name"])) if "class_name" in fields else None,
-        stamp_ns=_time(item, _single(fields["object_stamp"])) if "object_stamp" in fields else None,
-        object_id=object_id(value_at(item, _single(fields["object_id"]))) if "object_id" in fields else None,
-    )
-
-
-def _text(item: RosMessage, path: str) -> str:
-    value = value_at(item, path)
-    if not isinstance(value, str | int | float | np.generic):
-        raise FieldError(f"{path}: is no text and no number")
-    return str(value)
 
 
 def _message_stamp(message: RosMessage, fields: Mapping[str, FieldPath]) -> int | None:
     if "stamp" in fields:
-        return _time(message, _single(fields["stamp"]))
-    header = getattr(message, "header", None)
-    return None if header is None else stamp_ns(header.stamp)
+        return _time(message, fields["stamp"])
+    return stamp_ns(message.header.stamp) if hasattr(message, "header") else None
 
 
-def _single(path: FieldPath) -> str:
-    path = path.path if isinstance(path, Field) else path
-    if not isinstance(path, str):
-        raise FieldError(f"{path}: one path is needed, not several")
-    return path
-
-
-def _number(message: RosMessage, path: FieldPath, name: str) -> float:
-    return converted(_raw(message, path.path if isinstance(path, Field) else path), path, name)
-
-
-def converted(raw: float, path: FieldPath, name: str) -> float:
-    """Value of the component `name` where `path` leads to `raw`; an angle in degrees or with an offset is wrapped.
-
-    More than 1.5 turns of radians stay as they are: they may be degrees, which wrapping would hide.
-    """
-    if not isinstance(path, Field):
-        return raw
-    value = path.value(raw)
-    wraps = path.degrees or (path.offset != 0.0 and abs(value) <= 3.0 * math.pi)
-    return wrap_angle(value) if wraps and name in ANGULAR and math.isfinite(value) else value
-
-
-def _raw(message: RosMessage, path: Path) -> float:
-    if not isinstance(path, str):
-        return math.hypot(*[_raw(message, part) for part in path])
-    value = value_at(message, path)
-    if hasattr(value, "w"):  # a quaternion; what names it wants the yaw
-        yaw = yaw_rad(value)
-        return math.nan if yaw is None else yaw
-    try:
-        return float(value)
-    except (TypeError, ValueError) as error:
-        raise FieldError(f"{path}: is not a number") from error
-
-
-def _time(message: RosMessage, path: str) -> int:
+def _time(message: RosMessage, path: FieldPath) -> int:
     """A ROS time, integer nanoseconds or float seconds."""
-    value = value_at(message, path)
+    value = value_at(message, single_path(path))
     if hasattr(value, "nanosec"):
         return stamp_ns(value)
     return round(value * NS_PER_S) if isinstance(value, float) else int(value)

@@ -26,8 +26,7 @@ from fgtrack.core.files import read_whole
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import seconds
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
-from fgtrack.io.adapters.common import signed_speed_mps, split
-from fgtrack.io.adapters.ids import object_id
+from fgtrack.io.adapters.common import object_id, signed_speed_mps, split
 from fgtrack.io.config import InputConfig, NuscenesInput
 from fgtrack.io.source import FileFormat
 

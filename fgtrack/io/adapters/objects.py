@@ -14,6 +14,7 @@ from fgtrack.io.adapters.common import (
     RosMessage,
     covariance,
     measured,
+    object_id,
     object_list,
     object_stamp_ns,
     planar,
@@ -21,7 +22,6 @@ from fgtrack.io.adapters.common import (
     speed_variance,
     yaw_rad,
 )
-from fgtrack.io.adapters.ids import object_id
 
 _ORIENTATION_AVAILABLE = 2  # in autoware's DetectedObjectKinematics
 _AUTOWARE_CLASSES = ("unknown", "car", "truck", "bus", "trailer", "motorcycle", "bicycle", "pedestrian")

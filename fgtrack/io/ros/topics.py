@@ -9,7 +9,7 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DESCRIBING, MEASURABLE, Detection, DetectionList, Message, TruthState
 from fgtrack.io.adapters import ADAPTERS, message_types
-from fgtrack.io.adapters.common import ObjectList, RosMessage, split
+from fgtrack.io.adapters.common import ObjectList, RosMessage, object_id, split
 from fgtrack.io.adapters.ego import ODOMETRY, ego_from_odometry
 from fgtrack.io.adapters.fields import (
     EGO_FIELDS,
@@ -20,7 +20,6 @@ from fgtrack.io.adapters.fields import (
     objects_by_fields,
     value_at,
 )
-from fgtrack.io.adapters.ids import object_id
 from fgtrack.io.adapters.native import DETECTIONS, EGO, NATIVE_ADAPTERS, TRUTH, detections
 from fgtrack.io.adapters.scans import grouped
 from fgtrack.io.config import InputConfig, TopicInput
