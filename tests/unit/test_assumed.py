@@ -200,6 +200,14 @@ def test_what_leaves_the_view_of_the_only_sensor_that_gives_positions_ends_at_on
                 yield message(POINT, sensor="lidar", stamp_ms=25.0 * k)
 
     assert assumed(Config(), source_of(with_slow_sensor)).config.lifecycle.out_of_view_s == pytest.approx(3.1, rel=0.1)
+
+    def silent():  # the second of two sensors says nothing for a second
+        for one in forward():
+            yield one
+            if getattr(one, "objects", ()) and not 3.0 <= (one.stamp_ns - START_NS) * 1e-9 < 4.0:
+                yield replace(one, sensor="lidar")
+
+    assert assumed(Config(), source_of(silent)).config.lifecycle.out_of_view_s == pytest.approx(1.6, abs=0.1)
     own = replace(Config(), lifecycle=ExistenceRules(out_of_view_s=2.0))
     assert assumed(own, source_of(forward)).config.lifecycle == own.lifecycle
 

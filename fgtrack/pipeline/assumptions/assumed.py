@@ -43,6 +43,8 @@ _BOX_STD_M = 0.3
 """Standard deviation of the middle of a box: the translation error of LiDAR detectors is 0.25 to 0.5 m (nuScenes)."""
 _LISTS_OUT_OF_VIEW = 2.5
 """Periods of the slowest sensor for which a track that is out of view lives on."""
+_SILENCES = 1.5
+"""Longest silences of a sensor for which a track that it alone sees lives on."""
 _LEAST_CLUTTER = 0.05
 """False detections of a list that can never be excluded."""
 
@@ -273,9 +275,9 @@ def _with_offsets(sensors: dict[str, SensorModel], covered: Mapping[str, Coverag
             continue
         own_m = max(sensor.std["x_m"], one.persistence.std_m)
         std_m = float(f"{one.disagreement_m / math.sqrt(2.0):.2g}")
-        share = round(1.0 - (own_m / std_m) ** 2, 2)
-        if share < _LEAST_SHARE:
+        if (1.0 - _LEAST_SHARE) * std_m**2 < own_m**2:
             continue
+        share = round(1.0 - (own_m / std_m) ** 2, 2)
         reason = f"it and another sensor disagree by {one.disagreement_m:.2g} m on each axis, as on large hulls"
         sensors[name] = replace(
             sensor, std={**sensor.std, "x_m": std_m, "y_m": std_m}, correlation=Correlation(share, _OFFSET_S)
@@ -289,14 +291,17 @@ def _out_of_view_s(config: Config, seen: Mapping[str, Coverage]) -> tuple[float,
     """Return how long a track lives that no sensor can see, and the reason.
 
     Where one sensor alone gives positions nothing else sees what has left its view: the first list that could not show
-    it ends it. Else it may come into the view of another one, and outlives two lists of the slowest sensor.
+    it ends it. Else it may come into the view of another one, and outlives two lists of the slowest sensor, and the
+    longest silence of the one that saw it, while others go on.
     """
     periods_s = {name: 1.0 / one.rate_hz for name, one in seen.items() if one.rate_hz}
     placing = [name for name, one in config.used_sensors.items() if one.gives_position]
     if len(placing) == 1 and placing[0] in periods_s:
         return 0.5 * periods_s[placing[0]], "no other sensor gives positions, half its period"
     slow_s = _LISTS_OUT_OF_VIEW * max(periods_s.values(), default=0.0)
-    return max(ExistenceRules.out_of_view_s, slow_s), _TWO_LISTS
+    silent_s = _SILENCES * max((seen[name].silence_s for name in placing if name in seen), default=0.0)
+    longest_s = max(ExistenceRules.out_of_view_s, slow_s, silent_s)
+    return longest_s, _TWO_LISTS if longest_s == slow_s else "beyond the longest silence of a sensor"
 
 
 def _with_coverage(name: str, sensor: SensorModel, seen: Coverage, found: list[Assumption]) -> SensorModel:

@@ -26,6 +26,8 @@ _NARROWEST_RAD, _WIDEST_RAD = 0.35, 2.8
 #: Axes are multiples of 45 degrees, where the middle of the sector is so near to one.
 _AXES_RAD, _AXIS_TOLERANCE_RAD = math.pi / 4.0, 0.15
 
+_OUTAGE_S = 2.0
+
 
 @dataclass(frozen=True)
 class Coverage:
@@ -51,6 +53,8 @@ class Coverage:
     """True if its detections have a length and a width."""
     area_m2: float | None = None
     """Area over which its detections with a range are spread, at least that of the narrowest sector up to there."""
+    silence_s: float = 0.0
+    """Longest time between two lists running, up to `_OUTAGE_S`: after longer ones objects are new."""
 
     def __str__(self) -> str:
         rate = "" if self.rate_hz is None else f" at {self.rate_hz:.3g} Hz"
@@ -137,7 +141,10 @@ class _Detections:
         receipts_s = np.array(self.receipts_s)
         span_s = float(np.ptp(receipts_s))
         rate_hz = (len(receipts_s) - 1) / span_s if span_s > 0.0 else None
-        found = Coverage(frozenset(self.measured), len(receipts_s), self.num_detections, rate_hz, boxes=self.boxes)
+        gaps_s = np.diff(np.sort(self.stamps_s))
+        silence_s = float(gaps_s[gaps_s <= _OUTAGE_S].max(initial=0.0))
+        measured, count = frozenset(self.measured), len(receipts_s)
+        found = Coverage(measured, count, self.num_detections, rate_hz, boxes=self.boxes, silence_s=silence_s)
         rows = np.array(self.rows).reshape(-1, 6)
         has_range = rows[:, 4] > 0.0
         rows = rows[has_range] if has_range.any() else rows
