@@ -16,7 +16,8 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.plugins import Registry
 from fgtrack.estimation.base import Estimator, Smoother, Start, TrackBank
 from fgtrack.estimation.filters.initiation import DEFAULT
-from fgtrack.estimation.filters.replay import ReplayBank, ReplayEkf
+from fgtrack.estimation.filters.replay import ReplayEkf
+from fgtrack.estimation.filters.replay_bank import ReplayBank
 from fgtrack.estimation.filters.track_initiation import initiated
 from fgtrack.estimation.hypotheses import hypotheses
 from fgtrack.estimation.object_bank import ObjectBank, OneObject

@@ -9,9 +9,9 @@ from scipy.optimize import minimize
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.filters.iekf import IekfRecursion, negative_log_posterior
-from fgtrack.estimation.filters.recursion import EkfRecursion
-from fgtrack.estimation.filters.ukf import IplfRecursion, UkfRecursion
+from fgtrack.estimation.filters.iekf import IekfReplay, negative_log_posterior
+from fgtrack.estimation.filters.replay import ReplayEkf
+from fgtrack.estimation.filters.ukf import IplfReplay, UkfReplay
 from fgtrack.estimation.registry import estimator
 from fgtrack.models.motion import CTRV, CV
 from fgtrack.models.sensors import RobustLoss
@@ -28,13 +28,12 @@ def seen(loss: RobustLoss | None = None) -> Measurement:
     return Measurement.of(0, range_m=10.0, bearing_rad=0.75, std=std, loss=loss)
 
 
-def recursions() -> dict[str, EkfRecursion]:
-    return {
-        "ekf": EkfRecursion(MOTION),
-        "iekf": IekfRecursion(MOTION, 100, 1e-9),
-        "ukf": UkfRecursion(MOTION),
-        "iplf": IplfRecursion(MOTION, 100, 1e-9),
-    }
+FILTERS: dict[str, ReplayEkf] = {
+    "ekf": ReplayEkf(MOTION, START, 1.0),
+    "iekf": IekfReplay(MOTION, START, 1.0, 100, 1e-9),
+    "ukf": UkfReplay(MOTION, START, 1.0),
+    "iplf": IplfReplay(MOTION, START, 1.0, 100, 1e-9),
+}
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -60,14 +59,14 @@ def test_the_iterated_update_is_the_mode(loss: RobustLoss | None) -> None:
         y = measurement.model.residual(measurement.z, measurement.model.predict(x))
         return negative_log_posterior(x - MEAN, P, y, measurement.R, loss)
 
-    found = recursions()["iekf"].correct_one(MEAN, P, measurement)
+    found = FILTERS["iekf"].correct(MEAN, P, measurement)
     best = minimize(cost, found.mean, method="Nelder-Mead", options={"xatol": 1e-10, "fatol": 1e-14, "maxiter": 20000})
     np.testing.assert_allclose(found.mean, best.x, atol=1e-4)
-    assert cost(found.mean) < cost(recursions()["ekf"].correct_one(MEAN, P, measurement).mean)
+    assert cost(found.mean) < cost(FILTERS["ekf"].correct(MEAN, P, measurement).mean)
 
 
 def test_the_iterated_update_says_what_the_extended_one_says_of_the_innovation() -> None:
-    found, plain = (recursions()[name].correct_one(MEAN, P, seen()) for name in ("iekf", "ekf"))
+    found, plain = (FILTERS[name].correct(MEAN, P, seen()) for name in ("iekf", "ekf"))
     np.testing.assert_array_equal(found.innovation, plain.innovation)
     assert found.nis == plain.nis
 
@@ -93,8 +92,8 @@ def divergence(mean: FloatArray, covariance: FloatArray) -> float:
 
 def test_iterating_comes_nearer_to_the_posterior_of_a_precise_range() -> None:
     found = {}
-    for name, each in recursions().items():
-        correction = each.correct_one(MEAN, P, seen())
+    for name, each in FILTERS.items():
+        correction = each.correct(MEAN, P, seen())
         found[name] = divergence(correction.mean, correction.covariance)
     assert found["iekf"] < 0.2 * found["ekf"]
     assert found["iplf"] < 0.2 * found["ukf"]
@@ -109,8 +108,8 @@ def test_a_step_that_makes_it_worse_is_halved() -> None:
         y = measurement.model.residual(measurement.z, measurement.model.predict(x))
         return negative_log_posterior(x - mean, wide, y, measurement.R, None)
 
-    plain = recursions()["ekf"].correct_one(mean, wide, measurement)
-    found = recursions()["iekf"].correct_one(mean, wide, measurement)
+    plain = FILTERS["ekf"].correct(mean, wide, measurement)
+    found = FILTERS["iekf"].correct(mean, wide, measurement)
     assert cost(plain.mean) > cost(mean)  # the full step overshoots
     assert cost(found.mean) < 0.01 * cost(mean)
 
@@ -119,7 +118,7 @@ def test_the_unscented_prediction_is_the_mean_over_the_spread() -> None:
     wide = np.diag([0.1, 0.1, 0.09, 1.0, 0.01])
     x = np.random.default_rng(0).multivariate_normal(MEAN, wide, size=400_000)
     moved = MOTION.predict(x, 1.0)
-    found, plain = (recursions()[name].predict(MEAN[None], wide[None], np.ones(1)) for name in ("ukf", "ekf"))
+    found, plain = (FILTERS[name].predict(MEAN[None], wide[None], np.ones(1)) for name in ("ukf", "ekf"))
     np.testing.assert_allclose(found.mean[0], moved.mean(axis=0), atol=0.02)
     assert np.linalg.norm(plain.mean - moved.mean(axis=0)) > 0.2
     spread = np.cov(moved.T) + MOTION.process_noise(MEAN, 1.0)
@@ -129,11 +128,10 @@ def test_the_unscented_prediction_is_the_mean_over_the_spread() -> None:
 
 
 def test_one_iteration_is_the_filter_without_any() -> None:
-    once = IekfRecursion(MOTION, 1, 0.0), IplfRecursion(MOTION, 1, 0.0)
+    once = IekfReplay(MOTION, START, 1.0, 1, 0.0), IplfReplay(MOTION, START, 1.0, 1, 0.0)
     for one, name in zip(once, ("ekf", "ukf"), strict=True):
-        np.testing.assert_array_equal(
-            one.correct_one(MEAN, P, seen()).mean, recursions()[name].correct_one(MEAN, P, seen()).mean
-        )
+        found, expected = (each.correct(MEAN, P, seen()).mean for each in (one, FILTERS[name]))
+        np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize(

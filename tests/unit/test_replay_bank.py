@@ -9,7 +9,8 @@ from support.examples import few
 
 from fgtrack.core.time import nanoseconds
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
-from fgtrack.estimation.filters.replay import ReplayBank, ReplayEkf
+from fgtrack.estimation.filters.replay import ReplayEkf
+from fgtrack.estimation.filters.replay_bank import ReplayBank
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.registry import estimator_bank
 from fgtrack.models.measurement import SensorPose, measurement_model

@@ -11,8 +11,7 @@ from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.filters.ekf import OneCorrection, linearised, updated_one
 from fgtrack.estimation.filters.initiation import DEFAULT
-from fgtrack.estimation.filters.recursion import EkfRecursion
-from fgtrack.estimation.filters.replay import ReplayingFilter
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.robust import penalty, weight
 from fgtrack.models.sensors import RobustLoss
@@ -20,30 +19,40 @@ from fgtrack.models.sensors import RobustLoss
 _MAX_HALVINGS = 8
 
 
-class IekfRecursion(EkfRecursion):
-    """An EKF that relinearises the measurement at the updated state until that no longer moves.
+class IekfReplay(ReplayEkf):
+    """Iterated EKF that rewinds and replays: each update is linearised at its own result (Gauss-Newton).
 
     Bell and Cathey, The iterated Kalman filter update as a Gauss-Newton method, IEEE Transactions on Automatic Control
     38(2), 1993: the update minimises half of |x - x_0|^2 in P^-1 and |z - h(x)|^2 in R^-1, or a robust loss instead of
-    the latter. A step that does not lower this sum is halved.
+    the latter. A step that does not lower this sum is halved. A linear measurement is fused as by `ReplayEkf`.
 
     Parameters
     ----------
-    motion
-        Motion model.
-    max_iterations, tolerance
-        When it ends; the tolerance is in standard deviations. Raises `ValueError` for a value out of range.
+    motion, prior, lag_s, initiation
+        See `ReplayEkf`.
+    max_iterations
+        Linearisations per update; 1 is the EKF.
+    tolerance
+        A step below this many standard deviations of the prediction ends the iteration.
     """
 
-    def __init__(self, motion: MotionModel, max_iterations: int, tolerance: float) -> None:
-        super().__init__(motion)
+    def __init__(
+        self,
+        motion: MotionModel,
+        prior: Start,
+        lag_s: float,
+        max_iterations: int = 10,
+        tolerance: float = 1e-6,
+        initiation: str = DEFAULT,
+    ) -> None:
+        super().__init__(motion, prior, lag_s, initiation)
         check_iteration(max_iterations, tolerance)
         self._max_iterations, self._tolerance = max_iterations, tolerance
 
-    def correct_one(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
-        """See `EkfRecursion.correct_one`."""
+    def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
+        """See `ReplayEkf.correct`."""
         if measurement.model.linear:
-            return super().correct_one(mean, covariance, measurement)
+            return super().correct(mean, covariance, measurement)
 
         def cost(x: FloatArray) -> float:
             y = measurement.model.residual(measurement.z, measurement.model.predict(x, measurement.pose))
@@ -58,38 +67,8 @@ class IekfRecursion(EkfRecursion):
             x = update.mean if self._max_iterations == 1 else descended(cost, limit, last, update.mean)
             if largest_move(x - last, covariance) < self._tolerance:
                 break
-        first = super().correct_one(mean, covariance, measurement)
+        first = super().correct(mean, covariance, measurement)
         return first._replace(mean=x, covariance=update.covariance, weight=update.weight)
-
-
-class IekfReplay(ReplayingFilter):
-    """Iterated EKF that rewinds and replays: each update is linearised at its own result (Gauss-Newton).
-
-    Bell and Cathey 1993, see `IekfRecursion`. What is linear, like a measured position, it fuses as `ReplayEkf`.
-
-    Parameters
-    ----------
-    motion, prior, lag_s
-        See `WindowedFilter`.
-    max_iterations
-        Linearisations per update; 1 is the EKF.
-    tolerance
-        A step below this many standard deviations of the prediction ends the iteration.
-    initiation
-        See `ReplayingFilter`.
-    """
-
-    def __init__(
-        self,
-        motion: MotionModel,
-        prior: Start,
-        lag_s: float,
-        max_iterations: int = 10,
-        tolerance: float = 1e-6,
-        initiation: str = DEFAULT,
-    ) -> None:
-        recursion = IekfRecursion(motion, max_iterations, tolerance)
-        super().__init__(motion, prior, lag_s, recursion, initiation)
 
 
 def check_iteration(max_iterations: int, tolerance: float) -> None:

@@ -14,10 +14,9 @@ from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import OneCorrection, Prediction, correct_one, predict
-from fgtrack.estimation.filters.initiation import DEFAULT, Initiation
+from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.filters.propagation import wrapped
-from fgtrack.estimation.filters.recursion import EkfRecursion, Step
-from fgtrack.estimation.filters.replay import ReplayingFilter
+from fgtrack.estimation.filters.replay import ReplayEkf, Step
 from fgtrack.estimation.registry import motion_model
 from fgtrack.models.correlated_errors import CorrelatedErrors
 from fgtrack.models.motion import CTRA, CTRV, MotionModel
@@ -77,100 +76,7 @@ class ImmStep(Step):
     mixture: Mixture | None = None
 
 
-class ImmRecursion(EkfRecursion):
-    """Extended Kalman filters of several models, mixed before each step and weighted after it; see `ImmReplay`.
-
-    Parameters
-    ----------
-    models
-        Motion models, the first of which is that of the states.
-    sojourns
-        How an object goes from one to another.
-    """
-
-    def __init__(self, models: Sequence[MotionModel], sojourns: Sojourns) -> None:
-        super().__init__(models[0])
-        self._models, self._sojourns = models, sojourns
-
-    def first(self, prior: Start, initiation: Initiation) -> ImmStep:
-        """See `EkfRecursion.first`."""
-        states = [initial_state(model, prior) for model in self._models]
-        means, covariances = zip(*states, strict=True)
-        return _with(super().first(prior, initiation), Mixture(means, covariances, self._sojourns.share))
-
-    def ahead(self, before: Step, stamp_ns: int) -> Prediction:
-        """See `EkfRecursion.ahead`; the cross-covariance, of which nothing is asked, is the covariance."""
-        mixture = self._mixed(before, stamp_ns)
-        mean, covariance = self._moments(mixture, mixture.probabilities, self.motion)
-        return Prediction(mean, covariance, covariance)
-
-    def fused(self, before: Step, measurement: Measurement) -> tuple[Step, OneCorrection]:
-        """See `EkfRecursion.fused`."""
-        prior = self._mixed(before, measurement.stamp_ns)
-        predicted = self._moments(prior, prior.probabilities, self.motion)
-        corrected = [
-            correct_one(mean, covariance, measurement.seen_by(model))
-            for model, mean, covariance in zip(self._models, prior.means, prior.covariances, strict=True)
-        ]
-        posterior = Mixture(
-            tuple(wrapped(model, each.mean) for model, each in zip(self._models, corrected, strict=True)),
-            tuple(each.covariance for each in corrected),
-            _weighed(prior.probabilities, [_log_likelihood(each, measurement) for each in corrected]),
-        )
-        found = correct_one(*predicted, measurement)
-        weight = float(posterior.probabilities @ [each.weight for each in corrected])
-        whole = self._moments(posterior, posterior.probabilities, self.motion)
-        corrected_whole = OneCorrection(*whole, found.innovation, found.nis, weight, found.S)
-        step, correction = self._concluded(before, measurement, Prediction(*predicted, predicted[1]), corrected_whole)
-        if step.along:  # the state comes from all that was measured, along a line, by `motion`
-            alike = [self._own(self.motion, model, step.mean, step.covariance) for model in self._models]
-            means, covariances = zip(*alike, strict=True)
-            posterior = posterior._replace(means=means, covariances=covariances)
-        return _with(step, posterior), correction
-
-    def _mixed(self, before: Step, stamp_ns: int) -> Mixture:
-        """The mixture at `stamp_ns`, from the step before it.
-
-        Each model starts from the mixture of what the object may have followed before, given that it follows that model
-        now; all of these together have the moments of the mixture before.
-        """
-        old = _mixture(before)
-        if stamp_ns == before.stamp_ns:
-            return old
-        dt_s = seconds(stamp_ns - before.stamp_ns)
-        joint = old.probabilities[:, None] * self._sojourns.transition(dt_s)
-        probabilities = joint.sum(axis=0)
-        means, covariances = [], []
-        for model, shares, total in zip(self._models, joint.T, probabilities, strict=True):
-            mean, covariance = predict(*self._moments(old, shares / total, model), model, dt_s)
-            means.append(mean)
-            covariances.append(covariance)
-        return Mixture(tuple(means), tuple(covariances), probabilities)
-
-    def _moments(self, mixture: Mixture, weights: FloatArray, model: MotionModel) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance of the Gaussians of `mixture` with other `weights`, in the state of `model`."""
-        states = [
-            self._own(each, model, mean, covariance)
-            for each, mean, covariance in zip(self._models, mixture.means, mixture.covariances, strict=True)
-        ]
-        if len(states) == 1:
-            return states[0]
-        reference = states[int(weights.argmax())][0]
-        apart = [wrapped(model, mean - reference) for mean, _ in states]
-        offset = weights @ np.array(apart)
-        spread = [P + np.outer(d - offset, d - offset) for d, (_, P) in zip(apart, states, strict=True)]
-        return reference + offset, symmetrise(np.tensordot(weights, np.array(spread), axes=1))
-
-    def _own(
-        self, model: MotionModel, wanted: MotionModel, mean: FloatArray, covariance: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """A state of `model` in the form of another one that is `wanted`."""
-        if model.state_names == wanted.state_names:
-            return mean, covariance
-        return wanted.from_kinematic(*model.kinematic(mean, covariance))
-
-
-class ImmReplay(ReplayingFilter):
+class ImmReplay(ReplayEkf):
     """Interacting multiple model filter that rewinds and replays: `motion` and another model, weighed by what they say.
 
     Blom and Bar-Shalom, The interacting multiple model algorithm for systems with Markovian switching coefficients,
@@ -181,8 +87,8 @@ class ImmReplay(ReplayingFilter):
 
     Parameters
     ----------
-    motion, prior, lag_s
-        See `WindowedFilter`. States are those of `motion`.
+    motion, prior, lag_s, initiation
+        See `ReplayEkf`. States are those of `motion`.
     other
         The other model, or its name. Where nothing is given: CTRA if `motion` is CTRV, CTRV if it is CTRA, with the
         same noise, and none beside another `motion`.
@@ -190,8 +96,6 @@ class ImmReplay(ReplayingFilter):
         Mean time that an object stays with `motion`, and with the other model.
     accel_density_m2ps5
         Noise of the acceleration of CTRA beside CTRV.
-    initiation
-        See `ReplayingFilter`.
     """
 
     spreads = mixes = True
@@ -208,15 +112,87 @@ class ImmReplay(ReplayingFilter):
         accel_density_m2ps5: float = CTRA.accel_density_m2ps5,
         initiation: str = DEFAULT,
     ) -> None:
+        super().__init__(motion, prior, lag_s, initiation)
         beside = _beside(motion, other, accel_density_m2ps5)
-        models = (motion,) if beside is None else (motion, beside)
-        recursion = ImmRecursion(models, Sojourns((stay_s, other_stay_s)[: len(models)]))
-        super().__init__(motion, prior, lag_s, recursion, initiation)
+        self._models = (motion,) if beside is None else (motion, beside)
+        self._sojourns = Sojourns((stay_s, other_stay_s)[: len(self._models)])
+        means, covariances = zip(*(initial_state(model, prior) for model in self._models), strict=True)
+        self.steps = [_with(self.steps[0], Mixture(means, covariances, self._sojourns.share))]
 
     @property
     def probabilities(self) -> FloatArray:
         """Probabilities of `motion` and the other model after the newest measurement, shape (m,)."""
         return _mixture(self.steps[-1]).probabilities.copy()
+
+    def _ahead(self, before: Step, stamp_ns: int) -> Prediction:
+        """See `ReplayEkf._ahead`; the cross-covariance, which is not used, is the covariance."""
+        mixture = self._mixed(before, stamp_ns)
+        mean, covariance = self._moments(mixture, mixture.probabilities, self._motion)
+        return Prediction(mean, covariance, covariance)
+
+    def _step(self, before: Step, measurement: Measurement) -> tuple[Step, OneCorrection]:
+        prior = self._mixed(before, measurement.stamp_ns)
+        mean, covariance = self._moments(prior, prior.probabilities, self._motion)
+        corrected = [
+            correct_one(mean, covariance, measurement.seen_by(model))
+            for model, mean, covariance in zip(self._models, prior.means, prior.covariances, strict=True)
+        ]
+        posterior = Mixture(
+            tuple(wrapped(model, each.mean) for model, each in zip(self._models, corrected, strict=True)),
+            tuple(each.covariance for each in corrected),
+            _weighed(prior.probabilities, [_log_likelihood(each, measurement) for each in corrected]),
+        )
+        x, P = self._moments(posterior, posterior.probabilities, self._motion)
+        weight = float(posterior.probabilities @ [each.weight for each in corrected])
+        correction = correct_one(mean, covariance, measurement)._replace(mean=x, covariance=P, weight=weight)
+        step = self._concluded(before, measurement, Prediction(mean, covariance, covariance), correction)
+        if step.along:  # the state comes from all that was measured, along a line, by `motion`
+            alike = [_converted(self._motion, model, step.mean, step.covariance) for model in self._models]
+            means, covariances = zip(*alike, strict=True)
+            posterior = posterior._replace(means=means, covariances=covariances)
+        return _with(step, posterior), correction
+
+    def _mixed(self, before: Step, stamp_ns: int) -> Mixture:
+        """The mixture at `stamp_ns`, from the step before it.
+
+        Each model starts from the mixture of what the object may have followed before, given that it follows that model
+        now; all of these together have the moments of the mixture before.
+        """
+        old = _mixture(before)
+        if stamp_ns == before.stamp_ns:
+            return old
+        dt_s = seconds(stamp_ns - before.stamp_ns)
+        joint = old.probabilities[:, None] * self._sojourns.transition(dt_s)
+        probabilities = joint.sum(axis=0)
+        states = [
+            predict(*self._moments(old, shares / total, model), model, dt_s)
+            for model, shares, total in zip(self._models, joint.T, probabilities, strict=True)
+        ]
+        means, covariances = zip(*states, strict=True)
+        return Mixture(means, covariances, probabilities)
+
+    def _moments(self, mixture: Mixture, weights: FloatArray, model: MotionModel) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance of the Gaussians of `mixture` with other `weights`, in the state of `model`."""
+        states = [
+            _converted(each, model, mean, covariance)
+            for each, mean, covariance in zip(self._models, mixture.means, mixture.covariances, strict=True)
+        ]
+        if len(states) == 1:
+            return states[0]
+        reference = states[int(weights.argmax())][0]
+        apart = [wrapped(model, mean - reference) for mean, _ in states]
+        offset = weights @ np.array(apart)
+        spread = [P + np.outer(d - offset, d - offset) for d, (_, P) in zip(apart, states, strict=True)]
+        return reference + offset, symmetrise(np.tensordot(weights, np.array(spread), axes=1))
+
+
+def _converted(
+    model: MotionModel, wanted: MotionModel, mean: FloatArray, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """A state of `model` in the form of another one that is `wanted`."""
+    if model.state_names == wanted.state_names:
+        return mean, covariance
+    return wanted.from_kinematic(*model.kinematic(mean, covariance))
 
 
 def _beside(motion: MotionModel, other: str | MotionModel, accel_density_m2ps5: float) -> MotionModel | None:

@@ -1,329 +1,154 @@
-"""Filters that roll back to a late measurement and filter the later ones again, for one object or many together."""
+"""Filters of one object that roll back to a late measurement and filter the later ones again."""
 
 import bisect
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
-
-from fgtrack.core.checks import LARGEST_NS
-from fgtrack.core.linalg import kernels
+from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
-from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus
-from fgtrack.estimation.filters.ekf import OneCorrection, Prediction
+from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.birth import initial_state
+from fgtrack.estimation.filters.ekf import OneCorrection, Prediction, correct_one, predict_across
 from fgtrack.estimation.filters.initiation import DEFAULT, checked_initiation
 from fgtrack.estimation.filters.propagation import track_state, wrapped
-from fgtrack.estimation.filters.recursion import EkfRecursion, Step
+from fgtrack.estimation.filters.track_initiation import TrackInitiation
 from fgtrack.estimation.filters.windowed import WindowedFilter
-from fgtrack.estimation.object_bank import ObjectBank
-from fgtrack.estimation.present import PresentStates
 from fgtrack.estimation.rts import rts_step
-from fgtrack.models.measurement import MeasurementModel
-from fgtrack.models.motion import MotionModel, WhiteNoise
+from fgtrack.models.motion import MotionModel
 
 
-class ReplayingFilter(WindowedFilter):
-    """A filter that keeps the measurements of a window; its estimates do not depend on the order of arrival.
+@dataclass(slots=True)
+class Step:
+    """A measurement of a replaying filter with the state after it."""
 
-    Rewind and replay, as in robot_localization; see docs/baseline.md.
+    stamp_ns: int
+    measurement: Measurement | None
+    """None of the oldest step, which is the prior."""
+    mean: FloatArray
+    covariance: FloatArray
+    predicted: Prediction
+    """The state before it, predicted from the step before."""
+    search: TrackInitiation | None = None
+    """Measurements up to here, where the direction of travel was sought."""
+
+    @property
+    def along(self) -> bool:
+        """True if the state comes from all that had been measured, along a line, and not from the step before."""
+        return self.search is not None and self.search.line is not None
+
+
+class ReplayEkf(WindowedFilter):
+    """An EKF that keeps the measurements of a window; its estimates do not depend on the order of arrival.
+
+    Rewind and replay, as in robot_localization; see docs/baseline.md. Filters with another prediction or correction
+    override `predict` and `correct`.
 
     Parameters
     ----------
     motion, prior, lag_s
         See `WindowedFilter`.
-    recursion
-        How states are predicted and corrected.
     initiation
-        How the direction of travel is found where `prior` gives none, see `Initiation`.
+        Method for the direction of travel where `prior` gives none, see `Initiation`.
     """
 
     exact = "any lag, any number"
     retrodicts = True
     initiates = True
 
-    def __init__(
-        self, motion: MotionModel, prior: Start, lag_s: float, recursion: EkfRecursion, initiation: str = DEFAULT
-    ) -> None:
+    def __init__(self, motion: MotionModel, prior: Start, lag_s: float, initiation: str = DEFAULT) -> None:
         super().__init__(motion, prior, lag_s)
-        self.recursion = recursion
-        self.steps = [recursion.first(prior, checked_initiation(initiation))]
+        x, P = initial_state(motion, prior)
+        search = TrackInitiation.of(motion, prior, checked_initiation(initiation))
+        self.steps = [Step(prior.stamp_ns, None, x, P, Prediction(x, P, P), search)]
         """The steps of the window and the one that it is replayed from, by stamp and content."""
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: the filter's state, from the measurements up to that stamp."""
-        mean, covariance, _ = self.recursion.ahead(self.step_before(stamp_ns), stamp_ns)
+        before = self.steps[max(bisect.bisect_right(self.steps, stamp_ns, key=_stamp) - 1, 0)]
+        mean, covariance, _ = self._ahead(before, stamp_ns)
         return track_state(self._motion, stamp_ns, mean, covariance)
-
-    def step_before(self, stamp_ns: int) -> Step:
-        """The newest step at or before `stamp_ns`; the first one where there is none."""
-        return self.steps[max(bisect.bisect_right(self.steps, stamp_ns, key=_stamp) - 1, 0)]
 
     def _forget_before(self, stamp_ns: int) -> None:
         # what is measured at that very stamp may still come, and belongs behind the first step
         del self.steps[: max(bisect.bisect_left(self.steps, stamp_ns, key=_stamp) - 1, 0)]
 
     def _fuse(self, measurement: Measurement) -> OneCorrection:
-        stamps_ns = [each.stamp_ns for each in self.steps]
-        place = _place(stamps_ns, [each.measurement for each in self.steps], measurement)
-        later, (step, found) = self.steps[place:], self.recursion.fused(self.steps[place - 1], measurement)
+        index = insertion(
+            [each.stamp_ns for each in self.steps], [each.measurement for each in self.steps], measurement
+        )
+        later, (step, correction) = self.steps[index:], self._step(self.steps[index - 1], measurement)
         if later and self.retrodicts:
-            state = _retrodicted(self.recursion, step, later)
-            expected = self.recursion.correct_one(*state, measurement)
-            found = found._replace(innovation=expected.innovation, nis=expected.nis, S=expected.S)
+            expected = self.correct(*self._retrodicted(step, later), measurement)
+            correction = correction._replace(innovation=expected.innovation, nis=expected.nis, S=expected.S)
         chain = [step]
         for each in later:
             if each.measurement is not None:
-                chain.append(self.recursion.fused(chain[-1], each.measurement)[0])
-        self.steps[place:] = chain
-        return found
+                chain.append(self._step(chain[-1], each.measurement)[0])
+        self.steps[index:] = chain
+        return correction
+
+    def predict(self, mean: FloatArray, covariance: FloatArray, dt_s: float) -> Prediction:
+        """State `mean` (n,), `covariance` (n, n) after `dt_s` >= 0."""
+        return predict_across(mean, covariance, self._motion, dt_s)
+
+    def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
+        """State after `measurement`, made at the stamp of `mean` (n,) and `covariance` (n, n).
+
+        Innovation, NIS and S are those of the prediction. Raises `numpy.linalg.LinAlgError` for a measurement that
+        cannot be fused.
+        """
+        return correct_one(mean, covariance, measurement)
+
+    def _ahead(self, before: Step, stamp_ns: int) -> Prediction:
+        """State at `stamp_ns`, predicted from a step."""
+        if stamp_ns == before.stamp_ns:
+            return Prediction(before.mean, before.covariance, before.covariance)
+        return self.predict(before.mean, before.covariance, seconds(stamp_ns - before.stamp_ns))
+
+    def _step(self, before: Step, measurement: Measurement) -> tuple[Step, OneCorrection]:
+        """The step of `measurement` after the step before it. Raises as `correct`."""
+        predicted = self._ahead(before, measurement.stamp_ns)
+        corrected = self.correct(predicted.mean, predicted.covariance, measurement)
+        return self._concluded(before, measurement, predicted, corrected), corrected
+
+    def _concluded(
+        self, before: Step, measurement: Measurement, predicted: Prediction, corrected: OneCorrection
+    ) -> Step:
+        """The step of a corrected state; while the direction of travel is sought, that along the line instead."""
+        mean, covariance = corrected.mean, corrected.covariance
+        search = None if before.search is None else before.search.with_measurement(measurement)
+        if search is not None and search.line is not None:
+            mean, covariance = search.state()
+        return Step(measurement.stamp_ns, measurement, self._wrapped(mean), covariance, predicted, search)
+
+    def _retrodicted(self, new: Step, later: Sequence[Step]) -> tuple[FloatArray, FloatArray]:
+        """State (n,), (n, n) at the `new` measurement, given all that was fused before it, also the `later` steps.
+
+        From the newest step back (see `rts_step`), each as it was when the new measurement was unknown.
+        """
+        without = Step(new.stamp_ns, None, *new.predicted[:2], new.predicted)
+        mean, covariance = later[-1].mean, later[-1].covariance
+        for index in range(len(later) - 1, -1, -1):
+            after, before = later[index], later[index - 1] if index else without
+            if after.along and after.search is not None:
+                return after.search.retrodicted(new.stamp_ns, mean, covariance)
+            if before.stamp_ns == after.stamp_ns:  # the same state
+                continue
+            predicted = after.predicted if index else self._ahead(without, after.stamp_ns)
+            shift = wrapped(self._motion, mean - predicted.mean)
+            mean, covariance, _ = rts_step(before.mean, before.covariance, predicted, shift, covariance)
+        return mean, covariance
 
 
-def _retrodicted(recursion: EkfRecursion, new: Step, later: Sequence[Step]) -> tuple[FloatArray, FloatArray]:
-    """State (n,), (n, n) that the `new` measurement finds, given all that was fused, also the `later` steps.
-
-    From the newest step back (see `rts_step`), each as it was when the new measurement was unknown.
-    """
-    without = Step(new.stamp_ns, None, *new.predicted[:2], new.predicted)
-    mean, covariance = later[-1].mean, later[-1].covariance
-    for place in range(len(later) - 1, -1, -1):
-        after, before = later[place], later[place - 1] if place else without
-        if after.along and after.search is not None:
-            return after.search.retrodicted(new.stamp_ns, mean, covariance)
-        if before.stamp_ns == after.stamp_ns:  # the same state
-            continue
-        predicted = after.predicted if place else recursion.ahead(without, after.stamp_ns)
-        shift = wrapped(recursion.motion, mean - predicted.mean)
-        mean, covariance, _ = rts_step(before.mean, before.covariance, predicted, shift, covariance)
-    return mean, covariance
-
-
-class ReplayEkf(ReplayingFilter):
-    """An EKF that keeps the measurements of a window; its estimates do not depend on the order of arrival.
-
-    Rewind and replay, as in robot_localization; see docs/baseline.md.
-
-    Parameters
-    ----------
-    motion, prior, lag_s
-        See `WindowedFilter`.
-    initiation
-        See `ReplayingFilter`.
-    """
-
-    def __init__(self, motion: MotionModel, prior: Start, lag_s: float, initiation: str = DEFAULT) -> None:
-        super().__init__(motion, prior, lag_s, EkfRecursion(motion), initiation)
-
-
-@dataclass(slots=True)
-class _Chain:
-    """The steps of a filter in the arrays of `ReplayBank`, whose row they are in."""
-
-    row: int
-    stamps_ns: list[int]
-    measurements: list[Measurement | None]
-    filter: ReplayEkf
-
-
-class ReplayBank(ObjectBank[ReplayEkf]):
-    """`ReplayEkf` of all objects, whose steps lie in arrays: a compiled loop replays all that a list concerns.
-
-    Filters of their own remain where a direction of travel is sought, and where a window has a measurement with a
-    robust loss or of what is not an entry of the state. See `ObjectBank` and `fgtrack.estimation.kernels.replay`.
-
-    Parameters
-    ----------
-    motion
-        A shipped motion model.
-    start, lag_s
-        See `ObjectBank`.
-    """
-
-    def __init__(self, motion: WhiteNoise, start: Callable[[Start], ReplayEkf], lag_s: float) -> None:
-        super().__init__(motion, start, lag_s)
-        self._kernels = kernels("fgtrack.estimation.kernels.replay")
-        self._kind, self._density = motion.kind, motion.density
-        self._start_ns = -int(LARGEST_NS)  # of all windows, by the clock
-        self._chains: dict[int, _Chain] = {}
-        self._free: list[int] = []
-        self._order, self._steps = np.empty((0, 0), dtype=np.int64), list[Any]()
-        self._allocate(8, 64, 4)
-
-    def _allocate(self, rows: int, slots: int, k: int) -> None:
-        """Make arrays for so many tracks, steps and components; what is there is kept."""
-        n = self._motion.dim
-        shapes = ((), np.int64), ((n,), float), ((n, n), float), ((n,), float), ((n, n), float), ((n, n), float)
-        measured = ((k,), float), ((k, k), float), ((k,), np.int64), ((), np.int64)
-        order, old = np.tile(np.arange(slots), (rows, 1)), self._order.shape
-        order[: old[0], : old[1]] = self._order
-        steps = [np.zeros((rows, slots, *shape), dtype) for shape, dtype in (*shapes, *measured)]
-        for new, present in zip(steps, self._steps, strict=bool(self._steps)):
-            new[tuple(map(slice, present.shape))] = present
-        self._free += range(old[0], rows)
-        self._order, self._steps = order, steps
-
-    def advance(self, now_ns: int) -> None:
-        """See `TrackBank.advance`."""
-        self._now_ns = now_ns
-        self._start_ns = max(self._start_ns, now_ns - self._lag_ns)
-        if len(self._chains) < len(self._estimators):
-            self._ask(lambda _, one: one.advance(now_ns), [i for i in self._estimators if i not in self._chains])
-
-    def states_at(self, stamp_ns: int) -> StatesAt:
-        """See `TrackBank.states_at`."""
-        known = self._estimators if stamp_ns >= self._start_ns else self._estimators.keys() - self._chains.keys()
-        inside = [i for i, one in self._estimators.items() if i in known and one.window_ns[0] <= stamp_ns]
-        return StatesAt(tuple(inside), *self._ahead(inside, [stamp_ns] * len(inside)))
-
-    def present(self) -> list[TrackState]:
-        """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
-        stamps_ns = [max(self._now_ns, one.window_ns[0]) for one in self._estimators.values()]
-        return PresentStates(self._motion, self._now_ns, *self._ahead(list(self._estimators), stamps_ns))
-
-    def update(
-        self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
-    ) -> list[UpdateResult]:
-        """See `TrackBank.update`."""
-        seen = [one.seen_by(self._motion) for one in measurements]
-        found = dict[int, UpdateResult]()
-        alike: dict[tuple[int, tuple[str, ...]], list[int]] = {}
-        for place, track_id in enumerate(track_ids):
-            in_chain = track_id in self._chains
-            if stamp_ns < self._estimators[track_id].window_ns[0] or (in_chain and stamp_ns < self._start_ns):
-                found[track_id] = UpdateResult(UpdateStatus.TOO_OLD)
-            elif in_chain and _is_plain(seen[place]):
-                alike.setdefault((id(seen[place].model), seen[place].assumed), []).append(place)
-        for places in alike.values():
-            found |= self._fused(stamp_ns, [track_ids[place] for place in places], [seen[place] for place in places])
-        rest = [place for place, track_id in enumerate(track_ids) if track_id not in found]
-        for place in rest:
-            self._take_out(track_ids[place])
-        if rest:
-            ids = [track_ids[place] for place in rest]
-            found |= zip(ids, super().update(stamp_ns, ids, [seen[place] for place in rest]), strict=True)
-            for track_id in ids:
-                self._put_in(track_id)
-        return [found[track_id] for track_id in track_ids]
-
-    def birth(self, track_id: int, prior: Start) -> None:
-        """See `TrackBank.birth`."""
-        super().birth(track_id, prior)
-        self._put_in(track_id)
-
-    def remove(self, track_id: int) -> None:
-        """See `TrackBank.remove`."""
-        if track_id in self._chains:
-            self._free.append(self._chains.pop(track_id).row)
-        super().remove(track_id)
-
-    def _fused(self, stamp_ns: int, track_ids: Sequence[int], seen: Sequence[Measurement]) -> dict[int, UpdateResult]:
-        """Outcomes, by track, of measurements of the same that could be fused."""
-        chains, one = [self._chains[track_id] for track_id in track_ids], seen[0]
-        k = len(one.model.selected)
-        for chain in chains:
-            self._make_room(chain, k)
-        places = [_place(chain.stamps_ns, chain.measurements, each) for chain, each in zip(chains, seen, strict=True)]
-        at = [(chain.row, place, len(chain.stamps_ns)) for chain, place in zip(chains, places, strict=True)]
-        own = np.arange(k) if one.measured is None else np.array(one.measured)
-        z, R = np.array([each.z for each in seen]), np.array([each.R for each in seen])
-        steps, selected = (self._kind, self._density, self._order, *self._steps), one.model.selected
-        y, nis, S, fused = self._kernels.fuse(*steps, np.array(at), stamp_ns, z, R, selected, own)
-        found, numbers = dict[int, UpdateResult](), nis.tolist()
-        for i in fused.nonzero()[0].tolist():
-            chain = chains[i]
-            chain.stamps_ns.insert(places[i], stamp_ns)
-            chain.measurements.insert(places[i], seen[i])
-            found[track_ids[i]] = UpdateResult(chain.filter.moved_on(stamp_ns), y[i], numbers[i], S[i])
-        return found
-
-    def _make_room(self, chain: _Chain, k: int) -> None:
-        """Let there be a free slot for a measurement of `k` components."""
-        rows, slots = self._order.shape
-        if len(chain.stamps_ns) == slots:
-            start_ns = max(self._start_ns, chain.filter.window_ns[0])
-            gone = max(bisect.bisect_left(chain.stamps_ns, start_ns) - 1, 0)
-            del chain.stamps_ns[:gone], chain.measurements[:gone]
-            self._order[chain.row] = np.roll(self._order[chain.row], -gone)
-        largest, is_full = self._steps[6].shape[-1], len(chain.stamps_ns) == slots
-        if k > largest or is_full:
-            self._allocate(rows, slots * (1 + is_full), max(k, largest))
-
-    def _ahead(self, track_ids: Sequence[int], stamps_ns: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """Means (m, n) and covariances (m, n, n) of tracks, each at its stamp, with the yaw in (-pi, pi]."""
-        chosen, others = list[tuple[int, int, int]](), dict[int, TrackState]()
-        for i, (track_id, stamp_ns) in enumerate(zip(track_ids, stamps_ns, strict=True)):
-            chain = self._chains.get(track_id)
-            if chain is None:
-                others[i] = self._estimators[track_id].state_at(stamp_ns)
-            else:
-                place = max(bisect.bisect_right(chain.stamps_ns, stamp_ns) - 1, 0)
-                chosen.append((chain.row, place, stamp_ns))
-        at = np.array(chosen, dtype=np.int64).reshape(-1, 3)
-        found: tuple[FloatArray, FloatArray] = self._kernels.ahead(
-            self._kind, self._density, self._order, *self._steps[:6], at
-        )
-        if not others:
-            return found
-        states = iter(zip(*found, strict=True))
-        rest = [(others[i].mean, others[i].covariance) if i in others else next(states) for i in range(len(track_ids))]
-        mean, covariance = zip(*rest, strict=True)
-        return np.array(mean), np.array(covariance)
-
-    def _put_in(self, track_id: int) -> None:
-        """Move the steps of a filter into the arrays, where these can hold them."""
-        one = self._estimators[track_id]
-        if not all(each.search is None and _is_plain(each.measurement) for each in one.steps):
-            return
-        k = max((len(each.measurement.z) for each in one.steps if each.measurement is not None), default=0)
-        if not self._free:
-            self._allocate(2 * len(self._order), *self._steps[7].shape[1:3])
-        chain = _Chain(self._free.pop(), [], [], one)
-        for each in one.steps:
-            self._make_room(chain, k)
-            slot = self._order[chain.row, len(chain.stamps_ns)]
-            known = each.stamp_ns, each.mean, each.covariance, *each.predicted
-            for array, value in zip(self._steps, known, strict=False):
-                array[chain.row, slot] = value
-            if each.measurement is not None:
-                own, d = each.measurement, len(each.measurement.z)
-                z, R, columns, sizes = self._steps[6:]
-                z[chain.row, slot, :d], R[chain.row, slot, :d, :d] = own.z, own.R
-                columns[chain.row, slot, :d], sizes[chain.row, slot] = own.model.selected, d
-            chain.stamps_ns.append(each.stamp_ns)
-            chain.measurements.append(each.measurement)
-        one.steps = []
-        self._chains[track_id] = chain
-
-    def _take_out(self, track_id: int) -> None:
-        """Move the steps of a filter out of the arrays, if they are there."""
-        chain = self._chains.pop(track_id, None)
-        if chain is None:
-            return
-        self._free.append(chain.row)
-        for slot, stamp_ns, measurement in zip(
-            self._order[chain.row], chain.stamps_ns, chain.measurements, strict=False
-        ):
-            mean, covariance, *before = (array[chain.row, slot].copy() for array in self._steps[1:6])
-            chain.filter.steps.append(Step(stamp_ns, measurement, mean, covariance, Prediction(*before)))
-        chain.filter.advance(self._start_ns + self._lag_ns)
-
-
-def _is_plain(measurement: Measurement | None) -> bool:
-    """True if a measurement, or what is none, is of entries of the state, without a loss."""
-    if measurement is None:
-        return True
-    return measurement.loss is None and type(measurement.model) is MeasurementModel and measurement.model.linear
-
-
-def _place(stamps_ns: Sequence[int], measurements: Sequence[Measurement | None], new: Measurement) -> int:
+def insertion(stamps_ns: Sequence[int], measurements: Sequence[Measurement | None], new: Measurement) -> int:
     """Index of `new` among measurements: by stamp, and at one stamp by content; never before the first."""
-    place = max(bisect.bisect_right(stamps_ns, new.stamp_ns), 1)
-    while place > 1 and stamps_ns[place - 1] == new.stamp_ns:
-        last = measurements[place - 1]
+    index = max(bisect.bisect_right(stamps_ns, new.stamp_ns), 1)
+    while index > 1 and stamps_ns[index - 1] == new.stamp_ns:
+        last = measurements[index - 1]
         if last is None or last.content <= new.content:
             break
-        place -= 1
-    return place
+        index -= 1
+    return index
 
 
 def _stamp(step: Step) -> int:

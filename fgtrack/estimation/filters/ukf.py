@@ -6,7 +6,7 @@ columns of the covariance's root. They give no weight to the mean, so every cova
 """
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -17,8 +17,7 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.filters.ekf import OneCorrection, Prediction, updated_one
 from fgtrack.estimation.filters.iekf import check_iteration, descended, largest_move, negative_log_posterior, reweighted
 from fgtrack.estimation.filters.initiation import DEFAULT
-from fgtrack.estimation.filters.recursion import EkfRecursion
-from fgtrack.estimation.filters.replay import ReplayingFilter
+from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.models.measurement import MeasurementModel
 from fgtrack.models.motion import MotionModel
 
@@ -89,131 +88,51 @@ def _difference(model: MeasurementModel) -> Callable[[FloatArray, FloatArray], F
     return difference
 
 
-class UkfRecursion(EkfRecursion):
-    """A filter that takes motion and measurement as what they are on average over the spread of the state.
+class UkfReplay(ReplayEkf):
+    """Unscented Kalman filter that rewinds and replays: means over the spread of the state instead of derivatives.
 
     Julier and Uhlmann, Unscented filtering and nonlinear estimation, Proceedings of the IEEE 92(3), 2004, written as
     the statistical linear regression that it is (see `regression`). The process noise, that of the mean, is added. What
-    is linear it does as the extended Kalman filter.
+    is linear it does as `ReplayEkf`, whose parameters it has.
     """
 
+    spreads = True
+
     def predict(self, mean: FloatArray, covariance: FloatArray, dt_s: float) -> Prediction:
-        """See `EkfRecursion.predict`."""
-        if self.motion.linear:
+        """See `ReplayEkf.predict`."""
+        if self._motion.linear:
             return super().predict(mean, covariance, dt_s)
-        after, A, noise = regression(lambda x: self.motion.predict(x, dt_s), mean, covariance)
-        AP, Q = A @ covariance, self.motion.process_noise(mean, dt_s)
+        after, A, noise = regression(lambda x: self._motion.predict(x, dt_s), mean, covariance)
+        AP, Q = A @ covariance, self._motion.process_noise(mean, dt_s)
         return Prediction(after, symmetrise(AP @ A.mT + noise + Q), AP)
 
-    def correct_one(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
-        """See `EkfRecursion.correct_one`."""
+    def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
+        """See `ReplayEkf.correct`."""
         if measurement.model.linear:
-            return super().correct_one(mean, covariance, measurement)
+            return super().correct(mean, covariance, measurement)
         z, A, noise = measurement_regression(measurement, mean, covariance)
         y, R = measurement.model.residual(measurement.z, z), measurement.R + noise
         return updated_one(mean, covariance, y, A, R, measurement.loss, measurement.measured)
 
 
-class UkfReplay(ReplayingFilter):
-    """Unscented Kalman filter that rewinds and replays: means over the spread of the state in place of derivatives.
-
-    Julier and Uhlmann 2004, see `UkfRecursion`. What is linear it does as `ReplayEkf`.
-
-    Parameters
-    ----------
-    motion, prior, lag_s
-        See `WindowedFilter`.
-    initiation
-        See `ReplayingFilter`.
-    """
-
-    spreads = True
-
-    def __init__(
-        self,
-        motion: MotionModel,
-        prior: Start,
-        lag_s: float,
-        initiation: str = DEFAULT,
-    ) -> None:
-        super().__init__(motion, prior, lag_s, UkfRecursion(motion), initiation)
-
-
-class IplfRecursion(UkfRecursion):
-    """An unscented filter whose update takes the measurement as what it is over the spread of the posterior.
+class IplfReplay(UkfReplay):
+    """Iterated posterior linearisation filter that rewinds and replays: averages over the spread of the posterior.
 
     Garcia-Fernandez, Svensson, Morelande and Sarkka, Posterior linearization filter: principles and implementation
     using sigma points, IEEE Transactions on Signal Processing 63(20), 2015. The regression is repeated over each
     posterior that the prior and the last regression give. With the spread and noise of a regression held, a step of
     the mean that does not lower prior plus loss is halved (Raitoharju et al., Damped posterior linearization filter,
-    IEEE Signal Processing Letters 25(4), 2018).
+    IEEE Signal Processing Letters 25(4), 2018). What is linear it does as `ReplayEkf`.
 
     Parameters
     ----------
-    motion
-        See `UkfRecursion`.
-    max_iterations, tolerance
-        When it ends; the tolerance is in standard deviations. Raises `ValueError` for a value out of range.
-    """
-
-    def __init__(self, motion: MotionModel, max_iterations: int, tolerance: float) -> None:
-        super().__init__(motion)
-        check_iteration(max_iterations, tolerance)
-        self._max_iterations, self._tolerance = max_iterations, tolerance
-
-    def correct_one(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
-        """See `EkfRecursion.correct_one`."""
-        if measurement.model.linear:
-            return super().correct_one(mean, covariance, measurement)
-        x, P = mean, covariance
-        for _ in range(self._max_iterations):
-            last, spread = x, P
-            z, A, noise = measurement_regression(measurement, x, P)
-            y, R = measurement.model.residual(measurement.z, z), measurement.R + noise
-            update = reweighted(mean, covariance, y, A, R, measurement.loss, x - mean)
-            cost = partial(self._cost, (mean, covariance), measurement, spread, R)
-            limit = negative_log_posterior(x - mean, covariance, y, R, measurement.loss)
-            x, P = update.mean, update.covariance
-            if self._max_iterations > 1:
-                x = descended(cost, limit, last, x)
-            narrowed = np.abs(1.0 - spread.diagonal() / P.diagonal()).max()
-            if max(largest_move(x - last, P), narrowed) < self._tolerance:
-                break
-        first = super().correct_one(mean, covariance, measurement)
-        return first._replace(mean=x, covariance=P, weight=update.weight)
-
-    def _cost(
-        self,
-        prior: tuple[FloatArray, FloatArray],
-        measurement: Measurement,
-        spread: FloatArray,
-        R: FloatArray,
-        x: FloatArray,
-    ) -> float:
-        """Cost that a step lowers: the negative logarithm of the posterior at a state `x` (n,) of `spread` (n, n)."""
-        z = measurement_regression(measurement, x, spread).mean
-        residual = measurement.model.residual(measurement.z, z)
-        return negative_log_posterior(x - prior[0], prior[1], residual, R, measurement.loss)
-
-
-class IplfReplay(ReplayingFilter):
-    """Iterated posterior linearisation filter that rewinds and replays: averages over the spread of the posterior.
-
-    Garcia-Fernandez et al. 2015, see `IplfRecursion`. What is linear it does as `ReplayEkf`.
-
-    Parameters
-    ----------
-    motion, prior, lag_s
-        See `WindowedFilter`.
+    motion, prior, lag_s, initiation
+        See `ReplayEkf`.
     max_iterations
         Regressions per update; 1 is the unscented filter.
     tolerance
         Where mean and standard deviations change by less than this many standard deviations, the iteration ends.
-    initiation
-        See `ReplayingFilter`.
     """
-
-    spreads = True
 
     def __init__(
         self,
@@ -224,5 +143,32 @@ class IplfReplay(ReplayingFilter):
         tolerance: float = 1e-2,
         initiation: str = DEFAULT,
     ) -> None:
-        recursion = IplfRecursion(motion, max_iterations, tolerance)
-        super().__init__(motion, prior, lag_s, recursion, initiation)
+        super().__init__(motion, prior, lag_s, initiation)
+        check_iteration(max_iterations, tolerance)
+        self._max_iterations, self._tolerance = max_iterations, tolerance
+
+    def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
+        """See `ReplayEkf.correct`."""
+        first = super().correct(mean, covariance, measurement)
+        if measurement.model.linear:
+            return first
+        x, P = mean, covariance
+        for _ in range(self._max_iterations):
+            last, spread = x, P
+            z, A, noise = measurement_regression(measurement, x, P)
+            y, R = measurement.model.residual(measurement.z, z), measurement.R + noise
+            update = reweighted(mean, covariance, y, A, R, measurement.loss, x - mean)
+            x, P = update.mean, update.covariance
+            if self._max_iterations > 1:
+
+                def cost(x: FloatArray, spread: FloatArray = spread, R: FloatArray = R) -> float:
+                    z = measurement_regression(measurement, x, spread).mean
+                    residual = measurement.model.residual(measurement.z, z)
+                    return negative_log_posterior(x - mean, covariance, residual, R, measurement.loss)
+
+                limit = negative_log_posterior(last - mean, covariance, y, R, measurement.loss)
+                x = descended(cost, limit, last, x)
+            narrowed = np.abs(1.0 - spread.diagonal() / P.diagonal()).max()
+            if max(largest_move(x - last, P), narrowed) < self._tolerance:
+                break
+        return first._replace(mean=x, covariance=P, weight=update.weight)

@@ -81,7 +81,7 @@ class DelayedHorizon(BufferedEkf):
     horizon_s
         D, at most `lag_s`. Raises `CallError` otherwise.
     initiation
-        See `ReplayingFilter`.
+        See `ReplayEkf`.
     """
 
     exact = "up to now - D: any lag, any number"
@@ -114,7 +114,7 @@ class ReorderBuffer(BufferedEkf):
     hold_s
         D, at most `lag_s`. Raises `CallError` otherwise.
     initiation
-        See `ReplayingFilter`.
+        See `ReplayEkf`.
     """
 
     exact = "up to D before the newest stamp: any lag, any number"
