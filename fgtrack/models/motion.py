@@ -200,11 +200,11 @@ class WhiteNoise(MotionModel):
             shape = np.broadcast_shapes(shape, t.shape)
             x, t = np.broadcast_to(x, (*shape, n)), np.broadcast_to(t, shape)
         states = np.array(x, dtype=np.float64, order="C").reshape(-1, n)
-        compiled = kernels("fgtrack.models.transitions")
-        mean, F, Q = compiled.transitions(self.kind, states, np.array(t, order="C").reshape(-1), self.density)
-        if len(shape) == 1:
-            return Transition(mean, F, Q)
-        return Transition(mean.reshape(*shape, n), F.reshape(*shape, n, n), Q.reshape(*shape, n, n))
+        times_s = np.array(t, order="C").reshape(-1)
+        found = Transition(np.empty((*shape, n)), np.empty((*shape, n, n)), np.empty((*shape, n, n)))
+        flat = found.mean.reshape(-1, n), found.F.reshape(-1, n, n), found.Q.reshape(-1, n, n)
+        kernels("fgtrack.models.transitions").transitions(self.kind, states, times_s, self.density, *flat)
+        return found
 
     @cached_property
     def density(self) -> FloatArray:

@@ -149,13 +149,10 @@ def transition(
                 F[i, k] = GM[i, k] if part else G[i, k]
 
 
-@njit("(int64, float64[:, ::1], float64[::1], float64[::1])")
+@njit("(int64, float64[:, ::1], float64[::1], float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, ::1])")
 def transitions(
-    kind: int, x: FloatArray, dt_s: FloatArray, density: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Mean (m, n), F and Q (m, n, n) of states (m, n) after `dt_s` (m,)."""
-    m, n = x.shape
-    mean, F, Q = np.empty((m, n)), np.empty((m, n, n)), np.empty((m, n, n))
-    for k in range(m):
+    kind: int, x: FloatArray, dt_s: FloatArray, density: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
+) -> None:
+    """Write mean (m, n), F and Q (m, n, n) of states (m, n) after `dt_s` (m,)."""
+    for k in range(len(x)):
         transition(kind, x[k], dt_s[k], density, mean[k], F[k], Q[k])
-    return mean, F, Q

@@ -124,7 +124,7 @@ def test_a_stream_of_a_window_many_times_as_long_stays_the_same_and_small() -> N
             offset_ns = (50 * k - late_ms) * MS
             chosen = [i for i in range(5) if rng.random() < 0.9]
             banks.update(START.stamp_ns + offset_ns, chosen, [drawn(rng, motion, offset_ns) for _ in chosen])
-    assert banks.found._order.shape == (8, 64)
+    assert banks.found._arrays[0].shape == (8, 64)
 
 
 def test_what_cannot_be_fused_fails_alone_and_changes_nothing() -> None:

@@ -145,12 +145,10 @@ def predict_across(
 ) -> Prediction:
     """`predict`, and the cross-covariance of both states, which is half way to the covariance."""
     after, F, Q = motion.transition(mean, dt_s)
-    shape, n = after.shape[:-1], after.shape[-1]
-    P = np.broadcast_to(covariance, (*shape, n, n))
-    found, cross = kernels(_KALMAN).predict(
-        *(np.array(each, dtype=np.float64, order="C").reshape(-1, n, n) for each in (F, P, Q))
-    )
-    return Prediction(after, found.reshape(*shape, n, n), cross.reshape(*shape, n, n))
+    shape, n = Q.shape, Q.shape[-1]
+    F, P, Q = (np.array(each, order="C") for each in (F, np.broadcast_to(covariance, shape), Q))
+    _, cross = kernels(_KALMAN).predict(*(each.reshape(-1, n, n) for each in (F, P, Q)))
+    return Prediction(after, Q, cross.reshape(shape))
 
 
 def correct(
@@ -187,14 +185,16 @@ def correct_with_innovation(
     rows = np.arange(y.shape[-1]) if measured is None else np.array(measured, dtype=np.int64)
     x, P, y, R = (np.array(each, dtype=np.float64, order="C") for each in (mean, covariance, y, R))
     H = np.array(H, dtype=np.float64, order="C", ndmin=3)
-    after, covariance, nis, S, fused = kernels(_KALMAN).correct(x, P, y, H, R, rows)
-    w = np.ones(len(x))
+    S, nis, w, fused = np.empty(R.shape), np.empty(len(x)), np.ones(len(x)), np.empty(len(x), dtype=bool)
+    fuse = kernels(_KALMAN).correct
+    fuse(x, P, y, H, R, rows, S, nis, fused)
     if any(losses):
+        x, P = (np.array(each, dtype=np.float64, order="C") for each in (mean, covariance))
         spread = congruence(H, P)
         for row, loss in enumerate(losses):
             w[row] = robust_weight(loss, y[row], spread[row], R[row]) if fused[row] else 1.0
-        after, covariance, _, _, fused = kernels(_KALMAN).correct(x, P, y, H, R / w[:, None, None], rows)
-    return Correction(after, covariance, y, nis, w, S, fused)
+        fuse(x, P, y, H, R / w[:, None, None], rows, np.empty(R.shape), np.empty(len(x)), fused)
+    return Correction(x, P, y, nis, w, S, fused)
 
 
 def updated_one(

@@ -61,10 +61,9 @@ class EulerCtrv(ExactPropagator):
         """See `ExactPropagator.propagate`."""
         euler = kernels("fgtrack.estimation.kernels.euler")
         x, P = (np.array(each, dtype=np.float64, order="C") for each in (mean, covariance))
-        after: tuple[FloatArray, FloatArray] = euler.propagate(
-            x, P, np.array(steps, dtype=np.int64), dt_s, self._density, self.accelerates, self.yaw_limit_rad
-        )
-        return after
+        counts = np.array(steps, dtype=np.int64)
+        euler.propagate(x, P, counts, dt_s, self._density, self.accelerates, self.yaw_limit_rad)
+        return x, P
 
 
 def track_state(motion: MotionModel, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> TrackState:

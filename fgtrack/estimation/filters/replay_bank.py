@@ -50,21 +50,22 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         self._start_ns = -int(LARGEST_NS)  # of all windows, by the clock
         self._chains: dict[int, _Chain] = {}
         self._free: list[int] = []
-        self._order, self._steps = np.empty((0, 0), dtype=np.int64), list[Any]()
+        self._arrays = list[Any]()
         self._allocate(8, 64, 4)
 
     def _allocate(self, rows: int, slots: int, k: int) -> None:
-        """Make arrays for so many tracks, steps and components; what is there is kept."""
+        """Make arrays for so many tracks, steps and components with the present contents (see the kernels)."""
         n = self._motion.dim
-        shapes = ((), np.int64), ((n,), float), ((n, n), float), ((n,), float), ((n, n), float), ((n, n), float)
-        measured = ((k,), float), ((k, k), float), ((k,), np.int64), ((), np.int64)
-        order, old = np.tile(np.arange(slots), (rows, 1)), self._order.shape
-        order[: old[0], : old[1]] = self._order
-        steps = [np.zeros((rows, slots, *shape), dtype) for shape, dtype in (*shapes, *measured)]
-        for new, present in zip(steps, self._steps, strict=bool(self._steps)):
+        arrays = [
+            np.tile(np.arange(slots), (rows, 1)),
+            np.zeros((rows, slots, 2 + k), dtype=np.int64),
+            np.zeros((rows, slots, 3 * n + 2, n)),
+            np.zeros((rows, slots, k + 1, k)),
+        ]
+        self._free += range(len(self._arrays[0]) if self._arrays else 0, rows)
+        for new, present in zip(arrays, self._arrays, strict=bool(self._arrays)):
             new[tuple(map(slice, present.shape))] = present
-        self._free += range(old[0], rows)
-        self._order, self._steps = order, steps
+        self._arrays = arrays
 
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`."""
@@ -123,34 +124,34 @@ class ReplayBank(ObjectBank[ReplayEkf]):
     def _fused(self, stamp_ns: int, track_ids: Sequence[int], seen: Sequence[Measurement]) -> dict[int, UpdateResult]:
         """Outcomes, by track, of measurements of the same that could be fused."""
         chains, one = [self._chains[track_id] for track_id in track_ids], seen[0]
-        k = len(one.model.selected)
+        m, k = len(chains), len(one.z)
         for chain in chains:
             self._make_room(chain, k)
-        places = [
-            insertion(chain.stamps_ns, chain.measurements, each) for chain, each in zip(chains, seen, strict=True)
-        ]
-        at = [(chain.row, place, len(chain.stamps_ns)) for chain, place in zip(chains, places, strict=True)]
-        own = np.arange(k) if one.measured is None else np.array(one.measured)
-        z, R = np.array([each.z for each in seen]), np.array([each.R for each in seen])
-        steps, selected = (self._kind, self._density, self._order, *self._steps), one.model.selected
-        y, nis, S, fused = self._kernels.fuse(*steps, np.array(at), stamp_ns, z, R, selected, own)
+        indices = [insertion(own.stamps_ns, own.measurements, each) for own, each in zip(chains, seen, strict=True)]
+        at = [(own.row, index, len(own.stamps_ns)) for own, index in zip(chains, indices, strict=True)]
+        rows = np.arange(k) if one.measured is None else np.array(one.measured)
+        new, label = np.empty((m, k + 1, k)), np.array([stamp_ns, k, *one.model.selected])
+        new[:, 0], new[:, 1:] = [each.z for each in seen], [each.R for each in seen]
+        y, S, nis, fused = np.empty((m, k)), np.empty((m, k, k)), np.empty(m), np.empty(m, dtype=bool)
+        self._kernels.fuse(self._kind, self._density, *self._arrays, np.array(at), label, new, rows, y, S, nis, fused)
         found, numbers = dict[int, UpdateResult](), nis.tolist()
         for i in fused.nonzero()[0].tolist():
             chain = chains[i]
-            chain.stamps_ns.insert(places[i], stamp_ns)
-            chain.measurements.insert(places[i], seen[i])
+            chain.stamps_ns.insert(indices[i], stamp_ns)
+            chain.measurements.insert(indices[i], seen[i])
             found[track_ids[i]] = UpdateResult(chain.filter.moved_on(stamp_ns), y[i], numbers[i], S[i])
         return found
 
     def _make_room(self, chain: _Chain, k: int) -> None:
         """Let there be a free slot for a measurement of `k` components."""
-        rows, slots = self._order.shape
+        order = self._arrays[0]
+        rows, slots = order.shape
         if len(chain.stamps_ns) == slots:
             start_ns = max(self._start_ns, chain.filter.window_ns[0])
             gone = max(bisect.bisect_left(chain.stamps_ns, start_ns) - 1, 0)
             del chain.stamps_ns[:gone], chain.measurements[:gone]
-            self._order[chain.row] = np.roll(self._order[chain.row], -gone)
-        largest, is_full = self._steps[6].shape[-1], len(chain.stamps_ns) == slots
+            order[chain.row] = np.roll(order[chain.row], -gone)
+        largest, is_full = self._arrays[3].shape[-1], len(chain.stamps_ns) == slots
         if k > largest or is_full:
             self._allocate(rows, slots * (1 + is_full), max(k, largest))
 
@@ -165,9 +166,10 @@ class ReplayBank(ObjectBank[ReplayEkf]):
                 place = max(bisect.bisect_right(chain.stamps_ns, stamp_ns) - 1, 0)
                 chosen.append((chain.row, place, stamp_ns))
         at = np.array(chosen, dtype=np.int64).reshape(-1, 3)
-        found: tuple[FloatArray, FloatArray] = self._kernels.ahead(
-            self._kind, self._density, self._order, *self._steps[:6], at
-        )
+        n = self._motion.dim
+        predicted = np.empty((len(at), 2 * n + 1, n))
+        self._kernels.ahead(self._kind, self._density, *self._arrays[:3], at, predicted)
+        found = predicted[:, 0].copy(), predicted[:, 1 : n + 1].copy()
         if not others:
             return found
         states = iter(zip(*found, strict=True))
@@ -182,21 +184,20 @@ class ReplayBank(ObjectBank[ReplayEkf]):
             return
         k = max((len(each.measurement.z) for each in one.steps if each.measurement is not None), default=0)
         if not self._free:
-            self._allocate(2 * len(self._order), *self._steps[7].shape[1:3])
+            self._allocate(2 * len(self._arrays[0]), self._arrays[0].shape[1], self._arrays[3].shape[-1])
         chain = _Chain(self._free.pop(), [], [], one)
         for each in one.steps:
             self._make_room(chain, k)
-            slot = self._order[chain.row, len(chain.stamps_ns)]
-            known = each.stamp_ns, each.mean, each.covariance, *each.predicted
-            for array, value in zip(self._steps, known, strict=False):
-                array[chain.row, slot] = value
-            if each.measurement is not None:
-                own, d = each.measurement, len(each.measurement.z)
-                z, R, columns, sizes = self._steps[6:]
-                z[chain.row, slot, :d], R[chain.row, slot, :d, :d] = own.z, own.R
-                columns[chain.row, slot, :d], sizes[chain.row, slot] = own.model.selected, d
+            order, labels, steps, measured = (array[chain.row] for array in self._arrays)
+            slot, own = order[len(chain.stamps_ns)], each.measurement
+            steps[slot] = np.vstack([each.mean, each.covariance, *each.predicted])
+            labels[slot, 0] = each.stamp_ns
+            if own is not None:
+                d = len(own.z)
+                labels[slot, 1 : d + 2] = d, *own.model.selected
+                measured[slot, 0, :d], measured[slot, 1 : d + 1, :d] = own.z, own.R
             chain.stamps_ns.append(each.stamp_ns)
-            chain.measurements.append(each.measurement)
+            chain.measurements.append(own)
         one.steps = []
         self._chains[track_id] = chain
 
@@ -206,11 +207,12 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         if chain is None:
             return
         self._free.append(chain.row)
-        for slot, stamp_ns, measurement in zip(
-            self._order[chain.row], chain.stamps_ns, chain.measurements, strict=False
-        ):
-            mean, covariance, *before = (array[chain.row, slot].copy() for array in self._steps[1:6])
-            chain.filter.steps.append(Step(stamp_ns, measurement, mean, covariance, Prediction(*before)))
+        order, _, steps, _ = (array[chain.row] for array in self._arrays)
+        n = self._motion.dim
+        for slot, stamp_ns, measurement in zip(order, chain.stamps_ns, chain.measurements, strict=False):
+            own = steps[slot].copy()
+            predicted = Prediction(own[n + 1], own[n + 2 : 2 * n + 2], own[2 * n + 2 :])
+            chain.filter.steps.append(Step(stamp_ns, measurement, own[0], own[1 : n + 1], predicted))
         chain.filter.advance(self._start_ns + self._lag_ns)
 
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import add_product_transposed, njit, product
+from fgtrack.core.compiled import add_product_transposed, copy, njit, product
 from fgtrack.core.types import FloatArray, IntArray
 
 
@@ -17,35 +17,34 @@ def propagate(
     density: FloatArray,
     accelerates: bool,
     yaw_limit_rad: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Means (m, n) and covariances (m, n, n), each after its own number of `steps` (m,): P' = F P F' + Q dt.
+) -> None:
+    """Move means (m, n) and covariances (m, n, n), each by its own number of `steps` (m,): P' = F P F' + Q dt.
 
     `density`, shape (n,): diagonal of Q, along and across the heading first. What follows the yaw rate stays, but that
     an acceleration may drive the speed, without a part in F; the yaw goes up to `yaw_limit_rad`.
     """
     m, n = mean.shape
-    after, covariance = mean.copy(), P.copy()
-    F, FP, more = np.eye(n), np.empty((n, n)), np.empty((n, n))
+    F, FP, more = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    for j in range(n):
+        for k in range(n):
+            F[j, k] = 1.0 if j == k else 0.0
     F[2, 4] = dt_s
     along, across = density[0] * dt_s, density[1] * dt_s
     for i in range(m):
-        x = after[i]
+        x = mean[i]
         for _ in range(steps[i]):
             c, s, way = math.cos(x[2]), math.sin(x[2]), x[3] * dt_s
             F[0, 2], F[0, 3], F[1, 2], F[1, 3] = -way * s, c * dt_s, way * c, s * dt_s
-            product(F, covariance[i], FP)
+            product(F, P[i], FP)
             for j in range(n):
                 for k in range(n):
                     more[j, k] = density[j] * dt_s if j == k else 0.0
             more[0, 0], more[1, 1] = along * c * c + across * s * s, along * s * s + across * c * c
             more[0, 1] = more[1, 0] = (along - across) * c * s
             add_product_transposed(FP, F, more)
-            for j in range(n):
-                for k in range(n):
-                    covariance[i, j, k] = more[j, k]
+            copy(more, P[i])
             x[0] += way * c
             x[1] += way * s
             x[2] = min(x[2] + x[4] * dt_s, yaw_limit_rad)
             if accelerates:
                 x[3] += x[5] * dt_s
-    return after, covariance

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fgtrack.core.compiled import add_congruence, copy, inlined, njit, product, solve
+from fgtrack.core.compiled import add_congruence, add_product_transposed, copy, inlined, njit, product, solve
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 
 _VECTORS, _MATRICES = "float64[:, ::1]", "float64[:, :, ::1]"
@@ -10,52 +10,46 @@ _VECTORS, _MATRICES = "float64[:, ::1]", "float64[:, :, ::1]"
 
 @inlined
 def innovate(
-    P: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray, measured: IntArray, S: FloatArray, HP: FloatArray
+    P: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray, rows: IntArray, S: FloatArray, K: FloatArray
 ) -> float:
-    """Write S = H P H' + R and S^-1 H P, and return the NIS of the entries `measured`; NaN where S has no root."""
-    k, nis = len(y), 0.0
+    """Write S = H P H' + R and K' = S^-1 H P, and return the NIS of the `rows` of y; NaN where S has no root."""
+    k, d, nis = len(y), len(rows), 0.0
     copy(R, S)
-    add_congruence(H, P, HP, S)
-    for whole in range(2):
-        d, n = (k, len(P)) if whole else (len(measured), 1)
-        factor, columns = np.empty((d, d)), np.empty((d, n))
-        for a in range(d):
-            row = a if whole else measured[a]
-            for b in range(d):
-                factor[a, b] = S[row, b if whole else measured[b]]
-            for b in range(n):
-                columns[a, b] = HP[a, b] if whole else y[row]
-        if not solve(factor, columns):
-            return np.nan
-        for a in range(d):
-            if not whole:
-                nis += y[measured[a]] * columns[a, 0]
-            else:
-                for b in range(n):
-                    HP[a, b] = columns[a, b]
-    return nis
+    add_congruence(H, P, K, S)
+    marginal, weighted, root = np.empty((d, d)), np.empty((d, 1)), np.empty((k, k))
+    for a in range(d):
+        weighted[a, 0] = y[rows[a]]
+        for b in range(d):
+            marginal[a, b] = S[rows[a], rows[b]]
+    if not solve(marginal, weighted):
+        return np.nan
+    for a in range(d):
+        nis += y[rows[a]] * weighted[a, 0]
+    copy(S, root)
+    return nis if solve(root, K) else np.nan
 
 
 @inlined
 def correct_one(mean: FloatArray, P: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray, K: FloatArray) -> bool:
     """Overwrite mean and P by x + K y and (I - K H) P (I - K H)' + K R K', of K transposed; True if all is finite."""
-    n, k = len(mean), len(y)
-    A, AP, KR, found = np.empty((n, n)), np.empty((n, n)), np.empty((n, k)), np.zeros((n, n))
-    gain = np.empty((n, k))
-    total = 0.0
+    n, k, total = len(mean), len(y), 0.0
+    A, AP, KR, gain = np.empty((n, n)), np.empty((n, n)), np.empty((n, k)), np.empty((n, k))
     for a in range(n):
         for b in range(k):
             gain[a, b] = K[b, a]
             mean[a] += K[b, a] * y[b]
-        total += abs(mean[a])
     product(gain, H, A)
     for a in range(n):
         for b in range(n):
             A[a, b] = (1.0 if a == b else 0.0) - A[a, b]
-    add_congruence(A, P, AP, found)
-    add_congruence(gain, R, KR, found)
-    copy(found, P)
+    product(A, P, AP)
     for a in range(n):
+        for b in range(n):
+            P[a, b] = 0.0
+    add_product_transposed(AP, A, P)
+    add_congruence(gain, R, KR, P)
+    for a in range(n):
+        total += abs(mean[a])
         for b in range(n):
             total += abs(P[a, b])
     return total < np.inf
@@ -63,28 +57,34 @@ def correct_one(mean: FloatArray, P: FloatArray, y: FloatArray, H: FloatArray, R
 
 @njit(f"({_MATRICES}, {_MATRICES}, {_MATRICES})")
 def predict(F: FloatArray, P: FloatArray, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Covariances F P F' + Q and cross-covariances F P, shapes (m, n, n)."""
-    cross, found = np.empty(P.shape), Q.copy()
+    """Return covariances F P F' + Q, written over Q, and cross-covariances F P, shapes (m, n, n)."""
+    cross = np.empty(P.shape)
     for i in range(len(P)):
-        add_congruence(F[i], P[i], cross[i], found[i])
-    return found, cross
+        add_congruence(F[i], P[i], cross[i], Q[i])
+    return Q, cross
 
 
-@njit(f"({_VECTORS}, {_MATRICES}, {_VECTORS}, {_MATRICES}, {_MATRICES}, int64[::1])")
+@njit(
+    f"({_VECTORS}, {_MATRICES}, {_VECTORS}, {_MATRICES}, {_MATRICES}, int64[::1], {_MATRICES}, float64[::1], b1[::1])"
+)
 def correct(
-    mean: FloatArray, P: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray, measured: IntArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Means x + K y and covariances (I - K H) P (I - K H)' + K R K' with K = P H' S^-1 and S = H P H' + R.
+    mean: FloatArray,
+    P: FloatArray,
+    y: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+    rows: IntArray,
+    S: FloatArray,
+    nis: FloatArray,
+    fused: BoolArray,
+) -> None:
+    """Overwrite means and covariances by x + K y and (I - K H) P (I - K H)' + K R K' with K = P H' S^-1.
 
-    Then the NIS of the entries `measured` of y, S, and where S was positive definite and all is finite. Shapes (m, n),
-    (m, n, n), (m, k), (1, k, n) or (m, k, n), (m, k, k).
+    Writes S = H P H' + R, the NIS of the `rows` of y, and where S was positive definite and all is finite. Shapes
+    (m, n), (m, n, n), (m, k), (1, k, n) or (m, k, n), (m, k, k).
     """
-    m, k = y.shape
-    after, covariance, nis, S = mean.copy(), P.copy(), np.empty(m), np.empty(R.shape)
-    fused, K = np.zeros(m, np.bool_), np.empty((k, mean.shape[1]))
-    for i in range(m):
+    K = np.empty((y.shape[1], mean.shape[1]))
+    for i in range(len(y)):
         h = H[min(i, len(H) - 1)]
-        nis[i] = innovate(P[i], y[i], h, R[i], measured, S[i], K)
-        if not np.isnan(nis[i]):
-            fused[i] = correct_one(after[i], covariance[i], y[i], h, R[i], K)
-    return after, covariance, nis, S, fused
+        nis[i] = innovate(P[i], y[i], h, R[i], rows, S[i], K)
+        fused[i] = not np.isnan(nis[i]) and correct_one(mean[i], P[i], y[i], h, R[i], K)

@@ -1,8 +1,9 @@
 """The extended Kalman filter with replay, of many tracks: arrays (tracks, slots, ...) hold the steps of their windows.
 
-`order[track]` has the slots of a track's steps, oldest first, and then the free ones. A step is what was measured, the
-state predicted for it (`before`, with the cross-covariance to the step before), and the state after it. Measurements
-are entries of the state: component a of a slot is entry `columns[a]`.
+`order[track]` has the slots of a track's steps, oldest first, and then the free ones. A slot of `steps` has in rows of
+n, the dimension of the state, mean and covariance after the measurement (n + 1 rows), mean and covariance predicted for
+it, and the cross-covariance of that with the step before. One of `measured` has z in its first row, and then R; one of
+`labels` the stamp, the number k of components, and the entries of the state that these are.
 """
 
 import math
@@ -28,84 +29,66 @@ def _wrapped(angle_rad: float) -> float:
 
 
 @inlined
-def _ahead(
-    motion: int,
-    density: FloatArray,
-    x: FloatArray,
-    P: FloatArray,
-    late_ns: int,
-    mean: FloatArray,
-    covariance: FloatArray,
-    cross: FloatArray,
-) -> None:
-    """Write mean, covariance and cross-covariance after a time: f(x), F P F' + Q and F P."""
-    F = np.empty(P.shape)
-    transition(motion, x, late_ns / NS_PER_S, density, mean, F, covariance)
-    add_congruence(F, P, cross, covariance)
+def _ahead(motion: int, density: FloatArray, state: FloatArray, late_ns: int, predicted: FloatArray) -> None:
+    """Write f(x), F P F' + Q and F P, (2 n + 1, n), of the state x, P, (n + 1, n)."""
+    n = len(density)
+    F = np.empty((n, n))
+    transition(motion, state[0], late_ns / NS_PER_S, density, predicted[0], F, predicted[1 : n + 1])
+    add_congruence(F, state[1:], predicted[n + 1 :], predicted[1 : n + 1])
 
 
 @inlined
-def _innovation(x: FloatArray, z: FloatArray, columns: IntArray, wraps: bool, y: FloatArray, H: FloatArray) -> None:
-    """Write y = z - H x, and H, which selects `columns`."""
+def _innovation(x: FloatArray, z: FloatArray, label: IntArray, wraps: bool, y: FloatArray, H: FloatArray) -> None:
+    """Write y = z - H x, and H, which selects entries."""
     for a in range(len(y)):
-        y[a] = z[a] - x[columns[a]]
-        if wraps and columns[a] == _YAW:
+        entry = label[2 + a]
+        y[a] = z[a] - x[entry]
+        if wraps and entry == _YAW:
             y[a] = _wrapped(y[a])
         for b in range(len(x)):
-            H[a, b] = 1.0 if b == columns[a] else 0.0
+            H[a, b] = 1.0 if b == entry else 0.0
 
 
 @inlined
 def _retrodict(
-    motion: int,
-    density: FloatArray,
-    slots: IntArray,
-    new: int,
-    stamps_ns: IntArray,
-    mean: FloatArray,
-    covariance: FloatArray,
-    before: FloatArray,
-    before_P: FloatArray,
-    cross: FloatArray,
-    x: FloatArray,
-    P: FloatArray,
+    motion: int, density: FloatArray, slots: IntArray, labels: IntArray, steps: FloatArray, now: FloatArray
 ) -> bool:
-    """Smooth x, P, the state after the last of the later steps in `slots`, back to the prediction of the step `new`.
+    """Smooth `now`, the state after the last of `slots`, back to the prediction of the first, which is new.
 
     From step to step (Rauch, Tung and Striebel), x_j + C s and P_j + C (P - P_-) C' with the prediction x_-, P_- of the
     step after, the shift s = x - x_- and C = (P_-^-1 F P_j)'. False where some P_- has no root.
     """
-    n, wraps = len(x), motion == ARC
-    ahead, ahead_P, gain, root = np.empty((1, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    shift, C, CD = np.empty(n), np.empty((n, n)), np.empty((n, n))
-    for j in range(len(slots) - 1, -1, -1):
-        after, left = slots[j], slots[j - 1] if j else new
-        late_ns = stamps_ns[after] - stamps_ns[left]
+    n = len(density)
+    ahead, root, C, CD = np.empty((2 * n + 1, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    gain, shift = ahead[n + 1 :], now[0]
+    for j in range(len(slots) - 1, 0, -1):
+        after, left, start = slots[j], slots[j - 1], 0 if j > 1 else n + 1
+        late_ns = labels[after, 0] - labels[left, 0]
         if late_ns == 0:  # the same state
             continue
-        if j:
-            copy(before[after : after + 1], ahead)
-            copy(before_P[after], ahead_P)
-            copy(cross[after], gain)
+        state = steps[left, start : start + n + 1]
+        if start:
+            _ahead(motion, density, state, late_ns, ahead)
         else:
-            _ahead(motion, density, before[new], before_P[new], late_ns, ahead[0], ahead_P, gain)
-        copy(ahead_P, root)
+            copy(steps[after, n + 1 :], ahead)
+        copy(ahead[1:], root)
         if not solve(root, gain):
             return False
         for a in range(n):
-            shift[a] = x[a] - ahead[0, a]
+            shift[a] -= ahead[0, a]
             for b in range(n):
                 C[a, b] = gain[b, a]
-                root[a, b] = P[a, b] - ahead_P[a, b]
-        if wraps:
+                root[a, b] = now[1 + a, b] - ahead[1 + a, b]
+        if motion == ARC:
             shift[_YAW] = _wrapped(shift[_YAW])
         product(C, root, CD)
-        copy(covariance[left] if j else before_P[new], P)
-        add_product_transposed(CD, C, P)
         for a in range(n):
-            x[a] = mean[left, a] if j else before[new, a]
+            root[0, a] = state[0, a]
             for b in range(n):
-                x[a] += C[a, b] * shift[b]
+                root[0, a] += C[a, b] * shift[b]
+        copy(state, now)
+        copy(root[:1], now[:1])
+        add_product_transposed(CD, C, now[1:])
     return True
 
 
@@ -113,132 +96,103 @@ def _retrodict(
 def _step(
     motion: int,
     density: FloatArray,
-    left: int,
-    slot: int,
-    stamps_ns: IntArray,
-    mean: FloatArray,
-    covariance: FloatArray,
     before: FloatArray,
-    before_P: FloatArray,
-    cross: FloatArray,
-    z: FloatArray,
-    R: FloatArray,
-    columns: IntArray,
+    after: FloatArray,
+    late_ns: int,
+    label: IntArray,
+    measured: FloatArray,
 ) -> bool:
-    """Predict from the step in `left`, and fuse the measurement of `slot`; False where it cannot be fused."""
-    late_ns = stamps_ns[slot] - stamps_ns[left]
-    _ahead(motion, density, mean[left], covariance[left], late_ns, before[slot], before_P[slot], cross[slot])
-    k, n = len(z), mean.shape[1]
-    for a in range(n):
-        mean[slot, a] = before[slot, a]
-    copy(before_P[slot], covariance[slot])
-    y, H, S, own, K = np.empty(k), np.empty((k, n)), np.empty((k, k)), np.empty((k, k)), np.empty((k, n))
-    copy(R, own)
-    _innovation(before[slot], z, columns, motion == ARC, y, H)
-    nis = innovate(before_P[slot], y, H, own, columns[:0], S, K)
-    if np.isnan(nis) or not correct_one(mean[slot], covariance[slot], y, H, own, K):
+    """Predict the step `after` from that `before`, and fuse its measurement; False where it cannot be fused."""
+    k, n = label[1], len(density)
+    _ahead(motion, density, before[: n + 1], late_ns, after[n + 1 :])
+    copy(after[n + 1 :], after[: n + 1])
+    y, H, S, K = np.empty(k), np.empty((k, n)), np.empty((k, k)), np.empty((k, n))
+    _innovation(after[0], measured[0], label, motion == ARC, y, H)
+    nis = innovate(after[n + 2 : 2 * n + 2], y, H, measured[1:], label[:0], S, K)
+    if np.isnan(nis) or not correct_one(after[0], after[1 : n + 1], y, H, measured[1:], K):
         return False
     if motion == ARC:
-        mean[slot, _YAW] = _wrapped(mean[slot, _YAW])
+        after[0, _YAW] = _wrapped(after[0, _YAW])
     return True
 
 
-_STEPS = (
-    "int64, float64[::1], int64[:, ::1], int64[:, ::1], float64[:, :, ::1], float64[:, :, :, ::1], float64[:, :, ::1], "
-    "float64[:, :, :, ::1], float64[:, :, :, ::1]"
-)
+_STEPS = "int64, float64[::1], int64[:, ::1], int64[:, :, ::1], float64[:, :, :, ::1]"
 
 
 @njit(
-    f"({_STEPS}, float64[:, :, ::1], float64[:, :, :, ::1], int64[:, :, ::1], int64[:, ::1], int64[:, ::1], int64, "
-    "float64[:, ::1], float64[:, :, ::1], int64[::1], int64[::1])"
+    f"({_STEPS}, float64[:, :, :, ::1], int64[:, ::1], int64[::1], float64[:, :, ::1], int64[::1], float64[:, ::1], "
+    "float64[:, :, ::1], float64[::1], b1[::1])"
 )
 def fuse(
     motion: int,
     density: FloatArray,
     order: IntArray,
-    stamps_ns: IntArray,
-    mean: FloatArray,
-    covariance: FloatArray,
-    before: FloatArray,
-    before_P: FloatArray,
-    cross: FloatArray,
-    z: FloatArray,
-    R: FloatArray,
-    columns: IntArray,
-    sizes: IntArray,
+    labels: IntArray,
+    steps: FloatArray,
+    measured: FloatArray,
     at: IntArray,
-    stamp_ns: int,
-    new_z: FloatArray,
-    new_R: FloatArray,
-    new_columns: IntArray,
-    measured: IntArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Put a measurement of `stamp_ns` into each chain of steps, and filter the later ones again.
+    new_label: IntArray,
+    new: FloatArray,
+    rows: IntArray,
+    y: FloatArray,
+    S: FloatArray,
+    nis: FloatArray,
+    fused: BoolArray,
+) -> None:
+    """Put a measurement `new` (m, k + 1, k) into each chain of steps, and filter the later ones again.
 
-    Rows of `at` (m, 3) are a track, the place of its measurement, and the number of its steps, fewer than its slots.
-    Returns innovations y (m, k), the NIS of their entries `measured`, and S (m, k, k), given all that was fused; and
-    False where a measurement cannot be fused: there all is as it was.
+    Rows of `at` (m, 3) are a track, the index of its measurement, and the number of its steps, fewer than its slots.
+    Writes innovations y (m, k), the NIS of their `rows`, and S (m, k, k), given all that was fused; and False where a
+    measurement cannot be fused: there all is as it was.
     """
-    (m, k), n = new_z.shape, mean.shape[2]
-    y, S, nis, fused = np.empty((m, k)), np.empty((m, k, k)), np.empty(m), np.zeros(m, np.bool_)
-    x, P, H, K, own = np.empty(n), np.empty((n, n)), np.empty((k, n)), np.empty((k, n)), np.empty((k, k))
-    for i in range(m):
-        t, place, count = at[i, 0], at[i, 1], at[i, 2]
-        slots = order[t]
-        new = slots[count]
-        stamps_ns[t, new], sizes[t, new] = stamp_ns, k
-        for a in range(k):
-            z[t, new, a], columns[t, new, a] = new_z[i, a], new_columns[a]
+    k, n = y.shape[1], len(density)
+    now, H, K = np.empty((n + 1, n)), np.empty((k, n)), np.empty((k, n))
+    for i in range(len(at)):
+        t, index, count = at[i, 0], at[i, 1], at[i, 2]
+        slots, own = order[t], order[t, count]
+        for a in range(k + 2):
+            labels[t, own, a] = new_label[a]
+        for a in range(k + 1):
             for b in range(k):
-                R[t, new, a, b] = new_R[i, a, b]
-        for j in range(count, place, -1):
+                measured[t, own, a, b] = new[i, a, b]
+        for j in range(count, index, -1):
             slots[j] = slots[j - 1]
-        slots[place] = new
-        steps = stamps_ns[t], mean[t], covariance[t], before[t], before_P[t], cross[t]
-        j, last, fused[i] = place, count, True
+        slots[index] = own
+        j, last, fused[i] = index, count, True
         while j <= last:
-            s, d = slots[j], sizes[t, slots[j]]
-            ok = _step(motion, density, slots[j - 1], s, *steps, z[t, s, :d], R[t, s], columns[t, s, :d])
-            if ok and s == new:
+            s, left = slots[j], slots[j - 1]
+            late_ns = labels[t, s, 0] - labels[t, left, 0]
+            ok = _step(motion, density, steps[t, left], steps[t, s], late_ns, labels[t, s], measured[t, s])
+            if ok and s == own:
                 newest = slots[count]
-                for a in range(n):
-                    x[a] = before[t, new, a] if place == count else mean[t, newest, a]
-                copy(before_P[t, new] if place == count else covariance[t, newest], P)
-                ok = _retrodict(motion, density, slots[place + 1 : count + 1], new, *steps, x, P)
-                copy(new_R[i], own)
-                _innovation(x, new_z[i], new_columns, motion == ARC, y[i], H)
-                nis[i] = innovate(P, y[i], H, own, measured, S[i], K)
+                copy(steps[t, newest, n + 1 if index == count else 0 :], now)
+                ok = _retrodict(motion, density, slots[index : count + 1], labels[t], steps[t], now)
+                _innovation(now[0], new[i, 0], new_label, motion == ARC, y[i], H)
+                nis[i] = innovate(now[1:], y[i], H, new[i, 1:], rows, S[i], K)
                 ok = ok and not np.isnan(nis[i])
             j += 1
             if not ok and fused[i]:  # take it out, and filter the later ones again without it
-                for j in range(place, count):
+                for j in range(index, count):
                     slots[j] = slots[j + 1]
-                slots[count] = new
-                j, last, fused[i] = place, count - 1, False
-    return y, nis, S, fused
+                slots[count] = own
+                j, last, fused[i] = index, count - 1, False
 
 
-@njit(f"({_STEPS}, int64[:, ::1])")
+@njit(f"({_STEPS}, int64[:, ::1], float64[:, :, ::1])")
 def ahead(
     motion: int,
     density: FloatArray,
     order: IntArray,
-    stamps_ns: IntArray,
-    mean: FloatArray,
-    covariance: FloatArray,
-    before: FloatArray,
-    before_P: FloatArray,
-    cross: FloatArray,
+    labels: IntArray,
+    steps: FloatArray,
     at: IntArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Means (m, n) and covariances (m, n, n), each predicted; rows of `at` are track, place of the step, and stamp."""
-    m, n = len(at), mean.shape[2]
-    found, P, FP = np.empty((m, n)), np.empty((m, n, n)), np.empty((n, n))
-    for i in range(m):
-        t, place, at_ns = at[i, 0], at[i, 1], at[i, 2]
-        s = order[t, place]
-        _ahead(motion, density, mean[t, s], covariance[t, s], at_ns - stamps_ns[t, s], found[i], P[i], FP)
+    predicted: FloatArray,
+) -> None:
+    """Write the `_ahead` (m, 2 n + 1, n) of steps; rows of `at` are track, index of the step, and stamp."""
+    n = len(density)
+    for i in range(len(at)):
+        t, at_ns = at[i, 0], at[i, 2]
+        s = order[t, at[i, 1]]
+        _ahead(motion, density, steps[t, s, : n + 1], at_ns - labels[t, s, 0], predicted[i])
         if motion == ARC:
-            found[i, _YAW] = _wrapped(found[i, _YAW])
-    return found, P
+            predicted[i, 0, _YAW] = _wrapped(predicted[i, 0, _YAW])
