@@ -12,7 +12,7 @@ from fgtrack.core.types import Disposition
 from fgtrack.evaluation.diagnostics import excluded_lines
 from fgtrack.evaluation.matching import ERROR_NAMES, Matching, confirmed, match, scenes, track_errors
 from fgtrack.evaluation.scores.consistency import Consistency, consistency
-from fgtrack.evaluation.scores.continuity import breaks, late_switches, switches, times_to_confirm, tracked_visits
+from fgtrack.evaluation.scores.continuity import breaks, switches, times_to_confirm, tracked_visits
 from fgtrack.evaluation.scores.innovations import (
     RESIDUAL_NAMES,
     local_innovations,
@@ -29,8 +29,6 @@ from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, Table
 
 FALSE_TRACK_SHARE = 0.5
 """A track that is paired with a true object in less than this share of its rows is false."""
-LATE_SWITCH_S = 0.5
-"""An identity switch within this time after an out-of-sequence update counts as late."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +45,6 @@ class ObjectMetrics:
     """Times that tracking went on after a loss, or with another track."""
     id_switches: int = 0
     """Times that it went on with another track than the last one."""
-    late_id_switches: int = 0
-    """Those that follow on an out-of-sequence update, see `late_switches`."""
     time_to_confirm_s: Moments = field(default_factory=Moments)
     """From the first detection to the first confirmed track, a sample for each object, see `times_to_confirm`."""
     ticks_in_sight: int = 0
@@ -217,7 +213,6 @@ def evaluate_matched(run: Run, matching: Matching | None, options: EvaluationCon
 
 def _truth_metrics(run: Run, matching: Matching, options: EvaluationConfig) -> TruthMetrics:
     errors = track_errors(matching)
-    late = late_switches(run, matching, LATE_SWITCH_S)
     confirm_s = times_to_confirm(run, matching, options.gate_m)
     objects = {}
     for index, object_id in enumerate(matching.object_ids):
@@ -230,7 +225,6 @@ def _truth_metrics(run: Run, matching: Matching, options: EvaluationConfig) -> T
             ticks_tracked=int((present & tracked).sum()),
             breaks=breaks(matching.track_ids[present, index]),
             id_switches=len(switches(matching.track_ids[present, index])),
-            late_id_switches=int(late[index]),
             time_to_confirm_s=Moments.of(confirm_s[index : index + 1]),
             ticks_in_sight=int((present & in_sight).sum()),
             ticks_tracked_in_sight=int((present & in_sight & tracked).sum()),

@@ -6,79 +6,57 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluation_runs import ROUND, WEST, update, write_run
+from evaluation_runs import WEST, update, write_run
 from scipy.stats import chi2
 
 from fgtrack.core.types import Disposition, UpdateRecord
-from fgtrack.evaluation.matching import Matching, match
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.scores.consistency import normalised_squares, state_nees
+from fgtrack.evaluation.scores.consistency import position_squares
 from fgtrack.evaluation.scores.innovations import FEWEST, Autocorrelation
 from fgtrack.evaluation.scores.statistics import ChiSquareMean
 from fgtrack.io.run import COVARIANCE_COLUMNS, Run, Table
 
 
-def table_of(covariances: np.ndarray) -> Table:
+def table_of(covariances: np.ndarray, errors: np.ndarray) -> Table:
     rows, columns = np.triu_indices(5)
-    return Table(dict(zip(COVARIANCE_COLUMNS, covariances[:, rows, columns].T, strict=True)))
-
-
-def matching_of(run: Run) -> Matching:
-    found = match(run)
-    assert found is not None
-    return found
+    entries = dict(zip(COVARIANCE_COLUMNS, covariances[:, rows, columns].T, strict=True))
+    return Table({**entries, "x_m": errors[:, 0], "y_m": errors[:, 1]})
 
 
 # --- normalised squares
 
 
-@pytest.mark.parametrize("size", [1, 2, 4, 5])
-def test_a_normalised_square_weighs_the_errors_with_their_covariance(size: int) -> None:
+def test_a_normalised_square_weighs_the_errors_with_their_covariance() -> None:
     rng = np.random.default_rng(3)
     roots = rng.normal(size=(50, 5, 5))
     covariances = roots @ np.swapaxes(roots, 1, 2)
-    errors = rng.normal(size=(50, size))
-    expected = [e @ np.linalg.solve(P[:size, :size], e) for e, P in zip(errors, covariances, strict=True)]
-    assert normalised_squares(table_of(covariances), errors) == pytest.approx(np.array(expected), rel=1e-8)
+    errors = rng.normal(size=(50, 2))
+    expected = [e @ np.linalg.solve(P[:2, :2], e) for e, P in zip(errors, covariances, strict=True)]
+    assert position_squares(table_of(covariances, errors), np.zeros((50, 2))) == pytest.approx(expected, rel=1e-8)
 
 
 def test_without_a_positive_definite_covariance_there_is_no_square() -> None:
     indefinite = np.eye(5)
     indefinite[0, 1] = indefinite[1, 0] = 2.0
-    unknown = np.eye(5)
-    unknown[4, :] = unknown[:, 4] = np.nan
-    covariances = np.array([np.eye(5), indefinite, np.zeros((5, 5)), -np.eye(5), unknown])
-    squares = normalised_squares(table_of(covariances), np.ones((5, 2)))
-    assert np.isnan(squares).tolist() == [False, True, True, True, False]
-    assert np.isnan(normalised_squares(table_of(covariances), np.ones((5, 5))))[4]
-    assert np.isnan(normalised_squares(table_of(covariances[:1]), np.array([[1.0, np.nan]])))[0]
-    covariances[0, 0, :2], covariances[0, 1, 0] = (1e-300, 1e60), 1e60  # out of these comes more than a number holds
-    assert np.isnan(normalised_squares(table_of(covariances[:1]), np.full((1, 2), 1e3)))[0]
+    huge = np.eye(5)
+    huge[0, :2], huge[1, 0] = (1e-300, 1e60), 1e60  # out of these comes more than a number holds
+    covariances = np.array([np.eye(5), indefinite, np.zeros((5, 5)), -np.eye(5), huge, np.eye(5)])
+    errors = np.ones((6, 2))
+    errors[5, 1] = np.nan
+    squares = position_squares(table_of(covariances, errors), np.zeros((6, 5)))
+    assert np.isnan(squares).tolist() == [False, True, True, True, True, True]
 
 
 # --- one run
 
 
-def test_nees_of_the_position_and_of_the_state_have_their_known_values(tmp_path: Path) -> None:
-    """The covariance is the identity; the yaw of WEST jumps from pi to -pi."""
-    errors = {"along_m": 3.0, "across_m": 4.0, "yaw_rad": 0.5, "speed_mps": 2.0}
+def test_nees_of_the_position_has_its_known_value(tmp_path: Path) -> None:
+    """The covariance is the identity."""
+    errors = {"along_m": 3.0, "across_m": 4.0}
     tracks = [[WEST.track(k, 1, **errors), WEST.track(k, 2, across_m=60.0)] for k in range(5)]
     run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(5)))
     found = evaluate(replace(run, config_text="evaluation: {gate_m: 6}")).consistency
     assert found.position_nees == ChiSquareMean(5, pytest.approx(25.0), 2.0)
-    assert found.state_nees == ChiSquareMean(5, pytest.approx(29.25), 4.0)
-
-
-def test_the_yaw_rate_counts_where_truth_and_model_have_one(tmp_path: Path) -> None:
-    truth = [replace(row, yaw_rate_radps=0.75) for row in ROUND.truth(range(4))]
-    tracks = [[ROUND.track(k, 1)] for k in range(4)]  # its yaw rate is 0.5
-    straight = np.eye(5)
-    straight[4, 4] = 0.0
-    state = tracks[3][0].state
-    tracks[3] = [replace(tracks[3][0], state=replace(state, covariance=straight))]
-    values, dof = state_nees(matching_of(write_run(tmp_path / "run", tracks, truth=truth)))
-    assert dof.tolist() == [5, 5, 5, 4]
-    assert values == pytest.approx([0.0625] * 3 + [0.0], abs=1e-9)
 
 
 def test_nis_has_the_degrees_of_freedom_of_what_was_measured(tmp_path: Path) -> None:
@@ -92,7 +70,7 @@ def test_nis_has_the_degrees_of_freedom_of_what_was_measured(tmp_path: Path) -> 
     }
     found = evaluate(write_run(tmp_path / "run", updates=updates)).consistency
     assert dict(found.nis) == {"lidar": ChiSquareMean(2, 2.5, 2.5), "radar": ChiSquareMean(1, 2.0, 1.0)}
-    assert found.position_nees.count == found.state_nees.count == 0
+    assert found.position_nees.count == 0
 
 
 def test_the_band_is_that_of_a_sum_of_independent_squares() -> None:

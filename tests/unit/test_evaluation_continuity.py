@@ -1,4 +1,4 @@
-"""Late identity switches and the time to confirm an object, told tick by tick (20 ms each)."""
+"""Time to confirm an object, tick by tick (20 ms each)."""
 
 import math
 from dataclasses import replace
@@ -9,57 +9,10 @@ from evaluation_runs import ROUND, WEST, update, write_run
 
 from fgtrack.core.types import Disposition, UpdateRecord
 from fgtrack.evaluation.matching import match
-from fgtrack.evaluation.scores.continuity import late_switches, times_to_confirm
+from fgtrack.evaluation.scores.continuity import times_to_confirm
 from fgtrack.io.run import Run
 
-LATE = Disposition.OUT_OF_SEQUENCE
 GATE_M = 5.0
-
-
-def switching_run(folder: Path, updates: dict[int, list[UpdateRecord]]) -> Run:
-    """Track 1 follows WEST to tick 9, track 2 from tick 12 on; track 3 follows ROUND all the time."""
-    tracks = []
-    for k in range(20):
-        west = [WEST.track(k, 1)] if k < 10 else [WEST.track(k, 2)] if k >= 12 else []
-        tracks.append([*west, ROUND.track(k, 3)])
-    return write_run(folder, tracks, truth=[*WEST.truth(range(20)), *ROUND.truth(range(20))], updates=updates)
-
-
-def late_of(run: Run, within_s: float) -> list[int]:
-    matching = match(run)
-    assert matching is not None
-    return late_switches(run, matching, within_s).tolist()
-
-
-@pytest.mark.parametrize(
-    ("tick", "track_id", "disposition", "late"),
-    [
-        (9, 1, LATE, 1),
-        (12, 2, LATE, 1),
-        (12, 2, Disposition.BEYOND_WINDOW, 1),
-        (7, 1, LATE, 1),  # 100 ms before the switch, not more
-        (6, 1, LATE, 0),
-        (13, 2, LATE, 0),  # after it
-        (9, 3, LATE, 0),  # another track
-        (9, 1, Disposition.IN_SEQUENCE, 0),
-        (9, 1, Disposition.TOO_OLD, 0),
-    ],
-)
-def test_a_switch_is_late_soon_after_an_out_of_sequence_update_of_one_of_the_two_tracks(
-    tmp_path: Path, tick: int, track_id: int, disposition: Disposition, late: int
-) -> None:
-    # sensed long before: it counts when it was fused
-    updates = {tick: [update(tick=0, disposition=disposition, track_id=track_id)]}
-    assert late_of(switching_run(tmp_path / "run", updates), 0.1) == [late, 0]
-
-
-def test_an_update_of_a_tick_that_was_never_finished_does_not_count(tmp_path: Path) -> None:
-    run = switching_run(tmp_path / "run", {12: [update(disposition=LATE, track_id=2)], 19: [update(disposition=LATE)]})
-    finished = run.tables["timing"]["tick"] < 15
-    assert late_of(run.with_tables(timing=run.tables["timing"].where(finished)), 0.1) == [1, 0]
-
-
-# --- time to confirm
 
 
 def confirm_of(run: Run) -> list[float]:
@@ -75,7 +28,7 @@ def test_the_time_to_confirm_is_from_the_first_stamp_to_the_tick_of_the_first_co
     updates = {
         5: [update(tick=2, delay_ns=50_000_000, disposition=Disposition.BIRTH)],
         6: [update(tick=4, disposition=Disposition.IN_SEQUENCE)],
-        8: [update(tick=3, disposition=LATE)],
+        8: [update(tick=3, disposition=Disposition.OUT_OF_SEQUENCE)],
     }
     run = write_run(tmp_path / "run", tracks, truth=[*WEST.truth(range(10)), *ROUND.truth(range(10))], updates=updates)
     west, round_ = confirm_of(run)

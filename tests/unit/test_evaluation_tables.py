@@ -253,12 +253,11 @@ def test_the_tracking_table_has_errors_continuity_and_times(tables: Tables, runs
     assert headings[1:8] == ["[m]", "[m]", "[m]", "[rad]", "[m/s]", "pos.", "[%]"]
     metrics = evaluate(runs["smoother"])
     assert metrics.truth is not None
-    west = replace(metrics.truth.objects[7], breaks=3, id_switches=2, late_id_switches=1)
+    west = replace(metrics.truth.objects[7], breaks=3, id_switches=2)
     changed = replace(metrics, truth=replace(metrics.truth, objects={7: west}), num_tracks=5)
     times = Distribution(9, mean=0.004, p50=0.001, p90=0.002, p99=0.003)
     other = compare(evaluated("run", runs["smoother"], replace(changed, time_per_tick_s=times)))
     assert rows_of(other, "tracking")[0].split()[-5:] == ["3/2", "0", "1.00", "5/2", "1.00/3.00"]
-    assert rows_of(other, "multi_object")[0].split()[-2] == "2/1"
 
 
 def test_the_multi_object_table_has_gospa_scores_switches_and_the_time_to_confirm(tmp_path: Path) -> None:
@@ -273,7 +272,7 @@ def test_the_multi_object_table_has_gospa_scores_switches_and_the_time_to_confir
     # GOSPA^2 = 2.75^2 + 12.5 + 12.5 at every tick; MOTA 1 - (4 + 4 + 1) / 8; IDF1 2 * 2 / (8 + 8)
     # a similarity of 0.725 passes 14 of 19 bounds: DetA 14/19 * 4/12, AssA 14/19 * 1/2, HOTA 14/19 sqrt(1/6)
     assert rows_of(tables, "multi_object") == [
-        "run 5.71 2.75 3.54 3.54 0.000 5.71 -12.5 25.0 30.1 24.6 36.8 1/1 0.060",
+        "run 5.71 2.75 3.54 3.54 0.000 5.71 -12.5 25.0 30.1 24.6 36.8 1 0.060",
         f"plain{' -' * 13}",
     ]
     table = tables["multi_object"]
@@ -296,7 +295,6 @@ def test_the_consistency_table_has_means_bands_and_whiteness(tmp_path: Path) -> 
     run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(40)), updates=updates)
     assert rows_of(compare({"run": run}), "consistency") == [
         "run NEES position 40 9.00 2.00 1.43 to 2.67 -",
-        "run NEES state 40 9.00 4.00 3.17 to 4.92 -",
         "run NIS lidar 30 5.00 2.00 1.35 to 2.78 -0.967 ± 0.352",
         "run NIS radar 30 1.00 1.00 0.560 to 1.57 0.967 ± 0.352",
     ]

@@ -16,7 +16,6 @@ from fgtrack.evaluation.tables.verdict import verdict
 
 FITS = Consistency(
     position_nees=ChiSquareMean(1000, 2.1, 2.0),
-    state_nees=ChiSquareMean(),
     nis={"radar": ChiSquareMean(500, 4.2, 4.0), "camera": ChiSquareMean(5, 40.0, 1.0)},
     autocorrelation={},
     position_nees_interval=Estimate(2.1, 1.8, 2.4, 20),

@@ -1,9 +1,9 @@
-"""Breaks, identity switches and those caused by late measurements, time to the first confirmed track."""
+"""Breaks, identity switches, time to the first confirmed track."""
 
 import numpy as np
 
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import FUSED, LATE, FloatArray, IntArray
+from fgtrack.core.types import FUSED, FloatArray, IntArray
 from fgtrack.evaluation.matching import Matching, confirmed, published_rows
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run import NO_TRACK, Run
@@ -22,28 +22,6 @@ def switches(track_ids: IntArray) -> IntArray:
     tracked = np.flatnonzero(track_ids != NO_TRACK)
     sequence = track_ids[tracked]
     return np.asarray(tracked[1:][sequence[1:] != sequence[:-1]])
-
-
-def late_switches(run: Run, matching: Matching, within_s: float) -> IntArray:
-    """Identity switches of every object that follow on an out-of-sequence update, shape (objects,).
-
-    A switch counts where the track before it or the one after it had such an update in the ticks from `within_s`
-    before the switch up to it.
-    """
-    ticks, updates = run.tables["timing"]["tick"], run.tables["updates"]
-    finished = np.isin(updates["tick"], ticks)  # only of a killed run some are not
-    updates = updates.where(np.isin(updates["disposition"], [name.value for name in LATE]) & finished)
-    updated_ns = matching.now_ns[np.searchsorted(ticks, updates["tick"])]
-    counts = np.zeros(len(matching.object_ids), dtype=np.int64)
-    for index in range(len(counts)):
-        present = np.flatnonzero(matching.present[:, index])
-        track_ids = matching.track_ids[present, index]
-        for k in switches(track_ids).tolist():
-            age_ns = matching.now_ns[present[k]] - updated_ns
-            recent = (age_ns >= 0) & (age_ns <= within_s * NS_PER_S)
-            last = track_ids[:k][track_ids[:k] != NO_TRACK][-1]
-            counts[index] += np.isin(updates["track_id"][recent], (last, track_ids[k])).any()
-    return counts
 
 
 def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:

@@ -10,7 +10,7 @@ import numpy as np
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, within_run
 from fgtrack.evaluation.matching import Matching, TrackErrors, state_errors
-from fgtrack.evaluation.scores.consistency import normalised_squares
+from fgtrack.evaluation.scores.consistency import position_squares
 from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.evaluation.truth import TRUE_STATE, true_paths
 from fgtrack.io.run import Run, Table
@@ -68,7 +68,7 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
         parts[WINDOW] = final
     present, truth = matching.tracks.where(matching.paired), matching.true_states[matching.paired]
     errors = _moments(state_errors(present, truth))
-    found = [LagMetrics(0.0, errors, Moments.of(_position_nees(present, truth)), errors)]
+    found = [LagMetrics(0.0, errors, Moments.of(position_squares(present, truth)), errors)]
     for lag_s, every in parts.items():
         states, truth, rows = _with_truth(run, matching, every)
         present = Table({name: column[rows] for name, column in matching.tracks.items()})
@@ -77,7 +77,7 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
         reduction = within_run(
             by_stamp(states["stamp_ns"], squares), lambda S: 1.0 - np.sqrt(S[0] / S[1]), np.random.default_rng(_SEED)
         )
-        nees = Moments.of(_position_nees(states, truth))
+        nees = Moments.of(position_squares(states, truth))
         found.append(LagMetrics(lag_s, _moments(of_states), nees, _moments(of_present), reduction))
     return tuple(found)
 
@@ -124,8 +124,3 @@ def _rows_at(matching: Matching, states: Table) -> IntArray:
 
 def _moments(errors: Mapping[str, FloatArray]) -> dict[str, Moments]:
     return {name: Moments.of(values) for name, values in errors.items()}
-
-
-def _position_nees(states: Table, truth: FloatArray) -> FloatArray:
-    """Normalised error squared of x and y, shape (n,); NaN where the covariance is not positive definite."""
-    return normalised_squares(states, np.stack([states["x_m"], states["y_m"]], axis=-1) - truth[:, :2])

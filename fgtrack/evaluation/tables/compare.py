@@ -180,14 +180,13 @@ def _multi_object(metrics: Mapping[str, Metrics], compared: Sequence[Comparison]
         Column("unseen\n[m]", "gospa_out_of_sight_m"),
         Column("with\nunseen", "gospa_rms_m"),
         *(Column(f"{name}\n[%]", name.lower(), scale=PERCENT) for name in ("MOTA", "IDF1", "HOTA", "DetA", "AssA")),
-        Column("switches/\nlate", "id_switches late_id_switches", "{}/{}"),
+        Column("switches", "id_switches"),
         Column("confirm\n[s]", "time_to_confirm_s"),
     ]
     notes = [
         "GOSPA: root mean square over ticks; the squares of its parts add up to its own",
         "unseen: missed where no sensor could see; the scores in % count it too",
         "scores: 100 is perfect; defined in docs/metrics.md",
-        "late: switches soon after an out-of-sequence update of one of the two tracks",
         "confirm: from an object's first detection to its first confirmed track",
         *([BEST_NOTE] if any(map(_is_best(compared, _GOSPA), records)) else []),
     ]
@@ -209,7 +208,6 @@ def _scores(of: MultiObjectMetrics, overall: ObjectMetrics) -> dict[str, float]:
         "idf1": of.identity["idf1"],
         **of.hota,
         "id_switches": overall.id_switches,
-        "late_id_switches": overall.late_id_switches,
         "time_to_confirm_s": overall.time_to_confirm_s.mean,
     }
 
@@ -256,8 +254,7 @@ def _consistency(metrics: Mapping[str, Metrics]) -> Table:
     records = []
     for label, one in metrics.items():
         of = one.consistency
-        squares = {"NEES position": of.position_nees, "NEES state": of.state_nees}
-        squares |= {f"NIS {sensor}": nis for sensor, nis in of.nis.items()}
+        squares = {"NEES position": of.position_nees} | {f"NIS {sensor}": nis for sensor, nis in of.nis.items()}
         for name, square in squares.items():
             record: dict[str, Any] = {"run": label, "of": name, "num_samples": square.count, "mean": square.mean}
             record |= {"expected": square.dof, "band_low": square.band[0], "band_high": square.band[1]}

@@ -25,7 +25,6 @@ _BETTER: Mapping[str, Literal["less", "more", "nearer"]] = {
     "multi_object.gospa.in_sight_rms_m": "less",
     "multi_object.gospa.rms_m": "less",
     "consistency.position_nees.mean": "nearer",
-    "consistency.state_nees.mean": "nearer",
     "consistency.nis.*.mean": "nearer",
     "lagged.*.errors.*.rmse": "less",
     "truth.overall.tracked_share_in_sight": "more",
