@@ -67,10 +67,8 @@ def viewer_messages(runs: Mapping[str, Run]) -> tuple[Iterator[ViewerMessage], l
         ego_messages(first.tables["ego"], at_ns),
         *truth_messages(first.tables["truth"]),
     ]
-    for look, (name, run) in zip(_looks(runs), runs.items(), strict=True):
+    for look, run in zip(_looks(runs), runs.values(), strict=True):
         parts += run_messages(run, look)
-        if run.tables["updates"].num_rows and not run.tables["detections"].num_rows:
-            notes.append(f"{name}: has no detections.csv, so no detections are shown; repeat the run")
     return merge(*parts, key=lambda message: message.log_ns), notes
 
 

@@ -101,7 +101,6 @@ def _entity(entity: Entity, time: sdk.Timestamp, late_ns: int) -> sdk.SceneEntit
         id=entity.name,
         lifetime=sdk.Duration(*divmod(lifetime_ns, NS_PER_S)),
         frame_locked=entity.frame == "ego",
-        metadata=[sdk.KeyValuePair(key=key, value=value) for key, value in entity.facts.items()],
         **lists,
     )
 

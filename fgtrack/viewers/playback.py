@@ -132,8 +132,6 @@ class _Recording:
         of_ticks = [ticks, self.rows(tables["tracks"], "now_ns", "track_id"), past]
         ticks, tracks, past = _thinned(of_ticks, "now_ns", most, one.label, notes)
         (final,) = _thinned([final], "stamp_ns", most, f"{one.label}, final states", notes)
-        if tables["updates"].num_rows and not tables["detections"].num_rows:
-            notes[f"{one.label}: has no detections.csv, so no detections are shown; repeat the run"] = None
         return {
             "ticks": _column(self.seconds(ticks["now_ns"]), _TIME_DIGITS),
             "tracks": {

@@ -1,7 +1,6 @@
 """Messages that show a run: map, ego, truth, tracks and how sure they are, their corrected past, detections."""
 
 import math
-from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -34,7 +33,6 @@ _MAP_LINE_M, _TRACK_LINE_M = 0.3, 0.35
 _DEVIATIONS = 2.0  # of an ellipse
 _SHOWN_S = 0.5  # of a list that no later one of its sensor replaces
 _DOT_M, _BEARING_M = 1.0, 150.0
-_TRAIL, _TRAIL_S = 50, 10.0  # final states of the line through the last of them; how long it is shown
 _USED = (*FUSED, Disposition.MERGED)
 
 
@@ -104,7 +102,7 @@ def run_messages(run: Run, look: Look) -> Iterator[Messages]:
     """Streams of the messages that show a run alone, each in the order of log times."""
     yield from _track_messages(run, look)
     yield _past_messages(run, look)
-    yield from _final_messages(run, look)
+    yield _final_messages(run, look)
     yield from _detection_messages(run, look)
     yield _outcome_messages(run, look)
 
@@ -113,7 +111,7 @@ def _track_messages(run: Run, look: Look) -> Iterator[Messages]:
     """At every tick boxes, numbers and speeds, the 2-sigma ellipses of the positions, and the poses."""
     tracks = located(run.tables["tracks"])
     states, axes = _states(tracks, run.tables["objects"]), ellipses(tracks, _DEVIATIONS).tolist()
-    facts = list(_rows(tracks, "track_id", "status", "speed_mps", "num_measured"))
+    facts = list(_rows(tracks, "track_id", "status", "speed_mps"))
     rows_at = dict.fromkeys(run.tables["timing"]["now_ns"].tolist(), np.zeros(0, dtype=np.int64))
     rows_at |= dict(groups(tracks["now_ns"]))
 
@@ -123,7 +121,7 @@ def _track_messages(run: Run, look: Look) -> Iterator[Messages]:
             yield now_ns, int(tracks["stamp_ns"][rows].max()) if len(rows) else now_ns, entities
 
     def box(row: int) -> Entity:
-        track_id, status, speed_mps, num_measured = facts[row]
+        track_id, status, speed_mps = facts[row]
         state, at_m, size_m = states[row], _point(states[row]), _size(states[row])
         yaw_rad, name = state.yaw_rad or 0.0, f"{track_id} {state.class_name or ''}".strip()
         shapes = [
@@ -133,8 +131,7 @@ def _track_messages(run: Run, look: Look) -> Iterator[Messages]:
         if math.isfinite(speed_mps) and speed_mps:
             turned_rad = yaw_rad if speed_mps > 0.0 else yaw_rad + math.pi
             shapes.append(_arrow(at_m, turned_rad, abs(speed_mps) * _SPEED_ARROW_S, 0.25, look.of_track(track_id)))
-        details = {"status": status, "speed": f"{speed_mps:.2f} m/s", "measured": str(num_measured)}
-        return Entity(f"track {track_id}", tuple(shapes), facts=details)
+        return Entity(f"track {track_id}", tuple(shapes))
 
     def patch(row: int) -> Entity | None:
         long_m, short_m, yaw_rad = axes[row]
@@ -162,37 +159,21 @@ def _past_messages(run: Run, look: Look) -> Messages:
     def steps() -> Iterator[tuple[int, int, list[Entity]]]:
         for now_ns, rows in groups(states["now_ns"]):
             lines = {track_id: rows[mine] for track_id, mine in groups(states["track_id"][rows])}
-            yield now_ns, now_ns, [_trail(look, k, points_m[mine], 1.0) for k, mine in lines.items() if len(mine) > 1]
+            entities = [
+                Entity(f"track {k}", (_line(points_m[mine].tolist(), _TRACK_LINE_M, look.of_track(k)),))
+                for k, mine in lines.items()
+                if len(mine) > 1
+            ]
+            yield now_ns, now_ns, entities
 
     return _scenes(f"{look.prefix}/past", steps())
 
 
-def _final_messages(run: Run, look: Look) -> Iterator[Messages]:
-    """Final states as soon as nothing can change them any more, and lines through the last of them."""
+def _final_messages(run: Run, look: Look) -> Messages:
+    """Final states as soon as nothing can change them any more."""
     final = located(run.tables["smoothed"].where(run.tables["smoothed"]["kind"] == "final"))
-    states, known_ns, topic = _states(final, run.tables["objects"]), final_ns(run, final), f"{look.prefix}/smoothed"
-
-    def trails() -> Messages:
-        lines: defaultdict[int, deque[Point]] = defaultdict(lambda: deque(maxlen=_TRAIL))
-        for log_ns, rows in groups(known_ns):
-            rows = rows[np.argsort(final["stamp_ns"][rows], kind="stable")]
-            ids = final["track_id"][rows].tolist()
-            for row, track_id in zip(rows.tolist(), ids, strict=True):
-                lines[track_id].append(_point(states[row]))
-            entities = tuple(_trail(look, k, lines[k], 0.7, _TRAIL_S) for k in sorted(set(ids)) if len(lines[k]) > 1)
-            if entities:
-                yield ViewerMessage(log_ns, int(final["stamp_ns"][rows[-1]]), topic, Scene(entities))
-
-    yield trails()
-    yield _objects(topic, known_ns, final["stamp_ns"], states)
-
-
-def _trail(
-    look: Look, track_id: int, points_m: Iterable[Sequence[float]], opacity: float, lifetime_s: float | None = None
-) -> Entity:
-    """A line through states of a track."""
-    line = _line(points_m, _TRACK_LINE_M, look.of_track(track_id, opacity))
-    return Entity(f"track {track_id}", (line,), lifetime_s)
+    states = _states(final, run.tables["objects"])
+    return _objects(f"{look.prefix}/smoothed", final_ns(run, final), final["stamp_ns"], states)
 
 
 def _detection_messages(run: Run, look: Look) -> Iterator[Messages]:

@@ -1,7 +1,7 @@
 """Messages that show a run, for any file format: each has the time it is known at, and the time it is of."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 from fgtrack.core.types import Detection, EgoState
@@ -39,8 +39,6 @@ class Entity:
     shapes: tuple[Shape, ...]
     lifetime_s: float | None = None
     """Time in seconds for which it is shown from its log time on; None until it is replaced or removed."""
-    facts: Mapping[str, str] = field(default_factory=dict)
-    """Texts that a viewer shows of a selected entity."""
     frame: Literal["map", "ego"] = "map"
 
 
