@@ -37,7 +37,7 @@ def _beginning(names: Iterable[str], start: str) -> list[str]:
 
 Input = Annotated[
     Path,
-    typer.Argument(help="Recording: rosbag2, .mcap, .db3, .bag, stream, CSV or data set."),
+    typer.Argument(metavar="INPUT", help="Recording: rosbag2, .mcap, .db3, .bag, stream, CSV or data set."),
 ]
 ConfigFile = Annotated[
     str | None,
@@ -58,7 +58,9 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what such 
 Reference = Annotated[
     str | None, typer.Option("--reference", help="Sensor whose clock is right, where two do not agree.")
 ]
-Runs = Annotated[list[Path], typer.Argument(help="Run folders, or folders of runs, as that of the demo.")]
+Runs = Annotated[
+    list[Path], typer.Argument(metavar="RUN...", help="Run folders, or folders of runs, as that of the demo.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 StorageOption = Annotated[Storage, typer.Option("--storage", help="Storage of a rosbag2 folder.")]
 

@@ -151,7 +151,9 @@ def _run(words: Sequence[str], debug: bool) -> int:
             sys.stdout.flush()
         return BAD_CALL if not words else outcome if isinstance(outcome, int) else DONE
     except typer.TyperException as error:
-        return _failed(error.format_message(), BAD_CALL, debug)
+        context = getattr(error, "ctx", None)
+        usage = "" if context is None else f" ({context.get_usage().replace('Usage:', 'usage:')})"
+        return _failed(f"{error.format_message()}{usage}", BAD_CALL, debug)
     except FgtrackError as error:
         return _failed(str(error), BAD_CALL if isinstance(error, CallError) else BAD_DATA, debug)
     except MemoryError:

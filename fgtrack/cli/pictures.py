@@ -26,7 +26,9 @@ from fgtrack.viewers.report import write_report
 
 
 def figure(
-    runs: Annotated[list[Path], typer.Argument(help="Run folders, folders of run folders, or one sweep folder.")],
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN...", help="Run folders, folders of run folders, or one sweep folder.")
+    ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the pictures, or one .pdf.")],
     form: Annotated[Literal["png", "svg", "pdf"], typer.Option("--format", help="Format of the pictures.")] = "png",
     stamp: Annotated[float | None, typer.Option(help="Stamp of the close-up: s after the first tick.")] = None,

@@ -54,7 +54,7 @@ def simulate(
 
 def convert(
     recording: Input,
-    out: Annotated[Path, typer.Argument(help="Stream (.jsonl, .jsonl.gz), else a rosbag2 folder.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Stream (.jsonl, .jsonl.gz), else a rosbag2 folder.")],
     config_file: ConfigFile = None,
     delays_file: Annotated[
         Path | None,

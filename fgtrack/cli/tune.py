@@ -24,7 +24,9 @@ _KNOWN = {"yes": "yes", "roughly": "roughly", "limit": "a limit", "no": "not ide
 
 
 def tune(
-    recordings: Annotated[list[Path], typer.Argument(help="Recordings, as for replay; their noise is the same.")],
+    recordings: Annotated[
+        list[Path], typer.Argument(metavar="INPUT...", help="Recordings, as for replay; their noise is the same.")
+    ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Tuned configuration to write (YAML).")],
     config_file: ConfigFile = None,
     track_map: TrackMap = None,

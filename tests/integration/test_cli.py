@@ -254,7 +254,7 @@ def foreign_folder(path: Path) -> None:
         (("config", "-c", "broken.yaml"), "broken.yaml:2: invalid YAML"),
         (("demo", "-o", "busy"), "busy/recording: exists and is not a rosbag2 folder"),
         (("convert", "drive.jsonl", "drive.html"), "drive.html: is written as .jsonl, as .jsonl.gz, or as a rosbag2"),
-        (("replay", "drive.jsonl", "b", "-o", "run"), "unexpected extra argument"),
+        (("replay", "drive.jsonl", "b", "-o", "run"), "usage: fgtrack replay [OPTIONS] {INPUT})"),
         (("replay", "drive.jsonl"), "--out"),
         (("replya", "drive.jsonl"), "Did you mean 'replay'?"),
         (("replay", "drive.jsonl", "-o", "run", "-e", "smother"), "did you mean 'smoother'"),
