@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from fgtrack.core.checks import LARGEST
-from fgtrack.core.errors import DataError
 from fgtrack.core.geometry import in_polygon, wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import EGO_ID, BoolArray, FloatArray, IntArray
@@ -78,6 +77,15 @@ def true_paths(truth: Table) -> list[TruePath]:
     return paths
 
 
+def true_states(truth: Table, object_index: IntArray, stamps_ns: IntArray) -> FloatArray:
+    """Return the true states at `stamps_ns` of these of the `true_paths`, shape (n, 5); NaN without truth."""
+    states = np.full((len(stamps_ns), len(TRUE_STATE)), np.nan)
+    for index, path in enumerate(true_paths(truth)):
+        mine = object_index == index
+        states[mine] = path.at(stamps_ns[mine])
+    return states
+
+
 def ignored_paths(ignored: Table) -> list[TruePath]:
     """Objects of a neighbouring class: a track that follows one of them is neither right nor false.
 
@@ -102,10 +110,7 @@ def in_ignored_regions(run: Run, stamps_ns: IntArray, points_m: FloatArray) -> B
     nearest_ns = known_ns[np.searchsorted(known_ns[:-1] + np.diff(known_ns) // 2, stamps_ns)]
     for stamp_ns, text in zip(regions["stamp_ns"], regions["outline_m"], strict=True):
         rows = np.flatnonzero((nearest_ns == stamp_ns) & ~inside)
-        try:
-            inside[rows] = in_polygon(points_m[rows], np.array(text.split(), dtype=np.float64).reshape(-1, 2))
-        except ValueError as error:
-            raise DataError(f"{run.path}: ignored.csv holds a bad outline ({error}), repeat the run") from error
+        inside[rows] = in_polygon(points_m[rows], np.array(text.split(), dtype=np.float64).reshape(-1, 2))
     return inside
 
 
@@ -115,11 +120,6 @@ def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> BoolArray:
     The sensors are those that the run had detections of, as its configuration describes them, from the pose of the ego
     that ego.csv gives (linear between its stamps), without occlusion. Where the ego's path or a sensor is not known,
     every object counts as visible; an object without truth is not visible.
-
-    Raises
-    ------
-    DataError
-        The configuration of the run is damaged.
     """
     positions_m = np.stack([path.at(now_ns)[:, :2] for path in paths], axis=1)
     present = np.asarray(np.isfinite(positions_m).all(axis=-1))
@@ -162,12 +162,6 @@ def _sensors(run: Run) -> list[SensorModel]:
     """Models of the sensors that occur in the run; empty where one has none."""
     configured: Mapping[str, Any] = run.config.get("sensors") or {}
     names = np.unique(run.tables["updates"]["sensor"]).tolist()
-    try:
-        models = TypeAdapter(dict[str, SensorModel]).validate_python(
-            {name: configured[name] for name in names if name in configured}
-        )
-    except ValidationError as error:
-        (first, *_) = error.errors()
-        key = ".".join(map(str, first["loc"]))
-        raise DataError(f"{run.config_path}: sensors.{key}: {first['msg']}") from error
+    known = {name: configured[name] for name in names if name in configured}
+    models = TypeAdapter(dict[str, SensorModel]).validate_python(known)
     return list(models.values()) if len(models) == len(names) else []

@@ -4,14 +4,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 from evaluation_runs import ROUND, START_NS, TICK_NS, WEST, Car, write_run
 
-from fgtrack.core.errors import DataError
 from fgtrack.core.types import TruthState
 from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.io.run import Run, load_run
+from fgtrack.io.run import Run
 
 TICKS = range(10)
 VAN = Car(21, 300.0, 300.0, 0.0, 10.0)
@@ -66,13 +64,3 @@ def test_a_track_in_a_region_is_not_false_unless_it_leaves_it(tmp_path: Path) ->
     found = match(run)
     assert found is not None
     assert (found.track_ids == 1).all()
-
-
-def test_a_damaged_outline_is_one_line(tmp_path: Path) -> None:
-    tracks = [[WEST.track(tick, 1), ROUND.track(tick, 2)] for tick in TICKS]
-    regions = [region(0, *ROUND.state(0.0)[:2])]
-    run = write_run(tmp_path / "run", tracks, truth=[*WEST.truth(TICKS), *regions])
-    path = tmp_path / "run/ignored.csv"
-    path.write_text(path.read_text().replace(" ", " x", 1))
-    with pytest.raises(DataError, match=r"ignored\.csv holds a bad outline"):
-        match(load_run(run.path or ""))

@@ -38,9 +38,6 @@ def lagged_of(run: Run) -> dict[object, LagMetrics]:
     return {entry.lag_s: entry for entry in lag_metrics(run, match(run))}
 
 
-# --- metrics
-
-
 def test_every_lag_has_its_known_errors_at_its_own_stamps(tmp_path: Path) -> None:
     lagged = lagged_of(smoothed_run(tmp_path / "run"))
     assert list(lagged) == [0.0, 0.1, 0.2, WINDOW]
@@ -109,6 +106,3 @@ def test_nees_weighs_the_error_with_the_covariance(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", tracks, truth=WEST.truth(TICKS), smoothed={10: states})
     nees = lagged_of(run)[0.1].position_nees
     assert (nees.count, nees.mean) == (2, pytest.approx(18.0))
-
-
-# --- figure

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from evaluation_runs import START_NS, TICK_NS, Car, update, write_run
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from support.pictures import faults
 
@@ -14,8 +13,6 @@ from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState
 from fgtrack.evaluation.runs import evaluated
 from fgtrack.io.run import Run
 from fgtrack.plotting import plot
-from fgtrack.plotting.paper import styled
-from fgtrack.plotting.style import StyledFigure
 
 TICKS = range(50)
 LONG = "a-run-with-a-name-that-goes-on-and-on-until-nobody-wants-to-read-it-any-more-and-then-some"
@@ -85,21 +82,3 @@ def figures(runs: list[Run]) -> Iterator[tuple[str, Figure]]:
 def test_no_text_is_cut_off_or_lies_on_another(scene: str, tmp_path: Path) -> None:
     found = {name: faults(figure) for name, figure in figures(SCENES[scene](tmp_path))}
     assert {name: lines for name, lines in found.items() if lines} == {}
-
-
-@styled
-def an_empty_figure(width_in: float) -> tuple[Figure, Axes]:
-    figure = StyledFigure(figsize=(width_in, 2.5))
-    return figure, figure.add_subplot()
-
-
-def test_a_text_that_is_cut_off_or_hidden_is_found() -> None:
-    figure, axes = an_empty_figure(3.0)
-    assert faults(figure) == []
-    axes.text(0.9, 0.5, "far beyond the right edge of the canvas").set_in_layout(False)
-    axes.text(0.1, 0.2, "first")
-    axes.text(0.12, 0.2, "second")
-    assert faults(figure) == [
-        "cut off: 'far beyond the right edge of the canvas'",
-        "overlap: 'first' and 'second'",
-    ]

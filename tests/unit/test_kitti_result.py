@@ -3,17 +3,14 @@
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 from support.kitti import RECTIFIED_FROM_IMU, folder, oxts
 from typer.testing import CliRunner
 
 from fgtrack.cli.main import app
 from fgtrack.core.errors import CallError, DataError
-from fgtrack.core.types import DetectionList
 from fgtrack.evaluation.kitti_result import write_kitti_result
 from fgtrack.io.adapters.kitti_view import Box, read_views
-from fgtrack.io.source import open_input
 from fgtrack.pipeline.public import replay
 
 SIZE = "1.5 1.6 4.0"  # height, width, length
@@ -85,39 +82,6 @@ def test_a_result_holds_a_box_of_every_track_at_every_frame(tmp_path, replayed):
         assert [float(value) for value in fields[6:10]] == pytest.approx(list(map(float, label[6:10])), abs=5.0)
         x_m, z_m = float(fields[13]), float(fields[15])
         assert math.cos(float(fields[3 + 2]) - (float(fields[16]) - math.atan2(x_m, z_m))) == pytest.approx(1.0)
-
-
-def test_a_result_is_read_again_as_detections(tmp_path, replayed):
-    """What goes out in camera coordinates comes back in those of the ego, tilted as it is."""
-    run, oxts_file = replayed
-    data = oxts_file.parents[1]
-    (tmp_path / "tracker").mkdir()
-    for name in ("oxts", "calib"):
-        (tmp_path / name).symlink_to(data / name)
-    write_kitti_result(run, oxts_file, tmp_path / "tracker/0001.txt")
-    lists = [item for item in open_input(tmp_path).messages() if isinstance(item, DetectionList)]
-    ends = lists[-1].objects
-    expected = sorted(place(29, car) for car in (0, 1))
-    assert len(ends) == 2
-    for detection, (ahead_m, aside_m, yaw_rad) in zip(sorted(ends, key=lambda each: each.x_m), expected, strict=True):
-        assert (detection.x_m, detection.y_m) == pytest.approx((ahead_m, aside_m), abs=0.1)
-        assert math.cos(detection.yaw_rad - yaw_rad) > 0.999
-
-
-def test_boxes_are_those_of_the_tick_at_the_frame(tmp_path, replayed):
-    """Ticks between the frames are brought to the frame: the file is nearly the same."""
-    run, oxts_file = replayed
-    settings = {"input.kitti.min_score": {}, "clock.node_hz": 13.0}
-    other = replay(oxts_file, "kitti", estimator="ekf-replay", set=settings)
-    write_kitti_result(run, oxts_file, tmp_path / "exact.txt")
-    write_kitti_result(other, oxts_file, tmp_path / "moved.txt")
-    exact, moved = rows(tmp_path / "exact.txt"), rows(tmp_path / "moved.txt")
-    both = [key for key in exact if key in moved and 10 <= key[0] < 29]
-    assert len(both) > 30
-    offsets = np.array(
-        [np.subtract(list(map(float, exact[key][13:16])), list(map(float, moved[key][13:16]))) for key in both]
-    )
-    assert np.abs(offsets).max() < 0.15
 
 
 def test_without_a_size_nothing_is_written(tmp_path, replayed):

@@ -31,7 +31,7 @@ def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
     object within `gate_m`), and ends with the tick at which the object is first paired with a row that is `confirmed`.
     NaN where there is no such row.
     """
-    count, tracks, updates = len(matching.object_ids), run.tables["tracks"], run.tables["updates"]
+    tracks, updates = run.tables["tracks"], run.tables["updates"]
     fused = np.isin(updates["disposition"], [name.value for name in FUSED])
     updates = updates.where(fused & (updates["track_id"] != NO_TRACK))
     rows = published_rows(tracks, updates["tick"], updates["track_id"])
@@ -43,12 +43,12 @@ def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
     distances_m[~(distances_m <= gate_m)] = np.inf
     near = np.isfinite(distances_m).any(axis=1)
     never = np.iinfo(np.int64).max
-    seen_ns, confirmed_ns = np.full(count, never), np.full(count, never)
-    np.minimum.at(seen_ns, distances_m[near].argmin(axis=1), stamps_ns[near])
+    detected_ns, confirmed_ns = np.full((2, len(paths)), never)
+    np.minimum.at(detected_ns, distances_m[near].argmin(axis=1), stamps_ns[near])
     paired = matching.paired & confirmed(matching.tracks)
     np.minimum.at(confirmed_ns, matching.object_index[paired], matching.now_ns[matching.tick_index[paired]])
-    known = (seen_ns != never) & (confirmed_ns != never)
-    return np.where(known, np.where(known, confirmed_ns - seen_ns, 0) / NS_PER_S, np.nan)
+    known = (detected_ns != never) & (confirmed_ns != never)
+    return np.where(known, np.where(known, confirmed_ns - detected_ns, 0) / NS_PER_S, np.nan)
 
 
 def tracked_visits(matching: Matching) -> int:

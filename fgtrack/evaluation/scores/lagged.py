@@ -9,10 +9,10 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, within_run
-from fgtrack.evaluation.matching import Matching, TrackErrors, state_errors
+from fgtrack.evaluation.matching import NO_OBJECT, Matching, TrackErrors, state_errors
 from fgtrack.evaluation.scores.consistency import position_squares
 from fgtrack.evaluation.scores.statistics import Moments
-from fgtrack.evaluation.truth import TRUE_STATE, true_paths
+from fgtrack.evaluation.truth import true_states
 from fgtrack.io.run import Run, Table
 
 WINDOW: Literal["window"] = "window"
@@ -97,10 +97,8 @@ def _final(run: Run) -> Table:
 def _with_truth(run: Run, matching: Matching, states: Table) -> tuple[Table, FloatArray, IntArray]:
     """Return those of `states` that belong to an object, its true states there, shape (n, 5), and their track rows."""
     rows = _rows_at(matching, states)
-    truth = np.full((len(rows), len(TRUE_STATE)), np.nan)
-    for index, path in enumerate(true_paths(run.tables["truth"])):
-        mine = (rows != _NO_ROW) & (matching.object_index[rows] == index)
-        truth[mine] = path.at(states["stamp_ns"][mine])
+    object_index = np.where(rows == _NO_ROW, NO_OBJECT, matching.object_index[rows])
+    truth = true_states(run.tables["truth"], object_index, states["stamp_ns"])
     known = np.isfinite(truth[:, 0]) & np.isfinite(states["x_m"])
     return states.where(known), truth[known], rows[known]
 

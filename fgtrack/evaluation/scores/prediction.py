@@ -10,7 +10,7 @@ from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.matching import Matching, confirmed
 from fgtrack.evaluation.roads import roads
 from fgtrack.evaluation.scores.statistics import Moments
-from fgtrack.evaluation.truth import TRUE_STATE, true_paths
+from fgtrack.evaluation.truth import TRUE_STATE, true_states
 from fgtrack.io.run import Run
 from fgtrack.models.predictor import ArcPredictor, Predictor, RailPredictor
 
@@ -61,15 +61,11 @@ def displacements(run: Run, matching: Matching) -> Displacements:
     stamps_ns, objects = tracks["stamp_ns"][chosen], matching.object_index[chosen]
     ahead_s: FloatArray = _STEP_S * np.arange(1, round(HORIZONS_S[-1] / _STEP_S) + 1, dtype=np.float64)
     at_ns = stamps_ns[:, None] + np.round(ahead_s * NS_PER_S).astype(np.int64)
-    truth = np.full((*at_ns.shape, 2), np.nan)
-    for index, path in enumerate(true_paths(run.tables["truth"])):
-        mine = objects == index
-        truth[mine] = path.at(at_ns[mine].reshape(-1))[:, :2].reshape(-1, len(ahead_s), 2)
+    every = true_states(run.tables["truth"], np.repeat(objects, len(ahead_s)), at_ns.reshape(-1))
+    truth = every[:, :2].reshape(*at_ns.shape, 2)
     road = roads(run)[0].get("track")
-    predictors: dict[str, Predictor] = {
-        "arc": ArcPredictor(),
-        **({} if road is None else {"rail": RailPredictor(road)}),
-    }
+    predictors: dict[str, Predictor] = {"arc": ArcPredictor()}
+    predictors |= {} if road is None else {"rail": RailPredictor(road)}
     found = {
         name: np.asarray(np.linalg.norm(predictor.positions(states[chosen], ahead_s) - truth, axis=-1))
         for name, predictor in predictors.items()
@@ -78,13 +74,13 @@ def displacements(run: Run, matching: Matching) -> Displacements:
 
 
 def prediction_errors(run: Run, matching: Matching | None) -> dict[str, dict[str, PredictionErrors]]:
-    """Means of `displacements` by predictor and horizon, `1s` to `5s`; empty without truth."""
-    found: dict[str, dict[str, PredictionErrors]] = {}
+    """Return means of `displacements` by predictor and horizon, `1s` to `5s`; empty without truth."""
+    errors: dict[str, dict[str, PredictionErrors]] = {}
     for name, distances_m in displacements(run, matching).distances_m.items() if matching is not None else ():
-        found[name] = {}
+        errors[name] = {}
         for horizon_s in HORIZONS_S:
             until = distances_m[:, : round(horizon_s / _STEP_S)]
             until = until[np.isfinite(until).all(axis=1)]
-            errors = PredictionErrors(Moments.of(until[:, -1]), Moments.of(until.mean(axis=1)))
-            found[name][f"{horizon_s:g}s"] = errors
-    return found
+            final_m, average_m = Moments.of(until[:, -1]), Moments.of(until.mean(axis=1))
+            errors[name][f"{horizon_s:g}s"] = PredictionErrors(final_m, average_m)
+    return errors

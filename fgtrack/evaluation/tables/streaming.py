@@ -28,7 +28,7 @@ from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.scores.statistics import Distribution
 from fgtrack.evaluation.tables import MS, PERCENT, RUN, Column, Table
 from fgtrack.evaluation.tables.verdict import who_is_best
-from fgtrack.evaluation.truth import true_paths
+from fgtrack.evaluation.truth import true_states
 from fgtrack.io.run import Node, Run, ready_times
 
 #: A state is evaluated at its own stamp, as everywhere else; as published, at the moment when it was ready; the same
@@ -50,10 +50,7 @@ def streaming_errors(one: EvaluatedRun) -> dict[str, FloatArray]:
     rows = np.flatnonzero(matching.paired)
     tracks, ticks = matching.tracks.where(matching.paired), matching.tick_index[rows]
     object_index, ready_ns = matching.object_index[rows], _ready(one.run)[0][ticks]
-    truth = np.full((len(rows), 2), np.nan)
-    for index, path in enumerate(true_paths(one.run.tables["truth"])):
-        mine = object_index == index
-        truth[mine] = path.at(ready_ns[mine])[:, :2]
+    truth = true_states(one.run.tables["truth"], object_index, ready_ns)[:, :2]
     published = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
     way_m = tracks["speed_mps"] * (ready_ns - tracks["stamp_ns"]) / NS_PER_S
     moved = published + np.nan_to_num(cartesian(np.stack([tracks["yaw_rad"], way_m], axis=-1)))
