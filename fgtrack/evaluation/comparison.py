@@ -141,14 +141,7 @@ def common_samples(
 ) -> tuple[list[int], IntArray, list[IntArray]]:
     """Return the samples of several runs at the same object and stamp.
 
-    Returns
-    -------
-    counts
-        Distinct samples of each run.
-    stamps
-        Those of the common samples, shape (n,).
-    rows
-        Of each run the rows of the common samples, shape (n,) each.
+    Distinct samples of each run, the stamps of the common ones, shape (n,), and of each run their rows, shape (n,).
     """
     every_ns = np.unique(np.concatenate(stamps_ns))
     found = [

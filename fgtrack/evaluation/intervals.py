@@ -81,28 +81,15 @@ def average(values: Sequence[float] | FloatArray) -> Estimate:
 def within_run(ticks: FloatArray, statistic: Statistic, rng: np.random.Generator) -> Estimate:
     """The `statistic` of the sums of `ticks` over time and its 95 % interval by a circular block bootstrap.
 
-    A root mean square is sqrt(S[0] / S[1]) of the sums S of squared errors and counts; the difference of two is
-    sqrt(S[0] / S[2]) - sqrt(S[1] / S[2]), and ticks of both are drawn together.
+    `ticks` are summed in order of time, shape (n, k); `statistic` takes sums, shape (k, draws), and gives shape
+    (draws,). A root mean square is sqrt(S[0] / S[1]) of the sums S of squared errors and counts; the difference of two
+    is sqrt(S[0] / S[2]) - sqrt(S[1] / S[2]), and ticks of both are drawn together.
 
     Blocks of ticks are drawn with replacement, the end of the run joined to its beginning (Politis & Romano 1992). The
-    interval is theta +- t(m - 1) s sqrt(m / (m - 1)), with s the standard deviation of the drawn statistics and m the
-    number of blocks that fit into the run: m blocks vary around their own mean, and s itself is known from m blocks.
-    Quantiles of the draws would be too narrow. The length of the blocks is `block_length` of what each tick adds to
-    the statistic (its influence).
-
-    Parameters
-    ----------
-    ticks
-        What is summed, in order of time, shape (n, k).
-    statistic
-        Of the sums, shape (k, draws); gives shape (draws,).
-    rng
-        Draws the blocks.
-
-    Returns
-    -------
-    Estimate
-        `count` is m, rounded down. Interval unknown of fewer than eight ticks.
+    interval is theta +- t(m - 1) s sqrt(m / (m - 1)), with s the standard deviation of the drawn statistics and m, the
+    `count` of the result, the number of blocks that fit into the run: m blocks vary around their own mean, and s itself
+    is known from m blocks. Quantiles of the draws would be too narrow. The length of the blocks is `block_length` of
+    the influence of each tick on the statistic. The interval of fewer than eight ticks is unknown.
     """
     sums, pieces = ticks.sum(axis=0), _pieces(ticks)
     n = len(pieces)

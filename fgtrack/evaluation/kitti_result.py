@@ -37,14 +37,8 @@ def write_kitti_result(run: Run, sequence: Path, out: Path, *, overwrite: bool =
     """Write the tracks of `run` at the frames of `sequence` to the text file `out`.
 
     Returns the boxes, one of each track at each frame, the tracks that have one, and those that have none, because no
-    detection of theirs has a size.
-
-    A track is in it where it is `confirmed`, unless all are evaluated (`evaluation.confirmed_only`).
-
-    Parameters
-    ----------
-    sequence
-        The file of the sequence in `oxts/`, or a folder with one sequence: it has the pose of the camera.
+    detection of theirs has a size. Tracks are written where they are `confirmed`, unless all are evaluated
+    (`evaluation.confirmed_only`). `sequence` is the file of the sequence in `oxts/`, or a folder with one sequence.
 
     Raises
     ------

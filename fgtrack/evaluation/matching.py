@@ -144,16 +144,8 @@ def ambiguous(inside: BoolArray, tick_index: IntArray, num_ticks: int) -> BoolAr
 def pair(scores: FloatArray, ids: IntArray, tick_index: IntArray, previous: IntArray) -> IntArray:
     """Object of every row, shape (rows,), so that each tick has the largest sum of scores; `NO_OBJECT` without one.
 
-    A pair of track and object that the tick `previous` had stays.
-
-    Parameters
-    ----------
-    scores
-        Of the pairs that are allowed, shape (rows, objects); 0 of the others.
-    ids, tick_index
-        Track and tick of the rows, shape (rows,).
-    previous
-        Of each tick the one whose pairs stay, shape (ticks,), below 0 without one.
+    `scores` of the pairs that are allowed are positive, shape (rows, objects), the others 0; `ids` and `tick_index` are
+    of the rows. A pair of track and object that the tick `previous` had stays, shape (ticks,), below 0 without one.
     """
     num_ticks, inside = len(previous), scores > 0.0
     object_index = np.full(len(ids), NO_OBJECT)

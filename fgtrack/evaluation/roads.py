@@ -15,12 +15,9 @@ _BOUND_STEP_M = 2.0
 
 
 def roads(run: Run) -> tuple[dict[str, TrackMap], list[str]]:
-    """The maps that the configuration names, by `track` and `pit`, and a line for each file that is gone, of any kind.
+    """Return the maps that the configuration names, by `track` and `pit`, and a line for each file that is gone.
 
-    Raises
-    ------
-    DataError
-        A file is no map.
+    Raises `DataError` if a file is not a map.
     """
     found, notes = {}, []
     config = run.config.get("map") or {}
@@ -38,12 +35,9 @@ def roads(run: Run) -> tuple[dict[str, TrackMap], list[str]]:
 
 
 def excluded_lines(run: Run) -> list[FloatArray]:
-    """The rings of the exclusion areas that the configuration names, each closed, shape (n, 2); of lost files none.
+    """Return the rings of the exclusion areas that the configuration names, closed, shape (n, 2); of lost files none.
 
-    Raises
-    ------
-    DataError
-        A file holds no areas.
+    Raises `DataError` if a file holds no areas.
     """
     names = [name for name in (run.config.get("map") or {}).get("excluded") or () if Path(str(name)).is_file()]
     rings = [ring for polygon in ExclusionAreas.read(names).polygons_m for ring in polygon]
@@ -51,7 +45,7 @@ def excluded_lines(run: Run) -> list[FloatArray]:
 
 
 def road_lines(road: TrackMap) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The left bound, the right bound and the reference line of `road`, each of shape (n, 2)."""
+    """Return the left bound, the right bound and the reference line of `road`, each of shape (n, 2)."""
     s_m = np.linspace(0.0, road.length_m, max(2, round(road.length_m / _BOUND_STEP_M)) + 1)
     left_m, right_m = road.bounds(s_m)
     return road.position(s_m, left_m), road.position(s_m, -right_m), road.position(s_m, np.zeros_like(s_m))

@@ -48,14 +48,8 @@ Runs = OneRun | Mapping[str, OneRun] | Iterable[OneRun | Iterable[OneRun] | Mapp
 def evaluated(runs: Runs) -> list[EvaluatedRun]:
     """Return runs under labels of their own; a path is a run folder, or a folder of them; a mapping gives labels.
 
-    Runs of a folder come by name; they may be one folder deeper, as in that of `fgtrack demo`.
-
-    Raises
-    ------
-    CallError
-        A path is neither, or a run is given twice.
-    DataError
-        A run folder is damaged.
+    Runs of a folder come by name; they may be one folder deeper, as in that of `fgtrack demo`. Raises `CallError` if a
+    path is neither, or a run is given twice, and `DataError` if a run folder is damaged.
     """
     every = [one for entry in _several(runs) for one in _several(entry)]
     if all(isinstance(one, EvaluatedRun) for one in every):
@@ -91,12 +85,8 @@ def start_ns(runs: Sequence[EvaluatedRun]) -> int:
 def labelled(runs: Sequence[Run]) -> dict[str, Run]:
     """Runs by a label of their own: the end of their path, as long as it must be to be unique.
 
-    The estimator follows where the path does not name it, and alone for a run in memory.
-
-    Raises
-    ------
-    CallError
-        A run is given twice.
+    The estimator follows where the path does not name it, and alone for a run in memory. Raises `CallError` if a run is
+    given twice.
     """
     for identity, times in Counter(run.path.resolve() if run.path else id(run) for run in runs).items():
         if times > 1:

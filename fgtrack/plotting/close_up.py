@@ -69,13 +69,11 @@ class CloseUp:
 def close_up(runs: Runs, close_ups: Sequence[CloseUp], **paper: Unpack[Paper]) -> Figure:
     """A late detection and its effect on the estimates of each run.
 
-    Above, for each run, the present seen from the true position, in the direction of travel to the right: nearer to
+    Above, for each run, the present relative to the true position, in the direction of travel to the right: nearer to
     the centre is better. Below the error of the estimates at the stamps up to now, before the detection arrived (grey)
     and after it. In a column of a paper all errors are in one plot. Without truth the estimate of the first run
-    afterwards takes its role.
-
-    `close_ups` are those of each run, of the same detection: `fgtrack.close_ups`. Raises `CallError` if they are not as
-    many, or of different detections.
+    afterwards takes its role. `close_ups` are those of each run, of the same detection: `fgtrack.close_ups`. Raises
+    `CallError` if they are not as many, or of different detections.
     """
     every = evaluated(runs)
     if len(every) != len(close_ups) or len({one.arrival for one in close_ups}) != 1:

@@ -65,13 +65,7 @@ class Planned:
 
 
 def planned(runs: Sequence[EvaluatedRun]) -> list[Planned]:
-    """Return every figure that `runs` have data for; of many objects and runs but the worst few are extras.
-
-    Raises
-    ------
-    DataError
-        The map that a run names is not a map.
-    """
+    """Return every figure that `runs` have data for; of many objects and runs but the worst few are extras."""
     best = sorted(runs, key=_rmse_m)[:-_FEW] if len(runs) > _MOST_RUNS else []
     extra = {one.label for one in best}
     plans = []

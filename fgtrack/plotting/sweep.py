@@ -70,21 +70,9 @@ def sweep(
 ) -> Figure:
     """A metric of a sweep over its grid: mean over the seeds and 95 % interval, a line for each estimator.
 
-    The axis with the most numbers is the horizontal one; of the others every combination has a panel.
-
-    Parameters
-    ----------
-    table
-        The sweep or its folder.
-    metric
-        Column of sweep.csv.
-
-    Raises
-    ------
-    CallError
-        There is no such sweep, or no such metric.
-    DataError
-        The sweep has no value of the metric.
+    The axis with the most numbers is the horizontal one; of the others every combination has a panel. `table` is the
+    sweep or its folder, `metric` a column of sweep.csv. Raises `CallError` if there is no such sweep or metric, and
+    `DataError` if it has no value.
     """
     table = table if isinstance(table, SweepTable) else read_sweep(table)
     names = table.shown_axes
@@ -148,14 +136,8 @@ def error_against_delay(table: SweepTable | Path | str | None = None, **paper: U
     """Position error against the mean delay of a sensor, with 95 % intervals: what each method makes of late data.
 
     `table` is a sweep (or its folder) over delays alone, in seconds; by default the result of the shipped sweep
-    `error_against_delay`: a car, a LiDAR that is late and a RADAR, ten seeds; nothing is replayed.
-
-    Raises
-    ------
-    CallError
-        There is no such sweep.
-    DataError
-        The sweep has no position errors, or is not over one axis of numbers.
+    `error_against_delay`: a car, a LiDAR that is late and a RADAR, ten seeds; nothing is replayed. Raises `CallError`
+    if there is no such sweep, and `DataError` if it is not over one axis of delays.
     """
     if table is None:
         with as_file(files(__package__) / "error_against_delay") as folder:

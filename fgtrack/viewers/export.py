@@ -21,14 +21,8 @@ def export(runs: Runs, out: Path, *, ros2: bool = False, overwrite: bool = False
     """Write `runs` of one recording to `out`: an MCAP file for Foxglove, or with `ros2` a rosbag2 recording.
 
     Log times are those at which something was known (receipt, tick), publish times and header stamps those that it is
-    about. Several runs stand side by side, the topics of each below its name.
-
-    Returns
-    -------
-    counts
-        Messages by topic.
-    notes
-        Contents that could not be shown, a line each.
+    about. Several runs stand side by side, the topics of each below its name. Returns the number of messages by topic,
+    and a line for whatever could not be shown.
 
     Raises
     ------

@@ -33,14 +33,8 @@ _OUTCOME = {
 def write_foxglove(path: Path, messages: Iterable[ViewerMessage], overwrite: bool = False) -> dict[str, int]:
     """Write `messages`, in the order of their log times, to the MCAP file `path`; return their number by topic.
 
-    The file appears when it is complete. The same messages give the same bytes.
-
-    Raises
-    ------
-    CallError
-        Something is at `path`, or it cannot be written.
-    DataError
-        The disk is full, or a time lies before 1970.
+    The file appears when it is complete. The same messages give the same bytes. Raises `CallError` if something is at
+    `path`, and `DataError` if the disk is full or a time lies before 1970.
     """
     channels: dict[str, int] = {}
     counts: Counter[str] = Counter()

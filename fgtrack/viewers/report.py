@@ -53,14 +53,8 @@ def write_report(
     """Write the report of `runs` into the HTML file `out`, and return its size in bytes.
 
     Verdict, warnings, viewer and three figures are open, the rest is folded. The same runs and `pictures` (PNG by
-    name, in the order in which they are shown) give the same bytes.
-
-    Raises
-    ------
-    CallError
-        The file exists, or cannot be written.
-    DataError
-        A run or its map is damaged, or the disk is full.
+    name, in the order in which they are shown) give the same bytes. Raises `CallError` if the file exists, and
+    `DataError` if a run or its map is damaged.
     """
     text = _page(runs, tables, pictures, head).encode("utf-8", "backslashreplace")  # names need not be UTF-8
     with new_file(out, overwrite) as file:

@@ -1,20 +1,14 @@
 """All tracks against all true objects: GOSPA, CLEAR, IDF1 and HOTA.
 
-GOSPA is the distance between the set of the tracks and the set of the true objects (Rahmathullah, Garcia-Fernandez,
-Svensson: Generalized optimal sub-pattern assignment metric, Fusion 2017, with p = 2 and alpha = 2): with the best
-assignment of tracks to objects nearer than c,
+With the best assignment of tracks to objects nearer than c (Rahmathullah, Garcia-Fernandez, Svensson: Generalized
+optimal sub-pattern assignment metric, Fusion 2017, with p = 2 and alpha = 2),
 
     GOSPA^2 = sum of squared distances of the pairs + c^2 / 2 (number of missed objects + number of false tracks).
 
-The missed objects that no sensor could see are counted apart: no tracker can do better there.
-
 CLEAR (Bernardin and Stiefelhagen 2008) counts as TrackEval does. That of motrics 0.3 differs: it charges 1e18 for a
 pair outside the gate, in whose rounding the similarities of the other pairs are lost, and it keeps to the last track
-that an object ever had.
-
-IDF1 (Ristani et al. 2016) and HOTA (Luiten et al. 2021) are computed by motrics. They lie between 0 and 1, are NaN
-without a true object, and are those of TrackEval for its similarity of positions, 1 - d / zero distance, with
-a zero distance of twice the gate: the similarity of 0.5, from which on IDF1 counts a pair, is at the gate.
+that an object ever had. IDF1 (Ristani et al. 2016) and HOTA (Luiten et al. 2021) are computed by motrics, with the
+similarity of positions 1 - d / zero distance of TrackEval and a zero distance of twice the gate.
 """
 
 import math

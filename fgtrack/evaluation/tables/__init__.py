@@ -55,39 +55,24 @@ def two_digits(value: Value) -> str:
 
 @dataclass(frozen=True)
 class Column:
-    """One or several numbers of every record, in one cell.
-
-    Attributes
-    ----------
-    heading
-        Lines, with the unit.
-    names
-        Keys of the numbers, as a sequence or separated by spaces; by default the heading.
-    form
-        Format of the cell, with a field for each number.
-    scale
-        Factor of the numbers shown.
-    text
-        Text of a number.
-    left
-        True for text, which is aligned left. The leading columns of text name the rows.
-    is_extra
-        True if the column is shown only where the table is shown in full.
-    bold
-        True for the records whose cell is bold.
-    note
-        A line below the table where the column is shown.
-    """
+    """One or several numbers of every record, in one cell."""
 
     heading: str
+    """Lines, with the unit."""
     names: str | Sequence[str] = ""
+    """Keys of the numbers, as a sequence or separated by spaces; by default the heading."""
     form: str = "{}"
+    """Format of the cell, with a field for each number."""
     scale: float = 1.0
     text: Callable[[Value], str] = short
+    """Text of a number, after scaling."""
     left: bool = False
+    """True for text, which is aligned left. The leading columns of text name the rows."""
     is_extra: bool = False
+    """True if the column is shown only where the table is shown in full."""
     bold: Callable[[Record], bool] = lambda record: False
     note: str = ""
+    """A line below the table where the column is shown."""
 
     def cell(self, record: Record) -> str:
         """Text of the numbers of `record`; a dash without any."""
@@ -116,33 +101,20 @@ def named(name: str, moment: str) -> str:
 
 @dataclass(frozen=True)
 class Table:
-    """Records and the columns that show them; `str` gives the text of a terminal of 120 columns.
-
-    Attributes
-    ----------
-    title
-        Caption.
-    records
-        Rows: numbers by name with their units; a name that is missing, None and NaN are no value.
-    columns
-        Columns shown.
-    keys
-        Names that identify a row; the first is the run.
-    notes
-        Lines below the table.
-    is_detail
-        True for a table that is shown only where a comparison is shown in full.
-    is_main
-        True for the records that are shown unless the table is shown in full.
-    """
+    """Records and the columns that show them; `str` gives the text of a terminal of 120 columns."""
 
     title: str
     records: Sequence[Record]
+    """Rows: numbers by name with their units; a name that is missing, None and NaN are no value."""
     columns: Sequence[Column]
     keys: Sequence[str] = ("run",)
+    """Names that identify a row; the first is the run."""
     notes: Sequence[str] = ()
+    """Lines below the table."""
     is_detail: bool = False
+    """True for a table that is shown only where a comparison is shown in full."""
     is_main: Callable[[Record], bool] = lambda record: True
+    """True for the records that are shown unless the table is shown in full."""
 
     def in_full(self) -> "Table":
         """Return the table with all columns and records shown."""
@@ -273,20 +245,13 @@ class Tables(Mapping[str, DataFrame]):
     """Tables by name: `tables["tracking"]` is a pandas DataFrame, `tables[["tracking", "lag"]]` are two of the tables.
 
     `str` gives the verdict and the main tables as text, in full all that have rows.
-
-    Attributes
-    ----------
-    tables
-        By name, each with its `data` and the columns that show it.
-    details
-        JSON values beside the tables.
-    verdict
-        Sentences that summarise the tables.
     """
 
     tables: Mapping[str, Table]
     details: Mapping[str, Any] = field(default_factory=dict)  # Any: JSON values
+    """JSON values beside the tables."""
     verdict: tuple[str, ...] = ()
+    """Sentences that summarise the tables."""
 
     def in_full(self) -> "Tables":
         """Return the tables, all of them shown with all columns and records."""

@@ -118,12 +118,7 @@ class SeedComparison:
 def read_sweep(folder: Path | str) -> SweepTable:
     """Return the table of the sweep in `folder`.
 
-    Raises
-    ------
-    CallError
-        There is no table.
-    DataError
-        It is not the table of a sweep, or has no rows.
+    Raises `CallError` if there is no table, and `DataError` if it is not that of a sweep, or has no rows.
     """
     path = Path(folder) / SWEEP_FILE
     try:
