@@ -6,6 +6,8 @@ TOOLS := .venv-tools
 PIP := $(BIN)/python -m pip install --disable-pip-version-check
 # The matrices are small; more threads only wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
+# Modules that are compiled once let every further command start three seconds sooner.
+unexport PYTHONDONTWRITEBYTECODE
 # A file stays in one process, so what its tests share is made once.
 BY_FILE := --dist loadfile --no-loadscope-reorder
 # What is installed for which purpose, as requirements/PURPOSE.txt lists it.
