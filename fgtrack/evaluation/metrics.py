@@ -83,10 +83,8 @@ class TruthMetrics:
     """Tracks with an evaluated row."""
     false_tracks: int
     """Those of them paired in less than `FALSE_TRACK_SHARE` of their rows."""
-    tracked_objects: int
-    """True objects that a confirmed track was ever paired with."""
     tracked_visits: int
-    """Times that one came into sight and was tracked there: TP of the precision, see `tracked_visits`."""
+    """Times that an object came into sight and was tracked there: TP of the precision, see `tracked_visits`."""
 
     @property
     def overall(self) -> ObjectMetrics:
@@ -230,7 +228,6 @@ def _truth_metrics(run: Run, matching: Matching, options: EvaluationConfig) -> T
         objects=objects,
         judged_tracks=len(ids),
         false_tracks=int((paired_life < FALSE_TRACK_SHARE * life).sum()),
-        tracked_objects=len(np.unique(matching.object_index[matching.paired & confirmed(matching.tracks)])),
         tracked_visits=tracked_visits(matching),
     )
 

@@ -81,24 +81,22 @@ def _curves(runs: Sequence[EvaluatedRun], object_id: int | None) -> list[_Curve]
     """Errors of the present states of every run, then of the final ones of those that have them."""
     styles = run_looks(runs)
     first_ns = {one.label: start_ns(group) for group in by_recording(runs) for one in group}
-    present: list[_Curve] = []
-    final: list[_Curve] = []
-    for one in runs:
-        matching = one.matching
-        if matching is None or (object_id is not None and object_id not in matching.object_ids):
-            continue
-        step_ns, its = usual_step_ns(matching.tracks["now_ns"]), styles[one.label]
-        for found, label, look, curves in (
-            (track_errors(matching), one.label, its, present),
-            (final_errors(one.run, matching), f"{one.label}, final state", its._replace(line=":"), final),
-        ):
-            rows = np.argsort(found.stamps_ns, kind="stable")
-            if object_id is not None:
-                rows = rows[found.object_index[rows] == matching.object_ids.index(object_id)]
+    known = [(one, one.matching) for one in runs if one.matching is not None]
+    if object_id is not None:
+        known = [(one, matching) for one, matching in known if object_id in matching.object_ids]
+    every = [(one, matching, track_errors(matching), "") for one, matching in known]
+    every += [(one, matching, final_errors(one.run, matching), ", final state") for one, matching in known]
+    curves = []
+    for one, matching, found, more in every:
+        rows = np.argsort(found.stamps_ns, kind="stable")
+        if object_id is not None:
+            rows = rows[found.object_index[rows] == matching.object_ids.index(object_id)]
+        its = styles[one.label]._replace(line=":") if more else styles[one.label]
+        if len(rows) or not more:
             values = {name: each[rows] for name, each in found.values.items()}
-            if curves is present or len(rows):
-                curves.append(_Curve(label, look, first_ns[one.label], step_ns, found.stamps_ns[rows], values))
-    return [*present, *final]
+            step_ns, stamps_ns = usual_step_ns(matching.tracks["now_ns"]), found.stamps_ns[rows]
+            curves.append(_Curve(one.label + more, its, first_ns[one.label], step_ns, stamps_ns, values))
+    return curves
 
 
 def _draw_moving(axes: Axes, one: _Curve, values: FloatArray, unit: str, window_ns: int, has_label: bool) -> None:

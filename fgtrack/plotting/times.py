@@ -1,5 +1,6 @@
 """Figures of times: delays of messages, processing time."""
 
+from collections.abc import Mapping, Sequence
 from typing import Unpack
 
 import numpy as np
@@ -27,17 +28,13 @@ def delays(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     one = one_evaluated(run)
     if not one.run.tables["updates"].num_rows:
         raise DataError(f"{one.label}: has no detections, so there are no delays to draw")
-    sheet = Sheet(7.0, 3.8, paper)
-    axes = sheet.plots()[0, 0]
+    curves = []
     for k, (sensor, (_, delay_s)) in enumerate(sensor_delays(one.run).items()):
         spread = Distribution.of(_MS * delay_s)
         label = f"{sensor}: mean {spread.mean:.0f} ms, 90 % within {spread.p90:.0f} ms, all within {spread.max:.0f} ms"
-        axes.ecdf(_MS * delay_s, color=sensor_colour(k), lw=1.6, label=label)
-    axes.set(xlabel="delay from stamp to receipt [ms]", ylabel="share of the messages received")
-    axes.margins(x=0.02)
-    legend_above(axes)
-    sheet.title(titled(one.label, "delay of the messages with detections"))
-    return sheet.figure
+        curves.append((_MS * delay_s, label, {"color": sensor_colour(k)}))
+    texts = {"xlabel": "delay from stamp to receipt [ms]", "ylabel": "share of the messages received"}
+    return _distributions(curves, texts, titled(one.label, "delay of the messages with detections"), paper)
 
 
 def sensor_delays(run: Run) -> dict[str, tuple[IntArray, FloatArray]]:
@@ -53,20 +50,32 @@ def timing(runs: Runs, **paper: Unpack[Paper]) -> Figure:
     Raises `DataError` if no run has a tick with detections.
     """
     every = evaluated(runs)
-    if not any((one.run.tables["timing"]["num_detections"] > 0).any() for one in every):
-        raise DataError("no run has detections, so there are no processing times to draw")
-    sheet = Sheet(7.0, 3.8, paper)
-    axes = sheet.plots()[0, 0]
-    looks = run_looks(every)
-    for one in every:
+    curves = []
+    for one, its in zip(every, run_looks(every).values(), strict=True):
         ticks = one.run.tables["timing"]
         time_ms = ticks["process_ns"][ticks["num_detections"] > 0] / NS_PER_S * _MS
         if len(time_ms):
             spread = Distribution.of(time_ms)
             text = f"{one.label}: median {spread.p50:.3g} ms, 99 % within {spread.p99:.3g} ms"
-            axes.ecdf(time_ms, color=looks[one.label].colour, ls=looks[one.label].line, lw=1.6, label=text)
-    axes.set(xscale="log", xlabel="time per tick with detections [ms]", ylabel="share of the ticks")
-    log_axis(axes.xaxis)
+            curves.append((time_ms, text, {"color": its.colour, "ls": its.line}))
+    if not curves:
+        raise DataError("no run has detections, so there are no processing times to draw")
+    texts = {"xscale": "log", "xlabel": "time per tick with detections [ms]", "ylabel": "share of the ticks"}
+    return _distributions(curves, texts, "Processing time", paper)
+
+
+def _distributions(
+    curves: Sequence[tuple[FloatArray, str, Mapping[str, str]]], texts: Mapping[str, str], title: str, paper: Paper
+) -> Figure:
+    """Cumulative distributions of samples, each with its label and look."""
+    sheet = Sheet(7.0, 3.8, paper)
+    axes = sheet.plots()[0, 0]
+    for values, label, its in curves:
+        axes.ecdf(values, lw=1.6, label=label, **its)
+    axes.set(**texts)
+    axes.margins(x=0.02)
+    if "xscale" in texts:
+        log_axis(axes.xaxis)
     legend_above(axes)
-    sheet.title("Processing time")
+    sheet.title(title)
     return sheet.figure

@@ -3,7 +3,6 @@
 import base64
 import json
 import re
-import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -15,7 +14,7 @@ import fgtrack
 from fgtrack.core.errors import printable
 from fgtrack.evaluation.diagnostics import diagnostics, noise_diagnostics
 from fgtrack.evaluation.runs import EvaluatedRun, recordings_warning
-from fgtrack.evaluation.tables import Tables, html_cell
+from fgtrack.evaluation.tables import Column, Table, Tables
 from fgtrack.io.output import new_file
 from fgtrack.viewers.playback import Moment, playback
 
@@ -24,7 +23,6 @@ _FIRST = ("close_up", "errors", "error_against_delay", "error_against_lag", "map
 _CAPTIONS = {"error_against_delay": "error against delay: a sweep over ten races that comes with fgtrack"}
 _MOST_OPEN, _MOST_WARNINGS = 3, 3
 _NONE = "–"
-_PNG_SIZE = slice(16, 24)  # of its header
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,7 @@ def _page(runs: Sequence[EvaluatedRun], tables: Tables, pictures: Iterable[tuple
         "Tables": "".join(_wide(one.title, one.to_html()) + _list(one.shown_notes, "soft") for one in shown),
         "More figures": _figures(text for name, text in figures.items() if name not in first),
         "Configuration": _configuration(runs),
-        "Runs": _grid("What they were made of", _FACTS, [_facts(one) for one in runs]),
+        "Runs": _grid("Sources", [_facts(one) for one in runs]),
     }
     sections = [
         f'<section id="part-{name.lower()}">\n<h2>{name}</h2>\n{content}</section>\n'
@@ -124,11 +122,10 @@ def _list(lines: Iterable[str], kind: str = "") -> str:
     return f"<ul{name}>\n{items}</ul>\n" if items else ""
 
 
-def _grid(title: str, names: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+def _grid(title: str, records: Sequence[Mapping[str, str]]) -> str:
     """A table of texts."""
-    lines = (f"<tr>{''.join(html_cell('td', escape(text), True) for text in row)}</tr>\n" for row in rows)
-    head = "".join(html_cell("th", escape(name), True) for name in names)
-    return _wide(title, f"<thead><tr>{head}</tr></thead>\n<tbody>\n{''.join(lines)}</tbody>\n")
+    columns = [Column(name, [name], left=True) for name in records[0]]
+    return _wide(title, Table(title, records, columns).to_html())
 
 
 def _wide(title: str, content: str) -> str:
@@ -145,21 +142,18 @@ def _figures(texts: Iterable[str]) -> str:
 
 def _figure(name: str, picture: bytes) -> str:
     text, data = escape(name), base64.b64encode(picture).decode()
-    caption = _CAPTIONS.get(name, text.replace("_", " "))
-    width, height = struct.unpack(">II", picture[_PNG_SIZE])
-    return (
-        f'<figure class="figure" id="figure-{text}" tabindex="0"><img alt="{text}" width="{width}" height="{height}" '
-        f'src="data:image/png;base64,{data}"><figcaption>{caption}</figcaption></figure>\n'
-    )
+    image = f'<img alt="{text}" src="data:image/png;base64,{data}">'
+    caption = f"<figcaption>{_CAPTIONS.get(name, text.replace('_', ' '))}</figcaption>"
+    return f'<figure class="figure" id="figure-{text}" tabindex="0">{image}{caption}</figure>\n'
 
 
 def _configuration(runs: Sequence[EvaluatedRun]) -> str:
     """The keys whose values differ between runs, then everything of each run."""
     settings = {one.label: flattened(one.run.config) for one in runs}
     keys = dict.fromkeys(key for one in settings.values() for key in one)
-    rows = [[key, *(one.get(key, _NONE) for one in settings.values())] for key in keys]
-    rows = [row for row in rows if len(set(row[1:])) > 1]
-    text = _grid("Where the runs differ", ("key", *settings), rows) if rows else ""
+    rows = [{"key": key} | {label: one.get(key, _NONE) for label, one in settings.items()} for key in keys]
+    rows = [row for row in rows if len({row[label] for label in settings}) > 1]
+    text = _grid("Where the runs differ", rows) if rows else ""
     for one in runs:
         config = f"<pre>{escape(one.run.config_text)}</pre>"
         text += f"<details><summary>{escape(one.label)}: config.yaml</summary>{config}</details>\n"
@@ -177,20 +171,17 @@ def flattened(config: Mapping[str, Any], above: str = "") -> dict[str, str]:
     return flat
 
 
-_FACTS = ("run", "estimator", "recording", "detections", "time [s]", "versions", "digest")
-
-
-def _facts(one: EvaluatedRun) -> list[str]:
-    """Label, estimator, recording, detections, time [s], versions and digest of a run, in the order of `_FACTS`."""
+def _facts(one: EvaluatedRun) -> dict[str, str]:
+    """Origin of a run."""
     meta = one.run.meta
     wall_s = meta.get("wall_s")
     end = "" if meta.get("complete", True) else " (did not finish)"
-    return [
-        one.label,
-        str(meta.get("estimator", _NONE)),
-        str((meta.get("input") or {}).get("path", _NONE)) + end,
-        str(meta.get("detections_received", _NONE)),
-        f"{wall_s:.1f}" if isinstance(wall_s, int | float) else _NONE,
-        ", ".join(f"{name} {version}" for name, version in (meta.get("versions") or {}).items()),
-        str(meta.get("digest", _NONE)),
-    ]
+    return {
+        "run": one.label,
+        "estimator": str(meta.get("estimator", _NONE)),
+        "recording": str((meta.get("input") or {}).get("path", _NONE)) + end,
+        "detections": str(meta.get("detections_received", _NONE)),
+        "time [s]": f"{wall_s:.1f}" if isinstance(wall_s, int | float) else _NONE,
+        "versions": ", ".join(f"{name} {version}" for name, version in (meta.get("versions") or {}).items()),
+        "digest": str(meta.get("digest", _NONE)),
+    }

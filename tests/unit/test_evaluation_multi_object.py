@@ -127,17 +127,6 @@ def test_clear_identity_and_hota_are_those_of_trackeval(seed: int, side_m: float
         assert found.hota[name.lower()] == pytest.approx(np.mean(expected[name]), abs=1e-6)
 
 
-def test_identity_and_hota_of_a_run_are_what_can_be_counted(story: Run) -> None:
-    found = multi_object(story)
-    # WEST's track is the first one, at 5 of 18 objects and of 11 rows
-    assert (found.identity["idr"], found.identity["idp"]) == (pytest.approx(5 / 18), pytest.approx(5 / 11))
-    assert found.identity["idf1"] == pytest.approx(2 * 5 / (18 + 11))
-    # 0.8 m is a similarity of 0.92: 18 of the 19 bounds are below it, 9 pairs of 18 objects and 11 rows in all
-    assert found.hota["deta"] == pytest.approx(18 / 19 * 9 / (18 + 11 - 9))
-    # track 1: 5 pairs, 10 objects, 5 rows; track 2: 4 pairs, 4 rows
-    assert found.hota["assa"] == pytest.approx(18 / 19 * (5 * 5 / 10 + 4 * 4 / 10) / 9)
-
-
 def test_a_pair_at_the_gate_counts_and_one_beyond_it_does_not() -> None:
     for distance_m, pairs in ((GATE_M, 1), (GATE_M + 1e-6, 0)):
         there = Scenes(np.array([0]), np.array([1]), np.array([[distance_m]]), np.array([[True]]), np.array([[True]]))
