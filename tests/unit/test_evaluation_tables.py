@@ -221,6 +221,7 @@ def test_the_best_value_is_bold_in_every_form_that_has_bold() -> None:
 def test_the_verdict_stands_first_in_every_form(tables: Tables) -> None:
     for text in (str(tables), tables.to_markdown(), tables.to_latex()):
         assert text.lstrip("-% ").startswith(tables.verdict[0].split(" (")[0])
+    assert tables._repr_html_().startswith("<ul><li>")
 
 
 @pytest.mark.parametrize(

@@ -278,7 +278,12 @@ class Tables(Mapping[str, DataFrame]):
         return _text(self)
 
     def __repr__(self) -> str:
-        return f"Tables({', '.join(self.tables)})"
+        return "\n  ".join(["Tables", *self.verdict, ", ".join(self.tables)])
+
+    def _repr_html_(self) -> str:
+        verdict = "".join(f"<li>{escape(printable(line))}</li>" for line in self.verdict)
+        tables = (f"<table><caption>{escape(one.title)}</caption>{one.to_html()}</table>" for one in self._filled())
+        return f"<ul>{verdict}</ul>{''.join(tables)}"
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         yield from bulleted(self.verdict, options.max_width)
