@@ -1,16 +1,21 @@
-"""The figure of arrivals: delays and outcomes of detections."""
+"""The figure of arrivals: stamps, receipts and outcomes of detections."""
 
 from collections.abc import Mapping
 from typing import Unpack
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import BoolArray, IntArray
 from fgtrack.evaluation.runs import OneRun, one_evaluated, start_ns
+from fgtrack.io.run import Table
+from fgtrack.io.run.schema import Column
 from fgtrack.plotting.paper import Paper, Sheet, styled
-from fgtrack.plotting.style import legend_above, titled
+from fgtrack.plotting.style import legend_above, titled, usual_step_ns
 
 #: None is the colour of an estimator that is compared often.
 _COLOURS = {
@@ -29,32 +34,78 @@ _FATES: Mapping[str, str] = {
     "beyond_window": "fused beyond the window",
     "birth": "started a track",
 }
+_SENSOR_IN, _DELAYS_IN = 1.1, 1.2  # heights of a sensor: in the upper panel, and of its delays
+_SHOWN_LISTS = 20  # of the fastest sensor in the upper panel
 
 
 @styled
 def arrivals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
-    """Delay of each detection against its time of receipt, sensor by sensor, in the colour of its outcome.
+    """Above a part of the run, a line for each detection from stamp to receipt; below the delays, sensor by sensor.
 
-    Raises `DataError` if the run has no detections.
+    A line that crosses another was overtaken: it is out of sequence. The part shown is that in which the most
+    detections were fused out of sequence; the fastest sensor sends twenty lists in it. Colours are the outcomes of the
+    detections. Raises `DataError` if the run has no detections.
     """
     one = one_evaluated(run)
     updates = one.run.tables["updates"]
     if not updates.num_rows:
         raise DataError(f"{one.label}: has no detections, so there are no arrivals to draw")
     sensors = np.unique(updates["sensor"]).tolist()
-    sheet = Sheet(9.0, 1.5 + 1.6 * len(sensors), paper)
-    rows = sheet.plots(len(sensors), sharex=True)[:, 0]
+    heights = [_SENSOR_IN * len(sensors), *[_DELAYS_IN] * len(sensors)]
+    sheet = Sheet(9.0, sum(heights) + 1.5, paper)
+    flow, *rows = sheet.plots(len(heights), heights=heights)[:, 0]
+    first_ns = start_ns([one])
     fates = np.array([_FATES.get(name, "not used") for name in updates["disposition"].tolist()])
+    _draw_flow(flow, updates, fates, first_ns)
+    for name, color in _COLOURS.items():
+        count = int((fates == name).sum())
+        if count:
+            flow.plot([], [], "o", ms=4.0, color=color, label=f"{name}: {count} of {len(fates)}")
     delay_ms = (updates["receipt_ns"] - updates["stamp_ns"]) / (NS_PER_S / 1e3)
-    received_s = (updates["receipt_ns"] - start_ns([one])) / NS_PER_S
-    low_ms, high_ms = min(0.0, float(delay_ms.min())), max(1.0, float(delay_ms.max()))
+    received_s = (updates["receipt_ns"] - first_ns) / NS_PER_S
     for axes, sensor in zip(rows, sensors, strict=True):
         for name, color in _COLOURS.items():
-            count, mine = int((fates == name).sum()), (fates == name) & (updates["sensor"] == sensor)
-            label = f"{name}: {count} of {len(fates)}" if count else ""
-            axes.plot(received_s[mine], delay_ms[mine], ".", ms=4.0, mew=0, color=color, label=label)
-        axes.set(ylim=(low_ms, high_ms + 0.05 * (high_ms - low_ms)), ylabel=f"{sensor.replace('_', ' ')}\ndelay [ms]")
+            mine = (fates == name) & (updates["sensor"] == sensor)
+            axes.plot(received_s[mine], delay_ms[mine], ".", ms=4.0, mew=0, color=color)
+        low_ms, high_ms = min(0.0, float(delay_ms.min())), max(1.0, float(delay_ms.max()))
+        axes.set_ylim(low_ms, high_ms + 0.05 * (high_ms - low_ms))
+        axes.set_title(sensor.replace("_", " "), loc="left", y=0.98, pad=1.0)
+        axes.sharex(rows[0])
+        axes.tick_params(labelbottom=axes is rows[-1])
+    rows[len(rows) // 2].set_ylabel("delay [ms]")
     rows[-1].set_xlabel("time of receipt [s]")
-    legend_above(rows[0], markerscale=2.0)
-    sheet.title(titled(one.label, "delays and outcomes of the detections"))
+    legend_above(flow)
+    sheet.title(titled(one.label, "detections from stamp to receipt"))
     return sheet.figure
+
+
+def _draw_flow(axes: Axes, updates: Table, fates: Column, first_ns: int) -> None:
+    """A line for each detection of the busiest part, a pair of levels for each sensor."""
+    own = (updates["stamp_ns"][updates["sensor"] == name] for name in np.unique(updates["sensor"]).tolist())
+    shortest_ns = min(map(usual_step_ns, own))
+    length_ns = round(_SHOWN_LISTS * shortest_ns) if np.isfinite(shortest_ns) else NS_PER_S
+    start_ns = _busiest_ns(updates["receipt_ns"], fates == "fused out of sequence", length_ns)
+    inside = (updates["receipt_ns"] >= start_ns) & (updates["stamp_ns"] <= start_ns + length_ns)
+    sensors = np.unique(updates["sensor"][inside]).tolist()
+    for name, color in _COLOURS.items():
+        for level, sensor in enumerate(sensors):
+            mine = inside & (fates == name) & (updates["sensor"] == sensor)
+            sensed_s, received_s = ((updates[key][mine] - first_ns) / NS_PER_S for key in ("stamp_ns", "receipt_ns"))
+            tops = np.stack([sensed_s, np.full(len(sensed_s), level + 0.9)], axis=-1)
+            ends = np.stack([received_s, np.full(len(sensed_s), level + 0.1)], axis=-1)
+            axes.add_collection(
+                LineCollection(list(np.stack([tops, ends], axis=1)), colors=color, linewidths=1.3, zorder=3)
+            )
+            axes.plot(sensed_s, tops[:, 1], "o", ms=3.5, color=color, zorder=4)
+            axes.plot(received_s, ends[:, 1], "v", ms=4.5, color=color, zorder=4)
+    axes.set_yticks([level + at for level in range(len(sensors)) for at in (0.1, 0.9)])
+    axes.set_yticklabels([text for sensor in sensors for text in ("received", f"{sensor.replace('_', ' ')}: stamp")])
+    from_s = (start_ns - first_ns) / NS_PER_S
+    axes.set(xlim=(from_s, from_s + length_ns / NS_PER_S), ylim=(0.0, len(sensors)), xlabel="time [s]")
+
+
+def _busiest_ns(receipts_ns: IntArray, late: BoolArray, length_ns: int) -> int:
+    """When the part begins in which the most of the `late` were received, or of all where there are none."""
+    receipts_ns = np.sort(receipts_ns[late] if late.any() else receipts_ns)
+    counts = np.searchsorted(receipts_ns, receipts_ns + length_ns, side="right") - np.arange(len(receipts_ns))
+    return int(receipts_ns[counts.argmax()])

@@ -1,38 +1,58 @@
 """The figure of ego, detections, tracks and truth on the map."""
 
-from typing import Unpack
+from typing import NamedTuple, Unpack
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from fgtrack.core.types import FloatArray
+from fgtrack.core.time import NS_PER_S, nanoseconds
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.evaluation.matching import confirmed
 from fgtrack.evaluation.placement import placed
 from fgtrack.evaluation.roads import excluded_lines, road_lines, roads
-from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated
+from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_ns
 from fgtrack.evaluation.truth import true_paths
-from fgtrack.io.run import Table
+from fgtrack.io.run import Run, Table
 from fgtrack.plotting.paper import Paper, Sheet, styled
 from fgtrack.plotting.ranges import bulk
-from fgtrack.plotting.style import GREY, WRONG, broken_line, colour, legend_above, titled, usual_step_ns
+from fgtrack.plotting.style import (
+    GREY,
+    WRONG,
+    broken_line,
+    colour,
+    legend_above,
+    titled,
+    usual_step_ns,
+)
 
 _NAMED_OBJECTS = 8  # more objects than these share two entries of the legend
+
+
+_AROUND_S = 0.4  # of the life of a track before and after the moment of the close-up
+_LEAST_M = 4.0  # half a side of the close-up
+_WORTHWHILE = 3.0  # times the size of the close-up that the whole must have
 _DETECTIONS = "#8C7A1F"
 
 
 @styled
 def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
-    """Ego, detections, tracks and truth on the map that `config.yaml` names as `map.track`.
+    """Ego, detections, tracks and truth on the map that `config.yaml` names as `map.track`; beside it a close-up.
 
     Truth is a broad pale line, so a stretch that nothing tracked stays visible; a track has the colour of the
     object that it is paired with, and is black where it is paired with none. Without truth every confirmed
     track has a colour. The picture holds map, ego, truth and the bulk of the tracks and detections; what lies
-    outside is counted. Raises `DataError` if `config.yaml` is not YAML, or the map that it names is no map.
+    outside is counted. The close-up follows for 0.8 s the track with the most updates in so short a time.
+
+    Raises
+    ------
+    DataError
+        `config.yaml` is not YAML, or the map that it names is no map.
     """
     one = one_evaluated(run)
     maps, notes = roads(one.run)
     bounds_m = [line for road in maps.values() for line in road_lines(road)[:2]]
+    rings = excluded_lines(one.run)
     every = one.run.tables["tracks"]
     tracks = every.where(confirmed(every)) if one.matching is None else one.matching.tracks
     detections_m, ego_m = placed(one.run).position_m, _positions(one.run.tables["ego"])
@@ -40,23 +60,34 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     samples_m = [_positions(tracks), detections_m]
     edges = [bulk([each[:, k] for each in samples_m], [each[:, k] for each in required]) for k in range(2)]
     lows_m, highs_m = np.transpose(edges)
-    sheet = Sheet(8.0, 6.0, paper)
-    axes: Axes = sheet.plots()[0, 0]
-    for line in bounds_m:
-        axes.plot(*line.T, color=GREY, lw=0.7, zorder=3)
-    for k, ring in enumerate(excluded_lines(one.run)):
-        axes.plot(*ring.T, color=GREY, lw=1.2, ls=":", zorder=3, label="" if k else "excluded")
-    if np.isfinite(ego_m).any():
-        axes.plot(*ego_m.T, color="black", lw=0.8, ls="--", label="ego", zorder=3.5)
-    if np.isfinite(detections_m).any():
-        label = f"detections ({int(np.isfinite(detections_m[:, 0]).sum())})"
-        axes.plot(*detections_m.T, "x", ms=1.5, mew=0.3, color=_DETECTIONS, label=label, zorder=2.2)
-    _draw_objects(axes, one, tracks)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set(xlabel="x, east [m]", ylabel="y, north [m]")
-    axes.set_xlim(lows_m[0], highs_m[0], auto=True)  # an equal aspect may widen one of the two
-    axes.set_ylim(lows_m[1], highs_m[1], auto=True)
+    window = _window(one.run)
+    has_window = window is not None and (highs_m - lows_m).max() > _WORTHWHILE * 2.0 * window.half_m
+    sheet = Sheet(11.0 if has_window else 8.0, 6.0, paper)
+    panels = list(sheet.plots(1, 2 if has_window else 1)[0])
+    for axes, is_close in zip(panels, (False, True), strict=False):
+        for line in bounds_m:
+            axes.plot(*line.T, color=GREY, lw=0.7, zorder=3)
+        for k, ring in enumerate(rings):
+            axes.plot(*ring.T, color=GREY, lw=1.2, ls=":", zorder=3, label="" if k else "excluded")
+        near = window if is_close else None
+        ego, seen = (_near(one.run.tables[name]["stamp_ns"], near) for name in ("ego", "detections"))
+        if np.isfinite(ego_m).any():
+            axes.plot(*ego_m[ego].T, color="black", lw=0.8, ls="--", label="ego", zorder=3.5)
+        if np.isfinite(detections_m).any():
+            label = f"detections ({int(np.isfinite(detections_m[:, 0]).sum())})"
+            size, above = (5.0, 4.5) if is_close else (1.5, 2.2)
+            axes.plot(*detections_m[seen].T, "x", ms=size, mew=0.2 * size, color=_DETECTIONS, label=label, zorder=above)
+        _draw_objects(axes, one, tracks.where(_near(tracks["stamp_ns"], near)), near)
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set(xlabel="x, east [m]", ylabel="y, north [m]")
+    overview = panels[0]
+    _show(overview, lows_m, highs_m)
     text = [titled(one.label, "on the map")]
+    if has_window and window is not None:
+        _show(panels[1], window.middle_m - window.half_m, window.middle_m + window.half_m)
+        at_s = (window.middle_ns - start_ns([one])) / NS_PER_S
+        panels[1].set_title(f"close-up: {2 * _AROUND_S:g} s around {at_s:.1f} s", loc="left")
+        overview.plot(*window.middle_m, "s", ms=14, mfc="none", mec="black", mew=1.2, label="close-up", zorder=6)
     if notes:
         text.append("the map file is not there any more")
     if one.matching is None:
@@ -64,9 +95,49 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     outside = sum(int(((each < lows_m) | (each > highs_m)).any(axis=-1).sum()) for each in samples_m)
     if outside:
         text.append(f"{outside} rows of tracks and detections are outside of the picture")
-    legend_above(axes)
+    legend_above(overview, 1.0 / len(panels))
     sheet.title("\n".join(text))
     return sheet.figure
+
+
+class _Window(NamedTuple):
+    """Time and region of the close-up."""
+
+    middle_ns: int
+    middle_m: FloatArray
+    half_m: float
+
+
+def _window(run: Run) -> _Window | None:
+    """Around the track with the most updates in `_AROUND_S` before and after, at the first such stamp of them."""
+    used, around_ns = run.tables["updates"].where(run.tables["updates"]["track_id"] >= 0), nanoseconds(_AROUND_S)
+    best: tuple[int, int, int] = (0, 0, 0)
+    for track_id in np.unique(used["track_id"]).tolist():
+        stamps_ns = np.sort(used["stamp_ns"][used["track_id"] == track_id])
+        counts = np.searchsorted(stamps_ns, stamps_ns + around_ns, "right") - np.searchsorted(
+            stamps_ns, stamps_ns - around_ns
+        )
+        row = int(counts.argmax())
+        best = max(best, (int(counts[row]), -int(stamps_ns[row]), track_id))
+    middle_ns = -best[1]
+    tracks = run.tables["tracks"]
+    is_near = np.abs(tracks["stamp_ns"] - middle_ns) <= around_ns
+    positions_m = _positions(tracks.where((tracks["track_id"] == best[2]) & is_near))
+    if not best[0] or not len(positions_m):
+        return None
+    low_m, high_m = positions_m.min(axis=0), positions_m.max(axis=0)
+    return _Window(middle_ns, (low_m + high_m) / 2.0, max(_LEAST_M, 0.6 * float((high_m - low_m).max())))
+
+
+def _near(stamps_ns: IntArray, window: _Window | None) -> BoolArray:
+    """True for stamps of the time of `window`, for all where it is None."""
+    middle_ns, reach_ns = (0, np.inf) if window is None else (window.middle_ns, 2 * nanoseconds(_AROUND_S))
+    return np.asarray(np.abs(stamps_ns - middle_ns) <= reach_ns)
+
+
+def _show(axes: Axes, lows_m: FloatArray, highs_m: FloatArray) -> None:
+    axes.set_xlim(lows_m[0], highs_m[0], auto=True)  # an equal aspect may widen one of the two
+    axes.set_ylim(lows_m[1], highs_m[1], auto=True)
 
 
 def _positions(table: Table) -> FloatArray:
@@ -74,7 +145,7 @@ def _positions(table: Table) -> FloatArray:
     return np.stack([table["x_m"], table["y_m"]], axis=-1)
 
 
-def _draw_objects(axes: Axes, one: EvaluatedRun, tracks: Table) -> None:
+def _draw_objects(axes: Axes, one: EvaluatedRun, tracks: Table, window: _Window | None) -> None:
     """Truth and tracks, in their colours."""
     step_ns = usual_step_ns(one.run.tables["tracks"]["now_ns"])
     matching = one.matching
@@ -83,15 +154,17 @@ def _draw_objects(axes: Axes, one: EvaluatedRun, tracks: Table) -> None:
             _draw_tracks(axes, tracks.where(tracks["track_id"] == track_id), step_ns, colour(k), "")
         return
     paths = true_paths(one.run.tables["truth"])
-    few = len(paths) <= _NAMED_OBJECTS
+    few, index_of = len(paths) <= _NAMED_OBJECTS, matching.object_index[_near(matching.tracks["stamp_ns"], window)]
     for index, path in enumerate(paths):
-        name = (f"object {path.object_id}" if few else "objects") if few or not index else ""
-        x_m, y_m = path.states[:, :2].T
-        line = broken_line(path.stamps_ns, x_m, y_m, usual_step_ns(path.stamps_ns))
-        axes.plot(*line, color=colour(index), lw=4.0, alpha=0.3, label=name and f"{name}, truth")
-        mine = tracks.where(matching.object_index == index)
-        _draw_tracks(axes, mine, step_ns, colour(index), name and f"{name}, track")
-    _draw_tracks(axes, tracks.where(matching.object_index < 0), step_ns, WRONG, "paired with no object")
+        name = f"object {path.object_id}" if few else "objects"
+        rows = _near(path.stamps_ns, window)
+        x_m, y_m = path.states[rows, :2].T
+        stamps_ns: IntArray = path.stamps_ns[rows]
+        line = broken_line(stamps_ns, x_m, y_m, usual_step_ns(path.stamps_ns))
+        axes.plot(*line, color=colour(index), lw=4.0, alpha=0.3, label=f"{name}, truth" if few or not index else "")
+        label = f"{name}, track" if few or not index else ""
+        _draw_tracks(axes, tracks.where(index_of == index), step_ns, colour(index), label)
+    _draw_tracks(axes, tracks.where(index_of < 0), step_ns, WRONG, "paired with no object")
 
 
 def _draw_tracks(axes: Axes, tracks: Table, step_ns: float, color: str, label: str) -> None:

@@ -34,6 +34,7 @@ EXPECTED: dict[str, tuple[bool, set[str], list[str]]] = {
             "object 8, truth",
             "object 8, track",
             "paired with no object",
+            "close-up",
         ],
     ),
     "residuals": (
@@ -48,7 +49,7 @@ EXPECTED: dict[str, tuple[bool, set[str], list[str]]] = {
     ),
     "arrivals": (
         False,
-        {"time of receipt [s]", "lidar\ndelay [ms]", "radar\ndelay [ms]"},
+        {"time [s]", "time of receipt [s]", "delay [ms]"},
         ["fused in sequence: 120 of 120"],
     ),
     "delays": (
@@ -172,12 +173,23 @@ def test_there_is_a_figure_of_what_runs_have_data_for(
     assert [name for name in names([at_once]) if "delays" in name] == []
 
 
-def test_arrivals_have_the_delays_of_each_sensor_in_the_colours_of_the_outcomes(tmp_path: Path) -> None:
-    late = [update("lidar", tick=k, delay_ns=150_000_000, disposition=Disposition.OUT_OF_SEQUENCE) for k in range(9)]
-    updates = {k: [row, update("radar", tick=k, delay_ns=20_000_000)] for k, row in enumerate(late)}
-    lidar, radar = plot.arrivals(write_run(tmp_path / "run", updates=updates)).axes
-    assert legend(lidar) == ["fused in sequence: 9 of 18", "fused out of sequence: 9 of 18"]
-    for axes, delay_ms in ((lidar, 150.0), (radar, 20.0)):
+def test_arrivals_show_the_part_with_the_most_late_detections(tmp_path: Path) -> None:
+    late = {
+        k: [update("lidar", tick=k, delay_ns=150_000_000, disposition=Disposition.OUT_OF_SEQUENCE)]
+        for k in range(200, 220)
+    }
+    early = {k: [update("radar", tick=k, delay_ns=20_000_000)] for k in range(0, 400, 5)}
+    updates = {k: [*early.get(k, []), *late.get(k, [])] for k in {*early, *late}}
+    flow, *delays = plot.arrivals(write_run(tmp_path / "run", [[]] * 400, updates=updates)).axes
+    assert legend(flow) == ["fused in sequence: 80 of 100", "fused out of sequence: 20 of 100"]
+    low_s, high_s = flow.get_xlim()
+    assert low_s == pytest.approx(200 * TICK_NS / 1e9, abs=0.2)
+    assert high_s - low_s == pytest.approx(20 * 0.02)  # twenty lists of the fastest sensor
+    lines = [segment for lines in flow.collections for segment in lines.get_segments()]
+    lengths_s = {round(float(end[0] - start[0]), 3) for start, end in lines}
+    assert lengths_s == {0.15, 0.02}
+    assert [axes.get_title(loc="left") for axes in delays] == ["lidar", "radar"]  # a row for each
+    for axes, delay_ms in zip(delays, (150.0, 20.0), strict=True):
         assert {y for line in axes.lines for y in line.get_ydata()} == {delay_ms}
 
 
@@ -203,10 +215,10 @@ def circle_map(path: Path) -> Path:
 
 def test_the_map_shows_the_bounds_of_the_track(tmp_path: Path) -> None:
     run = a_run(tmp_path / "run", config_text=f"map:\n  track: {circle_map(tmp_path / 'map.csv')}\n")
-    (axes,) = plot.map(run).axes
+    axes, _ = plot.map(run).axes
     radii = [float(np.hypot(*np.asarray(line.get_data())).mean()) for line in axes.lines[:2]]
     assert radii == pytest.approx([292.5, 307.5], abs=0.5)
-    west, west_track, *_, wrong = [line.get_color() for line in axes.lines[2:]]
+    west, west_track, *_, wrong, _ = [line.get_color() for line in axes.lines[2:]]
     assert west == west_track != wrong == WRONG
 
 
