@@ -120,36 +120,32 @@ def moving_rms(stamps_ns: IntArray, values: FloatArray, window_ns: int) -> tuple
 
 
 @styled
-def lag(runs: Runs, quantity: str = "position_m", **paper: Unpack[Paper]) -> Figure:
-    """RMSE against the lag, a line for each run; level where a run has no lagged states.
+def lag(runs: Runs, **paper: Unpack[Paper]) -> Figure:
+    """Position RMSE against the lag, a line for each run; level where a run has no lagged states.
 
     Of a track that ended there are no lagged states of its last moments, so the thin dotted line shows the present
-    states of the same tracks at the same stamps: the distance between the two is what waiting brings. `quantity` is
-    `position_m`, `speed_mps` or `yaw_rad`; raises `DataError` if no run has truth of it.
+    states of the same tracks at the same stamps: the distance between the two is the gain of waiting. Raises
+    `DataError` if no run has tracks with truth.
     """
     every = evaluated(runs)
-    if quantity not in _QUANTITIES or not any(
-        entry.errors[quantity].count for one in every for entry in one.metrics.lagged
-    ):
-        raise DataError(f"no run has tracks with truth of {quantity}, so there are no errors to draw")
-    what, unit, factor = _QUANTITIES[quantity]
+    if not any(entry.errors["position_m"].count for one in every for entry in one.metrics.lagged):
+        raise DataError("no run has tracks with truth, so there are no errors to draw")
     sheet = Sheet(7.0, 4.2, paper)
     axes: Axes = sheet.plots()[0, 0]
     for one, its in zip(every, run_looks(every).values(), strict=True):
-        lagged = one.metrics.lagged
-        curve = [*lagged[:1], *(entry for entry in lagged if entry.is_lagged)]
-        rmse = [factor * entry.errors[quantity].rmse for entry in curve]
+        curve = [entry for entry in one.metrics.lagged if entry.lag_s == 0.0 or entry.is_lagged]
+        rmse_m = [entry.errors["position_m"].rmse for entry in curve]
         given: dict[str, Any] = {"color": its.colour, "ls": its.line, "lw": 1.6}
         if len(curve) > 1:
             lags_s = [float(entry.lag_s) for entry in curve]
-            present = [factor * entry.present_errors[quantity].rmse for entry in curve]
-            axes.plot(lags_s, rmse, marker=its.marker, ms=4, label=one.label, **given)
-            axes.plot(lags_s, present, color=its.colour, ls=":", lw=0.8)
+            present_m = [entry.present_errors["position_m"].rmse for entry in curve]
+            axes.plot(lags_s, rmse_m, marker=its.marker, ms=4, label=one.label, **given)
+            axes.plot(lags_s, present_m, color=its.colour, ls=":", lw=0.8)
         elif curve:
-            axes.axhline(rmse[0], label=f"{one.label} (no lag)", **given)
+            axes.axhline(rmse_m[0], label=f"{one.label} (no lag)", **given)
     if len(axes.lines) > len(every):
         axes.plot([], [], color="black", ls=":", lw=0.8, label="present, at the same stamps")
-    axes.set(xlabel="lag of the output [s]", ylabel=f"{what} RMSE [{unit}]")
+    axes.set(xlabel="lag of the output [s]", ylabel="position RMSE [m]")
     axes.set_ylim(0.0, 1.08 * axes.dataLim.y1 or 1.0)
     legend_above(axes)
     sheet.title("Error against lag: what it gains to wait")

@@ -5,7 +5,7 @@
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Unpack
@@ -13,9 +13,7 @@ from typing import Unpack
 import numpy as np
 from matplotlib.figure import Figure
 
-from fgtrack.evaluation.matching import track_errors
 from fgtrack.evaluation.runs import EvaluatedRun
-from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.evaluation.tables.seeds import SweepTable
 from fgtrack.plotting.arrivals import arrivals
 from fgtrack.plotting.close_up import close_up
@@ -76,9 +74,12 @@ def planned(runs: Sequence[EvaluatedRun]) -> list[Planned]:
     ):
         mine = [one for one in runs if has_data(one)]
         plans += [Planned(f"{name}_{one.label}", partial(draw, one), one.label in extra) for one in mine]
-    late = [one for one in runs if any(delay_s.any() for _, delay_s in sensor_delays(one.run).values())]
-    plans += _of_groups(_alike(runs, "disposition"), "arrivals", arrivals)
-    plans += _of_groups(_alike(late), "delays", delays)
+    groups = _alike(runs)
+    for k, (one, *_) in enumerate(groups):
+        ending, is_extra = f"_{one.label}" if len(groups) > 1 else "", len(groups) > _MOST_RUNS and k >= _FEW
+        plans.append(Planned(f"arrivals{ending}", partial(arrivals, one), is_extra))
+        if any(delay_s.any() for _, delay_s in sensor_delays(one.run).values()):
+            plans.append(Planned(f"delays{ending}", partial(delays, one), is_extra))
     ids = sorted({k for one in runs if one.matching for k in one.matching.object_ids})
     many = len(ids) > _FEW
     if many:
@@ -93,34 +94,23 @@ def planned(runs: Sequence[EvaluatedRun]) -> list[Planned]:
     return plans
 
 
-def _alike(runs: Sequence[EvaluatedRun], *names: str) -> list[list[EvaluatedRun]]:
-    """Runs with detections, together those whose columns `names` of updates.csv are the same."""
+def _alike(runs: Sequence[EvaluatedRun]) -> list[list[EvaluatedRun]]:
+    """Runs with detections, together those with the same detections at the same times."""
     groups: dict[bytes, list[EvaluatedRun]] = {}
     for one in runs:
         if (updates := one.run.tables["updates"]).num_rows:
             order = np.lexsort([updates[name] for name in _DETECTION])  # estimators may take them in another order
-            content = b"".join(updates[name][order].tobytes() for name in (*_DETECTION, *names))
-            groups.setdefault(content, []).append(one)
+            groups.setdefault(b"".join(updates[name][order].tobytes() for name in _DETECTION), []).append(one)
     return list(groups.values())
-
-
-def _of_groups(groups: Sequence[Sequence[EvaluatedRun]], name: str, draw: Callable[..., Figure]) -> Iterator[Planned]:
-    """One figure for each of `groups`; of many the first are no extras."""
-    for k, group in enumerate(groups):
-        label = "" if len(groups) == 1 else ", ".join(one.label for one in group)
-        file = name if len(groups) == 1 else f"{name}_{group[0].label}"
-        yield Planned(file, partial(draw, replace(group[0], label=label)), len(groups) > _MOST_RUNS and k >= _FEW)
 
 
 def _rmse_m(one: EvaluatedRun, object_id: int | None = None) -> float:
     """Position RMSE of a run, of one object or over all; infinite where nothing is tracked, -1 without truth of it."""
-    if one.matching is None or (object_id is not None and object_id not in one.matching.object_ids):
+    truth = one.metrics.truth
+    if truth is None or (object_id is not None and object_id not in truth.objects):
         return -1.0
-    found = track_errors(one.matching)
-    mine = np.ones(len(found.object_index), dtype=np.bool_)
-    if object_id is not None:
-        mine = found.object_index == one.matching.object_ids.index(object_id)
-    return Moments.of(found.values["position_m"][mine]).rmse if mine.any() else np.inf
+    errors_m = (truth.overall if object_id is None else truth.objects[object_id]).errors["position_m"]
+    return errors_m.rmse if errors_m.count else np.inf
 
 
 def planned_sweep(table: SweepTable) -> list[Planned]:
