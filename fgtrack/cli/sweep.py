@@ -19,7 +19,6 @@ from fgtrack.evaluation.tables.seeds import (
     read_sweep,
     seed_comparisons,
     summary_table,
-    to_csv,
 )
 from fgtrack.io.output import check_apart, write_file
 from fgtrack.io.run import Run
@@ -126,11 +125,11 @@ def swept(sweep_file: Path, out: Path, num_seeds: int | None = None) -> list[dic
 def _summarise(table: SweepTable, out: Path, form: Form | None, everything: bool) -> None:
     """Write means and paired differences of the estimators; show the differences of one metric, and the means."""
     contests = seed_comparisons(table.rows, table.axes)
-    write_file(out / PAIRED_TABLE, to_csv(contests, table.axes))
+    differences = difference_table(contests, table.axes)
+    write_file(out / PAIRED_TABLE, differences.to_csv())
     summary = summary_table(table, contests)
     write_file(out / SUMMARY_TABLE, summary.to_csv())
-    differences = difference_table(contests, table.axes)
-    if form is None and differences.records:
+    if form is None and any(map(differences.is_main, differences.records)):
         show(differences, form)
         say(f"all metrics: {out / PAIRED_TABLE}")
     show(summary.in_full() if everything else summary, form)

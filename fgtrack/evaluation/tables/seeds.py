@@ -15,7 +15,7 @@ from fgtrack.core.errors import CallError, DataError, did_you_mean
 from fgtrack.core.files import open_text
 from fgtrack.evaluation.comparison import Entry, entry_columns, entry_record, ranked
 from fgtrack.evaluation.intervals import paired
-from fgtrack.evaluation.tables import PERCENT, Column, Record, Table, csv_text
+from fgtrack.evaluation.tables import PERCENT, Column, Record, Table
 
 SWEEP_FILE = "sweep.csv"
 
@@ -168,31 +168,20 @@ def seed_comparisons(rows: Sequence[Mapping[str, str]], axes: Sequence[str]) -> 
     return [one for one in found if one is not None]
 
 
-def to_csv(compared: Sequence[SeedComparison], axes: Sequence[str]) -> str:
-    """Return a row for every comparison and estimator; floats with all digits, an empty cell for NaN."""
-    numbers = ("value", "worse_by", "low", "high")
-    rows: list[list[Any]] = [[*axes, "metric", "estimator", "seeds", "mean", *numbers[1:], "standing"]]
-    for one in compared:
-        for entry in one.entries:
-            record = entry_record(entry)
-            values = [record[name] for name in numbers]
-            rows.append([*one.point, one.metric, entry.name, one.seeds, *values, entry.standing])
-    return csv_text(rows)
-
-
 def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) -> Table:
-    """Return the first metric of `compared` at every point of several seeds."""
-    mine = [one for one in compared if one.metric == compared[0].metric and one.seeds > 1]
-    shown = distinguishing((one.point for one in mine), len(axes))
+    """Return a row for every comparison and estimator; shown are those of the first metric over several seeds."""
     records = [
-        {"point": ", ".join(one.point[k] for k in shown), "seeds": one.seeds, **entry_record(entry, "mean")}
-        for one in mine
+        {**dict(zip(axes, one.point, strict=True)), "metric": one.metric, "estimator": entry.name, "seeds": one.seeds}
+        | {name: value for name, value in entry_record(entry, "mean").items() if name not in ("run", "standing")}
+        | {"standing": entry.standing}
+        for one in compared
         for entry in one.entries
     ]
-    columns = [Column(_axis_names(shown, axes), "point", left=True), Column("estimator", "run", left=True)]
+    first, keys = compared[0].metric if compared else "", (*axes, "metric", "estimator")
+    columns = [_point_column({one.point for one in compared}, axes), Column("estimator", left=True)]
     columns += [*entry_columns("mean", "mean"), Column("seeds")]
     notes = [_INTERVALS, "+: best; =: ties with the best"]
-    return Table(mine[0].metric if mine else "", records, columns, ("point", "run"), notes)
+    return Table(first, records, columns, keys, notes, is_main=lambda row: row["metric"] == first and row["seeds"] > 1)
 
 
 def summary_table(sweep: SweepTable, compared: Sequence[SeedComparison]) -> Table:
@@ -206,7 +195,6 @@ def summary_table(sweep: SweepTable, compared: Sequence[SeedComparison]) -> Tabl
         (one.point, entry.name, one.metric) for one in compared for entry in one.entries if entry.standing == "best"
     }
     rows = list(dict.fromkeys((tuple(row[axis] for axis in sweep.axes), row["estimator"]) for row in sweep.rows))
-    shown = distinguishing((point for point, _ in rows), len(sweep.axes))
     main = [name for name in _MAIN if name in means] or list(means)[: len(_MAIN)]
     metrics = [*main, *(name for name in means if name not in main)]
     records = []
@@ -221,9 +209,7 @@ def summary_table(sweep: SweepTable, compared: Sequence[SeedComparison]) -> Tabl
     def is_best(metric: str) -> Callable[[Record], bool]:
         return lambda record: (tuple(record[axis] for axis in sweep.axes), record["estimator"], metric) in best
 
-    form = ", ".join(["{}"] * len(shown))
-    columns = [Column(_axis_names(shown, sweep.axes), [sweep.axes[k] for k in shown], form, left=True)]
-    columns.append(Column("estimator", left=True))
+    columns = [_point_column({point for point, _ in rows}, sweep.axes), Column("estimator", left=True)]
     for name in metrics:
         heading = _MAIN.get(name) or re.sub(r"\.(?!\d)", "\n", name)
         both, scale = (name, f"{name}.standard_error"), PERCENT if name in _SHARES else 1.0
@@ -234,9 +220,11 @@ def summary_table(sweep: SweepTable, compared: Sequence[SeedComparison]) -> Tabl
     return Table("Summary", records, [*columns, Column("seeds")], (*sweep.axes, "estimator"), notes)
 
 
-def _axis_names(shown: Sequence[int], axes: Sequence[str]) -> str:
-    """The last parts of the names of the axes shown."""
-    return ",\n".join(axes[k].rpartition(".")[2] for k in shown) or "point"
+def _point_column(points: Iterable[tuple[str, ...]], axes: Sequence[str]) -> Column:
+    """The axes that distinguish `points`, under the last parts of their names."""
+    shown = [axes[k] for k in distinguishing(points, len(axes))]
+    heading = ",\n".join(axis.rpartition(".")[2] for axis in shown) or "point"
+    return Column(heading, shown, ", ".join(["{}"] * len(shown)) or "{}", left=True)
 
 
 def _compared(point: tuple[str, ...], metric: str, rows: Sequence[Mapping[str, str]]) -> SeedComparison | None:
