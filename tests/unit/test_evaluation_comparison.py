@@ -154,15 +154,3 @@ def test_the_table_has_all_numbers_and_marks_best_tie_and_worse(trio: list[Run])
     assert mine["blocks"][2] > 20
     cells = [row[2] for row in compare(trio[:2]).tables["differences"].rows(bold="<{}>")]
     assert [cell[-3:] for cell in cells[:2]] == [" +>", "6  "]
-
-
-def test_a_value_of_the_other_tables_is_bold_only_where_no_run_ties_with_it(trio: list[Run]) -> None:
-    def bold(runs: list[Run]) -> list[bool]:
-        return [row[1].startswith("<") for row in compare(runs).tables["tracking"].rows(bold="<{}>")]
-
-    assert bold(trio) == [False, False, False]
-    tables = compare(trio[:2])
-    assert bold(trio[:2]) == (tables["tracking"]["run"] == tables["differences"]["run"][0]).tolist()
-    assert bold(trio[:1]) == [False]
-    assert "bold: the best run" in str(tables.tables["tracking"])
-    assert "bold" not in str(compare(trio[:1]).tables["tracking"])

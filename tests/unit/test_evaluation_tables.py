@@ -20,7 +20,7 @@ from fgtrack.evaluation.metrics import Metrics, evaluate
 from fgtrack.evaluation.runs import EvaluatedRun, labelled
 from fgtrack.evaluation.scores.statistics import Distribution
 from fgtrack.evaluation.tables import Column, Table, Tables, short, two_digits
-from fgtrack.evaluation.tables.compare import BACKWARD_FORWARD_NOTE, compare
+from fgtrack.evaluation.tables.compare import compare
 from fgtrack.io.run import Run
 
 ESTIMATORS = ("ekf-backward-forward", "ekf-replay", "smoother")
@@ -315,14 +315,6 @@ def test_residuals_have_moments_nis_and_delay_and_dispositions_add_up(tables: Ta
     assert tables.tables["dispositions"].notes[0].startswith("no detection was out of sequence or beyond window or too")
     assert sum(int(table[name.value].sum()) for name in Disposition) == table["detections"].sum() == 9
     assert (table["fused"] + table["merged"] + table["refused"] == table["detections"]).all()
-
-
-def test_the_note_on_backward_forward_stands_where_it_is_shown_only(runs: dict[str, Run], tables: Tables) -> None:
-    assert [name for name, table in tables.tables.items() if BACKWARD_FORWARD_NOTE in table.notes] == ["tracking"]
-    assert str(tables.in_full()).count(BACKWARD_FORWARD_NOTE) == str(tables).count(BACKWARD_FORWARD_NOTE) == 1
-    others = compare(runs["smoother"])
-    assert BACKWARD_FORWARD_NOTE not in str(others)
-    assert (tables.details["notes"], others.details["notes"]) == ([BACKWARD_FORWARD_NOTE], [])
 
 
 def test_failures_are_shown_by_kind_where_there_are_any(tmp_path: Path, tables: Tables) -> None:

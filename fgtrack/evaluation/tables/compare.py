@@ -1,7 +1,7 @@
 """Runs in comparison: their tables and the sentences that summarise them."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from fgtrack.core.errors import CallError
@@ -21,13 +21,9 @@ from fgtrack.evaluation.runs import OneRun, evaluated
 from fgtrack.evaluation.scores.innovations import FEWEST, RESIDUAL_NAMES
 from fgtrack.evaluation.scores.lagged import WINDOW
 from fgtrack.evaluation.scores.multi_object import MultiObjectMetrics
-from fgtrack.evaluation.tables import MS, PERCENT, RUN, Column, Record, Table, Tables, named
+from fgtrack.evaluation.tables import MS, PERCENT, RUN, Column, Table, Tables, named
 from fgtrack.evaluation.tables.streaming import streaming_tables
 from fgtrack.evaluation.tables.verdict import verdict
-
-BACKWARD_FORWARD = "ekf-backward-forward"
-BACKWARD_FORWARD_NOTE = "backward-forward forgets what was fused after the stamp of a late detection"
-BEST_NOTE = "bold: the best run of its recording in this, with 95 % confidence"
 
 _ERRORS = {
     "position_m": "pos.\n[m]",
@@ -68,11 +64,10 @@ def compare(*runs: OneRun | Iterable[OneRun] | Mapping[str, OneRun], streaming: 
     if not every:
         raise CallError("compare: no run is given, name at least one")
     metrics, compared = {one.label: one.metrics for one in every}, comparisons(every)
-    notes = [BACKWARD_FORWARD_NOTE] if any(one.estimator == BACKWARD_FORWARD for one in metrics.values()) else []
     tables = {
         "differences": _differences(compared),
-        "tracking": _tracking(metrics, compared, notes),
-        "multi_object": _multi_object(metrics, compared),
+        "tracking": _tracking(metrics),
+        "multi_object": _multi_object(metrics),
         "lag": _lag(metrics),
         "consistency": _consistency(metrics),
         **{f"residuals_{name}": _residuals(name, metrics) for one in metrics.values() for name in one.sensors},
@@ -83,7 +78,7 @@ def compare(*runs: OneRun | Iterable[OneRun] | Mapping[str, OneRun], streaming: 
     if streaming:
         more, added = streaming_tables(every)
         tables, sentences = tables | more, (*sentences, *added)
-    details = {"runs": {label: one.as_dict() for label, one in metrics.items()}, "notes": notes}
+    details = {"runs": {label: one.as_dict() for label, one in metrics.items()}}
     return Tables(tables, details, sentences)
 
 
@@ -112,7 +107,7 @@ def _differences(compared: Sequence[Comparison]) -> Table:
     )
 
 
-def _tracking(metrics: Mapping[str, Metrics], compared: Sequence[Comparison], notes: Sequence[str]) -> Table:
+def _tracking(metrics: Mapping[str, Metrics]) -> Table:
     """A row for each run: errors against truth, continuity, number of tracks, time."""
     with_truth = any(one.truth for one in metrics.values())
     records = [
@@ -122,17 +117,13 @@ def _tracking(metrics: Mapping[str, Metrics], compared: Sequence[Comparison], no
         | {"time_per_tick_p50_s": one.time_per_tick_s.p50, "time_per_tick_p99_s": one.time_per_tick_s.p99}
         for label, one in metrics.items()
     ]
-    truth = [
-        Column(heading, rmse, bold=_is_best(compared, rmse), is_extra=name != "position_m")
-        for name, heading in _ERRORS.items()
-        for rmse in [named(name, "rmse")]
-    ]
+    truth = [Column(heading, named(name, "rmse"), is_extra=name != "position_m") for name, heading in _ERRORS.items()]
     nees, tracked = "NEES: mean of the position's; 2 if consistent", "tracked: share of the ticks in sight of a sensor"
     breaks = "breaks: resumed after a loss or with another track; switches: the latter"
     false = f"false: paired with a true object in less than {FALSE_TRACK_SHARE:.0%} of its life"
     precision = "precision: true objects tracked / tracks that were confirmed"
     truth += [
-        Column("NEES\npos.", "position_nees", bold=_is_best(compared, POSITION_NEES), note=nees),
+        Column("NEES\npos.", "position_nees", note=nees),
         Column("tracked\n[%]", "tracked_share_in_sight", scale=PERCENT, note=tracked),
         Column("breaks/\nswitches", "breaks id_switches", "{}/{}", note=breaks),
         Column("false\ntracks", "false_tracks", note=false),
@@ -145,9 +136,8 @@ def _tracking(metrics: Mapping[str, Metrics], compared: Sequence[Comparison], no
         Column("tracks all/\nconfirmed", "num_tracks num_confirmed", "{}/{}", is_extra=with_truth, note=confirmed),
         Column("ms/tick\np50/p99", "time_per_tick_p50_s time_per_tick_p99_s", "{}/{}", MS),
     ]
-    own = [BEST_NOTE] if any(column.bold(record) for column in truth for record in records) else []
     title = "Tracking" + (" (errors: RMSE against truth)" if with_truth else "")
-    return Table(title, records, columns, notes=[*own, *notes])
+    return Table(title, records, columns)
 
 
 def _truth_numbers(one: Metrics, truth: TruthMetrics) -> dict[str, float]:
@@ -164,7 +154,7 @@ def _truth_numbers(one: Metrics, truth: TruthMetrics) -> dict[str, float]:
     }
 
 
-def _multi_object(metrics: Mapping[str, Metrics], compared: Sequence[Comparison]) -> Table:
+def _multi_object(metrics: Mapping[str, Metrics]) -> Table:
     """A row for each run with truth: GOSPA and its parts, CLEAR, IDF1, HOTA, switches, time to confirm."""
     records = [
         {"run": label}
@@ -173,7 +163,7 @@ def _multi_object(metrics: Mapping[str, Metrics], compared: Sequence[Comparison]
     ]
     columns = [
         RUN,
-        Column("GOSPA\n[m]", _GOSPA, bold=_is_best(compared, _GOSPA)),
+        Column("GOSPA\n[m]", _GOSPA),
         Column("local.\n[m]", "gospa_localisation_m"),
         Column("missed\n[m]", "gospa_missed_in_sight_m"),
         Column("false\n[m]", "gospa_false_m"),
@@ -188,7 +178,6 @@ def _multi_object(metrics: Mapping[str, Metrics], compared: Sequence[Comparison]
         "unseen: missed where no sensor could see; the scores in % count it too",
         "scores: 100 is perfect; defined in docs/metrics.md",
         "confirm: from an object's first detection to its first confirmed track",
-        *([BEST_NOTE] if any(map(_is_best(compared, _GOSPA), records)) else []),
     ]
     records = records if any(len(record) > 1 for record in records) else []
     return Table("Multi-object metrics", records, columns, notes=notes, is_detail=True)
@@ -352,10 +341,3 @@ def _failures(metrics: Mapping[str, Metrics]) -> Table:
     columns = [RUN, *(Column(kind.replace(" ", "\n"), kind.replace(" ", "_")) for kind in kinds)]
     is_detail = not any(record["failures"] for record in records)
     return Table("Failures inside the estimator", records, [*columns, Column("sum", "failures")], is_detail=is_detail)
-
-
-def _is_best(compared: Sequence[Comparison], quantity: str) -> Callable[[Record], bool]:
-    """Function of a record: True if its run is better than all others of its recording, none of which ties with it."""
-    first = [entries[0] for one in compared if (entries := one.quantities.get(quantity))]
-    best = {entry.name for entry in first if entry.standing == "best"}
-    return lambda record: record["run"] in best
