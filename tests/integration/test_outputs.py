@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support import kitti
 from support.paper import paper
 
 from fgtrack.cli import study
@@ -68,9 +69,12 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_stream("noisy.jsonl", noisy())
         write_stream("other.jsonl", drive(10))
         write_bag("bag", drive(10))
+        seen = [kitti.pose(frame, 20.0, 3.0, 0.0) for frame in range(30)]
+        kitti.folder(folder / "kitti", oxts=[kitti.oxts(speed_mps=10.0)] * 30, pointrcnn_car=seen)
         Path("sweep.yaml").write_text(SWEEP)
         for words in (
             ("replay", "other.jsonl", "-o", "run"),
+            ("replay", "kitti/oxts/0001.txt", "-o", "kitti_run"),
             ("demo", "-o", "demo"),
             *(words for words, _ in WRITERS if words[0] in ("figure", "report", "export", "tune", "advise", "info")),
         ):
@@ -127,6 +131,7 @@ WRITERS = [
     (("export", "run", "-o", "run.mcap"), "run.mcap"),
     (("export", "run", "-o", "ros2.mcap", "--ros2"), "ros2.mcap"),
     (("export", "run", "-o", "ros2", "--ros2"), "ros2"),
+    (("export", "kitti_run", "-o", "0001.txt", "--kitti", "kitti/oxts/0001.txt"), "0001.txt"),
     (("tune", "noisy.jsonl", "-o", "tuned.yaml"), "tuned.yaml"),
     (("advise", "drive.jsonl", "-o", "advised.yaml"), "advised.yaml"),
     (("info", "drive.jsonl", "--write", "my.yaml"), "my.yaml"),
@@ -238,6 +243,7 @@ TANGLED = [
     (("report", "run", "-o", "run/report.html"), "run"),
     (("study", "demo/recording", "-c", "demo/settings.yaml", "-o", "demo"), "demo/settings.yaml"),
     (("export", "run", "-o", "run/run.mcap"), "run"),
+    (("export", "kitti_run", "-o", "kitti/oxts/0001.txt", "--kitti", "kitti/oxts/0001.txt"), "kitti/oxts/0001.txt"),
     (("tune", "noisy.jsonl", "-c", "tuned.yaml", "-o", "tuned.yaml"), "tuned.yaml"),
     (("sweep", "sweep.yaml", "--input", "bag", "-o", "bag"), "bag"),
 ]

@@ -42,7 +42,11 @@ from fgtrack.io.adapters.kitti_view import PERIOD_NS, View, lines, read_views
 from fgtrack.io.config import InputConfig, KittiInput
 from fgtrack.io.source import FileFormat
 
-__all__ = ["FORMAT", "PERIOD_NS", "is_sequence", "read_sequence"]
+__all__ = ["CLASS_NAMES", "FORMAT", "PERIOD_NS", "is_sequence", "read_sequence", "view_of_sequence"]
+
+_TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
+CLASS_NAMES: Mapping[str, str] = {name.lower(): name for name in _TYPES}
+"""Types of the data set by the names that detections get."""
 
 _OXTS, _CALIB, _LABELS = "oxts", "calib", "label_02"
 _DONT_CARE = "DontCare"
@@ -78,7 +82,7 @@ def read_sequence(folder: Path, sequence: str, settings: KittiInput) -> Iterator
     DataError
         A file is missing or not what the data set holds; the message names file and line.
     """
-    views = read_views(folder / _OXTS / f"{sequence}.txt", folder / _CALIB / f"{sequence}.txt")
+    views = _views(folder, sequence)
     labels = folder / _LABELS / f"{sequence}.txt"
     truth = _rows(labels, len(views)) if labels.exists() else {}
     rows_of = {place.parent.name: _rows(place, len(views)) for place in _detection_places(folder, sequence)}
@@ -92,6 +96,15 @@ def read_sequence(folder: Path, sequence: str, settings: KittiInput) -> Iterator
             found: Iterator[Detection | str] = _read(rows.get(frame, []), parse)
             objects, left_out = split(found)
             yield DetectionList(sensor, view.ego.stamp_ns, view.ego.receipt_ns, objects, refers_to, left_out)
+
+
+def view_of_sequence(path: Path) -> list[View]:
+    """The ego at every frame of the sequence that `path`, a folder or a file of `oxts/`, means; raises as a reader."""
+    return _views(*_located(path))
+
+
+def _views(folder: Path, sequence: str) -> list[View]:
+    return read_views(folder / _OXTS / f"{sequence}.txt", folder / _CALIB / f"{sequence}.txt")
 
 
 def _located(path: Path, named: int | str | None = None) -> tuple[Path, str]:

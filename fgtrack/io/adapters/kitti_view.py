@@ -13,6 +13,8 @@ from fgtrack.core.geometry import rotation, wrap_angle
 from fgtrack.core.types import EgoState, FloatArray
 
 PERIOD_NS = 100_000_000
+IMAGE_PX = (1242.0, 375.0)
+"""Width and height of the images; of some sequences a few pixels less."""
 
 _LARGEST_MB = 16.0  # those of the data set have a few
 _EARTH_RADIUS_M = 6_378_137.0
@@ -44,6 +46,32 @@ class Calibration(NamedTuple):
         return self.point((-np.linalg.solve(self.projection[:, :3], self.projection[:, 3])).tolist())
 
 
+class Box(NamedTuple):
+    """A box in space, as labels and results give it: in the rectified camera frame, by the middle of its bottom."""
+
+    height_m: float
+    width_m: float
+    length_m: float
+    x_m: float
+    y_m: float
+    z_m: float
+    rotation_y_rad: float
+
+    def image_px(self, calibration: Calibration) -> tuple[float, float, float, float] | None:
+        """Left, top, right and bottom of what camera 2 sees of it; None where it does not."""
+        signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-1.0, 0.0) for c in (-0.5, 0.5)])
+        corners = signs * np.array([self.length_m, self.height_m, self.width_m])
+        corners[:, ::2] = corners[:, ::2] @ rotation(self.rotation_y_rad)  # about y, which points down
+        corners += np.array([self.x_m, self.y_m, self.z_m])
+        points = np.column_stack([corners, np.ones(8)]) @ calibration.projection.T
+        points = points[points[:, 2] > 0.1]
+        if not len(points):
+            return None
+        pixels = points[:, :2] / points[:, 2:]
+        low, high = np.maximum(pixels.min(axis=0), 0.0), np.minimum(pixels.max(axis=0), np.array(IMAGE_PX) - 1.0)
+        return (*low.tolist(), *high.tolist()) if (low < high).all() else None
+
+
 class View(NamedTuple):
     """The ego at a frame, how the inertial unit is tilted, and the calibration."""
 
@@ -56,6 +84,12 @@ class View(NamedTuple):
         """Position (3,) and yaw in the ego frame of an object given in the rectified camera frame."""
         heading = self.calibration.direction([math.cos(rotation_y_rad), 0.0, -math.sin(rotation_y_rad)])
         return self.levelled_from_imu @ self.calibration.point([x_m, y_m, z_m]), self._azimuth_rad(heading)
+
+    def rectified(self, position_m: FloatArray, yaw_rad: float) -> tuple[FloatArray, float]:
+        """Position (3,) and rotation about y in the rectified camera frame, the inverse of `pose`."""
+        turn = self.calibration.rectified_from_imu[:3, :3] @ self.levelled_from_imu.T
+        heading = turn @ [math.cos(yaw_rad), math.sin(yaw_rad), 0.0]
+        return turn @ position_m + self.calibration.rectified_from_imu[:3, 3], math.atan2(-heading[2], heading[0])
 
     def bearing_rad(self, u_px: float, v_px: float) -> float:
         """Bearing of an image point from camera 2, 0 along the ego's heading."""
