@@ -52,7 +52,7 @@ class Comparison:
     samples: int
     """Objects and stamps at which all runs have a paired track."""
     most_samples: int
-    """Those of the run with most of them."""
+    """Samples of the run with most of them."""
     quantities: Mapping[str, tuple[Entry, ...]]
     """By name, with the unit in it, the entries from the best to the worst; those that all runs have."""
 

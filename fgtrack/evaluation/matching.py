@@ -82,7 +82,7 @@ class TrackErrors:
     stamps_ns: IntArray
     object_index: IntArray
     track_ids: IntArray
-    """Of each row, shape (p,)."""
+    """Shape (p,) each."""
     values: Mapping[str, FloatArray]
     """By name of `ERROR_NAMES`, each of shape (p,); NaN where the truth has no value."""
 
@@ -103,7 +103,9 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
     if not paths:
         return None
     timing = run.tables["timing"]
-    tracks = run.tables["tracks"].where(_evaluated(run, options))
+    tracks = run.tables["tracks"]
+    kept = recorded(run, tracks["stamp_ns"]) & np.isin(tracks["tick"], timing["tick"])  # not of a tick that was killed
+    tracks = tracks.where(kept & confirmed(tracks) if options.confirmed_only else kept)
     if run.tables["ignored"].num_rows:
         tracks = tracks.where(~_ignored(run, tracks, paths, options.gate_m))
     candidates, distances_m = _distances(tracks, paths)
@@ -221,16 +223,6 @@ def recorded(run: Run, stamps_ns: IntArray) -> BoolArray:
     """True for those of `stamps_ns` between the first and the last stamp of the truth, shape (n,)."""
     truth_ns = run.tables["truth"]["stamp_ns"]
     return np.asarray((stamps_ns >= truth_ns.min()) & (stamps_ns <= truth_ns.max()))
-
-
-def _evaluated(run: Run, options: EvaluationConfig) -> BoolArray:
-    """True for the rows of tracks.csv stamped while truth was recorded, of a finished tick, confirmed if asked.
-
-    Only a run that was killed has rows of a tick that is missing in timing.csv.
-    """
-    tracks = run.tables["tracks"]
-    kept = recorded(run, tracks["stamp_ns"]) & np.isin(tracks["tick"], run.tables["timing"]["tick"])
-    return kept & confirmed(tracks) if options.confirmed_only else kept
 
 
 def _ignored(run: Run, tracks: Table, paths: list[TruePath], gate_m: float) -> BoolArray:

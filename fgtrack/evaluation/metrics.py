@@ -82,7 +82,7 @@ class TruthMetrics:
     judged_tracks: int
     """Tracks with an evaluated row."""
     false_tracks: int
-    """Those of them paired in less than `FALSE_TRACK_SHARE` of their rows."""
+    """Judged tracks paired in less than `FALSE_TRACK_SHARE` of their rows."""
     tracked_visits: int
     """Times that an object came into sight and was tracked there: TP of the precision, see `tracked_visits`."""
 
@@ -124,7 +124,7 @@ class Metrics:
     num_tracks: int
     """Distinct ids in tracks.csv."""
     num_confirmed: int
-    """Those of them that were `confirmed`."""
+    """Tracks that were `confirmed`."""
     sensors: Mapping[str, SensorMetrics]
     residuals: Mapping[str, Moments]
     """Innovations of all sensors and confirmed tracks, by name of `LOCAL_NAMES`: table I of Karle et al. 2023."""

@@ -24,7 +24,7 @@ class Consistency:
     """
 
     position_nees: ChiSquareMean
-    """Of the present position; empty without truth."""
+    """NEES of the present position; empty without truth."""
     nis: Mapping[str, ChiSquareMean]
     """By sensor."""
     autocorrelation: Mapping[str, Autocorrelation | None]

@@ -36,7 +36,7 @@ class LagMetrics:
     position_nees: Moments
     """Normalised error squared of x and y: a consistent estimator has a mean of 2."""
     present_errors: Mapping[str, Moments]
-    """Those of the present states that were published for these stamps."""
+    """Errors of the present states that were published for these stamps."""
     position_reduction: Estimate = UNKNOWN
     """Relative reduction of the position RMSE against the present states, with its interval."""
 

@@ -28,7 +28,7 @@ class PredictionErrors:
     final_m: Moments
     """At the horizon: the mean is the final displacement error, FDE."""
     average_m: Moments
-    """Of each prediction the mean over every 0.1 s until then: the mean is the average displacement error, ADE."""
+    """For each prediction the mean over every 0.1 s until then: the mean is the average displacement error, ADE."""
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,6 @@ class _Square(NamedTuple):
     square: ChiSquareMean
     interval: Estimate = UNKNOWN
 
-    @property
-    def may_be_chance(self) -> bool:
-        return self.interval.is_known and self.interval.low <= self.square.dof <= self.interval.high
-
     def __str__(self) -> str:
         low, high = two_digits(self.interval.low), two_digits(self.interval.high)
         known = f", 95 % interval {low} to {high}" if self.interval.is_known else ""
@@ -87,8 +83,8 @@ def _metres(entry: Entry, what: str = "") -> str:
 def _noise(label: str, one: Metrics) -> Iterator[str]:
     """Fit of the covariances of a run, the best one, to the errors."""
     squares = list(_squares(one))
-    far = [square for square in squares if is_far_off(square.square)]
-    off = [square for square in far if not square.may_be_chance]
+    far = [each for each in squares if is_far_off(each.square)]
+    off = [each for each in far if not each.interval.low <= each.square.dof <= each.interval.high]  # where it is known
     if off:
         small = [each.square.mean > each.square.dof for each in off]
         size = "too small" if all(small) else "partly too small, partly too large" if any(small) else "too large"
