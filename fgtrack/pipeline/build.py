@@ -1,6 +1,7 @@
 """From a configuration to a tracker."""
 
 from collections.abc import Callable, Collection, Mapping
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +23,6 @@ from fgtrack.estimation.filters.published import (
 from fgtrack.estimation.filters.track_initiation import initiated
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
 from fgtrack.estimation.registry import estimator_bank
-from fgtrack.estimation.smoothing.bank import MakeSolver, SmootherBank
-from fgtrack.estimation.smoothing.gtsam.batch import BatchSolver
-from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
-from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.models.areas import ExclusionAreas
 from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
 from fgtrack.models.published_map import CircularHeadingMap, PublishedMap
@@ -145,18 +142,22 @@ def _build_backward_forward(config: Config, failures: Failures) -> TrackBank:
     return ObjectBank(motion, one, config.filter.storage_s)
 
 
-def _smoother(make_solver: MakeSolver) -> Callable[[Config, Failures], TrackBank]:
-    return lambda config, failures: SmootherBank(
-        config.motion_model(), config.smoother, make_solver, config.initiation.method, failures
-    )
+def _smoother(module: str, solver: str) -> Callable[[Config, Failures], TrackBank]:
+    def build(config: Config, failures: Failures) -> TrackBank:
+        from fgtrack.estimation.smoothing.bank import SmootherBank  # half a second with its kernels and gtsam
+
+        make_solver = getattr(import_module(f"fgtrack.estimation.smoothing.{module}"), solver)
+        return SmootherBank(config.motion_model(), config.smoother, make_solver, config.initiation.method, failures)
+
+    return build
 
 
 #: Banks that are built from settings of their own.
 _BANKS: Mapping[str, Callable[[Config, Failures], TrackBank]] = {
     "ekf-backward-forward": _build_backward_forward,
-    "smoother": _smoother(IncrementalSolver),
-    "smoother-batch": _smoother(BatchSolver),
-    "smoother-banded": _smoother(Solver),
+    "smoother": _smoother("gtsam.incremental", "IncrementalSolver"),
+    "smoother-batch": _smoother("gtsam.batch", "BatchSolver"),
+    "smoother-banded": _smoother("solver", "Solver"),
 }
 
 
