@@ -42,17 +42,12 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     Truth is a broad pale line, so a stretch that nothing tracked stays visible; a track has the colour of the
     object that it is paired with, and is black where it is paired with none. Without truth every confirmed
     track has a colour. The picture holds map, ego, truth and the bulk of the tracks and detections; what lies
-    outside is counted. The close-up follows for 0.8 s the track with the most updates in so short a time.
-
-    Raises
-    ------
-    DataError
-        `config.yaml` is not YAML, or the map that it names is no map.
+    outside is counted. The close-up follows for 0.8 s the track with the most updates in so short a time. Raises
+    `DataError` if `config.yaml` is not YAML, or the map that it names is not a map.
     """
     one = one_evaluated(run)
     maps, notes = roads(one.run)
     bounds_m = [line for road in maps.values() for line in road_lines(road)[:2]]
-    rings = excluded_lines(one.run)
     every = one.run.tables["tracks"]
     tracks = every.where(confirmed(every)) if one.matching is None else one.matching.tracks
     detections_m, ego_m = placed(one.run).position_m, _positions(one.run.tables["ego"])
@@ -61,33 +56,36 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     edges = [bulk([each[:, k] for each in samples_m], [each[:, k] for each in required]) for k in range(2)]
     lows_m, highs_m = np.transpose(edges)
     window = _window(one.run)
-    has_window = window is not None and (highs_m - lows_m).max() > _WORTHWHILE * 2.0 * window.half_m
-    sheet = Sheet(11.0 if has_window else 8.0, 6.0, paper)
-    panels = list(sheet.plots(1, 2 if has_window else 1)[0])
-    for axes, is_close in zip(panels, (False, True), strict=False):
+    if window is not None and (highs_m - lows_m).max() <= _WORTHWHILE * 2.0 * window.half_m:
+        window = None
+    sheet = Sheet(8.0 if window is None else 11.0, 6.0, paper)
+    overview, *close_ups = sheet.plots(1, 1 if window is None else 2)[0]
+    for axes, near in ((overview, None), *((axes, window) for axes in close_ups)):
         for line in bounds_m:
             axes.plot(*line.T, color=GREY, lw=0.7, zorder=3)
-        for k, ring in enumerate(rings):
+        for k, ring in enumerate(excluded_lines(one.run)):
             axes.plot(*ring.T, color=GREY, lw=1.2, ls=":", zorder=3, label="" if k else "excluded")
-        near = window if is_close else None
-        ego, seen = (_near(one.run.tables[name]["stamp_ns"], near) for name in ("ego", "detections"))
+        ego, shown = (_near(one.run.tables[name]["stamp_ns"], near) for name in ("ego", "detections"))
         if np.isfinite(ego_m).any():
             axes.plot(*ego_m[ego].T, color="black", lw=0.8, ls="--", label="ego", zorder=3.5)
         if np.isfinite(detections_m).any():
             label = f"detections ({int(np.isfinite(detections_m[:, 0]).sum())})"
-            size, above = (5.0, 4.5) if is_close else (1.5, 2.2)
-            axes.plot(*detections_m[seen].T, "x", ms=size, mew=0.2 * size, color=_DETECTIONS, label=label, zorder=above)
+            size, above = (1.5, 2.2) if near is None else (5.0, 4.5)
+            axes.plot(
+                *detections_m[shown].T, "x", ms=size, mew=0.2 * size, color=_DETECTIONS, label=label, zorder=above
+            )
         _draw_objects(axes, one, tracks.where(_near(tracks["stamp_ns"], near)), near)
-        axes.set_aspect("equal", adjustable="datalim")
         axes.set(xlabel="x, east [m]", ylabel="y, north [m]")
-    overview = panels[0]
-    _show(overview, lows_m, highs_m)
+        axes.set_aspect("equal", adjustable="datalim")
+        corners = (lows_m, highs_m) if near is None else (near.middle_m - near.half_m, near.middle_m + near.half_m)
+        x_m, y_m = np.transpose(corners)
+        axes.set_xlim(*x_m, auto=True)  # an equal aspect may widen one of the two
+        axes.set_ylim(*y_m, auto=True)
+        if near is not None:
+            at_s = (near.middle_ns - start_ns([one])) / NS_PER_S
+            axes.set_title(f"close-up: {2 * _AROUND_S:g} s around {at_s:.1f} s", loc="left")
+            overview.plot(*near.middle_m, "s", ms=14, mfc="none", mec="black", mew=1.2, label="close-up", zorder=6)
     text = [titled(one.label, "on the map")]
-    if has_window and window is not None:
-        _show(panels[1], window.middle_m - window.half_m, window.middle_m + window.half_m)
-        at_s = (window.middle_ns - start_ns([one])) / NS_PER_S
-        panels[1].set_title(f"close-up: {2 * _AROUND_S:g} s around {at_s:.1f} s", loc="left")
-        overview.plot(*window.middle_m, "s", ms=14, mfc="none", mec="black", mew=1.2, label="close-up", zorder=6)
     if notes:
         text.append("the map file is not there any more")
     if one.matching is None:
@@ -95,7 +93,7 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     outside = sum(int(((each < lows_m) | (each > highs_m)).any(axis=-1).sum()) for each in samples_m)
     if outside:
         text.append(f"{outside} rows of tracks and detections are outside of the picture")
-    legend_above(overview, 1.0 / len(panels))
+    legend_above(overview, 1.0 / (1 + len(close_ups)))
     sheet.title("\n".join(text))
     return sheet.figure
 
@@ -111,33 +109,27 @@ class _Window(NamedTuple):
 def _window(run: Run) -> _Window | None:
     """Around the track with the most updates in `_AROUND_S` before and after, at the first such stamp of them."""
     used, around_ns = run.tables["updates"].where(run.tables["updates"]["track_id"] >= 0), nanoseconds(_AROUND_S)
-    best: tuple[int, int, int] = (0, 0, 0)
+    busiest: tuple[int, int, int] = (0, 0, 0)
     for track_id in np.unique(used["track_id"]).tolist():
         stamps_ns = np.sort(used["stamp_ns"][used["track_id"] == track_id])
-        counts = np.searchsorted(stamps_ns, stamps_ns + around_ns, "right") - np.searchsorted(
-            stamps_ns, stamps_ns - around_ns
-        )
+        first = np.searchsorted(stamps_ns, stamps_ns - around_ns)
+        counts = np.searchsorted(stamps_ns, stamps_ns + around_ns, "right") - first
         row = int(counts.argmax())
-        best = max(best, (int(counts[row]), -int(stamps_ns[row]), track_id))
-    middle_ns = -best[1]
+        busiest = max(busiest, (int(counts[row]), -int(stamps_ns[row]), track_id))
+    count, earlier_ns, track_id = busiest
     tracks = run.tables["tracks"]
-    is_near = np.abs(tracks["stamp_ns"] - middle_ns) <= around_ns
-    positions_m = _positions(tracks.where((tracks["track_id"] == best[2]) & is_near))
-    if not best[0] or not len(positions_m):
+    is_near = np.abs(tracks["stamp_ns"] + earlier_ns) <= around_ns
+    positions_m = _positions(tracks.where((tracks["track_id"] == track_id) & is_near))
+    if not count or not len(positions_m):
         return None
     low_m, high_m = positions_m.min(axis=0), positions_m.max(axis=0)
-    return _Window(middle_ns, (low_m + high_m) / 2.0, max(_LEAST_M, 0.6 * float((high_m - low_m).max())))
+    return _Window(-earlier_ns, (low_m + high_m) / 2.0, max(_LEAST_M, 0.6 * float((high_m - low_m).max())))
 
 
 def _near(stamps_ns: IntArray, window: _Window | None) -> BoolArray:
     """True for stamps of the time of `window`, for all where it is None."""
     middle_ns, reach_ns = (0, np.inf) if window is None else (window.middle_ns, 2 * nanoseconds(_AROUND_S))
     return np.asarray(np.abs(stamps_ns - middle_ns) <= reach_ns)
-
-
-def _show(axes: Axes, lows_m: FloatArray, highs_m: FloatArray) -> None:
-    axes.set_xlim(lows_m[0], highs_m[0], auto=True)  # an equal aspect may widen one of the two
-    axes.set_ylim(lows_m[1], highs_m[1], auto=True)
 
 
 def _positions(table: Table) -> FloatArray:
