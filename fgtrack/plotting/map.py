@@ -16,15 +16,7 @@ from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run import Run, Table
 from fgtrack.plotting.paper import Paper, Sheet, styled
 from fgtrack.plotting.ranges import bulk
-from fgtrack.plotting.style import (
-    GREY,
-    WRONG,
-    broken_line,
-    colour,
-    legend_above,
-    titled,
-    usual_step_ns,
-)
+from fgtrack.plotting.style import GREY, WRONG, broken_line, colour, legend_above, titled, usual_step_ns
 
 _NAMED_OBJECTS = 8  # more objects than these share two entries of the legend
 

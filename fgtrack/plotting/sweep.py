@@ -43,12 +43,7 @@ _EXPECTED: Mapping[str, float] = {"consistency.position_nees.mean": 2.0}
 #: Those that are drawn where nothing else is asked for.
 _FIRST = (*tuple(_NAMES)[:2], "consistency.position_nees.mean")
 #: Of the rest, those with a better and a worse.
-_REST = (
-    *_NAMES,
-    "truth.overall.errors.*.rmse",
-    "consistency.nis.*.mean",
-    "lagged.*.errors.position_m.rmse",
-)
+_REST = (*_NAMES, "truth.overall.errors.*.rmse", "consistency.nis.*.mean", "lagged.*.errors.position_m.rmse")
 _WIDE = 3  # panels side by side
 _LOG_FROM = 20.0  # largest over smallest value
 _DODGE = 0.012  # of the axis, between the error bars of two estimators

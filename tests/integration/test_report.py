@@ -143,13 +143,7 @@ def test_what_is_embedded_is_what_the_run_folders_hold(page: str, folder: Path) 
         long, short, direction = (numbers(one["tracks"][key]) for key in ("long", "short", "direction"))
         variance = (long * np.cos(direction)) ** 2 + (short * np.sin(direction)) ** 2
         np.testing.assert_allclose(variance / -2.0 / np.log(0.05), run.tables["tracks"]["p_x_x"][order], rtol=0.02)
-        check(
-            one["past"],
-            lagged.where(lagged["lag_s"] > 0.0),
-            "now_ns",
-            "track_id",
-            "stamp_ns",
-        )
+        check(one["past"], lagged.where(lagged["lag_s"] > 0.0), "now_ns", "track_id", "stamp_ns")
         check(one["final"], final.where(final["kind"] == "final"), "stamp_ns")
         places = zip(("x_m", "y_m"), placed(run).position_m.T, strict=True)
         check(one["detections"], {**run.tables["detections"], **dict(places)}, "receipt_ns", column="receipt")

@@ -47,11 +47,7 @@ EXPECTED: dict[str, tuple[bool, set[str], list[str]]] = {
         {"time [s]", "NEES of\nthe position", "NIS of\nlidar", "NIS of\nradar"},
         ["position: mean 0.073, expected 2; 77 % of the ticks in their band", "95 % band", "expected"],
     ),
-    "arrivals": (
-        False,
-        {"time [s]", "time of receipt [s]", "delay [ms]"},
-        ["fused in sequence: 120 of 120"],
-    ),
+    "arrivals": (False, {"time [s]", "time of receipt [s]", "delay [ms]"}, ["fused in sequence: 120 of 120"]),
     "delays": (
         False,
         {"delay from stamp to receipt [ms]", "share of the messages received"},
@@ -62,9 +58,7 @@ EXPECTED: dict[str, tuple[bool, set[str], list[str]]] = {
     ),
     "errors": (
         True,
-        {
-            *("position error [m]", "speed error [m/s]", "yaw error [deg]", "time [s]"),
-        },
+        {*("position error [m]", "speed error [m/s]", "yaw error [deg]", "time [s]")},
         ["smoother: RMSE 0.27 m", "ekf-replay: RMSE 0.54 m"],
     ),
     "lag": (
@@ -155,7 +149,7 @@ def test_there_is_a_figure_of_what_runs_have_data_for(
         truth=runs[0].tables["truth"].where(np.zeros(len(runs[0].tables["truth"]["stamp_ns"]), dtype=bool))
     )
     assert names([plain]) == [
-        *("map_smoother", "residuals_smoother", "consistency_smoother", "arrivals", "delays", "timing"),
+        *("map_smoother", "residuals_smoother", "consistency_smoother", "arrivals", "delays", "timing")
     ]
     other = write_run(tmp_path / "other", updates={0: [update(delay_ns=1_000_000)]})
     assert [name for name in names([*runs, other]) if "delays" in name] == [

@@ -147,10 +147,7 @@ def test_dispositions_sum_to_the_detections_received(tmp_path: Path) -> None:
 
 def test_the_delay_of_a_message_counts_once(tmp_path: Path) -> None:
     late, soon = 200_000_000, 100_000_000
-    updates = {
-        0: [update(index=k, delay_ns=late) for k in range(8)],
-        5: [update(tick=5, delay_ns=soon)],
-    }
+    updates = {0: [update(index=k, delay_ns=late) for k in range(8)], 5: [update(tick=5, delay_ns=soon)]}
     delay_s = evaluate(write_run(tmp_path / "run", updates=updates)).sensors["lidar"].delay_s
     assert (delay_s.count, delay_s.max) == (2, 0.2)
     assert delay_s.mean == pytest.approx(0.15)

@@ -43,11 +43,7 @@ def test_differences_are_paired_by_seed_and_the_standing_follows_from_the_interv
     small = np.random.default_rng(2).normal(0.0, 0.001, SEEDS)
     values = {"worse": list(common + 0.02 + small), "good": list(common), "same": list(common + small - small.mean())}
     found = only(rows_of(values))
-    assert {entry.name: entry.standing for entry in found.entries} == {
-        "good": "tie",
-        "same": "tie",
-        "worse": "worse",
-    }
+    assert {entry.name: entry.standing for entry in found.entries} == {"good": "tie", "same": "tie", "worse": "worse"}
     last = found.entries[-1]
     assert last.worse_by == paired(values["worse"], values[found.entries[0].name])
     assert last.value == pytest.approx(np.mean(values["worse"]))
