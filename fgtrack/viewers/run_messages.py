@@ -189,7 +189,8 @@ def _detection_messages(run: Run, look: Look) -> Iterator[Messages]:
     lists = [(key, list(rows)) for key, rows in groupby(order, key=keys.__getitem__)]
     names = np.unique(table["sensor"]).tolist()
     colours = {name: rgba(SENSORS[k % len(SENSORS)]) for k, name in enumerate(names)}
-    positions_m, ends_m = where.position_m.tolist(), track_positions(run, update_of).tolist()
+    positions_m: list[Point] = list(map(tuple, where.position_m.tolist()))
+    ends_m = track_positions(run, update_of).tolist()
 
     def scenes(topic: str, shape: Callable[[int, Colour], Shape | None], is_sparse: bool) -> Messages:
         for (receipt_ns, sensor, stamp_ns), rows in lists:
@@ -210,18 +211,12 @@ def _detection_messages(run: Run, look: Look) -> Iterator[Messages]:
         colour = (*colour[:3], 1.0 if fates[row] in LATE else 0.3)
         return _arrow((x_m, y_m), math.atan2(end_y_m - y_m, end_x_m - x_m), length_m, 0.3, colour)
 
-    def objects() -> Messages:
-        for (receipt_ns, sensor, stamp_ns), rows in lists:
-            states = tuple(
-                Detection(x_m, y_m, _known(float(where.yaw_rad[row])))
-                for row in rows
-                for x_m, y_m in [positions_m[row]]
-                if math.isfinite(x_m + y_m)
-            )
-            yield ViewerMessage(receipt_ns, stamp_ns, f"{look.prefix}/detections/{token(sensor)}", states)
-
     yield scenes("detections", mark, is_sparse=False)
-    yield objects()
+    for sensor in names:
+        mine = np.flatnonzero((table["sensor"] == sensor) & np.isfinite(where.position_m).all(axis=1))
+        states = [Detection(*positions_m[row], _known(float(where.yaw_rad[row]))) for row in mine.tolist()]
+        topic = f"{look.prefix}/detections/{token(sensor)}"
+        yield _objects(topic, table["receipt_ns"][mine], table["stamp_ns"][mine], states)
     yield scenes("arrivals", arrival, is_sparse=True)
 
 
