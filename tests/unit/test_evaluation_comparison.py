@@ -10,7 +10,7 @@ from evaluation_runs import ROUND, WEST, update, write_run
 
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.comparison import Comparison, comparisons
-from fgtrack.evaluation.runs import EvaluatedRun, same_recording
+from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.tables.compare import compare
 from fgtrack.io.run import Run
 
@@ -18,10 +18,10 @@ TICKS = 200
 NOISE_M = np.random.default_rng(1).normal(0.0, 0.3, TICKS)
 
 
-def a_run(folder: Path, across_m: FloatArray, *, first: int = 0, config_text: str = "", stamps_late: int = 0) -> Run:
+def a_run(folder: Path, across_m: FloatArray, *, first: int = 0, config_text: str = "") -> Run:
     """A car tracked from tick `first` on with the errors `across_m`; another one that is missed."""
     tracks = [[WEST.track(k, 1, across_m=float(across_m[k]))] if k >= first else [] for k in range(TICKS)]
-    updates = {k: [update(tick=k - stamps_late, delay_ns=stamps_late * 20_000_000)] for k in range(first, TICKS, 5)}
+    updates = {k: [update(tick=k)] for k in range(first, TICKS, 5)}
     truth = [*WEST.truth(range(TICKS)), *ROUND.truth(range(TICKS))]
     return write_run(folder, tracks, truth=truth, updates=updates, config_text=config_text)
 
@@ -126,15 +126,6 @@ def test_runs_of_other_recordings_or_judged_otherwise_are_not_paired(tmp_path: P
     )
     for other in (other_truth, other_gate, more_detections):
         assert comparisons([one, EvaluatedRun("other", other)]) == []
-
-
-def test_the_same_detections_with_other_delays_or_other_stamps_are_paired(tmp_path: Path, trio: list[Run]) -> None:
-    one = EvaluatedRun("one", trio[0])
-    later = write_run(tmp_path / "later", updates={k: [update(tick=k, delay_ns=7)] for k in range(0, TICKS, 5)})
-    restamped = a_run(tmp_path / "restamped", NOISE_M, stamps_late=1)
-    for other in (trio[1].with_tables(updates=later.tables["updates"]), restamped):
-        assert same_recording(one.run, other)
-        assert len(comparisons([one, EvaluatedRun("other", other)])) == 1
 
 
 def test_each_recording_has_a_comparison_of_its_own(tmp_path: Path, trio: list[Run]) -> None:

@@ -41,6 +41,8 @@ def test_a_recording_is_the_same_whatever_the_configuration_and_the_estimator() 
     assert same_recording(one, run_of(drive(), "estimator=ekf-replay", "clock.node_hz=20.0"))
     later = [replace(m, receipt_ns=m.receipt_ns + 5 * MS) for m in drive()]
     assert same_recording(one, run_of(later)), "the same with other delays"
+    restamped = [replace(m, stamp_ns=m.stamp_ns - 5 * MS) if isinstance(m, DetectionList) else m for m in drive()]
+    assert same_recording(one, run_of(restamped)), "the same with other stamps"
 
 
 def test_other_detections_are_another_recording_even_at_the_same_times() -> None:

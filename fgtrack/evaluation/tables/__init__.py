@@ -135,7 +135,8 @@ class Table:
 
     def plain(self) -> list[dict[str, Value | None]]:
         """Return the records as JSON values: None where there is no value."""
-        return [{name: _plain(record.get(name)) for name in self.names} for record in self.records]
+        names = self.names
+        return [{name: _plain(record.get(name)) for name in names} for record in self.records]
 
     def to_csv(self) -> str:
         """Return all numbers with all digits; an empty cell where there is no value."""
