@@ -139,15 +139,15 @@ def _bounds(
 
         What lies before the oldest measurement that is still to come does not change any more and is kept.
         """
-        found, settled, J = [], 0, start
+        result, settled, J = [], 0, start
         for time_ns in now_ns:
             here, counts = int(np.searchsorted(stamps_ns, time_ns)), from_ns <= time_ns
             waiting = index[~counts & (from_ns != _NEVER_NS)]
             final = min([here, *waiting.tolist()])
             J, settled = advanced(J, settled, final, counts), final
             at_now = measured(advanced(J, settled, here, counts), here, counts)
-            found.append(symmetrise(psd_solve(at_now, np.eye(motion.dim))))
-        return np.array(found)
+            result.append(symmetrise(psd_solve(at_now, np.eye(motion.dim))))
+        return np.array(result)
 
     def advanced(J: FloatArray, first: int, last: int, counts: BoolArray) -> FloatArray:
         """Information of stamp `last`, before its own measurements, from that of `first`, before its own."""

@@ -144,13 +144,13 @@ def common_samples(
     Distinct samples of each run, the stamps of the common ones, shape (n,), and of each run their rows, shape (n,).
     """
     every_ns = np.unique(np.concatenate(stamps_ns))
-    found = [
+    samples = [
         np.unique(index * len(every_ns) + np.searchsorted(every_ns, ns), return_index=True)
         for index, ns in zip(objects, stamps_ns, strict=True)
     ]
-    common = functools.reduce(np.intersect1d, [codes for codes, _ in found])
-    rows = [first[np.searchsorted(codes, common)] for codes, first in found]
-    return [len(codes) for codes, _ in found], every_ns[common % max(len(every_ns), 1)], rows
+    common = functools.reduce(np.intersect1d, [codes for codes, _ in samples])
+    rows = [first[np.searchsorted(codes, common)] for codes, first in samples]
+    return [len(codes) for codes, _ in samples], every_ns[common % max(len(every_ns), 1)], rows
 
 
 def compared(name: str, labels: Sequence[str], ticks: FloatArray) -> tuple[Entry, ...]:

@@ -96,13 +96,13 @@ class Fragmentation:
 
 def diagnostics(run: Run) -> list[Diagnostic]:
     """Defects of `run`, as far as its files show them."""
-    found = (_stamps, _angles, _ego, _map, _unused, _window, _failures, _fragmentation)
-    return [one for of_kind in found for one in of_kind(run)]
+    kinds = (_stamps, _angles, _ego, _map, _unused, _window, _failures, _fragmentation)
+    return [diagnostic for kind in kinds for diagnostic in kind(run)]
 
 
 def noise_diagnostics(run: Run) -> list[Diagnostic]:
     """Sensors whose innovations are inconsistent with the noise; see also the verdict of `compare`."""
-    found = []
+    result = []
     for sensor, nis in misfits(run):
         size = "small" if nis.mean > nis.dof else "large"
         factor = math.sqrt(max(nis.mean, 0.0) / nis.dof)  # below 0 by rounding, where one std is 1e9 of another
@@ -114,8 +114,8 @@ def noise_diagnostics(run: Run) -> list[Diagnostic]:
         if lag1 is not None and lag1 > CORRELATED:
             text += f", and errors are correlated in time ({lag1:.2f}), which fitted white noise cannot express"
         fit = _advise(run, " --tune -o advised.yaml")
-        found.append(Diagnostic(sensor, f"{text}; `{fit}` fits it, or reports what has to be done first"))
-    return found
+        result.append(Diagnostic(sensor, f"{text}; `{fit}` fits it, or reports what has to be done first"))
+    return result
 
 
 def innovation_lag1(run: Run, sensor: str) -> float | None:
@@ -166,13 +166,13 @@ def excluded_lines(meta: Mapping[str, Any]) -> Iterator[str]:
     """A line for each sensor of a run with this meta.json whose detections settings excluded."""
     bounds, unread = (dict(meta.get(key) or {}) for key in ("out_of_bounds", "left_out"))
     for sensor in sorted({*bounds, *unread}):
-        found = []
+        parts = []
         if sensor in bounds:
             count, total = sum(bounds[sensor].values()), sum(meta["counts"][sensor].values())
-            found.append(f"{count} of {total} detections out of bounds ({reasons(bounds[sensor])})")
+            parts.append(f"{count} of {total} detections out of bounds ({reasons(bounds[sensor])})")
         if sensor in unread:
-            found.append(f"{sum(unread[sensor].values())} left out when read ({reasons(unread[sensor])})")
-        yield f"{sensor}: {'; '.join(found)}"
+            parts.append(f"{sum(unread[sensor].values())} left out when read ({reasons(unread[sensor])})")
+        yield f"{sensor}: {'; '.join(parts)}"
 
 
 def _advise(run: Run, options: str = "") -> str:
@@ -200,8 +200,8 @@ def _angles(run: Run) -> Iterator[Diagnostic]:
     for about, table in [(EGO, run.tables["ego"]), *by_sensor]:
         for name in ANGULAR:
             finite = [value for value in table.get(name, np.empty(0)).tolist() if math.isfinite(value)]
-            if found := in_degrees(about, name, min(finite, default=0.0), max(finite, default=0.0)):
-                yield found
+            if wrong := in_degrees(about, name, min(finite, default=0.0), max(finite, default=0.0)):
+                yield wrong
 
 
 def _ego(run: Run) -> Iterator[Diagnostic]:
@@ -309,14 +309,14 @@ def _failures(run: Run) -> Iterator[Diagnostic]:
 
 def _fragmentation(run: Run) -> Iterator[Diagnostic]:
     """Tracks that break off and begin again, and births that die unconfirmed: bad tracking that needs no truth."""
-    found, now_ns = Fragmentation.of(run), run.tables["timing"]["now_ns"]
-    total, recorded_s = len(found.lifetimes_s), float(np.ptp(now_ns)) / NS_PER_S if len(now_ns) else 0.0
-    minutes = float(found.lifetimes_s.sum()) / 60.0
-    enough = found.breaks >= max(_FEWEST_BREAKS, _BREAKS_SHARE * total)
-    if enough and found.breaks > MOST_BREAKS_PER_MINUTE * minutes:
+    lives, now_ns = Fragmentation.of(run), run.tables["timing"]["now_ns"]
+    total, recorded_s = len(lives.lifetimes_s), float(np.ptp(now_ns)) / NS_PER_S if len(now_ns) else 0.0
+    minutes = float(lives.lifetimes_s.sum()) / 60.0
+    enough = lives.breaks >= max(_FEWEST_BREAKS, _BREAKS_SHARE * total)
+    if enough and lives.breaks > MOST_BREAKS_PER_MINUTE * minutes:
         text = (
-            f"{found.breaks} of {total} confirmed tracks begin where another one has just ended: "
-            f"{found.breaks / minutes:.2g} breaks per object and minute, median life {found.median_s:.2g} of "
+            f"{lives.breaks} of {total} confirmed tracks begin where another one has just ended: "
+            f"{lives.breaks / minutes:.2g} breaks per object and minute, median life {lives.median_s:.2g} of "
             f"{recorded_s:.3g} s; likely causes: a field of view or range larger than what a sensor covers, "
             f"detection_probability, lifecycle.lifetime_s, noise; `{_advise(run)}` looks for them"
         )

@@ -93,11 +93,11 @@ def _fused(run: Run) -> dict[int, list[tuple[Any, ...]]]:
     fused = np.flatnonzero(rows >= 0)
     fused = fused[updates["track_id"][rows[fused]] != NO_TRACK]
     columns = (detections[name][fused].tolist() for name in (*_SIZE, "score", "class_name"))
-    found: dict[int, list[tuple[Any, ...]]] = defaultdict(list)
+    result: dict[int, list[tuple[Any, ...]]] = defaultdict(list)
     ticks, ids = (updates[name][rows[fused]].tolist() for name in ("tick", "track_id"))
     for track_id, *entry in sorted(zip(ids, ticks, *columns, strict=True), key=itemgetter(1)):
-        found[track_id].append(tuple(entry))
-    return found
+        result[track_id].append(tuple(entry))
+    return result
 
 
 def _described(entries: list[tuple[Any, ...]], tick: int) -> _Description | None:
@@ -115,14 +115,14 @@ def _described(entries: list[tuple[Any, ...]], tick: int) -> _Description | None
 
 def _ticks(run: Run, num_frames: int) -> dict[int, tuple[int, int]]:
     """Time and number of the newest tick at each frame; not of a frame within whose period there was none before."""
-    found: dict[int, tuple[int, int]] = {}
+    result: dict[int, tuple[int, int]] = {}
     for now_ns, tick in zip(
         run.tables["timing"]["now_ns"].tolist(), run.tables["timing"]["tick"].tolist(), strict=True
     ):
         frame = -(-now_ns // PERIOD_NS)  # the first one that is not before the tick
         if 0 <= frame < num_frames:
-            found[frame] = (now_ns, tick)
-    return dict(sorted(found.items()))
+            result[frame] = (now_ns, tick)
+    return dict(sorted(result.items()))
 
 
 def _moved(state: np.ndarray, ahead_s: float) -> tuple[float, float, float]:

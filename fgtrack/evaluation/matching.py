@@ -164,9 +164,9 @@ def pair(scores: FloatArray, ids: IntArray, tick_index: IntArray, previous: IntA
         track_of[object_index[before]] = ids[before]
         mine = scores[rows]
         stays = inside[rows] & (ids[rows, None] == track_of)
-        found, columns = linear_sum_assignment(mine + (1.0 + mine.sum()) * stays, maximize=True)
-        allowed = inside[rows][found, columns]
-        object_index[rows[found[allowed]]] = columns[allowed]
+        chosen, columns = linear_sum_assignment(mine + (1.0 + mine.sum()) * stays, maximize=True)
+        allowed = inside[rows][chosen, columns]
+        object_index[rows[chosen[allowed]]] = columns[allowed]
     return object_index
 
 

@@ -44,12 +44,12 @@ def look(estimator: str) -> Look:
 
 def looks(estimators: Sequence[str]) -> list[Look]:
     """Return one look for each of `estimators`, in their order; equal colours get different lines."""
-    found: list[Look] = []
+    result: list[Look] = []
     for one in map(look, estimators):
         lines = (one.line, *_LINES)
-        free = (line for line in lines if all((one.colour, line) != (other.colour, other.line) for other in found))
-        found.append(one._replace(line=next(free, one.line)))
-    return found
+        free = (line for line in lines if all((one.colour, line) != (other.colour, other.line) for other in result))
+        result.append(one._replace(line=next(free, one.line)))
+    return result
 
 
 def distinct_colours(estimators: Sequence[str]) -> list[str]:
@@ -57,8 +57,8 @@ def distinct_colours(estimators: Sequence[str]) -> list[str]:
 
     The first of a name has the name's colour, a further one takes a free colour of the palette while there is one.
     """
-    found: list[str] = []
+    result: list[str] = []
     for own in (look(name).colour for name in estimators):
-        free = (colour for colour in (own, *PALETTE) if colour not in found)
-        found.append(next(free, own))
-    return found
+        free = (colour for colour in (own, *PALETTE) if colour not in result)
+        result.append(next(free, own))
+    return result

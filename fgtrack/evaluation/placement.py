@@ -72,11 +72,11 @@ def _mounts(run: Run, sensors: Column, mounted: BoolArray) -> FloatArray:
     config = run.config
     ego, known = config.get("ego") or {}, config.get("sensors") or {}
     origin = np.array([float(ego.get("detection_origin_x_m", 0.0)), float(ego.get("detection_origin_y_m", 0.0)), 0.0])
-    found = np.tile(origin, (len(sensors), 1))
+    result = np.tile(origin, (len(sensors), 1))
     for name in np.unique(sensors).tolist():
         mount = (known.get(name) or {}).get("mount") or {}
-        found[mounted & (sensors == name)] += [float(mount.get(key, 0.0)) for key in ("x_m", "y_m", "yaw_rad")]
-    return found
+        result[mounted & (sensors == name)] += [float(mount.get(key, 0.0)) for key in ("x_m", "y_m", "yaw_rad")]
+    return result
 
 
 def _wrapped(angles_rad: FloatArray) -> FloatArray:

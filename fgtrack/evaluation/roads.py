@@ -19,19 +19,19 @@ def roads(run: Run) -> tuple[dict[str, TrackMap], list[str]]:
 
     Raises `DataError` if a file is not a map.
     """
-    found, notes = {}, []
+    result, notes = {}, []
     config = run.config.get("map") or {}
     for key, built_in in (("track", make_oval), ("pit", make_pit_lane)):
         name = config.get(key)
         if name == OVAL:
-            found[key] = built_in()
+            result[key] = built_in()
         elif name and Path(str(name)).is_file():
-            found[key] = TrackMap.read(Path(str(name)))
+            result[key] = TrackMap.read(Path(str(name)))
         elif name and name != OPEN_SPACE:
             notes.append(f"map.{key}: {name} is not there any more, so it is not shown")
     lost = [name for name in config.get("excluded") or () if not Path(str(name)).is_file()]
     notes += [f"map.excluded: {name} is not there any more, so it is not shown" for name in lost]
-    return found, notes
+    return result, notes
 
 
 def excluded_lines(run: Run) -> list[FloatArray]:

@@ -86,19 +86,19 @@ _Squares = tuple[IntArray, FloatArray, IntArray]  # stamps, values, degrees of f
 
 def _panels(one: EvaluatedRun) -> dict[str, _Squares]:
     """Stamps, normalised squares and degrees of freedom to show, by name of the panel."""
-    found: dict[str, _Squares] = {}
+    result: dict[str, _Squares] = {}
     if one.matching is not None:
         values, stamps_ns = position_nees(one.matching), one.matching.tracks["stamp_ns"][one.matching.paired]
         known = np.isfinite(values)
         if known.any():
-            found[_NEES] = stamps_ns[known], values[known], np.full(known.sum(), 2)
+            result[_NEES] = stamps_ns[known], values[known], np.full(known.sum(), 2)
     updates = one.run.tables["updates"]
     measured = num_measured(updates)
     for sensor in np.unique(updates["sensor"]).tolist():
         mine = (updates["sensor"] == sensor) & np.isfinite(updates["nis"]) & (measured > 0)
         if mine.any():
-            found[f"NIS of {sensor}"] = updates["receipt_ns"][mine], updates["nis"][mine], measured[mine]
-    return found
+            result[f"NIS of {sensor}"] = updates["receipt_ns"][mine], updates["nis"][mine], measured[mine]
+    return result
 
 
 def has_squares(one: EvaluatedRun) -> bool:

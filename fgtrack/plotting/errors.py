@@ -87,15 +87,15 @@ def _curves(runs: Sequence[EvaluatedRun], object_id: int | None) -> list[_Curve]
     every = [(one, matching, track_errors(matching), "") for one, matching in known]
     every += [(one, matching, final_errors(one.run, matching), ", final state") for one, matching in known]
     curves = []
-    for one, matching, found, more in every:
-        rows = np.argsort(found.stamps_ns, kind="stable")
+    for one, matching, its_errors, more in every:
+        rows = np.argsort(its_errors.stamps_ns, kind="stable")
         if object_id is not None:
-            rows = rows[found.object_index[rows] == matching.object_ids.index(object_id)]
-        its = styles[one.label]._replace(line=":") if more else styles[one.label]
+            rows = rows[its_errors.object_index[rows] == matching.object_ids.index(object_id)]
+        look = styles[one.label]._replace(line=":") if more else styles[one.label]
         if len(rows) or not more:
-            values = {name: each[rows] for name, each in found.values.items()}
-            step_ns, stamps_ns = usual_step_ns(matching.tracks["now_ns"]), found.stamps_ns[rows]
-            curves.append(_Curve(one.label + more, its, first_ns[one.label], step_ns, stamps_ns, values))
+            values = {name: each[rows] for name, each in its_errors.values.items()}
+            step_ns, stamps_ns = usual_step_ns(matching.tracks["now_ns"]), its_errors.stamps_ns[rows]
+            curves.append(_Curve(one.label + more, look, first_ns[one.label], step_ns, stamps_ns, values))
     return curves
 
 

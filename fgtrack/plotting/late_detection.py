@@ -71,10 +71,10 @@ def drawn_close_up(
     """
     same = by_recording(runs)[0]
     try:
-        found = close_ups([one.run for one in same], stamp_ns)
+        late = close_ups([one.run for one in same], stamp_ns)
     except DataError as error:
         return [], error
-    return [("close_up", figure_of(same, found, **paper))], found[0]
+    return [("close_up", figure_of(same, late, **paper))], late[0]
 
 
 def _recorded(run: Run) -> Iterator[Message]:
@@ -131,14 +131,14 @@ def _is_list_of(arrival: Arrival, message: Message) -> bool:
 
 def _estimates(tracker: Tracker, track_id: int, stamps_ns: Iterable[int]) -> Estimates:
     """States at the falling `stamps_ns`, as far as the track's window reaches back."""
-    found = []
+    states = []
     for stamp_ns in stamps_ns:
         try:
-            found.append(tracker.state_at(track_id, stamp_ns).state)
+            states.append(tracker.state_at(track_id, stamp_ns).state)
         except CallError:  # before its window
             break
-    found.reverse()
-    return Estimates(np.array([state.stamp_ns for state in found]), np.array([state.mean for state in found]))
+    states.reverse()
+    return Estimates(np.array([state.stamp_ns for state in states]), np.array([state.mean for state in states]))
 
 
 class _Late(NamedTuple):

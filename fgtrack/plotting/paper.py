@@ -80,8 +80,8 @@ class Paper(TypedDict, total=False):
 def inches(width: float | str) -> float:
     """Return a width in inches. Raises `CallError` if it is not a width between 1.5 and 40 inches."""
     text = str(width).strip()
-    found = re.fullmatch(r"([0-9]+\.?[0-9]*|\.[0-9]+)\s*(in|cm|mm|pt|)", text)
-    value = float(found[1]) * _UNITS_IN[found[2] or "in"] if found else math.nan
+    match = re.fullmatch(r"([0-9]+\.?[0-9]*|\.[0-9]+)\s*(in|cm|mm|pt|)", text)
+    value = float(match[1]) * _UNITS_IN[match[2] or "in"] if match else math.nan
     if not _NARROWEST_IN <= value <= _WIDEST_IN:
         raise CallError(
             f"width {text!r}: not between {_NARROWEST_IN:g} and {_WIDEST_IN:g} inches, write 3.4in, 8.6cm or 86mm"
@@ -113,10 +113,10 @@ def settings(paper: Mapping[str, Any]) -> Any:  # Any: keys of rcParams are a Li
     wanted = {**_STYLE, **(_COLUMN if is_column(paper) else {})}
     current: Any = mpl.rcParams
     usual: Any = mpl.rcParamsDefault
-    found: Any = {key: value for key, value in wanted.items() if current[key] == usual[key]}
+    result: Any = {key: value for key, value in wanted.items() if current[key] == usual[key]}
     if "style" in paper:
         try:
-            found.update(
+            result.update(
                 style.library.get(str(paper["style"])) or mpl.rc_params_from_file(paper["style"], False, False)
             )
         except (OSError, ValueError) as error:
@@ -124,8 +124,8 @@ def settings(paper: Mapping[str, Any]) -> Any:  # Any: keys of rcParams are a Li
                 f"style {paper['style']}: cannot be used ({error}), name an .mplstyle file or a style of matplotlib"
             ) from error
     if "font" in paper:
-        found["font.family"] = _families(paper["font"])
-    return found
+        result["font.family"] = _families(paper["font"])
+    return result
 
 
 @cache  # so that a substitute is named once
@@ -176,8 +176,8 @@ class Sheet:
                 raise CallError(f"ax: a figure of {rows * columns} plots needs axes made by `plt.subplots`")
             self._ax.set_axis_off()
             grid = where.subgridspec(rows, columns, **ratios)
-        found: NDArray[Any] = np.asarray(grid.subplots(sharex=sharex, sharey=sharey, squeeze=False), dtype=object)
-        return found
+        result: NDArray[Any] = np.asarray(grid.subplots(sharex=sharex, sharey=sharey, squeeze=False), dtype=object)
+        return result
 
     def title(self, text: str) -> None:
         """Write `text` above the figure, where it has a title."""

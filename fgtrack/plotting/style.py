@@ -85,8 +85,8 @@ def sensor_colour(index: int) -> str:
 
 def run_looks(runs: Sequence[EvaluatedRun]) -> dict[str, Look]:
     """Return how the curves of each run look, by label: colours are those of the estimators."""
-    found = looks([str(one.run.meta.get("estimator") or one.label) for one in runs])
-    return {one.label: each for one, each in zip(runs, found, strict=True)}
+    result = looks([str(one.run.meta.get("estimator") or one.label) for one in runs])
+    return {one.label: each for one, each in zip(runs, result, strict=True)}
 
 
 def title(figure: Figure, text: str) -> None:

@@ -103,7 +103,7 @@ def _page(runs: Sequence[EvaluatedRun], tables: Tables, pictures: Iterable[tuple
         "script": _template("viewer.js"),
     }
     # Each {{name}} is replaced once: what is put in is not searched again.
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: contents[found[1]], _template("page.html"))
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: contents[match[1]], _template("page.html"))
 
 
 def _folded(title: str, content: str) -> str:

@@ -269,12 +269,12 @@ def _states(states: Table, objects: Table) -> list[Detection]:
         for track_id, length_m, width_m, height_m, name in _rows(objects, *_OBJECT)
     }
     names = ("p_x_x", "p_x_y", "p_x_yaw", "p_x_y", "p_y_y", "p_y_yaw", "p_x_yaw", "p_y_yaw", "p_yaw_yaw")
-    found = []
+    result = []
     for x_m, y_m, yaw_rad, track_id, *covariance in _rows(states, "x_m", "y_m", "yaw_rad", "track_id", *names):
         P = tuple(covariance) if math.isfinite(yaw_rad + sum(covariance)) else None
         pose = {"x_m": x_m, "y_m": y_m, "yaw_rad": _known(yaw_rad), "covariance": P, "object_id": track_id}
-        found.append(replace(described.get(track_id, Detection()), **pose))
-    return found
+        result.append(replace(described.get(track_id, Detection()), **pose))
+    return result
 
 
 def _rows(table: Table, *names: str) -> Iterator[tuple[Any, ...]]:  # Any: values of a row

@@ -40,10 +40,10 @@ def track_positions(run: Run, update_rows: IntArray) -> FloatArray:
     tracks, updates = run.tables["tracks"], run.tables["updates"]
     known = np.flatnonzero(update_rows >= 0)
     ticks, ids = (updates[name][update_rows[known]] for name in ("tick", "track_id"))
-    rows, found = published_rows(tracks, ticks, ids), np.full((len(update_rows), 2), np.nan)
+    rows, result = published_rows(tracks, ticks, ids), np.full((len(update_rows), 2), np.nan)
     positions_m = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
-    found[known[rows >= 0]] = positions_m[rows[rows >= 0]]
-    return found
+    result[known[rows >= 0]] = positions_m[rows[rows >= 0]]
+    return result
 
 
 def final_ns(run: Run, final: Table) -> IntArray:

@@ -68,7 +68,7 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
         parts[WINDOW] = final
     present, truth = matching.tracks.where(matching.paired), matching.true_states[matching.paired]
     errors = _moments(state_errors(present, truth))
-    found = [LagMetrics(0.0, errors, Moments.of(position_squares(present, truth)), errors)]
+    result = [LagMetrics(0.0, errors, Moments.of(position_squares(present, truth)), errors)]
     for lag_s, every in parts.items():
         states, truth, rows = _with_truth(run, matching, every)
         present = Table({name: column[rows] for name, column in matching.tracks.items()})
@@ -78,8 +78,8 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
             by_stamp(states["stamp_ns"], squares), lambda S: 1.0 - np.sqrt(S[0] / S[1]), np.random.default_rng(_SEED)
         )
         nees = Moments.of(position_squares(states, truth))
-        found.append(LagMetrics(lag_s, _moments(of_states), nees, _moments(of_present), reduction))
-    return tuple(found)
+        result.append(LagMetrics(lag_s, _moments(of_states), nees, _moments(of_present), reduction))
+    return tuple(result)
 
 
 def final_errors(run: Run, matching: Matching) -> TrackErrors:

@@ -66,11 +66,11 @@ def displacements(run: Run, matching: Matching) -> Displacements:
     road = roads(run)[0].get("track")
     predictors: dict[str, Predictor] = {"arc": ArcPredictor()}
     predictors |= {} if road is None else {"rail": RailPredictor(road)}
-    found = {
+    distances_m = {
         name: np.asarray(np.linalg.norm(predictor.positions(states[chosen], ahead_s) - truth, axis=-1))
         for name, predictor in predictors.items()
     }
-    return Displacements(stamps_ns, objects, found)
+    return Displacements(stamps_ns, objects, distances_m)
 
 
 def prediction_errors(run: Run, matching: Matching | None) -> dict[str, dict[str, PredictionErrors]]:

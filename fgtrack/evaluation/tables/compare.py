@@ -270,10 +270,10 @@ def _consistency(metrics: Mapping[str, Metrics]) -> Table:
 
 def _residuals(sensor: str, metrics: Mapping[str, Metrics]) -> Table:
     """A row for each run with the sensor: mean and standard deviation of the innovations, NIS, delay."""
-    found = {label: one.sensors[sensor] for label, one in metrics.items() if sensor in one.sensors}
-    names = [name for name in RESIDUAL_NAMES if any(name in one.residuals for one in found.values())]
+    sensors = {label: one.sensors[sensor] for label, one in metrics.items() if sensor in one.sensors}
+    names = [name for name in RESIDUAL_NAMES if any(name in one.residuals for one in sensors.values())]
     records = []
-    for label, one in found.items():
+    for label, one in sensors.items():
         record: dict[str, Any] = {"run": label}
         for name in names:
             if name in one.residuals:

@@ -164,8 +164,8 @@ def seed_comparisons(rows: Sequence[Mapping[str, str]], axes: Sequence[str]) -> 
     for row in rows:
         points.setdefault(tuple(row[axis] for axis in axes), []).append(row)
     metrics = [name for pattern in _BETTER for name in (rows[0] if rows else ()) if fnmatchcase(name, pattern)]
-    found = (_compared(point, metric, mine) for metric in metrics for point, mine in points.items())
-    return [one for one in found if one is not None]
+    every = (_compared(point, metric, mine) for metric in metrics for point, mine in points.items())
+    return [one for one in every if one is not None]
 
 
 def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) -> Table:
@@ -189,8 +189,8 @@ def summary_table(sweep: SweepTable, compared: Sequence[SeedComparison]) -> Tabl
 
     The best value at a point is bold where `compared`, those of the sweep, have no tie.
     """
-    means = {metric: found for metric in sweep.metrics if (found := sweep.means(metric, sweep.axes))}
-    values = {(one.point, one.estimator, metric): one for metric, found in means.items() for one in found}
+    means = {metric: of for metric in sweep.metrics if (of := sweep.means(metric, sweep.axes))}
+    values = {(one.point, one.estimator, metric): one for metric, of in means.items() for one in of}
     best = {
         (one.point, entry.name, one.metric) for one in compared for entry in one.entries if entry.standing == "best"
     }
@@ -238,8 +238,8 @@ def _compared(point: tuple[str, ...], metric: str, rows: Sequence[Mapping[str, s
     seeds = sorted(set.intersection(*map(set, values.values())), key=int) if len(values) > 1 else []
     if not seeds:
         return None
-    found = np.array([[of[seed] for seed in seeds] for of in values.values()])
-    means, costs = found[..., 0].mean(axis=1), found[..., 1]
+    table = np.array([[of[seed] for seed in seeds] for of in values.values()])
+    means, costs = table[..., 0].mean(axis=1), table[..., 1]
     entries = ranked(list(values), means, costs.mean(axis=1), lambda one, best: paired(costs[one], costs[best]))
     return SeedComparison(point, metric, len(seeds), entries)
 
