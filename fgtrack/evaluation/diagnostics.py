@@ -225,7 +225,7 @@ def _ego(run: Run) -> Iterator[Diagnostic]:
         )
         yield Diagnostic(EGO, text)
     for reason, count in dict(run.meta.get("ego_refused") or {}).items():
-        if 2 * count > num_states:
+        if 0 < num_states < 2 * count:
             text = f"{count} of {num_states} states not used, {reason}: look at the clock of its driver"
             yield Diagnostic(EGO, text)
 

@@ -75,6 +75,13 @@ def test_a_state_without_a_pair_at_its_stamp_is_not_judged(tmp_path: Path) -> No
     assert lagged[WINDOW].errors["position_m"].count == 6  # at ticks 3.75, ..., 8.75; that of 2.75 goes with tick 3
 
 
+def test_without_a_confirmed_track_there_are_no_errors(tmp_path: Path) -> None:
+    run = write_run(
+        tmp_path / "run", [[]] * 9, truth=WEST.truth(range(9)), smoothed={8: [WEST.later(k, 1) for k in (3, 4)]}
+    )
+    assert {lag_s: entry.errors["position_m"].count for lag_s, entry in lagged_of(run).items()} == {0.0: 0, WINDOW: 0}
+
+
 def test_a_state_belongs_to_the_object_that_its_track_followed_at_its_stamp(tmp_path: Path) -> None:
     twin = replace(WEST, object_id=9, y_m=30.0)
     tracks = [[(WEST if k < 10 else twin).track(k, 1)] for k in TICKS]

@@ -9,7 +9,7 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, within_run
-from fgtrack.evaluation.matching import NO_OBJECT, Matching, TrackErrors, state_errors
+from fgtrack.evaluation.matching import Matching, TrackErrors, state_errors
 from fgtrack.evaluation.scores.consistency import position_squares
 from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.evaluation.truth import true_states
@@ -97,8 +97,9 @@ def _final(run: Run) -> Table:
 def _with_truth(run: Run, matching: Matching, states: Table) -> tuple[Table, FloatArray, IntArray]:
     """Return those of `states` that belong to an object, its true states there, shape (n, 5), and their track rows."""
     rows = _rows_at(matching, states)
-    object_index = np.where(rows == _NO_ROW, NO_OBJECT, matching.object_index[rows])
-    truth = true_states(run.tables["truth"], object_index, states["stamp_ns"])
+    alive = rows != _NO_ROW
+    states, rows = states.where(alive), rows[alive]
+    truth = true_states(run.tables["truth"], matching.object_index[rows], states["stamp_ns"])
     known = np.isfinite(truth[:, 0]) & np.isfinite(states["x_m"])
     return states.where(known), truth[known], rows[known]
 
