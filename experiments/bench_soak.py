@@ -47,7 +47,7 @@ Sent = EgoState | DetectionList
 _WRONG_S = (-3600.0, -60.0, -5.0, -1.0, 0.5, 5.0, 60.0, 3600.0)
 _WRONG_LIST, _WRONG_EGO, _REPEATED, _NO_NUMBERS = 1e-3, 1e-4, 5e-3, 1e-3
 #: Failures that wrong stamps and false tracks bring about, and no fault of the tracker.
-_OF_THE_DATA = (Failure.DIVERGED, Failure.STEP_DAMPED)
+_OF_THE_DATA = (Failure.STEP_DAMPED,)
 _SETTLED = 6  # of so many parts of the time, the first is for what is built up once
 _MOST_GROWTH = 0.01
 

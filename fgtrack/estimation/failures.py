@@ -15,14 +15,10 @@ _MOST_ENDED = 100
 class Failure(StrEnum):
     """A kind of failure, or of what was done about one."""
 
-    DIVERGED = "diverged"
-    """A track's measurements contradicted it several times in a row, see `Divergence`."""
     NOT_FINITE = "not finite"
-    """A state that was to be published was not."""
+    """A state that was to be published was not, or was beyond any vehicle on Earth, see `faults`."""
     NOT_DEFINITE = "not positive definite"
     """A covariance that was to be published was not."""
-    OUT_OF_BOUNDS = "out of bounds"
-    """A state that was to be published was not one that an object can have, see `faults`."""
     UPDATE_FAILED = "update failed"
     """A measurement could not be fused; its disposition is `failed`."""
     ESTIMATOR_RAISED = "estimator raised"

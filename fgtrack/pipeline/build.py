@@ -34,7 +34,6 @@ from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules
 from fgtrack.tracking.guarded_bank import GuardedBank
 from fgtrack.tracking.inbox import QueueInbox
 from fgtrack.tracking.lifecycle import CountingLifecycle, Lifecycle
-from fgtrack.tracking.objects import Objects
 from fgtrack.tracking.preprocess import Preprocess
 from fgtrack.tracking.published import (
     PublishedEgo,
@@ -79,7 +78,6 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
         bank=GuardedBank(lambda: build_bank(config, failures), failures),
         failures=failures,
         motion=motion,
-        objects=Objects(config.objects),
         lifecycle=build_lifecycle(config),
         suppress_births_near_newer_tracks=config.lifecycle.suppress_births_near_newer_tracks,
         birth=config.birth,

@@ -24,7 +24,6 @@ from fgtrack.tracking.birth import FixedBirth, MeasuredBirth
 from fgtrack.tracking.detections import ConnectedMerge, NoMerge
 from fgtrack.tracking.existence import ExistenceRules
 from fgtrack.tracking.lifecycle import LifecycleRules
-from fgtrack.tracking.objects import ObjectRules
 from fgtrack.tracking.published import NeighbourhoodMerge, UngatedEuclidean
 
 __all__ = [
@@ -263,7 +262,6 @@ class Config:
     ego: EgoConfig = field(default_factory=EgoConfig)
     merge: MergeConfig = field(default_factory=NoMerge)
     association: AssociationConfig = field(default_factory=GatedMahalanobis)
-    objects: ObjectRules = field(default_factory=ObjectRules)
     lifecycle: LifecycleConfig = field(default_factory=ExistenceRules)
     birth: BirthConfig = field(default_factory=MeasuredBirth)
     initiation: InitiationConfig = field(default_factory=InitiationConfig)

@@ -4,11 +4,14 @@ import math
 
 import numpy as np
 
+from fgtrack.core.checks import LARGEST
 from fgtrack.core.compiled import cholesky, njit
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.kernels.kalman import innovate
 
-SOUND, NOT_FINITE, OUT_OF_BOUNDS, NOT_DEFINITE = range(4)
+SOUND, NOT_FINITE, NOT_DEFINITE = range(3)
+_ROUNDING = 1e-9
+"""Tolerance of an eigenvalue of a correlation matrix below 0: rounding, where an entry is known for certain."""
 
 
 @njit("(float64[:, ::1], float64[:, :, ::1], float64[:, :, ::1], int64[:], float64[:, :, ::1])")
@@ -30,26 +33,23 @@ def innovations(
     return nis, logdet
 
 
-@njit("int64[::1](float64[:, ::1], float64[:, :, ::1], float64[::1], float64)")
-def faults(means: FloatArray, covariances: FloatArray, most: FloatArray, rounding: float) -> IntArray:
-    """Fault of each state (m, n) and (m, n, n), shape (m,): not finite, larger than `most`, invalid covariance."""
+@njit("int64[::1](float64[:, ::1], float64[:, :, ::1])")
+def faults(means: FloatArray, covariances: FloatArray) -> IntArray:
+    """Fault of each state (m, n) and (m, n, n), shape (m,): not finite or beyond any vehicle, invalid covariance."""
     m, n = means.shape
-    found, C = np.zeros(m, np.int64), np.empty((n, n))
+    found, C = np.full(m, SOUND), np.empty((n, n))
     for i in range(m):
-        P, total, small, sound = covariances[i], 0.0, True, True
+        P, size, total, sound = covariances[i], 0.0, 0.0, True
         for a in range(n):
-            total += abs(means[i, a])
-            small = small and abs(means[i, a]) <= most[a]
+            size += abs(means[i, a])
             for b in range(n):
                 total += abs(P[a, b])
                 root = math.sqrt(max(P[a, a], 1e-300)) * math.sqrt(max(P[b, b], 1e-300))
-                C[a, b] = 1.0 + rounding if a == b else P[a, b] / root
-                sound = sound and abs(P[a, b] - P[b, a]) / root <= rounding
+                C[a, b] = 1.0 + _ROUNDING if a == b else P[a, b] / root
+                sound = sound and abs(P[a, b] - P[b, a]) / root <= _ROUNDING
             sound = sound and P[a, a] >= 0.0
-        if not total < np.inf:
+        if not (size <= LARGEST and total < np.inf):
             found[i] = NOT_FINITE
-        elif not small:
-            found[i] = OUT_OF_BOUNDS
         elif not (sound and cholesky(C, n, C)):
             found[i] = NOT_DEFINITE
     return found

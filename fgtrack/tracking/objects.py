@@ -9,36 +9,20 @@ import numpy as np
 
 from fgtrack.core.types import BoolArray, Detection, IntArray, ObjectReport
 
-__all__ = ["Apart", "ObjectRules", "Objects"]
-
 #: Says which pairs of candidates and tracks, as positions in their lists, both (m,), are not one object, shape (m,).
 Apart = Callable[[IntArray, IntArray], BoolArray]
 
-_VEHICLES = ("car", "van", "truck", "bus", "trailer", "vehicle")
-_PERSONS = ("pedestrian", "person", "person_sitting")
-_RIDERS = ("cyclist", "bicycle", "motorcycle", "rider")
+#: Classes that a detector may confuse; any other class is like none.
+_ALIKE = (
+    ("car", "van", "truck", "bus", "trailer", "vehicle"),
+    ("pedestrian", "person", "person_sitting"),
+    ("cyclist", "bicycle", "motorcycle", "rider"),
+)
 _UNKNOWN = 0
+_GROUPS = {name: -1 - number for number, group in enumerate(_ALIKE) for name in group}
 _SIZES = ("length_m", "width_m", "height_m")
 _NO_SIZES = None, None, None
 _sizes_m = attrgetter(*_SIZES)
-
-
-@dataclass(frozen=True)
-class ObjectRules:
-    """Rules for the class of a detection, which may only belong to a track of its class or of one like it.
-
-    One without a class may belong to any. The class of a track is that of most of its detections.
-    """
-
-    alike: tuple[tuple[str, ...], ...] = (_VEHICLES, _PERSONS, _RIDERS)
-    """Groups of classes that a detector may confuse, in lower case; any other class is like none."""
-
-    def __post_init__(self) -> None:
-        names = [name for group in self.alike for name in group]
-        if len(set(names)) < len(names):
-            raise ValueError("alike: a class is named twice")
-        if any(name != name.lower() for name in names):
-            raise ValueError("alike: write classes in lower case")
 
 
 @dataclass(slots=True)
@@ -53,10 +37,13 @@ class _Seen:
 
 
 class Objects:
-    """Class and size of each track, and the pairs that they exclude."""
+    """Class and size of each track, and the pairs that they exclude.
 
-    def __init__(self, rules: ObjectRules) -> None:
-        self._groups = {name: -1 - number for number, group in enumerate(rules.alike) for name in group}
+    A detection with a class may only belong to a track of its class, which is that of most of its detections, or of
+    one like it; one without a class to any.
+    """
+
+    def __init__(self) -> None:
         self._seen: dict[int, _Seen] = {}
 
     def learn(self, track_id: int, detections: Iterable[Detection]) -> None:
@@ -81,7 +68,7 @@ class Objects:
         classes = [self._class(track_id) for track_id in track_ids]
         if not any(classes):
             return None
-        numbers = dict(self._groups)
+        numbers = dict(_GROUPS)
         theirs, own = (np.array([_number(name, numbers) for name in names]) for names in (named, classes))
 
         def differ(rows: IntArray, columns: IntArray) -> BoolArray:

@@ -34,7 +34,7 @@ from fgtrack.tracking.ego import EgoPose, EgoSource
 from fgtrack.tracking.guarded_bank import faults
 from fgtrack.tracking.inbox import Batch, Inbox, record
 from fgtrack.tracking.lifecycle import Lifecycle, MatchedDetection, Scan
-from fgtrack.tracking.objects import ObjectRules, Objects
+from fgtrack.tracking.objects import Objects
 from fgtrack.tracking.preprocess import Candidate, Preprocess
 
 
@@ -53,7 +53,7 @@ class TrackerParts:
     suppress_births_near_newer_tracks: bool
     birth: Birth
     road: Road
-    objects: Objects = field(default_factory=lambda: Objects(ObjectRules()))
+    objects: Objects = field(default_factory=Objects)
     failures: Failures = field(default_factory=Failures)
     """Counts what fails inside, shared with `bank`."""
     propagated_exceptions: tuple[type[Exception], ...] = (FgtrackError, MemoryError)

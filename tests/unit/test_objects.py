@@ -10,15 +10,14 @@ from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.public import replay
-from fgtrack.tracking.objects import ObjectRules, Objects
+from fgtrack.tracking.objects import Objects
 from fgtrack.tracking.tracker import Tracker
 
 POINTS = SensorModel(std={"x_m": 0.5, "y_m": 0.5})
 
 
-def tracker(config: Config | None = None, **rules: object) -> Tracker:
-    given = config or Config()
-    return build_tracker(replace(given, sensors={"lidar": POINTS}, objects=ObjectRules(**rules)))
+def tracker(config: Config | None = None) -> Tracker:
+    return build_tracker(replace(config or Config(), sensors={"lidar": POINTS}))
 
 
 def one_list(k: int, *objects: Detection) -> DetectionList:
@@ -44,19 +43,18 @@ def test_a_car_never_joins_the_track_of_a_pedestrian(association: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "rules", "joins"),
+    ("first", "second", "joins"),
     [
-        ("car", "Truck", {}, True),
-        ("car", "animal", {}, False),
-        ("animal", "debris", {}, False),
-        ("animal", "Animal", {}, True),
-        ("car", "truck", {"alike": ()}, False),
-        (None, "pedestrian", {}, True),
-        ("car", None, {}, True),
+        ("car", "Truck", True),
+        ("car", "animal", False),
+        ("animal", "debris", False),
+        ("animal", "Animal", True),
+        (None, "pedestrian", True),
+        ("car", None, True),
     ],
 )
-def test_which_classes_may_be_one_object(first: str | None, second: str | None, rules, joins: bool) -> None:
-    one = tracker(**rules)
+def test_which_classes_may_be_one_object(first: str | None, second: str | None, joins: bool) -> None:
+    one = tracker()
     for k in range(3):
         seen(one, k, Detection(x_m=10.0, y_m=0.0, class_name=first))
     report = seen(one, 3, Detection(x_m=10.0, y_m=0.0, class_name=second))
@@ -86,7 +84,7 @@ def test_a_track_without_any_word_on_its_object_says_nothing() -> None:
 
 
 def test_what_is_known_ends_with_the_track() -> None:
-    objects = Objects(ObjectRules())
+    objects = Objects()
     objects.learn(3, [Detection(class_name="car", height_m=1.5)])
     assert objects.report(3) == ObjectReport("car", 1.0, height_m=1.5)
     apart = objects.apart(["person", None, "car"], [3, 4])
@@ -103,10 +101,3 @@ def test_the_run_folder_has_a_row_for_each_object(tmp_path) -> None:
     row = {"track_id": 0, "class_name": "car", "class_share": 1.0, "length_m": 4.0, "width_m": 2.0, "height_m": 1.5}
     for run in (replay(messages, Config(), out=tmp_path / "run"), replay(messages, Config())):
         assert {name: run.objects[name].tolist() for name in run.objects} == {name: [row[name]] for name in row}
-
-
-def test_a_class_cannot_be_like_two_others() -> None:
-    with pytest.raises(ValueError, match="alike: a class is named twice"):
-        ObjectRules(alike=(("car", "van"), ("van", "bus")))
-    with pytest.raises(ValueError, match="lower case"):
-        ObjectRules(alike=(("Car",),))
