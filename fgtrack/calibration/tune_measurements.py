@@ -90,7 +90,7 @@ class _WatchedPreprocess(Preprocess):
     ) -> tuple[list[Candidate], list[UpdateRecord]]:
         candidates, records = self._watched(batch, sensor, ego)
         objects = batch.message.objects
-        self._sensor = batch.sensor, sensor
+        self._sensor = batch.message.sensor, sensor
         self._own = {
             id(one.measurement): sensor.message_covariance
             and any(objects[index].covariance is not None for index in (one.index, *one.merged))

@@ -123,6 +123,8 @@ def validated_detection(item: Detection) -> Detection:
 def _check_fields(item: Message | Detection) -> None:
     for name, (holds, expected), is_optional in _FIELDS[type(item)]:
         value = getattr(item, name)
+        if type(value) is float and holds is _is_number:  # as nearly always
+            continue
         if not (is_optional if value is None else holds(value)):
             raise _invalid(name, expected, value)
 

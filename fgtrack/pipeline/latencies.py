@@ -1,8 +1,6 @@
 """Latencies of sensors and durations of ticks of a running tracker."""
 
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,23 +53,12 @@ class TickTiming:
     """Periods of the node in which the host called no tick."""
 
 
-class _Durations:
-    """Median and 99th percentile of the newest durations in ns, longest of all."""
-
-    def __init__(self) -> None:
-        self._newest: deque[int] = deque(maxlen=NEWEST)
-        self._worst_ns = 0
-
-    def add(self, duration_ns: int) -> None:
-        self._worst_ns = max(duration_ns, self._worst_ns) if self._newest else duration_ns
-        self._newest.append(duration_ns)
-
-    def summary_s(self) -> tuple[float | None, float | None, float | None]:
-        """Median, 99th percentile, longest; None before the first."""
-        if not self._newest:
-            return None, None, None
-        median_s, p99_s = (np.quantile(self._newest, (0.5, 0.99)) / 1e9).tolist()
-        return median_s, p99_s, seconds(self._worst_ns)
+def _summary_s(newest_ns: deque[int], worst_ns: int) -> tuple[float | None, float | None, float | None]:
+    """Median, 99th percentile, longest; None before the first."""
+    if not newest_ns:
+        return None, None, None
+    median_s, p99_s = (np.quantile(newest_ns, (0.5, 0.99)) / 1e9).tolist()
+    return median_s, p99_s, seconds(worst_ns)
 
 
 class Receptions:
@@ -80,39 +67,39 @@ class Receptions:
     def __init__(self) -> None:
         self.messages = self.detections = 0
         self._last_receipt_ns: int | None = None
-        self._delays = _Durations()
+        self._delays_ns: deque[int] = deque(maxlen=NEWEST)
+        self._worst_ns = 0
 
     def add(self, stamp_ns: int, receipt_ns: int, num_detections: int) -> None:
         """Count a message."""
         self.messages += 1
         self.detections += num_detections
-        self._delays.add(receipt_ns - stamp_ns)
+        delay_ns = receipt_ns - stamp_ns
+        self._worst_ns = max(self._worst_ns, delay_ns) if self._delays_ns else delay_ns
+        self._delays_ns.append(delay_ns)
         self._last_receipt_ns = max(receipt_ns, self._last_receipt_ns or receipt_ns)
 
     def lateness(self, too_late: int, first_tick_ns: int, now_ns: int) -> Lateness:
         """Return the report at `now_ns`."""
         since_ns = first_tick_ns if self._last_receipt_ns is None else self._last_receipt_ns
-        silent_s, delays_s = max(seconds(now_ns - since_ns), 0.0), self._delays.summary_s()
+        silent_s, delays_s = max(seconds(now_ns - since_ns), 0.0), _summary_s(self._delays_ns, self._worst_ns)
         return Lateness(self.messages, self.detections, too_late, *delays_s, self._last_receipt_ns, silent_s)
 
 
 class TickTimes:
-    """Durations of the ticks of a node by `clock_ns`; without `period_ns` there are no deadlines."""
+    """Durations of the ticks of a node; without `period_ns` there are no deadlines."""
 
-    def __init__(self, clock_ns: Callable[[], int], period_ns: int | None) -> None:
-        self._clock_ns = clock_ns
+    def __init__(self, period_ns: int | None) -> None:
         self._node = Node(period_ns)
-        self._durations = _Durations()
+        self._newest_ns: deque[int] = deque(maxlen=NEWEST)
+        self._worst_ns = 0
         self._ticks = self._skipped = 0
         self._last_ns: int | None = None
 
-    @contextmanager
-    def tick(self, now_ns: int) -> Iterator[None]:
-        """Time the block as the tick at `now_ns`."""
-        begun_ns = self._clock_ns()
-        yield
-        process_ns = self._clock_ns() - begun_ns
-        self._durations.add(process_ns)
+    def add(self, now_ns: int, process_ns: int) -> None:
+        """Count the tick at `now_ns`."""
+        self._worst_ns = max(self._worst_ns, process_ns)
+        self._newest_ns.append(process_ns)
         self._node.done_ns(now_ns, process_ns)
         self._ticks += 1
         if self._node.period_ns is not None and self._last_ns is not None:
@@ -122,4 +109,4 @@ class TickTimes:
     @property
     def timing(self) -> TickTiming:
         """Report so far."""
-        return TickTiming(self._ticks, *self._durations.summary_s(), self._node.misses, self._skipped)
+        return TickTiming(self._ticks, *_summary_s(self._newest_ns, self._worst_ns), self._node.misses, self._skipped)

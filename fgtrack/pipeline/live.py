@@ -79,7 +79,8 @@ class Tracker:
         self._arrivals: deque[EgoState | DetectionList] = deque()
         self._receptions = {name: Receptions() for name in (*config.sensors, EGO)}
         node_hz = config.clock.node_hz
-        self._times = TickTimes((clock or WallClock()).now_ns, None if node_hz is None else period_ns(node_hz))
+        self._clock = clock or WallClock()
+        self._times = TickTimes(None if node_hz is None else period_ns(node_hz))
         self._turn = threading.RLock()
 
     @classmethod
@@ -166,7 +167,8 @@ class Tracker:
         if not isinstance(message, EgoState | DetectionList):
             self._refused["neither ego state nor object list"] += 1
             return
-        if not all(0 <= whole(stamp_ns) <= LARGEST_NS for stamp_ns in (message.stamp_ns, message.receipt_ns)):
+        stamp_ns, receipt_ns = whole(message.stamp_ns), whole(message.receipt_ns)
+        if not (0 <= stamp_ns <= LARGEST_NS and 0 <= receipt_ns <= LARGEST_NS):
             raise OverflowError("stamps are nanoseconds since 1970")
         if isinstance(message, EgoState):
             self._receptions[EGO].add(message.stamp_ns, message.receipt_ns, 0)
@@ -205,11 +207,12 @@ class Tracker:
             if self._last.tick >= 0 and now_ns < self._last.now_ns:
                 self._refused["tick before the last one"] += 1
                 return replace(self._last, updates=(), smoothed=())
-            with self._times.tick(now_ns):
-                self._take_arrivals()
-                report = self._tracker.tick(now_ns)
-                report = replace(report, updates=(*self._records, *report.updates))
-                self._records = []
+            begun_ns = self._clock.now_ns()
+            self._take_arrivals()
+            report = self._tracker.tick(now_ns)
+            report = replace(report, updates=(*self._records, *report.updates))
+            self._records = []
+            self._times.add(now_ns, self._clock.now_ns() - begun_ns)
             for update in report.updates:
                 self._counts.setdefault(update.sensor, Counter())[update.disposition] += 1
             if self._last.tick < 0:

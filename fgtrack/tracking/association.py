@@ -130,9 +130,9 @@ def _near(candidates: Sequence[Candidate], states: StatesAt, reach_m: float | Fl
 
 def _refusing(suspects: set[int], assignment: Assignment) -> Assignment:
     """Return `assignment` in which those of `suspects` without a track start none."""
-    refused = tuple([i for i in assignment.new if i in suspects])
-    if not refused:
+    if suspects.isdisjoint(assignment.new):
         return assignment
+    refused = tuple([i for i in assignment.new if i in suspects])
     return assignment._replace(new=[i for i in assignment.new if i not in suspects], refused=refused)
 
 
@@ -181,6 +181,6 @@ def _least_cost(i: IntArray, j: IntArray, cost: FloatArray, shape: tuple[int, in
 
 def _outcome(rows: IntArray, columns: IntArray, num_candidates: int, num_tracks: int) -> Assignment:
     pairs = sorted(zip(rows.tolist(), columns.tolist(), strict=True))
-    paired, matched = {i for i, _ in pairs}, {j for _, j in pairs}
-    new = [i for i in range(num_candidates) if i not in paired]
-    return Assignment(pairs, new, [j for j in range(num_tracks) if j not in matched])
+    new = set(range(num_candidates)).difference(rows.tolist())
+    missed = set(range(num_tracks)).difference(columns.tolist())
+    return Assignment(pairs, sorted(new), sorted(missed))

@@ -24,7 +24,6 @@ X, Y, YAW, RANGE, BEARING, CURVATURE = (
     COMPONENTS.index(name) for name in ("x_m", "y_m", "yaw_rad", "range_m", "bearing_rad", "curvature_radpm")
 )
 _VALUES = attrgetter(*MEASURABLE)
-_FEW = 6  # so many points are moved faster one by one
 
 
 class MapDetections(NamedTuple):
@@ -72,11 +71,11 @@ def in_map_frame(batch: Batch, sensor: SensorModel, pose: SensorPose) -> MapDete
     if detections:
         values[:, : len(MEASURABLE)] = [_VALUES(detection) for detection in detections]
     values[:, _unmeasured(tuple(sensor.std))] = np.nan
-    if batch.frame != "map":
+    if batch.message.frame != "map":
         if "yaw_rad" in sensor.std:
             values[:, YAW] = wrap_angles(values[:, YAW] + pose.yaw_rad)
         if "x_m" in sensor.std:
-            _move_to_map(values[:, :2], pose)
+            values[:, 0], values[:, 1] = _in_map(values[:, 0], values[:, 1], pose)
     points_m = values[:, :2].copy()
     if "range_m" in sensor.std:
         polar = np.isnan(points_m[:, 0])
@@ -149,15 +148,6 @@ def common(kinds: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
 def _unmeasured(names: tuple[str, ...]) -> list[int]:
     """Columns of what is not among `names`."""
     return [column for column, name in enumerate(MEASURABLE) if name not in names]
-
-
-def _move_to_map(points_m: FloatArray, pose: SensorPose) -> None:
-    """Let `points_m` (m, 2), seen from `pose`, be points of the map."""
-    if len(points_m) > _FEW:
-        points_m[:, 0], points_m[:, 1] = _in_map(points_m[:, 0], points_m[:, 1], pose)
-        return
-    for point_m, (x_m, y_m) in zip(points_m, points_m.tolist(), strict=True):
-        point_m[0], point_m[1] = _in_map(x_m, y_m, pose)
 
 
 def _in_map(x_m: Real, y_m: Real, pose: SensorPose) -> tuple[Real, Real]:
@@ -234,7 +224,7 @@ class NoMerge(Merge):
 
     def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
         """See `Merge.groups`."""
-        return {i: (i,) for i in range(len(points_m))}
+        return dict(enumerate(zip(range(len(points_m)))))
 
 
 @dataclass(frozen=True)
@@ -247,21 +237,15 @@ class ConnectedMerge(Merge):
 
     def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
         """See `Merge.groups`; in the order of their first members, which lead."""
-        labels = _linked(points_m, self.distance_m)
-        if labels is None:
-            return NoMerge().groups(points_m)
+        num = len(points_m)
+        links = np.empty((0, 2), dtype=np.int64)
+        if num > 1:
+            links = cKDTree(points_m).query_pairs(self.distance_m, output_type="ndarray")
+        if not len(links):
+            return dict(enumerate(zip(range(num))))
+        graph = coo_array((np.ones(len(links), dtype=np.int8), links.T), shape=(num, num))
+        labels = connected_components(graph, directed=False)[1]
         members: dict[int, list[int]] = {}
         for index, label in enumerate(labels.tolist()):
             members.setdefault(label, []).append(index)
         return {group[0]: tuple(group) for group in members.values()}
-
-
-def _linked(points_m: FloatArray, distance_m: float) -> IntArray | None:
-    """Labels of `points_m` (n, 2), equal for those that steps of at most `distance_m` link; None without a link."""
-    if len(points_m) < 2:
-        return None
-    pairs = cKDTree(points_m).query_pairs(distance_m, output_type="ndarray")
-    if not len(pairs):
-        return None
-    links = coo_array((np.ones(len(pairs), dtype=np.int8), pairs.T), shape=(len(points_m),) * 2)
-    return np.asarray(connected_components(links, directed=False)[1])

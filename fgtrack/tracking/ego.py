@@ -4,7 +4,7 @@ import bisect
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from functools import lru_cache
 from operator import attrgetter
 from typing import NamedTuple
@@ -22,6 +22,7 @@ from fgtrack.tracking.inbox import ASYMMETRY
 MAX_EXTRAPOLATION_S = 1.0
 LARGEST_STEP_BACK_S = 1.0
 """A state that is older than the newest one by more than this has a wrong stamp."""
+_LARGEST_STEP_BACK_NS = nanoseconds(LARGEST_STEP_BACK_S)
 
 CONTRADICTS = "contradicts its neighbours"
 _LONGEST_S, _SLACK_M, _SHARE, _SIGMAS = 1.0, 2.0, 0.5, 3.0  # see `Continuity`
@@ -45,8 +46,8 @@ class EgoPose(NamedTuple):
 
 
 def is_finite(ego: EgoState) -> bool:
-    """True if every number of `ego` is finite and bounded (by `LARGEST`)."""
-    return all(abs(value) <= LARGEST for value in _VALUES(ego)[2:8])
+    """True if the numbers of `ego` are finite, and their magnitudes sum up to at most `LARGEST`."""
+    return bool(sum(map(abs, _VALUES(ego)[2:8])) <= LARGEST)
 
 
 def extrapolated(ego: EgoState, stamp_ns: int, covariance: FloatArray | None = None, straight: bool = False) -> EgoPose:
@@ -78,8 +79,7 @@ def extrapolated(ego: EgoState, stamp_ns: int, covariance: FloatArray | None = N
     )
 
 
-@dataclass(frozen=True)
-class EgoStd:
+class EgoStd(NamedTuple):
     """Standard deviations of an ego state that are taken where it does not say; 0 for exactly known."""
 
     position_m: float = 0.0
@@ -87,15 +87,12 @@ class EgoStd:
     speed_mps: float = 0.0
     yaw_rate_radps: float = 0.0
 
-    def covariance(self, given: tuple[float, ...] | None) -> FloatArray | None:
-        """The covariance `given`, shape (5, 5), read-only, with these in place of variances of 0; None for all zero."""
-        return _covariance(given, (self.position_m, self.position_m, self.yaw_rad, self.speed_mps, self.yaw_rate_radps))
 
-
-@lru_cache(maxsize=1024)  # one localisation often says the same of all its states
-def _covariance(given: tuple[float, ...] | None, std: tuple[float, ...]) -> FloatArray | None:
+@lru_cache(maxsize=1024)  # one localisation often reports the same for all its states
+def _completed(given: tuple[float, ...] | None, std: EgoStd) -> FloatArray | None:
+    """The covariance `given`, shape (5, 5), read-only, with `std` instead of variances of 0; None for all zero."""
     P = np.zeros((5, 5)) if given is None else symmetrise(np.array(given).reshape(5, 5))
-    P += np.diag(np.where(np.diag(P) > 0.0, 0.0, np.square(std)))
+    P += np.diag(np.where(np.diag(P) > 0.0, 0.0, np.square((std.position_m, *std))))
     P.flags.writeable = False
     return P if P.any() else None
 
@@ -205,7 +202,7 @@ class EgoSource(ABC):
         if ego.stamp_ns - ego.receipt_ns > self._max_future_ns:
             return "stamp ahead of its receipt"
         newest_ns = ego.stamp_ns if self._newest_ns is None else self._newest_ns
-        if newest_ns - ego.stamp_ns > nanoseconds(LARGEST_STEP_BACK_S):
+        if newest_ns - ego.stamp_ns > _LARGEST_STEP_BACK_NS:
             return "stamp jumps back"
         self._newest_ns = max(newest_ns, ego.stamp_ns)
         if self._continuity is None:
@@ -236,7 +233,7 @@ class EgoSource(ABC):
         return extrapolated(ego, stamp_ns, self._covariance(ego), self._straight)
 
     def _covariance(self, ego: EgoState) -> FloatArray | None:
-        return None if self._std is None else self._std.covariance(ego.covariance)
+        return None if self._std is None else _completed(ego.covariance, self._std)
 
     def _low_passed(self, ego: EgoState, yaw_rad: float, yaw_rate_radps: float) -> EgoState:
         """`ego` with its yaw and yaw rate drawn towards the given ones."""

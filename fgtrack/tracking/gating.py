@@ -18,7 +18,6 @@ MOST_NEAR = 128
 """Tracks, the nearest ones, that a candidate is compared with: no real scene has as many inside one gate."""
 _DENSE = 1 << 14  # a matrix of so many distances is faster than a tree
 _PORTION = 1 << 17  # pairs whose innovations are in memory at a time
-_NOWHERE = np.full(2, np.nan)
 _MARGIN = 1.0 + 1e-9  # a tree rounds differently
 
 
@@ -65,19 +64,20 @@ def grouped(candidates: Sequence[Candidate]) -> list[Group]:
     for candidate in candidates:
         own, error = candidate.measurement, candidate.pose_error
         kinds.append((id(own.model), id(own.pose), 0 if error is None else id(error.covariance)))
-    return [_stacked([candidates[row] for row in rows], np.array(rows)) for rows in equal_ones(kinds)]
-
-
-def _stacked(candidates: Sequence[Candidate], rows: IntArray) -> Group:
-    example = candidates[0].measurement
-    z = np.array([candidate.measurement.z for candidate in candidates])
-    R = np.array([candidate.measurement.R for candidate in candidates])
-    errors = [candidate.pose_error for candidate in candidates if candidate.pose_error is not None]
-    error = None
-    if errors and example.model.relative:
-        placement = np.array([each.placement for each in errors])
-        error = PoseError(errors[0].covariance, placement, np.array([each.R for each in errors]))
-    return Group(rows, example, z, R, error)
+    groups = []
+    for rows in equal_ones(kinds):
+        z, R, errors = [], [], []
+        for row in rows:
+            z.append(candidates[row].measurement.z)
+            R.append(candidates[row].measurement.R)
+            errors.append(candidates[row].pose_error)
+        example, first = candidates[rows[0]].measurement, errors[0]
+        error = None
+        if first is not None and example.model.relative:
+            parts = zip(*((each.placement, each.R) for each in errors if each is not None), strict=True)
+            error = PoseError(first.covariance, *map(np.array, parts))
+        groups.append(Group(np.array(rows), example, np.array(z), np.array(R), error))
+    return groups
 
 
 def near(candidates: Sequence[Candidate], means: FloatArray, reach_m: float | FloatArray) -> Pairs:
@@ -125,8 +125,11 @@ def _distances(points: FloatArray, candidates: Sequence[Candidate], means: Float
 
 def _positions_m(candidates: Sequence[Candidate]) -> FloatArray:
     """Positions in the map, shape (m, 2); NaN of a bearing."""
-    points = [_NOWHERE if candidate.position_m is None else candidate.position_m for candidate in candidates]
-    return np.array(points, dtype=np.float64).reshape(-1, 2)
+    points = np.full((len(candidates), 2), np.nan)
+    for point, candidate in zip(points, candidates, strict=True):
+        if candidate.position_m is not None:
+            point[:] = candidate.position_m
+    return points
 
 
 def _distances_to_ray(candidate: Candidate, means: FloatArray) -> FloatArray:

@@ -58,8 +58,8 @@ class GuardedBank:
         states: StatesAt = self._ask(methodcaller("states_at", stamp_ns), _check_states)
         if math.isfinite(states.means.sum() + states.covariances.sum()):
             return states
-        finite = np.isfinite(states.means).all(axis=1) & np.isfinite(states.covariances).all(axis=(1, 2))
-        track_ids = tuple(track_id for track_id, kept in zip(states.track_ids, finite, strict=True) if kept)
+        finite = np.isfinite(states.means.sum(axis=1) + states.covariances.sum(axis=(1, 2)))
+        track_ids = tuple(track_id for track_id, kept in zip(states.track_ids, finite.tolist(), strict=True) if kept)
         return StatesAt(track_ids, states.means[finite], states.covariances[finite])
 
     def update(

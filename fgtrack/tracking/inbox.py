@@ -31,16 +31,6 @@ class Batch:
     last: bool = True
     """True for the newest batch of its message; only detections with stamps of their own make several."""
 
-    @property
-    def sensor(self) -> str:
-        """Name of the sensor."""
-        return self.message.sensor
-
-    @property
-    def frame(self) -> Frame:
-        """Frame that the detections are given in."""
-        return self.message.frame
-
 
 def record(
     message: DetectionList,
@@ -81,19 +71,21 @@ class Inbox(Protocol):
 
 def is_usable(detection: Detection, sensor: SensorModel) -> bool:
     """True if `detection` has valid values and a position or bearing, and is not an empty slot (x = y = 0)."""
-    measured = {name: value for name in sensor.std if (value := getattr(detection, name)) is not None}
-    if not all(map(is_bounded, measured.values())) or not is_covariance(detection, sensor):
+    for name in sensor.std:
+        value = getattr(detection, name)
+        if value is not None and not abs(value) <= LARGEST:
+            return False
+    if detection.covariance is not None and not is_covariance(detection, sensor):
         return False
     if detection.x_m == 0.0 and detection.y_m == 0.0:
         return False
-    if "x_m" in measured or "y_m" in measured:
-        return "x_m" in measured and "y_m" in measured
-    return "bearing_rad" in measured
-
-
-def is_bounded(value: float) -> bool:
-    """True if `value` is finite and at most `LARGEST`."""
-    return abs(value) <= LARGEST
+    has_x, has_y = (
+        ("x_m" in sensor.std and detection.x_m is not None),
+        ("y_m" in sensor.std and detection.y_m is not None),
+    )
+    if has_x or has_y:
+        return has_x and has_y
+    return "bearing_rad" in sensor.std and detection.bearing_rad is not None
 
 
 def own_covariance(detection: Detection, names: Sequence[str]) -> FloatArray:
@@ -126,50 +118,16 @@ def is_covariance(detection: Detection, sensor: SensorModel) -> bool:
 
 def stamps(message: DetectionList, sensor: SensorModel) -> list[int]:
     """Stamp of every detection of `message`: the list's, its own, or the mean of those that have one."""
+    if sensor.stamp_from not in ("object", "objects_mean"):
+        return [message.stamp_ns] * len(message.objects)
     own = [detection.stamp_ns for detection in message.objects]
     known = [stamp_ns for stamp_ns in own if stamp_ns is not None]
     if sensor.stamp_from == "objects_mean" and known:
         return [sum(known) // len(known)] * len(own)
-    if sensor.stamp_from == "object":
-        return [message.stamp_ns if stamp_ns is None else stamp_ns for stamp_ns in own]
-    return [message.stamp_ns] * len(own)
+    return [message.stamp_ns if stamp_ns is None or sensor.stamp_from != "object" else stamp_ns for stamp_ns in own]
 
 
 _values = attrgetter(*(each.name for each in fields(Detection)))
-
-
-def _contents(objects: Sequence[Detection]) -> int:
-    """Hash of the detections in any order. It is that of their bits, for NaN equals nothing, and hash(-1) hash(-2)."""
-    try:
-        values = [marshal.dumps(_values(one), 2) for one in objects]  # 2: without references to what is shared
-    except ValueError:  # numbers of other libraries
-        values = [repr(_values(one)).encode() for one in objects]
-    return hash((len(objects), *sorted(values)))
-
-
-class _Seen:
-    """Lists that were received not long ago, by sensor, stamp and contents."""
-
-    def __init__(self, memory_ns: int) -> None:
-        self._memory_ns = memory_ns
-        self._receipts_ns: dict[tuple[str, int, Frame, int], int] = {}  # in order of receipt
-
-    def is_copy(self, message: DetectionList, usable: Sequence[bool]) -> bool:
-        """True if `message` repeats one that is remembered; it is remembered from now on.
-
-        Those that are not `usable` are not compared, nor is their order.
-        """
-        if message.objects and not any(usable):
-            return False
-        oldest_ns = message.receipt_ns - self._memory_ns
-        while self._receipts_ns and self._receipts_ns[first := next(iter(self._receipts_ns))] < oldest_ns:
-            del self._receipts_ns[first]
-        contents = message.objects if all(usable) else tuple(compress(message.objects, usable))
-        key = (message.sensor, message.stamp_ns, message.frame, _contents(contents))
-        if key in self._receipts_ns:
-            return True
-        self._receipts_ns[key] = message.receipt_ns
-        return False
 
 
 class QueueInbox:
@@ -179,42 +137,60 @@ class QueueInbox:
         """`memory_s`: how long a list is remembered; at least as long as a sensor's list may take."""
         self._sensors = sensors
         self._max_future_ns = nanoseconds(max_future_s)
-        longest_s = max((each.max_delay_s or 0.0 for each in sensors.values()), default=0.0)
-        self._seen = _Seen(nanoseconds(max(memory_s, longest_s)))
+        limits_s = {name: sensor.max_delay_s for name, sensor in sensors.items() if sensor.max_delay_s is not None}
+        self._max_delay_ns = {name: nanoseconds(limit_s) for name, limit_s in limits_s.items()}
+        self._memory_ns = max([nanoseconds(memory_s), *self._max_delay_ns.values()])
+        self._receipts_ns: dict[tuple[str, int, Frame, int], int] = {}  # of lists, in order of receipt
         self._pending: list[Batch] = []
 
     def put(self, message: DetectionList) -> list[UpdateRecord]:
         """See `Inbox.put`; a message is repeated if an earlier one of the sensor had its stamp and contents."""
         sensor = self._sensors[message.sensor]
-        usable = [is_usable(detection, sensor) for detection in message.objects]
-        if self._seen.is_copy(message, usable):
+        usable = []
+        for detection in message.objects:
+            usable.append(is_usable(detection, sensor))
+        if self._is_copy(message, usable):
             return records(message, Disposition.DUPLICATE)
         ended: list[UpdateRecord] = []
         kept: dict[int, list[int]] = {} if message.objects else {message.stamp_ns: []}
-        stamps_ns = stamps(message, sensor)
-        refusals = {stamp_ns: self._refusal(message, sensor, stamp_ns) for stamp_ns in set(stamps_ns)}
-        for index, stamp_ns in enumerate(stamps_ns):
-            refusal = refusals[stamp_ns] if usable[index] else Disposition.INVALID
-            if refusal is None:
-                kept.setdefault(stamp_ns, []).append(index)
+        max_delay_ns = self._max_delay_ns.get(message.sensor)
+        for index, stamp_ns in enumerate(stamps(message, sensor)):
+            delay_ns = message.receipt_ns - stamp_ns
+            if not usable[index] or -delay_ns > self._max_future_ns:
+                ended.append(record(message, index, Disposition.INVALID))
+            elif max_delay_ns is not None and delay_ns > max_delay_ns:
+                ended.append(record(message, index, Disposition.TOO_OLD))
             else:
-                ended.append(record(message, index, refusal))
+                kept.setdefault(stamp_ns, []).append(index)
         newest_ns = max(kept, default=0)
-        self._pending += [
-            Batch(message, stamp_ns, tuple(indices), last=stamp_ns == newest_ns) for stamp_ns, indices in kept.items()
-        ]
+        for stamp_ns, indices in kept.items():
+            self._pending.append(Batch(message, stamp_ns, tuple(indices), last=stamp_ns == newest_ns))
         return ended
 
-    def _refusal(self, message: DetectionList, sensor: SensorModel, stamp_ns: int) -> Disposition | None:
-        if stamp_ns - message.receipt_ns > self._max_future_ns:
-            return Disposition.INVALID
-        limit_s = sensor.max_delay_s
-        if limit_s is not None and message.receipt_ns - stamp_ns > nanoseconds(limit_s):
-            return Disposition.TOO_OLD
-        return None
+    def _is_copy(self, message: DetectionList, usable: Sequence[bool]) -> bool:
+        """True if `message` repeats one that is remembered; it is remembered from now on.
+
+        Compared are its usable detections, in any order, by their bits: NaN equals nothing, and hash(-1) hash(-2).
+        """
+        if message.objects and not any(usable):
+            return False
+        oldest_ns = message.receipt_ns - self._memory_ns
+        while self._receipts_ns and self._receipts_ns[first := next(iter(self._receipts_ns))] < oldest_ns:
+            del self._receipts_ns[first]
+        contents = []
+        for values in map(_values, compress(message.objects, usable)):
+            try:
+                contents.append(marshal.dumps(values, 2))  # 2: without references to what is shared
+            except ValueError:  # numbers of other libraries
+                contents.append(repr(values).encode())
+        key = (message.sensor, message.stamp_ns, message.frame, hash((len(contents), *sorted(contents))))
+        if key in self._receipts_ns:
+            return True
+        self._receipts_ns[key] = message.receipt_ns
+        return False
 
     def collect(self) -> list[Batch]:
         """See `Inbox.collect`."""
-        batches = sorted(self._pending, key=lambda batch: batch.stamp_ns)
+        batches = sorted(self._pending, key=attrgetter("stamp_ns"))
         self._pending = []
         return batches

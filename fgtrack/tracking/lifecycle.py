@@ -76,12 +76,6 @@ class Life:
     misses: int = 0
     """Misses since the last match."""
 
-    def status(self, confirm_count: int) -> TrackStatus:
-        """Status of the track."""
-        if self.num_placed < confirm_count:
-            return TrackStatus.TENTATIVE
-        return TrackStatus.COASTING if self.misses else TrackStatus.CONFIRMED
-
 
 @dataclass(frozen=True)
 class LifecycleRules:
@@ -163,7 +157,10 @@ class CountingLifecycle:
 
     def status(self, track_id: int) -> TrackStatus:
         """See `Lifecycle.status`."""
-        return self.lives[track_id].status(self._rules.confirm_count)
+        life = self.lives[track_id]
+        if life.num_placed < self._rules.confirm_count:
+            return TrackStatus.TENTATIVE
+        return TrackStatus.COASTING if life.misses else TrackStatus.CONFIRMED
 
     def num_measured(self, track_id: int) -> int:
         """See `Lifecycle.num_measured`."""

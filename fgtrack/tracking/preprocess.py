@@ -144,7 +144,9 @@ class Preprocess:
         if ego is not None and sensor.near_side_m:
             move_back(items, pose, sensor.near_side_m)
         items = self._on_road(items, sensor, lost)
-        records = [_out_of_bounds(batch, index, reason) for index, reason in lost.items()]
+        records = []
+        for index, reason in lost.items():
+            records.append(replace(record(batch.message, index, Disposition.OUT_OF_BOUNDS), reason=reason))
         return self._candidates(items, view), records
 
     def _sensor_pose(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> SensorPose:
@@ -156,7 +158,7 @@ class Preprocess:
             return SensorPose()
         yaw_rad = ego.yaw_rad
         x_m, y_m = self._origin_m
-        if batch.frame == "sensor":
+        if batch.message.frame == "sensor":
             x_m, y_m = x_m + sensor.placed.x_m, y_m + sensor.placed.y_m
             yaw_rad += sensor.placed.yaw_rad
         x_m, y_m, vx_mps, vy_mps = body_point(*ego[:5], x_m, y_m)
@@ -268,7 +270,7 @@ class Preprocess:
         self, items: MapDetections, groups: Sequence[_Group], columns: tuple[int, ...], view: _View
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Means z (m, k), covariances R (m, k, k) and positions (m, 2) of `groups`, averaged over each."""
-        names, frame, sensor, pose = _names(columns), view.batch.frame, view.sensor, view.pose
+        names, frame, sensor, pose = _names(columns), view.batch.message.frame, view.sensor, view.pose
         leaders = np.array([group.leader for group in groups])
         z, points_m = items.values[leaders].take(columns, axis=1), items.points_m[leaders]
         order = leaders.tolist()
@@ -291,7 +293,7 @@ class Preprocess:
         model = measurement_model(names, self._motion)
         if view.sensor.correlation is None:
             return [model] * len(R), R
-        split = [split_error(view.batch.sensor, view.sensor, model, one, self._motion.state_names) for one in R]
+        split = [split_error(view.batch.message.sensor, view.sensor, model, one, self._motion.state_names) for one in R]
         return [each for each, _ in split], np.array([white for _, white in split])
 
     def _pose_errors(
@@ -307,7 +309,7 @@ class Preprocess:
         if view.pose_covariance is None:
             return None
         pose = view.pose
-        if view.batch.frame == "map":
+        if view.batch.message.frame == "map":
             placed = np.zeros((len(white), len(names), len(pose)))
         else:
             placed = placement(names, points_m - np.array([pose.x_m, pose.y_m]), assumed)
@@ -326,10 +328,6 @@ def _without(items: MapDetections, outside: BoolArray, reason: str, lost: dict[i
     return items.at(~outside)
 
 
-def _out_of_bounds(batch: Batch, index: int, reason: str) -> UpdateRecord:
-    return replace(record(batch.message, index, Disposition.OUT_OF_BOUNDS), reason=reason)
-
-
 @cache
 def _names(columns: tuple[int, ...]) -> tuple[str, ...]:
     return tuple(COMPONENTS[column] for column in columns)
@@ -344,7 +342,7 @@ def _pose_covariance(pose: SensorPose, batch: Batch, sensor: SensorModel, ego: E
     """Covariance of `pose` by that of the ego, shape (5, 5); None where it matters to no detection of `batch`."""
     if ego is None or ego.covariance is None:
         return None
-    if batch.frame == "map" and not any(name in RELATIVE for name in sensor.std):
+    if batch.message.frame == "map" and not any(name in RELATIVE for name in sensor.std):
         return None
     arm_m, velocity_mps = (pose.x_m - ego.x_m, pose.y_m - ego.y_m), (pose.vx_mps, pose.vy_mps)
     return congruence(body_point_jacobian(ego.yaw_rad, arm_m, velocity_mps), ego.covariance)

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
+from fgtrack.core.checks import LARGEST
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DetectionList, Disposition, EgoState, FloatArray, TickReport, UpdateRecord
 from fgtrack.estimation.base import StatesAt
@@ -16,7 +17,7 @@ from fgtrack.tracking.association import Assignment, assigned_densely
 from fgtrack.tracking.detections import Merge
 from fgtrack.tracking.ego import EgoPose, EgoSource, EgoStd
 from fgtrack.tracking.gating import euclidean_distances
-from fgtrack.tracking.inbox import Batch, is_bounded, is_covariance, record, records
+from fgtrack.tracking.inbox import Batch, is_covariance, record, records
 from fgtrack.tracking.lifecycle import CountingLifecycle, Life, MatchedDetection, Scan
 from fgtrack.tracking.objects import Apart
 from fgtrack.tracking.preprocess import Candidate, Preprocess
@@ -101,7 +102,9 @@ class SlotInbox:
             values = [getattr(detection, name) for name in sensor.components]
             if (detection.x_m or 0.0) == 0.0 and (detection.y_m or 0.0) == 0.0:
                 ended.append(record(message, index, Disposition.INVALID))
-            elif all(value is not None and is_bounded(value) for value in values) and is_covariance(detection, sensor):
+            elif all(value is not None and abs(value) <= LARGEST for value in values) and is_covariance(
+                detection, sensor
+            ):
                 kept.append(index)
             else:
                 broken = True

@@ -101,7 +101,8 @@ class Tracker:
             if reason is not None:
                 self.refused_ego[reason] += 1
             return
-        check_sensor(message.sensor, self._parts.sensors)
+        if message.sensor not in self._parts.sensors:
+            check_sensor(message.sensor, self._parts.sensors)
         if message.frame not in FRAMES:
             raise DataError(f"{message.sensor}: frame: one of {', '.join(FRAMES)} expected, not {message.frame!r}")
         self._records += self._parts.inbox.put(message)
@@ -113,13 +114,13 @@ class Tracker:
         self._end(self._parts.lifecycle.expired(now_ns))
         self._parts.bank.advance(now_ns)
         self._parts.ego.start_tick()
-        self._seen = {id(batch.message): set() for batch in batches}
+        self._seen = {}
         for batch in batches:
             self._process_if_possible(batch)
         updates, self._records = tuple(self._records), []
         bank = self._parts.bank
         states = bank.present()  # first: tracks may end by it
-        tracks = tuple([self._report(*track) for track in zip(bank.track_ids, states, strict=True)])
+        tracks = tuple(map(self._report, bank.track_ids, states))
         return TickReport(self._tick, now_ns, tracks, updates, tuple(bank.smoothed()))
 
     def finish(self) -> tuple[SmoothedReport, ...]:
@@ -170,9 +171,9 @@ class Tracker:
     def _process(self, batch: Batch) -> None:
         """One object list, at its own stamp: transform, filter, merge, associate, age, estimate, give birth."""
         parts = self._parts
-        sensor = parts.sensors[batch.sensor]
+        sensor = parts.sensors[batch.message.sensor]
         ego = parts.ego.pose_at(batch.stamp_ns, parts.bank.present_ns)
-        if ego is None and batch.frame != "map":
+        if ego is None and batch.message.frame != "map":
             self._records += [record(batch.message, index, Disposition.FAILED) for index in batch.indices]
             return
         candidates, out_of_bounds = parts.preprocess(batch, sensor, ego)
@@ -187,24 +188,27 @@ class Tracker:
         self._estimate(batch, candidates, assignment, states)
         for position in assignment.refused:
             self._conclude(batch, candidates[position], Disposition.GATED)
-        for position in self._unclaimed(batch, candidates, assignment.new, states):
+        new = assignment.new
+        if new and parts.suppress_births_near_newer_tracks:
+            new = self._unclaimed(batch, candidates, new, states)
+        for position in new:
             self._give_birth(batch, candidates[position], sensor, ego)
 
     def _assigned(self, batch: Batch, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
         """Return the assignment of candidates to tracks of the same class."""
         objects = batch.message.objects
-        named = [objects[candidate.index].class_name for candidate in candidates]
-        return self._parts.association(candidates, states, self._parts.objects.apart(named, states.track_ids))
+        names = []
+        for candidate in candidates:
+            names.append(objects[candidate.index].class_name)
+        return self._parts.association(candidates, states, self._parts.objects.apart(names, states.track_ids))
 
     def _unclaimed(
         self, batch: Batch, candidates: Sequence[Candidate], new: Sequence[int], states: StatesAt
-    ) -> Sequence[int]:
+    ) -> list[int]:
         """Return those of `new` that belong to no track which began after the batch's stamp.
 
         The detection that started it has overtaken them. They are too old for it, and no other object.
         """
-        if not new or not self._parts.suppress_births_near_newer_tracks:
-            return new
         younger = self._younger(batch.stamp_ns, states)
         claims = self._assigned(batch, [candidates[position] for position in new], younger)
         for place, track in claims.pairs:
@@ -252,7 +256,7 @@ class Tracker:
         A track is missed by a message as a whole, so only its last batch counts.
         """
         lifecycle = self._parts.lifecycle
-        seen = self._seen[id(batch.message)]
+        seen = self._seen.setdefault(id(batch.message), set())
         scan = self._scan(batch, ego)
         for place, track in assignment.pairs:
             seen.add(states.track_ids[track])
@@ -260,27 +264,30 @@ class Tracker:
                 matched = MatchedDetection(candidates[place], states.means[track], states.covariances[track])
                 lifecycle.matched(states.track_ids[track], scan, matched)
             self._describe(batch, candidates[place], states.track_ids[track])
+        sensor = self._parts.sensors[batch.message.sensor]
+        if not assignment.missed or not batch.last or not (sensor.gives_position and sensor.scan):
+            return
         rows = [track for track in assignment.missed if states.track_ids[track] not in seen]
-        sensor = self._parts.sensors[batch.sensor]
-        if not rows or not batch.last or not (sensor.gives_position and sensor.scan):
+        if not rows:
             return
         missed = [states.track_ids[track] for track in rows]
         positions_m = states.means[rows, :2]
         self._end(lifecycle.missed(scan, missed, positions_m, self._ranges_m(missed, positions_m, ego)))
 
     def _scan(self, batch: Batch, ego: EgoPose | None) -> Scan:
-        return Scan(batch.sensor, batch.stamp_ns, self._parts.bank.present_ns, ego, batch.message.objects)
+        return Scan(batch.message.sensor, batch.stamp_ns, self._parts.bank.present_ns, ego, batch.message.objects)
 
     def _estimate(
         self, batch: Batch, candidates: Sequence[Candidate], assignment: Assignment, states: StatesAt
     ) -> None:
-        matched = [candidates[position] for position, _ in assignment.pairs]
-        rows = [track for _, track in assignment.pairs]
-        if not matched:
+        if not assignment.pairs:
             return
-        fused = [one.measurement_at(states.means[row]) for one, row in zip(matched, rows, strict=True)]
-        track_ids = [states.track_ids[row] for row in rows]
-        results = self._parts.bank.update(batch.stamp_ns, track_ids, fused)
+        matched, track_ids, measurements = [], [], []
+        for position, track in assignment.pairs:
+            matched.append(candidates[position])
+            track_ids.append(states.track_ids[track])
+            measurements.append(candidates[position].measurement_at(states.means[track]))
+        results = self._parts.bank.update(batch.stamp_ns, track_ids, measurements)
         for candidate, track_id, result in zip(matched, track_ids, results, strict=True):
             if result.innovation is not None:
                 self._parts.lifecycle.fused(track_id, candidate.position_m is not None)
@@ -304,14 +311,14 @@ class Tracker:
             return
         if prior.yaw_rad is None and not parts.motion.cartesian:
             self._undirected[track_id] = prior
-        self._seen[id(batch.message)].add(track_id)
+        self._seen.setdefault(id(batch.message), set()).add(track_id)
         parts.lifecycle.born(track_id, self._scan(batch, ego), MatchedDetection(candidate))
         self._describe(batch, candidate, track_id)
         self._conclude(batch, candidate, Disposition.BIRTH, track_id)
 
     def _describe(self, batch: Batch, candidate: Candidate, track_id: int) -> None:
-        objects = batch.message.objects
-        self._parts.objects.learn(track_id, [objects[index] for index in (candidate.index, *candidate.merged)])
+        indices = candidate.index, *candidate.merged
+        self._parts.objects.learn(track_id, map(batch.message.objects.__getitem__, indices))
 
     def _conclude(
         self,
@@ -325,10 +332,12 @@ class Tracker:
         nis, innovation = None, dict[str, float]()
         if result is not None and result.innovation is not None:
             nis, measurement = result.nis, candidate.measurement
-            by_name = zip(measurement.model.components, result.innovation.tolist(), strict=True)
-            innovation = {name: y for name, y in by_name if name not in measurement.assumed}
+            innovation = dict(zip(measurement.model.components, result.innovation.tolist(), strict=True))
+            for name in measurement.assumed:
+                innovation.pop(name, None)
         self._records.append(record(batch.message, candidate.index, disposition, track_id, nis, innovation))
-        self._records += [record(batch.message, index, Disposition.MERGED, track_id) for index in candidate.merged]
+        for index in candidate.merged:
+            self._records.append(record(batch.message, index, Disposition.MERGED, track_id))
 
     def _end(self, track_ids: Sequence[int]) -> None:
         for track_id in track_ids:

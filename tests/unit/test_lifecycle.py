@@ -112,11 +112,11 @@ def test_the_status_tells_unconfirmed_from_seen_from_missed() -> None:
     for _ in range(2):
         life.matched(0, Scan("both", START_NS, START_NS))
         life.fused(0)
-        status.append(life.lives[0].status(3))
+        status.append(life.status(0))
     life.missed(Scan("both", START_NS, START_NS), [0], NOWHERE, np.array([1.0]))
-    status.append(life.lives[0].status(3))
+    status.append(life.status(0))
     life.matched(0, Scan("both", START_NS, START_NS))
-    status.append(life.lives[0].status(3))
+    status.append(life.status(0))
     assert status == [
         TrackStatus.TENTATIVE,
         TrackStatus.CONFIRMED,
