@@ -123,7 +123,8 @@ def test_the_status_tells_unconfirmed_from_seen_from_missed() -> None:
         TrackStatus.COASTING,
         TrackStatus.CONFIRMED,
     ]
-    assert Life(1, START_NS, num_measured=2, misses=1).status(3) is TrackStatus.TENTATIVE
+    life.lives[0] = Life(1, START_NS, num_measured=2, misses=1)
+    assert life.status(0) is TrackStatus.TENTATIVE
 
 
 @pytest.mark.parametrize(
