@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import compress
 from operator import attrgetter
 from typing import Literal, NamedTuple
 
@@ -53,14 +54,8 @@ class MapDetections(NamedTuple):
 
     def kinds(self) -> list[tuple[int, ...]]:
         """Columns of the components that each has."""
-        known = self.values == self.values  # NaN is not equal to itself
-        if len(known) and (len(known) == 1 or bool((known == known[0]).all())):
-            return [tuple(known[0].nonzero()[0].tolist())] * len(known)
-        rows, columns = known.nonzero()
-        found: list[list[int]] = [[] for _ in self.detections]
-        for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
-            found[row].append(column)
-        return list(map(tuple, found))
+        columns = range(self.values.shape[1])
+        return [tuple(compress(columns, measured)) for measured in (~np.isnan(self.values)).tolist()]
 
 
 def in_map_frame(batch: Batch, sensor: SensorModel, pose: SensorPose) -> MapDetections:
@@ -178,13 +173,10 @@ class PoseError(NamedTuple):
     R: FloatArray
     """Covariance of the detection itself, without e, shape (k, k) or (m, k, k)."""
 
-    def gain(self, model: MeasurementModel, pose: SensorPose, x: FloatArray) -> FloatArray:
-        """G at the states `x` (..., n) of the object, shape (..., k, 5), or (k, 5) where it is the same at all."""
-        return self.placement - model.pose_jacobian(x, pose) if model.relative else self.placement
-
     def noise(self, model: MeasurementModel, pose: SensorPose, x: FloatArray) -> FloatArray:
         """R + G P_e G' at the states `x` (..., n), shape (..., k, k), or (k, k) where it is the same at all."""
-        return self.R + symmetrise(congruence(self.gain(model, pose, x), self.covariance))
+        G = self.placement - model.pose_jacobian(x, pose) if model.relative else self.placement
+        return self.R + symmetrise(congruence(G, self.covariance))
 
 
 def placement(components: tuple[str, ...], offsets_m: FloatArray, assumed: tuple[str, ...] = ()) -> FloatArray:

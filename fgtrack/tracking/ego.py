@@ -303,29 +303,21 @@ class EgoTrajectory(EgoSource):
         return self._extrapolated(nearest, stamp_ns)
 
     def _interpolated(self, before: EgoState, after: EgoState, stamp_ns: int) -> EgoPose:
+        """Pose between two states, the short way round, with the mean of their covariances (None counts as zero).
+
+        The error of (1 - share) a + share b has at most this covariance, and just this where the two errors are the
+        same, as those of a localisation within a moment nearly are.
+        """
         share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
-        return interpolated(before, after, share, mixed(self._covariance(before), self._covariance(after), share))
-
-
-def mixed(before: FloatArray | None, after: FloatArray | None, share: float) -> FloatArray | None:
-    """Covariance, shape (5, 5), of the error between two states, at a `share` of the way; of None as of zero.
-
-    The mean of both: the error of (1 - share) a + share b has at most this covariance, and just this where the two
-    errors are the same, as those of a localisation within a moment nearly are.
-    """
-    if before is after:
-        return before
-    none = np.zeros((5, 5))
-    return (1.0 - share) * (none if before is None else before) + share * (none if after is None else after)
-
-
-def interpolated(before: EgoState, after: EgoState, share: float, covariance: FloatArray | None = None) -> EgoPose:
-    """Pose at a `share` of the way between two states, the short way round."""
-    return EgoPose(
-        before.x_m + share * (after.x_m - before.x_m),
-        before.y_m + share * (after.y_m - before.y_m),
-        before.yaw_rad + share * wrap_angle(after.yaw_rad - before.yaw_rad),
-        before.speed_mps + share * (after.speed_mps - before.speed_mps),
-        before.yaw_rate_radps + share * (after.yaw_rate_radps - before.yaw_rate_radps),
-        covariance,
-    )
+        covariance, newer = self._covariance(before), self._covariance(after)
+        if covariance is not newer:
+            older, newer = (np.zeros((5, 5)) if one is None else one for one in (covariance, newer))
+            covariance = (1.0 - share) * older + share * newer
+        return EgoPose(
+            before.x_m + share * (after.x_m - before.x_m),
+            before.y_m + share * (after.y_m - before.y_m),
+            before.yaw_rad + share * wrap_angle(after.yaw_rad - before.yaw_rad),
+            before.speed_mps + share * (after.speed_mps - before.speed_mps),
+            before.yaw_rate_radps + share * (after.yaw_rate_radps - before.yaw_rate_radps),
+            covariance,
+        )

@@ -92,12 +92,6 @@ class Existence:
     travelled: bool = False
     """True if it was ever as far from there as a track must be to be confirmed."""
 
-    @classmethod
-    def born(cls, lifetime_s: float, stamp_ns: int, log_odds: float) -> "Existence":
-        """Return the existence of a new object."""
-        log_odds = _bounded(log_odds)
-        return cls(lifetime_s, [stamp_ns], [log_odds], [log_odds], in_view_ns=stamp_ns)
-
     def learn(self, stamp_ns: int, weight: float) -> None:
         """Evidence of `stamp_ns`, in any order; what is older than all that is remembered counts as the oldest."""
         place = max(bisect_right(self.stamps_ns, stamp_ns), 1)
@@ -152,8 +146,10 @@ class ExistenceLifecycle:
     def born(self, track_id: int, scan: Scan, matched: MatchedDetection) -> None:
         """See `Lifecycle.born`."""
         odds = self._rules.birth_probability / (1.0 - self._rules.birth_probability)
-        log_odds = math.log(odds) + self._score(scan, matched)
-        self.lives[track_id] = life = Existence.born(self._rules.lifetime_s, scan.stamp_ns, log_odds)
+        log_odds = _bounded(math.log(odds) + self._score(scan, matched))
+        self.lives[track_id] = life = Existence(
+            self._rules.lifetime_s, [scan.stamp_ns], [log_odds], [log_odds], in_view_ns=scan.stamp_ns
+        )
         life.first_m, life.travelled = matched.candidate.position_m, self._rules.min_travel_m == 0.0
         self._judge(life)
 

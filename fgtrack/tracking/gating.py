@@ -17,7 +17,6 @@ from fgtrack.tracking.preprocess import Candidate
 MOST_NEAR = 128
 """Tracks, the nearest ones, that a candidate is compared with: no real scene has as many inside one gate."""
 _DENSE = 1 << 14  # a matrix of so many distances is faster than a tree
-_PORTION = 1 << 17  # pairs whose innovations are in memory at a time
 _MARGIN = 1.0 + 1e-9  # a tree rounds differently
 
 
@@ -143,37 +142,26 @@ def _distances_to_ray(candidate: Candidate, means: FloatArray) -> FloatArray:
 
 def innovations(
     pairs: Pairs, groups: Sequence[Group], num_candidates: int, states: StatesAt
-) -> Iterator[tuple[IntArray | slice, FloatArray, FloatArray, int]]:
+) -> Iterator[tuple[IntArray, FloatArray, FloatArray, int]]:
     """Yield the innovations of `pairs` of candidates, which are in `groups`, and tracks with these states.
 
     Indices of pairs that measure the same, assumed components included, with NIS and log det S, shapes (p,), and the
     number k of components. NaN where S has no root.
     """
     P = np.array(states.covariances, dtype=np.float64, order="C")
-    for chosen, members, group in _by_group(pairs.rows, groups, num_candidates):
-        columns = pairs.columns[chosen]
+    member, number = np.empty((2, num_candidates), dtype=np.int64)
+    for k, group in enumerate(groups):
+        member[group.rows], number[group.rows] = np.arange(len(group.rows)), k
+    for k, group in enumerate(groups):
+        chosen = np.flatnonzero(number[pairs.rows] == k)
+        if not len(chosen):
+            continue
+        members, columns = member[pairs.rows[chosen]], pairs.columns[chosen]
         x = states.means[columns]
         y, H = linearised(group.z[members], x, group.example.model, group.example.pose)
         R = group.noise(members, x)
         H = np.array(H, ndmin=3, order="C")
         yield chosen, *kernels("fgtrack.tracking.kernels").innovations(y, H, P, columns, R), y.shape[-1]
-
-
-def _by_group(
-    rows: IntArray, groups: Sequence[Group], num_candidates: int
-) -> Iterator[tuple[IntArray | slice, IntArray, Group]]:
-    """Yield pairs of the candidates of each group, their indices in the group, and the group; in portions."""
-    if len(groups) == 1 and len(rows) <= _PORTION:
-        yield slice(None), rows, groups[0]
-        return
-    member, number = np.empty((2, num_candidates), dtype=np.int64)
-    for k, group in enumerate(groups):
-        member[group.rows], number[group.rows] = np.arange(len(group.rows)), k
-    for k, group in enumerate(groups):
-        chosen = np.flatnonzero(number[rows] == k)
-        for start in range(0, len(chosen), _PORTION):
-            part = chosen[start : start + _PORTION]
-            yield part, member[rows[part]], group
 
 
 def reaches_m(groups: Sequence[Group], states: StatesAt, quantiles: Sequence[float], limit_m: float) -> FloatArray:

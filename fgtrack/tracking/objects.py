@@ -69,7 +69,10 @@ class Objects:
         if not any(classes):
             return None
         numbers = dict(_GROUPS)
-        theirs, own = (np.array([_number(name, numbers) for name in names]) for names in (named, classes))
+        theirs, own = (
+            np.array([numbers.setdefault(name.lower(), len(numbers) + 1) if name else _UNKNOWN for name in names])
+            for names in (named, classes)
+        )
 
         def differ(rows: IntArray, columns: IntArray) -> BoolArray:
             a, b = theirs[rows], own[columns]
@@ -93,8 +96,3 @@ class Objects:
     def _class(self, track_id: int) -> str | None:
         seen = self._seen.get(track_id)
         return max(seen.classes, key=seen.classes.__getitem__) if seen is not None and seen.classes else None
-
-
-def _number(name: str | None, numbers: dict[str, int]) -> int:
-    """The number of the group of a class, 0 of none; a class that is in no group gets the next."""
-    return _UNKNOWN if not name else numbers.setdefault(name.lower(), len(numbers) + 1)

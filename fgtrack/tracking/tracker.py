@@ -23,7 +23,7 @@ from fgtrack.core.types import (
 from fgtrack.estimation.base import Start, StatesAt, TrackBank, UpdateResult, no_states
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.ekf import propagated
-from fgtrack.estimation.object_bank import state_of, states_of
+from fgtrack.estimation.object_bank import states_of
 from fgtrack.estimation.present import PresentStates
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
@@ -133,16 +133,13 @@ class Tracker:
 
         Raises `CallError` for a track that does not exist, a stamp before its window, and a state that is not sound.
         """
-        bank, motion = self._parts.bank, self._parts.motion
-        if track_id not in bank.track_ids:
-            raise CallError(
-                f"track {track_id} does not exist: there are {', '.join(map(str, bank.track_ids)) or 'none'}"
-            )
-        state = state_of(bank, motion, track_id, stamp_ns)
-        found = PresentStates(motion, stamp_ns, state.mean[None], state.covariance[None])
-        for fault in faults(found).values():
-            raise CallError(f"track {track_id} has no state at {stamp_ns} ns: it is {fault}")
-        return self._report(track_id, found[0])
+        track_ids = self._parts.bank.track_ids
+        if track_id not in track_ids:
+            raise CallError(f"track {track_id} does not exist: there are {', '.join(map(str, track_ids)) or 'none'}")
+        for track in self.tracks_at(stamp_ns):
+            if track.track_id == track_id:
+                return track
+        raise CallError(f"track {track_id} has no state at {stamp_ns} ns: before its window, or not finite")
 
     def tracks_at(self, stamp_ns: int) -> tuple[TrackReport, ...]:
         """All tracks that have a state at a stamp, see `state_at`, in order of birth."""
@@ -150,9 +147,9 @@ class Tracker:
         states = states_of(bank, motion, stamp_ns)
         if not states.track_ids:
             return ()
-        found = PresentStates(motion, stamp_ns, states.means, states.covariances)
-        unsound, rows = faults(found), enumerate(zip(states.track_ids, found, strict=True))
-        return tuple(self._report(*track) for place, track in rows if place not in unsound)
+        present = PresentStates(motion, stamp_ns, states.means, states.covariances)
+        unsound, rows = faults(present), enumerate(zip(states.track_ids, present, strict=True))
+        return tuple(self._report(*track) for row, track in rows if row not in unsound)
 
     def _process_if_possible(self, batch: Batch) -> None:
         """Process a batch; where that raises what is no answer, what is left of the batch ends as failed."""

@@ -36,7 +36,6 @@ def peak_bytes(call: Callable[[], object]) -> int:
 def sparse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small problems are solved as large ones are."""
     monkeypatch.setattr(gating, "_DENSE", -1)
-    monkeypatch.setattr(gating, "_PORTION", 7)
     monkeypatch.setattr(associations, "_DENSE", -1)
 
 

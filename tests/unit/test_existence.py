@@ -40,6 +40,10 @@ def ego(x_m: float = 0.0, y_m: float = 0.0, yaw_rad: float = 0.0) -> EgoPose:
     return EgoPose(x_m, y_m, yaw_rad, 0.0, 0.0)
 
 
+def existing(lifetime_s: float, stamp_ns: int, log_odds: float) -> Existence:
+    return Existence(lifetime_s, [stamp_ns], [log_odds], [log_odds], in_view_ns=stamp_ns)
+
+
 def probability(life: ExistenceLifecycle, at_ms: float = 0.0) -> float:
     return life.lives[0].probability(START_NS + ms(at_ms))
 
@@ -60,14 +64,14 @@ def test_a_miss_and_a_match_change_the_probability_as_integrated_data_associatio
 
 
 def test_an_object_survives_as_long_as_its_lifetime_says() -> None:
-    one = Existence.born(4.0, START_NS, math.log(3.0))
+    one = existing(4.0, START_NS, math.log(3.0))
     assert one.probability(START_NS) == pytest.approx(0.75)
     assert one.probability(START_NS + ms(6000)) == pytest.approx(0.75 * math.exp(-1.5))
 
 
 @pytest.mark.parametrize("gap_s", [400.0, 1e7])
 def test_nothing_survives_a_gap_of_many_lifetimes(gap_s: float) -> None:
-    one = Existence.born(10.0, START_NS, math.log(3.0))
+    one = existing(10.0, START_NS, math.log(3.0))
     assert one.probability(START_NS + ms(1e3 * gap_s)) < 1e-9
     life = lifecycle(ExistenceRules())
     life.born(0, scan(), MatchedDetection(HERE))
@@ -80,18 +84,18 @@ def test_evidence_counts_at_its_own_stamp_in_whatever_order_it_arrives() -> None
     evidence = [(300.0, -1.2), (500.0, 2.5), (900.0, -0.4), (1400.0, 1.0)]
     found = set()
     for order in permutations(evidence):
-        one = Existence.born(2.0, START_NS, 0.3)
+        one = existing(2.0, START_NS, 0.3)
         for at_ms, weight in order:
             one.learn(START_NS + ms(at_ms), weight)
         found.add(one.probability(START_NS + ms(1500)))
     assert len(found) == 1
-    late = Existence.born(2.0, START_NS, 0.3)
+    late = existing(2.0, START_NS, 0.3)
     late.learn(START_NS + ms(1400), sum(weight for _, weight in evidence))
     assert late.probability(START_NS + ms(1500)) != pytest.approx(found.pop(), abs=1e-3)
 
 
 def test_what_is_forgotten_changes_nothing_and_what_is_older_counts_as_the_oldest() -> None:
-    one, other = (Existence.born(2.0, START_NS, 0.3) for _ in range(2))
+    one, other = (existing(2.0, START_NS, 0.3) for _ in range(2))
     for each in (one, other):
         each.learn(START_NS + ms(300), -1.0)
         each.learn(START_NS + ms(600), 1.5)
