@@ -160,29 +160,27 @@ def _counts_each_measurement_as_what_it_is(subject: Subject, stream: Stream) -> 
         late = measurement.stamp_ns < newest_ns
         allowed = (*_LATE, UpdateStatus.TOO_OLD, UpdateStatus.FAILED) if late else (UpdateStatus.IN_SEQUENCE,)
         require(result.status in allowed, f"place {place}: {'late' if late else 'in sequence'}, is {result.status}")
-        fused = result.status in FUSED
-        require(fused == (result.innovation is not None), f"place {place}: innovation {result.innovation}")
-        require(fused == (result.nis is not None), f"place {place}: {result.status} with NIS {result.nis}")
-        require(not fused or 0.0 <= (result.nis or 0.0) < np.inf, f"place {place}: NIS is {result.nis}")
-        _says_a_sound_innovation(result, measurement, place)
+        complete = (result.status in FUSED) == (result.innovation is not None) == (result.nis is not None)
+        require(complete, f"place {place}: {result.status}, innovation {result.innovation}, NIS {result.nis}")
+        if result.innovation is not None:
+            _check_innovation(result, measurement, place)
         newest_ns = max(newest_ns, measurement.stamp_ns)
     end_ns = estimator.window_ns[1]
     require(0 <= newest_ns - end_ns <= NEAR_NS, f"window_ns ends at {end_ns}, newest is {newest_ns}")
 
 
-def _says_a_sound_innovation(result: UpdateResult, measurement: Measurement, place: int) -> None:
-    """Its covariance, where it is given, is that by which the NIS is normalised."""
-    y, S = result.innovation, result.innovation_covariance
-    if y is None or result.nis is None:
-        return
+def _check_innovation(result: UpdateResult, measurement: Measurement, place: int) -> None:
+    """Require a finite innovation and NIS; its covariance, where given, is that by which the NIS is normalised."""
+    y, S, nis = np.asarray(result.innovation), result.innovation_covariance, float(result.nis or 0.0)
     require(y.shape == measurement.z.shape and np.isfinite(y).all(), f"place {place}: the innovation is {y}")
+    require(0.0 <= nis < np.inf, f"place {place}: NIS is {nis}")
     if S is not None:
-        require(S.shape == measurement.R.shape, f"place {place}: the innovation covariance has shape {S.shape}")
         sound(y, (S + S.T) / 2.0, f"the innovation at place {place}")
         require(np.allclose(S, S.T, 1e-9), f"place {place}: the innovation covariance is not symmetric")
-        nis = measurement.nis(y, S)
-        same = abs(nis - result.nis) <= 1e-6 * (1.0 + nis)
-        require(same, f"place {place}: the NIS is {result.nis}, of the innovation and its covariance {nis}")
+        own = measurement.nis(y, S)
+        require(
+            abs(own - nis) <= 1e-6 * (1.0 + own), f"place {place}: the NIS is {nis}, not {own}"
+        )
 
 
 def _gives_symmetric_positive_definite_covariances(subject: Subject, stream: Stream) -> None:

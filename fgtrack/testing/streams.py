@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgtrack.core.time import NS_PER_S, seconds
-from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.models.measurement import SensorPose, measurement_model
@@ -117,9 +116,11 @@ def mild(rng: np.random.Generator) -> Stream:
         yaw_rate_std_radps=0.05,
     )
     noise = {"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.15}, {"range_m": 0.5, "bearing_rad": 0.02, "range_rate_mps": 0.1}
-    x, measurements = _drawn_start(rng, start), list[Measurement]()
+    mean, P = initial_state(NONLINEAR, start)
+    x, measurements = mean + np.linalg.cholesky(P) @ rng.standard_normal(len(mean)), list[Measurement]()
     for k in range(1, 25):
-        x = _drawn_step(rng, x, 0.025)
+        root = np.linalg.cholesky(NONLINEAR.process_noise(x, 0.025))
+        x = NONLINEAR.predict(x, 0.025) + root @ rng.standard_normal(len(x))
         std = np.array(list(noise[k % 2].values()))
         turned_rad = 0.01 * k - 0.3
         pose = SensorPose(np.sin(turned_rad) * 50.0, -np.cos(turned_rad) * 50.0, turned_rad - 1.95, 19.0, -6.0)
@@ -138,16 +139,6 @@ def mild_robust(rng: np.random.Generator) -> Stream:
         off[2:] = 0.0
         measurements.append(replace(one, z=one.z + off, loss=RobustLoss("huber", 1.5)))
     return replace(stream, measurements=tuple(measurements))
-
-
-def _drawn_start(rng: np.random.Generator, start: Start) -> FloatArray:
-    mean, P = initial_state(NONLINEAR, start)
-    return np.asarray(mean + np.linalg.cholesky(P) @ rng.standard_normal(len(mean)))
-
-
-def _drawn_step(rng: np.random.Generator, x: FloatArray, dt_s: float) -> FloatArray:
-    root = np.linalg.cholesky(NONLINEAR.process_noise(x, dt_s))
-    return np.asarray(NONLINEAR.predict(x, dt_s) + root @ rng.standard_normal(len(x)))
 
 
 def _names(rng: np.random.Generator, motion: MotionModel) -> tuple[str, ...]:

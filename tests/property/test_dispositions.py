@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.examples import few
 from support.paper import paper
 
 from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState, TickReport, UpdateRecord
@@ -213,26 +212,3 @@ def test_a_detection_stamped_ahead_of_the_clock_starts_a_track_at_once(estimator
     [track] = report.tracks
     assert track.state.stamp_ns == START_NS
     assert track.state.mean[:2] == pytest.approx([20.0, 1.0])
-
-
-@few
-@given(messages=streams(), name=st.sampled_from(list(CONFIGS)))
-def test_the_same_input_gives_the_same_bits(messages: list[Delivered], name: str) -> None:
-    config = CONFIGS[name]
-    messages = [m for m in messages if isinstance(m, EgoState) or m.sensor in config.sensors]
-    assert repr_of(run(config, messages)) == repr_of(run(config, messages))
-
-
-def repr_of(reports: list[TickReport]) -> list[tuple[object, ...]]:
-    """All that reports say, to the bit."""
-    return [
-        (
-            report.now_ns,
-            [
-                (t.track_id, t.status, t.num_measured, t.state.mean.tobytes(), t.state.covariance.tobytes())
-                for t in report.tracks
-            ],
-            repr(report.updates),
-        )
-        for report in reports
-    ]

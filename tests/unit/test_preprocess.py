@@ -81,17 +81,6 @@ def test_without_an_ego_nothing_is_moved_and_a_near_side_must_be_finite() -> Non
         replace(POINTS, near_side_m=math.inf)
 
 
-@pytest.mark.parametrize("frame", ["map", "ego", "sensor"])
-def test_few_detections_are_placed_where_they_are_among_many(frame: Frame) -> None:
-    many = [Detection(x_m=10.0 + 3.0 * k, y_m=2.0 * k - 9.0, yaw_rad=0.1 * k) for k in range(20)]
-    among = candidates(*many, frame=frame)
-    for k in (0, 7, 19):
-        [alone] = candidates(many[k], frame=frame)
-        assert alone.measurement.z == pytest.approx(among[k].measurement.z, rel=1e-14)
-        assert alone.position_m == pytest.approx(among[k].position_m, rel=1e-14)
-        np.testing.assert_allclose(alone.measurement.R, among[k].measurement.R, rtol=1e-12)
-
-
 def test_the_sensor_pose_has_lever_arm_mount_and_the_velocity_of_the_ego() -> None:
     [found] = candidates(Detection(range_m=10.0, bearing_rad=0.1), sensor=POLAR, frame="sensor")
     pose = found.measurement.pose
