@@ -178,9 +178,7 @@ def _check_innovation(result: UpdateResult, measurement: Measurement, place: int
         sound(y, (S + S.T) / 2.0, f"the innovation at place {place}")
         require(np.allclose(S, S.T, 1e-9), f"place {place}: the innovation covariance is not symmetric")
         own = measurement.nis(y, S)
-        require(
-            abs(own - nis) <= 1e-6 * (1.0 + own), f"place {place}: the NIS is {nis}, not {own}"
-        )
+        require(abs(own - nis) <= 1e-6 * (1.0 + own), f"place {place}: the NIS is {nis}, not {own}")
 
 
 def _gives_symmetric_positive_definite_covariances(subject: Subject, stream: Stream) -> None:
