@@ -75,7 +75,7 @@ class GatedEuclidean:
             pairs = pairs.at(pairs.values <= limits_m[pairs.rows, pairs.columns])
         suspects = set[int]()
         if self.max_nis is not None and len(pairs.rows):
-            suspects.update(pairs.rows.tolist())
+            suspects = set(pairs.rows.tolist())
             nis = np.empty(len(pairs.rows))
             for chosen, found, _, _ in innovations(pairs, grouped(candidates), len(candidates), states):
                 nis[chosen] = found

@@ -107,9 +107,9 @@ def in_any_direction(states: StatesAt, stamp_ns: int, starts: Mapping[int, Start
     A state with a yaw that is unknown is linearised along that yaw, and its predicted position spreads along it alone.
     Until a second position gives the direction, the position gets the same variance across, (speed_std dt)^2.
     """
-    rows = [row for row, track_id in enumerate(states.track_ids) if track_id in starts]
-    if not rows:
+    if not starts:
         return states
+    rows = [row for row, track_id in enumerate(states.track_ids) if track_id in starts]
     covariances = states.covariances.copy()
     for row in rows:
         start, yaw_rad = starts[states.track_ids[row]], float(states.means[row, YAW])

@@ -60,11 +60,11 @@ class MapDetections(NamedTuple):
 
 def in_map_frame(batch: Batch, sensor: SensorModel, pose: SensorPose) -> MapDetections:
     """The detections of `batch`, what `sensor` measures of them, seen from `pose`."""
-    detections = [batch.message.objects[index] for index in batch.indices]
+    detections = list(map(batch.message.objects.__getitem__, batch.indices))
     values = np.empty((len(detections), len(COMPONENTS)))
     values[:, len(MEASURABLE) :] = np.nan
     if detections:
-        values[:, : len(MEASURABLE)] = [_VALUES(detection) for detection in detections]
+        values[:, : len(MEASURABLE)] = list(map(_VALUES, detections))
     values[:, _unmeasured(tuple(sensor.std))] = np.nan
     if batch.message.frame != "map":
         if "yaw_rad" in sensor.std:
@@ -117,13 +117,12 @@ def covariances(
     if more is not None:
         R[:, np.arange(len(names)), np.arange(len(names))] += more
     carrying = []
-    if sensor.message_covariance:
-        carrying = [row for row, detection in enumerate(items.detections) if detection.covariance is not None]
-        for row in carrying:
-            measured = items.detections[row].measured
-            carried = [name for name in names if name in measured and name in sensor.std]
+    for row, detection in enumerate(items.detections if sensor.message_covariance else ()):
+        if detection.covariance is not None:
+            carrying.append(row)
+            carried = [name for name in names if name in detection.measured and name in sensor.std]
             here = [names.index(name) for name in carried]
-            R[row][np.ix_(here, here)] = own_covariance(items.detections[row], carried)
+            R[row][np.ix_(here, here)] = own_covariance(detection, carried)
     if "x_m" not in names:
         return R
     if frame != "map" and carrying:

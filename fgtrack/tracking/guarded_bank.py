@@ -1,7 +1,7 @@
 """A bank that outlives the failures of its estimators: a track that fails ends, is counted, and may be born again."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from operator import methodcaller
 from typing import TypeVar
 
@@ -73,9 +73,9 @@ class GuardedBank:
             raise
         except EstimatorError as error:
             results = [error.answers.get(track_id, results[0]) for track_id in track_ids]
-            self._end_all(error.causes, Failure.UPDATE_FAILED)
+            self._end(error.causes, Failure.UPDATE_FAILED)
         except Exception as error:
-            self._end_all(dict.fromkeys(track_ids, error), Failure.UPDATE_FAILED)
+            self._end(dict.fromkeys(track_ids, error), Failure.UPDATE_FAILED)
         for result in results:
             if result.nis is None and result.status is UpdateStatus.FAILED:
                 self.failures.add(Failure.UPDATE_FAILED)
@@ -118,7 +118,7 @@ class GuardedBank:
                 return states
             for track_id, fault in [(self.track_ids[row], fault) for row, fault in unsound.items()]:
                 self.failures.add(fault)
-                self._end(track_id, fault, f"the state of track {track_id} is {fault.value}")
+                self._end({track_id: f"the state of track {track_id} is {fault.value}"}, fault)
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`; those that are not sound are left out."""
@@ -140,7 +140,7 @@ class GuardedBank:
             except Exception as error:
                 self.failures.add(Failure.ESTIMATOR_RAISED)
                 if isinstance(error, EstimatorError) and error.causes.keys() & self._alive.keys():
-                    self._end_all(error.causes, Failure.ESTIMATOR_RAISED)
+                    self._end(error.causes, Failure.ESTIMATOR_RAISED)
                 elif self._alive:
                     self._start_over(error)
                 else:
@@ -153,15 +153,12 @@ class GuardedBank:
             raise ValueError(f"{len(self._alive)} tracks have {len(states)} states")
         return states, faults(states)
 
-    def _end_all(self, causes: dict[int, Exception], failure: Failure) -> None:
+    def _end(self, causes: Mapping[int, str | Exception], failure: Failure) -> None:
         for track_id, cause in causes.items():
-            self._end(track_id, failure, cause)
-
-    def _end(self, track_id: int, failure: Failure, cause: str | Exception) -> None:
-        if track_id in self._alive:  # else it has ended with another one
-            self.failures.note(cause)
-            self.failures.end(track_id, self._now_ns, failure)
-            self.remove(track_id)
+            if track_id in self._alive:  # else it has ended with another one
+                self.failures.note(cause)
+                self.failures.end(track_id, self._now_ns, failure)
+                self.remove(track_id)
 
     def _start_over(self, error: Exception) -> None:
         """Take a new bank, as the state of this one is unknown: all its tracks end."""

@@ -76,8 +76,9 @@ class Candidate:
 
     def measurement_at(self, x: FloatArray) -> Measurement:
         """The measurement of an object at the state `x`, shape (n,)."""
-        R = self.noise_at(x)
-        return self.measurement if R is self.measurement.R else replace(self.measurement, R=R)
+        if self.pose_error is None or not self.measurement.model.relative:
+            return self.measurement
+        return replace(self.measurement, R=self.noise_at(x))
 
 
 class _View(NamedTuple):
@@ -249,7 +250,7 @@ class Preprocess:
         places: Iterable[FloatArray | None] = [None] * len(groups) if bearings else points_m
         own: Iterable[PoseError | None] = [None] * len(groups)
         if errors is not None:
-            own = [PoseError(errors.covariance, *each) for each in zip(errors.placement, white, strict=True)]
+            own = map(partial(PoseError, errors.covariance), errors.placement, white)
         stamp_ns, loss, indices = view.batch.stamp_ns, view.sensor.loss, items.indices.tolist()
         return [
             Candidate(

@@ -255,12 +255,13 @@ class Tracker:
         lifecycle = self._parts.lifecycle
         seen = self._seen.setdefault(id(batch.message), set())
         scan = self._scan(batch, ego)
-        for place, track in assignment.pairs:
-            seen.add(states.track_ids[track])
-            if candidates[place].position_m is not None:
-                matched = MatchedDetection(candidates[place], states.means[track], states.covariances[track])
-                lifecycle.matched(states.track_ids[track], scan, matched)
-            self._describe(batch, candidates[place], states.track_ids[track])
+        for position, track in assignment.pairs:
+            candidate, track_id = candidates[position], states.track_ids[track]
+            seen.add(track_id)
+            if candidate.position_m is not None:
+                matched = MatchedDetection(candidate, states.means[track], states.covariances[track])
+                lifecycle.matched(track_id, scan, matched)
+            self._describe(batch, candidate, track_id)
         sensor = self._parts.sensors[batch.message.sensor]
         if not assignment.missed or not batch.last or not (sensor.gives_position and sensor.scan):
             return
