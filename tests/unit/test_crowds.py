@@ -5,8 +5,6 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from support.tracking import bearing, candidate, states
 
 from fgtrack.core.types import FloatArray
@@ -14,7 +12,6 @@ from fgtrack.models.measurement import SensorPose
 from fgtrack.tracking import association as associations
 from fgtrack.tracking import gating
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis, assigned, assigned_densely
-from fgtrack.tracking.detections import ConnectedMerge
 from fgtrack.tracking.gating import Pairs, euclidean_distances, grouped, innovations
 from fgtrack.tracking.preprocess import Candidate
 
@@ -119,33 +116,3 @@ def test_detections_and_tracks_all_in_one_place_are_not_all_compared(
     peak = peak_bytes(lambda: found.append(association(candidates, tracks)))
     assert peak < 125 * MB, f"{peak / MB:.0f} MB"
     assert len(found[0].pairs) > 2_500
-
-
-# --- merge
-
-
-def groups_by_hand(points_m: FloatArray, distance_m: float) -> set[frozenset[int]]:
-    left, groups = set(range(len(points_m))), set()
-    while left:
-        frontier = [left.pop()]
-        group = set(frontier)
-        while frontier:
-            here = frontier.pop()
-            close = {i for i in left if np.sum((points_m[i] - points_m[here]) ** 2) <= distance_m**2}
-            group |= close
-            left -= close
-            frontier += close
-        groups.add(frozenset(group))
-    return groups
-
-
-@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 60), lattice=st.booleans())
-def test_groups_are_those_of_a_search_by_hand(seed: int, count: int, lattice: bool) -> None:
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(-1.0, 1.0, size=(count, 2)) * rng.uniform(2.0, 60.0) + rng.choice([0.0, 1e6])
-    if lattice:
-        points = 2.5 * np.round(points / 2.5)  # many steps of just the distance, and equal points
-    groups = ConnectedMerge(distance_m=5.0).groups(points)
-    assert {frozenset(members) for members in groups.values()} == groups_by_hand(points, 5.0)
-    assert list(groups) == sorted(groups)
-    assert all(leader == members[0] and sorted(members) == list(members) for leader, members in groups.items())
