@@ -21,10 +21,7 @@ from fgtrack.pipeline.recorded import recorded_of
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config, read_scenario
 from fgtrack.plotting.plot import error_against_delay
-from fgtrack.sim.delays import AnyDelay, ConstantDelay, GammaDelay
-from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.simulate import simulate
-from fgtrack.sim.vehicles import TrackVehicle
 
 
 def study(
@@ -67,9 +64,6 @@ def show_study(found: Study, recording: Path) -> None:
         raise DataError(f"{located(found.broken, str(recording))}; used up to there")
 
 
-#: Where further cars drive: ahead of the ego as far as its speed is theirs, and to the left of the middle of the road.
-_GRID = tuple((along_m, lateral_m) for along_m in (25.0, -25.0, 50.0, -50.0) for lateral_m in (6.0, -6.0))
-_LIDAR = "lidar_cluster"
 _CONFIG = "tuned"
 
 
@@ -78,57 +72,20 @@ def demo(
         "fgtrack-demo"
     ),
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random generator.")] = 1,
-    delay_s: Annotated[
-        float | None,
-        typer.Option("--delay", min=0.0, max=1.0, help="Mean delay of the LiDAR in s; the RADAR's in proportion."),
-    ] = None,
-    num_objects: Annotated[int, typer.Option("--objects", min=1, max=len(_GRID) + 2, help="Cars besides the ego.")] = 2,
     overwrite: Overwrite = False,
 ) -> None:
     """Simulate a race, record it, and study the recording."""
-    scenario, settings = _changed(read_scenario("default"), delay_s, num_objects)
+    scenario = read_scenario("default")
     with claimed(out):
         bag = out / "recording"
         check_recording(bag, overwrite)
         with progress("simulate") as tell:
             messages = counted(simulate(scenario, np.random.default_rng(seed)), tell)
             write_recording(bag, messages, overwrite=overwrite, settings=recorded_of(scenario))
-        config = read_config(_CONFIG, settings, track_map=OVAL, pit_map=OVAL)
+        config = read_config(_CONFIG, track_map=OVAL, pit_map=OVAL)
     with progress("study") as tell:
         sweep = {"error_against_delay": error_against_delay()}
         found = studied(bag, out, config, advice=False, figures=sweep, overwrite=overwrite, on_step=tell)
     say(f"{scenario.duration_s:g} s of a simulated race ({bag}), noise fitted to other races (-c {_CONFIG}):")
     show_study(found, bag)
     say(f"error against delay, of a sweep over ten races: {out / 'figures/error_against_delay.png'}")
-
-
-def _changed(scenario: Scenario, delay_s: float | None, num_objects: int) -> tuple[Scenario, list[str]]:
-    """The race with other delays and as many cars, and settings with which what comes so late is still fused."""
-    ego, opponents = scenario.ego, scenario.opponents[:num_objects]
-    if isinstance(ego, TrackVehicle):
-        more = [
-            TrackVehicle(arc_m=ego.arc_m + along_m, lateral_m=lateral_m, speed=ego.speed)
-            for along_m, lateral_m in _GRID[: max(0, num_objects - len(opponents))]
-        ]
-        opponents = (*opponents, *more)
-    changed, settings = replace(scenario, opponents=opponents), list[str]()
-    mean_s = next((s.delay.mean_s for s in scenario.sensors if s.name == _LIDAR and isinstance(s.delay, GammaDelay)), 0)
-    if delay_s is not None and mean_s:
-        factor = delay_s / mean_s
-        sensors = tuple(replace(sensor, delay=_scaled(sensor.delay, factor)) for sensor in scenario.sensors)
-        changed = replace(changed, sensors=sensors)
-        config = read_config(_CONFIG)
-        times_s = {f"sensors.{one.name}.max_delay_s": config.sensors[one.name].max_delay_s for one in sensors}
-        times_s |= {"smoother.lag_s": config.smoother.lag_s, "smoother.ring_s": config.smoother.ring_s}
-        times_s |= {"filter.storage_s": config.filter.storage_s}
-        if factor > 1.0:
-            settings = [f"{key}={time_s * factor:.3f}" for key, time_s in times_s.items() if time_s is not None]
-    return changed, settings
-
-
-def _scaled(delay: AnyDelay, factor: float) -> AnyDelay:
-    if not isinstance(delay, GammaDelay):
-        return delay
-    if factor == 0.0:
-        return ConstantDelay(0.0)
-    return GammaDelay(delay.min_s * factor, delay.mean_s * factor, delay.q90_s * factor)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fgtrack.cli import show, study
+from fgtrack.cli import show
 from fgtrack.cli.main import run
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
@@ -18,7 +18,6 @@ from fgtrack.io.run import load_run
 from fgtrack.io.stream import read_stream, write_stream
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
-from fgtrack.pipeline.shipped import read_scenario
 
 MS = 1_000_000
 START_NS = 1_600_000_000_000_000_000
@@ -136,22 +135,6 @@ def test_off_a_terminal_progress_is_lines_with_a_percentage(
     assert len(lines) > 1
     monkeypatch.setattr(show, "LINE_PERIOD_S", 60.0)
     assert fgtrack("simulate", "default", "-o", "y.jsonl", "--duration", "2").err == "", "short work says nothing"
-
-
-def test_the_demo_takes_seed_delay_and_objects(monkeypatch: pytest.MonkeyPatch) -> None:
-    scenario = read_scenario("default")
-    changed, settings = study._changed(scenario, 0.302, 5)
-    assert len(changed.opponents) == 5
-    delays = {sensor.name: sensor.delay for sensor in changed.sensors}
-    assert delays["lidar_cluster"].mean_s == pytest.approx(0.302)
-    assert delays["radar"].mean_s == pytest.approx(0.124)
-    limits = dict(setting.split("=") for setting in settings)
-    assert float(limits["sensors.lidar_cluster.max_delay_s"]) > delays["lidar_cluster"].q90_s
-    assert float(limits["smoother.lag_s"]) == pytest.approx(2.0)
-    assert study._changed(scenario, None, 2) == (scenario, [])
-    none, settings = study._changed(scenario, 0.0, 1)
-    assert (len(none.opponents), settings) == (1, [])
-    assert all(sensor.delay.delay_s == 0.0 for sensor in none.sensors)
 
 
 def test_several_estimators_have_a_folder_each(fgtrack: Command, stream: Path) -> None:
