@@ -2,7 +2,8 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from fgtrack.core.types import (
 )
 from fgtrack.estimation.base import Start, StatesAt, TrackBank, UpdateResult, no_states
 from fgtrack.estimation.failures import Failure, Failures
-from fgtrack.estimation.filters.ekf import propagated
+from fgtrack.estimation.filters.ekf import correct_one, propagated
 from fgtrack.estimation.object_bank import states_of
 from fgtrack.estimation.present import PresentStates
 from fgtrack.models.motion import MotionModel
@@ -280,17 +281,22 @@ class Tracker:
     ) -> None:
         if not assignment.pairs:
             return
-        matched, track_ids, measurements = [], [], []
+        matched, track_ids, measurements, rows = [], [], [], []
         for position, track in assignment.pairs:
             matched.append(candidates[position])
+            rows.append(track)
             track_ids.append(states.track_ids[track])
             measurements.append(candidates[position].measurement_at(states.means[track]))
         results = self._parts.bank.update(batch.stamp_ns, track_ids, measurements)
-        for candidate, track_id, result in zip(matched, track_ids, results, strict=True):
+        for k, (candidate, track_id, result) in enumerate(zip(matched, track_ids, results, strict=True)):
             if result.innovation is not None:
                 self._parts.lifecycle.fused(track_id, candidate.position_m is not None)
-                if candidate.position_m is not None:
-                    self._undirected.pop(track_id, None)
+                if candidate.position_m is not None and self._undirected.pop(track_id, None) is not None:
+                    # The prior of the estimator, linearised along an unknown direction, spreads along it alone.
+                    expected = states.means[rows[k]], states.covariances[rows[k]]
+                    with suppress(np.linalg.LinAlgError):
+                        nis = correct_one(*expected, measurements[k].seen_by(self._parts.motion)).nis
+                        result = replace(result, nis=nis)
             self._conclude(batch, candidate, Disposition(result.status.value), track_id, result)
 
     def _give_birth(self, batch: Batch, candidate: Candidate, sensor: SensorModel, ego: EgoPose | None) -> None:
