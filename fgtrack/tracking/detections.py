@@ -2,7 +2,6 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import compress
@@ -131,11 +130,6 @@ def covariances(
         rest = np.delete(np.arange(len(R)), carrying)
         R[rest] = _turned(R[rest], np.arctan2(offsets_m[rest, 1], offsets_m[rest, 0]))
     return R
-
-
-def common(kinds: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
-    """The columns that are in all of `kinds`."""
-    return tuple(column for column in kinds[0] if all(column in other for other in kinds[1:]))
 
 
 @cache

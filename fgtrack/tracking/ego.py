@@ -115,11 +115,10 @@ def is_ego_covariance(given: tuple[float, ...]) -> bool:
 class Continuity:
     """Holds back a state that contradicts the one before it, until the next one tells which of the two is wrong.
 
-    A stamp that is half a second off puts the ego tens of metres from where it was, and with it all that is seen from
-    it. Two states contradict each other where the way between them differs from that at their speeds by more than half
-    of it, by 2 m, and by three standard deviations of their positions as far as they say them. What is more than 1 s
-    apart says nothing. A single state that contradicts both neighbours is left out; where the states go on from it,
-    the ego has jumped, and is followed. States that never fit, of an ego that does not know its speed, are all taken.
+    Two states at most 1 s apart contradict each other where the way between them differs from that at their speeds by
+    more than the sum of half of it, 2 m, and three standard deviations of their positions. A single state that
+    contradicts both neighbours is left out; where the states go on from it, the ego has jumped, and is followed. States
+    that never fit, of an ego that does not know its speed, are all taken.
     """
 
     def __init__(self) -> None:
@@ -159,12 +158,11 @@ def _consistent(before: EgoState, after: EgoState) -> bool:
     )
     if off_m <= _SLACK_M:  # as nearly always
         return True
-    return off_m <= _SLACK_M + _SHARE * abs(travelled_m) + _SIGMAS * math.sqrt(_variance(before) + _variance(after))
-
-
-def _variance(ego: EgoState) -> float:
-    """Variance of x and y together, 0 where the state has none; covariances are in the order of `EgoPose`."""
-    return 0.0 if ego.covariance is None else max(ego.covariance[0] + ego.covariance[6], 0.0)
+    variance_m2 = 0.0
+    for ego in (before, after):
+        if ego.covariance is not None:
+            variance_m2 += max(ego.covariance[0] + ego.covariance[6], 0.0)  # of x and y
+    return off_m <= _SLACK_M + _SHARE * abs(travelled_m) + _SIGMAS * math.sqrt(variance_m2)
 
 
 class EgoSource(ABC):

@@ -34,7 +34,6 @@ from fgtrack.tracking.detections import (
     Merge,
     PoseError,
     X,
-    common,
     covariances,
     in_map_frame,
     move_back,
@@ -197,7 +196,7 @@ class Preprocess:
             merged = [i for i in members if i not in claimed]
             claimed.update(merged)
             parts = tuple(rows[i] for i in members)
-            columns = common([kinds[row] for row in parts])
+            columns = tuple(column for column in kinds[parts[0]] if all(column in kinds[row] for row in parts))
             if X not in columns and not {RANGE, BEARING} <= set(columns):  # nothing that all have says where they are
                 parts = (rows[leader],)
                 columns = kinds[rows[leader]]
