@@ -51,7 +51,7 @@ def sweep(
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the tables; what is done there is kept.")],
     jobs: Annotated[
-        int | None, typer.Option("--jobs", help="Processes on this machine.", show_default="one for each core")
+        int | None, typer.Option("--jobs", min=1, help="Processes on this machine.", show_default="one for each core")
     ] = None,
     dask: Annotated[
         str | None, typer.Option("--dask", metavar="ADDRESS", help="Let the workers of a dask cluster do it.")
@@ -71,8 +71,6 @@ def sweep(
     Ends with mean and standard error at each point of the grid, and who is better.
     """
     tell = say if form is None else lambda line: None
-    if jobs is not None and jobs < 1:
-        raise CallError(f"--jobs {jobs}: at least one process is needed")
     if jobs is not None and dask is not None:
         raise CallError("--jobs, --dask: the cluster has its own number of workers, give one of them")
     sweep_file = find_file("sweep", sweep_name)

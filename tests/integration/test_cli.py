@@ -283,7 +283,6 @@ def test_no_command_shows_the_help_and_is_a_bad_call(fgtrack: Command) -> None:
     [
         (b"", "is empty"),
         (b"hello\n", "is none of the inputs"),
-        (b"\x00\x01\x02", "is none of the inputs"),
         (b'{"type": "ego"}\n', "starts with a header"),
         (b'{"type": "header", "format": "fgtrack-stream/2"}\n', "fgtrack-stream/2"),
     ],
@@ -325,25 +324,20 @@ def test_a_truncated_stream_is_replayed_up_to_the_break(fgtrack: Command, stream
     assert fgtrack("compare", "run").code == 0
 
 
-def edited(messages: list[Message], place: int, **changes: int) -> list[Message]:
-    return [replace(message, **changes) if i == place else message for i, message in enumerate(messages)]
-
-
 @pytest.mark.parametrize(
-    ("name", "changes", "message"),
-    [
-        ("loop.jsonl", {"receipt_ns": START_NS}, "receipt"),  # a bag is read in order of receipt
-        ("loop.jsonl", {"receipt_ns": START_NS + 10**13}, "nothing was received for"),
-    ],
+    ("receipt_ns", "message"),
+    [(START_NS, "receipt"), (START_NS + 10**13, "nothing was received for")],
 )
 def test_a_recording_with_broken_time_is_replayed_up_to_there(
-    fgtrack: Command, tmp_path: Path, name: str, changes: dict[str, int], message: str
+    fgtrack: Command, tmp_path: Path, receipt_ns: int, message: str
 ) -> None:
-    recording = tmp_path / name
-    (write_stream if name.endswith("jsonl") else write_bag)(recording, edited(drive(), 60, **changes))
+    recording = tmp_path / "loop.jsonl"  # a bag is read in order of receipt
+    messages = drive()
+    messages[60] = replace(messages[60], receipt_ns=receipt_ns)
+    write_stream(recording, messages)
     called = fgtrack("replay", recording, "-o", "run")
     assert message in called.error
-    assert name in called.error
+    assert "loop.jsonl" in called.error
     assert called.code == 1
     found = load_run("run")
     assert len(found.updates) == found.meta["detections_received"] >= 30
@@ -366,9 +360,7 @@ def test_an_unknown_sensor_says_what_to_do(fgtrack: Command, tmp_path: Path) -> 
     "words",
     [
         "replay STREAM -o LONG",
-        "replay STREAM -o run -c LONG",
         "simulate LONG -o run",
-        "export LONG -o run.mcap",
     ],
 )
 def test_a_path_that_no_file_can_have_is_a_line(fgtrack: Command, stream: Path, words: str) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 import fgtrack
 from fgtrack.core.types import Detection, DetectionList
-from fgtrack.pipeline.assumptions.list_statistics import ListStatistics
+from fgtrack.pipeline.assumptions.revisits import ListStatistics
 
 SECOND_NS = 10**9
 

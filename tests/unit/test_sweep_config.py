@@ -115,7 +115,6 @@ one_at_a_time:
         ("seed: 3", "seed: unknown key, did you mean 'seeds'"),
         ("seeds: 0", "seeds: a number of seeds, or a list"),
         ("seeds: [1, 1]", "seeds: one is named twice"),
-        ("seeds: [1, x]", 'seeds.1: Input should be a valid integer, not "x"'),
         ("seeds: 90000\nvary: {clock.node_hz: [5.0, 9.0]}", "vary, seeds: 180000 jobs, at most 100000 are possible"),
         ("vary: {association.gate_m: 5.0}", "vary.association.gate_m: a list of values is needed"),
         ("vary: {a: {label: [1]}}", "vary.a: a list of values is needed, or a mapping"),

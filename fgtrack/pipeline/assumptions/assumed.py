@@ -18,8 +18,7 @@ from fgtrack.io.errors import MOST_SENSORS
 from fgtrack.io.source import InputSource
 from fgtrack.models.sensors import Correlation, Mount, Score, SensorModel
 from fgtrack.pipeline.assumptions.coverage import Coverage, coverages
-from fgtrack.pipeline.assumptions.list_statistics import ListStatistics
-from fgtrack.pipeline.assumptions.revisits import for_slow_revisits
+from fgtrack.pipeline.assumptions.revisits import ListStatistics, for_slow_revisits
 from fgtrack.pipeline.config import Config, FilterConfig
 from fgtrack.pipeline.load import plain
 from fgtrack.pipeline.recorded import RecordedSensor, recorded

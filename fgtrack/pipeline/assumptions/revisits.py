@@ -1,7 +1,7 @@
-"""Revisit intervals of objects, and the motion that is assumed where they are long."""
+"""Statistics of the lists of a sensor: scans or single reports, clutter, and revisit intervals of objects."""
 
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from statistics import median
@@ -14,7 +14,7 @@ from fgtrack.core.types import DetectionList, FloatArray
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.pipeline.config import NOISE_HZ, ClockConfig, Config, FilterConfig, MotionConfig
 
-__all__ = ["Revisits", "for_slow_revisits", "positions_m"]
+__all__ = ["ListStatistics", "Revisits", "for_slow_revisits"]
 
 #: No vehicle is faster than an airliner [m/s], and no position of one is worse than this [m].
 _FASTEST_MPS, _POSITION_M = 300.0, 10.0
@@ -26,6 +26,10 @@ _MEMORY_S, _MOST, _FEWEST = 60.0, 5000, 20
 #: most 25 degrees accelerates by 4.6 m/s^2, evenly distributed sigma = 2.6 m/s^2, for some 17 s. Ships do less.
 _MANOEUVRES = {"velocity": 150.0}
 _NODE_HZ, _LONGEST_S = 1.0, 60.0
+_REPORTS_SHARE = 0.75
+"""Share of lists with one object from which on a sensor reports objects one by one, if none of its lists is empty."""
+_FEWEST_LISTS = 10
+"""Lists that say nothing of their kind if there are fewer."""
 
 
 @dataclass
@@ -58,6 +62,45 @@ class Revisits:
     def typical_s(self) -> float | None:
         """Median; None of a sensor that gives no positions, or too few."""
         return median(self.times_s) if len(self.times_s) >= _FEWEST else None
+
+
+@dataclass
+class ListStatistics:
+    """Counts of the lists of one sensor."""
+
+    num_objects: Counter[int] = field(default_factory=Counter)
+    """Number of lists by the number of their objects."""
+    low_m: tuple[float, float] = (math.inf, math.inf)
+    """Smallest x and y of a detection, in its frame."""
+    high_m: tuple[float, float] = (-math.inf, -math.inf)
+    """Largest x and y."""
+    revisits: Revisits = field(default_factory=Revisits)
+    """Intervals at which an object is measured."""
+
+    def add(self, message: DetectionList) -> None:
+        """Count a list."""
+        self.num_objects[len(message.objects)] += 1
+        self.revisits.add(message)
+        for x_m, y_m in positions_m(message):
+            self.low_m = min(self.low_m[0], x_m), min(self.low_m[1], y_m)
+            self.high_m = max(self.high_m[0], x_m), max(self.high_m[1], y_m)
+
+    @property
+    def scans(self) -> bool:
+        """False if the sensor reports objects one by one, as ADS-B, AIS and V2X do: a list misses nobody.
+
+        Its lists hold one object, now and then several by coincidence, and none is empty.
+        """
+        lists = self.num_objects.total()
+        return lists < _FEWEST_LISTS or 0 in self.num_objects or self.num_objects[1] < _REPORTS_SHARE * lists
+
+    @property
+    def largest_clutter_per_m2(self) -> float:
+        """Density of all detections, objects or not, over the rectangle that holds them; infinite if it has no area."""
+        lists, sides_m = self.num_objects.total(), (self.high_m[0] - self.low_m[0], self.high_m[1] - self.low_m[1])
+        if lists < _FEWEST_LISTS or min(sides_m) <= 0.0:
+            return math.inf
+        return sum(size * count for size, count in self.num_objects.items()) / lists / math.prod(sides_m)
 
 
 def for_slow_revisits(config: Config, revisits: Iterable[Revisits]) -> tuple[dict[str, Any], str]:
