@@ -4,15 +4,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from fgtrack.calibration.arrivals import FEWEST, Arrivals, arrivals_of, beyond_lags, overtaken, window_findings
+from fgtrack.calibration.arrivals import FEWEST, Arrivals, arrivals_of, overtaken, window_findings
 from fgtrack.calibration.clock_offsets import OffsetReport, estimate_offsets
-from fgtrack.calibration.clocks import (
-    bias_findings,
-    clock_findings,
-    clock_verdicts,
-    receipt_findings,
-    stamp_findings,
-)
+from fgtrack.calibration.clocks import bias_findings, clock_findings, stamp_findings
 from fgtrack.calibration.finding import Finding, milliseconds, percent
 from fgtrack.calibration.outcome import Outcome, harm, noise_findings, objection
 from fgtrack.calibration.page import Advice
@@ -45,7 +39,7 @@ _LONGEST_STORAGE_S = 60.0
 _USELESS = 90.0  # what weighs more leaves nothing to be judged
 _FIRST = 45.0  # what weighs more comes before noise
 _OFTEN = 0.05  # share of lists that are overtaken
-_LOST = 0.02
+_SLOW_EGO_S = 0.2
 
 
 def advise(
@@ -142,7 +136,6 @@ class _Adviser:
             raise DataError(f"{self._recording}: there are no detections of a sensor that the configuration has")
         for name in [*sensors, *([EGO] if EGO in self._arrivals else [])]:
             self._take(stamp_findings(self._arrivals[name]))
-        self._take(receipt_findings([self._arrivals[name] for name in sensors]))
         self._take(self._misread())
         self._on_step("clocks", 0.2 * work)
         self._take(self._offsets())
@@ -152,7 +145,7 @@ class _Adviser:
             if isinstance(message, DetectionList) and message.sensor in sensors
         )
         shares, timed = overtaken(seen, sensors), [one for one in seen.values() if one.has_stamps]
-        self._take(self._late(timed, shares))
+        self._take(self._late(shares))
         self._take(window_findings(timed, self._config))
         self._take(self._ego())
         self._on_step("tracking", 0.6 * work)
@@ -176,7 +169,6 @@ class _Adviser:
             config=self._config,
             arrivals=tuple(seen.values()),
             overtaken=shares,
-            beyond=beyond_lags(timed),
             before=old,
             after=new,
             broken=broken,
@@ -256,15 +248,8 @@ class _Adviser:
         )
         yield from bias_findings(self._clocks, self._config.ego)
 
-    def _late(self, arrivals: Sequence[Arrivals], shares: Mapping[str, float]) -> Iterator[Finding]:
-        """Losses, and an estimator that cannot deal with what is overtaken."""
-        for one in arrivals:
-            if one.lost is not None and one.lost > _LOST:
-                text = (
-                    f"{percent(one.lost)} of its lists never came, one by one (period "
-                    f"{milliseconds(one.period_s or 0.0)}). No setting brings them back."
-                )
-                yield Finding("loss", one.name, 25.0, text)
+    def _late(self, shares: Mapping[str, float]) -> Iterator[Finding]:
+        """Yield an estimator that cannot deal with what is overtaken."""
         often = {name: share for name, share in shares.items() if share > _OFTEN}
         if often and self._config.estimator == "ekf-backward-forward":
             named = ", ".join(f"{percent(share)} of {name}" for name, share in often.items())
@@ -279,19 +264,18 @@ class _Adviser:
         one = self._arrivals.get(EGO)
         if one is None or len(one.stamps_ns) < FEWEST or not one.has_stamps:
             return
-        limit_s = MAX_EXTRAPOLATION_S
-        gaps = [gap_s for gap_s in (one.sensed_ns[1:] - one.sensed_ns[:-1]) / 1e9 if gap_s > 2.0 * limit_s]
-        if gaps:
+        limit_s, gaps_s = MAX_EXTRAPOLATION_S, one.steps_s
+        long_s = gaps_s[gaps_s > 2.0 * limit_s]
+        if len(long_s):
             text = (
-                f"{len(gaps)} gaps in its states are longer than twice {limit_s:g} s, the longest "
-                f"{max(gaps):.3g} s: what is sensed in the middle cannot be placed, and fails."
+                f"{len(long_s)} gaps in its states are longer than twice {limit_s:g} s, up to {long_s.max():.3g} s: "
+                "detections in the middle cannot be transformed to the map, and fail."
             )
             yield Finding("ego", EGO, 65.0, text)
-        period_s = one.period_s or 0.0
-        if period_s > 0.2:
+        if one.period_s > _SLOW_EGO_S:
             text = (
-                f"one state every {milliseconds(period_s)}: between them the pose is that of constant speed and yaw "
-                "rate, which a turn belies. Record it more often."
+                f"one state every {milliseconds(one.period_s)}: between them the pose is that of constant speed and "
+                "yaw rate, which fails in a turn. Record it more often."
             )
             yield Finding("ego", EGO, 35.0, text)
 
@@ -350,15 +334,14 @@ class _Adviser:
         self._runs.append((config, found))
         return found
 
-    def _replayed(self, messages: Iterable[Message], config: Config) -> tuple[Run, str | None]:
-        """`replay_in_memory`; the run of the present settings where these refuse nothing for its delay."""
-        kept = list(messages)
+    def _replayed(self, messages: Sequence[Message], config: Config) -> Run:
+        """Return a replay in memory; the run of the present settings where these refuse nothing for its delay."""
         unlimited = all(sensor.max_delay_s is None for sensor in self._config.sensors.values())
         if unlimited and self._config.estimator != "ekf-backward-forward":
             run = self._run(self._config)
             if run is not None:
-                return run, run.meta.get("broken_off")
-        return replay_in_memory(kept, config)
+                return run
+        return replay_in_memory(messages, config)[0]
 
     def _fine(self, seen: Mapping[str, Arrivals], outcome: Outcome | None) -> Iterator[str]:
         """Yield the checks that found nothing."""
@@ -366,14 +349,14 @@ class _Adviser:
         kinds = {kind for kind, _ in wrong}
         ego = self._arrivals.get(EGO)
         if ego is not None and not wrong & {("ego", EGO), ("clock", EGO), ("input", EGO)} and ego.period_s:
-            longest, delay = milliseconds(ego.longest_gap_s), milliseconds(ego.quantile_s(0.5))
+            longest, delay = milliseconds(float(ego.steps_s.max())), milliseconds(ego.quantile_s(0.5))
             yield f"the ego ({1.0 / ego.period_s:.0f} Hz, longest gap {longest}, delay {delay})"
         stamps = [name for name, one in seen.items() if len(one.stamps_ns) >= FEWEST and not one.is_receipt]
         stamps = [name for name in stamps if ("clock", name) not in wrong]
         if stamps:
             yield f"stamps of {', '.join(stamps)}"
-        verdicts = [] if self._clocks is None else clock_verdicts(self._clocks)
-        clocks = [one.sensor for one in verdicts if one.is_known and one.offset_s is None]
+        offsets = [] if self._clocks is None else self._clocks.others
+        clocks = [one.sensor for one in offsets if one.is_known and not one.is_off]
         if clocks:
             yield f"clock of {', '.join(clocks)}"
         if not kinds & {"input", "model"}:

@@ -20,9 +20,9 @@ larger ones more (Carter, Schnepel, Steigerwald, Review of Economics and Statist
 
 import math
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import ClassVar, NamedTuple
+from collections.abc import Callable, Container, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
@@ -42,8 +42,7 @@ __all__ = ["RECEIPT_S", "TRUTH", "Bias", "OffsetReport", "SensorOffset", "estima
 
 TRUTH = "truth"
 """Name of the reference where offsets are those against the truth."""
-_FEWEST = 30  # detections of a sensor
-_MOST = 2000
+_FEWEST, _MOST = 30, 2000  # detections of a sensor
 _NEAR_M = 20.0  # a track is of the object whose path it is nearer to than this, in the median
 _STEP_S = 0.01  # of differences
 _STRETCH_S, _STRETCHES, _FEWEST_STRETCHES = 5.0, 12, 4
@@ -59,58 +58,39 @@ RECEIPT_S = 1e-5
 """Stamps that are nearer to the receipt are the receipt."""
 
 _Pair = tuple[Sightings, ObjectPath]
-Replayed = Callable[[Iterable[Message], Config], tuple[Run, str | None]]
-"""A function that replays messages, and says why they broke off: `replay_in_memory`, or one that remembers."""
 
 
-@dataclass(frozen=True)
-class Bias:
-    """Constant error of the positions of a sensor, detections minus truth; 0 in a direction without one.
+class Bias(NamedTuple):
+    """Constant error of the positions of a sensor, detections minus truth; 0 in a direction without one."""
 
-    Attributes
-    ----------
-    of
-        Whose directions are meant: those of the `ego`, or of the `vehicle` that is seen.
-    """
-
-    EGO: ClassVar[str] = "ego"
-    VEHICLE: ClassVar[str] = "vehicle"
-    of: str
+    of: Literal["ego", "vehicle"]
+    """Whose directions are meant."""
     ahead_m: float
     left_m: float
 
 
 @dataclass(frozen=True)
 class SensorOffset:
-    """Clock of one sensor: reported stamp = time at which it sensed + offset.
-
-    Attributes
-    ----------
-    offset_s
-        None where nothing could be estimated.
-    std_s, dof
-        Standard deviation, and its degrees of freedom.
-    num_detections
-        Used in the estimate.
-    why
-        A line on what the estimate rests on, or why there is none.
-    bias
-        Of its positions against the truth; None where there is none, or no truth.
-    """
+    """Clock of one sensor: reported stamp = time at which it sensed + offset."""
 
     sensor: str
     offset_s: float | None
+    """None where nothing could be estimated."""
     std_s: float | None
     num_detections: int
+    """Used in the estimate."""
     why: str
+    """A line on what the estimate rests on, or why there is none."""
     dof: float | None = None
+    """Degrees of freedom of `std_s`."""
     bias: Bias | None = None
+    """Of its positions against the truth; None where there is none, or no truth."""
 
     @property
     def half_s(self) -> float | None:
         """Half of the 95 % interval of the offset; None where there is none, or it is wider than the offset matters."""
         half_s = self._times_std_s(0.975)
-        return half_s if half_s is not None and half_s < 2.0 * _LARGEST_HALF_S else None
+        return half_s if half_s < 2.0 * _LARGEST_HALF_S else None
 
     @property
     def is_known(self) -> bool:
@@ -120,40 +100,30 @@ class SensorOffset:
     @property
     def is_off(self) -> bool:
         """True if the offset is no chance, and matters."""
-        least_s = self._times_std_s(_SURE)
-        if self.offset_s is None or self.half_s is None or least_s is None:
-            return False
-        return abs(self.offset_s) >= max(least_s, _SMALLEST_OFFSET_S)
+        least_s = max(self._times_std_s(_SURE), _SMALLEST_OFFSET_S)
+        return self.half_s is not None and self.offset_s is not None and abs(self.offset_s) >= least_s
 
-    def _times_std_s(self, share: float) -> float | None:
+    def _times_std_s(self, share: float) -> float:
         if self.offset_s is None or not self.std_s or self.dof is None:
-            return None
+            return math.inf
         return self.std_s * float(stdtrit(self.dof, share))
 
 
 @dataclass(frozen=True)
 class OffsetReport:
-    """Offsets of all sensors against the truth, or against the clock of one of them.
-
-    Attributes
-    ----------
-    reference
-        Name of that sensor, or `truth`.
-    num_tracks, num_detections
-        Used.
-    broken
-        Why the input broke off, where it did; what came before was used.
-    least_delays_s
-        Shortest delay of each sensor: its stamps are not earlier than the truth by more than that, for nothing is
-        received before it was sensed.
-    """
+    """Offsets of all sensors against the truth, or against the clock of one of them."""
 
     reference: str
+    """Name of that sensor, or `truth`."""
     sensors: tuple[SensorOffset, ...]
-    num_tracks: int
-    num_detections: int
-    broken: str | None
-    least_delays_s: Mapping[str, float] = field(default_factory=dict)
+    least_delays_s: Mapping[str, float]
+    """Shortest delay of each sensor: its stamps are not earlier than the truth by more than that, for nothing is
+    received before it was sensed."""
+
+    @property
+    def others(self) -> list[SensorOffset]:
+        """The sensors but the reference."""
+        return [one for one in self.sensors if one.sensor != self.reference]
 
     def as_dict(self) -> dict[str, object]:
         """Return plain values for JSON."""
@@ -172,22 +142,19 @@ class OffsetReport:
 
 
 class _Fit(NamedTuple):
-    """Solution of r + A x = 0, x = (offset, bias ahead and to the left).
-
-    Attributes
-    ----------
-    std
-        Standard deviations of x.
-    dof
-        Degrees of freedom of that of the offset.
-    cost
-        Robust sum of squared residuals that is left.
-    """
+    """Solution of r + A x = 0, x = (offset, bias ahead and to the left)."""
 
     x: tuple[float, ...]
     std: tuple[float, ...]
+    """Standard deviations of x."""
     dof: float
+    """Degrees of freedom of that of the offset."""
     cost: float
+    """Robust sum of squared residuals."""
+
+
+def _replayed(messages: Sequence[Message], config: Config) -> Run:
+    return replay_in_memory(messages, config)[0]
 
 
 def estimate_offsets(
@@ -195,7 +162,7 @@ def estimate_offsets(
     config: Config,
     reference: str | None = None,
     doubtful: Container[str] = (),
-    replayed: Replayed = replay_in_memory,
+    replayed: Callable[[Sequence[Message], Config], Run] = _replayed,
 ) -> OffsetReport:
     """Return the clock offsets of the sensors, from tracks that the tracker of `config` makes.
 
@@ -213,8 +180,11 @@ def estimate_offsets(
     heard = [corrected(one, config.sensors) if isinstance(one, DetectionList) else one for one in messages]
     config = _unrefused(replace(config, estimator="ekf-replay"))
     lists = [one for one in heard if isinstance(one, DetectionList) and one.sensor in config.used_sensors]
-    counts = Counter({one.sensor: 0 for one in lists})
-    counts.update(one.sensor for one in lists for _ in one.objects)
+    counts, least_s = Counter[str](), dict[str, float]()
+    for one in lists:
+        counts[one.sensor] += len(one.objects)
+        delay_s = seconds(one.receipt_ns - one.stamp_ns)
+        least_s[one.sensor] = min(least_s.get(one.sensor, math.inf), delay_s)
     if not counts:
         raise DataError("there are no detections of a sensor that the configuration names (sensors)")
     if reference is not None and reference not in counts:
@@ -222,27 +192,22 @@ def estimate_offsets(
         raise CallError(
             f"reference {reference!r} is no sensor of the input, which has {', '.join(sorted(counts))}{hint}"
         )
-    run, broken = replayed(heard, config)
     needs_ego = any(one.frame != "map" for one in lists)
+    run = replayed(heard, config)
     ego = EgoPath(one for one in heard if isinstance(one, EgoState)) if needs_ego else None
     seen = sightings_of(run, lists, config, ego)
-    least_s: dict[str, float] = {}
-    for one in lists:
-        delay_s = seconds(one.receipt_ns - one.stamp_ns)
-        least_s[one.sensor] = min(least_s.get(one.sensor, math.inf), delay_s)
     sensors = [name for name in config.sensors if name in counts]
 
     def against(name: str, paths: Sequence[ObjectPath]) -> OffsetReport:
-        rows, tracks = [], set[int]()
+        rows = []
         for sensor in sensors:
-            found = {} if sensor == name else dict(_paired(seen.get(sensor, {}), paths))
+            pairs = [] if sensor == name else _paired(seen.get(sensor, {}), paths)
             is_swapped = name != TRUTH and counts[sensor] > counts[name]  # the path of the better sensor is smoother
             if is_swapped:
-                found = dict(_paired(seen.get(name, {}), _paths(seen, sensor)))
-            row = _row(sensor, list(found.values()), name, len(sensors))
+                pairs = _paired(seen.get(name, {}), _paths(seen, sensor))
+            row = _row(sensor, pairs, name, len(sensors))
             rows.append(replace(row, offset_s=-row.offset_s) if is_swapped and row.offset_s is not None else row)
-            tracks |= found.keys()
-        return OffsetReport(name, tuple(rows), len(tracks), sum(one.num_detections for one in rows), broken, least_s)
+        return OffsetReport(name, tuple(rows), least_s)
 
     paths = true_paths(messages) if reference is None else []
     if paths:
@@ -275,13 +240,14 @@ def _unrefused(config: Config) -> Config:
 
 
 def _paths(seen: Mapping[str, Mapping[int, Sightings]], reference: str) -> list[ObjectPath]:
-    found = [ObjectPath.through(one.stamps_ns, one.at(one.stamps_ns)) for one in seen.get(reference, {}).values()]
-    return [one for one in found if one is not None]
+    paths = [ObjectPath.through(one.stamps_ns, one.at(one.stamps_ns)) for one in seen.get(reference, {}).values()]
+    return [one for one in paths if one is not None]
 
 
-def _paired(tracks: Mapping[int, Sightings], paths: Sequence[ObjectPath]) -> Iterator[tuple[int, _Pair]]:
-    """Yield each track with the path that it is nearest to, by its identity."""
-    for track_id, one in tracks.items():
+def _paired(tracks: Mapping[int, Sightings], paths: Sequence[ObjectPath]) -> list[_Pair]:
+    """Return each track that is near a path with the one that it is nearest to."""
+    pairs = []
+    for one in tracks.values():
         positions_m = one.at(one.stamps_ns)
         best, best_m = None, _NEAR_M
         for path in paths:
@@ -289,7 +255,8 @@ def _paired(tracks: Mapping[int, Sightings], paths: Sequence[ObjectPath]) -> Ite
             if np.isfinite(gaps_m).sum() > len(gaps_m) / 2 and float(np.nanmedian(gaps_m)) < best_m:
                 best, best_m = path, float(np.nanmedian(gaps_m))
         if best is not None:
-            yield track_id, (one, best)
+            pairs.append((one, best))
+    return pairs
 
 
 def _row(name: str, pairs: Sequence[_Pair], reference: str, num_sensors: int) -> SensorOffset:
@@ -309,7 +276,7 @@ def _row(name: str, pairs: Sequence[_Pair], reference: str, num_sensors: int) ->
     for _ in range(_ROUNDS):
         r, g, frames = _residuals(pairs, offset_s)
         if reference != TRUTH:
-            frames = {"": np.empty((len(r), 2, 0))}
+            frames = {"vehicle": np.empty((len(r), 2, 0))}
         fits = {of: _solved(r, np.concatenate([g[:, :, None], axes], axis=2), stamps_ns) for of, axes in frames.items()}
         of, fit = min(fits.items(), key=lambda one: round(one[1].cost, 6))
         move_s = float(np.clip(fit.x[0], -_LARGEST_STEP_S, _LARGEST_STEP_S))
@@ -331,7 +298,10 @@ def _sure(bias_m: float, std_m: float) -> float:
     return bias_m if abs(bias_m) > max(_BIAS_STDS * std_m, _SMALLEST_BIAS_M) else 0.0
 
 
-def _residuals(pairs: Sequence[_Pair], offset_s: float) -> tuple[FloatArray, FloatArray, dict[str, FloatArray]]:
+_Frames = dict[Literal["ego", "vehicle"], FloatArray]
+
+
+def _residuals(pairs: Sequence[_Pair], offset_s: float) -> tuple[FloatArray, FloatArray, _Frames]:
     """Return residuals at `offset_s`, their derivatives by it, (n, 2), and (n, 2, 2) axes in which a bias may stay."""
     step_ns, rows = nanoseconds(_STEP_S), []
     for one, path in pairs:
@@ -343,8 +313,8 @@ def _residuals(pairs: Sequence[_Pair], offset_s: float) -> tuple[FloatArray, Flo
         ego_rad = np.full(len(yaws_rad), np.nan) if one.ego is None else one.ego(one.stamps_ns)[:, 2]
         rows.append((sides_m[1], (sides_m[0] - sides_m[2]) / (2.0 * _STEP_S), yaws_rad, ego_rad))
     r, g, vehicle_rad, ego_rad = (np.concatenate(column) for column in zip(*rows, strict=True))
-    frames = {Bias.EGO: rotations(ego_rad)} if np.isfinite(ego_rad).any() else {}  # which is taken where both agree
-    return r, g, frames | {Bias.VEHICLE: rotations(vehicle_rad)}
+    frames: _Frames = {"ego": rotations(ego_rad)} if np.isfinite(ego_rad).any() else {}  # taken where both agree
+    return r, g, {**frames, "vehicle": rotations(vehicle_rad)}
 
 
 def _solved(r: FloatArray, A: FloatArray, stamps_ns: IntArray) -> _Fit:

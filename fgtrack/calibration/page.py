@@ -38,8 +38,7 @@ class Advice:
     arrivals: tuple[Arrivals, ...] = field(repr=False)
     """Arrivals of the sensors that are used, with the stamps that the advice gives them."""
     overtaken: Mapping[str, float] = field(repr=False)
-    beyond: Mapping[float, Mapping[str, float]] = field(repr=False)
-    """Share of the detections of each sensor that are later than a window of so many seconds."""
+    """Share of the lists of each sensor that came after a newer one."""
     before: Outcome | None = field(repr=False)
     """Outcome of a replay with the configuration; None where nothing can be tracked."""
     after: Outcome | None = field(repr=False)
@@ -65,8 +64,8 @@ class Advice:
 
     @property
     def tables(self) -> Tables:
-        """`outcome` of the replays, `lateness` of each sensor, and `beyond`: what shorter windows would lose."""
-        tables = {"outcome": self._outcome(), "lateness": self._lateness(), "beyond": self._beyond()}
+        """`outcome` of the replays, and `lateness` of each sensor."""
+        tables = {"outcome": self._outcome(), "lateness": self._lateness()}
         return Tables(tables, verdict=self.sentences)
 
     def __str__(self) -> str:
@@ -103,15 +102,6 @@ class Advice:
         ]
         return Table("Lists by sensor, with the stamps advised", records, columns, ("sensor",))
 
-    def _beyond(self) -> Table:
-        shares = {f"{one.name}_share": one.name for one in self.arrivals}
-        records = [
-            {"lag_s": lag_s} | {key: row[name] for key, name in shares.items()} for lag_s, row in self.beyond.items()
-        ]
-        columns = [Column("lag [s]", "lag_s", text=str)]
-        columns += [Column(name, [key], scale=100.0) for key, name in shares.items()]
-        return Table("Detections that are later than a window or limit [%]", records, columns, ("lag_s",))
-
     def as_dict(self) -> dict[str, object]:
         """Plain values for JSON."""
         return {
@@ -129,7 +119,7 @@ class Advice:
         if not self.changes:
             lines = ["Nothing is changed."]
         rest = [line for one in self.findings if not one.settings for line in _wrapped(str(one))]
-        return [*lines, *(["", "Without a setting that mends it:"] if rest else []), *rest]
+        return [*lines, *(["", "Without a setting that corrects it:"] if rest else []), *rest]
 
 
 def _wrapped(text: str) -> list[str]:

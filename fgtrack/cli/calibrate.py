@@ -3,7 +3,6 @@
 import shlex
 from collections.abc import Set
 from contextlib import suppress
-from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +11,7 @@ import typer
 
 from fgtrack.calibration.advise import advise as advised
 from fgtrack.calibration.clock_offsets import OffsetReport, estimate_offsets
-from fgtrack.calibration.clocks import clock_verdicts
+from fgtrack.calibration.clocks import clock_text
 from fgtrack.calibration.starting import write_starting
 from fgtrack.calibration.trial import Trial, try_out
 from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, Overwrite, PitMap, Reference, Settings, TrackMap
@@ -158,7 +157,7 @@ def advise(
 ) -> None:
     """Say what is late or wrong, and which settings mend it.
 
-    Sentences in order of importance, and what windows of several lengths would lose.
+    Sentences in order of importance, and the lateness of each sensor.
     """
     form = chosen_form(as_json, form)
     if out is not None:
@@ -201,15 +200,14 @@ def offsets(
         found = assumed(config, source)
         readable = UntilBreak(source.messages())
         report = estimate_offsets(list(readable), found.config, reference)
-        report = report if readable.error is None else replace(report, broken=str(readable.error))
     for line in found.lines() if form is None else ():
         say(line)
-    verdicts = clock_verdicts(report)
-    show(_offsets(report), form, report.as_dict() | {"verdicts": [asdict(one) for one in verdicts]})
+    verdicts = {one.sensor: clock_text(one, report) for one in report.others}
+    show(_offsets(report), form, report.as_dict() | {"verdicts": verdicts})
     if form is None:
-        sentences(f"{one.sensor}: {one}" for one in verdicts)
-    if report.broken is not None:
-        raise DataError(f"{located(report.broken, str(recording))}; used up to there")
+        sentences(f"{name}: {text}" for name, text in verdicts.items())
+    if readable.error is not None:
+        raise DataError(f"{located(str(readable.error), str(recording))}; used up to there")
 
 
 def _offsets(report: OffsetReport) -> Table:
@@ -226,5 +224,4 @@ def _offsets(report: OffsetReport) -> Table:
         Column("known", left=True),
     ]
     notes = [f"{one.sensor}: {one.why}" for one in report.sensors]
-    title = f"Offsets of {report.num_detections} detections of {report.num_tracks} tracks (reported stamp - true time)"
-    return Table(title, records, columns, ("sensor",), notes)
+    return Table("Clock offsets (reported stamp - true time)", records, columns, ("sensor",), notes)

@@ -79,7 +79,7 @@ def test_a_wrong_clock_is_found_by_the_command_without_truth(tmp_path: Path, cap
     lidar = next(item for item in report["sensors"] if item["sensor"] == "lidar_cluster")
     assert abs(lidar["offset_s"] - 0.04) < 4.0 * lidar["std_s"] < 0.02
     assert lidar["num_detections"] > 60
-    assert report["verdicts"][0]["is_known"]
+    assert "its stamps are" in report["verdicts"]["lidar_cluster"]
 
 
 def test_a_large_offset_is_found_against_the_sensor_that_sees_most() -> None:
