@@ -148,15 +148,9 @@ KITTI = "0 7 Car 0 0 0.1 400 170 460 190 1.5 1.6 4.0"
 def test_results_in_the_form_of_the_data_set_are_detections(tmp_path, score, value):
     x_m, y_m, z_m = RECTIFIED_FROM_IMU @ [20.0, 3.0, -1.5, 1.0]
     line = f"{KITTI} {x_m} {y_m} {z_m} {-0.4 - 0.5 * math.pi}{score}"
-    per_frame = tmp_path / "frames/pointpillars/0001"
     folder(tmp_path / "one", laser=[line, line.replace("Car", "Cyclist")])
-    folder(tmp_path / "frames")
-    per_frame.mkdir(parents=True)
-    (per_frame / "000000.txt").write_text(line.removeprefix("0 7 "))
-    (one,), (other,) = lists(tmp_path / "one"), lists(tmp_path / "frames")
-    assert (one.sensor, other.sensor) == ("laser", "pointpillars")
-    assert one.objects == other.objects
-    (car,) = one.objects
+    (found,) = lists(tmp_path / "one")
+    (car,) = found.objects
     assert (car.x_m, car.y_m, car.yaw_rad) == pytest.approx((20.0, 3.0, 0.4))
     assert (car.length_m, car.score, car.class_name) == (4.0, value, "car")
 
@@ -169,10 +163,8 @@ def test_results_without_a_place_in_space_are_bearings(tmp_path):
         "sensor",
         (Detection(bearing_rad=bearing_rad, score=0.8, class_name="car"),),
     )
-    with pytest.raises(DataError, match=r"camera/0001\.txt:2: .*in the image alone"):
+    with pytest.raises(DataError, match=r"camera: some boxes have a position, others are in the image alone"):
         lists(folder(tmp_path, camera=[pose(0, 10.0, 0.0, 0.0), line]))
-    with pytest.raises(DataError, match=r"camera/0001\.txt:2: .*a box in space, where the file begins"):
-        lists(folder(tmp_path, camera=[line, pose(0, 10.0, 0.0, 0.0)]))
 
 
 def test_fields_may_be_any_spaces_apart(tmp_path):
@@ -220,9 +212,9 @@ def test_an_input_is_a_folder_of_one_sequence_a_file_or_a_sequence_by_name(tmp_p
     assert len(lists(tmp_path)) == 1
     folder(tmp_path, "0012", laser=[pose(0, 30.0, 0.0, 0.0)])
     assert lists(tmp_path / "oxts/0012.txt") == lists(tmp_path, sequence=12) == lists(tmp_path, sequence="0012")
-    with pytest.raises(CallError, match=r"holds 2 sequences, name one by its file: .*oxts/0001\.txt"):
+    with pytest.raises(CallError, match=r"holds the sequences 0001, 0012, name one .*oxts/0001\.txt"):
         open_input(tmp_path)
-    with pytest.raises(CallError, match="holds no sequence 0007, but 0001, 0012"):
+    with pytest.raises(CallError, match="holds the sequences 0001, 0012, name one of them"):
         messages(tmp_path, sequence=7)
 
 
@@ -230,12 +222,11 @@ def test_an_input_is_a_folder_of_one_sequence_a_file_or_a_sequence_by_name(tmp_p
     ("files", "where"),
     [
         ({"oxts": ["1 2 3"]}, r"oxts/0001\.txt:1: "),
-        ({"oxts": [oxts(yaw_rad=math.inf)]}, r"oxts/0001\.txt:1: .*not finite"),
         ({"calib": ["P2: 1 2 x"]}, r"calib/0001\.txt:1: "),
         ({"calib": ["P2: 1 2 3"]}, r"calib/0001\.txt: "),
         ({"laser": [pose(0, 1.0, 2.0, 0.0), "0,2,3"]}, r"laser/0001\.txt:2: .*3 fields"),
         ({"laser": ["car"]}, r"laser/0001\.txt:1: "),
-        ({"laser": [pose(7, 1.0, 2.0, 0.0)]}, r"laser/0001\.txt:1: is of frame 7"),
+        ({"laser": [pose(7, 1.0, 2.0, 0.0)]}, r"laser/0001\.txt:1: .*of frame 7"),
         ({"label_02": ["0 1 Car 0 0"]}, r"label_02/0001\.txt:1: "),
     ],
 )

@@ -1,9 +1,9 @@
 """Where things of a KITTI sequence are: calibration, the ego at every frame, from camera to ego frame and back."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -18,6 +18,8 @@ IMAGE_PX = (1242.0, 375.0)
 
 _LARGEST_MB = 16.0  # those of the data set have a few
 _EARTH_RADIUS_M = 6_378_137.0
+
+Item = TypeVar("Item")
 
 
 class Calibration(NamedTuple):
@@ -35,10 +37,6 @@ class Calibration(NamedTuple):
     def direction(self, rectified: Sequence[float]) -> FloatArray:
         """Direction in the frame of the inertial unit, shape (3,)."""
         return np.asarray(np.linalg.solve(self.rectified_from_imu[:3, :3], rectified))
-
-    def ray(self, u_px: float, v_px: float) -> FloatArray:
-        """Direction from camera 2 to an image point, in the frame of the inertial unit, shape (3,)."""
-        return self.direction(np.linalg.solve(self.projection[:, :3], [u_px, v_px, 1.0]).tolist())
 
     @property
     def camera_m(self) -> FloatArray:
@@ -93,7 +91,8 @@ class View(NamedTuple):
 
     def bearing_rad(self, u_px: float, v_px: float) -> float:
         """Bearing of an image point from camera 2, 0 along the ego's heading."""
-        return self._azimuth_rad(self.calibration.ray(u_px, v_px))
+        ray = np.linalg.solve(self.calibration.projection[:, :3], [u_px, v_px, 1.0])
+        return self._azimuth_rad(self.calibration.direction(ray.tolist()))
 
     def in_map(self, position_m: FloatArray) -> FloatArray:
         """Points in the map, shape (..., 2), from those in the ego frame."""
@@ -104,14 +103,23 @@ class View(NamedTuple):
         return math.atan2(aside, ahead)
 
 
-def _calibration(file: Path) -> Calibration:
-    matrices: dict[str, FloatArray] = {}
-    for number, line in enumerate(lines(file), 1):
-        name, _, values = line.replace(":", " ", 1).strip().partition(" ")
+def parsed(file: Path, parse: Callable[[list[str]], Item]) -> Iterator[Item]:
+    """Results of `parse` for the fields of every line of `file`, which blanks or commas separate.
+
+    Raises `DataError`, with file and line, where `parse` raises a `ValueError` or `IndexError`.
+    """
+    text = read_whole(file, _LARGEST_MB).decode(errors="replace").rstrip()
+    for number, line in enumerate(text.splitlines(), 1):
         try:
-            matrices[name.replace("R0_", "R_").replace("_to_", "_")] = np.array(values.split(), dtype=np.float64)
-        except ValueError as error:
-            raise DataError(f"{file}:{number}: is no matrix ({error})") from error
+            with np.errstate(all="ignore"):  # of values that are not finite: the tracker counts them
+                yield parse(line.strip().split(",") if "," in line else line.split())
+        except (ValueError, IndexError) as error:
+            raise DataError(f"{file}:{number}: is not a line of the data set ({error})") from error
+
+
+def _calibration(file: Path) -> Calibration:
+    matrices = dict(parsed(file, lambda fields: (fields[0].strip(":"), np.array(fields[1:], dtype=np.float64))))
+    matrices = {name.replace("R0_", "R_").replace("_to_", "_"): values for name, values in matrices.items()}
     try:
         rectified_from_camera = np.eye(4)
         rectified_from_camera[:3, :3] = matrices["R_rect"].reshape(3, 3)
@@ -120,34 +128,19 @@ def _calibration(file: Path) -> Calibration:
         )
         projection = matrices["P2"].reshape(3, 4)
     except (KeyError, ValueError) as error:
-        raise DataError(f"{file}: is no calibration of the data set ({error!r})") from error
-    calibration = Calibration(projection, rectified_from_camera @ camera_from_velodyne @ velodyne_from_imu)
-    for matrix in (projection[:, :3], calibration.rectified_from_imu):
-        if not np.isfinite(matrix).all() or np.linalg.matrix_rank(matrix) < len(matrix):
-            raise DataError(f"{file}: is no calibration of the data set (a matrix has no inverse)")
-    return calibration
+        raise DataError(f"{file}: is not a calibration of the data set ({error!r})") from error
+    return Calibration(projection, rectified_from_camera @ camera_from_velodyne @ velodyne_from_imu)
 
 
 def read_views(file: Path, calibration_file: Path) -> list[View]:
     """Ego at every frame of the `oxts` file; raises `DataError` where the files are not those of the data set."""
     calibration = _calibration(calibration_file)
+    rows = list(parsed(file, lambda fields: [float(fields[index]) for index in (0, 1, 3, 4, 5, 8, 14, 22)]))
     views: list[View] = []
-    origin_m, scale = np.zeros(2), 1.0
-    for number, line in enumerate(lines(file), 1):
-        try:
-            values = [float(value) for value in line.split()]
-            if not all(map(math.isfinite, values)):
-                raise ValueError("a value is not finite")
-            latitude_deg, longitude_deg, _, roll_rad, pitch_rad, yaw_rad = values[:6]
-            speed_mps, accel_mps2, yaw_rate_radps = values[8], values[14], values[22]
-            if not views:
-                scale = math.cos(math.radians(latitude_deg))
-            position_m = _mercator(latitude_deg, longitude_deg, scale)
-        except (ValueError, IndexError) as error:
-            raise DataError(f"{file}:{number}: is no line of the data set ({error})") from error
-        if not views:
-            origin_m = position_m
-        x_m, y_m = (position_m - origin_m).tolist()
+    for latitude_deg, longitude_deg, roll_rad, pitch_rad, yaw_rad, speed_mps, accel_mps2, yaw_rate_radps in rows:
+        scale = math.cos(math.radians(rows[0][0]))
+        origin_m = _mercator(rows[0][0], rows[0][1], scale)
+        x_m, y_m = (_mercator(latitude_deg, longitude_deg, scale) - origin_m).tolist()
         stamp_ns = len(views) * PERIOD_NS
         ego = EgoState(stamp_ns, stamp_ns, x_m, y_m, wrap_angle(yaw_rad), speed_mps, yaw_rate_radps, accel_mps2)
         views.append(View(ego, _levelling(roll_rad, pitch_rad), calibration))
@@ -166,11 +159,3 @@ def _levelling(roll_rad: float, pitch_rad: float) -> FloatArray:
     about_x[1:, 1:] = rotation(roll_rad)
     about_y[::2, ::2] = rotation(-pitch_rad)  # rows and columns x and z, which y turns from z to x
     return np.asarray(about_y @ about_x)
-
-
-def lines(file: Path) -> list[str]:
-    """The lines of `file`, without empty ones at its end."""
-    try:
-        return [line.strip() for line in read_whole(file, _LARGEST_MB).decode().rstrip().splitlines()]
-    except UnicodeDecodeError as error:
-        raise DataError(f"{file}: is no text ({error.reason})") from error
