@@ -77,7 +77,7 @@ class TrackerNode(Node):
 
     def _on_jump(self, jump: TimeJump) -> None:
         """Time has begun again, as where a recording is played in a loop."""
-        self.get_logger().warning("time went back: begin anew")
+        self.get_logger().warning("time went back: starting over")
         self._buffer.clear()
         self._begin()
 

@@ -155,7 +155,7 @@ def advise(
     as_json: Json = False,
     form: FormOption = None,
 ) -> None:
-    """Say what is late or wrong, and which settings mend it.
+    """Report what is late or wrong, and which settings correct it.
 
     Sentences in order of importance, and the lateness of each sensor.
     """

@@ -39,12 +39,12 @@ def one_line(text: str) -> str:
 
 
 def printable(text: str) -> str:
-    """`text` with escapes in place of what is no letter or sign."""
+    """`text` with escapes for what is neither a letter nor a sign."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 def printable_lines(text: str) -> str:
-    """`text` with escapes in place of what is no letter, sign or end of a line."""
+    """`text` with escapes for what is neither a letter, a sign nor an end of line."""
     return "\n".join(map(printable, text.split("\n")))

@@ -170,7 +170,7 @@ class TrackStatus(StrEnum):
     """Confidence in a track."""
 
     TENTATIVE = "tentative"
-    """Not yet believed: measured too seldom, or too improbable, as the lifecycle says."""
+    """Not yet confirmed: measured too seldom, or too improbable, as the lifecycle says."""
     CONFIRMED = "confirmed"
     COASTING = "coasting"
     """Not matched by the newest batch that expected to see it."""

@@ -24,7 +24,7 @@ class Failure(StrEnum):
     ESTIMATOR_RAISED = "estimator raised"
     """An estimator raised an exception when it was asked for states, or told of the clock."""
     GRAPH_REBUILT = "graph rebuilt"
-    """A factor graph could not be solved with a new measurement, and was built anew without it."""
+    """A factor graph could not be solved with a new measurement, and was rebuilt without it."""
     STEP_DAMPED = "step damped"
     """A smoother's step went too far and was taken again by Levenberg-Marquardt."""
     BIRTH_FAILED = "birth failed"

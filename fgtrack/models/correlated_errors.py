@@ -1,7 +1,7 @@
 """Errors of a sensor that are correlated in time, estimated with the state of the object.
 
 Where the errors of successive detections resemble each other, as those of a box around a car seen from one side,
-an estimator that takes them for white believes them too much: a smoother, which averages over its window, most of all.
+an estimator that takes them for white is overconfident: a smoother, which averages over its window, most of all.
 The remedy is as old as the filter: the part of the error that lasts is a first-order Gauss-Markov process and a state
 (Bryson and Henrikson, "Estimation using sampled data containing sequentially correlated noise", 1968; Bar-Shalom, Li,
 Kirubarajan 2001, section 8.3). Every estimator does it alike, because motion and measurement models bring the state.
@@ -25,10 +25,10 @@ _MOST = 30.0  # exponent of an error that is moved back in time, in which it wou
 
 @dataclass(frozen=True)
 class CorrelatedErrors(MotionModel):
-    """A motion model whose state also has, of one object, the lasting errors of sensors.
+    """A motion model whose state also has the time-correlated errors of sensors about one object.
 
     Each is a stationary first-order Gauss-Markov process of mean 0 and variance 1,
-    e(t + dt) = exp(-dt / T) e(t) + N(0, 1 - exp(-2 dt / T)), in standard deviations of the lasting part.
+    e(t + dt) = exp(-dt / T) e(t) + N(0, 1 - exp(-2 dt / T)), in standard deviations of the correlated part.
     """
 
     base: MotionModel
@@ -125,7 +125,7 @@ def with_correlated_errors(motion: MotionModel, sensors: Mapping[str, SensorMode
 def split_error(
     sensor: str, model: SensorModel, measurement: MeasurementModel, R: FloatArray, state_names: Sequence[str]
 ) -> tuple[MeasurementModel, FloatArray]:
-    """The measurement model with the lasting part of the error, and the covariance (k, k) of the rest.
+    """The measurement model with the correlated part of the error, and the covariance (k, k) of the rest.
 
     Of the covariance R (k, k) of the components that the sensor measures, the share s = `model.correlation.share`
     lasts: z = h(x) + (s R)^1/2 e + N(0, (1 - s) R), so that a detection alone is as uncertain as R says. `state_names`
@@ -146,14 +146,14 @@ def split_error(
 
 
 def whole_error(measurement: MeasurementModel, white: FloatArray) -> FloatArray:
-    """Covariance R, shape (k, k), of the lasting error and the rest `white`: the inverse of `split_error`."""
+    """Covariance R, shape (k, k), of the correlated error and the rest `white`: the inverse of `split_error`."""
     if not isinstance(measurement, ColouredNoiseMeasurement):
         return white
     return white + measurement.gain @ measurement.gain.T
 
 
 def position_cross(measurement: MeasurementModel, z: FloatArray, pose: SensorPose) -> dict[str, tuple[float, float]]:
-    """Covariance of the position that z (k,) gives with the lasting errors, by the names of these in the state.
+    """Covariance of the position that z (k,) gives with the correlated errors, by the names of these in the state.
 
     An object that is placed at its first detection, x = G (z - gain e - noise), is off by what the error is: -G gain.
     """

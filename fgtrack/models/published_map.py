@@ -33,7 +33,7 @@ class PublishedMap:
         column["psi_ref_rad"] = wrap_angles(column["psi_ref_rad"] - 0.5 * math.pi)
 
         def closed(name: str) -> FloatArray:
-            """A column with the closing point in place of its last row."""
+            """A column whose last row is the closing point."""
             values = column[name][:-1]
             return np.append(values, _CLOSING * (values[0] - values[-1]) + values[-1])
 

@@ -156,7 +156,7 @@ class SensorModel:
     births: bool = True
     """True if an unmatched detection of this sensor starts a track."""
     loss: RobustLoss | None = None
-    """Robust loss of its measurements; null is the Gaussian. A smoother weighs them anew while they are in its
+    """Robust loss of its measurements; null is the Gaussian. A smoother updates the weights while they are in its
     window, a filter once, at the state that the update gives."""
     detection_probability: float = 0.5
     """Probability that a list shows an object in range and in the field of view (`lifecycle.kind: existence`). By
@@ -172,7 +172,7 @@ class SensorModel:
     mount: Mount | None = None
     """Pose of the sensor in the ego's detection frame; null: in a replay that of the recording, else the origin."""
     correlation: Correlation | None = None
-    """Errors that are correlated in time, estimated with each object; null: every detection errs anew."""
+    """Errors that are correlated in time, estimated with each object; null: errors are white."""
 
     def __post_init__(self) -> None:
         unknown = set(self.std) - set(MEASURABLE)

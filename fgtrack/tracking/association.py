@@ -48,7 +48,7 @@ class GatedEuclidean:
 
     `max_nis` is for what the distance does not show, as a ghost that crosses a track at another speed: a pair whose
     innovation is larger is out as well, and the candidate starts no track, which would compete for the next detections.
-    Without it, as in the paper, every pair inside the gate is believed.
+    Without it, as in the paper, every pair inside the gate is accepted.
     """
 
     kind: Literal["euclidean"] = "euclidean"

@@ -35,7 +35,7 @@ _SINGULAR = 1e-12
 
 @dataclass(frozen=True)
 class ExistenceRules:
-    """When a track is believed: by the probability that its object exists."""
+    """Confirmation and end of tracks by the probability that the object exists."""
 
     kind: Literal["existence"] = "existence"
     birth_probability: float = 0.2

@@ -51,7 +51,7 @@ class SmootherBank:
     initiation
         How the direction of travel of a new object is found where nothing else gives one, see `Initiation`.
     failures
-        Counts how often windows are built anew and steps are damped.
+        Counts how often windows are rebuilt and steps are damped.
     """
 
     def __init__(

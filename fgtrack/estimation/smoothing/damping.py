@@ -33,7 +33,7 @@ class DampedWindow:
         self._P = nodes.predicted[oldest, :, :n].copy()
 
     def solved(self) -> FloatArray:
-        """Means (m, n) with the least cost near the linearisation points, which are lost: solve anew.
+        """Means (m, n) with the least cost near the linearisation points, which are lost: solve again.
 
         Raises `numpy.linalg.LinAlgError` if it fails.
         """

@@ -221,10 +221,10 @@ class Nodes:
 
 
 class Undo:
-    """Values of the nodes of some tracks before an update that may fail; what is linearised anew is not among them."""
+    """Values of the nodes of some tracks before an update that may fail; what is relinearised is not among them."""
 
     def __init__(self, nodes: Nodes, tracks: IntArray) -> None:
-        nodes.make_room(tracks)  # what is saved is not laid out anew then
+        nodes.make_room(tracks)  # before values are saved, which would move
         self._nodes, self._tracks = nodes, tracks
         self._order = [getattr(nodes, name).take(tracks, axis=0) for name in nodes._ORDER]
         self.first = nodes.first[tracks]

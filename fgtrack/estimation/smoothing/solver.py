@@ -184,7 +184,7 @@ class Solver:
             self.nodes.linearise_terms(number)
 
     def rebuild(self, tracks: IntArray) -> None:
-        """Linearise everything anew where the linearisation points are, and solve it."""
+        """Relinearise everything where the linearisation points are, and solve it."""
         for track in tracks.tolist():
             self.linearise(track)
         first = self.nodes.first[tracks]

@@ -76,7 +76,7 @@ class Persistence:
 def disagreement_m(one: Persistence, own: Lists, other: Lists) -> float | None:
     """Standard deviation, per axis, of where another sensor sees the objects of `one`, in its lists; None if unknown.
 
-    It shows what a sensor alone does not: errors that last, as on an object that is larger than what it sees of it.
+    A sensor alone does not show time-correlated errors, as on an object that is larger than what it sees of it.
     Two detections are of one object if each is the nearest to the other: its neighbour is nearest where it is missed.
     Both sensors see the same objects only if detections are nearer to where these are than to places beside them.
 

@@ -36,7 +36,7 @@ _LOSSES: Mapping[str, Callable[[float], _Loss]] = {
 class BatchSolver(GraphSolver):
     """Windows that are solved from their last estimates. What leaves them is replaced by the prior that it gives.
 
-    Process noise stays that of the linearisation point; all else is linearised anew at every step.
+    Process noise stays that of the linearisation point; all else is relinearised at every step.
     """
 
     is_damped: ClassVar[bool] = True

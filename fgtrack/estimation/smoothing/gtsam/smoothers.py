@@ -23,7 +23,7 @@ def smoother(
 def smoother_batch(
     motion: MotionModel, start: Start, lag_s: float, initiation: str = DEFAULT, **options: Any
 ) -> FixedLagSmoother:
-    """Fixed-lag smoother, a factor graph that Levenberg-Marquardt solves anew at every update: slow, for checks."""
+    """Fixed-lag smoother, a factor graph that Levenberg-Marquardt solves at every update: slow, for checks."""
     settings = SmootherSettings.of_options(lag_s, options)
     return FixedLagSmoother(motion, start, settings, BatchSolver, initiation)
 

@@ -1,0 +1,54 @@
+"""Docstrings, comments, messages and pages use the words of the field."""
+
+import ast
+import re
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+MODULES = sorted((ROOT / "fgtrack").rglob("*.py"))
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *(ROOT / "docs").glob("*.md"),
+    *ROOT.glob("experiments/**/README.md"),
+]
+#: Words with which no docstring begins: it begins with what is returned, or with a noun.
+OPENINGS = ("What", "Whether", "Of", "Those", "How", "So")
+BANNED = re.compile(
+    r"\b(anew|mend(ed|s)?|spoil(t|s)?|nasty|strangers?|guilty|believed?|in place of|forth and back|noise that fits"
+    r"|unaware|errors that last|lasting errors?|is told|are told|dates that are none|relied)\b"
+)
+
+
+def texts(module: Path) -> Iterator[tuple[int, str]]:
+    """Comments and strings of a module, with their lines."""
+    with module.open("rb") as file:
+        for token in tokenize.tokenize(file.readline):
+            if token.type in (tokenize.COMMENT, tokenize.STRING):
+                yield token.start[0], token.string
+
+
+@pytest.mark.parametrize("folder", sorted({each.relative_to(ROOT / "fgtrack").parts[0] for each in MODULES}))
+def test_no_docstring_begins_with_a_question_word(folder: str) -> None:
+    modules = [each for each in MODULES if each.relative_to(ROOT / "fgtrack").parts[0] == folder]
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    for module in modules:
+        for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
+            text = ast.get_docstring(node) if isinstance(node, documented) else None
+            first = (text or "-").split(maxsplit=1)[0].rstrip(",.:")
+            assert first not in OPENINGS, f"{module}: {text}"
+
+
+def test_the_package_uses_the_words_of_the_field() -> None:
+    banned = [f"{module}:{line}: {text}" for module in MODULES for line, text in texts(module) if BANNED.search(text)]
+    assert not banned, "\n".join(banned)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_a_page_uses_the_words_of_the_field(page: Path) -> None:
+    found = BANNED.search(page.read_text(encoding="utf-8"))
+    assert found is None, f"{page.name}: {found}"
