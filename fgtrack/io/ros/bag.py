@@ -49,22 +49,9 @@ class BagMessage:
 class Bag:
     """A recording, which can be read any number of times.
 
-    Parameters
-    ----------
-    path
-        rosbag2 folder (with or without metadata.yaml), `.mcap`, `.db3` or ROS 1 `.bag` file.
-    message_definitions
-        `.msg` files, or folders of them, for types that the recording does not define. The package is the
-        name of the folder (or of the one above a folder `msg`).
-    largest_bytes
-        A chunk or message that unpacks to more is refused.
-    most_objects
-        A message with a longer list of objects is refused.
-
-    Raises
-    ------
-    DataError
-        The recording cannot be read at all.
+    `path` is a rosbag2 folder (with or without metadata.yaml), an `.mcap`, `.db3` or ROS 1 `.bag` file. The package of
+    a `.msg` file of `message_definitions` is the name of its folder (or of the one above a folder `msg`). Raises
+    `DataError` where it cannot be read at all.
     """
 
     def __init__(

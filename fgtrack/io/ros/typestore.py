@@ -6,8 +6,7 @@ and numbers there.
 
 import math
 import re
-from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, cast
@@ -31,14 +30,12 @@ Key = tuple[str, MessageDefinition | None]
 _LARGEST_MESSAGE = 32_000_000
 """Bytes of a message that is decoded: an object list or a state, never an image; each byte takes up to a hundred."""
 _LONGEST_TEXT = 200_000
-_LONGEST_NAME = 255
-_MOST_MEMBERS = 2_000
 _MOST_VALUES = 4_000
 """Most values of a type with all its parts: arrays of texts and messages become code for each element."""
 _LONGEST_ARRAY = 1_000_000
 _INTEGERS = range(-(1 << 63), 1 << 64)
-_TYPE_NAME = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*)+", re.ASCII)
-_MEMBER_NAME = re.compile(r"(?!__)[A-Za-z_]\w*", re.ASCII)
+_TYPE_NAME = re.compile(r"(?!.{256})[A-Za-z]\w*(/[A-Za-z]\w*)+", re.ASCII)
+_MEMBER_NAME = re.compile(r"(?!__|.{256})[A-Za-z_]\w*", re.ASCII)
 _BASE_NAME = re.compile(r"[a-z]+[0-9]*", re.ASCII)
 _SEPARATOR = "=" * 80 + "\n"
 _MSG_HEADER = re.compile(r"MSG: ([A-Za-z0-9/_]+)[ \t]*\n")
@@ -59,21 +56,7 @@ class MessageTypes:
 
     Precedence: the definition embedded for the type, those embedded for others, the user's, fgtrack's, rosbags'.
 
-    Parameters
-    ----------
-    keys
-        The types, with their definitions in the recording.
-    ros1
-        True if the messages are serialized as ROS 1 does.
-    message_definitions
-        The user's `.msg` files, or folders of them.
-    most_objects
-        A message with a longer list is refused.
-
-    Raises
-    ------
-    CallError
-        One of the user's `message_definitions` cannot be read.
+    Raises `CallError` where one of the user's `message_definitions`, files or folders, cannot be read.
     """
 
     def __init__(
@@ -104,7 +87,6 @@ class MessageTypes:
         for key, types in embedded.items():
             try:
                 self._types[key] = _closure(key[0], (types, shared, known))
-                _check_size(key[0], self._types[key])
             except (ValueError, RecursionError) as error:
                 self.problems[key] = str(error)
 
@@ -120,10 +102,7 @@ class MessageTypes:
     def decode(self, key: Key, data: bytes, what: str) -> Any:  # a message has the attributes of its type
         """Message that is serialized in `data`; `what` names it in errors.
 
-        Raises
-        ------
-        DataError
-            The bytes are not of the type, or hold a list of more than `most_objects`.
+        Raises `DataError` for bytes of another type, and for a list of more than `most_objects`.
         """
         refuse_larger(len(data), what, _LARGEST_MESSAGE)
         try:
@@ -161,25 +140,43 @@ def _registered(types: Typesdict) -> Typestore:
     return store
 
 
-def _closure(name: str, sources: Iterable[Typesdict]) -> Typesdict:
-    """The type `name` with all its parts, each from the first of `sources` that has it; else `ValueError`."""
+def _closure(name: str, sources: Sequence[Typesdict]) -> Typesdict:
+    """The type `name` with all its parts, each from the first of `sources` that has it.
+
+    Raises `ValueError` for an undefined part, a type that contains itself, and one of more than `_MOST_VALUES` values.
+    """
     needed: Typesdict = {}
-    pending = [name]
-    while pending:
-        current = pending.pop()
-        if current in needed:
-            continue
-        found = next((types[current] for types in sources if current in types), None)
-        if found is None:
-            raise ValueError(
-                f"the definition of {current or 'a type without a name'} is neither in the recording nor known, "
-                "name its .msg file in message_definitions"
-            )
-        needed[current] = found
-        for _, description in found[1]:
-            kind, value = _innermost(description)
-            if kind == Nodetype.NAME:
-                pending.append(cast("str", value))
+    sizes: dict[str, int] = {}
+
+    def size_of(description: FieldDesc) -> int:
+        kind, value = description
+        if kind == Nodetype.BASE:
+            return 1
+        if kind == Nodetype.NAME:
+            return size_of_type(cast("str", value))
+        inner, count = cast("tuple[FieldDesc, int]", value)
+        size, fixed = size_of(inner), int(count) if kind == Nodetype.ARRAY else 1
+        if kind == Nodetype.SEQUENCE and size == 0:
+            raise ValueError(f"{name} has a list of elements without content")
+        is_number = inner[0] == Nodetype.BASE and cast("tuple[str, int]", inner[1])[0] not in ("string", "wstring")
+        return size * (min(fixed, 1) if is_number else fixed)  # numbers become one NumPy array
+
+    def size_of_type(current: str) -> int:
+        if current not in sizes:
+            definition = next((types[current] for types in sources if current in types), None)
+            if definition is None:
+                raise ValueError(
+                    f"the definition of {current or 'a type without a name'} is not in the recording, "
+                    "name its .msg file in message_definitions"
+                )
+            needed[current] = definition
+            sizes[current] = _MOST_VALUES + 1  # until it is computed: a type that contains itself is too large
+            sizes[current] = sum(size_of(description) for _, description in definition[1])
+        if sizes[current] > _MOST_VALUES:
+            raise ValueError(f"{name} has more than {_MOST_VALUES} values, or contains itself")
+        return sizes[current]
+
+    size_of_type(name)
     return needed
 
 
@@ -256,15 +253,12 @@ def check_definition(name: str, definition: tuple[Constdefs, Fielddefs]) -> None
     """Raise `ValueError` unless all names of a definition are names, and its constants plain values."""
     constants, members = definition
     _check_type_name(name)
-    if len(constants) + len(members) > _MOST_MEMBERS:
-        raise ValueError(f"{name} has more than {_MOST_MEMBERS} members")
-    names = [*(constant[0] for constant in constants), *(one[0] for one in members)]
+    names = [*(constant[0] for constant in constants), *(member[0] for member in members)]
     for member in names:
-        if len(member) > _LONGEST_NAME or not _MEMBER_NAME.fullmatch(member):
-            raise ValueError(f"{member[:_LONGEST_NAME]!a} is not a name of a member")
-    for member, count in Counter(map(normalize_fieldname, names)).items():
-        if count > 1:
-            raise ValueError(f"{name} has the member {member} twice")
+        if not _MEMBER_NAME.fullmatch(member):
+            raise ValueError(f"{member!a:.200} is not a name of a member")
+    if len(set(map(normalize_fieldname, names))) < len(names):
+        raise ValueError(f"{name} has two members of one name")
     for member, kind, value in constants:
         if not _is_plain(value) or not _BASE_NAME.fullmatch(kind):
             raise ValueError(f"the constant {member} is not a plain value")
@@ -277,8 +271,8 @@ def check_definition(name: str, definition: tuple[Constdefs, Fielddefs]) -> None
 
 
 def _check_type_name(name: str) -> None:
-    if len(name) > _LONGEST_NAME or not _TYPE_NAME.fullmatch(name):
-        raise ValueError(f"{name[:_LONGEST_NAME]!a} is not a name of a message type")
+    if not _TYPE_NAME.fullmatch(name):
+        raise ValueError(f"{name!a:.200} is not a name of a message type")
 
 
 def _is_plain(value: object) -> bool:
@@ -294,31 +288,3 @@ def _innermost(description: FieldDesc) -> FieldDesc:
         if not 0 <= int(size) <= _LONGEST_ARRAY:
             raise ValueError(f"an array is longer than {_LONGEST_ARRAY}")
     return description
-
-
-def _check_size(name: str, types: Typesdict) -> None:
-    """Raise `ValueError` for a type that contains itself, or has more values than any message needs."""
-    sizes: dict[str, int] = {}
-
-    def size_of(description: FieldDesc) -> int:
-        kind, value = description
-        if kind == Nodetype.BASE:
-            return 1
-        if kind == Nodetype.NAME:
-            return size_of_type(cast("str", value))
-        inner, count = cast("tuple[FieldDesc, int]", value)
-        size, fixed = size_of(inner), int(count) if kind == Nodetype.ARRAY else 1
-        if kind == Nodetype.SEQUENCE and size == 0:
-            raise ValueError(f"{name} has a list of elements without content")
-        is_number = inner[0] == Nodetype.BASE and cast("tuple[str, int]", inner[1])[0] not in ("string", "wstring")
-        return size * (min(fixed, 1) if is_number else fixed)  # numbers become one NumPy array
-
-    def size_of_type(current: str) -> int:
-        if current not in sizes:
-            sizes[current] = _MOST_VALUES + 1  # until it is known: a type that contains itself is too large
-            sizes[current] = sum(size_of(description) for _, description in types[current][1])
-        if sizes[current] > _MOST_VALUES:
-            raise ValueError(f"{name} has more than {_MOST_VALUES} values, or contains itself")
-        return sizes[current]
-
-    size_of_type(name)
