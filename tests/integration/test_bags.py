@@ -58,6 +58,15 @@ def test_a_folder_without_metadata_is_read(tmp_path):
     assert read(tmp_path / "bag") == drive()
 
 
+def test_two_copies_of_one_file_in_a_folder_are_refused(tmp_path):
+    write_bag(tmp_path / "bag", drive())
+    content = storage_file(tmp_path / "bag").read_bytes()
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    (tmp_path / "bag" / "copy.mcap").write_bytes(content)
+    with pytest.raises(DataError, match="are copies of one recording: remove or name one"):
+        read(tmp_path / "bag")
+
+
 def test_a_stamp_that_ros_cannot_hold_is_one_line(tmp_path):
     with pytest.raises(DataError, match="1901 to 2038"):
         write_bag(tmp_path / "bag", [EgoState(1 << 62, 0, 0.0, 0.0, 0.0, 0.0)])

@@ -1,10 +1,12 @@
 """The files of a recording: which they are, and what its metadata.yaml says."""
 
+import filecmp
 import json
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -71,11 +73,15 @@ def _decompress(source: Path, target: Path) -> None:
 def parts_of(path: Path) -> Parts:
     """Files of the recording at `path`: itself, those that metadata.yaml names, or those of the folder.
 
-    Raises `DataError` for an invalid metadata.yaml.
+    Raises `DataError` for an invalid metadata.yaml, and for copies of one file.
     """
     if (path / METADATA).is_file():
         return _named_parts(path)
-    return Parts(tuple(bags_in(path)) if path.is_dir() else (path,))
+    files = tuple(bags_in(path)) if path.is_dir() else (path,)
+    for one, other in combinations(files, 2):
+        if one.stat().st_size and filecmp.cmp(one, other, shallow=False):
+            raise DataError(f"{path}: {one.name} and {other.name} are copies of one recording: remove or name one")
+    return Parts(files)
 
 
 def settings_of(path: Path) -> Mapping[str, object]:
