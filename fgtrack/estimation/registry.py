@@ -39,7 +39,7 @@ ESTIMATORS = Registry(
             "iplf-replay": "fgtrack.estimation.filters.ukf:IplfReplay",
             "smoother": "fgtrack.estimation.smoothing.gtsam.smoothers:smoother",
             "smoother-batch": "fgtrack.estimation.smoothing.gtsam.smoothers:smoother_batch",
-            "smoother-banded": "fgtrack.estimation.smoothing.banded:smoother_banded",
+            "smoother-banded": "fgtrack.estimation.smoothing.bank:smoother_banded",
             "ukf-replay": "fgtrack.estimation.filters.ukf:UkfReplay",
         },
         OOSM_GROUP: {

@@ -3,13 +3,11 @@
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
-import numpy as np
-
 from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import SmoothedReport, TrackState
+from fgtrack.core.types import SmoothedReport
 from fgtrack.estimation.base import Smoother, Start
 from fgtrack.estimation.object_bank import ObjectBank
-from fgtrack.estimation.present import smoothed_reports
+from fgtrack.estimation.present import final_reports, smoothed_reports
 from fgtrack.models.motion import MotionModel
 
 _S = TypeVar("_S", bound=Smoother)
@@ -37,7 +35,7 @@ class SmoothingBank(ObjectBank[_S]):
         """See `TrackBank.remove`; what was still inside the window becomes final."""
         try:
             rest = self._ask(lambda _, one: one.take_rest(), [track_id])[track_id]
-            self._ended += self._reports([(track_id, state) for state in rest])
+            self._ended += final_reports(self._motion, [(track_id, state) for state in rest])
         finally:
             super().remove(track_id)
 
@@ -45,18 +43,12 @@ class SmoothingBank(ObjectBank[_S]):
         """See `TrackBank.smoothed`."""
         final = self._ask(lambda _, one: one.take_final())
         reports, self._ended = self._ended, []
-        reports += self._reports([(track_id, state) for track_id, states in final.items() for state in states])
+        reports += final_reports(
+            self._motion, [(track_id, state) for track_id, states in final.items() for state in states]
+        )
         for lag_s in self._lagged_s:
             stamp_ns = self.present_ns - nanoseconds(lag_s)
             known = super().states_at(stamp_ns)
             stamps_ns = [stamp_ns] * len(known.track_ids)
             reports += smoothed_reports(self._motion, known.track_ids, stamps_ns, known.means, known.covariances, lag_s)
         return reports
-
-    def _reports(self, states: Sequence[tuple[int, TrackState]]) -> list[SmoothedReport]:
-        """Reports of final states in the motion model's own form, each with its track."""
-        if not states:
-            return []
-        track_ids, found = zip(*states, strict=True)
-        means, covariances = np.array([one.mean for one in found]), np.array([one.covariance for one in found])
-        return smoothed_reports(self._motion, track_ids, [one.stamp_ns for one in found], means, covariances)

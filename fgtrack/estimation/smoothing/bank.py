@@ -3,38 +3,29 @@
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import compress
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import BoolArray, FloatArray, IntArray, SmoothedReport, TrackState
-from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states
+from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
 from fgtrack.estimation.filters.propagation import track_state
-from fgtrack.estimation.present import PresentStates, smoothed_reports
+from fgtrack.estimation.present import PresentStates, final_reports, smoothed_reports
 from fgtrack.estimation.smoothing.nodes import grown
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.estimation.smoothing.terms import Innovations
-from fgtrack.estimation.smoothing.windows import States, Windows
+from fgtrack.estimation.smoothing.windows import Windows
 from fgtrack.models.motion import MotionModel
 
 MakeSolver = Callable[[MotionModel, SmootherSettings], Solver]
 
 _TOO_OLD, _FAILED = UpdateResult(UpdateStatus.TOO_OLD), UpdateResult(UpdateStatus.FAILED)
 _STATUSES = UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE, UpdateStatus.BEYOND_WINDOW
-
-
-class _Known(NamedTuple):
-    """Tracks that are known at a stamp."""
-
-    track_ids: tuple[int, ...]
-    positions: dict[int, int]
-    """Positions of the track ids."""
-    states: States
 
 
 class SmootherBank:
@@ -69,13 +60,14 @@ class SmootherBank:
         self._tracks: dict[int, int] = {}
         """Row of the arrays that holds each track, by track id in order of birth."""
         self._free: list[int] = []
-        self._now_ns = 0
+        self.present_ns = 0
+        """See `TrackBank.present_ns`."""
         self._clock_ns: IntArray = np.zeros(0, dtype=np.int64)
         self._first_ns: IntArray = np.zeros(0, dtype=np.int64)
         self._initiation = checked_initiation(initiation)
         self._searches: dict[int, Search] = {}
         """Initiations of the tracks whose direction is sought, by row."""
-        self._known: dict[int, _Known] = {}
+        self._known: dict[int, StatesAt] = {}
         """By stamp, until something changes."""
         self._known_times: IntArray | None = None
         """See `_times`, until something changes."""
@@ -86,18 +78,13 @@ class SmootherBank:
     # --- a `TrackBank`
 
     @property
-    def present_ns(self) -> int:
-        """See `TrackBank.present_ns`."""
-        return self._now_ns
-
-    @property
     def window_start_ns(self) -> int:
         """See `TrackBank.window_start_ns`; where late measurements are an error, they must come as far as here."""
         return 0 if self._settings.late == "raise" else self._oldest_ns
 
     @property
     def _oldest_ns(self) -> int:
-        return self._now_ns - self._lag_ns - self._behind_ns
+        return self.present_ns - self._lag_ns - self._behind_ns
 
     @property
     def track_ids(self) -> tuple[int, ...]:
@@ -106,15 +93,21 @@ class SmootherBank:
 
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`; the nodes that leave are marginalised at the next update."""
-        self._now_ns = now_ns
+        self.present_ns = now_ns
         self._clock_ns = np.maximum(self._clock_ns, now_ns)
         self._changed()  # which tracks are known at a stamp depends on the clock
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`. Raises `DataError` for a stamp before the window where the policy is `raise`."""
         self._settings.refuse_older(stamp_ns, self._oldest_ns)
-        known = self._known_at(stamp_ns)
-        return StatesAt(known.track_ids, *known.states) if known.track_ids else no_states(self._motion.dim)
+        known = self._known.get(stamp_ns)
+        if known is None:
+            tracks = self._all_tracks()
+            is_known = self._times()[3, tracks] <= stamp_ns
+            track_ids, tracks = tuple(compress(self._tracks, is_known.tolist())), tracks[is_known]
+            states = self.windows.states_at(tracks, np.full(len(tracks), stamp_ns))
+            known = self._known[stamp_ns] = StatesAt(track_ids, *states)
+        return known
 
     def update(
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
@@ -128,12 +121,13 @@ class SmootherBank:
         if not rows.size:
             return results
         chosen = [measurements[row].seen_by(self._motion) for row in rows.tolist()]
-        known = self._known_at(stamp_ns)
-        positions = [known.positions[track_ids[row]] for row in rows.tolist()]
-        states = States(known.states.means[positions], known.states.covariances[positions])
-        innovations = Innovations.of(chosen, *states)
+        known = self.states_at(stamp_ns)
+        positions = {track_id: position for position, track_id in enumerate(known.track_ids)}
+        at = [positions[track_ids[row]] for row in rows.tolist()]
+        means = known.means[at]
+        innovations = Innovations.of(chosen, means, known.covariances[at])
         is_fused = np.isfinite(innovations.nis)
-        self._fuse(stamp_ns, tracks[rows], chosen, innovations, states.means, start_ns[rows], reach_ns[rows], is_fused)
+        self._fuse(stamp_ns, tracks[rows], chosen, innovations, means, start_ns[rows], reach_ns[rows], is_fused)
         late = [
             2 if stamp_ns < a else int(stamp_ns < b) for a, b in zip(start_ns.tolist(), newest_ns.tolist(), strict=True)
         ]
@@ -158,7 +152,7 @@ class SmootherBank:
 
     def remove(self, track_id: int) -> None:
         """See `TrackBank.remove`; what was still inside the window becomes final."""
-        self._ended += self._reports([(track_id, state) for state in self.take_rest(track_id)])
+        self._ended += final_reports(self._motion, [(track_id, state) for state in self.take_rest(track_id)])
         self._free.append(self._tracks.pop(track_id))
         self._changed()
 
@@ -167,31 +161,25 @@ class SmootherBank:
         if not self._tracks:
             return []
         tracks = self._all_tracks()
-        states = self.windows.states_at(tracks, np.maximum(self._now_ns, self._times()[3, tracks]))
-        return PresentStates(self._motion, self._now_ns, *states)
+        states = self.windows.states_at(tracks, np.maximum(self.present_ns, self._times()[3, tracks]))
+        return PresentStates(self._motion, self.present_ns, *states)
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`."""
         reports, self._ended = self._ended, []
-        reports += self._reports(
-            [(track_id, state) for track_id, track in self._tracks.items() for state in self._final.get(track, ())]
+        reports += final_reports(
+            self._motion,
+            [(track_id, state) for track_id, track in self._tracks.items() for state in self._final.get(track, ())],
         )
         self._final.clear()
         for lag_s in self._settings.lagged_s:
-            stamp_ns = self._now_ns - nanoseconds(lag_s)
+            stamp_ns = self.present_ns - nanoseconds(lag_s)
             states = self.states_at(stamp_ns)
             stamps_ns = [stamp_ns] * len(states.track_ids)
             reports += smoothed_reports(
                 self._motion, states.track_ids, stamps_ns, states.means, states.covariances, lag_s
             )
         return reports
-
-    def _reports(self, states: Sequence[tuple[int, TrackState]]) -> list[SmoothedReport]:
-        if not states:
-            return []
-        track_ids, final = zip(*states, strict=True)
-        means, covariances = np.array([each.mean for each in final]), np.array([each.covariance for each in final])
-        return smoothed_reports(self._motion, track_ids, [each.stamp_ns for each in final], means, covariances)
 
     # --- one track
 
@@ -253,10 +241,8 @@ class SmootherBank:
                 self._fuse(stamp_ns, tracks, measurements, innovations, guesses, start_ns, reach_ns, alone)
                 is_fused[row] = alone[row]
             return
-        for track, left_ns, mean, covariance in zip(
-            left.tracks.tolist(), left.stamps_ns.tolist(), *left.states, strict=True
-        ):
-            self._final.setdefault(track, []).append(track_state(self._motion, left_ns, mean, covariance))
+        for track, state in left:
+            self._final.setdefault(track, []).append(state)
         for track in self._searches.keys() & set(of.tolist()):
             self._initiate(track, stamp_ns)
         self.windows.damp(of)
@@ -293,20 +279,6 @@ class SmootherBank:
             reach = np.maximum(start - self._behind_ns, first)
             self._known_times = np.array([newest, start, reach, np.maximum(reach, nodes.stamps_ns[: len(first), 0])])
         return self._known_times
-
-    def _known_at(self, stamp_ns: int) -> _Known:
-        """Return the tracks that are known at `stamp_ns`, in order of birth."""
-        known = self._known.get(stamp_ns)
-        if known is None:
-            tracks = self._all_tracks()
-            is_known = self._times()[3, tracks] <= stamp_ns
-            track_ids = tuple(compress(self._tracks, is_known.tolist()))
-            tracks = tracks[is_known]
-            states = self.windows.states_at(tracks, np.full(len(tracks), stamp_ns))
-            known = self._known[stamp_ns] = _Known(
-                track_ids, dict(zip(track_ids, range(len(tracks)), strict=True)), states
-            )
-        return known
 
 
 class FixedLagSmoother:
@@ -365,3 +337,14 @@ class FixedLagSmoother:
     def converge(self, max_iterations: int = 50) -> None:
         """Relinearise until nothing moves; for comparisons."""
         self.bank.converge(0, max_iterations)
+
+
+# Any: an option may be any value that `SmootherSettings` takes.
+def smoother_banded(
+    motion: MotionModel, start: Start, lag_s: float, initiation: str = DEFAULT, **options: Any
+) -> FixedLagSmoother:
+    """Fixed-lag smoother, solved in covariance form by compiled code, all objects of a tracker together."""
+    return FixedLagSmoother(motion, start, SmootherSettings.of_options(lag_s, options), initiation=initiation)
+
+
+vars(smoother_banded).update(exact="any lag, any number", nonlinear="at convergence", smooths=True, initiates=True)

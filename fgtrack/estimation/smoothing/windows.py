@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from fgtrack.core.time import NS_PER_S, seconds
-from fgtrack.core.types import YAW, BoolArray, FloatArray, IntArray
+from fgtrack.core.types import YAW, BoolArray, FloatArray, IntArray, TrackState
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.initiation import Fix, Line, along, fixes_of
+from fgtrack.estimation.filters.propagation import track_state
 from fgtrack.estimation.kernels import kalman
 from fgtrack.estimation.smoothing import kernels
 from fgtrack.estimation.smoothing.damping import DampedWindow
@@ -32,16 +33,6 @@ class States(NamedTuple):
     """Shape (m, n)."""
     covariances: FloatArray
     """Shape (m, n, n)."""
-
-
-class Leaving(NamedTuple):
-    """Smoothed states of the nodes that leave their windows, oldest first for each track."""
-
-    tracks: IntArray
-    """Shape (m,)."""
-    stamps_ns: IntArray
-    """Shape (m,)."""
-    states: States
 
 
 class Windows:
@@ -114,12 +105,12 @@ class Windows:
         guesses: FloatArray,
         start_ns: IntArray,
         reach_ns: IntArray,
-    ) -> Leaving:
+    ) -> list[tuple[int, TrackState]]:
         """Fuse one measurement of each of `tracks`, all at `stamp_ns`, and move the windows up to `start_ns`.
 
         `innovations` are those at `guesses`, shape (m, n), the states at `stamp_ns`. One node at or before `start_ns`
-        stays in each window; behind it, what `reach_ns` needs is kept. Returns the states of the nodes that left.
-        Raises `numpy.linalg.LinAlgError` if it fails; all is as before then.
+        stays in each window; behind it, what `reach_ns` needs is kept. Returns the smoothed states of the nodes
+        that left, oldest first for each track. Raises `numpy.linalg.LinAlgError` if it fails; all is as before then.
         """
         nodes, solver = self.nodes, self.solver
         guesses = self._relinearised(tracks, stamp_ns, measurements, guesses)
@@ -184,17 +175,18 @@ class Windows:
             guesses[first] = self.states_at(tracks[first], np.full(len(first), stamp_ns)).means
         return guesses
 
-    def _leaving(self, tracks: IntArray, anchors: IntArray) -> Leaving:
-        nodes, n = self.nodes, self._motion.dim
+    def _leaving(self, tracks: IntArray, anchors: IntArray) -> list[tuple[int, TrackState]]:
+        nodes = self.nodes
         num = anchors - nodes.first[tracks]
         if not self._final or not num.any():
-            return Leaving(np.empty(0, np.int64), np.empty(0, np.int64), States(np.empty((0, n)), np.empty((0, n, n))))
+            return []
         self.solver.prepare_leaving(tracks[num > 0], anchors[num > 0])
         rows, columns = np.nonzero(np.arange(int(num.max())) < num[:, None])
         tracks, indices = tracks[rows], nodes.first[tracks[rows]] + columns
         steps, covariances = self.solver.smoothed(tracks, indices)
         means = nodes.origin[nodes.numbers[tracks, indices]] + steps
-        return Leaving(tracks, nodes.stamps_ns[tracks, indices], States(means, covariances))
+        leaving = zip(tracks.tolist(), nodes.stamps_ns[tracks, indices].tolist(), means, covariances, strict=True)
+        return [(track, track_state(self._motion, stamp_ns, x, P)) for track, stamp_ns, x, P in leaving]
 
     def _at_nodes(self, stamps_ns: IntArray, measurements: Sequence[Measurement]) -> Sequence[Measurement]:
         """Measurements of the nodes at `stamps_ns`, which may be closer to theirs than the solver can tell apart."""
