@@ -96,8 +96,7 @@ class Scan:
         R = (LIDAR_STD_M if self.late else RADAR_STD_M) ** 2 * np.eye(2)
         found = []
         for index, z in enumerate(self.positions_m):
-            values = dict(zip(POSITION.components, z.tolist(), strict=True))
-            found.append(Candidate(index, (), Measurement(self.stamp_ns, POSITION, z, R), z, R, values))
+            found.append(Candidate(index, (), Measurement(self.stamp_ns, POSITION, z, R), z, R))
         return found
 
 

@@ -93,7 +93,7 @@ class _WatchedPreprocess(Preprocess):
         self._sensor = batch.message.sensor, sensor
         self._own = {
             id(one.measurement): sensor.message_covariance
-            and any(objects[index].covariance is not None for index in (one.index, *one.merged))
+            and any(objects[index].covariance is not None for index in (one.leader, *one.merged))
             for one in candidates
         }
         return candidates, records

@@ -50,12 +50,12 @@ class MotionModel(ABC):
     linear: ClassVar[bool] = False
     """True if the Jacobian is the same at every state."""
 
-    @property
+    @cached_property
     def dim(self) -> int:
         """Number n of entries of the state."""
         return len(self.state_names)
 
-    @property
+    @cached_property
     def cartesian(self) -> bool:
         """True if the state holds the velocity as vx and vy, and not as yaw and speed."""
         return self.state_names[:4] == CARTESIAN

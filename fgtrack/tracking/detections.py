@@ -2,10 +2,11 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from itertools import compress
 from operator import attrgetter
+from types import MappingProxyType
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from fgtrack.core.geometry import Real, circular_mean, rotations, wrap_angles
 from fgtrack.core.linalg import congruence, symmetrise
-from fgtrack.core.types import MEASURABLE, BoolArray, Detection, FloatArray, Frame, IntArray
+from fgtrack.core.types import MEASURABLE, BoolArray, Detection, FloatArray, IntArray
 from fgtrack.models.measurement import ANGULAR, COMPONENTS, MIN_RANGE_M, MeasurementModel, SensorPose
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.inbox import Batch, own_covariance
@@ -27,17 +28,24 @@ _VALUES = attrgetter(*MEASURABLE)
 
 
 class MapDetections(NamedTuple):
-    """Detections with their components in the map frame."""
+    """Detections of one batch with their components in the map frame."""
 
+    batch: Batch
+    sensor: SensorModel
+    pose: SensorPose
+    """Pose that they are seen from."""
     indices: IntArray
     """Positions in the message, shape (m,)."""
-    detections: list[Detection]
     values: FloatArray
     """In the order of `COMPONENTS`, shape (m, 8); NaN where there is none."""
     points_m: FloatArray
     """Positions in the map, shape (m, 2); NaN where only a bearing was measured."""
     map_yaw: BoolArray
     """True where the yaw is that of the map, shape (m,)."""
+    merged: Mapping[int, tuple[int, ...]] = MappingProxyType({})
+    """Positions of the detections that end as merged, by that of the detection which leads them."""
+    averaged: "Mapping[int, MapDetections]" = MappingProxyType({})
+    """Detections of which the values are averages, by the position of the leading one."""
 
     @property
     def placed(self) -> IntArray:
@@ -45,25 +53,27 @@ class MapDetections(NamedTuple):
         x_m = self.points_m[:, 0]
         return np.asarray((x_m == x_m).nonzero()[0])  # NaN is not equal to itself
 
+    @property
+    def detections(self) -> list[Detection]:
+        """The detections as received."""
+        return list(map(self.batch.message.objects.__getitem__, self.indices.tolist()))
+
     def at(self, rows: IntArray | BoolArray) -> "MapDetections":
         """Return the detections at `rows`."""
-        chosen = np.arange(len(self.indices))[rows].tolist()
-        detections = [self.detections[row] for row in chosen]
-        return MapDetections(self.indices[rows], detections, self.values[rows], self.points_m[rows], self.map_yaw[rows])
-
-    def kinds(self) -> list[tuple[int, ...]]:
-        """Columns of the components that each has."""
-        columns = range(self.values.shape[1])
-        return [tuple(compress(columns, measured)) for measured in (~np.isnan(self.values)).tolist()]
+        return self._replace(
+            indices=self.indices[rows],
+            values=self.values[rows],
+            points_m=self.points_m[rows],
+            map_yaw=self.map_yaw[rows],
+        )
 
 
 def in_map_frame(batch: Batch, sensor: SensorModel, pose: SensorPose) -> MapDetections:
     """The detections of `batch`, what `sensor` measures of them, seen from `pose`."""
-    detections = list(map(batch.message.objects.__getitem__, batch.indices))
-    values = np.empty((len(detections), len(COMPONENTS)))
+    values = np.empty((len(batch.indices), len(COMPONENTS)))
     values[:, len(MEASURABLE) :] = np.nan
-    if detections:
-        values[:, : len(MEASURABLE)] = list(map(_VALUES, detections))
+    if batch.indices:
+        values[:, : len(MEASURABLE)] = list(map(_VALUES, map(batch.message.objects.__getitem__, batch.indices)))
     values[:, _unmeasured(tuple(sensor.std))] = np.nan
     if batch.message.frame != "map":
         if "yaw_rad" in sensor.std:
@@ -77,13 +87,13 @@ def in_map_frame(batch: Batch, sensor: SensorModel, pose: SensorPose) -> MapDete
         points_m[polar, 0], points_m[polar, 1] = _in_map(
             range_m * np.cos(bearing_rad), range_m * np.sin(bearing_rad), pose
         )
-    none = np.zeros(len(detections), dtype=bool)
-    return MapDetections(np.array(batch.indices, dtype=np.int64), detections, values, points_m, none)
+    none = np.zeros(len(values), dtype=bool)
+    return MapDetections(batch, sensor, pose, np.array(batch.indices, dtype=np.int64), values, points_m, none)
 
 
-def move_back(items: MapDetections, pose: SensorPose, by_m: float) -> None:
-    """Move all positions away from the sensor at `pose` by `by_m`, along the line of sight."""
-    offsets_m = items.points_m - np.array([pose.x_m, pose.y_m])
+def move_back(items: MapDetections, by_m: float) -> None:
+    """Move all positions away from the sensor by `by_m`, along the line of sight."""
+    offsets_m = items.points_m - np.array(items.pose[:2])
     ranges_m = np.hypot(offsets_m[:, 0], offsets_m[:, 1])
     moves_m = by_m * offsets_m / np.maximum(ranges_m, MIN_RANGE_M)[:, None]
     items.points_m[:] += moves_m
@@ -91,27 +101,57 @@ def move_back(items: MapDetections, pose: SensorPose, by_m: float) -> None:
     items.values[:, RANGE] += by_m
 
 
-def take_map_yaw(items: MapDetections, rows: IntArray | slice, yaw_rad: FloatArray) -> None:
+def take_map_yaw(items: MapDetections, rows: IntArray, yaw_rad: FloatArray) -> None:
     """Give those of `rows` that have no yaw that of the map, shape (m,)."""
-    given = items.values[rows, YAW]
-    lack = given != given  # NaN is not equal to itself
-    if False in lack.tolist():
-        rows, yaw_rad = np.arange(len(items.indices))[rows][lack], yaw_rad[lack]
-    items.values[rows, YAW] = yaw_rad
+    lack = np.isnan(items.values[rows, YAW])
+    rows = rows[lack]
+    items.values[rows, YAW] = yaw_rad[lack]
     items.map_yaw[rows] = True
 
 
-def covariances(
-    items: MapDetections, names: tuple[str, ...], frame: Frame, sensor: SensorModel, pose: SensorPose
-) -> FloatArray:
+def merged(items: MapDetections, merge: "Merge") -> MapDetections:
+    """Return `items` with those of one object averaged, in the order of the merge; bearings alone are last.
+
+    Averaged are the components that all have; where none of these gives a position, the leading one stands for all.
+    """
+    placed = items.placed.tolist()
+    groups = merge.groups(items.points_m if len(placed) == len(items.indices) else items.points_m[placed])
+    rows = [placed[leader] for leader in groups]
+    if len(placed) < len(items.indices):
+        rows += np.isnan(items.points_m[:, 0]).nonzero()[0].tolist()
+    if rows == list(range(len(items.indices))) and all(len(members) == 1 for members in groups.values()):
+        return items
+    result, claimed = items.at(np.array(rows, dtype=np.int64)), set(groups)
+    others, averaged = dict[int, tuple[int, ...]](), dict[int, MapDetections]()
+    for row, members in enumerate(groups.values()):
+        if len(members) == 1:
+            continue
+        index = int(result.indices[row])
+        new = [member for member in members if member not in claimed]
+        claimed.update(new)
+        others[index] = tuple(items.indices[[placed[member] for member in new]].tolist())
+        parts = items.at(np.array([placed[member] for member in members]))
+        columns = np.flatnonzero(~np.isnan(parts.values).any(axis=0)).tolist()
+        if X in columns or (RANGE in columns and BEARING in columns):
+            averaged[index] = parts
+            result.values[row] = np.nan
+            result.values[row, columns] = [merge.mean(COMPONENTS[k], parts.values[:, k]) for k in columns]
+            result.points_m[row] = parts.points_m.mean(axis=0)
+            result.map_yaw[row] = parts.map_yaw.any()
+    return result._replace(merged=others, averaged=averaged)
+
+
+def covariances(items: MapDetections, names: tuple[str, ...]) -> FloatArray:
     """Covariances of `names` in the map, shape (m, k, k): a detection's own where it has one, else the sensor's R.
 
-    What the map gave has the sensor's standard deviation for it and is not correlated with the rest.
+    What the map gave has the sensor's standard deviation for it and is not correlated with the rest. The covariance of
+    an average is the mean of those of its detections.
     """
+    sensor, pose = items.sensor, items.pose
     shared = sensor.noise(names)
     R = np.empty((len(items.indices), *shared.shape))
     R[:] = shared
-    offsets_m = items.points_m - np.array([pose.x_m, pose.y_m])
+    offsets_m = items.points_m - np.array(pose[:2])
     more = sensor.growth(names, np.hypot(offsets_m[:, 0], offsets_m[:, 1])) if sensor.std_growth else None
     if more is not None:
         R[:, np.arange(len(names)), np.arange(len(names))] += more
@@ -122,13 +162,15 @@ def covariances(
             carried = [name for name in names if name in detection.measured and name in sensor.std]
             here = [names.index(name) for name in carried]
             R[row][np.ix_(here, here)] = own_covariance(detection, carried)
-    if "x_m" not in names:
-        return R
-    if frame != "map" and carrying:
-        R[carrying] = _turned(R[carrying], np.full(len(carrying), pose.yaw_rad))
-    if not sensor.round and len(carrying) < len(R):
-        rest = np.delete(np.arange(len(R)), carrying)
-        R[rest] = _turned(R[rest], np.arctan2(offsets_m[rest, 1], offsets_m[rest, 0]))
+    if "x_m" in names:
+        if items.batch.message.frame != "map" and carrying:
+            R[carrying] = _turned(R[carrying], np.full(len(carrying), pose.yaw_rad))
+        if not sensor.round and len(carrying) < len(R):
+            rest = np.delete(np.arange(len(R)), carrying)
+            R[rest] = _turned(R[rest], np.arctan2(offsets_m[rest, 1], offsets_m[rest, 0]))
+    for row, index in enumerate(items.indices.tolist() if items.averaged else ()):
+        if index in items.averaged:
+            R[row] = covariances(items.averaged[index], names).mean(axis=0)
     return R
 
 

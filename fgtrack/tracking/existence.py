@@ -224,7 +224,7 @@ class ExistenceLifecycle:
         model = self._sensors[scan.sensor].score
         if model is None or not scan.objects:
             return 0.0
-        places = (matched.candidate.index, *matched.candidate.merged)
+        places = (matched.candidate.leader, *matched.candidate.merged)
         scores = [score for place in places if (score := scan.objects[place].score) is not None]
         return model.log_ratio(max(scores)) if scores else 0.0
 

@@ -1,14 +1,15 @@
 """From the detections of one batch to candidates for association: map frame, on the road, merged."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import replace
 from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
 
 from fgtrack.core.geometry import body_point, body_point_jacobian
+from fgtrack.core.grouping import equal_ones
 from fgtrack.core.linalg import congruence
 from fgtrack.core.types import BoolArray, Disposition, FloatArray, UpdateRecord
 from fgtrack.estimation.base import Measurement
@@ -17,7 +18,6 @@ from fgtrack.models.correlated_errors import split_error
 from fgtrack.models.measurement import (
     COMPONENTS,
     RELATIVE,
-    MeasurementModel,
     SensorPose,
     measured_position,
     measurement_model,
@@ -26,16 +26,14 @@ from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.detections import (
-    BEARING,
     CURVATURE,
-    RANGE,
     YAW,
     MapDetections,
     Merge,
     PoseError,
-    X,
     covariances,
     in_map_frame,
+    merged,
     move_back,
     placement,
     take_map_yaw,
@@ -47,11 +45,10 @@ _FAR_M = 1e6
 _NO_AREAS = ExclusionAreas(())
 
 
-@dataclass(frozen=True, slots=True)
-class Candidate:
+class Candidate(NamedTuple):
     """A detection, or several merged ones, ready for association."""
 
-    index: int
+    leader: int
     """Position, in the message, of the detection that carries the outcome."""
     merged: tuple[int, ...]
     """Positions of the others that were merged into it and have no outcome of their own."""
@@ -60,11 +57,14 @@ class Candidate:
     """Position in the map, shape (2,); None where only a bearing was measured."""
     position_covariance: FloatArray | None
     """Shape (2, 2)."""
-    values: Mapping[str, float]
-    """Measured components by name, in the map frame."""
     pose_error: PoseError | None = None
     """Error of the ego in the measurement; None where it is not considered. `measurement.R` includes it
     as far as the detection alone tells."""
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Measured components by name, in the map frame."""
+        return dict(zip(self.measurement.model.components, self.measurement.z.tolist(), strict=True))
 
     def noise_at(self, x: FloatArray) -> FloatArray:
         """Covariance of the measurement of an object at the states `x` (..., n), (..., k, k) or (k, k) for all."""
@@ -78,28 +78,6 @@ class Candidate:
         if self.pose_error is None or not self.measurement.model.relative:
             return self.measurement
         return replace(self.measurement, R=self.noise_at(x))
-
-
-class _View(NamedTuple):
-    """A batch, and where its sensor saw it from."""
-
-    batch: Batch
-    sensor: SensorModel
-    pose: SensorPose
-    pose_covariance: FloatArray | None
-    """Covariance of the entries of `pose`, shape (5, 5); None where not considered, or of no effect."""
-
-
-class _Group(NamedTuple):
-    """Detections that are one object, as rows of `MapDetections`."""
-
-    leader: int
-    merged: tuple[int, ...]
-    """Detections without an outcome of their own."""
-    parts: tuple[int, ...]
-    """Detections that are averaged."""
-    columns: tuple[int, ...]
-    """Components that are averaged."""
 
 
 class Preprocess:
@@ -128,26 +106,24 @@ class Preprocess:
         `ego` is the pose at the batch's stamp; it may be None for detections in the map frame.
         """
         pose = self._sensor_pose(batch, sensor, ego)
-        view = _View(batch, sensor, pose, _pose_covariance(pose, batch, sensor, ego))
-        items = in_map_frame(batch, sensor, pose)
-        lost = dict[int, str]()
+        items, lost = in_map_frame(batch, sensor, pose), dict[int, str]()
         if sensor.filters:
             names = [sensor.refusing(detection) for detection in items.detections]
             lost = {index: f"filters.{name}" for index, name in zip(batch.indices, names, strict=True) if name}
             items = items.at(np.array([name is None for name in names], dtype=bool)) if lost else items
         if ego is not None and sensor.max_range_m is not None:
-            offsets_m = items.points_m - np.array([pose.x_m, pose.y_m])
+            offsets_m = items.points_m - np.array(pose[:2])
             far = np.hypot(offsets_m[:, 0], offsets_m[:, 1]) > sensor.max_range_m
             items = _without(items, far, "max_range_m", lost)
         if self._excluded.polygons_m:
             items = _without(items, self._excluded.contain(items.points_m), "map.excluded", lost)
         if ego is not None and sensor.near_side_m:
-            move_back(items, pose, sensor.near_side_m)
-        items = self._on_road(items, sensor, lost)
+            move_back(items, sensor.near_side_m)
+        items = merged(self._on_road(items, lost), self._merge)
         records = []
         for index, reason in lost.items():
             records.append(replace(record(batch.message, index, Disposition.OUT_OF_BOUNDS), reason=reason))
-        return self._candidates(items, view), records
+        return self._candidates(items, _pose_covariance(pose, batch, sensor, ego)), records
 
     def _sensor_pose(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> SensorPose:
         """Pose of the frame that the detections are given in, and the velocity of its origin.
@@ -164,156 +140,69 @@ class Preprocess:
         x_m, y_m, vx_mps, vy_mps = body_point(*ego[:5], x_m, y_m)
         return SensorPose(float(x_m), float(y_m), yaw_rad, float(vx_mps), float(vy_mps))
 
-    def _on_road(self, items: MapDetections, sensor: SensorModel, lost: dict[int, str]) -> MapDetections:
+    def _on_road(self, items: MapDetections, lost: dict[int, str]) -> MapDetections:
         """Return the detections inside the bounds, with yaw and curvature of the map; `lost` gets the rest."""
         placed = items.placed
         if not self._road.known or not len(placed):
             return items
-        all_placed = len(placed) == len(items.indices)
-        view = self._road.view(items.points_m if all_placed else items.points_m[placed])
-        if sensor.yaw_from_map_std_rad is not None:
-            take_map_yaw(items, slice(None) if all_placed else placed, view.yaw_rad)
-        if sensor.curvature_from_map_std_radpm is not None:
+        view = self._road.view(items.points_m[placed])
+        if items.sensor.yaw_from_map_std_rad is not None:
+            take_map_yaw(items, placed, view.yaw_rad)
+        if items.sensor.curvature_from_map_std_radpm is not None:
             items.values[placed, CURVATURE] = view.curvature_radpm
-        if not any(view.outside.tolist()):
-            return items
         outside = np.zeros(len(items.indices), dtype=bool)
-        outside[placed[view.outside]] = True
+        outside[placed] = view.outside
         return _without(items, outside, "map.track", lost)
 
-    def _candidates(self, items: MapDetections, view: _View) -> list[Candidate]:
-        placed = items.placed
-        groups = self._merge.groups(items.points_m if len(placed) == len(items.indices) else items.points_m[placed])
-        kinds = items.kinds()
-        found: list[_Group] = []
-        claimed = set(groups)
-        rows = placed.tolist()
-        for leader, members in groups.items():
-            if len(members) == 1:
-                row = rows[leader]
-                found.append(_Group(row, (), (row,), kinds[row]))
-                continue
-            merged = [i for i in members if i not in claimed]
-            claimed.update(merged)
-            parts = tuple(rows[i] for i in members)
-            columns = tuple(column for column in kinds[parts[0]] if all(column in kinds[row] for row in parts))
-            if X not in columns and not {RANGE, BEARING} <= set(columns):  # nothing that all have says where they are
-                parts = (rows[leader],)
-                columns = kinds[rows[leader]]
-            found.append(_Group(rows[leader], tuple(rows[i] for i in merged), parts, columns))
-        if len(placed) < len(items.indices):
-            found += [
-                _Group(row, (), (row,), kinds[row]) for row in np.flatnonzero(np.isnan(items.points_m[:, 0])).tolist()
-            ]
-        return self._finished(items, found, view)
-
-    def _finished(self, items: MapDetections, groups: Sequence[_Group], view: _View) -> list[Candidate]:
-        """The candidates of `groups`; those that measure the same are made together."""
-        map_yaw = items.map_yaw.tolist()
-        alike: dict[tuple[tuple[int, ...], bool], list[int]] = {}
-        for place, group in enumerate(groups):
-            assumed = YAW in group.columns and any(map_yaw[row] for row in group.parts)
-            alike.setdefault((group.columns, assumed), []).append(place)
-        if len(alike) == 1:
-            [(columns, assumed)] = alike
-            return self._alike(items, groups, columns, assumed, view)
+    def _candidates(self, items: MapDetections, pose_covariance: FloatArray | None) -> list[Candidate]:
+        """Candidates of `items` in their order; those that measure the same components are made together."""
+        measured = ~np.isnan(items.values)
+        kinds = list(zip(map(tuple, measured.tolist()), (items.map_yaw & measured[:, YAW]).tolist(), strict=True))
+        if len(set(kinds)) <= 1:
+            return self._alike(items, pose_covariance) if kinds else []
         candidates: dict[int, Candidate] = {}
-        for (columns, assumed), places in alike.items():
-            chosen = [groups[place] for place in places]
-            candidates.update(zip(places, self._alike(items, chosen, columns, assumed, view), strict=True))
-        return [candidates[place] for place in range(len(groups))]
+        for rows in equal_ones(kinds):
+            candidates.update(zip(rows, self._alike(items.at(np.array(rows)), pose_covariance), strict=True))
+        return [candidates[row] for row in range(len(kinds))]
 
-    def _alike(
-        self, items: MapDetections, groups: Sequence[_Group], columns: tuple[int, ...], assumed: bool, view: _View
-    ) -> list[Candidate]:
-        """Candidates that measure the same: one detection each, or the average of several."""
-        names, pose = _names(columns), view.pose
-        z, R, points_m = self._measured(items, groups, columns, view)
-        bearings = math.isnan(points_m[0, 0])  # all or none: what measures the same is placed or not
-        curved = ("curvature_radpm",) if CURVATURE in columns else ()
-        assumes = self._assumed(assumed) + curved
-        models, white = self._models(names, R, view)
-        whole, errors = white, self._pose_errors(names, models[0], points_m, white, assumes, view)
-        if errors is not None:
+    def _alike(self, items: MapDetections, pose_covariance: FloatArray | None) -> list[Candidate]:
+        """Candidates of `items`, which all measure the same components; `pose_covariance` is that of the pose."""
+        batch, sensor, pose, points_m = items.batch, items.sensor, items.pose, items.points_m
+        columns = (items.values[0] == items.values[0]).nonzero()[0]  # NaN is not equal to itself
+        names = _names(tuple(columns.tolist()))
+        assumed = self._assumed(YAW in columns and bool(items.map_yaw[0]))
+        assumed += ("curvature_radpm",) if CURVATURE in columns else ()
+        z, R, model = (
+            items.values.take(columns, axis=1),
+            covariances(items, names),
+            measurement_model(names, self._motion),
+        )
+        models, white = [model] * len(z), R
+        if sensor.correlation is not None:
+            split = [split_error(batch.message.sensor, sensor, model, one, self._motion.state_names) for one in R]
+            models, white = [each for each, _ in split], np.array([noise for _, noise in split])
+        whole, is_placed = white, not math.isnan(points_m[0, 0])  # all or none
+        own: Iterable[PoseError | None] = [None] * len(z)
+        if pose_covariance is not None:
+            G = np.zeros((len(z), len(names), len(pose)))
+            if batch.message.frame != "map":
+                G = placement(names, points_m - np.array(pose[:2]), assumed)
             x = points_m
             if models[0].relative:
-                x = np.zeros((len(groups), self._motion.dim))
-                x[:, :2] = points_m
-                if bearings:
-                    bearings_rad = z[:, names.index("bearing_rad")].tolist()
-                    x[:, :2] = [_far_along(bearing_rad, pose) for bearing_rad in bearings_rad]
-            whole = errors.noise(models[0], pose, x)
-            R = R + (whole - white)
+                x = np.zeros((len(z), self._motion.dim))
+                x[:, :2] = points_m if is_placed else _far_along(z[:, names.index("bearing_rad")], pose)
+            whole = PoseError(pose_covariance, G, white).noise(models[0], pose, x)
+            R, own = R + (whole - white), map(partial(PoseError, pose_covariance), G, white)
         spreads: Iterable[FloatArray | None]
         spreads = R[:, :2, :2] if names[:2] == ("x_m", "y_m") else map(partial(_spread, names, pose), z, R)
-        places: Iterable[FloatArray | None] = [None] * len(groups) if bearings else points_m
-        own: Iterable[PoseError | None] = [None] * len(groups)
-        if errors is not None:
-            own = map(partial(PoseError, errors.covariance), errors.placement, white)
-        stamp_ns, loss, indices = view.batch.stamp_ns, view.sensor.loss, items.indices.tolist()
-        return [
-            Candidate(
-                indices[group.leader],
-                tuple([indices[row] for row in group.merged]) if group.merged else (),
-                Measurement(stamp_ns, model, one, noise, pose, loss, assumes),
-                point_m,
-                spread,
-                dict(zip(names, numbers, strict=True)),
-                error,
-            )
-            for group, model, one, noise, point_m, spread, numbers, error in zip(
-                groups, models, z, whole, places, spreads, z.tolist(), own, strict=True
-            )
-        ]
-
-    def _measured(
-        self, items: MapDetections, groups: Sequence[_Group], columns: tuple[int, ...], view: _View
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Means z (m, k), covariances R (m, k, k) and positions (m, 2) of `groups`, averaged over each."""
-        names, frame, sensor, pose = _names(columns), view.batch.message.frame, view.sensor, view.pose
-        leaders = np.array([group.leader for group in groups])
-        z, points_m = items.values[leaders].take(columns, axis=1), items.points_m[leaders]
-        order = leaders.tolist()
-        every = len(order) == len(items.indices) and order == sorted(order)
-        R = covariances(items if every else items.at(leaders), names, frame, sensor, pose)
-        for place, group in enumerate(groups):
-            if len(group.parts) > 1:
-                parts = items.at(np.array(group.parts))
-                z[place] = [
-                    self._merge.mean(name, parts.values[:, column]) for name, column in zip(names, columns, strict=True)
-                ]
-                R[place] = covariances(parts, names, frame, sensor, pose).mean(axis=0)
-                points_m[place] = parts.points_m.mean(axis=0)
-        return z, R, points_m
-
-    def _models(
-        self, names: tuple[str, ...], R: FloatArray, view: _View
-    ) -> tuple[Sequence[MeasurementModel], FloatArray]:
-        """Measurement models of measurements with the covariances R (m, k, k), and those of the errors that are new."""
-        model = measurement_model(names, self._motion)
-        if view.sensor.correlation is None:
-            return [model] * len(R), R
-        split = [split_error(view.batch.message.sensor, view.sensor, model, one, self._motion.state_names) for one in R]
-        return [each for each, _ in split], np.array([white for _, white in split])
-
-    def _pose_errors(
-        self,
-        names: tuple[str, ...],
-        model: MeasurementModel,
-        points_m: FloatArray,
-        white: FloatArray,
-        assumed: tuple[str, ...],
-        view: _View,
-    ) -> PoseError | None:
-        """Error of the sensor pose in measurements at `points_m` in the map, all stacked."""
-        if view.pose_covariance is None:
-            return None
-        pose = view.pose
-        if view.batch.message.frame == "map":
-            placed = np.zeros((len(white), len(names), len(pose)))
-        else:
-            placed = placement(names, points_m - np.array([pose.x_m, pose.y_m]), assumed)
-        return PoseError(view.pose_covariance, placed, white)
+        positions_m: Iterable[FloatArray | None] = points_m if is_placed else [None] * len(z)
+        candidates, indices = [], items.indices.tolist()
+        for index, each, mean, noise, point_m, spread, error in zip(
+            indices, models, z, whole, positions_m, spreads, own, strict=True
+        ):
+            measurement = Measurement(batch.stamp_ns, each, mean, noise, pose, sensor.loss, assumed)
+            candidates.append(Candidate(index, items.merged.get(index, ()), measurement, point_m, spread, error))
+        return candidates
 
     def _assumed(self, map_yaw: bool) -> tuple[str, ...]:
         """Components that are prior knowledge: a yaw that the map gave."""
@@ -322,7 +211,7 @@ class Preprocess:
 
 def _without(items: MapDetections, outside: BoolArray, reason: str, lost: dict[int, str]) -> MapDetections:
     """`items` without those `outside`, shape (m,), whose indices `lost` gets with the `reason`."""
-    if True not in outside.tolist():
+    if not outside.any():
         return items
     lost |= dict.fromkeys(items.indices[outside].tolist(), reason)
     return items.at(~outside)
@@ -348,7 +237,7 @@ def _pose_covariance(pose: SensorPose, batch: Batch, sensor: SensorModel, ego: E
     return congruence(body_point_jacobian(ego.yaw_rad, arm_m, velocity_mps), ego.covariance)
 
 
-def _far_along(bearing_rad: float, pose: SensorPose) -> tuple[float, float]:
-    """A place in the map so far along a line of sight that the place of the sensor no longer matters."""
-    angle_rad = pose.yaw_rad + bearing_rad
-    return pose.x_m + _FAR_M * math.cos(angle_rad), pose.y_m + _FAR_M * math.sin(angle_rad)
+def _far_along(bearings_rad: FloatArray, pose: SensorPose) -> list[tuple[float, float]]:
+    """Points so far along lines of sight (m,) that the position of the sensor no longer matters."""
+    angles_rad = [pose.yaw_rad + bearing_rad for bearing_rad in bearings_rad.tolist()]
+    return [(pose.x_m + _FAR_M * math.cos(angle), pose.y_m + _FAR_M * math.sin(angle)) for angle in angles_rad]

@@ -197,7 +197,7 @@ class Tracker:
         objects = batch.message.objects
         names = []
         for candidate in candidates:
-            names.append(objects[candidate.index].class_name)
+            names.append(objects[candidate.leader].class_name)
         return self._parts.association(candidates, states, self._parts.objects.apart(names, states.track_ids))
 
     def _unclaimed(
@@ -321,7 +321,7 @@ class Tracker:
         self._conclude(batch, candidate, Disposition.BIRTH, track_id)
 
     def _describe(self, batch: Batch, candidate: Candidate, track_id: int) -> None:
-        indices = candidate.index, *candidate.merged
+        indices = candidate.leader, *candidate.merged
         self._parts.objects.learn(track_id, map(batch.message.objects.__getitem__, indices))
 
     def _conclude(
@@ -339,7 +339,7 @@ class Tracker:
             innovation = dict(zip(measurement.model.components, result.innovation.tolist(), strict=True))
             for name in measurement.assumed:
                 innovation.pop(name, None)
-        self._records.append(record(batch.message, candidate.index, disposition, track_id, nis, innovation))
+        self._records.append(record(batch.message, candidate.leader, disposition, track_id, nis, innovation))
         for index in candidate.merged:
             self._records.append(record(batch.message, index, Disposition.MERGED, track_id))
 

@@ -38,14 +38,14 @@ def candidate(x_m: float, y_m: float, variance_m2: float = 0.09) -> Candidate:
     R = variance_m2 * np.eye(2)
     position = np.array([x_m, y_m])
     measurement = Measurement(START_NS, measurement_model(("x_m", "y_m"), CTRV()), position, R)
-    return Candidate(0, (), measurement, position, R, {"x_m": x_m, "y_m": y_m})
+    return Candidate(0, (), measurement, position, R)
 
 
 def bearing(bearing_rad: float, pose: SensorPose, std_rad: float = 0.02) -> Candidate:
     """A line of sight."""
     model = measurement_model(("bearing_rad",), CTRV())
     measurement = Measurement(START_NS, model, np.array([bearing_rad]), np.array([[std_rad**2]]), pose)
-    return Candidate(0, (), measurement, None, None, {"bearing_rad": bearing_rad})
+    return Candidate(0, (), measurement, None, None)
 
 
 def states(positions_m: Sequence[tuple[float, float]], variance_m2: float = 0.09) -> StatesAt:

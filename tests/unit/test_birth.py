@@ -27,7 +27,7 @@ def seen(**values: float) -> Candidate:
     R[:2, :2] = POSITION_COVARIANCE
     z = np.array(list(components.values()))
     measurement = Measurement(START_NS, measurement_model(tuple(components), CTRV()), z, R)
-    return Candidate(0, (), measurement, z[:2], R[:2, :2], components)
+    return Candidate(0, (), measurement, z[:2], R[:2, :2])
 
 
 @pytest.mark.parametrize("birth", [FixedBirth, MeasuredBirth])

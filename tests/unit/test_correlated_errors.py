@@ -166,7 +166,7 @@ def test_the_tracker_gives_a_new_track_the_error_of_its_detection() -> None:
         "lidar", sensor, measurement_model(("x_m", "y_m"), motion), np.eye(2), motion.state_names
     )
     z = np.array([3.0, 4.0])
-    candidate = Candidate(0, (), Measurement(0, model, z, white), z, np.eye(2), {"x_m": 3.0, "y_m": 4.0})
+    candidate = Candidate(0, (), Measurement(0, model, z, white), z, np.eye(2))
     measured = MeasuredBirth().prior(candidate, OpenSpace(), None, ego_in_pit=False)
     assert measured is not None
     assert measured.position_cross["lidar.x_m"] == pytest.approx((-(0.9**0.5), 0.0))

@@ -136,7 +136,7 @@ def test_a_position_on_an_endless_line_proves_nothing(angle_rad: float) -> None:
     life = lifecycle()
     life.born(0, scan(), MatchedDetection(HERE))
     along = np.array([math.cos(angle_rad), math.sin(angle_rad)])
-    far = replace(candidate(10.0, 0.0), position_covariance=1e18 * np.outer(along, along) + 0.01 * np.eye(2))
+    far = candidate(10.0, 0.0)._replace(position_covariance=1e18 * np.outer(along, along) + 0.01 * np.eye(2))
     life.matched(0, scan(at_ms=20.0), MatchedDetection(far, MEAN, P))
     assert 0.0 < probability(life, 20.0) < 0.2001
 

@@ -152,7 +152,7 @@ def test_a_bearing_alone_has_no_place() -> None:
     [placed, bearing] = candidates(
         Detection(bearing_rad=0.2), Detection(range_m=9.0, bearing_rad=0.2), sensor=POLAR, road=StraightRoad()
     )
-    assert (placed.index, bearing.index) == (1, 0)  # placed ones first
+    assert (placed.leader, bearing.leader) == (1, 0)  # placed ones first
     assert (bearing.position_m, bearing.position_covariance) == (None, None)
     assert bearing.measurement.model.components == ("bearing_rad",)
 
@@ -181,7 +181,7 @@ def test_detections_off_the_road_are_recorded_and_dropped_before_the_merge() -> 
         (2, Disposition.OUT_OF_BOUNDS),
     ]
     [merged] = found
-    assert (merged.index, merged.merged) == (1, (3,))
+    assert (merged.leader, merged.merged) == (1, (3,))
     assert merged.position_m == pytest.approx([1.0, 3.5])
 
 
@@ -189,7 +189,7 @@ def test_detections_beyond_the_range_of_the_sensor_are_recorded_and_dropped() ->
     step = Preprocess(OpenSpace(), NoMerge(), CTRV(), ORIGIN_M)
     items = [Detection(x_m=29.9, y_m=0.0), Detection(x_m=30.1, y_m=0.0)]
     found, records = step(batch(*items), replace(POINTS, max_range_m=30.0), EGO)
-    assert [item.index for item in found] == [0]
+    assert [item.leader for item in found] == [0]
     assert [(record.index, record.disposition) for record in records] == [(1, Disposition.OUT_OF_BOUNDS)]
 
 
@@ -215,7 +215,7 @@ def test_every_detection_leads_or_is_merged_into_exactly_one_candidate(merge: Me
     points = np.random.default_rng(seed).uniform(0.0, 15.0, size=(count, 2)).round(1)
     items = [Detection(x_m=x, y_m=y, yaw_rad=0.0) for x, y in points.tolist()]
     found = candidates(*items, merge=merge, frame="map")
-    indices = [i for item in found for i in (item.index, *item.merged)]
+    indices = [i for item in found for i in (item.leader, *item.merged)]
     assert sorted(indices) == list(range(count))
 
 
@@ -248,7 +248,7 @@ def test_detections_that_say_in_different_ways_where_they_are_merge_into_the_fir
     both = SensorModel(std={"x_m": 0.3, "y_m": 0.3, "range_m": 0.5, "bearing_rad": 0.02})
     items = (Detection(range_m=20.0, bearing_rad=0.0), Detection(x_m=20.0, y_m=0.5, bearing_rad=0.0))
     [found] = candidates(*items, sensor=both, merge=merge)
-    assert (found.index, found.merged) == (0, (1,))
+    assert (found.leader, found.merged) == (0, (1,))
     assert found.values == {"range_m": 20.0, "bearing_rad": 0.0}
 
 
