@@ -193,7 +193,7 @@ def sightings_of(
                 continue
             placed = None if ego is None else EgoPose(pose[0], pose[1], pose[2], 0.0)
             for one in preprocess(batch, sensors[message.sensor], placed)[0]:
-                key = message.sensor, own_ns[one.leader], message.receipt_ns, one.index
+                key = message.sensor, own_ns[one.leader], message.receipt_ns, one.leader
                 if key in tracks and one.position_m is not None:
                     in_map = ego is None or message.frame == "map"
                     z_m = one.position_m if in_map else (one.position_m - pose[:2]) @ rotations(pose[2])

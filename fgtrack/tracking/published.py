@@ -13,10 +13,9 @@ from fgtrack.core.types import DetectionList, Disposition, EgoState, FloatArray,
 from fgtrack.estimation.base import StatesAt
 from fgtrack.estimation.filters.published import published_yaw
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.association import Assignment, assigned_densely
+from fgtrack.tracking.association import Assignment, assigned_densely, euclidean_distances
 from fgtrack.tracking.detections import Merge
 from fgtrack.tracking.ego import EgoPose, EgoSource, EgoStd
-from fgtrack.tracking.gating import euclidean_distances
 from fgtrack.tracking.inbox import Batch, is_covariance, record, records
 from fgtrack.tracking.lifecycle import CountingLifecycle, Life, MatchedDetection, Scan
 from fgtrack.tracking.objects import Apart

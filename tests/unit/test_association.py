@@ -10,8 +10,7 @@ from support.tracking import bearing, candidate, states
 
 from fgtrack.core.types import BoolArray, IntArray
 from fgtrack.models.measurement import SensorPose
-from fgtrack.tracking.association import Assignment, Association, GatedEuclidean, GatedMahalanobis
-from fgtrack.tracking.gating import euclidean_distances
+from fgtrack.tracking.association import Assignment, Association, GatedEuclidean, GatedMahalanobis, euclidean_distances
 from fgtrack.tracking.published import UngatedEuclidean
 
 ALL = [GatedEuclidean(), GatedEuclidean(max_nis=20.0), GatedMahalanobis(), UngatedEuclidean()]

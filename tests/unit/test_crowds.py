@@ -10,9 +10,16 @@ from support.tracking import bearing, candidate, states
 from fgtrack.core.types import FloatArray
 from fgtrack.models.measurement import SensorPose
 from fgtrack.tracking import association as associations
-from fgtrack.tracking import gating
-from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis, assigned, assigned_densely
-from fgtrack.tracking.gating import Pairs, euclidean_distances, grouped, innovations
+from fgtrack.tracking.association import (
+    GatedEuclidean,
+    GatedMahalanobis,
+    Pairs,
+    assigned,
+    assigned_densely,
+    euclidean_distances,
+    grouped,
+    innovations,
+)
 from fgtrack.tracking.preprocess import Candidate
 
 MB = 1e6
@@ -32,8 +39,8 @@ def peak_bytes(call: Callable[[], object]) -> int:
 @pytest.fixture
 def sparse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small problems are solved as large ones are."""
-    monkeypatch.setattr(gating, "_DENSE", -1)
-    monkeypatch.setattr(associations, "_DENSE", -1)
+    monkeypatch.setattr(associations, "_DENSE_DISTANCES", -1)
+    monkeypatch.setattr(associations, "_DENSE_COSTS", -1)
 
 
 # --- assignment
