@@ -132,19 +132,27 @@ def _calibration(file: Path) -> Calibration:
     return Calibration(projection, rectified_from_camera @ camera_from_velodyne @ velodyne_from_imu)
 
 
-def read_views(file: Path, calibration_file: Path) -> list[View]:
-    """Ego at every frame of the `oxts` file; raises `DataError` where the files are not those of the data set."""
+def read_views(file: Path, calibration_file: Path) -> Iterator[View]:
+    """Ego at every frame of the `oxts` file; raises `DataError` at a line that is not one of the data set."""
     calibration = _calibration(calibration_file)
-    rows = list(parsed(file, lambda fields: [float(fields[index]) for index in (0, 1, 3, 4, 5, 8, 14, 22)]))
     views: list[View] = []
-    for latitude_deg, longitude_deg, roll_rad, pitch_rad, yaw_rad, speed_mps, accel_mps2, yaw_rate_radps in rows:
-        scale = math.cos(math.radians(rows[0][0]))
-        origin_m = _mercator(rows[0][0], rows[0][1], scale)
+    scale, origin_m = 1.0, np.zeros(2)
+
+    def view(fields: list[str]) -> View:
+        nonlocal scale, origin_m
+        latitude_deg, longitude_deg, roll_rad, pitch_rad, yaw_rad, speed_mps, accel_mps2, yaw_rate_radps = (
+            float(fields[index]) for index in (0, 1, 3, 4, 5, 8, 14, 22)
+        )
+        if not views:
+            scale = math.cos(math.radians(latitude_deg))
+            origin_m = _mercator(latitude_deg, longitude_deg, scale)
         x_m, y_m = (_mercator(latitude_deg, longitude_deg, scale) - origin_m).tolist()
         stamp_ns = len(views) * PERIOD_NS
         ego = EgoState(stamp_ns, stamp_ns, x_m, y_m, wrap_angle(yaw_rad), speed_mps, yaw_rate_radps, accel_mps2)
         views.append(View(ego, _levelling(roll_rad, pitch_rad), calibration))
-    return views
+        return views[-1]
+
+    return parsed(file, view)
 
 
 def _mercator(latitude_deg: float, longitude_deg: float, scale: float) -> FloatArray:
