@@ -23,7 +23,7 @@ _HOMES = {
     "EgoState": "fgtrack.core.types",
     "Estimator": "fgtrack.estimation.base",
     "FgtrackError": "fgtrack.core.errors",
-    "Lateness": "fgtrack.pipeline.latencies",
+    "Lateness": "fgtrack.pipeline.live",
     "Measurement": "fgtrack.estimation.base",
     "MeasurementModel": "fgtrack.models.measurement",
     "Message": "fgtrack.core.types",
@@ -40,7 +40,7 @@ _HOMES = {
     "Study": "fgtrack.calibration.study",
     "Tables": "fgtrack.evaluation.tables",
     "TickReport": "fgtrack.core.types",
-    "TickTiming": "fgtrack.pipeline.latencies",
+    "TickTiming": "fgtrack.pipeline.live",
     "TrackBank": "fgtrack.estimation.base",
     "TrackOutput": "fgtrack.pipeline.live",
     "TrackReport": "fgtrack.core.types",
@@ -130,8 +130,8 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.models.sensors import SensorModel as SensorModel
     from fgtrack.pipeline import config as config
     from fgtrack.pipeline.config import Config as Config
-    from fgtrack.pipeline.latencies import Lateness as Lateness
-    from fgtrack.pipeline.latencies import TickTiming as TickTiming
+    from fgtrack.pipeline.live import Lateness as Lateness
+    from fgtrack.pipeline.live import TickTiming as TickTiming
     from fgtrack.pipeline.live import Tracker as Tracker
     from fgtrack.pipeline.live import TrackOutput as TrackOutput
     from fgtrack.pipeline.live import TracksAt as TracksAt

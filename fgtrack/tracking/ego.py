@@ -3,7 +3,6 @@
 import bisect
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import fields
 from functools import lru_cache
 from operator import attrgetter
@@ -25,7 +24,7 @@ LARGEST_STEP_BACK_S = 1.0
 _LARGEST_STEP_BACK_NS = nanoseconds(LARGEST_STEP_BACK_S)
 
 CONTRADICTS = "contradicts its neighbours"
-_LONGEST_S, _SLACK_M, _SHARE, _SIGMAS = 1.0, 2.0, 0.5, 3.0  # see `Continuity`
+_LONGEST_S, _SLACK_M, _SHARE, _SIGMAS = 1.0, 2.0, 0.5, 3.0  # see `EgoTrajectory`
 _STRAIGHT_RAD = 1e-6  # half of a turn below which chord and arc are the same
 
 _FIELDS = [field.name for field in fields(EgoState)]
@@ -112,41 +111,6 @@ def is_ego_covariance(given: tuple[float, ...]) -> bool:
     return bool(symmetric and np.linalg.eigvalsh(symmetrise(correlation))[0] >= -ASYMMETRY)
 
 
-class Continuity:
-    """Holds back a state that contradicts the one before it, until the next one tells which of the two is wrong.
-
-    Two states at most 1 s apart contradict each other where the way between them differs from that at their speeds by
-    more than the sum of half of it, 2 m, and three standard deviations of their positions. A single state that
-    contradicts both neighbours is left out; where the states go on from it, the ego has jumped, and is followed. States
-    that never fit, of an ego that does not know its speed, are all taken.
-    """
-
-    def __init__(self) -> None:
-        self.jumps = 0
-        """Places at which states went on elsewhere."""
-        self._last: EgoState | None = None
-        self._pending: EgoState | None = None
-        self._consistent = False  # the last two states
-
-    def accepted(self, ego: EgoState) -> tuple[Sequence[EgoState], str | None]:
-        """Return the states to take now, in their order, and the reason if the one held back is left out."""
-        last, held = self._last, self._pending
-        self._pending = None
-        if last is None or _consistent(last, ego):
-            self._consistent = last is not None
-            self._last = ego
-            return (ego,), None if held is None else CONTRADICTS
-        if held is None and self._consistent:
-            self._pending = ego
-            return (), None
-        self._last = ego
-        if held is None:
-            return (ego,), None
-        self._consistent = _consistent(held, ego)
-        self.jumps += self._consistent
-        return (held, ego), None
-
-
 def _consistent(before: EgoState, after: EgoState) -> bool:
     dt_s = seconds(after.stamp_ns - before.stamp_ns)
     if abs(dt_s) > _LONGEST_S:
@@ -181,9 +145,10 @@ class EgoSource(ABC):
         self._max_future_ns = nanoseconds(max_future_s)
         self._newest_ns: int | None = None
         self._straight = False
-        self._continuity: Continuity | None = None
         self.current: EgoState | None = None
         """Newest known state."""
+        self.jumps = 0
+        """Number of times that the states went on from another position."""
         self.in_pit = False
         """True if the ego was last reported in the pit lane."""
         self._yaw_weight = yaw_weight
@@ -203,21 +168,11 @@ class EgoSource(ABC):
         if newest_ns - ego.stamp_ns > _LARGEST_STEP_BACK_NS:
             return "stamp jumps back"
         self._newest_ns = max(newest_ns, ego.stamp_ns)
-        if self._continuity is None:
-            return self._store(ego)
-        taken, reason = self._continuity.accepted(ego)
-        for state in taken:
-            reason = self._store(state) or reason
-        return reason
-
-    @property
-    def jumps(self) -> int:
-        """Places at which the ego went on elsewhere, see `Continuity`."""
-        return 0 if self._continuity is None else self._continuity.jumps
+        return self._store(ego)
 
     @abstractmethod
     def _store(self, ego: EgoState) -> str | None:
-        """Take a state; the reason, where it is refused."""
+        """Take a state; the reason, where it is refused, or one that was held back."""
 
     @abstractmethod
     def start_tick(self) -> None:
@@ -246,6 +201,12 @@ class EgoTrajectory(EgoSource):
     """Low-passed ego states, each filtered once, and interpolated between their stamps.
 
     The low-pass pulls towards the previous state *extrapolated to the new stamp*, so a steady turn is not delayed.
+
+    A state that contradicts the one before it is held back until the next one tells which of the two is wrong. Two
+    states at most 1 s apart contradict each other where the way between them differs from that at their speeds by more
+    than the sum of half of it, 2 m, and three standard deviations of their positions. A single state that contradicts
+    both neighbours is left out; where the states go on from it, the ego has jumped, and is followed. States that never
+    fit, of an ego that does not know its speed, are all taken.
     """
 
     def __init__(
@@ -258,14 +219,33 @@ class EgoTrajectory(EgoSource):
         max_future_s: float = 1.0,
     ) -> None:
         super().__init__(yaw_weight, yaw_rate_weight, std, max_future_s)
-        self._continuity = Continuity()
+        self._last: EgoState | None = None
+        self._held: EgoState | None = None
+        self._fits = False  # the last two states are consistent
         self._memory_ns = nanoseconds(memory_s)
         self._max_extrapolation_ns = nanoseconds(max_extrapolation_s)
         self._states: list[EgoState] = []
         self._stamps: list[int] = []
 
     def _store(self, ego: EgoState) -> str | None:
-        """See `EgoSource._store`; a late state is put in its place, unfiltered."""
+        """See `EgoSource._store`."""
+        last, held, self._held = self._last, self._held, None
+        if last is None or _consistent(last, ego):
+            self._fits, self._last = last is not None, ego
+            return self._insert(ego) or (None if held is None else CONTRADICTS)
+        if held is None and self._fits:
+            self._held = ego
+            return None
+        self._last = ego
+        if held is None:
+            return self._insert(ego)
+        self._fits = _consistent(held, ego)
+        self.jumps += self._fits
+        reason = self._insert(held)
+        return self._insert(ego) or reason
+
+    def _insert(self, ego: EgoState) -> str | None:
+        """Insert a state by its stamp, a late one unfiltered; the reason, where it is refused."""
         place = bisect.bisect_left(self._stamps, ego.stamp_ns)
         if place < len(self._stamps) and self._stamps[place] == ego.stamp_ns:
             return "repeated stamp"

@@ -92,7 +92,7 @@ class Tracker:
 
     @property
     def ego_jumps(self) -> int:
-        """Number of jumps in the ego's states, see `Continuity`."""
+        """Number of jumps in the ego's states, see `EgoTrajectory`."""
         return self._parts.ego.jumps
 
     def receive(self, message: EgoState | DetectionList) -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from fgtrack.core.types import EgoState
-from fgtrack.tracking.ego import CONTRADICTS, Continuity, EgoTrajectory
+from fgtrack.tracking.ego import CONTRADICTS, EgoTrajectory
 
 MS = 1_000_000
 SPEED_MPS = 60.0
@@ -22,14 +22,23 @@ def moved(ego: EgoState, by_ms: float) -> EgoState:
     return replace(ego, stamp_ns=ego.stamp_ns + round(by_ms * MS))
 
 
+class Recorded(EgoTrajectory):
+    """A trajectory that keeps the states it takes, in their order."""
+
+    def __init__(self) -> None:
+        super().__init__(1.0, 1.0, 10.0, 1.0)
+        self.taken: list[EgoState] = []
+
+    def _insert(self, ego: EgoState) -> str | None:
+        self.taken.append(ego)
+        return super()._insert(ego)
+
+
 def judged(states: list[EgoState]) -> tuple[list[EgoState], int, int]:
-    """What is taken, how many are left out, how many jumps there are."""
-    continuity, taken, left_out = Continuity(), list[EgoState](), 0
-    for ego in states:
-        found, reason = continuity.accepted(ego)
-        taken += found
-        left_out += reason == CONTRADICTS
-    return taken, left_out, continuity.jumps
+    """States taken, number of those left out, number of jumps."""
+    trajectory = Recorded()
+    left_out = [trajectory.receive(ego) for ego in states].count(CONTRADICTS)
+    return trajectory.taken, left_out, trajectory.jumps
 
 
 @pytest.mark.parametrize("by_ms", [900.0, 500.0, 100.0, -100.0, -900.0])

@@ -16,8 +16,7 @@ from fgtrack.estimation.failures import Failures
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.latencies import TickTiming
-from fgtrack.pipeline.live import EGO, Tracker
+from fgtrack.pipeline.live import EGO, TickTiming, Tracker
 from fgtrack.pipeline.shipped import read_config
 
 MS = 1_000_000
