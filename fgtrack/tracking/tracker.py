@@ -21,7 +21,7 @@ from fgtrack.core.types import (
     TrackState,
     UpdateRecord,
 )
-from fgtrack.estimation.base import Start, StatesAt, TrackBank, UpdateResult, no_states
+from fgtrack.estimation.base import Start, StatesAt, TrackBank, UpdateResult, UpdateStatus, no_states
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.ekf import correct_one, propagated
 from fgtrack.estimation.object_bank import states_of
@@ -37,6 +37,8 @@ from fgtrack.tracking.inbox import Batch, Inbox, record
 from fgtrack.tracking.lifecycle import Lifecycle, MatchedDetection, Scan
 from fgtrack.tracking.objects import Objects
 from fgtrack.tracking.preprocess import Candidate, Preprocess
+
+_DISPOSITIONS = {status: Disposition(status.value) for status in UpdateStatus}
 
 
 @dataclass(frozen=True)
@@ -169,12 +171,13 @@ class Tracker:
     def _process(self, batch: Batch) -> None:
         """One object list, at its own stamp: transform, filter, merge, associate, age, estimate, give birth."""
         parts = self._parts
-        sensor = parts.sensors[batch.message.sensor]
-        ego = parts.ego.pose_at(batch.stamp_ns, parts.bank.present_ns)
-        if ego is None and batch.message.frame != "map":
-            self._records += [record(batch.message, index, Disposition.FAILED) for index in batch.indices]
+        message, present_ns = batch.message, parts.bank.present_ns
+        ego = parts.ego.pose_at(batch.stamp_ns, present_ns)
+        if ego is None and message.frame != "map":
+            self._records += [record(message, index, Disposition.FAILED) for index in batch.indices]
             return
-        candidates, out_of_bounds = parts.preprocess(batch, sensor, ego)
+        scan = Scan(message.sensor, batch.stamp_ns, present_ns, ego, message.objects)
+        candidates, out_of_bounds = parts.preprocess(batch, parts.sensors[message.sensor], ego)
         self._records += out_of_bounds
         if self._is_too_old(batch):
             for candidate in candidates:
@@ -182,7 +185,7 @@ class Tracker:
             return
         states = self._offered(batch)
         assignment = self._assigned(batch, candidates, states)
-        self._count(batch, candidates, assignment, states, ego)
+        self._count(batch, candidates, assignment, states, scan)
         self._estimate(batch, candidates, assignment, states)
         for position in assignment.refused:
             self._conclude(batch, candidates[position], Disposition.GATED)
@@ -190,7 +193,7 @@ class Tracker:
         if new and parts.suppress_births_near_newer_tracks:
             new = self._unclaimed(batch, candidates, new, states)
         for position in new:
-            self._give_birth(batch, candidates[position], sensor, ego)
+            self._give_birth(batch, candidates[position], scan)
 
     def _assigned(self, batch: Batch, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
         """Return the assignment of candidates to tracks of the same class."""
@@ -247,7 +250,7 @@ class Tracker:
         candidates: Sequence[Candidate],
         assignment: Assignment,
         states: StatesAt,
-        ego: EgoPose | None,
+        scan: Scan,
     ) -> None:
         """Lives of matched and missed tracks, where it is positions that are seen; tracks that run out end here.
 
@@ -255,7 +258,6 @@ class Tracker:
         """
         lifecycle = self._parts.lifecycle
         seen = self._seen.setdefault(id(batch.message), set())
-        scan = self._scan(batch, ego)
         for position, track in assignment.pairs:
             candidate, track_id = candidates[position], states.track_ids[track]
             seen.add(track_id)
@@ -267,42 +269,35 @@ class Tracker:
         if not assignment.missed or not batch.last or not (sensor.gives_position and sensor.scan):
             return
         rows = [track for track in assignment.missed if states.track_ids[track] not in seen]
-        if not rows:
-            return
-        missed = [states.track_ids[track] for track in rows]
-        positions_m = states.means[rows, :2]
-        self._end(lifecycle.missed(scan, missed, positions_m, self._ranges_m(missed, positions_m, ego)))
-
-    def _scan(self, batch: Batch, ego: EgoPose | None) -> Scan:
-        return Scan(batch.message.sensor, batch.stamp_ns, self._parts.bank.present_ns, ego, batch.message.objects)
+        if rows:
+            missed, positions_m = [states.track_ids[track] for track in rows], states.means[rows, :2]
+            self._end(lifecycle.missed(scan, missed, positions_m, self._ranges_m(missed, positions_m, scan.ego)))
 
     def _estimate(
         self, batch: Batch, candidates: Sequence[Candidate], assignment: Assignment, states: StatesAt
     ) -> None:
         if not assignment.pairs:
             return
-        matched, track_ids, measurements, rows = [], [], [], []
+        track_ids, measurements = [], []
         for position, track in assignment.pairs:
-            matched.append(candidates[position])
-            rows.append(track)
             track_ids.append(states.track_ids[track])
             measurements.append(candidates[position].measurement_at(states.means[track]))
         results = self._parts.bank.update(batch.stamp_ns, track_ids, measurements)
-        for k, (candidate, track_id, result) in enumerate(zip(matched, track_ids, results, strict=True)):
+        for (position, track), measurement, result in zip(assignment.pairs, measurements, results, strict=True):
+            candidate, track_id = candidates[position], states.track_ids[track]
             if result.innovation is not None:
                 self._parts.lifecycle.fused(track_id, candidate.position_m is not None)
                 if candidate.position_m is not None and self._undirected.pop(track_id, None) is not None:
                     # The prior of the estimator, linearised along an unknown direction, spreads along it alone.
-                    expected = states.means[rows[k]], states.covariances[rows[k]]
+                    seen = measurement.seen_by(self._parts.motion)
                     with suppress(np.linalg.LinAlgError):
-                        nis = correct_one(*expected, measurements[k].seen_by(self._parts.motion)).nis
+                        nis = correct_one(states.means[track], states.covariances[track], seen).nis
                         result = replace(result, nis=nis)
-            self._conclude(batch, candidate, Disposition(result.status.value), track_id, result)
+            self._conclude(batch, candidate, _DISPOSITIONS[result.status], track_id, result)
 
-    def _give_birth(self, batch: Batch, candidate: Candidate, sensor: SensorModel, ego: EgoPose | None) -> None:
-        parts = self._parts
-        prior = None
-        if sensor.births:
+    def _give_birth(self, batch: Batch, candidate: Candidate, scan: Scan) -> None:
+        parts, prior = self._parts, None
+        if parts.sensors[scan.sensor].births:
             prior = parts.birth.prior(candidate, parts.road, parts.ego.current, parts.ego.in_pit)
         if prior is None:
             self._conclude(batch, candidate, Disposition.GATED)
@@ -316,7 +311,7 @@ class Tracker:
         if prior.yaw_rad is None and not parts.motion.cartesian:
             self._undirected[track_id] = prior
         self._seen.setdefault(id(batch.message), set()).add(track_id)
-        parts.lifecycle.born(track_id, self._scan(batch, ego), MatchedDetection(candidate))
+        parts.lifecycle.born(track_id, scan, MatchedDetection(candidate))
         self._describe(batch, candidate, track_id)
         self._conclude(batch, candidate, Disposition.BIRTH, track_id)
 
