@@ -116,10 +116,10 @@ def merged(items: MapDetections, merge: "Merge") -> MapDetections:
     """
     placed = items.placed.tolist()
     groups = merge.groups(items.points_m if len(placed) == len(items.indices) else items.points_m[placed])
-    rows = [placed[leader] for leader in groups]
+    rows = list(map(placed.__getitem__, groups))
     if len(placed) < len(items.indices):
         rows += np.isnan(items.points_m[:, 0]).nonzero()[0].tolist()
-    if rows == list(range(len(items.indices))) and all(len(members) == 1 for members in groups.values()):
+    if rows == list(range(len(items.indices))) and max(map(len, groups.values()), default=1) == 1:
         return items
     result, claimed = items.at(np.array(rows, dtype=np.int64)), set(groups)
     others, averaged = dict[int, tuple[int, ...]](), dict[int, MapDetections]()

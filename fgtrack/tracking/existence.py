@@ -81,7 +81,6 @@ class Existence:
     """Logarithm of the factor by which each evidence changes the odds; of the first the log-odds themselves."""
     log_odds: list[float] = field(default_factory=list)
     """After each evidence."""
-    num_measured: int = 1
     in_view_ns: int = 0
     """Stamp of the newest list that could have shown it."""
     misses: int = 0
@@ -169,9 +168,8 @@ class ExistenceLifecycle:
         life.learn(scan.stamp_ns, math.log(1.0 - seen + seen * ratio))
         self._judge(life)
 
-    def fused(self, track_id: int, placed: bool = True) -> None:
-        """See `Lifecycle.fused`."""
-        self.lives[track_id].num_measured += 1
+    def fused(self, track_id: int) -> None:
+        """See `Lifecycle.fused`; the match has counted already."""
 
     def missed(self, scan: Scan, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
         """See `Lifecycle.missed`."""
@@ -205,10 +203,6 @@ class ExistenceLifecycle:
         if not life.confirmed or life.probability(self._present_ns) < self._rules.doubt_probability:
             return TrackStatus.TENTATIVE
         return TrackStatus.COASTING if life.misses else TrackStatus.CONFIRMED
-
-    def num_measured(self, track_id: int) -> int:
-        """See `Lifecycle.num_measured`."""
-        return self.lives[track_id].num_measured
 
     def _judge(self, life: Existence) -> None:
         believed = life.travelled and life.probability(self._present_ns) >= self._rules.confirm_probability

@@ -120,11 +120,14 @@ def stamps(message: DetectionList, sensor: SensorModel) -> list[int]:
     """Stamp of every detection of `message`: the list's, its own, or the mean of those that have one."""
     if sensor.stamp_from not in ("object", "objects_mean"):
         return [message.stamp_ns] * len(message.objects)
-    own = [detection.stamp_ns for detection in message.objects]
-    known = [stamp_ns for stamp_ns in own if stamp_ns is not None]
+    result, known = [], []
+    for detection in message.objects:
+        if detection.stamp_ns is not None:
+            known.append(detection.stamp_ns)
+        result.append(message.stamp_ns if detection.stamp_ns is None else detection.stamp_ns)
     if sensor.stamp_from == "objects_mean" and known:
-        return [sum(known) // len(known)] * len(own)
-    return [message.stamp_ns if stamp_ns is None or sensor.stamp_from != "object" else stamp_ns for stamp_ns in own]
+        return [sum(known) // len(known)] * len(result)
+    return result
 
 
 _values = attrgetter(*(each.name for each in fields(Detection)))

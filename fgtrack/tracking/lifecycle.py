@@ -45,8 +45,8 @@ class Lifecycle(Protocol):
     def matched(self, track_id: int, scan: Scan, matched: MatchedDetection) -> None:
         """A detection was associated."""
 
-    def fused(self, track_id: int, placed: bool = True) -> None:
-        """The associated detection, which is `placed` where it gives a position, changed the state."""
+    def fused(self, track_id: int) -> None:
+        """The associated detection, which gives a position, changed the state."""
 
     def missed(self, scan: Scan, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
         """Return the ids that end of tracks, at `positions_m` (n, 2) and so far from the ego, that a list misses."""
@@ -60,9 +60,6 @@ class Lifecycle(Protocol):
     def status(self, track_id: int) -> TrackStatus:
         """Status of the track."""
 
-    def num_measured(self, track_id: int) -> int:
-        """Number of detections that have changed its state, the first one included."""
-
 
 @dataclass(slots=True)
 class Life:
@@ -70,9 +67,8 @@ class Life:
 
     counter: int
     last_seen_ns: int
-    num_measured: int = 1
     num_placed: int = 1
-    """Measurements that give a position."""
+    """Measurements of its position that have changed its state, the first one included."""
     misses: int = 0
     """Misses since the last match."""
 
@@ -121,10 +117,9 @@ class CountingLifecycle:
         life.last_seen_ns = max(life.last_seen_ns, scan.stamp_ns)
         life.misses = 0
 
-    def fused(self, track_id: int, placed: bool = True) -> None:
+    def fused(self, track_id: int) -> None:
         """See `Lifecycle.fused`."""
-        self.lives[track_id].num_measured += 1
-        self.lives[track_id].num_placed += placed
+        self.lives[track_id].num_placed += 1
 
     def missed(self, scan: Scan, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
         """See `Lifecycle.missed`."""
@@ -161,7 +156,3 @@ class CountingLifecycle:
         if life.num_placed < self._rules.confirm_count:
             return TrackStatus.TENTATIVE
         return TrackStatus.COASTING if life.misses else TrackStatus.CONFIRMED
-
-    def num_measured(self, track_id: int) -> int:
-        """See `Lifecycle.num_measured`."""
-        return self.lives[track_id].num_measured

@@ -83,6 +83,9 @@ class Candidate(NamedTuple):
 class Preprocess:
     """Transformation to the map, false-positive filter and merge (Karle et al. 2023, sections III-B and III-C)."""
 
+    _assumes_map_yaw = True
+    """A yaw that the map gave is prior knowledge, not measured."""
+
     def __init__(
         self,
         road: Road,
@@ -170,7 +173,7 @@ class Preprocess:
         batch, sensor, pose, points_m = items.batch, items.sensor, items.pose, items.points_m
         columns = (items.values[0] == items.values[0]).nonzero()[0]  # NaN is not equal to itself
         names = _names(tuple(columns.tolist()))
-        assumed = self._assumed(YAW in columns and bool(items.map_yaw[0]))
+        assumed: tuple[str, ...] = ("yaw_rad",) if self._assumes_map_yaw and YAW in columns and items.map_yaw[0] else ()
         assumed += ("curvature_radpm",) if CURVATURE in columns else ()
         z, R, model = (
             items.values.take(columns, axis=1),
@@ -203,10 +206,6 @@ class Preprocess:
             measurement = Measurement(batch.stamp_ns, each, mean, noise, pose, sensor.loss, assumed)
             candidates.append(Candidate(index, items.merged.get(index, ()), measurement, point_m, spread, error))
         return candidates
-
-    def _assumed(self, map_yaw: bool) -> tuple[str, ...]:
-        """Components that are prior knowledge: a yaw that the map gave."""
-        return ("yaw_rad",) if map_yaw else ()
 
 
 def _without(items: MapDetections, outside: BoolArray, reason: str, lost: dict[int, str]) -> MapDetections:

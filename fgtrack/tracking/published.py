@@ -167,8 +167,7 @@ class NeighbourhoodMerge(Merge):
 class PublishedPreprocess(Preprocess):
     """A heading that the map gave counts as measured, in the innovations and their NIS."""
 
-    def _assumed(self, map_yaw: bool) -> tuple[str, ...]:
-        return ()
+    _assumes_map_yaw = False
 
 
 @dataclass(frozen=True)

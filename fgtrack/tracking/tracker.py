@@ -85,6 +85,7 @@ class Tracker:
         self._tick = -1
         self._next_id = 0
         self._records: list[UpdateRecord] = []
+        self._num_measured = Counter[int]()  # detections that have changed the state, by track
         self._undirected: dict[int, Start] = {}  # of tracks with one position and an unknown heading, by id
         self._seen: dict[int, set[int]] = {}  # in this tick, by message: tracks that it has matched or started
         self.failures = parts.failures
@@ -286,8 +287,11 @@ class Tracker:
         for (position, track), measurement, result in zip(assignment.pairs, measurements, results, strict=True):
             candidate, track_id = candidates[position], states.track_ids[track]
             if result.innovation is not None:
-                self._parts.lifecycle.fused(track_id, candidate.position_m is not None)
-                if candidate.position_m is not None and self._undirected.pop(track_id, None) is not None:
+                self._num_measured[track_id] += 1
+                is_placed = candidate.position_m is not None
+                if is_placed:
+                    self._parts.lifecycle.fused(track_id)
+                if is_placed and self._undirected.pop(track_id, None) is not None:
                     # The prior of the estimator, linearised along an unknown direction, spreads along it alone.
                     seen = measurement.seen_by(self._parts.motion)
                     with suppress(np.linalg.LinAlgError):
@@ -311,6 +315,7 @@ class Tracker:
         if prior.yaw_rad is None and not parts.motion.cartesian:
             self._undirected[track_id] = prior
         self._seen.setdefault(id(batch.message), set()).add(track_id)
+        self._num_measured[track_id] = 1
         parts.lifecycle.born(track_id, scan, MatchedDetection(candidate))
         self._describe(batch, candidate, track_id)
         self._conclude(batch, candidate, Disposition.BIRTH, track_id)
@@ -343,14 +348,9 @@ class Tracker:
             self._parts.bank.remove(track_id)
             self._parts.objects.forget(track_id)
             self._undirected.pop(track_id, None)
+            del self._num_measured[track_id]
             self._parts.lifecycle.forget(track_id)
 
     def _report(self, track_id: int, state: TrackState) -> TrackReport:
-        lifecycle = self._parts.lifecycle
-        return TrackReport(
-            track_id,
-            lifecycle.status(track_id),
-            state,
-            lifecycle.num_measured(track_id),
-            self._parts.objects.report(track_id),
-        )
+        status, report = self._parts.lifecycle.status(track_id), self._parts.objects.report(track_id)
+        return TrackReport(track_id, status, state, self._num_measured[track_id], report)

