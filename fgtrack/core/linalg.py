@@ -1,6 +1,6 @@
 """Small dense linear algebra on stacks of symmetric matrices."""
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from functools import cache
 from importlib import import_module
 from types import ModuleType
@@ -23,6 +23,14 @@ def identity(n: int) -> FloatArray:
     matrix = np.eye(n)
     matrix.flags.writeable = False
     return matrix
+
+
+def equal_ones(items: Sequence[Hashable]) -> list[list[int]]:
+    """Indices of equal `items`, which are calculated as one stack: ascending, in the order of the first of each."""
+    groups: dict[Hashable, list[int]] = {}
+    for index, item in enumerate(items):
+        groups.setdefault(item, []).append(index)
+    return list(groups.values())
 
 
 def symmetrise(matrix: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat
 from scipy import optimize, special
 
-from fgtrack.core.types import BoolArray, FloatArray
+from fgtrack.core.types import FloatArray
 from fgtrack.sim.settings import Probability, require, settings
 
 
@@ -147,10 +147,9 @@ class MarkovDelay:
 
     def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
         """Delays, see `AnyDelay`."""
-        moves, share = np.ones(len(stamps_s)), self.to_bad / (self.to_bad + self.to_good)
-        bad = _two_states(rng, share, self.to_bad * moves, self.to_good * moves)
-        good_s = self.good.draw(rng, stamps_s)  # both are drawn for all messages
-        return np.where(bad, self.bad.draw(rng, stamps_s), good_s)
+        moves = np.ones(len(stamps_s))
+        share = self.to_bad / (self.to_bad + self.to_good)
+        return _two_states(self, rng, stamps_s, share, self.to_bad * moves, self.to_good * moves)
 
 
 @settings
@@ -170,13 +169,9 @@ class MarkovTimeDelay:
     def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
         """Delays, see `AnyDelay`."""
         rate_per_s = self.to_bad_per_s + self.to_good_per_s
-        forgotten, share = (
-            -np.expm1(-rate_per_s * np.diff(stamps_s, prepend=stamps_s[:1])),
-            self.to_bad_per_s / rate_per_s,
-        )
-        bad = _two_states(rng, share, share * forgotten, (1.0 - share) * forgotten)
-        good_s = self.good.draw(rng, stamps_s)  # both are drawn for all messages
-        return np.where(bad, self.bad.draw(rng, stamps_s), good_s)
+        share = self.to_bad_per_s / rate_per_s
+        forgotten = -np.expm1(-rate_per_s * np.diff(stamps_s, prepend=stamps_s[:1]))
+        return _two_states(self, rng, stamps_s, share, share * forgotten, (1.0 - share) * forgotten)
 
 
 #: Every delay model, chosen by `kind`; `draw` gives the delays in s of the messages stamped `stamps_s` (ascending),
@@ -195,17 +190,25 @@ def _relative_q90(log_shape: float) -> float:
     return float(special.gammaincinv(shape, 0.9)) / shape
 
 
-def _two_states(rng: np.random.Generator, share: float, to_bad: FloatArray, to_good: FloatArray) -> BoolArray:
-    """True where the chain is bad, at each of n messages: at the first one with probability `share`.
+def _two_states(
+    model: MarkovDelay | MarkovTimeDelay,
+    rng: np.random.Generator,
+    stamps_s: FloatArray,
+    share: float,
+    to_bad: FloatArray,
+    to_good: FloatArray,
+) -> FloatArray:
+    """Delays of `model`, whose chain is bad at the first message with probability `share`.
 
     Entry k of `to_bad` and `to_good`, shape (n,), is the probability to move from message k - 1 to k; the first
     is not used.
     """
-    draws, bad = rng.random(len(to_bad)), np.zeros(len(to_bad), dtype=bool)
+    draws, bad = rng.random(len(stamps_s)), np.zeros(len(stamps_s), dtype=bool)
     bad[:1] = draws[:1] < share
     for k in range(1, len(bad)):
         bad[k] = draws[k] >= to_good[k] if bad[k - 1] else draws[k] < to_bad[k]
-    return bad
+    good_s = model.good.draw(rng, stamps_s)  # both are drawn for all messages
+    return np.where(bad, model.bad.draw(rng, stamps_s), good_s)
 
 
 #: Delays of Karle et al. 2023, section IV-B: mean and 90 % quantile.

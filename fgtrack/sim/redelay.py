@@ -54,7 +54,9 @@ class Redelayed:
         rows = zip(self._ranks.tolist(), self._stamps_ns.tolist(), self._receipts_ns.tolist(), strict=True)
         for message, (rank, stamp_ns, receipt_ns) in zip(self._read(), rows, strict=False):
             if rank >= 0:
-                waiting[rank] = _moved(message, stamp_ns, receipt_ns)
+                if isinstance(message, DetectionList):  # all others keep their stamp
+                    message = restamped(message, stamp_ns)
+                waiting[rank] = replace(message, receipt_ns=receipt_ns)
             while next_rank in waiting:
                 yield waiting.pop(next_rank)
                 next_rank += 1
@@ -122,15 +124,6 @@ def _chosen(delays: Mapping[str, SensorDelays], known: Iterable[str]) -> dict[st
     named = {sensor: settings for sensor, settings in delays.items() if sensor != OTHERS}
     others = {sensor: delays[OTHERS] for sensor in names if sensor not in delays} if OTHERS in delays else {}
     return named | others
-
-
-def _moved(message: Message, stamp_ns: int, receipt_ns: int) -> Message:
-    """`message` with another stamp and receipt."""
-    if (message.stamp_ns, message.receipt_ns) == (stamp_ns, receipt_ns):
-        return message
-    if isinstance(message, DetectionList):
-        message = restamped(message, stamp_ns)
-    return replace(message, receipt_ns=receipt_ns)
 
 
 def restamped(message: DetectionList, stamp_ns: int) -> DetectionList:

@@ -13,8 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.special import gammaincinv
 
 from fgtrack.core.checks import between_0_and_1, not_negative, positive
-from fgtrack.core.grouping import equal_ones
-from fgtrack.core.linalg import kernels, symmetrise
+from fgtrack.core.linalg import equal_ones, kernels, symmetrise
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, StatesAt
 from fgtrack.estimation.filters.ekf import linearised

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fgtrack.core.geometry import body_point, body_point_jacobian
-from fgtrack.core.grouping import equal_ones
-from fgtrack.core.linalg import congruence
+from fgtrack.core.linalg import congruence, equal_ones
 from fgtrack.core.types import BoolArray, Disposition, FloatArray, UpdateRecord
 from fgtrack.estimation.base import Measurement
 from fgtrack.models.areas import ExclusionAreas

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.grouping import equal_ones
+from fgtrack.core.linalg import equal_ones
 from fgtrack.core.time import nanoseconds, period_ns, seconds
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states

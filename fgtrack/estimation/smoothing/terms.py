@@ -7,8 +7,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from fgtrack.core.grouping import equal_ones
-from fgtrack.core.linalg import congruence, inverse_roots, mahalanobis_squared
+from fgtrack.core.linalg import congruence, equal_ones, inverse_roots, mahalanobis_squared
 from fgtrack.core.time import seconds
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, UpdateResult, UpdateStatus

@@ -29,6 +29,7 @@ from fgtrack.core.files import read_whole
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
+from fgtrack.io.adapters.common import reported_as
 from fgtrack.io.source import FileFormat
 
 SENSORS = {1: "lidar", 2: "radar", 3: "infrared", 4: "daylight"}
@@ -72,7 +73,7 @@ FORMAT = FileFormat(
 def _sensed(file: Path) -> Iterator[EgoState | DetectionList]:
     newest_ns: int | None = None
     for index, record in enumerate(_records(file)):
-        try:
+        with reported_as(f"{file}: record {index} is not one of the data set"):
             stamp_ns = _nanoseconds(record["time"])
             north_m, east_m = map(float, record["ownshipPosition"])
             sensor = record["sensorID"]
@@ -82,8 +83,6 @@ def _sensed(file: Path) -> Iterator[EgoState | DetectionList]:
                 if sensor in _CAMERAS
                 else _points(record["measurement"], north_m, east_m)
             )
-        except (KeyError, TypeError, ValueError, ArithmeticError) as error:
-            raise DataError(f"{file}: record {index} is not one of the data set ({error!r})") from error
         newer = newest_ns is None or stamp_ns > newest_ns
         receipt_ns = stamp_ns if newest_ns is None else max(stamp_ns, newest_ns)
         if newer:
@@ -115,22 +114,18 @@ def _truth(file: Path) -> list[TruthState]:
     """GNSS fixes, each once: the file repeats the nearest fix for every record."""
     states: dict[tuple[int, int], TruthState] = {}
     for index, fixes in enumerate(_records(file)):
-        try:
+        with reported_as(f"{file}: record {index} is not one of the data set"):
             for fix in fixes if isinstance(fixes, list) else [fixes]:
                 stamp_ns, target = _nanoseconds(fix["time"]), int(fix["targetID"])
                 north_m, east_m = map(float, fix["position"][:2])
                 state = TruthState(stamp_ns, stamp_ns, target, x_m=east_m, y_m=north_m)
                 states.setdefault((stamp_ns, target), state)
-        except (KeyError, TypeError, ValueError, ArithmeticError) as error:
-            raise DataError(f"{file}: record {index} is not one of the data set ({error!r})") from error
     return [states[key] for key in sorted(states)]
 
 
 def _records(file: Path) -> list[Json]:
-    try:
+    with reported_as(f"{file}: is not JSON, fetch it again"):
         records = json.loads(read_whole(file, _LARGEST_MB), parse_float=Decimal)
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{file}: is not JSON ({error}), fetch it again") from error
     if not isinstance(records, list):
         raise DataError(f"{file}: is not a list of records")
     return records

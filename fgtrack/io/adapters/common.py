@@ -1,13 +1,15 @@
 """Common parts of the adapters: headers, quaternions, speeds and covariances of ROS messages."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import blake2b
 from typing import Any
 
 import numpy as np
 
+from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import MEASURABLE, Detection, FloatArray, Frame
 
@@ -34,6 +36,17 @@ class ObjectList:
     objects: tuple[Detection, ...]
     left_out: tuple[str, ...] = ()
     """As of a `DetectionList`."""
+
+
+@contextmanager
+def reported_as(text: str) -> Iterator[None]:
+    """Raise `DataError` of `text` and the cause for whatever values of another form raise in the block."""
+    try:
+        yield
+    except FgtrackError:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
+        raise DataError(f"{text} ({type(error).__name__}: {str(error)[:200]})") from error
 
 
 def split(found: Iterable[Detection | str]) -> tuple[tuple[Detection, ...], tuple[str, ...]]:

@@ -22,6 +22,7 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.files import open_file
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.types import Detection, DetectionList, EgoState, Frame, Message
+from fgtrack.io.adapters.common import reported_as
 from fgtrack.io.errors import LARGEST_BYTES, TruncatedInput, refuse_larger
 from fgtrack.io.source import FileFormat
 
@@ -61,17 +62,13 @@ def read_log(folder: Path, frames: Mapping[str, Frame]) -> Iterator[Message]:
                 refuse_larger(len(line), f"{file}:{number}", LARGEST_BYTES)
                 if line.count(b";") < len(header) - 1 and not line.endswith(b"\n"):
                     raise TruncatedInput(f"{file}:{number}: breaks off in the middle of a row")
-                try:
+                with reported_as(f"{file}:{number}: is not a row of such a log"):
                     row = dict(zip(header, line.decode().rstrip("\n").split(";"), strict=True))
                     receipt_ns, detections, ego = (json.loads(row[name]) for name in _COLUMNS)
                     messages: list[Message] = list(_lists(detections or {}, receipt_ns, frames))
                     if "state" in ego and ego["t"] != last_ego_ns:
                         last_ego_ns = ego["t"]
                         messages.insert(0, _ego(ego, receipt_ns))
-                except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError) as error:
-                    raise DataError(
-                        f"{file}:{number}: is not a row of such a log ({type(error).__name__}: {str(error)[:200]})"
-                    ) from error
                 yield from messages
     except OSError as error:
         raise DataError(f"{file}: cannot be read ({error.strerror})") from error

@@ -14,20 +14,20 @@ stand in a folder of the version, `v1.0-...`, beside it. Choices that the data l
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from fgtrack.core.errors import CallError, DataError, FgtrackError
+from fgtrack.core.errors import CallError
 from fgtrack.core.files import read_whole
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import seconds
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
-from fgtrack.io.adapters.common import object_id, signed_speed_mps, split
-from fgtrack.io.config import InputConfig, NuscenesInput
+from fgtrack.io.adapters.common import object_id, reported_as, signed_speed_mps, split
+from fgtrack.io.config import NuscenesInput
 from fgtrack.io.source import FileFormat
 
 __all__ = ["FORMAT", "read_scene"]
@@ -65,7 +65,7 @@ def read_scene(file: Path, settings: NuscenesInput) -> Iterator[Message]:
         A file is not what the data set holds; the message names it.
     """
     tables = _tables(file, settings)
-    try:
+    with reported_as(f"{file}: it or its tables in {tables} are not those of nuScenes"):
         samples = _samples(tables, file, settings)
         boxes = {token: of for token, of in _entries(file, _OF_RESULTS) if token in samples}
         egos = _egos(tables, samples)
@@ -76,11 +76,6 @@ def read_scene(file: Path, settings: NuscenesInput) -> Iterator[Message]:
             if token in boxes
             for objects, left_out in [split(_boxes(boxes[token], settings))]
         ]
-    except FgtrackError:
-        raise
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        what = f"{type(error).__name__}: {str(error)[:100]}"
-        raise DataError(f"{file}: it or its tables in {tables} are not those of nuScenes ({what})") from error
     messages: list[Message] = [*truth, *egos, *lists]
     yield from sorted(messages, key=attrgetter("receipt_ns"))
 
@@ -91,7 +86,7 @@ def _entries(file: Path, begin: re.Pattern[str] = _A_LIST) -> Iterator[Json]:
     One after the other: the text of such a table has up to a gigabyte, and its values take five times as much.
     """
     decode = json.JSONDecoder().raw_decode
-    try:
+    with reported_as(f"{file}: is not JSON of the expected form, fetch it again"):
         text = read_whole(file, _LARGEST_MB).decode()
         start = begin.match(text)
         if start is None:
@@ -104,8 +99,6 @@ def _entries(file: Path, begin: re.Pattern[str] = _A_LIST) -> Iterator[Json]:
                 inner, at = decode(text, at)
                 value, at = (value, inner), _next(text, at)
             yield value
-    except (IndexError, ValueError, RecursionError) as error:
-        raise DataError(f"{file}: is not JSON of the expected form ({error}), fetch it again") from error
 
 
 def _next(text: str, at: int) -> int:
@@ -236,8 +229,8 @@ def _recognises(path: Path) -> bool:
         return _RESULTS.match(file.read(64)) is not None
 
 
-def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
-    return partial(read_scene, path, config.nuscenes)
-
-
-FORMAT = FileFormat("results in the form of nuScenes (.json) with its tables beside it", _recognises, _open)
+FORMAT = FileFormat(
+    "results in the form of nuScenes (.json) with its tables beside it",
+    _recognises,
+    lambda path, config: partial(read_scene, path, config.nuscenes),
+)
