@@ -58,7 +58,7 @@ def not_negative(**values: float | None) -> None:
 
 
 def between_0_and_1(**values: float | None) -> None:
-    """Between 0 and 1, neither of them."""
+    """Strictly between 0 and 1."""
     _check(values, "must lie between 0 and 1", lambda value: 0.0 < value < 1.0)
 
 

@@ -132,9 +132,9 @@ def _package(entry: EntryPoint) -> str:
 
 
 def _hash_of(entry: EntryPoint) -> str:
-    found, spec = hashlib.sha256(), find_spec(entry.module.partition(".")[0])
-    places = [] if spec is None else [Path(each) for each in spec.submodule_search_locations or [spec.origin or ""]]
-    for place in places:
-        for file in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
-            found.update(file.read_bytes() if file.is_file() else b"")
-    return found.hexdigest()
+    digest, spec = hashlib.sha256(), find_spec(entry.module.partition(".")[0])
+    paths = [] if spec is None else [Path(each) for each in spec.submodule_search_locations or [spec.origin or ""]]
+    for path in paths:
+        for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
+            digest.update(file.read_bytes() if file.is_file() else b"")
+    return digest.hexdigest()

@@ -13,8 +13,8 @@ from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import MEASURABLE, Detection, FloatArray, Frame
 
-#: Places of x, y and the rotation about z in a covariance of ROS.
 PLANAR = [0, 1, 5]
+"""Indices of x, y and the rotation about z in a covariance of ROS."""
 
 _INT64 = range(-(1 << 63), 1 << 63)
 
@@ -49,11 +49,11 @@ def reported_as(text: str) -> Iterator[None]:
         raise DataError(f"{text} ({type(error).__name__}: {str(error)[:200]})") from error
 
 
-def split(found: Iterable[Detection | str]) -> tuple[tuple[Detection, ...], tuple[str, ...]]:
-    """The detections among `found`, and what says of each other object by which setting it is left out."""
-    every = tuple(found)
-    left_out = tuple(one for one in every if isinstance(one, str))
-    return tuple(one for one in every if not isinstance(one, str)), left_out
+def split(items: Iterable[Detection | str]) -> tuple[tuple[Detection, ...], tuple[str, ...]]:
+    """The detections among `items`, and for each other object the setting that excludes it."""
+    every = tuple(items)
+    excluded = tuple(item for item in every if isinstance(item, str))
+    return tuple(item for item in every if not isinstance(item, str)), excluded
 
 
 def object_id(value: object) -> int | None:
@@ -82,9 +82,9 @@ def frame_of(header: RosMessage) -> Frame:
     return "map" if header.frame_id.lstrip("/") in MAP_FRAMES else "ego"
 
 
-def object_list(header: RosMessage, objects: Iterable[Detection]) -> ObjectList:
-    """An object list with the stamp and the frame of `header`."""
-    return ObjectList(stamp_ns(header.stamp), frame_of(header), tuple(objects))
+def object_list(header: RosMessage, objects: Iterable[Detection], frame: Frame | None = None) -> ObjectList:
+    """An object list with the stamp of `header`, and its frame where none is given."""
+    return ObjectList(stamp_ns(header.stamp), frame or frame_of(header), tuple(objects))
 
 
 def yaw_rad(orientation: RosMessage) -> float | None:

@@ -63,17 +63,12 @@ def _size(size: RosMessage, z_m: float | None = None) -> dict[str, Any]:
     return {"z_m": z_m, "length_m": size.x, "width_m": size.y, "height_m": size.z} if size.x > 0.0 else {}
 
 
-def detected_objects(message: RosMessage) -> ObjectList:
-    """`DetectedObjects` of autoware_perception_msgs and of autoware_auto_perception_msgs.
+def autoware_objects(message: RosMessage) -> ObjectList:
+    """`DetectedObjects` and `TrackedObjects` of autoware_perception_msgs and of autoware_auto_perception_msgs.
 
     Position, yaw where the orientation is available without a doubt about its sign, speed where there is a
     twist, which is in the object's own frame.
     """
-    return object_list(message.header, map(_autoware_object, message.objects))
-
-
-def tracked_objects(message: RosMessage) -> ObjectList:
-    """`TrackedObjects` of the same packages, as `DetectedObjects`; twist and covariances are always there."""
     return object_list(message.header, map(_autoware_object, message.objects))
 
 
@@ -93,8 +88,7 @@ def _autoware_object(item: RosMessage) -> Detection:
     }
     variance = None
     if getattr(kinematics, "has_twist_covariance", True):
-        planar_twist = np.asarray(twist.covariance, dtype=float).reshape(6, 6)[:2, :2]
-        variance = speed_variance(velocity.x, velocity.y, planar_twist)
+        variance = speed_variance(velocity.x, velocity.y, planar(twist.covariance)[:2, :2])
     pose_covariance = kinematics.pose_with_covariance.covariance
     label = max(item.classification, key=lambda each: each.probability).label if len(item.classification) else 0
     return Detection(
@@ -174,7 +168,6 @@ def odometry(message: RosMessage) -> ObjectList:
         "yaw_rad": yaw_rad(pose.orientation),
         "speed_mps": signed_speed_mps(velocity.x, velocity.y, 0.0),
     }
-    planar_twist = np.asarray(message.twist.covariance, dtype=float).reshape(6, 6)[:2, :2]
-    variance = speed_variance(velocity.x, velocity.y, planar_twist)
+    variance = speed_variance(velocity.x, velocity.y, planar(message.twist.covariance)[:2, :2])
     item = Detection(**values, covariance=covariance(measured(values), planar(message.pose.covariance), variance))
     return object_list(message.header, [item])

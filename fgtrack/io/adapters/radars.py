@@ -7,12 +7,11 @@ makes scans of them).
 """
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.types import Detection
-from fgtrack.io.adapters.common import ObjectList, RosMessage, stamp_ns
+from fgtrack.io.adapters.common import ObjectList, RosMessage, object_list
 
 __all__ = ["conti_radar", "delphi_esr", "delphi_mrr"]
 
@@ -21,7 +20,8 @@ _NO_TARGET = 0  # status of an ESR track
 
 def conti_radar(message: RosMessage) -> ObjectList:
     """`conti_radar/Measurement`, clusters of a Continental ARS 408: x ahead and y to the left, relative velocities."""
-    return _listed(message, [_conti(point) for point in message.points if getattr(point, "invalid_state", 0) == 0])
+    points = [point for point in message.points if getattr(point, "invalid_state", 0) == 0]
+    return object_list(message.header, map(_conti, points), "sensor")
 
 
 def _conti(point: RosMessage) -> Detection:
@@ -41,17 +41,17 @@ def _conti(point: RosMessage) -> Detection:
 def delphi_esr(message: RosMessage) -> ObjectList:
     """`delphi_esr_msgs/EsrTrack`, one track of a Delphi (Aptiv) ESR."""
     if message.status == _NO_TARGET:
-        return _listed(message, [])
+        return object_list(message.header, [], "sensor")
     track = _polar(message.range, -math.radians(message.angle), message.range_rate, message.id, float(message.width))
-    return _listed(message, [track])
+    return object_list(message.header, [track], "sensor")
 
 
 def delphi_mrr(message: RosMessage) -> ObjectList:
     """`delphi_mrr_msgs/Detection` (in older drivers `MrrDetection`), one detection of a Delphi (Aptiv) MRR."""
     if not _of(message, "valid_level", "validLevel") or _of(message, "host_veh_clutter", "hostVehClutter"):
-        return _listed(message, [])
+        return object_list(message.header, [], "sensor")
     rate, number = _of(message, "range_rate", "rangeRate"), _of(message, "detection_id", "detectionId")
-    return _listed(message, [_polar(message.range, -message.azimuth, rate, number)])
+    return object_list(message.header, [_polar(message.range, -message.azimuth, rate, number)], "sensor")
 
 
 def _polar(range_m: float, bearing_rad: float, rate_mps: float, number: int, width_m: float = 0.0) -> Detection:
@@ -66,7 +66,3 @@ def _polar(range_m: float, bearing_rad: float, rate_mps: float, number: int, wid
 
 def _of(message: RosMessage, *names: str) -> Any:  # Any: a number; the versions of a message name it differently
     return next(getattr(message, name) for name in names if hasattr(message, name))
-
-
-def _listed(message: RosMessage, objects: Sequence[Detection]) -> ObjectList:
-    return ObjectList(stamp_ns(message.header.stamp), "sensor", tuple(objects))
