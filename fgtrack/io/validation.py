@@ -175,9 +175,6 @@ _FIELDS = {
 
 
 def _invalid(name: str, expected: str, value: object) -> InvalidMessageError:
-    try:
-        text = ascii(value)
-    except ValueError:  # an integer of more digits than Python writes
-        text = f"an integer of {getattr(value, 'bit_length', int)()} bits"
+    text = ascii(value)
     text = text if len(text) <= 60 else f"{text[:57]}..."
     return InvalidMessageError(f"{name}: {expected} expected, not {text}")

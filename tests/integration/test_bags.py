@@ -35,10 +35,10 @@ def read(path: Path, config: InputConfig | None = None) -> list:
 # --- what fgtrack writes
 
 
-@given(messages=message_lists(), storage=st.sampled_from(STORAGES), standard=st.booleans())
-def test_every_field_survives_the_bag_to_the_bit_and_in_order(tmp_path_factory, messages, storage, standard):
+@given(messages=message_lists(), storage=st.sampled_from(STORAGES))
+def test_every_field_survives_the_bag_to_the_bit_and_in_order(tmp_path_factory, messages, storage):
     path = tmp_path_factory.mktemp("bag") / "bag"
-    assert write_bag(path, messages, storage, standard) == len(messages)
+    assert write_bag(path, messages, storage) == len(messages)
     if messages:
         assert exact(read(path)) == exact(messages)
 
@@ -120,7 +120,7 @@ def test_the_twins_say_what_other_tools_can_show(tmp_path):
 @pytest.mark.parametrize("kept", [0.5, 0.9, 0.999])
 def test_a_truncated_recording_gives_all_before_the_break_and_then_says_so(tmp_path, storage, kept):
     messages = drive(1500)
-    write_bag(tmp_path / "bag", messages, storage, standard_topics=False)
+    write_bag(tmp_path / "bag", messages, storage)
     file = storage_file(tmp_path / "bag")
     data = file.read_bytes()
     file.write_bytes(data[: int(len(data) * kept)])
@@ -166,7 +166,7 @@ def test_a_sqlite_recording_with_a_write_ahead_log_is_read_whole_and_left_alone(
 
 
 def test_of_a_broken_input_all_before_the_break_is_written(tmp_path):
-    write_bag(tmp_path / "a", drive(1200), standard_topics=False)
+    write_bag(tmp_path / "a", drive(1200))
     file = storage_file(tmp_path / "a")
     file.write_bytes(file.read_bytes()[:-3000])
     with pytest.raises(TruncatedInput):

@@ -52,8 +52,8 @@ def refused(path: Path, what: str) -> None:
     assert re.search(what, told)
 
 
-def drive_as(folder: Path, storage: str, messages: list[Message] | None = None, **options: bool) -> Path:
-    write_bag(folder / "bag", drive() if messages is None else messages, storage, **options)
+def drive_as(folder: Path, storage: str, messages: list[Message] | None = None) -> Path:
+    write_bag(folder / "bag", drive() if messages is None else messages, storage)
     (file,) = (file for file in (folder / "bag").iterdir() if file.suffix != ".yaml")
     return file
 

@@ -44,7 +44,6 @@ def of(**fields: object) -> DetectionList:
         ),
         (replace(EGO, receipt_ns=4 * 10**18 + 1), "receipt_ns: at most 4e.18 ns from 0 expected"),
         (replace(TRUTH, object_id="car"), "object_id: a 64 bit integer expected, not 'car'"),
-        (replace(TRUTH, object_id=10**5000), "object_id: a 64 bit integer expected, not an integer of"),
         (replace(EGO, x_m="1.0"), "x_m: a number expected, not '1.0'"),
         (replace(EGO, x_m=True), "x_m: a number expected, not True"),
         (replace(TRUTH, y_m=10**400), "y_m: a number expected, not 10"),
@@ -136,7 +135,7 @@ def autoferry(folder: Path) -> Path:
 
 
 def sqlite(folder: Path) -> Path:
-    write_bag(folder, drive(), "sqlite3", standard_topics=False)
+    write_bag(folder, drive(), "sqlite3")
     with closing(sqlite3.connect(next(folder.glob("*.db3")))) as database, database:
         database.execute("UPDATE messages SET timestamp = 'noon' WHERE id = 20")
     return folder
@@ -149,7 +148,7 @@ def sqlite(folder: Path) -> Path:
         (lambda path: log(path, time="noon"), r"message 5: receipt_ns: .* not 'noon'", 4),
         (lambda path: log(path, time=float("inf")), "message 5: receipt_ns: .* not inf", 4),
         (autoferry, "message 5: stamp_ns: a 64 bit integer", 4),
-        (sqlite, "is truncated .*noon", 19),
+        (sqlite, "is truncated .*noon", 12),
     ],
 )
 def test_a_damaged_input_is_replayed_converted_and_described_up_to_there(tmp_path, make, complaint, least) -> None:

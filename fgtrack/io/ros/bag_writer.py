@@ -30,7 +30,6 @@ def write_bag(
     path: Path | str,
     messages: Iterable[Message],
     storage: Literal["mcap", "sqlite3"] = "mcap",
-    standard_topics: bool = True,
     overwrite: bool = False,
     settings: Mapping[str, object] | None = None,
 ) -> int:
@@ -60,7 +59,7 @@ def write_bag(
         ):
             if settings:
                 bag.set_custom_data(SETTINGS, json.dumps(settings))
-            writer = _MessageWriter(bag, standard_topics)
+            writer = _MessageWriter(bag)
             readable = UntilBreak(messages)
             for message in readable:
                 writer.write(message)
@@ -101,9 +100,8 @@ def is_recording(path: Path) -> bool:
 class _MessageWriter:
     """Puts messages on their topics."""
 
-    def __init__(self, bag: Writer, standard_topics: bool) -> None:
+    def __init__(self, bag: Writer) -> None:
         self._bag = bag
-        self._standard_topics = standard_topics
         self._factory = MessageFactory()
         self._connections: dict[str, Connection] = {}
         self._truth: list[TruthState] = []
@@ -113,29 +111,20 @@ class _MessageWriter:
         match message:
             case EgoState():
                 self._put("/fgtrack/ego", self._factory.ego(message), message.receipt_ns)
+                self._put("/ego/odometry", self._factory.odometry(message), message.receipt_ns)
             case DetectionList():
-                topic = f"/fgtrack/detections/{token(message.sensor)}"
-                self._put(topic, self._factory.detections(message), message.receipt_ns)
+                topic = f"/detections/{token(message.sensor)}"
+                self._put(f"/fgtrack{topic}", self._factory.detections(message), message.receipt_ns)
+                self._put(topic, self._factory.detection3d_array(message), message.receipt_ns)
             case TruthState():
                 self._put("/fgtrack/truth", self._factory.truth(message), message.receipt_ns)
-        if self._standard_topics:
-            self._write_twin(message)
-        self.count += 1
-        if self.count % _CHECKPOINT == 0:
-            self._checkpoint()
-
-    def _write_twin(self, message: Message) -> None:
-        match message:
-            case EgoState():
-                self._put("/ego/odometry", self._factory.odometry(message), message.receipt_ns)
-            case TruthState():
                 times = (message.stamp_ns, message.receipt_ns)
                 if self._truth and (self._truth[0].stamp_ns, self._truth[0].receipt_ns) != times:
                     self.write_truth_twin()
                 self._truth.append(message)
-            case DetectionList():
-                twin = self._factory.detection3d_array(message)
-                self._put(f"/detections/{token(message.sensor)}", twin, message.receipt_ns)
+        self.count += 1
+        if self.count % _CHECKPOINT == 0:
+            self._checkpoint()
 
     def write_truth_twin(self) -> None:
         """Write the true states that wait for others of their stamp."""

@@ -185,9 +185,8 @@ def _full_covariance(item: Detection) -> FloatArray | None:
     if item.covariance is None:
         return None
     given, pose = np.asarray(item.covariance).reshape(len(item.measured), -1), np.zeros((6, 6))
-    place = {"x_m": 0, "y_m": 1, "yaw_rad": 5}
-    kept = [(place[name], index) for index, name in enumerate(item.measured) if name in place]
-    for row, i in kept:
-        for column, j in kept:
-            pose[row, column] = given[i, j]
+    axes = {"x_m": 0, "y_m": 1, "yaw_rad": 5}
+    kept = [index for index, name in enumerate(item.measured) if name in axes]
+    rows = [axes[item.measured[index]] for index in kept]
+    pose[np.ix_(rows, rows)] = given[np.ix_(kept, kept)]
     return pose

@@ -68,13 +68,17 @@ def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
     """
     names = {topic.name for topic in bag.topics}
     truth = config.truth if isinstance(config.truth, tuple) else (config.truth,) if config.truth else ()
-    named = [item.topic for item in (config.ego, *config.detections.values(), *truth) if item]
+    roles: list[tuple[str, TopicInput, Callable[[BagTopic, TopicInput], Convert]]] = [
+        *([("ego", config.ego, _ego)] if config.ego else []),
+        *((f"detections {name}", item, partial(_detections, sensor=name)) for name, item in config.detections.items()),
+        *(("truth", item, partial(_truths, number=number, topics=len(truth))) for number, item in enumerate(truth)),
+    ]
     native = tuple(
         TopicUse(topic, "messages", _native(topic.type)) for topic in bag.topics if topic.type in NATIVE_ADAPTERS
     )
-    if native and names.isdisjoint(named):
+    if native and names.isdisjoint(item.topic for _, item, _ in roles):
         return native
-    if not named:
+    if not roles:
         if bag.break_off:
             raise TruncatedInput(f"{bag.break_off}, and holds no topic that fgtrack has written")
         raise DataError(
@@ -82,18 +86,10 @@ def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
             f"(input.ego, input.detections); it has {_listed(bag.topics)}"
         )
     uses = []
-    if config.ego:
-        _check_keys("ego", config.ego)
-        topic = _find(bag, config.ego)
-        uses.append(TopicUse(topic, "ego", _stamped(_ego(topic, config.ego), config.ego)))
-    for sensor, item in config.detections.items():
-        _check_keys("detections", item)
+    for role, item, converter in roles:
+        _check_keys(role.split()[0], item)
         topic = _find(bag, item)
-        uses.append(TopicUse(topic, f"detections {sensor}", _stamped(_detections(topic, item, sensor), item)))
-    for number, item in enumerate(truth):
-        _check_keys("truth", item)
-        topic = _find(bag, item)
-        uses.append(TopicUse(topic, "truth", _stamped(_truths(topic, item, number, len(truth)), item)))
+        uses.append(TopicUse(topic, role, _stamped(converter(topic, item), item)))
     return tuple(uses)
 
 
@@ -145,9 +141,8 @@ def _find(bag: Bag, item: TopicInput) -> BagTopic:
         raise DataError(f"{bag.path}: topic {item.topic} has several types ({types}), name one as its type")
     if here:
         raise DataError(f"{bag.path}: topic {item.topic} is a {here[0].type}, not a {wanted}")
-    alike = [topic for topic in bag.topics if topic.type == wanted]
-    has = f"of that type it has {_listed(alike)}" if alike else f"it has {_listed(bag.topics)}"
-    raise DataError(f"{bag.path}: has no topic {item.topic}; {has}")
+    alike = [topic for topic in bag.topics if topic.type == wanted] or bag.topics
+    raise DataError(f"{bag.path}: has no topic {item.topic}; it has {_listed(alike)}")
 
 
 def _listed(topics: tuple[BagTopic, ...] | list[BagTopic]) -> str:

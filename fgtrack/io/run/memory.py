@@ -41,12 +41,12 @@ class MemoryRun(RunSink):
             tables[table] = Table({name: np.concatenate(parts) for name, parts in self._columns[table].items()})
         return Run(None, dict(self._meta), self._config_text, tables)
 
-    def _append(self, table: str, found: Sequence[Row]) -> None:
+    def _append(self, table: str, rows: Sequence[Row]) -> None:
         if table == "tracks":
-            self._tracks.update(text(table, found).encode())
+            self._tracks.update(text(table, rows).encode())
         elif table == "updates":
-            self._updates += text(table, found).encode()
-        self._waiting[table] += found
+            self._updates += text(table, rows).encode()
+        self._waiting[table] += rows
         if len(self._waiting[table]) >= _CHUNK:
             self._pack(table)
 

@@ -9,7 +9,7 @@ from functools import cached_property, lru_cache
 from html import escape
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from ruamel.yaml.error import YAMLError
@@ -19,7 +19,7 @@ from fgtrack.core.files import open_file, read_whole
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray
 from fgtrack.io.run.schema import COLUMNS, NO_TRACK, OPTIONAL_TABLES, RUN_FORMAT, Column, column, column_type
-from fgtrack.io.run.settings import EvaluationConfig, check_config, check_meta
+from fgtrack.io.run.settings import CONFIG, META, EvaluationConfig, check_values
 from fgtrack.io.run.writer import LARGEST_META_MB, path_from_run, save_run
 from fgtrack.io.yaml_text import safe_yaml
 
@@ -141,7 +141,7 @@ class Run:
             raise DataError(f"{self.config_path}: is not YAML, repeat the run") from error
         if not isinstance(config, dict | None):
             raise DataError(f"{self.config_path}: holds no settings, repeat the run")
-        check_config(config or {}, self.config_path)
+        check_values(CONFIG, config or {}, self.config_path)
         return config or {}
 
     @property
@@ -219,7 +219,7 @@ def _read_meta(path: Path) -> Mapping[str, Any]:
         raise DataError(f"{file}: is not JSON ({error}), repeat the run") from error
     if not isinstance(meta, dict) or meta.get("format") != RUN_FORMAT:
         raise DataError(f"{file}: does not say format {RUN_FORMAT!r}, so this is not a run folder")
-    check_meta(meta, file)
+    check_values(META, meta, file)
     return meta
 
 
@@ -237,14 +237,17 @@ def _read_table(path: Path, table: str, complete: bool) -> Table:
     numbers = {name: ["", "nan"] for name in names if column_type(name) is float}
     try:
         with open_file(path) as file:
-            frame = pandas.read_csv(
-                _whole_lines(path, file, complete),
-                dtype=types,
-                na_values=numbers | {"track_id": [""]},
-                keep_default_na=False,
-                skip_blank_lines=False,
-                low_memory=False,
-            )
+            content = file.read()
+        if complete and content and not content.endswith(b"\n"):
+            raise DataError(f"{path}: breaks off in its last row, repeat the run")
+        frame = pandas.read_csv(
+            BytesIO(content[: content.rfind(b"\n") + 1]),
+            dtype=types,
+            na_values=numbers | {"track_id": [""]},
+            keep_default_na=False,
+            skip_blank_lines=False,
+            low_memory=False,
+        )
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}), is this a run folder?") from error
     except pandas.errors.EmptyDataError as error:
@@ -258,15 +261,3 @@ def _read_table(path: Path, table: str, complete: bool) -> Table:
     if "track_id" in names:
         frame["track_id"] = frame["track_id"].fillna(NO_TRACK)
     return Table({name: column(name, frame[name].to_numpy()) for name in names})
-
-
-def _whole_lines(path: Path, file: BinaryIO, complete: bool) -> BinaryIO:
-    """The table without a half-written last row, which only a run that did not finish may have."""
-    if file.seek(0, os.SEEK_END) and (file.seek(-1, os.SEEK_END), file.read())[1] != b"\n":
-        if complete:
-            raise DataError(f"{path}: breaks off in its last row, repeat the run")
-        file.seek(0)
-        content = file.read()
-        return BytesIO(content[: content.rfind(b"\n") + 1])
-    file.seek(0)
-    return file

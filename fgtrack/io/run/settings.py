@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field, ValidationError, create_model
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import DataError
 
-__all__ = ["EvaluationConfig", "check_config", "check_meta"]
+__all__ = ["CONFIG", "META", "EvaluationConfig", "check_values"]
 
 _Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 _Counts = Mapping[str, Mapping[str, int]]
@@ -41,7 +41,7 @@ def _model(**kinds: Any) -> type[BaseModel]:  # Any: types, also generic ones
     return create_model("Mapping", **fields)
 
 
-_META = _model(
+META = _model(
     input=_model(path=str, kind=str),
     effective=_model(lag_key=str, lag_s=_Number) | None,
     estimator=str,
@@ -60,7 +60,7 @@ _META = _model(
     broken_off=str | None,
 )
 _OF_SENSORS: Any = Mapping  # the type checker takes no model that is made by a call
-_CONFIG = _model(
+CONFIG = _model(
     sensors=_OF_SENSORS[str, _model(mount=Mapping[str, _Number] | None, max_delay_s=_Number | None) | None] | None,
     ego=_model(detection_origin_x_m=_Number, detection_origin_y_m=_Number) | None,
     map=_model(track=str | None, pit=str | None, excluded=Sequence[str] | None) | None,
@@ -72,17 +72,8 @@ _CONFIG = _model(
 )
 
 
-def check_meta(meta: Any, path: Path) -> None:
-    """Raise `DataError` where a value of meta.json at `path` has not the type that a run writes."""
-    _check(_META, meta, path)
-
-
-def check_config(config: Any, path: Path) -> None:
-    """Raise `DataError` where a value of config.yaml at `path` has not the type that a run writes."""
-    _check(_CONFIG, config, path)
-
-
-def _check(model: type[BaseModel], value: Any, path: Path) -> None:
+def check_values(model: type[BaseModel], value: Any, path: Path) -> None:
+    """Raise `DataError` where a value of the file `path` has not the type that a run writes, by `META` or `CONFIG`."""
     try:
         text = json.dumps(value, default=str, skipkeys=True, ensure_ascii=False)
         model.model_validate_json(text.encode("utf-8", "replace"), strict=True)  # names of files need not be UTF-8

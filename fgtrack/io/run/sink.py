@@ -50,14 +50,12 @@ class RunSink(ABC):
                 self._out_of_bounds.setdefault(record.sensor, Counter())[record.reason] += 1
         self._append_objects({track.track_id for track in report.tracks})
         self._objects |= {track.track_id: track.object for track in report.tracks if track.object is not None}
-        for table, found in rows(report, process_ns, num_detections, self._smoothed_lag_s):
-            if found:
-                self._append(table, found)
+        for table, cells in rows(report, process_ns, num_detections, self._smoothed_lag_s):
+            self._append(table, cells)
 
     def write_smoothed(self, reports: Sequence[SmoothedReport]) -> None:
         """Take rows of `smoothed`; the end of a run may have none."""
-        if reports:
-            self._append("smoothed", smoothed_rows(reports))
+        self._append("smoothed", smoothed_rows(reports))
 
     def write_truth(self, truth: TruthState) -> None:
         """Take a row of `truth`, or of `ignored`; the next tick puts it behind the others, as all that is received."""
@@ -95,18 +93,16 @@ class RunSink(ABC):
     def _append_objects(self, alive: Set[int]) -> None:
         """Append rows of `objects` of tracks that are not `alive` any more."""
         ended = sorted(self._objects.keys() - alive)
-        if ended:
-            self._append("objects", [(track_id, *astuple(self._objects.pop(track_id))) for track_id in ended])
+        self._append("objects", [(track_id, *astuple(self._objects.pop(track_id))) for track_id in ended])
 
     def _append_received(self) -> None:
-        for table, found in self._received.items():
-            if found:
-                self._append(table, found)
-                self._received[table] = []
+        for table, cells in self._received.items():
+            self._append(table, cells)
+            self._received[table] = []
 
     @abstractmethod
-    def _append(self, table: str, found: Sequence[Row]) -> None:
-        """Put rows at the end of `table`."""
+    def _append(self, table: str, rows: Sequence[Row]) -> None:
+        """Append `rows`, which may be empty, to `table`."""
 
     @abstractmethod
     def _digest(self) -> str:

@@ -103,8 +103,9 @@ class RunWriter(RunSink):
         (self.path / _OLD_META).unlink(missing_ok=True)
 
     def _append(self, table: str, rows: Sequence[Row]) -> None:
-        self._begin()
-        self._write(table, text(table, rows))
+        if rows:
+            self._begin()
+            self._write(table, text(table, rows))
 
     def _begin(self) -> Path:
         """Make the files, with the first tick: a run that fails before leaves nothing."""
@@ -161,8 +162,7 @@ def save_run(
                 else [empty.get(cell, cell) for cell in values.tolist()]
                 for name, values in columns.items()
             ]
-            if rows := list(zip(*cells, strict=True)):
-                writer._append(table, rows)
+            writer._append(table, list(zip(*cells, strict=True)))
         writer.finish(meta)
 
 
