@@ -2,8 +2,9 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +51,7 @@ class TopicInfo:
     used_as: str | None
     """Its use in a replay with the configuration."""
     note: str | None
-    """Why it cannot be decoded, what is odd, or what a configuration could name it as."""
+    """Why it cannot be decoded, what is unusual, or what a configuration could name it as."""
 
 
 @dataclass(frozen=True)
@@ -112,24 +113,28 @@ class _Times:
     newest: tuple[int | None, int] = (None, 0)
     """Newest stamp, and number of messages of it in a row before the newest."""
 
-    def add(self, receipt_ns: int, stamp_ns: int | None, object_id: int | None = None) -> None:
+    def add(
+        self,
+        receipt_ns: int,
+        stamp_ns: int | None,
+        object_id: int | None = None,
+        states: Sequence[EgoState | TruthState | Detection] = (),
+    ) -> None:
         self.receipts_ns[object_id].append(receipt_ns)
         if stamp_ns is not None:
             self.delays_ns.append(receipt_ns - stamp_ns)
-
-    def add_angles(self, one: EgoState | TruthState | Detection) -> None:
-        for name in ANGULAR:
-            value = getattr(one, name, None)
+        for state, name in product(states, ANGULAR):
+            value = getattr(state, name, None)
             if value is not None and math.isfinite(value):
                 least, most = self.angles.get(name, (value, value))
                 self.angles[name] = min(least, value), max(most, value)
 
     def spans(self) -> list[tuple[int, int, int]]:
         """Number, first and last of the receipts of every object."""
-        return [(len(found), min(found), max(found)) for found in self.receipts_ns.values()]
+        return [(len(receipts), min(receipts), max(receipts)) for receipts in self.receipts_ns.values()]
 
     def topic(self, key: _Key, used_as: str | None, note: str | None) -> TopicInfo:
-        count = sum(number for number, _, _ in self.spans())
+        count = sum(map(len, self.receipts_ns.values()))
         length_s = sum(seconds(last - first) for _, first, last in self.spans())
         rate_hz = (count - len(self.receipts_ns)) / length_s if length_s > 0.0 else None
         return TopicInfo(*key, count, rate_hz, self.delay(), used_as, note)
@@ -137,8 +142,7 @@ class _Times:
     def cautions(self, name: str) -> Iterator[Diagnostic]:
         texts = (wrong_unit(*span) for span in self.spans())
         yield from [Diagnostic(name, text) for text in texts if text is not None][:1]
-        found = (in_degrees(name, angle, *span) for angle, span in self.angles.items())
-        yield from (one for one in found if one is not None)
+        yield from filter(None, (in_degrees(name, angle, *span) for angle, span in self.angles.items()))
 
     def delay(self) -> DelayInfo | None:
         if not self.delays_ns:
@@ -160,10 +164,10 @@ def _read_bag(path: Path, config: InputConfig | None, times: dict[_Key, _Times])
         times[topic.name, topic.type] = _Times()
     try:
         for topic, log_ns, stamp_ns in bag.stamps():
-            found = times[topic.name, topic.type]
-            found.newest = (stamp_ns, found.newest[1] + 1) if stamp_ns == found.newest[0] else (stamp_ns, 0)
+            own = times[topic.name, topic.type]
+            own.newest = (stamp_ns, own.newest[1] + 1) if stamp_ns == own.newest[0] else (stamp_ns, 0)
             # true states of one stamp are of as many objects
-            found.add(log_ns, stamp_ns, found.newest[1] if topic.type == TRUTH else None)
+            own.add(log_ns, stamp_ns, own.newest[1] if topic.type == TRUTH else None)
     except TruncatedInput as error:
         problem = str(error)
     return used, {(topic.name, topic.type): _note(topic, times) for topic in bag.topics}, problem
@@ -185,13 +189,12 @@ def _read_messages(path: Path, config: InputConfig | None, times: dict[_Key, _Ti
     messages = UntilBreak(open_input(path, config).messages())
     for message in messages:
         if isinstance(message, DetectionList):
-            key, use = (message.sensor, "detections"), f"detections {message.sensor}"
+            key = message.sensor, "detections"
+            used[key] = f"detections {message.sensor}"
+            times[key].add(message.receipt_ns, message.stamp_ns, states=message.objects)
         else:
             use = "ego" if isinstance(message, EgoState) else "truth"
-            key = (use, use)
-        used[key] = use
-        own_id = message.object_id if isinstance(message, TruthState) else None
-        times[key].add(message.receipt_ns, message.stamp_ns, own_id)
-        for one in message.objects if isinstance(message, DetectionList) else (message,):
-            times[key].add_angles(one)
+            used[use, use] = use
+            object_id = message.object_id if isinstance(message, TruthState) else None
+            times[use, use].add(message.receipt_ns, message.stamp_ns, object_id, [message])
     return used, {}, None if messages.error is None else str(messages.error)

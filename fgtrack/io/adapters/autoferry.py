@@ -24,6 +24,7 @@ from heapq import merge
 from pathlib import Path
 from typing import Any
 
+from fgtrack.core.checks import LARGEST_NS
 from fgtrack.core.errors import DataError
 from fgtrack.core.files import read_whole
 from fgtrack.core.geometry import wrap_angle
@@ -71,7 +72,7 @@ FORMAT = FileFormat(
 
 
 def _sensed(file: Path) -> Iterator[EgoState | DetectionList]:
-    newest_ns: int | None = None
+    newest_ns = -LARGEST_NS
     for index, record in enumerate(_records(file)):
         with reported_as(f"{file}: record {index} is not one of the data set"):
             stamp_ns = _nanoseconds(record["time"])
@@ -83,9 +84,8 @@ def _sensed(file: Path) -> Iterator[EgoState | DetectionList]:
                 if sensor in _CAMERAS
                 else _points(record["measurement"], north_m, east_m)
             )
-        newer = newest_ns is None or stamp_ns > newest_ns
-        receipt_ns = stamp_ns if newest_ns is None else max(stamp_ns, newest_ns)
-        if newer:
+        receipt_ns = max(stamp_ns, newest_ns)
+        if stamp_ns > newest_ns:
             yield EgoState(stamp_ns, receipt_ns, x_m=east_m, y_m=north_m, yaw_rad=0.0, speed_mps=0.0)
         yield DetectionList(name, stamp_ns, receipt_ns, objects, "ego" if sensor in _CAMERAS else "map")
         newest_ns = receipt_ns
