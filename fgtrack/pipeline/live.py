@@ -4,7 +4,7 @@ import threading
 from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from operator import index as whole
+from operator import index as integer
 from pathlib import Path
 from typing import Self
 
@@ -267,7 +267,7 @@ class Tracker:
         if not isinstance(message, EgoState | DetectionList):
             self._refused["neither ego state nor object list"] += 1
             return
-        stamp_ns, receipt_ns = whole(message.stamp_ns), whole(message.receipt_ns)
+        stamp_ns, receipt_ns = integer(message.stamp_ns), integer(message.receipt_ns)
         if not (0 <= stamp_ns <= LARGEST_NS and 0 <= receipt_ns <= LARGEST_NS):
             raise OverflowError("stamps are nanoseconds since 1970")
         if isinstance(message, EgoState):
@@ -348,7 +348,7 @@ class Tracker:
 def _stamp(name: str, value: int) -> int:
     """`value` as an integer. Raises `CallError` for what is no time in nanoseconds since 1970."""
     try:
-        stamp_ns = whole(value)
+        stamp_ns = integer(value)
     except TypeError:
         stamp_ns = -1
     if not 0 <= stamp_ns <= LARGEST_NS:

@@ -113,7 +113,7 @@ class GatedEuclidean:
     ) -> Assignment:
         """Return the assignment with other gates; `gates_m` broadcasts to (candidates, tracks)."""
         is_one = isinstance(gates_m, float)
-        pairs = _near(candidates, states, gates_m if is_one else float(np.max(gates_m, initial=0.0)), apart)
+        pairs = near(candidates, states.means, gates_m if is_one else float(np.max(gates_m, initial=0.0)), apart)
         if not is_one:
             limits_m = np.broadcast_to(gates_m, (len(candidates), len(states.means)))
             pairs = pairs.at(pairs.values <= limits_m[pairs.rows, pairs.columns])
@@ -121,8 +121,8 @@ class GatedEuclidean:
         if self.max_nis is not None and len(pairs.rows):
             suspects = set(pairs.rows.tolist())
             nis = np.empty(len(pairs.rows))
-            for chosen, found, _, _ in innovations(pairs, grouped(candidates), len(candidates), states):
-                nis[chosen] = found
+            for chosen, chosen_nis, _, _ in innovations(pairs, grouped(candidates), len(candidates), states):
+                nis[chosen] = chosen_nis
             pairs = pairs.at(nis <= self.max_nis)
         return _refusing(suspects, assigned(pairs, len(candidates), len(states.means)))
 
@@ -153,7 +153,7 @@ class GatedMahalanobis:
         groups = grouped(candidates)
         quantiles = [chi_square_quantile(self.gate_probability, group.z.shape[-1]) for group in groups]
         reach_m = reaches_m(groups, states, quantiles, self.max_distance_m)
-        pairs = _near(candidates, states, reach_m, apart)
+        pairs = near(candidates, states.means, reach_m, apart)
         cost, inside = np.empty(len(pairs.rows)), np.empty(len(pairs.rows), dtype=bool)
         for chosen, nis, logdet, k in innovations(pairs, groups, len(candidates), states) if len(cost) else ():
             cost[chosen] = nis + logdet
@@ -162,14 +162,8 @@ class GatedMahalanobis:
         if not (self.claim_m and result.new):
             return result
         loose = np.array(result.new)
-        claimed = _near(candidates, states, self.claim_m, apart).rows
+        claimed = near(candidates, states.means, self.claim_m, apart).rows
         return _refusing(set(loose[np.isin(loose, claimed)].tolist()), result)
-
-
-def _near(candidates: Sequence[Candidate], states: StatesAt, reach_m: float | FloatArray, apart: Apart | None) -> Pairs:
-    """Return the pairs at most `reach_m` apart that are not `apart`."""
-    pairs = near(candidates, states.means, reach_m)
-    return pairs if apart is None else pairs.at(~apart(pairs.rows, pairs.columns))
 
 
 def _refusing(suspects: set[int], assignment: Assignment) -> Assignment:
@@ -188,8 +182,8 @@ def chi_square_quantile(probability: float, freedom: int) -> float:
 
 def assigned(pairs: Pairs, num_candidates: int, num_tracks: int) -> Assignment:
     """Assignment of as many of `pairs` as possible at least total cost, which are their values."""
-    one, other = pairs.rows.tolist(), pairs.columns.tolist()
-    if len(set(one)) == len(one) and len(set(other)) == len(other):  # nothing competes, as nearly always
+    rows_used, columns_used = set(pairs.rows.tolist()), set(pairs.columns.tolist())
+    if len(rows_used) == len(columns_used) == len(pairs.rows):  # nothing competes, as nearly always
         return _outcome(pairs.rows, pairs.columns, num_candidates, num_tracks)
     if num_candidates * num_tracks <= _DENSE_COSTS:
         cost = np.full((num_candidates, num_tracks), _OUTSIDE)
@@ -252,8 +246,10 @@ def grouped(candidates: Sequence[Candidate]) -> list[Group]:
     return groups
 
 
-def near(candidates: Sequence[Candidate], means: FloatArray, reach_m: float | FloatArray) -> Pairs:
-    """Return the pairs at most `reach_m` apart, a number or one for each track; the values are distances.
+def near(
+    candidates: Sequence[Candidate], means: FloatArray, reach_m: float | FloatArray, excluded: Apart | None = None
+) -> Pairs:
+    """Return the pairs, with distances, at most `reach_m` (a number or one for each track) apart and not `excluded`.
 
     Of a candidate with more than `MOST_NEAR` tracks so near, the nearest of them. Distances are in the map; that of a
     bearing is from the track to the line of sight.
@@ -262,21 +258,27 @@ def near(candidates: Sequence[Candidate], means: FloatArray, reach_m: float | Fl
     if len(points) * len(means) <= _DENSE_DISTANCES:
         distances = _distances(points, candidates, means)
         rows, columns = (distances <= reach_m).nonzero()
-        return Pairs(rows, columns, distances[rows, columns])
+        pairs = Pairs(rows, columns, distances[rows, columns])
+    else:
+        pairs = _near_by_tree(points, candidates, means, np.broadcast_to(reach_m, len(means)))
+    return pairs if excluded is None else pairs.at(~excluded(pairs.rows, pairs.columns))
+
+
+def _near_by_tree(points: FloatArray, candidates: Sequence[Candidate], means: FloatArray, reach_m: FloatArray) -> Pairs:
+    """See `near`, of many pairs."""
     placed = np.flatnonzero(~np.isnan(points[:, 0]))
-    reach_m = np.broadcast_to(reach_m, len(means))
     nearest = range(1, min(len(means), MOST_NEAR) + 1)
     farthest_m = float(reach_m.max()) * _MARGIN
     apart, tracks = cKDTree(means[:, :2]).query(points[placed], nearest, distance_upper_bound=farthest_m)
     inside, order = np.isfinite(apart).nonzero()
     rows, columns = placed[inside], np.asarray(tracks)[inside, order]
     offsets = points[rows] - means[columns, :2]
-    found = [(rows, columns, np.sqrt(np.vecdot(offsets, offsets)))]
+    parts = [(rows, columns, np.sqrt(np.vecdot(offsets, offsets)))]
     for row in np.flatnonzero(np.isnan(points[:, 0])).tolist():
         distances = _distances_to_ray(candidates[row], means)
         columns = np.argsort(distances, kind="stable")[:MOST_NEAR]
-        found.append((np.full(len(columns), row), columns, distances[columns]))
-    pairs = Pairs(*(np.concatenate(arrays) for arrays in zip(*found, strict=True)))
+        parts.append((np.full(len(columns), row), columns, distances[columns]))
+    pairs = Pairs(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
     pairs = pairs.at(pairs.values <= reach_m[pairs.columns])
     return pairs.at(np.lexsort((pairs.columns, pairs.rows)))
 

@@ -188,8 +188,8 @@ def _in_map(x_m: Real, y_m: Real, pose: SensorPose) -> tuple[Real, Real]:
 def _turned(R: FloatArray, yaws_rad: FloatArray) -> FloatArray:
     """R with its position blocks, and the correlations of the position with the rest, turned by `yaws_rad` (m,)."""
     turns = np.zeros(R.shape)
-    places = np.arange(R.shape[-1])
-    turns[:, places, places] = 1.0
+    diagonal = np.arange(R.shape[-1])
+    turns[:, diagonal, diagonal] = 1.0
     turns[:, :2, :2] = rotations(yaws_rad)
     return congruence(turns, R)
 

@@ -246,16 +246,16 @@ class EgoTrajectory(EgoSource):
 
     def _insert(self, ego: EgoState) -> str | None:
         """Insert a state by its stamp, a late one unfiltered; the reason, where it is refused."""
-        place = bisect.bisect_left(self._stamps, ego.stamp_ns)
-        if place < len(self._stamps) and self._stamps[place] == ego.stamp_ns:
+        row = bisect.bisect_left(self._stamps, ego.stamp_ns)
+        if row < len(self._stamps) and self._stamps[row] == ego.stamp_ns:
             return "repeated stamp"
-        if place == len(self._states):
+        if row == len(self._states):
             if self.current is not None:
                 turned_rad = self.current.yaw_rate_radps * seconds(ego.stamp_ns - self.current.stamp_ns)
                 ego = self._low_passed(ego, self.current.yaw_rad + turned_rad, self.current.yaw_rate_radps)
             self.current = ego
-        self._stamps.insert(place, ego.stamp_ns)
-        self._states.insert(place, ego)
+        self._stamps.insert(row, ego.stamp_ns)
+        self._states.insert(row, ego)
         keep = bisect.bisect_left(self._stamps, self._stamps[-1] - self._memory_ns)
         if keep > 64:  # in portions: cutting a list copies it
             del self._stamps[: keep - 1], self._states[: keep - 1]
@@ -271,8 +271,8 @@ class EgoTrajectory(EgoSource):
         """
         if not self._stamps:
             return None
-        place = bisect.bisect_left(self._stamps, stamp_ns)
-        around = self._states[max(place - 1, 0) : place + 1]
+        row = bisect.bisect_left(self._stamps, stamp_ns)
+        around = self._states[max(row - 1, 0) : row + 1]
         if len(around) == 2 and around[1].stamp_ns - around[0].stamp_ns <= 2 * self._max_extrapolation_ns:
             return self._interpolated(around[0], around[1], stamp_ns)
         nearest = min(around, key=lambda ego: abs(stamp_ns - ego.stamp_ns))

@@ -93,12 +93,12 @@ class Existence:
 
     def learn(self, stamp_ns: int, weight: float) -> None:
         """Evidence of `stamp_ns`, in any order; what is older than all that is remembered counts as the oldest."""
-        place = max(bisect_right(self.stamps_ns, stamp_ns), 1)
+        row = max(bisect_right(self.stamps_ns, stamp_ns), 1)
         self.in_view_ns = max(self.in_view_ns, stamp_ns)
-        self.stamps_ns.insert(place, max(stamp_ns, self.stamps_ns[0]))
-        self.weights.insert(place, weight)
-        del self.log_odds[place:]
-        for k in range(place, len(self.stamps_ns)):
+        self.stamps_ns.insert(row, max(stamp_ns, self.stamps_ns[0]))
+        self.weights.insert(row, weight)
+        del self.log_odds[row:]
+        for k in range(row, len(self.stamps_ns)):
             self.log_odds.append(_bounded(self._survived(k - 1, self.stamps_ns[k]) + self.weights[k]))
 
     def probability(self, stamp_ns: int) -> float:
@@ -112,9 +112,9 @@ class Existence:
             del self.stamps_ns[:keep], self.weights[:keep], self.log_odds[:keep]
             self.weights[0] = self.log_odds[0]
 
-    def _survived(self, place: int, stamp_ns: int) -> float:
-        """Log-odds that it exists and is still there at `stamp_ns`, given the evidence up to `place`."""
-        log_odds, dt_s = self.log_odds[place], seconds(stamp_ns - self.stamps_ns[place])
+    def _survived(self, row: int, stamp_ns: int) -> float:
+        """Log-odds that it exists and is still there at `stamp_ns`, given the evidence up to `row`."""
+        log_odds, dt_s = self.log_odds[row], seconds(stamp_ns - self.stamps_ns[row])
         if dt_s <= 0.0:
             return log_odds
         gone = -math.expm1(-dt_s / self.lifetime_s)
@@ -150,7 +150,7 @@ class ExistenceLifecycle:
             self._rules.lifetime_s, [scan.stamp_ns], [log_odds], [log_odds], in_view_ns=scan.stamp_ns
         )
         life.first_m, life.travelled = matched.candidate.position_m, self._rules.min_travel_m == 0.0
-        self._judge(life)
+        self._confirm(life)
 
     def matched(self, track_id: int, scan: Scan, matched: MatchedDetection) -> None:
         """See `Lifecycle.matched`."""
@@ -159,14 +159,14 @@ class ExistenceLifecycle:
         if not life.travelled and matched.mean is not None and life.first_m is not None:
             travel_m = math.dist(matched.mean[:2].tolist(), life.first_m.tolist())
             life.travelled = travel_m >= self._rules.min_travel_m
-        found = _position_density(matched)
-        if found is None:
+        density = _position_density(matched)
+        if density is None:
             return
         sensor = self._sensors[scan.sensor]
-        ratio = found / sensor.clutter_per_m2 * math.exp(self._score(scan, matched))
-        seen = sensor.detection_probability
-        life.learn(scan.stamp_ns, math.log(1.0 - seen + seen * ratio))
-        self._judge(life)
+        ratio = density / sensor.clutter_per_m2 * math.exp(self._score(scan, matched))
+        P_D = sensor.detection_probability
+        life.learn(scan.stamp_ns, math.log(1.0 - P_D + P_D * ratio))
+        self._confirm(life)
 
     def fused(self, track_id: int) -> None:
         """See `Lifecycle.fused`; the match has counted already."""
@@ -204,9 +204,9 @@ class ExistenceLifecycle:
             return TrackStatus.TENTATIVE
         return TrackStatus.COASTING if life.misses else TrackStatus.CONFIRMED
 
-    def _judge(self, life: Existence) -> None:
-        believed = life.travelled and life.probability(self._present_ns) >= self._rules.confirm_probability
-        life.confirmed = life.confirmed or believed
+    def _confirm(self, life: Existence) -> None:
+        if life.travelled and life.probability(self._present_ns) >= self._rules.confirm_probability:
+            life.confirmed = True
 
     def _ends(self, life: Existence) -> bool:
         if self._newest_ns - life.in_view_ns > self._out_of_view_ns:
@@ -218,8 +218,8 @@ class ExistenceLifecycle:
         model = self._sensors[scan.sensor].score
         if model is None or not scan.objects:
             return 0.0
-        places = (matched.candidate.leader, *matched.candidate.merged)
-        scores = [score for place in places if (score := scan.objects[place].score) is not None]
+        indices = (matched.candidate.leader, *matched.candidate.merged)
+        scores = [score for index in indices if (score := scan.objects[index].score) is not None]
         return model.log_ratio(max(scores)) if scores else 0.0
 
 

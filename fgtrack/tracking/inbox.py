@@ -91,8 +91,8 @@ def is_usable(detection: Detection, sensor: SensorModel) -> bool:
 def own_covariance(detection: Detection, names: Sequence[str]) -> FloatArray:
     """Covariance of the components `names` that `detection` carries, shape (k, k)."""
     measured = detection.measured
-    places = [measured.index(name) for name in names]
-    return np.array(detection.covariance).reshape(len(measured), len(measured))[np.ix_(places, places)]
+    rows = [measured.index(name) for name in names]
+    return np.array(detection.covariance).reshape(len(measured), len(measured))[np.ix_(rows, rows)]
 
 
 def is_covariance(detection: Detection, sensor: SensorModel) -> bool:
@@ -120,13 +120,13 @@ def stamps(message: DetectionList, sensor: SensorModel) -> list[int]:
     """Stamp of every detection of `message`: the list's, its own, or the mean of those that have one."""
     if sensor.stamp_from not in ("object", "objects_mean"):
         return [message.stamp_ns] * len(message.objects)
-    result, known = [], []
+    result, own = [], []
     for detection in message.objects:
         if detection.stamp_ns is not None:
-            known.append(detection.stamp_ns)
+            own.append(detection.stamp_ns)
         result.append(message.stamp_ns if detection.stamp_ns is None else detection.stamp_ns)
-    if sensor.stamp_from == "objects_mean" and known:
-        return [sum(known) // len(known)] * len(result)
+    if sensor.stamp_from == "objects_mean" and own:
+        return [sum(own) // len(own)] * len(result)
     return result
 
 

@@ -48,13 +48,13 @@ class Objects:
 
     def learn(self, track_id: int, detections: Iterable[Detection]) -> None:
         """Add detections of the track."""
-        for one in detections:
-            sizes_m = _sizes_m(one)
-            if one.class_name is None and sizes_m == _NO_SIZES:
+        for detection in detections:
+            sizes_m = _sizes_m(detection)
+            if detection.class_name is None and sizes_m == _NO_SIZES:
                 continue
             seen = self._seen.setdefault(track_id, _Seen())
-            if one.class_name is not None:
-                seen.classes[one.class_name] += 1
+            if detection.class_name is not None:
+                seen.classes[detection.class_name] += 1
             for name, value in zip(_SIZES, sizes_m, strict=True):
                 if value is not None:
                     seen.num_sizes[name] += 1

@@ -183,7 +183,7 @@ class Preprocess:
         if sensor.correlation is not None:
             split = [split_error(batch.message.sensor, sensor, model, one, self._motion.state_names) for one in R]
             models, white = [each for each, _ in split], np.array([noise for _, noise in split])
-        whole, is_placed = white, not math.isnan(points_m[0, 0])  # all or none
+        total, is_placed = white, not math.isnan(points_m[0, 0])  # all or none
         own: Iterable[PoseError | None] = [None] * len(z)
         if pose_covariance is not None:
             G = np.zeros((len(z), len(names), len(pose)))
@@ -193,14 +193,14 @@ class Preprocess:
             if models[0].relative:
                 x = np.zeros((len(z), self._motion.dim))
                 x[:, :2] = points_m if is_placed else _far_along(z[:, names.index("bearing_rad")], pose)
-            whole = PoseError(pose_covariance, G, white).noise(models[0], pose, x)
-            R, own = R + (whole - white), map(partial(PoseError, pose_covariance), G, white)
+            total = PoseError(pose_covariance, G, white).noise(models[0], pose, x)
+            R, own = R + (total - white), map(partial(PoseError, pose_covariance), G, white)
         spreads: Iterable[FloatArray | None]
         spreads = R[:, :2, :2] if names[:2] == ("x_m", "y_m") else map(partial(_spread, names, pose), z, R)
         positions_m: Iterable[FloatArray | None] = points_m if is_placed else [None] * len(z)
         candidates, indices = [], items.indices.tolist()
         for index, each, mean, noise, point_m, spread, error in zip(
-            indices, models, z, whole, positions_m, spreads, own, strict=True
+            indices, models, z, total, positions_m, spreads, own, strict=True
         ):
             measurement = Measurement(batch.stamp_ns, each, mean, noise, pose, sensor.loss, assumed)
             candidates.append(Candidate(index, items.merged.get(index, ()), measurement, point_m, spread, error))
@@ -221,8 +221,8 @@ def _names(columns: tuple[int, ...]) -> tuple[str, ...]:
 
 
 def _spread(names: tuple[str, ...], pose: SensorPose, z: FloatArray, R: FloatArray) -> FloatArray | None:
-    found = measured_position(names, z, R, pose)
-    return None if found is None else found[1]
+    position = measured_position(names, z, R, pose)
+    return None if position is None else position[1]
 
 
 def _pose_covariance(pose: SensorPose, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> FloatArray | None:

@@ -156,7 +156,7 @@ class Tracker:
         return tuple(self._report(*track) for row, track in rows if row not in unsound)
 
     def _process_if_possible(self, batch: Batch) -> None:
-        """Process a batch; where that raises what is no answer, what is left of the batch ends as failed."""
+        """Process a batch; after an exception that is not propagated, the rest of it ends as failed."""
         first = len(self._records)
         try:
             self._process(batch)
@@ -165,9 +165,9 @@ class Tracker:
                 raise
             self.failures.add(Failure.LIST_FAILED)
             self.failures.note(error)
-            ended = {one.index for one in self._records[first:]}
-            left = [index for index in batch.indices if index not in ended]
-            self._records += [record(batch.message, index, Disposition.FAILED) for index in left]
+            ended = {update.index for update in self._records[first:]}
+            failed = [index for index in batch.indices if index not in ended]
+            self._records += [record(batch.message, index, Disposition.FAILED) for index in failed]
 
     def _process(self, batch: Batch) -> None:
         """One object list, at its own stamp: transform, filter, merge, associate, age, estimate, give birth."""
@@ -213,11 +213,11 @@ class Tracker:
         """
         younger = self._younger(batch.stamp_ns, states)
         claims = self._assigned(batch, [candidates[position] for position in new], younger)
-        for place, track in claims.pairs:
-            self._conclude(batch, candidates[new[place]], Disposition.TOO_OLD, younger.track_ids[track])
-        for place in claims.refused:
-            self._conclude(batch, candidates[new[place]], Disposition.GATED)
-        return [new[place] for place in claims.new]
+        for k, track in claims.pairs:
+            self._conclude(batch, candidates[new[k]], Disposition.TOO_OLD, younger.track_ids[track])
+        for k in claims.refused:
+            self._conclude(batch, candidates[new[k]], Disposition.GATED)
+        return [new[k] for k in claims.new]
 
     def _younger(self, stamp_ns: int, states: StatesAt) -> StatesAt:
         """Tracks that are not among `states`: their present states, moved back to `stamp_ns`."""
