@@ -15,7 +15,8 @@ __all__ = ["bias_findings", "clock_findings", "clock_text", "stamp_findings"]
 
 _AHEAD_S, _AHEAD_SHARE = 1e-3, 0.005  # rounding of stamps
 _PARTS, _SHORTEST_PART_S = 10, 1.0  # of a recording, whose median delays are compared
-_CHANGE_S, _CHANGE_STDS = 0.015, 4.0  # of the mean delay of two successive halves; of a drift they are 5 apart
+_CHANGE_S, _JUMP_STDS = 0.015, 7.0  # of the mean delay before and after the best of seven splits
+_DRIFT_STDS, _DRIFT_CORRELATION = 4.0, 0.9  # a steady drift is 5 apart, but correlates with time as chance does not
 _SAME_BIAS_M = 0.5  # of sensors of one frame: what two calibrations, or two parts of a car, may differ by
 
 
@@ -57,7 +58,11 @@ def _change(one: Arrivals) -> Iterator[Finding]:
     k = int(np.argmin(within))
     before_s, after_s = (float(half.mean()) for half in halves[k])
     std_s = math.sqrt(within[k] / (_PARTS - 2) * (1.0 / splits[k] + 1.0 / (_PARTS - splits[k])))
-    if abs(after_s - before_s) < max(_CHANGE_S, _CHANGE_STDS * std_s):
+    change_s = abs(after_s - before_s)
+    if change_s < max(_CHANGE_S, _DRIFT_STDS * std_s):
+        return
+    correlation = np.corrcoef(medians_s, np.arange(_PARTS))[0, 1]
+    if change_s < _JUMP_STDS * std_s and abs(correlation) < _DRIFT_CORRELATION:
         return
     at_s = times_s[splits[k] * len(times_s) // _PARTS]
     text = (

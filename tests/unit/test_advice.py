@@ -50,6 +50,18 @@ def test_a_change_in_the_last_seconds_is_no_jump_of_the_clock(at_s: float, is_ju
     assert any("its delay is 50 ms until about 30 s and 300 ms after" in one.text for one in found) == is_jump
 
 
+@pytest.mark.parametrize(("drift_s", "fewest", "most"), [(0.0, 0, 1), (0.3, 195, 200)])
+def test_scatter_of_the_delay_is_no_change_but_a_drift_is(drift_s: float, fewest: int, most: int) -> None:
+    stamps_ns = np.arange(1, 601) * (SECOND_NS // 20)
+    num_changes = 0
+    for seed in range(200):
+        delays_s = np.random.default_rng(seed).normal(0.2, 0.1, 600) + np.linspace(0.0, drift_s, 600)
+        receipts_ns = stamps_ns + (1e9 * delays_s).astype(np.int64)
+        found = stamp_findings(Arrivals("radar", stamps_ns, receipts_ns, np.ones(600, int)))
+        num_changes += any("its delay is" in one.text for one in found)
+    assert fewest <= num_changes <= most
+
+
 def report(offset_s: float, least_s: float, std_s: float = 0.005) -> OffsetReport:
     radar = SensorOffset("radar", offset_s, std_s, 500, "", dof=5.0)
     lidar = SensorOffset("lidar", 0.0, 0.0, 500, "the reference")
