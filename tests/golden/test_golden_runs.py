@@ -39,7 +39,7 @@ class Golden:
 
 
 def counted(lives: Mapping[int, Life]) -> dict[int, tuple[int, int, int]]:
-    return {track_id: (life.counter, life.num_measured, life.last_seen_ns) for track_id, life in lives.items()}
+    return {track_id: (life.counter, life.num_placed, life.last_seen_ns) for track_id, life in lives.items()}
 
 
 @pytest.fixture(scope="module", params=[*RUNS[:3], pytest.param(RUNS[3], marks=pytest.mark.slow)])
