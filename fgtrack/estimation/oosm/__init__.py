@@ -7,7 +7,7 @@ counted in steps. The methods differ in their estimate of the state at tau; most
 from fgtrack.estimation.oosm.asd import AccumulatedStateDensity
 from fgtrack.estimation.oosm.buffers import DelayedHorizon, ReorderBuffer
 from fgtrack.estimation.oosm.crossing import A1, B1, Al1, Bl1, C, FixedPoint, Larsen, RtsCrossCovariance
-from fgtrack.estimation.oosm.forward import CovarianceIntersection, Fpfd, determinant, trace
+from fgtrack.estimation.oosm.forward import CovarianceIntersection, Fpfd
 from fgtrack.estimation.oosm.late import AsCurrent, Drop, RewindForget
 
 __all__ = [
@@ -27,6 +27,4 @@ __all__ = [
     "ReorderBuffer",
     "RewindForget",
     "RtsCrossCovariance",
-    "determinant",
-    "trace",
 ]

@@ -10,7 +10,7 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.filters.ekf import OneCorrection, Prediction, linearised, propagated, robust_weight
-from fgtrack.estimation.oosm.history import FilterStep, require_finite
+from fgtrack.estimation.oosm.history import FilterStep
 from fgtrack.estimation.oosm.late import LateEkf
 from fgtrack.estimation.rts import rts_step
 from fgtrack.models.motion import MotionModel
@@ -44,7 +44,8 @@ def fuse_across(mean: FloatArray, covariance: FloatArray, past: Past, measuremen
     across = past.cross @ H.T
     gain = psd_solve(S, across.T).T
     result = OneCorrection(mean + gain @ y, symmetrise(covariance - gain @ across.T), y, nis, w, expected)
-    require_finite(result)
+    if not (np.isfinite(result.mean).all() and np.isfinite(result.covariance).all()):
+        raise np.linalg.LinAlgError("the measurement gives a state that is not finite")
     return result
 
 
@@ -105,13 +106,16 @@ def retrodicted(
 
 
 class _OneLag(CrossingEkf):
-    """Retrodiction through the measurements of the newest stamp only, whatever the lag."""
+    """Retrodiction as one lag: through the measurements of the newest stamp, or all since the step m before tau."""
 
     noise_in_state: ClassVar[bool]
+    equivalent: ClassVar[bool] = False
 
     def _past(self, stamp_ns: int) -> Past:
         now, first = self._history.newest, self._history.first_at_newest
         before = first.predicted_mean, first.predicted_covariance
+        if self.equivalent:
+            before = self._history.predicted(self._history.left(stamp_ns), now.stamp_ns)
         return retrodicted(self._motion, now, before, seconds(now.stamp_ns - stamp_ns), self.noise_in_state)
 
 
@@ -165,18 +169,7 @@ class C(CrossingEkf):
         return Past(mean, symmetrise(back @ cross), cross)
 
 
-class _OneStep(CrossingEkf):
-    """Retrodiction from the present to the last step m before the late stamp, as one lag."""
-
-    noise_in_state: ClassVar[bool]
-
-    def _past(self, stamp_ns: int) -> Past:
-        now = self._history.newest
-        before = self._history.predicted(self._history.left(stamp_ns), now.stamp_ns)
-        return retrodicted(self._motion, now, before, seconds(now.stamp_ns - stamp_ns), self.noise_in_state)
-
-
-class Al1(_OneStep):
+class Al1(_OneLag):
     """Algorithm Al1: A1 with the equivalent measurement of the last l steps.
 
     Bar-Shalom, Chen and Mallick, One-step solution for the multistep out-of-sequence-measurement problem in tracking,
@@ -190,10 +183,10 @@ class Al1(_OneStep):
 
     exact = "one lag, first late measurement"
 
-    noise_in_state = True
+    noise_in_state, equivalent = True, True
 
 
-class Bl1(_OneStep):
+class Bl1(_OneLag):
     """Algorithm Bl1: Al1 without the noise in the retrodicted state.
 
     Bar-Shalom, Chen and Mallick 2004 (see `Al1`): x_tau = F(tau, k) x_k and P_vv = Q, so that of the steps only the
@@ -202,7 +195,7 @@ class Bl1(_OneStep):
     Exact for: nothing, but close to `Al1`.
     """
 
-    noise_in_state = False
+    noise_in_state, equivalent = False, True
 
 
 class RtsCrossCovariance(CrossingEkf):

@@ -1,7 +1,6 @@
 """Predict the late measurement forward as an estimate of its own, and fuse it with the present one."""
 
 from abc import abstractmethod
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -9,11 +8,9 @@ from scipy.optimize import minimize_scalar
 
 from fgtrack.core.linalg import identity, psd_solve, symmetrise
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.filters.ekf import OneCorrection
-from fgtrack.estimation.oosm.history import corrected
+from fgtrack.estimation.base import Measurement
+from fgtrack.estimation.filters.ekf import OneCorrection, correct_one
 from fgtrack.estimation.oosm.late import LateEkf
-from fgtrack.models.motion import MotionModel
 
 
 class Estimate(NamedTuple):
@@ -36,7 +33,7 @@ class _ForwardEkf(LateEkf):
         history, stamp_ns = self._history, measurement.stamp_ns
         now = history.newest
         mean, covariance = history.predicted(history.left(stamp_ns), stamp_ns)
-        at_tau = corrected(mean, covariance, measurement)
+        at_tau = correct_one(mean, covariance, measurement)
         late = Estimate(*history.moved(at_tau.mean, at_tau.covariance, stamp_ns, now.stamp_ns))
         common = Estimate(*history.moved(mean, covariance, stamp_ns, now.stamp_ns))
         fused = self._fused(Estimate(now.mean, now.covariance), late, common)
@@ -71,16 +68,6 @@ class Fpfd(_ForwardEkf):
         return Estimate(now.mean + covariance @ pull, covariance)
 
 
-def trace(covariance: FloatArray) -> float:
-    """Sum of the variances; it adds up entries of different units."""
-    return float(np.trace(covariance))
-
-
-def determinant(covariance: FloatArray) -> float:
-    """Squared volume of the ellipsoid, whatever the units."""
-    return float(np.linalg.det(covariance))
-
-
 class CovarianceIntersection(_ForwardEkf):
     """Fuse both estimates without knowing what they share.
 
@@ -89,24 +76,11 @@ class CovarianceIntersection(_ForwardEkf):
 
         P^-1 = w P_k^-1 + (1 - w) P_1^-1,   P^-1 x = w P_k^-1 x_k + (1 - w) P_1^-1 x_1
 
-    with the w in [0, 1] that makes P smallest.
+    with the w in [0, 1] for which the trace of P is smallest, whose entries differ in their units.
 
     Exact for: nothing; never overconfident. Where one estimate is better than the other in all, it takes that one and
     loses the other.
-
-    Parameters
-    ----------
-    motion, prior, lag_s
-        See `WindowedFilter`.
-    size
-        What shall be small: `trace` or `determinant`.
     """
-
-    def __init__(
-        self, motion: MotionModel, prior: Start, lag_s: float, size: Callable[[FloatArray], float] = trace
-    ) -> None:
-        super().__init__(motion, prior, lag_s)
-        self._size = size
 
     def _fused(self, now: Estimate, late: Estimate, common: Estimate) -> Estimate:
         P_k, P_1 = information(now.covariance), information(late.covariance)
@@ -114,8 +88,11 @@ class CovarianceIntersection(_ForwardEkf):
         def covariance(w: float) -> FloatArray:
             return symmetrise(information(w * P_k + (1.0 - w) * P_1))
 
-        inner = float(minimize_scalar(lambda w: self._size(covariance(w)), bounds=(0.0, 1.0), method="bounded").x)
-        w = min((0.0, inner, 1.0), key=lambda w: self._size(covariance(w)))
+        def spread(w: float) -> float:
+            return float(np.trace(covariance(w)))
+
+        inner = float(minimize_scalar(spread, bounds=(0.0, 1.0), method="bounded").x)
+        w = min((0.0, inner, 1.0), key=spread)
         P = covariance(w)
         return Estimate(now.mean + (1.0 - w) * P @ (P_1 @ (late.mean - now.mean)), P)
 

@@ -32,19 +32,6 @@ class FilterStep:
     """H' S^-1 H, shape (n, n); with it I - K H = I - P_{j|j-1} weight."""
 
 
-def corrected(mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
-    """`correct_one`, which raises `numpy.linalg.LinAlgError` where the result is not finite, too."""
-    result = correct_one(mean, covariance, measurement)
-    require_finite(result)
-    return result
-
-
-def require_finite(result: OneCorrection) -> None:
-    """Raise `numpy.linalg.LinAlgError` unless mean and covariance are finite."""
-    if not (np.isfinite(result.mean).all() and np.isfinite(result.covariance).all()):
-        raise np.linalg.LinAlgError("the measurement gives a state that is not finite")
-
-
 class History:
     """Steps of a filter in order of their stamps, the first of them the prior."""
 
@@ -95,7 +82,7 @@ class History:
         Raises `numpy.linalg.LinAlgError` for a measurement that cannot be fused.
         """
         mean, covariance = self.predicted(place, measurement.stamp_ns)
-        result = corrected(mean, covariance, measurement)
+        result = correct_one(mean, covariance, measurement)
         y, H = linearised(measurement.z, mean, measurement.model, measurement.pose)
         weighted = psd_solve(propagated(H, covariance, measurement.R / result.weight), np.column_stack((y, H)))
         score, weight = H.T @ weighted[:, 0], symmetrise(H.T @ weighted[:, 1:])
