@@ -155,18 +155,15 @@ def claimed(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise CallError(f"{folder}: cannot be made a folder ({error.strerror}), choose another one") from error
     try:
-        with suppress(OSError):  # a file system without locks
-            _lock(lock, folder)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise CallError(f"{folder}: another command is writing there, choose another folder or wait") from error
+        except OSError:  # a file system without locks
+            pass
         yield
     finally:
         with suppress(OSError):
             for path in missing:
                 path.rmdir()
         os.close(lock)
-
-
-def _lock(descriptor: int, folder: Path) -> None:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise CallError(f"{folder}: another command is writing there, choose another folder or wait") from error

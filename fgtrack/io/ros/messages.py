@@ -158,9 +158,8 @@ class MessageFactory:
             orientation=self._make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=z, w=w),
         )
 
-    def _with_covariance(self, kind: str, value: RosMessage, covariance: FloatArray | None) -> RosMessage:
-        flat = np.zeros(36) if covariance is None else covariance.ravel()
-        fields = {kind.lower(): value, "covariance": flat}
+    def _with_covariance(self, kind: str, value: RosMessage, covariance: FloatArray) -> RosMessage:
+        fields = {kind.lower(): value, "covariance": covariance.ravel()}
         return self._make(f"geometry_msgs/msg/{kind}WithCovariance", **fields)
 
 
@@ -171,11 +170,9 @@ def _or_nothing(name: str, value: RosMessage) -> RosMessage:
     return value if value is not None else "" if name in TEXTS else 0
 
 
-def _odometry_covariances(state: EgoState) -> tuple[FloatArray, FloatArray] | tuple[None, None]:
-    """Covariances, shape (6, 6), of pose and twist; None where the state has none."""
-    if state.covariance is None:
-        return None, None
-    given, pose, twist = np.reshape(state.covariance, (5, 5)), np.zeros((6, 6)), np.zeros((6, 6))
+def _odometry_covariances(state: EgoState) -> tuple[FloatArray, FloatArray]:
+    """Covariances, shape (6, 6), of pose and twist; zero where the state has none."""
+    given, pose, twist = np.reshape(state.covariance or (0.0,) * 25, (5, 5)), np.zeros((6, 6)), np.zeros((6, 6))
     pose[np.ix_(PLANAR, PLANAR)], twist[np.ix_([0, 5], [0, 5])] = given[:3, :3], given[3:, 3:]
     return pose, twist
 

@@ -39,6 +39,8 @@ _KEYS = {
     "object_id": ("truth",),
 }
 
+_EGOS: dict[str, Callable[[RosMessage, int], Message]] = {EGO: NATIVE_ADAPTERS[EGO], ODOMETRY: ego_from_odometry}
+
 Convert = Callable[[RosMessage, int], Iterator[Message]]
 
 
@@ -74,7 +76,9 @@ def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
         *(("truth", item, partial(_truths, number=number, topics=len(truth))) for number, item in enumerate(truth)),
     ]
     native = tuple(
-        TopicUse(topic, "messages", _native(topic.type)) for topic in bag.topics if topic.type in NATIVE_ADAPTERS
+        TopicUse(topic, "messages", _single(NATIVE_ADAPTERS[topic.type]))
+        for topic in bag.topics
+        if topic.type in NATIVE_ADAPTERS
     )
     if native and names.isdisjoint(item.topic for _, item, _ in roles):
         return native
@@ -166,8 +170,7 @@ def _check_fields(item: TopicInput, known: frozenset[str], needed: tuple[str, ..
             raise CallError(f"topic {item.topic}: fields must name {name}")
 
 
-def _native(msgtype: str) -> Convert:
-    adapter = NATIVE_ADAPTERS[msgtype]
+def _single(adapter: Callable[[RosMessage, int], Message]) -> Convert:
     return lambda message, receipt_ns: iter((adapter(message, receipt_ns),))
 
 
@@ -175,12 +178,10 @@ def _ego(topic: BagTopic, item: TopicInput) -> Convert:
     fields = item.fields
     if fields is not None:
         _check_fields(item, EGO_FIELDS, ("x_m", "y_m", "yaw_rad", "speed_mps"))
-        return lambda message, receipt_ns: iter((ego_by_fields(message, fields, receipt_ns),))
-    if topic.type == EGO:
-        return _native(topic.type)
-    if topic.type != ODOMETRY:
+        return _single(lambda message, receipt_ns: ego_by_fields(message, fields, receipt_ns))
+    if topic.type not in _EGOS:
         raise CallError(f"topic {topic.name}: an ego of type {topic.type} needs fields, known is {ODOMETRY}")
-    return lambda message, receipt_ns: iter((ego_from_odometry(message, receipt_ns),))
+    return _single(_EGOS[topic.type])
 
 
 def _objects(
@@ -244,7 +245,7 @@ def _detections(topic: BagTopic, item: TopicInput, sensor: str) -> Convert:
 def _truths(topic: BagTopic, item: TopicInput, number: int, topics: int) -> Convert:
     """Return the adapter of truth; each of several topics has one object, its index is the id if there is no other."""
     if topic.type == TRUTH and item.fields is None and item.object_id is None and not item.filters:
-        return _native(topic.type)
+        return _single(NATIVE_ADAPTERS[TRUTH])
     if topics == 1 and item.object_id is None:
         return _objects(topic, item, _truth)
     own = object_id(number if item.object_id is None else item.object_id)
