@@ -41,6 +41,14 @@ def started(name: str = "ekf-replay") -> tuple[Tracker, TickReport]:
     return tracker, report
 
 
+def test_the_end_of_a_run_gives_the_final_states_of_the_window() -> None:
+    tracker, report = started("smoother")
+    finals = [one for one in tracker.finish() if one.lag_s is None]
+    assert {one.track_id for one in finals} == {report.tracks[0].track_id}
+    assert [one.state.stamp_ns for one in finals] == [NOW_NS + k * 50 * MS for k in range(5)]
+    assert tracker.tick(report.now_ns + 20 * MS).tracks == ()
+
+
 @pytest.mark.parametrize("name", ["ekf-replay", "smoother", "ekf-backward-forward"])
 def test_a_track_can_be_asked_for_any_time_in_or_after_its_window(name: str) -> None:
     tracker, report = started(name)
