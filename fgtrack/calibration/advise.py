@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from fgtrack.calibration.arrivals import FEWEST, Arrivals, arrivals_of, overtaken, window_findings
+from fgtrack.calibration.arrivals import FEWEST, LONGEST_STORAGE_S, Arrivals, arrivals_of, overtaken, window_findings
 from fgtrack.calibration.clock_offsets import OffsetReport, estimate_offsets
 from fgtrack.calibration.clocks import bias_findings, clock_findings, stamp_findings
 from fgtrack.calibration.finding import Finding, milliseconds, percent
@@ -35,7 +35,6 @@ TRACKED_S = 300.0
 TUNED_S = 60.0
 """Noise is fitted to so much of it."""
 _TUNE_RULES = TuneRules(train_share=1.0, max_rounds=3, max_observations=1500)  # the replay judges the result
-_LONGEST_STORAGE_S = 60.0
 _USELESS = 90.0  # what weighs more leaves nothing to be judged
 _FIRST = 45.0  # what weighs more comes before noise
 _OFTEN = 0.05  # share of lists that are overtaken
@@ -323,7 +322,7 @@ class _Adviser:
         for known, run in self._runs:
             if known == config:
                 return run
-        storage_s = min(config.effective.reach_s, _LONGEST_STORAGE_S)
+        storage_s = min(config.effective.reach_s, LONGEST_STORAGE_S)
         fast = config
         if config.estimator.startswith("smoother"):
             fast = replace(fast, estimator="ekf-replay", filter=replace(config.filter, storage_s=storage_s))

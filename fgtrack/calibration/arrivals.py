@@ -13,7 +13,7 @@ from fgtrack.core.types import DetectionList, EgoState, FloatArray, IntArray, Me
 from fgtrack.pipeline.config import Config
 from fgtrack.tracking.existence import ExistenceRules
 
-__all__ = ["FEWEST", "Arrivals", "arrivals_of", "overtaken", "window_findings"]
+__all__ = ["FEWEST", "LONGEST_STORAGE_S", "Arrivals", "arrivals_of", "overtaken", "window_findings"]
 
 FEWEST = 20
 """Messages below which nothing is concluded."""
@@ -22,7 +22,7 @@ _LONGEST_LOSS = 40  # periods; what is silent for longer was switched off, or ha
 _OTHER_CLOCK_S = 3600.0
 _LOST = 0.001  # share of detections that may fall beyond a window
 _SPARE = 1.2
-_LONGEST_STORAGE_S = 60.0
+LONGEST_STORAGE_S = 60.0
 _LISTS = 3.0  # of the slowest sensor that a window, and a track, should outlive
 
 
@@ -142,7 +142,7 @@ def _window(arrivals: Sequence[Arrivals], config: Config, needed_s: float) -> It
         worst = max(arrivals, key=lambda one: one.beyond(reach.reach_s))
         lost = worst.beyond(reach.reach_s)
         text = f"{shorter} the delays: {percent(lost)} of the detections of {worst.name} fall beyond it."
-        value = min(nice_above(_SPARE * max(needed_s, _LISTS * slowest.period_s)), _LONGEST_STORAGE_S)
+        value = min(nice_above(_SPARE * max(needed_s, _LISTS * slowest.period_s)), LONGEST_STORAGE_S)
         yield Finding("window", "window", 50.0 + 40.0 * lost, text, {reach.lag_key: value})
     elif reach.lag_s < slowest.period_s:
         text = f"{shorter} the time between two lists of {slowest.name}, {slowest.period_s:.3g} s: too short."

@@ -84,8 +84,7 @@ def bounds(
     Where F varies much from one trajectory to the next, as with headings in every direction, its mean loses what ties
     position, heading and speed together, and the bound is far from what can be reached: see `bounds_along`.
     """
-    stamps_ns = _chain_stamps(start_ns, measurements, now_ns)
-    return _bounds(motion, stamps_ns, truth(stamps_ns), prior_covariance, measurements, now_ns)
+    return _bounds(motion, *_chain(start_ns, measurements, truth, now_ns), prior_covariance, measurements, now_ns)
 
 
 def bounds_along(
@@ -102,17 +101,22 @@ def bounds_along(
     the true states: closer to what can be reached, but no bound in the strict sense, since no theorem forbids an
     estimator to do better.
     """
-    stamps_ns = _chain_stamps(start_ns, measurements, now_ns)
-    each = [_bounds(motion, stamps_ns, one[None], prior_covariance, measurements, now_ns) for one in truth(stamps_ns)]
+    stamps_ns, states = _chain(start_ns, measurements, truth, now_ns)
+    each = [_bounds(motion, stamps_ns, one[None], prior_covariance, measurements, now_ns) for one in states]
     return Bounds(*(np.mean(covariances, axis=0) for covariances in zip(*each, strict=True)))
 
 
-def _chain_stamps(start_ns: int, measurements: Sequence[ScheduledMeasurement], now_ns: Sequence[int]) -> IntArray:
-    """All stamps that matter, ascending. Raises `ValueError` where one lies before the start."""
+def _chain(
+    start_ns: int,
+    measurements: Sequence[ScheduledMeasurement],
+    truth: Callable[[IntArray], FloatArray],
+    now_ns: Sequence[int],
+) -> tuple[IntArray, FloatArray]:
+    """All stamps that matter, ascending, and the true states there. Raises `ValueError` if one precedes the start."""
     stamps_ns = np.unique([start_ns, *(item.stamp_ns for item in measurements), *now_ns])
     if stamps_ns[0] < start_ns:
         raise ValueError(f"start_ns: {start_ns} is after a measurement or a time at {stamps_ns[0]}")
-    return np.asarray(stamps_ns)
+    return stamps_ns, truth(stamps_ns)
 
 
 def _bounds(
