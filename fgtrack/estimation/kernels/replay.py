@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import add_congruence, add_product_transposed, copy, inlined, njit, product, solve
+from fgtrack.core.compiled import add_congruence, add_product_transposed, copy, inlined, merged, njit, product, solve
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.kernels.kalman import correct_one, innovate
@@ -49,7 +49,7 @@ def _innovation(x: FloatArray, z: FloatArray, label: IntArray, wraps: bool, y: F
             H[a, b] = 1.0 if b == entry else 0.0
 
 
-@inlined
+@merged
 def _retrodict(
     motion: int, density: FloatArray, slots: IntArray, labels: IntArray, steps: FloatArray, now: FloatArray
 ) -> bool:
@@ -92,7 +92,7 @@ def _retrodict(
     return True
 
 
-@inlined
+@merged
 def _step(
     motion: int,
     density: FloatArray,
