@@ -24,7 +24,7 @@ demo: $(RUN)
 # Importing compiles what numba has not kept yet; in two halves, else each worker would do all of it.
 test: $(TEST)
 	@$(BIN)/python -c 'import fgtrack.estimation.kernels.replay, fgtrack.estimation.kernels.euler' & \
-	    $(BIN)/python -c 'import fgtrack.estimation.smoothing.node_kernels, fgtrack.tracking.association'; wait
+	    $(BIN)/python -c 'import fgtrack.estimation.smoothing.node_kernels, fgtrack.tracking.kernels'; wait
 	$(BIN)/python -m pytest -n auto $(BY_FILE)
 
 # The tests marked slow, and the others with many more random examples.
