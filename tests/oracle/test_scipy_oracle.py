@@ -1,14 +1,14 @@
 """Every exact estimator against a calculation with SciPy that shares no code with it, in random orders of arrival."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 from support import oracle_streams as streams
-from support.oracle_references import reference, start
+from support.oracle import filtered
 from support.oracle_streams import Stream
-from support.stress_streams import NASTY, gathered, spinning
 
 from fgtrack.core import geometry
 from fgtrack.core.types import TrackState
@@ -24,18 +24,32 @@ AHEAD_NS = 100_000_000
 SMOOTHED: dict[Draw, float] = {
     streams.whole: 1e-5,
     streams.observed: 1e-5,
-    gathered: 1e-5,
     streams.robust: 1e-5,
     streams.accelerated: 1e-5,
     streams.leaving: 5e-3,
-    streams.short: 5e-2,
 }
-FILTERED = (streams.whole, streams.observed, gathered, streams.robust, streams.accelerated, streams.leaving)
+#: A window that keeps everything, and thresholds at which a smoother relinearises at every move.
+CONVERGED = {
+    "ring_s": 10.0,
+    "relinearise": {"yaw_rad": 1e-7, "speed_mps": 1e-7, "yaw_rate_radps": 1e-7, "accel_mps2": 1e-7},
+}
+OPTIONS: Mapping[str, Mapping[str, Any]] = {
+    "smoother": {**CONVERGED, "max_iterations": 20},
+    "smoother-batch": CONVERGED,
+    "smoother-banded": {**CONVERGED, "max_iterations": 20},
+}
+FILTERED = (streams.whole, streams.observed, streams.robust, streams.accelerated, streams.leaving)
 
 
 @cache
 def drawn(draw: Draw) -> Stream:
     return draw(np.random.default_rng(1))
+
+
+def start(name: str, stream: Stream) -> Estimator:
+    """The estimator `name`, with settings by which it solves its equations to rounding."""
+    factory = ESTIMATORS.load(name)
+    return start_estimator(name, factory, stream.motion, stream.prior, stream.lag_s, OPTIONS.get(name, {}))
 
 
 def fed(estimator: Estimator, stream: Stream, order: str = "random") -> Estimator:
@@ -60,7 +74,9 @@ def largest(differences: list[Difference]) -> float:
 
 def apart(name: str, draw: Draw) -> float:
     stream = drawn(draw)
-    found, expected = fed(start(name, stream), stream), reference(name, stream)
+    found, expected = fed(start(name, stream), stream), filtered(stream.problem).state_at
+    if name in SMOOTHERS:
+        expected = stream.solution.state_at
     stamps = probes_ns(name, stream)
     return largest([difference(found.state_at(at), TrackState(at, *expected(at)), stream.motion) for at in stamps])
 
@@ -74,10 +90,10 @@ def test_the_dense_joint_of_a_linear_model_is_that_of_scipy(draw: Draw) -> None:
     assert largest([difference(joint[at], TrackState(at, *expected(at))) for at in stamps]) < 1e-7
 
 
-@pytest.mark.parametrize("draw", [streams.linear, streams.close, streams.late])
+@pytest.mark.parametrize("draw", [streams.linear, streams.late])
 @pytest.mark.parametrize("name", [name for name in ESTIMATORS if Claims.of(ESTIMATORS.load(name)).is_exact])
 def test_the_paper_s_stream_in_a_linear_model_gives_the_dense_joint(name: str, draw: Draw) -> None:
-    """With its delays, with stamps 1 us apart, and, for smoothers, with a window shorter than the delays."""
+    """With its delays and, for smoothers, with a window shorter than the delays."""
     if draw is streams.late and name not in SMOOTHERS:
         pytest.skip("what is older than the window of a filter is refused")
     stream, claims = drawn(draw), Claims.of(ESTIMATORS.load(name))
@@ -104,36 +120,6 @@ def test_the_slow_smoother_does_as_well(draw: Draw) -> None:
 @pytest.mark.parametrize("draw", FILTERED)
 def test_the_replaying_filter_is_the_extended_kalman_filter(draw: Draw) -> None:
     assert apart("ekf-replay", draw) < 1e-7
-
-
-@pytest.mark.parametrize(
-    "name", [one if k % 4 == 0 else pytest.param(one, marks=pytest.mark.slow) for k, one in enumerate(NASTY)]
-)
-@pytest.mark.parametrize("estimator", ["ekf-replay", "smoother", "smoother-banded"])
-def test_the_order_of_arrival_does_not_matter_on_a_stream_made_to_show_it(name: str, estimator: str) -> None:
-    stream, rng = NASTY[name](np.random.default_rng(1)), np.random.default_rng(2)
-    count = len(stream.measurements)
-    orders = {"time": range(count), "one": rng.permutation(count).tolist(), "other": rng.permutation(count).tolist()}
-    object.__setattr__(stream, "orders", orders)
-    runs = [fed(start(estimator, stream), stream, order) for order in orders]
-    for at in probes_ns(estimator, stream):
-        for run in runs[1:]:
-            off = max(difference(run.state_at(at), runs[0].state_at(at), stream.motion))
-            assert off < (1e-9 if estimator == "ekf-replay" else 1e-5)
-
-
-@pytest.mark.parametrize("name", ["smoother", "smoother-banded"])
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_fast_turn_is_found_whatever_is_late_by_as_much_as_it_likes(name: str, seed: int) -> None:
-    """With the default settings; several numbers of turns would explain a part of the yaws."""
-    rng = np.random.default_rng(seed)
-    stream = spinning(rng)
-    expected = fed(start(name, stream), stream, "time").state_at(stream.newest_ns)
-    made = ESTIMATORS.load(name)
-    plain = start_estimator(name, made, stream.motion, stream.prior, stream.lag_s, {})
-    for place in stream.orders["random"]:
-        plain.update(stream.measurements[place])
-    assert difference(plain.state_at(stream.newest_ns), expected, stream.motion).mean_sigma < 0.15
 
 
 def without_arm(patch: pytest.MonkeyPatch) -> None:

@@ -7,11 +7,7 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from support.oracle.dynamics import Dynamics
-from support.oracle.estimates import Solution, smoothed
-from support.oracle.kinematics import kinematic_start
-from support.oracle.problem import Problem
-from support.oracle.sightings import Eye, Sighting, Vehicle, mounted, seen
+from support.oracle import Dynamics, Eye, Problem, Sighting, Solution, Vehicle, kinematic_start, mounted, seen, smoothed
 
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray, Frame
@@ -30,7 +26,6 @@ _START_NS = NS_PER_S
 _RADAR_PHASE_S = 0.023
 _POSITION = ("x_m", "y_m")
 _LOSS_WIDTH = 1.5
-_OUTLIERS, _MANY_OUTLIERS = 0.2, 0.5
 
 #: A fast car that begins to turn; one that passes a yaw of pi before a turning observer.
 FAST = Start(
@@ -45,14 +40,6 @@ FAST = Start(
 )
 _TURNING = replace(FAST, position_m=(30.0, 12.0), yaw_rad=3.0, yaw_std_rad=0.2, speed_mps=12.0, yaw_rate_radps=0.5)
 
-_KNOWN = replace(
-    _TURNING,
-    position_std_m=0.3,
-    yaw_rad=3.05,
-    yaw_std_rad=0.03,
-    speed_std_mps=0.3,
-    yaw_rate_std_radps=0.05,
-)
 
 #: Seen from the observer: its detections' frame, and the pose of its RADAR in that frame. The object is behind it.
 _FRAME_M = (-1.2, 0.3)
@@ -71,7 +58,6 @@ _ONBOARD: Mapping[str, SensorModel] = {
 class Stream:
     """Measurements in the order of their stamps, and the orders in which they arrive."""
 
-    name: str
     motion: MotionModel
     prior: Start
     measurements: tuple[Measurement, ...]
@@ -109,13 +95,9 @@ def problem_of(motion: MotionModel, prior: Start, sightings: Sequence[Sighting])
     values = *prior.position_m, prior.yaw_rad or 0.0, prior.speed_mps, prior.yaw_rate_radps, prior.accel_mps2
     std = prior.position_std_m, prior.position_std_m, prior.yaw_std_rad or 0.0, prior.speed_std_mps
     start = kinematic_start(motion.state_names, values, (*std, prior.yaw_rate_std_radps, prior.accel_std_mps2))
-    return Problem(dynamics_of(motion), prior.stamp_ns, start, tuple(sightings))
-
-
-def dynamics_of(motion: MotionModel) -> Dynamics:
-    """The differential equation of a model that comes with fgtrack."""
     names = motion.density_names() if isinstance(motion, CTRV | CV) else ()
-    return Dynamics.of(motion.state_names, {name.partition("_density_")[0]: getattr(motion, name) for name in names})
+    density = {name.partition("_density_")[0]: getattr(motion, name) for name in names}
+    return Problem(Dynamics.of(motion.state_names, density), prior.stamp_ns, start, tuple(sightings))
 
 
 # A sensor measures the state x at a stamp.
@@ -125,25 +107,17 @@ Plan = tuple[FloatArray, npt.NDArray[np.str_]]
 
 def linear(rng: np.random.Generator) -> Stream:
     """Positions of the paper's LiDAR and RADAR in a linear model, with the paper's delays."""
-    return drawn(rng, "CV, paper's delays", CV(), paper_stamps(1.2), lag_s=1.0, reach_s=0.95)
-
-
-def close(rng: np.random.Generator) -> Stream:
-    """The same with stamps of the two sensors that are equal, or 1 us or 1 ms apart."""
-    stamps_s, sensors = paper_stamps(0.5)
-    gaps_s = np.resize([0.0, 1e-6, 1e-3, _RADAR_PHASE_S], len(stamps_s) // 2)
-    stamps_s = np.where(sensors == "radar", stamps_s - _RADAR_PHASE_S + np.repeat(gaps_s, 2), stamps_s)
-    return drawn(rng, "CV, stamps 1 us apart", CV(), (stamps_s, sensors), lag_s=1.5, reach_s=1.4)
+    return drawn(rng, CV(), paper_stamps(1.2), lag_s=1.0, reach_s=0.95)
 
 
 def late(rng: np.random.Generator) -> Stream:
     """A window shorter than the delays: most of it arrives when it is older than the window."""
-    return drawn(rng, "CV, lag 0.05 s", CV(), paper_stamps(1.0), lag_s=0.05, reach_s=0.5, late=True)
+    return drawn(rng, CV(), paper_stamps(1.0), lag_s=0.05, reach_s=0.5, late=True)
 
 
 def whole(rng: np.random.Generator) -> Stream:
     """A car at 65 m/s in a bend, the RADAR with its speed; shorter than the window."""
-    return drawn(rng, "CTRV, all in the window", CTRV(), paper_stamps(0.7), lag_s=2.0, reach_s=1.9)
+    return drawn(rng, CTRV(), paper_stamps(0.7), lag_s=2.0, reach_s=1.9)
 
 
 def observed(rng: np.random.Generator) -> Stream:
@@ -153,32 +127,23 @@ def observed(rng: np.random.Generator) -> Stream:
     """
     stamps_s, sensors = paper_stamps(0.6)
     stamps_s = np.where(stamps_s > 0.3, stamps_s + 0.7, stamps_s)  # nothing for a while
-    return onboard(rng, "CTRV, from a turning ego", (stamps_s, sensors))
-
-
-def onboard(rng: np.random.Generator, name: str, plan: Plan) -> Stream:
-    """As `observed`, at other stamps."""
-    return drawn(rng, name, CTRV(), plan, lag_s=2.0, reach_s=1.9, start=_TURNING, sense=_Onboard(plan[0]))
+    plan = stamps_s, sensors
+    return drawn(rng, CTRV(), plan, lag_s=2.0, reach_s=1.9, start=_TURNING, sense=_Onboard(stamps_s))
 
 
 def robust(rng: np.random.Generator) -> Stream:
     """Outliers among the positions, and a Huber loss."""
-    return drawn(rng, "CTRV, Huber loss", CTRV(), paper_stamps(0.45), lag_s=2.0, reach_s=1.9, sense=_with_outliers)
+    return drawn(rng, CTRV(), paper_stamps(0.45), lag_s=2.0, reach_s=1.9, sense=_with_outliers)
 
 
 def accelerated(rng: np.random.Generator) -> Stream:
     """A short stream in CTRA."""
-    return drawn(rng, "CTRA, all in the window", CTRA(), paper_stamps(0.4), lag_s=2.0, reach_s=1.9)
+    return drawn(rng, CTRA(), paper_stamps(0.4), lag_s=2.0, reach_s=1.9)
 
 
 def leaving(rng: np.random.Generator) -> Stream:
     """As `whole`, longer than the window."""
-    return drawn(rng, "CTRV, lag 1 s", CTRV(), paper_stamps(1.25), lag_s=1.0, reach_s=0.4)
-
-
-def short(rng: np.random.Generator) -> Stream:
-    """As `whole`, in a window as long as the delays: some arrives when it is older than the window."""
-    return drawn(rng, "CTRV, lag 0.3 s", CTRV(), paper_stamps(0.9), lag_s=0.3, reach_s=0.6, late=True)
+    return drawn(rng, CTRV(), paper_stamps(1.25), lag_s=1.0, reach_s=0.4)
 
 
 def paper_stamps(duration_s: float) -> Plan:
@@ -198,12 +163,10 @@ def paper(rng: np.random.Generator, x: FloatArray, stamp_ns: int, sensor: str) -
     return measurement, Sighting(stamp_ns, names, z, np.diag(std**2))
 
 
-def _with_outliers(
-    rng: np.random.Generator, x: FloatArray, stamp_ns: int, sensor: str, share: float = _OUTLIERS
-) -> tuple[Measurement, Sighting]:
+def _with_outliers(rng: np.random.Generator, x: FloatArray, stamp_ns: int, sensor: str) -> tuple[Measurement, Sighting]:
     measurement, sighting = paper(rng, x, stamp_ns, sensor)
     outlier = np.sqrt(np.diag(sighting.R)) * rng.normal(0.0, 8.0, len(sighting.z))
-    z = sighting.z + outlier * (rng.random() < share)
+    z = sighting.z + outlier * (rng.random() < 0.2)
     measurement = replace(measurement, z=z, loss=RobustLoss("huber", _LOSS_WIDTH))
     return measurement, replace(sighting, z=z, loss=("huber", _LOSS_WIDTH))
 
@@ -261,7 +224,6 @@ def _observer(stamp_ns: int) -> Vehicle:
 
 def drawn(
     rng: np.random.Generator,
-    name: str,
     motion: MotionModel,
     plan: Plan,
     lag_s: float,
@@ -272,7 +234,7 @@ def drawn(
 ) -> Stream:
     """Truth with the motion model's own noise, measured as `plan` says; in the random order up to `reach_s` late."""
     stamps_s, sensors = plan
-    empty = Stream(name, motion, start, (), (), {}, lag_s, late)
+    empty = Stream(motion, start, (), (), {}, lag_s, late)
     dynamics, x = empty.problem.dynamics, empty.problem.start.mean
     measurements, sightings, last_s = list[Measurement](), list[Sighting](), 0.0
     for stamp_s, sensor in zip(stamps_s.tolist(), sensors.tolist(), strict=True):
@@ -286,8 +248,7 @@ def drawn(
     delays_s = np.where(sensors == "radar", RADAR_DELAY.draw(rng, stamps_s), LIDAR_DELAY.draw(rng, stamps_s))
     random_s = rng.uniform(0.0, reach_s, len(stamps_s))
     orders = {
-        "time": range(len(measurements)),
         "arrival": np.argsort(stamps_s + delays_s, kind="stable").tolist(),
         "random": np.argsort(stamps_s + random_s, kind="stable").tolist(),
     }
-    return Stream(name, motion, start, tuple(measurements), tuple(sightings), orders, lag_s, late)
+    return Stream(motion, start, tuple(measurements), tuple(sightings), orders, lag_s, late)
