@@ -158,7 +158,7 @@ def unused(run: Run) -> str | None:
 
 
 def reasons(counts: Mapping[str, int]) -> str:
-    """`counts` by setting in words, the most first: `40 by filters.score, 2 by map.excluded`."""
+    """`counts` by setting in words, the most first: `40 by filters.score, 2 by max_range_m`."""
     return ", ".join(f"{count} by {name}" for name, count in sorted(counts.items(), key=lambda item: -item[1]))
 
 

@@ -1,4 +1,4 @@
-"""The maps that the configuration of a run names: roads with their lines, and exclusion areas."""
+"""The maps that the configuration of a run names: roads with their lines."""
 
 from pathlib import Path
 
@@ -6,7 +6,6 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray
 from fgtrack.io.run import Run
-from fgtrack.models.areas import ExclusionAreas
 from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
 from fgtrack.models.road import OPEN_SPACE
 from fgtrack.models.track_map import TrackMap
@@ -29,19 +28,7 @@ def roads(run: Run) -> tuple[dict[str, TrackMap], list[str]]:
             result[key] = TrackMap.read(Path(str(name)))
         elif name and name != OPEN_SPACE:
             notes.append(f"map.{key}: {name} is not there any more, so it is not shown")
-    lost = [name for name in config.get("excluded") or () if not Path(str(name)).is_file()]
-    notes += [f"map.excluded: {name} is not there any more, so it is not shown" for name in lost]
     return result, notes
-
-
-def excluded_lines(run: Run) -> list[FloatArray]:
-    """Return the rings of the exclusion areas that the configuration names, closed, shape (n, 2); of lost files none.
-
-    Raises `DataError` if a file holds no areas.
-    """
-    names = [name for name in (run.config.get("map") or {}).get("excluded") or () if Path(str(name)).is_file()]
-    rings = [ring for polygon in ExclusionAreas.read(names).polygons_m for ring in polygon]
-    return [np.concatenate([ring, ring[:1]]) for ring in rings]
 
 
 def road_lines(road: TrackMap) -> tuple[FloatArray, FloatArray, FloatArray]:

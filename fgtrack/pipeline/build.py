@@ -23,7 +23,6 @@ from fgtrack.estimation.filters.published import (
 from fgtrack.estimation.filters.track_initiation import initiated
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
 from fgtrack.estimation.registry import estimator_bank
-from fgtrack.models.areas import ExclusionAreas
 from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
 from fgtrack.models.published_map import CircularHeadingMap, PublishedMap
 from fgtrack.models.road import MappedRoad, OpenSpace, Road
@@ -72,7 +71,7 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
         ego=_build_ego(config),
         inbox=(SlotInbox if "one_slot" in config.defects else QueueInbox)(config.sensors),
         preprocess=(PublishedPreprocess if published_order else Preprocess)(
-            road, config.merge, motion, config.ego.detection_origin_m, ExclusionAreas.read(config.map.excluded)
+            road, config.merge, motion, config.ego.detection_origin_m
         ),
         association=config.association,
         bank=GuardedBank(lambda: build_bank(config, failures), failures),

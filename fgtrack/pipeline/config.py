@@ -65,8 +65,6 @@ class MapConfig:
     """The same for the outer bound."""
     pit_buffer_m: float = 0.0
     """The same for both bounds of the pit lane."""
-    excluded: tuple[str, ...] = ()
-    """Files of polygons in which no object is, as shore and buildings: GeoJSON or CSV, in metres of the map."""
 
     @property
     def track_file(self) -> str | None:

@@ -10,7 +10,7 @@ from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.evaluation.matching import confirmed
 from fgtrack.evaluation.placement import placed
-from fgtrack.evaluation.roads import excluded_lines, road_lines, roads
+from fgtrack.evaluation.roads import road_lines, roads
 from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_ns
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run import Run, Table
@@ -55,8 +55,6 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     for axes, near in ((overview, None), *((axes, window) for axes in close_ups)):
         for line in bounds_m:
             axes.plot(*line.T, color=GREY, lw=0.7, zorder=3)
-        for k, ring in enumerate(excluded_lines(one.run)):
-            axes.plot(*ring.T, color=GREY, lw=1.2, ls=":", zorder=3, label="" if k else "excluded")
         ego, shown = (_near(one.run.tables[name]["stamp_ns"], near) for name in ("ego", "detections"))
         if np.isfinite(ego_m).any():
             axes.plot(*ego_m[ego].T, color="black", lw=0.8, ls="--", label="ego", zorder=3.5)

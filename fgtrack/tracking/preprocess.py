@@ -12,7 +12,6 @@ from fgtrack.core.geometry import body_point, body_point_jacobian
 from fgtrack.core.linalg import congruence, equal_ones
 from fgtrack.core.types import BoolArray, Disposition, FloatArray, UpdateRecord
 from fgtrack.estimation.base import Measurement
-from fgtrack.models.areas import ExclusionAreas
 from fgtrack.models.correlated_errors import split_error
 from fgtrack.models.measurement import (
     COMPONENTS,
@@ -41,7 +40,6 @@ from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.inbox import Batch, record
 
 _FAR_M = 1e6
-_NO_AREAS = ExclusionAreas(())
 
 
 class Candidate(NamedTuple):
@@ -85,20 +83,12 @@ class Preprocess:
     _assumes_map_yaw = True
     """A yaw that the map gave is prior knowledge, not measured."""
 
-    def __init__(
-        self,
-        road: Road,
-        merge: Merge,
-        motion: MotionModel,
-        detection_origin_m: tuple[float, float],
-        excluded: ExclusionAreas = _NO_AREAS,
-    ) -> None:
+    def __init__(self, road: Road, merge: Merge, motion: MotionModel, detection_origin_m: tuple[float, float]) -> None:
         """`detection_origin_m`: origin of the ego frame of detections, seen from the ego reference point."""
         self._road = road
         self._merge = merge
         self._motion = motion
         self._origin_m = detection_origin_m
-        self._excluded = excluded
 
     def __call__(
         self, batch: Batch, sensor: SensorModel, ego: EgoPose | None
@@ -117,8 +107,6 @@ class Preprocess:
             offsets_m = items.points_m - np.array(pose[:2])
             far = np.hypot(offsets_m[:, 0], offsets_m[:, 1]) > sensor.max_range_m
             items = _without(items, far, "max_range_m", lost)
-        if self._excluded.polygons_m:
-            items = _without(items, self._excluded.contain(items.points_m), "map.excluded", lost)
         if ego is not None and sensor.near_side_m:
             move_back(items, sensor.near_side_m)
         items = merged(self._on_road(items, lost), self._merge)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation.palette import distinct_colours
-from fgtrack.evaluation.roads import excluded_lines, roads
+from fgtrack.evaluation.roads import roads
 from fgtrack.evaluation.runs import Runs, evaluated, run_folders, same_recording
 from fgtrack.io.output import check_apart, check_output
 from fgtrack.io.ros.bag_writer import check_bag, token
@@ -57,7 +57,7 @@ def viewer_messages(runs: Mapping[str, Run]) -> tuple[Iterator[ViewerMessage], l
     at_ns = start_ns(first)
     maps, notes = roads(first)
     parts = [
-        map_messages(maps, excluded_lines(first), at_ns),
+        map_messages(maps, at_ns),
         ego_messages(first.tables["ego"], at_ns),
         *truth_messages(first.tables["truth"]),
     ]

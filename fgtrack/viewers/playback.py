@@ -13,7 +13,7 @@ from fgtrack.core.types import EGO_ID, LATE, FloatArray, IntArray
 from fgtrack.evaluation.diagnostics import USED
 from fgtrack.evaluation.palette import SENSORS, distinct_colours
 from fgtrack.evaluation.placement import placed, update_rows
-from fgtrack.evaluation.roads import excluded_lines, road_lines, roads
+from fgtrack.evaluation.roads import road_lines, roads
 from fgtrack.evaluation.runs import EvaluatedRun, by_recording
 from fgtrack.io.run import Run, Table
 from fgtrack.viewers.states import AROUND_95, NOMINAL_SIZE_M, ellipses, final_ns, located, start_ns, track_positions
@@ -111,7 +111,6 @@ class _Recording:
         maps, gone = roads(run)
         notes.update(dict.fromkeys(gone))
         lines = [(kind, line) for road in maps.values() for kind, line in zip(_LINES, road_lines(road), strict=True)]
-        lines += [("bound", line) for line in excluded_lines(run)]
         ego, truth = run.tables["ego"], run.tables["truth"].where(run.tables["truth"]["object_id"] != EGO_ID)
         (ego,) = _thinned([self.rows(ego, "stamp_ns")], "stamp_ns", most, "ego", notes)
         (truth,) = _thinned([self.rows(truth, "stamp_ns", "object_id")], "stamp_ns", most, "truth", notes)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fgtrack.core.time import seconds
-from fgtrack.core.types import EGO_ID, FUSED, LATE, STATE_NAMES, Detection, Disposition, EgoState, FloatArray, IntArray
+from fgtrack.core.types import EGO_ID, FUSED, LATE, STATE_NAMES, Detection, Disposition, EgoState, IntArray
 from fgtrack.evaluation.palette import PALETTE, SENSORS
 from fgtrack.evaluation.placement import Placed, placed, update_rows
 from fgtrack.evaluation.roads import road_lines
@@ -55,10 +55,9 @@ def rgba(text: str, opacity: float = 1.0) -> Colour:
     return r, g, b, opacity
 
 
-def map_messages(maps: dict[str, TrackMap], excluded: Sequence[FloatArray], at_ns: int) -> Messages:
-    """Bounds and reference line of each road, and the outlines of exclusion areas, once."""
+def map_messages(maps: dict[str, TrackMap], at_ns: int) -> Messages:
+    """Bounds and reference line of each road, once."""
     opacities = {name: zip(road_lines(road), (0.9, 0.9, 0.3), strict=True) for name, road in maps.items()}
-    opacities["excluded"] = zip(excluded, [0.6] * len(excluded), strict=True)
     entities = [
         Entity(name, tuple(_line(points.tolist(), _MAP_LINE_M, (*_GREY[:3], alpha)) for points, alpha in lines))
         for name, lines in opacities.items()

@@ -288,9 +288,6 @@ input:
 sensors:
   radar: {std: {range_m: 0.5, bearing_rad: 0.02}, max_delay_s: 1.0}
 """
-EXCLUDED = b"""{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {}, "geometry":
-{"type": "MultiPolygon", "coordinates":
-[[[[0.0, 0.0], [90.0, 0.0], [90.0, 90.5], [0.0, 0.0]]], [[[5, 5], [9, 5], [9, 9], [5, 5]]]]}}]}"""
 DELAYS = b"""radar:
   delay: {kind: gamma, min_s: 0.01, mean_s: 0.1, q90_s: 0.15}
   clock: [{kind: offset, offset_s: -0.06}, {kind: drift, drift_ppm: 40.0}, {kind: quantised, step_s: 0.001}]

@@ -76,9 +76,6 @@ TARGETS = {
         lambda: [inputs.nuscenes()],
         [("info", "in/results.json"), ("replay", "in/results.json", "--set", inputs.NUSCENES, *_OPEN)],
     ),
-    "excluded": _beside(
-        "x.json", lambda: [inputs.EXCLUDED], ("replay", "x.jsonl", "--set", 'map.excluded=["x.json"]', *_OPEN)
-    ),
     "configuration": Target(
         inputs.configurations,
         [("config", "-c", "x.yaml"), ("replay", "x.jsonl", "-c", "x.yaml", *_REPLAY, "ekf-replay")],

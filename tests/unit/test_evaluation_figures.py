@@ -19,7 +19,6 @@ from fgtrack.io.run import Run
 from fgtrack.models.track_map import COLUMNS, TrackMap
 from fgtrack.plotting import plot
 from fgtrack.plotting.style import FORMATS, WRONG, broken_line
-from fgtrack.viewers.export import viewer_messages
 
 TICKS = range(60)
 
@@ -214,17 +213,6 @@ def test_the_map_shows_the_bounds_of_the_track(tmp_path: Path) -> None:
     assert radii == pytest.approx([292.5, 307.5], abs=0.5)
     west, west_track, *_, wrong, _ = [line.get_color() for line in axes.lines[2:]]
     assert west == west_track != wrong == WRONG
-
-
-def test_exclusion_areas_are_shown_on_the_map_and_in_the_viewer(tmp_path: Path, runs: list[Run]) -> None:
-    (tmp_path / "shore.csv").write_text("area,x_m,y_m\na,0,0\na,9,0\na,9,9\nb,20,0\nb,29,0\nb,29,9\nb,20,9\n")
-    shown = replace(runs[0], config_text=f"map: {{excluded: [{tmp_path / 'shore.csv'}, lost.csv]}}")
-    axes = plot.map(shown).axes[0]
-    assert [len(line.get_xdata()) for line in axes.lines if line.get_linestyle() == ":"] == [4, 5]
-    messages, notes = viewer_messages({"run": shown})
-    scene = next(message.content for message in messages if message.topic == "/map")
-    assert [len(line.points_m) for line in scene.entities[0].shapes] == [4, 5]
-    assert notes[0] == "map.excluded: lost.csv is not there any more, so it is not shown"
 
 
 def test_a_line_is_not_drawn_across_a_pause() -> None:

@@ -1,7 +1,7 @@
 """Keys of the meta.json and config.yaml of a run that are used, and their types; other keys may hold anything."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -63,7 +63,7 @@ _OF_SENSORS: Any = Mapping  # the type checker takes no model that is made by a 
 CONFIG = _model(
     sensors=_OF_SENSORS[str, _model(mount=Mapping[str, _Number] | None, max_delay_s=_Number | None) | None] | None,
     ego=_model(detection_origin_x_m=_Number, detection_origin_y_m=_Number) | None,
-    map=_model(track=str | None, pit=str | None, excluded=Sequence[str] | None) | None,
+    map=_model(track=str | None, pit=str | None) | None,
     birth=_model(ego_speed_factor=_Number | None) | None,
     clock=_model(node_hz=Annotated[float, Field(gt=0.0, le=LARGEST)] | None) | None,
     smoother=_model(lag_s=Annotated[float, Field(ge=0.0, le=LARGEST)]) | None,
