@@ -58,7 +58,7 @@ def replay(
             folders,
             origin=str(recording),
             kind=source.kind,
-            on_tick=tick_progress(tell, source.end_ns(), names),
+            on_tick=tick_progress(tell, None, names),
             overwrite=overwrite,
             realtime=realtime,
         )

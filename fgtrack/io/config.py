@@ -8,7 +8,6 @@ from typing import Annotated, Literal
 from pydantic import NonNegativeFloat, StringConstraints
 
 from fgtrack.core.types import Frame
-from fgtrack.io.errors import LARGEST_BYTES, MOST_OBJECTS
 from fgtrack.models.sensors import Filter
 
 Path = str | Sequence[str]
@@ -147,18 +146,3 @@ class InputConfig:
     kitti: KittiInput = field(default_factory=KittiInput)
     csv: CsvInput = field(default_factory=CsvInput)
     nuscenes: NuscenesInput = field(default_factory=NuscenesInput)
-    largest_mb: float = LARGEST_BYTES / 1e6
-    """A chunk, message or line of the input that is larger than this, unpacked, is refused."""
-    most_objects: int = MOST_OBJECTS
-    """A list with more objects than this is refused."""
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.largest_mb <= 10_000.0:
-            raise ValueError(f"largest_mb: must be positive, and at most 10000, is {self.largest_mb}")
-        if self.most_objects < 1:
-            raise ValueError(f"most_objects: must be at least 1, is {self.most_objects}")
-
-    @property
-    def largest_bytes(self) -> int:
-        """`largest_mb` in bytes."""
-        return int(self.largest_mb * 1e6)

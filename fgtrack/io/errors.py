@@ -6,14 +6,6 @@ from pathlib import Path
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import Message
 
-_MEGABYTE = 1_000_000
-LARGEST_BYTES = 128 * _MEGABYTE
-"""Largest chunk, message or line, where nothing else is said."""
-MOST_OBJECTS = 100_000
-"""In a list, where nothing else is said."""
-MOST_SENSORS = 100
-"""Most sensors of a recording or a configuration. Each is a row of figures and tables, and 30 lines of a run folder."""
-
 
 def one_line(error: BaseException) -> str:
     """Text of `error` in one line of at most 200 characters."""
@@ -25,14 +17,6 @@ class TruncatedInput(DataError):  # noqa: N818 - it names what the input is; the
 
     A replay finishes the run with what there is, reports the break and exits with 1.
     """
-
-
-def refuse_larger(num_bytes: int, what: str, largest_bytes: int) -> None:
-    """Raise `DataError` where `what` has more than `largest_bytes`: a few packed bytes can stand for gigabytes."""
-    if num_bytes > largest_bytes:
-        raise DataError(
-            f"{what}: is larger than {largest_bytes / _MEGABYTE:g} MB: raise input.largest_mb, if that is right"
-        )
 
 
 class UntilBreak:

@@ -153,7 +153,7 @@ class _Times:
 
 def _read_bag(path: Path, config: InputConfig | None, times: dict[_Key, _Times]) -> _Found:
     given = config or InputConfig()
-    bag = Bag(path, given.message_definitions, given.largest_bytes, given.most_objects)
+    bag = Bag(path, given.message_definitions)
     used: dict[_Key, str] = {}
     problem: str | None = None
     try:

@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -34,8 +33,6 @@ class InputSource:
 
     Raises `DataError` where the input cannot be read.
     """
-    end_ns: Callable[[], int | None] = lambda: None
-    """Gives about the receipt of the last message; None where that takes much reading."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +47,6 @@ class FileFormat:
     """Opens the input at a path: gives what `InputSource.messages` is, and raises as `open_input`."""
     settings: Callable[[Path], Mapping[str, object]] = lambda path: {}
     """Settings that the input at a path carries, as `InputSource.settings`."""
-    end_ns: Callable[[Path], int | None] = lambda path: None
-    """About the receipt of the last message, as `InputSource.end_ns`; errors of any kind mean None."""
     validates: bool = False
     """True if the reader validates every message by itself, with `validated_message`."""
 
@@ -73,15 +68,7 @@ def open_input(path: Path | str, config: InputConfig | None = None) -> InputSour
     with ADAPTERS.blamed(name, f"cannot open {path}"):
         form = file_format(name)
         messages = form.open(path, config)
-    end_ns = partial(_end_ns, form, path)
-    read = partial(validated, path, messages, config.most_objects, form.validates)
-    return InputSource(path, name, read, partial(form.settings, path), end_ns)
-
-
-def _end_ns(form: FileFormat, path: Path) -> int | None:
-    with suppress(Exception):  # it only makes a progress bar better
-        return form.end_ns(path)
-    return None
+    return InputSource(path, name, partial(validated, path, messages, form.validates), partial(form.settings, path))
 
 
 def input_kind(path: Path) -> str:

@@ -22,7 +22,7 @@ from fgtrack.core.types import (
     TruthState,
 )
 from fgtrack.io.config import InputConfig
-from fgtrack.io.errors import LARGEST_BYTES, TruncatedInput, UntilBreak, refuse_larger
+from fgtrack.io.errors import TruncatedInput, UntilBreak
 from fgtrack.io.output import new_file
 from fgtrack.io.source import FileFormat
 from fgtrack.io.validation import InvalidMessageError, validated_message
@@ -31,7 +31,6 @@ STREAM_FORMAT = "fgtrack-stream/1"
 SETTINGS = "settings"
 """Entry of the header record with what the recording carries of a configuration."""
 GZIP_MAGIC = b"\x1f\x8b"
-_TAIL = 1 << 16
 
 _logger = logging.getLogger(__name__)
 _KINDS: dict[str, type[Message]] = {"ego": EgoState, "detections": DetectionList, "truth": TruthState}
@@ -40,16 +39,11 @@ _KINDS: dict[str, type[Message]] = {"ego": EgoState, "detections": DetectionList
 Record = dict[str, Any]
 
 
-def read_stream(path: Path | str, largest_bytes: int = LARGEST_BYTES) -> Iterator[Message]:
+def read_stream(path: Path | str) -> Iterator[Message]:
     """Messages of the stream `path` in the order of the file, which is receipt order.
 
     Gzip is recognised by its magic number. Unknown keys are ignored; one warning is logged with their names
     and counts.
-
-    Parameters
-    ----------
-    largest_bytes
-        A line that is longer, unpacked, is refused.
 
     Raises
     ------
@@ -61,7 +55,7 @@ def read_stream(path: Path | str, largest_bytes: int = LARGEST_BYTES) -> Iterato
     path = Path(path)
     unknown: Counter[str] = Counter()
     newest_ns: int | None = None
-    with closing(_records(path, largest_bytes)) as records:
+    with closing(_records(path)) as records:
         _check_header(path, next(records, None))
         for line, record in records:
             try:
@@ -90,7 +84,7 @@ def _recognises(path: Path) -> bool:
 
 
 def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
-    return partial(read_stream, path, config.largest_bytes)
+    return partial(read_stream, path)
 
 
 def _settings(path: Path) -> Mapping[str, object]:
@@ -99,15 +93,7 @@ def _settings(path: Path) -> Mapping[str, object]:
     return found if isinstance(found, dict) else {}
 
 
-def _end_ns(path: Path) -> int | None:
-    """Receipt of the last record of a stream; None of a gzipped one."""
-    with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - _TAIL))
-        lines = file.read().splitlines()
-    return max((json.loads(line)["receipt_ns"] for line in lines[1:] if b"receipt_ns" in line), default=None)
-
-
-FORMAT = FileFormat("an fgtrack stream (.jsonl, .jsonl.gz)", _recognises, _open, _settings, _end_ns, validates=True)
+FORMAT = FileFormat("an fgtrack stream (.jsonl, .jsonl.gz)", _recognises, _open, _settings, validates=True)
 
 
 def read_header(path: Path | str) -> Mapping[str, Any]:
@@ -189,7 +175,7 @@ def _given(value: EgoState | TruthState | Detection) -> Record:
     return given
 
 
-def _records(path: Path, largest_bytes: int = LARGEST_BYTES) -> Generator[tuple[int, Record], None, None]:
+def _records(path: Path) -> Generator[tuple[int, Record], None, None]:
     """Line number and JSON object of every line that is not blank."""
     line, num_records = 0, 0
     try:
@@ -197,8 +183,7 @@ def _records(path: Path, largest_bytes: int = LARGEST_BYTES) -> Generator[tuple[
             packed = raw.read(2) == GZIP_MAGIC
             raw.seek(0)
             file: BinaryIO | gzip.GzipFile = gzip.GzipFile(fileobj=raw) if packed else raw
-            for line, text in enumerate(iter(lambda: file.readline(largest_bytes + 1), b""), 1):
-                refuse_larger(len(text), f"{path}:{line}", largest_bytes)
+            for line, text in enumerate(file, 1):
                 if not text.strip():
                     continue
                 try:

@@ -25,7 +25,7 @@ from fgtrack.core.types import (
     Message,
     TruthState,
 )
-from fgtrack.io.errors import MOST_OBJECTS, MOST_SENSORS, one_line
+from fgtrack.io.errors import one_line
 
 __all__ = ["InvalidMessageError", "validated", "validated_detection", "validated_message"]
 
@@ -38,32 +38,18 @@ class InvalidMessageError(Exception):
     """Problem of a message; the reader adds where it is."""
 
 
-def validated(
-    path: Path, messages: Callable[[], Iterator[Message]], most_objects: int = MOST_OBJECTS, done: bool = False
-) -> Iterator[Message]:
+def validated(path: Path, messages: Callable[[], Iterator[Message]], done: bool = False) -> Iterator[Message]:
     """Messages of the input at `path`; those of a reader that has validated them are `done`.
-
-    A list with more than `most_objects` is refused, and one of a sensor beyond `MOST_SENSORS`.
 
     Raises
     ------
     DataError
         The reader failed, or gave an invalid message; raised after everything before that.
     """
-    count, sensors = 0, set[str]()
+    count = 0
     try:
         for message in messages():
-            message = message if done else validated_message(message)
-            if isinstance(message, DetectionList):
-                sensors.add(message.sensor)
-                if len(sensors) > MOST_SENSORS:
-                    raise InvalidMessageError(
-                        f"{message.sensor}: the lists before it are of {MOST_SENSORS} other sensors"
-                    )
-                if len(message.objects) > most_objects:
-                    many = f"a list of {len(message.objects)} objects"
-                    raise InvalidMessageError(f"{message.sensor}: {many}, more than input.most_objects allows")
-            yield message
+            yield message if done else validated_message(message)
             count += 1
     except InvalidMessageError as error:
         raise DataError(f"{path}: message {count + 1}: {error}") from error

@@ -11,7 +11,6 @@ from fgtrack.estimation.filters.initiation import DEFAULT, Initiation
 from fgtrack.estimation.registry import ESTIMATORS, Claims, motion_model
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.io.config import InputConfig
-from fgtrack.io.errors import MOST_SENSORS
 from fgtrack.io.run import EvaluationConfig
 from fgtrack.models.correlated_errors import with_correlated_errors
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
@@ -274,8 +273,6 @@ class Config:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "estimator", ESTIMATORS.resolve(self.estimator))
-        if len(self.sensors) > MOST_SENSORS:
-            raise ValueError(f"sensors: {len(self.sensors)} of them, at most {MOST_SENSORS} can be used")
         for name in self.options:
             if ESTIMATORS.resolve(name) != name:
                 raise ValueError(f"options: {name!r} is now {ESTIMATORS.resolve(name)!r}")

@@ -120,9 +120,6 @@ def small_yaml(text: str) -> Callable[[Path], None]:
     return make
 
 
-_LAUGHS = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
-    f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 10)
-)
 _RACE = """ego: {kind: track, arc_m: 0.0, speed: [[0, 50]]}
 sensors: [{name: radar, std: {x_m: 1.0, y_m: 1.0}, rate_hz: RATE, clutter: {mean_per_scan: CLUTTER}}]
 duration_s: DURATION
@@ -191,7 +188,6 @@ BOMBS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     "nuscenes of 3 GB": (nuscenes_zeros, ("info", "results.json")),
     "table of 3 GB": (table_zeros, TABLE),
     "yaml of 3 GB": (yaml_zeros, CONFIG),
-    "yaml with aliases": (small_yaml(_LAUGHS), CONFIG),
     "scenario of 10^9 scans": (race(1e4, 0.0, 86_400.0), SIMULATE),
     "sweep of 10^9 cells": (sweep, ("sweep", "x.yaml", "-o", "out", "--jobs", "1")),
     "sqlite3 with a blob of 900 MB": (blob, ("info", "bag")),

@@ -1,21 +1,17 @@
 """Whatever a reader meets: one line that names the place, and everything before it is there."""
 
 import json
-import sqlite3
 from collections.abc import Iterator
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.messages import drive
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.info import describe
-from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.source import open_input
 from fgtrack.io.stream import read_stream, write_stream
 from fgtrack.io.validation import validated
@@ -84,15 +80,6 @@ def test_descriptions_that_are_not_finite_are_none_and_measurements_pass_as_they
     assert same is LIST
 
 
-def test_a_recording_of_more_sensors_than_anyone_has_ends_there() -> None:
-    """A name that counts, as a frame with a number: the run of 10,000 could be written, and not read again."""
-    lists = [replace(LIST, sensor=f"radar{k}") for k in range(1_000)]
-    readable = UntilBreak(validated(Path("drive"), lambda: iter(lists)))
-    assert len(list(readable)) == 100
-    with pytest.raises(DataError, match=r"^drive: message 101: radar100: the lists before it are of 100 other sensors"):
-        readable.raise_error()
-
-
 def test_numbers_that_are_not_finite_and_those_of_numpy_pass() -> None:
     passing = [
         replace(EGO, x_m=float("nan")),
@@ -134,13 +121,6 @@ def autoferry(folder: Path) -> Path:
     return folder
 
 
-def sqlite(folder: Path) -> Path:
-    write_bag(folder, drive(), "sqlite3")
-    with closing(sqlite3.connect(next(folder.glob("*.db3")))) as database, database:
-        database.execute("UPDATE messages SET timestamp = 'noon' WHERE id = 20")
-    return folder
-
-
 @pytest.mark.parametrize(
     ("make", "complaint", "least"),
     [
@@ -148,7 +128,6 @@ def sqlite(folder: Path) -> Path:
         (lambda path: log(path, time="noon"), r"message 5: receipt_ns: .* not 'noon'", 4),
         (lambda path: log(path, time=float("inf")), "message 5: receipt_ns: .* not inf", 4),
         (autoferry, "message 5: stamp_ns: a 64 bit integer", 4),
-        (sqlite, "is truncated .*noon", 12),
     ],
 )
 def test_a_damaged_input_is_replayed_converted_and_described_up_to_there(tmp_path, make, complaint, least) -> None:

@@ -23,7 +23,7 @@ from fgtrack.core.files import open_file
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.types import Detection, DetectionList, EgoState, Frame, Message
 from fgtrack.io.adapters.common import reported_as
-from fgtrack.io.errors import LARGEST_BYTES, TruncatedInput, refuse_larger
+from fgtrack.io.errors import TruncatedInput
 from fgtrack.io.source import FileFormat
 
 LOG_NAME = "data_logs.csv"
@@ -53,13 +53,11 @@ def read_log(folder: Path, frames: Mapping[str, Frame]) -> Iterator[Message]:
     file = folder / LOG_NAME
     try:
         with open_file(file) as lines:
-            rows = iter(lambda: lines.readline(LARGEST_BYTES + 1), b"")
-            header = next(rows, b"").decode(errors="replace").rstrip("\n").split(";")
+            header = next(lines, b"").decode(errors="replace").rstrip("\n").split(";")
             if missing := [name for name in _COLUMNS if name not in header]:
                 raise DataError(f"{file}:1: has no column {missing[0]}, so it is not a log of FusionTracking")
             last_ego_ns: int | None = None
-            for number, line in enumerate(rows, 2):
-                refuse_larger(len(line), f"{file}:{number}", LARGEST_BYTES)
+            for number, line in enumerate(lines, 2):
                 if line.count(b";") < len(header) - 1 and not line.endswith(b"\n"):
                     raise TruncatedInput(f"{file}:{number}: breaks off in the middle of a row")
                 with reported_as(f"{file}:{number}: is not a row of such a log"):

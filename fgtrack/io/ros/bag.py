@@ -15,7 +15,7 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2
 
 from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.time import NS_PER_S
-from fgtrack.io.errors import LARGEST_BYTES, MOST_OBJECTS, TruncatedInput, one_line, refuse_larger
+from fgtrack.io.errors import TruncatedInput, one_line
 from fgtrack.io.ros.bag_files import BagFile, bags_in, check_serialization, parts_of, storage_of
 from fgtrack.io.ros.rosbag1_file import Rosbag1File
 from fgtrack.io.ros.typestore import Key, MessageTypes, type_name
@@ -54,15 +54,8 @@ class Bag:
     `DataError` where it cannot be read at all.
     """
 
-    def __init__(
-        self,
-        path: Path | str,
-        message_definitions: Collection[str] = (),
-        largest_bytes: int = LARGEST_BYTES,
-        most_objects: int = MOST_OBJECTS,
-    ) -> None:
+    def __init__(self, path: Path | str, message_definitions: Collection[str] = ()) -> None:
         self.path = Path(path)
-        self._largest_bytes = largest_bytes
         with _as_data_error(self.path):
             self._parts = parts_of(self.path)
         with self._files() as files:
@@ -71,7 +64,7 @@ class Bag:
                 if isinstance(item.ext, ConnectionExtRosbag2):
                     check_serialization(self.path, item.topic, item.ext.serialization_format)
             self._ros1 = any(isinstance(file, Rosbag1File) for file in files)
-            self._types = MessageTypes(map(_key, connections), self._ros1, message_definitions, most_objects)
+            self._types = MessageTypes(map(_key, connections), self._ros1, message_definitions)
             self._stamped = set(filter(self._types.begins_with_header, map(_key, connections)))
             self.break_off = self._break_off(files)
         self.topics = _topics(connections, self._types.problems)
@@ -105,11 +98,6 @@ class Bag:
             topic = by_key[connection.topic, connection.msgtype]
             yield topic, log_ns, self._stamp_ns(data) if _key(connection) in self._stamped else None
 
-    def end_ns(self) -> int | None:
-        """The end of the log times as the indexes of the files say it, without reading messages; None without any."""
-        with self._files() as files:
-            return max((file.end_time for file in files), default=0) or None
-
     def _stamp_ns(self, data: bytes) -> int | None:
         """Stamp of the header with which the message `data` begins."""
         offset = 4  # behind the CDR header, or in ROS 1 behind the sequence number
@@ -129,7 +117,7 @@ class Bag:
                 if kind is None and not (empty and len(paths) > 1):
                     raise DataError(f"{path}: {'is empty' if empty else 'is not a bag file'}")
                 if kind is not None:
-                    file = kind(path) if issubclass(kind, Rosbag1File) else kind(path, self._largest_bytes)
+                    file = kind(path)
                     stack.callback(file.close)
                     file.open()
                     files.append(file)
@@ -149,9 +137,7 @@ class Bag:
                 records = [iter(file.messages(connections)) for file, connections in wanted if connections]
                 for connection, log_ns, data in heapq.merge(*records, key=itemgetter(1)):
                     if data[:4] == _ZSTD_MAGIC and not self._ros1:
-                        what = f"{self.path}: the message on {connection.topic} at {log_ns} ns"
-                        refuse_larger(zstandard.frame_content_size(data), what, self._largest_bytes)
-                        data = decompress(data, max_output_size=self._largest_bytes)
+                        data = decompress(data)
                     yield connection, log_ns, data
                     count += 1
             except (FgtrackError, MemoryError):

@@ -16,7 +16,7 @@ from ruamel.yaml.error import YAMLError
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.files import open_file, read_whole
-from fgtrack.io.errors import LARGEST_BYTES, one_line
+from fgtrack.io.errors import one_line
 from fgtrack.io.ros.mcap_file import MCAP_MAGIC, McapFile
 from fgtrack.io.ros.rosbag1_file import Rosbag1File
 from fgtrack.io.ros.sqlite3_file import Sqlite3File
@@ -30,7 +30,6 @@ SETTINGS = "fgtrack"
 """Entry of its custom data with what the recording carries of a configuration, as JSON."""
 _BAG_SUFFIXES = (".mcap", ".db3")
 _NEWEST_VERSION = 9
-_LARGEST_RATIO = 100
 _READERS: Mapping[bytes, type[BagFile]] = {
     MCAP_MAGIC: McapFile,
     b"SQLite format 3\x00": Sqlite3File,
@@ -55,19 +54,9 @@ class Parts:
         with TemporaryDirectory() as folder:
             targets = tuple(Path(folder) / file.stem for file in self.files)
             for source, target in zip(self.files, targets, strict=True):
-                _decompress(source, target)
+                with source.open("rb") as file, target.open("wb") as out:
+                    zstandard.ZstdDecompressor().copy_stream(file, out)
             yield targets
-
-
-def _decompress(source: Path, target: Path) -> None:
-    """Write the decompressed zstd file `source` to `target`. Raises `DataError` for one that fills the disk."""
-    allowed = max(LARGEST_BYTES, _LARGEST_RATIO * source.stat().st_size)
-    with source.open("rb") as file, target.open("wb") as out:
-        for portion in zstandard.ZstdDecompressor().read_to_iter(file):
-            allowed -= len(portion)
-            if allowed < 0:
-                raise DataError(f"{source}: decompresses to more than {_LARGEST_RATIO} times its size")
-            out.write(portion)
 
 
 def parts_of(path: Path) -> Parts:

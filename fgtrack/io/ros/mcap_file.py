@@ -11,8 +11,9 @@ from mcap.records import Channel, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 
-from fgtrack.io.errors import LARGEST_BYTES, one_line
+from fgtrack.io.errors import one_line
 
+_LARGEST_BYTES = 1 << 30  # of a record: a damaged length would take more memory than there is
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 _FORMATS = {
     "ros2msg": MessageDefinitionFormat.MSG,
@@ -25,13 +26,10 @@ _NO_SCHEMA = Schema(data=b"", encoding="", id=0, name="")
 class McapFile:
     """MCAP file. One without its index is scanned, a truncated one up to its last whole chunk."""
 
-    def __init__(self, path: Path, largest_bytes: int = LARGEST_BYTES) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
         self.connections: list[Connection] = []
         self.break_off: str | None = None
-        self.end_time = 0
-        """Last log time in ns."""
-        self._largest_bytes = largest_bytes
         self._file: BinaryIO | None = None
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
@@ -49,7 +47,6 @@ class McapFile:
                 self._channels.setdefault(record.id, record)
             elif isinstance(record, Message):
                 self._counts[record.channel_id] += 1
-                self.end_time = max(self.end_time, record.log_time)
         self.connections = [self._connection(channel) for channel in self._channels.values()]
 
     def close(self) -> None:
@@ -72,7 +69,7 @@ class McapFile:
 
     def _reader(self) -> SeekingReader:
         assert self._file
-        return SeekingReader(self._file, validate_crcs=True, record_size_limit=self._largest_bytes)
+        return SeekingReader(self._file, validate_crcs=True, record_size_limit=_LARGEST_BYTES)
 
     def _read_summary(self) -> bool:
         """Read channels and counts from the end of the file; False unless all messages are in chunks of its index."""
@@ -87,7 +84,6 @@ class McapFile:
             return False
         self._schemas, self._channels = summary.schemas, summary.channels
         self._counts = Counter({number: min(n, 1 << 62) for number, n in known.channel_message_counts.items()})
-        self.end_time = known.message_end_time
         return True
 
     def _records(self) -> Iterator[McapRecord]:
@@ -95,7 +91,7 @@ class McapFile:
         assert self._file
         self._file.seek(0)
         try:
-            yield from StreamReader(self._file, validate_crcs=True, record_size_limit=self._largest_bytes).records
+            yield from StreamReader(self._file, validate_crcs=True, record_size_limit=_LARGEST_BYTES).records
         except MemoryError:
             raise
         except Exception as error:  # the end of the file, or whatever damaged bytes raise

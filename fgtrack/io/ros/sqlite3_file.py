@@ -12,7 +12,6 @@ import apsw
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 
 from fgtrack.core.errors import DataError
-from fgtrack.io.errors import LARGEST_BYTES, refuse_larger
 
 _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
 _NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
@@ -23,13 +22,10 @@ _ROWS = "SELECT topic_id, timestamp, data FROM messages"
 class Sqlite3File:
     """SQLite file; one that was not closed is recovered in a copy, a truncated one is read row by row."""
 
-    def __init__(self, path: Path, largest_bytes: int = LARGEST_BYTES) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
         self.connections: list[Connection] = []
         self.break_off: str | None = None
-        self.end_time = 0
-        """Time after the last log time in ns; 0 where unknown."""
-        self._largest_bytes = largest_bytes
         self._copies: TemporaryDirectory[str] | None = None
         self._base: apsw.Connection | None = None
         self._is_truncated = False
@@ -46,10 +42,7 @@ class Sqlite3File:
             recovering.close()
         try:
             self._connect(path)
-            query = "SELECT topic_id, count(*), max(timestamp) FROM messages GROUP BY 1"
-            counts = {topic_id: (count, last_ns) for topic_id, count, last_ns in self._rows(query)}
-            self.end_time = max((last_ns + 1 for _, last_ns in counts.values()), default=0)
-            self._read_topics({topic_id: count for topic_id, (count, _) in counts.items()})
+            self._read_topics(dict(self._rows("SELECT topic_id, count(*) FROM messages GROUP BY 1")))
         except (apsw.Error, TypeError):
             self.break_off, self._is_truncated = self.break_off or "is truncated", True
             self._connect(self._whole_pages())
@@ -71,7 +64,6 @@ class Sqlite3File:
             rows = self._rows(f"{_ROWS} ORDER BY timestamp, id")
         for topic_id, log_ns, data in rows:
             if topic_id in by_id:
-                refuse_larger(len(data), f"{self.path}: the message at {log_ns} ns", self._largest_bytes)
                 yield by_id[topic_id], log_ns, data
 
     def _connect(self, path: Path) -> None:

@@ -98,15 +98,13 @@ def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
 
 
 def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
-    bag = Bag(path, config.message_definitions, config.largest_bytes, config.most_objects)
+    bag = Bag(path, config.message_definitions)
     uses = topic_uses(bag, config)
     windows_ns = {name: nanoseconds(each.scan_s) for name, each in config.detections.items() if each.scan_s is not None}
     return lambda: grouped(bag_messages(bag, uses), windows_ns) if windows_ns else bag_messages(bag, uses)
 
 
-FORMAT = FileFormat(
-    "a rosbag2 folder, an .mcap, .db3 or ROS 1 .bag file", is_bag, _open, settings_of, lambda path: Bag(path).end_ns()
-)
+FORMAT = FileFormat("a rosbag2 folder, an .mcap, .db3 or ROS 1 .bag file", is_bag, _open, settings_of)
 
 
 def bag_messages(bag: Bag, uses: tuple[TopicUse, ...]) -> Iterator[Message]:

@@ -11,10 +11,9 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
 
-from fgtrack.core.errors import CallError, DataError, printable
+from fgtrack.core.errors import DataError, printable
 from fgtrack.core.types import MEASURABLE, DetectionList, Message
 from fgtrack.estimation.smoothing.settings import SmootherSettings
-from fgtrack.io.errors import MOST_SENSORS
 from fgtrack.io.source import InputSource
 from fgtrack.models.sensors import Correlation, Mount, Score, SensorModel
 from fgtrack.pipeline.assumptions.coverage import Coverage, coverages
@@ -322,10 +321,7 @@ def _with_coverage(name: str, sensor: SensorModel, seen: Coverage, found: list[A
 def _seen(
     source: InputSource, config: Config, mounts: Mapping[str, Mount]
 ) -> tuple[dict[str, Coverage], dict[str, ListStatistics]]:
-    """Coverage and lists of the sensors of `source` that are not ignored; coverage of those that only `input` names.
-
-    Raises `CallError` where there are too many.
-    """
+    """Coverage and lists of the sensors of `source` that are not ignored; coverage of those that only `input` names."""
     lists: dict[str, ListStatistics] = {}
 
     def readable() -> Iterator[Message]:
@@ -341,8 +337,6 @@ def _seen(
     for name in (*config.input.detections, *config.input.csv.detections):
         if name not in config.ignore_sensors:
             found.setdefault(name, Coverage(frozenset(), 0, 0, None))
-    if len(found) > MOST_SENSORS:
-        raise CallError(f"input: {len(found)} sensors with those of the recording, at most {MOST_SENSORS} can be used")
     return dict(sorted(found.items())), lists
 
 
