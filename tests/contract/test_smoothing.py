@@ -7,7 +7,6 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from fgtrack.core.errors import DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateStatus
@@ -277,19 +276,6 @@ def test_fusing_late_data_reaches_as_far_as_the_ring_and_says_so() -> None:
     found = [one.update(measured(rng, motion, ms * MS)).status for ms in (499, 500, 699, 700)]
     too_old, beyond = UpdateStatus.TOO_OLD, UpdateStatus.BEYOND_WINDOW
     assert found == [too_old, beyond, beyond, UpdateStatus.OUT_OF_SEQUENCE]
-
-
-@every_solver
-def test_late_data_may_be_an_error_and_the_estimator_stays_as_it_was(name: str) -> None:
-    motion, rng = CTRV(), np.random.default_rng(0)
-    one = smoother(motion, name, late="raise")
-    fill(motion, rng, one, num=11)
-    start_ns, newest_ns = one.window_ns
-    before = [repr(one.state_at(stamp_ns)) for stamp_ns in (start_ns, newest_ns)]
-    with pytest.raises(DataError, match=r"0\.01 s older than the window: lengthen smoother\.lag_s"):
-        one.update(measured(rng, motion, start_ns - START_NS - 10 * MS))
-    assert [repr(one.state_at(stamp_ns)) for stamp_ns in (start_ns, newest_ns)] == before
-    assert one.update(measured(rng, motion, start_ns - START_NS)).status is UpdateStatus.OUT_OF_SEQUENCE
 
 
 # --- many tracks

@@ -264,12 +264,9 @@ estimators: [ekf-replay, smoother]
 metrics: [truth.overall.errors.position_m.rmse]
 vary:
   what:
-    label: [good, negative gate, no map, refused, good again]
-    association.gate_m: [5.0, -1.0, 5.0, 5.0, 4.0]
-    scenario.map: [oval, oval, missing.csv, oval, oval]
-    smoother.late: [fuse, fuse, fuse, raise, fuse]
-    smoother.lag_s: [1.0, 1.0, 1.0, 0.0, 1.0]
-    smoother.lagged_s: [[], [], [], [], []]
+    label: [good, negative gate, no map, good again]
+    association.gate_m: [5.0, -1.0, 5.0, 4.0]
+    scenario.map: [oval, oval, missing.csv, oval]
 """,
     )
     assert run(["sweep", str(sweep), "-o", str(tmp_path / "out"), "--jobs", "1"]) == 1
@@ -277,19 +274,16 @@ vary:
     bad = {(row["what"], row["estimator"]): row["error"] for row in rows(tmp_path / "out/errors.csv")}
     assert sorted([*good, *bad]) == sorted(
         (what, name)
-        for what in ("good", "negative gate", "no map", "refused", "good again")
+        for what in ("good", "negative gate", "no map", "good again")
         for name in ("ekf-replay", "smoother")
     )
-    assert set(bad) == {
-        *((what, name) for what in ("negative gate", "no map") for name in ("ekf-replay", "smoother")),
-        ("refused", "smoother"),
-    }
+    assert set(bad) == {(what, name) for what in ("negative gate", "no map") for name in ("ekf-replay", "smoother")}
     assert "gate_m: must be positive and finite, is -1.0" in bad["negative gate", "smoother"]
     assert "missing.csv" in bad["no map", "ekf-replay"]
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 1
     first = "what=negative gate, .*gate_m: must be"
-    assert re.match(rf"fgtrack: error: .*errors\.csv: 5 bad cells, the first: {first}", said[0])
+    assert re.match(rf"fgtrack: error: .*errors\.csv: 4 bad cells, the first: {first}", said[0])
 
 
 def deadly(run: Run) -> tuple[dict, dict]:

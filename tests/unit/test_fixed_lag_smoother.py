@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from fgtrack.core.errors import DataError
 from fgtrack.core.types import IntArray
 from fgtrack.estimation.base import Measurement, SensorPose, Start, UpdateStatus
 from fgtrack.estimation.smoothing.bank import FixedLagSmoother, SmootherBank
@@ -154,13 +153,3 @@ def test_a_bank_reports_lagged_and_final_states() -> None:
     bank.remove(7)
     assert [report.state.stamp_ns for report in bank.smoothed()] == [100 * k * MS for k in (2, 3, 4, 5)]
     assert bank.smoothed() == []
-
-
-def test_a_bank_refuses_late_data_where_that_is_an_error() -> None:
-    bank = SmootherBank(CV(), SmootherSettings(lag_s=0.3, late="raise"))
-    bank.birth(0, Start())
-    bank.advance(1000 * MS)
-    assert bank.window_start_ns == 0
-    assert bank.states_at(700 * MS).track_ids == (0,)
-    with pytest.raises(DataError, match=r"0\.1 s older than the window.*smoother\.lag_s"):
-        bank.states_at(600 * MS)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from fgtrack.core.linalg import equal_ones
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import BoolArray, FloatArray, IntArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus
@@ -79,11 +80,7 @@ class SmootherBank:
 
     @property
     def window_start_ns(self) -> int:
-        """See `TrackBank.window_start_ns`; where late measurements are an error, they must come as far as here."""
-        return 0 if self._settings.late == "raise" else self._oldest_ns
-
-    @property
-    def _oldest_ns(self) -> int:
+        """See `TrackBank.window_start_ns`."""
         return self.present_ns - self._lag_ns - self._behind_ns
 
     @property
@@ -98,8 +95,7 @@ class SmootherBank:
         self._changed()  # which tracks are known at a stamp depends on the clock
 
     def states_at(self, stamp_ns: int) -> StatesAt:
-        """See `TrackBank.states_at`. Raises `DataError` for a stamp before the window where the policy is `raise`."""
-        self._settings.refuse_older(stamp_ns, self._oldest_ns)
+        """See `TrackBank.states_at`."""
         known = self._known.get(stamp_ns)
         if known is None:
             tracks = self._all_tracks()
@@ -115,24 +111,23 @@ class SmootherBank:
         """See `TrackBank.update`."""
         tracks = np.array([self._tracks[track_id] for track_id in track_ids], dtype=np.int64)
         newest_ns, start_ns, reach_ns, oldest_ns = self._times().take(tracks, axis=1)
-        self._settings.refuse_older(stamp_ns, int(start_ns.max(initial=stamp_ns)))
         results = [_TOO_OLD] * len(tracks)
-        rows = (oldest_ns <= stamp_ns).nonzero()[0]
-        if not rows.size:
-            return results
-        chosen = [measurements[row].seen_by(self._motion) for row in rows.tolist()]
-        known = self.states_at(stamp_ns)
-        positions = {track_id: position for position, track_id in enumerate(known.track_ids)}
-        at = [positions[track_ids[row]] for row in rows.tolist()]
-        means = known.means[at]
-        innovations = Innovations.of(chosen, means, known.covariances[at])
-        is_fused = np.isfinite(innovations.nis)
-        self._fuse(stamp_ns, tracks[rows], chosen, innovations, means, start_ns[rows], reach_ns[rows], is_fused)
-        late = [
-            2 if stamp_ns < a else int(stamp_ns < b) for a, b in zip(start_ns.tolist(), newest_ns.tolist(), strict=True)
-        ]
-        for k, (row, fused) in enumerate(zip(rows.tolist(), is_fused.tolist(), strict=True)):
-            results[row] = innovations.result(k, _STATUSES[late[row]]) if fused else _FAILED
+        rows = (oldest_ns <= stamp_ns).nonzero()[0].tolist()
+        chosen = {row: measurements[row].seen_by(self._motion) for row in rows}
+        states = self.states_at(stamp_ns)
+        positions = {track_id: position for position, track_id in enumerate(states.track_ids)}
+        for alike in equal_ones([(id(m.model), id(m.pose), m.assumed, m.loss) for m in chosen.values()]):
+            group = np.array([rows[k] for k in alike])
+            at = [positions[track_ids[row]] for row in group]
+            measured, means = [chosen[row] for row in group], states.means[at]
+            innovations = Innovations.of(measured, means, states.covariances[at])
+            window_ns = start_ns[group], reach_ns[group]
+            is_fused = np.isfinite(innovations.nis)
+            self._fuse(stamp_ns, tracks[group], measured, innovations, means, *window_ns, is_fused)
+            late = (stamp_ns < newest_ns[group]) + (stamp_ns < start_ns[group]).astype(int)
+            for k, (row, fused) in enumerate(zip(group.tolist(), is_fused.tolist(), strict=True)):
+                y, S, nis = innovations.y[k], innovations.S[k], float(innovations.nis[k])
+                results[row] = UpdateResult(_STATUSES[late[k]], y, nis, S) if fused else _FAILED
         return results
 
     def birth(self, track_id: int, prior: Start) -> None:
@@ -190,8 +185,8 @@ class SmootherBank:
 
     def state_at(self, track_id: int, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`."""
-        states = self.windows.states_at(np.array([self._tracks[track_id]]), np.array([stamp_ns]))
-        return track_state(self._motion, stamp_ns, states.means[0], states.covariances[0])
+        means, covariances = self.windows.states_at(np.array([self._tracks[track_id]]), np.array([stamp_ns]))
+        return track_state(self._motion, stamp_ns, means[0], covariances[0])
 
     def take_final(self, track_id: int) -> list[TrackState]:
         """Smoothed states of the nodes that have left the window since the last call, in order."""
@@ -230,7 +225,7 @@ class SmootherBank:
         chosen = [measurements[row] for row in rows.tolist()]
         of, window_ns = tracks[rows], (start_ns[rows], reach_ns[rows])
         try:
-            left = self.windows.fuse(of, stamp_ns, chosen, innovations.at(is_fused), guesses[rows], *window_ns)
+            left = self.windows.fuse(of, stamp_ns, chosen, innovations.at(rows), guesses[rows], *window_ns)
         except np.linalg.LinAlgError:
             if len(rows) == 1:
                 self.windows.failures.add(Failure.GRAPH_REBUILT)

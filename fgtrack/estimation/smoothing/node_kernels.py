@@ -2,23 +2,10 @@
 
 import numpy as np
 
-from fgtrack.core.compiled import cholesky, inlined, njit
+from fgtrack.core.compiled import cholesky, njit
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.smoothing.kernels import MATRICES, ORDER, TRACKS, VECTORS, regularise
-
-
-@inlined
-def _before(stamp_ns: int, all_ns: IntArray, count: int) -> int:
-    """Return the index of the newest of `count` nodes at or before `stamp_ns`; -1 if there is none."""
-    low, high = -1, count
-    while high - low > 1:
-        middle = (low + high) // 2
-        if all_ns[middle] <= stamp_ns:
-            low = middle
-        else:
-            high = middle
-    return low
 
 
 @njit(f"int64({TRACKS}, {TRACKS}, {ORDER}, {TRACKS}, {ORDER}, {TRACKS}, {TRACKS}, float64[::1], float64[::1])")
@@ -40,7 +27,13 @@ def locate(
     num_between = 0
     for t in range(len(tracks)):
         track, stamp_ns = tracks[t], stamps_ns[t]
-        index = _before(stamp_ns, all_ns[track], count[track])
+        index, end = -1, count[track]  # bisect to the newest node at or before the stamp
+        while end - index > 1:
+            middle = (index + end) // 2
+            if all_ns[track, middle] <= stamp_ns:
+                index = middle
+            else:
+                end = middle
         until_s[t], after_s[t] = (stamp_ns - all_ns[track, index]) / NS_PER_S, 0.0
         if until_s[t] > 0.0 and index < count[track] - 1:
             index += 1
@@ -48,41 +41,6 @@ def locate(
             num_between += 1
         indices[t], at[t] = index, numbers[track, index]
     return num_between
-
-
-@njit(f"void({TRACKS}, int64, int64, {ORDER}, {TRACKS}, {TRACKS}, {TRACKS})")
-def nearest(
-    tracks: IntArray,
-    stamp_ns: int,
-    near_ns: int,
-    all_ns: IntArray,
-    count: IntArray,
-    indices: IntArray,
-    at_ns: IntArray,
-) -> None:
-    """Write the stamps of the nodes at most `near_ns` from `stamp_ns`, or else this, and the nodes there or before."""
-    for t in range(len(tracks)):
-        stamps_ns, num = all_ns[tracks[t]], count[tracks[t]]
-        index = _before(stamp_ns, stamps_ns, num)
-        before_ns = stamp_ns - stamps_ns[index]
-        after_ns = stamps_ns[index + 1] - stamp_ns if index + 1 < num else near_ns + 1
-        at_ns[t] = stamp_ns
-        if min(before_ns, after_ns) <= near_ns:
-            index += after_ns < before_ns
-            at_ns[t] = stamps_ns[index]
-        indices[t] = index
-
-
-@njit(f"void({TRACKS}, {TRACKS}, {TRACKS}, {ORDER}, {TRACKS}, {TRACKS})")
-def last_before(
-    tracks: IntArray, indices: IntArray, stamps_ns: IntArray, all_ns: IntArray, count: IntArray, last: IntArray
-) -> None:
-    """Write the same, or `indices` where these are later; searches step by step from there."""
-    for t in range(len(tracks)):
-        track, index = tracks[t], indices[t]
-        while index + 1 < count[track] and all_ns[track, index + 1] <= stamps_ns[t]:
-            index += 1
-        last[t] = index
 
 
 @njit(f"void({TRACKS}, {TRACKS}, int64, {ORDER}, {ORDER}, {TRACKS}, {TRACKS})")
@@ -136,10 +94,9 @@ def shift(
                     back[behind, i, n] += back[behind, i, j] * steps[t, j]
 
 
-@njit(f"b1({TRACKS}, {TRACKS}, {VECTORS}, {MATRICES}, {MATRICES}, {VECTORS}, {MATRICES}, {TRACKS})")
+@njit(f"b1({TRACKS}, {VECTORS}, {MATRICES}, {MATRICES}, {VECTORS}, {MATRICES}, {TRACKS})")
 def observe(
     numbers: IntArray,
-    size: IntArray,
     y: FloatArray,
     H: FloatArray,
     R: FloatArray,
@@ -148,10 +105,10 @@ def observe(
     num_rows: IntArray,
 ) -> bool:
     """Append L^-1 [H | y + H offset], R = L L', to the rows of the nodes; False if an R is not positive definite."""
-    n = H.shape[2]
-    L = np.empty(R.shape[1:])
+    k, n = H.shape[1:]
+    L = np.empty((k, k))
     for t in range(len(numbers)):
-        at, k = numbers[t], size[t]
+        at = numbers[t]
         if not cholesky(R[t], k, L):
             return False
         used = num_rows[at]

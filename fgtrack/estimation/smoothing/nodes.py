@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.smoothing import node_kernels
-from fgtrack.estimation.smoothing.terms import Innovations, MeasurementTerm, is_nonlinear, whitened
+from fgtrack.estimation.smoothing.terms import NEAR_NS, Innovations, MeasurementTerm, is_nonlinear, whitened
 
 _FEW_TRACKS, _FEW_NODES, _FEW_COMPONENTS = 4, 16, 4
 _NEVER_NS = int(np.iinfo(np.int64).max)
@@ -81,29 +81,18 @@ class Nodes:
         self.order = self.first, self.count, self.numbers
         """Arguments of all loops over the windows."""
 
-    def located(self, tracks: IntArray, stamps_ns: IntArray) -> tuple[IntArray, IntArray, FloatArray, FloatArray, int]:
-        """Return index and number of the node after each of `stamps_ns`, or of the last one, with the times around it.
+    def nearest(self, tracks: IntArray, stamp_ns: int) -> tuple[IntArray, IntArray]:
+        """Return the indices of the nodes at most `NEAR_NS` from `stamp_ns`, or else before it, and their stamps."""
+        each, all_ns = np.arange(len(tracks)), self.stamps_ns[tracks]
+        gaps_ns = np.abs(all_ns - stamp_ns)
+        indices = gaps_ns.argmin(axis=1)
+        is_near = gaps_ns[each, indices] <= NEAR_NS
+        before = (all_ns <= stamp_ns).sum(axis=1) - 1
+        return np.where(is_near, indices, before), np.where(is_near, all_ns[each, indices], stamp_ns)
 
-        These are until the stamp, from the node before it, and from there to the node, 0 if it is not after the stamp;
-        then how many of the nodes are.
-        """
-        m = len(tracks)
-        (indices, numbers), (until_s, after_s) = np.empty((2, m), dtype=np.int64), np.empty((2, m))
-        given = self.stamps_ns, self.count, self.numbers
-        num_between = node_kernels.locate(tracks, stamps_ns, *given, indices, numbers, until_s, after_s)
-        return indices, numbers, until_s, after_s, num_between
-
-    def nearest(self, tracks: IntArray, stamp_ns: int, near_ns: int) -> tuple[IntArray, IntArray]:
-        """Return the indices of the nodes at most `near_ns` from `stamp_ns`, or else before it, and their stamps."""
-        indices, at_ns = np.empty((2, len(tracks)), dtype=np.int64)
-        node_kernels.nearest(tracks, stamp_ns, near_ns, self.stamps_ns, self.count, indices, at_ns)
-        return indices, at_ns
-
-    def last_before(self, tracks: IntArray, indices: IntArray, stamps_ns: IntArray) -> IntArray:
-        """Return the indices of the newest nodes at or before `stamps_ns`, or `indices` if these are later."""
-        last = np.empty(len(tracks), dtype=np.int64)
-        node_kernels.last_before(tracks, indices, stamps_ns, self.stamps_ns, self.count, last)
-        return last
+    def last_before(self, tracks: IntArray, stamps_ns: IntArray) -> IntArray:
+        """Return the indices of the newest nodes at or before `stamps_ns`; -1 if there are none."""
+        return np.asarray((self.stamps_ns[tracks] <= stamps_ns[:, None]).sum(axis=1) - 1)
 
     def window(self, track: int) -> IntArray:
         """Return the numbers of all nodes of a window."""
@@ -179,7 +168,7 @@ class Nodes:
         Raises `numpy.linalg.LinAlgError` for an R that is not positive definite.
         """
         self._fit_rows(int(self.num_rows[numbers].max(initial=0)) + measured.y.shape[1])
-        given = measured.size, measured.y, measured.H, measured.R
+        given = measured.y, measured.H, measured.R
         if not node_kernels.observe(numbers, *given, offsets, self.rows, self.num_rows):
             raise np.linalg.LinAlgError("a covariance is not positive definite")
         self.changed[numbers] = True
@@ -190,6 +179,20 @@ class Nodes:
         self.predicted[numbers, :, -1] = 0.0
         for number in numbers.tolist():
             self.terms[number] = []
+
+    def saved(self, tracks: IntArray, anchors: IntArray, is_old: BoolArray) -> list[tuple[str, IntArray, FloatArray]]:
+        """Return the values of `tracks` before an update that may fail, which inserts a node into each at most.
+
+        These are names of arrays, rows and values. What is relinearised is not among them; the nodes that have left
+        the windows are, where a measurement `is_old`.
+        """
+        self.make_room(tracks)  # before values are saved, which would move
+        numbers, first = self.numbers[tracks], self.first[tracks]
+        columns, oldest = np.arange(numbers.shape[1]), np.where(is_old, 0, first - 1)
+        behind = numbers[(columns >= oldest[:, None]) & (columns < anchors[:, None])]
+        rows = {"predicted": numbers[np.arange(len(tracks)), first], "back": behind, "C": behind, "origin": numbers}
+        rows |= dict.fromkeys(self._ORDER, tracks)
+        return [(name, at, getattr(self, name)[at]) for name, at in rows.items()]
 
     def make_room(self, tracks: IntArray) -> None:
         """Make room for one more node of each of `tracks`."""
@@ -218,38 +221,3 @@ class Nodes:
     def _fit_rows(self, most: int) -> None:
         while most > self.rows.shape[1]:
             self.rows = np.concatenate([self.rows, np.zeros_like(self.rows)], axis=1)
-
-
-class Undo:
-    """Values of the nodes of some tracks before an update that may fail; what is relinearised is not among them."""
-
-    def __init__(self, nodes: Nodes, tracks: IntArray) -> None:
-        nodes.make_room(tracks)  # before values are saved, which would move
-        self._nodes, self._tracks = nodes, tracks
-        self._order = [getattr(nodes, name).take(tracks, axis=0) for name in nodes._ORDER]
-        self.first = nodes.first[tracks]
-        self._saved: list[tuple[str, IntArray, FloatArray]] = []
-        self._keep("predicted", nodes.numbers[tracks, self.first])
-        self._keep("back", nodes.numbers[tracks, np.maximum(self.first - 1, 0)])
-        self._keep("origin", nodes.numbers[tracks])
-        self.added: list[int] = []
-        """Nodes to which a measurement was added."""
-
-    def keep_ring(self, track: int) -> None:
-        """Save what is behind the window of `track`."""
-        numbers = self._nodes.numbers[track, : self._nodes.first[track]].copy()
-        self._keep("back", numbers)
-        self._keep("C", numbers)
-
-    def _keep(self, name: str, numbers: IntArray) -> None:
-        self._saved.append((name, numbers, getattr(self._nodes, name)[numbers]))
-
-    def __call__(self) -> None:
-        """Restore what was saved."""
-        nodes = self._nodes
-        for name, values in zip(nodes._ORDER, self._order, strict=True):
-            getattr(nodes, name)[self._tracks] = values
-        for name, numbers, values in reversed(self._saved):
-            getattr(nodes, name)[numbers] = values
-        for number in self.added:
-            nodes.terms[number].pop()

@@ -14,30 +14,29 @@ from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.filters.ekf import joseph, kalman_gain, propagated
 from fgtrack.estimation.interpolation import between
 from fgtrack.estimation.smoothing.nodes import Nodes
-from fgtrack.estimation.smoothing.terms import NEAR_NS, EquivalentMeasurement, NearMeasurement, whitened
+from fgtrack.estimation.smoothing.terms import EquivalentMeasurement, NearMeasurement, whitened
 from fgtrack.models.motion import MotionModel
 
 _Conditional = tuple[FloatArray, FloatArray, FloatArray]
 """A (n, n), b (n,), C (n, n)."""
 
 
-def fuse_behind(nodes: Nodes, motion: MotionModel, track: int, measurement: Measurement) -> EquivalentMeasurement:
-    """Fuse a detection older than the window of `track` behind it; return what it says of the oldest node inside.
+def fuse_behind(
+    nodes: Nodes, motion: MotionModel, track: int, index: int, measurement: Measurement
+) -> EquivalentMeasurement:
+    """Fuse a detection older than the window of `track` behind it; return its equivalent of the oldest node inside.
 
-    A node is inserted at its stamp, unless there is one at most `NEAR_NS` away. Raises `numpy.linalg.LinAlgError` if it
-    cannot be fused; all is as it was then.
+    A node is inserted at its stamp, after that at `index`, unless it is one of that node. Raises
+    `numpy.linalg.LinAlgError` if it cannot be fused; all is as it was then.
     """
     first, n = int(nodes.first[track]), nodes.dim
-    stamps_ns = nodes.stamps_ns[track, : first + 1]
-    index = int(np.abs(stamps_ns - measurement.stamp_ns).argmin())
-    is_new = abs(int(stamps_ns[index]) - measurement.stamp_ns) > NEAR_NS
-    if is_new:
-        index = int(stamps_ns.searchsorted(measurement.stamp_ns))
-        origin, *split = _split(nodes, motion, track, index, measurement.stamp_ns)
+    at_node = isinstance(measurement, NearMeasurement) or nodes.stamps_ns[track, index] == measurement.stamp_ns
+    split: list[_Conditional] = []
+    if at_node:
+        origin = nodes.origin[nodes.numbers[track, index]]
     else:
-        origin, split = nodes.origin[nodes.numbers[track, index]], []
-        if stamps_ns[index] != measurement.stamp_ns:
-            measurement = NearMeasurement.at(measurement, int(stamps_ns[index]), motion)
+        index += 1
+        origin, *split = _split(nodes, motion, track, index, measurement.stamp_ns)
     rows = whitened(measurement, origin)
     H, y, R = rows[:, :n], rows[:, n], np.eye(len(rows))
     path: list[_Conditional] = [*split[1:]]
@@ -49,7 +48,7 @@ def fuse_behind(nodes: Nodes, motion: MotionModel, track: int, measurement: Meas
         rest, through = y - H @ b, H @ A
         updated.append((A - K @ through, b + K @ rest, joseph(C, K, H, R)))
         y, H, R = rest, through, symmetrise(S)
-    if is_new:
+    if not at_node:
         nodes.insert_at(np.array([track]), np.array([index]), measurement.stamp_ns, origin[None])
         nodes.first[track] += 1
     changed = nodes.numbers[track, index - len(split[:1]) : nodes.first[track]]

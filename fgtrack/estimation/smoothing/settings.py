@@ -7,8 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from fgtrack.core.checks import not_negative
-from fgtrack.core.errors import CallError, DataError
-from fgtrack.core.time import seconds
+from fgtrack.core.errors import CallError
 from fgtrack.core.types import FloatArray
 from fgtrack.models.motion import MotionModel
 
@@ -24,9 +23,9 @@ class SmootherSettings:
 
     lag_s: float = 1.0
     """Length of the window behind the newest stamp of the track, or the clock."""
-    late: Literal["fuse", "drop", "raise"] = "fuse"
+    late: Literal["fuse", "drop"] = "fuse"
     """Treatment of a detection older than the window: fused exactly through what the window has marginalised
-    (counted as `beyond_window`), dropped (`too_old`), or an error."""
+    (counted as `beyond_window`), or dropped (`too_old`)."""
     ring_s: float = 2.0
     """Reach of `fuse` behind the window; older detections are `too_old`."""
     relinearise: Mapping[str, float] = field(default_factory=_RELINEARISE.copy)
@@ -66,14 +65,6 @@ class SmootherSettings:
         if unknown:
             raise CallError(f"unknown option {unknown[0]!r}; its options are {', '.join(taken)}, initiation")
         return cls(lag_s=lag_s, **{"lagged_s": (), **options})
-
-    def refuse_older(self, stamp_ns: int, oldest_ns: int) -> None:
-        """Raise `DataError` for a detection before `oldest_ns` where `late` is `raise`."""
-        if self.late == "raise" and stamp_ns < oldest_ns:
-            raise DataError(
-                f"a detection at {stamp_ns} ns is {seconds(oldest_ns - stamp_ns):g} s older than the window: "
-                "lengthen smoother.lag_s, or set smoother.late to fuse or drop"
-            )
 
     def thresholds(self, motion: MotionModel, nonlinear: bool) -> FloatArray:
         """Relinearisation thresholds of the state of `motion`, shape (n,).

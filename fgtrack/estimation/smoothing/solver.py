@@ -1,6 +1,6 @@
 """The windows of all tracks as systems of equations: linearised, relinearised where they moved, and solved."""
 
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
@@ -15,17 +15,6 @@ from fgtrack.models.motion import MotionModel
 STEP_TOLERANCE = 1e-7
 
 
-class Moved(NamedTuple):
-    """Nodes whose linearisation points have moved."""
-
-    starts: IntArray
-    """First index in each of m tracks, or `count` if none has moved; shape (m,)."""
-    tracks: IntArray
-    """Track of each of k nodes, shape (k,)."""
-    indices: IntArray
-    """Their indices, shape (k,)."""
-
-
 class Solver:
     """Linearised windows of many tracks, each by its number; solved in covariance form by compiled loops.
 
@@ -37,8 +26,6 @@ class Solver:
         Those of relinearisation.
     """
 
-    near_ns: ClassVar[int] = 0
-    """Stamps at most so far apart share a node."""
     is_damped: ClassVar[bool] = False
     """True if no step makes the fit worse."""
 
@@ -117,17 +104,14 @@ class Solver:
         num = kernels.find_far(tracks, anchors, starts, *nodes.order, self._thresholds, nodes.step, rows, indices)
         return rows[:num], indices[:num]
 
-    def move_far(self, tracks: IntArray, anchors: IntArray, starts: IntArray) -> Moved:
-        """Move the linearisation points that are too far from their states, not yet the motion from there."""
+    def move_far(self, tracks: IntArray, anchors: IntArray, starts: IntArray) -> tuple[IntArray, IntArray]:
+        """Move the linearisation points of nodes that are `far`, not yet the motion from there; return what it does."""
         nodes = self.nodes
         rows, indices = self.far(tracks, anchors, starts)
-        of = tracks[rows]
         if rows.size:
-            numbers = nodes.numbers[of, indices]
-            nodes.move(of, numbers, nodes.step[numbers])
-        starts = nodes.count[tracks]
-        np.minimum.at(starts, rows, indices)
-        return Moved(starts, of, indices)
+            numbers = nodes.numbers[tracks[rows], indices]
+            nodes.move(tracks[rows], numbers, nodes.step[numbers])
+        return rows, indices
 
     def linearise_motion(self, tracks: IntArray, indices: IntArray) -> None:
         """Linearise the motion from the nodes at `indices` to the next ones, where there are any."""
@@ -145,13 +129,13 @@ class Solver:
     def iterate(self, tracks: IntArray, max_iterations: int) -> None:
         """Take Gauss-Newton steps while a state is further than a threshold from its linearisation point."""
         for _ in range(max_iterations):
-            moved = self.move_far(tracks, self.nodes.first[tracks], self.nodes.count[tracks])
-            if not moved.tracks.size:
+            rows, indices = self.move_far(tracks, self.nodes.first[tracks], self.nodes.count[tracks])
+            if not rows.size:
                 return
-            self.linearise_motion(moved.tracks, moved.indices)
-            has_moved = moved.starts < self.nodes.count[tracks]
-            tracks = tracks[has_moved]
-            self.solve(tracks, moved.starts[has_moved], self.nodes.first[tracks])
+            self.linearise_motion(tracks[rows], indices)
+            rows, first_of = np.unique(rows, return_index=True)  # indices rise within a track
+            tracks = tracks[rows]
+            self.solve(tracks, indices[first_of], self.nodes.first[tracks])
 
     # --- one track
 

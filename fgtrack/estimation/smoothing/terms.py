@@ -7,10 +7,10 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from fgtrack.core.linalg import congruence, equal_ones, inverse_roots, mahalanobis_squared
+from fgtrack.core.linalg import congruence, inverse_roots, mahalanobis_squared
 from fgtrack.core.time import seconds
-from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.estimation.base import Measurement, UpdateResult, UpdateStatus
+from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.filters import ekf
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.robust import penalty, weight
@@ -56,23 +56,15 @@ def is_nonlinear(term: MeasurementTerm) -> bool:
     return isinstance(term, Measurement) and (term.loss is not None or not term.model.linear)
 
 
-class Linearised(NamedTuple):
-    """y = H (x - x0) + N(0, R) near the state x0."""
-
-    y: FloatArray
-    H: FloatArray
-    R: FloatArray
-
-
-def linearised(term: MeasurementTerm, x: FloatArray) -> Linearised:
-    """Linearise `term` at the state `x`, shape (n,)."""
+def linearised(term: MeasurementTerm, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return y, H and R of y = H (x' - x) + N(0, R) near the state `x`, shape (n,)."""
     if isinstance(term, EquivalentMeasurement):
-        return Linearised(term.y - term.H @ (x - term.origin), term.H, term.R)
+        return term.y - term.H @ (x - term.origin), term.H, term.R
     if isinstance(term, NearMeasurement):
         ahead, F = term.motion.predict(x, term.ahead_s), term.motion.jacobian(x, term.ahead_s)
         y, H = ekf.linearised(term.z, ahead, term.model, term.pose)
-        return Linearised(y, H @ F, term.R)
-    return Linearised(*ekf.linearised(term.z, x, term.model, term.pose), term.R)
+        return y, H @ F, term.R
+    return *ekf.linearised(term.z, x, term.model, term.pose), term.R
 
 
 def whitened(term: MeasurementTerm, x: FloatArray) -> FloatArray:
@@ -105,17 +97,15 @@ def overshot(terms: Iterable[MeasurementTerm], origin: FloatArray, mean: FloatAr
     for term in terms:
         if isinstance(term, Measurement) and not term.model.linear:
             y, H, R = linearised(term, origin)
-            error = term.model.residual(linearised(term, mean).y, y - H @ (mean - origin))
+            error = term.model.residual(linearised(term, mean)[0], y - H @ (mean - origin))
             if mahalanobis_squared(error, R) > 1.0:
                 return True
     return False
 
 
 class Innovations(NamedTuple):
-    """Innovations of m measurements at as many states; k is the largest number of components."""
+    """Innovations of m measurements at as many states."""
 
-    size: IntArray
-    """Number of components of each, shape (m,); the others are 0, with variance 1."""
     y: FloatArray
     """Shape (m, k)."""
     H: FloatArray
@@ -127,46 +117,19 @@ class Innovations(NamedTuple):
     nis: FloatArray
     """Shape (m,); NaN if it cannot be computed."""
 
-    def at(self, rows: BoolArray) -> "Innovations":
+    def at(self, rows: IntArray) -> "Innovations":
         """Return those of some of the measurements."""
-        if rows.all():
-            return self
-        size, *arrays = self
-        return Innovations(size[rows], *(values[rows] for values in arrays))
-
-    def result(self, row: int, status: UpdateStatus) -> UpdateResult:
-        """Return the outcome of the measurement of `row`."""
-        size = self.size[row]
-        return UpdateResult(status, self.y[row, :size], float(self.nis[row]), self.S[row, :size, :size])
+        return Innovations(*(values[rows] for values in self))
 
     @classmethod
     def of(cls, measurements: Sequence[Measurement], means: FloatArray, covariances: FloatArray) -> "Innovations":
-        """Return those of `measurements` at the states (m, n), (m, n, n)."""
-        alike = equal_ones([(id(each.model), id(each.pose), each.assumed, each.loss) for each in measurements])
-        if len(alike) == 1:
-            return cls._alike(measurements, means, covariances)
-        m, n, k = *means.shape, max(len(each.z) for each in measurements)
-        unit = np.broadcast_to(np.eye(k), (m, k, k))
-        every = cls(np.empty(m, np.int64), np.zeros((m, k)), np.zeros((m, k, n)), unit.copy(), unit.copy(), np.empty(m))
-        for positions in alike:
-            part = cls._alike(
-                [measurements[position] for position in positions], means[positions], covariances[positions]
-            )
-            used = part.y.shape[1]
-            every.size[positions], every.nis[positions] = part.size, part.nis
-            every.y[positions, :used], every.H[positions, :used] = part.y, part.H
-            every.R[positions, :used, :used], every.S[positions, :used, :used] = part.R, part.S
-        return every
-
-    @classmethod
-    def _alike(cls, measurements: Sequence[Measurement], means: FloatArray, covariances: FloatArray) -> "Innovations":
-        """Return those of measurements with one model, sensor pose and loss."""
+        """Return those of measurements with one model, sensor pose and loss at the states (m, n), (m, n, n)."""
         first = measurements[0]
         z, R = np.array([each.z for each in measurements]), np.array([each.R for each in measurements])
         y, H = ekf.linearised(z, means, first.model, first.pose)
         S = congruence(H, covariances) + R
         H = np.broadcast_to(H, (*y.shape, means.shape[1])).copy()
-        return cls(np.full(len(y), y.shape[1]), y, H, R, S, _nis(y, S, first.measured))
+        return cls(y, H, R, S, _nis(y, S, first.measured))
 
 
 def _nis(y: FloatArray, S: FloatArray, entries: Sequence[int] | None) -> FloatArray:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import NamedTuple
 
 import numpy as np
 
@@ -13,26 +12,16 @@ from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.initiation import Fix, Line, along, fixes_of
 from fgtrack.estimation.filters.propagation import track_state
 from fgtrack.estimation.kernels import kalman
-from fgtrack.estimation.smoothing import kernels
+from fgtrack.estimation.smoothing import kernels, node_kernels
 from fgtrack.estimation.smoothing.damping import DampedWindow
-from fgtrack.estimation.smoothing.nodes import Undo
 from fgtrack.estimation.smoothing.ring import fuse_behind
-from fgtrack.estimation.smoothing.solver import Moved, Solver
+from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.estimation.smoothing.terms import Innovations, NearMeasurement, is_nonlinear, overshot
 
 #: Nodes behind the window are forgotten when there are so many that nobody needs.
 _MANY = 16
 #: Later than any index.
 _NEVER = np.iinfo(np.int64).max
-
-
-class States(NamedTuple):
-    """States of m tracks."""
-
-    means: FloatArray
-    """Shape (m, n)."""
-    covariances: FloatArray
-    """Shape (m, n, n)."""
 
 
 class Windows:
@@ -57,10 +46,16 @@ class Windows:
 
     # --- states
 
-    def states_at(self, tracks: IntArray, stamps_ns: IntArray) -> States:
-        """States of `tracks` at `stamps_ns`, not older than the oldest node: interpolated, or predicted ahead."""
-        nodes = self.nodes
-        indices, numbers, until_s, after_s, num_between = nodes.located(tracks, stamps_ns)
+    def states_at(self, tracks: IntArray, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return means (m, n) and covariances (m, n, n) of `tracks` at `stamps_ns`, not older than the oldest node.
+
+        They are interpolated, or predicted ahead.
+        """
+        nodes, n = self.nodes, self._motion.dim
+        indices, numbers = np.empty((2, len(tracks)), dtype=np.int64)
+        until_s, after_s = np.empty((2, len(tracks)))
+        given = nodes.stamps_ns, nodes.count, nodes.numbers
+        num_between = node_kernels.locate(tracks, stamps_ns, *given, indices, numbers, until_s, after_s)
         self.solver.look_up(tracks, indices, after_s > 0.0)
         means, covariances = self.solver.smoothed(tracks, indices)
         means += nodes.origin[numbers]
@@ -71,28 +66,15 @@ class Windows:
             covariances, means = kalman.predict(F, covariances, Q)[0], ahead
         if num_between:
             k = slice(None) if num_between == len(tracks) else after_s > 0.0
-            left = nodes.numbers[tracks[k], indices[k] - 1]
-            means[k], covariances[k] = self._between(left, numbers[k], until_s[k], after_s[k], means[k], covariances[k])
-        return States(means, covariances)
-
-    def _between(
-        self,
-        left: IntArray,
-        right: IntArray,
-        until_s: FloatArray,
-        after_s: FloatArray,
-        means: FloatArray,
-        covariances: FloatArray,
-    ) -> States:
-        """States so long after the nodes `left` and before the nodes `right`, which have the means and covariances."""
-        nodes, n = self.nodes, self._motion.dim
-        back, C = nodes.back[left], nodes.C[left]
-        mean = nodes.origin[left] + np.matvec(back[:, :, :n], means - nodes.origin[right]) + back[:, :, n]
-        first = self._motion.transition(mean, until_s)
-        second = self._motion.transition(first.mean, after_s)
-        if not kernels.interpolate(*first, *second, means, back, C, covariances):
-            raise np.linalg.LinAlgError("process noise is not positive definite")
-        return States(first.mean, covariances)
+            left, P = nodes.numbers[tracks[k], indices[k] - 1], covariances[k]
+            back, C = nodes.back[left], nodes.C[left]
+            mean = nodes.origin[left] + np.matvec(back[:, :, :n], means[k] - nodes.origin[numbers[k]]) + back[:, :, n]
+            first = self._motion.transition(mean, until_s[k])
+            second = self._motion.transition(first.mean, after_s[k])
+            if not kernels.interpolate(*first, *second, means[k], back, C, P):
+                raise np.linalg.LinAlgError("process noise is not positive definite")
+            means[k], covariances[k] = first.mean, P
+        return means, covariances
 
     # --- updates
 
@@ -114,33 +96,48 @@ class Windows:
         """
         nodes, solver = self.nodes, self.solver
         guesses = self._relinearised(tracks, stamp_ns, measurements, guesses)
-        anchors = nodes.last_before(tracks, nodes.first[tracks], start_ns)
+        anchors = np.maximum(nodes.first[tracks], nodes.last_before(tracks, start_ns))
         left = self._leaving(tracks, anchors)
-        indices, stamps_ns = nodes.nearest(tracks, stamp_ns, solver.near_ns)
-        measurements = self._at_nodes(stamps_ns, measurements)
+        indices, stamps_ns = nodes.nearest(tracks, stamp_ns)
+        at_nodes = [
+            each if stamp_ns == node_ns else NearMeasurement.at(each, node_ns, self._motion)
+            for each, node_ns in zip(measurements, stamps_ns.tolist(), strict=True)
+        ]
         is_old = indices < anchors
-        undo = Undo(nodes, tracks)
+        saved, added = nodes.saved(tracks, anchors, is_old), list[int]()
         try:
-            moved = solver.move_far(tracks, anchors, indices)
-            starts = moved.starts
+            of, at = solver.move_far(tracks, anchors, indices)
+            starts = nodes.count[tracks]
+            np.minimum.at(starts, of, at)
+            of = tracks[of]
             if is_old.any():
-                solver.linearise_motion(moved.tracks, moved.indices)
-                moved = Moved(starts, tracks[:0], tracks[:0])
+                solver.linearise_motion(of, at)
+                of = at = tracks[:0]
                 solver.solve(tracks[is_old], starts[is_old], anchors[is_old])
                 for row in is_old.nonzero()[0].tolist():
                     track = int(tracks[row])
-                    undo.keep_ring(track)
-                    term = fuse_behind(nodes, self._motion, track, measurements[row])
+                    factor = fuse_behind(nodes, self._motion, track, int(indices[row]), at_nodes[row])
                     starts[row] = anchors[row] = nodes.first[track]
-                    number = int(nodes.numbers[track, starts[row]])
-                    nodes.terms[number].append(term)
-                    undo.added.append(number)
-                    nodes.linearise_terms(number)
-            numbers = self._insert(tracks, stamp_ns, stamps_ns, indices, ~is_old, guesses, moved)
-            self._measure(numbers, measurements, innovations, guesses, ~is_old, undo)
+                    added.append(int(nodes.numbers[track, starts[row]]))
+                    nodes.terms[added[-1]].append(factor)
+                    nodes.linearise_terms(added[-1])
+            numbers = self._insert(tracks, stamp_ns, stamps_ns, indices, ~is_old, guesses, of, at, starts)
+            is_linear = ~is_old
+            for row in is_linear.nonzero()[0].tolist():
+                added.append(int(numbers[row]))
+                nodes.terms[added[-1]].append(at_nodes[row])
+                if is_nonlinear(at_nodes[row]) or isinstance(at_nodes[row], NearMeasurement):
+                    is_linear[row] = False
+                    nodes.linearise_terms(added[-1])
+            if is_linear.any():
+                rows = is_linear.nonzero()[0]
+                nodes.observe(numbers[rows], innovations.at(rows), guesses[rows] - nodes.origin[numbers[rows]])
             solver.solve(tracks, starts, anchors)
         except np.linalg.LinAlgError:
-            undo()
+            for name, at, values in saved:
+                getattr(nodes, name)[at] = values
+            for number in added:
+                nodes.terms[number].pop()
             solver.rebuild(tracks)
             raise
         self._forget_before(tracks, reach_ns)
@@ -172,7 +169,7 @@ class Windows:
             for track in tracks[first].tolist():
                 self.solver.mark_nonlinear(track)
             guesses = guesses.copy()
-            guesses[first] = self.states_at(tracks[first], np.full(len(first), stamp_ns)).means
+            guesses[first] = self.states_at(tracks[first], np.full(len(first), stamp_ns))[0]
         return guesses
 
     def _leaving(self, tracks: IntArray, anchors: IntArray) -> list[tuple[int, TrackState]]:
@@ -188,13 +185,6 @@ class Windows:
         leaving = zip(tracks.tolist(), nodes.stamps_ns[tracks, indices].tolist(), means, covariances, strict=True)
         return [(track, track_state(self._motion, stamp_ns, x, P)) for track, stamp_ns, x, P in leaving]
 
-    def _at_nodes(self, stamps_ns: IntArray, measurements: Sequence[Measurement]) -> Sequence[Measurement]:
-        """Measurements of the nodes at `stamps_ns`, which may be closer to theirs than the solver can tell apart."""
-        return [
-            each if each.stamp_ns == node_ns else NearMeasurement.at(each, node_ns, self._motion)
-            for each, node_ns in zip(measurements, stamps_ns.tolist(), strict=True)
-        ]
-
     def _insert(
         self,
         tracks: IntArray,
@@ -203,17 +193,18 @@ class Windows:
         indices: IntArray,
         is_live: BoolArray,
         guesses: FloatArray,
-        moved: Moved,
+        of: IntArray,
+        at: IntArray,
+        starts: IntArray,
     ) -> IntArray:
         """Insert nodes at `stamps_ns` where there are none, after those at `indices`; return the numbers of the nodes.
 
-        Linearises the motion from and to them, and from the nodes that have `moved`. The windows have changed from
-        there on: `moved.starts` becomes smaller.
+        Linearises the motion from and to them, and from the nodes of the tracks `of` at the indices `at`, which have
+        moved. `starts`, from which on the windows have changed, become smaller.
         """
         nodes = self.nodes
         is_new = is_live & (nodes.stamps_ns[tracks, indices] != stamps_ns)
         indices = indices + is_new
-        of, at = moved.tracks, moved.indices
         if is_new.any():
             to, inner = tracks[is_new], indices[is_new]
             nodes.insert_at(to, inner, stamp_ns, guesses[is_new])
@@ -222,40 +213,16 @@ class Windows:
                 inserted[to] = inner
                 at = at + (at >= inserted[of])
             of, at = np.concatenate([of, to, to]), np.concatenate([at, inner - 1, inner])
-        if of.size:
-            self.solver.linearise_motion(of, at)
-        np.minimum(moved.starts, indices, out=moved.starts, where=is_live)
+        self.solver.linearise_motion(of, at)
+        np.minimum(starts, indices, out=starts, where=is_live)
         return nodes.numbers[tracks, indices]
-
-    def _measure(
-        self,
-        numbers: IntArray,
-        measurements: Sequence[Measurement],
-        innovations: Innovations,
-        guesses: FloatArray,
-        is_live: BoolArray,
-        undo: Undo,
-    ) -> None:
-        """Add the measurements of the nodes `numbers`, where `is_live`."""
-        nodes = self.nodes
-        is_linear = is_live.copy()
-        for row in is_live.nonzero()[0].tolist():
-            number, term = int(numbers[row]), measurements[row]
-            nodes.terms[number].append(term)
-            undo.added.append(number)
-            if is_nonlinear(term) or isinstance(term, NearMeasurement):
-                is_linear[row] = False
-                nodes.linearise_terms(number)
-        if is_linear.any():
-            at = numbers[is_linear]
-            nodes.observe(at, innovations.at(is_linear), guesses[is_linear] - nodes.origin[at])
 
     def _forget_before(self, tracks: IntArray, stamps_ns: IntArray) -> None:
         nodes = self.nodes
         most = nodes.first[tracks] - 1
         if not ((most >= _MANY) & (nodes.stamps_ns[tracks, _MANY - 1] <= stamps_ns)).any():
             return
-        num = np.minimum(nodes.last_before(tracks, np.zeros_like(tracks), stamps_ns), most)
+        num = np.minimum(nodes.last_before(tracks, stamps_ns), most)
         many = num >= _MANY
         if many.any():
             nodes.drop(tracks[many], num[many])

@@ -1,7 +1,6 @@
 """Base of the solvers on gtsam: states and covariances that are read from the factor graph of each window."""
 
 from abc import abstractmethod
-from typing import ClassVar
 
 import numpy as np
 
@@ -9,7 +8,6 @@ from fgtrack.core.linalg import psd_solve, symmetrise
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver
-from fgtrack.estimation.smoothing.terms import NEAR_NS
 from fgtrack.models.motion import MotionModel
 
 
@@ -18,8 +16,6 @@ class GraphSolver(Solver):
 
     A track has no graph before something is fused: most tracks of clutter end as they began.
     """
-
-    near_ns: ClassVar[int] = NEAR_NS
 
     def __init__(self, motion: MotionModel, settings: SmootherSettings) -> None:
         super().__init__(motion, settings)
