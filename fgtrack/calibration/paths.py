@@ -23,7 +23,7 @@ from fgtrack.core.types import (
     TruthState,
 )
 from fgtrack.io.run import NO_TRACK, Run
-from fgtrack.models.road import OpenSpace
+from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.config import Config
 from fgtrack.tracking.ego import EgoPose, is_finite
@@ -180,7 +180,7 @@ def sightings_of(
         for sensor, stamp_ns, receipt_ns, index, track_id, is_fused in zip(*columns, fused, strict=True)
         if is_fused and track_id != NO_TRACK
     }
-    preprocess = Preprocess(OpenSpace(), config.merge, config.motion.model(), config.ego.detection_origin_m)
+    preprocess = Preprocess(Road(), config.merge, config.motion.model(), config.ego.detection_origin_m)
     sensors = {name: _position_only(sensor) for name, sensor in config.sensors.items()}
     found: dict[str, dict[int, list[tuple[int, FloatArray, bool]]]] = defaultdict(lambda: defaultdict(list))
     for message in lists:

@@ -5,31 +5,26 @@ import math
 import numpy as np
 
 from fgtrack.core.compiled import njit
-from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.core.types import FloatArray
 
 _ALONG, _QUANTITIES = 9, 10  # see `fgtrack.models.track_map`
 
 
-@njit("(float64[:, ::1], int64[:], Array(float64, 2, 'C', readonly=True))")
-def feet(points_m: FloatArray, nearest: IntArray, segments: FloatArray) -> tuple[FloatArray, FloatArray]:
+@njit("(float64[:, ::1], Array(float64, 2, 'C', readonly=True))")
+def feet(points_m: FloatArray, segments: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Quantities (m, 10) at the feet of points (m, 2) on the line, and lateral offsets (m,), left positive.
 
-    `segments` (n, 20) are the rows of `TrackMap`. The foot is on the one that begins or ends at the `nearest` point of
-    the line, which is sought where it is not given (0,). It has the point on its normal: Re((q - t e) (B + t dB)) = 0
-    with q from the start of the segment to the point, e the segment, and B, dB the inverse of the heading and its
-    change, as complex numbers.
+    `segments` (n, 20) are the rows of `TrackMap`. The foot is on the one that begins or ends at the nearest point of
+    the line. It has the point on its normal: Re((q - t e) (B + t dB)) = 0 with q from the start of the segment to the
+    point, e the segment, and B, dB the inverse of the heading and its change, as complex numbers.
     """
-    found, lateral = np.empty((len(points_m), _QUANTITIES)), np.empty(len(points_m))
+    quantities, lateral = np.empty((len(points_m), _QUANTITIES)), np.empty(len(points_m))
     for i in range(len(points_m)):
-        x, y, first = points_m[i, 0], points_m[i, 1], 0
-        if len(nearest):
-            first = nearest[i]
-        else:
-            least = np.inf
-            for j in range(len(segments)):
-                squared_m2 = (segments[j, 0] - x) ** 2 + (segments[j, 1] - y) ** 2
-                if squared_m2 < least:
-                    least, first = squared_m2, j
+        x, y, first, least = points_m[i, 0], points_m[i, 1], 0, np.inf
+        for j in range(len(segments)):
+            squared_m2 = (segments[j, 0] - x) ** 2 + (segments[j, 1] - y) ** 2
+            if squared_m2 < least:
+                least, first = squared_m2, j
         at = segments[first]
         if (x - at[0]) * at[2] - (y - at[1]) * at[3] < 0.0:
             at = segments[(first - 1) % len(segments)]
@@ -40,7 +35,7 @@ def feet(points_m: FloatArray, nearest: IntArray, segments: FloatArray) -> tuple
         part = c / (math.sqrt(max(b * b + at[_ALONG + _QUANTITIES] * c, 0.0)) + b)
         part = min(max(part, 0.0), 1.0)
         for j in range(_QUANTITIES):
-            found[i, j] = at[j] + part * at[_QUANTITIES + j]
+            quantities[i, j] = at[j] + part * at[_QUANTITIES + j]
         right, up = right - part * at[10], up - part * at[11]
-        lateral[i] = (right * found[i, 3] + up * found[i, 2]) / math.hypot(found[i, 2], found[i, 3])
-    return found, lateral
+        lateral[i] = (right * quantities[i, 3] + up * quantities[i, 2]) / math.hypot(quantities[i, 2], quantities[i, 3])
+    return quantities, lateral

@@ -6,7 +6,6 @@ reweighting lowers prior plus loss (Huber and Ronchetti, Robust Statistics, 2009
 """
 
 import math
-from collections.abc import Callable, Mapping
 
 from fgtrack.models.sensors import RobustLoss
 
@@ -14,39 +13,22 @@ from fgtrack.models.sensors import RobustLoss
 LEAST_WEIGHT = 1e-12
 
 
-def _huber(d: float, c: float) -> tuple[float, float]:
-    return (0.5 * d * d, 1.0) if d <= c else (c * (d - 0.5 * c), c / d)
-
-
-def _cauchy(d: float, c: float) -> tuple[float, float]:
-    return 0.5 * c * c * math.log1p((d / c) ** 2), c * c / (c * c + d * d)
-
-
-def _tukey(d: float, c: float) -> tuple[float, float]:
-    left = max(1.0 - (d / c) ** 2, 0.0)
-    return c * c / 6.0 * (1.0 - left**3), left**2
-
-
-def _geman_mcclure(d: float, c: float) -> tuple[float, float]:
-    left = c * c / (c * c + d * d)
-    return 0.5 * d * d * left, left**2
-
-
-def _dcs(d: float, c: float) -> tuple[float, float]:
-    """Dynamic covariance scaling (Agarwal et al. 2013), whose square ends at c."""
+def _loss(loss: RobustLoss, d: float) -> tuple[float, float]:
+    """The loss rho(d) and the weight rho'(d) / d; `dcs` is dynamic covariance scaling (Agarwal et al. 2013)."""
+    c = loss.width
+    share = c * c / (c * c + d * d)
+    if loss.kind == "cauchy":
+        return 0.5 * c * c * math.log1p((d / c) ** 2), share
+    if loss.kind == "geman_mcclure":
+        return 0.5 * d * d * share, share**2
+    if loss.kind == "tukey":
+        left = max(1.0 - (d / c) ** 2, 0.0)
+        return c * c / 6.0 * (1.0 - left**3), left**2
     if d <= c:
         return 0.5 * d * d, 1.0
-    left = 2.0 * c * c / (c * c + d * d)
-    return c * c * (1.5 - left), left**2
-
-
-_LOSSES: Mapping[str, Callable[[float, float], tuple[float, float]]] = {
-    "huber": _huber,
-    "cauchy": _cauchy,
-    "tukey": _tukey,
-    "geman_mcclure": _geman_mcclure,
-    "dcs": _dcs,
-}
+    if loss.kind == "huber":
+        return c * (d - 0.5 * c), c / d
+    return c * c * (1.5 - 2.0 * share), (2.0 * share) ** 2
 
 
 def weight(loss: RobustLoss, distance: float) -> float:
@@ -56,9 +38,9 @@ def weight(loss: RobustLoss, distance: float) -> float:
     """
     if not math.isfinite(distance):
         return LEAST_WEIGHT
-    return max(_LOSSES[loss.kind](distance, loss.width)[1], LEAST_WEIGHT)
+    return max(_loss(loss, distance)[1], LEAST_WEIGHT)
 
 
 def penalty(loss: RobustLoss | None, distance: float) -> float:
     """The loss rho itself; without a `loss` the square, d^2 / 2."""
-    return 0.5 * distance * distance if loss is None else _LOSSES[loss.kind](distance, loss.width)[0]
+    return 0.5 * distance * distance if loss is None else _loss(loss, distance)[0]

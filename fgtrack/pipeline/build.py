@@ -24,8 +24,8 @@ from fgtrack.estimation.filters.track_initiation import initiated
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
 from fgtrack.estimation.registry import estimator_bank
 from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
-from fgtrack.models.published_map import CircularHeadingMap, PublishedMap
-from fgtrack.models.road import MappedRoad, OpenSpace, Road
+from fgtrack.models.published_map import PublishedMap
+from fgtrack.models.road import Road
 from fgtrack.models.track_map import TrackMap
 from fgtrack.pipeline.config import NOISE_HZ, Config, Defect, MapConfig
 from fgtrack.tracking.ego import EgoSource, EgoStd, EgoTrajectory
@@ -100,15 +100,15 @@ def build_road(config: MapConfig, defects: Collection[Defect] = ()) -> Road:
             raise CallError(
                 f"{config.pit}: a pit lane (map.pit) needs the map of its track (map.track), give --map too"
             )
-        return OpenSpace()
+        return Road()
     track = _read_map(config.track_file, make_oval)
     pit = None if config.pit is None else _read_map(config.pit, make_pit_lane)
     buffers = (config.inner_buffer_m, config.outer_buffer_m, config.pit_buffer_m)
     if not {"heading_jump", "circular_heading"} & set(defects):
-        return MappedRoad(track, pit, *buffers)
-    lookup = PublishedMap if "heading_jump" in defects else CircularHeadingMap
+        return Road(track, pit, *buffers)
+    circular = "heading_jump" not in defects
     try:
-        return MappedRoad(lookup(track), None if pit is None else lookup(pit), *buffers)
+        return Road(PublishedMap(track, circular), None if pit is None else PublishedMap(pit, circular), *buffers)
     except DataError as error:
         raise DataError(f"{config.track}: {error}") from error
 

@@ -14,7 +14,7 @@ from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray, F
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
-from fgtrack.models.road import OpenSpace
+from fgtrack.models.road import Road
 from fgtrack.models.sensors import Mount, RobustLoss, SensorModel
 from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY
 from fgtrack.tracking.detections import NoMerge
@@ -176,7 +176,7 @@ class _Onboard:
 
     def __init__(self, stamps_s: FloatArray) -> None:
         self._ego = EgoTrajectory(yaw_weight=1.0, yaw_rate_weight=1.0, memory_s=60.0, max_extrapolation_s=1.0)
-        self._prepare = Preprocess(OpenSpace(), NoMerge(), CTRV(), _FRAME_M)
+        self._prepare = Preprocess(Road(), NoMerge(), CTRV(), _FRAME_M)
         for stamp_s in sorted({0.0, *stamps_s.tolist()}):
             stamp_ns = _START_NS + nanoseconds(stamp_s)
             self._ego.receive(EgoState(stamp_ns, stamp_ns, *_observer(stamp_ns)))

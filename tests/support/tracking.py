@@ -8,6 +8,7 @@ from fgtrack.core.types import Detection, DetectionList, FloatArray, Frame
 from fgtrack.estimation.base import Measurement, StatesAt
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV
+from fgtrack.models.road import Road
 from fgtrack.models.track_map import RoadView
 from fgtrack.tracking.inbox import Batch
 from fgtrack.tracking.preprocess import Candidate
@@ -56,13 +57,14 @@ def states(positions_m: Sequence[tuple[float, float]], variance_m2: float = 0.09
     return StatesAt(tuple(range(10, 10 + len(positions_m))), means, covariances)
 
 
-class StraightRoad:
+class StraightRoad(Road):
     """Runs along a heading; outside is what lies further than `half_width_m` from y = 0."""
 
     known = True
 
     def __init__(self, yaw_rad: float = 0.4, curvature_radpm: float = 0.01, half_width_m: float = np.inf) -> None:
-        self._yaw_rad, self._curvature_radpm, self._half_width_m = yaw_rad, curvature_radpm, half_width_m
+        super().__init__()
+        self.__dict__.update(_yaw_rad=yaw_rad, _curvature_radpm=curvature_radpm, _half_width_m=half_width_m)
 
     def view(self, points_m: FloatArray) -> RoadView:
         """See `fgtrack.models.road.Road.view`."""

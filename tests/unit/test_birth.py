@@ -11,7 +11,7 @@ from fgtrack.estimation.base import Measurement, StatesAt
 from fgtrack.estimation.birth import initial_state
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV
-from fgtrack.models.road import OpenSpace
+from fgtrack.models.road import Road
 from fgtrack.tracking.birth import FixedBirth, MeasuredBirth, in_any_direction
 from fgtrack.tracking.preprocess import Candidate
 
@@ -44,7 +44,7 @@ def test_what_is_not_measured_comes_from_the_map_and_the_ego(birth) -> None:
 
 
 def test_a_position_of_unknown_heading_is_as_uncertain_across_as_along() -> None:
-    start = MeasuredBirth(speed_std_mps=50.0).prior(seen(), OpenSpace(), None, ego_in_pit=False)
+    start = MeasuredBirth(speed_std_mps=50.0).prior(seen(), Road(), None, ego_in_pit=False)
     motion, dt_s = CTRV(), 0.5
     x, P = initial_state(motion, start)
     F = motion.jacobian(x, dt_s)
@@ -85,10 +85,10 @@ def test_a_slow_ego_lends_its_acceleration() -> None:
 
 
 def test_without_a_map_the_heading_is_unknown_and_the_road_straight() -> None:
-    prior = FixedBirth().prior(seen(), OpenSpace(), EGO, ego_in_pit=False)
+    prior = FixedBirth().prior(seen(), Road(), EGO, ego_in_pit=False)
     assert prior.yaw_rad is None
     assert prior.yaw_rate_radps == 0.0
-    assert FixedBirth().prior(seen(yaw_rad=0.3), OpenSpace(), EGO, ego_in_pit=False).yaw_rad == 0.3
+    assert FixedBirth().prior(seen(yaw_rad=0.3), Road(), EGO, ego_in_pit=False).yaw_rad == 0.3
 
 
 def test_a_bearing_alone_starts_nothing() -> None:

@@ -19,7 +19,7 @@ from fgtrack.models.correlated_errors import (
 )
 from fgtrack.models.measurement import SensorPose, measured_position, measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
-from fgtrack.models.road import OpenSpace
+from fgtrack.models.road import Road
 from fgtrack.models.sensors import Correlation, SensorModel
 from fgtrack.testing import check_motion_model
 from fgtrack.tracking.birth import FixedBirth, MeasuredBirth
@@ -167,11 +167,11 @@ def test_the_tracker_gives_a_new_track_the_error_of_its_detection() -> None:
     )
     z = np.array([3.0, 4.0])
     candidate = Candidate(0, (), Measurement(0, model, z, white), z, np.eye(2))
-    measured = MeasuredBirth().prior(candidate, OpenSpace(), None, ego_in_pit=False)
+    measured = MeasuredBirth().prior(candidate, Road(), None, ego_in_pit=False)
     assert measured is not None
     assert measured.position_cross["lidar.x_m"] == pytest.approx((-(0.9**0.5), 0.0))
     assert measured.position_cross["lidar.y_m"] == pytest.approx((0.0, -(0.9**0.5)))
-    fixed = FixedBirth().prior(candidate, OpenSpace(), None, ego_in_pit=False)
+    fixed = FixedBirth().prior(candidate, Road(), None, ego_in_pit=False)
     assert fixed is not None
     assert fixed.position_cross == {}
 

@@ -14,7 +14,7 @@ from fgtrack.core.types import Detection, FloatArray, Frame
 from fgtrack.estimation.base import Measurement
 from fgtrack.models.correlated_errors import whole_error, with_correlated_errors
 from fgtrack.models.motion import CTRV, CV, MotionModel
-from fgtrack.models.road import OpenSpace, Road
+from fgtrack.models.road import Road
 from fgtrack.models.sensors import Correlation, Mount, SensorModel
 from fgtrack.tracking.detections import ConnectedMerge, NoMerge
 from fgtrack.tracking.ego import EgoPose
@@ -51,7 +51,7 @@ def candidates(
     if road is not None:
         sensor = replace(sensor, yaw_from_map_std_rad=0.3)
     merge = ConnectedMerge(5.1) if len(seen) > 1 else NoMerge()
-    preprocess = Preprocess(road or OpenSpace(), merge, motion or CTRV(), ORIGIN_M)
+    preprocess = Preprocess(road or Road(), merge, motion or CTRV(), ORIGIN_M)
     return preprocess(batch(*(Detection(**values) for values in seen), frame=frame), sensor, ego)[0]
 
 
@@ -148,7 +148,7 @@ def test_a_lasting_error_of_the_sensor_and_that_of_the_ego_stand_side_by_side(se
     lasting = SensorModel(std={name: STD[name] for name in seen}, mount=MOUNT, correlation=Correlation())
     motion = with_correlated_errors(CTRV(), {"lidar": lasting})
     [plain] = candidates(EGO._replace(covariance=P), seen)
-    preprocess = Preprocess(OpenSpace(), NoMerge(), motion, ORIGIN_M)
+    preprocess = Preprocess(Road(), NoMerge(), motion, ORIGIN_M)
     [[found], _] = preprocess(batch(Detection(**seen)), lasting, EGO._replace(covariance=P))
     x = np.array([130.0, 70.0, 2.0, 15.0, 0.1, 0.5, -0.5])
     whole = whole_error(found.measurement.model, found.noise_at(x))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fgtrack.models.oval import make_oval
-from fgtrack.models.predictor import ArcPredictor, RailPredictor
+from fgtrack.models.predictor import arc_positions, rail_positions
 
 TRACK = make_oval()
 AHEAD_S = 0.1 * np.arange(1, 51)
@@ -21,14 +21,14 @@ def on_the_track(s_m: np.ndarray, lateral_m: float, speed_mps: float = 60.0) -> 
 
 
 def test_an_arc_is_a_circle() -> None:
-    (positions,) = ArcPredictor().positions(np.array([[10.0, 0.0, math.pi / 2, 20.0, 2.0]]), np.array([math.pi / 2]))
+    (positions,) = arc_positions(np.array([[10.0, 0.0, math.pi / 2, 20.0, 2.0]]), np.array([math.pi / 2]))
     assert positions[0] == pytest.approx([-10.0, 0.0], abs=1e-9)  # half of a circle of 10 m
 
 
 @pytest.mark.parametrize("lateral_m", [-6.0, 0.0, 4.0])
 def test_a_rail_keeps_its_speed_and_its_place_across_the_track(lateral_m: float) -> None:
     states = on_the_track(np.linspace(0.0, TRACK.length_m, 40), lateral_m)
-    positions = RailPredictor(TRACK).positions(states, AHEAD_S)
+    positions = rail_positions(TRACK, states, AHEAD_S)
     steps_m = np.linalg.norm(np.diff(positions, axis=1), axis=2)
     np.testing.assert_allclose(steps_m, 6.0, atol=0.02)
     # Off by what the arc leaves the lane in 0.2 s where the curvature changes.
@@ -43,7 +43,7 @@ def test_a_rail_keeps_its_speed_and_its_place_across_the_track(lateral_m: float)
 def test_until_a_fifth_of_a_second_a_rail_is_the_arc() -> None:
     states = on_the_track(np.array([100.0, 700.0]), 2.0)
     states[:, 4] += 0.5
-    rail, arc = (one.positions(states, AHEAD_S) for one in (RailPredictor(TRACK), ArcPredictor()))
+    rail, arc = rail_positions(TRACK, states, AHEAD_S), arc_positions(states, AHEAD_S)
     np.testing.assert_array_equal(rail[:, :2], arc[:, :2])
     assert np.abs(rail[:, 2:] - arc[:, 2:]).max() > 1.0
 
@@ -51,9 +51,9 @@ def test_until_a_fifth_of_a_second_a_rail_is_the_arc() -> None:
 def test_who_is_beyond_a_bound_goes_on_along_it_and_who_drives_back_stays() -> None:
     (left_m,), (right_m,) = TRACK.bounds(np.array([0.0]))
     states = np.concatenate([on_the_track(np.array([50.0]), lateral) for lateral in (left_m + 2.0, -right_m - 2.0)])
-    lateral_m = TRACK.frenet(RailPredictor(TRACK).positions(states, AHEAD_S)[:, -1])[1]
+    lateral_m = TRACK.frenet(rail_positions(TRACK, states, AHEAD_S)[:, -1])[1]
     np.testing.assert_allclose(lateral_m, [left_m, -right_m], atol=1e-6)
     states[:, 3] = -10.0
-    stays = RailPredictor(TRACK).positions(states, AHEAD_S)
+    stays = rail_positions(TRACK, states, AHEAD_S)
     np.testing.assert_array_equal(stays[:, 2], stays[:, -1])
-    assert RailPredictor(TRACK).positions(states[:0], AHEAD_S).shape == (0, 50, 2)
+    assert rail_positions(TRACK, states[:0], AHEAD_S).shape == (0, 50, 2)

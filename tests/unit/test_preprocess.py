@@ -10,7 +10,7 @@ from support.tracking import StraightRoad, batch
 from fgtrack.core.geometry import rotation
 from fgtrack.core.types import Detection, Disposition, Frame
 from fgtrack.models.motion import CTRV
-from fgtrack.models.road import OpenSpace, Road
+from fgtrack.models.road import Road
 from fgtrack.models.sensors import Mount, SensorModel
 from fgtrack.tracking.detections import ConnectedMerge, Merge, NoMerge
 from fgtrack.tracking.ego import EgoPose
@@ -22,7 +22,7 @@ POINTS = SensorModel(std={"x_m": 0.3, "y_m": 0.3}, yaw_from_map_std_rad=0.35)
 POLAR = SensorModel(std={"range_m": 0.5, "bearing_rad": 0.02}, mount=Mount(2.0, 1.0, math.pi / 2))
 EGO = EgoPose(100.0, 50.0, math.pi / 2, 20.0)
 ORIGIN_M = (-1.74, 0.0)
-ALONE, OPEN = NoMerge(), OpenSpace()
+ALONE, OPEN = NoMerge(), Road()
 
 
 def candidates(
@@ -186,7 +186,7 @@ def test_detections_off_the_road_are_recorded_and_dropped_before_the_merge() -> 
 
 
 def test_detections_beyond_the_range_of_the_sensor_are_recorded_and_dropped() -> None:
-    step = Preprocess(OpenSpace(), NoMerge(), CTRV(), ORIGIN_M)
+    step = Preprocess(Road(), NoMerge(), CTRV(), ORIGIN_M)
     items = [Detection(x_m=29.9, y_m=0.0), Detection(x_m=30.1, y_m=0.0)]
     found, records = step(batch(*items), replace(POINTS, max_range_m=30.0), EGO)
     assert [item.leader for item in found] == [0]

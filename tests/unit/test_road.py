@@ -6,13 +6,13 @@ import pytest
 from fgtrack.core.errors import DataError
 from fgtrack.models.oval import make_oval, make_pit_lane
 from fgtrack.models.published_map import PublishedMap
-from fgtrack.models.road import MappedRoad, OpenSpace
+from fgtrack.models.road import Road
 from fgtrack.models.track_map import COLUMNS, TrackMap
 
 
 def test_without_a_map_an_object_may_be_anywhere_and_no_heading_is_known() -> None:
-    view = OpenSpace().view(np.array([[0.0, 0.0], [1e6, -1e6]]))
-    assert not OpenSpace.known
+    view = Road().view(np.array([[0.0, 0.0], [1e6, -1e6]]))
+    assert not Road().known
     assert [part.tolist() for part in view] == [[0.0, 0.0], [0.0, 0.0], [False, False]]
 
 
@@ -20,16 +20,16 @@ def test_an_object_is_outside_where_it_is_neither_on_the_track_nor_in_the_pit_la
     track, pit = make_oval(), make_pit_lane()
     lateral = np.array([0.0, 24.0, 60.0, 8.0])  # on the track, in the pit lane, on neither, just off the track
     points = track.position(np.full(4, 100.0), lateral)
-    assert MappedRoad(track, None, 0.0, 0.0, 0.0).view(points).outside.tolist() == [False, True, True, True]
-    road = MappedRoad(track, pit, 0.0, 0.0, 0.0)
+    assert Road(track).view(points).outside.tolist() == [False, True, True, True]
+    road = Road(track, pit, 0.0, 0.0, 0.0)
     assert road.view(points).outside.tolist() == [False, False, True, True]
-    assert MappedRoad(track, pit, 1.0, 0.0, 0.0).view(points).outside.tolist() == [False, False, True, False]
-    assert MappedRoad(track, pit, 0.0, 0.0, -5.0).view(points).outside.tolist() == [False, True, True, True]
+    assert Road(track, pit, 1.0, 0.0, 0.0).view(points).outside.tolist() == [False, False, True, False]
+    assert Road(track, pit, 0.0, 0.0, -5.0).view(points).outside.tolist() == [False, True, True, True]
     np.testing.assert_array_equal(road.view(points).yaw_rad, track.heading(points))
 
 
 def test_a_published_look_up_needs_a_raceline_that_goes_on() -> None:
     table = make_oval().table.copy()
     table[:, COLUMNS.index("s_racetraj_m")] = 0.0
-    with pytest.raises(DataError, match="row 1: s_racetraj_m does not grow"):
+    with pytest.raises(DataError, match="s_racetraj_m does not grow"):
         PublishedMap(TrackMap(table))

@@ -12,7 +12,7 @@ from fgtrack.evaluation.roads import roads
 from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.evaluation.truth import TRUE_STATE, true_states
 from fgtrack.io.run import Run
-from fgtrack.models.predictor import ArcPredictor, Predictor, RailPredictor
+from fgtrack.models.predictor import arc_positions, rail_positions
 
 #: Times ahead of the predictions, in s.
 HORIZONS_S = (1.0, 2.0, 3.0, 5.0)
@@ -64,12 +64,10 @@ def displacements(run: Run, matching: Matching) -> Displacements:
     every = true_states(run.tables["truth"], np.repeat(objects, len(ahead_s)), at_ns.reshape(-1))
     truth = every[:, :2].reshape(*at_ns.shape, 2)
     road = roads(run)[0].get("track")
-    predictors: dict[str, Predictor] = {"arc": ArcPredictor()}
-    predictors |= {} if road is None else {"rail": RailPredictor(road)}
-    distances_m = {
-        name: np.asarray(np.linalg.norm(predictor.positions(states[chosen], ahead_s) - truth, axis=-1))
-        for name, predictor in predictors.items()
-    }
+    positions_m = {"arc": arc_positions(states[chosen], ahead_s)}
+    if road is not None:
+        positions_m["rail"] = rail_positions(road, states[chosen], ahead_s)
+    distances_m = {name: np.asarray(np.linalg.norm(each - truth, axis=-1)) for name, each in positions_m.items()}
     return Displacements(stamps_ns, objects, distances_m)
 
 
