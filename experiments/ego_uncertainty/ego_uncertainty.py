@@ -37,7 +37,7 @@ from fgtrack.sim.scenario import EgoMessages, Scenario
 from fgtrack.sim.sensor import SimulatedSensor
 from fgtrack.sim.simulate import simulate
 from fgtrack.sim.vehicles import DrawnVehicle
-from fgtrack.tracking.birth import MeasuredBirth
+from fgtrack.tracking.birth import Birth
 
 MODES = ("none", "independent")
 EXACT = "no error"
@@ -108,7 +108,7 @@ def result(messages: Sequence[Message], mode: str, estimator: str) -> Result:
         sensors={"lidar": SensorModel(std=STD)},
         motion=MOTION,
         ego=EgoConfig(detection_origin_x_m=ORIGIN_M, uncertainty=mode),
-        birth=MeasuredBirth(ego_speed_factor=1.0, speed_std_mps=3.0, yaw_rate_std_radps=math.sqrt(0.3)),
+        birth=Birth(ego_speed_factor=1.0, speed_std_mps=3.0, yaw_rate_std_radps=math.sqrt(0.3)),
     )
     matching = match(replay(iter(messages), config))
     tracks, truth = matching.tracks.where(matching.paired), matching.true_states[matching.paired]

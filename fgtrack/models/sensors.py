@@ -2,21 +2,20 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 from numbers import Real
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from fgtrack.core.checks import between_0_and_1, not_negative, positive
 from fgtrack.core.geometry import body_point, polar, wrap_angles
+from fgtrack.core.settings import OpenProbability, settings
 from fgtrack.core.types import DESCRIBING, MEASURABLE, BoolArray, Detection, FloatArray
 
-_LONGEST_OFFSET_S = 60.0
 
-
-@dataclass(frozen=True)
+@settings
 class Mount:
     """Pose of the sensor frame in the ego's detection frame."""
 
@@ -28,7 +27,7 @@ class Mount:
 _AT_ORIGIN = Mount()
 
 
-@dataclass(frozen=True)
+@settings
 class Filter:
     """Which values pass; all that is given must hold."""
 
@@ -57,97 +56,85 @@ class Filter:
         return low <= float(value) <= high
 
 
-@dataclass(frozen=True)
+@settings
 class RobustLoss:
     """A loss that grows slower than the square, so that an outlier pulls less."""
 
     kind: Literal["huber", "cauchy", "tukey", "geman_mcclure", "dcs"]
     """`tukey`, `geman_mcclure` and `dcs` are redescending: they can lose a track for good."""
-    width: float
+    width: PositiveFloat
     """Where the loss leaves the square, in standard deviations (of the whole measurement)."""
 
-    def __post_init__(self) -> None:
-        positive(width=self.width)
 
-
-@dataclass(frozen=True)
+@settings
 class Correlation:
     """Correlation between the errors of an object's successive detections."""
 
-    share: float = 0.8
-    """Share of the variance that lasts; the rest is new in every detection."""
-    time_s: float = 1.0
-    """After this time the lasting part has fallen to 1/e: what the autocorrelation of the errors shows."""
-
-    def __post_init__(self) -> None:
-        between_0_and_1(share=self.share)
-        positive(time_s=self.time_s)
+    share: OpenProbability = 0.8
+    """Correlated share of the variance; the rest is new in every detection."""
+    time_s: PositiveFloat = 1.0
+    """After this time the correlated part has fallen to 1/e, as the autocorrelation of the errors shows."""
 
 
-@dataclass(frozen=True)
+@settings
 class Score:
     """Likelihood ratio of a detection's score: log p(score | object) / p(score | clutter) = (score - even) / scale."""
 
     even: float
     """A score that objects and clutter have equally often."""
-    scale: float
+    scale: PositiveFloat
     """Increase of the score that makes an object e times more probable."""
-
-    def __post_init__(self) -> None:
-        if not math.isfinite(self.even):
-            raise ValueError(f"even: must be finite, is {self.even}")
-        positive(scale=self.scale)
 
     def log_ratio(self, score: float) -> float:
         """The logarithm of the ratio, at most 10 to either side."""
         return min(max((score - self.even) / self.scale, -10.0), 10.0)
 
 
-#: What the map may stand in for, and the key that says how well.
+#: Components that the map may give, and the keys of their standard deviations.
 _FROM_MAP = {"yaw_rad": "yaw_from_map_std_rad", "curvature_radpm": "curvature_from_map_std_radpm"}
 
 
-@dataclass(frozen=True)
+@settings
 class SensorModel:
     """One modality. Positions have their standard deviations along and across the line of sight."""
 
-    std: Mapping[str, float]
+    std: Mapping[str, PositiveFloat]
     """Standard deviation of each measured component; the keys say what the sensor measures."""
-    yaw_from_map_std_rad: float | None = None
+    yaw_from_map_std_rad: PositiveFloat | None = None
     """Where the sensor measures no yaw: take the map heading as a yaw measurement with this standard deviation."""
-    curvature_from_map_std_radpm: float | None = None
+    curvature_from_map_std_radpm: PositiveFloat | None = None
     """Take the curvature of the map's line as a measurement of yaw rate over speed with this standard deviation: the
     yaw rate is speed times curvature, but for what a driver does beside the line; null: the map says nothing of it."""
-    std_growth: Mapping[str, float] = field(default_factory=dict)
+    std_growth: Mapping[str, NonNegativeFloat] = field(default_factory=dict)
     """By how much the standard deviation of a component grows with each metre of range: its variance is std^2 +
     (std_growth range)^2. A detection's own covariance stays as it is."""
-    max_delay_s: float | None = None
+    max_delay_s: PositiveFloat | None = None
     """A message that arrives later than this is refused as too old."""
-    counter_init: int = 3
+    counter_init: PositiveInt = 3
     """Status counter of a track that this sensor gave birth to."""
-    counter_add: int = 1
+    counter_add: NonNegativeInt = 1
     """Increment of the status counter by a match with this sensor."""
     ages: Literal["always", "short_range", "long_range", "never"] = "always"
     """At which range a track that this sensor does not see loses one count."""
     stamp_from: Literal["message", "object", "objects_mean", "receipt"] = "message"
     """A detection's stamp: the list's, its own where it carries one, the mean of those that do, or the receipt, where
     the driver sets none or one of another clock."""
-    clock_offset_s: float = 0.0
+    clock_offset_s: Annotated[float, Field(ge=-60.0, le=60.0)] = 0.0
     """Advance of its stamps over the time at which it sensed; subtracted before anything else is done. With
     `stamp_from: receipt` its latency. `fgtrack advise` and `fgtrack offsets` find it."""
     message_covariance: bool = True
     """Use a detection's own covariance where the message carries one."""
-    max_range_m: float | None = None
+    max_range_m: PositiveFloat | None = None
     """A detection further from the sensor than this is out of bounds: beyond it clutter outweighs objects."""
     filters: Mapping[str, Filter] = field(default_factory=dict)
     """Which detections are used, by anything that they say: `{score: {min: 0.5}, class_name: {one_of: [car]}}`. The
     others are out of bounds."""
-    view_range_m: float | None = None
+    view_range_m: PositiveFloat | None = None
     """Range of sight, where that is less than `max_range_m`; for existence and evaluation, no detection is out of
     bounds by it."""
-    max_range_behind_m: float | None = None
+    max_range_behind_m: PositiveFloat | None = None
     """Range of sight in the half behind it, where that is less; for existence and evaluation."""
-    field_of_view_rad: float | None = None
+    field_of_view_rad: Annotated[float, Field(gt=0.0, le=math.tau)] | None = None
     """Full angle that it sees, centred on its axis; for existence and evaluation, as these ranges. null: in a replay
     that of the recording, or where it detects in it, if no range is given either; else all around."""
     scan: bool = True
@@ -158,11 +145,11 @@ class SensorModel:
     loss: RobustLoss | None = None
     """Robust loss of its measurements; null is the Gaussian. A smoother updates the weights while they are in its
     window, a filter once, at the state that the update gives."""
-    detection_probability: float = 0.5
+    detection_probability: OpenProbability = 0.5
     """Probability that a list shows an object in range and in the field of view (`lifecycle.kind: existence`). By
     default a list that lacks an object is as likely as one that shows it: RADAR and occluded objects come near that,
     and successive misses are correlated. A value too large ends tracks, one too small only delays their end."""
-    clutter_per_m2: float = 1e-4
+    clutter_per_m2: PositiveFloat = 1e-4
     """False detections in a list for each square metre (`lifecycle.kind: existence`)."""
     score: Score | None = None
     """Evidence of the score of a detection for the existence of its object; null: none."""
@@ -175,33 +162,16 @@ class SensorModel:
     """Errors that are correlated in time, estimated with each object; null: errors are white."""
 
     def __post_init__(self) -> None:
-        unknown = set(self.std) - set(MEASURABLE)
-        if unknown:
-            raise ValueError(f"std: unknown component {sorted(unknown)[0]!r}, known are {', '.join(MEASURABLE)}")
-        if not self.std:
-            raise ValueError("std: name at least one measured component")
-        positive(**{f"std.{name}": value for name, value in self.std.items()})
-        for name in self.filters:
-            if name not in (*MEASURABLE, *DESCRIBING):
-                raise ValueError(f"filters: unknown {name!r}, known are {', '.join((*MEASURABLE, *DESCRIBING))}")
-        for name in self.std_growth:
-            if name not in self.std:
-                raise ValueError(f"std_growth.{name}: the sensor measures {', '.join(self.components)}")
-        not_negative(**{f"std_growth.{name}": value for name, value in self.std_growth.items()})
-        if ("x_m" in self.std) != ("y_m" in self.std):
-            raise ValueError("std: x_m and y_m are measured together")
-        ranges = "max_range_m", "view_range_m", "max_range_behind_m"
-        for name in ("max_delay_s", *ranges, *_FROM_MAP.values(), "clutter_per_m2"):
-            positive(**{name: getattr(self, name)})
-        between_0_and_1(detection_probability=self.detection_probability)
-        if not math.isfinite(self.near_side_m):
-            raise ValueError(f"near_side_m: must be finite, is {self.near_side_m}")
-        if not abs(self.clock_offset_s) <= _LONGEST_OFFSET_S:
-            raise ValueError(f"clock_offset_s: must lie within {_LONGEST_OFFSET_S:g} s, is {self.clock_offset_s}")
-        if self.field_of_view_rad is not None and not 0.0 < self.field_of_view_rad <= math.tau:
-            raise ValueError(f"field_of_view_rad: must lie in (0, 2 pi], is {self.field_of_view_rad}")
-        if self.counter_init < 1 or self.counter_add < 0:
-            raise ValueError("counter_init must be at least 1 and counter_add not negative")
+        for key, names, known in (
+            ("std", self.std, MEASURABLE),
+            ("std_growth", self.std_growth, self.components),
+            ("filters", self.filters, (*MEASURABLE, *DESCRIBING)),
+        ):
+            unknown = [name for name in names if name not in known]
+            if unknown:
+                raise ValueError(f"{key}: unknown {unknown[0]!r}, known are {', '.join(known)}")
+        if not self.std or ("x_m" in self.std) != ("y_m" in self.std):
+            raise ValueError("std: name at least one measured component, and x_m and y_m together")
 
     @property
     def components(self) -> tuple[str, ...]:

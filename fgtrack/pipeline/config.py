@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Discriminator, Field, NonNegativeFloat, Tag
 
+from fgtrack.core.settings import settings
 from fgtrack.estimation.filters.initiation import DEFAULT, Initiation
 from fgtrack.estimation.registry import ESTIMATORS, Claims, motion_model
 from fgtrack.estimation.smoothing.settings import SmootherSettings
@@ -17,9 +18,8 @@ from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.road import OPEN_SPACE
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.load import dump, load, plain, with_settings
-from fgtrack.sim.settings import settings
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
-from fgtrack.tracking.birth import FixedBirth, MeasuredBirth
+from fgtrack.tracking.birth import Birth
 from fgtrack.tracking.detections import ConnectedMerge, NoMerge
 from fgtrack.tracking.existence import ExistenceRules
 from fgtrack.tracking.lifecycle import LifecycleRules
@@ -27,7 +27,6 @@ from fgtrack.tracking.published import NeighbourhoodMerge, UngatedEuclidean
 
 __all__ = [
     "ClockConfig",
-    "CountingConfig",
     "EgoConfig",
     "FilterConfig",
     "InitiationConfig",
@@ -37,7 +36,6 @@ __all__ = [
 
 MergeConfig = Annotated[ConnectedMerge | NoMerge | NeighbourhoodMerge, Discriminator("kind")]
 AssociationConfig = Annotated[GatedEuclidean | GatedMahalanobis | UngatedEuclidean, Discriminator("kind")]
-BirthConfig = Annotated[MeasuredBirth | FixedBirth, Discriminator("kind")]
 _Weight = Annotated[float, Field(gt=0.0, le=1.0)]
 
 
@@ -119,17 +117,6 @@ an ego low-pass that filters its own output again at every tick (Q13); a trackin
 (Q14)."""
 
 
-@dataclass(frozen=True)
-class CountingConfig(LifecycleRules):
-    """Start and end of tracks by counts of matches and misses."""
-
-    kind: Literal["counting", "published"] = "counting"
-    """`published`: which sensor ages which track, and when, as published (Q9, Q15, Q22)."""
-    suppress_births_near_newer_tracks: bool = False
-    """True if a track claims a detection that the newer one which started it has overtaken. As in the paper it does
-    not, and the detection starts a second track: with a fast and a slow sensor nearly every new object gets two."""
-
-
 def _lifecycle_kind(value: object) -> str:
     """Which form of `lifecycle` is meant: by existence where it does not say."""
     kind = value.get("kind", "existence") if isinstance(value, Mapping) else getattr(value, "kind", "existence")
@@ -137,7 +124,7 @@ def _lifecycle_kind(value: object) -> str:
 
 
 LifecycleConfig = Annotated[
-    Annotated[CountingConfig, Tag("counting")] | Annotated[ExistenceRules, Tag("existence")],
+    Annotated[LifecycleRules, Tag("counting")] | Annotated[ExistenceRules, Tag("existence")],
     Discriminator(_lifecycle_kind),
 ]
 
@@ -260,7 +247,7 @@ class Config:
     merge: MergeConfig = field(default_factory=NoMerge)
     association: AssociationConfig = field(default_factory=GatedMahalanobis)
     lifecycle: LifecycleConfig = field(default_factory=ExistenceRules)
-    birth: BirthConfig = field(default_factory=MeasuredBirth)
+    birth: Birth = field(default_factory=Birth)
     initiation: InitiationConfig = field(default_factory=InitiationConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
     filter: FilterConfig = field(default_factory=FilterConfig)

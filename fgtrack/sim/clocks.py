@@ -10,9 +10,9 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Discriminator, Field
 
+from fgtrack.core.settings import settings
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import IntArray
-from fgtrack.sim.settings import settings
 
 _LARGEST_ERROR_S = 86_400.0  # a day
 

@@ -13,8 +13,8 @@ import numpy as np
 from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat
 from scipy import optimize, special
 
+from fgtrack.core.settings import Probability, require, settings
 from fgtrack.core.types import FloatArray
-from fgtrack.sim.settings import Probability, require, settings
 
 
 @settings

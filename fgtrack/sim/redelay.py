@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgtrack.core.errors import CallError, DataError, did_you_mean
+from fgtrack.core.settings import Probability, settings
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import DetectionList, IntArray, Message
 from fgtrack.sim.clocks import AnyClock, reported_stamps
 from fgtrack.sim.delays import AnyDelay
-from fgtrack.sim.settings import Probability, settings
 
 #: Stands for all sensors that are not named.
 OTHERS = "*"

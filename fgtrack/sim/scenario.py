@@ -5,10 +5,10 @@ from typing import Annotated
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt
 
+from fgtrack.core.settings import Rate, require, settings
 from fgtrack.models.oval import OVAL
 from fgtrack.sim.delays import AnyDelay, ConstantDelay
 from fgtrack.sim.sensor import SimulatedSensor
-from fgtrack.sim.settings import Rate, require, settings
 from fgtrack.sim.vehicles import AnyVehicle, TrackVehicle
 
 

@@ -8,11 +8,11 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, NonNegativeFloat
 
+from fgtrack.core.settings import Probability, Rate, require, settings
 from fgtrack.core.types import MEASURABLE, BoolArray, FloatArray, Frame
 from fgtrack.models.sensors import Mount
 from fgtrack.sim.clocks import AnyClock
 from fgtrack.sim.delays import AnyDelay, NoDelay
-from fgtrack.sim.settings import Probability, Rate, require, settings
 
 #: Components in the frame of the sensor, relative to it.
 POLAR = ("range_m", "bearing_rad", "range_rate_mps")

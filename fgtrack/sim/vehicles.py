@@ -10,10 +10,10 @@ from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat
 from scipy.interpolate import CubicHermiteSpline
 
 from fgtrack.core.geometry import wrap_angles
+from fgtrack.core.settings import require, settings
 from fgtrack.core.types import STATE_NAMES, YAW, FloatArray
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.models.path import Path
-from fgtrack.sim.settings import require, settings
 
 
 @settings

@@ -1,104 +1,87 @@
 """Prior of a new track (Karle et al. 2023, section III-E)."""
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+from pydantic import PositiveFloat
 
-from fgtrack.core.checks import positive
 from fgtrack.core.geometry import rotation
+from fgtrack.core.settings import settings
 from fgtrack.core.time import seconds
-from fgtrack.core.types import YAW, EgoState, FloatArray
+from fgtrack.core.types import YAW, EgoState
 from fgtrack.estimation.base import Start, StatesAt
 from fgtrack.models.correlated_errors import position_cross, whole_error
 from fgtrack.models.road import Road
 from fgtrack.tracking.preprocess import Candidate
 
 
-@dataclass(frozen=True)
-class Birth(ABC):
+@settings
+class Birth:
     """First state of a track: values and standard deviations of all that its first detection does not measure."""
 
+    kind: Literal["measured", "fixed"] = "measured"
+    """`measured`: a measured component starts with its own standard deviation, the others with the one assumed;
+    `fixed`: every object starts with the same covariance, whatever the sensor measured (as published)."""
     ego_speed_factor: float = 0.0
     """An object is assumed as fast as the ego times this; 0 for traffic that has nothing to do with the ego."""
-    yaw_std_rad: float = 0.5
+    yaw_std_rad: PositiveFloat = 0.5
     """Standard deviation of a yaw from the map."""
-    speed_std_mps: float = 100.0
+    speed_std_mps: PositiveFloat = 100.0
     """Standard deviation of a speed that is not measured. The default excludes no vehicle: the gate of 3.7 standard
     deviations passes airliners, race cars lie within one; a second position makes it irrelevant."""
-    yaw_rate_std_radps: float = 0.5
+    yaw_rate_std_radps: PositiveFloat = 0.5
     """Standard deviation of the yaw rate."""
-    accel_std_mps2: float = 1.0
+    accel_std_mps2: PositiveFloat = 1.0
     """Standard deviation of the acceleration."""
     slow_ego_mps: float = 0.0
     """Below this ego speed an object is assumed to accelerate as the ego does (models with acceleration)."""
-
-    def __post_init__(self) -> None:
-        positive(**{each.name: getattr(self, each.name) for each in fields(self) if "_std_" in each.name})
+    along_std_m: PositiveFloat = 0.1
+    """Standard deviation of the position along the heading (`kind: fixed`)."""
+    across_std_m: PositiveFloat = 0.1
+    """Standard deviation of the position across the heading (`kind: fixed`)."""
 
     def prior(self, candidate: Candidate, road: Road, ego: EgoState | None, ego_in_pit: bool) -> Start | None:
         """First state at the candidate's stamp; None where it has no position to start from.
 
-        What was measured comes first, then map heading, road curvature and a share of the ego speed.
+        Measured components come first, then map heading, road curvature and a share of the ego speed.
         """
         if candidate.position_m is None:
             return None
-        yaw_rad, curvature_radpm = candidate.values.get("yaw_rad"), 0.0
+        measurement, values = candidate.measurement, candidate.values
+        yaw_rad, curvature_radpm = values.get("yaw_rad"), 0.0
         if road.known:
             view = road.view(candidate.position_m[None])
             curvature_radpm = float(view.curvature_radpm[0])
             if yaw_rad is None:
                 yaw_rad = float(view.yaw_rad[0])
         assumed_mps = 0.0 if ego is None or ego_in_pit else self.ego_speed_factor * ego.speed_mps
-        speed_mps = candidate.values.get("speed_mps", assumed_mps)
+        speed_mps = values.get("speed_mps", assumed_mps)
         slow = ego is not None and ego.speed_mps < self.slow_ego_mps
-        position_covariance, yaw_std_rad, speed_std_mps = self.spread(candidate, yaw_rad or 0.0)
+        if self.kind == "measured":
+            R = whole_error(measurement.model, measurement.R)
+            stds = dict(zip(values, np.sqrt(np.diag(R)).tolist(), strict=True))
+            position = np.zeros((2, 2)) if candidate.position_covariance is None else candidate.position_covariance
+            cross = position_cross(measurement.model, measurement.z, measurement.pose)
+        else:
+            stds, cross, turn = {}, {}, rotation(yaw_rad or 0.0)
+            position = turn @ np.diag([self.along_std_m**2, self.across_std_m**2]) @ turn.T
         return Start(
-            stamp_ns=candidate.measurement.stamp_ns,
+            stamp_ns=measurement.stamp_ns,
             position_m=candidate.position_m,
-            position_covariance=position_covariance,
-            position_cross=self.position_cross(candidate),
+            position_covariance=position,
+            position_cross=cross,
             yaw_rad=yaw_rad,
-            yaw_std_rad=yaw_std_rad if yaw_rad is not None else None,
+            yaw_std_rad=stds.get("yaw_rad", self.yaw_std_rad) if yaw_rad is not None else None,
             speed_mps=speed_mps,
-            speed_std_mps=speed_std_mps,
+            speed_std_mps=stds.get("speed_mps", self.speed_std_mps),
             yaw_rate_radps=speed_mps * curvature_radpm,
             yaw_rate_std_radps=self.yaw_rate_std_radps,
             accel_mps2=ego.accel_mps2 if ego is not None and slow else 0.0,
             accel_std_mps2=self.accel_std_mps2,
         )
-
-    @abstractmethod
-    def spread(self, candidate: Candidate, yaw_rad: float) -> tuple[FloatArray, float, float]:
-        """Covariance of the position, standard deviations of yaw and speed, of an object that heads for `yaw_rad`."""
-
-    def position_cross(self, candidate: Candidate) -> dict[str, tuple[float, float]]:
-        """Covariance of the position with time-correlated errors of the sensor."""
-        return {}
-
-
-@dataclass(frozen=True)
-class MeasuredBirth(Birth):
-    """A measured component starts with its own standard deviation, the others with the one assumed."""
-
-    kind: Literal["measured"] = "measured"
-
-    def spread(self, candidate: Candidate, yaw_rad: float) -> tuple[FloatArray, float, float]:
-        """See `Birth.spread`."""
-        position = candidate.position_covariance
-        measurement = candidate.measurement
-        R = whole_error(measurement.model, measurement.R)
-        own = dict(zip(candidate.values, np.sqrt(np.diag(R)).tolist(), strict=True))
-        position = np.zeros((2, 2)) if position is None else position
-        return position, own.get("yaw_rad", self.yaw_std_rad), own.get("speed_mps", self.speed_std_mps)
-
-    def position_cross(self, candidate: Candidate) -> dict[str, tuple[float, float]]:
-        """See `Birth.position_cross`; an object stands where its first detection says, but for what that errs."""
-        measurement = candidate.measurement
-        return position_cross(measurement.model, measurement.z, measurement.pose)
 
 
 def in_any_direction(states: StatesAt, stamp_ns: int, starts: Mapping[int, Start]) -> StatesAt:
@@ -117,20 +100,3 @@ def in_any_direction(states: StatesAt, stamp_ns: int, starts: Mapping[int, Start
         across = std_m * np.array([-math.sin(yaw_rad), math.cos(yaw_rad)])
         covariances[row, :2, :2] += np.outer(across, across)
     return replace(states, covariances=covariances)
-
-
-@dataclass(frozen=True)
-class FixedBirth(Birth):
-    """Every object starts with the same covariance, whatever the sensor measured (as published)."""
-
-    kind: Literal["fixed"] = "fixed"
-    along_std_m: float = 0.1
-    """Standard deviation of the position along the heading."""
-    across_std_m: float = 0.1
-    """Standard deviation of the position across the heading."""
-
-    def spread(self, candidate: Candidate, yaw_rad: float) -> tuple[FloatArray, float, float]:
-        """See `Birth.spread`."""
-        turn = rotation(yaw_rad)
-        position = turn @ np.diag([self.along_std_m**2, self.across_std_m**2]) @ turn.T
-        return position, self.yaw_std_rad, self.speed_std_mps

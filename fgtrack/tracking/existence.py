@@ -20,9 +20,10 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from pydantic import NonNegativeFloat, PositiveFloat
 
-from fgtrack.core.checks import between_0_and_1, not_negative, positive
 from fgtrack.core.linalg import mahalanobis_squared
+from fgtrack.core.settings import OpenProbability, settings
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray, TrackStatus
 from fgtrack.models.sensors import SensorModel
@@ -33,41 +34,37 @@ _LARGEST_LOG_ODDS = 30.0
 _SINGULAR = 1e-12
 
 
-@dataclass(frozen=True)
+@settings
 class ExistenceRules:
     """Confirmation and end of tracks by the probability that the object exists."""
 
     kind: Literal["existence"] = "existence"
-    birth_probability: float = 0.2
+    birth_probability: OpenProbability = 0.2
     """Probability that an unassociated detection stems from an object, before its score is considered."""
-    confirm_probability: float = 0.9
+    confirm_probability: OpenProbability = 0.9
     """A track is confirmed from here on."""
-    doubt_probability: float = 0.5
+    doubt_probability: OpenProbability = 0.5
     """A confirmed track below this is published as tentative until it is seen again."""
-    delete_probability: float = 0.02
+    delete_probability: OpenProbability = 0.02
     """A track below this ends."""
-    lifetime_s: float = 20.0
+    lifetime_s: PositiveFloat = 20.0
     """Mean time for which an object stays: oncoming traffic is near for seconds, a car ahead for minutes. It matters
     where few lists could show an object; elsewhere those that miss it end its track."""
-    out_of_view_s: float = 0.5
+    out_of_view_s: PositiveFloat = 0.5
     """A track ends where the newest list that could not show it is so much newer than the last one that could: half a
     second bridges a gap between two fields of view, and little is known of an object that nothing sees for longer."""
-    min_travel_m: float = 0.0
+    min_travel_m: NonNegativeFloat = 0.0
     """A track is not confirmed before it was so far from where it began: what never moves is shore, or moored."""
-    memory_s: float = 5.0
+    memory_s: PositiveFloat = 5.0
     """Time for which late lists change the probability at their own stamp; older ones count as if they were so old."""
     suppress_births_near_newer_tracks: bool = True
     """True if a late detection near a track that a newer detection has started begins no track of its own."""
 
     def __post_init__(self) -> None:
-        for name in ("birth_probability", "confirm_probability", "doubt_probability", "delete_probability"):
-            between_0_and_1(**{name: getattr(self, name)})
         if not self.delete_probability < min(self.birth_probability, self.doubt_probability):
             raise ValueError("delete_probability: must be less than birth_probability and doubt_probability")
         if self.doubt_probability > self.confirm_probability:
             raise ValueError("doubt_probability: must not be more than confirm_probability")
-        not_negative(min_travel_m=self.min_travel_m)
-        positive(lifetime_s=self.lifetime_s, out_of_view_s=self.out_of_view_s, memory_s=self.memory_s)
 
 
 @dataclass(slots=True)

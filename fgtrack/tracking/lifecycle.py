@@ -2,9 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
-from fgtrack.core.checks import not_negative, positive
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
+
+from fgtrack.core.settings import settings
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Detection, FloatArray, TrackStatus
 from fgtrack.models.sensors import SensorModel
@@ -73,24 +75,23 @@ class Life:
     """Misses since the last match."""
 
 
-@dataclass(frozen=True)
+@settings
 class LifecycleRules:
-    """When a track counts up, counts down, and ends."""
+    """Start and end of tracks by counts of matches and misses."""
 
-    counter_cap: int = 25
+    kind: Literal["counting", "published"] = "counting"
+    """`published`: which sensor ages which track, and when, as published (Q9, Q15, Q22)."""
+    counter_cap: PositiveInt = 25
     """Largest value of the status counter."""
-    forget_s: float = 2.0
+    forget_s: PositiveFloat = 2.0
     """A track not measured for so long ends."""
-    short_range_m: float = 60.0
+    short_range_m: NonNegativeFloat = 60.0
     """Up to here short-range sensors age a track, beyond it long-range sensors do."""
-    confirm_count: int = 3
+    confirm_count: PositiveInt = 3
     """Measurements of its position after which a track is confirmed."""
-
-    def __post_init__(self) -> None:
-        if self.counter_cap < 1 or self.confirm_count < 1:
-            raise ValueError("counter_cap and confirm_count must be at least 1")
-        positive(forget_s=self.forget_s)
-        not_negative(short_range_m=self.short_range_m)
+    suppress_births_near_newer_tracks: bool = False
+    """True if a track claims a detection that the newer one which started it has overtaken. As in the paper it does
+    not, and the detection starts a second track: with a fast and a slow sensor nearly every new object gets two."""
 
 
 class CountingLifecycle:

@@ -282,7 +282,7 @@ def test_a_rear_sensor_gets_a_mount_that_looks_back() -> None:
             yield replace(one, objects=objects) if objects else one
 
     found = assumed(Config(), source_of(rear))
-    assert found.config.sensors["radar"].mount == Mount(yaw_rad=pytest.approx(math.pi, abs=0.01))
+    assert found.config.sensors["radar"].mount.yaw_rad == pytest.approx(math.pi, abs=0.01)
     assert "axis 180 degrees, sees 57 degrees, up to 33 m (where it detects, of 360 detections" in found.lines()[0]
 
 

@@ -8,17 +8,17 @@ from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState, 
 from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.models.sensors import Correlation, SensorModel
 from fgtrack.pipeline.build import build_tracker
-from fgtrack.pipeline.config import Config, CountingConfig, MotionConfig
+from fgtrack.pipeline.config import Config, MotionConfig
 from fgtrack.tracking.association import GatedEuclidean
-from fgtrack.tracking.birth import MeasuredBirth
+from fgtrack.tracking.birth import Birth
 from fgtrack.tracking.existence import ExistenceRules
 from fgtrack.tracking.lifecycle import LifecycleRules
 from fgtrack.tracking.tracker import Tracker
 
 AT_M = np.array([40.0, 10.0])
 LIVES: list[LifecycleRules | ExistenceRules] = [
-    CountingConfig(forget_s=2.0, confirm_count=3),
-    CountingConfig(kind="published", forget_s=2.0, confirm_count=3),
+    LifecycleRules(forget_s=2.0, confirm_count=3),
+    LifecycleRules(kind="published", forget_s=2.0, confirm_count=3),
     ExistenceRules(lifetime_s=2.0, out_of_view_s=1e6),
 ]
 SENSORS = {"lidar": SensorModel(std={"x_m": 0.3, "y_m": 0.3}), "camera": SensorModel(std={"bearing_rad": 0.01})}
@@ -31,7 +31,7 @@ def tracker(lifecycle, estimator: str = "ekf-replay", camera: SensorModel = SENS
         sensors={**SENSORS, "camera": camera},
         lifecycle=lifecycle,
         association=GatedEuclidean(gate_m=5.0),
-        birth=MeasuredBirth(ego_speed_factor=0.0, speed_std_mps=2.0),
+        birth=Birth(ego_speed_factor=0.0, speed_std_mps=2.0),
         motion=motion,
     )
     return build_tracker(config)

@@ -12,7 +12,7 @@ from fgtrack.estimation.birth import initial_state
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.models.road import Road
-from fgtrack.tracking.birth import FixedBirth, MeasuredBirth, in_any_direction
+from fgtrack.tracking.birth import Birth, in_any_direction
 from fgtrack.tracking.preprocess import Candidate
 
 EGO = EgoState(START_NS, START_NS, 0.0, 0.0, 0.0, speed_mps=50.0, accel_mps2=-2.0)
@@ -30,9 +30,9 @@ def seen(**values: float) -> Candidate:
     return Candidate(0, (), measurement, z[:2], R[:2, :2])
 
 
-@pytest.mark.parametrize("birth", [FixedBirth, MeasuredBirth])
-def test_what_is_not_measured_comes_from_the_map_and_the_ego(birth) -> None:
-    prior = birth(ego_speed_factor=0.8, speed_std_mps=2.0).prior(seen(), ROAD, EGO, ego_in_pit=False)
+@pytest.mark.parametrize("kind", ["fixed", "measured"])
+def test_what_is_not_measured_comes_from_the_map_and_the_ego(kind) -> None:
+    prior = Birth(kind=kind, ego_speed_factor=0.8, speed_std_mps=2.0).prior(seen(), ROAD, EGO, ego_in_pit=False)
     assert prior.stamp_ns == START_NS
     assert tuple(prior.position_m) == (3.0, 4.0)
     assert prior.yaw_rad == 0.4
@@ -40,11 +40,11 @@ def test_what_is_not_measured_comes_from_the_map_and_the_ego(birth) -> None:
     assert prior.yaw_rate_radps == pytest.approx(40.0 * 0.01)
     assert prior.accel_mps2 == 0.0
     assert (prior.yaw_std_rad, prior.speed_std_mps) == (0.5, 2.0)
-    assert birth().prior(seen(), ROAD, EGO, ego_in_pit=False).speed_mps == 0.0
+    assert Birth(kind=kind).prior(seen(), ROAD, EGO, ego_in_pit=False).speed_mps == 0.0
 
 
 def test_a_position_of_unknown_heading_is_as_uncertain_across_as_along() -> None:
-    start = MeasuredBirth(speed_std_mps=50.0).prior(seen(), Road(), None, ego_in_pit=False)
+    start = Birth(speed_std_mps=50.0).prior(seen(), Road(), None, ego_in_pit=False)
     motion, dt_s = CTRV(), 0.5
     x, P = initial_state(motion, start)
     F = motion.jacobian(x, dt_s)
@@ -54,7 +54,7 @@ def test_a_position_of_unknown_heading_is_as_uncertain_across_as_along() -> None
     assert found.covariances[1, :2, :2] == pytest.approx(POSITION_COVARIANCE + 25.0**2 * np.eye(2))
 
 
-@pytest.mark.parametrize("birth", [FixedBirth(), MeasuredBirth()])
+@pytest.mark.parametrize("birth", [Birth(kind="fixed"), Birth()])
 def test_what_is_measured_stays(birth) -> None:
     prior = birth.prior(seen(yaw_rad=1.0, speed_mps=20.0), ROAD, EGO, ego_in_pit=False)
     assert (prior.yaw_rad, prior.speed_mps) == (1.0, 20.0)
@@ -63,10 +63,10 @@ def test_what_is_measured_stays(birth) -> None:
 
 def test_a_measured_component_starts_with_its_own_deviation_or_a_fixed_one() -> None:
     candidate = seen(yaw_rad=1.0, speed_mps=20.0)
-    measured = MeasuredBirth().prior(candidate, ROAD, EGO, ego_in_pit=False)
+    measured = Birth().prior(candidate, ROAD, EGO, ego_in_pit=False)
     assert (measured.yaw_std_rad, measured.speed_std_mps) == pytest.approx((0.7, 0.7))
     assert measured.position_covariance == pytest.approx(POSITION_COVARIANCE)
-    fixed = FixedBirth(along_std_m=2.0, across_std_m=0.5).prior(candidate, ROAD, EGO, ego_in_pit=False)
+    fixed = Birth(kind="fixed", along_std_m=2.0, across_std_m=0.5).prior(candidate, ROAD, EGO, ego_in_pit=False)
     assert (fixed.yaw_std_rad, fixed.speed_std_mps) == (0.5, 100.0)
     turn = rotation(1.0)
     assert fixed.position_covariance == pytest.approx(turn @ np.diag([4.0, 0.25]) @ turn.T)
@@ -74,25 +74,27 @@ def test_a_measured_component_starts_with_its_own_deviation_or_a_fixed_one() -> 
 
 @pytest.mark.parametrize(("ego", "in_pit"), [(None, False), (EGO, True)])
 def test_without_an_ego_on_the_track_an_object_is_assumed_to_stand(ego: EgoState | None, in_pit: bool) -> None:
-    prior = FixedBirth(ego_speed_factor=0.8).prior(seen(), ROAD, ego, ego_in_pit=in_pit)
+    prior = Birth(kind="fixed", ego_speed_factor=0.8).prior(seen(), ROAD, ego, ego_in_pit=in_pit)
     assert (prior.speed_mps, prior.yaw_rate_radps, prior.accel_mps2) == (0.0, 0.0, 0.0)
 
 
 def test_a_slow_ego_lends_its_acceleration() -> None:
     for speed_mps, accel_mps2 in [(9.9, -2.0), (10.0, 0.0)]:
-        prior = FixedBirth(slow_ego_mps=10.0).prior(seen(), ROAD, replace(EGO, speed_mps=speed_mps), ego_in_pit=False)
+        prior = Birth(kind="fixed", slow_ego_mps=10.0).prior(
+            seen(), ROAD, replace(EGO, speed_mps=speed_mps), ego_in_pit=False
+        )
         assert prior.accel_mps2 == accel_mps2
 
 
 def test_without_a_map_the_heading_is_unknown_and_the_road_straight() -> None:
-    prior = FixedBirth().prior(seen(), Road(), EGO, ego_in_pit=False)
+    prior = Birth(kind="fixed").prior(seen(), Road(), EGO, ego_in_pit=False)
     assert prior.yaw_rad is None
     assert prior.yaw_rate_radps == 0.0
-    assert FixedBirth().prior(seen(yaw_rad=0.3), Road(), EGO, ego_in_pit=False).yaw_rad == 0.3
+    assert Birth(kind="fixed").prior(seen(yaw_rad=0.3), Road(), EGO, ego_in_pit=False).yaw_rad == 0.3
 
 
 def test_a_bearing_alone_starts_nothing() -> None:
-    assert FixedBirth().prior(bearing(0.1, SensorPose()), ROAD, EGO, ego_in_pit=False) is None
+    assert Birth(kind="fixed").prior(bearing(0.1, SensorPose()), ROAD, EGO, ego_in_pit=False) is None
 
 
 @pytest.mark.parametrize(
@@ -100,12 +102,12 @@ def test_a_bearing_alone_starts_nothing() -> None:
 )
 def test_a_deviation_that_makes_no_sense_is_named(name: str) -> None:
     with pytest.raises(ValueError, match=name):
-        FixedBirth(**{name: 0.0})
+        Birth(kind="fixed", **{name: 0.0})
 
 
 @pytest.mark.parametrize("motion", MODELS, ids=lambda motion: type(motion).__name__)
 def test_the_first_state_of_every_motion_model_is_the_prior(motion) -> None:
-    prior = MeasuredBirth().prior(seen(yaw_rad=1.0, speed_mps=20.0), ROAD, EGO, ego_in_pit=False)
+    prior = Birth().prior(seen(yaw_rad=1.0, speed_mps=20.0), ROAD, EGO, ego_in_pit=False)
     mean, P = initial_state(motion, prior)
     assert mean.shape == (motion.dim,)
     assert np.array_equal(P, P.T)

@@ -13,7 +13,7 @@ from fgtrack.pipeline.load import dump, load, read_yaml
 from fgtrack.pipeline.sweep_plan import SweepConfig
 from fgtrack.sim.scenario import Scenario
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
-from fgtrack.tracking.birth import FixedBirth
+from fgtrack.tracking.birth import Birth
 from fgtrack.tracking.published import PublishedTracker
 from fgtrack.tracking.tracker import Tracker
 
@@ -74,7 +74,7 @@ def test_the_papers_configurations_name_every_value_of_the_paper(name: str) -> N
     given = read_yaml(CONFIGS / f"{name}.yaml")
     assert given["ego"].keys() >= {"yaw_weight", "yaw_rate_weight", "detection_origin_x_m"}
     assert given["map"].keys() >= {"inner_buffer_m", "outer_buffer_m", "pit_buffer_m"}
-    assert given["birth"].keys() >= {entry.name for entry in fields(FixedBirth)} - {"accel_std_mps2"}
+    assert given["birth"].keys() >= {entry.name for entry in fields(Birth)} - {"accel_std_mps2"}
     assert given["lifecycle"].keys() >= {"kind", "counter_cap", "forget_s", "short_range_m", "confirm_count"}
     assert given["motion"].keys() >= {"kind", "std_per_s"}
     assert (given["merge"]["distance_m"], given["association"]["gate_m"], given["clock"]["node_hz"]) == (5.1, 5.0, 50.0)
@@ -163,7 +163,7 @@ def test_a_setting_below_a_key_of_the_file_adds_nothing_to_it(tmp_path: Path) ->
             "filter.frequence: unknown key, did you mean 'frequency_hz', known here: frequency_hz",
         ),
         ("sensors: {lidar: {std: {x_m: 1.0, y_m: 1.0}, colour: red}}\n", "sensors.lidar.colour: unknown key"),
-        ("sensors: {lidar: {std: {x_m: 1.0, y_m: 1.0, mass_kg: 1.0}}}\n", "unknown component 'mass_kg'"),
+        ("sensors: {lidar: {std: {x_m: 1.0, y_m: 1.0, mass_kg: 1.0}}}\n", "std: unknown 'mass_kg'"),
         ("sensors: {lidar: {counter_init: 3}}\n", "sensors.lidar.std"),
         (
             "sensors: {radar: {std: {range_m: 1.0}}}\ninput: {detections: {sonar: {topic: /sonar}}}\n",

@@ -47,7 +47,7 @@ def test_what_grows_with_range_is_measured_and_does_not_shrink() -> None:
     found = sensor.growth(("x_m", "y_m"), np.array([0.0, 10.0, np.nan]))
     assert found is not None
     np.testing.assert_allclose(found, [[0.0, 0.0], [0.0, 0.01], [0.0, 0.0]])
-    for growth, said in (({"speed_mps": 0.1}, "measures x_m, y_m"), ({"x_m": -0.1}, "not negative")):
+    for growth, said in (({"speed_mps": 0.1}, "known are x_m, y_m"), ({"x_m": -0.1}, "greater than or equal to 0")):
         with pytest.raises(ValueError, match=said):
             SensorModel(std=POSITION, std_growth=growth)
 

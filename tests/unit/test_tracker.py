@@ -10,11 +10,11 @@ from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.models.oval import make_oval
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_tracker
-from fgtrack.pipeline.config import CountingConfig
 from fgtrack.tracking.association import GatedEuclidean
+from fgtrack.tracking.lifecycle import LifecycleRules
 from fgtrack.tracking.tracker import Tracker
 
-CLAIMING = CountingConfig(suppress_births_near_newer_tracks=True)
+CLAIMING = LifecycleRules(suppress_births_near_newer_tracks=True)
 POINTS = SensorModel(std={"x_m": 0.3, "y_m": 0.3})
 
 

@@ -1,4 +1,4 @@
-"""Settings of a scenario: frozen, finite, in their range, checked wherever they are made."""
+"""Settings: frozen, finite, in their range, checked wherever they are made."""
 
 from dataclasses import field
 from typing import Annotated, TypeVar, dataclass_transform
@@ -11,6 +11,8 @@ T = TypeVar("T")
 Rate = Annotated[float, Field(gt=0.0, le=10_000.0)]
 """In Hz."""
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+OpenProbability = Annotated[float, Field(gt=0.0, lt=1.0)]
+"""Strictly between 0 and 1."""
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
