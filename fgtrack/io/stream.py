@@ -3,25 +3,20 @@
 import gzip
 import json
 import logging
+import math
 import zlib
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from collections.abc import Generator, Iterable, Iterator, Mapping
+from contextlib import ExitStack, closing
 from dataclasses import MISSING, fields
 from functools import partial
+from operator import methodcaller
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.files import open_file
-from fgtrack.core.types import (
-    Detection,
-    DetectionList,
-    EgoState,
-    Message,
-    TruthState,
-)
-from fgtrack.io.config import InputConfig
+from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.io.errors import TruncatedInput, UntilBreak
 from fgtrack.io.output import new_file
 from fgtrack.io.source import FileFormat
@@ -34,6 +29,8 @@ GZIP_MAGIC = b"\x1f\x8b"
 
 _logger = logging.getLogger(__name__)
 _KINDS: dict[str, type[Message]] = {"ego": EgoState, "detections": DetectionList, "truth": TruthState}
+
+_Made = TypeVar("_Made")
 
 # A parsed JSON object: its values are checked one by one below.
 Record = dict[str, Any]
@@ -54,7 +51,7 @@ def read_stream(path: Path | str) -> Iterator[Message]:
     """
     path = Path(path)
     unknown: Counter[str] = Counter()
-    newest_ns: int | None = None
+    newest_ns = -math.inf
     with closing(_records(path)) as records:
         _check_header(path, next(records, None))
         for line, record in records:
@@ -63,7 +60,7 @@ def read_stream(path: Path | str) -> Iterator[Message]:
             except InvalidMessageError as error:
                 raise DataError(f"{path}:{line}: {error}") from error
             if not isinstance(message, TruthState):
-                if newest_ns is not None and message.receipt_ns < newest_ns:
+                if message.receipt_ns < newest_ns:
                     raise DataError(
                         f"{path}:{line}: receipt_ns {message.receipt_ns} is before {newest_ns} of an earlier "
                         "record, sort the stream by receipt_ns"
@@ -83,17 +80,19 @@ def _recognises(path: Path) -> bool:
     return start.startswith(GZIP_MAGIC) or start.lstrip().startswith(b"{")
 
 
-def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
-    return partial(read_stream, path)
-
-
 def _settings(path: Path) -> Mapping[str, object]:
     """Settings in the header."""
     found = read_header(path).get(SETTINGS)
     return found if isinstance(found, dict) else {}
 
 
-FORMAT = FileFormat("an fgtrack stream (.jsonl, .jsonl.gz)", _recognises, _open, _settings, validates=True)
+FORMAT = FileFormat(
+    "an fgtrack stream (.jsonl, .jsonl.gz)",
+    _recognises,
+    lambda path, config: partial(read_stream, path),
+    _settings,
+    validates=True,
+)
 
 
 def read_header(path: Path | str) -> Mapping[str, Any]:
@@ -132,7 +131,10 @@ def write_stream(
     """
     path = Path(path)
     count = 0
-    with new_file(path, overwrite) as file, _packed(file, path.name.endswith(".gz")) as lines:
+    with ExitStack() as stack:
+        lines: BinaryIO | gzip.GzipFile = stack.enter_context(new_file(path, overwrite))
+        if path.name.endswith(".gz"):
+            lines = stack.enter_context(gzip.GzipFile(filename="", mode="wb", fileobj=lines, mtime=0))
         lines.write(_line({"type": "header", "format": STREAM_FORMAT, **(header or {})}))
         readable = UntilBreak(messages)
         for message in readable:
@@ -143,21 +145,8 @@ def write_stream(
     return count
 
 
-@contextmanager
-def _packed(file: BinaryIO, gzipped: bool) -> Iterator[BinaryIO | gzip.GzipFile]:
-    if not gzipped:
-        yield file
-        return
-    with gzip.GzipFile(filename="", mode="wb", fileobj=file, mtime=0) as packed:
-        yield packed
-
-
 def _line(record: Mapping[str, object]) -> bytes:
-    return json.dumps(record, default=_plain).encode() + b"\n"
-
-
-def _plain(value: Any) -> object:  # a NumPy scalar, which json does not know
-    return value.item()
+    return json.dumps(record, default=methodcaller("item")).encode() + b"\n"  # of a NumPy scalar
 
 
 def _record(message: Message) -> Record:
@@ -169,10 +158,8 @@ def _record(message: Message) -> Record:
 
 
 def _given(value: EgoState | TruthState | Detection) -> Record:
-    given = {name: field for name in _FIELDS[type(value)] if (field := getattr(value, name)) is not None}
-    if given.get("ignored") is False:
-        del given["ignored"]
-    return given
+    given = {name: getattr(value, name) for name in _FIELDS[type(value)]}
+    return {name: field for name, field in given.items() if field is not None and (name, field) != ("ignored", False)}
 
 
 def _records(path: Path) -> Generator[tuple[int, Record], None, None]:
@@ -216,52 +203,40 @@ def _check_header(path: Path, first: tuple[int, Record] | None) -> Record:
 
 
 def _message(record: Record, unknown: Counter[str]) -> Message:
-    name = record.get("type")
-    kind = _KINDS.get(name) if isinstance(name, str) else None
+    name = record.pop("type", None)
+    kind = _KINDS.get(str(name))
     if kind is None:
         raise InvalidMessageError(f"unknown record type {name!r}, known are {', '.join(_KINDS)}")
-    values = _values(str(name), kind, record, unknown)
     if kind is DetectionList:
-        values["objects"] = [_detection(index, item, unknown) for index, item in enumerate(values["objects"])]
-    return validated_message(kind(**values))
+        objects = record.get("objects")
+        if not isinstance(objects, list):
+            raise InvalidMessageError(f"objects: a list expected, not {objects!r:.60}")
+        record["objects"] = tuple(_made("objects", Detection, item, unknown) for item in objects)
+    return validated_message(_made(str(name), kind, record, unknown))
 
 
-def _detection(index: int, item: object, unknown: Counter[str]) -> Detection:
-    if not isinstance(item, dict):
-        raise InvalidMessageError(f"objects[{index}]: a JSON object expected, not {item!r}")
-    return Detection(**_values("objects", Detection, item, unknown))
-
-
-def _values(name: str, kind: type, record: Record, unknown: Counter[str]) -> Record:
-    """Values of the fields of `kind` in `record`; null is not given. Unknown keys are counted."""
-    given = {key: value for key, value in record.items() if value is not None and key != "type"}
+def _made(name: str, kind: type[_Made], record: object, unknown: Counter[str]) -> _Made:
+    """An instance of `kind` from a JSON object; null is not given. Unknown keys are counted."""
+    if not isinstance(record, dict):
+        raise InvalidMessageError(f"{name}: a JSON object expected, not {record!r}")
     known = _FIELDS[kind]
-    if given.keys() - known.keys():
-        unknown.update(f"{name}.{key}" for key in given.keys() - known.keys())
-    values = {}
+    if not record.keys() <= known.keys():
+        unknown.update(f"{name}.{key}" for key in record.keys() - known.keys())
+    given = {key: _value(key, value) for key, value in record.items() if value is not None and key in known}
     for key, is_needed in known.items():
-        if key in given:
-            value = given[key]
-            is_list = isinstance(value, list)
-            if is_list != (key in _LISTS):
-                raise InvalidMessageError(
-                    f"{key}: {'no list' if is_list else 'a list'} expected, not {str(value)[:60]}"
-                )
-            values[key] = tuple(map(_plain_number, value)) if is_list else value
-            if key not in _INTEGERS:
-                values[key] = _plain_number(values[key])
-        elif is_needed:
+        if is_needed and key not in given:
             raise InvalidMessageError(f"{key}: is missing")
-    return values
+    return kind(**given)
 
 
-def _plain_number(value: Any) -> Any:
-    """A float where `value` is an integer that can be one."""
-    return float(value) if type(value) is int and value.bit_length() < 1000 else value
+def _value(key: str, value: Any) -> Any:
+    """`value` with lists as tuples, and integers as floats where `key` is a number that can be one."""
+    if type(value) is list:
+        return tuple(_value(key, each) for each in value)
+    return float(value) if type(value) is int and key not in _INTEGERS and value.bit_length() < 1000 else value
 
 
 _INTEGERS = frozenset({"stamp_ns", "receipt_ns", "object_id"})
-_LISTS = frozenset({"objects", "covariance", "outline_m"})
 #: Names of the fields of messages and detections, and if they have to be given.
 _FIELDS: dict[type, dict[str, bool]] = {
     kind: {field.name: field.default is MISSING for field in fields(kind) if field.name != "left_out"}

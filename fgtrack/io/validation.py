@@ -29,8 +29,6 @@ from fgtrack.io.errors import one_line
 
 __all__ = ["InvalidMessageError", "validated", "validated_detection", "validated_message"]
 
-_LONGEST_NAME = 200
-_FAR_M = 1e9
 _INT64 = range(-(1 << 63), 1 << 63)
 
 
@@ -63,7 +61,7 @@ def validated(path: Path, messages: Callable[[], Iterator[Message]], done: bool 
 def validated_message(message: Message) -> Message:
     """Return `message`, its detections as of `validated_detection`. Raises `InvalidMessageError`."""
     if not isinstance(message, DetectionList | EgoState | TruthState):
-        raise InvalidMessageError(f"a {type(message).__name__} is no message")
+        raise InvalidMessageError(f"a {type(message).__name__} is not a message")
     _check_fields(message)
     if not is_stamp(message.receipt_ns):  # all windows are counted from it
         raise _invalid("receipt_ns", f"at most {LARGEST_NS:.0g} ns from 0", message.receipt_ns)
@@ -75,35 +73,24 @@ def validated_message(message: Message) -> Message:
             except InvalidMessageError as error:
                 raise InvalidMessageError(f"{message.sensor}: objects[{index}]: {error}") from error
         return message if all(map(is_, objects, message.objects)) else replace(message, objects=tuple(objects))
-    if isinstance(message, EgoState):
+    if isinstance(message, EgoState) and message.covariance is not None:
         size = len(EGO_COVARIANCE_STATES)
-        if message.covariance is not None and len(message.covariance) != size**2:
+        if len(message.covariance) != size**2:
             raise InvalidMessageError(f"covariance: a list of {size} x {size} numbers expected")
-    elif message.outline_m is not None and not _is_ring(message.outline_m):
-        raise _invalid("outline_m", "x and y of at least three corners", message.outline_m)
     return message
 
 
-def _is_ring(corners: tuple[float, ...]) -> bool:
-    return len(corners) >= 6 and len(corners) % 2 == 0 and all(abs(each) <= _FAR_M for each in corners)
-
-
 def validated_detection(item: Detection) -> Detection:
-    """Return `item` with None for describing numbers that are not finite and for class names that are too long.
+    """Return `item` with None for describing numbers that are not finite.
 
     Raises `InvalidMessageError` for a value of a wrong type.
     """
     if not isinstance(item, Detection):
-        raise InvalidMessageError(f"a {type(item).__name__} is no detection")
-    lost = []
-    for name in DESCRIBING:
-        value = getattr(item, name)
-        is_long = isinstance(value, str) and len(value) > _LONGEST_NAME
-        if is_long or (isinstance(value, (float, np.floating)) and not isfinite(value)):
-            lost.append(name)
-    item = replace(item, **dict.fromkeys(lost)) if lost else item
+        raise InvalidMessageError(f"a {type(item).__name__} is not a detection")
     _check_fields(item)
-    return item
+    numbers = ((name, getattr(item, name)) for name in DESCRIBING if name != "class_name")
+    undefined = [name for name, value in numbers if value is not None and not isfinite(value)]
+    return replace(item, **dict.fromkeys(undefined)) if undefined else item
 
 
 def _check_fields(item: Message | Detection) -> None:
@@ -119,35 +106,34 @@ def _is_integer(value: object) -> bool:
     return value in _INT64 if type(value) is int else isinstance(value, np.integer)
 
 
-def _is_flag(value: object) -> bool:
-    return isinstance(value, bool | np.bool_)
-
-
 def _is_number(value: object) -> bool:
     if type(value) is int:
         return value.bit_length() <= 1000
-    return type(value) is float or isinstance(value, (float, np.floating, np.integer))
+    return isinstance(value, (float, np.floating, np.integer))
 
 
-def _is_name(value: object) -> bool:
-    is_short = isinstance(value, str) and 0 < len(value) <= _LONGEST_NAME
-    return is_short and str(value).encode(errors="replace").decode() == value
+def _is_text(value: object) -> bool:
+    return isinstance(value, str) and value.encode(errors="replace").decode() == value
 
 
 def _are_numbers(value: object) -> bool:
     return isinstance(value, tuple) and all(each is None or _is_number(each) for each in value)
 
 
-_INTEGER, _FLAG = (_is_integer, "a 64 bit integer"), (_is_flag, "true or false")
-_NAME = (_is_name, f"a name of up to {_LONGEST_NAME} characters")
-_NUMBERS = (_are_numbers, "a list of numbers")
+def _is_outline(value: object) -> bool:
+    return isinstance(value, tuple) and _are_numbers(value) and len(value) >= 6 and len(value) % 2 == 0
+
+
+_INTEGER = (_is_integer, "a 64 bit integer")
+_FLAG = (lambda value: isinstance(value, bool | np.bool_), "true or false")
 #: By field its rule and what it expects; all others are numbers.
 _RULES: dict[str, tuple[Callable[[object], bool], str]] = {
     **dict.fromkeys(("stamp_ns", "receipt_ns", "object_id"), _INTEGER),
     **dict.fromkeys(("in_pit", "ignored"), _FLAG),
-    "sensor": _NAME,
-    "class_name": (lambda value: value == "" or _is_name(value), _NAME[1]),
-    **dict.fromkeys(("covariance", "outline_m"), _NUMBERS),
+    "sensor": (lambda value: value != "" and _is_text(value), "a name"),
+    "class_name": (_is_text, "a text"),
+    "covariance": (_are_numbers, "a list of numbers"),
+    "outline_m": (_is_outline, "x and y of at least three corners"),
     "frame": (lambda value: value in FRAMES, f"one of {', '.join(sorted(FRAMES))}"),
 }
 _FIELDS = {
@@ -161,6 +147,4 @@ _FIELDS = {
 
 
 def _invalid(name: str, expected: str, value: object) -> InvalidMessageError:
-    text = ascii(value)
-    text = text if len(text) <= 60 else f"{text[:57]}..."
-    return InvalidMessageError(f"{name}: {expected} expected, not {text}")
+    return InvalidMessageError(f"{name}: {expected} expected, not {value!a:.60}")
