@@ -21,7 +21,7 @@ class Target:
     commands: Sequence[Sequence[str]]
     """Words of the commands, called in the folder of the files; `LINE` for those in that file."""
     corrupted: str | None = None
-    """The file that is corrupted, else any."""
+    """End of the names of the files that are corrupted, else any."""
 
 
 def words_of(command: Sequence[str], folder: Path) -> Sequence[str]:
@@ -115,6 +115,7 @@ TARGETS = {
             ("export", "in", "-o", "x.mcap", "--overwrite"),
             ("export", "in", "-o", "bag", "--ros2", "--overwrite"),
         ],
+        ".csv",
     ),
     "line": Target(inputs.lines, [("replay", "x.jsonl", "-c", "open_space", "-o", "in"), (LINE,)], LINE),
 }

@@ -42,7 +42,7 @@ def files_of(name: str, seed: int, case: int) -> dict[str, bytes]:
     rng, right = np.random.default_rng([seed, case]), healthy(name)
     files = dict(right[rng.integers(len(right))])
     corrupted = TARGETS[name].corrupted
-    names = sorted(one for one in files if corrupted is None or one == corrupted)
+    names = sorted(one for one in files if corrupted is None or one.endswith(corrupted))
     for one in rng.choice(names, size=1 if rng.integers(4) else min(2, len(names)), replace=False).tolist():
         files[one] = mutated(rng, one, files[one])
     return files

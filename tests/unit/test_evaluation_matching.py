@@ -170,9 +170,12 @@ def test_pairs_inside_the_gate_stay_and_the_rest_is_assigned(seed: int, density:
     [
         (
             "evaluation: {gate_m: -1}",
-            r"run.config\.yaml: evaluation: gate_m: must be positive and at most 1e\+09, is -1",
+            r"run.config\.yaml: evaluation: Value error, gate_m: must be positive and at most 1e\+09, is -1",
         ),
-        ("evaluation: {confirmed_only: [1]}", r"run.config\.yaml: evaluation.confirmed_only is not"),
+        (
+            "evaluation: {confirmed_only: [1]}",
+            r"run.config\.yaml: evaluation.confirmed_only: Input should be",
+        ),
         ("evaluation: {", r"run.config\.yaml: is not YAML"),
     ],
 )

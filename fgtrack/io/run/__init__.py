@@ -1,9 +1,8 @@
 """The run folder `fgtrack-run/1`, the interface of tracking and evaluation: writer, reader, layout; runs in memory."""
 
 from fgtrack.io.run.memory import MemoryRun
-from fgtrack.io.run.reader import Run, Table, load_run
+from fgtrack.io.run.reader import EvaluationConfig, Run, Table, load_run
 from fgtrack.io.run.schema import COLUMNS, COVARIANCE_COLUMNS, NO_TRACK, OPTIONAL_TABLES, RUN_FORMAT
-from fgtrack.io.run.settings import EvaluationConfig
 from fgtrack.io.run.timing import Node, ready_times
 from fgtrack.io.run.writer import RunWriter, check_run, digest, is_run_folder, path_from_run, write_metrics
 

@@ -6,20 +6,20 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from html import escape
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 from ruamel.yaml.error import YAMLError
 
+from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import DataError
 from fgtrack.core.files import open_file, read_whole
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray
 from fgtrack.io.run.schema import COLUMNS, NO_TRACK, OPTIONAL_TABLES, RUN_FORMAT, Column, column, column_type
-from fgtrack.io.run.settings import CONFIG, META, EvaluationConfig, check_values
 from fgtrack.io.run.writer import LARGEST_META_MB, path_from_run, save_run
 from fgtrack.io.yaml_text import safe_yaml
 
@@ -55,17 +55,34 @@ class Table(dict[str, Column]):
         return Table({name: values[mask] for name, values in self.items()})
 
 
-class _Frame(cached_property["DataFrame"]):
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """Pairing of tracks with true objects, and the metrics that are computed."""
+
+    gate_m: float = 5.0
+    """Largest distance of a track from its true object. The default is the tracker's own association distance, a
+    car's length (more for ships): a track farther off is not updated by its object any more. It bounds the errors,
+    so compare at one gate."""
+    confirmed_only: bool = True
+    """True to leave out tentative tracks: by counting, those measured less than `lifecycle.confirm_count` times."""
+    multi_object: bool = True
+    """True to compute GOSPA, CLEAR, IDF1 and HOTA."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.gate_m <= LARGEST:
+            raise ValueError(f"gate_m: must be positive and at most {LARGEST:g}, is {self.gate_m}")
+
+
+def _frame(table: str, doc: str) -> "cached_property[DataFrame]":
     """A table of a run as a pandas DataFrame."""
 
-    def __init__(self, doc: str) -> None:
-        super().__init__(self._made)
-        self.__doc__ = doc
-
-    def _made(self, run: "Run") -> "DataFrame":
+    def made(run: "Run") -> "DataFrame":
         import pandas
 
-        return pandas.DataFrame(run.tables[str(self.attrname)])
+        return pandas.DataFrame(run.tables[table])
+
+    made.__doc__ = doc
+    return cached_property(made)
 
 
 @dataclass(frozen=True, repr=False)
@@ -93,16 +110,16 @@ class Run:
         empty = {name: Table({key: column(key, ()) for key in COLUMNS[name]}) for name in COLUMNS}
         object.__setattr__(self, "tables", empty | dict(self.tables))
 
-    tracks = _Frame("States of every track at every tick.")
-    updates = _Frame("A row per detection: its disposition, track, NIS and innovation.")
-    smoothed = _Frame("Final states, and lagged ones of the first lag.")
-    lagged = _Frame("Lagged states of every lag.")
-    timing = _Frame("A row per tick: its time, processing time, numbers of tracks and detections.")
-    truth = _Frame("True objects.")
-    ignored = _Frame("Objects and regions at which a track is neither right nor false.")
-    ego = _Frame("States of the ego, in order of receipt.")
-    objects = _Frame("Class and size of the objects of tracks, where detections have them.")
-    detections = _Frame("Detections in order of receipt, a row for each of `updates`; of fgtrack 0.1 without rows.")
+    tracks = _frame("tracks", "States of every track at every tick.")
+    updates = _frame("updates", "A row per detection: its disposition, track, NIS and innovation.")
+    smoothed = _frame("smoothed", "Final states, and lagged ones of the first lag.")
+    lagged = _frame("lagged", "Lagged states of every lag.")
+    timing = _frame("timing", "A row per tick: its time, processing time, numbers of tracks and detections.")
+    truth = _frame("truth", "True objects.")
+    ignored = _frame("ignored", "Objects and regions at which a track is neither right nor false.")
+    ego = _frame("ego", "States of the ego, in order of receipt.")
+    objects = _frame("objects", "Class and size of the objects of tracks, where detections have them.")
+    detections = _frame("detections", "Detections in order of receipt, a row for each of `updates`.")
 
     def __repr__(self) -> str:
         meta, updates, truth = self.meta, self.tables["updates"], self.tables["truth"]
@@ -121,12 +138,6 @@ class Run:
         }
         return "\n".join(["Run", *(f"  {name}: {value}" for name, value in lines.items() if value)])
 
-    def _repr_html_(self) -> str:
-        _, *lines = repr(self).splitlines()
-        cells = (line.strip().split(": ", 1) for line in lines)
-        rows = (f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in cells)
-        return f"<table>{''.join(rows)}</table>"
-
     @property
     def estimator(self) -> str:
         """Name of the estimator."""
@@ -141,7 +152,6 @@ class Run:
             raise DataError(f"{self.config_path}: is not YAML, repeat the run") from error
         if not isinstance(config, dict | None):
             raise DataError(f"{self.config_path}: holds no settings, repeat the run")
-        check_values(CONFIG, config or {}, self.config_path)
         return config or {}
 
     @property
@@ -152,9 +162,11 @@ class Run:
     @property
     def evaluation(self) -> EvaluationConfig:
         """Section `evaluation` of config.yaml, with defaults. Raises as `config`."""
-        values = self.config.get("evaluation") or {}
-        known = EvaluationConfig.__dataclass_fields__
-        return EvaluationConfig(**{name: value for name, value in values.items() if name in known})
+        try:
+            return TypeAdapter(EvaluationConfig).validate_python(self.config.get("evaluation") or {})
+        except ValidationError as error:
+            where, first = ".".join(map(str, ("evaluation", *error.errors()[0]["loc"]))), error.errors()[0]["msg"]
+            raise DataError(f"{self.config_path}: {where}: {first}") from error
 
     @property
     def recording(self) -> Path | None:
@@ -219,7 +231,6 @@ def _read_meta(path: Path) -> Mapping[str, Any]:
         raise DataError(f"{file}: is not JSON ({error}), repeat the run") from error
     if not isinstance(meta, dict) or meta.get("format") != RUN_FORMAT:
         raise DataError(f"{file}: does not say format {RUN_FORMAT!r}, so this is not a run folder")
-    check_values(META, meta, file)
     return meta
 
 
