@@ -29,7 +29,6 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
-from operator import itemgetter
 from pathlib import Path
 from typing import TypeVar
 
@@ -64,24 +63,18 @@ Item = TypeVar("Item")
 def read_sequence(folder: Path, sequence: str, settings: KittiInput) -> Iterator[Message]:
     """Messages of `sequence` in receipt order; at a frame the truth comes first, then the ego, then the detections.
 
-    Raises
-    ------
-    DataError
-        A file is missing, or a line of it is damaged: then after all messages of earlier frames. The message names
-        file and line.
+    Raises `DataError`, with file and line, where a file is missing or damaged.
     """
-    views, error = _until_damage(_views(folder, sequence))
-    damages = [] if error is None else [(len(views), error)]
+    views = list(_views(folder, sequence))
     labels = folder / _LABELS / f"{sequence}.txt"
-    truth = _by_frame(labels, views, partial(_truth, settings), damages) if labels.exists() else {}
+    truth = _by_frame(labels, views, partial(_truth, settings)) if labels.exists() else {}
     sensors = {
-        file.parent.name: _by_frame(file, views, partial(_detection, settings, file.parent.name), damages)
+        file.parent.name: _by_frame(file, views, partial(_detection, settings, file.parent.name))
         for file in sorted(folder.glob(f"*/{sequence}.txt"))
         if file.parent.name not in (_OXTS, _CALIB, _LABELS)
     }
     in_image = {name: _in_image(folder / name, frames) for name, frames in sensors.items()}
-    end, damage = min(damages, key=itemgetter(0), default=(len(views), None))
-    for frame, view in enumerate(views[:end]):
+    for frame, view in enumerate(views):
         states = [state for state in truth.get(frame, ()) if state is not None]
         regions = [state for state in states if state.outline_m is not None]
         yield from [state for state in states if state.outline_m is None]
@@ -91,46 +84,19 @@ def read_sequence(folder: Path, sequence: str, settings: KittiInput) -> Iterator
             objects, left_out = split(frames.get(frame, ()))
             refers_to: Frame = "sensor" if in_image[sensor] else "ego"
             yield DetectionList(sensor, view.ego.stamp_ns, view.ego.receipt_ns, objects, refers_to, left_out)
-    if damage is not None:
-        raise damage
 
 
-def _until_damage(items: Iterator[Item]) -> tuple[list[Item], DataError | None]:
-    """Items before the first damaged line, and the error that it raised."""
-    intact = []
-    try:
-        for item in items:
-            intact.append(item)
-    except DataError as error:
-        return intact, error
-    return intact, None
-
-
-def _by_frame(
-    file: Path,
-    views: list[View],
-    parse: Callable[[View, list[str]], Item],
-    damages: list[tuple[int, DataError]],
-) -> Mapping[int, list[Item]]:
-    """Results of `parse` for the lines of `file`, by frame; a damaged line is added to `damages` with its frame.
-
-    Lines are in the order of their frames, so a damaged frame number is not before that of the line above.
-    """
-    latest = 0
+def _by_frame(file: Path, views: list[View], parse: Callable[[View, list[str]], Item]) -> Mapping[int, list[Item]]:
+    """Results of `parse` for the lines of `file`, by frame."""
 
     def at_frame(fields: list[str]) -> tuple[int, Item]:
-        nonlocal latest
         frame = int(fields[0])
-        latest = max(latest, frame)
         if not 0 <= frame < len(views):
             raise ValueError(f"of frame {frame}, but {_OXTS} has {len(views)} frames")
         return frame, parse(views[frame], fields)
 
-    items, error = _until_damage(parsed(file, at_frame))
-    if error is not None:
-        damages.append((latest, error))
     by_frame = defaultdict(list)
-    for frame, item in items:
+    for frame, item in parsed(file, at_frame):
         by_frame[frame].append(item)
     return by_frame
 

@@ -16,7 +16,7 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2
 from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.io.errors import TruncatedInput, one_line
-from fgtrack.io.ros.bag_files import BagFile, bags_in, check_serialization, parts_of, storage_of
+from fgtrack.io.ros.bag_files import BagFile, bags_in, parts_of, storage_of
 from fgtrack.io.ros.rosbag1_file import Rosbag1File
 from fgtrack.io.ros.typestore import Key, MessageTypes, type_name
 
@@ -61,8 +61,11 @@ class Bag:
         with self._files() as files:
             connections = [item for file in files for item in file.connections]
             for item in connections:
-                if isinstance(item.ext, ConnectionExtRosbag2):
-                    check_serialization(self.path, item.topic, item.ext.serialization_format)
+                kind = item.ext.serialization_format if isinstance(item.ext, ConnectionExtRosbag2) else "cdr"
+                if kind != "cdr":
+                    raise DataError(
+                        f"{self.path}: topic {item.topic} is serialized as {kind!r}, only 'cdr' can be read"
+                    )
             self._ros1 = any(isinstance(file, Rosbag1File) for file in files)
             self._types = MessageTypes(map(_key, connections), self._ros1, message_definitions)
             self._stamped = set(filter(self._types.begins_with_header, map(_key, connections)))

@@ -29,7 +29,6 @@ METADATA = "metadata.yaml"
 SETTINGS = "fgtrack"
 """Entry of its custom data with what the recording carries of a configuration, as JSON."""
 _BAG_SUFFIXES = (".mcap", ".db3")
-_NEWEST_VERSION = 9
 _READERS: Mapping[bytes, type[BagFile]] = {
     MCAP_MAGIC: McapFile,
     b"SQLite format 3\x00": Sqlite3File,
@@ -65,12 +64,13 @@ def parts_of(path: Path) -> Parts:
     Raises `DataError` for an invalid metadata.yaml, and for copies of one file.
     """
     if (path / METADATA).is_file():
-        return _named_parts(path)
-    files = tuple(bags_in(path)) if path.is_dir() else (path,)
-    for one, other in combinations(files, 2):
+        parts = _named_parts(path)
+    else:
+        parts = Parts(tuple(bags_in(path)) if path.is_dir() else (path,))
+    for one, other in combinations(parts.files, 2):
         if one.stat().st_size and filecmp.cmp(one, other, shallow=False):
             raise DataError(f"{path}: {one.name} and {other.name} are copies of one recording: remove or name one")
-    return Parts(files)
+    return parts
 
 
 def settings_of(path: Path) -> Mapping[str, object]:
@@ -102,31 +102,16 @@ def _named_parts(path: Path) -> Parts:
     try:
         metadata = _metadata(path)
         files = [path / PurePath(name).name for name in metadata["relative_file_paths"]]
-        version = int(metadata["version"])
-        mode = (metadata.get("compression_mode") or "none").lower()
-        form = metadata.get("compression_format") or "zstd"
-        topics = [item["topic_metadata"] for item in metadata.get("topics_with_message_count") or ()]
-        serializations = {str(topic["name"]): str(topic["serialization_format"]) for topic in topics}
-    except (KeyError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError, YAMLError) as error:
+        mode, form = metadata.get("compression_mode") or "none", metadata.get("compression_format") or "zstd"
+        if mode.lower() != "none" and form != "zstd":
+            raise ValueError(f"compression {form!r} is not supported")
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError, YAMLError) as error:
         raise DataError(
             f"{file}: is not the metadata of a recording ({type(error).__name__}: {one_line(error)})"
         ) from error
     if missing := [file for file in files if not file.is_file()]:
         raise DataError(f"{missing[0]}: is missing, {file} names it")
-    if len(set(files)) < len(files):
-        raise DataError(f"{file}: names a file twice")
-    if version > _NEWEST_VERSION or (mode != "none" and form != "zstd"):
-        what = f"version {version}" if version > _NEWEST_VERSION else f"compression {form!r}"
-        raise DataError(f"{file}: {what} of a recording is not supported")
-    for topic, serialization in serializations.items():
-        check_serialization(file, topic, serialization)
-    return Parts(tuple(files), mode == "file")
-
-
-def check_serialization(path: Path, topic: str, serialization: str) -> None:
-    """Raise `DataError` where the messages of a topic cannot be decoded."""
-    if serialization != "cdr":
-        raise DataError(f"{path}: topic {topic} is serialized as {serialization!r}, only 'cdr' can be read")
+    return Parts(tuple(files), mode.lower() == "file")
 
 
 def storage_of(path: Path) -> type[BagFile] | None:

@@ -31,14 +31,6 @@ from fgtrack.io.source import FileFormat
 DETECTION_FIELDS = frozenset({*MEASURABLE, *DESCRIBING, "object_id"})
 """Fields that a filter may use, whatever the type of the message."""
 
-#: Keys of a topic that say something of one role only.
-_KEYS = {
-    "frame": ("detections",),
-    "filters": ("detections", "truth"),
-    "scan_s": ("detections",),
-    "object_id": ("truth",),
-}
-
 _EGOS: dict[str, Callable[[RosMessage, int], Message]] = {EGO: NATIVE_ADAPTERS[EGO], ODOMETRY: ego_from_odometry}
 
 Convert = Callable[[RosMessage, int], Iterator[Message]]
@@ -91,7 +83,6 @@ def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
         )
     uses = []
     for role, item, converter in roles:
-        _check_keys(role.split()[0], item)
         topic = _find(bag, item)
         uses.append(TopicUse(topic, role, _stamped(converter(topic, item), item)))
     return tuple(uses)
@@ -132,31 +123,19 @@ def bag_messages(bag: Bag, uses: tuple[TopicUse, ...]) -> Iterator[Message]:
 
 def _find(bag: Bag, item: TopicInput) -> BagTopic:
     wanted = type_name(item.type) if item.type else None
-    here = [topic for topic in bag.topics if topic.name == item.topic]
-    found = [topic for topic in here if wanted in (None, topic.type)]
+    found = [topic for topic in bag.topics if topic.name == item.topic and wanted in (None, topic.type)]
     if len(found) == 1:
         return found[0]
-    if not here and bag.break_off:
+    if not found and bag.break_off:
         raise TruncatedInput(f"{bag.break_off}, before topic {item.topic}")
-    if len(found) > 1:
-        types = ", ".join(topic.type for topic in found)
-        raise DataError(f"{bag.path}: topic {item.topic} has several types ({types}), name one as its type")
-    if here:
-        raise DataError(f"{bag.path}: topic {item.topic} is a {here[0].type}, not a {wanted}")
-    alike = [topic for topic in bag.topics if topic.type == wanted] or bag.topics
-    raise DataError(f"{bag.path}: has no topic {item.topic}; it has {_listed(alike)}")
+    if found:
+        raise DataError(f"{bag.path}: topic {item.topic} has several types ({_listed(found)}), name one as its type")
+    kind = f" of type {wanted}" if wanted else ""
+    raise DataError(f"{bag.path}: has no topic {item.topic}{kind}; it has {_listed(bag.topics)}")
 
 
 def _listed(topics: tuple[BagTopic, ...] | list[BagTopic]) -> str:
     return ", ".join(f"{topic.name} ({topic.type})" for topic in topics) or "no topic"
-
-
-def _check_keys(role: str, item: TopicInput) -> None:
-    for name, roles in _KEYS.items():
-        if role not in roles and getattr(item, name) not in (None, {}, "map"):
-            raise CallError(
-                f"topic {item.topic}: {name} is of {' and '.join(roles)}, the {role} takes none: leave it out"
-            )
 
 
 def _check_fields(item: TopicInput, known: frozenset[str], needed: tuple[str, ...] = ()) -> None:
