@@ -178,31 +178,21 @@ class SmootherBank:
 
     # --- one track
 
-    def window_ns(self, track_id: int) -> tuple[int, int]:
-        """See `Estimator.window_ns`."""
-        newest_ns, _, _, oldest_ns = self._times()[:, self._tracks[track_id]].tolist()
-        return oldest_ns, newest_ns
-
     def state_at(self, track_id: int, stamp_ns: int) -> TrackState:
-        """See `Estimator.state_at`."""
+        """See `Estimator.state_at`: smoothed in the past, interpolated under the motion model, predicted ahead."""
         means, covariances = self.windows.states_at(np.array([self._tracks[track_id]]), np.array([stamp_ns]))
         return track_state(self._motion, stamp_ns, means[0], covariances[0])
 
     def take_final(self, track_id: int) -> list[TrackState]:
-        """Smoothed states of the nodes that have left the window since the last call, in order."""
+        """Return smoothed states of the nodes that have left the window since the last call, in order."""
         return self._final.pop(self._tracks[track_id], [])
 
     def take_rest(self, track_id: int) -> list[TrackState]:
-        """Like `take_final`, and of the nodes that are still inside."""
+        """Return `take_final`, and the states of the nodes that are still inside."""
         if not self._settings.final:
             return []
         stamps_ns = self.windows.nodes.window_stamps_ns(self._tracks[track_id]).tolist()
         return self.take_final(track_id) + [self.state_at(track_id, stamp_ns) for stamp_ns in stamps_ns]
-
-    def converge(self, track_id: int, max_iterations: int) -> None:
-        """Relinearise a track until nothing moves; for comparisons."""
-        self.windows.solver.converge(self._tracks[track_id], max_iterations)
-        self._changed()
 
     # --- inside
 
@@ -307,7 +297,8 @@ class FixedLagSmoother:
     @property
     def window_ns(self) -> tuple[int, int]:
         """See `Estimator.window_ns`."""
-        return self.bank.window_ns(0)
+        newest_ns, _, _, oldest_ns = self.bank._times()[:, 0].tolist()
+        return oldest_ns, newest_ns
 
     def advance(self, now_ns: int) -> None:
         """See `Estimator.advance`; the nodes that leave are marginalised at the next update."""
@@ -318,20 +309,21 @@ class FixedLagSmoother:
         return self.bank.update(measurement.stamp_ns, [0], [measurement])[0]
 
     def state_at(self, stamp_ns: int) -> TrackState:
-        """See `Estimator.state_at`: smoothed in the past, interpolated under the motion model, predicted ahead."""
+        """See `SmootherBank.state_at`."""
         return self.bank.state_at(0, stamp_ns)
 
     def take_final(self) -> list[TrackState]:
-        """Smoothed states of the nodes that have left the window since the last call, in order."""
+        """See `SmootherBank.take_final`."""
         return self.bank.take_final(0)
 
     def take_rest(self) -> list[TrackState]:
-        """Like `take_final`, and of the nodes that are still inside: for when the track ends."""
+        """See `SmootherBank.take_rest`: for when the track ends."""
         return self.bank.take_rest(0)
 
     def converge(self, max_iterations: int = 50) -> None:
         """Relinearise until nothing moves; for comparisons."""
-        self.bank.converge(0, max_iterations)
+        self.bank.windows.solver.converge(0, max_iterations)
+        self.bank._changed()
 
 
 # Any: an option may be any value that `SmootherSettings` takes.

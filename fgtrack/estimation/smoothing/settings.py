@@ -60,10 +60,9 @@ class SmootherSettings:
 
         Raises `CallError` for an option that does not exist.
         """
-        taken = [each.name for each in fields(cls) if each.name != "lag_s"]
-        unknown = sorted(set(options) - set(taken))
-        if unknown:
-            raise CallError(f"unknown option {unknown[0]!r}; its options are {', '.join(taken)}, initiation")
+        taken = [each.name for each in fields(cls)]
+        if unknown := set(options).difference(taken):
+            raise CallError(f"unknown option {min(unknown)!r}; its options are {', '.join(taken[1:])}, initiation")
         return cls(lag_s=lag_s, **{"lagged_s": (), **options})
 
     def thresholds(self, motion: MotionModel, nonlinear: bool) -> FloatArray:

@@ -13,7 +13,7 @@ from fgtrack.estimation.filters.initiation import Fix, Line, along, fixes_of
 from fgtrack.estimation.filters.propagation import track_state
 from fgtrack.estimation.kernels import kalman
 from fgtrack.estimation.smoothing import kernels, node_kernels
-from fgtrack.estimation.smoothing.damping import DampedWindow
+from fgtrack.estimation.smoothing.damping import damped
 from fgtrack.estimation.smoothing.ring import fuse_behind
 from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.estimation.smoothing.terms import Innovations, NearMeasurement, is_nonlinear, overshot
@@ -156,7 +156,7 @@ class Windows:
             track = int(tracks[row])
             means = nodes.origin[nodes.window(track)]
             with suppress(np.linalg.LinAlgError):  # then the linearisation points remain
-                means = DampedWindow(solver, track).solved()
+                means = damped(solver, track)
             solver.solve_at(track, means)
             self.failures.add(Failure.STEP_DAMPED)
 

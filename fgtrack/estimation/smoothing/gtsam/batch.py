@@ -1,7 +1,7 @@
 """The slow check: Levenberg-Marquardt on the whole window at every update, with factors that call the models."""
 
 from collections.abc import Callable, Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import gtsam
 import numpy as np
@@ -11,7 +11,10 @@ from scipy.linalg.lapack import dtrtri
 from fgtrack.core.linalg import identity, inverse_roots, noise_roots
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.smoothing.gtsam.graph_solver import GraphSolver
+from fgtrack.estimation.base import Start
+from fgtrack.estimation.filters.initiation import DEFAULT
+from fgtrack.estimation.smoothing.bank import FixedLagSmoother
+from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver, smoother
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.terms import (
     EquivalentMeasurement,
@@ -33,8 +36,8 @@ _LOSSES: Mapping[str, Callable[[float], _Loss]] = {
 }
 
 
-class BatchSolver(GraphSolver):
-    """Windows that are solved from their last estimates. What leaves them is replaced by the prior that it gives.
+class BatchSolver(IncrementalSolver):
+    """Windows that Levenberg-Marquardt solves from their last estimates; a prior replaces what leaves them.
 
     Process noise stays that of the linearisation point; all else is relinearised at every step.
     """
@@ -56,7 +59,7 @@ class BatchSolver(GraphSolver):
     def _update(self, tracks: IntArray, starts: IntArray) -> None:
         nodes = self.nodes
         for track in tracks.tolist():
-            graph, values = self._graph(track), gtsam.Values()
+            graph, values = self._factors(track), gtsam.Values()
             _, last = self._solved.get(track, (None, values))
             numbers = nodes.window(track).tolist()
             for number in numbers:
@@ -67,7 +70,7 @@ class BatchSolver(GraphSolver):
                 nodes.step[number] = values.atVector(number) - nodes.origin[number]
 
     def _covariance(self, track: int, *numbers: int) -> FloatArray:
-        """See `GraphSolver._covariance`; from one dense QR of the whole linearised window."""
+        """See `IncrementalSolver._covariance`; from one dense QR of the whole linearised window."""
         graph, values = self._solved[track]
         ordering, n = gtsam.Ordering(), self.motion.dim
         for number in (*sorted(set(values.keys()).difference(numbers)), *numbers):
@@ -80,7 +83,7 @@ class BatchSolver(GraphSolver):
     def _forget(self, track: int) -> None:
         self._solved.pop(track, None)
 
-    def _graph(self, track: int) -> gtsam.NonlinearFactorGraph:
+    def _factors(self, track: int) -> gtsam.NonlinearFactorGraph:
         """Return the factors of a window as functions of the states."""
         nodes, n = self.nodes, self.motion.dim
         graph, numbers = gtsam.NonlinearFactorGraph(), nodes.window(track).tolist()
@@ -134,3 +137,16 @@ def measurement_factor(key: int, term: MeasurementTerm, origin: FloatArray) -> g
 
 def _gaussian(root: FloatArray) -> gtsam.noiseModel.Base:
     return gtsam.noiseModel.Gaussian.SqrtInformation(root, smart=False)
+
+
+# Any: an option may be any value that `SmootherSettings` takes.
+def smoother_batch(
+    motion: MotionModel, start: Start, lag_s: float, initiation: str = DEFAULT, **options: Any
+) -> FixedLagSmoother:
+    """Fixed-lag smoother, a factor graph that Levenberg-Marquardt solves at every update: slow, for checks."""
+    settings = SmootherSettings.of_options(lag_s, options)
+    return FixedLagSmoother(motion, start, settings, BatchSolver, initiation)
+
+
+# It compares errors at absolute positions: eps W of 50 m instead of the standard deviation, 0.5 m.
+vars(smoother_batch).update(vars(smoother), rounding=100.0, tolerance=1e-6)
