@@ -258,7 +258,7 @@ def starting_config(recording: Path) -> str:
         "Guesses from names and values: check units, frames and noise, then",
         f"  fgtrack info {recording} -c THIS.yaml; fgtrack replay {recording} -c THIS.yaml -o RUN",
         *_contents(found),
-        *(f"Check: {line}" for line in [*map(str, found.cautions), *checks, *filter(None, [found.problem])]),
+        *(f"Check: {line}" for line in [*checks, *filter(None, [found.problem])]),
         *(f"Not taken: {line}" for line in [*left, *refused]),
         *(f"{part.label}: {note}" for part in taken for note in part.notes),
     ]

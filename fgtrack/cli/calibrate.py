@@ -1,7 +1,6 @@
 """`fgtrack info`, `advise` and `offsets`: contents of a recording, its problems, and the clocks of its sensors."""
 
 import shlex
-from collections.abc import Set
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -67,15 +66,13 @@ def info(
         "start_ns": found.start_ns,
         "duration_s": found.duration_s,
     }
-    values |= {"problem": found.problem, "cautions": list(map(str, found.cautions)), "topics": topics.plain()}
+    values |= {"problem": found.problem, "topics": topics.plain()}
     show(topics, form, {**values, "effective": comes_to.values()})
     if form is None:
         sentences([f"{config_file or 'without a configuration'}: {comes_to}"])
-    for one in found.cautions:
-        warn(str(one))
     trial = None
     if config is not None and found.problem is None and form is None:
-        trial = _try_out(recording, config, {(one.about, one.text.split()[0]) for one in found.cautions})
+        trial = _try_out(recording, config)
     elif form is None:
         with suppress(FgtrackError), progress("detections"):  # whose topics and columns nothing names
             sentences(assumed(Config(), open_input(recording)).lines())
@@ -84,7 +81,7 @@ def info(
         raise DataError(problem)
 
 
-def _try_out(recording: Path, config: Config, warned: Set[tuple[str, str]]) -> Trial:
+def _try_out(recording: Path, config: Config) -> Trial:
     with progress("first seconds"):
         source = open_input(recording, config.input)
         open_settings = assumed(config, source)
@@ -100,8 +97,7 @@ def _try_out(recording: Path, config: Config, warned: Set[tuple[str, str]]) -> T
             say(f"first {trial.duration_s:g} s of {line}")
         say(f"first {trial.duration_s:g} s: {len(set(trial.run.tables['tracks']['track_id'].tolist()))} tracks")
     for found in trial.suspicions:
-        if (found.about, found.text.split()[0]) not in warned:
-            warn(str(found))
+        warn(str(found))
     return trial
 
 
