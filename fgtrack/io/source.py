@@ -1,6 +1,5 @@
 """Opens an input, whatever it is: a recording, a stream or a data set, recognised by its content."""
 
-import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -12,8 +11,6 @@ from fgtrack.core.types import Message
 from fgtrack.io.adapters import ADAPTERS
 from fgtrack.io.config import InputConfig
 from fgtrack.io.validation import validated
-
-_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -75,7 +72,8 @@ def input_kind(path: Path) -> str:
     """Name of the format of `path`, by its content; raises as `open_input`. Plug-ins are asked first."""
     if not path.exists():
         raise CallError(f"{path}: there is no such file or folder")
-    formats = _formats()
+    # The last registered first: plug-ins, then the built-in ones, which recognise the loosest last.
+    formats = {name: file_format(name) for name in reversed(list(ADAPTERS)) if "/" not in name}
     try:
         if not path.is_file() and not path.is_dir():
             raise DataError(f"{path}: is neither a file nor a folder, write what comes out of it to a file first")
@@ -94,36 +92,15 @@ def input_kind(path: Path) -> str:
 
 
 def file_format(name: str) -> FileFormat:
-    """The format `name`. Raises `CallError` where there is none."""
-    found = ADAPTERS.load(name)
-    if not isinstance(found, FileFormat) and callable(found):
-        with ADAPTERS.blamed(name, "cannot be made"):
-            found = found()
+    """The format `name`. Raises `CallError` where a plug-in fails or is not one."""
+    with ADAPTERS.blamed(name, "cannot be made"):
+        found = ADAPTERS.load(name)
+        found = found if isinstance(found, FileFormat) else found()
     if not isinstance(found, FileFormat):
         raise CallError(f"adapter {name!r}: is a {type(found).__name__}, not a FileFormat")
-    if not (isinstance(found.description, str) and callable(found.recognises) and callable(found.open)):
-        raise CallError(f"adapter {name!r}: its description must be a text, `recognises` and `open` functions")
     return found
 
 
 def _recognises(name: str, form: FileFormat, path: Path) -> bool:
-    """True if `path` is of this format; False, with a warning, where a plug-in fails."""
-    try:
-        with ADAPTERS.blamed(name, f"cannot look at {path}"):
-            return bool(form.recognises(path))
-    except CallError as error:
-        if name not in ADAPTERS.plugins():
-            raise
-        _logger.warning("%s", error)
-        return False
-
-
-def _formats() -> dict[str, FileFormat]:
-    """All formats by name, the last registered first: the built-in ones recognise the loosest last."""
-    formats = {}
-    for name in reversed([name for name in ADAPTERS if "/" not in name]):
-        try:
-            formats[name] = file_format(name)
-        except CallError as error:
-            _logger.warning("%s", error)
-    return formats
+    with ADAPTERS.blamed(name, f"cannot look at {path}"):
+        return bool(form.recognises(path))

@@ -87,17 +87,6 @@ def test_tracked_objects_are_read_as_detected_ones_with_their_id(package):
     assert found == replace(expected, object_id=5)
 
 
-def test_a_continental_radar_gives_what_it_measures_and_no_invalid_point():
-    point = Message(id=3, longitude_dist=3.0, lateral_dist=4.0, longitude_vel=-10.0, lateral_vel=0.0, invalid_state=0)
-    invalid = Message(**vars(point) | {"invalid_state": 1})
-    found = read("conti_radar/msg/Measurement", Message(header=header(), points=[point, invalid]))
-    assert (found.frame, len(found.objects)) == ("sensor", 1)
-    (item,) = found.objects
-    assert (item.x_m, item.y_m, item.range_m, item.object_id) == (3.0, 4.0, 5.0, 3)
-    assert item.bearing_rad == pytest.approx(math.atan2(4.0, 3.0))
-    assert item.range_rate_mps == pytest.approx(-6.0)
-
-
 def test_a_delphi_esr_counts_degrees_clockwise():
     track = Message(header=header(), status=3, range=50.0, angle=90.0, range_rate=-2.0, id=7, width=0.0)
     (found,) = read("delphi_esr_msgs/msg/EsrTrack", track).objects
@@ -105,20 +94,6 @@ def test_a_delphi_esr_counts_degrees_clockwise():
     assert found == Detection(range_m=50.0, bearing_rad=bearing_rad, range_rate_mps=-2.0, object_id=7)
     track.status = 0
     assert read("delphi_esr_msgs/msg/EsrTrack", track).objects == ()
-
-
-@pytest.mark.parametrize("camel", [False, True])
-def test_a_delphi_mrr_counts_radians_clockwise(camel):
-    names = ("detection_id", "valid_level", "host_veh_clutter", "range_rate")
-    if camel:
-        names = ("detectionId", "validLevel", "hostVehClutter", "rangeRate")
-    values = dict(zip(names, (9, True, False, 1.5), strict=True))
-    message = Message(header=header(), azimuth=0.5, range=20.0, **values)
-    found = read("delphi_mrr_msgs/msg/Detection", message)
-    expected = Detection(range_m=20.0, bearing_rad=-0.5, range_rate_mps=1.5, object_id=9)
-    assert (found.frame, found.objects) == ("sensor", (expected,))
-    setattr(message, names[2], True)
-    assert read("delphi_mrr_msgs/msg/MrrDetection", message).objects == ()
 
 
 @pytest.mark.parametrize("availability", [0, 1])
@@ -169,22 +144,6 @@ def test_a_box_without_size_leaves_the_pose_to_the_hypothesis():
     assert (item.x_m, item.y_m) == (5.0, 6.0)
     (item,) = read("vision_msgs/msg/Detection3DArray", vision(size=0.0, results=False)).objects
     assert (item.x_m, item.covariance) == (1.0, None)
-
-
-@pytest.mark.parametrize(("velocity", "speed_mps"), [((0.0, 4.0), 4.0), ((0.0, -4.0), -4.0)])
-def test_a_derived_object_moves_backwards_when_its_velocity_opposes_its_heading(velocity, speed_mps):
-    twist = Message(linear=xyz(*velocity))
-    item = Message(header=header(7), id=9, pose=pose(1.0, 2.0, math.pi / 2), twist=twist)
-    message = Message(header=header(), objects=[item])
-    (found,) = read("derived_object_msgs/msg/ObjectArray", message).objects
-    assert found == Detection(
-        x_m=1.0,
-        y_m=2.0,
-        yaw_rad=pytest.approx(math.pi / 2),
-        speed_mps=speed_mps,
-        stamp_ns=7,
-        object_id=9,
-    )
 
 
 def test_a_radar_track_has_a_speed_without_sign_and_no_yaw():

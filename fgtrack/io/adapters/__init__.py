@@ -8,7 +8,6 @@ A package adds an adapter by an entry point of the group `fgtrack.adapters`. Its
 from fgtrack.core.plugins import Registry
 
 _OBJECTS = "fgtrack.io.adapters.objects"
-_RADARS = "fgtrack.io.adapters.radars"
 ADAPTERS = Registry(
     "adapter",
     {
@@ -24,11 +23,7 @@ ADAPTERS = Registry(
             "autoware_perception_msgs/msg/DetectedObjects": f"{_OBJECTS}:autoware_objects",
             "autoware_auto_perception_msgs/msg/TrackedObjects": f"{_OBJECTS}:autoware_objects",
             "autoware_perception_msgs/msg/TrackedObjects": f"{_OBJECTS}:autoware_objects",
-            "conti_radar/msg/Measurement": f"{_RADARS}:conti_radar",
-            "delphi_esr_msgs/msg/EsrTrack": f"{_RADARS}:delphi_esr",
-            "delphi_mrr_msgs/msg/Detection": f"{_RADARS}:delphi_mrr",
-            "delphi_mrr_msgs/msg/MrrDetection": f"{_RADARS}:delphi_mrr",
-            "derived_object_msgs/msg/ObjectArray": f"{_OBJECTS}:object_array",
+            "delphi_esr_msgs/msg/EsrTrack": f"{_OBJECTS}:delphi_esr",
             "geometry_msgs/msg/PoseArray": f"{_OBJECTS}:pose_array",
             "nav_msgs/msg/Odometry": f"{_OBJECTS}:odometry",
             "radar_msgs/msg/RadarTracks": f"{_OBJECTS}:radar_tracks",

@@ -4,10 +4,12 @@ Which of it a tracker uses is the sensor model's choice. A speed is negative whe
 No object is left out: what is not a number stays so and is counted by the tracker.
 """
 
+import math
 from typing import Any
 
 import numpy as np
 
+from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.types import Detection
 from fgtrack.io.adapters.common import (
     ObjectList,
@@ -25,6 +27,7 @@ from fgtrack.io.adapters.common import (
 
 _ORIENTATION_AVAILABLE = 2  # in autoware's DetectedObjectKinematics
 _AUTOWARE_CLASSES = ("unknown", "car", "truck", "bus", "trailer", "motorcycle", "bicycle", "pedestrian")
+_ESR_NO_TARGET = 0  # status
 _ID_MASK = (1 << 63) - 1
 
 
@@ -105,21 +108,20 @@ def _autoware_object(item: RosMessage) -> Detection:
     )
 
 
-def object_array(message: RosMessage) -> ObjectList:
-    """`derived_object_msgs/ObjectArray`: position, yaw, speed; the twist is in the frame of the header."""
-    return object_list(message.header, map(_derived_object, message.objects))
-
-
-def _derived_object(item: RosMessage) -> Detection:
-    yaw = yaw_rad(item.pose.orientation)
-    return Detection(
-        x_m=item.pose.position.x,
-        y_m=item.pose.position.y,
-        yaw_rad=yaw,
-        speed_mps=signed_speed_mps(item.twist.linear.x, item.twist.linear.y, yaw),
-        stamp_ns=object_stamp_ns(item.header),
-        object_id=int(item.id),
-    )
+def delphi_esr(message: RosMessage) -> ObjectList:
+    """`delphi_esr_msgs/EsrTrack`, one track of a Delphi (Aptiv) ESR, whose angles are in degrees, clockwise."""
+    tracks = []
+    if message.status != _ESR_NO_TARGET:
+        bearing_rad = -math.radians(message.angle)
+        track = Detection(
+            range_m=float(message.range),
+            bearing_rad=wrap_angle(bearing_rad) if math.isfinite(bearing_rad) else math.nan,
+            range_rate_mps=float(message.range_rate),
+            object_id=int(message.id),
+            width_m=float(message.width) if message.width > 0.0 else None,
+        )
+        tracks.append(track)
+    return object_list(message.header, tracks, "sensor")
 
 
 def radar_tracks(message: RosMessage) -> ObjectList:

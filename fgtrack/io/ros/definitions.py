@@ -53,21 +53,6 @@ _AUTOWARE = {
     "TrackedObjects": "std_msgs/Header header\nTrackedObject[] objects\n",
 }
 
-_DELPHI_MRR_DETECTION = """\
-std_msgs/Header header
-uint8 detection_id
-uint8 confid_azimuth
-bool super_res_target
-bool nd_target
-bool host_veh_clutter
-bool valid_level
-float32 azimuth
-float32 range
-float32 range_rate
-int8 amplitude
-uint8 index_2lsb
-"""
-
 _COMPONENTS = "\n".join(f"float64 {name}" for name in MEASURABLE)
 FGTRACK_DEFINITIONS = {
     "fgtrack_msgs/msg/Ego": """\
@@ -151,27 +136,6 @@ float32[6] acceleration_covariance
 float32[6] size_covariance
 """,
     "radar_msgs/msg/RadarTracks": "std_msgs/Header header\nRadarTrack[] tracks\n",
-    "conti_radar/msg/ContiRadar": """\
-std_msgs/Header header
-uint16 id
-float32 longitude_dist
-float32 lateral_dist
-float32 longitude_vel
-float32 lateral_vel
-float32 longitude_vel_comp
-float32 lateral_vel_comp
-uint16 dynProp
-float32 rcs
-uint32 is_quality_valid
-uint32 ambig_state
-uint32 x_rms
-uint32 y_rms
-uint32 vx_rms
-uint32 vy_rms
-uint32 invalid_state
-uint32 ProbExists
-""",
-    "conti_radar/msg/Measurement": "std_msgs/Header header\nContiRadar[] points\n",
     "delphi_esr_msgs/msg/EsrTrack": """\
 std_msgs/Header header
 string canmsg
@@ -189,21 +153,4 @@ float32 range_accel
 uint8 med_range_mode
 float32 range_rate
 """,
-    "delphi_mrr_msgs/msg/Detection": _DELPHI_MRR_DETECTION,
-    "delphi_mrr_msgs/msg/MrrDetection": _DELPHI_MRR_DETECTION,
-    "derived_object_msgs/msg/Object": """\
-std_msgs/Header header
-uint32 id
-uint8 detection_level
-bool object_classified
-geometry_msgs/Pose pose
-geometry_msgs/Twist twist
-geometry_msgs/Accel accel
-geometry_msgs/Polygon polygon
-shape_msgs/SolidPrimitive shape
-uint8 classification
-uint8 classification_certainty
-uint32 classification_age
-""",
-    "derived_object_msgs/msg/ObjectArray": "std_msgs/Header header\nObject[] objects\n",
 }
