@@ -1,40 +1,16 @@
-"""Detections that come one per message, put together to the scans that they are of."""
+"""Scans of detections that come one per message."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain
 
-from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Detection, DetectionList, Message
+from fgtrack.io.errors import UntilBreak
 
 __all__ = ["grouped"]
 
 _LONGEST_NS = NS_PER_S  # after the last detection of a scan, in receipts: it is complete then
-
-
-@dataclass(eq=False)
-class _Scan:
-    """Lists of one scan, whose place in the order of receipt is that of the last one."""
-
-    lists: list[DetectionList]
-    is_open: bool = True
-
-    def joined(self) -> DetectionList:
-        """The scan: the mean stamp of its lists, the last receipt, and of every detection its own stamp."""
-        stamps_ns = [one.stamp_ns for one in self.lists]
-        same = min(stamps_ns) == max(stamps_ns)
-        objects: list[Detection] = []
-        for one in self.lists:
-            objects += one.objects if same else [_stamped(item, one.stamp_ns) for item in one.objects]
-        last = self.lists[-1]
-        mean_ns = stamps_ns[0] + sum(stamp - stamps_ns[0] for stamp in stamps_ns) // len(stamps_ns)
-        left_out = tuple(chain.from_iterable(one.left_out for one in self.lists))
-        return DetectionList(last.sensor, mean_ns, last.receipt_ns, objects, last.frame, left_out)
-
-
-def _stamped(item: Detection, stamp_ns: int) -> Detection:
-    return item if item.stamp_ns is not None else replace(item, stamp_ns=stamp_ns)
 
 
 def grouped(messages: Iterable[Message], windows_ns: Mapping[str, int]) -> Iterator[Message]:
@@ -43,35 +19,43 @@ def grouped(messages: Iterable[Message], windows_ns: Mapping[str, int]) -> Itera
     Lists whose stamps are at most the window from the first one's are one scan; it is received with its last list.
     Whatever ends `messages` in a `DataError`, the scans that are open then come before it.
     """
-    scans: dict[str, _Scan] = {}
-    waiting: list[Message | _Scan] = []
-    error: DataError | None = None
+    waiting: dict[int, list[Message]] = {}  # a message, or the lists of a scan, by the index of the last
+    newest: dict[str, int] = {}  # index of the scan of every sensor to which lists are added
+    readable = UntilBreak(messages)
+    for index, message in enumerate(readable):
+        group: list[Message] = []
+        if isinstance(message, DetectionList) and (window_ns := windows_ns.get(message.sensor)) is not None:
+            scan = waiting.get(newest.get(message.sensor, -1), [])
+            if scan and _is_recent(scan, message) and abs(message.stamp_ns - scan[0].stamp_ns) <= window_ns:
+                group = waiting.pop(newest[message.sensor])
+            newest[message.sensor] = index
+        waiting[index] = [*group, message]
+        for first in list(waiting):
+            if first in newest.values() and _is_recent(waiting[first], message):
+                break
+            yield _joined(waiting.pop(first))
+    yield from map(_joined, waiting.values())
+    readable.raise_error()
 
-    def ready() -> Iterator[Message]:
-        while waiting and not (isinstance(waiting[0], _Scan) and waiting[0].is_open):
-            first = waiting.pop(0)
-            yield first.joined() if isinstance(first, _Scan) else first
 
-    try:
-        for message in messages:
-            for scan in scans.values():
-                scan.is_open &= message.receipt_ns - scan.lists[-1].receipt_ns <= _LONGEST_NS
-            if isinstance(message, DetectionList) and (window_ns := windows_ns.get(message.sensor)) is not None:
-                scan = scans.get(message.sensor, _Scan([], is_open=False))
-                if scan.is_open and abs(message.stamp_ns - scan.lists[0].stamp_ns) <= window_ns:
-                    waiting.remove(scan)
-                else:
-                    scan.is_open = False
-                    scan = scans[message.sensor] = _Scan([])
-                scan.lists.append(message)
-                waiting.append(scan)
-            else:
-                waiting.append(message)
-            yield from ready()
-    except DataError as found:
-        error = found
-    for scan in scans.values():
-        scan.is_open = False
-    yield from ready()
-    if error is not None:
-        raise error
+def _is_recent(scan: list[Message], message: Message) -> bool:
+    return message.receipt_ns - scan[-1].receipt_ns <= _LONGEST_NS
+
+
+def _joined(group: list[Message]) -> Message:
+    """The scan: the mean stamp of its lists, the last receipt, and of every detection its own stamp."""
+    lists = [each for each in group if isinstance(each, DetectionList)]
+    if len(lists) <= 1:
+        return group[0]
+    first_ns = lists[0].stamp_ns
+    mean_ns = first_ns + sum(each.stamp_ns - first_ns for each in lists) // len(lists)
+    objects: list[Detection] = []
+    is_own = any(each.stamp_ns != first_ns for each in lists)
+    for each in lists:
+        objects += [_stamped(item, each.stamp_ns) for item in each.objects] if is_own else each.objects
+    left_out = tuple(chain.from_iterable(each.left_out for each in lists))
+    return replace(lists[-1], stamp_ns=mean_ns, objects=objects, left_out=left_out)
+
+
+def _stamped(item: Detection, stamp_ns: int) -> Detection:
+    return item if item.stamp_ns is not None else replace(item, stamp_ns=stamp_ns)

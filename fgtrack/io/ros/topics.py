@@ -1,6 +1,6 @@
 """Converts the topics of a recording to fgtrack's messages, as configured."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -31,9 +31,7 @@ from fgtrack.io.source import FileFormat
 DETECTION_FIELDS = frozenset({*MEASURABLE, *DESCRIBING, "object_id"})
 """Fields that a filter may use, whatever the type of the message."""
 
-_EGOS: dict[str, Callable[[RosMessage, int], Message]] = {EGO: NATIVE_ADAPTERS[EGO], ODOMETRY: ego_from_odometry}
-
-Convert = Callable[[RosMessage, int], Iterator[Message]]
+Convert = Callable[[RosMessage, int], Iterable[Message]]
 
 
 @dataclass(frozen=True)
@@ -67,11 +65,7 @@ def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
         *((f"detections {name}", item, partial(_detections, sensor=name)) for name, item in config.detections.items()),
         *(("truth", item, partial(_truths, number=number, topics=len(truth))) for number, item in enumerate(truth)),
     ]
-    native = tuple(
-        TopicUse(topic, "messages", _single(NATIVE_ADAPTERS[topic.type]))
-        for topic in bag.topics
-        if topic.type in NATIVE_ADAPTERS
-    )
+    native = tuple(TopicUse(topic, "messages", _native(topic)) for topic in bag.topics if topic.type in NATIVE_ADAPTERS)
     if native and names.isdisjoint(item.topic for _, item, _ in roles):
         return native
     if not roles:
@@ -84,7 +78,8 @@ def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
     uses = []
     for role, item, converter in roles:
         topic = _find(bag, item)
-        uses.append(TopicUse(topic, role, _stamped(converter(topic, item), item)))
+        convert = converter(topic, item)
+        uses.append(TopicUse(topic, role, convert if item.stamp_from == "message" else _at_receipt(convert)))
     return tuple(uses)
 
 
@@ -147,116 +142,95 @@ def _check_fields(item: TopicInput, known: frozenset[str], needed: tuple[str, ..
             raise CallError(f"topic {item.topic}: fields must name {name}")
 
 
-def _single(adapter: Callable[[RosMessage, int], Message]) -> Convert:
-    return lambda message, receipt_ns: iter((adapter(message, receipt_ns),))
+def _native(topic: BagTopic) -> Convert:
+    adapter = NATIVE_ADAPTERS[topic.type]
+    return lambda message, receipt_ns: (adapter(message, receipt_ns),)
 
 
 def _ego(topic: BagTopic, item: TopicInput) -> Convert:
     fields = item.fields
     if fields is not None:
         _check_fields(item, EGO_FIELDS, ("x_m", "y_m", "yaw_rad", "speed_mps"))
-        return _single(lambda message, receipt_ns: ego_by_fields(message, fields, receipt_ns))
-    if topic.type not in _EGOS:
+        return lambda message, receipt_ns: (ego_by_fields(message, fields, receipt_ns),)
+    if topic.type == EGO:
+        return _native(topic)
+    if topic.type != ODOMETRY:
         raise CallError(f"topic {topic.name}: an ego of type {topic.type} needs fields, known is {ODOMETRY}")
-    return _single(_EGOS[topic.type])
+    return lambda message, receipt_ns: (ego_from_odometry(message, receipt_ns),)
 
 
-def _objects(
-    topic: BagTopic, item: TopicInput, messages: Callable[[ObjectList | DetectionList, int, int], Iterator[Message]]
-) -> Convert:
-    """Makes `messages` of an object list, its stamp (without one the receipt) and its receipt."""
-    for name in item.filters if item.fields is None else ():
-        if name not in DETECTION_FIELDS:
-            known = ", ".join(sorted(DETECTION_FIELDS))
-            raise CallError(f"topic {item.topic}: without fields, filters go by {known}, not by {name!r}")
+def _detections(topic: BagTopic, item: TopicInput, sensor: str) -> Convert:
     read = _object_list(topic, item)
 
-    def convert(message: RosMessage, receipt_ns: int) -> Iterator[Message]:
-        objects = read(message)
-        return messages(objects, receipt_ns if objects.stamp_ns is None else objects.stamp_ns, receipt_ns)
+    def convert(message: RosMessage, receipt_ns: int) -> Iterable[Message]:
+        found = read(message)
+        stamp_ns = receipt_ns if found.stamp_ns is None else found.stamp_ns
+        frame = item.frame or found.frame or "ego"
+        objects, left_out = split(found.objects)
+        if item.filters:
+            own = objects if item.fields is None else items_by_fields(message, item.fields)
+            objects, left_out = split(_judged(item, *pair) for pair in zip(objects, own, strict=True))
+        return (DetectionList(sensor, stamp_ns, receipt_ns, objects, frame, left_out),)
 
     return convert
 
 
 def _object_list(topic: BagTopic, item: TopicInput) -> Callable[[RosMessage], ObjectList | DetectionList]:
-    read: Callable[[RosMessage], ObjectList | DetectionList]
     if item.fields is not None:
         _check_fields(item, OBJECT_FIELDS)
-        read = partial(objects_by_fields, fields=item.fields)
-    elif topic.type == DETECTIONS:
-        read = partial(detections, receipt_ns=0)  # a list of fgtrack's own has what an object list has
-    elif topic.type not in ADAPTERS:
+        return partial(objects_by_fields, fields=item.fields)
+    if unknown := item.filters.keys() - DETECTION_FIELDS:
+        known = ", ".join(sorted(DETECTION_FIELDS))
+        raise CallError(f"topic {item.topic}: without fields, filters go by {known}, not by {min(unknown)!r}")
+    if topic.type == DETECTIONS:
+        return partial(detections, receipt_ns=0)  # a list of fgtrack's own has what an object list has
+    if topic.type not in ADAPTERS:
         known = ", ".join(message_types())
         raise CallError(f"topic {topic.name}: objects of type {topic.type} need fields, known are {known}")
-    else:
-        read = ADAPTERS.load(topic.type)
-    return partial(_passing, read, item) if item.filters else read
-
-
-def _passing(
-    read: Callable[[RosMessage], ObjectList | DetectionList], item: TopicInput, message: RosMessage
-) -> ObjectList | DetectionList:
-    """The objects of `message` that all filters let pass."""
-    found = read(message)
-    own = found.objects if item.fields is None else items_by_fields(message, item.fields)
-    kept, left_out = split(_judged(item, *pair) for pair in zip(found.objects, own, strict=True))
-    return replace(found, objects=kept, left_out=left_out)
+    read: Callable[[RosMessage], ObjectList] = ADAPTERS.load(topic.type)
+    return read
 
 
 def _judged(item: TopicInput, detection: Detection, source: RosMessage) -> Detection | str:
-    """`detection`, or the first filter that it does not pass: by what it says, or by a field that it is read from."""
+    """`detection`, or the first filter that it does not pass: by its own values, or by a field that it is read from."""
     for name, each in item.filters.items():
         if not each.passes(getattr(detection, name) if name in DETECTION_FIELDS else value_at(source, name)):
             return f"filters.{name}"
     return detection
 
 
-def _detections(topic: BagTopic, item: TopicInput, sensor: str) -> Convert:
-    def messages(objects: ObjectList | DetectionList, stamp_ns: int, receipt_ns: int) -> Iterator[Message]:
-        frame = item.frame or objects.frame or "ego"
-        yield DetectionList(sensor, stamp_ns, receipt_ns, objects.objects, frame, objects.left_out)
-
-    return _objects(topic, item, messages)
-
-
 def _truths(topic: BagTopic, item: TopicInput, number: int, topics: int) -> Convert:
     """Return the adapter of truth; each of several topics has one object, its index is the id if there is no other."""
     if topic.type == TRUTH and item.fields is None and item.object_id is None and not item.filters:
-        return _single(NATIVE_ADAPTERS[TRUTH])
-    if topics == 1 and item.object_id is None:
-        return _objects(topic, item, _truth)
-    own = object_id(number if item.object_id is None else item.object_id)
+        return _native(topic)
+    read = _detections(topic, item, "truth")
+    own = None
+    if topics > 1 or item.object_id is not None:
+        own = object_id(number if item.object_id is None else item.object_id)
 
-    def messages(objects: ObjectList | DetectionList, stamp_ns: int, receipt_ns: int) -> Iterator[Message]:
-        if len(objects.objects) > 1:
-            raise FieldError("truth of one object expected, give no object_id and name one topic of truth alone")
-        named = tuple(replace(state, object_id=own) for state in objects.objects)
-        return _truth(replace(objects, objects=named), stamp_ns, receipt_ns)
+    def convert(message: RosMessage, receipt_ns: int) -> Iterable[Message]:
+        for each in read(message, receipt_ns):
+            states = each.objects if isinstance(each, DetectionList) else ()
+            if own is not None and len(states) > 1:
+                raise FieldError("truth of one object expected, give no object_id and name one topic of truth alone")
+            for index, state in enumerate(states):
+                if state.x_m is None or state.y_m is None:
+                    raise FieldError("truth needs x_m and y_m")
+                yield TruthState(
+                    each.stamp_ns if state.stamp_ns is None else state.stamp_ns,
+                    receipt_ns,
+                    next(number for number in (own, state.object_id, index) if number is not None),
+                    *(state.x_m, state.y_m, state.yaw_rad, state.speed_mps),
+                )
 
-    return _objects(topic, item, messages)
-
-
-def _stamped(convert: Convert, item: TopicInput) -> Convert:
-    if item.stamp_from == "message":
-        return convert
-    return lambda message, receipt_ns: map(_at_receipt, convert(message, receipt_ns))
-
-
-def _at_receipt(message: Message) -> Message:
-    if isinstance(message, DetectionList):
-        objects = [replace(item, stamp_ns=None) for item in message.objects]
-        return replace(message, stamp_ns=message.receipt_ns, objects=objects)
-    return replace(message, stamp_ns=message.receipt_ns)
+    return convert
 
 
-def _truth(objects: ObjectList | DetectionList, stamp_ns: int, receipt_ns: int) -> Iterator[Message]:
-    """One state per object; an object without an id is known by its place in the list."""
-    for index, state in enumerate(objects.objects):
-        if state.x_m is None or state.y_m is None:
-            raise FieldError("truth needs x_m and y_m")
-        yield TruthState(
-            stamp_ns if state.stamp_ns is None else state.stamp_ns,
-            receipt_ns,
-            index if state.object_id is None else state.object_id,
-            *(state.x_m, state.y_m, state.yaw_rad, state.speed_mps),
-        )
+def _at_receipt(convert: Convert) -> Convert:
+    def stamped(message: RosMessage, receipt_ns: int) -> Iterable[Message]:
+        for each in convert(message, receipt_ns):
+            if isinstance(each, DetectionList):
+                each = replace(each, objects=[replace(item, stamp_ns=None) for item in each.objects])
+            yield replace(each, stamp_ns=receipt_ns)
+
+    return stamped
