@@ -8,6 +8,7 @@ from types import ModuleType
 import numpy as np
 from scipy.linalg.lapack import dgesv, dpotrf, dtrtri
 
+from fgtrack.core.checks import LARGEST
 from fgtrack.core.types import FloatArray
 
 
@@ -38,6 +39,27 @@ def symmetrise(matrix: FloatArray) -> FloatArray:
     both: FloatArray = matrix + matrix.T if matrix.ndim == 2 else matrix + matrix.mT
     both *= 0.5
     return both
+
+
+#: Of the standard deviations' product: what rounding a covariance to single precision may leave.
+ASYMMETRY = 1e-6
+
+
+def is_covariance(P: FloatArray, least: float) -> bool:
+    """True if `P`, shape (n, n), is finite, symmetric, and the eigenvalues of its correlations exceed `least`.
+
+    A variance of 0 stands for itself.
+    """
+    variances = np.diag(P)
+    if not (np.abs(P) <= LARGEST**2).all() or (variances < 0.0).any():
+        return False
+    scale = np.sqrt(np.where(variances > 0.0, variances, 1.0))
+    correlation = P / np.outer(scale, scale)
+    try:
+        np.linalg.cholesky(correlation - least * identity(len(P)))
+    except np.linalg.LinAlgError:
+        return False
+    return bool(np.abs(correlation - correlation.T).max() <= ASYMMETRY)
 
 
 def product(A: FloatArray, B: FloatArray) -> FloatArray:

@@ -28,16 +28,15 @@ from fgtrack.models.published_map import PublishedMap
 from fgtrack.models.road import Road
 from fgtrack.models.track_map import TrackMap
 from fgtrack.pipeline.config import NOISE_HZ, Config, Defect, MapConfig
-from fgtrack.tracking.ego import EgoSource, EgoStd, EgoTrajectory
-from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules
+from fgtrack.tracking.ego import EgoStd, EgoTrajectory
+from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules, Lifecycle
 from fgtrack.tracking.guarded_bank import GuardedBank
-from fgtrack.tracking.inbox import QueueInbox
-from fgtrack.tracking.lifecycle import CountingLifecycle, Lifecycle
+from fgtrack.tracking.inbox import Inbox
+from fgtrack.tracking.lifecycle import CountingLifecycle
 from fgtrack.tracking.preprocess import Preprocess
 from fgtrack.tracking.published import (
     PublishedEgo,
     PublishedLifecycle,
-    PublishedPreprocess,
     PublishedTracker,
     SlotInbox,
 )
@@ -69,9 +68,9 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
     parts = TrackerParts(
         sensors=config.sensors,
         ego=_build_ego(config),
-        inbox=(SlotInbox if "one_slot" in config.defects else QueueInbox)(config.sensors),
-        preprocess=(PublishedPreprocess if published_order else Preprocess)(
-            road, config.merge, motion, config.ego.detection_origin_m
+        inbox=(SlotInbox if "one_slot" in config.defects else Inbox)(config.sensors),
+        preprocess=Preprocess(
+            road, config.merge, motion, config.ego.detection_origin_m, assumes_map_yaw=not published_order
         ),
         association=config.association,
         bank=GuardedBank(lambda: build_bank(config, failures), failures),
@@ -185,7 +184,7 @@ def build_propagator(config: Config, step_s: float) -> ExactPropagator:
     return _EULER["saturated_yaw" in config.defects, noise.is_driven](motion, density)
 
 
-def _build_ego(config: Config) -> EgoSource:
+def _build_ego(config: Config) -> EgoTrajectory:
     ego = config.ego
     std = EgoStd(ego.position_std_m, ego.yaw_std_rad, ego.speed_std_mps, ego.yaw_rate_std_radps)
     known = None if ego.uncertainty == "none" else std

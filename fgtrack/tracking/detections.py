@@ -1,7 +1,6 @@
 """The detections of one batch in the map frame, as arrays: errors of the pose in them, and merging."""
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -231,12 +230,12 @@ def placement(components: tuple[str, ...], offsets_m: FloatArray, assumed: tuple
     return D
 
 
-class Merge(ABC):
+class Merge:
     """Finds detections of one list that are the same object, and averages them."""
 
-    @abstractmethod
     def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
-        """Members of all groups of `points_m` (n, 2), by the point that leads it; one alone is a group of its own."""
+        """Members of all groups of `points_m` (n, 2), by the point that leads it; here each is a group of its own."""
+        return dict(enumerate(zip(range(len(points_m)))))
 
     def mean(self, name: str, values: FloatArray) -> float:
         """Average of component `name`; of angles on the circle."""
@@ -248,10 +247,6 @@ class NoMerge(Merge):
     """Every detection stands for itself."""
 
     kind: Literal["none"] = "none"
-
-    def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
-        """See `Merge.groups`."""
-        return dict(enumerate(zip(range(len(points_m)))))
 
 
 @dataclass(frozen=True)
@@ -269,7 +264,7 @@ class ConnectedMerge(Merge):
         if num > 1:
             links = cKDTree(points_m).query_pairs(self.distance_m, output_type="ndarray")
         if not len(links):
-            return dict(enumerate(zip(range(num))))
+            return super().groups(points_m)
         graph = coo_array((np.ones(len(links), dtype=np.int8), links.T), shape=(num, num))
         labels = connected_components(graph, directed=False)[1]
         members: dict[int, list[int]] = {}

@@ -2,7 +2,6 @@
 
 import bisect
 import math
-from abc import ABC, abstractmethod
 from dataclasses import fields
 from functools import lru_cache
 from operator import attrgetter
@@ -12,16 +11,17 @@ import numpy as np
 
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.geometry import wrap_angle
-from fgtrack.core.linalg import congruence, symmetrise
-from fgtrack.core.time import nanoseconds, seconds
+from fgtrack.core.linalg import ASYMMETRY, congruence, is_covariance, symmetrise
+from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
 from fgtrack.core.types import EgoState, FloatArray
-from fgtrack.tracking.inbox import ASYMMETRY
 
 #: A detection whose stamp is further than this from any ego state cannot be placed, in a gap neither.
 MAX_EXTRAPOLATION_S = 1.0
 LARGEST_STEP_BACK_S = 1.0
 """A state that is older than the newest one by more than this has a wrong stamp."""
 _LARGEST_STEP_BACK_NS = nanoseconds(LARGEST_STEP_BACK_S)
+_MAX_EXTRAPOLATION_NS = nanoseconds(MAX_EXTRAPOLATION_S)
+_MAX_FUTURE_NS = NS_PER_S  # a state stamped further ahead of its receipt has a wrong stamp
 
 CONTRADICTS = "contradicts its neighbours"
 _LONGEST_S, _SLACK_M, _SHARE, _SIGMAS = 1.0, 2.0, 0.5, 3.0  # see `EgoTrajectory`
@@ -79,7 +79,7 @@ def extrapolated(ego: EgoState, stamp_ns: int, covariance: FloatArray | None = N
 
 
 class EgoStd(NamedTuple):
-    """Standard deviations of an ego state that are taken where it does not say; 0 for exactly known."""
+    """Standard deviations of an ego state that are taken where it gives none; 0 for exactly known."""
 
     position_m: float = 0.0
     yaw_rad: float = 0.0
@@ -99,16 +99,7 @@ def _completed(given: tuple[float, ...] | None, std: EgoStd) -> FloatArray | Non
 @lru_cache(maxsize=1024)
 def is_ego_covariance(given: tuple[float, ...]) -> bool:
     """True if these are the 25 entries of a symmetric positive semidefinite matrix."""
-    if len(given) != 25 or not all(abs(entry) <= LARGEST**2 for entry in given):
-        return False
-    P = np.array(given).reshape(5, 5)
-    variances = np.diag(P)
-    if (variances < 0.0).any():
-        return False
-    scale = np.sqrt(np.where(variances > 0.0, variances, 1.0))
-    correlation = P / np.outer(scale, scale)
-    symmetric = np.abs(correlation - correlation.T).max() <= ASYMMETRY
-    return bool(symmetric and np.linalg.eigvalsh(symmetrise(correlation))[0] >= -ASYMMETRY)
+    return len(given) == 25 and is_covariance(np.array(given).reshape(5, 5), -ASYMMETRY)
 
 
 def _consistent(before: EgoState, after: EgoState) -> bool:
@@ -129,30 +120,39 @@ def _consistent(before: EgoState, after: EgoState) -> bool:
     return off_m <= _SLACK_M + _SHARE * abs(travelled_m) + _SIGMAS * math.sqrt(variance_m2)
 
 
-class EgoSource(ABC):
-    """Holds the ego's past; the weights of its low-pass are those of new values.
+class EgoTrajectory:
+    """Low-passed ego states, each filtered once, and interpolated between their stamps.
 
-    With `std`, poses have a covariance. It is what the states say of themselves, and `std` where they say nothing. The
-    low-pass leaves it as it is: how much a low-pass takes off depends on how fast the error changes, which no state
-    says.
+    The weights of the low-pass are those of new values. It pulls towards the previous state *extrapolated to the new
+    stamp*, so a steady turn is not delayed. With `std`, poses have the covariance of their states, and `std` where
+    these give none; the low-pass leaves it as it is.
+
+    A state that contradicts the one before it is held back until the next one decides which of the two is wrong. Two
+    states at most 1 s apart contradict each other where the way between them differs from that at their speeds by more
+    than the sum of half of it, 2 m, and three standard deviations of their positions. A single state that contradicts
+    both neighbours is left out; where the states go on from it, the ego has jumped, and is followed. States that never
+    fit, of an ego with an unknown speed, are all taken.
     """
 
+    _straight = False
+
     def __init__(
-        self, yaw_weight: float, yaw_rate_weight: float, std: EgoStd | None = None, max_future_s: float = 1.0
+        self, yaw_weight: float, yaw_rate_weight: float, std: EgoStd | None = None, memory_s: float = 5.0
     ) -> None:
-        """`max_future_s`: a state stamped further than this ahead of its receipt has a wrong stamp."""
-        self._std = std
-        self._max_future_ns = nanoseconds(max_future_s)
+        self._yaw_weight, self._yaw_rate_weight, self._std = yaw_weight, yaw_rate_weight, std
+        self._memory_ns = nanoseconds(memory_s)
         self._newest_ns: int | None = None
-        self._straight = False
+        self._last: EgoState | None = None
+        self._held: EgoState | None = None
+        self._fits = False  # the last two states are consistent
+        self._states: list[EgoState] = []
+        self._stamps: list[int] = []
         self.current: EgoState | None = None
-        """Newest known state."""
+        """Newest state."""
         self.jumps = 0
         """Number of times that the states went on from another position."""
         self.in_pit = False
         """True if the ego was last reported in the pit lane."""
-        self._yaw_weight = yaw_weight
-        self._yaw_rate_weight = yaw_rate_weight
 
     def receive(self, ego: EgoState) -> str | None:
         """Take a message; the reason, where it is refused, or one that was held back."""
@@ -162,7 +162,7 @@ class EgoSource(ABC):
             return "not finite"
         if self._std is not None and ego.covariance is not None and not is_ego_covariance(ego.covariance):
             return "not a covariance"
-        if ego.stamp_ns - ego.receipt_ns > self._max_future_ns:
+        if ego.stamp_ns - ego.receipt_ns > _MAX_FUTURE_NS:
             return "stamp ahead of its receipt"
         newest_ns = ego.stamp_ns if self._newest_ns is None else self._newest_ns
         if newest_ns - ego.stamp_ns > _LARGEST_STEP_BACK_NS:
@@ -170,65 +170,28 @@ class EgoSource(ABC):
         self._newest_ns = max(newest_ns, ego.stamp_ns)
         return self._store(ego)
 
-    @abstractmethod
+    def start_tick(self) -> None:
+        """A tick begins; nothing depends on ticks here."""
+
+    def pose_at(self, stamp_ns: int, present_ns: int) -> EgoPose | None:
+        """Pose at `stamp_ns`, or None where it is unknown; `present_ns` is the tracking time.
+
+        Beyond its ends, and into a gap, the trajectory is extrapolated for a limited time. A gap is longer than all
+        that two extrapolations, one from either side, could cover.
+        """
+        if not self._stamps:
+            return None
+        row = bisect.bisect_left(self._stamps, stamp_ns)
+        around = self._states[max(row - 1, 0) : row + 1]
+        if len(around) == 2 and around[1].stamp_ns - around[0].stamp_ns <= 2 * _MAX_EXTRAPOLATION_NS:
+            return self._interpolated(around[0], around[1], stamp_ns)
+        nearest = min(around, key=lambda ego: abs(stamp_ns - ego.stamp_ns))
+        if abs(stamp_ns - nearest.stamp_ns) > _MAX_EXTRAPOLATION_NS:
+            return None
+        return self._extrapolated(nearest, stamp_ns)
+
     def _store(self, ego: EgoState) -> str | None:
         """Take a state; the reason, where it is refused, or one that was held back."""
-
-    @abstractmethod
-    def start_tick(self) -> None:
-        """A tick begins."""
-
-    @abstractmethod
-    def pose_at(self, stamp_ns: int, present_ns: int) -> EgoPose | None:
-        """Pose at `stamp_ns`, or None where it is not known; `present_ns` is the tracking time."""
-
-    def _extrapolated(self, ego: EgoState, stamp_ns: int) -> EgoPose:
-        return extrapolated(ego, stamp_ns, self._covariance(ego), self._straight)
-
-    def _covariance(self, ego: EgoState) -> FloatArray | None:
-        return None if self._std is None else _completed(ego.covariance, self._std)
-
-    def _low_passed(self, ego: EgoState, yaw_rad: float, yaw_rate_radps: float) -> EgoState:
-        """`ego` with its yaw and yaw rate drawn towards the given ones."""
-        values = list(_VALUES(ego))  # in a third of the time of `dataclasses.replace`, at every message
-        values[_YAW] = wrap_angle(yaw_rad + self._yaw_weight * wrap_angle(ego.yaw_rad - yaw_rad))
-        own, last = self._yaw_rate_weight, 1.0 - self._yaw_rate_weight
-        values[_YAW_RATE] = last * yaw_rate_radps + own * ego.yaw_rate_radps
-        return EgoState(*values)
-
-
-class EgoTrajectory(EgoSource):
-    """Low-passed ego states, each filtered once, and interpolated between their stamps.
-
-    The low-pass pulls towards the previous state *extrapolated to the new stamp*, so a steady turn is not delayed.
-
-    A state that contradicts the one before it is held back until the next one tells which of the two is wrong. Two
-    states at most 1 s apart contradict each other where the way between them differs from that at their speeds by more
-    than the sum of half of it, 2 m, and three standard deviations of their positions. A single state that contradicts
-    both neighbours is left out; where the states go on from it, the ego has jumped, and is followed. States that never
-    fit, of an ego that does not know its speed, are all taken.
-    """
-
-    def __init__(
-        self,
-        yaw_weight: float,
-        yaw_rate_weight: float,
-        memory_s: float = 5.0,
-        max_extrapolation_s: float = MAX_EXTRAPOLATION_S,
-        std: EgoStd | None = None,
-        max_future_s: float = 1.0,
-    ) -> None:
-        super().__init__(yaw_weight, yaw_rate_weight, std, max_future_s)
-        self._last: EgoState | None = None
-        self._held: EgoState | None = None
-        self._fits = False  # the last two states are consistent
-        self._memory_ns = nanoseconds(memory_s)
-        self._max_extrapolation_ns = nanoseconds(max_extrapolation_s)
-        self._states: list[EgoState] = []
-        self._stamps: list[int] = []
-
-    def _store(self, ego: EgoState) -> str | None:
-        """See `EgoSource._store`."""
         last, held, self._held = self._last, self._held, None
         if last is None or _consistent(last, ego):
             self._fits, self._last = last is not None, ego
@@ -261,24 +224,19 @@ class EgoTrajectory(EgoSource):
             del self._stamps[: keep - 1], self._states[: keep - 1]
         return None
 
-    def start_tick(self) -> None:
-        """See `EgoSource.start_tick`; nothing depends on ticks here."""
+    def _extrapolated(self, ego: EgoState, stamp_ns: int) -> EgoPose:
+        return extrapolated(ego, stamp_ns, self._covariance(ego), self._straight)
 
-    def pose_at(self, stamp_ns: int, present_ns: int) -> EgoPose | None:
-        """See `EgoSource.pose_at`; beyond its ends, and into a gap, the trajectory is extrapolated for a limited time.
+    def _covariance(self, ego: EgoState) -> FloatArray | None:
+        return None if self._std is None else _completed(ego.covariance, self._std)
 
-        A gap is longer than all that two extrapolations, one from either side, could cover.
-        """
-        if not self._stamps:
-            return None
-        row = bisect.bisect_left(self._stamps, stamp_ns)
-        around = self._states[max(row - 1, 0) : row + 1]
-        if len(around) == 2 and around[1].stamp_ns - around[0].stamp_ns <= 2 * self._max_extrapolation_ns:
-            return self._interpolated(around[0], around[1], stamp_ns)
-        nearest = min(around, key=lambda ego: abs(stamp_ns - ego.stamp_ns))
-        if abs(stamp_ns - nearest.stamp_ns) > self._max_extrapolation_ns:
-            return None
-        return self._extrapolated(nearest, stamp_ns)
+    def _low_passed(self, ego: EgoState, yaw_rad: float, yaw_rate_radps: float) -> EgoState:
+        """`ego` with its yaw and yaw rate drawn towards the given ones."""
+        values = list(_VALUES(ego))  # in a third of the time of `dataclasses.replace`, at every message
+        values[_YAW] = wrap_angle(yaw_rad + self._yaw_weight * wrap_angle(ego.yaw_rad - yaw_rad))
+        own, last = self._yaw_rate_weight, 1.0 - self._yaw_rate_weight
+        values[_YAW_RATE] = last * yaw_rate_radps + own * ego.yaw_rate_radps
+        return EgoState(*values)
 
     def _interpolated(self, before: EgoState, after: EgoState, stamp_ns: int) -> EgoPose:
         """Pose between two states, the short way round, with the mean of their covariances (None counts as zero).

@@ -27,7 +27,7 @@ from fgtrack.core.settings import OpenProbability, settings
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray, TrackStatus
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.lifecycle import MatchedDetection, Scan
+from fgtrack.tracking.lifecycle import CountingLifecycle, MatchedDetection, Scan
 
 #: Bounds of log-odds: a probability that differs from 0 or 1 by less says nothing more.
 _LARGEST_LOG_ODDS = 30.0
@@ -140,7 +140,7 @@ class ExistenceLifecycle:
         """Existence by track id."""
 
     def born(self, track_id: int, scan: Scan, matched: MatchedDetection) -> None:
-        """See `Lifecycle.born`."""
+        """See `CountingLifecycle.born`."""
         odds = self._rules.birth_probability / (1.0 - self._rules.birth_probability)
         log_odds = _bounded(math.log(odds) + self._score(scan, matched))
         self.lives[track_id] = life = Existence(
@@ -150,7 +150,7 @@ class ExistenceLifecycle:
         self._confirm(life)
 
     def matched(self, track_id: int, scan: Scan, matched: MatchedDetection) -> None:
-        """See `Lifecycle.matched`."""
+        """See `CountingLifecycle.matched`."""
         life = self.lives[track_id]
         life.misses = 0
         if not life.travelled and matched.mean is not None and life.first_m is not None:
@@ -166,10 +166,10 @@ class ExistenceLifecycle:
         self._confirm(life)
 
     def fused(self, track_id: int) -> None:
-        """See `Lifecycle.fused`; the match has counted already."""
+        """See `CountingLifecycle.fused`; the match has counted already."""
 
     def missed(self, scan: Scan, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
-        """See `Lifecycle.missed`."""
+        """See `CountingLifecycle.missed`."""
         sensor = self._sensors[scan.sensor]
         self._newest_ns = max(self._newest_ns, scan.stamp_ns)
         weight = math.log1p(-sensor.detection_probability)
@@ -184,18 +184,18 @@ class ExistenceLifecycle:
         return [track_id for track_id in track_ids if self._ends(self.lives[track_id])]
 
     def expired(self, present_ns: int) -> list[int]:
-        """See `Lifecycle.expired`."""
+        """See `CountingLifecycle.expired`."""
         self._present_ns = present_ns
         for life in self.lives.values():
             life.forget(present_ns - self._memory_ns)
         return [track_id for track_id, life in self.lives.items() if self._ends(life)]
 
     def forget(self, track_id: int) -> None:
-        """See `Lifecycle.forget`."""
+        """See `CountingLifecycle.forget`."""
         del self.lives[track_id]
 
     def status(self, track_id: int) -> TrackStatus:
-        """See `Lifecycle.status`."""
+        """See `CountingLifecycle.status`."""
         life = self.lives[track_id]
         if not life.confirmed or life.probability(self._present_ns) < self._rules.doubt_probability:
             return TrackStatus.TENTATIVE
@@ -218,6 +218,9 @@ class ExistenceLifecycle:
         indices = (matched.candidate.leader, *matched.candidate.merged)
         scores = [score for index in indices if (score := scan.objects[index].score) is not None]
         return model.log_ratio(max(scores)) if scores else 0.0
+
+
+Lifecycle = CountingLifecycle | ExistenceLifecycle
 
 
 def _position_density(matched: MatchedDetection) -> float | None:

@@ -5,19 +5,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import compress
 from operator import attrgetter
-from typing import Protocol
 
 import numpy as np
 
 from fgtrack.core.checks import LARGEST
-from fgtrack.core.time import nanoseconds
+from fgtrack.core.linalg import is_covariance
+from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import Detection, DetectionList, Disposition, FloatArray, Frame, UpdateRecord
 from fgtrack.models.sensors import SensorModel
 
 #: In any unit: no sensor is better than this.
 SMALLEST_STD = 1e-6
-#: Of the standard deviations' product: what rounding a covariance to single precision may leave.
-ASYMMETRY = 1e-6
+_MAX_FUTURE_NS = NS_PER_S  # a detection stamped further ahead of its receipt has a wrong stamp
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,23 +58,13 @@ def records(message: DetectionList, disposition: Disposition) -> list[UpdateReco
     return [record(message, index, disposition) for index in range(len(message.objects))]
 
 
-class Inbox(Protocol):
-    """Receives messages, and gives them out at the tick."""
-
-    def put(self, message: DetectionList) -> list[UpdateRecord]:
-        """Receive a message; the records of detections that end here."""
-
-    def collect(self) -> list[Batch]:
-        """Everything received since the last call, oldest stamp first."""
-
-
 def is_usable(detection: Detection, sensor: SensorModel) -> bool:
     """True if `detection` has valid values and a position or bearing, and is not an empty slot (x = y = 0)."""
     for name in sensor.std:
         value = getattr(detection, name)
         if value is not None and not abs(value) <= LARGEST:
             return False
-    if detection.covariance is not None and not is_covariance(detection, sensor):
+    if detection.covariance is not None and not is_valid_covariance(detection, sensor):
         return False
     if detection.x_m == 0.0 and detection.y_m == 0.0:
         return False
@@ -95,7 +84,7 @@ def own_covariance(detection: Detection, names: Sequence[str]) -> FloatArray:
     return np.array(detection.covariance).reshape(len(measured), len(measured))[np.ix_(rows, rows)]
 
 
-def is_covariance(detection: Detection, sensor: SensorModel) -> bool:
+def is_valid_covariance(detection: Detection, sensor: SensorModel) -> bool:
     """True if the covariance of `detection` is not used, or is symmetric positive definite."""
     if detection.covariance is None or not sensor.message_covariance:
         return True
@@ -103,17 +92,7 @@ def is_covariance(detection: Detection, sensor: SensorModel) -> bool:
     if len(detection.covariance) != len(measured) ** 2:
         return False
     own = own_covariance(detection, [name for name in measured if name in sensor.std])
-    variances = np.diag(own)
-    if not np.all((np.abs(own) <= LARGEST**2) & (variances[:, None] >= SMALLEST_STD**2)):
-        return False
-    deviations = np.sqrt(variances)
-    if not np.all(np.abs(own - own.T) <= ASYMMETRY * np.outer(deviations, deviations)):
-        return False
-    try:
-        np.linalg.cholesky(own)
-    except np.linalg.LinAlgError:
-        return False
-    return True
+    return bool((np.diag(own) >= SMALLEST_STD**2).all()) and is_covariance(own, 0.0)
 
 
 def stamps(message: DetectionList, sensor: SensorModel) -> list[int]:
@@ -133,13 +112,12 @@ def stamps(message: DetectionList, sensor: SensorModel) -> list[int]:
 _values = attrgetter(*(each.name for each in fields(Detection)))
 
 
-class QueueInbox:
+class Inbox:
     """Keeps every message. Refuses repeated, too late and future ones, and single detections that are no detections."""
 
-    def __init__(self, sensors: Mapping[str, SensorModel], max_future_s: float = 1.0, memory_s: float = 10.0) -> None:
+    def __init__(self, sensors: Mapping[str, SensorModel], memory_s: float = 10.0) -> None:
         """`memory_s`: how long a list is remembered; at least as long as a sensor's list may take."""
         self._sensors = sensors
-        self._max_future_ns = nanoseconds(max_future_s)
         limits_s = {name: sensor.max_delay_s for name, sensor in sensors.items() if sensor.max_delay_s is not None}
         self._max_delay_ns = {name: nanoseconds(limit_s) for name, limit_s in limits_s.items()}
         self._memory_ns = max([nanoseconds(memory_s), *self._max_delay_ns.values()])
@@ -147,7 +125,10 @@ class QueueInbox:
         self._pending: list[Batch] = []
 
     def put(self, message: DetectionList) -> list[UpdateRecord]:
-        """See `Inbox.put`; a message is repeated if an earlier one of the sensor had its stamp and contents."""
+        """Receive a message; the records of detections that end here.
+
+        A message is repeated if an earlier one of the sensor had its stamp and contents.
+        """
         sensor = self._sensors[message.sensor]
         usable = []
         for detection in message.objects:
@@ -159,7 +140,7 @@ class QueueInbox:
         max_delay_ns = self._max_delay_ns.get(message.sensor)
         for index, stamp_ns in enumerate(stamps(message, sensor)):
             delay_ns = message.receipt_ns - stamp_ns
-            if not usable[index] or -delay_ns > self._max_future_ns:
+            if not usable[index] or -delay_ns > _MAX_FUTURE_NS:
                 ended.append(record(message, index, Disposition.INVALID))
             elif max_delay_ns is not None and delay_ns > max_delay_ns:
                 ended.append(record(message, index, Disposition.TOO_OLD))
@@ -193,7 +174,7 @@ class QueueInbox:
         return False
 
     def collect(self) -> list[Batch]:
-        """See `Inbox.collect`."""
+        """Everything received since the last call, oldest stamp first."""
         batches = sorted(self._pending, key=attrgetter("stamp_ns"))
         self._pending = []
         return batches

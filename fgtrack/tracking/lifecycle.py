@@ -1,8 +1,8 @@
-"""Life of a track: the protocol, and the status counter of Karle et al. 2023, section III-D."""
+"""Life of a track: the status counter of Karle et al. 2023, section III-D."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
@@ -32,35 +32,6 @@ class MatchedDetection(NamedTuple):
     candidate: Candidate
     mean: FloatArray | None = None
     covariance: FloatArray | None = None
-
-
-class Lifecycle(Protocol):
-    """Status of tracks, and which of them end.
-
-    Only sensors that give positions count: a bearing fits whatever is behind or before its object as well, so it
-    neither starts nor confirms nor keeps a track.
-    """
-
-    def born(self, track_id: int, scan: Scan, matched: MatchedDetection) -> None:
-        """A detection started a track."""
-
-    def matched(self, track_id: int, scan: Scan, matched: MatchedDetection) -> None:
-        """A detection was associated."""
-
-    def fused(self, track_id: int) -> None:
-        """The associated detection, which gives a position, changed the state."""
-
-    def missed(self, scan: Scan, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
-        """Return the ids that end of tracks, at `positions_m` (n, 2) and so far from the ego, that a list misses."""
-
-    def expired(self, present_ns: int) -> list[int]:
-        """The ids of tracks that end because time has passed."""
-
-    def forget(self, track_id: int) -> None:
-        """The track has ended."""
-
-    def status(self, track_id: int) -> TrackStatus:
-        """Status of the track."""
 
 
 @dataclass(slots=True)
@@ -95,9 +66,11 @@ class LifecycleRules:
 
 
 class CountingLifecycle:
-    """Counts matches and misses, and says which tracks end.
+    """Counts matches and misses: status of tracks, and which of them end.
 
-    A track is aged by every sensor at the range it is responsible for, and by time alone as well.
+    A track is aged by every sensor at the range it is responsible for, and by time alone as well. Only sensors that
+    give positions count: a bearing fits whatever is behind or before its object as well, so it neither starts nor
+    confirms nor keeps a track.
     """
 
     def __init__(self, rules: LifecycleRules, sensors: Mapping[str, SensorModel]) -> None:
@@ -108,22 +81,22 @@ class CountingLifecycle:
         """Counters by track id."""
 
     def born(self, track_id: int, scan: Scan, matched: MatchedDetection | None = None) -> None:
-        """See `Lifecycle.born`."""
+        """A detection started a track."""
         self.lives[track_id] = Life(self._sensors[scan.sensor].counter_init, scan.stamp_ns)
 
     def matched(self, track_id: int, scan: Scan, matched: MatchedDetection | None = None) -> None:
-        """See `Lifecycle.matched`."""
+        """A detection was associated."""
         life = self.lives[track_id]
         life.counter = min(life.counter + self._sensors[scan.sensor].counter_add, self._rules.counter_cap)
         life.last_seen_ns = max(life.last_seen_ns, scan.stamp_ns)
         life.misses = 0
 
     def fused(self, track_id: int) -> None:
-        """See `Lifecycle.fused`."""
+        """The associated detection, which gives a position, changed the state."""
         self.lives[track_id].num_placed += 1
 
     def missed(self, scan: Scan, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
-        """See `Lifecycle.missed`."""
+        """Return the ids that end of tracks, at `positions_m` (n, 2) and so far from the ego, that a list misses."""
         ended = []
         for track_id, range_m in zip(track_ids, ranges_m.tolist(), strict=True):
             life = self.lives[track_id]
@@ -144,15 +117,15 @@ class CountingLifecycle:
         return life.counter <= 0
 
     def expired(self, present_ns: int) -> list[int]:
-        """See `Lifecycle.expired`."""
+        """The ids of tracks that end because time has passed."""
         return [i for i, life in self.lives.items() if present_ns - life.last_seen_ns > self._forget_ns]
 
     def forget(self, track_id: int) -> None:
-        """See `Lifecycle.forget`."""
+        """The track has ended."""
         del self.lives[track_id]
 
     def status(self, track_id: int) -> TrackStatus:
-        """See `Lifecycle.status`."""
+        """Status of the track."""
         life = self.lives[track_id]
         if life.num_placed < self._rules.confirm_count:
             return TrackStatus.TENTATIVE

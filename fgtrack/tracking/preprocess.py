@@ -80,15 +80,24 @@ class Candidate(NamedTuple):
 class Preprocess:
     """Transformation to the map, false-positive filter and merge (Karle et al. 2023, sections III-B and III-C)."""
 
-    _assumes_map_yaw = True
-    """A yaw that the map gave is prior knowledge, not measured."""
+    def __init__(
+        self,
+        road: Road,
+        merge: Merge,
+        motion: MotionModel,
+        detection_origin_m: tuple[float, float],
+        assumes_map_yaw: bool = True,
+    ) -> None:
+        """`detection_origin_m`: origin of the ego frame of detections, seen from the ego reference point.
 
-    def __init__(self, road: Road, merge: Merge, motion: MotionModel, detection_origin_m: tuple[float, float]) -> None:
-        """`detection_origin_m`: origin of the ego frame of detections, seen from the ego reference point."""
+        `assumes_map_yaw`: a yaw that the map gave is prior knowledge; as published it counts as measured, in the
+        innovations and their NIS.
+        """
         self._road = road
         self._merge = merge
         self._motion = motion
         self._origin_m = detection_origin_m
+        self._assumes_map_yaw = assumes_map_yaw
 
     def __call__(
         self, batch: Batch, sensor: SensorModel, ego: EgoPose | None

@@ -15,17 +15,19 @@ from fgtrack.estimation.filters.published import published_yaw
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Assignment, assigned_densely, euclidean_distances
 from fgtrack.tracking.detections import Merge
-from fgtrack.tracking.ego import EgoPose, EgoSource, EgoStd
-from fgtrack.tracking.inbox import Batch, is_covariance, record, records
+from fgtrack.tracking.ego import EgoPose, EgoStd, EgoTrajectory
+from fgtrack.tracking.inbox import Batch, Inbox, is_valid_covariance, record, records
 from fgtrack.tracking.lifecycle import CountingLifecycle, Life, MatchedDetection, Scan
 from fgtrack.tracking.objects import Apart
-from fgtrack.tracking.preprocess import Candidate, Preprocess
+from fgtrack.tracking.preprocess import Candidate
 from fgtrack.tracking.tracker import Tracker, TrackerParts
 
 
-class PublishedEgo(EgoSource):
+class PublishedEgo(EgoTrajectory):
     """Ego storage at the ticks, nearest entry instead of interpolation, and a low-pass that filters its own output
     again on every tick without a new message (defect Q13)."""
+
+    _straight = True
 
     def __init__(
         self,
@@ -34,16 +36,14 @@ class PublishedEgo(EgoSource):
         step_ns: int,
         storage_ticks: int,
         std: EgoStd | None = None,
-        max_future_s: float = 1.0,
     ) -> None:
-        super().__init__(yaw_weight, yaw_rate_weight, std, max_future_s)
-        self._straight = True
+        super().__init__(yaw_weight, yaw_rate_weight, std)
         self._half_step_ns = step_ns / 2
         self._length = storage_ticks
         self._stored: list[EgoState] = []  # newest last
 
     def _store(self, ego: EgoState) -> str | None:
-        """See `EgoSource._store`."""
+        """See `EgoTrajectory._store`."""
         if self.current is not None and ego.stamp_ns == self.current.stamp_ns:
             return "repeated stamp"
         self.current = ego
@@ -69,7 +69,7 @@ class PublishedEgo(EgoSource):
             self._stored[-1] = turned
 
     def pose_at(self, stamp_ns: int, present_ns: int) -> EgoPose | None:
-        """See `EgoSource.pose_at`; from the nearest entry, however far away it is."""
+        """See `EgoTrajectory.pose_at`; from the nearest entry, however far away it is."""
         if self.current is None:
             return None
         if present_ns - stamp_ns <= self._half_step_ns:
@@ -78,12 +78,12 @@ class PublishedEgo(EgoSource):
         return self._extrapolated(nearest, stamp_ns)
 
 
-class SlotInbox:
+class SlotInbox(Inbox):
     """One slot per sensor: a second message within a tick overwrites the first, a repeated stamp empties the slot
     (defect Q12). The mean of object stamps is taken in floating point."""
 
     def __init__(self, sensors: Mapping[str, SensorModel]) -> None:
-        self._sensors = sensors
+        super().__init__(sensors)
         self._slots: dict[str, Batch] = {}
         self._last_stamp_ns: dict[str, int] = {}
 
@@ -101,7 +101,7 @@ class SlotInbox:
             values = [getattr(detection, name) for name in sensor.components]
             if (detection.x_m or 0.0) == 0.0 and (detection.y_m or 0.0) == 0.0:
                 ended.append(record(message, index, Disposition.INVALID))
-            elif all(value is not None and abs(value) <= LARGEST for value in values) and is_covariance(
+            elif all(value is not None and abs(value) <= LARGEST for value in values) and is_valid_covariance(
                 detection, sensor
             ):
                 kept.append(index)
@@ -164,12 +164,6 @@ class NeighbourhoodMerge(Merge):
         return float(values.sum() / len(values))
 
 
-class PublishedPreprocess(Preprocess):
-    """A heading that the map gave counts as measured, in the innovations and their NIS."""
-
-    _assumes_map_yaw = False
-
-
 @dataclass(frozen=True)
 class UngatedEuclidean:
     """Hungarian assignment over all pairs; too distant pairs are torn up afterwards, and both partners are then
@@ -197,11 +191,11 @@ class PublishedLifecycle(CountingLifecycle):
     """
 
     def born(self, track_id: int, scan: Scan, matched: MatchedDetection | None = None) -> None:
-        """See `Lifecycle.born`."""
+        """See `CountingLifecycle.born`."""
         super().born(track_id, scan._replace(stamp_ns=scan.present_ns))
 
     def matched(self, track_id: int, scan: Scan, matched: MatchedDetection | None = None) -> None:
-        """See `Lifecycle.matched`."""
+        """See `CountingLifecycle.matched`."""
         life = self.lives[track_id]
         if life.counter < self._rules.counter_cap:
             life.counter += self._sensors[scan.sensor].counter_add
@@ -215,7 +209,7 @@ class PublishedLifecycle(CountingLifecycle):
         return life.counter <= 0 or present_ns - life.last_seen_ns > self._forget_ns
 
     def expired(self, present_ns: int) -> list[int]:
-        """See `Lifecycle.expired`; never, without a list."""
+        """See `CountingLifecycle.expired`; never, without a list."""
         return []
 
 

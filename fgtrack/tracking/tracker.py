@@ -31,10 +31,11 @@ from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Assignment, Association
 from fgtrack.tracking.birth import Birth, in_any_direction
-from fgtrack.tracking.ego import EgoPose, EgoSource
+from fgtrack.tracking.ego import EgoPose, EgoTrajectory
+from fgtrack.tracking.existence import Lifecycle
 from fgtrack.tracking.guarded_bank import faults
 from fgtrack.tracking.inbox import Batch, Inbox, record
-from fgtrack.tracking.lifecycle import Lifecycle, MatchedDetection, Scan
+from fgtrack.tracking.lifecycle import MatchedDetection, Scan
 from fgtrack.tracking.objects import Objects
 from fgtrack.tracking.preprocess import Candidate, Preprocess
 
@@ -46,7 +47,7 @@ class TrackerParts:
     """The components that a tracker is made of."""
 
     sensors: Mapping[str, SensorModel]
-    ego: EgoSource
+    ego: EgoTrajectory
     inbox: Inbox
     preprocess: Preprocess
     association: Association

@@ -175,7 +175,7 @@ class _Onboard:
     """Sensors of an observer that drives on a circle: prepared by the tracker's own code, and by the oracle's."""
 
     def __init__(self, stamps_s: FloatArray) -> None:
-        self._ego = EgoTrajectory(yaw_weight=1.0, yaw_rate_weight=1.0, memory_s=60.0, max_extrapolation_s=1.0)
+        self._ego = EgoTrajectory(yaw_weight=1.0, yaw_rate_weight=1.0, memory_s=60.0)
         self._prepare = Preprocess(Road(), NoMerge(), CTRV(), _FRAME_M)
         for stamp_s in sorted({0.0, *stamps_s.tolist()}):
             stamp_ns = _START_NS + nanoseconds(stamp_s)

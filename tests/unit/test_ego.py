@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from support.tracking import START_NS, ms
 
 from fgtrack.core.types import EgoState
-from fgtrack.tracking.ego import EgoPose, EgoSource, EgoStd, EgoTrajectory, extrapolated
+from fgtrack.tracking.ego import EgoPose, EgoStd, EgoTrajectory, extrapolated
 from fgtrack.tracking.published import PublishedEgo
 
 
@@ -17,10 +17,10 @@ def ego(stamp_ms: float, x_m: float = 0.0, yaw_rad: float = 0.0, speed_mps: floa
 
 
 def trajectory(yaw_weight: float = 1.0, yaw_rate_weight: float = 1.0, memory_s: float = 5.0) -> EgoTrajectory:
-    return EgoTrajectory(yaw_weight, yaw_rate_weight, memory_s, max_extrapolation_s=1.0)
+    return EgoTrajectory(yaw_weight, yaw_rate_weight, memory_s=memory_s)
 
 
-def pose(source: EgoSource, stamp_ms: float):
+def pose(source: EgoTrajectory, stamp_ms: float):
     return source.pose_at(START_NS + ms(stamp_ms), START_NS)
 
 
@@ -28,7 +28,7 @@ def pose(source: EgoSource, stamp_ms: float):
 
 
 @pytest.mark.parametrize("source", [trajectory(), PublishedEgo(0.9, 0.4, ms(10), 350)])
-def test_a_stray_stamp_is_refused_and_the_next_ones_are_taken(source: EgoSource) -> None:
+def test_a_stray_stamp_is_refused_and_the_next_ones_are_taken(source: EgoTrajectory) -> None:
     assert source.receive(ego(0.0)) is None
     assert source.receive(replace(ego(60_000.0), receipt_ns=START_NS + ms(10))) == "stamp ahead of its receipt"
     assert source.receive(ego(20.0)) is None
@@ -155,7 +155,7 @@ def test_the_memory_keeps_what_it_promises_and_not_much_more() -> None:
 
 
 @pytest.mark.parametrize("source", [trajectory(), PublishedEgo(0.9, 0.4, ms(10), 350)])
-def test_the_pit_lane_is_remembered_until_the_source_says_otherwise(source: EgoSource) -> None:
+def test_the_pit_lane_is_remembered_until_the_source_says_otherwise(source: EgoTrajectory) -> None:
     said = []
     for k, in_pit in enumerate([None, True, None, False, None]):
         source.receive(ego(10.0 * k, in_pit=in_pit))
@@ -231,7 +231,7 @@ def flat(matrix: np.ndarray) -> tuple[float, ...]:
 
 
 def uncertain(**std: float) -> EgoTrajectory:
-    return EgoTrajectory(1.0, 1.0, 5.0, max_extrapolation_s=1.0, std=EgoStd(**std))
+    return EgoTrajectory(1.0, 1.0, EgoStd(**std))
 
 
 def test_the_pose_is_as_uncertain_as_its_states_and_in_between_as_their_mean() -> None:
@@ -243,7 +243,7 @@ def test_the_pose_is_as_uncertain_as_its_states_and_in_between_as_their_mean() -
 
 
 @pytest.mark.parametrize("source", [uncertain(), PublishedEgo(1.0, 1.0, ms(10), 350, EgoStd())])
-def test_ahead_of_the_states_it_grows_by_the_numeric_derivative(source: EgoSource) -> None:
+def test_ahead_of_the_states_it_grows_by_the_numeric_derivative(source: EgoTrajectory) -> None:
     entries = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
     state = EgoState(START_NS, START_NS, 3.0, -2.0, 0.7, 20.0, 0.3, covariance=flat(COVARIANCE))
     straight = isinstance(source, PublishedEgo)
@@ -304,7 +304,7 @@ def test_a_covariance_that_is_none_is_refused_where_it_is_asked_for(given: tuple
 
 def test_a_trajectory_goes_on_along_the_circle_and_the_published_ego_along_its_heading() -> None:
     state = EgoState(START_NS, START_NS, 3.0, -2.0, 0.7, 60.0, 0.4)
-    there = pose_of(EgoTrajectory(1.0, 1.0, 60.0, 2.0), state, 1000.0)
+    there = pose_of(EgoTrajectory(1.0, 1.0), state, 1000.0)
     radius_m = 60.0 / 0.4
     assert there.x_m == pytest.approx(3.0 + radius_m * (math.sin(1.1) - math.sin(0.7)))
     assert there.y_m == pytest.approx(-2.0 - radius_m * (math.cos(1.1) - math.cos(0.7)))
@@ -313,7 +313,7 @@ def test_a_trajectory_goes_on_along_the_circle_and_the_published_ego_along_its_h
     assert (published.x_m, published.y_m) == pytest.approx((3.0 + 60.0 * math.cos(0.7), -2.0 + 60.0 * math.sin(0.7)))
 
 
-def pose_of(source: EgoSource, state: EgoState, after_ms: float) -> EgoPose:
+def pose_of(source: EgoTrajectory, state: EgoState, after_ms: float) -> EgoPose:
     source.receive(state)
     source.start_tick()
     found = source.pose_at(state.stamp_ns + ms(after_ms), state.stamp_ns)

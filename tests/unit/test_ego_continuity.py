@@ -76,7 +76,7 @@ def test_states_that_may_be_right_are_all_taken(states: list[EgoState]) -> None:
 
 
 def test_a_trajectory_tells_what_it_left_out_and_where_it_jumped() -> None:
-    trajectory, states = EgoTrajectory(1.0, 1.0, 10.0, 1.0), driven(60)
+    trajectory, states = EgoTrajectory(1.0, 1.0, memory_s=10.0), driven(60)
     shown = [moved(ego, 400.0) if k >= 40 or k == 20 else ego for k, ego in enumerate(states)]
     assert [reason for reason in map(trajectory.receive, shown) if reason is not None] == [CONTRADICTS]
     assert trajectory.jumps == 1

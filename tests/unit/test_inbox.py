@@ -9,7 +9,7 @@ from support.tracking import START_NS, message, ms
 
 from fgtrack.core.types import Detection, DetectionList, UpdateRecord
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.inbox import QueueInbox, is_usable, stamps
+from fgtrack.tracking.inbox import Inbox, is_usable, stamps
 from fgtrack.tracking.published import SlotInbox
 
 STD = {"x_m": 0.3, "y_m": 0.3}
@@ -23,8 +23,8 @@ NOWHERE = Detection(x_m=0.0, y_m=0.0, speed_mps=5.0)
 BROKEN = Detection(x_m=math.nan, y_m=1.0, speed_mps=5.0)
 
 
-def queue() -> QueueInbox:
-    return QueueInbox(SENSORS, max_future_s=1.0)
+def queue() -> Inbox:
+    return Inbox(SENSORS)
 
 
 def slot() -> SlotInbox:
@@ -96,7 +96,7 @@ def test_a_copy_is_recognised_by_its_bits_where_a_number_that_is_not_used_is_nan
 
 
 def test_a_list_that_comes_again_when_all_are_forgotten_is_no_copy() -> None:
-    inbox = QueueInbox(SENSORS, max_future_s=1.0, memory_s=0.1)
+    inbox = Inbox(SENSORS, memory_s=0.1)
     for delay_ms in (0.0, 299.0, 700.0):
         inbox.put(message(CAR, sensor="each", delay_ms=delay_ms))
     assert len(inbox.collect()) == 2  # the second one is a copy
