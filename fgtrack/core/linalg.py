@@ -59,7 +59,7 @@ def is_covariance(P: FloatArray, least: float) -> bool:
         np.linalg.cholesky(correlation - least * identity(len(P)))
     except np.linalg.LinAlgError:
         return False
-    return bool(np.abs(correlation - correlation.T).max() <= ASYMMETRY)
+    return bool((np.abs(correlation - correlation.T) <= ASYMMETRY).all())
 
 
 def product(A: FloatArray, B: FloatArray) -> FloatArray:
