@@ -300,13 +300,3 @@ class Estimator(Protocol):
 
     def advance(self, now_ns: int) -> None:
         """The clock moved: move the window, nothing else."""
-
-
-class Smoother(Estimator, Protocol):
-    """An `Estimator` whose states of the past contain what was measured later."""
-
-    def take_final(self) -> list[TrackState]:
-        """Smoothed states that have left the window since the last call, in order."""
-
-    def take_rest(self) -> list[TrackState]:
-        """Like `take_final`, and those that are still inside: for when the track ends."""

@@ -6,7 +6,7 @@ function `(**parameters) -> MotionModel`.
 """
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import cache
 from typing import Any, Literal
@@ -14,14 +14,13 @@ from typing import Any, Literal
 from fgtrack.core.checks import is_number
 from fgtrack.core.errors import CallError
 from fgtrack.core.plugins import Registry
-from fgtrack.estimation.base import Estimator, Smoother, Start, TrackBank
+from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.filters.replay_bank import ReplayBank
 from fgtrack.estimation.filters.track_initiation import initiated
 from fgtrack.estimation.hypotheses import hypotheses
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
-from fgtrack.estimation.smoothing_bank import SmoothingBank
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel, WhiteNoise
 
 OOSM_GROUP = "fgtrack.oosm"
@@ -100,9 +99,6 @@ class Claims:
     initiates: bool = False
     """True if it finds an unknown direction of travel by itself, and takes `initiation` as an option. Another one is
     made again, along its first positions, until their direction is certain (see `Initiated`)."""
-    reports: bool = False
-    """True if it hands out what it has smoothed, by `take_final` and `take_rest` of `Smoother`;
-    one that does has to initiate, too."""
     bank: bool = False
     """True if the entry makes the estimators of all objects together."""
 
@@ -177,14 +173,9 @@ def start_estimator(
     return hypotheses(motion, start, wanted, made)
 
 
-def estimator_bank(
-    name: str, motion: MotionModel, lag_s: float, options: Mapping[str, Any], lagged_s: Sequence[float] = ()
-) -> TrackBank:
-    """The estimators `name` of all objects; raises as `estimator`. One that is a bank itself takes no `initiation`.
-
-    Of one that hands out smoothed states, `lagged_s` says at which lags behind the present.
-    """
-    return start_bank(name, ESTIMATORS.load(name), motion, lag_s, options, lagged_s)
+def estimator_bank(name: str, motion: MotionModel, lag_s: float, options: Mapping[str, Any]) -> TrackBank:
+    """The estimators `name` of all objects; raises as `estimator`. One that is a bank itself takes no `initiation`."""
+    return start_bank(name, ESTIMATORS.load(name), motion, lag_s, options)
 
 
 def start_bank(
@@ -193,7 +184,6 @@ def start_bank(
     motion: MotionModel,
     lag_s: float,
     options: Mapping[str, Any],
-    lagged_s: Sequence[float] = (),
 ) -> TrackBank:
     """`estimator_bank` of a factory that need not be registered; `name` stands in errors."""
     claims = Claims.of(factory)
@@ -201,13 +191,6 @@ def start_bank(
     if claims.bank:
         return _made_bank(name, factory, motion, lag_s, own)
     _check_options(name, factory, 3, own)
-    if claims.reports:
-
-        def one(start: Start) -> Smoother:
-            smoother: Smoother = _checked(name, _made(ESTIMATORS, name, factory, motion, start, lag_s, **own), Smoother)
-            return smoother
-
-        return SmoothingBank(motion, one, lag_s, lagged_s)
     if factory is ReplayEkf and isinstance(motion, WhiteNoise) and type(motion) in (CTRV, CTRA, CV):
         return ReplayBank(motion, lambda start: _made(ESTIMATORS, name, factory, motion, start, lag_s, **own), lag_s)
     return ObjectBank(motion, lambda start: start_estimator(name, factory, motion, start, lag_s, options), lag_s)

@@ -166,7 +166,7 @@ def build_bank(config: Config, failures: Failures | None = None) -> TrackBank:
     if build is None:
         options = {"initiation": config.initiation.method, **options}
         lag_s = config.effective.lag_s
-        return estimator_bank(config.estimator, config.motion_model(), lag_s, options, config.smoother.lagged_s)
+        return estimator_bank(config.estimator, config.motion_model(), lag_s, options)
     if options:
         raise CallError(f"options.{config.estimator}: set the keys of smoother or filter instead")
     return build(config, failures or Failures())

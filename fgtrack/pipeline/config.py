@@ -9,7 +9,7 @@ from pydantic import Discriminator, Field, NonNegativeFloat, Tag
 
 from fgtrack.core.settings import settings
 from fgtrack.estimation.filters.initiation import DEFAULT, Initiation
-from fgtrack.estimation.registry import ESTIMATORS, Claims, motion_model
+from fgtrack.estimation.registry import ESTIMATORS, motion_model
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.io.config import InputConfig
 from fgtrack.io.run import EvaluationConfig
@@ -309,8 +309,6 @@ class Config:
         key, lag_s, behind_s = "filter.storage_s", self.filter.storage_s, 0.0
         if self.estimator in _SMOOTHERS:
             key, lag_s, behind_s = "smoother.lag_s", self.smoother.lag_s, self.smoother.behind_s
-        elif Claims.of(ESTIMATORS.load(self.estimator)).reports:
-            key, lag_s = "smoother.lag_s", self.smoother.lag_s
         distance_m = None if isinstance(self.merge, NoMerge) else self.merge.distance_m
         return Effective(self.ego.detection_origin_m, distance_m, key, lag_s, lag_s + behind_s)
 

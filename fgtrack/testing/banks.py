@@ -11,7 +11,7 @@ from fgtrack.estimation.filters.propagation import wrapped_yaw
 from fgtrack.estimation.object_bank import state_of
 from fgtrack.models.motion import MotionModel
 from fgtrack.testing.promise import Subject, require, sound
-from fgtrack.testing.references import dense_joint, difference
+from fgtrack.testing.references import difference
 from fgtrack.testing.streams import MS, Stream
 
 _TOGETHER = 1e-6
@@ -47,40 +47,6 @@ def gives_each_of_several_objects_what_it_gives_one_alone(subject: Subject, stre
     _publishes_the_present(bank, stream.motion)
     for report in bank.smoothed():
         _sound_of(report.state, stream.motion, f"a smoothed state of object {report.track_id}")
-
-
-def hands_out_sound_smoothed_states(subject: Subject, stream: Stream) -> None:
-    """Final ones once each and in order, then the rest; in a linear model between the filtered and the best states."""
-    estimator, final = subject.start(stream), list[TrackState]()
-    for measurement in stream.measurements:
-        estimator.update(measurement)
-        final += estimator.take_final()  # type: ignore[attr-defined]  # the claim says that it has it
-    require(estimator.take_final() == [], "take_final gives states again")  # type: ignore[attr-defined]
-    rest = estimator.take_rest()  # type: ignore[attr-defined]
-    stamps = [state.stamp_ns for state in (*final, *rest)]
-    require(stamps == sorted(set(stamps)), f"stamps of final states and the rest are {stamps}: not in order, or twice")
-    missing = sorted({m.stamp_ns for m in stream.measurements} - set(stamps))
-    require(not missing, f"neither a final state nor one of the rest is at {missing}")
-    within = not stamps or (stream.start.stamp_ns <= stamps[0] and stamps[-1] <= stream.newest_ns)
-    require(within, f"stamps of final states and the rest are {stamps}, measured was up to {stream.newest_ns}")
-    for state in (*final, *rest):
-        sound(state.mean, state.covariance, f"the smoothed state at {state.stamp_ns}")
-        if stream.motion.linear:
-            _is_between(state, stream, _TOGETHER + subject.claims.tolerance)
-
-
-def _is_between(state: TrackState, stream: Stream, tolerance: float) -> None:
-    """Require that `state` contains the measurements up to its stamp at least, and all at most."""
-    motion, at_ns = stream.motion, state.stamp_ns
-    before = [m for m in stream.measurements if m.stamp_ns <= at_ns]
-    filtered = dense_joint(motion, stream.start, before, [at_ns])[at_ns]
-    best = dense_joint(motion, stream.start, stream.measurements, [at_ns])[at_ns]
-    least, own, most = (np.diag(each.covariance) for each in (best, state, filtered))
-    inside = (own >= (1.0 - tolerance) * least).all() and (own <= (1.0 + tolerance) * most).all()
-    require(inside, f"variances of the smoothed state at {at_ns} are {own}, not between {least} and {most}")
-    # of two estimates from nested data the difference has the difference of the covariances
-    off = np.abs(state.mean - best.mean)
-    require((off <= 6.0 * np.sqrt(most)).all(), f"the smoothed state at {at_ns} is {off} from that of all measurements")
 
 
 def _shifted(stream: Stream, number: int) -> Stream:

@@ -14,10 +14,7 @@ from fgtrack.estimation.base import Estimator, Measurement, UpdateResult, Update
 from fgtrack.estimation.registry import ESTIMATORS, EXACT, Claims, Factory
 from fgtrack.estimation.smoothing.terms import NEAR_NS
 from fgtrack.models.motion import MotionModel
-from fgtrack.testing.banks import (
-    gives_each_of_several_objects_what_it_gives_one_alone,
-    hands_out_sound_smoothed_states,
-)
+from fgtrack.testing.banks import gives_each_of_several_objects_what_it_gives_one_alone
 from fgtrack.testing.promise import Draw, Promise, Subject, require, run_all, sound
 from fgtrack.testing.references import dense_joint, difference, innovation_difference, kalman_filter, rounding_bound
 from fgtrack.testing.streams import (
@@ -299,8 +296,6 @@ def _drawn(make: Callable[..., Stream], *what: MotionModel | int) -> tuple[Draw,
 
 
 _BOTH = (LINEAR, NONLINEAR)
-#: Longer than the window.
-_LONG = tuple(partial(regular, each, num=30) for each in _BOTH)
 _PROMISES = (
     Promise(_is_the_kalman_filter_in_sequence, _drawn(regular, LINEAR), lambda claims: not claims.mixes),
     Promise(
@@ -339,7 +334,6 @@ _PROMISES = (
     Promise(_predicts_ahead_by_the_motion_model, _drawn(regular, *_BOTH), lambda claims: not claims.mixes),
     Promise(_comes_near_the_posterior_of_a_nonlinear_model, (mild, mild_robust), lambda claims: not claims.mixes),
     Promise(gives_each_of_several_objects_what_it_gives_one_alone, _drawn(regular, *_BOTH)),
-    Promise(hands_out_sound_smoothed_states, (*_drawn(regular, *_BOTH), *_LONG), lambda claims: claims.reports),
 )
 
 

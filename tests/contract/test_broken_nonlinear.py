@@ -1,4 +1,4 @@
-"""What is wrong in a nonlinear model alone, with several objects, or in what is handed out, is found out as well."""
+"""What is wrong in a nonlinear model alone, or with several objects, is found out as well."""
 
 from dataclasses import replace
 
@@ -6,21 +6,16 @@ import numpy as np
 import pytest
 
 from fgtrack.core.types import TrackState
-from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult
+from fgtrack.estimation.base import Measurement, StatesAt, UpdateResult
 from fgtrack.estimation.filters.ekf import correct_one
-from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.object_bank import ObjectBank
-from fgtrack.estimation.registry import EXACT
-from fgtrack.estimation.smoothing.bank import FixedLagSmoother
-from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.models.motion import MotionModel
 from fgtrack.testing import BrokenPromiseError, check_estimator, estimator_checks
 
 NEAR = "comes near the posterior of a nonlinear model"
 SEVERAL = "gives each of several objects what it gives one alone"
 COUNTS = "counts each measurement as what it is"
-SMOOTHED = "hands out sound smoothed states"
 
 
 class Sees(ReplayEkf):
@@ -87,34 +82,6 @@ class GivesOneForAll(FilterBank):
         return replace(states, means=np.repeat(states.means[:1], len(states.means), axis=0))
 
 
-class Reports(FixedLagSmoother):
-    """What the broken smoothers are made of."""
-
-    exact = EXACT
-    nonlinear = "at convergence"
-    smooths = initiates = reports = True
-
-    def __init__(self, motion: MotionModel, start: Start, lag_s: float, initiation: str = DEFAULT) -> None:
-        settings = SmootherSettings(lag_s=lag_s, lagged_s=())
-        super().__init__(motion, start, settings, initiation=initiation)
-
-
-class ReportsTwice(Reports):
-    def take_rest(self) -> list[TrackState]:
-        return super().take_rest() * 2
-
-
-class ReportsTooSure(Reports):
-    def take_final(self) -> list[TrackState]:
-        return [TrackState(one.stamp_ns, one.mean, 0.5 * one.covariance) for one in super().take_final()]
-
-
-class ReportsNothing(Reports):
-    def take_final(self) -> list[TrackState]:
-        super().take_final()
-        return []
-
-
 @pytest.mark.parametrize(
     ("broken", "promise"),
     [
@@ -125,9 +92,6 @@ class ReportsNothing(Reports):
         (RemovesTheNext, SEVERAL),
         (ShowsAnother, SEVERAL),
         (GivesOneForAll, SEVERAL),
-        (ReportsTwice, SMOOTHED),
-        (ReportsTooSure, SMOOTHED),
-        (ReportsNothing, SMOOTHED),
     ],
 )
 def test_what_is_broken_is_found_out_by_its_promise(broken: type, promise: str) -> None:
@@ -136,6 +100,6 @@ def test_what_is_broken_is_found_out_by_its_promise(broken: type, promise: str) 
     assert list(error.value.promises) == [promise]
 
 
-@pytest.mark.parametrize("kind", [Sees, FilterBank, Reports])
+@pytest.mark.parametrize("kind", [Sees, FilterBank])
 def test_what_they_are_made_of_keeps_the_contract(kind: type) -> None:
     check_estimator(kind, num_streams=2)
