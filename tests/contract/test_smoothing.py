@@ -113,20 +113,6 @@ def test_so_they_do_with_what_is_older_than_the_window(late: str) -> None:
         assert largest_difference(motion, measurements, lag_s=0.3, late=late, ring_s=0.4) < 1e-9
 
 
-def test_a_whole_window_converges_to_the_minimum_that_levenberg_marquardt_finds() -> None:
-    motion = CTRV()
-    for seed in range(2):
-        stream = shuffled(motion, np.random.default_rng([seed, 4]))
-        three = [smoother(motion, name, 9.0, relinearise=dict.fromkeys(motion.state_names, 1e-7)) for name in SOLVERS]
-        for each in three:
-            for measurement in stream.measurements:
-                each.update(measurement)
-            each.converge()
-        for at_ns in (START_NS, *stream.stamps_ns, stream.newest_ns + 100 * MS):
-            states = [each.state_at(at_ns) for each in three]
-            assert max(*difference(states[0], states[1]), *difference(states[0], states[2])) < 1e-6
-
-
 # --- failures
 
 

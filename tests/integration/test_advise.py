@@ -9,16 +9,14 @@ import numpy as np
 import pytest
 
 import fgtrack
-from fgtrack.calibration import advise as advise_module
 from fgtrack.calibration.arrivals import Arrivals, window_findings
 from fgtrack.cli.main import run as run_command
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.io.run import Run, load_run
+from fgtrack.io.run import load_run
 from fgtrack.io.source import open_input
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.assumptions.assumed import assumed
-from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.sim.redelay import restamped
 
@@ -105,23 +103,6 @@ def test_a_healthy_recording_is_fine_and_nothing_is_changed(call: Call) -> None:
     for name in ("c", "a"):
         assert call("replay", "drive.jsonl", "-c", f"{name}.yaml", "-o", f"runs/{name}")[0] == 0
     assert load_run("runs/a").meta["digest"] == load_run("runs/c").meta["digest"]
-
-
-def test_what_nothing_is_changed_of_is_tracked_once(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
-    tracked: list[Config] = []
-    real = advise_module.replay_in_memory
-
-    def counted(messages: Sequence[Message], config: Config) -> tuple[Run, str | None]:
-        tracked.append(config)
-        return real(messages, config)
-
-    monkeypatch.setattr(advise_module, "replay_in_memory", counted)
-    write(drive(60))
-    assert not fgtrack.advise("drive.jsonl", "c.yaml").changes
-    assert len(tracked) == 1
-    Path("c.yaml").write_text(CONFIG.replace("lidar: {", "lidar: {max_delay_s: 0.05, "))
-    assert fgtrack.advise("drive.jsonl", "c.yaml").changes
-    assert len(tracked) == 1 + 3  # before, after, and for the clocks once without the limit
 
 
 @pytest.mark.parametrize("command", ["advise", "tune", "offsets"])

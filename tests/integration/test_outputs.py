@@ -261,15 +261,6 @@ def test_an_input_is_never_the_output(here: Path, call: Call, words: tuple[str, 
     assert content(here) == before
 
 
-def test_a_folder_of_runs_may_hold_what_is_made_of_them(here: Path, call: Call) -> None:
-    """What else is in a shared folder stays, so pictures and tables may lie beside what they are made of."""
-    assert call("report", "demo/runs", "-o", "demo/runs/report.html")[0] == 0
-    assert call("figure", "run", "-o", ".")[0] == 0
-    Path("swept").mkdir()
-    shutil.copy("sweep.yaml", "swept")
-    assert call("sweep", "swept/sweep.yaml", "--input", "drive.jsonl", "-o", "swept", "--jobs", "1")[0] == 0
-
-
 def test_links_are_not_followed(here: Path, call: Call) -> None:
     Path("precious").write_text("years of work")
     Path("link.jsonl").symlink_to("precious")

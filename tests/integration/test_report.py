@@ -159,16 +159,6 @@ def test_what_is_embedded_is_what_the_run_folders_hold(page: str, folder: Path) 
     np.testing.assert_allclose(place_m, late_case.after.means[-1, :2], atol=1e-9)
 
 
-@pytest.mark.slow
-def test_the_same_runs_give_the_same_bytes_and_replace_nothing(
-    page: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command(["report", str(folder / "runs"), "-o", str(folder / "again.html")]) == 0
-    assert (folder / "again.html").read_text(encoding="utf-8") == page
-    assert command(["report", str(folder / "runs"), "-o", str(folder / "again.html")]) == 2
-    assert "--overwrite" in capsys.readouterr().err
-
-
 def test_a_sensor_whose_clock_is_years_off_has_no_stamps(folder: Path) -> None:
     run = fgtrack.load_run(folder / "runs" / NAMES[0])
     off = {"stamp_ns": run.tables["detections"]["stamp_ns"] - 10**18}

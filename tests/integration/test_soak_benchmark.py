@@ -1,7 +1,6 @@
 """The soak of a day, as twice half a minute: every detection accounted for, the same rows twice, failures seen."""
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -39,9 +38,3 @@ def test_table_figure_and_page_say_the_same(folder: Path) -> None:
     assert said in (folder / "page.md").read_text().replace("<!-- begin soak -->\n\n", "").replace("\n\n<!--", "\n<!--")
     assert "2 runs have the same" in said
     assert (folder / "soak.png").stat().st_size > 10_000
-
-
-def part(**changes: object) -> bench_soak.Part:
-    counts = {"birth": 1, "in_sequence": 9}
-    right = bench_soak.Part(1.0, 100.0, 10, (1e3, 2e3), 1.0, 2.0, 10, counts, {}, {}, 50, "ab", 1.0)
-    return replace(right, **changes)

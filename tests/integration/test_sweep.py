@@ -98,20 +98,6 @@ def test_the_committed_smoke_sweep_has_a_row_for_every_cell(done: Path) -> None:
     assert all(0.0 < float(row["truth.overall.errors.position_m.rmse"]) < 3.0 for row in table)
 
 
-def test_estimators_are_compared_over_the_seeds(done: Path) -> None:
-    cells = {(*map(row.get, POINT), row["estimator"]): row for row in rows(done / "sweep.csv")}
-    metric = "truth.overall.errors.position_m.rmse"
-    compared = [row for row in rows(done / "paired.csv") if row["metric"] == metric]
-    assert len(compared) == 8  # four points and two estimators
-    for row in compared:
-        mine = [float(cells[(*map(row.get, POINT[:2]), str(seed), row["estimator"])][metric]) for seed in range(3)]
-        assert float(row["mean"]) == pytest.approx(np.mean(mine))
-        assert row["seeds"] == "3"
-    for best, other in zip(compared[::2], compared[1::2], strict=True):
-        assert float(other["worse_by"]) == pytest.approx(float(other["mean"]) - float(best["mean"]))
-        assert (float(other["low"]) > 0.0) == (other["standing"] == "worse") == (best["standing"] == "best")
-
-
 def test_it_ends_with_means_and_standard_errors(smoke: Path, done: Path, capsys: pytest.CaptureFixture[str]) -> None:
     metric = "truth.overall.errors.position_m.rmse"
     summary = rows(done / "summary.csv")
@@ -233,22 +219,6 @@ def test_a_dask_cluster_gives_the_same_bytes(smoke: Path, done: Path, tmp_path: 
             count, _ = cluster.communicate("")
     assert int(count) == len(parts(done))  # the workers did it, not this machine
     assert (out / "sweep.csv").read_bytes() == (done / "sweep.csv").read_bytes()
-
-
-def surroundings(run: Run) -> tuple[dict, dict]:
-    """What a process of the pool finds."""
-    deaf = signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
-    return {"threads": os.environ.get("OMP_NUM_THREADS"), "deaf": int(deaf)}, {"pid": os.getpid()}
-
-
-@pytest.mark.slow
-def test_processes_have_one_thread_each_and_leave_ctrl_c_to_the_first(tmp_path: Path) -> None:
-    text = "duration_s: 0.5\nestimators: [ekf-replay]\nseeds: 4\n"
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
-    Sweep.open(load_plan(write_sweep(tmp_path, text)), tmp_path / "out").run(surroundings, jobs=2)
-    assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before
-    assert {(row["threads"], row["deaf"]) for row in rows(tmp_path / "out/sweep.csv")} == {("1", "1")}
-    assert str(os.getpid()) not in {row["pid"] for row in rows(tmp_path / "out/timing.csv")}
 
 
 # --- what goes wrong

@@ -10,8 +10,6 @@ import pytest
 from fgtrack.calibration.tune_measurements import recorded
 from fgtrack.calibration.tune_space import ConfigNoise
 from fgtrack.cli.main import run
-from fgtrack.core.types import EgoState
-from fgtrack.io.run import load_run
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
@@ -77,19 +75,6 @@ def test_a_gate_is_opened_to_the_uncertainty_of_a_bearing_far_away(association: 
     assert radar_count(4.0) > 70
 
 
-def test_a_tuned_file_is_replayed_and_not_replaced_without_being_asked(
-    written: Path, stream: Path, capsys: Capture
-) -> None:
-    text = written.read_text(encoding="utf-8")
-    assert run(["replay", str(stream), "-c", str(written), "-o", str(written.with_name("run"))]) == 0
-    assert load_run(written.with_name("run")).meta["estimator"] == "smoother"
-    assert run(["tune", str(stream), "-c", "open_space", "-o", str(written)]) == 2
-    assert "--overwrite" in capsys.readouterr().err
-    assert run(["tune", str(stream), "-c", "open_space", "-o", str(stream), "--overwrite"]) == 2
-    assert "is the input or holds it" in capsys.readouterr().err
-    assert written.read_text(encoding="utf-8") == text
-
-
 @pytest.mark.slow
 def test_json_says_the_same_and_every_parameter_has_a_row(stream: Path, capsys: Capture, tmp_path: Path) -> None:
     """Also of sensors that the configuration does not name."""
@@ -121,15 +106,6 @@ def test_a_key_to_keep_must_be_noise(stream: Path, capsys: Capture, tmp_path: Pa
     out = str(tmp_path / "tuned.yaml")
     assert run(["tune", str(stream), "-c", "open_space", "-o", out, "--keep", "motion.kind"]) == 2
     assert "keep motion.kind: is no noise of the configuration" in capsys.readouterr().err
-
-
-def test_a_recording_of_nothing_is_one_line(tmp_path: Path, capsys: Capture) -> None:
-    path = tmp_path / "drive.jsonl"
-    write_stream(path, [EgoState(k * 10_000_000, k * 10_000_000, 0.0, 0.0, 0.0, 0.0) for k in range(50)])
-    assert run(["tune", str(path), "-c", "smoother", "-o", str(tmp_path / "tuned.yaml")]) == 1
-    [line] = capsys.readouterr().err.splitlines()
-    assert "nothing to fit noise to" in line
-    assert not (tmp_path / "tuned.yaml").exists()
 
 
 def test_sensors_that_are_ignored_are_not_tuned_and_stay_as_they_are() -> None:

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from support.late_positions import STEP_NS, late_positions
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
@@ -15,9 +14,11 @@ from fgtrack.estimation.smoothing.bank import FixedLagSmoother
 from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.evaluation.bounds import Bounds, ScheduledMeasurement, bounds, bounds_along
+from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.sim.vehicles import drawn
 
+STEP_NS = 50_000_000
 START_NS = 1_790_000_000 * NS_PER_S
 PRIOR = Start(
     stamp_ns=START_NS,
@@ -42,6 +43,17 @@ def make(name: str, motion: MotionModel) -> Estimator:
         return ReplayEkf(motion, PRIOR, 1.0)
     settings = SmootherSettings(lag_s=1.0, lagged_s=(), final=False)
     return FixedLagSmoother(motion, PRIOR, settings, IncrementalSolver)
+
+
+def late_positions(motion: MotionModel, start_ns: int, num_steps: int) -> list[ScheduledMeasurement]:
+    """Good positions 151 ms late at every other step, bad ones 62 ms late in between, in order of receipt."""
+    position = measurement_model(("x_m", "y_m"), motion)
+    found = []
+    for k in range(1, num_steps + 1):
+        stamp_ns = start_ns + k * STEP_NS
+        late_ns, std_m = (151_000_000, 0.3) if k % 2 else (62_000_000, 1.0)
+        found.append(ScheduledMeasurement(stamp_ns, stamp_ns + late_ns, position, std_m**2 * np.eye(2)))
+    return sorted(found, key=lambda item: item.receipt_ns)
 
 
 @dataclass(frozen=True)
