@@ -13,7 +13,7 @@ from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from fgtrack.core.checks import not_negative, positive
+from fgtrack.core.checks import not_negative
 from fgtrack.core.errors import CallError
 from fgtrack.core.geometry import cartesian, cartesian_gradient, polar, polar_gradient
 from fgtrack.core.linalg import congruence, kernels, symmetrise
@@ -164,12 +164,11 @@ class WhiteNoise(MotionModel):
 
         Its densities are std^2 / frequency_hz. `std` is per second, as in Karle et al. 2023; its keys are the
         names of all densities up to `_density_`: `position`, `yaw`, `speed`, ... Raises `ValueError` when a
-        key is missing or unknown or the frequency is not positive.
+        key is missing or unknown.
         """
         names = {name.partition("_density_")[0]: name for name in cls.density_names()}
         if set(std) != set(names):
             raise ValueError(f"std of {cls.__name__}: give {', '.join(names)}, not {', '.join(std) or 'nothing'}")
-        positive(frequency_hz=frequency_hz)
         return cls(**{names[key]: value * value / frequency_hz for key, value in std.items()})
 
     @classmethod

@@ -1,19 +1,19 @@
 """Gates, and association of candidates with tracks (Karle et al. 2023, section III-D)."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import cache
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
+from pydantic import NonNegativeFloat, PositiveFloat
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 from scipy.spatial import cKDTree
 from scipy.special import gammaincinv
 
-from fgtrack.core.checks import between_0_and_1, not_negative, positive
 from fgtrack.core.linalg import equal_ones, kernels, symmetrise
+from fgtrack.core.settings import OpenProbability, settings
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, StatesAt
 from fgtrack.estimation.filters.ekf import linearised
@@ -86,7 +86,7 @@ class Association(Protocol):
         """The states are those of the tracks at the candidates' stamp; pairs that are `apart` are not made."""
 
 
-@dataclass(frozen=True)
+@settings
 class GatedEuclidean:
     """Hungarian assignment on distances; pairs further apart than the gate are out before the assignment.
 
@@ -96,13 +96,10 @@ class GatedEuclidean:
     """
 
     kind: Literal["euclidean"] = "euclidean"
-    gate_m: float = 5.0
+    gate_m: PositiveFloat = 5.0
     """Largest distance of a pair."""
-    max_nis: float | None = None
+    max_nis: PositiveFloat | None = None
     """Largest NIS of a pair; null for no limit."""
-
-    def __post_init__(self) -> None:
-        positive(gate_m=self.gate_m, max_nis=self.max_nis)
 
     def __call__(self, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None) -> Assignment:
         """See `Association`."""
@@ -127,7 +124,7 @@ class GatedEuclidean:
         return _refusing(suspects, assigned(pairs, len(candidates), len(states.means)))
 
 
-@dataclass(frozen=True)
+@settings
 class GatedMahalanobis:
     """Hungarian assignment on squared Mahalanobis distances of the innovation, gated by the chi-square quantile.
 
@@ -136,17 +133,12 @@ class GatedMahalanobis:
     """
 
     kind: Literal["mahalanobis"] = "mahalanobis"
-    gate_probability: float = 0.999
+    gate_probability: OpenProbability = 0.999
     """Probability with which a true pair passes the gate."""
-    max_distance_m: float = 5000.0
+    max_distance_m: PositiveFloat = 5000.0
     """Largest distance of a pair: as far as an airliner flies in 20 s. The chi-square gate decides below it."""
-    claim_m: float = 0.0
+    claim_m: NonNegativeFloat = 0.0
     """A candidate that belongs to no track starts none nearer than this to one: it is the other end of a long hull."""
-
-    def __post_init__(self) -> None:
-        not_negative(claim_m=self.claim_m)
-        between_0_and_1(gate_probability=self.gate_probability)
-        positive(max_distance_m=self.max_distance_m)
 
     def __call__(self, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None) -> Assignment:
         """See `Association`; the cost adds log det S, so that a vague track does not win by being vague."""

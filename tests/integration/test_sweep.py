@@ -248,7 +248,7 @@ vary:
         for name in ("ekf-replay", "smoother")
     )
     assert set(bad) == {(what, name) for what in ("negative gate", "no map") for name in ("ekf-replay", "smoother")}
-    assert "gate_m: must be positive and finite, is -1.0" in bad["negative gate", "smoother"]
+    assert "gate_m: Input should be greater than 0" in bad["negative gate", "smoother"]
     assert "missing.csv" in bad["no map", "ekf-replay"]
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 1

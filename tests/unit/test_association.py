@@ -154,7 +154,7 @@ def test_the_uncertainty_of_a_bearing_is_that_seen_from_the_sensor() -> None:
         (lambda: GatedMahalanobis(gate_probability=0.0), "gate_probability"),
         (lambda: GatedMahalanobis(gate_probability=1.0), "gate_probability"),
         (lambda: GatedMahalanobis(max_distance_m=0.0), "max_distance_m"),
-        (lambda: GatedMahalanobis(claim_m=-1.0), "claim_m: must be finite and not negative"),
+        (lambda: GatedMahalanobis(claim_m=-1.0), "claim_m"),
     ],
 )
 def test_a_gate_that_makes_no_sense_is_named(make, message: str) -> None:

@@ -182,7 +182,7 @@ def test_a_setting_below_a_key_of_the_file_adds_nothing_to_it(tmp_path: Path) ->
         ("association: {gate_m: 3.0}\n", "association: needs the key `kind`"),
         ("association: {kind: nearest}\n", "association"),
         ("association: {kind: mahalanobis, gate_m: 3.0}\n", "association.gate_m: unknown key"),
-        ("association: {kind: mahalanobis, gate_probability: 1.5}\n", "gate_probability: must lie between 0 and 1"),
+        ("association: {kind: mahalanobis, gate_probability: 1.5}\n", "gate_probability: Input should be less than 1"),
         ("motion: {kind: cv}\n", "std of CV: give velocity"),
         ("defects: [saturated_yaw]\n", "defects: noise_per_step and saturated_yaw are of motion.kind ctrv_euler"),
         ("lifecycle: {counter_cap: 0}\n", "counter_cap"),

@@ -72,12 +72,6 @@ def test_one_detection_is_as_uncertain_as_its_covariance_says(name: str) -> None
     assert model.linear == (name == "lidar")
 
 
-@pytest.mark.parametrize(("share", "time_s"), [(0.0, 1.0), (1.0, 1.0), (0.5, 0.0), (0.5, np.inf)])
-def test_a_correlation_that_makes_no_sense_is_refused(share: float, time_s: float) -> None:
-    with pytest.raises(ValueError, match="Correlation"):
-        Correlation(share=share, time_s=time_s)
-
-
 def nees(name: str, modelled: bool, lag_s: float, num_runs: int = 40) -> float:
     """NEES of the position `lag_s` ago of an object with positions whose errors last for a second."""
     correlation, step_s, found = Correlation(0.8, 1.0), 0.1, []

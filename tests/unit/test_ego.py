@@ -53,13 +53,6 @@ def test_a_gap_is_filled_from_its_ends_as_far_as_they_are_extrapolated() -> None
     assert pose(source, 3900.0) is None
 
 
-def test_states_as_far_apart_as_two_extrapolations_are_interpolated() -> None:
-    source = trajectory()
-    source.receive(ego(0.0, x_m=0.0))
-    source.receive(ego(2000.0, x_m=100.0))
-    assert pose(source, 500.0).x_m == pytest.approx(25.0)
-
-
 # --- the clean trajectory
 
 
@@ -166,32 +159,6 @@ def test_the_pit_lane_is_remembered_until_the_source_says_otherwise(source: EgoT
 # --- the published storage
 
 
-def test_the_published_low_pass_filters_its_own_output_again_at_every_tick() -> None:
-    source = PublishedEgo(0.9, 0.4, ms(10), 350)
-    source.receive(ego(0.0, yaw_rad=0.0))
-    source.start_tick()
-    source.receive(ego(10.0, yaw_rad=1.0, yaw_rate_radps=1.0))
-    for k in range(1, 4):
-        source.start_tick()
-        assert source.current.yaw_rad == pytest.approx(0.9**k)
-        assert source.current.yaw_rate_radps == pytest.approx(0.4**k)
-
-
-def test_the_published_pose_is_from_the_nearest_entry_and_of_two_the_newer() -> None:
-    source = PublishedEgo(1.0, 1.0, ms(10), 350)
-    for k in range(3):
-        source.receive(ego(20.0 * k, x_m=100.0 * k, speed_mps=10.0))
-        source.start_tick()
-    present_ns = START_NS + ms(40)
-
-    def x_at(stamp_ms: float) -> float:
-        return source.pose_at(START_NS + ms(stamp_ms), present_ns).x_m
-
-    assert x_at(30.0) == pytest.approx(200.0 - 0.1)
-    assert x_at(29.9) == pytest.approx(100.0 + 0.099)
-    assert x_at(-5000.0) == pytest.approx(-50.0)  # however far away
-
-
 def test_the_published_pose_without_delay_is_from_the_newest_message_even_before_it_is_stored() -> None:
     source = PublishedEgo(1.0, 1.0, ms(10), 350)
     source.receive(ego(0.0, x_m=1.0))
@@ -200,16 +167,6 @@ def test_the_published_pose_without_delay_is_from_the_newest_message_even_before
     half_step_ns = START_NS + ms(15)
     assert source.pose_at(half_step_ns, START_NS + ms(20)).x_m == 9.0
     assert source.pose_at(half_step_ns - 1, START_NS + ms(20)).x_m == pytest.approx(1.15)
-
-
-def test_the_published_ego_refuses_repeated_stamps_only_of_the_newest() -> None:
-    source = PublishedEgo(1.0, 1.0, ms(10), 3)
-    assert source.pose_at(START_NS, START_NS) is None
-    assert source.receive(ego(10.0)) is None
-    assert source.receive(ego(10.0)) == "repeated stamp"
-    assert source.receive(ego(20.0, x_m=math.nan)) == "not finite"
-    assert source.receive(ego(0.0)) is None
-    assert source.current.stamp_ns == START_NS
 
 
 def test_the_published_storage_has_a_length_in_ticks() -> None:

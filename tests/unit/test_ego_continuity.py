@@ -26,7 +26,7 @@ class Recorded(EgoTrajectory):
     """A trajectory that keeps the states it takes, in their order."""
 
     def __init__(self) -> None:
-        super().__init__(1.0, 1.0, 10.0, 1.0)
+        super().__init__(1.0, 1.0, memory_s=10.0)
         self.taken: list[EgoState] = []
 
     def _insert(self, ego: EgoState) -> str | None:

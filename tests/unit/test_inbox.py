@@ -1,5 +1,4 @@
 import math
-from collections import Counter
 from collections.abc import Callable
 from fractions import Fraction
 
@@ -49,13 +48,6 @@ def test_all_messages_of_a_tick_are_kept_and_come_out_oldest_first() -> None:
     assert inbox.collect() == []
 
 
-def test_equal_stamps_come_out_in_order_of_receipt() -> None:
-    inbox = queue()
-    for sensor in ("each", "lidar"):
-        inbox.put(message(CAR, sensor=sensor))
-    assert [batch.message.sensor for batch in inbox.collect()] == ["each", "lidar"]
-
-
 def test_a_copy_is_recognised_behind_other_lists() -> None:
     inbox = queue()
     for stamp_ms in (0.0, 20.0, 40.0):
@@ -78,14 +70,6 @@ def test_a_copy_in_another_order_is_recognised_and_another_number_of_each_is_no_
     assert inbox.put(message(CAR, CAR, other)) == []
     assert said(inbox.put(message(other, CAR, delay_ms=5.0))) == [(0, "duplicate"), (1, "duplicate")]
     assert inbox.put(message(CAR, other, other, delay_ms=10.0)) == []
-
-
-def test_a_copy_of_a_list_with_a_detection_that_is_none_is_recognised() -> None:
-    inbox = queue()
-    nan = Detection(x_m=float("nan"), y_m=1.0)
-    assert said(inbox.put(message(CAR, nan))) == [(1, "invalid")]
-    again = message(CAR, Detection(x_m=float("nan") * 2.0, y_m=1.0), delay_ms=5.0)
-    assert said(inbox.put(again)) == [(0, "duplicate"), (1, "duplicate")]
 
 
 def test_a_copy_is_recognised_by_its_bits_where_a_number_that_is_not_used_is_nan() -> None:
@@ -221,45 +205,12 @@ def test_a_second_message_within_a_tick_supersedes_the_first() -> None:
     assert (batch.stamp_ns, batch.indices) == (START_NS + ms(10), (0, 1))
 
 
-def test_a_repeated_stamp_empties_the_slot() -> None:
-    inbox = slot()
-    inbox.put(message(CAR))
-    records = inbox.put(message(CAR, CAR))
-    assert Counter(disposition for _, disposition in said(records)) == {"superseded": 1, "duplicate": 2}
-    assert inbox.collect() == []
-    assert said(inbox.put(message(CAR))) == [(0, "duplicate")]  # also in a later tick
-
-
-def test_a_late_message_leaves_the_slot_and_the_last_stamp_alone() -> None:
-    inbox = slot()
-    inbox.put(message(CAR, stamp_ms=500.0))
-    assert said(inbox.put(message(CAR, stamp_ms=0.0, delay_ms=301.0))) == [(0, "too_old")]
-    assert len(inbox.collect()) == 1
-    assert said(inbox.put(message(CAR, stamp_ms=500.0))) == [(0, "duplicate")]
-
-
 def test_a_list_of_broken_detections_empties_the_slot_and_is_not_remembered() -> None:
     inbox = slot()
     inbox.put(message(CAR, stamp_ms=0.0))
     assert sorted(said(inbox.put(message(BROKEN, stamp_ms=10.0)))) == [(0, "invalid"), (0, "superseded")]
     assert inbox.collect() == []
     assert inbox.put(message(CAR, stamp_ms=10.0)) == []
-
-
-def test_a_list_of_empty_slots_counts_as_having_seen_nothing() -> None:
-    inbox = slot()
-    assert said(inbox.put(message(NOWHERE, NOWHERE))) == [(0, "invalid"), (1, "invalid")]
-    assert [batch.indices for batch in inbox.collect()] == [()]
-    assert inbox.put(message(stamp_ms=10.0)) == []
-    assert [batch.indices for batch in inbox.collect()] == [()]
-
-
-def test_equal_stamps_come_out_in_the_order_of_the_sensors() -> None:
-    inbox = slot()
-    inbox.put(message(CAR, sensor="radar"))
-    inbox.put(message(CAR, sensor="lidar"))
-    inbox.put(message(CAR, sensor="each", stamp_ms=-1.0))
-    assert [batch.message.sensor for batch in inbox.collect()] == ["each", "lidar", "radar"]
 
 
 def test_the_published_mean_of_stamps_is_that_of_floating_point() -> None:

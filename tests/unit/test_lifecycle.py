@@ -124,12 +124,3 @@ def test_the_status_tells_unconfirmed_from_seen_from_missed() -> None:
     ]
     life.lives[0] = Life(1, START_NS, num_placed=2, misses=1)
     assert life.status(0) is TrackStatus.TENTATIVE
-
-
-@pytest.mark.parametrize(
-    "rules",
-    [{"counter_cap": 0}, {"confirm_count": 0}, {"forget_s": 0.0}, {"short_range_m": -1.0}],
-)
-def test_rules_that_make_no_sense_are_named(rules: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=next(iter(rules))):
-        LifecycleRules(**rules)

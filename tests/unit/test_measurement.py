@@ -97,20 +97,6 @@ def test_every_subset_is_the_rows_of_the_whole(motion: MotionModel) -> None:
 
 
 @every_model
-@pytest.mark.parametrize("components", [SELECTION, ("x_m", "y_m"), DOPPLER, ("bearing_rad",), MEASURABLE])
-def test_many_states_at_once_equal_one_by_one(motion: MotionModel, components: tuple[str, ...]) -> None:
-    rng = np.random.default_rng(5)
-    model, pose = measurement_model(components, motion), SensorPose(1.0, 2.0, 0.4, 5.0, -3.0)
-    x = rng.normal(size=(3, 4, motion.dim)) * 10.0
-    predicted, H = model.predict(x, pose), model.jacobian(x, pose)
-    assert predicted.shape == (3, 4, len(components))
-    assert H.shape == (3, 4, len(components), motion.dim)
-    for index in np.ndindex(3, 4):
-        assert_allclose(predicted[index], model.predict(x[index], pose), rtol=1e-14)
-        assert_allclose(H[index], model.jacobian(x[index], pose), rtol=1e-14, atol=1e-16)
-
-
-@every_model
 def test_a_model_is_linear_where_it_selects_entries_of_the_state(motion: MotionModel) -> None:
     cartesian = motion.cartesian
     assert measurement_model(("x_m", "y_m"), motion).linear

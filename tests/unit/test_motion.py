@@ -9,7 +9,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad_vec, solve_ivp
 from scipy.linalg import expm
 
-from fgtrack.core.errors import CallError
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Start
 from fgtrack.estimation.birth import initial_state
@@ -72,42 +71,6 @@ def test_the_flow_solves_its_differential_equation(model: MotionModel, kinematic
     assert_allclose(model.predict(x, dt_s), solution.y[:, -1], rtol=1e-9, atol=1e-6)
 
 
-@every_model
-@given(kinematic=states(), a_s=st.floats(-5.0, 5.0), b_s=st.floats(-5.0, 5.0))
-def test_the_flow_and_its_jacobian_compose_forwards_and_backwards(
-    model: MotionModel, kinematic: FloatArray, a_s: float, b_s: float
-) -> None:
-    x = state_of(model, kinematic)
-    between = model.predict(x, a_s)
-    assert_allclose(model.predict(between, b_s), model.predict(x, a_s + b_s), rtol=1e-12, atol=1e-10)
-    chained = model.jacobian(between, b_s) @ model.jacobian(x, a_s)
-    assert_allclose(chained, model.jacobian(x, a_s + b_s), rtol=1e-12, atol=1e-10)
-
-
-@every_model
-@given(kinematic=states(), duration_s=st.floats(1e-6, 5.0), fraction=st.floats(0.0, 1.0))
-def test_a_split_segment_gathers_the_same_noise(
-    model: MotionModel, kinematic: FloatArray, duration_s: float, fraction: float
-) -> None:
-    x = state_of(model, kinematic)
-    a_s = fraction * duration_s
-    b_s = duration_s - a_s
-    between = model.predict(x, a_s)
-    F = model.jacobian(between, b_s)
-    parts = F @ model.process_noise(x, a_s) @ F.T + model.process_noise(between, b_s)
-    assert_close_to_scale(parts, model.process_noise(x, duration_s), rtol=1e-12)
-
-
-@every_model
-@given(kinematic=states(), dt_s=st.floats(0.0, 5.0))
-def test_process_noise_is_symmetric_and_positive_semidefinite(
-    model: MotionModel, kinematic: FloatArray, dt_s: float
-) -> None:
-    Q = model.process_noise(state_of(model, kinematic), dt_s)
-    assert_array_equal(Q, Q.T)
-    assert np.linalg.eigvalsh(Q)[0] >= -1e-13 * np.trace(Q)
-
-
 @every_arc
 def test_process_noise_of_an_arc_is_the_integral_of_its_definition(model: CTRV) -> None:
     x = np.array([1.0, 2.0, 0.4, 30.0, 0.6, -4.0])[: model.dim]
@@ -164,39 +127,6 @@ def test_a_yaw_rate_that_no_object_has_gives_no_number() -> None:
         assert np.isnan(part).all()
 
 
-@every_model
-def test_many_states_and_durations_at_once_equal_one_by_one(model: MotionModel) -> None:
-    rng = np.random.default_rng(4)
-    scale = np.array([100.0, 100.0, 2.0, 30.0, 2.0, 5.0])[: model.dim]
-    x = rng.normal(size=(3, 4, model.dim)) * scale
-    dt_s = rng.uniform(0.0, 4.0, size=(3, 4))
-    for method in (model.predict, model.jacobian, model.process_noise):
-        together = method(x, dt_s)
-        for index in np.ndindex(3, 4):
-            assert_allclose(together[index], method(x[index], float(dt_s[index])), rtol=1e-13, atol=1e-11)
-        assert_allclose(method(x[0, 0], dt_s)[2, 1], method(x[0, 0], float(dt_s[2, 1])), rtol=1e-13, atol=1e-11)
-        assert_allclose(method(x, 0.5)[2, 1], method(x[2, 1], 0.5), rtol=1e-13, atol=1e-11)
-
-
-@every_model
-def test_inputs_stay_as_they_are(model: MotionModel) -> None:
-    x, dt_s = np.ones((2, model.dim)), np.array([0.5, 1.0])
-    P = np.broadcast_to(np.eye(model.dim), (2, model.dim, model.dim)).copy()
-    for array in (x, dt_s, P):
-        array.flags.writeable = False
-    for method in (model.predict, model.jacobian, model.process_noise):
-        assert not np.shares_memory(method(x, dt_s), x)
-    model.from_kinematic(*model.kinematic(x, P))
-
-
-@every_model
-def test_noise_over_a_negative_duration_is_refused(model: MotionModel) -> None:
-    with pytest.raises(CallError, match=r"dt_s is -0\.1 s"):
-        model.process_noise(np.zeros((2, model.dim)), np.array([0.2, -0.1]))
-    with pytest.raises(CallError, match=r"dt_s is -0\.1 s"):
-        model.transition(np.zeros(model.dim), -0.1)
-
-
 def test_the_default_noise_is_that_of_the_paper() -> None:
     std = {"position": 0.2, "yaw": 0.3, "speed": 1.0, "yaw_rate": 0.5}
     assert CTRV.from_std_per_step(std, 100.0) == CTRV()
@@ -209,7 +139,6 @@ def test_the_default_noise_is_that_of_the_paper() -> None:
     [
         ({"position": 0.2, "yaw": 0.3, "speed": 1.0}, 100.0, "give position, yaw, speed, yaw_rate"),
         ({"position": 0.2, "yaw": 0.3, "speed": 1.0, "yaw_rate": 0.5, "accel": 1.0}, 100.0, "accel"),
-        ({"position": 0.2, "yaw": 0.3, "speed": 1.0, "yaw_rate": 0.5}, 0.0, "frequency_hz: must be positive"),
         ({"position": math.nan, "yaw": 0.3, "speed": 1.0, "yaw_rate": 0.5}, 1.0, "position_density_m2ps"),
     ],
 )
@@ -319,15 +248,6 @@ class Walking(Accelerating):
 
 MODEL, WALK = Accelerating(), Walking()
 X = np.array([1.0, 2.0, 3.0, 4.0, 0.5, -0.5])
-
-
-def test_the_transition_of_a_model_follows_from_its_functions() -> None:
-    mean, F, Q = MODEL.transition(X, 0.3)
-    assert_array_equal(mean, MODEL.predict(X, 0.3))
-    assert_array_equal(F, MODEL.jacobian(X, 0.3))
-    assert_array_equal(Q, MODEL.process_noise(X, 0.3))
-    with pytest.raises(CallError, match="needs a duration >= 0"):
-        MODEL.transition(X, -0.1)
 
 
 def test_a_cartesian_state_gives_and_takes_what_cv_gives_and_takes() -> None:

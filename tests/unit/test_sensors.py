@@ -50,17 +50,3 @@ def test_what_grows_with_range_is_measured_and_does_not_shrink() -> None:
     for growth, said in (({"speed_mps": 0.1}, "known are x_m, y_m"), ({"x_m": -0.1}, "greater than or equal to 0")):
         with pytest.raises(ValueError, match=said):
             SensorModel(std=POSITION, std_growth=growth)
-
-
-@pytest.mark.parametrize(
-    "setting",
-    [
-        {"curvature_from_map_std_radpm": 0.0},
-        {"field_of_view_rad": 0.0},
-        {"field_of_view_rad": 7.0},
-        {"max_range_behind_m": 0.0},
-    ],
-)
-def test_a_field_of_view_must_make_sense(setting: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=next(iter(setting))):
-        SensorModel(std=POSITION, **setting)

@@ -85,12 +85,6 @@ def test_points_beyond_the_centre_of_curvature_and_far_away_give_finite_answers(
     assert np.isfinite(track.heading(points)).all()
 
 
-def test_no_points_give_no_answers() -> None:
-    none = np.empty((0, 2))
-    assert [len(part) for part in OVAL.frenet(none)] == [0, 0]
-    assert len(OVAL.heading(none)) == len(OVAL.view(none, 0.0, 0.0).outside) == 0
-
-
 # Heading and curvature
 
 
