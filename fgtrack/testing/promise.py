@@ -52,6 +52,18 @@ def sound(mean: FloatArray, covariance: FloatArray, what: str) -> None:
     require(least > 0.0, f"the covariance of {what} is not positive definite")
 
 
+# Any: a check of an estimator or of a motion model.
+def fault(check: Callable[..., None], *arguments: Any) -> str:
+    """Return the fault that `check` raises for `arguments`, or an empty text."""
+    try:
+        check(*arguments)
+    except WrongError as error:
+        return str(error)
+    except Exception as error:  # of a foreign estimator or model: anything
+        return f"{type(error).__name__}: {error}"
+    return ""
+
+
 @dataclass(frozen=True)
 class Subject:
     """An estimator under test."""
@@ -95,28 +107,18 @@ class Promise:
         for kind, draw in enumerate(self.draws):
             for number in range(num_streams if self.repeats else 1):
                 stream = draw(np.random.default_rng([seed, kind, number]))
-                wrong = self._wrong(subject, stream)
+                wrong = fault(self.check, subject, stream)
                 place = 0
                 while wrong and place < len(stream.measurements) > 1:
                     smaller = stream.without(place)
-                    if still := self._wrong(subject, smaller):
+                    if still := fault(self.check, subject, smaller):
                         stream, wrong = smaller, still
                     else:
                         place += 1
                 if wrong:
-                    raise BrokenPromiseError(subject.name, {self.name: f"{wrong}\n{stream}"}) from None
+                    raise BrokenPromiseError(subject.name, {self.name: f"{wrong}\n{stream}"})
 
     @property
     def name(self) -> str:
         """Name of the promise: a sentence without its subject."""
         return self.check.__name__.removeprefix("_").replace("_", " ")
-
-    def _wrong(self, subject: Subject, stream: Stream) -> str:
-        """Return the fault, or an empty text."""
-        try:
-            self.check(subject, stream)
-        except WrongError as error:
-            return str(error)
-        except Exception as error:  # of a foreign estimator: anything
-            return f"{type(error).__name__}: {error}"
-        return ""
