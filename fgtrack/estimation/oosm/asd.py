@@ -74,13 +74,13 @@ class AccumulatedStateDensity(WindowedFilter):
         return result
 
     def _with_state(self, stamp_ns: int) -> tuple[_Stack, slice]:
-        """The stack with a state at `stamp_ns`, and its place in the stack."""
+        """The stack with a state at `stamp_ns`, and its slice of the stack."""
         n, (stamps_ns, mean, covariance) = self._motion.dim, self._stack
-        place = max(bisect.bisect_right(stamps_ns, stamp_ns) - 1, 0)
-        if stamps_ns[place] == stamp_ns:
-            return self._stack, slice(place * n, place * n + n)
-        own, A, noise = self._given_neighbours(place, stamp_ns)
-        neighbours, at = slice(place * n, place * n + A.shape[1]), place * n + n
+        index = max(bisect.bisect_right(stamps_ns, stamp_ns) - 1, 0)
+        if stamps_ns[index] == stamp_ns:
+            return self._stack, slice(index * n, index * n + n)
+        own, A, noise = self._given_neighbours(index, stamp_ns)
+        neighbours, at = slice(index * n, index * n + A.shape[1]), index * n + n
         cross = A @ covariance[neighbours]
         grown = np.empty((len(mean) + n, len(mean) + n))
         others = np.delete(np.arange(len(grown)), np.s_[at : at + n])
@@ -88,18 +88,18 @@ class AccumulatedStateDensity(WindowedFilter):
         grown[at : at + n, others] = cross
         grown[others, at : at + n] = cross.T
         grown[at : at + n, at : at + n] = propagated(A, covariance[neighbours, neighbours], noise)
-        stamps_ns = (*stamps_ns[: place + 1], stamp_ns, *stamps_ns[place + 1 :])
+        stamps_ns = (*stamps_ns[: index + 1], stamp_ns, *stamps_ns[index + 1 :])
         return _Stack(stamps_ns, np.insert(mean, at, own), grown), slice(at, at + n)
 
-    def _given_neighbours(self, place: int, stamp_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Mean (n,), A and noise (n, n) of x = A [neighbours] + noise after the state at `place`.
+    def _given_neighbours(self, index: int, stamp_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Mean (n,), A and noise (n, n) of x = A [neighbours] + noise after the state at `index`.
 
         A is (n, n) after the newest state, and (n, 2 n) between two.
         """
         n, (stamps_ns, mean, _) = self._motion.dim, self._stack
-        left, until_s = mean[place * n : place * n + n], seconds(stamp_ns - stamps_ns[place])
-        if place + 1 == len(stamps_ns):
+        left, until_s = mean[index * n : index * n + n], seconds(stamp_ns - stamps_ns[index])
+        if index + 1 == len(stamps_ns):
             return self._motion.transition(left, until_s)
-        right, after_s = mean[place * n + n : place * n + 2 * n], seconds(stamps_ns[place + 1] - stamp_ns)
+        right, after_s = mean[index * n + n : index * n + 2 * n], seconds(stamps_ns[index + 1] - stamp_ns)
         inner = between(self._motion, left, right, until_s, after_s)
         return inner.mean, np.hstack((inner.Lambda, inner.Psi)), inner.Sigma

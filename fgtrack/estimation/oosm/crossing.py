@@ -10,8 +10,7 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.filters.ekf import OneCorrection, Prediction, linearised, propagated, robust_weight
-from fgtrack.estimation.oosm.history import FilterStep
-from fgtrack.estimation.oosm.late import LateEkf
+from fgtrack.estimation.oosm.late import FilterStep, LateEkf
 from fgtrack.estimation.rts import rts_step
 from fgtrack.models.motion import MotionModel
 
@@ -52,29 +51,29 @@ def fuse_across(mean: FloatArray, covariance: FloatArray, past: Past, measuremen
 class CrossingEkf(LateEkf):
     """A `LateEkf` that corrects the present through its cross-covariance with the past (see `fuse_across`).
 
-    The corrected present enters the history with an equivalent measurement there (see `History.absorb`), so a second
+    The corrected present enters the history with an equivalent measurement there (see `_absorb`), so a second
     late measurement finds the state that the first one made. What lies between the first one's stamp and the present
     keeps the state it had.
     """
 
     def _fuse_late(self, measurement: Measurement) -> OneCorrection:
-        now = self._history.newest
+        now = self._steps[-1]
         past = self._past(measurement.stamp_ns)
         result = fuse_across(now.mean, now.covariance, past, measurement)
         np.linalg.cholesky(result.covariance)  # an approximate cross-covariance may take away more than there is
-        self._history.absorb(result.mean, result.covariance)
+        self._absorb(result.mean, result.covariance)
         return result
 
     @abstractmethod
     def _past(self, stamp_ns: int) -> Past:
         """Estimate of the state at `stamp_ns`, and its cross-covariance with the present."""
 
-    def _predicted(self, stamp_ns: int) -> tuple[int, FloatArray, FloatArray, FloatArray]:
-        """Place m of the last step before `stamp_ns`; x_{tau|m}, P_{tau|m} and F(m + 1, tau)."""
-        place = self._history.left(stamp_ns)
-        mean, covariance = self._history.predicted(place, stamp_ns)
-        after = self._history.steps[place + 1]
-        return place, mean, covariance, self._history.transition(mean, stamp_ns, after.stamp_ns)
+    def _before(self, stamp_ns: int) -> tuple[int, FloatArray, FloatArray, FloatArray]:
+        """Return the index m of the last step before `stamp_ns`; x_{tau|m}, P_{tau|m} and F(m + 1, tau)."""
+        index = self._left(stamp_ns)
+        mean, covariance = self._predicted(index, stamp_ns)
+        F = self._motion.jacobian(mean, seconds(self._steps[index + 1].stamp_ns - stamp_ns))
+        return index, mean, covariance, F
 
 
 def retrodicted(
@@ -112,10 +111,12 @@ class _OneLag(CrossingEkf):
     equivalent: ClassVar[bool] = False
 
     def _past(self, stamp_ns: int) -> Past:
-        now, first = self._history.newest, self._history.first_at_newest
-        before = first.predicted_mean, first.predicted_covariance
+        now = self._steps[-1]
         if self.equivalent:
-            before = self._history.predicted(self._history.left(stamp_ns), now.stamp_ns)
+            before = self._predicted(self._left(stamp_ns), now.stamp_ns)
+        else:
+            first = next(step for step in self._steps if step.stamp_ns == now.stamp_ns)
+            before = first.predicted_mean, first.predicted_covariance
         return retrodicted(self._motion, now, before, seconds(now.stamp_ns - stamp_ns), self.noise_in_state)
 
 
@@ -162,7 +163,7 @@ class C(CrossingEkf):
     exact = "no process noise: any lag, any number"
 
     def _past(self, stamp_ns: int) -> Past:
-        now = self._history.newest
+        now = self._steps[-1]
         dt_s = seconds(stamp_ns - now.stamp_ns)
         mean, back = self._motion.predict(now.mean, dt_s), self._motion.jacobian(now.mean, dt_s)
         cross = now.covariance @ back.T
@@ -217,14 +218,14 @@ class RtsCrossCovariance(CrossingEkf):
     exact = "any lag, first late measurement"
 
     def _past(self, stamp_ns: int) -> Past:
-        steps = self._history.steps
-        left, mean, covariance, F = self._predicted(stamp_ns)
+        steps = self._steps
+        left, mean, covariance, F = self._before(stamp_ns)
         smoothed, P, path = steps[-1].mean, steps[-1].covariance, steps[-1].covariance
-        for place in range(len(steps) - 1, left, -1):
-            after, before = steps[place], steps[place - 1]
-            at_tau = place == left + 1
+        for index in range(len(steps) - 1, left, -1):
+            after, before = steps[index], steps[index - 1]
+            at_tau = index == left + 1
             x, P_x = (mean, covariance) if at_tau else (before.mean, before.covariance)
-            transition = F if at_tau else self._history.transition_to(place)
+            transition = F if at_tau else self._transition_to(index)
             predicted = Prediction(after.predicted_mean, after.predicted_covariance, transition @ P_x)
             smoothed, P, gain = rts_step(x, P_x, predicted, smoothed - after.predicted_mean, P)
             path = gain @ path
@@ -248,12 +249,12 @@ class FixedPoint(CrossingEkf):
     exact = "any lag, first late measurement"
 
     def _past(self, stamp_ns: int) -> Past:
-        steps = self._history.steps
-        left, mean, covariance, F = self._predicted(stamp_ns)
+        steps = self._steps
+        left, mean, covariance, F = self._before(stamp_ns)
         cross = covariance
-        for place in range(left + 1, len(steps)):
-            step = steps[place]
-            cross = (F if place == left + 1 else self._history.transition_to(place)) @ cross
+        for index in range(left + 1, len(steps)):
+            step = steps[index]
+            cross = (F if index == left + 1 else self._transition_to(index)) @ cross
             weighted = step.weight @ cross
             mean = mean + cross.T @ step.score
             covariance = symmetrise(covariance - cross.T @ weighted)
@@ -279,11 +280,11 @@ class Larsen(CrossingEkf):
     """
 
     def _past(self, stamp_ns: int) -> Past:
-        steps = self._history.steps
-        left, mean, covariance, M = self._predicted(stamp_ns)
-        for place in range(left + 1, len(steps)):
-            step = steps[place]
-            if place > left + 1:
-                M = self._history.transition_to(place) @ M
+        steps = self._steps
+        left, mean, covariance, M = self._before(stamp_ns)
+        for index in range(left + 1, len(steps)):
+            step = steps[index]
+            if index > left + 1:
+                M = self._transition_to(index) @ M
             M = M - step.predicted_covariance @ (step.weight @ M)
         return Past(mean, covariance, np.asarray(M @ covariance))

@@ -30,15 +30,14 @@ class _ForwardEkf(LateEkf):
     """
 
     def _fuse_late(self, measurement: Measurement) -> OneCorrection:
-        history, stamp_ns = self._history, measurement.stamp_ns
-        now = history.newest
-        mean, covariance = history.predicted(history.left(stamp_ns), stamp_ns)
+        stamp_ns, now = measurement.stamp_ns, self._steps[-1]
+        mean, covariance = self._predicted(self._left(stamp_ns), stamp_ns)
         at_tau = correct_one(mean, covariance, measurement)
-        late = Estimate(*history.moved(at_tau.mean, at_tau.covariance, stamp_ns, now.stamp_ns))
-        common = Estimate(*history.moved(mean, covariance, stamp_ns, now.stamp_ns))
+        late = Estimate(*self._moved(at_tau.mean, at_tau.covariance, stamp_ns, now.stamp_ns))
+        common = Estimate(*self._moved(mean, covariance, stamp_ns, now.stamp_ns))
         fused = self._fused(Estimate(now.mean, now.covariance), late, common)
         np.linalg.cholesky(fused.covariance)
-        history.absorb(*fused)
+        self._absorb(*fused)
         return OneCorrection(*fused, at_tau.innovation, at_tau.nis, S=at_tau.S)
 
     @abstractmethod

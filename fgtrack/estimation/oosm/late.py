@@ -1,20 +1,43 @@
 """EKFs that step through what arrives in sequence: ignore late measurements, take them as current, or rewind."""
 
+import bisect
 from abc import abstractmethod
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
-from fgtrack.core.types import TrackState
+import numpy as np
+
+from fgtrack.core.linalg import psd_solve, symmetrise
+from fgtrack.core.time import seconds
+from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.filters.ekf import OneCorrection
+from fgtrack.estimation.filters.ekf import OneCorrection, correct_one, linearised, predict, propagated
 from fgtrack.estimation.filters.propagation import track_state
 from fgtrack.estimation.filters.windowed import WindowedFilter
-from fgtrack.estimation.oosm.history import History
 from fgtrack.models.motion import MotionModel
 
 
+@dataclass(frozen=True, slots=True)
+class FilterStep:
+    """A state before and after a measurement, and what the measurement said; yaws are not wrapped."""
+
+    stamp_ns: int
+    mean: FloatArray
+    """x_{j|j}, shape (n,)."""
+    covariance: FloatArray
+    """P_{j|j}, shape (n, n)."""
+    predicted_mean: FloatArray
+    """x_{j|j-1}, shape (n,)."""
+    predicted_covariance: FloatArray
+    """P_{j|j-1}, shape (n, n)."""
+    score: FloatArray
+    """H' S^-1 y, shape (n,)."""
+    weight: FloatArray
+    """H' S^-1 H, shape (n, n); with it I - K H = I - P_{j|j-1} weight."""
+
+
 class LateEkf(WindowedFilter):
-    """An EKF for measurements in sequence; `_fuse_late` says what becomes of the others.
+    """An EKF for measurements in sequence; `_fuse_late` defines what becomes of the others.
 
     Exact and approximate are meant for a linear model throughout the package; in a nonlinear one all is linearised at
     the stored means.
@@ -27,25 +50,33 @@ class LateEkf(WindowedFilter):
 
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
         super().__init__(motion, prior, lag_s)
-        self._history = History(motion, prior.stamp_ns, *initial_state(motion, prior))
+        x, P = initial_state(motion, prior)
+        self._steps = [FilterStep(prior.stamp_ns, x, P, x, P, np.zeros_like(x), np.zeros_like(P))]
+        """In order of their stamps, the first of them the prior."""
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: predicted from the last stored step before that stamp."""
-        step = self._history.steps[self._history.left(stamp_ns)]
-        moved = self._history.moved(self._wrapped(step.mean), step.covariance, step.stamp_ns, stamp_ns)
+        step = self._steps[self._left(stamp_ns)]
+        moved = self._moved(self._wrapped(step.mean), step.covariance, step.stamp_ns, stamp_ns)
         return track_state(self._motion, stamp_ns, *moved)
 
     def _forget_before(self, stamp_ns: int) -> None:
-        self._history.forget_before(stamp_ns)
+        del self._steps[: self._left(stamp_ns)]
 
     def _fuse(self, measurement: Measurement) -> OneCorrection | None:
         late = measurement.stamp_ns < self._newest_ns
         return self._fuse_late(measurement) if late else self._fuse_next(measurement)
 
     def _fuse_next(self, measurement: Measurement) -> OneCorrection:
-        """The ordinary step from the present."""
-        step, result = self._history.stepped(len(self._history.steps) - 1, measurement)
-        self._history.append(step)
+        """Take the ordinary step from the last one before `measurement`, and forget those after it, if it is late."""
+        index = self._left(measurement.stamp_ns)
+        mean, covariance = self._predicted(index, measurement.stamp_ns)
+        result = correct_one(mean, covariance, measurement)
+        y, H = linearised(measurement.z, mean, measurement.model, measurement.pose)
+        weighted = psd_solve(propagated(H, covariance, measurement.R / result.weight), np.column_stack((y, H)))
+        information = H.T @ weighted[:, 0], symmetrise(H.T @ weighted[:, 1:])
+        step = FilterStep(measurement.stamp_ns, result.mean, result.covariance, mean, covariance, *information)
+        self._steps[index + 1 :] = [step]
         return result
 
     @abstractmethod
@@ -54,6 +85,41 @@ class LateEkf(WindowedFilter):
 
         Raises `numpy.linalg.LinAlgError`, with all as it was, for one that cannot be fused.
         """
+
+    def _left(self, stamp_ns: int) -> int:
+        """Return the index of the last step that is not after `stamp_ns`, or of the first step, where all are."""
+        return max(bisect.bisect_right(self._steps, stamp_ns, key=lambda step: step.stamp_ns) - 1, 0)
+
+    def _predicted(self, index: int, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Return mean (n,) and covariance (n, n) at `stamp_ns` from the step at `index`."""
+        step = self._steps[index]
+        return self._moved(step.mean, step.covariance, step.stamp_ns, stamp_ns)
+
+    def _moved(
+        self, mean: FloatArray, covariance: FloatArray, from_ns: int, to_ns: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return mean (n,) and covariance (n, n) at `to_ns` from those at `from_ns`."""
+        if from_ns == to_ns:
+            return mean, covariance
+        return predict(mean, covariance, self._motion, seconds(to_ns - from_ns))
+
+    def _transition_to(self, index: int) -> FloatArray:
+        """Return F_j, shape (n, n), from the step before `index` to the one there."""
+        before = self._steps[index - 1]
+        return self._motion.jacobian(before.mean, seconds(self._steps[index].stamp_ns - before.stamp_ns))
+
+    def _absorb(self, mean: FloatArray, covariance: FloatArray) -> None:
+        """Add `mean` (n,) and `covariance` (n, n) of the present, into which a late measurement turned its state.
+
+        They become a step at the present stamp, with the one measurement of the present state that has the same
+        effect: H' S^-1 y = P^-1 (x+ - x), H' S^-1 H = P^-1 (P - P+) P^-1 (the equivalent measurement of Bar-Shalom,
+        Chen and Mallick 2004).
+        """
+        now = self._steps[-1]
+        gained = psd_solve(now.covariance, now.covariance - covariance)
+        score = psd_solve(now.covariance, mean - now.mean)
+        weight = symmetrise(psd_solve(now.covariance, gained.T))
+        self._steps.append(FilterStep(now.stamp_ns, mean, covariance, now.mean, now.covariance, score, weight))
 
 
 class Drop(LateEkf):
@@ -91,13 +157,6 @@ class RewindForget(LateEkf):
     Exact for: nothing. For what it keeps it is the filter in order of stamps, so it stays consistent, but all
     measurements between the late stamp and the present are lost.
     """
-
-    def _fuse_next(self, measurement: Measurement) -> OneCorrection:
-        place = self._history.left(measurement.stamp_ns)
-        step, result = self._history.stepped(place, measurement)
-        self._history.forget_after(place)
-        self._history.append(step)
-        return result
 
     def _fuse_late(self, measurement: Measurement) -> OneCorrection:
         return self._fuse_next(measurement)
