@@ -387,25 +387,3 @@ def test_a_bank_of_tracks_of_all_ages_is_a_bank_of_single_smoothers(make: type[S
             expected.state.stamp_ns,
         )
         assert max(known_apart(found.state, expected.state)) < 1e-8
-
-
-def test_the_arrays_stay_as_small_as_window_and_ring_need() -> None:
-    motion, rng = CTRV(), np.random.default_rng(4)
-    bank = SmootherBank(motion, SmootherSettings(lag_s=0.3, ring_s=0.3), IncrementalSolver)
-    for k in range(1, 301):
-        stamp_ns = START_NS + 25 * k * MS
-        bank.advance(stamp_ns)
-        if k % 30 == 1:  # one after the other, and one that stays
-            for track_id in bank.track_ids[1:]:
-                bank.remove(track_id)
-            bank.birth(k, replace(START, stamp_ns=stamp_ns))
-        seen = [track_id for track_id in bank.track_ids if rng.random() < 0.9]
-        bank.states_at(stamp_ns)
-        bank.update(stamp_ns, seen, [measured(rng, motion, 25 * k * MS) for _ in seen])
-        bank.smoothed()
-    nodes = bank.windows.nodes
-    assert nodes.stamps_ns.shape == (4, 64)
-    assert nodes.rows.shape[:2] == (4 * 64, 4)
-    assert len(nodes.terms) <= 4 * 64
-    assert max(map(len, nodes.terms.values())) <= 1
-    assert len(bank._known) <= 2

@@ -21,8 +21,6 @@ from fgtrack.models.oval import make_oval
 from fgtrack.pipeline.shipped import shipped_folder
 
 Files = Mapping[str, bytes]
-LINE = "line.json"
-"""File of the words of a command."""
 
 
 def _drive(duration_s: float) -> tuple[fgtrack.EgoState | fgtrack.DetectionList, ...]:
@@ -173,17 +171,6 @@ def run_folder() -> Files:
         return {f"in/{file.name}": file.read_bytes() for file in path.iterdir()}
 
 
-def named() -> Files:
-    """What sweeps and `LINES` name."""
-    return {
-        "x.jsonl": stream(_drive(4.0)),
-        "x.csv": track_map(),
-        "x.yaml": RESWEEP,
-        "d.yaml": DELAYS,
-        "s.jsonl": straight(),
-    }
-
-
 def configurations() -> list[Files]:
     """Each shipped one, beside a stream of lists of its sensors that measure places."""
     found = []
@@ -202,21 +189,6 @@ def configurations() -> list[Files]:
     return found
 
 
-def lines() -> list[Files]:
-    """Each of `LINES`, beside all that it names."""
-    return [{LINE: json.dumps(line.split()).encode(), **named()} for line in LINES.strip().splitlines()]
-
-
-def words(content: bytes) -> list[str]:
-    """Words as a shell hands them over, whatever has become of those of a `LINE`."""
-    text = content.decode(errors="surrogateescape").replace("\0", "")
-    try:
-        found = json.loads(text)
-    except ValueError:
-        found = text.split()
-    return [str(word).replace("\0", "") for word in (found if isinstance(found, list) else [found])] or ["--help"]
-
-
 def shipped(kind: str) -> list[bytes]:
     return [file.read_bytes() for file in sorted((shipped_folder() / kind).glob("*.yaml"))]
 
@@ -230,42 +202,6 @@ estimators: [ekf-replay]
 set: {map.track: null}
 vary: {association.gate_m: [3.0, 5.0], scenario.sensors.radar.rate_hz: [10.0]}
 metrics: ["truth.overall.errors.*"]
-"""
-LINES = """
-simulate single_opponent -o out.jsonl --seed 3 --duration 0.5
-simulate default -o bag --storage sqlite3 --duration 0.2 --overwrite
-replay x.jsonl -c open_space -e ekf-replay -o run --set clock.node_hz=10 --overwrite
-replay x.jsonl -e smoother,ekf-backward-forward -o run --map x.csv --pit-map oval --set map.track=null
-replay x.jsonl -c karle2023 -o run --realtime --set map.track=null --set lifecycle.confirm_count=3
-compare in --json --streaming
-compare in --format latex --all
-figure in -o figures --format svg --track 1 --stamp 1.5
-report in -o x.html --overwrite
-export in -o x.mcap --overwrite
-export in -o bag --ros2
-sweep x.yaml -o swept --jobs 1 --input x.jsonl --set map.track=null --format csv --all
-tune s.jsonl -o y.yaml --keep sensors.radar.std.x_m --set motion={"kind":"cv","std_per_s":{"velocity":3.0}} --json
-advise x.jsonl -c open_space -o y.yaml --reference radar --set clock.node_hz=10 --format md
-offsets x.jsonl -c open_space --reference radar --map oval --json
-info x.jsonl -c open_space --format md
-convert x.jsonl out.jsonl --delays d.yaml --seed 4 --overwrite
-convert x.jsonl bag -c open_space --storage mcap
-config -c smoother --set clock.node_hz=50
-config --list
-"""
-"""Calls of the commands."""
-RESWEEP = b"""format: fgtrack-sweep/1
-input: x.jsonl
-delays: d.yaml
-config: open_space
-seeds: 1
-estimators: [ekf-replay, ekf-backward-forward]
-set: {clock.node_hz: 20.0}
-one_at_a_time:
-  gate:
-    label: [narrow, wide]
-    association.gate_m: [2.0, 6.0]
-  delays.radar.loss_probability: [0.0, 0.5]
 """
 MAPPING = b"""estimator: ekf-replay
 input:

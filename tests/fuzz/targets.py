@@ -3,10 +3,9 @@
 import gzip
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from fuzz import inputs
-from fuzz.inputs import LINE, Files
+from fuzz.inputs import Files
 
 RUN = "run"
 """Folder of the run that a command writes, which is looked at."""
@@ -19,14 +18,9 @@ class Target:
     healthy: Callable[[], Sequence[Files]]
     """Inputs that are right, as contents by name."""
     commands: Sequence[Sequence[str]]
-    """Words of the commands, called in the folder of the files; `LINE` for those in that file."""
+    """Words of the commands, called in the folder of the files."""
     corrupted: str | None = None
     """End of the names of the files that are corrupted, else any."""
-
-
-def words_of(command: Sequence[str], folder: Path) -> Sequence[str]:
-    """Words of a command, those of the file where it is `LINE`."""
-    return inputs.words((folder / LINE).read_bytes()) if command == (LINE,) else command
 
 
 _REPLAY = ("--overwrite", "-o", RUN, "-e")
@@ -86,7 +80,7 @@ TARGETS = {
         [("simulate", "x.yaml", "-o", "out.jsonl", "--overwrite", "--duration", "0.5")],
     ),
     "sweep": Target(
-        lambda: [{**inputs.named(), "x.yaml": content} for content in (inputs.SWEEP, inputs.RESWEEP)],
+        lambda: [{"x.yaml": inputs.SWEEP}],
         [("sweep", "x.yaml", "-o", "swept", "--jobs", "1")],
         "x.yaml",
     ),
@@ -117,5 +111,4 @@ TARGETS = {
         ],
         ".csv",
     ),
-    "line": Target(inputs.lines, [("replay", "x.jsonl", "-c", "open_space", "-o", "in"), (LINE,)], LINE),
 }

@@ -18,7 +18,7 @@ from fgtrack.estimation.failures import Failure
 from fgtrack.io.run import load_run
 from fuzz.inputs import Files
 from fuzz.mutation import mutated
-from fuzz.targets import RUN, TARGETS, Target, words_of
+from fuzz.targets import RUN, TARGETS, Target
 
 MOST_MB, LONGEST_S, LONGEST_LINE = 2000.0, 20.0, 2000
 _A_FEW, _SEED = 4, 20_261
@@ -54,7 +54,7 @@ def problem_of(server: Server, target: Target, files: Files, folder: Path, right
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(content)
     for command in target.commands:
-        done = server(words_of(command, folder), folder, kill_after_s=10.0 * LONGEST_S)
+        done = server(command, folder, kill_after_s=10.0 * LONGEST_S)
         problem = _problem(done) or _problem_of_run(folder / RUN)
         if problem is None and right and done.code:
             problem = f"exit code {done.code} for an input that is right: {done.said.strip()}"

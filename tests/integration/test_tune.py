@@ -90,15 +90,6 @@ def test_json_says_the_same_and_every_parameter_has_a_row(stream: Path, capsys: 
     assert [one["key"] for one in found["parameters"] if one["why"] == "kept as asked"] == [kept]
     assert values[kept] == 1.0
     assert all(one["why"] for one in found["parameters"] if one["known"] in ("no", "limit"))
-    assert all(one["tuned"] == one["configured"] for one in found["parameters"] if one["known"] == "no")
-    errors = {one["key"]: one["std_error"] or 0.0 for one in found["parameters"]}
-    known = {one["key"]: one["known"] for one in found["parameters"]}
-    assert {key for key, is_known in known.items() if is_known == "yes"} == {
-        key for key, error in errors.items() if 0.0 < error <= 0.05
-    }
-    assert {key for key, is_known in known.items() if is_known == "roughly"} == {
-        key for key, error in errors.items() if 0.05 < error <= 0.5
-    }
     assert found["held_out"]["after"] > found["held_out"]["before"]
 
 

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from support.examples import slow
 
 import fgtrack
 from fgtrack.core.geometry import rotation
@@ -96,9 +97,6 @@ def confirmed(
     return len(ids)
 
 
-#: Every meeting, each heading elsewhere and drawn anew.
-SCENES = [(name, (60.0, 150.0, -100.0)[seed % 3], seed) for seed, name in enumerate(MEETINGS)]
-
 MERGE = {"merge": {"kind": "connected", "distance_m": 5.1}}
 NO_MERGE = {"merge": {"kind": "none"}}
 
@@ -115,23 +113,14 @@ SETTINGS: dict[str, tuple[str | None, dict[str, object], int]] = {
 }
 
 
-def counts(name: str, towards_deg: float, seed: int, settings: str, estimators: tuple[str, ...], apart: int) -> None:
-    sent = messages(MEETINGS[name], towards_deg, seed)
-    config, changes, most = SETTINGS[settings]
-    found = {estimator: confirmed(sent, estimator, config, **changes) for estimator in estimators}
+FAST = [*MEETINGS][:3]
+
+
+@pytest.mark.parametrize(("seed", "name"), [*enumerate(FAST), *slow(*enumerate([*MEETINGS][len(FAST) :], len(FAST)))])
+def test_two_cars_that_meet_are_as_many_tracks_with_every_estimator(seed: int, name: str) -> None:
+    """Each meeting heads elsewhere, with other noise and settings."""
+    sent = messages(MEETINGS[name], (60.0, 150.0, -100.0)[seed % 3], seed)
+    config, changes, most = list(SETTINGS.values())[seed % len(SETTINGS)]
+    found = {estimator: confirmed(sent, estimator, config, **changes) for estimator in FEW}
     assert 2 <= min(found.values()) <= max(found.values()) <= most, found
-    assert max(found.values()) - min(found.values()) <= apart, found
-
-
-@pytest.mark.parametrize(
-    ("name", "towards_deg", "seed", "settings"),
-    [
-        pytest.param(*scene, settings, marks=[] if k == n else pytest.mark.slow)
-        for k, scene in enumerate(SCENES)
-        for n, settings in enumerate(SETTINGS)
-    ],
-)
-def test_two_cars_that_meet_are_as_many_tracks_with_every_estimator(
-    name: str, towards_deg: float, seed: int, settings: str
-) -> None:
-    counts(name, towards_deg, seed, settings, FEW, apart=1)
+    assert max(found.values()) - min(found.values()) <= 1, found
