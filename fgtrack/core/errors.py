@@ -28,10 +28,9 @@ def did_you_mean(name: object, known: Iterable[object]) -> str:
 
 
 def one_line(text: str) -> str:
-    """`text` as a terminal can show it: on one line, not endless, what is no letter or sign written as an escape.
+    """`text` on one line, with escapes for what is not printable; of a long one the beginning and the end.
 
-    Names of sensors and topics, and whatever else a file says, come into messages: they must neither move the cursor
-    nor fill the screen. Of a long text the beginning and the end are kept, which say where and what to do.
+    Messages contain names of sensors and topics from files: they must neither move the cursor nor fill the screen.
     """
     if len(text) > _LONGEST:
         text = f"{text[: _LONGEST - _TAIL]} ... {text[-_TAIL:]}"

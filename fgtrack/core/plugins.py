@@ -19,22 +19,14 @@ class Registry:
     """Parts of one kind by name.
 
     A plug-in is an entry point of one of the groups. It is loaded when its name is used, so a broken one does not
-    disturb the others. One that takes the name of a built-in part, or of a plug-in found before, is left out with a
-    warning.
-
-    Parameters
-    ----------
-    noun
-        What the parts are, for messages: `estimator`.
-    built_in
-        Where the built-in parts are, `module:attribute`, by name, for every entry-point group.
-    aliases
-        Present names by former ones.
+    disturb the others. One with the name of a built-in part, or of an earlier plug-in, is left out with a warning.
     """
 
     def __init__(
         self, noun: str, built_in: Mapping[str, Mapping[str, str]], aliases: Mapping[str, str] | None = None
     ) -> None:
+        """`noun`: kind of the parts, for messages; `built_in`: `module:attribute` by name, for every entry-point group;
+        `aliases`: present names by former ones."""
         self._noun = noun
         self._built_in = built_in
         self._aliases = dict(aliases or {})
@@ -64,10 +56,7 @@ class Registry:
         return {name: _package(entry) for name, entry in self._entries.items() if entry.dist is not None}
 
     def sources(self) -> dict[str, str]:
-        """Names of the plug-ins with the package of each and a hash of its code, which may change without its version.
-
-        That is all of the package that the entry names, or its one module.
-        """
+        """Names of the plug-ins, with the package of each and a hash of the code of that package or module."""
         return {name: f"{package} {_hash_of(self._entries[name])}" for name, package in self.plugins().items()}
 
     def resolve(self, name: str) -> str:

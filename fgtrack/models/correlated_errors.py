@@ -2,7 +2,7 @@
 
 Where the errors of successive detections resemble each other, as those of a box around a car seen from one side,
 an estimator that takes them for white is overconfident: a smoother, which averages over its window, most of all.
-The remedy is as old as the filter: the part of the error that lasts is a first-order Gauss-Markov process and a state
+The remedy: the correlated part of the error is a first-order Gauss-Markov process and a state
 (Bryson and Henrikson, "Estimation using sampled data containing sequentially correlated noise", 1968; Bar-Shalom, Li,
 Kirubarajan 2001, section 8.3). Every estimator does it alike, because motion and measurement models bring the state.
 """
@@ -44,11 +44,11 @@ class CorrelatedErrors(MotionModel):
     def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.predict`."""
         moved = self.base.predict(x[..., : self._n], dt_s)
-        return np.concatenate([moved, x[..., self._n :] * self._decay(dt_s)], axis=-1)
+        return np.concatenate([moved, x[..., self._n :] * np.exp(self._exponents(dt_s))], axis=-1)
 
     def jacobian(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.jacobian`."""
-        return self._beside(self.base.jacobian(x[..., : self._n], dt_s), self._decay(dt_s))
+        return self._beside(self.base.jacobian(x[..., : self._n], dt_s), np.exp(self._exponents(dt_s)))
 
     def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.process_noise`."""
@@ -68,19 +68,16 @@ class CorrelatedErrors(MotionModel):
         return np.array([1.0 / time_s for _, time_s in self.times_s])
 
     def _exponents(self, dt_s: float | FloatArray) -> FloatArray:
+        """Logarithms of the decays, shape (..., errors)."""
         return np.minimum(-np.asarray(dt_s, dtype=np.float64)[..., None] * self._rates_hz, _MOST)
-
-    def _decay(self, dt_s: float | FloatArray) -> FloatArray:
-        """Shape (..., errors)."""
-        return np.asarray(np.exp(self._exponents(dt_s)))
 
     def _beside(self, block: FloatArray, diagonal: FloatArray) -> FloatArray:
         """Block-diagonal matrix (..., n, n) of `block` and of `diagonal` (..., errors)."""
-        found = np.zeros((*block.shape[:-2], self.dim, self.dim))
-        found[..., : self._n, : self._n] = block
-        places = np.arange(self._n, self.dim)
-        found[..., places, places] = diagonal
-        return found
+        matrix = np.zeros((*block.shape[:-2], self.dim, self.dim))
+        matrix[..., : self._n, : self._n] = block
+        indices = np.arange(self._n, self.dim)
+        matrix[..., indices, indices] = diagonal
+        return matrix
 
 
 @dataclass(frozen=True)
@@ -112,9 +109,9 @@ class ColouredNoiseMeasurement(MeasurementModel):
 
 
 def with_correlated_errors(motion: MotionModel, sensors: Mapping[str, SensorModel]) -> MotionModel:
-    """`motion` with a state for every component of the sensors whose errors last; itself where there is none."""
+    """`motion` with a state for every component of the sensors with correlated errors; itself where there is none."""
     times_s = [
-        (_name(sensor, component), model.correlation.time_s)
+        (f"{sensor}.{component}", model.correlation.time_s)
         for sensor, model in sensors.items()
         if model.correlation is not None
         for component in model.components
@@ -128,20 +125,21 @@ def split_error(
     """The measurement model with the correlated part of the error, and the covariance (k, k) of the rest.
 
     Of the covariance R (k, k) of the components that the sensor measures, the share s = `model.correlation.share`
-    lasts: z = h(x) + (s R)^1/2 e + N(0, (1 - s) R), so that a detection alone is as uncertain as R says. `state_names`
-    are those of the motion model. Both come back as they are where no error lasts.
+    is correlated: z = h(x) + (s R)^1/2 e + N(0, (1 - s) R), so that a detection alone has the covariance R.
+    `state_names` are those of the motion model. Both are returned as they are without correlation.
     """
     if model.correlation is None:
         return measurement, R
     own = [row for row, name in enumerate(measurement.components) if name in model.std]
     block = np.ix_(own, own)
     share = model.correlation.share
-    lasting = share * R[block]
+    correlated = share * R[block]
     white = R.copy()
-    white[block] -= lasting
+    white[block] -= correlated
     gain = np.zeros((len(R), len(own)))
-    gain[own] = _root(lasting)
-    columns = tuple(state_names.index(_name(sensor, measurement.components[row])) for row in own)
+    values, vectors = np.linalg.eigh(correlated)
+    gain[own] = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T  # turns with the axes of the covariance
+    columns = tuple(state_names.index(f"{sensor}.{measurement.components[row]}") for row in own)
     return ColouredNoiseMeasurement(measurement.components, measurement.state_names, columns, gain), symmetrise(white)
 
 
@@ -165,13 +163,3 @@ def position_cross(measurement: MeasurementModel, z: FloatArray, pose: SensorPos
     x_m, y_m = (-G @ measurement.gain).tolist()
     names = [measurement.state_names[column] for column in measurement.columns]
     return dict(zip(names, zip(x_m, y_m, strict=True), strict=True))
-
-
-def _name(sensor: str, component: str) -> str:
-    return f"{sensor}.{component}"
-
-
-def _root(covariance: FloatArray) -> FloatArray:
-    """The symmetric root, shape (k, k): its axes turn with those of the covariance."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)

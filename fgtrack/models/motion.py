@@ -1,8 +1,7 @@
 """Motion models: exact flow, Jacobian and composing process noise of CTRV, CTRA and CV.
 
-All functions take a state `x`, shape (..., n), and a duration `dt_s`, a float or an array of shape (...), and
-broadcast the two. A duration may be 0. For `predict` and `jacobian` it may be negative: the flow runs
-backwards. `predict` does not wrap the yaw; `MeasurementModel.residual` does.
+All functions broadcast a state `x`, shape (..., n), and a duration `dt_s`, a float or an array of shape (...), which
+may be negative for `predict` and `jacobian`. Only `MeasurementModel.residual` wraps the yaw.
 """
 
 from abc import ABC, abstractmethod
@@ -89,15 +88,14 @@ class MotionModel(ABC):
         return Transition(self.predict(x, dt_s), self.jacobian(x, dt_s), self.process_noise(x, dt_s))
 
     def start_variance(self, name: str) -> float:
-        """Variance of the entry `name` of a new object of which nothing is known of it; its mean is 0."""
+        """Variance of an unobserved entry `name` of a new object; its mean is 0."""
         return 1.0
 
     def kinematic(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean, shape (..., m), and first-order covariance, (..., m, m), of the leading m entries of `STATE_NAMES`.
 
-        m is 6 of a model with an acceleration, else 5; an entry that the state lacks is 0 with variance 0. Of a
-        Cartesian state the yaw is 0 at speed 0; its variance there is that of the velocity across over
-        `MIN_SPEED_MPS` squared, large but finite: the heading of an object at rest is unknown.
+        m is 6 of a model with an acceleration, else 5; an entry that the state lacks is 0 with variance 0. The yaw of
+        a Cartesian state at speed 0 is 0, with a large but finite variance, see `MIN_SPEED_MPS`.
         """
         if self._leads:
             return x, P
@@ -110,11 +108,10 @@ class MotionModel(ABC):
         return mean, symmetrise(congruence(J, P))
 
     def from_kinematic(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """State and covariance P of this model from what `kinematic` of any model gives.
+        """State and covariance P of this model from a kinematic state; a missing entry is 0 with `start_variance`.
 
-        What the kinematic state lacks is 0 with `start_variance`. The covariance of a Cartesian velocity is of first
-        order, plus the variance of the product of speed error and yaw error, across the heading: without it, an
-        object born at speed 0 could not move sideways.
+        The covariance of a Cartesian velocity is of first order, plus the variance of the product of speed error and
+        yaw error, across the heading: without it, an object born at speed 0 could not move sideways.
         """
         n = self.dim
         if self._leads and n <= mean.shape[-1]:

@@ -78,16 +78,15 @@ class Correlation:
 
 @settings
 class Score:
-    """Likelihood ratio of a detection's score: log p(score | object) / p(score | clutter) = (score - even) / scale."""
+    """Likelihood ratio of a detection's score: log p(score | object) / p(score | clutter) = (score - even) / scale.
+
+    Its logarithm is at most 10 to either side.
+    """
 
     even: float
     """A score that objects and clutter have equally often."""
     scale: PositiveFloat
     """Increase of the score that makes an object e times more probable."""
-
-    def log_ratio(self, score: float) -> float:
-        """The logarithm of the ratio, at most 10 to either side."""
-        return min(max((score - self.even) / self.scale, -10.0), 10.0)
 
 
 #: Components that the map may give, and the keys of their standard deviations.

@@ -100,14 +100,6 @@ def move_back(items: MapDetections, by_m: float) -> None:
     items.values[:, RANGE] += by_m
 
 
-def take_map_yaw(items: MapDetections, rows: IntArray, yaw_rad: FloatArray) -> None:
-    """Give those of `rows` that have no yaw that of the map, shape (m,)."""
-    lack = np.isnan(items.values[rows, YAW])
-    rows = rows[lack]
-    items.values[rows, YAW] = yaw_rad[lack]
-    items.map_yaw[rows] = True
-
-
 def merged(items: MapDetections, merge: "Merge") -> MapDetections:
     """Return `items` with those of one object averaged, in the order of the merge; bearings alone are last.
 

@@ -217,7 +217,7 @@ class ExistenceLifecycle:
             return 0.0
         indices = (matched.candidate.leader, *matched.candidate.merged)
         scores = [score for index in indices if (score := scan.objects[index].score) is not None]
-        return model.log_ratio(max(scores)) if scores else 0.0
+        return min(max((max(scores) - model.even) / model.scale, -10.0), 10.0) if scores else 0.0
 
 
 Lifecycle = CountingLifecycle | ExistenceLifecycle

@@ -34,7 +34,6 @@ from fgtrack.tracking.detections import (
     merged,
     move_back,
     placement,
-    take_map_yaw,
 )
 from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.inbox import Batch, record
@@ -146,7 +145,9 @@ class Preprocess:
             return items
         view = self._road.view(items.points_m[placed])
         if items.sensor.yaw_from_map_std_rad is not None:
-            take_map_yaw(items, placed, view.yaw_rad)
+            lack = np.isnan(items.values[placed, YAW])
+            items.values[placed[lack], YAW] = view.yaw_rad[lack]
+            items.map_yaw[placed[lack]] = True
         if items.sensor.curvature_from_map_std_radpm is not None:
             items.values[placed, CURVATURE] = view.curvature_radpm
         outside = np.zeros(len(items.indices), dtype=bool)
