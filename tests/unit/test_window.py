@@ -115,12 +115,12 @@ def test_the_state_between_two_nodes_is_the_conditional_of_the_joint(
     gain = np.linalg.solve(outer, cross.T).T
     right = kind.predict(middle, after_s) + 0.1 * rng.standard_normal(n)
 
-    found = between(kind, left, right, until_s, after_s)
+    mean, Lambda, Psi, Sigma = between(kind, left, right, until_s, after_s)
     scale = np.abs(gain).max()
-    np.testing.assert_allclose(np.hstack([found.Lambda, found.Psi]), gain, atol=1e-6 * scale)
-    np.testing.assert_allclose(found.Sigma, M - gain @ cross.T, atol=1e-7 * np.abs(M).max())
+    np.testing.assert_allclose(np.hstack([Lambda, Psi]), gain, atol=1e-6 * scale)
+    np.testing.assert_allclose(Sigma, M - gain @ cross.T, atol=1e-7 * np.abs(M).max())
     moved = gain @ np.concatenate([np.zeros(n), right - kind.predict(middle, after_s)])
-    np.testing.assert_allclose(found.mean, middle + moved, atol=1e-6 * max(1.0, np.abs(moved).max()))
+    np.testing.assert_allclose(mean, middle + moved, atol=1e-6 * max(1.0, np.abs(moved).max()))
 
 
 @pytest.mark.parametrize("kind", MODELS, ids=MOTIONS)
@@ -128,9 +128,9 @@ def test_at_its_ends_the_state_between_two_nodes_is_theirs(kind: MotionModel) ->
     left = np.array([12.0, 7.0, 0.4, 20.0, 0.3, 1.5])[: kind.dim]
     right = kind.predict(left, 0.3) + 0.1
     at_left, at_right = (between(kind, left, right, *times) for times in ((0.0, 0.3), (0.3, 0.0)))
-    np.testing.assert_allclose(at_left.mean, left, atol=1e-9)
-    np.testing.assert_allclose(at_left.Lambda, np.eye(kind.dim), atol=1e-9)
-    np.testing.assert_allclose(at_right.mean, right, atol=1e-9)
-    np.testing.assert_allclose(at_right.Psi, np.eye(kind.dim), atol=1e-9)
-    for end in (at_left, at_right):
-        np.testing.assert_allclose(end.Sigma, 0.0, atol=1e-12)
+    np.testing.assert_allclose(at_left[0], left, atol=1e-9)
+    np.testing.assert_allclose(at_left[1], np.eye(kind.dim), atol=1e-9)
+    np.testing.assert_allclose(at_right[0], right, atol=1e-9)
+    np.testing.assert_allclose(at_right[2], np.eye(kind.dim), atol=1e-9)
+    for _, _, _, Sigma in (at_left, at_right):
+        np.testing.assert_allclose(Sigma, 0.0, atol=1e-12)

@@ -48,7 +48,10 @@ def update(P: FloatArray, H: FloatArray, y: FloatArray, R: FloatArray, foreign: 
     S = (HP @ H.mT + foreign) + scales * R
     columns = np.concatenate([HP, y[..., None]], axis=-1)
     solved = psd_solve(S, columns)
-    log_density = _log_shares(odds) - 0.5 * (np.vecdot(y, solved[..., -1]) + np.linalg.slogdet(S)[1])
+    share = outlier_share(odds)
+    with np.errstate(divide="ignore"):
+        log_shares = np.log(np.stack([1.0 - share, *(part * share for part in PARTS)]))
+    log_density = log_shares - 0.5 * (np.vecdot(y, solved[..., -1]) + np.linalg.slogdet(S)[1])
     highest = log_density.max(axis=0)
     weights = np.exp(log_density - highest)
     total = weights.sum(axis=0)
@@ -69,10 +72,3 @@ def update(P: FloatArray, H: FloatArray, y: FloatArray, R: FloatArray, foreign: 
 def outlier_share(odds: FloatArray) -> FloatArray:
     """Share of outliers, below `MAX_SHARE`, from a positive number that is about the share where it is small."""
     return np.asarray(MAX_SHARE * odds / (MAX_SHARE + odds))
-
-
-def _log_shares(odds: FloatArray) -> FloatArray:
-    """Log probabilities of the classes, shape (3, ...)."""
-    share = outlier_share(odds)
-    with np.errstate(divide="ignore"):
-        return np.asarray(np.log(np.stack([1.0 - share, *(part * share for part in PARTS)])))

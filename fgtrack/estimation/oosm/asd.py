@@ -101,5 +101,5 @@ class AccumulatedStateDensity(WindowedFilter):
         if index + 1 == len(stamps_ns):
             return self._motion.transition(left, until_s)
         right, after_s = mean[index * n + n : index * n + 2 * n], seconds(stamps_ns[index + 1] - stamp_ns)
-        inner = between(self._motion, left, right, until_s, after_s)
-        return inner.mean, np.hstack((inner.Lambda, inner.Psi)), inner.Sigma
+        own, Lambda, Psi, Sigma = between(self._motion, left, right, until_s, after_s)
+        return own, np.hstack((Lambda, Psi)), Sigma

@@ -66,12 +66,12 @@ def _split(
     n = nodes.dim
     left_A, left_b, left_C = nodes.back[before, :, :n], nodes.back[before, :, n], nodes.C[before]
     times_s = seconds(stamp_ns - before_ns), seconds(after_ns - stamp_ns)
-    inner = between(motion, nodes.origin[before], nodes.origin[after], *times_s)
-    A = inner.Lambda @ left_A + inner.Psi
-    C = propagated(inner.Lambda, left_C, inner.Sigma)
-    b = inner.Lambda @ left_b
+    mean, Lambda, Psi, Sigma = between(motion, nodes.origin[before], nodes.origin[after], *times_s)
+    A = Lambda @ left_A + Psi
+    C = propagated(Lambda, left_C, Sigma)
+    b = Lambda @ left_b
     # Given the state between them the left one no longer depends on the right one: left_A = gain A. Stamps close
     # together leave hardly a digit of the same gain as C_left Lambda' C^-1.
     gain = np.asarray(np.linalg.solve(A.T, left_A.T)).T
-    spread = joseph(left_C, gain, inner.Lambda, inner.Sigma)
-    return inner.mean, (gain, left_b - gain @ b, spread), (A, b, C)
+    spread = joseph(left_C, gain, Lambda, Sigma)
+    return mean, (gain, left_b - gain @ b, spread), (A, b, C)
