@@ -98,7 +98,7 @@ class SmootherBank:
         """See `TrackBank.states_at`."""
         known = self._known.get(stamp_ns)
         if known is None:
-            tracks = self._all_tracks()
+            tracks = np.array([*self._tracks.values()], dtype=np.int64)
             is_known = self._times()[3, tracks] <= stamp_ns
             track_ids, tracks = tuple(compress(self._tracks, is_known.tolist())), tracks[is_known]
             states = self.windows.states_at(tracks, np.full(len(tracks), stamp_ns))
@@ -155,7 +155,7 @@ class SmootherBank:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
         if not self._tracks:
             return []
-        tracks = self._all_tracks()
+        tracks = np.array([*self._tracks.values()], dtype=np.int64)
         states = self.windows.states_at(tracks, np.maximum(self.present_ns, self._times()[3, tracks]))
         return PresentStates(self._motion, self.present_ns, *states)
 
@@ -248,9 +248,6 @@ class SmootherBank:
         """Forget what was computed of the states."""
         self._known.clear()
         self._known_times = None
-
-    def _all_tracks(self) -> IntArray:
-        return np.fromiter(self._tracks.values(), dtype=np.int64, count=len(self._tracks))
 
     def _times(self) -> IntArray:
         """Return four stamps of each row, shape (4, rows).

@@ -105,7 +105,10 @@ class Nodes:
     def begin_window(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
         """Make the first node of a new track."""
         while track >= len(self.count):
-            self._grow_tracks()
+            self._grow(axis=0)
+            for name in ("count", "first", "known"):
+                setattr(self, name, grown(getattr(self, name), len(self.numbers)))
+            self.order = self.first, self.count, self.numbers
         self.stamps_ns[track] = _NEVER_NS
         self.stamps_ns[track, 0] = stamp_ns
         self.count[track] = 1
@@ -118,8 +121,7 @@ class Nodes:
         self.P[number], self.step[number] = covariance, 0.0
 
     def insert_at(self, tracks: IntArray, indices: IntArray, stamp_ns: int, origins: FloatArray) -> None:
-        """Insert nodes at `indices`, one for each of `tracks`, linearised at `origins` (m, n)."""
-        self.make_room(tracks)
+        """Insert nodes at `indices`, one for each of `tracks` that were `saved`, linearised at `origins` (m, n)."""
         numbers = np.empty(len(tracks), dtype=np.int64)
         node_kernels.insert(tracks, indices, stamp_ns, self.stamps_ns, self.numbers, self.count, numbers)
         self._empty(numbers)
@@ -186,24 +188,14 @@ class Nodes:
         These are names of arrays, rows and values. What is relinearised is not among them; the nodes that have left
         the windows are, where a measurement `is_old`.
         """
-        self.make_room(tracks)  # before values are saved, which would move
+        if self.count[tracks].max(initial=0) >= self.stamps_ns.shape[1]:  # before values are saved, which would move
+            self._grow(axis=1)
         numbers, first = self.numbers[tracks], self.first[tracks]
         columns, oldest = np.arange(numbers.shape[1]), np.where(is_old, 0, first - 1)
         behind = numbers[(columns >= oldest[:, None]) & (columns < anchors[:, None])]
         rows = {"predicted": numbers[np.arange(len(tracks)), first], "back": behind, "C": behind, "origin": numbers}
         rows |= dict.fromkeys(self._ORDER, tracks)
         return [(name, at, getattr(self, name)[at]) for name, at in rows.items()]
-
-    def make_room(self, tracks: IntArray) -> None:
-        """Make room for one more node of each of `tracks`."""
-        if self.count[tracks].max(initial=0) >= self.stamps_ns.shape[1]:
-            self._grow(axis=1)
-
-    def _grow_tracks(self) -> None:
-        self._grow(axis=0)
-        for name in ("count", "first", "known"):
-            setattr(self, name, grown(getattr(self, name), len(self.numbers)))
-        self.order = self.first, self.count, self.numbers
 
     def _grow(self, axis: int) -> None:
         """Double the tracks, or the nodes of each; a node keeps its number and, if it is of a track, its values."""

@@ -109,26 +109,23 @@ class IncrementalSolver(Solver):
 
     def look_up(self, tracks: IntArray, indices: IntArray, with_previous: BoolArray) -> None:
         """See `Solver.look_up`."""
-        nodes = self.nodes
+        nodes, n = self.nodes, self.motion.dim
         rows = zip(tracks.tolist(), indices.tolist(), nodes.first[tracks].tolist(), with_previous.tolist(), strict=True)
         for track, index, first, has_previous in rows:
             number, known = int(nodes.numbers[track, max(index, first)]), self._known[track]
             left = int(nodes.numbers[track, index - 1]) if has_previous and index > first else None
-            if (left, number) not in known:
-                known[left, number] = self._read(track, left, number)
+            if (left, number) in known:
+                pass
+            elif left is None:
+                known[left, number] = self._covariance(track, number)
+            else:
+                joint = self._covariance(track, left, number)
+                cross, P = joint[:n, n:], joint[n:, n:]
+                A = psd_solve(P, cross.T).T  # the state on the left, given this one
+                nodes.back[left, :, :n], nodes.back[left, :, n] = A, nodes.step[left] - A.dot(nodes.step[number])
+                nodes.C[left] = symmetrise(joint[:n, :n] - A.dot(cross.T))
+                known[left, number] = P
             nodes.P[number] = known[left, number]
-
-    def _read(self, track: int, left: int | None, number: int) -> FloatArray:
-        """Read the covariance of a node, and the distribution of that on its left given it."""
-        if left is None:
-            return self._covariance(track, number)
-        nodes, n = self.nodes, self.motion.dim
-        joint = self._covariance(track, left, number)
-        cross, P = joint[:n, n:], joint[n:, n:]
-        A = psd_solve(P, cross.T).T
-        nodes.back[left, :, :n], nodes.back[left, :, n] = A, nodes.step[left] - A.dot(nodes.step[number])
-        nodes.C[left] = symmetrise(joint[:n, :n] - A.dot(cross.T))
-        return P
 
     def solve(self, tracks: IntArray, starts: IntArray, anchors: IntArray) -> None:
         """See `Solver.solve`."""
