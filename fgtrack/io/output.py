@@ -112,17 +112,12 @@ def new_folder(path: Path, overwrite: bool, replaceable: Callable[[Path], bool],
     check_output(path, overwrite, replaceable, what)
     with _part_of(path) as part:
         part.mkdir(parents=True)
-        new, old = part / Path(os.path.abspath(path)).name, part / _REPLACED
+        new = part / Path(os.path.abspath(path)).name
         yield new
         check_output(path, overwrite, replaceable, what)
         if path.exists():
-            os.rename(path, old)
-        try:
-            os.rename(new, path)
-        except OSError:
-            if old.exists():
-                os.rename(old, path)
-            raise
+            os.rename(path, part / _REPLACED)
+        os.rename(new, path)
         shutil.rmtree(part)
 
 

@@ -80,11 +80,9 @@ def test_the_twins_say_what_other_tools_can_show(tmp_path):
     assert types["/ego/odometry"] == ("nav_msgs/msg/Odometry", 50)
     assert types["/detections/lidar"] == ("vision_msgs/msg/Detection3DArray", 10)
     assert types["/detections/radar"] == ("vision_msgs/msg/Detection3DArray", 10)
-    assert types["/truth/poses"] == ("geometry_msgs/msg/PoseArray", 50)
     config = InputConfig(
         ego=TopicInput("/ego/odometry"),
         detections={"lidar": TopicInput("/detections/lidar"), "radar": TopicInput("/detections/radar")},
-        truth=TopicInput("/truth/poses"),
     )
     found = read(tmp_path / "bag", config)
     lists = [message for message in drive() if isinstance(message, DetectionList)]
@@ -99,9 +97,6 @@ def test_the_twins_say_what_other_tools_can_show(tmp_path):
             assert b.yaw_rad == (None if a.yaw_rad is None else pytest.approx(a.yaw_rad, abs=1e-15))
     ego = next(message for message in found if isinstance(message, EgoState))
     assert ego == EgoState(START_NS, START_NS, 0.0, 0.0, pytest.approx(0.25), 50.0, 0.1)
-    truth = [message for message in found if isinstance(message, TruthState)]
-    assert len(truth) == 100
-    assert truth[0] == TruthState(START_NS, START_NS, 0, 30.0, 1.0, pytest.approx(0.1))
 
 
 # --- what breaks off

@@ -12,7 +12,7 @@ from fgtrack.core.types import DetectionList, TruthState
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.io.config import Filter, InputConfig, TopicInput
 from fgtrack.io.ros.messages import ODOMETRY, MessageFactory
-from fgtrack.io.ros.typestore import build_typestore
+from fgtrack.io.ros.typestore import typestore_of
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.public import replay
 from fgtrack.pipeline.shipped import read_config
@@ -33,7 +33,7 @@ def position(car: int, t_s: float) -> tuple[float, float, float]:
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("racecar") / "MULTI-FAST"
-    store = build_typestore({ESR: None, ODOMETRY: None}, ros1=False)[0]
+    store = typestore_of((ESR, ODOMETRY))
     make = MessageFactory()
     rng = np.random.default_rng(4)
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from fgtrack.io.ros.typestore import build_typestore
+from fgtrack.io.ros.typestore import typestore_of
 
 TYPES = (
     "vision_msgs/msg/Detection3DArray",
@@ -24,7 +24,7 @@ TYPES = (
     "geometry_msgs/msg/TransformStamped",
     "builtin_interfaces/msg/Time",
 )
-STORE = build_typestore(dict.fromkeys(TYPES), False)[0]
+STORE = typestore_of(TYPES)
 
 
 def _default(kind: Any, what: Any) -> Any:

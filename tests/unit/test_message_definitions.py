@@ -45,7 +45,7 @@ PART_OF_IDL = "module a_msgs { module msg { struct C { long x; }; }; };"
 
 def test_what_ros_generates_in_idl_is_read() -> None:
     key = (NAME, MessageDefinition(MessageDefinitionFormat.IDL, f"{IDL}{PART_OF_IDL}"))
-    constants, members = MessageTypes([key], ros1=False).types(key)[NAME]
+    constants, members = MessageTypes([key], ros1=False).types[key][NAME]
     assert [(name, value) for name, _, value in constants][:3] == [("CAR", 1), ("NONE", -1), ("SMALL", -1.5e-3)]
     assert [name for name, _ in members] == ["stamp", "x", "covariance", "names", "parts"]
     assert dict(members)["covariance"] == (Nodetype.ARRAY, (NUMBER, 36))

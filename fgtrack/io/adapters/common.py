@@ -72,11 +72,6 @@ def stamp_ns(time: RosMessage) -> int:
     return int(time.sec) * NS_PER_S + int(time.nanosec)
 
 
-def object_stamp_ns(header: RosMessage) -> int | None:
-    """Stamp of a nested header; None where it was not filled in."""
-    return stamp_ns(header.stamp) or None
-
-
 def frame_of(header: RosMessage) -> Frame:
     """Frame that a header names: `map` for the usual names of a fixed frame, else `ego`."""
     return "map" if header.frame_id.lstrip("/") in MAP_FRAMES else "ego"
@@ -117,25 +112,18 @@ def speed_variance(vx_mps: float, vy_mps: float, covariance: FloatArray) -> floa
 
 
 def covariance(
-    components: Sequence[str], pose: FloatArray | None, speed: float | None = None
+    values: Mapping[str, float | None], pose: FloatArray | None, speed: float | None = None
 ) -> tuple[float, ...] | None:
-    """Covariance of the measured `components`, row-major; None where it does not cover them all.
+    """Covariance of the measured `values` (position, yaw, speed), row-major; None where it does not cover them all.
 
-    Parameters
-    ----------
-    components
-        Measured components in the order of `MEASURABLE`: positions, yaw and speed.
-    pose
-        Covariance, shape (3, 3), of x, y and yaw; None or all zero says "not known".
-    speed
-        Variance of the speed; None says "not known".
+    `pose` is the covariance, shape (3, 3), of x, y and yaw, `speed` the variance of the speed; None is "not known".
     """
-    if pose is None or not np.any(pose) or ("speed_mps" in components and not speed):
+    index = [row for row, name in enumerate(MEASURABLE) if values.get(name) is not None]
+    if pose is None:
         return None
     full = np.zeros((4, 4))
     full[:3, :3] = pose
     full[3, 3] = speed or 0.0
-    index = [MEASURABLE.index(name) for name in components]
     chosen = full[np.ix_(index, index)]
     if (np.diag(chosen) <= 0.0).any():  # ROS says "not known" by 0 or -1
         return None
@@ -145,8 +133,3 @@ def covariance(
 def planar(covariance36: Sequence[float]) -> FloatArray:
     """Covariance of x, y and their rotation, shape (3, 3), from the 36 values of a pose's or twist's covariance."""
     return np.asarray(covariance36, dtype=float).reshape(6, 6)[np.ix_(PLANAR, PLANAR)]
-
-
-def measured(values: Mapping[str, float | None]) -> tuple[str, ...]:
-    """Names of `values` that are given, in the order of `MEASURABLE`."""
-    return tuple(name for name in MEASURABLE if values.get(name) is not None)

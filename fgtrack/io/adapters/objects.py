@@ -15,13 +15,12 @@ from fgtrack.io.adapters.common import (
     ObjectList,
     RosMessage,
     covariance,
-    measured,
     object_id,
     object_list,
-    object_stamp_ns,
     planar,
     signed_speed_mps,
     speed_variance,
+    stamp_ns,
     yaw_rad,
 )
 
@@ -52,8 +51,8 @@ def _detection3d(item: RosMessage) -> Detection:
     values = {"x_m": pose.position.x, "y_m": pose.position.y, "yaw_rad": yaw_rad(pose.orientation)}
     return Detection(
         **values,
-        covariance=None if hypothesis is None else covariance(measured(values), planar(hypothesis.covariance)),
-        stamp_ns=object_stamp_ns(item.header),
+        covariance=None if hypothesis is None else covariance(values, planar(hypothesis.covariance)),
+        stamp_ns=stamp_ns(item.header.stamp) or None,
         object_id=object_id(identity),
         **_size(size, pose.position.z),
         score=getattr(kind, "score", None),
@@ -97,7 +96,7 @@ def _autoware_object(item: RosMessage) -> Detection:
     return Detection(
         **values,
         covariance=covariance(
-            measured(values),
+            values,
             planar(pose_covariance) if getattr(kinematics, "has_position_covariance", True) else None,
             variance,
         ),
@@ -139,7 +138,7 @@ def _radar_track(item: RosMessage) -> Detection:
         "speed_mps": signed_speed_mps(velocity.x, velocity.y, None),
     }
     variance = speed_variance(velocity.x, velocity.y, _planar_triangle(item.velocity_covariance))
-    own = covariance(measured(values), pose, variance)
+    own = covariance(values, pose, variance)
     return Detection(**values, covariance=own, object_id=_uuid(item.uuid), **_size(item.size))
 
 
@@ -171,5 +170,5 @@ def odometry(message: RosMessage) -> ObjectList:
         "speed_mps": signed_speed_mps(velocity.x, velocity.y, 0.0),
     }
     variance = speed_variance(velocity.x, velocity.y, planar(message.twist.covariance)[:2, :2])
-    item = Detection(**values, covariance=covariance(measured(values), planar(message.pose.covariance), variance))
+    item = Detection(**values, covariance=covariance(values, planar(message.pose.covariance), variance))
     return object_list(message.header, [item])

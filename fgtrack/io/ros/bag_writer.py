@@ -35,11 +35,10 @@ def write_bag(
 ) -> int:
     """Write `messages` to the rosbag2 folder `path`; gives their number. With `overwrite` a recording is replaced.
 
-    `/fgtrack/ego`, `/fgtrack/detections/SENSOR` and `/fgtrack/truth` hold every field to the bit and carry
-    their definitions; the log time is the receipt, the header stamp the stamp. The twins for other tools are
-    `/ego/odometry` (nav_msgs/Odometry), `/detections/SENSOR` (vision_msgs/Detection3DArray, without speeds) and
-    `/truth/poses` (geometry_msgs/PoseArray); an object without a position is not in them. What is written reaches the
-    disk every thousand messages: a killed writer leaves a recording (`<path>.*.part`) that `Bag` reads up to there.
+    `/fgtrack/ego`, `/fgtrack/detections/SENSOR` and `/fgtrack/truth` hold every field to the bit and carry their
+    definitions; the log time is the receipt, the header stamp the stamp. The twins for other tools are `/ego/odometry`
+    (nav_msgs/Odometry) and `/detections/SENSOR` (vision_msgs/Detection3DArray, of objects with a position, without
+    speeds). Every thousand messages reach the disk: a killed writer leaves a readable recording (`<path>.*.part`).
     `settings`, what the recording carries of a configuration, are in the custom data of metadata.yaml.
 
     Raises
@@ -64,7 +63,6 @@ def write_bag(
             for message in readable:
                 writer.write(message)
             readable.raise_before_replacing(Path(path))
-            writer.write_truth_twin()
     except FgtrackError:
         raise
     except Exception as error:  # rosbags lets SQLite and struct errors through
@@ -104,7 +102,6 @@ class _MessageWriter:
         self._bag = bag
         self._factory = MessageFactory()
         self._connections: dict[str, Connection] = {}
-        self._truth: list[TruthState] = []
         self.count = 0
 
     def write(self, message: Message) -> None:
@@ -118,19 +115,14 @@ class _MessageWriter:
                 self._put(topic, self._factory.detection3d_array(message), message.receipt_ns)
             case TruthState():
                 self._put("/fgtrack/truth", self._factory.truth(message), message.receipt_ns)
-                times = (message.stamp_ns, message.receipt_ns)
-                if self._truth and (self._truth[0].stamp_ns, self._truth[0].receipt_ns) != times:
-                    self.write_truth_twin()
-                self._truth.append(message)
         self.count += 1
         if self.count % _CHECKPOINT == 0:
-            self._checkpoint()
-
-    def write_truth_twin(self) -> None:
-        """Write the true states that wait for others of their stamp."""
-        if self._truth:
-            self._put("/truth/poses", self._factory.pose_array(self._truth), self._truth[0].receipt_ns)
-            self._truth = []
+            match self._bag.storage:
+                case McapWriter() as storage:
+                    storage.close_chunk()
+                    storage.bio.flush()
+                case Sqlite3Writer() as storage:
+                    storage.conn.commit()
 
     def _put(self, topic: str, message: RosMessage, log_ns: int) -> None:
         if not 0 <= log_ns < _INT64_LIMIT:
@@ -142,11 +134,3 @@ class _MessageWriter:
             connection = self._bag.add_connection(topic, msgtype, typestore=self._factory.typestore)
             self._connections[key] = connection
         self._bag.write(connection, log_ns, self._factory.serialize(message))
-
-    def _checkpoint(self) -> None:
-        match self._bag.storage:
-            case McapWriter() as storage:
-                storage.close_chunk()
-                storage.bio.flush()
-            case Sqlite3Writer() as storage:
-                storage.conn.commit()

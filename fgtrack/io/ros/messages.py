@@ -1,10 +1,8 @@
 """Makes ROS messages: fgtrack's own, and the standard ones that other tools show."""
 
 import math
-from functools import cache
 
 import numpy as np
-from rosbags.typesys.store import Typestore
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
@@ -20,11 +18,10 @@ from fgtrack.io.adapters.native import (
     TRUTH_OPTIONAL,
     presence,
 )
-from fgtrack.io.ros.typestore import build_typestore
+from fgtrack.io.ros.typestore import typestore_of
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 DETECTION3D_ARRAY = "vision_msgs/msg/Detection3DArray"
-POSE_ARRAY = "geometry_msgs/msg/PoseArray"
 MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
@@ -32,18 +29,14 @@ _FRAME_IDS: dict[Frame, str] = {"map": "map", "ego": "base_link"}
 _SECONDS_LIMIT = 1 << 31  # builtin_interfaces/Time holds 32 bits
 
 
-@cache
-def _typestore() -> Typestore:
-    standard = (ODOMETRY, DETECTION3D_ARRAY, POSE_ARRAY, MARKER_ARRAY, TRANSFORMS)
-    types = (EGO, DETECTIONS, TRUTH, *standard)
-    return build_typestore(dict.fromkeys(types), ros1=False)[0]
+_TYPES = (EGO, DETECTIONS, TRUTH, ODOMETRY, DETECTION3D_ARRAY, MARKER_ARRAY, TRANSFORMS)
 
 
 class MessageFactory:
     """Makes and serializes messages of the types that fgtrack writes."""
 
     def __init__(self) -> None:
-        self.typestore = _typestore()
+        self.typestore = typestore_of(_TYPES)
 
     def serialize(self, message: RosMessage) -> memoryview:
         """CDR bytes of `message`."""
@@ -102,14 +95,6 @@ class MessageFactory:
             DETECTION3D_ARRAY,
             header=self._header(message.stamp_ns, _FRAME_IDS.get(message.frame, message.sensor)),
             detections=[self._detection3d(item) for item in message.objects if None not in (item.x_m, item.y_m)],
-        )
-
-    def pose_array(self, states: list[TruthState]) -> RosMessage:
-        """`geometry_msgs/PoseArray` in the frame `map`, of states of one stamp."""
-        return self._make(
-            POSE_ARRAY,
-            header=self._header(states[0].stamp_ns, "map"),
-            poses=[self._pose(state.x_m, state.y_m, state.yaw_rad) for state in states],
         )
 
     def _make(self, name: str, **fields: RosMessage) -> RosMessage:

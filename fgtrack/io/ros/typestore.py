@@ -4,7 +4,7 @@ rosbags generates Python code from a definition and runs it; its grammar admits 
 """
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, cast
@@ -19,7 +19,7 @@ from fgtrack.core.files import read_whole
 from fgtrack.io.errors import one_line
 from fgtrack.io.ros.definitions import DEFINITIONS
 
-__all__ = ["Key", "MessageTypes", "build_typestore", "type_name"]
+__all__ = ["Key", "MessageTypes", "type_name", "typestore_of"]
 
 Key = tuple[str, MessageDefinition | None]
 """A message type and its definition in the recording: two topics may define one name differently."""
@@ -46,7 +46,8 @@ class MessageTypes:
 
     def __init__(self, keys: Iterable[Key], ros1: bool, message_definitions: Iterable[str] = ()) -> None:
         self._ros1 = ros1
-        self._types: dict[Key, Typesdict] = {}
+        self.types: dict[Key, Typesdict] = {}
+        """Types without a problem, each with all its parts."""
         self._stores: dict[Key, Typestore] = {}
         self.problems: dict[Key, str] = {}
         """Why messages of a type cannot be decoded."""
@@ -64,24 +65,20 @@ class MessageTypes:
             shared = types | shared
         for key, types in embedded.items():
             try:
-                self._types[key] = _closure(key[0], (types, shared, known))
+                self.types[key] = _closure(key[0], (types, shared, known))
             except ValueError as error:
                 self.problems[key] = str(error)
 
     def begins_with_header(self, key: Key) -> bool:
         """True if the first member of a type that can be decoded is a header."""
-        members = [] if key in self.problems else self._types[key][key[0]][1]
+        members = [] if key in self.problems else self.types[key][key[0]][1]
         return bool(members) and members[0][1][1] == "std_msgs/msg/Header"
-
-    def types(self, key: Key) -> Typesdict:
-        """A type that has no problem, with all its parts."""
-        return self._types[key]
 
     def decode(self, key: Key, data: bytes, what: str) -> Any:  # a message has the attributes of its type
         """Message that is serialized in `data`; `what` names it in the `DataError` of bytes of another type."""
         try:
             if key not in self._stores:
-                self._stores[key] = _registered(self._types[key])
+                self._stores[key] = _registered(self.types[key])
             store = self._stores[key]
             return (store.deserialize_ros1 if self._ros1 else store.deserialize_cdr)(data, key[0])
         except MemoryError:
@@ -90,18 +87,13 @@ class MessageTypes:
             raise DataError(f"{what} is not a {key[0]} ({one_line(error)})") from error
 
 
-def build_typestore(
-    definitions: Mapping[str, MessageDefinition | None], ros1: bool, message_definitions: Iterable[str] = ()
-) -> tuple[Typestore, Mapping[str, str]]:
-    """One store of the types that are the keys of `definitions`, and why the others cannot be read.
-
-    Arguments and errors as of `MessageTypes`, by type name.
-    """
-    found = MessageTypes(definitions.items(), ros1, message_definitions)
+@cache
+def typestore_of(names: tuple[str, ...]) -> Typestore:
+    """One store of shipped ROS 2 types and all their parts."""
     needed: Typesdict = {}
-    for key in definitions.items():
-        needed |= {} if key in found.problems else found.types(key)
-    return _registered(needed), {name: problem for (name, _), problem in found.problems.items()}
+    for name in names:
+        needed |= _closure(name, [_shipped_types(False)])
+    return _registered(needed)
 
 
 def _registered(types: Typesdict) -> Typestore:
