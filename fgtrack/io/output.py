@@ -34,10 +34,8 @@ def check_output(
     try:
         if not os.path.lexists(path):
             parent = next(above for above in Path(os.path.abspath(path)).parents if above.exists())
-            if not parent.is_dir():
-                raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
-            if not os.access(parent, os.W_OK):
-                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+            if not parent.is_dir() or not os.access(parent, os.W_OK):
+                raise PermissionError(errno.EACCES, f"{parent} is not a folder to write into")
             return
         is_folder = path.is_dir() and not path.is_symlink()
         if is_folder and all(name.endswith(".part") for name in os.listdir(path)):

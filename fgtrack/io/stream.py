@@ -3,7 +3,6 @@
 import gzip
 import json
 import logging
-import math
 import zlib
 from collections import Counter
 from collections.abc import Generator, Iterable, Iterator, Mapping
@@ -51,22 +50,13 @@ def read_stream(path: Path | str) -> Iterator[Message]:
     """
     path = Path(path)
     unknown: Counter[str] = Counter()
-    newest_ns = -math.inf
     with closing(_records(path)) as records:
         _check_header(path, next(records, None))
         for line, record in records:
             try:
-                message = _message(record, unknown)
+                yield _message(record, unknown)
             except InvalidMessageError as error:
                 raise DataError(f"{path}:{line}: {error}") from error
-            if not isinstance(message, TruthState):
-                if message.receipt_ns < newest_ns:
-                    raise DataError(
-                        f"{path}:{line}: receipt_ns {message.receipt_ns} is before {newest_ns} of an earlier "
-                        "record, sort the stream by receipt_ns"
-                    )
-                newest_ns = message.receipt_ns
-            yield message
     if unknown:
         names = ", ".join(f"{name} ({count})" for name, count in sorted(unknown.items()))
         _logger.warning("%s: ignored unknown keys: %s", path, names)

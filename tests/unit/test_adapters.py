@@ -180,12 +180,6 @@ def odometry(yaw):
     return Message(header=header(), pose=Message(pose=pose(1.0, 2.0, yaw), covariance=square(6)), twist=twist)
 
 
-def test_an_ego_without_orientation_has_no_number_for_its_yaw():
-    state = ego_from_odometry(odometry(None), 9)
-    assert math.isnan(state.yaw_rad)
-    assert (state.speed_mps, state.yaw_rate_radps, state.receipt_ns) == (5.0, 0.7, 9)
-
-
 def test_paths_read_vectors_quaternions_and_the_stamps_of_objects():
     item = Message(p=pose(1.0, 2.0, 0.5), v=[3.0, 4.0], vel=xyz(3.0, 4.0), t=2.5, number=4)
     message = Message(header=header(frame_id="odom"), tracks=[item])

@@ -167,14 +167,6 @@ def test_results_without_a_place_in_space_are_bearings(tmp_path):
         lists(folder(tmp_path, camera=[pose(0, 10.0, 0.0, 0.0), line]))
 
 
-def test_fields_may_be_any_spaces_apart(tmp_path):
-    line = label(0, 3, "Car", 10.0, 0.0, 0.3)
-    one, other = (
-        folder(tmp_path / name, label_02=[text]) for name, text in (("a", line), ("b", line.replace(" ", "  ")))
-    )
-    assert messages(one) == messages(other)
-
-
 def test_classes_are_named(tmp_path):
     drive = folder(
         tmp_path,
@@ -244,13 +236,6 @@ def test_what_is_not_finite_in_a_detection_is_left_to_the_tracker_without_a_warn
     lines = [",".join([*cells[:10], bad, *cells[11:]]) for bad in ("inf", "nan")] + [whole]
     (found,) = lists(folder(tmp_path, laser=lines))
     assert [math.isfinite(item.x_m + item.y_m) for item in found.objects] == [False, False, True]
-
-
-def test_a_sequence_without_a_calibration_is_one_line(tmp_path):
-    drive = folder(tmp_path)
-    (drive / "calib/0001.txt").unlink()
-    with pytest.raises(DataError, match=r"calib/0001\.txt: cannot be read"):
-        messages(drive)
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from dataclasses import replace
 from decimal import Decimal
 from functools import partial
 from io import TextIOWrapper
-from itertools import groupby
+from itertools import chain, groupby
 from operator import itemgetter
 from pathlib import Path
 
@@ -77,7 +77,12 @@ def _read(file: Path, table: CsvTable, role: str) -> tuple[list[Message], DataEr
     skipped: Row | None = None
     times = {name: path for name, path in table.columns.items() if name in _TIMES}
     try:
-        for row in _checked_rows(file, table):
+        found = rows(file, table.delimiter)
+        where, header = next(found)
+        for column in [*chain.from_iterable(map(paths_of, table.columns.values())), *table.filters]:
+            if column not in header:
+                raise DataError(f"{where}: has no column {column!r}, but {', '.join(header)}")
+        for row in found:
             if (name := _excluding_filter(table, row[1])) is not None:
                 left_out.append(f"filters.{name}")
                 skipped = skipped or row
@@ -95,16 +100,6 @@ def _read(file: Path, table: CsvTable, role: str) -> tuple[list[Message], DataEr
         column = single_path(table.columns["stamp"])
         return [], DataError(f"{first[0]}: {column}: {text}: change `time_unit` (input.csv.{role})")
     return messages, None
-
-
-def _checked_rows(file: Path, table: CsvTable) -> Iterator[Row]:
-    """Rows of `file` behind its header, which has all columns of `table`."""
-    found = rows(file, table.delimiter)
-    where, header = next(found)
-    for name in [*(name for path in table.columns.values() for name in paths_of(path)), *table.filters]:
-        if name not in header:
-            raise DataError(f"{where}: has no column {name!r}, but {', '.join(header)}")
-    return found
 
 
 def rows(file: Path, delimiter: str | None = None) -> Iterator[Row]:
