@@ -32,40 +32,40 @@ merged = numba.njit(error_model="numpy", inline="always")
 
 
 @inlined
-def copy(source: FloatArray, found: FloatArray) -> None:
-    """Fill the matrix `found` from the first rows and columns of `source`."""
-    for i in range(found.shape[0]):
-        for j in range(found.shape[1]):
-            found[i, j] = source[i, j]
+def copy(source: FloatArray, out: FloatArray) -> None:
+    """Fill the matrix `out` from the first rows and columns of `source`."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = source[i, j]
 
 
 @inlined
-def product(A: FloatArray, B: FloatArray, found: FloatArray) -> None:
-    """Write A B; further columns of A and B than meet or fit are left out."""
-    for i in range(found.shape[0]):
-        for j in range(found.shape[1]):
+def product(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
+    """Write A B; columns beyond those that meet are ignored."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
             value = 0.0
             for k in range(min(A.shape[1], B.shape[0])):
                 value += A[i, k] * B[k, j]
-            found[i, j] = value
+            out[i, j] = value
 
 
 @inlined
-def add_product_transposed(A: FloatArray, B: FloatArray, found: FloatArray) -> None:
-    """Add A B', which is symmetric, to `found`: its lower triangle, and the mirror of that."""
+def add_product_transposed(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
+    """Add A B', which is symmetric, to `out`: its lower triangle, and the mirror of that."""
     for i in range(A.shape[0]):
         for j in range(i + 1):
-            value = found[i, j]
+            value = out[i, j]
             for k in range(A.shape[1]):
                 value += A[i, k] * B[j, k]
-            found[i, j] = found[j, i] = value
+            out[i, j] = out[j, i] = value
 
 
 @inlined
-def add_congruence(A: FloatArray, P: FloatArray, AP: FloatArray, found: FloatArray) -> None:
-    """Add A P A' to `found`, and write A P."""
+def add_congruence(A: FloatArray, P: FloatArray, AP: FloatArray, out: FloatArray) -> None:
+    """Add A P A' to `out`, and write A P."""
     product(A, P, AP)
-    add_product_transposed(AP, A, found)
+    add_product_transposed(AP, A, out)
 
 
 @inlined

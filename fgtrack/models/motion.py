@@ -197,10 +197,10 @@ class WhiteNoise(MotionModel):
             x, t = np.broadcast_to(x, (*shape, n)), np.broadcast_to(t, shape)
         states = np.array(x, dtype=np.float64, order="C").reshape(-1, n)
         times_s = np.array(t, order="C").reshape(-1)
-        found = Transition(np.empty((*shape, n)), np.empty((*shape, n, n)), np.empty((*shape, n, n)))
-        flat = found.mean.reshape(-1, n), found.F.reshape(-1, n, n), found.Q.reshape(-1, n, n)
+        result = Transition(np.empty((*shape, n)), np.empty((*shape, n, n)), np.empty((*shape, n, n)))
+        flat = result.mean.reshape(-1, n), result.F.reshape(-1, n, n), result.Q.reshape(-1, n, n)
         kernels("fgtrack.models.transitions").transitions(self.kind, states, times_s, self.density, *flat)
-        return found
+        return result
 
     @cached_property
     def density(self) -> FloatArray:

@@ -113,10 +113,8 @@ def _consistent(before: EgoState, after: EgoState) -> bool:
     )
     if off_m <= _SLACK_M:  # as nearly always
         return True
-    variance_m2 = 0.0
-    for ego in (before, after):
-        if ego.covariance is not None:
-            variance_m2 += max(ego.covariance[0] + ego.covariance[6], 0.0)  # of x and y
+    given = [ego.covariance for ego in (before, after) if ego.covariance is not None]
+    variance_m2 = sum(max(each[0] + each[6], 0.0) for each in given)  # of x and y
     return off_m <= _SLACK_M + _SHARE * abs(travelled_m) + _SIGMAS * math.sqrt(variance_m2)
 
 

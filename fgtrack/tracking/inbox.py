@@ -68,12 +68,9 @@ def is_usable(detection: Detection, sensor: SensorModel) -> bool:
         return False
     if detection.x_m == 0.0 and detection.y_m == 0.0:
         return False
-    has_x, has_y = (
-        ("x_m" in sensor.std and detection.x_m is not None),
-        ("y_m" in sensor.std and detection.y_m is not None),
-    )
-    if has_x or has_y:
-        return has_x and has_y
+    position = detection.x_m is not None, detection.y_m is not None
+    if "x_m" in sensor.std and any(position):
+        return all(position)
     return "bearing_rad" in sensor.std and detection.bearing_rad is not None
 
 
@@ -97,16 +94,12 @@ def is_valid_covariance(detection: Detection, sensor: SensorModel) -> bool:
 
 def stamps(message: DetectionList, sensor: SensorModel) -> list[int]:
     """Stamp of every detection of `message`: the list's, its own, or the mean of those that have one."""
-    if sensor.stamp_from not in ("object", "objects_mean"):
+    own = [each.stamp_ns for each in message.objects if each.stamp_ns is not None]
+    if sensor.stamp_from not in ("object", "objects_mean") or not own:
         return [message.stamp_ns] * len(message.objects)
-    result, own = [], []
-    for detection in message.objects:
-        if detection.stamp_ns is not None:
-            own.append(detection.stamp_ns)
-        result.append(message.stamp_ns if detection.stamp_ns is None else detection.stamp_ns)
-    if sensor.stamp_from == "objects_mean" and own:
-        return [sum(own) // len(own)] * len(result)
-    return result
+    if sensor.stamp_from == "objects_mean":
+        return [sum(own) // len(own)] * len(message.objects)
+    return [message.stamp_ns if each.stamp_ns is None else each.stamp_ns for each in message.objects]
 
 
 _values = attrgetter(*(each.name for each in fields(Detection)))
@@ -118,8 +111,9 @@ class Inbox:
     def __init__(self, sensors: Mapping[str, SensorModel], memory_s: float = 10.0) -> None:
         """`memory_s`: how long a list is remembered; at least as long as a sensor's list may take."""
         self._sensors = sensors
-        limits_s = {name: sensor.max_delay_s for name, sensor in sensors.items() if sensor.max_delay_s is not None}
-        self._max_delay_ns = {name: nanoseconds(limit_s) for name, limit_s in limits_s.items()}
+        self._max_delay_ns = {
+            name: nanoseconds(sensor.max_delay_s) for name, sensor in sensors.items() if sensor.max_delay_s is not None
+        }
         self._memory_ns = max([nanoseconds(memory_s), *self._max_delay_ns.values()])
         self._receipts_ns: dict[tuple[str, int, Frame, int], int] = {}  # of lists, in order of receipt
         self._pending: list[Batch] = []
@@ -130,9 +124,7 @@ class Inbox:
         A message is repeated if an earlier one of the sensor had its stamp and contents.
         """
         sensor = self._sensors[message.sensor]
-        usable = []
-        for detection in message.objects:
-            usable.append(is_usable(detection, sensor))
+        usable = [is_usable(detection, sensor) for detection in message.objects]
         if self._is_copy(message, usable):
             return records(message, Disposition.DUPLICATE)
         ended: list[UpdateRecord] = []

@@ -176,11 +176,11 @@ class UngatedEuclidean:
     def __call__(self, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None) -> Assignment:
         """See `Association`; torn pairs are born after the detections that had no partner. Nothing is `apart`."""
         cost = euclidean_distances(candidates, states.means)
-        found = assigned_densely(cost, np.ones(cost.shape, dtype=bool))
-        torn = [pair for pair in found.pairs if cost[pair] > self.gate_m]
-        good = [pair for pair in found.pairs if pair not in torn]
-        missed = sorted(found.missed + [j for _, j in torn])
-        return Assignment(good, found.new + [i for i, _ in torn], missed)
+        assignment = assigned_densely(cost, np.ones(cost.shape, dtype=bool))
+        torn = [pair for pair in assignment.pairs if cost[pair] > self.gate_m]
+        good = [pair for pair in assignment.pairs if pair not in torn]
+        missed = sorted(assignment.missed + [j for _, j in torn])
+        return Assignment(good, assignment.new + [i for i, _ in torn], missed)
 
 
 class PublishedLifecycle(CountingLifecycle):
