@@ -115,7 +115,7 @@ class SmootherBank:
         rows = (oldest_ns <= stamp_ns).nonzero()[0].tolist()
         chosen = {row: measurements[row].seen_by(self._motion) for row in rows}
         states = self.states_at(stamp_ns)
-        positions = {track_id: position for position, track_id in enumerate(states.track_ids)}
+        positions = dict(zip(states.track_ids, range(len(states.track_ids)), strict=True))
         for alike in equal_ones([(id(m.model), id(m.pose), m.assumed, m.loss) for m in chosen.values()]):
             group = np.array([rows[k] for k in alike])
             at = [positions[track_ids[row]] for row in group]

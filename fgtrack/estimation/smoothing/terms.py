@@ -119,7 +119,7 @@ class Innovations(NamedTuple):
 
     def at(self, rows: IntArray) -> "Innovations":
         """Return those of some of the measurements."""
-        return Innovations(*(values[rows] for values in self))
+        return Innovations(self.y[rows], self.H[rows], self.R[rows], self.S[rows], self.nis[rows])
 
     @classmethod
     def of(cls, measurements: Sequence[Measurement], means: FloatArray, covariances: FloatArray) -> "Innovations":

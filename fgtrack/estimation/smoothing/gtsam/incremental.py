@@ -18,8 +18,8 @@ from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.models.motion import MotionModel
 
-_Changed = tuple[int, gtsam.JacobianFactor]
-"""Node and its factor."""
+_Changed = dict[int, gtsam.JacobianFactor]
+"""Factors by node."""
 
 
 class _Graph:
@@ -45,7 +45,7 @@ class _Graph:
         self._newest = -1
 
     def solve(
-        self, numbers: Sequence[int], num_leaving: int, values: gtsam.Values, first: int, changed: Sequence[_Changed]
+        self, numbers: Sequence[int], num_leaving: int, values: gtsam.Values, first: int, changed: _Changed
     ) -> FloatArray:
         """Return the states of the nodes `numbers`, one after the other, without the first ones, which are leaving.
 
@@ -53,7 +53,7 @@ class _Graph:
         new nodes.
         """
         factors, order = gtsam.GaussianFactorGraph(), gtsam.KeyGroupMap()
-        for _, factor in changed:
+        for factor in changed.values():
             factors.push_back(factor)
         if self._prior is not None:
             factors.push_back(self._prior)
@@ -62,11 +62,10 @@ class _Graph:
             first -= 1
         for group, number in enumerate(numbers[first:]):
             order.insert2(number, group)
-        slots = [self.slots[number] for number, _ in changed]
-        removed = [slot for slot in slots if slot is not None]
+        removed = [slot for slot in map(self.slots.get, changed) if slot is not None]
         graph = gtsam.LinearContainerFactor.ConvertLinearGraph(factors)  # in half the time of one by one
         added = self.isam.update(graph, values, removed, order).getNewFactorsIndices()
-        self.slots.update(zip((number for number, _ in changed), added, strict=False))
+        self.slots.update(zip(changed, added, strict=False))
         self._newest = numbers[-1]
         if num_leaving:
             leaves = gtsam.KeyList()
@@ -139,7 +138,8 @@ class IncrementalSolver(Solver):
             self._update(tracks, first)
         except (RuntimeError, ValueError, IndexError) as error:
             raise np.linalg.LinAlgError(f"the graph cannot be solved ({error})") from error
-        self._known.update((track, {}) for track in tracks.tolist())
+        for track in tracks.tolist():
+            self._known[track] = {}
         nodes.known[tracks] = anchors
 
     def rebuild(self, tracks: IntArray) -> None:
@@ -198,7 +198,7 @@ class IncrementalSolver(Solver):
             nodes.changed[window] = True
         return graph
 
-    def _changed_factors(self, tracks: IntArray, starts: IntArray, most: int) -> list[tuple[int, list[_Changed]]]:
+    def _changed_factors(self, tracks: IntArray, starts: IntArray, most: int) -> list[tuple[int, _Changed]]:
         """Return the factors that have changed, at most so many, of each track, and the first index from `starts`."""
         nodes, n = self.nodes, self.motion.dim
         owners, factors = np.empty((most, 5), dtype=np.int64), np.empty((most, 2 * n + 1, n + nodes.rows.shape[1]))
@@ -206,7 +206,7 @@ class IncrementalSolver(Solver):
         num = node_kernels.changed_factors(tracks, starts, nodes.count, nodes.numbers, *given, owners, factors)
         if num < 0:
             raise ValueError("process noise is not positive definite")
-        changed: list[tuple[int, list[_Changed]]] = [(0, []) for _ in tracks]
+        changed: list[tuple[int, _Changed]] = [(0, {}) for _ in tracks]
         for (row, index, number, right, size), each in zip(owners[:num].tolist(), factors, strict=False):
             A, b, unit = each[:n, :size].T, each[-1, :size], _unit(size)
             if right < 0:
@@ -215,7 +215,7 @@ class IncrementalSolver(Solver):
                 factor = gtsam.JacobianFactor(number, A, right, each[n:-1, :size].T, b, unit)
             if not changed[row][1]:
                 changed[row] = index - int(starts[row]), changed[row][1]
-            changed[row][1].append((number, factor))
+            changed[row][1][number] = factor
         return changed
 
 
