@@ -251,19 +251,6 @@ def test_final_states_of_a_nonlinear_model_are_near_the_optimum_of_what_had_arri
     assert np.median(differences) < 0.008
 
 
-# --- late measurements
-
-
-def test_fusing_late_data_reaches_as_far_as_the_ring_and_says_so() -> None:
-    motion, rng = CV(), np.random.default_rng(0)
-    one = smoother(motion, "incremental", ring_s=0.2)
-    fill(motion, rng, one, num=20)
-    assert one.window_ns == (START_NS + 500 * MS, START_NS + 1000 * MS)
-    found = [one.update(measured(rng, motion, ms * MS)).status for ms in (499, 500, 699, 700)]
-    too_old, beyond = UpdateStatus.TOO_OLD, UpdateStatus.BEYOND_WINDOW
-    assert found == [too_old, beyond, beyond, UpdateStatus.OUT_OF_SEQUENCE]
-
-
 # --- many tracks
 
 

@@ -13,9 +13,9 @@ from support.oracle_streams import Stream
 from fgtrack.core import geometry
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Estimator
-from fgtrack.estimation.registry import ESTIMATORS, Claims, start_estimator
+from fgtrack.estimation.registry import ESTIMATORS, start_estimator
 from fgtrack.models.sensors import SensorModel
-from fgtrack.testing.references import Difference, dense_joint, difference, rounding_bound
+from fgtrack.testing.references import Difference, dense_joint, difference
 
 Draw = Callable[[np.random.Generator], Stream]
 SMOOTHERS = ("smoother", "smoother-banded", "smoother-batch")
@@ -52,9 +52,9 @@ def start(name: str, stream: Stream) -> Estimator:
     return start_estimator(name, factory, stream.motion, stream.prior, stream.lag_s, OPTIONS.get(name, {}))
 
 
-def fed(estimator: Estimator, stream: Stream, order: str = "random") -> Estimator:
+def fed(estimator: Estimator, stream: Stream) -> Estimator:
     """`estimator` after all of `stream`, every measurement fused, converged where it has to be asked for that."""
-    for place in stream.orders[order]:
+    for place in stream.orders["random"]:
         assert estimator.update(stream.measurements[place]).innovation is not None
     converge = getattr(estimator, "converge", None)
     if converge is not None:
@@ -88,22 +88,6 @@ def test_the_dense_joint_of_a_linear_model_is_that_of_scipy(draw: Draw) -> None:
     joint = dense_joint(stream.motion, stream.prior, stream.measurements, stamps)
     expected = stream.solution.state_at
     assert largest([difference(joint[at], TrackState(at, *expected(at))) for at in stamps]) < 1e-7
-
-
-@pytest.mark.parametrize("draw", [streams.linear, streams.late])
-@pytest.mark.parametrize("name", [name for name in ESTIMATORS if Claims.of(ESTIMATORS.load(name)).is_exact])
-def test_the_paper_s_stream_in_a_linear_model_gives_the_dense_joint(name: str, draw: Draw) -> None:
-    """With its delays and, for smoothers, with a window shorter than the delays."""
-    if draw is streams.late and name not in SMOOTHERS:
-        pytest.skip("what is older than the window of a filter is refused")
-    stream, claims = drawn(draw), Claims.of(ESTIMATORS.load(name))
-    tolerance = max(
-        claims.tolerance, claims.rounding * rounding_bound(stream.motion, [m.stamp_ns for m in stream.measurements])
-    )
-    joint = dense_joint(stream.motion, stream.prior, stream.measurements, probes_ns(name, stream))
-    for order in ("arrival", "random"):
-        found = fed(start(name, stream), stream, order)
-        assert largest([difference(found.state_at(at), expected) for at, expected in joint.items()]) < tolerance
 
 
 @pytest.mark.parametrize("draw", SMOOTHED)

@@ -1,7 +1,6 @@
 """Steps of the smoother that go further than their linearisation holds are taken again with damping."""
 
 import numpy as np
-import pytest
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
@@ -12,7 +11,6 @@ from fgtrack.estimation.smoothing.gtsam.batch import BatchSolver
 from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver
-from fgtrack.estimation.smoothing.windows import Windows
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CV
 
@@ -50,11 +48,6 @@ def tracked(streams: list[list[Measurement]], make: type[Solver]) -> SmootherBan
     return bank
 
 
-def worst_m(bank: SmootherBank, found: list[tuple[list[Measurement], FloatArray]]) -> float:
-    states = [bank.state_at(track_id, found[0][0][-1].stamp_ns) for track_id in range(len(found))]
-    return max(float(np.hypot(*(s.mean - truth)[:2])) for s, (_, truth) in zip(states, found, strict=True))
-
-
 def test_bearings_alone_lead_where_levenberg_marquardt_does() -> None:
     found = [heard(np.random.default_rng(seed)) for seed in (2,)]
     streams = [stream for stream, _ in found]
@@ -68,15 +61,6 @@ def test_bearings_alone_lead_where_levenberg_marquardt_does() -> None:
             assert np.abs((state.mean - expected.mean) / std).max() < 0.1
             d = state.mean - truth
             assert d @ np.linalg.solve(state.covariance, d) < 23.5  # one in ten thousand
-
-
-@pytest.mark.slow
-def test_without_damping_some_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = [heard(np.random.default_rng(seed)) for seed in range(4)]
-    streams = [measurements for measurements, _ in found]
-    assert worst_m(tracked(streams, Solver), found) < 20.0
-    monkeypatch.setattr(Windows, "damp", lambda self, tracks: None)
-    assert worst_m(tracked(streams, Solver), found) > 1000.0
 
 
 def test_positions_need_none() -> None:

@@ -75,24 +75,6 @@ def test_an_exact_method_stays_exact_when_the_next_late_measurement_is_newer_tha
     assert_same(estimator.state_at(stamp(2.2)), replayed(measurements).state_at(stamp(2.2)))
 
 
-@pytest.mark.parametrize("seed", range(10))
-def test_the_accumulated_density_gives_the_answer_of_the_time_order_for_any_arrival(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    stamps_s = np.round(rng.uniform(0.001, 2.0, 15), 6)
-    several = [measured(rng, at_s) for at_s in [*stamps_s, *stamps_s[:3], *(stamps_s[3:6] + 1e-6)]]
-    order = [several[i] for i in rng.permutation(len(several))]
-    assert_same(last(fed(started("asd"), order)), last(replayed(order)))
-
-
-def test_the_accumulated_density_knows_the_smoothed_past() -> None:
-    rng = np.random.default_rng(3)
-    measurements = [*in_sequence(rng), late(rng, 4), late(rng, 7)]
-    estimator = fed(started("asd"), measurements)
-    stamps_ns = [stamp(at_s) for at_s in (0.0, 0.55, 1.33, 1.5, 2.0, 2.4)]
-    for stamp_ns, expected in dense_joint(LINEAR, prior(), measurements, stamps_ns).items():
-        assert_same(estimator.state_at(stamp_ns), expected)
-
-
 @pytest.mark.parametrize("name", ["c", "rts", "zlz"])
 def test_without_process_noise_nothing_is_lost_by_any_number_of_late_measurements(name: str) -> None:
     motion, rng = CV(velocity_density_m2ps3=0.0), np.random.default_rng(5)
