@@ -28,7 +28,7 @@ from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.tracking.ego import MAX_EXTRAPOLATION_S
 
-__all__ = ["advice_on", "advise"]
+__all__ = ["Adviser", "advise"]
 
 TRACKED_S = 300.0
 """Length of the beginning that is tracked, to judge clocks and noise; delays are those of the whole recording."""
@@ -60,12 +60,8 @@ def advise(
     ----------
     recording
         Path of anything that fgtrack reads.
-    config
-        Name of a shipped configuration, path of a YAML file, or a `Config`; None for the defaults.
-    map, pit_map
-        CSV files of the track and of the pit lane, or `oval`; instead of those of the configuration.
-    set
-        Values of single settings: `{"smoother.lag_s": 3.0}`.
+    config, map, pit_map, set
+        As for `fgtrack.replay`.
     reference
         The sensor whose clock is right, where two do not agree and the recording has no truth.
     tune
@@ -87,23 +83,10 @@ def advise(
     messages = list(readable)
     broken = None if readable.error is None else str(readable.error)
     found = assumed(resolved, replace(source, messages=lambda: iter(messages)))
-    return advice_on(str(recording), messages, found, reference, tune, broken, on_step)
+    return Adviser(str(recording), messages, found, reference, on_step).advice(broken, tune)
 
 
-def advice_on(
-    recording: str,
-    messages: Sequence[Message],
-    found: Assumed,
-    reference: str | None = None,
-    tune: bool = False,
-    broken: str | None = None,
-    on_step: Callable[[str, float], None] = lambda text, share: None,
-) -> Advice:
-    """Return `advise` of messages that have been read; `broken` is why the recording breaks off, where it does."""
-    return _Adviser(recording, messages, found, reference, on_step).advice(broken, tune)
-
-
-class _Adviser:
+class Adviser:
     """The steps of `advise`: each sees the settings of those before it."""
 
     def __init__(
@@ -111,8 +94,8 @@ class _Adviser:
         recording: str,
         messages: Sequence[Message],
         found: Assumed,
-        reference: str | None,
-        on_step: Callable[[str, float], None],
+        reference: str | None = None,
+        on_step: Callable[[str, float], None] = lambda text, share: None,
     ) -> None:
         self._recording, self._messages, self._reference, self._on_step = recording, messages, reference, on_step
         self._assumed, self._config = found, found.config
@@ -122,8 +105,8 @@ class _Adviser:
         self._runs: list[tuple[Config, Run | None]] = []
         self._clocks: OffsetReport | None = None
 
-    def advice(self, broken: str | None, tune: bool) -> Advice:
-        """Return the advice after all steps."""
+    def advice(self, broken: str | None = None, tune: bool = False) -> Advice:
+        """Return the advice after all steps; `broken` is why the recording breaks off, where it does."""
         work = 0.35 if tune else 1.0  # share of the work without the tuning
         if self._assumed.assumptions:
             text = f"not configured: {'. '.join(self._assumed.lines())}."
@@ -236,8 +219,11 @@ class _Adviser:
         if self._is_useless:
             return
         doubtful = {one.about for one in self._findings if one.kind == "clock"}
+        unlimited = all(sensor.max_delay_s is None for sensor in self._config.sensors.values())
+        is_same = unlimited and self._config.estimator != "ekf-backward-forward"  # nothing is refused for its delay
         try:
-            self._clocks = estimate_offsets(self._tracked, self._config, self._reference, doubtful, self._replayed)
+            run = self._run(self._config) if is_same else None
+            self._clocks = estimate_offsets(self._tracked, self._config, self._reference, doubtful, run)
         except (DataError, CallError) as error:
             if self._reference is not None and isinstance(error, CallError):
                 raise
@@ -332,15 +318,6 @@ class _Adviser:
             found = None
         self._runs.append((config, found))
         return found
-
-    def _replayed(self, messages: Sequence[Message], config: Config) -> Run:
-        """Return a replay in memory; the run of the present settings where these refuse nothing for its delay."""
-        unlimited = all(sensor.max_delay_s is None for sensor in self._config.sensors.values())
-        if unlimited and self._config.estimator != "ekf-backward-forward":
-            run = self._run(self._config)
-            if run is not None:
-                return run
-        return replay_in_memory(messages, config)[0]
 
     def _fine(self, seen: Mapping[str, Arrivals], outcome: Outcome | None) -> Iterator[str]:
         """Yield the checks that found nothing."""

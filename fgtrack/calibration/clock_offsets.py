@@ -20,7 +20,7 @@ larger ones more (Carter, Schnepel, Steigerwald, Review of Economics and Statist
 
 import math
 from collections import Counter
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -153,22 +153,19 @@ class _Fit(NamedTuple):
     """Robust sum of squared residuals."""
 
 
-def _replayed(messages: Sequence[Message], config: Config) -> Run:
-    return replay_in_memory(messages, config)[0]
-
-
 def estimate_offsets(
     messages: Sequence[Message],
     config: Config,
     reference: str | None = None,
     doubtful: Container[str] = (),
-    replayed: Callable[[Sequence[Message], Config], Run] = _replayed,
+    run: Run | None = None,
 ) -> OffsetReport:
     """Return the clock offsets of the sensors, from tracks that the tracker of `config` makes.
 
     Without truth, or where `reference` is named, offsets are differences of two clocks. The reference is then the
     sensor with most detections, but for those that are `doubtful` and those whose clock must be wrong: nothing is
-    received before it was sensed. Sensors are not refused for their delays here: a wrong stamp looks like one.
+    received before it was sensed. Sensors are not refused for their delays here: a wrong stamp looks like one. `run` is
+    one of `messages` in which nothing was refused; without it they are replayed.
 
     Raises
     ------
@@ -178,7 +175,16 @@ def estimate_offsets(
         There are no detections, fewer than five ego states, or a sensor has no model.
     """
     heard = [corrected(one, config.sensors) if isinstance(one, DetectionList) else one for one in messages]
-    config = _unrefused(replace(config, estimator="ekf-replay"))
+    unrefused = {  # corrected stamps are taken as they are, and none is too late
+        name: replace(
+            one,
+            max_delay_s=None,
+            clock_offset_s=0.0,
+            stamp_from="message" if one.stamp_from == "receipt" else one.stamp_from,
+        )
+        for name, one in config.sensors.items()
+    }
+    config = replace(config, estimator="ekf-replay", sensors=unrefused)
     lists = [one for one in heard if isinstance(one, DetectionList) and one.sensor in config.used_sensors]
     counts, least_s = Counter[str](), dict[str, float]()
     for one in lists:
@@ -193,7 +199,7 @@ def estimate_offsets(
             f"reference {reference!r} is no sensor of the input, which has {', '.join(sorted(counts))}{hint}"
         )
     needs_ego = any(one.frame != "map" for one in lists)
-    run = replayed(heard, config)
+    run = replay_in_memory(heard, config)[0] if run is None else run
     ego = EgoPath(one for one in heard if isinstance(one, EgoState)) if needs_ego else None
     seen = sightings_of(run, lists, config, ego)
     sensors = [name for name in config.sensors if name in counts]
@@ -223,20 +229,6 @@ def estimate_offsets(
         return report
     reference = max(late, key=lambda one: one.num_detections).sensor
     return against(reference, _paths(seen, reference))
-
-
-def _unrefused(config: Config) -> Config:
-    """Return `config` for messages with corrected stamps: it takes these as they are, and none is too late."""
-    sensors = {
-        name: replace(
-            one,
-            max_delay_s=None,
-            clock_offset_s=0.0,
-            stamp_from="message" if one.stamp_from == "receipt" else one.stamp_from,
-        )
-        for name, one in config.sensors.items()
-    }
-    return replace(config, sensors=sensors)
 
 
 def _paths(seen: Mapping[str, Mapping[int, Sightings]], reference: str) -> list[ObjectPath]:
@@ -288,14 +280,12 @@ def _row(name: str, pairs: Sequence[_Pair], reference: str, num_sensors: int) ->
     why = f"objects move {speed_mps:.2g} m/s (rms) in its frame, against {reference}"
     if not abs(move_s) <= max(0.2 * fit.std[0], 1e-3) or abs(offset_s) > _REACH_S or math.isinf(fit.std[0]):
         return SensorOffset(name, None, None, len(stamps_ns), why)
-    biases = [_sure(*one) for one in zip(fit.x[1:], fit.std[1:], strict=True)]
+    biases = [  # 0 where it may be chance or does not matter
+        bias_m if abs(bias_m) > max(_BIAS_STDS * std_m, _SMALLEST_BIAS_M) else 0.0
+        for bias_m, std_m in zip(fit.x[1:], fit.std[1:], strict=True)
+    ]
     bias = Bias(of, *biases) if any(biases) else None
     return SensorOffset(name, offset_s, fit.std[0], len(stamps_ns), why, fit.dof, bias)
-
-
-def _sure(bias_m: float, std_m: float) -> float:
-    """Return `bias_m`, or 0 where it may be chance or does not matter."""
-    return bias_m if abs(bias_m) > max(_BIAS_STDS * std_m, _SMALLEST_BIAS_M) else 0.0
 
 
 _Frames = dict[Literal["ego", "vehicle"], FloatArray]

@@ -116,8 +116,6 @@ class Outcome:
     """Beginnings of tracks."""
     confirmed: int
     """Tracks that were ever confirmed."""
-    life_s: float
-    """Median life of these; NaN without any."""
     used: Mapping[str, float]
     """Share of the detections of each sensor that took part."""
     noise: tuple[NoiseFit, ...]
@@ -132,11 +130,10 @@ class Outcome:
         """Return the numbers of `run`."""
         counts = dict(run.meta["counts"])
         used = {name: sum(one.get(fate, 0) for fate in USED) / (sum(one.values()) or 1) for name, one in counts.items()}
-        found, truth, ticks_ns = Fragmentation.of(run), evaluate(run).truth, run.tables["timing"]["now_ns"]
+        truth, ticks_ns = evaluate(run).truth, run.tables["timing"]["now_ns"]
         return cls(
             births=int(np.count_nonzero(run.tables["updates"]["disposition"] == "birth")),
-            confirmed=len(found.lifetimes_s),
-            life_s=found.median_s,
+            confirmed=len(Fragmentation.of(run).lifetimes_s),
             used=used,
             noise=tuple(noise_fits(run)),
             truth=None if truth is None else truth.overall,
@@ -166,7 +163,6 @@ class Outcome:
         """Yield what a page shows, with units."""
         yield "beginnings of tracks", self.births
         yield "tracks confirmed", self.confirmed
-        yield "their median life [s]", self.life_s
         if self.truth is not None:
             yield "tracked [%]", 100.0 * self.truth.tracked_share_in_sight
             yield "breaks per object and minute", self.breaks_per_minute
@@ -181,8 +177,7 @@ class Outcome:
 def harm(before: Outcome, after: Outcome) -> str | None:
     """Return what gets worse from one run to another, with its numbers; None where nothing does.
 
-    Counts get worse where they rise by more than two standard deviations of their difference (Poisson); a
-    track that is never confirmed does no harm. Where clearly
+    Counts get worse where they rise by more than two standard deviations of their difference (Poisson). Where clearly
     more detections of a sensor are used, the two runs are not of the same data, and nothing is harm.
     """
     if any(share > before.used.get(name, 0.0) + _MORE_USED for name, share in after.used.items()):

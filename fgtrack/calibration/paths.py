@@ -24,7 +24,6 @@ from fgtrack.core.types import (
 )
 from fgtrack.io.run import NO_TRACK, Run
 from fgtrack.models.road import Road
-from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.config import Config
 from fgtrack.tracking.ego import EgoPose, is_finite
 from fgtrack.tracking.inbox import Batch, stamps
@@ -181,7 +180,16 @@ def sightings_of(
         if is_fused and track_id != NO_TRACK
     }
     preprocess = Preprocess(Road(), config.merge, config.motion.model(), config.ego.detection_origin_m)
-    sensors = {name: _position_only(sensor) for name, sensor in config.sensors.items()}
+    sensors = {
+        name: replace(
+            sensor,
+            std={component: value for component, value in sensor.std.items() if component in _POSITION},
+            yaw_from_map_std_rad=None,
+            max_range_m=None,
+            correlation=None,
+        )
+        for name, sensor in config.sensors.items()
+    }
     found: dict[str, dict[int, list[tuple[int, FloatArray, bool]]]] = defaultdict(lambda: defaultdict(list))
     for message in lists:
         own_ns = [message.stamp_ns if one.stamp_ns is None else one.stamp_ns for one in message.objects]
@@ -204,8 +212,3 @@ def sightings_of(
 def _gathered(rows: Sequence[tuple[int, FloatArray, bool]], ego: EgoPath | None) -> Sightings:
     stamps_ns, positions_m, in_map = zip(*rows, strict=True)
     return Sightings(np.array(stamps_ns), np.array(positions_m), np.array(in_map), ego)
-
-
-def _position_only(sensor: SensorModel) -> SensorModel:
-    std = {name: value for name, value in sensor.std.items() if name in _POSITION}
-    return replace(sensor, std=std, yaw_from_map_std_rad=None, max_range_m=None, correlation=None)

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from ruamel.yaml import YAML
 
-from fgtrack.calibration.trial import beginning, suspicions
+from fgtrack.calibration.trial import TRIAL_S, beginning, suspicions
 from fgtrack.core.errors import CallError, DataError, FgtrackError
+from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DESCRIBING, MEASURABLE, STATE_NAMES
 from fgtrack.io.adapters import ADAPTERS
 from fgtrack.io.adapters.ego import ODOMETRY
@@ -224,7 +225,6 @@ def _spreads(values: Mapping[str, Sequence[float]]) -> str:
 
 
 _MARK = "(fgtrack info --write)"
-_TRIAL_NS = 5_000_000_000
 
 
 def write_starting(out: Path, recording: Path, overwrite: bool) -> None:
@@ -250,7 +250,10 @@ def starting_config(recording: Path) -> str:
     try:
         source = open_input(recording, config.input)
         with_sensors = assumed(config, source)
-        checks = [str(one) for one in suspicions(list(beginning(source.messages(), _TRIAL_NS)), with_sensors.config)]
+        checks = [
+            str(one)
+            for one in suspicions(list(beginning(source.messages(), nanoseconds(TRIAL_S))), with_sensors.config)
+        ]
     except FgtrackError as error:  # of a recording in which nothing can be taken
         with_sensors, checks = Assumed(config, ()), [str(error)] if taken else []
     head = [

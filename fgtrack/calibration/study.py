@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from fgtrack.calibration.advise import advice_on
+from fgtrack.calibration.advise import Adviser
 from fgtrack.calibration.page import Advice
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
@@ -192,12 +192,8 @@ def study(
         Path of anything that fgtrack reads.
     out
         Folder to write to.
-    config
-        Name of a shipped configuration, path of a YAML file, or a `Config`; None for the defaults.
-    map, pit_map
-        CSV files of the track and of the pit lane, or `oval`; instead of those of the configuration.
-    set
-        Values of single settings: `{"smoother.lag_s": 3.0}`.
+    config, map, pit_map, set
+        As for `fgtrack.replay`.
     advice
         True to follow the settings of `fgtrack.advise`.
     figures
@@ -284,12 +280,12 @@ def outputs(out: Path) -> list[Path]:
 def _advised(recording: Path, messages: Sequence[Message], known: Assumed, on_step: OnStep) -> Advice | None:
     """Return the advice on `recording`; None where nothing can be judged, which the runs report as well."""
     with suppress(DataError):
-        return advice_on(
+        return Adviser(
             str(recording),
             messages,
             Assumed(known.config, ()),
             on_step=lambda text, share: on_step(f"advice, {text}", _ADVICE + (_REPLAY - _ADVICE) * share),
-        )
+        ).advice()
     return None
 
 

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, pairwise
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -60,12 +60,8 @@ def tune(
     ----------
     recordings
         Path of anything that fgtrack reads, or several of them.
-    config
-        Name of a shipped configuration, path of a YAML file, or a `Config`; None for the defaults.
-    map, pit_map
-        CSV files of the track and of the pit lane, or `oval`; instead of those of the configuration.
-    set
-        Values of single settings: `{"motion.kind": "ctra"}`.
+    config, map, pit_map, set
+        As for `fgtrack.replay`.
     keep
         Keys that stay as configured: `["motion.std_per_s.speed"]`.
 
@@ -77,8 +73,6 @@ def tune(
         A recording cannot be read, a sensor of it has no model, or nothing can be fitted to it.
     """
     resolved = read_config(config, set, track_map=map, pit_map=pit_map)
-    if not isinstance(recordings, (str, Path, Sequence)):
-        raise CallError(f"recordings: must be a path or several, is a {type(recordings).__name__}")
     paths = [recordings] if isinstance(recordings, (str, Path)) else list(recordings)
     return tuned({str(path): open_input(path, resolved.input) for path in paths}, resolved, TuneRules(keep=tuple(keep)))
 
@@ -158,7 +152,7 @@ class _Tuning:
         """Return the result of rounds of association and fit to the first part, judged by the rest."""
         series, _ = self._associated(self._configured)
         splits = [self._split_ns(tracks) for tracks in series] if self._rules.train_share < 1.0 else None
-        values, optima, rounds, settled = self._configured, 0, 0, False
+        values, rounds, settled = self._configured, 0, False
         while not settled and rounds < self._rules.max_rounds:
             if rounds:
                 self._on_step(f"association {rounds + 1}")
@@ -172,7 +166,7 @@ class _Tuning:
             ]
             problem = self._problem(first)
             if rounds == 1:
-                values, optima = self._best_start(problem)
+                values = self._best_start(problem)
             self._on_step(f"fit {rounds}")
             before = values
             values, likelihood, free = self._maximum(problem, values)
@@ -198,7 +192,6 @@ class _Tuning:
             num_tracks=len(problem.series),
             num_mixed=sum(len(one.mixed) for one in problem.series),
             rounds=rounds,
-            optima=optima,
             settled=settled,
             broken=broken,
         )
@@ -256,15 +249,15 @@ class _Tuning:
             why = f"the errors behind {keys} are 0, or nearly so: was it simulated without noise?"
         return DataError(f"{', '.join(self._recordings)}: nothing to fit noise to: {why}")
 
-    def _best_start(self, problem: Problem) -> tuple[FloatArray, int]:
-        """Return the best of three starts, by the maximum that it reaches on a part of the data, and their number."""
+    def _best_start(self, problem: Problem) -> FloatArray:
+        """Return the best of three starts, by the maximum that it reaches on a part of the data."""
         self._on_step("starts")
         longest = sorted(problem.series, key=lambda one: -len(one.observations))[:_START_TRACKS]
         some = [replace(one, observations=one.observations[:_START_OBSERVATIONS]) for one in longest]
         part = replace(problem, series=some)
         free = self._free(problem) & (part.counts() >= _MIN_COUNT)
         if not free.any():  # too little in the part to choose a start by
-            return self._configured.copy(), 1
+            return self._configured.copy()
         moving = np.flatnonzero(free[: self._space.num_motion])
         reached: list[tuple[float, FloatArray]] = []
         for factor in (1.0, _START_FACTOR, 1.0 / _START_FACTOR):
@@ -272,9 +265,7 @@ class _Tuning:
             start[moving] *= factor
             values, likelihood = part.maximum(start, free)
             reached.append((likelihood.cost(np.log(values[free])).objective, values))
-        reached.sort(key=lambda one: one[0])
-        optima = 1 + sum(lower[0] - higher[0] > 1.0 for higher, lower in pairwise(reached))
-        return reached[0][1], optima
+        return min(reached, key=lambda one: one[0])[1]
 
     def _fitted(self, problem: Problem, start: FloatArray) -> _Fitted:
         """Return the maximum; instead of what is not known there, what is configured, or what is nearest to it.

@@ -194,8 +194,6 @@ class TuneReport:
     """Measurements that were left out, because most of those around them are outliers; see `without_mixed`."""
     rounds: int
     """Number of associations."""
-    optima: int
-    """Different maxima of the likelihood found from several starts; the highest one is reported."""
     settled: bool
     """True if another association would have changed nothing any more."""
     broken: Mapping[str, str]

@@ -111,8 +111,6 @@ def _sensors(report: TuneReport) -> list[str]:
     lines.append(f"{report.num_tracks} tracks, {report.rounds} associations{settled}")
     if report.num_mixed:
         lines.append(f"{report.num_mixed} measurements left out: most around them are outliers (an exchanged object?)")
-    if report.optima > 1:
-        lines.append(f"{report.optima} maxima of the likelihood from several starts: this is the highest one")
     return lines
 
 

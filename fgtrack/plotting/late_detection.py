@@ -100,33 +100,33 @@ def close_up_of(run: Run, arrival: Arrival, messages: Iterable[Message] | None =
         tracker = build_tracker(config)
     except CallError as error:  # as above
         raise DataError(f"{error}, so no close-up") from error
+    key = arrival.sensor, arrival.receipt_ns, arrival.index
     start_ns, fused_ns = arrival.stamp_ns - nanoseconds(_BACK_S), list[tuple[int | None, int]]()
     name = f"detection {arrival.index} of {arrival.sensor} received at {arrival.receipt_ns} ns"
     for now_ns, batch in delivered(_recorded(run) if messages is None else messages, config):
-        place = next((k for k, message in enumerate(batch) if _is_list_of(arrival, message)), None)
-        for message in batch[:place]:
+        lists = (
+            k
+            for k, message in enumerate(batch)
+            if isinstance(message, DetectionList) and key[:2] == (message.sensor, message.receipt_ns)
+        )
+        row = next(lists, None)
+        for message in batch[:row]:
             tracker.receive(message)
         report = tracker.tick(now_ns)
         fused_ns += [(one.track_id, one.stamp_ns) for one in report.updates if one.disposition in FUSED[1:]]
-        if place is None:
+        if row is None:
             continue
         stamps_ns = sorted({*range(now_ns, start_ns - 1, -nanoseconds(STEP_S)), arrival.stamp_ns}, reverse=True)
         before = {one.track_id: _estimates(tracker, one.track_id, stamps_ns) for one in report.tracks}
-        tracker.receive(batch[place])
-        key = arrival.sensor, arrival.index, arrival.receipt_ns
+        tracker.receive(batch[row])
         updates = tracker.tick(now_ns).updates
-        taken = next((one for one in updates if (one.sensor, one.index, one.receipt_ns) == key), None)
+        taken = next((one for one in updates if (one.sensor, one.receipt_ns, one.index) == key), None)
         if taken is None or taken.disposition not in FUSED or taken.track_id not in before:
             raise DataError(f"{name}: no track has fused it ({taken.disposition if taken else 'no such detection'})")
         track_id, after = taken.track_id, _estimates(tracker, taken.track_id, stamps_ns)
         since_ns = sorted(stamp for track, stamp in fused_ns if track == track_id and stamp >= start_ns)
         return CloseUp(arrival, now_ns, track_id, before[track_id], after, np.array(since_ns, dtype=np.int64))
     raise DataError(f"{name}: there is no such list")
-
-
-def _is_list_of(arrival: Arrival, message: Message) -> bool:
-    key = arrival.sensor, arrival.receipt_ns
-    return isinstance(message, DetectionList) and (message.sensor, message.receipt_ns) == key
 
 
 def _estimates(tracker: Tracker, track_id: int, stamps_ns: Iterable[int]) -> Estimates:

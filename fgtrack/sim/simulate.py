@@ -5,7 +5,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fgtrack.core.errors import CallError
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import (
@@ -30,8 +29,6 @@ from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.sensor import SimulatedSensor
 from fgtrack.sim.vehicles import AnyVehicle, DrawnVehicle, Trajectory
 
-_MOST_STATES = 5e6  # three hours of the default scenario
-
 
 def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
     """Messages of `scenario` in order of receipt; at the same receipt truth, ego, sensors in their order.
@@ -45,15 +42,7 @@ def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
     ------
     DataError
         If the map cannot be read.
-    CallError
-        If it does not fit into memory.
     """
-    count = _num_states(scenario)
-    if count > _MOST_STATES:
-        raise CallError(
-            f"the scenario has some {count:.3g} measurements and states, more than {_MOST_STATES:g} do not fit into "
-            "memory: shorten duration_s, or lower rates, vehicles or clutter"
-        )
     vehicles_rng, ego_rng, sensors_rng = rng.spawn(3)
     track = _track(scenario)
     path = None if track is None else Path.through(track.table[:, :2])
@@ -67,15 +56,6 @@ def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
         messages += _scans(scenario, sensor, ego, opponents, track, child)
     messages.sort(key=lambda message: message.receipt_ns)
     return messages
-
-
-def _num_states(scenario: Scenario) -> float:
-    """About how many states of vehicles, measurements and clutter are drawn."""
-    vehicles = (scenario.ego, *scenario.opponents)
-    per_s = scenario.ego_messages.rate_hz + scenario.truth_rate_hz * len(vehicles)
-    per_s += sum(sensor.rate_hz * (len(vehicles) + sensor.clutter.mean_per_scan) for sensor in scenario.sensors)
-    per_s += sum(1.0 / vehicle.step_s for vehicle in vehicles if isinstance(vehicle, DrawnVehicle))
-    return scenario.duration_s * per_s
 
 
 def _track(scenario: Scenario) -> TrackMap | None:

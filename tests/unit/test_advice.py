@@ -15,7 +15,7 @@ from fgtrack.evaluation.metrics import ObjectMetrics
 
 SECOND_NS = 1_000_000_000
 TRUTH = replace(ObjectMetrics.total(()), ticks_present=6000, ticks_in_sight=6000, ticks_tracked_in_sight=5900)
-GOOD = Outcome(births=20, confirmed=3, life_s=30.0, used={"radar": 0.9}, noise=(), truth=TRUTH, tick_s=0.02)
+GOOD = Outcome(births=20, confirmed=3, used={"radar": 0.9}, noise=(), truth=TRUTH, tick_s=0.02)
 
 
 def test_harm_is_more_breaks_more_tracks_and_less_that_is_tracked_or_used() -> None:

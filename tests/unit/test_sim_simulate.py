@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fgtrack.core.errors import CallError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.pipeline.shipped import read_scenario
@@ -123,17 +122,3 @@ def test_equal_receipts_are_ordered_truth_ego_sensors() -> None:
         "radar",
         "lidar",
     ]
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"duration_s": 86_400.0},
-        {"sensors": (SimulatedSensor("radar", {"x_m": 1.0, "y_m": 1.0}, clutter=Clutter(1e6)),)},
-        {"sensors": (SimulatedSensor("radar", {"x_m": 1.0, "y_m": 1.0}, rate_hz=1e4),), "duration_s": 3600.0},
-        {"opponents": (DrawnVehicle(0.0, 0.0, 0.0, 10.0, step_s=1e-9),)},
-    ],
-)
-def test_a_scenario_that_does_not_fit_into_memory_is_refused(changes):
-    with pytest.raises(CallError, match="do not fit into memory: shorten duration_s, or lower rates, vehicles or clut"):
-        run(replace(SHORT, **changes))
