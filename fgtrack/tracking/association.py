@@ -6,10 +6,8 @@ from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
-from scipy.optimize import linear_sum_assignment
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import min_weight_full_bipartite_matching
-from scipy.spatial import cKDTree
 from scipy.special import gammaincinv
 
 from fgtrack.core.linalg import equal_ones, kernels, symmetrise
@@ -22,10 +20,8 @@ from fgtrack.tracking.objects import Apart
 from fgtrack.tracking.preprocess import Candidate
 
 _OUTSIDE = 1e9  # cost outside the gate: any number of pairs inside is cheaper
-_DENSE_COSTS = 1 << 12  # a matrix of so many costs is solved faster than its pairs
 MOST_NEAR = 128
 """Tracks, the nearest ones, that a candidate is compared with: no real scene has as many inside one gate."""
-_DENSE_DISTANCES = 1 << 14  # a matrix of so many distances is faster than a tree
 _MARGIN = 1.0 + 1e-9  # a tree rounds differently
 
 
@@ -174,32 +170,23 @@ def chi_square_quantile(probability: float, freedom: int) -> float:
 
 def assigned(pairs: Pairs, num_candidates: int, num_tracks: int) -> Assignment:
     """Assignment of as many of `pairs` as possible at least total cost, which are their values."""
-    rows_used, columns_used = set(pairs.rows.tolist()), set(pairs.columns.tolist())
-    if len(rows_used) == len(columns_used) == len(pairs.rows):  # nothing competes, as nearly always
-        return _outcome(pairs.rows, pairs.columns, num_candidates, num_tracks)
-    if num_candidates * num_tracks <= _DENSE_COSTS:
-        cost = np.full((num_candidates, num_tracks), _OUTSIDE)
-        cost[pairs.rows, pairs.columns] = pairs.values
-        inside = np.zeros(cost.shape, dtype=bool)
-        inside[pairs.rows, pairs.columns] = True
-        return assigned_densely(cost, inside)
-    if num_candidates > num_tracks:
-        columns, rows = _least_cost(pairs.columns, pairs.rows, pairs.values, (num_tracks, num_candidates))
-    else:
-        rows, columns = _least_cost(pairs.rows, pairs.columns, pairs.values, (num_candidates, num_tracks))
-    return _outcome(rows, columns, num_candidates, num_tracks)
+    rows, columns, cost = pairs
+    competes = not len(set(rows.tolist())) == len(set(columns.tolist())) == len(rows)
+    if competes:
+        if num_candidates > num_tracks:
+            columns, rows = _least_cost(columns, rows, cost, num_tracks, num_candidates)
+        else:
+            rows, columns = _least_cost(rows, columns, cost, num_candidates, num_tracks)
+    pairs_made = sorted(zip(rows.tolist(), columns.tolist(), strict=True))
+    new = set(range(num_candidates)).difference(rows.tolist())
+    missed = set(range(num_tracks)).difference(columns.tolist())
+    return Assignment(pairs_made, sorted(new), sorted(missed))
 
 
-def assigned_densely(cost: FloatArray, inside: BoolArray) -> Assignment:
-    """Assignment of all pairs `inside` their gates, both arguments of shape (candidates, tracks)."""
-    rows, columns = (np.asarray(part) for part in linear_sum_assignment(np.where(inside, cost, _OUTSIDE)))
-    good = inside[rows, columns]
-    return _outcome(rows[good], columns[good], *cost.shape)
-
-
-def _least_cost(i: IntArray, j: IntArray, cost: FloatArray, shape: tuple[int, int]) -> tuple[IntArray, IntArray]:
+def _least_cost(
+    i: IntArray, j: IntArray, cost: FloatArray, num_rows: int, num_columns: int
+) -> tuple[IntArray, IntArray]:
     """Rows and columns of the best pairs: each row may take a column of its own instead, outside every gate."""
-    num_rows, num_columns = shape
     own = np.arange(num_rows)
     shifted = cost + (1.0 - cost.min())  # a sparse graph has no edges of weight 0
     costs = np.concatenate([shifted, np.full(num_rows, _OUTSIDE)])
@@ -207,13 +194,6 @@ def _least_cost(i: IntArray, j: IntArray, cost: FloatArray, shape: tuple[int, in
     rows, columns = min_weight_full_bipartite_matching(csr_array((costs, edges), (num_rows, num_columns + num_rows)))
     inside = columns < num_columns
     return np.asarray(rows[inside], dtype=np.int64), np.asarray(columns[inside], dtype=np.int64)
-
-
-def _outcome(rows: IntArray, columns: IntArray, num_candidates: int, num_tracks: int) -> Assignment:
-    pairs = sorted(zip(rows.tolist(), columns.tolist(), strict=True))
-    new = set(range(num_candidates)).difference(rows.tolist())
-    missed = set(range(num_tracks)).difference(columns.tolist())
-    return Assignment(pairs, sorted(new), sorted(missed))
 
 
 def grouped(candidates: Sequence[Candidate]) -> list[Group]:
@@ -246,65 +226,17 @@ def near(
     Of a candidate with more than `MOST_NEAR` tracks so near, the nearest of them. Distances are in the map; that of a
     bearing is from the track to the line of sight.
     """
-    points = _positions_m(candidates)
-    if len(points) * len(means) <= _DENSE_DISTANCES:
-        distances = _distances(points, candidates, means)
-        rows, columns = (distances <= reach_m).nonzero()
-        pairs = Pairs(rows, columns, distances[rows, columns])
-    else:
-        pairs = _near_by_tree(points, candidates, means, np.broadcast_to(reach_m, len(means)))
-    return pairs if excluded is None else pairs.at(~excluded(pairs.rows, pairs.columns))
-
-
-def _near_by_tree(points: FloatArray, candidates: Sequence[Candidate], means: FloatArray, reach_m: FloatArray) -> Pairs:
-    """See `near`, of many pairs."""
-    placed = np.flatnonzero(~np.isnan(points[:, 0]))
-    nearest = range(1, min(len(means), MOST_NEAR) + 1)
-    farthest_m = float(reach_m.max()) * _MARGIN
-    apart, tracks = cKDTree(means[:, :2]).query(points[placed], nearest, distance_upper_bound=farthest_m)
-    inside, order = np.isfinite(apart).nonzero()
-    rows, columns = placed[inside], np.asarray(tracks)[inside, order]
-    offsets = points[rows] - means[columns, :2]
-    parts = [(rows, columns, np.sqrt(np.vecdot(offsets, offsets)))]
-    for row in np.flatnonzero(np.isnan(points[:, 0])).tolist():
-        distances = _distances_to_ray(candidates[row], means)
-        columns = np.argsort(distances, kind="stable")[:MOST_NEAR]
-        parts.append((np.full(len(columns), row), columns, distances[columns]))
-    pairs = Pairs(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-    pairs = pairs.at(pairs.values <= reach_m[pairs.columns])
-    return pairs.at(np.lexsort((pairs.columns, pairs.rows)))
-
-
-def euclidean_distances(candidates: Sequence[Candidate], means: FloatArray) -> FloatArray:
-    """Distances of all pairs as those of `near`, shape (candidates, tracks)."""
-    return _distances(_positions_m(candidates), candidates, means)
-
-
-def _distances(points: FloatArray, candidates: Sequence[Candidate], means: FloatArray) -> FloatArray:
-    offsets = points[:, None] - means[:, :2]
-    distances = np.sqrt(np.vecdot(offsets, offsets))
-    for row, candidate in enumerate(candidates):
-        if candidate.position_m is None:
-            distances[row] = _distances_to_ray(candidate, means)
-    return np.asarray(distances)
-
-
-def _positions_m(candidates: Sequence[Candidate]) -> FloatArray:
-    """Positions in the map, shape (m, 2); NaN of a bearing."""
-    points = np.full((len(candidates), 2), np.nan)
+    points = np.full((len(candidates), 3), np.nan)
     for point, candidate in zip(points, candidates, strict=True):
         if candidate.position_m is not None:
-            point[:] = candidate.position_m
-    return points
-
-
-def _distances_to_ray(candidate: Candidate, means: FloatArray) -> FloatArray:
-    pose = candidate.measurement.pose
-    offsets = means[:, :2] - np.array([pose.x_m, pose.y_m])
-    ranges = np.hypot(offsets[:, 0], offsets[:, 1])
-    angle = np.arctan2(offsets[:, 1], offsets[:, 0]) - pose.yaw_rad - candidate.values["bearing_rad"]
-    across = np.abs(ranges * np.sin(angle))
-    return np.asarray(np.where(np.cos(angle) > 0.0, across, ranges))
+            point[:2] = candidate.position_m
+        else:
+            pose = candidate.measurement.pose
+            point[:] = pose.x_m, pose.y_m, pose.yaw_rad + candidate.values["bearing_rad"]
+    limits_m = np.full(len(means), reach_m, dtype=np.float64)
+    find_near = kernels("fgtrack.tracking.kernels").near
+    pairs = Pairs(*find_near(points, np.ascontiguousarray(means), limits_m, MOST_NEAR))
+    return pairs if excluded is None else pairs.at(~excluded(pairs.rows, pairs.columns))
 
 
 def innovations(

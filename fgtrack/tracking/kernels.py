@@ -14,6 +14,40 @@ _ROUNDING = 1e-9
 """Tolerance of an eigenvalue of a correlation matrix below 0: rounding, where an entry is known for certain."""
 
 
+@njit("(float64[:, ::1], float64[:, ::1], float64[::1], int64)")
+def near(
+    points: FloatArray, means: FloatArray, reach_m: FloatArray, most: int
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return rows, columns and distances of the pairs of `points` and tracks that are at most `reach_m` (n,) apart.
+
+    Of a point in (m, 3) the third entry is NaN, of a line of sight from there its direction. At most so many tracks of
+    each point, the nearest ones.
+    """
+    m, n = len(points), len(means)
+    largest, count = m * min(n, most), 0
+    rows, columns, distances = np.empty(largest, np.int64), np.empty(largest, np.int64), np.empty(largest)
+    for i in range(m):
+        first = count
+        for j in range(n):
+            dx, dy, angle = means[j, 0] - points[i, 0], means[j, 1] - points[i, 1], points[i, 2]
+            distance = math.sqrt(dx * dx + dy * dy)
+            if not math.isnan(angle):
+                off = math.atan2(dy, dx) - angle
+                distance = abs(distance * math.sin(off)) if math.cos(off) > 0.0 else distance
+            if distance > reach_m[j]:
+                continue
+            at = count
+            if count - first == most:  # in place of the farthest
+                at = first
+                for k in range(first, count):
+                    at = k if distances[k] > distances[at] else at
+                if distances[at] <= distance:
+                    continue
+            rows[at], columns[at], distances[at] = i, j, distance
+            count = max(count, at + 1)
+    return rows[:count], columns[:count], distances[:count]
+
+
 @njit("(float64[:, ::1], float64[:, :, ::1], float64[:, :, ::1], int64[:], float64[:, :, ::1])")
 def innovations(
     y: FloatArray, H: FloatArray, P: FloatArray, tracks: IntArray, R: FloatArray

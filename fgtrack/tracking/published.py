@@ -13,7 +13,7 @@ from fgtrack.core.types import DetectionList, Disposition, EgoState, FloatArray,
 from fgtrack.estimation.base import StatesAt
 from fgtrack.estimation.filters.published import published_yaw
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.association import Assignment, assigned_densely, euclidean_distances
+from fgtrack.tracking.association import Assignment, assigned, near
 from fgtrack.tracking.detections import Merge
 from fgtrack.tracking.ego import EgoPose, EgoStd, EgoTrajectory
 from fgtrack.tracking.inbox import Batch, Inbox, is_valid_covariance, record, records
@@ -175,8 +175,10 @@ class UngatedEuclidean:
 
     def __call__(self, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None) -> Assignment:
         """See `Association`; torn pairs are born after the detections that had no partner. Nothing is `apart`."""
-        cost = euclidean_distances(candidates, states.means)
-        assignment = assigned_densely(cost, np.ones(cost.shape, dtype=bool))
+        pairs = near(candidates, states.means, np.inf)
+        rows, columns, distances_m = (array.tolist() for array in pairs)
+        cost = dict(zip(zip(rows, columns, strict=True), distances_m, strict=True))
+        assignment = assigned(pairs, len(candidates), len(states.means))
         torn = [pair for pair in assignment.pairs if cost[pair] > self.gate_m]
         good = [pair for pair in assignment.pairs if pair not in torn]
         missed = sorted(assignment.missed + [j for _, j in torn])

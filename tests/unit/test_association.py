@@ -10,7 +10,7 @@ from support.tracking import bearing, candidate, states
 
 from fgtrack.core.types import BoolArray, IntArray
 from fgtrack.models.measurement import SensorPose
-from fgtrack.tracking.association import Assignment, Association, GatedEuclidean, GatedMahalanobis, euclidean_distances
+from fgtrack.tracking.association import Assignment, Association, GatedEuclidean, GatedMahalanobis, near
 from fgtrack.tracking.published import UngatedEuclidean
 
 ALL = [GatedEuclidean(), GatedEuclidean(max_nis=20.0), GatedMahalanobis(), UngatedEuclidean()]
@@ -127,7 +127,7 @@ def test_a_wide_covariance_does_not_reach_beyond_the_largest_distance() -> None:
 def test_the_distance_of_a_bearing_is_from_the_track_to_the_line_of_sight_ahead() -> None:
     pose = SensorPose(1.0, 2.0, math.pi / 2)  # looks north; bearing -pi/2 is east
     tracks = states([(11.0, 2.0), (11.0, 5.0), (-4.0, 2.0), (1.0, 2.0)])
-    distances = euclidean_distances([bearing(-math.pi / 2, pose), candidate(11.0, 2.0)], tracks.means)
+    distances = near([bearing(-math.pi / 2, pose), candidate(11.0, 2.0)], tracks.means, math.inf).values.reshape(2, 4)
     assert distances[0] == pytest.approx([0.0, 3.0, 5.0, 0.0], abs=1e-12)
     assert distances[1] == pytest.approx([0.0, 3.0, 15.0, 10.0])
 

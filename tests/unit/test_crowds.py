@@ -5,20 +5,20 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.optimize import linear_sum_assignment
 from support.tracking import bearing, candidate, states
 
-from fgtrack.core.types import FloatArray
+from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.models.measurement import SensorPose
-from fgtrack.tracking import association as associations
 from fgtrack.tracking.association import (
+    Assignment,
     GatedEuclidean,
     GatedMahalanobis,
     Pairs,
     assigned,
-    assigned_densely,
-    euclidean_distances,
     grouped,
     innovations,
+    near,
 )
 from fgtrack.tracking.preprocess import Candidate
 
@@ -36,13 +36,6 @@ def peak_bytes(call: Callable[[], object]) -> int:
         tracemalloc.stop()
 
 
-@pytest.fixture
-def sparse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Small problems are solved as large ones are."""
-    monkeypatch.setattr(associations, "_DENSE_DISTANCES", -1)
-    monkeypatch.setattr(associations, "_DENSE_COSTS", -1)
-
-
 # --- assignment
 
 
@@ -51,11 +44,17 @@ def pairs_of(cost: FloatArray) -> Pairs:
     return Pairs(rows, columns, cost[rows, columns])
 
 
+def densely_assigned(cost: FloatArray, inside: BoolArray) -> Assignment:
+    rows, columns = linear_sum_assignment(np.where(inside, cost, 1e9))
+    pairs = [(i, j) for i, j in zip(rows.tolist(), columns.tolist(), strict=True) if inside[i, j]]
+    new, missed = ({*range(size)} - {pair[axis] for pair in pairs} for axis, size in enumerate(cost.shape))
+    return Assignment(pairs, sorted(new), sorted(missed))
+
+
 def outcome(cost: FloatArray, pairs: list[tuple[int, int]]) -> tuple[int, float]:
     return len(pairs), sum(cost[pair] for pair in pairs)
 
 
-@pytest.mark.usefixtures("sparse")
 @pytest.mark.parametrize("equal", [False, True])
 @pytest.mark.parametrize("seed", range(10))
 def test_an_assignment_of_pairs_is_that_of_the_matrix(equal: bool, seed: int) -> None:
@@ -63,7 +62,7 @@ def test_an_assignment_of_pairs_is_that_of_the_matrix(equal: bool, seed: int) ->
     shape = rng.integers(1, 12, size=2)
     cost = rng.integers(-2, 3, size=shape).astype(float) if equal else rng.uniform(-9.0, 9.0, size=shape)
     cost[rng.random(cost.shape) > rng.uniform(0.05, 0.9)] = np.inf
-    result, dense = assigned(pairs_of(cost), *cost.shape), assigned_densely(cost, np.isfinite(cost))
+    result, dense = assigned(pairs_of(cost), *cost.shape), densely_assigned(cost, np.isfinite(cost))
     assert outcome(cost, result.pairs) == pytest.approx(outcome(cost, dense.pairs), abs=1e-5)
     assert equal or result == dense
     assert len({i for i, _ in result.pairs}) == len({j for _, j in result.pairs}) == len(result.pairs)
@@ -79,36 +78,20 @@ def mixed(rng: np.random.Generator, count: int, side_m: float) -> list[Candidate
     return [bearing(float(rng.uniform(-0.5, 1.0)), eye) if rng.random() < 0.1 else each for each in found]
 
 
-@pytest.mark.parametrize(
-    "association",
-    [
-        GatedEuclidean(gate_m=3.0),
-        GatedEuclidean(gate_m=4.0, max_nis=30.0),
-        GatedMahalanobis(gate_probability=0.999, max_distance_m=9.0),
-    ],
-)
 @pytest.mark.parametrize(("bearings", "seed"), [(False, 0), (True, 1)])
-def test_an_association_by_a_tree_is_that_of_all_pairs(
-    association: GatedEuclidean | GatedMahalanobis, bearings: bool, seed: int, request: pytest.FixtureRequest
-) -> None:
+def test_an_association_is_that_of_all_pairs(bearings: bool, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    candidates = mixed(rng, 60, 40.0)
-    candidates = [each for each in candidates if bearings or each.position_m is not None]
+    candidates = [each for each in mixed(rng, 60, 40.0) if bearings or each.position_m is not None]
     tracks = states([(x, y) for x, y in rng.uniform(0.0, 40.0, size=(30, 2))])
     tracks.covariances[:] *= rng.uniform(0.1, 30.0, size=(30, 1, 1))
-    whole = association(candidates, tracks)
-    request.getfixturevalue("sparse")
-    assert association(candidates, tracks) == whole
-    if isinstance(association, GatedMahalanobis):
-        distances = euclidean_distances(candidates, tracks.means)
-        everywhere = np.nonzero(np.ones_like(distances, dtype=bool))
-        pairs = Pairs(*everywhere, distances[everywhere])
-        cost, inside = np.empty(len(pairs.rows)), np.empty(len(pairs.rows), dtype=bool)
-        for chosen, nis, logdet, k in innovations(pairs, grouped(candidates), len(candidates), tracks):
-            cost[chosen] = nis + logdet
-            limit = {1: 10.8275661707, 2: 13.8155105580}[k]  # chi-square quantiles of 0.999
-            inside[chosen] = (nis <= limit) & (pairs.values[chosen] <= 9.0)
-        assert whole == assigned_densely(cost.reshape(distances.shape), inside.reshape(distances.shape))
+    pairs, shape = near(candidates, tracks.means, np.inf), (len(candidates), 30)
+    cost, inside = np.empty(len(pairs.rows)), np.empty(len(pairs.rows), dtype=bool)
+    for chosen, nis, logdet, k in innovations(pairs, grouped(candidates), len(candidates), tracks):
+        cost[chosen] = nis + logdet
+        limit = {1: 10.8275661707, 2: 13.8155105580}[k]  # chi-square quantiles of 0.999
+        inside[chosen] = (nis <= limit) & (pairs.values[chosen] <= 9.0)
+    rule = GatedMahalanobis(gate_probability=0.999, max_distance_m=9.0)
+    assert rule(candidates, tracks) == densely_assigned(cost.reshape(shape), inside.reshape(shape))
 
 
 @pytest.mark.parametrize("association", [GatedEuclidean(gate_m=5.0), GatedMahalanobis()])
@@ -119,7 +102,7 @@ def test_detections_and_tracks_all_in_one_place_are_not_all_compared(
     rng = np.random.default_rng(0)
     candidates = [candidate(x, y) for x, y in rng.normal(0.0, 0.3, size=(3_000, 2)).tolist()]
     tracks = states([(x, y) for x, y in rng.normal(0.0, 0.3, size=(3_000, 2)).tolist()])
-    found: list[associations.Assignment] = []
+    found: list[Assignment] = []
     peak = peak_bytes(lambda: found.append(association(candidates, tracks)))
     assert peak < 125 * MB, f"{peak / MB:.0f} MB"
     assert len(found[0].pairs) > 2_500
