@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from operator import methodcaller
+from itertools import compress
 from typing import TypeVar
 
 import numpy as np
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.linalg import kernels
-from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
+from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import EstimatorError, Failure, Failures
 from fgtrack.estimation.present import PresentStates
@@ -51,16 +51,15 @@ class GuardedBank:
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`."""
         self._now_ns = now_ns
-        self._ask(methodcaller("advance", now_ns))
+        self._ask(lambda bank: bank.advance(now_ns))
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`; states that are not finite are left out."""
-        states: StatesAt = self._ask(methodcaller("states_at", stamp_ns), _check_states)
+        states = self._ask(lambda bank: bank.states_at(stamp_ns))
         if math.isfinite(states.means.sum() + states.covariances.sum()):
             return states
         finite = np.isfinite(states.means.sum(axis=1) + states.covariances.sum(axis=(1, 2)))
-        track_ids = tuple(track_id for track_id, kept in zip(states.track_ids, finite.tolist(), strict=True) if kept)
-        return StatesAt(track_ids, states.means[finite], states.covariances[finite])
+        return StatesAt(tuple(compress(states.track_ids, finite)), states.means[finite], states.covariances[finite])
 
     def update(
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
@@ -113,28 +112,27 @@ class GuardedBank:
     def present(self) -> list[TrackState]:
         """See `TrackBank.present`; all are sound."""
         while True:
-            states, unsound = self._ask(self._present)
+            states = self._ask(lambda bank: bank.present())
+            unsound = {self.track_ids[row]: fault for row, fault in faults(states).items()}
             if not unsound:
                 return states
-            for track_id, fault in [(self.track_ids[row], fault) for row, fault in unsound.items()]:
+            for track_id, fault in unsound.items():
                 self.failures.add(fault)
                 self._end({track_id: f"the state of track {track_id} is {fault.value}"}, fault)
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`; those that are not sound are left out."""
-        reports, unsound = self._ask(_smoothed)
+        reports = self._ask(lambda bank: bank.smoothed())
+        unsound = faults([report.state for report in reports])
         for fault in unsound.values():
             self.failures.add(fault)
         return [report for row, report in enumerate(reports) if row not in unsound] if unsound else reports
 
-    def _ask(self, question: Callable[[TrackBank], _T], check: Callable[[_T], None] | None = None) -> _T:
-        """Return the bank's answer, which passes `check`, when the tracks that prevent one have ended."""
+    def _ask(self, question: Callable[[TrackBank], _T]) -> _T:
+        """Return the bank's answer, when the tracks that prevent one have ended."""
         while True:
             try:
-                answer = question(self._bank)
-                if check is not None:
-                    check(answer)
-                return answer
+                return question(self._bank)
             except DataError:
                 raise
             except Exception as error:
@@ -146,12 +144,6 @@ class GuardedBank:
                 else:
                     text = f"the estimator fails even without tracks ({type(error).__name__}: {error})"
                     raise DataError(text) from error
-
-    def _present(self, bank: TrackBank) -> tuple[list[TrackState], dict[int, Failure]]:
-        states = bank.present()
-        if list(bank.track_ids) != list(self._alive) or len(states) != len(self._alive):
-            raise ValueError(f"{len(self._alive)} tracks have {len(states)} states")
-        return states, faults(states)
 
     def _end(self, causes: Mapping[int, str | Exception], failure: Failure) -> None:
         for track_id, cause in causes.items():
@@ -167,33 +159,14 @@ class GuardedBank:
             self.failures.end(track_id, self._now_ns, Failure.ESTIMATOR_RAISED)
         self._alive.clear()
         self._bank = self._make()
-        self._ask(methodcaller("advance", self._now_ns))
-
-
-def _check_states(states: StatesAt) -> None:
-    _check_real(states.means, states.covariances)
-    if not len(states.track_ids) == len(states.means) == len(states.covariances):
-        raise ValueError(f"{len(states.track_ids)} tracks have {len(states.means)} states")
-
-
-def _smoothed(bank: TrackBank) -> tuple[list[SmoothedReport], dict[int, Failure]]:
-    """Return the smoothed states, and the faults of some by their index."""
-    reports = bank.smoothed()
-    return reports, faults([report.state for report in reports])
-
-
-def _check_real(means: FloatArray, covariances: FloatArray) -> None:
-    """Raise `TypeError` where one of them does not hold real numbers."""
-    if means.dtype.kind not in "fiu" or covariances.dtype.kind not in "fiu":
-        raise TypeError(f"states must be real numbers, are of type {means.dtype} and {covariances.dtype}")
+        self.advance(self._now_ns)
 
 
 def faults(states: Sequence[TrackState]) -> dict[int, Failure]:
     """Return the faults of kinematic states by their index; nothing where all can be published.
 
     A state is sound where it is finite, its entries sum up to at most 10^9, and its covariance is symmetric and
-    positive definite: up to rounding, as an entry that the motion model does not have is 0 with variance 0. Raises
-    `TypeError` for what is not a real number, `ValueError` for wrong shapes.
+    positive definite: up to rounding, as an entry that the motion model does not have is 0 with variance 0.
     """
     if not states:
         return {}
@@ -202,10 +175,6 @@ def faults(states: Sequence[TrackState]) -> dict[int, Failure]:
     else:
         means = np.array([state.mean for state in states])
         covariances = np.array([state.covariance for state in states])
-    _check_real(means, covariances)
-    n = means.shape[1]
-    if not 5 <= n <= 6 or covariances.shape[1:] != (n, n):
-        raise ValueError(f"states have the shapes {means.shape} and {covariances.shape}")
     x, P = np.array(means, dtype=np.float64, order="C"), np.array(covariances, dtype=np.float64, order="C")
     codes = kernels("fgtrack.tracking.kernels").faults(x, P)
     kinds = Failure.NOT_FINITE, Failure.NOT_DEFINITE

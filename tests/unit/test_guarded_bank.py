@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-import pytest
 
 from fgtrack.core.errors import DataError
-from fgtrack.core.types import SmoothedReport, TrackState
-from fgtrack.estimation.base import Estimator, Measurement, Start, StatesAt, UpdateResult, UpdateStatus
+from fgtrack.core.types import TrackState
+from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import EndedTrack, Failure
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.object_bank import ObjectBank
@@ -147,54 +146,4 @@ def test_a_bank_that_cannot_remove_a_track_is_replaced() -> None:
         bank.birth(track_id, Start(yaw_rad=0.0))
     bank.remove(0)
     assert (bank.track_ids, bank.present()) == ((), [])
-    assert counted(bank) == {"estimator raised": 1, "track ended": 1}
-
-
-class Wrong(ObjectBank[Moody]):
-    """A bank that answers with what is none from the third tick on."""
-
-    wrong = ""
-    _ticks = 0
-
-    def advance(self, now_ns: int) -> None:
-        self._ticks += 1
-        super().advance(now_ns)
-
-    def _is(self, wrong: str) -> bool:
-        return self.wrong == wrong and self._ticks >= 3
-
-    @property
-    def track_ids(self) -> tuple[int, ...]:
-        return None if self._is("no tracks") else super().track_ids  # type: ignore[return-value]  # wrong on purpose
-
-    def smoothed(self) -> list[SmoothedReport]:
-        return None if self._is("no smoothed states") else super().smoothed()  # type: ignore[return-value]  # the same
-
-    def states_at(self, stamp_ns: int) -> StatesAt:
-        found = super().states_at(stamp_ns)
-        if self._is("complex states"):
-            return StatesAt(found.track_ids, found.means * 1j, found.covariances)
-        return StatesAt((), found.means, found.covariances) if self._is("other tracks") else found
-
-    def present(self) -> list[TrackState]:
-        states = super().present()
-        if self._is("complex present"):
-            return [TrackState(one.stamp_ns, one.mean + 0j, one.covariance) for one in states]
-        return states
-
-
-@pytest.mark.parametrize(
-    "wrong", ["no tracks", "no smoothed states", "complex states", "other tracks", "complex present"]
-)
-def test_an_invalid_answer_is_counted_and_never_given(wrong: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Wrong, "wrong", wrong)
-    bank = GuardedBank(lambda: Wrong(MOTION, Moody, 1.0))
-    bank.advance(0)
-    bank.birth(0, Start(stamp_ns=0, yaw_rad=0.0, speed_mps=10.0))
-    for k in range(1, 4):
-        bank.advance(100 * MS * k)
-        bank.states_at(100 * MS * k)
-        assert all(np.isrealobj(state.mean) for state in bank.present())
-        assert bank.smoothed() == []
-    assert bank.track_ids == ()
     assert counted(bank) == {"estimator raised": 1, "track ended": 1}

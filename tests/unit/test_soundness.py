@@ -65,12 +65,3 @@ def test_a_covariance_may_be_singular_up_to_rounding_whatever_its_units() -> Non
             P[0, 1] = P[1, 0] = correlation * size
             found = faults(spoilt(states, 0, states[0].mean, P))
             assert found == ({} if sound else {0: Failure.NOT_DEFINITE})
-
-
-@pytest.mark.parametrize("kind", [complex, object, str, bool])
-def test_states_are_real_numbers(kind: type) -> None:
-    states = present(CTRV())
-    for x, P in ((states[0].mean.astype(kind), states[0].covariance), (states[0].mean, np.eye(5).astype(kind))):
-        with pytest.raises(TypeError, match="real numbers"):
-            faults([TrackState(0, x, P)])
-    assert faults([TrackState(0, states[0].mean.astype(np.float32), np.eye(5, dtype=int))]) == {}
