@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -234,6 +234,7 @@ class StatesAt:
     """Shape (m, n, n)."""
 
 
+@runtime_checkable
 class TrackBank(Protocol):
     """The estimators of all objects; a bank may work on them together.
 
@@ -285,6 +286,7 @@ def no_states(dim: int) -> StatesAt:
     return StatesAt((), np.empty((0, dim)), np.empty((0, dim, dim)))
 
 
+@runtime_checkable
 class Estimator(Protocol):
     """One object: fuses measurements in any order of arrival."""
 

@@ -8,7 +8,6 @@ function `(**parameters) -> MotionModel`.
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from functools import cache
 from typing import Any, Literal
 
 from fgtrack.core.checks import is_number
@@ -164,7 +163,7 @@ def start_estimator(
     def plain(start: Start) -> Estimator:
         if claims.bank:
             return OneObject(motion, _made_bank(name, factory, motion, lag_s, own), start)
-        one: Estimator = _checked(name, _made(ESTIMATORS, name, factory, motion, start, lag_s, **own), Estimator)
+        one: Estimator = _made_as(Estimator, name, factory, motion, start, lag_s, **own)
         return one
 
     def made(start: Start) -> Estimator:
@@ -173,26 +172,21 @@ def start_estimator(
     return hypotheses(motion, start, wanted, made)
 
 
-def estimator_bank(name: str, motion: MotionModel, lag_s: float, options: Mapping[str, Any]) -> TrackBank:
-    """The estimators `name` of all objects; raises as `estimator`. One that is a bank itself takes no `initiation`."""
-    return start_bank(name, ESTIMATORS.load(name), motion, lag_s, options)
-
-
-def start_bank(
-    name: str,
-    factory: Factory,
-    motion: MotionModel,
-    lag_s: float,
-    options: Mapping[str, Any],
+def estimator_bank(
+    name: str, motion: MotionModel, lag_s: float, options: Mapping[str, Any], factory: Factory | None = None
 ) -> TrackBank:
-    """`estimator_bank` of a factory that need not be registered; `name` stands in errors."""
+    """The estimators `name` of all objects; raises as `estimator`. One that is a bank itself takes no `initiation`.
+
+    A `factory` need not be registered; `name` then stands in errors alone.
+    """
+    factory = factory or ESTIMATORS.load(name)
     claims = Claims.of(factory)
     own = {key: options[key] for key in options if claims.initiates or key != "initiation"}
     if claims.bank:
         return _made_bank(name, factory, motion, lag_s, own)
     _check_options(name, factory, 3, own)
     if factory is ReplayEkf and isinstance(motion, WhiteNoise) and type(motion) in (CTRV, CTRA, CV):
-        return ReplayBank(motion, lambda start: _made(ESTIMATORS, name, factory, motion, start, lag_s, **own), lag_s)
+        return ReplayBank(motion, lambda start: ReplayEkf(motion, start, lag_s, **own), lag_s)
     return ObjectBank(motion, lambda start: start_estimator(name, factory, motion, start, lag_s, options), lag_s)
 
 
@@ -205,8 +199,16 @@ def motion_model(name: str, parameters: Mapping[str, Any]) -> MotionModel:
 
 
 def _made_bank(name: str, factory: Factory, motion: MotionModel, lag_s: float, options: Mapping[str, Any]) -> TrackBank:
-    bank: TrackBank = _checked(name, _made(ESTIMATORS, name, factory, motion, lag_s, **options), TrackBank)
+    bank: TrackBank = _made_as(TrackBank, name, factory, motion, lag_s, **options)
     return bank
+
+
+def _made_as(protocol: type, name: str, factory: Factory, *arguments: Any, **options: Any) -> Any:
+    """Return what the estimator `name` makes. Raises `CallError` where that lacks something of `protocol`."""
+    made = _made(ESTIMATORS, name, factory, *arguments, **options)
+    if not isinstance(made, protocol):
+        raise CallError(f"estimator {name!r}: {type(made).__name__} lacks a member of {protocol.__name__}, see there")
+    return made
 
 
 def _made(registry: Registry, name: str, factory: Factory, *arguments: Any, **options: Any) -> Any:
@@ -228,20 +230,3 @@ def _check_options(name: str, factory: Factory, num_arguments: int, options: Map
     except TypeError as error:
         taken = list(signature.parameters)[num_arguments:]
         raise CallError(f"{name}: {error}; its options are {', '.join(taken) or 'none'}") from error
-
-
-def _checked(name: str, found: Any, protocol: type) -> Any:
-    """`found`, which has all that `protocol` names. What an attribute is, is seen when it is used."""
-    lacking = [what for what in _members(protocol) if not hasattr(found, what)]
-    if lacking:
-        raise CallError(
-            f"estimator {name!r}: {type(found).__name__} lacks {', '.join(lacking)}, see {protocol.__name__}"
-        )
-    return found
-
-
-@cache
-def _members(protocol: type) -> tuple[str, ...]:
-    """Names of the attributes and methods of a protocol, in the order in which they are written."""
-    named = [name for each in reversed(protocol.__mro__) if each is not object for name in vars(each)]
-    return tuple(name for name in dict.fromkeys(named) if not name.startswith("_"))

@@ -8,7 +8,7 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, TrackBank, UpdateResult
-from fgtrack.estimation.registry import Claims, Factory, start_bank, start_estimator
+from fgtrack.estimation.registry import Claims, Factory, estimator_bank, start_estimator
 from fgtrack.testing.streams import LAG_S, Stream
 
 
@@ -79,7 +79,7 @@ class Subject:
 
     def start_bank(self, stream: Stream) -> TrackBank:
         """A new bank without any object, as the tracker has it."""
-        return start_bank(self.name, self.factory, stream.motion, LAG_S, self.options)
+        return estimator_bank(self.name, stream.motion, LAG_S, self.options, factory=self.factory)
 
     def fed(self, stream: Stream) -> tuple[Estimator, list[UpdateResult]]:
         """A new one that has taken all of `stream`, and the results."""

@@ -151,7 +151,7 @@ class LackingBank:
         (Raising, r"plug-in x:Y of odd 1\.0 cannot be made \(RuntimeError: oh\)"),
         (Leaving, r"plug-in x:Y of odd 1\.0 cannot be made \(SystemExit: 0\)"),
         (5, r"odd: 5 is no class or function of Python"),
-        (LackingBank, r"estimator 'odd': LackingBank lacks present_ns, .*, smoothed, see TrackBank"),
+        (LackingBank, r"estimator 'odd': LackingBank lacks a member of TrackBank"),
     ],
     ids=["raises", "leaves", "number", "bank"],
 )
