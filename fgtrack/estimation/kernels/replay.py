@@ -3,7 +3,8 @@
 `order[track]` has the slots of a track's steps, oldest first, and then the free ones. A slot of `steps` has in rows of
 n, the dimension of the state, mean and covariance after the measurement (n + 1 rows), mean and covariance predicted for
 it, and the cross-covariance of that with the step before. One of `measured` has z in its first row, and then R; one of
-`labels` the stamp, the number k of components, and the entries of the state that these are.
+`labels` the stamp, the number k of components, and the entries of the state that these are; k of the first step, which
+is a prior, is 0. A row of `windows` has the number of the track's steps, and its oldest and newest stamp.
 """
 
 import math
@@ -12,10 +13,11 @@ import numpy as np
 
 from fgtrack.core.compiled import add_congruence, add_product_transposed, copy, inlined, merged, njit, product, solve
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.kernels.kalman import correct_one, innovate
 from fgtrack.models.transitions import ARC, transition
 
+FAILED, TOO_OLD, IN_SEQUENCE, OUT_OF_SEQUENCE = range(4)
 _YAW = 2
 
 
@@ -116,12 +118,28 @@ def _step(
     return True
 
 
-_STEPS = "int64, float64[::1], int64[:, ::1], int64[:, :, ::1], float64[:, :, :, ::1]"
+@inlined
+def _comes_after(label: IntArray, measured: FloatArray, new_label: IntArray, new: FloatArray) -> bool:
+    """True if a step comes after a new measurement: by stamp, and at one stamp by content, whatever came first."""
+    k = label[1]
+    if label[0] != new_label[0] or k == 0:
+        return bool(label[0] > new_label[0])
+    for a in range(1, 2 + min(k, new_label[1])):
+        if label[a] != new_label[a]:
+            return bool(label[a] > new_label[a])
+    for a in range(k + 1):
+        for b in range(k):
+            if measured[a, b] != new[a, b]:
+                return bool(measured[a, b] > new[a, b])
+    return False
+
+
+_STEPS = "int64, float64[::1], int64[:, ::1], int64[:, :, ::1], float64[:, :, :, ::1], int64[:, ::1]"
 
 
 @njit(
-    f"({_STEPS}, float64[:, :, :, ::1], int64[:, ::1], int64[::1], float64[:, :, ::1], int64[::1], float64[:, ::1], "
-    "float64[:, :, ::1], float64[::1], b1[::1])"
+    f"({_STEPS}, float64[:, :, :, ::1], int64[::1], int64, int64, int64[::1], float64[:, :, ::1], int64[::1], "
+    "float64[:, ::1], float64[:, :, ::1], float64[::1], int64[::1])"
 )
 def fuse(
     motion: int,
@@ -129,36 +147,44 @@ def fuse(
     order: IntArray,
     labels: IntArray,
     steps: FloatArray,
+    windows: IntArray,
     measured: FloatArray,
-    at: IntArray,
+    tracks: IntArray,
+    lag_ns: int,
+    oldest_ns: int,
     new_label: IntArray,
     new: FloatArray,
     rows: IntArray,
     y: FloatArray,
     S: FloatArray,
     nis: FloatArray,
-    fused: BoolArray,
+    status: IntArray,
 ) -> None:
-    """Put a measurement `new` (m, k + 1, k) into each chain of steps, and filter the later ones again.
+    """Put a measurement `new` (m, k + 1, k) into the steps of each of `tracks` (m,), and filter the later ones again.
 
-    Rows of `at` (m, 3) are a track, the index of its measurement, and the number of its steps, fewer than its slots.
-    Writes innovations y (m, k), the NIS of their `rows`, and S (m, k, k), given all that was fused; and False where a
-    measurement cannot be fused: there all is as it was.
+    A track has fewer steps than slots. Writes innovations y (m, k), the NIS of their `rows`, and S (m, k, k), given all
+    that was fused, and the status. Where a measurement fails, or is older than `oldest_ns` or the window of the track,
+    all is as it was.
     """
-    k, n = y.shape[1], len(density)
+    k, n, stamp_ns = y.shape[1], len(density), new_label[0]
     now, H, K = np.empty((n + 1, n)), np.empty((k, n)), np.empty((k, n))
-    for i in range(len(at)):
-        t, index, count = at[i, 0], at[i, 1], at[i, 2]
-        slots, own = order[t], order[t, count]
+    for i in range(len(tracks)):
+        t = tracks[i]
+        slots, count, window = order[t], windows[t, 0], windows[t]
+        if stamp_ns < max(window[1], oldest_ns):
+            status[i] = TOO_OLD
+            continue
+        index, own = count, slots[count]
+        while index > 1 and _comes_after(labels[t, slots[index - 1]], measured[t, slots[index - 1]], new_label, new[i]):
+            slots[index] = slots[index - 1]
+            index -= 1
+        slots[index] = own
         for a in range(k + 2):
             labels[t, own, a] = new_label[a]
         for a in range(k + 1):
             for b in range(k):
                 measured[t, own, a, b] = new[i, a, b]
-        for j in range(count, index, -1):
-            slots[j] = slots[j - 1]
-        slots[index] = own
-        j, last, fused[i] = index, count, True
+        j, last, fused = index, count, True
         while j <= last:
             s, left = slots[j], slots[j - 1]
             late_ns = labels[t, s, 0] - labels[t, left, 0]
@@ -171,28 +197,38 @@ def fuse(
                 nis[i] = innovate(now[1:], y[i], H, new[i, 1:], rows, S[i], K)
                 ok = ok and not np.isnan(nis[i])
             j += 1
-            if not ok and fused[i]:  # take it out, and filter the later ones again without it
+            if not ok and fused:  # take it out, and filter the later ones again without it
                 for j in range(index, count):
                     slots[j] = slots[j + 1]
                 slots[count] = own
-                j, last, fused[i] = index, count - 1, False
+                j, last, fused = index, count - 1, False
+        status[i] = FAILED
+        if fused:
+            status[i] = IN_SEQUENCE if stamp_ns >= window[2] else OUT_OF_SEQUENCE
+            window[0], window[2] = count + 1, max(window[2], stamp_ns)
+            window[1] = max(window[1], window[2] - lag_ns)
 
 
-@njit(f"({_STEPS}, int64[:, ::1], float64[:, :, ::1])")
+@njit(f"({_STEPS}, int64[::1], int64[::1], float64[:, :, ::1])")
 def ahead(
     motion: int,
     density: FloatArray,
     order: IntArray,
     labels: IntArray,
     steps: FloatArray,
-    at: IntArray,
+    windows: IntArray,
+    tracks: IntArray,
+    stamps_ns: IntArray,
     predicted: FloatArray,
 ) -> None:
-    """Write the `_ahead` (m, 2 n + 1, n) of steps; rows of `at` are track, index of the step, and stamp."""
+    """Write the `_ahead` (m, 2 n + 1, n) of `tracks` at their stamps: from their last step up to there."""
     n = len(density)
-    for i in range(len(at)):
-        t, at_ns = at[i, 0], at[i, 2]
-        s = order[t, at[i, 1]]
-        _ahead(motion, density, steps[t, s, : n + 1], at_ns - labels[t, s, 0], predicted[i])
+    for i in range(len(tracks)):
+        t = tracks[i]
+        j = windows[t, 0] - 1
+        while j > 0 and labels[t, order[t, j], 0] > stamps_ns[i]:
+            j -= 1
+        s = order[t, j]
+        _ahead(motion, density, steps[t, s, : n + 1], stamps_ns[i] - labels[t, s, 0], predicted[i])
         if motion == ARC:
             predicted[i, 0, _YAW] = _wrapped(predicted[i, 0, _YAW])
