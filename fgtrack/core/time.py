@@ -41,8 +41,3 @@ def nanoseconds(duration_s: float) -> int:
 def period_ns(frequency_hz: float) -> int:
     """Period of `frequency_hz` in integer nanoseconds, truncated as clocks are."""
     return int(NS_PER_S / frequency_hz)
-
-
-def first_multiple(stamp_ns: int, step_ns: int) -> int:
-    """Smallest multiple of `step_ns` that is not before `stamp_ns`."""
-    return -(-stamp_ns // step_ns) * step_ns

@@ -6,7 +6,7 @@ from dataclasses import replace
 from itertools import groupby
 from typing import NamedTuple
 
-from fgtrack.core.time import first_multiple, nanoseconds, period_ns
+from fgtrack.core.time import nanoseconds, period_ns
 from fgtrack.core.types import DetectionList, EgoState
 from fgtrack.models.sensors import SensorModel
 from fgtrack.sim.redelay import restamped
@@ -28,7 +28,7 @@ def node_ticks(messages: Iterable[Delivered], node_hz: float) -> Iterator[Tick]:
     """
     step_ns = period_ns(node_hz)
     next_ns: int | None = None
-    for due_ns, delivered in groupby(messages, lambda message: first_multiple(message.receipt_ns, step_ns)):
+    for due_ns, delivered in groupby(messages, lambda message: -(-message.receipt_ns // step_ns) * step_ns):
         for now_ns in range(due_ns if next_ns is None else next_ns, due_ns, step_ns):
             yield Tick(now_ns, [])
         yield Tick(due_ns, list(delivered))

@@ -189,20 +189,6 @@ def test_at_speed_zero_the_heading_is_unknown_but_finite() -> None:
     assert_allclose(np.diag(covariance), [1.0, 1.0, 9.0 / MIN_SPEED_MPS**2, 4.0, 0.0])
 
 
-@given(yaw=st.floats(-3.0, 3.0), speed=st.sampled_from([0.0, 3.0]))
-def test_a_birth_with_constant_velocity_has_the_spread_of_its_samples(yaw: float, speed: float) -> None:
-    """Also at speed 0, where the first order alone would be singular."""
-    mean = np.array([0.0, 0.0, yaw, speed, 0.0])
-    covariance = np.diag([1.0, 1.0, 0.05**2, 2.0**2, 1.0])
-    P = CV().from_kinematic(mean, covariance)[1]
-    rng = np.random.default_rng(0)
-    yaws, speeds = yaw + 0.05 * rng.normal(size=40_000), speed + 2.0 * rng.normal(size=40_000)
-    samples = np.cov(np.stack([speeds * np.cos(yaws), speeds * np.sin(yaws)]))
-    assert_allclose(np.linalg.eigvalsh(P[2:, 2:]), np.linalg.eigvalsh(samples), rtol=0.03)
-    assert_allclose(P[2:, 2:], samples, atol=0.05)
-    assert np.linalg.eigvalsh(P)[0] > 0.0
-
-
 def test_a_birth_at_rest_is_as_uncertain_across_its_heading_as_the_product_of_yaw_and_speed() -> None:
     """E[(a b)^2] - E[a b]^2 = var(a) var(b) + cov(a, b)^2 of Gaussians."""
     covariance = np.diag([1.0, 1.0, 0.05**2, 2.0**2, 1.0])
@@ -248,19 +234,6 @@ class Walking(Accelerating):
 
 MODEL, WALK = Accelerating(), Walking()
 X = np.array([1.0, 2.0, 3.0, 4.0, 0.5, -0.5])
-
-
-def test_a_cartesian_state_gives_and_takes_what_cv_gives_and_takes() -> None:
-    P = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) + 0.1
-    found, expected = MODEL.kinematic(X, P), CV().kinematic(X[:4], P[:4, :4])
-    assert_allclose(found[0], expected[0])
-    assert_allclose(found[1], expected[1])
-    back, back_P = MODEL.from_kinematic(*expected)
-    cv, cv_P = CV().from_kinematic(*expected)
-    assert_array_equal(back[:4], cv)
-    assert_allclose(back_P[:4, :4], cv_P)
-    assert_array_equal(back[4:], 0.0)
-    assert_array_equal(back_P[4:], np.eye(6)[4:])
 
 
 def test_what_a_kinematic_state_lacks_starts_at_zero_with_the_model_s_variance() -> None:

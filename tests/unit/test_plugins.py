@@ -117,11 +117,6 @@ def test_options_that_an_estimator_does_not_take_are_refused() -> None:
         motion_model("cv", {"drag": 0.1})
 
 
-def test_a_plug_in_that_ends_the_program_is_named(registry: Registry) -> None:
-    with pytest.raises(CallError, match=r"^part 'zero': plug-in leaving_plugin:Part of wrecked 1\.0 .*SystemExit: 0"):
-        registry.load("zero")
-
-
 class Raising:
     """A part that cannot be made."""
 
