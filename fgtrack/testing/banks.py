@@ -1,4 +1,4 @@
-"""Promises of an estimator about several objects at once, and about smoothed states."""
+"""Promises of an estimator about several objects at once."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -30,7 +30,9 @@ def gives_each_of_several_objects_what_it_gives_one_alone(subject: Subject, stre
     half, new = (len(lists) + 1) // 2, len(objects)
     later = [{new if number == _GONE else number: m for number, m in one.items()} for one in lists[half:]]
     bank = subject.start_bank(stream)
-    _born(bank, [one.start for one in objects])
+    for number, one in enumerate(objects):
+        bank.advance(max(bank.present_ns, one.start.stamp_ns))
+        bank.birth(number, one.start)
     reported = _fed(bank, lists[:half])
     bank.remove(_GONE)
     bank.birth(new, objects[_GONE].start)
@@ -43,7 +45,13 @@ def gives_each_of_several_objects_what_it_gives_one_alone(subject: Subject, stre
         estimator, results = _alone(subject, own, number, [*lists[:half], *later], begun)
         _same_results(number, [one[number] for one in reported if number in one], results)
         for at_ns in (bank.present_ns - 120 * MS, bank.present_ns):
-            _same(state_of(bank, stream.motion, number, at_ns), estimator.state_at(at_ns), number, stream.motion)
+            state = state_of(bank, stream.motion, number, at_ns)
+            off, covariance = difference(state, estimator.state_at(at_ns), stream.motion)
+            require(
+                off < _TOGETHER and covariance < _TOGETHER,
+                f"the state of object {number} at {at_ns} differs from what it is alone by {off:.1e} standard "
+                f"deviations in the mean and {covariance:.1e} in the covariance",
+            )
     _publishes_the_present(bank, stream.motion)
     for report in bank.smoothed():
         _sound_of(report.state, stream.motion, f"a smoothed state of object {report.track_id}")
@@ -88,15 +96,6 @@ def _same_results(number: int, found: Sequence[UpdateResult], expected: Sequence
             require(same, f"of object {number} the innovation is {one.innovation}, alone it is {other.innovation}")
 
 
-def _same(found: TrackState, expected: TrackState, number: int, motion: MotionModel) -> None:
-    off, covariance = difference(found, expected, motion)
-    require(
-        off < _TOGETHER and covariance < _TOGETHER,
-        f"the state of object {number} at {found.stamp_ns} differs from what it is alone by {off:.1e} standard "
-        f"deviations in the mean and {covariance:.1e} in the covariance",
-    )
-
-
 def _sound_of(shown: TrackState, motion: MotionModel, what: str) -> None:
     """Require that a kinematic state is sound in the entries that `motion` has; the others are 0."""
     known = [k for k, name in enumerate(STATE_NAMES[: len(shown.mean)]) if k < YAW_RATE or name in motion.state_names]
@@ -120,13 +119,6 @@ def _publishes_the_present(bank: TrackBank, motion: MotionModel) -> None:
         apart = np.abs(state.covariance - covariance) <= _ROUNDING * np.outer(sigma, sigma)
         require((np.abs(off) <= _ROUNDING * sigma + _ROUNDING).all(), f"{what} is {state.mean}, not {mean}")
         require(apart.all(), f"the covariance of {what} is\n{state.covariance}\nnot\n{covariance}")
-
-
-def _born(bank: TrackBank, starts: Sequence[Start]) -> None:
-    """Let objects begin, numbered from 0."""
-    for number, start in enumerate(starts):
-        bank.advance(max(bank.present_ns, start.stamp_ns))
-        bank.birth(number, start)
 
 
 def _fed(bank: TrackBank, lists: Sequence[List]) -> list[dict[int, UpdateResult]]:

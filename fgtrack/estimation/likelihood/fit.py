@@ -93,7 +93,7 @@ class Likelihood:
         return np.asarray(self._innovations.evaluate(values).log_likelihoods.sum(axis=1))
 
     def cost(self, logs: FloatArray) -> Cost:
-        """Return the cost at the free logarithms, shape (f,)."""
+        """Return the cost at the free logarithms, shape (f,); kept, for the search asks twice."""
         key = logs.tobytes()
         if key not in self._costs:
             self._costs[key] = self._cost(logs)
