@@ -17,7 +17,7 @@ import typer
 from typer.core import TyperGroup
 
 import fgtrack
-from fgtrack.cli.entry import INTERRUPTED, interrupted
+from fgtrack.cli.entry import INTERRUPTED
 from fgtrack.cli.streams import standard_streams
 from fgtrack.core.errors import CallError, DataError, FgtrackError, one_line
 from fgtrack.io.output import FULL
@@ -170,8 +170,6 @@ def _run(words: Sequence[str], debug: bool) -> int:
 def _failed(message: str, code: int, debug: bool) -> int:
     if debug:
         traceback.print_exc()
-    if code != INTERRUPTED and interrupted():  # the error is what a library has made of it
-        message, code = "interrupted", INTERRUPTED
     with suppress(OSError):  # where that cannot be written either, the code is all that can be said
         print(f"fgtrack: error: {one_line(message)}", file=sys.stderr, flush=True)
     return code

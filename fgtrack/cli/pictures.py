@@ -53,7 +53,9 @@ def figure(
     one_file = out.suffix.lower() == ".pdf" and not out.is_dir()
     if out.suffix.lower() in (".png", ".svg") and not out.is_dir():
         raise CallError(f"{out}: one picture cannot hold all figures, name a folder or a .pdf")
-    paper = _paper(width, font, style)
+    given = {"width": width, "font": font, "style": style}
+    paper = cast(Paper, {name: value for name, value in given.items() if value is not None})
+    settings(paper)  # raises where one is not usable
     picture = out if one_file else out / f"figure.{form}"  # what else is in the folder stays
     with progress("draw"):
         first, plans, missing = _of_sweep(runs, stamp) or _of_runs(runs, picture, stamp, paper)
@@ -72,14 +74,6 @@ def figure(
     left_out = 0 if every else sum(one.is_extra for one in plans)
     if left_out:
         say(f"{left_out} more with --all")
-
-
-def _paper(width: str | None, font: str | None, style: str | None) -> Paper:
-    """Return the options as keywords of the figures. Raises `CallError` where one is not usable."""
-    given = {"width": width, "font": font, "style": style}
-    paper = cast(Paper, {name: value for name, value in given.items() if value is not None})
-    settings(paper)
-    return paper
 
 
 _Figures = tuple[list[tuple[str, Figure]], list[Planned], DataError | None]  # the close-up, the others, why it is none

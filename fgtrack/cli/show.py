@@ -2,8 +2,6 @@
 
 import json
 import os
-import sys
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
@@ -25,8 +23,6 @@ from fgtrack.core.types import Message
 from fgtrack.evaluation.tables import Table, Tables, bulleted
 
 _WIDTH_WITHOUT_TERMINAL = 120
-LINE_PERIOD_S = 10.0
-"""Between two lines of progress off a terminal."""
 _MESSAGES = 1000  # between two signs of progress
 _SPEED_PERIOD_S = 600.0  # over which the time of the rest is estimated: jobs differ
 
@@ -80,18 +76,21 @@ class Progress(Protocol):
 
 @contextmanager
 def progress(what: str, total: int | None = None) -> Iterator[Progress]:
-    """A bar that moves while the block runs; off a terminal a line now and then, where the work takes long.
+    """A bar on a terminal that moves while the block runs, with the time that the rest will take.
 
-    The function given sets the text beside it, after each of `total` steps, or with the share that is done. With either
-    also the percentage, and the time that the rest will take.
+    The function given sets the text beside it, after each of `total` steps, or with the share that is done.
     """
     stderr = Console(stderr=True)
-    if not stderr.is_terminal:
-        yield _Lines(what, total)
-        return
     columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
     left = TextColumn("left"), TimeRemainingColumn()
-    with RichProgress(*columns, *left, console=stderr, transient=True, speed_estimate_period=_SPEED_PERIOD_S) as bar:
+    with RichProgress(
+        *columns,
+        *left,
+        console=stderr,
+        transient=True,
+        speed_estimate_period=_SPEED_PERIOD_S,
+        disable=not stderr.is_terminal,
+    ) as bar:
         task = bar.add_task(what, total=total)
 
         def moved(text: str = "", share: float | None = None) -> None:
@@ -99,24 +98,6 @@ def progress(what: str, total: int | None = None) -> Iterator[Progress]:
             bar.update(task, description=f"{what} {text}".rstrip(), **at)
 
         yield moved
-
-
-class _Lines:
-    """Progress for a file: a line every few seconds."""
-
-    def __init__(self, what: str, total: int | None) -> None:
-        self._what, self._total, self._steps = what, total, 0
-        self._last_s = time.monotonic()
-
-    def __call__(self, text: str = "", share: float | None = None) -> None:
-        self._steps += 1
-        share = self._steps / self._total if share is None and self._total else share
-        now_s = time.monotonic()
-        if now_s - self._last_s < LINE_PERIOD_S:
-            return
-        self._last_s = now_s
-        parts = [self._what, *([] if share is None else [f"{share:.0%}"]), *([text] if text else [])]
-        print(f"fgtrack: {', '.join(parts)}", file=sys.stderr, flush=True)
 
 
 def counted(messages: Sequence[Message], moved: Progress) -> Iterator[Message]:

@@ -1,7 +1,6 @@
 """The command line in-process: exit codes, one line for every error, and the chain from scenario to figure."""
 
 import json
-import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -9,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from fgtrack.cli import show
 from fgtrack.cli.main import run
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
@@ -49,7 +47,6 @@ Command = Callable[..., Outcome]
 def fgtrack(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
     """Runs a command in an empty folder."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(show, "LINE_PERIOD_S", math.inf)  # a slow machine says no more than a fast one
 
     def call(*arguments: object) -> Outcome:
         capsys.readouterr()
@@ -115,21 +112,6 @@ def test_every_storage_gives_the_same_run_to_the_byte(runs: dict[str, Path]) -> 
     assert all(content == contents[0] for content in contents)
     assert len({load_run(path).meta["digest"] for path in runs.values()}) == 1
     assert len(load_run(runs["mcap"]).tracks) > 50
-
-
-def test_off_a_terminal_progress_is_lines(
-    fgtrack: Command, recordings: dict[str, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(show, "LINE_PERIOD_S", 0.0)
-    words = ("replay", recordings["mcap"], "-c", "karle2023", "-e", "drop,ekf-replay", "--map", "oval", "-o", "runs")
-    told = [line for line in fgtrack(*words).err.splitlines() if line.startswith("fgtrack: replay, ")]
-    assert len(told) > 2
-    assert all(" s of data" in line for line in told)
-    lines = fgtrack("simulate", "default", "-o", "x.jsonl", "--duration", "5").err.splitlines()
-    assert lines[0] == "fgtrack: simulate, 0%"
-    assert len(lines) > 1
-    monkeypatch.setattr(show, "LINE_PERIOD_S", 60.0)
-    assert fgtrack("simulate", "default", "-o", "y.jsonl", "--duration", "2").err == "", "short work says nothing"
 
 
 def test_runs_are_compared_as_tables_and_as_json(fgtrack: Command, runs: dict[str, Path]) -> None:

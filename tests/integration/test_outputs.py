@@ -1,7 +1,6 @@
 """What a command did not make it neither removes nor replaces."""
 
 import json
-import math
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -102,7 +101,6 @@ def here(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def call(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Call]:
     """Runs a command; gives its exit code and the line on stderr."""
-    monkeypatch.setattr("fgtrack.cli.show.LINE_PERIOD_S", math.inf)  # a busy machine would make it tell its progress
 
     def called(*words: str) -> tuple[int, str]:
         capfd.readouterr()

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-#: Ctrl-C while a module loads, as an extension module in C hands it on.
+#: Ctrl-C while a module loads.
 INTERRUPTED = """
 import signal, sys
 from fgtrack.cli import entry
@@ -14,10 +14,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell may ha
 class Loading:
     def find_spec(self, name, *rest):
         if name == {module!r}:
-            try:
-                signal.raise_signal(signal.SIGINT)
-            except KeyboardInterrupt as error:
-                raise {error}
+            signal.raise_signal(signal.SIGINT)
 
 sys.meta_path.insert(0, Loading())
 sys.argv = ["fgtrack", *{words!r}]
@@ -29,12 +26,11 @@ def run(program: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=50.0)
 
 
-@pytest.mark.parametrize("error", ["error", "ImportError('initialization failed') from None"])
 @pytest.mark.parametrize(
     ("module", "words"), [("fgtrack.cli.main", []), ("fgtrack.cli.calibrate", ["info", "x"]), ("numpy", ["info", "x"])]
 )
-def test_an_interrupt_while_something_loads_is_one_line(module: str, words: list[str], error: str) -> None:
-    done = run(INTERRUPTED.format(module=module, words=words, error=error))
+def test_an_interrupt_while_something_loads_is_one_line(module: str, words: list[str]) -> None:
+    done = run(INTERRUPTED.format(module=module, words=words))
     assert done.returncode == 130
     assert done.stderr.startswith("fgtrack: error: interrupted")
     assert done.stderr.count("\n") == 1
