@@ -96,7 +96,7 @@ class Fragmentation:
 
 def diagnostics(run: Run) -> list[Diagnostic]:
     """Defects of `run`, as far as its files show them."""
-    kinds = (_stamps, _angles, _ego, _map, _unused, _window, _failures, _fragmentation)
+    kinds = (_stamps, _angles, _ego, _map, _unused, _failures, _fragmentation)
     return [diagnostic for kind in kinds for diagnostic in kind(run)]
 
 
@@ -284,17 +284,6 @@ def _too_old(run: Run, sensor: str) -> str:
         f"median delay {delay_s:.3g} s, within {window}: no track is as old as these detections, check births, gate "
         "and clock"
     )
-
-
-def _window(run: Run) -> Iterator[Diagnostic]:
-    """A window that holds less than two lists of a sensor."""
-    window, lag_s = _reported_window(run)
-    updates = run.tables["updates"]
-    for sensor, mine in _by_sensor(updates):
-        stamps_ns = np.unique(updates["stamp_ns"][mine])
-        period_s = float(np.median(np.diff(stamps_ns))) / NS_PER_S if len(stamps_ns) >= FEWEST else 0.0
-        if lag_s < period_s:
-            yield Diagnostic(sensor, f"one list every {period_s:.3g} s, longer than {window}: raise it")
 
 
 def _failures(run: Run) -> Iterator[Diagnostic]:
