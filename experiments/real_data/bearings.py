@@ -24,7 +24,7 @@ from scores import autoferry_sources, nis_ratios, write
 import fgtrack
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import FloatArray, IntArray, Message
-from fgtrack.evaluation.comparison import paired_sums
+from fgtrack.evaluation.comparison import comparison
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, within_run
 from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.truth import ego_states, true_paths
@@ -160,7 +160,7 @@ def bounds(one: Estimate) -> tuple[float, float, float]:
 
 def change(without: EvaluatedRun, run: EvaluatedRun, quantity: str) -> Estimate:
     """What the cameras change, less is better."""
-    ticks = paired_sums([without, run]).sums[quantity]
+    ticks = comparison([without, run]).sums[quantity]
     return within_run(ticks, lambda S: np.sqrt(S[1] / S[2]) - np.sqrt(S[0] / S[2]), np.random.default_rng(SEED))
 
 

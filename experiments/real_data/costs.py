@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from fgtrack.core.types import FloatArray, Message
-from fgtrack.evaluation.comparison import paired_sums
+from fgtrack.evaluation.comparison import comparison
 from fgtrack.evaluation.intervals import Estimate, by_stamp, within_run
 from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.scores.prediction import displacements
@@ -34,7 +34,7 @@ def sums(prompt: Sequence[EvaluatedRun], after: Sequence[EvaluatedRun], horizons
     Positions where all runs track the same object at the same stamp, now and `horizons_s` ahead; GOSPA at all ticks.
     """
     runs = [*prompt, *after]
-    found = paired_sums(runs).sums
+    found = comparison(runs).sums
     ahead = {f"position_{horizon_s:g}_s_ahead_rmse_m": _ahead(runs, horizon_s) for horizon_s in horizons_s}
     return {**{name: found[name] for name in QUANTITIES if name in found}, **ahead}
 

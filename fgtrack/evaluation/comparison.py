@@ -6,8 +6,8 @@ bootstrap over time (`fgtrack.evaluation.intervals`).
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 
@@ -55,11 +55,13 @@ class Comparison:
     """Samples of the run with most of them."""
     quantities: Mapping[str, tuple[Entry, ...]]
     """By name, with the unit in it, the entries from the best to the worst; those that all runs have."""
+    sums: Mapping[str, FloatArray] = field(default_factory=dict)
+    """By quantity: of every stamp the sum of each run, and in the last column the count, shape (n, runs + 1)."""
 
 
 def comparisons(runs: Sequence[EvaluatedRun]) -> list[Comparison]:
     """A comparison for every recording of which there are several runs with truth."""
-    return [_comparison(group) for group in comparable(runs) if len(group) > 1]
+    return [comparison(group) for group in comparable(runs) if len(group) > 1]
 
 
 def comparable(runs: Sequence[EvaluatedRun]) -> list[list[EvaluatedRun]]:
@@ -67,7 +69,7 @@ def comparable(runs: Sequence[EvaluatedRun]) -> list[list[EvaluatedRun]]:
     groups: dict[tuple[int, EvaluationConfig], list[EvaluatedRun]] = {}
     for number, group in enumerate(by_recording([one for one in runs if one.matching is not None])):
         for one in group:
-            groups.setdefault((number, one.options), []).append(one)
+            groups.setdefault((number, one.run.evaluation), []).append(one)
     return list(groups.values())
 
 
@@ -109,18 +111,8 @@ def entry_columns(heading: str, name: str = "value") -> list[Column]:
     ]
 
 
-class Paired(NamedTuple):
-    """Sums by which runs of one recording are compared."""
-
-    samples: int
-    most_samples: int
-    """See `Comparison`."""
-    sums: Mapping[str, FloatArray]
-    """By quantity: of every stamp the sum of each run, and in the last column the count, shape (n, runs + 1)."""
-
-
-def paired_sums(group: Sequence[EvaluatedRun]) -> Paired:
-    """The errors of `group`, runs of one recording, at the same objects and stamps, stamp by stamp."""
+def comparison(group: Sequence[EvaluatedRun]) -> Comparison:
+    """Return the comparison of `group`, runs of one recording, at the same objects and stamps."""
     matchings = [one.matching for one in group if one.matching is not None]
     errors, squares = [track_errors(one) for one in matchings], [position_nees(one) for one in matchings]
     codes, at_ns, rows = common_samples([one.object_index for one in errors], [one.stamps_ns for one in errors])
@@ -131,9 +123,11 @@ def paired_sums(group: Sequence[EvaluatedRun]) -> Paired:
             sums[name] = by_stamp(at_ns, np.stack(values, axis=-1))
         values = [one[row] for one, row in zip(squares, rows, strict=True)]
         sums[POSITION_NEES] = by_stamp(at_ns, np.stack(values, axis=-1))
-    if all(one.options.multi_object for one in group):
+    if all(one.run.evaluation.multi_object for one in group):
         sums["gospa_in_sight_rms_m"] = _gospa_sums(group)
-    return Paired(len(at_ns), max(codes), sums)
+    labels = tuple(one.label for one in group)
+    quantities = {name: compared(name, labels, ticks) for name, ticks in sums.items() if ticks[:, -1].any()}
+    return Comparison(labels, len(at_ns), max(codes), quantities, sums)
 
 
 def common_samples(
@@ -173,12 +167,6 @@ def compared(name: str, labels: Sequence[str], ticks: FloatArray) -> tuple[Entry
     return ranked(labels, means if is_nees else np.sqrt(means), cost(means), worse_by)
 
 
-def _comparison(group: Sequence[EvaluatedRun]) -> Comparison:
-    paired, labels = paired_sums(group), tuple(one.label for one in group)
-    quantities = {name: compared(name, labels, ticks) for name, ticks in paired.sums.items() if ticks[:, -1].any()}
-    return Comparison(labels, paired.samples, paired.most_samples, quantities)
-
-
 def _gospa_sums(group: Sequence[EvaluatedRun]) -> FloatArray:
     """Squared GOSPA of the visible objects of every run, and 1, at the ticks that all have.
 
@@ -194,6 +182,6 @@ def _gospa_sums(group: Sequence[EvaluatedRun]) -> FloatArray:
     for one, scene, mine in zip(group, there, rows, strict=True):
         in_sight = scene.in_sight.copy()
         in_sight[mine] = seen
-        parts = gospa(replace(scene, in_sight=in_sight), one.options.gate_m)
+        parts = gospa(replace(scene, in_sight=in_sight), one.run.evaluation.gate_m)
         columns.append((parts.total_m2 - parts.out_of_sight_m2)[mine])
     return np.stack([*columns, np.ones(len(common_ns))], axis=-1)

@@ -181,9 +181,7 @@ def state_errors(states: Table, truth: FloatArray) -> dict[str, FloatArray]:
     """Errors by name of `ERROR_NAMES`, shape (n,) each, of n rows against x, y, yaw, speed ..., shape (n, 5)."""
     dx_m, dy_m = states["x_m"] - truth[:, 0], states["y_m"] - truth[:, 1]
     c, s = np.cos(truth[:, 2]), np.sin(truth[:, 2])
-    yaw_rad = states["yaw_rad"] - truth[:, 2]
-    known = np.isfinite(yaw_rad)
-    yaw_rad[known] = wrap_angles(yaw_rad[known])
+    yaw_rad = wrap_angles(states["yaw_rad"] - truth[:, 2])
     along_m, across_m = c * dx_m + s * dy_m, c * dy_m - s * dx_m
     errors = (np.hypot(dx_m, dy_m), along_m, across_m, yaw_rad, states["speed_mps"] - truth[:, 3])
     return dict(zip(ERROR_NAMES, errors, strict=True))

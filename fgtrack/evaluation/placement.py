@@ -47,7 +47,8 @@ def placed(run: Run) -> Placed:
     position_m = np.where(in_map[:, None], given_m, turned_m)
     position_m = np.where(np.isfinite(given_m).all(axis=-1)[:, None], position_m, polar_m)
     yaw_rad = np.where(in_map, table["yaw_rad"], table["yaw_rad"] + sensor_rad)
-    return Placed(position_m, _wrapped(yaw_rad), sensor_m, _wrapped(bearing_rad))
+    with np.errstate(invalid="ignore"):  # of infinite angles
+        return Placed(position_m, wrap_angles(yaw_rad), sensor_m, wrap_angles(bearing_rad))
 
 
 def update_rows(run: Run) -> IntArray:
@@ -77,8 +78,3 @@ def _mounts(run: Run, sensors: Column, mounted: BoolArray) -> FloatArray:
         mount = (known.get(name) or {}).get("mount") or {}
         result[mounted & (sensors == name)] += [float(mount.get(key, 0.0)) for key in ("x_m", "y_m", "yaw_rad")]
     return result
-
-
-def _wrapped(angles_rad: FloatArray) -> FloatArray:
-    known = np.isfinite(angles_rad)
-    return np.where(known, wrap_angles(np.where(known, angles_rad, 0.0)), np.nan)

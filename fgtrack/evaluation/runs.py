@@ -14,7 +14,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.types import MEASURABLE
 from fgtrack.evaluation.matching import Matching, match
 from fgtrack.evaluation.metrics import Metrics, evaluate_matched
-from fgtrack.io.run import EvaluationConfig, Run, is_run_folder, load_run
+from fgtrack.io.run import Run, is_run_folder, load_run
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,17 +28,12 @@ class EvaluatedRun:
     @cached_property
     def matching(self) -> Matching | None:
         """Pairs of tracks and true objects; None for a run without truth."""
-        return match(self.run, self.options)
-
-    @cached_property
-    def options(self) -> EvaluationConfig:
-        """Settings of the evaluation."""
-        return self.run.evaluation
+        return match(self.run)
 
     @cached_property
     def metrics(self) -> Metrics:
         """All metrics, by the settings of the run's configuration."""
-        return evaluate_matched(self.run, self.matching, self.options)
+        return evaluate_matched(self.run, self.matching, self.run.evaluation)
 
 
 OneRun = Run | EvaluatedRun | Path | str

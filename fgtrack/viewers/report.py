@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+
+import pandas as pd
 
 import fgtrack
 from fgtrack.core.errors import printable
@@ -149,7 +150,11 @@ def _figure(name: str, picture: bytes) -> str:
 
 def _configuration(runs: Sequence[EvaluatedRun]) -> str:
     """The keys whose values differ between runs, then everything of each run."""
-    settings = {one.label: flattened(one.run.config) for one in runs}
+    flat = {one.label: pd.json_normalize(one.run.config).to_dict("records")[0] for one in runs}
+    settings = {
+        label: {key: value if isinstance(value, str) else json.dumps(value, default=str) for key, value in one.items()}
+        for label, one in flat.items()
+    }
     keys = dict.fromkeys(key for one in settings.values() for key in one)
     rows = [{"key": key} | {label: one.get(key, _NONE) for label, one in settings.items()} for key in keys]
     rows = [row for row in rows if len({row[label] for label in settings}) > 1]
@@ -158,17 +163,6 @@ def _configuration(runs: Sequence[EvaluatedRun]) -> str:
         config = f"<pre>{escape(one.run.config_text)}</pre>"
         text += f"<details><summary>{escape(one.label)}: config.yaml</summary>{config}</details>\n"
     return text
-
-
-def flattened(config: Mapping[str, Any], above: str = "") -> dict[str, str]:
-    """Return the values of `config` as text, by the path of their key (`smoother.lag_s`)."""
-    flat: dict[str, str] = {}
-    for key, value in config.items():
-        if isinstance(value, Mapping) and value:
-            flat |= flattened(value, f"{above}{key}.")
-        else:
-            flat[f"{above}{key}"] = value if isinstance(value, str) else json.dumps(value, default=str)
-    return flat
 
 
 def _facts(one: EvaluatedRun) -> dict[str, str]:

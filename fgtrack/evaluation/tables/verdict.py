@@ -1,30 +1,15 @@
 """Sentences of a comparison with their intervals: the best run, the fit of the noise, the worth of waiting."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
 
 from fgtrack.evaluation.comparison import Comparison, Entry
 from fgtrack.evaluation.diagnostics import FEWEST, is_far_off
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate
 from fgtrack.evaluation.metrics import Metrics
 from fgtrack.evaluation.scores.lagged import WINDOW
-from fgtrack.evaluation.scores.statistics import ChiSquareMean
 from fgtrack.evaluation.tables import PERCENT, short, two_digits
 
 _POSITION = "position_rmse_m"
-
-
-class _Square(NamedTuple):
-    """A mean NEES or NIS, and its interval where the values are correlated."""
-
-    name: str
-    square: ChiSquareMean
-    interval: Estimate = UNKNOWN
-
-    def __str__(self) -> str:
-        low, high = two_digits(self.interval.low), two_digits(self.interval.high)
-        known = f", 95 % interval {low} to {high}" if self.interval.is_known else ""
-        return f"{self.name} {short(self.square.mean)} (expected {self.square.dof:.3g}{known})"
 
 
 def verdict(metrics: Mapping[str, Metrics], compared: Sequence[Comparison]) -> tuple[str, ...]:
@@ -81,30 +66,30 @@ def _metres(entry: Entry, what: str = "") -> str:
 
 
 def _noise(label: str, one: Metrics) -> Iterator[str]:
-    """Fit of the covariances of a run, the best one, to the errors."""
-    squares = list(_squares(one))
-    far = [each for each in squares if is_far_off(each.square)]
-    off = [each for each in far if not each.interval.low <= each.square.dof <= each.interval.high]  # where it is known
+    """Fit of the covariances of a run, the best one, to the errors: NEES of the position, NIS of every sensor."""
+    of = one.consistency
+    squares = [("NEES of the position", of.position_nees, of.position_nees_interval)] if of.position_nees.count else []
+    squares += [(f"NIS of {name}", nis, UNKNOWN) for name, nis in of.nis.items() if nis.count >= FEWEST]
+    texts = {
+        name: f"{name} {short(square.mean)} (expected {square.dof:.3g}"
+        + (f", 95 % interval {two_digits(interval.low)} to {two_digits(interval.high)})" if interval.is_known else ")")
+        for name, square, interval in squares
+    }
+    far = [(name, square, interval) for name, square, interval in squares if is_far_off(square)]
+    off = {name: square for name, square, interval in far if not interval.low <= square.dof <= interval.high}
     if off:
-        small = [each.square.mean > each.square.dof for each in off]
+        small = [square.mean > square.dof for square in off.values()]
         size = "too small" if all(small) else "partly too small, partly too large" if any(small) else "too large"
         yield (
-            f"The configured noise is {size} (judged by {label}): {', '.join(map(str, off))}. "
+            f"The configured noise is {size} (judged by {label}): {', '.join(texts[name] for name in off)}. "
             "`fgtrack advise --tune` fits it, or reports what has to be corrected first; the order of the runs may "
             "change then."
         )
     elif far:
-        yield f"Too short a run to tell if the noise fits (judged by {label}): {', '.join(map(str, far))}."
+        names = ", ".join(texts[name] for name, *_ in far)
+        yield f"Too short a run to tell if the noise fits (judged by {label}): {names}."
     elif squares:
-        yield f"The noise fits (judged by {label}): {', '.join(map(str, squares))}."
-
-
-def _squares(one: Metrics) -> Iterator[_Square]:
-    """NEES of the position, and NIS of every sensor with enough of them."""
-    if one.consistency.position_nees.count:
-        interval = one.consistency.position_nees_interval
-        yield _Square("NEES of the position", one.consistency.position_nees, interval)
-    yield from (_Square(f"NIS of {name}", nis) for name, nis in one.consistency.nis.items() if nis.count >= FEWEST)
+        yield f"The noise fits (judged by {label}): {', '.join(texts.values())}."
 
 
 def _percent(share: Estimate) -> str:
