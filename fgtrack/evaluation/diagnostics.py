@@ -277,7 +277,9 @@ def _too_old(run: Run, sensor: str) -> str:
     if limit_s is not None and delay_s > limit_s:
         cure = f"raise sensors.{sensor}.max_delay_s or correct its clock"
         return f"median delay {delay_s:.3g} s, allowed {limit_s:g} s: {cure}"
-    window, lag_s = _reported_window(run)
+    reported = run.meta.get("effective") or {}
+    lag_s = float(reported.get("lag_s", np.inf))
+    window = f"the window ({reported.get('lag_key')} {lag_s:g} s)"
     if delay_s > lag_s:
         return f"median delay {delay_s:.3g} s, older than {window}: raise it, or correct the clock"
     return (
@@ -319,13 +321,6 @@ def _fragmentation(run: Run) -> Iterator[Diagnostic]:
             f"or motion larger than configured, a wrong ego or clock; `{_advise(run)}` looks for them"
         )
         yield Diagnostic("tracks", text)
-
-
-def _reported_window(run: Run) -> tuple[str, float]:
-    """The window with the key that sets its length, and its length; infinite where a run does not report it."""
-    window = run.meta.get("effective") or {}
-    lag_s = float(window.get("lag_s", np.inf))
-    return f"the window ({window.get('lag_key')} {lag_s:g} s)", lag_s
 
 
 def _section(run: Run, name: str) -> Mapping[str, Any]:

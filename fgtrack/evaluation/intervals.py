@@ -91,7 +91,8 @@ def within_run(ticks: FloatArray, statistic: Statistic, rng: np.random.Generator
     is known from m blocks. Quantiles of the draws would be too narrow. The length of the blocks is `block_length` of
     the influence of each tick on the statistic. The interval of fewer than eight ticks is unknown.
     """
-    sums, pieces = ticks.sum(axis=0), _pieces(ticks)
+    sums, size = ticks.sum(axis=0), max(1, math.ceil(len(ticks) / _MOST_PIECES))
+    pieces = np.add.reduceat(ticks, np.arange(0, len(ticks), size), axis=0) if len(ticks) else ticks
     n = len(pieces)
     with np.errstate(divide="ignore", invalid="ignore"):  # a mean of nothing is NaN
         value = float(statistic(sums))
@@ -153,12 +154,6 @@ def block_length(values: FloatArray) -> int:
         return 1
     length: float = (1.5 * (float((lags * weighted).sum()) / total) ** 2 * n) ** (1.0 / 3.0)
     return min(max(math.ceil(length), 1), n // _FEWEST_BLOCKS)
-
-
-def _pieces(ticks: FloatArray) -> FloatArray:
-    """Sums of neighbouring ticks, so that there are at most `_MOST_PIECES`."""
-    starts = np.arange(0, len(ticks), max(1, math.ceil(len(ticks) / _MOST_PIECES)))
-    return np.asarray(np.add.reduceat(ticks, starts, axis=0)) if len(ticks) else ticks
 
 
 def _gradient(statistic: Statistic, sums: FloatArray) -> FloatArray:

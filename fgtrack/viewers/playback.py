@@ -41,10 +41,13 @@ def playback(runs: Sequence[EvaluatedRun], moment: Moment | None = None) -> tupl
     """
     recordings, notes = [_Recording.of(group) for group in by_recording(runs)], dict[str, None]()
     first = recordings[0]
+    x0_m, y0_m = first.origin_m.tolist()
     return {
         "colours": distinct_colours([str(one.run.meta.get("estimator", "")) for one in runs]),
         "sensor_colours": SENSORS,
-        "moment": None if moment is None else first.moment(moment),
+        "moment": None
+        if moment is None
+        else {"t": (moment[0] - first.start_ns) / NS_PER_S, "x": moment[1] - x0_m, "y": moment[2] - y0_m},
         "size_m": NOMINAL_SIZE_M[:2],
         "recordings": [one.values(notes, MOST_ROWS // len(recordings)) for one in recordings],
         "runs": [
@@ -78,10 +81,6 @@ class _Recording:
     def seconds(self, times_ns: IntArray) -> FloatArray:
         times_s = (times_ns - self.start_ns) / NS_PER_S
         return np.where(np.abs(times_s) < _LONGEST_S, times_s, math.nan)
-
-    def moment(self, moment: Moment) -> Json:
-        x0_m, y0_m = self.origin_m.tolist()
-        return {"t": (moment[0] - self.start_ns) / NS_PER_S, "x": moment[1] - x0_m, "y": moment[2] - y0_m}
 
     def place(self, position_m: FloatArray, prefix: str = "") -> Json:
         """Columns of positions, shape (n, 2)."""

@@ -67,18 +67,24 @@ def _write(folder: Path, messages: Iterable[ViewerMessage]) -> dict[str, int]:
             for topic, made in factory.messages(message):
                 if topic not in connections:
                     latched = isinstance(message.content, Scene) and message.content.latched
+                    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
+                    quality = Qos(
+                        QosHistory.KEEP_LAST,
+                        10,
+                        QosReliability.RELIABLE,
+                        durability,
+                        _FOREVER,
+                        _FOREVER,
+                        QosLiveliness.SYSTEM_DEFAULT,
+                        _FOREVER,
+                        False,
+                    )
                     connections[topic] = bag.add_connection(
-                        topic, made.__msgtype__, typestore=factory.typestore, offered_qos_profiles=[_quality(latched)]
+                        topic, made.__msgtype__, typestore=factory.typestore, offered_qos_profiles=[quality]
                     )
                 bag.write(connections[topic], message.log_ns, factory.serialize(made))
                 counts[topic] += 1
     return dict(counts)
-
-
-def _quality(latched: bool) -> Qos:
-    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
-    reliable, liveliness = QosReliability.RELIABLE, QosLiveliness.SYSTEM_DEFAULT
-    return Qos(QosHistory.KEEP_LAST, 10, reliable, durability, _FOREVER, _FOREVER, liveliness, _FOREVER, False)
 
 
 class _MarkerFactory(MessageFactory):

@@ -101,7 +101,10 @@ def run_messages(run: Run, look: Look) -> Iterator[Messages]:
     """Streams of the messages that show a run alone, each in the order of log times."""
     yield from _track_messages(run, look)
     yield _past_messages(run, look)
-    yield _final_messages(run, look)
+    # Final states appear as soon as nothing can change them any more.
+    final = located(run.tables["smoothed"].where(run.tables["smoothed"]["kind"] == "final"))
+    states = _states(final, run.tables["objects"])
+    yield _objects(f"{look.prefix}/smoothed", final_ns(run, final), final["stamp_ns"], states)
     yield from _detection_messages(run, look)
     yield _outcome_messages(run, look)
 
@@ -166,13 +169,6 @@ def _past_messages(run: Run, look: Look) -> Messages:
             yield now_ns, now_ns, entities
 
     return _scenes(f"{look.prefix}/past", steps())
-
-
-def _final_messages(run: Run, look: Look) -> Messages:
-    """Final states as soon as nothing can change them any more."""
-    final = located(run.tables["smoothed"].where(run.tables["smoothed"]["kind"] == "final"))
-    states = _states(final, run.tables["objects"])
-    return _objects(f"{look.prefix}/smoothed", final_ns(run, final), final["stamp_ns"], states)
 
 
 def _detection_messages(run: Run, look: Look) -> Iterator[Messages]:

@@ -70,7 +70,7 @@ def multi_object_metrics(scenes: Scenes, gate_m: float) -> MultiObjectMetrics:
     total_m2, sight_m2, *means_m2 = (_mean(values) for values in (parts.total_m2, in_sight_m2, *parts))
     roots = {"mean_m": _mean(np.sqrt(parts.total_m2)), "rms_m": math.sqrt(total_m2)}
     own = dict(zip(parts._fields, means_m2, strict=True)) | {"in_sight_rms_m": math.sqrt(sight_m2)}
-    similarity = similarities(scenes.distances_m, gate_m)
+    similarity = np.maximum(0.0, 1.0 - scenes.distances_m / (2.0 * gate_m))
     ids, rows_of = scenes.track_ids.tolist(), list(zip(scenes, scenes.present, strict=True))
     objects = [np.flatnonzero(present).tolist() for _, present in rows_of]
     frames = objects, [ids[k] for k, _ in rows_of], [similarity[k].T[here].tolist() for k, here in rows_of]
@@ -88,7 +88,7 @@ def clear(scenes: Scenes, gate_m: float) -> dict[str, float]:
 
     Pairs of the last tick with objects and tracks stay, the others have the largest sum of similarities.
     """
-    similarity = similarities(scenes.distances_m, gate_m)
+    similarity = np.maximum(0.0, 1.0 - scenes.distances_m / (2.0 * gate_m))
     scores = np.where(similarity >= AT_GATE - np.finfo(np.float64).eps, similarity, 0.0)
     used = scenes.present.any(axis=1) & (scenes.per_tick(np.ones(len(scores))) > 0)
     last = np.maximum.accumulate(np.where(used, np.arange(scenes.num_ticks), 0))
@@ -132,11 +132,6 @@ def gospa(scenes: Scenes, c_m: float) -> GospaParts:
         false_m2=single_m2 * (scenes.per_tick(np.ones(len(squares))) - paired.sum(axis=1)),
         out_of_sight_m2=single_m2 * (missed & ~scenes.in_sight).sum(axis=1),
     )
-
-
-def similarities(distances_m: FloatArray, gate_m: float) -> FloatArray:
-    """Similarity 1 - d / (2 gate), 0 where that is negative; the shape is kept."""
-    return np.maximum(0.0, 1.0 - distances_m / (2.0 * gate_m))
 
 
 def _mean(values: FloatArray) -> float:
