@@ -24,6 +24,7 @@ from fgtrack.io.output import check_apart, check_output, new_file
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumptions.assumed import Assumed, assumed
 from fgtrack.pipeline.config import Config
+from fgtrack.pipeline.load import plain
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config
 
@@ -67,7 +68,7 @@ def info(
         "duration_s": found.duration_s,
     }
     values |= {"problem": found.problem, "topics": topics.plain()}
-    show(topics, form, {**values, "effective": comes_to.values()})
+    show(topics, form, {**values, "effective": plain(comes_to)})
     if form is None:
         sentences([f"{config_file or 'without a configuration'}: {comes_to}"])
     trial = None

@@ -35,9 +35,6 @@ def replay(
     track_map: TrackMap = None,
     pit_map: PitMap = None,
     settings: Settings = None,
-    realtime: Annotated[
-        bool, typer.Option("--realtime", help="As fast as it was recorded: every tick waits until it is due.")
-    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Replay a recording through the tracker."""
@@ -60,7 +57,6 @@ def replay(
             kind=source.kind,
             on_tick=tick_progress(tell, None, names),
             overwrite=overwrite,
-            realtime=realtime,
         )
     for line in dict.fromkeys(str(replace(found.config, estimator=name).effective) for name in names):
         say(line)
@@ -69,8 +65,7 @@ def replay(
         say(line)
     for result in results:
         what = "{estimator}, {detections_received} detections, {wall_s:.1f} s, digest {digest:.12}"
-        missed = f", {result.deadline_misses} ticks slower than real time" if result.deadline_misses else ""
-        say(f"{result.path}: {what.format_map(result.meta)}{missed}")
+        say(f"{result.path}: {what.format_map(result.meta)}")
     for line in excluded_lines(results[0].meta):  # the same of all
         say(line)
     for line in dict.fromkeys(

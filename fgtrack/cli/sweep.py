@@ -80,8 +80,6 @@ def sweep(
     work = Sweep.open(plan, out, overwrite)
     left = len(work.todo)
     tell(f"jobs: {len(work.plan.jobs)}, each of {len(work.plan.estimators)} estimators; to do: {left}")
-    if work.num_unused:
-        tell(f"{work.num_unused} parts in {out} belong to other settings, files or versions and stay unused")
     bad: list[Cell] = []
     with progress("sweep", left) as moved:
 

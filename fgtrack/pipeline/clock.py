@@ -1,6 +1,5 @@
-"""Time in a replay: stamps corrected for the clocks of sensors, the ticks of the node, and the wall clock."""
+"""Time in a replay: stamps corrected for the clocks of sensors, and the ticks of the node."""
 
-import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import groupby
@@ -51,15 +50,3 @@ def corrected(message: DetectionList, sensors: Mapping[str, SensorModel]) -> Det
         objects = tuple(item if item.stamp_ns is None else replace(item, stamp_ns=None) for item in message.objects)
         return replace(message, stamp_ns=message.receipt_ns - offset_ns, objects=objects)
     return restamped(message, message.stamp_ns - offset_ns)
-
-
-class WallClock:
-    """The clock of the machine, which only goes forward."""
-
-    def now_ns(self) -> int:
-        """Return the present time."""
-        return time.perf_counter_ns()
-
-    def wait_until(self, time_ns: int) -> None:
-        """Return at `time_ns`, at once where that has passed."""
-        time.sleep(max(time_ns - self.now_ns(), 0) / 1e9)

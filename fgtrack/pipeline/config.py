@@ -1,7 +1,7 @@
 """The configuration of a run. The defaults are those of open space; a YAML file overrides them."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -224,10 +224,6 @@ class Effective:
         merge = "none" if self.merge_distance_m is None else f"up to {self.merge_distance_m:g} m"
         late = "" if self.reach_s == self.lag_s else f", late detections up to {self.reach_s:g} s"
         return f"detection origin {x_m:g} m ahead, {y_m:g} m left of the ego; merge {merge}; lag {self.lag_s:g} s{late}"
-
-    def values(self) -> dict[str, object]:
-        """JSON values."""
-        return {**asdict(self), "detection_origin_m": list(self.detection_origin_m)}
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from operator import index as integer
 from pathlib import Path
+from time import perf_counter_ns
 from typing import Self
 
 import numpy as np
@@ -26,7 +27,7 @@ from fgtrack.core.types import (
 from fgtrack.io.run import Node
 from fgtrack.io.validation import InvalidMessageError, validated_detection
 from fgtrack.pipeline.build import build_tracker
-from fgtrack.pipeline.clock import WallClock, corrected
+from fgtrack.pipeline.clock import corrected
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.tracking.inbox import records
@@ -154,8 +155,6 @@ class Tracker:
         where it cannot be built.
     map, pit_map, estimator, set
         As of `fgtrack.replay`.
-    clock
-        Times the ticks; nothing else depends on it.
     """
 
     def __init__(
@@ -166,7 +165,6 @@ class Tracker:
         pit_map: str | Path | None = None,
         estimator: str | None = None,
         set: Mapping[str, object] | None = None,  # noqa: A002 - the name of the option
-        clock: WallClock | None = None,
     ) -> None:
         config = read_config(config, set, track_map=map, pit_map=pit_map, estimator=estimator)
         self.config = config
@@ -179,7 +177,6 @@ class Tracker:
         self._arrivals: deque[EgoState | DetectionList] = deque()
         self._receptions = {name: _Receptions() for name in (*config.sensors, EGO)}
         node_hz = config.clock.node_hz
-        self._clock = clock or WallClock()
         self._times = _TickTimes(None if node_hz is None else period_ns(node_hz))
         self._turn = threading.RLock()
 
@@ -307,12 +304,12 @@ class Tracker:
             if self._last.tick >= 0 and now_ns < self._last.now_ns:
                 self._refused["tick before the last one"] += 1
                 return replace(self._last, updates=(), smoothed=())
-            begun_ns = self._clock.now_ns()
+            begun_ns = perf_counter_ns()
             self._take_arrivals()
             report = self._tracker.tick(now_ns)
             report = replace(report, updates=(*self._records, *report.updates))
             self._records = []
-            self._times.add(now_ns, self._clock.now_ns() - begun_ns)
+            self._times.add(now_ns, perf_counter_ns() - begun_ns)
             for update in report.updates:
                 self._counts.setdefault(update.sensor, Counter())[update.disposition] += 1
             if self._last.tick < 0:

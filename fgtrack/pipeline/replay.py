@@ -8,19 +8,20 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import count
 from pathlib import Path
+from time import perf_counter_ns
 
 from fgtrack.core.errors import DataError
-from fgtrack.core.time import NS_PER_S, period_ns, seconds
+from fgtrack.core.time import NS_PER_S, seconds
 from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.io.errors import UntilBreak
-from fgtrack.io.run import MemoryRun, Node, Run, RunWriter, path_from_run
+from fgtrack.io.run import MemoryRun, Run, RunWriter, path_from_run
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.assumptions.assumed import assumed, is_open, source_of
 from fgtrack.pipeline.build import build_tracker
-from fgtrack.pipeline.clock import Delivered, Tick, WallClock, corrected, message_ticks, node_ticks
+from fgtrack.pipeline.clock import Delivered, Tick, corrected, message_ticks, node_ticks
 from fgtrack.pipeline.config import ClockConfig, Config
 from fgtrack.pipeline.ego_clock import EgoClock
-from fgtrack.pipeline.load import dump
+from fgtrack.pipeline.load import dump, plain
 from fgtrack.tracking.tracker import Tracker, TrackerParts, check_sensor
 
 #: Ticks go on while nothing is received: a few messages must not make a recording of days.
@@ -37,8 +38,6 @@ class ReplayResult:
     meta: dict[str, object]
     broken: str | None
     """Why the input broke off, where it did; the run holds everything before."""
-    deadline_misses: int | None = None
-    """Ticks that were not done when the next one was due; None where every message ticks."""
 
 
 @dataclass
@@ -176,7 +175,7 @@ def replay_in_memory(
     config = assumed(config, source_of(repeated)).config
     tracker = build_tracker(config, observed)
     memory = MemoryRun(*_opening(config, origin, kind))
-    _, broken, _ = _drive(tracker, repeated(), config, memory, origin=origin)
+    _, broken = _drive(tracker, repeated(), config, memory, origin=origin)
     return memory.run, broken
 
 
@@ -201,28 +200,20 @@ def _drive(
     writer: RunWriter | MemoryRun,
     on_tick: Callable[[int, int], None] | None = None,
     origin: str = "",
-    clock: WallClock | None = None,
-    realtime: bool = False,
-) -> tuple[dict[str, object], str | None, int | None]:
-    """Run `tracker` over `messages` into `writer`; gives meta, why the input broke off, and missed deadlines.
+) -> tuple[dict[str, object], str | None]:
+    """Run `tracker` over `messages` into `writer`; return meta and why the input broke off.
 
     Only here the wall clock is read: the ticks are those of the recording, however long they take.
     """
-    clock = clock or WallClock()
-    started_ns, ahead_ns = clock.now_ns(), 0
-    node = Node(None if config.clock.node_hz is None else period_ns(config.clock.node_hz))
+    started_ns = perf_counter_ns()
     ignored = frozenset(config.ignore_sensors)
     feed = _Feed(messages, config.sensors, ignored, writer.write_truth, writer.write_ego, writer.write_detections)
     for tick in _ticks(feed, config.clock):
-        if realtime:
-            ahead_ns = ahead_ns or clock.now_ns() - tick.now_ns
-            clock.wait_until(tick.now_ns + ahead_ns)
-        before_ns = clock.now_ns()
+        before_ns = perf_counter_ns()
         for message in tick.messages:
             tracker.receive(message)
         report = tracker.tick(tick.now_ns)
-        process_ns = clock.now_ns() - before_ns
-        node.done_ns(tick.now_ns, process_ns)
+        process_ns = perf_counter_ns() - before_ns
         num_detections = sum(len(one.objects) for one in tick.messages if isinstance(one, DetectionList))
         writer.write_tick(report, process_ns, num_detections)
         if on_tick is not None:
@@ -231,7 +222,7 @@ def _drive(
         raise DataError(located(feed.broken, origin))
     writer.write_smoothed(tracker.finish())
     meta = {
-        "wall_s": (clock.now_ns() - started_ns) / NS_PER_S,
+        "wall_s": (perf_counter_ns() - started_ns) / NS_PER_S,
         "messages_received": feed.num_messages,
         "first_receipt_ns": feed.first_receipt_ns,
         "last_receipt_ns": feed.last_receipt_ns,
@@ -242,7 +233,7 @@ def _drive(
         **tracker.failures.as_meta(),
         "broken_off": feed.broken,
     }
-    return writer.finish(meta), feed.broken, None if node.period_ns is None else node.misses
+    return writer.finish(meta), feed.broken
 
 
 def _opening(
@@ -253,7 +244,7 @@ def _opening(
     if folder is not None and (place := path_from_run(origin, folder)) is not None:
         source["path_from_run"] = place
     meta: dict[str, object] = {"input": source, "estimator": config.estimator, "versions": versions(), "seed": None}
-    meta["effective"] = config.effective.values()
+    meta["effective"] = plain(config.effective)
     return dump(config), meta, next(iter(config.smoother.lagged_s), None)
 
 
@@ -266,12 +257,8 @@ def replay_each(
     kind: str = "",
     on_tick: Callable[[int, int], None] | None = None,
     overwrite: bool = False,
-    realtime: bool = False,
 ) -> list[ReplayResult]:
-    """A `replay` for every estimator of `folders` into its folder; all are built and claimed before the first one.
-
-    In real time each tick waits until it is due; the runs are the same.
-    """
+    """A `replay` for every estimator of `folders` into its folder; all are built and claimed before the first one."""
     results = []
     config = assumed(config, source_of(messages)).config
     with ExitStack() as claims:
@@ -282,7 +269,7 @@ def replay_each(
             writer = RunWriter(folder, *_opening(chosen, origin, kind, folder), overwrite)
             runs.append((chosen, tracker, claims.enter_context(writer)))
         for chosen, tracker, writer in runs:
-            finished = _drive(tracker, messages(), chosen, writer, on_tick, origin, realtime=realtime)
+            finished = _drive(tracker, messages(), chosen, writer, on_tick, origin)
             results.append(ReplayResult(writer.path, *finished))
     return results
 

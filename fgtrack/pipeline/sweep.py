@@ -123,11 +123,6 @@ class Sweep:
         seeds = {seed: rank for rank, seed in enumerate(dict.fromkeys(job.seed for job in self.plan.jobs))}
         return sorted(left.values(), key=lambda job: seeds[job.seed])
 
-    @property
-    def num_unused(self) -> int:
-        """Number of parts in the folder that belong to other settings, files or versions."""
-        return len({path.stem for path in (self.folder / _PARTS).glob("*.json")} - {job.key for job in self.plan.jobs})
-
     def run(
         self,
         score: Score,
@@ -264,38 +259,17 @@ _Result = tuple[str, Sequence[Cell]]
 
 
 def _local(tasks: Mapping[str, Recipe], score: Score, jobs: int) -> Iterator[_Result]:
-    """Yield results of processes of this machine, as they come.
-
-    Where a process dies (out of memory, a crash in a library) joblib gives up all that were handed out. These are
-    repeated alone; what kills its process again is bad.
-    """
-    count, left = joblib.effective_n_jobs(jobs), dict(tasks)
-    while left:
-        try:
-            for key, cells in _in_processes(dict(left), score, count):
-                del left[key]
-                yield key, cells
-        except TerminatedWorkerError:
-            for key, recipe in list(left.items())[: _HANDED_OUT * count]:
-                yield key, [_alone(key, replace(recipe, estimators=(name,)), score) for name in recipe.estimators]
-                del left[key]
-
-
-def _alone(key: str, recipe: Recipe, score: Score) -> Cell:
-    """Return the cell of a recipe with one estimator, from a process of its own."""
-    try:
-        ((_, (cell,)),) = _in_processes({key: recipe}, score, 2)  # one process would be this one
-    except TerminatedWorkerError:
-        error = "the process that ran it died: out of memory, or a crash in a library"
-        return Cell(recipe.estimators[0], {}, {}, error)
-    return cell
-
-
-def _in_processes(tasks: Mapping[str, Recipe], score: Score, count: int) -> Iterator[_Result]:
+    """Yield results of processes of this machine, as they come."""
     # With several jobs at once, threads of BLAS would only wait for each other.
     settings = {"inner_max_num_threads": 1, "initializer": _end_with_parent, "initargs": (os.getpid(),)}
-    with joblib.parallel_config("loky", n_jobs=count, **settings):
-        yield from _results(tasks, score)
+    with joblib.parallel_config("loky", n_jobs=joblib.effective_n_jobs(jobs), **settings):
+        try:
+            yield from _results(tasks, score)
+        except TerminatedWorkerError as error:
+            raise DataError(
+                "a process died, out of memory or by a crash in a library: start the sweep again to go on, perhaps "
+                "with fewer --jobs"
+            ) from error
 
 
 def _end_with_parent(parent: int) -> None:

@@ -17,6 +17,7 @@ import pytest
 
 from fgtrack.cli.main import run
 from fgtrack.cli.sweep import score, swept
+from fgtrack.core.errors import DataError
 from fgtrack.io.run import Run
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.load import load
@@ -265,7 +266,7 @@ def deadly(run: Run) -> tuple[dict, dict]:
 
 
 @pytest.mark.slow
-def test_a_cell_that_kills_its_process_is_bad_and_the_rest_is_done(tmp_path: Path) -> None:
+def test_a_process_that_dies_ends_the_sweep_in_a_line_and_what_is_done_stays(tmp_path: Path) -> None:
     sweep = write_sweep(
         tmp_path,
         """
@@ -274,29 +275,23 @@ estimators: [ekf-replay, ekf-backward-forward]
 vary: {evaluation.gate_m: [5.0, 3.0, 4.0]}
 """,
     )
-    result = Sweep.open(load_plan(sweep), tmp_path / "out").run(deadly, jobs=2)
-    assert (result.num_good, result.num_bad) == (5, 1)
-    bad = rows(tmp_path / "out/errors.csv")
-    assert [(row["evaluation.gate_m"], row["estimator"]) for row in bad] == [("3.0", "ekf-backward-forward")]
-    assert "the process that ran it died" in bad[0]["error"]
+    plan, out = load_plan(sweep), tmp_path / "out"
+    with pytest.raises(DataError, match="a process died, out of memory"):
+        Sweep.open(plan, out).run(deadly, jobs=2)
+    assert len(rows(out / "sweep.csv")) == 2 * len(Sweep.open(plan, out).done)
 
 
 # --- going on
 
 
-def test_a_changed_sweep_reuses_what_it_can_and_says_what_it_cannot(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_changed_sweep_reuses_what_it_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = "duration_s: 0.5\nestimators: [ekf-replay]\nseeds: 2\nvary: {association.gate_m: [5.0, 3.0]}\n"
     out = tmp_path / "out"
     call = ["sweep", str(write_sweep(tmp_path, text)), "-o", str(out), "--jobs", "1"]
     assert run(call) == 0
-    assert "unused" not in capsys.readouterr().out
     write_sweep(tmp_path, text.replace("seeds: 2", "seeds: 3").replace("3.0", "2.0"))
     assert run(call) == 0
-    said = capsys.readouterr().out
-    assert "jobs: 6, each of 1 estimators; to do: 4" in said
-    assert f"2 parts in {out} belong to other settings, files or versions and stay unused" in said
+    assert "jobs: 6, each of 1 estimators; to do: 4" in capsys.readouterr().out
     assert [row["association.gate_m"] for row in rows(out / "sweep.csv")] == ["5.0"] * 3 + ["2.0"] * 3
 
 

@@ -15,6 +15,7 @@ from fgtrack.models.sensors import Mount, SensorModel
 from fgtrack.pipeline.assumptions.assumed import ASSUMED_STD, assumed, source_of
 from fgtrack.pipeline.build import build_road
 from fgtrack.pipeline.config import Config, Effective
+from fgtrack.pipeline.load import plain
 from fgtrack.pipeline.public import replay, simulate
 from fgtrack.pipeline.recorded import recorded_of
 from fgtrack.pipeline.shipped import read_config, read_scenario
@@ -79,7 +80,7 @@ def test_messages_without_any_configuration_are_tracked() -> None:
             yield one
 
     run = replay(messages())
-    assert run.meta["effective"] == Effective((0.0, 0.0), None, "filter.storage_s", 3.0, 3.0).values()
+    assert run.meta["effective"] == plain(Effective((0.0, 0.0), None, "filter.storage_s", 3.0, 3.0))
     assert set(run.config["sensors"]) == {"odd"}
     assert set(run.tracks["track_id"].tolist()) == {0}
     newest = run.tracks["now_ns"] == run.tracks["now_ns"].max()

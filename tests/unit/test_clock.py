@@ -1,4 +1,4 @@
-"""The ticks of a replay, corrected stamps and the wall clock."""
+"""The ticks of a replay, and corrected stamps."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from fgtrack.core.types import Detection, DetectionList, EgoState
 from fgtrack.models.sensors import SensorModel
-from fgtrack.pipeline.clock import Delivered, WallClock, corrected, message_ticks, node_ticks
+from fgtrack.pipeline.clock import Delivered, corrected, message_ticks, node_ticks
 
 MS = 1_000_000
 receipts = st.lists(st.integers(0, 300 * MS), max_size=20).map(sorted)
@@ -65,11 +65,3 @@ def test_the_offset_of_a_clock_is_taken_off_and_a_receipt_may_stand_for_a_stamp(
     first = replace(given.objects[0], stamp_ns=None if own_ms is None else own_ms * MS)
     expected = replace(given, stamp_ns=stamp_ms * MS, objects=(first, given.objects[1]))
     assert corrected(given, {"radar": SensorModel(std={"x_m": 1.0, "y_m": 1.0}, **settings)}) == expected
-
-
-def test_the_wall_clock_comes_back_no_earlier_and_at_once_where_the_time_has_passed() -> None:
-    clock = WallClock()
-    until_ns = clock.now_ns() + 3 * MS
-    clock.wait_until(until_ns)
-    assert clock.now_ns() >= until_ns
-    clock.wait_until(0)

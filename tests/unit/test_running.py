@@ -321,11 +321,8 @@ class Clock:
             self._times_ns += [self._times_ns[-1], self._times_ns[-1] + duration_ms * MS]
         self._times_ns.pop(0)
 
-    def now_ns(self) -> int:
+    def __call__(self) -> int:
         return self._times_ns.pop(0)
-
-    def wait_until(self, time_ns: int) -> None:
-        raise NotImplementedError
 
 
 @pytest.mark.parametrize(
@@ -338,10 +335,11 @@ class Clock:
     ],
 )
 def test_it_counts_missed_deadlines_and_skipped_ticks(
-    period_ms: int, durations_ms: list[int], misses: int, skipped: int
+    monkeypatch: pytest.MonkeyPatch, period_ms: int, durations_ms: list[int], misses: int, skipped: int
 ) -> None:
     config = read_config("smoother", ["clock.node_hz=50"])
-    tracker = Tracker(config, clock=Clock(durations_ms))
+    tracker = Tracker(config)
+    monkeypatch.setattr("fgtrack.pipeline.live.perf_counter_ns", Clock(durations_ms))
     assert tracker.timing == TickTiming(0, None, None, None, 0, 0)
     for k in range(4):
         tracker.tick(NOW_NS + k * period_ms * MS)

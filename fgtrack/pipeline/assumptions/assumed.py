@@ -190,8 +190,11 @@ def assumed(config: Config, source: InputSource) -> Assumed:
         covered, lists = _seen(source, config, mounts)
         named = bool(sensors)
         if not named:
-            config, more = _for_revisits(config, lists)
-            found += more
+            sections, reason = for_slow_revisits(config, lists.values())
+            for section, value in sections.items():
+                given = departures(value).items()
+                found += [Assumption(f"{section}.{key}", item, reason) for key, item in given]
+            config = replace(config, **sections)
             for name, one in covered.items():
                 std = _std(one)
                 found.append(Assumption(f"sensors.{name}.std", std, USUAL_BOX if one.boxes else USUAL))
@@ -366,14 +369,6 @@ def _with_lists(
         found["clutter_per_m2"] = density, "all detections of a list over the area that they cover"
     sensor = replace(sensor, **{key: value for key, (value, _) in found.items()})
     return sensor, [Assumption(f"sensors.{name}.{key}", plain(value), why) for key, (value, why) in found.items()]
-
-
-def _for_revisits(config: Config, lists: Mapping[str, ListStatistics]) -> tuple[Config, list[Assumption]]:
-    """`config` with what suits objects that are seldom measured, see `for_slow_revisits`."""
-    sections, reason = for_slow_revisits(config, [one.revisits for one in lists.values()])
-    given = {name: departures(section) for name, section in sections.items()}
-    found = [Assumption(f"{name}.{key}", value, reason) for name, one in given.items() for key, value in one.items()]
-    return replace(config, **sections), found
 
 
 def _std(seen: Coverage) -> dict[str, float]:

@@ -153,7 +153,8 @@ class _Detections:
         numbers, offsets_m = rows[:, 0].astype(np.int64), self._offsets_m(rows, path, mount)
         if has_range.any():
             extent_m = np.quantile(offsets_m, 1.0 - _OUTSIDE, axis=0) - np.quantile(offsets_m, _OUTSIDE, axis=0)
-            area_m2 = max(float(np.prod(extent_m)), _narrowest_m2(offsets_m))  # one object may keep its place
+            reach_m = float(np.quantile(np.hypot(*offsets_m.T), 1.0 - _OUTSIDE))
+            area_m2 = max(float(np.prod(extent_m)), 0.5 * _NARROWEST_RAD * reach_m**2)  # one object may keep its place
             stamps_s, columns = self.lists(path, rows[:, 5], np.hypot(*offsets_m.T))
             found = replace(found, persistence=persistence(stamps_s, *columns), area_m2=area_m2)
         period_s = float(np.median(np.diff(receipts_s))) if len(receipts_s) > 1 else 0.0
@@ -214,11 +215,6 @@ def _turned(vectors_m: FloatArray, angles_rad: FloatArray) -> FloatArray:
     cosine, sine = np.cos(angles_rad), np.sin(angles_rad)
     x_m, y_m = vectors_m.T
     return np.column_stack([cosine * x_m - sine * y_m, sine * x_m + cosine * y_m])
-
-
-def _narrowest_m2(offsets_m: FloatArray) -> float:
-    """Area of the narrowest sector that reaches as far as detections at `offsets_m` (n, 2)."""
-    return 0.5 * _NARROWEST_RAD * float(np.quantile(np.hypot(*offsets_m.T), 1.0 - _OUTSIDE)) ** 2
 
 
 def _comes_back(points: FloatArray, numbers: IntArray) -> BoolArray:

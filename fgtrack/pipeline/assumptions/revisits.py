@@ -14,7 +14,7 @@ from fgtrack.core.types import DetectionList, FloatArray
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.pipeline.config import NOISE_HZ, ClockConfig, Config, FilterConfig, MotionConfig
 
-__all__ = ["ListStatistics", "Revisits", "for_slow_revisits"]
+__all__ = ["ListStatistics", "for_slow_revisits"]
 
 #: No vehicle is faster than an airliner [m/s], and no position of one is worse than this [m].
 _FASTEST_MPS, _POSITION_M = 300.0, 10.0
@@ -33,38 +33,6 @@ _FEWEST_LISTS = 10
 
 
 @dataclass
-class Revisits:
-    """Times from one detection of an object to its next one by the same sensor, for one sensor."""
-
-    times_s: list[float] = field(default_factory=list)
-    """One for each detection that an earlier one could be of, within reach of the fastest vehicle."""
-    _recent: deque[tuple[int, FloatArray]] = field(default_factory=deque)
-
-    def add(self, message: DetectionList) -> None:
-        """Learn from a list; those of a sensor come in order of receipt."""
-        if len(self.times_s) >= _MOST:
-            return
-        found_m = np.array(list(positions_m(message)), dtype=np.float64).reshape(-1, 2)
-        oldest_ns = message.stamp_ns - round(_MEMORY_S * 1e9)
-        while self._recent and self._recent[0][0] < oldest_ns:
-            self._recent.popleft()
-        for position_m in found_m:
-            for stamp_ns, points_m in reversed(self._recent):
-                elapsed_s = seconds(message.stamp_ns - stamp_ns)
-                reach_m = _FASTEST_MPS * elapsed_s + _POSITION_M
-                if elapsed_s > 0.0 and (np.abs(points_m - position_m).max(axis=1) <= reach_m).any():
-                    self.times_s.append(elapsed_s)
-                    break
-        if len(found_m):
-            self._recent.append((message.stamp_ns, found_m))
-
-    @property
-    def typical_s(self) -> float | None:
-        """Median; None of a sensor that gives no positions, or too few."""
-        return median(self.times_s) if len(self.times_s) >= _FEWEST else None
-
-
-@dataclass
 class ListStatistics:
     """Counts of the lists of one sensor."""
 
@@ -74,16 +42,38 @@ class ListStatistics:
     """Smallest x and y of a detection, in its frame."""
     high_m: tuple[float, float] = (-math.inf, -math.inf)
     """Largest x and y."""
-    revisits: Revisits = field(default_factory=Revisits)
-    """Intervals at which an object is measured."""
+    revisits_s: list[float] = field(default_factory=list)
+    """Time since the last one, of each detection that an earlier one could be of, within reach of the fastest
+    vehicle."""
+    _recent: deque[tuple[int, FloatArray]] = field(default_factory=deque)
 
     def add(self, message: DetectionList) -> None:
-        """Count a list."""
+        """Count a list; lists come in order of receipt."""
         self.num_objects[len(message.objects)] += 1
-        self.revisits.add(message)
-        for x_m, y_m in positions_m(message):
+        points_m = np.array(list(positions_m(message)), dtype=np.float64).reshape(-1, 2)
+        for x_m, y_m in points_m.tolist():
             self.low_m = min(self.low_m[0], x_m), min(self.low_m[1], y_m)
             self.high_m = max(self.high_m[0], x_m), max(self.high_m[1], y_m)
+        if len(self.revisits_s) < _MOST:
+            self._add_revisits(message.stamp_ns, points_m)
+
+    def _add_revisits(self, stamp_ns: int, points_m: FloatArray) -> None:
+        while self._recent and self._recent[0][0] < stamp_ns - round(_MEMORY_S * 1e9):
+            self._recent.popleft()
+        for position_m in points_m:
+            for earlier_ns, earlier_m in reversed(self._recent):
+                elapsed_s = seconds(stamp_ns - earlier_ns)
+                reach_m = _FASTEST_MPS * elapsed_s + _POSITION_M
+                if elapsed_s > 0.0 and (np.abs(earlier_m - position_m).max(axis=1) <= reach_m).any():
+                    self.revisits_s.append(elapsed_s)
+                    break
+        if len(points_m):
+            self._recent.append((stamp_ns, points_m))
+
+    @property
+    def revisit_s(self) -> float | None:
+        """Median time between two detections of an object; None of a sensor that gives no positions, or too few."""
+        return median(self.revisits_s) if len(self.revisits_s) >= _FEWEST else None
 
     @property
     def scans(self) -> bool:
@@ -103,7 +93,7 @@ class ListStatistics:
         return sum(size * count for size, count in self.num_objects.items()) / lists / math.prod(sides_m)
 
 
-def for_slow_revisits(config: Config, revisits: Iterable[Revisits]) -> tuple[dict[str, Any], str]:
+def for_slow_revisits(config: Config, lists: Iterable[ListStatistics]) -> tuple[dict[str, Any], str]:
     """Sections of `config` for objects that every sensor measures too seldom for the defaults, by name, and the reason.
 
     The default motion model is linearised along the heading, whose standard deviation after a time t without a
@@ -111,7 +101,7 @@ def for_slow_revisits(config: Config, revisits: Iterable[Revisits]) -> tuple[dic
     straight line with the noise of `_MANOEUVRES`, which is linear, predicts better. Windows then hold two
     measurements of an object, and ticks are as many times rarer. Sections that are not the default stay as they are.
     """
-    typical_s = [found.typical_s for found in revisits]
+    typical_s = [one.revisit_s for one in lists]
     known_s = [each for each in typical_s if each is not None]
     default = MotionConfig()
     density = default.std_per_s["yaw_rate"] ** 2 / NOISE_HZ
