@@ -1,14 +1,19 @@
 """The ROS 2 node of docs/live, on stand-ins for rclpy, tf2_ros and the messages."""
 
 import math
-from collections.abc import Iterator
-from types import ModuleType
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from support.ros import Node, Time, message_class, stand_ins
+from rosbags.interfaces import Nodetype
 from support.scripts import LIVE, load_file
+
+from fgtrack.io.ros.typestore import typestore_of
 
 MS = 1_000_000
 NOW_NS = 1_700_000_000_000_000_000
@@ -16,16 +21,158 @@ CAR_M = (100.0, 3.0)  # in the map
 SPEED_MPS = 20.0  # of the ego, along x, turning
 
 
+TYPES = (
+    *("vision_msgs/msg/Detection3DArray", "vision_msgs/msg/Detection3D", "vision_msgs/msg/ObjectHypothesisWithPose"),
+    *("nav_msgs/msg/Odometry", "geometry_msgs/msg/TransformStamped", "builtin_interfaces/msg/Time"),
+)
+STORE = typestore_of(TYPES)
+
+
+# --- stand-ins for rclpy, tf2_ros and message packages: what docs/live/ros_node.py uses of them
+
+
+def _default(kind: Any, what: Any) -> Any:
+    if kind is Nodetype.NAME:
+        return message_class(what)()
+    if kind is Nodetype.ARRAY:
+        return np.zeros(what[1])
+    if kind is Nodetype.SEQUENCE:
+        return []
+    return {"string": ""}.get(what[0], 0.0 if what[0].startswith("float") else 0)
+
+
+@cache
+def message_class(name: str) -> type:
+    """A message type with the fields of its definition and no others, which begin with defaults."""
+    fields = dict(STORE.fielddefs[name][1])
+
+    def make(self: Any, **values: Any) -> None:
+        for field_name, (kind, what) in fields.items():
+            setattr(self, field_name, values.pop(field_name) if field_name in values else _default(kind, what))
+        assert not values, f"{name} has no {values}"
+
+    return type(name.rpartition("/")[2], (), {"__slots__": tuple(fields), "__init__": make})
+
+
+@dataclass(frozen=True)
+class Time:
+    nanoseconds: int = 0
+
+    @classmethod
+    def from_msg(cls, message: Any) -> "Time":
+        return cls(message.sec * 10**9 + message.nanosec)
+
+    def to_msg(self) -> Any:
+        seconds, nanoseconds = divmod(self.nanoseconds, 10**9)
+        return message_class("builtin_interfaces/msg/Time")(sec=seconds, nanosec=nanoseconds)
+
+
+class TransformException(Exception):  # noqa: N818 - its name
+    pass
+
+
+class Buffer:
+    """Transforms at given stamps, and linearly in between."""
+
+    def __init__(self) -> None:
+        self.known: dict[int, tuple[float, float, float]] = {}  # by stamp: x, y, yaw
+
+    def clear(self) -> None:
+        self.known.clear()
+
+    def lookup_transform(self, target_frame: str, source_frame: str, time: Time) -> Any:
+        assert (target_frame, source_frame) == ("map", "base_link")
+        stamps = sorted(self.known)
+        stamp_ns = time.nanoseconds or max(stamps, default=0)
+        if not stamps or not stamps[0] <= stamp_ns <= stamps[-1]:
+            raise TransformException("Lookup would require extrapolation into the future")
+        since = [stamp - stamps[0] for stamp in stamps]
+        x, y, yaw = (
+            float(np.interp(stamp_ns - stamps[0], since, [self.known[s][k] for s in stamps])) for k in range(3)
+        )
+        found = message_class("geometry_msgs/msg/TransformStamped")()
+        found.header.stamp = Time(stamp_ns).to_msg()
+        found.transform.translation.x, found.transform.translation.y = x, y
+        found.transform.rotation.z, found.transform.rotation.w = np.sin(yaw / 2.0), np.cos(yaw / 2.0)
+        return found
+
+
+def listener(buffer: Buffer, node: "Node") -> None:
+    node.buffer = buffer
+
+
+class Node:
+    """Keeps what is subscribed, published and timed, for the test to call; its clock stands."""
+
+    given: Mapping[str, Any] = {}  # parameters, by name
+    buffer: Buffer
+
+    def __init__(self, name: str) -> None:
+        self.time_ns = 0
+        self.jumps: list[tuple[Any, Callable[[Any], None]]] = []
+        self.subscriptions: dict[str, Callable[[Any], None]] = {}
+        self.published: dict[str, list[Any]] = {}
+        self.timers: list[Callable[[], None]] = []
+
+    def declare_parameter(self, name: str, value: Any) -> Any:
+        return SimpleNamespace(value=self.given.get(name, value))
+
+    def get_clock(self) -> Any:
+        return SimpleNamespace(now=lambda: Time(self.time_ns), create_jump_callback=self._on_jumps)
+
+    def _on_jumps(self, threshold: Any, *, post_callback: Callable[[Any], None]) -> None:
+        self.jumps.append((threshold, post_callback))
+
+    def get_logger(self) -> Any:
+        return SimpleNamespace(warning=lambda line: None)
+
+    def create_subscription(self, kind: type, topic: str, callback: Callable[[Any], None], qos_profile: Any) -> None:
+        self.subscriptions[topic] = callback
+
+    def create_publisher(self, kind: type, topic: str, qos_profile: Any) -> Any:
+        return SimpleNamespace(publish=self.published.setdefault(topic, []).append)
+
+    def create_timer(self, timer_period_sec: float, callback: Callable[[], None]) -> None:
+        self.timers.append(callback)
+
+
+def messages_of(package: str) -> dict[str, type]:
+    return {name.rpartition("/")[2]: message_class(name) for name in TYPES if name.startswith(package)}
+
+
+STAND_INS: Mapping[str, Mapping[str, Any]] = {
+    "rclpy": {},
+    "rclpy.clock": {"JumpThreshold": SimpleNamespace, "TimeJump": object},
+    "rclpy.duration": {"Duration": SimpleNamespace},
+    "rclpy.executors": {"ExternalShutdownException": RuntimeError},
+    "rclpy.node": {"Node": Node},
+    "rclpy.qos": {
+        "QoSHistoryPolicy": SimpleNamespace(KEEP_LAST=1),
+        "QoSProfile": SimpleNamespace,
+        "QoSReliabilityPolicy": SimpleNamespace(BEST_EFFORT=2),
+    },
+    "rclpy.time": {"Time": Time},
+    "tf2_ros": {"Buffer": Buffer, "TransformException": TransformException, "TransformListener": listener},
+    "nav_msgs": {},
+    "nav_msgs.msg": messages_of("nav_msgs"),
+    "vision_msgs": {},
+    "vision_msgs.msg": messages_of("vision_msgs"),
+}
+
+
 @pytest.fixture(scope="module")
 def script() -> Iterator[ModuleType]:
-    with stand_ins():
+    with pytest.MonkeyPatch.context() as patch:
+        for name, members in STAND_INS.items():
+            patch.setitem(sys.modules, name, ModuleType(name))
+            vars(sys.modules[name]).update(members)
         yield load_file(LIVE / "ros_node.py", "live")
 
 
 def made(script: ModuleType, **parameters: Any) -> Any:
     Node.given = {"sensors": ["lidar_cluster", "radar"], "config": "smoother", **parameters}
     node = script.TrackerNode()
-    node.clock.time_ns = NOW_NS
+    node.time_ns = NOW_NS
     return node
 
 
@@ -49,16 +196,16 @@ def detections(stamp_ns: int, frame_id: str = "base_link") -> Any:
 
 
 def send(node: Any, topic: str, message: Any, receipt_ns: int) -> None:
-    node.clock.time_ns = receipt_ns
-    node.subscriptions[topic][1](message)
+    node.time_ns = receipt_ns
+    node.subscriptions[topic](message)
 
 
 def tick(node: Any, now_ns: int) -> Any:
     """The timer's tick; the message that it publishes, if any."""
-    node.clock.time_ns = now_ns
-    before = len(node.publishers["tracks"].messages)
-    node.timers[0][1]()
-    published = node.publishers["tracks"].messages[before:]
+    node.time_ns = now_ns
+    before = len(node.published["tracks"])
+    node.timers[0]()
+    published = node.published["tracks"][before:]
     return published[0] if published else None
 
 
@@ -116,7 +263,7 @@ def test_where_time_begins_again_the_tracker_does(script: ModuleType) -> None:
     send(node, "radar/detections", detections(NOW_NS + 10 * MS), NOW_NS + 20 * MS)
     assert len(tick(node, NOW_NS + 40 * MS).detections) == 1
     send(node, "radar/detections", detections(NOW_NS + 900 * MS), NOW_NS + 910 * MS)
-    [(threshold, on_jump)] = node.clock.jumps
+    [(threshold, on_jump)] = node.jumps
     assert threshold.min_forward is None
     assert threshold.min_backward.nanoseconds < 0
     on_jump(None)
