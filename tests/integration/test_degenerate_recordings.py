@@ -69,12 +69,8 @@ KINDS = {
     "truth of positions only": (lambda: drive(speed_is_truth=False), None),
     "truth beyond all bounds": (boundless_truth, None),
     "noiseless": (lambda: drive(std_m=0.0), NOISELESS),
-    "noiseless, standing": (lambda: drive(std_m=0.0, speed_mps=0.0, yaw_rad=0.0), NOISELESS),
-    "all alike": (lambda: drive(alike=True, yaw_rad=0.0), NOISELESS),
     "all alike, of unknown yaw": (lambda: drive(alike=True), "of objects that move"),
     "one detection": (one_detection, FEW),
-    "two lists": (lambda: drive(2), FEW),
-    "two stamps": (lambda: drive(stamps=2), FEW),
     "one stamp": (lambda: drive(stamps=1), FEW),
 }
 _FAST = ("constant yaw", "one detection")

@@ -129,7 +129,7 @@ def test_the_snippet_of_the_design_runs_as_written(drive: Path, monkeypatch: pyt
     assert Path("drive.jsonl").exists()
 
 
-@pytest.mark.parametrize("wrong", [5, b"x", 1j, np.array([1.0])], ids=repr)
+@pytest.mark.parametrize("wrong", [5, np.array([1.0])], ids=repr)
 def test_an_argument_of_another_type_is_named(wrong: object) -> None:
     """One line that says which, wherever a user comes in."""
     calls: dict[str, Callable[[], object]] = {

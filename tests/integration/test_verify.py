@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from fgtrack.cli.main import run
-from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Measurement, UpdateResult, UpdateStatus
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.registry import ESTIMATORS
@@ -22,14 +21,6 @@ class Careless(ReplayEkf):
         if self.window_ns[0] <= measurement.stamp_ns < self.window_ns[1]:
             return UpdateResult(UpdateStatus.OUT_OF_SEQUENCE, np.zeros(len(measurement.z)), 0.0)
         return super().update(measurement)
-
-
-class NotANumber(ReplayEkf):
-    """Gives states that are not finite."""
-
-    def state_at(self, stamp_ns: int) -> TrackState:
-        state = super().state_at(stamp_ns)
-        return TrackState(stamp_ns, state.mean * np.nan, state.covariance)
 
 
 def test_the_command_prints_a_table_and_a_closing_line(capsys: Capture) -> None:
@@ -48,11 +39,10 @@ def test_the_command_prints_json_and_nothing_else(capsys: Capture) -> None:
     assert values == {"met": True, "checked": ["drop"], "broken": {}}
 
 
-@pytest.mark.parametrize("kind", [Careless, NotANumber])
 def test_a_broken_promise_is_shown_with_its_measurements_and_fails_the_command(
-    kind: type[ReplayEkf], capsys: Capture, monkeypatch: pytest.MonkeyPatch
+    capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ESTIMATORS, "load", lambda name: kind)
+    monkeypatch.setattr(ESTIMATORS, "load", lambda name: Careless)
     assert run(["verify", "-e", "ekf-replay"]) == 1
     out = capsys.readouterr().out
     assert "ekf-replay: broken promise: it gives the dense joint posterior in any order" in out
@@ -60,12 +50,6 @@ def test_a_broken_promise_is_shown_with_its_measurements_and_fails_the_command(
     assert re.fullmatch(r"\d+ of \d+ promises broken", out.splitlines()[-1])
     assert run(["verify", "-e", "ekf-replay", "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["met"] is False
-
-
-@pytest.mark.slow
-def test_all_that_is_shipped_keeps_its_promises(capsys: Capture) -> None:
-    assert run(["verify"]) == 0
-    assert "promises kept" in capsys.readouterr().out
 
 
 def test_an_estimator_that_does_not_exist_cannot_be_verified(capsys: Capture) -> None:

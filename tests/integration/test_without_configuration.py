@@ -91,15 +91,3 @@ def test_a_car_that_no_sensor_sees_is_not_tracked() -> None:
     assert any(isinstance(one, TruthState) for one in messages)
     with pytest.raises(AssertionError):
         check_tracked(fgtrack.replay(messages))
-
-
-@pytest.mark.parametrize("estimator", ["ekf-replay", "smoother-banded"])
-def test_a_second_position_is_judged_by_a_prior_that_knows_no_direction(estimator: str) -> None:
-    lists = [
-        DetectionList("radar", t_ns, t_ns, [fgtrack.Detection(x_m=10.0, y_m=60.0 * k)], frame="map")
-        for k, t_ns in enumerate(range(10**9, 4 * 10**9, 10**9))
-    ]
-    run = fgtrack.replay(lists, "open_space", set={"association.gate_m": 100.0}, estimator=estimator)
-    nis = run.updates["nis"].tolist()
-    assert np.isnan(nis[0])
-    assert nis[1] == pytest.approx(60.0**2 / (40.0**2 + 2.0), rel=0.05)  # its speed has a standard deviation of 40 m/s

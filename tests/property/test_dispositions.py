@@ -46,11 +46,12 @@ CONFIGS = {
     "clean": _with_all_sensors(paper(*OVAL)),
     "clean in open space": _with_all_sensors(
         paper(
-            "association={kind: mahalanobis}", "birth={kind: measured}", "motion={kind: ctrv}", "filter.storage_s=0.3"
+            "association={kind: mahalanobis}",
+            "birth={kind: measured}",
+            "merge={kind: none}",
+            "motion={kind: cv, std_per_s: {velocity: 5.0}}",
+            "clock.node_hz=7.0",
         )
-    ),
-    "no merge, cv": _with_all_sensors(
-        paper("merge={kind: none}", "motion={kind: cv, std_per_s: {velocity: 5.0}}", "clock.node_hz=7.0")
     ),
     "replaying": replace(
         _with_all_sensors(paper(*OVAL, "filter.storage_s=0.3", "association.max_nis=50.0", CLAIM)),
@@ -71,7 +72,6 @@ CONFIGS = {
         estimator="smoother",
     ),
     "published": load(Config, REFERENCE, OVAL),
-    "published in open space": _with_all_sensors(load(Config, REFERENCE)),
 }
 
 # --- random streams
