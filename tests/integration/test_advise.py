@@ -105,15 +105,14 @@ def test_a_healthy_recording_is_fine_and_nothing_is_changed(call: Call) -> None:
     assert load_run("runs/a").meta["digest"] == load_run("runs/c").meta["digest"]
 
 
-@pytest.mark.parametrize("command", ["advise", "tune", "offsets"])
+@pytest.mark.parametrize("command", ["advise", "offsets"])
 def test_without_a_configuration_the_sensors_are_those_of_the_recording(call: Call, command: str) -> None:
     bare = changed(lambda item: replace(item, objects=[replace(one, yaw_rad=None) for one in item.objects]), drive(100))
     write(bare)
     out = () if command == "offsets" else ("-o", "a.yaml")
     code, text = call(command, "drive.jsonl", *out)
     assert code == 0, text
-    if command != "tune":  # whose table has them
-        assert "x_m 1, y_m 1 (usual of a detector" in text
+    assert "x_m 1, y_m 1 (usual of a detector" in text
     if out:
         assert call("replay", "drive.jsonl", "-c", "a.yaml", "-o", "run")[0] == 0
         assert set(load_run("run").config["sensors"]) == {"lidar", "radar"}

@@ -28,9 +28,9 @@ ATOL, ATOL_S = 0.6e-3, 0.6e-4  # m and rad, s
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four seconds of the default scenario, replayed with a filter and a smoother."""
+    """Three seconds of the default scenario, replayed with a filter and a smoother."""
     folder = tmp_path_factory.mktemp("report")
-    fgtrack.simulate("default", seed=3, duration_s=4.0, out=folder / "drive.jsonl")
+    fgtrack.simulate("default", seed=3, duration_s=3.0, out=folder / "drive.jsonl")
     for name in NAMES:
         fgtrack.replay(
             folder / "drive.jsonl",

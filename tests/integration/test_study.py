@@ -11,7 +11,7 @@ from fgtrack.cli.main import run as command
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return Path(fgtrack.simulate("default", seed=3, duration_s=5.0, out=tmp_path_factory.mktemp("in") / "drive.jsonl"))
+    return Path(fgtrack.simulate("default", seed=3, duration_s=3.0, out=tmp_path_factory.mktemp("in") / "drive.jsonl"))
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def test_a_recording_becomes_a_page_without_a_configuration(found: Study) -> Non
 
 def test_the_summary_is_short_and_says_what_to_do(found: Study) -> None:
     assert 4 <= len(found.summary) <= 7
-    assert found.summary[0].startswith("In 5 s detections came from lidar_cluster (")
+    assert found.summary[0].startswith("In 3 s detections came from lidar_cluster (")
     assert "tracks the objects" in found.summary[1]
     assert found.summary[-1].startswith(("Take ", "First: "))
 

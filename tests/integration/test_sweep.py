@@ -253,7 +253,7 @@ vary:
     assert "missing.csv" in bad["no map", "ekf-replay"]
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 1
-    first = "what=negative gate, .*gate_m: must be"
+    first = "what=negative gate, .*association.gate_m: "
     assert re.match(rf"fgtrack: error: .*errors\.csv: 4 bad cells, the first: {first}", said[0])
 
 
@@ -320,8 +320,8 @@ vary:
 
 def test_a_script_gets_the_table_that_is_there_or_runs_the_first_seeds(tmp_path: Path) -> None:
     sweep = write_sweep(
-        tmp_path, "duration_s: 0.5\nestimators: [ekf-replay]\nseeds: 3\nvary: {association.gate_m: [5.0, 3.0]}\n"
+        tmp_path, "duration_s: 0.5\nestimators: [ekf-replay]\nseeds: 2\nvary: {association.gate_m: [5.0, 3.0]}\n"
     )
-    found = swept(sweep, tmp_path / "out", num_seeds=2)
-    assert [(row["association.gate_m"], row["seed"]) for row in found] == [(g, s) for g in ("5.0", "3.0") for s in "01"]
+    found = swept(sweep, tmp_path / "out", num_seeds=1)
+    assert [(row["association.gate_m"], row["seed"]) for row in found] == [("5.0", "0"), ("3.0", "0")]
     assert swept(sweep, tmp_path / "out") == found
