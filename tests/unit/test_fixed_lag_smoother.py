@@ -90,17 +90,6 @@ def test_an_object_that_is_never_seen_again_has_no_graph() -> None:
         np.testing.assert_allclose(state.covariance, seen.covariance, rtol=1e-6, atol=1e-9)
 
 
-def test_the_oldest_state_keeps_the_linearisation_point_of_its_prior() -> None:
-    """iSAM2 does not relinearise it, so it is no reason for further iterations."""
-    thresholds = dict.fromkeys(CTRV().state_names, 1e-3)
-    settings = SmootherSettings(lag_s=0.25, lagged_s=(), relinearise=thresholds, max_iterations=20)
-    smoother = FixedLagSmoother(CTRV(), Start(yaw_rad=0.5, speed_mps=20.0), settings, Counted)
-    for k in range(1, 12):
-        Counted.num_updates = 0
-        smoother.update(at(100 * k, 2.2 * k, 0.1 * k * k))
-        assert Counted.num_updates < 20
-
-
 # --- window
 
 

@@ -112,14 +112,14 @@ class SmootherBank:
         tracks = np.array([self._tracks[track_id] for track_id in track_ids], dtype=np.int64)
         newest_ns, start_ns, reach_ns, oldest_ns = self._times().take(tracks, axis=1)
         results = [_TOO_OLD] * len(tracks)
-        rows = (oldest_ns <= stamp_ns).nonzero()[0].tolist()
-        chosen = {row: measurements[row].seen_by(self._motion) for row in rows}
+        rows = (oldest_ns <= stamp_ns).nonzero()[0]
+        chosen = [measurements[row].seen_by(self._motion) for row in rows]
         states = self.states_at(stamp_ns)
         positions = dict(zip(states.track_ids, range(len(states.track_ids)), strict=True))
-        for alike in equal_ones([(id(m.model), id(m.pose), m.assumed, m.loss) for m in chosen.values()]):
-            group = np.array([rows[k] for k in alike])
+        for alike in equal_ones([(id(m.model), id(m.pose), m.assumed, m.loss) for m in chosen]):
+            group = rows[alike]
             at = [positions[track_ids[row]] for row in group]
-            measured, means = [chosen[row] for row in group], states.means[at]
+            measured, means = [chosen[k] for k in alike], states.means[at]
             innovations = Innovations.of(measured, means, states.covariances[at])
             window_ns = start_ns[group], reach_ns[group]
             is_fused = np.isfinite(innovations.nis)
@@ -235,7 +235,7 @@ class SmootherBank:
 
     def _initiate(self, track: int, oldest_ns: int) -> None:
         """Begin again from a straight line, where the oldest new stamp asks for it, as long as nothing has left."""
-        if not self.windows.nothing_marginalised(track):
+        if self.windows.nodes.first[track] > 0:  # a node that left stays behind the window
             del self._searches[track]
             return
         following = self._searches[track].next_line(partial(self.windows.fixes, track), oldest_ns)

@@ -229,10 +229,6 @@ class Windows:
 
     # --- one track
 
-    def nothing_marginalised(self, track: int) -> bool:
-        """True if no node has left the window."""
-        return bool(self.nodes.first[track] == 0)  # a node that left stays behind the window
-
     def fixes(self, track: int) -> list[Fix]:
         """Positions measured at the nodes, after that of the prior, of a window that nothing has left yet."""
         nodes, numbers = self.nodes, self.nodes.window(track)
