@@ -1,7 +1,6 @@
 """Predict the late measurement forward as an estimate of its own, and fuse it with the present one."""
 
 from abc import abstractmethod
-from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -12,14 +11,8 @@ from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.filters.ekf import OneCorrection, correct_one
 from fgtrack.estimation.oosm.late import LateEkf
 
-
-class Estimate(NamedTuple):
-    """A state at the present stamp."""
-
-    mean: FloatArray
-    """Shape (n,)."""
-    covariance: FloatArray
-    """Shape (n, n)."""
+_Estimate = tuple[FloatArray, FloatArray]
+"""Mean (n,) and covariance (n, n) at the present stamp."""
 
 
 class _ForwardEkf(LateEkf):
@@ -33,15 +26,15 @@ class _ForwardEkf(LateEkf):
         stamp_ns, now = measurement.stamp_ns, self._steps[-1]
         mean, covariance = self._predicted(self._left(stamp_ns), stamp_ns)
         at_tau = correct_one(mean, covariance, measurement)
-        late = Estimate(*self._moved(at_tau.mean, at_tau.covariance, stamp_ns, now.stamp_ns))
-        common = Estimate(*self._moved(mean, covariance, stamp_ns, now.stamp_ns))
-        fused = self._fused(Estimate(now.mean, now.covariance), late, common)
-        np.linalg.cholesky(fused.covariance)
-        self._absorb(*fused)
-        return OneCorrection(*fused, at_tau.innovation, at_tau.nis, S=at_tau.S)
+        late = self._moved(at_tau.mean, at_tau.covariance, stamp_ns, now.stamp_ns)
+        common = self._moved(mean, covariance, stamp_ns, now.stamp_ns)
+        x, P = self._fused((now.mean, now.covariance), late, common)
+        np.linalg.cholesky(P)
+        self._absorb(x, P)
+        return OneCorrection(x, P, at_tau.innovation, at_tau.nis, S=at_tau.S)
 
     @abstractmethod
-    def _fused(self, now: Estimate, late: Estimate, common: Estimate) -> Estimate:
+    def _fused(self, now: _Estimate, late: _Estimate, common: _Estimate) -> _Estimate:
         """One estimate from `now` and `late`, which share the information of `common`."""
 
 
@@ -60,11 +53,11 @@ class Fpfd(_ForwardEkf):
 
     exact = "one lag, first late measurement"
 
-    def _fused(self, now: Estimate, late: Estimate, common: Estimate) -> Estimate:
-        P_k, P_1, P_0 = (information(each.covariance) for each in (now, late, common))
+    def _fused(self, now: _Estimate, late: _Estimate, common: _Estimate) -> _Estimate:
+        P_k, P_1, P_0 = (information(P) for _, P in (now, late, common))
         covariance = symmetrise(information(P_k + P_1 - P_0))
-        pull = P_1 @ (late.mean - now.mean) - P_0 @ (common.mean - now.mean)
-        return Estimate(now.mean + covariance @ pull, covariance)
+        pull = P_1 @ (late[0] - now[0]) - P_0 @ (common[0] - now[0])
+        return now[0] + covariance @ pull, covariance
 
 
 class CovarianceIntersection(_ForwardEkf):
@@ -81,8 +74,8 @@ class CovarianceIntersection(_ForwardEkf):
     loses the other.
     """
 
-    def _fused(self, now: Estimate, late: Estimate, common: Estimate) -> Estimate:
-        P_k, P_1 = information(now.covariance), information(late.covariance)
+    def _fused(self, now: _Estimate, late: _Estimate, common: _Estimate) -> _Estimate:
+        P_k, P_1 = information(now[1]), information(late[1])
 
         def covariance(w: float) -> FloatArray:
             return symmetrise(information(w * P_k + (1.0 - w) * P_1))
@@ -93,7 +86,7 @@ class CovarianceIntersection(_ForwardEkf):
         inner = float(minimize_scalar(spread, bounds=(0.0, 1.0), method="bounded").x)
         w = min((0.0, inner, 1.0), key=spread)
         P = covariance(w)
-        return Estimate(now.mean + (1.0 - w) * P @ (P_1 @ (late.mean - now.mean)), P)
+        return now[0] + (1.0 - w) * P @ (P_1 @ (late[0] - now[0])), P
 
 
 def information(covariance: FloatArray) -> FloatArray:
