@@ -89,10 +89,6 @@ class Score:
     """Increase of the score that makes an object e times more probable."""
 
 
-#: Components that the map may give, and the keys of their standard deviations.
-_FROM_MAP = {"yaw_rad": "yaw_from_map_std_rad", "curvature_radpm": "curvature_from_map_std_radpm"}
-
-
 @settings
 class SensorModel:
     """One modality. Positions have their standard deviations along and across the line of sight."""
@@ -218,9 +214,14 @@ class SensorModel:
         )
 
     def noise(self, components: tuple[str, ...]) -> FloatArray:
-        """Diagonal covariance R of `components`, shape (k, k), in the sensor's own axes; shared and read-only."""
+        """Diagonal covariance R of `components`, shape (k, k), in the sensor's own axes; shared and read-only.
+
+        A yaw that the sensor does not measure, and a curvature, come from the map.
+        """
         if components not in self._noises:
-            R = np.diag([self.component_std(name) ** 2 for name in components])
+            from_map = {"yaw_rad": self.yaw_from_map_std_rad, "curvature_radpm": self.curvature_from_map_std_radpm}
+            std = {name: value for name, value in {**from_map, **self.std}.items() if value is not None}
+            R = np.diag([std[name] ** 2 for name in components])
             R.flags.writeable = False
             self._noises[components] = R
         return self._noises[components]
@@ -242,15 +243,6 @@ class SensorModel:
     @cached_property
     def _noises(self) -> dict[tuple[str, ...], FloatArray]:
         return {}
-
-    def component_std(self, name: str) -> float:
-        """Standard deviation of `name`; a yaw that the sensor does not measure, and a curvature, come from the map."""
-        if name in self.std:
-            return self.std[name]
-        std: float | None = getattr(self, _FROM_MAP.get(name, ""), None)
-        if std is None:
-            raise KeyError(name)
-        return std
 
 
 def in_view(
