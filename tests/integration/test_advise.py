@@ -209,22 +209,10 @@ def test_a_limit_that_refuses_bursts(call: Call) -> None:
     assert "20 % of its detections come later than max_delay_s 0.3 s allows" in " ".join(advice.sentences)
 
 
-@pytest.mark.slow
-def test_a_window_shorter_than_the_delays_and_than_a_period(call: Call) -> None:
-    write(drive(300))
+def test_a_window_shorter_than_the_delays(call: Call) -> None:
+    write(drive(100))
     Path("c.yaml").write_text(CONFIG + "filter: {storage_s: 0.05}\n")
     assert fgtrack.advise("drive.jsonl", "c.yaml").config.filter.storage_s == pytest.approx(0.2)
-    slow = [
-        item
-        for item in drive(1200)
-        if not isinstance(item, DetectionList) or (item.stamp_ns - START_NS) % (1500 * MS) == 0
-    ]
-    write(slow)
-    text = CONFIG.replace("estimator: ekf-replay", "estimator: smoother-banded") + "lifecycle: {out_of_view_s: 1.0}\n"
-    Path("c.yaml").write_text(text)
-    advice = fgtrack.advise("drive.jsonl", "c.yaml")
-    assert advice.config.smoother.lag_s == pytest.approx(5.0)
-    assert advice.config.lifecycle.out_of_view_s == pytest.approx(5.0)
 
 
 def test_negative_delays_a_jump_and_a_drift(call: Call) -> None:
