@@ -278,9 +278,11 @@ class Config:
             )
 
     @classmethod
-    def from_yaml(cls, path: str | Path) -> Self:
-        """Return the configuration of a YAML file. Raises `CallError` with the file and the key."""
-        return load(cls, Path(path))
+    def from_yaml(cls, name: str | Path) -> Self:
+        """Return the configuration of a YAML file or of that shipped name. Raises `CallError` with file and key."""
+        from fgtrack.pipeline.shipped import find_file  # which imports this module
+
+        return load(cls, find_file("configuration", name))
 
     def to_yaml(self, path: str | Path) -> None:
         """Write every key to a YAML file, which is replaced."""

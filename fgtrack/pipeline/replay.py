@@ -25,7 +25,7 @@ from fgtrack.pipeline.load import dump, plain
 from fgtrack.tracking.tracker import Tracker, TrackerParts, check_sensor
 
 #: Ticks go on while nothing is received: a few messages must not make a recording of days.
-_GAP_S, _LONGEST_SILENCE_S = 10.0, 3600.0
+_LONGEST_SILENCE_S = 3600.0
 _TICKS = 50  # between two signs of progress
 _PACKAGES = ("fgtrack", "gtsam", "numpy", "scipy", "rosbags")
 
@@ -55,7 +55,6 @@ class _Feed:
     ignored_detections: int = 0
     received_detections: int = 0
     num_messages: int = 0
-    silent_s: float = 0.0
     _ego_clock: EgoClock = field(default_factory=EgoClock, init=False)
     first_receipt_ns: int | None = field(default=None, init=False)
     last_receipt_ns: int | None = field(default=None, init=False)
@@ -92,11 +91,6 @@ class _Feed:
         except DataError as error:
             self.broken = str(error)
 
-    @property
-    def is_empty(self) -> bool:
-        """True if nothing came out before the end or the break."""
-        return self.last_receipt_ns is None
-
     def _check_time(self, message: Delivered) -> None:
         """Receipts never go back and leave no gap of hours; ego stamps keep to one clock."""
         gap_s = 0.0 if self.last_receipt_ns is None else seconds(message.receipt_ns - self.last_receipt_ns)
@@ -104,11 +98,9 @@ class _Feed:
             raise DataError(
                 f"receipt time goes back by {-gap_s:g} s at {message.receipt_ns} ns: sort the input by receipt"
             )
-        self.silent_s += gap_s if gap_s > _GAP_S else 0.0
-        if self.silent_s > _LONGEST_SILENCE_S:
+        if gap_s > _LONGEST_SILENCE_S:
             raise DataError(
-                f"nothing was received for {gap_s:.0f} s before {message.receipt_ns} ns, for {self.silent_s:.0f} s in "
-                "all: cut the recording there"
+                f"nothing was received for {gap_s:.0f} s before {message.receipt_ns} ns: cut the recording there"
             )
         self.last_receipt_ns = message.receipt_ns
         if self.first_receipt_ns is None:
@@ -218,7 +210,7 @@ def _drive(
         writer.write_tick(report, process_ns, num_detections)
         if on_tick is not None:
             on_tick(tick.now_ns, len(report.tracks))
-    if feed.broken is not None and feed.is_empty:
+    if feed.broken is not None and feed.last_receipt_ns is None:
         raise DataError(located(feed.broken, origin))
     writer.write_smoothed(tracker.finish())
     meta = {

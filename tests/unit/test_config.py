@@ -275,5 +275,6 @@ def test_a_config_goes_through_a_file_and_takes_other_values(tmp_path: Path) -> 
     assert config.replace(smoother=paper().smoother).smoother == paper().smoother
     config.to_yaml(tmp_path / "my.yaml")
     assert Config.from_yaml(tmp_path / "my.yaml") == config
+    assert Config.from_yaml("smoother").estimator == "smoother"
     with pytest.raises(CallError, match=r"the configuration.*: smoother\.lags: unknown key, did you mean 'lag_s'"):
         config.replace({"smoother.lags": 2.0})

@@ -94,12 +94,6 @@ class Assumption:
     reason: str
     """A short sentence."""
 
-    def __str__(self) -> str:
-        value = self.value
-        if isinstance(value, Mapping):
-            value = ", ".join(f"{name} {one:g}" for name, one in value.items())
-        return f"{self.key}: {value} ({self.reason})"
-
     @property
     def text(self) -> str:
         """The setting in words, without its sensor and its reason."""
@@ -356,7 +350,7 @@ def _with_lists(
     if not lists.scans:
         found["scan"] = False, "its lists hold one object, and none is empty"
     if lists.scans and seen.persistence is not None and seen.area_m2:
-        reason = f"how its detections persist, of {seen.persistence.num_triples} in three lists running"
+        reason = f"how its detections persist, of {len(seen.persistence.lines)} in three lists running"
         clutter_per_m2 = max(seen.persistence.clutter_per_list, _LEAST_CLUTTER) / seen.area_m2
         clutter_per_m2 = max(clutter_per_m2, seen.persistence.near_clutter_per_m2 or 0.0)
         found["detection_probability"] = round(seen.persistence.detection_probability, 2), reason

@@ -67,11 +67,6 @@ class Persistence:
     std_m: float = 0.0
     """Standard deviation of a detection, per axis, of errors that differ from list to list."""
 
-    @property
-    def num_triples(self) -> int:
-        """Number of triples."""
-        return len(self.lines)
-
 
 def disagreement_m(one: Persistence, own: Lists, other: Lists) -> float | None:
     """Standard deviation, per axis, of where another sensor sees the objects of `one`, in its lists; None if unknown.
