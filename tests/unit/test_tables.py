@@ -223,7 +223,7 @@ def test_an_angle_of_many_turns_is_not_wrapped_as_it_may_be_in_degrees(tmp_path)
         ({}, r"name its columns in input\.csv: radar\.csv has t, seen, x, y"),
         (
             {"ego": CsvTable({"stamp": "t"}, "radar.csv")},
-            r"input\.csv\.ego\.columns: must name speed_mps, x_m, y_m, yaw_rad",
+            r"input\.csv\.ego\.columns: must name speed_mps, stamp, x_m, y_m, yaw_rad",
         ),
         (
             {"detections": {"radar": CsvTable({"x_m": "x"}, "radar.csv")}},
@@ -233,7 +233,10 @@ def test_an_angle_of_many_turns_is_not_wrapped_as_it_may_be_in_degrees(tmp_path)
             {"detections": {"radar": CsvTable({"stamp": "t", "speed": "v"}, "radar.csv")}},
             "unknown column 'speed', known",
         ),
-        ({"detections": {"radar": CsvTable({"stamp": "t", "score": "x"}, "radar.csv")}}, "must name what is measured"),
+        (
+            {"detections": {"radar": CsvTable({"stamp": "t", "score": "x"}, "radar.csv")}},
+            "must name stamp and what is measured",
+        ),
         ({"detections": {"radar": CsvTable({"stamp": "t", "x_m": "x"})}}, "is a folder, so .* must name its file"),
     ],
 )

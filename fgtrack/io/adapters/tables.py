@@ -213,10 +213,9 @@ def _file(path: Path, table: CsvTable, role: str) -> Path:
         raise CallError(
             f"{where}.columns: unknown column {min(columns - known)!r}, known are {', '.join(sorted(known))}"
         )
-    if needed - columns:
-        raise CallError(f"{where}.columns: must name {', '.join(sorted(needed - columns))}")
-    if role not in _NAMES and columns.isdisjoint(MEASURABLE):
-        raise CallError(f"{where}.columns: must name what is measured, one of {', '.join(MEASURABLE)}")
+    if needed - columns or (role not in _NAMES and columns.isdisjoint(MEASURABLE)):
+        measured = "" if role in _NAMES else f" and what is measured, one of {', '.join(MEASURABLE)}"
+        raise CallError(f"{where}.columns: must name {', '.join(sorted(needed))}{measured}")
     if table.file is None and path.is_dir():
         raise CallError(f"{path}: is a folder, so {where} must name its file")
     return path if table.file is None else (path if path.is_dir() else path.parent) / table.file

@@ -16,11 +16,11 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2
 from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.io.errors import TruncatedInput, one_line
-from fgtrack.io.ros.bag_files import BagFile, bags_in, parts_of, storage_of
+from fgtrack.io.ros.bag_files import ZSTD_MAGIC, BagFile, bags_in, decompressed, files_of, storage_of
 from fgtrack.io.ros.rosbag1_file import Rosbag1File
 from fgtrack.io.ros.typestore import Key, MessageTypes, type_name
 
-_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+HEADER = "std_msgs/msg/Header"
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Bag:
     def __init__(self, path: Path | str, message_definitions: Collection[str] = ()) -> None:
         self.path = Path(path)
         with _as_data_error(self.path):
-            self._parts = parts_of(self.path)
+            self._paths = files_of(self.path)
         with self._files() as files:
             connections = [item for file in files for item in file.connections]
             for item in connections:
@@ -68,7 +68,8 @@ class Bag:
                     )
             self._ros1 = any(isinstance(file, Rosbag1File) for file in files)
             self._types = MessageTypes(map(_key, connections), self._ros1, message_definitions)
-            self._stamped = set(filter(self._types.begins_with_header, map(_key, connections)))
+            first = {key: types[key[0]][1][:1] for key, types in self._types.types.items()}
+            self._stamped = {key for key, members in first.items() if members and members[0][1][1] == HEADER}
             self.break_off = self._break_off(files)
         self.topics = _topics(connections, self._types.problems)
         """Topics by name; a topic with two types is listed twice."""
@@ -112,24 +113,24 @@ class Bag:
     @contextmanager
     def _files(self) -> Iterator[list[BagFile]]:
         with _as_data_error(self.path), ExitStack() as stack:
-            paths = stack.enter_context(self._parts.decompressed())
             files: list[BagFile] = []
-            for path in paths:
-                empty = path.stat().st_size == 0
+            for part in self._paths:
+                if part.stat().st_size == 0 and len(self._paths) > 1:
+                    continue
+                path = stack.enter_context(decompressed(part))
                 kind = storage_of(path)
-                if kind is None and not (empty and len(paths) > 1):
-                    raise DataError(f"{path}: {'is empty' if empty else 'is not a bag file'}")
-                if kind is not None:
-                    file = kind(path)
-                    stack.callback(file.close)
-                    file.open()
-                    files.append(file)
+                if kind is None:
+                    raise DataError(f"{part}: is {'not a bag file' if part.stat().st_size else 'empty'}")
+                file = kind(path)
+                stack.callback(file.close)
+                file.open()
+                files.append(file)
             yield files
 
     def _break_off(self, files: list[BagFile]) -> str | None:
         """Reason why the first file that is not whole breaks off."""
         broken = [f"{file.path} {file.break_off}" for file in files if file.break_off]
-        empty = [f"{path} is empty" for path in self._parts.files if path.stat().st_size == 0]
+        empty = [f"{path} is empty" for path in self._paths if path.stat().st_size == 0]
         return next(iter(broken + empty), None)
 
     def _records(self, topics: Collection[str]) -> Iterator[tuple[Connection, int, bytes]]:
@@ -139,7 +140,7 @@ class Bag:
                 wanted = [(file, [item for item in file.connections if item.topic in topics]) for file in files]
                 records = [iter(file.messages(connections)) for file, connections in wanted if connections]
                 for connection, log_ns, data in heapq.merge(*records, key=itemgetter(1)):
-                    if data[:4] == _ZSTD_MAGIC and not self._ros1:
+                    if data[:4] == ZSTD_MAGIC and not self._ros1:
                         data = decompress(data)
                     yield connection, log_ns, data
                     count += 1

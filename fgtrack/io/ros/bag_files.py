@@ -5,7 +5,6 @@ import json
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
@@ -26,6 +25,7 @@ BagFile = McapFile | Sqlite3File | Rosbag1File
 """One file of a recording, read in log-time order up to where it breaks off (`break_off`)."""
 
 METADATA = "metadata.yaml"
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 SETTINGS = "fgtrack"
 """Entry of its custom data with what the recording carries of a configuration, as JSON."""
 _BAG_SUFFIXES = (".mcap", ".db3")
@@ -36,41 +36,32 @@ _READERS: Mapping[bytes, type[BagFile]] = {
 }
 
 
-@dataclass(frozen=True)
-class Parts:
-    """Files of a recording."""
-
-    files: tuple[Path, ...]
-    compressed: bool = False
-    """True if each is a zstd file."""
-
-    @contextmanager
-    def decompressed(self) -> Iterator[tuple[Path, ...]]:
-        """Files as the recorder wrote them; compressed ones are decompressed into a temporary folder."""
-        if not self.compressed:
-            yield self.files
+@contextmanager
+def decompressed(file: Path) -> Iterator[Path]:
+    """The file as the recorder wrote it; a zstd file is decompressed into a temporary folder."""
+    with open_file(file) as source, TemporaryDirectory() as folder:
+        if source.read(len(ZSTD_MAGIC)) != ZSTD_MAGIC:
+            yield file
             return
-        with TemporaryDirectory() as folder:
-            targets = tuple(Path(folder) / file.stem for file in self.files)
-            for source, target in zip(self.files, targets, strict=True):
-                with source.open("rb") as file, target.open("wb") as out:
-                    zstandard.ZstdDecompressor().copy_stream(file, out)
-            yield targets
+        source.seek(0)
+        target = Path(folder) / file.stem
+        with target.open("wb") as out:
+            zstandard.ZstdDecompressor().copy_stream(source, out)
+        yield target
 
 
-def parts_of(path: Path) -> Parts:
+def files_of(path: Path) -> tuple[Path, ...]:
     """Files of the recording at `path`: itself, those that metadata.yaml names, or those of the folder.
 
     Raises `DataError` for an invalid metadata.yaml, and for copies of one file.
     """
+    files = tuple(bags_in(path)) if path.is_dir() else (path,)
     if (path / METADATA).is_file():
-        parts = _named_parts(path)
-    else:
-        parts = Parts(tuple(bags_in(path)) if path.is_dir() else (path,))
-    for one, other in combinations(parts.files, 2):
+        files = _named_files(path)
+    for one, other in combinations(files, 2):
         if one.stat().st_size and filecmp.cmp(one, other, shallow=False):
             raise DataError(f"{path}: {one.name} and {other.name} are copies of one recording: remove or name one")
-    return parts
+    return files
 
 
 def settings_of(path: Path) -> Mapping[str, object]:
@@ -97,21 +88,17 @@ def _metadata(path: Path) -> Any:  # Any: YAML values, checked by who reads them
     return safe_yaml(read_whole(path / METADATA, 1.0).decode())["rosbag2_bagfile_information"]
 
 
-def _named_parts(path: Path) -> Parts:
+def _named_files(path: Path) -> tuple[Path, ...]:
     file = path / METADATA
     try:
-        metadata = _metadata(path)
-        files = [path / PurePath(name).name for name in metadata["relative_file_paths"]]
-        mode, form = metadata.get("compression_mode") or "none", metadata.get("compression_format") or "zstd"
-        if mode.lower() != "none" and form != "zstd":
-            raise ValueError(f"compression {form!r} is not supported")
+        files = tuple(path / PurePath(name).name for name in _metadata(path)["relative_file_paths"])
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError, YAMLError) as error:
         raise DataError(
             f"{file}: is not the metadata of a recording ({type(error).__name__}: {one_line(error)})"
         ) from error
-    if missing := [file for file in files if not file.is_file()]:
+    if missing := [each for each in files if not each.is_file()]:
         raise DataError(f"{missing[0]}: is missing, {file} names it")
-    return Parts(tuple(files), mode.lower() == "file")
+    return files
 
 
 def storage_of(path: Path) -> type[BagFile] | None:

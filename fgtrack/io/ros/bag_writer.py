@@ -16,7 +16,7 @@ from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.io.adapters.common import RosMessage
 from fgtrack.io.errors import UntilBreak, one_line
 from fgtrack.io.output import check_output, new_folder
-from fgtrack.io.ros.bag_files import METADATA, SETTINGS, parts_of
+from fgtrack.io.ros.bag_files import METADATA, SETTINGS, files_of
 from fgtrack.io.ros.messages import MessageFactory
 
 _CHECKPOINT = 1000  # messages; a killed writer loses no more than that
@@ -88,7 +88,7 @@ def is_recording(path: Path) -> bool:
     if not (path / METADATA).is_file():
         return False
     try:
-        listed = [file.name for file in parts_of(path).files]
+        listed = [file.name for file in files_of(path)]
     except DataError:
         return False
     known = {METADATA, *listed, *(f"{name}{journal}" for name in listed for journal in _JOURNALS)}

@@ -69,11 +69,6 @@ class MessageTypes:
             except ValueError as error:
                 self.problems[key] = str(error)
 
-    def begins_with_header(self, key: Key) -> bool:
-        """True if the first member of a type that can be decoded is a header."""
-        members = [] if key in self.problems else self.types[key][key[0]][1]
-        return bool(members) and members[0][1][1] == "std_msgs/msg/Header"
-
     def decode(self, key: Key, data: bytes, what: str) -> Any:  # a message has the attributes of its type
         """Message that is serialized in `data`; `what` names it in the `DataError` of bytes of another type."""
         try:
