@@ -71,12 +71,7 @@ _Uses = tuple[dict[_Key, str], dict[_Key, str | None], str | None]  # uses, note
 def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
     """Return the contents of the input at `path`, and their use in a replay with `config`.
 
-    Raises
-    ------
-    CallError
-        Nothing is there.
-    DataError
-        It is not an input, or damaged from the start.
+    Raises `CallError` where nothing is there, and `DataError` where it is not an input, or damaged from the start.
     """
     path = Path(path)
     kind = input_kind(path)

@@ -51,12 +51,8 @@ class FileFormat:
 def open_input(path: Path | str, config: InputConfig | None = None) -> InputSource:
     """Open the input at `path`.
 
-    Raises
-    ------
-    CallError
-        Nothing is there, or the configuration does not fit.
-    DataError
-        It is nothing that fgtrack reads, or damaged.
+    Raises `CallError` where nothing is there or the configuration does not fit, and `DataError` where it is not an
+    input, or damaged.
     """
     check_paths(recording=path)
     path = Path(path)

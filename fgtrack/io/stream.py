@@ -38,15 +38,8 @@ Record = dict[str, Any]
 def read_stream(path: Path | str) -> Iterator[Message]:
     """Messages of the stream `path` in the order of the file, which is receipt order.
 
-    Gzip is recognised by its magic number. Unknown keys are ignored; one warning is logged with their names
-    and counts.
-
-    Raises
-    ------
-    TruncatedInput
-        The file breaks off; raised after every message before the break.
-    DataError
-        Anything else is wrong; the message names file and line.
+    Gzip is recognised by its magic number. Unknown keys are ignored; one warning has their names and counts. Raises
+    `TruncatedInput` after every message before a break, and `DataError` with file and line.
     """
     path = Path(path)
     unknown: Counter[str] = Counter()
@@ -101,23 +94,9 @@ def write_stream(
     """Write `messages`, which must be in receipt order, to `path`; gives their number.
 
     A name that ends in `.gz` is gzipped; the same messages give the same bytes. The file gets its name when it is
-    whole; what a killed writer leaves beside it (`<path>.*.part`) is readable.
-
-    Parameters
-    ----------
-    header
-        Entries of the header record besides `type` and `format`.
-    overwrite
-        Replace a stream at `path`.
-
-    Raises
-    ------
-    TruncatedInput
-        `messages` broke off; what came before is written.
-    CallError
-        Something is at `path`, or it cannot be written.
-    DataError
-        The disk is full.
+    complete; what a killed writer leaves beside it (`<path>.*.part`) is readable. `header` are entries of the header
+    record besides `type` and `format`. Raises `TruncatedInput` where `messages` broke off, after writing what came
+    before, and as `new_file`.
     """
     path = Path(path)
     count = 0

@@ -39,10 +39,7 @@ class InvalidMessageError(Exception):
 def validated(path: Path, messages: Callable[[], Iterator[Message]], done: bool = False) -> Iterator[Message]:
     """Messages of the input at `path`; those of a reader that has validated them are `done`.
 
-    Raises
-    ------
-    DataError
-        The reader failed, or gave an invalid message; raised after everything before that.
+    Raises `DataError` where the reader failed, or gave an invalid message, after everything before that.
     """
     count = 0
     try:

@@ -235,7 +235,7 @@ def test_an_angle_of_many_turns_is_not_wrapped_as_it_may_be_in_degrees(tmp_path)
         ),
         (
             {"detections": {"radar": CsvTable({"stamp": "t", "score": "x"}, "radar.csv")}},
-            "must name stamp and what is measured",
+            "stamp and what is measured",
         ),
         ({"detections": {"radar": CsvTable({"stamp": "t", "x_m": "x"})}}, "is a folder, so .* must name its file"),
     ],

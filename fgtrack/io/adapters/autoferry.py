@@ -49,12 +49,7 @@ def detections_file(folder: Path) -> Path | None:
 def read_scenario(folder: Path) -> Iterator[Message]:
     """Messages of the scenario in `folder` in receipt order; truth only where the folder has it.
 
-    At equal receipts the truth comes first and the ego before the detections.
-
-    Raises
-    ------
-    DataError
-        A file is missing or not what the data set holds; the message names file and record.
+    At equal receipts the truth comes first and the ego before the detections. Raises `DataError`, with file and record.
     """
     file = detections_file(folder)
     if file is None:

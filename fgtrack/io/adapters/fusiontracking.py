@@ -38,17 +38,8 @@ Json = Any
 def read_log(folder: Path, frames: Mapping[str, Frame]) -> Iterator[Message]:
     """Messages of the log in `folder` in receipt order, the ego before the detections of its tick.
 
-    Parameters
-    ----------
-    frames
-        Frame of the sensors whose objects are not in the ego frame.
-
-    Raises
-    ------
-    TruncatedInput
-        The log ends in the middle of a row; raised after all rows before it.
-    DataError
-        The file is missing or not such a log; the message names the line.
+    `frames` are those of sensors whose objects are not in the ego frame. Raises `TruncatedInput` behind the rows before
+    a break, and `DataError`, with the line, where it is not such a log.
     """
     file = folder / LOG_NAME
     try:

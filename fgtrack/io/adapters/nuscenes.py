@@ -57,12 +57,7 @@ Json = Any
 def read_scene(file: Path, settings: NuscenesInput) -> Iterator[Message]:
     """Messages of a scene in the order of receipt; at one stamp the truth first, then the ego, then the boxes.
 
-    Raises
-    ------
-    CallError
-        The results are of several scenes and none is named, or the tables are not found.
-    DataError
-        A file is not what the data set holds; the message names it.
+    Raises `CallError` where one of several scenes has to be named or there are no tables, and `DataError`.
     """
     tables = _tables(file, settings)
     with reported_as(f"{file}: it or its tables in {tables} are not those of nuScenes"):

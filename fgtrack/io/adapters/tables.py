@@ -43,12 +43,8 @@ Row = tuple[str, dict[str, str]]
 def read_tables(tables: Sequence[tuple[Path, CsvTable, str]]) -> Iterator[Message]:
     """Messages of the tables, each given with its file and its role: `ego`, `truth` or `detections.SENSOR`.
 
-    They come in the order of receipt; at equal receipts in the order of `tables`.
-
-    Raises
-    ------
-    DataError
-        A row does not match the mapping; raised after all messages up to the last receipt before that row.
+    They come in the order of receipt; at equal receipts in the order of `tables`. Raises `DataError` where a row does
+    not match the mapping, after all messages up to the last receipt before that row.
     """
     keyed: list[tuple[tuple[int, int, int], Message]] = []
     until_ns, broken = math.inf, None
@@ -105,10 +101,7 @@ def _read(file: Path, table: CsvTable, role: str) -> tuple[list[Message], DataEr
 def rows(file: Path, delimiter: str | None = None) -> Iterator[Row]:
     """Rows of `file`, the header first; without a delimiter the most frequent of `,`, `;` and tab in the header.
 
-    Raises
-    ------
-    DataError
-        The file is not a table.
+    Raises `DataError` where the file is not a table.
     """
     where = f"{file}:1"
     try:

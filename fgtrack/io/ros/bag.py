@@ -77,12 +77,7 @@ class Bag:
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
         """Decoded messages on `topics` in log-time order; equal times keep the order of the recording.
 
-        Raises
-        ------
-        TruncatedInput
-            The recording breaks off; raised after every message before the break.
-        DataError
-            A topic's type is not known or a message of it cannot be decoded.
+        Raises `TruncatedInput` after every message before a break, and `DataError` for what cannot be decoded.
         """
         for topic in self.topics:
             if topic.name in topics and topic.problem:

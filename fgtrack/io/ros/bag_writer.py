@@ -41,14 +41,8 @@ def write_bag(
     speeds). Every thousand messages reach the disk: a killed writer leaves a readable recording (`<path>.*.part`).
     `settings`, what the recording carries of a configuration, are in the custom data of metadata.yaml.
 
-    Raises
-    ------
-    TruncatedInput
-        `messages` broke off; what came before is written.
-    CallError
-        Something is at `path`, or it cannot be written.
-    DataError
-        The disk is full, or a time lies outside what ROS messages hold.
+    Raises `TruncatedInput` where `messages` broke off, after writing what came before; as `new_folder`; and `DataError`
+    for a time outside what ROS messages hold.
     """
     path = Path(path)
     try:

@@ -48,15 +48,9 @@ class TopicUse:
 def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
     """Return the uses of the topics of `bag`, as `config` names them.
 
-    A recording that fgtrack wrote is recognised by its message types; `config` takes precedence where it names a
-    topic of the recording.
-
-    Raises
-    ------
-    DataError
-        The recording lacks a named topic, or nothing says what its topics are.
-    CallError
-        The configuration of a topic does not fit its type.
+    A recording that fgtrack wrote is recognised by its message types; `config` takes precedence where it names a topic
+    of the recording. Raises `DataError` for a topic that is not there or not named, and `CallError` for a configuration
+    that does not fit its type.
     """
     names = {topic.name for topic in bag.topics}
     truth = config.truth if isinstance(config.truth, tuple) else (config.truth,) if config.truth else ()
@@ -96,12 +90,7 @@ FORMAT = FileFormat("a rosbag2 folder, an .mcap, .db3 or ROS 1 .bag file", is_ba
 def bag_messages(bag: Bag, uses: tuple[TopicUse, ...]) -> Iterator[Message]:
     """Messages of `bag` in receipt order, which is the order of the recorder's log times.
 
-    Raises
-    ------
-    TruncatedInput
-        The recording breaks off; raised after everything before the break.
-    DataError
-        A message is not what its topic's use asks for.
+    Raises `TruncatedInput` after everything before a break, and `DataError` for a message that does not fit its use.
     """
     by_topic: dict[tuple[str, str], list[TopicUse]] = {}
     for use in uses:

@@ -31,16 +31,8 @@ def rows(
 ) -> Iterator[tuple[str, list[Row]]]:
     """The rows of one tick by table; lagged states only of the tracks that the tick reports.
 
-    Parameters
-    ----------
-    report
-        What the tracker gave.
-    process_ns
-        Wall time of the tick.
-    num_detections
-        Detections that the tick received.
-    smoothed_lag_s
-        The lag whose states are in `smoothed` with the final ones; those of every lag are in `lagged`.
+    `process_ns` is the wall time of the tick, `num_detections` the number of detections that it received. The states of
+    `smoothed_lag_s` are in `smoothed` with the final ones; those of every lag are in `lagged`.
     """
     tick = (report.tick, report.now_ns)
     yield "tracks", [_track_row(tick, track) for track in report.tracks]
