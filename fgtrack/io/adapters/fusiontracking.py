@@ -103,4 +103,4 @@ def _object(item: Json, frame: Frame) -> Detection:
     }
     if frame == "map" and "yaw_rad" in values:
         values["yaw_rad"] = wrap_angle(values["yaw_rad"] + 0.5 * math.pi)
-    return Detection(**values, covariance=None, stamp_ns=None, object_id=None)
+    return Detection(**values)

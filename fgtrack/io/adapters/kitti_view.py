@@ -149,7 +149,10 @@ def read_views(file: Path, calibration_file: Path) -> Iterator[View]:
         x_m, y_m = (_mercator(latitude_deg, longitude_deg, scale) - origin_m).tolist()
         stamp_ns = len(views) * PERIOD_NS
         ego = EgoState(stamp_ns, stamp_ns, x_m, y_m, wrap_angle(yaw_rad), speed_mps, yaw_rate_radps, accel_mps2)
-        views.append(View(ego, _levelling(roll_rad, pitch_rad), calibration))
+        about_x, about_y = np.eye(3), np.eye(3)
+        about_x[1:, 1:] = rotation(roll_rad)
+        about_y[::2, ::2] = rotation(-pitch_rad)  # rows and columns x and z, which y turns from z to x
+        views.append(View(ego, np.asarray(about_y @ about_x), calibration))
         return views[-1]
 
     return parsed(file, view)
@@ -159,11 +162,3 @@ def _mercator(latitude_deg: float, longitude_deg: float, scale: float) -> FloatA
     """Position to the east and north, shape (2,), true to scale at the latitude whose cosine is `scale`."""
     north = math.log(math.tan(math.radians(45.0 + 0.5 * latitude_deg)))
     return scale * _EARTH_RADIUS_M * np.array([math.radians(longitude_deg), north])
-
-
-def _levelling(roll_rad: float, pitch_rad: float) -> FloatArray:
-    """Rotation, shape (3, 3), from a frame that is rolled and pitched to a level one of the same heading."""
-    about_x, about_y = np.eye(3), np.eye(3)
-    about_x[1:, 1:] = rotation(roll_rad)
-    about_y[::2, ::2] = rotation(-pitch_rad)  # rows and columns x and z, which y turns from z to x
-    return np.asarray(about_y @ about_x)

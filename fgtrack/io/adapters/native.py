@@ -24,8 +24,6 @@ TRUTH_OPTIONAL = (*STATE_NAMES[2:], "outline_m")
 
 #: Fields that hold numbers in a list, and those that hold a text.
 LISTS, TEXTS = frozenset({"covariance", "outline_m"}), frozenset({"class_name"})
-_MOST_NUMBERS = 100_000
-"""In one of them: an outline may have many corners."""
 
 
 def presence(value: Detection | TruthState, names: tuple[str, ...]) -> int:
@@ -38,7 +36,7 @@ def _given(message: RosMessage) -> dict[str, RosMessage]:
     kind: RosMessage = type(message)
     optional, present = _optional(kind), message.present
     given = {name: getattr(message, name) for bit, name in enumerate(optional) if present >> bit & 1}
-    return {name: _numbers(name, value) if name in LISTS else value for name, value in given.items()}
+    return {name: tuple(value.tolist()) if name in LISTS else value for name, value in given.items()}
 
 
 @cache
@@ -46,12 +44,6 @@ def _optional(kind: RosMessage) -> tuple[str, ...]:
     """Names behind `present`; their order is that of the recording, whatever wrote it."""
     names = [field.name for field in fields(kind)]
     return tuple(names[names.index("present") + 1 :])
-
-
-def _numbers(name: str, values: RosMessage) -> tuple[float, ...]:
-    if len(values) > _MOST_NUMBERS:
-        raise ValueError(f"{name}: has {len(values)} numbers, no more than {_MOST_NUMBERS} are read")
-    return tuple(values.tolist())
 
 
 def ego(message: RosMessage, receipt_ns: int) -> EgoState:
@@ -62,7 +54,7 @@ def ego(message: RosMessage, receipt_ns: int) -> EgoState:
         receipt_ns,
         **{name: getattr(message, name) for name in STATE_NAMES},
         in_pit=message.in_pit if message.has_in_pit else None,
-        covariance=_numbers("covariance", covariance) if len(covariance) else None,
+        covariance=tuple(covariance.tolist()) if len(covariance) else None,
     )
 
 

@@ -192,7 +192,10 @@ def _boxes(boxes: list[Json], settings: NuscenesInput) -> Iterator[Detection | s
 def _truth(tables: Path, samples: Mapping[str, int], settings: NuscenesInput) -> list[TruthState]:
     if not (tables / "sample_annotation.json").is_file():
         return []
-    categories = {each["token"]: _class(each["name"]) for each in _entries(tables / "category.json")}
+    categories = {
+        each["token"]: next((name for begin, name in _CATEGORIES.items() if each["name"].startswith(begin)), None)
+        for each in _entries(tables / "category.json")
+    }
     kinds = {each["token"]: categories[each["category_token"]] for each in _entries(tables / "instance.json")}
     states = []
     for each in _entries(tables / "sample_annotation.json"):
@@ -205,11 +208,6 @@ def _truth(tables: Path, samples: Mapping[str, int], settings: NuscenesInput) ->
         unseen = not each.get("num_lidar_pts", 1) + each.get("num_radar_pts", 0)
         states.append(TruthState(stamp_ns, stamp_ns, number, x_m, y_m, _yaw_rad(each["rotation"]), ignored=unseen))
     return states
-
-
-def _class(category: str) -> str | None:
-    """Class of detections that `category` is of; None where the data set detects none."""
-    return next((name for start, name in _CATEGORIES.items() if category.startswith(start)), None)
 
 
 def _yaw_rad(rotation: list[float]) -> float:
