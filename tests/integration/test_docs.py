@@ -274,19 +274,17 @@ def test_every_delay_and_clock_model_has_a_row_with_its_parameters(model: Any) -
     assert f"| `{model.kind}` | {names}{' ' if names else ''}|" in (ROOT / "docs/delays.md").read_text(encoding="utf-8")
 
 
-def test_every_estimator_is_on_the_page_of_estimators() -> None:
-    page = (ROOT / "docs/estimators.md").read_text(encoding="utf-8")
-    assert [name for name in ESTIMATORS if name not in ESTIMATORS.plugins() and f"`{name}`" not in page] == []
-
-
-def test_every_public_name_is_on_the_page_of_the_api() -> None:
-    page = (ROOT / "docs/api.md").read_text(encoding="utf-8")
-    assert [name for name in dir(fgtrack) if not name.startswith("_") and f"`{name}`" not in page] == []
-
-
-def test_every_section_of_the_configuration_is_on_its_page() -> None:
-    page = (ROOT / "docs/configuration.md").read_text(encoding="utf-8")
-    assert [field.name for field in fields(Config) if f"| `{field.name}` |" not in page] == []
+@pytest.mark.parametrize(
+    ("page", "mark", "names"),
+    [
+        ("estimators", "`{}`", [name for name in ESTIMATORS if name not in ESTIMATORS.plugins()]),
+        ("api", "`{}`", [name for name in dir(fgtrack) if not name.startswith("_")]),
+        ("configuration", "| `{}` |", [field.name for field in fields(Config)]),
+    ],
+)
+def test_every_name_is_on_its_page(page: str, mark: str, names: list[str]) -> None:
+    text = (ROOT / f"docs/{page}.md").read_text(encoding="utf-8")
+    assert [name for name in names if mark.format(name) not in text] == []
 
 
 def test_every_setting_of_a_run_has_a_meaning_in_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
