@@ -82,13 +82,14 @@ class Nodes:
         """Arguments of all loops over the windows."""
 
     def nearest(self, tracks: IntArray, stamp_ns: int) -> tuple[IntArray, IntArray]:
-        """Return the indices of the nodes at most `NEAR_NS` from `stamp_ns`, or else before it, and their stamps."""
-        each, all_ns = np.arange(len(tracks)), self.stamps_ns[tracks]
-        gaps_ns = np.abs(all_ns - stamp_ns)
-        indices = gaps_ns.argmin(axis=1)
-        is_near = gaps_ns[each, indices] <= NEAR_NS
-        before = (all_ns <= stamp_ns).sum(axis=1) - 1
-        return np.where(is_near, indices, before), np.where(is_near, all_ns[each, indices], stamp_ns)
+        """Return the indices of the newest nodes at most `NEAR_NS` after `stamp_ns`, and the stamps to fuse it at.
+
+        These are those of nodes that are at most `NEAR_NS` from it, else `stamp_ns` itself.
+        """
+        all_ns = self.stamps_ns[tracks]
+        indices = (all_ns <= stamp_ns + NEAR_NS).sum(axis=1) - 1
+        at_ns = all_ns[np.arange(len(tracks)), indices]
+        return indices, np.where(at_ns < stamp_ns - NEAR_NS, stamp_ns, at_ns)
 
     def last_before(self, tracks: IntArray, stamps_ns: IntArray) -> IntArray:
         """Return the indices of the newest nodes at or before `stamps_ns`; -1 if there are none."""
