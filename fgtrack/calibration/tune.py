@@ -73,7 +73,9 @@ def tune(
         A recording cannot be read, a sensor of it has no model, or nothing can be fitted to it.
     """
     resolved = read_config(config, set, track_map=map, pit_map=pit_map)
-    paths = [recordings] if isinstance(recordings, (str, Path)) else list(recordings)
+    paths: Sequence[str | Path] = [recordings]  # type: ignore[list-item]  # open_input names what is not a path
+    if isinstance(recordings, Sequence) and not isinstance(recordings, str):
+        paths = recordings
     return tuned({str(path): open_input(path, resolved.input) for path in paths}, resolved, TuneRules(keep=tuple(keep)))
 
 

@@ -37,7 +37,7 @@ def near(
             if distance > reach_m[j]:
                 continue
             at = count
-            if count - first == most:  # in place of the farthest
+            if count - first == most:  # replaces the farthest
                 at = first
                 for k in range(first, count):
                     at = k if distances[k] > distances[at] else at
