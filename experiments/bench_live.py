@@ -27,7 +27,7 @@ from bench_report import plural, progress, put_into, short_machine
 from bench_tracker import yardstick_us
 
 import fgtrack
-from fgtrack.core.time import first_multiple, nanoseconds, period_ns
+from fgtrack.core.time import nanoseconds, period_ns
 
 Sent = fgtrack.EgoState | fgtrack.DetectionList
 
@@ -124,7 +124,7 @@ def track(receiver: Receiver, hz: float, duration_s: float, num_parts: int) -> l
     """Tick at multiples of the period, from the first message until the vehicle has stopped."""
     step_ns = period_ns(hz)
     receiver.begun.wait()
-    begun_ns = due_ns = first_multiple(time.time_ns(), step_ns)
+    begun_ns = due_ns = -(-time.time_ns() // step_ns) * step_ns
     parts: list[Part] = []
     tick_ms, cpu_ms, missed, skipped = list[float](), list[float](), 0, 0
     while True:
@@ -144,7 +144,7 @@ def track(receiver: Receiver, hz: float, duration_s: float, num_parts: int) -> l
             tick_ms, cpu_ms, missed, skipped = [], [], 0, 0
         if over:
             return parts
-        following_ns = max(due_ns + step_ns, first_multiple(done_ns, step_ns))
+        following_ns = max(due_ns + step_ns, -(-done_ns // step_ns) * step_ns)
         skipped += (following_ns - due_ns) // step_ns - 1
         due_ns = following_ns
 
