@@ -2,9 +2,11 @@
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Generic, TypeVar
 
 from fgtrack.core.errors import DataError
-from fgtrack.core.types import Message
+
+_T = TypeVar("_T")
 
 
 def one_line(error: BaseException) -> str:
@@ -19,17 +21,17 @@ class TruncatedInput(DataError):  # noqa: N818 - it names what the input is; the
     """
 
 
-class UntilBreak:
-    """Iterates over messages up to the end or the break, and keeps the error of the break for later.
+class UntilBreak(Generic[_T]):
+    """Iterates over messages, or other items, up to the end or the break, and keeps the error of the break for later.
 
     A `DataError` behind a message is a break as well; one before the first is raised.
     """
 
-    def __init__(self, messages: Iterable[Message]) -> None:
+    def __init__(self, messages: Iterable[_T]) -> None:
         self._messages = messages
         self.error: DataError | None = None
 
-    def __iter__(self) -> Iterator[Message]:
+    def __iter__(self) -> Iterator[_T]:
         count = 0
         try:
             for message in self._messages:

@@ -230,6 +230,30 @@ def test_a_damaged_file_is_one_line_that_names_it(tmp_path, files, where):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("file", "broken", "where"),
+    [
+        ("laser", pose(2, 11.0, 0.0, 0.0)[:20], r"laser/0001\.txt:3: "),
+        ("laser", "", r"laser/0001\.txt:3: "),
+        ("label_02", "2 5 Car 0", r"label_02/0001\.txt:3: "),
+        ("oxts", oxts()[:40], r"oxts/0001\.txt:3: "),
+    ],
+)
+def test_a_sequence_is_read_up_to_the_frame_of_a_damaged_line(tmp_path, file, broken, where):
+    files = {
+        "oxts": [oxts()] * 4,
+        "label_02": [label(frame, 5, "Car", 10.0, 0.0, 0.0) for frame in range(4)],
+        "laser": [pose(frame, 10.0, 0.0, 0.0) for frame in range(4)],
+    }
+    intact = messages(folder(tmp_path / "intact", **files))
+    end = 1 if not broken else 2  # a line without a frame may belong to that of the line above
+    files[file][2] = broken
+    received = []
+    with pytest.raises(DataError, match=where):
+        received.extend(open_input(folder(tmp_path / "damaged", **files)).messages())
+    assert received == [item for item in intact if item.stamp_ns < end * 100_000_000]
+
+
 def test_what_is_not_finite_in_a_detection_is_left_to_the_tracker_without_a_warning(tmp_path):
     whole = pose(0, 10.0, 0.0, 0.0)
     cells = whole.split(",")

@@ -29,6 +29,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import TypeVar
 
@@ -40,6 +41,7 @@ from fgtrack.core.types import Detection, DetectionList, Frame, Message, TruthSt
 from fgtrack.io.adapters.common import split
 from fgtrack.io.adapters.kitti_view import PERIOD_NS, View, parsed, read_views
 from fgtrack.io.config import KittiInput
+from fgtrack.io.errors import UntilBreak
 from fgtrack.io.source import FileFormat
 
 __all__ = ["CLASS_NAMES", "FORMAT", "PERIOD_NS", "is_sequence", "read_sequence", "view_of_sequence"]
@@ -63,18 +65,22 @@ Item = TypeVar("Item")
 def read_sequence(folder: Path, sequence: str, settings: KittiInput) -> Iterator[Message]:
     """Messages of `sequence` in receipt order; at a frame the truth comes first, then the ego, then the detections.
 
-    Raises `DataError`, with file and line, where a file is missing or damaged.
+    Raises `DataError`, with file and line, where a file is missing, and, after all messages of earlier frames, where a
+    line is damaged: the file may have been cut off there.
     """
-    views = list(_views(folder, sequence))
+    readable = UntilBreak(_views(folder, sequence))
+    views = list(readable)
+    damages = [] if readable.error is None else [(len(views), readable.error)]
     labels = folder / _LABELS / f"{sequence}.txt"
-    truth = _by_frame(labels, views, partial(_truth, settings)) if labels.exists() else {}
+    truth = _by_frame(labels, views, partial(_truth, settings), damages) if labels.exists() else {}
     sensors = {
-        file.parent.name: _by_frame(file, views, partial(_detection, settings, file.parent.name))
+        file.parent.name: _by_frame(file, views, partial(_detection, settings, file.parent.name), damages)
         for file in sorted(folder.glob(f"*/{sequence}.txt"))
         if file.parent.name not in (_OXTS, _CALIB, _LABELS)
     }
     in_image = {name: _in_image(folder / name, frames) for name, frames in sensors.items()}
-    for frame, view in enumerate(views):
+    end, damage = min(damages, key=itemgetter(0), default=(len(views), None))
+    for frame, view in enumerate(views[:end]):
         states = [state for state in truth.get(frame, ()) if state is not None]
         regions = [state for state in states if state.outline_m is not None]
         yield from [state for state in states if state.outline_m is None]
@@ -84,20 +90,32 @@ def read_sequence(folder: Path, sequence: str, settings: KittiInput) -> Iterator
             objects, left_out = split(frames.get(frame, ()))
             refers_to: Frame = "sensor" if in_image[sensor] else "ego"
             yield DetectionList(sensor, view.ego.stamp_ns, view.ego.receipt_ns, objects, refers_to, left_out)
+    if damage is not None:
+        raise damage
 
 
-def _by_frame(file: Path, views: list[View], parse: Callable[[View, list[str]], Item]) -> Mapping[int, list[Item]]:
-    """Results of `parse` for the lines of `file`, by frame."""
+def _by_frame(
+    file: Path, views: list[View], parse: Callable[[View, list[str]], Item], damages: list[tuple[int, DataError]]
+) -> Mapping[int, list[Item]]:
+    """Results of `parse` for the lines of `file`, by frame; a damaged line is added to `damages` with its frame.
+
+    Lines are in the order of their frames, so a damaged frame number is not before that of the line above.
+    """
+    latest, by_frame = 0, defaultdict(list)
 
     def at_frame(fields: list[str]) -> tuple[int, Item]:
+        nonlocal latest
         frame = int(fields[0])
+        latest = max(latest, frame)
         if not 0 <= frame < len(views):
             raise ValueError(f"of frame {frame}, but {_OXTS} has {len(views)} frames")
         return frame, parse(views[frame], fields)
 
-    by_frame = defaultdict(list)
-    for frame, item in parsed(file, at_frame):
+    lines = UntilBreak(parsed(file, at_frame))
+    for frame, item in lines:
         by_frame[frame].append(item)
+    if lines.error is not None:
+        damages.append((latest, lines.error))
     return by_frame
 
 
