@@ -108,7 +108,7 @@ HEAVY: dict[str, tuple[Make, tuple[str, ...], str]] = {
         ("info", "x.mcap"),
         "",
     ),
-    "scenario of 10^9 scans": (small("x.yaml", RACE), ("simulate", "x.yaml", "-o", "y.jsonl"), "duration_s"),
+    "scenario of 10^9 scans": (small("x.yaml", RACE), ("simulate", "x.yaml", "-o", "y.jsonl"), "memory"),
     "sweep of 10^9 cells": (small("x.yaml", SWEEP), ("sweep", "x.yaml", "-o", "out", "--jobs", "1"), "x.yaml"),
     "run with large meta": (large_meta, ("compare", "run"), "run"),
     "crowd of 30,000": (crowd((150, GRID_M)), ("replay", "x.jsonl", "-e", "smoother-banded", "-o", "run"), ""),
