@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from typing import Protocol, runtime_checkable
 
@@ -157,8 +157,8 @@ KNOWN_YAW_STD_RAD = 0.1
 class Start:
     """State of a new object at its first stamp, with standard deviations.
 
-    Raises `CallError` for a value that is no number, not finite or beyond 10^18, a negative standard deviation, a wrong
-    shape, and a stamp that is no integer.
+    Raises `CallError` for a value that is not a number, not finite or beyond 10^36, a negative standard deviation, a
+    wrong shape, and a stamp that is not an integer.
     """
 
     stamp_ns: int = 0
@@ -183,30 +183,22 @@ class Start:
 
     def __post_init__(self) -> None:
         _check("Start: stamp_ns", self.stamp_ns, _STAMP, is_stamp(self.stamp_ns))
-        for name, shape, largest in (("position_m", (2,), _MOST), ("position_covariance", (2, 2), _MOST**2)):
-            given = getattr(self, name)
-            if given is not None:
-                _check(f"Start: {name}", given, f"finite and of shape {shape}", _is_array(given, shape, largest))
-        for name, pair in self.position_cross.items():
-            _check(f"Start: position_cross of {name}", pair, "two finite numbers", _is_array(pair, (2,), _MOST**2))
-        for name, least in _START_NUMBERS:
-            value = getattr(self, name)
-            if type(value) is float and least <= value <= _MOST:  # nearly always
+        given = {name: getattr(self, name) for name in _START_NAMES}
+        given |= {f"position_cross of {name}": pair for name, pair in self.position_cross.items()}
+        for name, value in given.items():
+            if value is None and name in _MAY_BE_NONE:
                 continue
-            if value is not None or name not in _MAY_BE_UNKNOWN:
-                rule = "finite" if least else "finite and not negative"
-                _check(f"Start: {name}", value, f"{rule}, and at most {_MOST:g}", is_number(value, least, _MOST))
+            shape = _SHAPES.get(name.partition(" ")[0], ())
+            least = 0.0 if "_std_" in name else -_MOST
+            rule = f"finite{'' if least else ' and not negative'}, of shape {shape} and at most {_MOST:g}"
+            _check(f"Start: {name}", value, rule, _is_array(value, shape, least))
 
 
-_MOST = LARGEST**2
+_MOST = LARGEST**4
 """No number of a start is larger: products of what is measured and configured are not, and its square is finite."""
-_START_NUMBERS = (
-    *((name, -_MOST) for name in ("yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2")),
-    *((name, 0.0) for name in ("position_std_m", "yaw_std_rad", "speed_std_mps")),
-    *((name, 0.0) for name in ("yaw_rate_std_radps", "accel_std_mps2")),
-)
-"""Fields of `Start`, and the smallest value of each."""
-_MAY_BE_UNKNOWN = ("yaw_rad", "yaw_std_rad")
+_START_NAMES = tuple(each.name for each in fields(Start) if each.name not in ("stamp_ns", "position_cross"))
+_SHAPES = {"position_m": (2,), "position_covariance": (2, 2), "position_cross": (2,)}
+_MAY_BE_NONE = ("position_covariance", "yaw_rad", "yaw_std_rad")
 
 
 def _check(name: str, value: object, rule: str, holds: bool) -> None:
@@ -214,13 +206,13 @@ def _check(name: str, value: object, rule: str, holds: bool) -> None:
         raise CallError(f"{name}: must be {rule}, is {value!r}")
 
 
-def _is_array(value: object, shape: tuple[int, ...], largest: float) -> bool:
-    """True if it has this shape, and numbers of a magnitude up to `largest`."""
+def _is_array(value: object, shape: tuple[int, ...], least: float) -> bool:
+    """True if it has this shape, and numbers from `least` to `_MOST`."""
     try:
         array = np.asarray(value)
     except ValueError:  # rows of several lengths
         return False
-    return array.shape == shape and array.dtype.kind in "fiu" and bool((np.abs(array) <= largest).all())
+    return array.shape == shape and array.dtype.kind in "fiu" and bool(((least <= array) & (array <= _MOST)).all())
 
 
 @dataclass(frozen=True, slots=True)

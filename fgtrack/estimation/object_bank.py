@@ -20,8 +20,7 @@ from fgtrack.estimation.base import (
 )
 from fgtrack.estimation.failures import EstimatorError
 from fgtrack.estimation.filters.ekf import predict
-from fgtrack.estimation.filters.propagation import track_state
-from fgtrack.estimation.present import PresentStates
+from fgtrack.estimation.filters.propagation import PresentStates, track_state
 from fgtrack.models.motion import MotionModel
 
 _E = TypeVar("_E", bound=Estimator)

@@ -10,16 +10,8 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import period_ns, seconds
 from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.failures import Failures
-from fgtrack.estimation.filters.backward_forward import BackwardForwardBank
 from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator
-from fgtrack.estimation.filters.published import (
-    AcceleratedEulerCtrv,
-    LeadingClock,
-    LeadingClockStalePresent,
-    SaturatedAcceleratedEulerCtrv,
-    SaturatedEulerCtrv,
-    StalePresent,
-)
+from fgtrack.estimation.filters.published import PublishedStorage, SaturatedEulerCtrv
 from fgtrack.estimation.filters.track_initiation import initiated
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
 from fgtrack.estimation.registry import estimator_bank
@@ -42,19 +34,7 @@ from fgtrack.tracking.published import (
 )
 from fgtrack.tracking.tracker import Tracker, TrackerParts
 
-_EULER = {
-    (False, False): EulerCtrv,
-    (False, True): AcceleratedEulerCtrv,
-    (True, False): SaturatedEulerCtrv,
-    (True, True): SaturatedAcceleratedEulerCtrv,
-}
 _EGO_STORAGE_TICKS = 350  # of the published implementation
-_STORAGE = {
-    (False, False): BackwardForwardBank,
-    (False, True): StalePresent,
-    (True, False): LeadingClock,
-    (True, True): LeadingClockStalePresent,
-}
 
 
 def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerParts] | None = None) -> Tracker:
@@ -122,13 +102,14 @@ def _read_map(name: str, built_in: Callable[[], TrackMap]) -> TrackMap:
 
 def _build_backward_forward(config: Config, failures: Failures) -> TrackBank:
     step_ns = period_ns(config.filter.frequency_hz)
-    storage = _STORAGE["leading_clock" in config.defects, "stale_present" in config.defects]
+    leads, is_stale = "leading_clock" in config.defects, "stale_present" in config.defects
     steps = round(config.filter.storage_s * config.filter.frequency_hz)
 
     def bank() -> TrackBank:
-        return storage(build_propagator(config, seconds(step_ns)), step_ns, steps)
+        propagator = build_propagator(config, seconds(step_ns))
+        return PublishedStorage(propagator, step_ns, steps, leads=leads, is_stale=is_stale)
 
-    if config.map.track_file is not None or storage is not BackwardForwardBank:
+    if config.map.track_file is not None or leads or is_stale:
         return bank()
     motion = config.motion_model()  # without a map a track may begin in any direction, each at its own time
 
@@ -181,7 +162,8 @@ def build_propagator(config: Config, step_s: float) -> ExactPropagator:
     density = np.array([noise.std_per_s[name] ** 2 / NOISE_HZ for name in names])
     if "noise_per_step" in config.defects:
         density *= NOISE_HZ * step_s
-    return _EULER["saturated_yaw" in config.defects, noise.is_driven](motion, density)
+    make = SaturatedEulerCtrv if "saturated_yaw" in config.defects else EulerCtrv
+    return make(motion, density, accelerates=noise.is_driven)
 
 
 def _build_ego(config: Config) -> EgoTrajectory:

@@ -12,7 +12,7 @@ from fgtrack.core.linalg import kernels
 from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import EstimatorError, Failure, Failures
-from fgtrack.estimation.present import PresentStates
+from fgtrack.estimation.filters.propagation import PresentStates
 
 _T = TypeVar("_T")
 

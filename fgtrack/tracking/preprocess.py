@@ -62,18 +62,12 @@ class Candidate(NamedTuple):
         """Measured components by name, in the map frame."""
         return dict(zip(self.measurement.model.components, self.measurement.z.tolist(), strict=True))
 
-    def noise_at(self, x: FloatArray) -> FloatArray:
-        """Covariance of the measurement of an object at the states `x` (..., n), (..., k, k) or (k, k) for all."""
+    def measurement_at(self, x: FloatArray) -> Measurement:
+        """The measurement of an object at the state `x` (n,); its R is (..., k, k) at states (..., n)."""
         own = self.measurement
         if self.pose_error is None or not own.model.relative:
-            return own.R
-        return self.pose_error.noise(own.model, own.pose, x)
-
-    def measurement_at(self, x: FloatArray) -> Measurement:
-        """The measurement of an object at the state `x`, shape (n,)."""
-        if self.pose_error is None or not self.measurement.model.relative:
-            return self.measurement
-        return replace(self.measurement, R=self.noise_at(x))
+            return own
+        return replace(own, R=self.pose_error.noise(own.model, own.pose, x))
 
 
 class Preprocess:

@@ -24,8 +24,8 @@ from fgtrack.core.types import (
 from fgtrack.estimation.base import Start, StatesAt, TrackBank, UpdateResult, UpdateStatus, no_states
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.ekf import correct_one, propagated
+from fgtrack.estimation.filters.propagation import PresentStates
 from fgtrack.estimation.object_bank import states_of
-from fgtrack.estimation.present import PresentStates
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
 from fgtrack.estimation.filters.backward_forward import BackwardForwardBank
-from fgtrack.estimation.filters.ekf import correct
+from fgtrack.estimation.filters.ekf import correct, linearised
 from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator
-from fgtrack.estimation.filters.published import LeadingClock, StalePresent
+from fgtrack.estimation.filters.published import PublishedStorage
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV
 
@@ -240,8 +240,9 @@ class NaiveBank:
         places = self.nearest(stamp_ns)
         for track_id, m in zip(track_ids, measurements, strict=True):
             track, place = self.tracks[track_id], places[track_id]
+            mean = track.means[place][None]
             done = correct(
-                track.means[place][None], track.covariances[place][None], m.z[None], m.R[None], m.model, m.pose
+                mean, track.covariances[place][None], *linearised(m.z[None], mean, m.model, m.pose), m.R[None]
             )
             steps = len(track.means) - 1 - place
             del track.stamps_ns[place + 1 :], track.means[place:], track.covariances[place:]
@@ -300,14 +301,14 @@ def test_any_history_of_operations_is_that_of_a_bank_of_lists(seed: int, length:
 
 
 def test_a_leading_clock_reaches_now_or_leads_by_less_than_a_step_and_never_waits() -> None:
-    made = LeadingClock(euler(), STEP_NS, 20)
+    made = PublishedStorage(euler(), STEP_NS, 20, leads=True, is_stale=False)
     for now_ms, lead_ms in [(0, 0), (20, 20), (33, 40), (34, 50), (50, 60), (60, 70), (200, 200)]:
         made.advance(START_NS + ms(now_ms))
         assert made.present_ns == START_NS + ms(lead_ms)
 
 
 def test_a_stale_storage_keeps_the_prior_of_an_update_without_delay() -> None:
-    made = StalePresent(euler(), STEP_NS, 20)
+    made = PublishedStorage(euler(), STEP_NS, 20, leads=False, is_stale=True)
     made.advance(START_NS)
     made.birth(0, prior(START_NS))
     made.update(START_NS, [0], [position(START_NS, 1.0)])

@@ -84,11 +84,10 @@ def test_the_noise_grows_by_the_numeric_derivative(seen: dict[str, float], frame
     [found] = candidates(EGO._replace(covariance=P), seen, frame=frame, motion=motion)
     J = by_the_ego(x, [seen], frame, motion=motion)
     assert np.abs(J).max() > 0.5
-    np.testing.assert_allclose(found.noise_at(x) - plain.measurement.R, J @ P @ J.T, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(found.measurement_at(x).R - plain.measurement.R, J @ P @ J.T, rtol=1e-5, atol=1e-9)
     several = np.array([x, x + 1.0, x - 2.0])
-    stacked = np.broadcast_to(found.noise_at(several), (3, len(J), len(J)))
-    np.testing.assert_allclose(stacked, [found.noise_at(one) for one in several], rtol=1e-12)
-    np.testing.assert_array_equal(found.measurement_at(x).R, found.noise_at(x))
+    stacked = np.broadcast_to(found.measurement_at(several).R, (3, len(J), len(J)))
+    np.testing.assert_allclose(stacked, [found.measurement_at(one).R for one in several], rtol=1e-12)
     np.testing.assert_array_equal(found.measurement.z, plain.measurement.z)
 
 
@@ -121,7 +120,7 @@ def test_a_bearing_alone_knows_the_error_of_the_yaw_and_at_a_state_that_of_the_p
     assert found.measurement.R[0] == pytest.approx([1e-4 + 1e-4], rel=1e-5)
     pose = found.measurement.pose
     at = np.array([pose.x_m + 10.0, pose.y_m, 0.0, 0.0, 0.0])
-    assert float(found.noise_at(at)[0, 0]) > 1e-4 + 0.0025 + 1e-4 * (1.0 - 0.4) ** 2
+    assert float(found.measurement_at(at).R[0, 0]) > 1e-4 + 0.0025 + 1e-4 * (1.0 - 0.4) ** 2
 
 
 @pytest.mark.parametrize("covariance", [None, P])
@@ -151,6 +150,6 @@ def test_a_lasting_error_of_the_sensor_and_that_of_the_ego_stand_side_by_side(se
     preprocess = Preprocess(Road(), NoMerge(), motion, ORIGIN_M)
     [[found], _] = preprocess(batch(Detection(**seen)), lasting, EGO._replace(covariance=P))
     x = np.array([130.0, 70.0, 2.0, 15.0, 0.1, 0.5, -0.5])
-    whole = whole_error(found.measurement.model, found.noise_at(x))
-    np.testing.assert_allclose(whole, plain.noise_at(x[:5]), rtol=1e-12)
+    whole = whole_error(found.measurement.model, found.measurement_at(x).R)
+    np.testing.assert_allclose(whole, plain.measurement_at(x[:5]).R, rtol=1e-12)
     np.testing.assert_allclose(found.position_covariance, plain.position_covariance, rtol=1e-12)

@@ -8,13 +8,7 @@ from support.models import MODELS
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator
-from fgtrack.estimation.filters.published import (
-    YAW_LIMIT_RAD,
-    AcceleratedEulerCtrv,
-    SaturatedAcceleratedEulerCtrv,
-    SaturatedEulerCtrv,
-    published_yaw,
-)
+from fgtrack.estimation.filters.published import YAW_LIMIT_RAD, SaturatedEulerCtrv, published_yaw
 from fgtrack.models.motion import CTRA, CTRV, MotionModel
 
 ISOTROPIC = np.array([4e-4, 4e-4, 9e-4, 1e-2, 2.5e-3])
@@ -52,9 +46,9 @@ def naive_step(
 
 PROPAGATORS = {
     "free": (EulerCtrv, CTRV(), False, math.inf),
-    "accelerated": (AcceleratedEulerCtrv, CTRA(), True, math.inf),
+    "accelerated": (EulerCtrv, CTRA(), True, math.inf),
     "saturated": (SaturatedEulerCtrv, CTRV(), False, YAW_LIMIT_RAD),
-    "both": (SaturatedAcceleratedEulerCtrv, CTRA(), True, YAW_LIMIT_RAD),
+    "both": (SaturatedEulerCtrv, CTRA(), True, YAW_LIMIT_RAD),
 }
 
 
@@ -69,9 +63,10 @@ def test_all_euler_steps_at_once_are_the_steps_one_by_one(
     if motion.dim == 6:
         density = np.append(density, 9e-2)
     x, P = random_states(np.random.default_rng(seed), len(steps), motion.dim)
-    x = make(motion, density).wrap(x)
+    propagator = make(motion, density, accelerates=driving)
+    x = propagator.wrap(x)
     before = x.copy(), P.copy()
-    means, covariances = make(motion, density).propagate(x, P, np.array(steps), 0.01)
+    means, covariances = propagator.propagate(x, P, np.array(steps), 0.01)
     assert means.shape == x.shape
     assert np.array_equal(x, before[0])
     assert np.array_equal(P, before[1])

@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement
-from fgtrack.estimation.filters.ekf import correct, correct_one
+from fgtrack.estimation.filters.ekf import correct, correct_one, linearised
 from fgtrack.estimation.registry import ESTIMATORS, Claims, estimator
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
@@ -87,13 +87,12 @@ def test_a_redescending_loss_ignores_what_is_hopeless() -> None:
 
 def test_a_stack_of_states_is_weighted_one_by_one() -> None:
     items = [seen(0.2, RobustLoss("huber", 1.0)), seen(6.0, RobustLoss("huber", 1.0)), seen(6.0, None)]
+    means = np.array([MEAN] * 3)
     stacked = correct(
-        np.array([MEAN] * 3),
+        means,
         np.array([P] * 3),
-        np.array([item.z for item in items]),
+        *linearised(np.array([item.z for item in items]), means, POSITION, items[0].pose),
         np.array([item.R for item in items]),
-        POSITION,
-        items[0].pose,
         losses=[item.loss for item in items],
     )
     for row, item in enumerate(items):

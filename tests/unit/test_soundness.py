@@ -7,7 +7,7 @@ import pytest
 
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.failures import Failure
-from fgtrack.estimation.present import PresentStates
+from fgtrack.estimation.filters.propagation import PresentStates
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.tracking.guarded_bank import faults
 

@@ -17,9 +17,8 @@ from fgtrack.core.time import nanoseconds, period_ns, seconds
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.filters.ekf import correct
-from fgtrack.estimation.filters.propagation import ExactPropagator
-from fgtrack.estimation.present import PresentStates
+from fgtrack.estimation.filters.ekf import correct, linearised
+from fgtrack.estimation.filters.propagation import ExactPropagator, PresentStates
 from fgtrack.models.motion import MotionModel
 
 
@@ -186,7 +185,8 @@ class BackwardForwardBank:
         model, pose, measured = measurements[0].model, measurements[0].pose, measurements[0].measured
         residual = partial(self._propagator.residual, model)
         losses = [measurement.loss for measurement in measurements]
-        corrected = correct(means, covariances, z, R, model, pose, residual, measured, losses)
+        y, H = linearised(z, means, model, pose, residual)
+        corrected = correct(means, covariances, y, H, R, measured, losses)
         wrapped = self._propagator.wrap(corrected.mean)
         fused = corrected.fused.tolist()
         results = []

@@ -154,34 +154,17 @@ def predict_across(
 def correct(
     mean: FloatArray,
     covariance: FloatArray,
-    z: FloatArray,
-    R: FloatArray,
-    model: MeasurementModel,
-    pose: SensorPose,
-    residual: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
-    measured: Sequence[int] | None = None,
-    losses: Sequence[RobustLoss | None] = (),
-) -> Correction:
-    """Fuse z (m, k) with covariance R (m, k, k) into m states (Karle et al. 2023, eqs. 5 to 9).
-
-    `residual` may take the place of the model's own; `measured` is `Measurement.measured`, for the NIS; `losses`, none
-    or m of them, are those of the measurements (see `robust_weight`). The posterior covariance is in Joseph form.
-    """
-    return correct_with_innovation(
-        mean, covariance, *linearised(z, mean, model, pose, residual), R=R, measured=measured, losses=losses
-    )
-
-
-def correct_with_innovation(
-    mean: FloatArray,
-    covariance: FloatArray,
     y: FloatArray,
     H: FloatArray,
     R: FloatArray,
     measured: Sequence[int] | None = None,
     losses: Sequence[RobustLoss | None] = (),
 ) -> Correction:
-    """Fuse the innovations y (m, k) of measurements with Jacobians H (m, k, n) or (k, n)."""
+    """Fuse innovations y (m, k) of measurements with Jacobians H (m, k, n) or (k, n) and covariances R (m, k, k).
+
+    Karle et al. 2023, eqs. 5 to 9, on m states. `measured` is `Measurement.measured`, for the NIS; `losses`, none or m
+    of them, are those of the measurements (see `robust_weight`). The posterior covariance is in Joseph form.
+    """
     rows = np.arange(y.shape[-1]) if measured is None else np.array(measured, dtype=np.int64)
     x, P, y, R = (np.array(each, dtype=np.float64, order="C") for each in (mean, covariance, y, R))
     H = np.array(H, dtype=np.float64, order="C", ndmin=3)
@@ -210,9 +193,7 @@ def updated_one(
 
     Raises `numpy.linalg.LinAlgError` for one that cannot be fused.
     """
-    x, P, y, nis, w, S, fused = correct_with_innovation(
-        mean[None], covariance[None], y[None], H, R[None], measured, [loss]
-    )
+    x, P, y, nis, w, S, fused = correct(mean[None], covariance[None], y[None], H, R[None], measured, [loss])
     if not fused[0]:
         raise np.linalg.LinAlgError("innovation covariance not positive definite, or posterior not finite")
     return OneCorrection(x[0], P[0], y[0], float(nis[0]), float(w[0]), S[0])

@@ -1,12 +1,13 @@
-"""Propagators: many objects through equal time steps, each through its own number of them."""
+"""Propagators of many objects through equal time steps, and the kinematic states that a bank gives."""
 
 import math
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.linalg import kernels
-from fgtrack.core.types import YAW, FloatArray, IntArray, TrackState
+from fgtrack.core.types import YAW, FloatArray, IntArray, SmoothedReport, TrackState
 from fgtrack.estimation.filters.ekf import predict
 from fgtrack.models.measurement import MeasurementModel
 from fgtrack.models.motion import MotionModel
@@ -45,15 +46,18 @@ class EulerCtrv(ExactPropagator):
     States beyond the yaw rate are carried along unchanged, and so is their noise.
     """
 
-    accelerates = False
-    """True if an acceleration drives the speed."""
     yaw_limit_rad = math.inf
     """Largest yaw that a step gives."""
 
-    def __init__(self, motion: MotionModel, density: FloatArray) -> None:
-        """`density`: diagonal of Q per second, shape (n,), along and across the heading first."""
+    def __init__(self, motion: MotionModel, density: FloatArray, *, accelerates: bool = False) -> None:
+        """`density`: diagonal of Q per second, shape (n,), along and across the heading first.
+
+        `accelerates`: the acceleration is a state that drives the speed but is absent from the transition matrix
+        (defect Q5 of the published implementation).
+        """
         super().__init__(motion)
         self._density = np.array(density, dtype=np.float64)
+        self._accelerates = accelerates
 
     def propagate(
         self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
@@ -62,7 +66,7 @@ class EulerCtrv(ExactPropagator):
         euler = kernels("fgtrack.estimation.kernels.euler")
         x, P = (np.array(each, dtype=np.float64, order="C") for each in (mean, covariance))
         counts = np.array(steps, dtype=np.int64)
-        euler.propagate(x, P, counts, dt_s, self._density, self.accelerates, self.yaw_limit_rad)
+        euler.propagate(x, P, counts, dt_s, self._density, self._accelerates, self.yaw_limit_rad)
         return x, P
 
 
@@ -85,3 +89,49 @@ def wrapped_yaw(mean: FloatArray) -> FloatArray:
     found = mean.copy()
     found[..., YAW] = wrapped
     return found
+
+
+class PresentStates(list[TrackState]):
+    """Kinematic states of several tracks at one stamp, and the arrays that they are views of.
+
+    Parameters
+    ----------
+    motion
+        The motion model.
+    stamp_ns
+        Their stamp.
+    means, covariances
+        In the model's own form, shapes (m, n) and (m, n, n).
+    """
+
+    def __init__(self, motion: MotionModel, stamp_ns: int, means: FloatArray, covariances: FloatArray) -> None:
+        self.means, self.covariances = _kinematic(motion, means, covariances)
+        rows = zip(self.means, self.covariances, strict=True)
+        super().__init__([TrackState(stamp_ns, mean, covariance) for mean, covariance in rows])
+
+
+def smoothed_reports(
+    motion: MotionModel,
+    track_ids: Iterable[int],
+    stamps_ns: Iterable[int],
+    means: FloatArray,
+    covariances: FloatArray,
+    lag_s: float | None = None,
+) -> list[SmoothedReport]:
+    """Reports of m states of `motion`, shapes (m, n) and (m, n, n): final ones, or those `lag_s` before the present."""
+    rows = zip(track_ids, stamps_ns, *_kinematic(motion, means, covariances), strict=True)
+    return [SmoothedReport(track_id, TrackState(stamp_ns, x, P), lag_s) for track_id, stamp_ns, x, P in rows]
+
+
+def final_reports(motion: MotionModel, states: Sequence[tuple[int, TrackState]]) -> list[SmoothedReport]:
+    """Reports of final states in the form of `motion`, each with its track."""
+    if not states:
+        return []
+    track_ids, final = zip(*states, strict=True)
+    means, covariances = np.array([each.mean for each in final]), np.array([each.covariance for each in final])
+    return smoothed_reports(motion, track_ids, [each.stamp_ns for each in final], means, covariances)
+
+
+def _kinematic(motion: MotionModel, means: FloatArray, covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
+    means, covariances = motion.kinematic(means, covariances)
+    return wrapped_yaw(means), covariances

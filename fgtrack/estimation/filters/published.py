@@ -8,7 +8,7 @@ import numpy as np
 from fgtrack.core.geometry import TWO_PI
 from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.filters.backward_forward import BackwardForwardBank
-from fgtrack.estimation.filters.propagation import EulerCtrv
+from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator
 from fgtrack.models.measurement import MeasurementModel
 
 #: The published yaw range in REP-103 is (YAW_LIMIT - 2 pi, YAW_LIMIT].
@@ -25,14 +25,8 @@ def published_yaw(yaw_rad: FloatArray) -> FloatArray:
     return one_turn(yaw_rad - 0.5 * np.pi) + 0.5 * np.pi
 
 
-class AcceleratedEulerCtrv(EulerCtrv):
-    """The acceleration is a state that drives the speed but is absent from the transition matrix (defect Q5)."""
-
-    accelerates = True
-
-
-class SaturatedYaw:
-    """Mix-in: the predicted yaw sticks at the upper end of its range, and runs on below the lower one (defect Q2)."""
+class SaturatedEulerCtrv(EulerCtrv):
+    """The predicted yaw sticks at the upper end of its range, and runs on below the lower one (defect Q2)."""
 
     yaw_limit_rad = YAW_LIMIT_RAD
 
@@ -53,19 +47,24 @@ class SaturatedYaw:
         return y
 
 
-class SaturatedEulerCtrv(SaturatedYaw, EulerCtrv):
-    """CTRV in Euler steps with a yaw that sticks (defect Q2)."""
+class PublishedStorage(BackwardForwardBank):
+    """The published object storage.
 
+    With `leads` the tracking time leads the clock by up to one step, and never waits (defect Q14). With `is_stale` an
+    update that is not delayed does not reach the stored present state (defect Q8).
+    """
 
-class SaturatedAcceleratedEulerCtrv(SaturatedYaw, AcceleratedEulerCtrv):
-    """The published motion: defects Q2 and Q5 together."""
-
-
-class LeadingClock(BackwardForwardBank):
-    """The tracking time leads the clock by up to one step, and never waits (defect Q14)."""
+    def __init__(
+        self, propagator: ExactPropagator, step_ns: int, storage_steps: int, *, leads: bool, is_stale: bool
+    ) -> None:
+        super().__init__(propagator, step_ns, storage_steps)
+        self._leads, self._is_stale = leads, is_stale
 
     def advance(self, now_ns: int) -> None:
-        """Advance by at least one step, and as far as it takes to reach `now_ns`."""
+        """See `BackwardForwardBank.advance`; a leading clock advances by at least one step, up to `now_ns` or more."""
+        if not self._leads:
+            super().advance(now_ns)
+            return
         if self._now_ns is None:
             self._grid_ns = now_ns
         else:
@@ -73,13 +72,5 @@ class LeadingClock(BackwardForwardBank):
             self._advance_steps(max(-(-elapsed_ns // self._step_ns), 1))
         self._now_ns = self._grid_ns
 
-
-class StalePresent(BackwardForwardBank):
-    """An update that is not delayed does not reach the stored present state (defect Q8)."""
-
     def _visible_from(self, back: int) -> int:
-        return self._grid - back if back else self._grid + 1
-
-
-class LeadingClockStalePresent(LeadingClock, StalePresent):
-    """The published object storage: defects Q8 and Q14 together."""
+        return self._grid + 1 if self._is_stale and not back else self._grid - back

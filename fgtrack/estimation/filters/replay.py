@@ -9,7 +9,7 @@ from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import OneCorrection, Prediction, correct_one, predict_across
-from fgtrack.estimation.filters.initiation import DEFAULT, checked_initiation
+from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.filters.propagation import track_state, wrapped
 from fgtrack.estimation.filters.track_initiation import TrackInitiation
 from fgtrack.estimation.filters.windowed import WindowedFilter
@@ -58,7 +58,7 @@ class ReplayEkf(WindowedFilter):
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float, initiation: str = DEFAULT) -> None:
         super().__init__(motion, prior, lag_s)
         x, P = initial_state(motion, prior)
-        search = TrackInitiation.of(motion, prior, checked_initiation(initiation))
+        search = TrackInitiation.of(motion, prior, initiation)
         self.steps = [Step(prior.stamp_ns, None, x, P, Prediction(x, P, P), search)]
         """The steps of the window and the one that it is replayed from, by stamp and content."""
 
@@ -123,7 +123,7 @@ class ReplayEkf(WindowedFilter):
         search = None if before.search is None else before.search.with_measurement(measurement)
         if search is not None and search.line is not None:
             mean, covariance = search.state()
-        return Step(measurement.stamp_ns, measurement, self._wrapped(mean), covariance, predicted, search)
+        return Step(measurement.stamp_ns, measurement, wrapped(self._motion, mean), covariance, predicted, search)
 
     def _retrodicted(self, new: Step, later: Sequence[Step]) -> tuple[FloatArray, FloatArray]:
         """State (n,), (n, n) at the `new` measurement, given all that was fused before it, also the `later` steps.

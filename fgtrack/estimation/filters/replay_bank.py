@@ -10,9 +10,9 @@ from fgtrack.core.linalg import equal_ones, kernels
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus
 from fgtrack.estimation.filters.ekf import Prediction
+from fgtrack.estimation.filters.propagation import PresentStates
 from fgtrack.estimation.filters.replay import ReplayEkf, Step
 from fgtrack.estimation.object_bank import ObjectBank
-from fgtrack.estimation.present import PresentStates
 from fgtrack.models.measurement import MeasurementModel, measurement_model
 from fgtrack.models.motion import WhiteNoise
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.geometry import cartesian, polar, wrap_angle
+from fgtrack.core.geometry import cartesian, polar
 from fgtrack.core.linalg import product
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
@@ -25,6 +25,7 @@ from fgtrack.estimation.filters.initiation import (
     sought,
     straight_line,
 )
+from fgtrack.estimation.filters.propagation import wrapped
 from fgtrack.estimation.rts import rts_step
 from fgtrack.models.motion import MotionModel
 
@@ -63,12 +64,13 @@ class TrackInitiation:
     """Through the fixes; None where they are of one time."""
 
     @classmethod
-    def of(cls, motion: MotionModel, start: Start, method: Initiation) -> "TrackInitiation | None":
-        """Before the first measurement; None where no direction is sought."""
-        if not sought(motion, start, method):
+    def of(cls, motion: MotionModel, start: Start, method: str) -> "TrackInitiation | None":
+        """Before the first measurement; None where no direction is sought. Raises `CallError` for another `method`."""
+        checked = checked_initiation(method)
+        if not sought(motion, start, checked):
             return None
         x, P = initial_state(motion, start)
-        return cls(motion, start, method, fixes=(Fix(0.0, x[:2], P[:2, :2]),))
+        return cls(motion, start, checked, fixes=(Fix(0.0, x[:2], P[:2, :2]),))
 
     def with_measurement(self, measurement: Measurement) -> "TrackInitiation | None":
         """With one more measurement, the newest; None where the direction is known, or sought no more."""
@@ -131,9 +133,7 @@ class TrackInitiation:
             if after.stamp_ns == stamp_ns:
                 break
             if before.stamp_ns < after.stamp_ns:
-                shift = mean - after.predicted.mean
-                if not self.motion.cartesian:
-                    shift[YAW] = wrap_angle(shift[YAW])
+                shift = wrapped(self.motion, mean - after.predicted.mean)
                 mean, covariance, _ = rts_step(before.mean, before.covariance, after.predicted, shift, covariance)
         return mean, covariance
 
@@ -193,7 +193,7 @@ class TrackInitiation:
 
 def initiated(motion: MotionModel, start: Start, method: str, make: Callable[[Start], Estimator]) -> Estimator:
     """Return what `make` gives for `start`, by itself or as `Initiated`. Raises `CallError` for an unknown `method`."""
-    search = TrackInitiation.of(motion, start, checked_initiation(method))
+    search = TrackInitiation.of(motion, start, method)
     return make(start) if search is None else Initiated(search, make)
 
 

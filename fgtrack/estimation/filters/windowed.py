@@ -4,9 +4,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
-from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
 from fgtrack.estimation.filters.ekf import OneCorrection
 from fgtrack.models.motion import MotionModel
@@ -27,7 +25,6 @@ class WindowedFilter(ABC):
 
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
         self._motion = motion
-        self._yawed = "yaw_rad" in motion.state_names
         self._lag_ns = nanoseconds(lag_s)
         self._start_ns = self._newest_ns = prior.stamp_ns
 
@@ -71,10 +68,3 @@ class WindowedFilter(ABC):
     @abstractmethod
     def _forget_before(self, stamp_ns: int) -> None:
         """Drop what is not needed for stamps from `stamp_ns` on."""
-
-    def _wrapped(self, mean: FloatArray) -> FloatArray:
-        """A copy of `mean` (n,) with the yaw in (-pi, pi]."""
-        mean = mean.copy()
-        if self._yawed:
-            mean[YAW] = wrap_angle(mean[YAW])
-        return mean

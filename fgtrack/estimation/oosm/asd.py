@@ -10,6 +10,7 @@ from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import OneCorrection, propagated
+from fgtrack.estimation.filters.propagation import track_state
 from fgtrack.estimation.filters.windowed import WindowedFilter
 from fgtrack.estimation.interpolation import between
 from fgtrack.estimation.oosm.crossing import Past, fuse_across
@@ -57,7 +58,7 @@ class AccumulatedStateDensity(WindowedFilter):
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: smoothed, from all measurements."""
         stack, block = self._with_state(stamp_ns)
-        return TrackState(stamp_ns, self._wrapped(stack.mean[block]), stack.covariance[block, block].copy())
+        return track_state(self._motion, stamp_ns, stack.mean[block].copy(), stack.covariance[block, block].copy())
 
     def _forget_before(self, stamp_ns: int) -> None:
         stamps_ns, mean, covariance = self._stack

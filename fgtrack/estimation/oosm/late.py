@@ -12,7 +12,7 @@ from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import OneCorrection, correct_one, linearised, predict, propagated
-from fgtrack.estimation.filters.propagation import track_state
+from fgtrack.estimation.filters.propagation import track_state, wrapped
 from fgtrack.estimation.filters.windowed import WindowedFilter
 from fgtrack.models.motion import MotionModel
 
@@ -57,7 +57,7 @@ class LateEkf(WindowedFilter):
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: predicted from the last stored step before that stamp."""
         step = self._steps[self._left(stamp_ns)]
-        moved = self._moved(self._wrapped(step.mean), step.covariance, step.stamp_ns, stamp_ns)
+        moved = self._moved(wrapped(self._motion, step.mean), step.covariance, step.stamp_ns, stamp_ns)
         return track_state(self._motion, stamp_ns, *moved)
 
     def _forget_before(self, stamp_ns: int) -> None:

@@ -14,8 +14,7 @@ from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, 
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
-from fgtrack.estimation.filters.propagation import track_state
-from fgtrack.estimation.present import PresentStates, final_reports, smoothed_reports
+from fgtrack.estimation.filters.propagation import PresentStates, final_reports, smoothed_reports, track_state
 from fgtrack.estimation.smoothing.nodes import grown
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver
