@@ -10,6 +10,7 @@ import fgtrack
 from fgtrack.core.geometry import rotation, wrap_angle
 from fgtrack.core.types import YAW
 from fgtrack.estimation.base import Estimator, Measurement, Start
+from fgtrack.estimation.filters.backward_forward import BackwardForwardBank
 from fgtrack.estimation.filters.track_initiation import MOST_MEASUREMENTS, Initiated
 from fgtrack.estimation.registry import ESTIMATORS, Claims, start_estimator
 from fgtrack.models.motion import CTRV, MotionModel
@@ -118,7 +119,5 @@ def test_the_configuration_says_it_for_all_tracks(name: str, method: str) -> Non
 
 
 def test_on_a_map_backward_forward_stays_one_bank_for_all_objects() -> None:
-    assert (
-        type(build_bank(Config(estimator="ekf-backward-forward", map=MapConfig(track="oval")))).__name__
-        == "BackwardForwardBank"
-    )
+    bank = build_bank(Config(estimator="ekf-backward-forward", map=MapConfig(track="oval")))
+    assert isinstance(bank, BackwardForwardBank)
