@@ -7,7 +7,7 @@ from enum import StrEnum
 from traceback import format_exception
 from typing import Any
 
-__all__ = ["EndedTrack", "EstimatorError", "Failure", "Failures"]
+__all__ = ["EstimatorError", "Failure", "Failures"]
 
 _MOST_ENDED = 100
 
@@ -51,24 +51,13 @@ class EstimatorError(Exception):
         self.causes, self.answers = causes, answers
 
 
-@dataclass(frozen=True)
-class EndedTrack:
-    """A track that a failure has ended."""
-
-    track_id: int
-    now_ns: int
-    """Time of the tick."""
-    failure: Failure
-    """The failure after which it ended."""
-
-
 @dataclass
 class Failures:
     """Counts by kind, shared by all that may fail in one tracker."""
 
     counts: Counter[Failure] = field(default_factory=Counter)
-    ended: list[EndedTrack] = field(default_factory=list)
-    """Tracks that failures have ended, the first hundred."""
+    ended: list[dict[str, int | str]] = field(default_factory=list)
+    """Tracks that failures have ended, the first hundred, as in meta.json."""
     first: str | None = None
     """Message of the first failure, in a line."""
     last: str | None = None
@@ -82,7 +71,7 @@ class Failures:
         """Count a track that ends."""
         self.add(Failure.TRACK_ENDED)
         if len(self.ended) < _MOST_ENDED:
-            self.ended.append(EndedTrack(track_id, now_ns, failure))
+            self.ended.append({"track_id": track_id, "now_ns": now_ns, "failure": failure.value})
 
     def note(self, what: str | Exception) -> None:
         """Remember what a failure said, or the exception that it was."""
@@ -97,7 +86,5 @@ class Failures:
         return {
             "failures": {failure.value: self.counts[failure] for failure in Failure},
             "first_failure": self.first,
-            "ended_by_failure": [
-                {"track_id": one.track_id, "now_ns": one.now_ns, "failure": one.failure.value} for one in self.ended
-            ],
+            "ended_by_failure": list(self.ended),
         }

@@ -138,31 +138,23 @@ class Hypotheses:
         self._alive = left
 
 
-Wanted = int | Sequence[Start]
-"""Several starts, or a number of headings."""
-
-
-def hypotheses(motion: MotionModel, start: Start, wanted: Wanted, make: Callable[[Start], Estimator]) -> Estimator:
+def hypotheses(
+    motion: MotionModel, start: Start, wanted: int | Sequence[Start], make: Callable[[Start], Estimator]
+) -> Estimator:
     """Return what `make` gives for `start`, or `Hypotheses`: one for each of the `wanted` starts, or of so many
     headings where the start has none and `motion` needs one.
 
     Raises `CallError` for starts of different stamps, and for a number below 1.
     """
-    given = _given(motion, start, wanted)
-    return make(start) if given is None else Hypotheses(motion, [make(each) for each in given])
-
-
-def _given(motion: MotionModel, start: Start, wanted: Wanted) -> Sequence[Start] | None:
-    """The starts of the hypotheses; None where there is only `start`."""
     if isinstance(wanted, int):
         if wanted < 1:
             raise CallError(f"hypotheses: must be at least 1, is {wanted}")
         if wanted == 1 or motion.linear or start.yaw_rad is not None:
-            return None
-        return starts.headings(start, wanted)
+            return make(start)
+        wanted = starts.headings(start, wanted)
     if any(each.stamp_ns != start.stamp_ns for each in wanted):
         raise CallError("hypotheses: give starts of one and the same stamp, that of the start itself")
-    return wanted
+    return Hypotheses(motion, [make(each) for each in wanted])
 
 
 def _log_density(y: FloatArray, S: FloatArray) -> float:

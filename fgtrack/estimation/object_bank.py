@@ -1,6 +1,7 @@
 """A bank of independent estimators, and the estimator of one object from a bank."""
 
 from collections.abc import Callable, Sequence
+from itertools import repeat
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -20,7 +21,7 @@ from fgtrack.estimation.base import (
 )
 from fgtrack.estimation.failures import EstimatorError
 from fgtrack.estimation.filters.ekf import predict
-from fgtrack.estimation.filters.propagation import PresentStates, track_state
+from fgtrack.estimation.filters.propagation import kinematic_states, track_state
 from fgtrack.models.motion import MotionModel
 
 _E = TypeVar("_E", bound=Estimator)
@@ -99,7 +100,7 @@ class ObjectBank(Generic[_E]):
             return []
         states = self._ask(lambda _, one: self._state(one, max(self._now_ns, one.window_ns[0]))).values()
         means, covariances = zip(*((state.mean, state.covariance) for state in states), strict=True)
-        return PresentStates(self._motion, self._now_ns, np.array(means), np.array(covariances))
+        return kinematic_states(self._motion, repeat(self._now_ns), np.array(means), np.array(covariances))
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`: none."""

@@ -162,7 +162,7 @@ def start_estimator(
 
     def plain(start: Start) -> Estimator:
         if claims.bank:
-            return OneObject(motion, _made_bank(name, factory, motion, lag_s, own), start)
+            return OneObject(motion, _made_as(TrackBank, name, factory, motion, lag_s, **own), start)
         one: Estimator = _made_as(Estimator, name, factory, motion, start, lag_s, **own)
         return one
 
@@ -183,7 +183,8 @@ def estimator_bank(
     claims = Claims.of(factory)
     own = {key: options[key] for key in options if claims.initiates or key != "initiation"}
     if claims.bank:
-        return _made_bank(name, factory, motion, lag_s, own)
+        bank: TrackBank = _made_as(TrackBank, name, factory, motion, lag_s, **own)
+        return bank
     _check_options(name, factory, 3, own)
     if factory is ReplayEkf and isinstance(motion, WhiteNoise) and type(motion) in (CTRV, CTRA, CV):
         return ReplayBank(motion, lambda start: ReplayEkf(motion, start, lag_s, **own), lag_s)
@@ -196,11 +197,6 @@ def motion_model(name: str, parameters: Mapping[str, Any]) -> MotionModel:
     if not isinstance(model, MotionModel):
         raise CallError(f"motion model {name!r}: is a {type(model).__name__}, not a MotionModel")
     return model
-
-
-def _made_bank(name: str, factory: Factory, motion: MotionModel, lag_s: float, options: Mapping[str, Any]) -> TrackBank:
-    bank: TrackBank = _made_as(TrackBank, name, factory, motion, lag_s, **options)
-    return bank
 
 
 def _made_as(protocol: type, name: str, factory: Factory, *arguments: Any, **options: Any) -> Any:

@@ -175,22 +175,21 @@ class WhiteNoise(MotionModel):
 
     def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.predict`."""
-        return self._moved(x, np.asarray(dt_s, dtype=np.float64)).mean
+        return self.transition(x, dt_s, backwards=True).mean
 
     def jacobian(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.jacobian`."""
-        return self._moved(x, np.asarray(dt_s, dtype=np.float64)).F
+        return self.transition(x, dt_s, backwards=True).F
 
     def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.process_noise`."""
-        return self._moved(x, self.forward(dt_s)).Q
+        return self.transition(x, dt_s).Q
 
-    def transition(self, x: FloatArray, dt_s: float | FloatArray) -> Transition:
-        """See `MotionModel.transition`."""
-        return self._moved(x, self.forward(dt_s))
-
-    def _moved(self, x: FloatArray, t: FloatArray) -> Transition:
-        """Return the transition of any duration; where `t` is negative, Q means nothing."""
+    def transition(self, x: FloatArray, dt_s: float | FloatArray, *, backwards: bool = False) -> Transition:
+        """See `MotionModel.transition`; with `backwards`, a duration may be negative, and Q then means nothing."""
+        t = np.asarray(dt_s, dtype=np.float64)
+        if not backwards and (t < 0.0).any():
+            self.forward(t)
         n, shape = self.dim, x.shape[:-1]
         if shape != t.shape:
             shape = np.broadcast_shapes(shape, t.shape)

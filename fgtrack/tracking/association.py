@@ -54,13 +54,6 @@ class Group(NamedTuple):
     error: PoseError | None
     """Error of the ego where its effect depends on the track: of all, stacked."""
 
-    def noise(self, members: IntArray, x: FloatArray) -> FloatArray:
-        """Covariance of the measurements of `members` of objects at the states `x` (p, n), shape (p, k, k)."""
-        if self.error is None:
-            return self.R[members]
-        error = PoseError(self.error.covariance, self.error.placement[members], self.error.R[members])
-        return error.noise(self.example.model, self.example.pose, x)
-
 
 class Assignment(NamedTuple):
     """Outcome of an association."""
@@ -258,7 +251,10 @@ def innovations(
         members, columns = member[pairs.rows[chosen]], pairs.columns[chosen]
         x = states.means[columns]
         y, H = linearised(group.z[members], x, group.example.model, group.example.pose)
-        R = group.noise(members, x)
+        R = group.R[members]
+        if group.error is not None:
+            error = PoseError(group.error.covariance, group.error.placement[members], group.error.R[members])
+            R = error.noise(group.example.model, group.example.pose, x)
         H = np.array(H, ndmin=3, order="C")
         yield chosen, *kernels("fgtrack.tracking.kernels").innovations(y, H, P, columns, R), y.shape[-1]
 

@@ -12,7 +12,6 @@ from fgtrack.core.linalg import kernels
 from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import EstimatorError, Failure, Failures
-from fgtrack.estimation.filters.propagation import PresentStates
 
 _T = TypeVar("_T")
 
@@ -170,12 +169,8 @@ def faults(states: Sequence[TrackState]) -> dict[int, Failure]:
     """
     if not states:
         return {}
-    if isinstance(states, PresentStates):
-        means, covariances = states.means, states.covariances
-    else:
-        means = np.array([state.mean for state in states])
-        covariances = np.array([state.covariance for state in states])
-    x, P = np.array(means, dtype=np.float64, order="C"), np.array(covariances, dtype=np.float64, order="C")
+    x = np.array([state.mean for state in states], dtype=np.float64)
+    P = np.array([state.covariance for state in states], dtype=np.float64)
     codes = kernels("fgtrack.tracking.kernels").faults(x, P)
     kinds = Failure.NOT_FINITE, Failure.NOT_DEFINITE
     return {row: kinds[codes[row] - 1] for row in codes.nonzero()[0].tolist()} if codes.any() else {}

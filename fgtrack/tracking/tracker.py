@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import repeat
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from fgtrack.core.types import (
 from fgtrack.estimation.base import Start, StatesAt, TrackBank, UpdateResult, UpdateStatus, no_states
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.ekf import correct_one, propagated
-from fgtrack.estimation.filters.propagation import PresentStates
+from fgtrack.estimation.filters.propagation import kinematic_states
 from fgtrack.estimation.object_bank import states_of
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
@@ -152,7 +153,7 @@ class Tracker:
         states = states_of(bank, motion, stamp_ns)
         if not states.track_ids:
             return ()
-        present = PresentStates(motion, stamp_ns, states.means, states.covariances)
+        present = kinematic_states(motion, repeat(stamp_ns), states.means, states.covariances)
         unsound, rows = faults(present), enumerate(zip(states.track_ids, present, strict=True))
         return tuple(self._report(*track) for row, track in rows if row not in unsound)
 

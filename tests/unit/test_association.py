@@ -86,13 +86,6 @@ def test_the_gated_assignment_has_most_pairs_and_among_those_the_least_distance(
     assert (-len(found.pairs), total) == (best[0], pytest.approx(best[1], abs=1e-6))
 
 
-@pytest.mark.parametrize("association", [GatedEuclidean(gate_m=5e6), GatedMahalanobis(max_distance_m=5e6)])
-def test_two_poor_pairs_are_better_than_one_good_one_however_far_the_gate_reaches(association: Association) -> None:
-    """Squared Mahalanobis distances of 6.5, and log det S of 59."""
-    tracks = states([(0.0, 0.0), (-4.9e6, 0.0)], variance_m2=4.9e6**2 / 6.5)
-    assert association([candidate(0.0, 0.0), candidate(4.9e6, 0.0)], tracks).pairs == [(0, 1), (1, 0)]
-
-
 def test_what_is_near_but_not_believed_goes_nowhere_and_leaves_the_track_to_others() -> None:
     """A variance of 0.16 and 0.09 m2: 3 m off is 36."""
     ghost, other, far = candidate(3.0, 0.0), candidate(-1.0, 0.0), candidate(0.0, 9.0)

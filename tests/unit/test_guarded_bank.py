@@ -7,7 +7,6 @@ import numpy as np
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateResult, UpdateStatus
-from fgtrack.estimation.failures import EndedTrack, Failure
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.models.motion import CTRV, MotionModel
@@ -77,7 +76,7 @@ def test_a_track_whose_update_raises_ends_and_the_others_go_on() -> None:
     assert [result.status for result in results] == [fused, failed, fused]
     assert counted(bank) == {"update failed": 1, "track ended": 1}
     assert "singular" in str(bank.failures.last)
-    assert bank.failures.ended == [EndedTrack(1, 600 * MS, Failure.UPDATE_FAILED)]
+    assert bank.failures.ended == [{"track_id": 1, "now_ns": 600 * MS, "failure": "update failed"}]
     assert bank.track_ids == (0, 2)
     for track_id, state in states(bank).items():
         assert state.mean.tobytes() == states(calm)[track_id].mean.tobytes()

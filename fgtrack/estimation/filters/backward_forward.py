@@ -8,6 +8,7 @@ is the baseline, and not a replay.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import repeat
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import correct, linearised
-from fgtrack.estimation.filters.propagation import ExactPropagator, PresentStates
+from fgtrack.estimation.filters.propagation import ExactPropagator, kinematic_states
 from fgtrack.models.motion import MotionModel
 
 
@@ -121,26 +122,22 @@ class BackwardForwardBank:
         for storage in self._objects.values():
             storage.trim(self._grid - self._length + 1)
 
-    def _predicted(self, track_ids: Sequence[int], grid: int) -> StatesAt:
-        """States at `grid`; at the present they are the filters' own."""
-        if not track_ids:
+    def _at_grid(self, grid: int) -> StatesAt:
+        """States at `grid` of all objects that exist there; at the present they are the filters' own."""
+        if grid in self._cached:
+            return self._cached[grid]
+        rows = {i: each for i, each in self._objects.items() if grid == self._grid or each.oldest <= grid}
+        if not rows:
             return no_states(self._propagator.motion.dim)
-        objects = [self._objects[track_id] for track_id in track_ids]
-        anchors = [storage.anchors[-1] if grid == self._grid else storage.at(grid) for storage in objects]
+        anchors = [each.anchors[-1] if grid == self._grid else each.at(grid) for each in rows.values()]
         means, covariances = self._propagator.propagate(
             np.array([anchor.mean for anchor in anchors]),
             np.array([anchor.covariance for anchor in anchors]),
             np.array([grid - anchor.grid for anchor in anchors], dtype=np.int64),
             self._step_s,
         )
-        return StatesAt(tuple(track_ids), means, covariances)
-
-    def _at_grid(self, grid: int) -> StatesAt:
-        """States at `grid` of all objects that are known there."""
-        if grid not in self._cached:
-            known = [i for i, storage in self._objects.items() if grid == self._grid or storage.oldest <= grid]
-            self._cached[grid] = self._predicted(known, grid)
-        return self._cached[grid]
+        self._cached[grid] = states = StatesAt(tuple(rows), means, covariances)
+        return states
 
     def steps_back(self, stamp_ns: int) -> int:
         """Grid steps from the present back to the state nearest to `stamp_ns`; the newer one on a tie."""
@@ -231,7 +228,7 @@ class BackwardForwardBank:
         if rest_s:
             one = np.ones(len(mean), dtype=np.int64)
             mean, covariance = self._propagator.propagate(mean, covariance, one, rest_s)
-        return PresentStates(self._propagator.motion, self.present_ns, mean, covariance)
+        return kinematic_states(self._propagator.motion, repeat(self.present_ns), mean, covariance)
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`: none."""

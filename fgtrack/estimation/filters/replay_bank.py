@@ -1,6 +1,7 @@
 """The replaying EKFs of all objects in arrays."""
 
 from collections.abc import Callable, Sequence
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from fgtrack.core.linalg import equal_ones, kernels
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus
 from fgtrack.estimation.filters.ekf import Prediction
-from fgtrack.estimation.filters.propagation import PresentStates
+from fgtrack.estimation.filters.propagation import kinematic_states
 from fgtrack.estimation.filters.replay import ReplayEkf, Step
 from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.models.measurement import MeasurementModel, measurement_model
@@ -74,7 +75,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
     def present(self) -> list[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
         stamps_ns = [max(self._now_ns, start_ns) for start_ns in self._starts_ns()]
-        return PresentStates(self._motion, self._now_ns, *self._ahead(list(self._estimators), stamps_ns))
+        return kinematic_states(self._motion, repeat(self._now_ns), *self._ahead(list(self._estimators), stamps_ns))
 
     def update(
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]

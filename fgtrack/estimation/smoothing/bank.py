@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import compress
+from itertools import compress, repeat
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, 
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
-from fgtrack.estimation.filters.propagation import PresentStates, final_reports, smoothed_reports, track_state
+from fgtrack.estimation.filters.propagation import final_reports, kinematic_states, track_state
 from fgtrack.estimation.smoothing.nodes import grown
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver
@@ -156,7 +156,7 @@ class SmootherBank:
             return []
         tracks = np.array([*self._tracks.values()], dtype=np.int64)
         states = self.windows.states_at(tracks, np.maximum(self.present_ns, self._times()[3, tracks]))
-        return PresentStates(self._motion, self.present_ns, *states)
+        return kinematic_states(self._motion, repeat(self.present_ns), *states)
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`."""
@@ -169,10 +169,8 @@ class SmootherBank:
         for lag_s in self._settings.lagged_s:
             stamp_ns = self.present_ns - nanoseconds(lag_s)
             states = self.states_at(stamp_ns)
-            stamps_ns = [stamp_ns] * len(states.track_ids)
-            reports += smoothed_reports(
-                self._motion, states.track_ids, stamps_ns, states.means, states.covariances, lag_s
-            )
+            shown = kinematic_states(self._motion, repeat(stamp_ns), states.means, states.covariances)
+            reports += [SmoothedReport(i, state, lag_s) for i, state in zip(states.track_ids, shown, strict=True)]
         return reports
 
     # --- one track
