@@ -79,6 +79,19 @@ def test_the_counter_stops_at_its_cap_but_the_published_one_may_pass_it() -> Non
     assert (clean.lives[0].counter, published.lives[0].counter) == (6, 7)
 
 
+def test_the_last_sight_is_the_newest_stamp_and_in_the_published_one_the_last() -> None:
+    clean, published = lifecycle(), lifecycle(PublishedLifecycle)
+    for life in (clean, published):
+        life.born(0, Scan("near", START_NS, START_NS + ms(100)))
+    assert clean.lives[0].last_seen_ns == START_NS
+    assert published.lives[0].last_seen_ns == START_NS + ms(100)
+    for life in (clean, published):
+        life.matched(0, Scan("near", START_NS + ms(50), START_NS + ms(50)))
+        life.matched(0, Scan("near", START_NS + ms(20), START_NS + ms(20)))
+    assert clean.lives[0].last_seen_ns == START_NS + ms(50)
+    assert published.lives[0].last_seen_ns == START_NS + ms(20)
+
+
 def test_time_alone_ends_a_track_but_the_published_one_needs_a_list() -> None:
     clean, published = lifecycle(forget_s=2.0), lifecycle(PublishedLifecycle, forget_s=2.0)
     late_ns = START_NS + ms(2000) + 1
