@@ -43,6 +43,16 @@ def test_a_state_that_is_a_little_late_or_early_is_taken() -> None:
     assert source.receive(replace(ego(-90.0), receipt_ns=START_NS)) is None
 
 
+def test_a_state_off_the_way_of_an_ego_that_drives_diagonally_is_held_back() -> None:
+    source = trajectory()
+    for k in range(3):
+        state = replace(ego(1000.0 * k, 50.0 * k * math.cos(1.0), 1.0, 50.0), y_m=50.0 * k * math.sin(1.0))
+        assert source.receive(state) is None
+        assert source.current.y_m == state.y_m
+    assert source.receive(replace(state, stamp_ns=state.stamp_ns + ms(100), y_m=state.y_m + 40.0)) is None
+    assert source.current.y_m == state.y_m
+
+
 def test_a_gap_is_filled_from_its_ends_as_far_as_they_are_extrapolated() -> None:
     source = trajectory(memory_s=60.0)
     source.receive(ego(0.0, x_m=0.0))
