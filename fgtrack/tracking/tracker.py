@@ -22,7 +22,7 @@ from fgtrack.core.types import (
     TrackState,
     UpdateRecord,
 )
-from fgtrack.estimation.base import Start, StatesAt, TrackBank, UpdateResult, UpdateStatus, no_states
+from fgtrack.estimation.base import Start, StatesAt, TrackBank, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.ekf import correct_one, propagated
 from fgtrack.estimation.filters.propagation import kinematic_states
@@ -201,9 +201,7 @@ class Tracker:
     def _assigned(self, batch: Batch, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
         """Return the assignment of candidates to tracks of the same class."""
         objects = batch.message.objects
-        names = []
-        for candidate in candidates:
-            names.append(objects[candidate.leader].class_name)
+        names = [objects[candidate.leader].class_name for candidate in candidates]
         return self._parts.association(candidates, states, self._parts.objects.apart(names, states.track_ids))
 
     def _unclaimed(
@@ -211,27 +209,24 @@ class Tracker:
     ) -> list[int]:
         """Return those of `new` that belong to no track which began after the batch's stamp.
 
-        The detection that started it has overtaken them. They are too old for it, and no other object.
+        The detection that started it has overtaken them. They are too old for it, and not another object. Compared are
+        the present states of these tracks, moved back to the stamp.
         """
-        younger = self._younger(batch.stamp_ns, states)
+        bank, motion = self._parts.bank, self._parts.motion
+        now, back_s = bank.states_at(bank.present_ns), seconds(bank.present_ns - batch.stamp_ns)
+        rows = [row for row, track_id in enumerate(now.track_ids) if track_id not in states.track_ids]
+        if not rows:
+            return list(new)
+        x, F = now.means[rows], motion.jacobian(now.means[rows], -back_s)
+        P = propagated(F, now.covariances[rows], motion.process_noise(x, back_s))
+        moved = StatesAt(tuple(now.track_ids[row] for row in rows), motion.predict(x, -back_s), P)
+        younger = in_any_direction(moved, batch.stamp_ns, self._undirected)
         claims = self._assigned(batch, [candidates[position] for position in new], younger)
         for k, track in claims.pairs:
             self._conclude(batch, candidates[new[k]], Disposition.TOO_OLD, younger.track_ids[track])
         for k in claims.refused:
             self._conclude(batch, candidates[new[k]], Disposition.GATED)
         return [new[k] for k in claims.new]
-
-    def _younger(self, stamp_ns: int, states: StatesAt) -> StatesAt:
-        """Tracks that are not among `states`: their present states, moved back to `stamp_ns`."""
-        bank, motion = self._parts.bank, self._parts.motion
-        now, back_s = bank.states_at(bank.present_ns), seconds(bank.present_ns - stamp_ns)
-        rows = [row for row, track_id in enumerate(now.track_ids) if track_id not in states.track_ids]
-        if not rows:
-            return no_states(motion.dim)
-        x, F = now.means[rows], motion.jacobian(now.means[rows], -back_s)
-        P = propagated(F, now.covariances[rows], motion.process_noise(x, back_s))
-        states = StatesAt(tuple(now.track_ids[row] for row in rows), motion.predict(x, -back_s), P)
-        return in_any_direction(states, stamp_ns, self._undirected)
 
     def _is_too_old(self, batch: Batch) -> bool:
         """True if no track could fuse anything of `batch`."""
@@ -281,10 +276,8 @@ class Tracker:
     ) -> None:
         if not assignment.pairs:
             return
-        track_ids, measurements = [], []
-        for position, track in assignment.pairs:
-            track_ids.append(states.track_ids[track])
-            measurements.append(candidates[position].measurement_at(states.means[track]))
+        track_ids = [states.track_ids[track] for _, track in assignment.pairs]
+        measurements = [candidates[i].measurement_at(states.means[track]) for i, track in assignment.pairs]
         results = self._parts.bank.update(batch.stamp_ns, track_ids, measurements)
         for (position, track), measurement, result in zip(assignment.pairs, measurements, results, strict=True):
             candidate, track_id = candidates[position], states.track_ids[track]

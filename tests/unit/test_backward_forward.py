@@ -63,14 +63,6 @@ def ms(value: float) -> int:
 # --- the nearest stored state
 
 
-@pytest.mark.parametrize(
-    ("late_ms", "back"),
-    [(-500, 0), (-5, 0), (0, 0), (4.999999, 0), (5, 0), (5.000001, 1), (10, 1), (15, 1), (15.000001, 2), (20, 2)],
-)
-def test_the_nearest_stored_state_is_used_and_of_two_the_newer(late_ms: float, back: int) -> None:
-    assert bank().steps_back(START_NS - ms(late_ms)) == back
-
-
 # --- an update in the past
 
 
@@ -93,38 +85,7 @@ def test_what_was_fused_after_a_late_stamp_is_forgotten() -> None:
 # --- births
 
 
-def test_a_track_born_late_starts_at_its_stamp_and_is_not_offered_at_older_ones() -> None:
-    made = bank()
-    made.advance(START_NS + 20 * STEP_NS)
-    made.birth(1, prior(START_NS + ms(123)))
-    made.birth(2, prior(START_NS + ms(200), x_m=50.0))
-    assert made.states_at(START_NS + ms(114)).track_ids == ()
-    assert made.states_at(START_NS + ms(114)).means.shape == (0, 5)
-    start = made.states_at(START_NS + ms(120))
-    assert start.track_ids == (1,)
-    same(start.means, [[0.0, 0.0, 0.2, 40.0, 0.1]])
-    same(np.diag(start.covariances[0]), [0.1, 0.1, 0.09, 4.0, 0.04])
-    means, covariances = euler().propagate(start.means, start.covariances, np.array([8]), 0.01)
-    same(made.present()[0].mean, means[0])
-    same(made.present()[0].covariance, covariances[0])
-    assert made.states_at(START_NS + ms(200)).track_ids == (1, 2)
-
-
 # --- storage
-
-
-def test_a_clock_that_jumps_far_ahead_predicts_all_the_way() -> None:
-    made, slow = bank(20), bank(20)
-    for each in (made, slow):
-        each.birth(0, prior(START_NS))
-    made.advance(START_NS + 1017 * STEP_NS)
-    for tick in range(1, 1018):
-        slow.advance(START_NS + tick * STEP_NS)
-    np.testing.assert_allclose(made.present()[0].mean, slow.present()[0].mean, atol=1e-7)
-    np.testing.assert_allclose(made.present()[0].covariance, slow.present()[0].covariance, rtol=1e-9)
-    for back in (0, 7, 19):
-        stamp_ns = made.present_ns - back * STEP_NS
-        np.testing.assert_allclose(made.states_at(stamp_ns).means, slow.states_at(stamp_ns).means, atol=1e-7)
 
 
 def test_the_present_lies_between_grid_stamps_and_its_yaw_is_wrapped() -> None:

@@ -45,16 +45,7 @@ class _Storage:
 
     def at(self, grid: int) -> Anchor:
         """The anchor that the state at `grid` is predicted from."""
-        for anchor in reversed(self.anchors):
-            if anchor.visible_from <= grid:
-                return anchor
-        return self.anchors[0]
-
-    def put(self, anchor: Anchor) -> None:
-        """Let `anchor` replace all that was stored at and after it."""
-        while self.anchors and self.anchors[-1].visible_from >= anchor.visible_from:
-            self.anchors.pop()
-        self.anchors.append(anchor)
+        return next((each for each in reversed(self.anchors) if each.visible_from <= grid), self.anchors[0])
 
     def trim(self, oldest: int) -> None:
         """Forget what is older than `oldest`."""
@@ -192,7 +183,9 @@ class BackwardForwardBank:
                 results.append(UpdateResult(UpdateStatus.FAILED))
                 continue
             storage = self._objects[track_id]
-            storage.put(Anchor(self._grid - back, self._visible_from(back), wrapped[row], corrected.covariance[row]))
+            anchor = Anchor(self._grid - back, self._visible_from(back), wrapped[row], corrected.covariance[row])
+            kept = [each for each in storage.anchors if each.visible_from < anchor.visible_from]
+            storage.anchors = [*kept, anchor]  # it replaces all that was stored at and after it
             late = storage.newest_fused_ns > measurement.stamp_ns
             storage.newest_fused_ns = max(storage.newest_fused_ns, measurement.stamp_ns)
             status = UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE

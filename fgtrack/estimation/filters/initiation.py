@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
@@ -34,10 +34,9 @@ CERTAIN_TO_SMOOTHER, SMOOTHER_ITERATIONS = 3.0, 10
 
 def checked_initiation(method: str) -> Initiation:
     """`method`; raises `CallError` for one that does not exist."""
-    for known in get_args(Initiation):
-        if method == known:
-            return known  # type: ignore[no-any-return]  # a value of the Literal
-    raise CallError(f"initiation: must be {', '.join(get_args(Initiation))}, is {method!r}")
+    if method not in get_args(Initiation):
+        raise CallError(f"initiation: must be {', '.join(get_args(Initiation))}, is {method!r}")
+    return cast(Initiation, method)
 
 
 class Fix(NamedTuple):

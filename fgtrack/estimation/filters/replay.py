@@ -3,6 +3,7 @@
 import bisect
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
@@ -35,6 +36,9 @@ class Step:
     def along(self) -> bool:
         """True if the state comes from all that had been measured, along a line, and not from the step before."""
         return self.search is not None and self.search.line is not None
+
+
+_stamp = attrgetter("stamp_ns")
 
 
 class ReplayEkf(WindowedFilter):
@@ -153,7 +157,3 @@ def insertion(stamps_ns: Sequence[int], measurements: Sequence[Measurement | Non
             break
         index -= 1
     return index
-
-
-def _stamp(step: Step) -> int:
-    return step.stamp_ns
