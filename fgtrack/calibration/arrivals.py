@@ -69,10 +69,8 @@ class Arrivals:
 
     def quantile_s(self, share: float) -> float:
         """Return the delay that so many detections do not exceed; of lists where there are no detections."""
-        weights = self.counts if self.counts.any() else np.ones(len(self.counts), dtype=np.int64)
-        order = np.argsort(self.delays_s, kind="stable")
-        reached = np.cumsum(weights[order])
-        return float(self.delays_s[order][np.searchsorted(reached, share * reached[-1])])
+        weights = self.counts if self.counts.any() else None
+        return float(np.quantile(self.delays_s, share, weights=weights, method="inverted_cdf"))
 
     def beyond(self, lag_s: float) -> float:
         """Return the share of the detections with a longer delay."""

@@ -23,7 +23,6 @@ from fgtrack.io.adapters.tables import headers, rows
 from fgtrack.io.config import CsvInput, CsvTable, Field, InputConfig, TopicInput
 from fgtrack.io.guess import Guess, agreeing_with_motion, guesses, time_unit, words_of
 from fgtrack.io.info import OTHER_CLOCK_S, InputInfo, TopicInfo, describe
-from fgtrack.io.output import new_file
 from fgtrack.io.ros.bag import Bag
 from fgtrack.io.source import input_kind, open_input
 from fgtrack.models.sensors import Filter
@@ -31,7 +30,7 @@ from fgtrack.pipeline.assumptions.assumed import Assumed, assumed, departures
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import validate
 
-__all__ = ["Part", "starting_config", "table_parts", "topic_parts", "write_starting"]
+__all__ = ["Part", "starting_config", "table_parts", "topic_parts"]
 
 _ROWS, _MESSAGES, _FEW = 20_000, 20, 8  # that are looked at: of a table, of a topic; texts that tell rows apart
 _EGO = frozenset(("ego", "own", "ownship", "host", "self"))
@@ -225,13 +224,6 @@ def _spreads(values: Mapping[str, Sequence[float]]) -> str:
 
 
 _MARK = "(fgtrack info --write)"
-
-
-def write_starting(out: Path, recording: Path, overwrite: bool) -> None:
-    """Write the starting configuration for `recording`; raises as `starting_config` and `new_file`."""
-    text = starting_config(recording)
-    with new_file(out, overwrite) as file:
-        file.write(text.encode())
 
 
 def starting_config(recording: Path) -> str:

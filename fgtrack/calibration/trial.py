@@ -28,8 +28,6 @@ _FAR_M, _NEARER = 250.0, 0.3  # what is so far, and so much nearer in another fr
 class Trial:
     """Result of a trial."""
 
-    duration_s: float
-    """Length of the input that was tried."""
     samples: Mapping[str, str]
     """Contents of the first message of everything as read, by `ego`, `truth` and the names of sensors."""
     suspicions: tuple[Diagnostic, ...]
@@ -40,13 +38,13 @@ class Trial:
     """Why reading or tracking ended early."""
 
 
-def try_out(messages: Iterable[Message], config: Config, duration_s: float = TRIAL_S) -> Trial:
-    """Read and track the first `duration_s` of `messages`, in memory."""
+def try_out(messages: Iterable[Message], config: Config) -> Trial:
+    """Read and track the first `TRIAL_S` of `messages`, in memory."""
     readable = UntilBreak(messages)
     try:
-        found = list(beginning(readable, nanoseconds(duration_s)))
+        found = list(beginning(readable, nanoseconds(TRIAL_S)))
     except DataError as error:  # of the first message
-        return Trial(duration_s, {}, (), None, str(error))
+        return Trial({}, (), None, str(error))
     problem = None if readable.error is None else str(readable.error)
     run = None
     try:
@@ -54,7 +52,7 @@ def try_out(messages: Iterable[Message], config: Config, duration_s: float = TRI
         problem = problem or broken
     except DataError as error:
         problem = problem or str(error)
-    return Trial(duration_s, _samples(found), tuple(suspicions(found, config)), run, problem)
+    return Trial(_samples(found), tuple(suspicions(found, config)), run, problem)
 
 
 def beginning(messages: Iterable[Message], duration_ns: int) -> Iterator[Message]:

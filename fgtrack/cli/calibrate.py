@@ -11,8 +11,8 @@ import typer
 from fgtrack.calibration.advise import advise as advised
 from fgtrack.calibration.clock_offsets import OffsetReport, estimate_offsets
 from fgtrack.calibration.clocks import clock_text
-from fgtrack.calibration.starting import write_starting
-from fgtrack.calibration.trial import Trial, try_out
+from fgtrack.calibration.starting import starting_config
+from fgtrack.calibration.trial import TRIAL_S, Trial, try_out
 from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, Overwrite, PitMap, Reference, Settings, TrackMap
 from fgtrack.cli.show import chosen_form, progress, say, sentences, show, warn
 from fgtrack.core.errors import CallError, DataError, FgtrackError
@@ -53,7 +53,9 @@ def info(
             raise CallError("--write, -c: a starting configuration is made from the recording alone, give one of them")
         check_output(write, overwrite)
         check_apart(write, [recording])
-        write_starting(write, recording, overwrite)
+        text = starting_config(recording)
+        with new_file(write, overwrite) as file:
+            file.write(text.encode())
         if form is None:
             say(f"{write}: written; check its guesses, they are applied below")
         config_file = str(write)
@@ -93,10 +95,10 @@ def _try_out(recording: Path, config: Config) -> Trial:
     if trial.run is not None:
         for sensor, counts in trial.run.meta["counts"].items():
             became = ", ".join(f"{count} {fate.replace('_', ' ')}" for fate, count in counts.items() if count)
-            say(f"first {trial.duration_s:g} s of {sensor}: {became or 'no detection'}")
+            say(f"first {TRIAL_S:g} s of {sensor}: {became or 'no detection'}")
         for line in excluded_lines(trial.run.meta):
-            say(f"first {trial.duration_s:g} s of {line}")
-        say(f"first {trial.duration_s:g} s: {len(set(trial.run.tables['tracks']['track_id'].tolist()))} tracks")
+            say(f"first {TRIAL_S:g} s of {line}")
+        say(f"first {TRIAL_S:g} s: {len(set(trial.run.tables['tracks']['track_id'].tolist()))} tracks")
     for found in trial.suspicions:
         warn(str(found))
     return trial

@@ -27,7 +27,7 @@ from fgtrack.sim.delays import AnyDelay
 from fgtrack.sim.scanner import Scanner
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.sensor import SimulatedSensor
-from fgtrack.sim.vehicles import AnyVehicle, DrawnVehicle, Trajectory
+from fgtrack.sim.vehicles import AnyVehicle, DrawnVehicle, TrackTrajectory, Trajectory
 
 
 def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
@@ -68,7 +68,7 @@ def _trajectory(vehicle: AnyVehicle, path: Path | None, rng: np.random.Generator
     if isinstance(vehicle, DrawnVehicle):
         return vehicle.trajectory(rng, duration_s)
     assert path is not None, "a scenario without a map has no vehicle on a track"
-    return vehicle.trajectory(path)
+    return TrackTrajectory(vehicle, path)
 
 
 def _truth(scenario: Scenario, vehicles: Sequence[Trajectory]) -> list[Message]:

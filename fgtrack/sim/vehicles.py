@@ -48,10 +48,6 @@ class TrackVehicle:
             end_s = before.start_s + before.duration_s
             require(change.start_s >= end_s, "lane_changes", "one must end before the next", change.start_s)
 
-    def trajectory(self, path: Path) -> "TrackTrajectory":
-        """Motion of this vehicle along `path`."""
-        return TrackTrajectory(self, path)
-
 
 @dataclass(frozen=True, eq=False)
 class TrackTrajectory:
