@@ -29,6 +29,7 @@ from fgtrack.io.errors import one_line
 
 __all__ = ["InvalidMessageError", "validated", "validated_detection", "validated_message"]
 
+_MOST_OBJECTS = 100_000
 _INT64 = range(-(1 << 63), 1 << 63)
 
 
@@ -63,6 +64,9 @@ def validated_message(message: Message) -> Message:
     if not is_stamp(message.receipt_ns):  # all windows are counted from it
         raise _invalid("receipt_ns", f"at most {LARGEST_NS:.0g} ns from 0", message.receipt_ns)
     if isinstance(message, DetectionList):
+        if len(message.objects) > _MOST_OBJECTS:
+            many = f"a list of {len(message.objects)} objects"
+            raise InvalidMessageError(f"{message.sensor}: {many}, at most {_MOST_OBJECTS} are read")
         objects = []
         for index, item in enumerate(message.objects):
             try:

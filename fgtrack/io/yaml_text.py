@@ -1,5 +1,6 @@
 """YAML 1.2 of users and recordings: plain values only."""
 
+import re
 import warnings
 from typing import Any
 
@@ -8,9 +9,24 @@ from ruamel.yaml.error import ReusedAnchorWarning, YAMLError
 
 __all__ = ["safe_yaml"]
 
+_LONGEST = 2_000_000
+_MOST_ALIASES = 25
+_ALIAS = re.compile(r"(?:^|[\s\[{,:-])\*[\w-]", re.MULTILINE)
+
 
 def safe_yaml(text: str) -> Any:  # Any: the type is known after validation only
-    """Value of the YAML 1.2 document `text`. Raises `YAMLError` for invalid YAML."""
+    """Value of the YAML 1.2 document `text`.
+
+    Raises
+    ------
+    YAMLError
+        Invalid YAML, longer than `_LONGEST` characters, nested too deeply, or with so many aliases that they could
+        repeat each other without end.
+    """
+    if len(text) > _LONGEST:
+        raise YAMLError(f"is longer than {_LONGEST} characters")
+    if len(_ALIAS.findall(text)) > _MOST_ALIASES:
+        raise YAMLError(f"has more than {_MOST_ALIASES} aliases")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ReusedAnchorWarning)  # YAML allows it
         try:
@@ -18,4 +34,5 @@ def safe_yaml(text: str) -> Any:  # Any: the type is known after validation only
         except RecursionError as error:
             raise YAMLError("is nested too deeply, or has an alias that contains itself") from error
         except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-            raise YAMLError(f"a key or value cannot be read ({error})") from error
+            what = "a key is a list or a mapping" if "unhashable" in str(error) else f"a value cannot be read ({error})"
+            raise YAMLError(what) from error

@@ -10,6 +10,7 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import period_ns, seconds
 from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.failures import Failures
+from fgtrack.estimation.filters.backward_forward import BackwardForwardBank
 from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator
 from fgtrack.estimation.filters.published import PublishedStorage, SaturatedEulerCtrv
 from fgtrack.estimation.filters.track_initiation import initiated
@@ -107,6 +108,8 @@ def _build_backward_forward(config: Config, failures: Failures) -> TrackBank:
 
     def bank() -> TrackBank:
         propagator = build_propagator(config, seconds(step_ns))
+        if not (leads or is_stale):
+            return BackwardForwardBank(propagator, step_ns, steps)
         return PublishedStorage(propagator, step_ns, steps, leads=leads, is_stale=is_stale)
 
     if config.map.track_file is not None or leads or is_stale:

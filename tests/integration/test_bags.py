@@ -384,6 +384,20 @@ def test_a_topic_that_fgtrack_wrote_follows_the_keys_that_name_it(tmp_path):
         read(tmp_path / "bag", InputConfig(detections={"front": TopicInput("/fgtrack/truth")}))
 
 
+@pytest.mark.parametrize(
+    ("config", "complaint"),
+    [
+        (InputConfig(ego=TopicInput("/ego/odometry", scan_s=0.1)), "scan_s applies to detections only"),
+        (InputConfig(ego=TopicInput("/ego/odometry", frame="ego")), "frame applies to detections only"),
+        (InputConfig(detections={"lidar": TopicInput("/detections/lidar", object_id=1)}), "object_id applies to truth"),
+    ],
+)
+def test_a_key_that_a_topic_does_not_read_is_refused(tmp_path, config, complaint):
+    write_bag(tmp_path / "bag", drive())
+    with pytest.raises(CallError, match=complaint):
+        open_input(tmp_path / "bag", config)
+
+
 def test_any_type_is_read_by_its_paths(tmp_path):
     write_bag(tmp_path / "bag", drive())
     pose = "bbox.center"

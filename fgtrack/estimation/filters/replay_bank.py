@@ -166,9 +166,10 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         one = self._estimators[track_id]
         if not all(each.search is None and _is_plain(each.measurement) for each in one.steps):
             return
-        rows, slots = self._arrays[0].shape
-        k = max([self._arrays[4].shape[-1], *(len(each.measurement.z) for each in one.steps if each.measurement)])
-        self._allocate(rows * (1 + (not self._free)), max(slots, 2 * len(one.steps)), k)
+        (rows, slots), largest = self._arrays[0].shape, self._arrays[4].shape[-1]
+        k = max((len(each.measurement.z) for each in one.steps if each.measurement is not None), default=0)
+        if not self._free or len(one.steps) >= slots or k > largest:
+            self._allocate(rows * (1 + (not self._free)), max(slots, 2 * len(one.steps)), max(k, largest))
         row = self._rows[track_id] = self._free.pop()
         order, labels, steps, windows, measured = (array[row] for array in self._arrays)
         windows[:] = len(one.steps), *one.window_ns

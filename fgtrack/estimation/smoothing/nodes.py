@@ -92,7 +92,7 @@ class Nodes:
         return indices, np.where(at_ns < stamp_ns - NEAR_NS, stamp_ns, at_ns)
 
     def last_before(self, tracks: IntArray, stamps_ns: IntArray) -> IntArray:
-        """Return the indices of the newest nodes at or before `stamps_ns`; -1 if there are none."""
+        """Return the indices of the newest nodes at or before `stamps_ns`; -1 without such a node."""
         return np.asarray((self.stamps_ns[tracks] <= stamps_ns[:, None]).sum(axis=1) - 1)
 
     def window(self, track: int) -> IntArray:

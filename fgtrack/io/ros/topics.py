@@ -31,6 +31,14 @@ from fgtrack.io.source import FileFormat
 DETECTION_FIELDS = frozenset({*MEASURABLE, *DESCRIBING, "object_id"})
 """Fields that a filter may use, whatever the type of the message."""
 
+#: Keys of a topic that apply to some roles only.
+_KEYS = {
+    "frame": ("detections",),
+    "filters": ("detections", "truth"),
+    "scan_s": ("detections",),
+    "object_id": ("truth",),
+}
+
 Convert = Callable[[RosMessage, int], Iterable[Message]]
 
 
@@ -71,6 +79,9 @@ def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
         )
     uses = []
     for role, item, converter in roles:
+        for key, of in _KEYS.items():
+            if role.split()[0] not in of and getattr(item, key) not in (None, {}, "map"):
+                raise CallError(f"topic {item.topic}: {key} applies to {' and '.join(of)} only, leave it out")
         topic = _find(bag, item)
         convert = converter(topic, item)
         uses.append(TopicUse(topic, role, convert if item.stamp_from == "message" else _at_receipt(convert)))

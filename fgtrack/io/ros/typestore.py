@@ -1,8 +1,10 @@
 """The message types of a recording: rosbags', fgtrack's, the user's and those embedded in the recording.
 
-rosbags generates Python code from a definition and runs it; its grammar admits names and plain values only.
+rosbags generates Python code from a definition and runs it: what a recording brings must not become anything but names
+and numbers there.
 """
 
+import math
 import re
 from collections.abc import Iterable, Sequence
 from functools import cache
@@ -10,8 +12,9 @@ from pathlib import Path
 from typing import Any, cast
 
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat, Nodetype
-from rosbags.interfaces.typing import FieldDesc, Typesdict
+from rosbags.interfaces.typing import Constdefs, Fielddefs, FieldDesc, Typesdict
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
 from fgtrack.core.errors import CallError, DataError
@@ -19,15 +22,26 @@ from fgtrack.core.files import read_whole
 from fgtrack.io.errors import one_line
 from fgtrack.io.ros.definitions import DEFINITIONS
 
-__all__ = ["Key", "MessageTypes", "type_name", "typestore_of"]
+__all__ = ["Key", "MessageTypes", "check_definition", "type_name", "typestore_of"]
 
 Key = tuple[str, MessageDefinition | None]
 """A message type and its definition in the recording: two topics may define one name differently."""
 
+_LARGEST_BYTES = 32_000_000
+"""Of a message that is decoded: an object list or a state, never an image; each byte takes up to a hundred."""
+_LONGEST_TEXT = 200_000
+_MOST_VALUES = 4_000
+"""Most values of a type with all its parts: arrays of texts and messages become code for each element."""
+_LONGEST_ARRAY = 1_000_000
+_INTEGERS = range(-(1 << 63), 1 << 64)
+_TYPE_NAME = re.compile(r"(?!.{256})[A-Za-z]\w*(/[A-Za-z]\w*)+", re.ASCII)
+_MEMBER_NAME = re.compile(r"(?!__|.{256})[A-Za-z_]\w*", re.ASCII)
+_BASE_NAME = re.compile(r"[a-z]+[0-9]*", re.ASCII)
 _SEPARATOR = "=" * 80 + "\n"
 _EMPTY_LINE = re.compile(r"^[ \t]*(?:#[^\n]*)?\n", re.MULTILINE)
 _IDL_TEXT = re.compile(r'"(?:\\.|[^"\\])*"')
 _IDL_REMARK = re.compile(r"/\*.*?\*/|//[^\n]*|^#[^\n]*|@\s*[\w:]*(?:\s*\([^()]*\))?", re.DOTALL | re.MULTILINE)
+_IDL_COSTLY = re.compile(r"=[^;]*[()*/%|^&~<]|(?:sequence\s*<\s*){4}")
 
 
 def type_name(name: str) -> str:
@@ -66,11 +80,13 @@ class MessageTypes:
         for key, types in embedded.items():
             try:
                 self.types[key] = _closure(key[0], (types, shared, known))
-            except ValueError as error:
+            except (ValueError, RecursionError) as error:
                 self.problems[key] = str(error)
 
     def decode(self, key: Key, data: bytes, what: str) -> Any:  # a message has the attributes of its type
-        """Message that is serialized in `data`; `what` names it in the `DataError` of bytes of another type."""
+        """Message that is serialized in `data`; `what` names it in the `DataError` of a huge or wrong one."""
+        if len(data) > _LARGEST_BYTES:
+            raise DataError(f"{what}: has {len(data)} bytes, at most {_LARGEST_BYTES} are decoded")
         try:
             if key not in self._stores:
                 self._stores[key] = _registered(self.types[key])
@@ -100,32 +116,41 @@ def _registered(types: Typesdict) -> Typestore:
 def _closure(name: str, sources: Sequence[Typesdict]) -> Typesdict:
     """The type `name` with all its parts, each from the first of `sources` that has it.
 
-    Raises `ValueError` for an undefined part.
+    Raises `ValueError` for an undefined part, a type that contains itself, and one of more than `_MOST_VALUES` values.
     """
     needed: Typesdict = {}
-    waiting = [name]
-    while waiting:
-        current = waiting.pop()
-        definition = next((types[current] for types in sources if current in types), None)
-        if definition is None:
-            raise ValueError(
-                f"the definition of {current or 'a type without a name'} is not in the recording, "
-                "name its .msg file in message_definitions"
-            )
-        needed[current] = definition
-        waiting += _parts(description for _, description in definition[1]) - needed.keys()
-    return needed
+    sizes: dict[str, int] = {}
 
-
-def _parts(descriptions: Iterable[FieldDesc]) -> set[str]:
-    """Names of the message types of members, or of their elements."""
-    names = set()
-    for kind, value in descriptions:
-        while kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-            kind, value = cast("tuple[FieldDesc, int]", value)[0]
+    def size_of(description: FieldDesc) -> int:
+        kind, value = description
+        if kind == Nodetype.BASE:
+            return 1
         if kind == Nodetype.NAME:
-            names.add(cast("str", value))
-    return names
+            return size_of_type(cast("str", value))
+        inner, count = cast("tuple[FieldDesc, int]", value)
+        size, fixed = size_of(inner), int(count) if kind == Nodetype.ARRAY else 1
+        if kind == Nodetype.SEQUENCE and size == 0:
+            raise ValueError(f"{name} has a list of elements without content")
+        is_number = inner[0] == Nodetype.BASE and cast("tuple[str, int]", inner[1])[0] not in ("string", "wstring")
+        return size * (min(fixed, 1) if is_number else fixed)  # numbers become one NumPy array
+
+    def size_of_type(current: str) -> int:
+        if current not in sizes:
+            definition = next((types[current] for types in sources if current in types), None)
+            if definition is None:
+                raise ValueError(
+                    f"the definition of {current or 'a type without a name'} is not in the recording, "
+                    "name its .msg file in message_definitions"
+                )
+            needed[current] = definition
+            sizes[current] = _MOST_VALUES + 1  # until it is computed: a type that contains itself is too large
+            sizes[current] = sum(size_of(description) for _, description in definition[1])
+        if sizes[current] > _MOST_VALUES:
+            raise ValueError(f"{name} has more than {_MOST_VALUES} values, or contains itself")
+        return sizes[current]
+
+    size_of_type(name)
+    return needed
 
 
 @cache
@@ -145,7 +170,7 @@ def _user_types(path: Path) -> Typesdict:
     for file in files:
         package = file.parent.parent.name if file.parent.name == "msg" else file.parent.name
         try:
-            types |= get_types_from_msg(read_whole(file, 1.0).decode(), f"{package}/msg/{file.stem}")
+            types |= _checked(get_types_from_msg(read_whole(file, 1.0).decode(), f"{package}/msg/{file.stem}"))
         except Exception as error:  # whatever an invalid definition makes the parser raise
             raise CallError(f"{file}: is not a message definition ({one_line(error)})") from error
     return types
@@ -159,12 +184,71 @@ def _embedded(name: str, definition: MessageDefinition | None) -> Typesdict:
     form, text = (None, "") if definition is None else (definition.format, definition.data)
     if form not in (MessageDefinitionFormat.MSG, MessageDefinitionFormat.IDL) or not text.strip():
         return {}
-    types: Typesdict = {}
+    if len(text) > _LONGEST_TEXT:
+        raise ValueError(f"it has more than {_LONGEST_TEXT} characters")
+    _check_type_name(name)
     if form == MessageDefinitionFormat.MSG:
-        types |= get_types_from_msg(_EMPTY_LINE.sub("", f"{text}\n"), name)
-    else:
-        first, *others = text.split(_SEPARATOR)
-        for part in [part.partition("\n")[2] for part in others] if others and not first.strip() else [text]:
-            plain = _IDL_REMARK.sub(" ", _IDL_TEXT.sub('""', part))  # without comments, annotations, contents of texts
-            types |= get_types_from_idl(plain.replace(">", "> "))  # rosbags takes the end of `a<b<9>>` for a shift
+        return _checked(get_types_from_msg(_EMPTY_LINE.sub("", f"{text}\n"), name))
+    types: Typesdict = {}
+    first, *others = text.split(_SEPARATOR)
+    for part in [part.partition("\n")[2] for part in others] if others and not first.strip() else [text]:
+        types |= _checked(get_types_from_idl(_plain_idl(part)))
     return types
+
+
+def _plain_idl(text: str) -> str:
+    """Text without string contents, annotations, comments and preprocessor lines, which define no member.
+
+    Raises `ValueError` for what rosbags would parse or evaluate for minutes: computed constants, nested sequences.
+    """
+    plain = _IDL_REMARK.sub(" ", _IDL_TEXT.sub('""', text))
+    if _IDL_COSTLY.search(plain):
+        raise ValueError("it computes a constant or nests sequences, which no definition of ROS does")
+    return plain.replace(">", "> ")  # rosbags takes the end of `sequence<string<9>>` for a shift
+
+
+def _checked(types: Typesdict) -> Typesdict:
+    for name, definition in types.items():
+        check_definition(name, definition)
+    return types
+
+
+def check_definition(name: str, definition: tuple[Constdefs, Fielddefs]) -> None:
+    """Raise `ValueError` unless all names of a definition are names, and its constants plain values."""
+    constants, members = definition
+    _check_type_name(name)
+    names = [*(constant[0] for constant in constants), *(member[0] for member in members)]
+    for member in names:
+        if not _MEMBER_NAME.fullmatch(member):
+            raise ValueError(f"{member!a:.200} is not a name of a member")
+    if len(set(map(normalize_fieldname, names))) < len(names):
+        raise ValueError(f"{name} has two members of one name")
+    for member, kind, value in constants:
+        if not _is_plain(value) or not _BASE_NAME.fullmatch(kind):
+            raise ValueError(f"the constant {member} is not a plain value")
+    for member, description in members:
+        node, inner = _innermost(description)
+        if node == Nodetype.NAME:
+            _check_type_name(cast("str", inner))
+        elif not _BASE_NAME.fullmatch(cast("tuple[str, int]", inner)[0]):
+            raise ValueError(f"{member} is of an unknown type")
+
+
+def _check_type_name(name: str) -> None:
+    if not _TYPE_NAME.fullmatch(name):
+        raise ValueError(f"{name!a:.200} is not a name of a message type")
+
+
+def _is_plain(value: object) -> bool:
+    if type(value) is int:
+        return value in _INTEGERS
+    return math.isfinite(value) if type(value) is float else type(value) in (bool, str)
+
+
+def _innermost(description: FieldDesc) -> FieldDesc:
+    """The type of the elements of arrays and sequences, of whatever depth."""
+    while description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        description, size = cast("tuple[FieldDesc, int]", description[1])
+        if not 0 <= int(size) <= _LONGEST_ARRAY:
+            raise ValueError(f"an array is longer than {_LONGEST_ARRAY}")
+    return description
