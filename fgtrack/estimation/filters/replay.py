@@ -81,9 +81,13 @@ class ReplayEkf(WindowedFilter):
         del self.steps[: max(bisect.bisect_left(self.steps, stamp_ns, key=_stamp) - 1, 0)]
 
     def _fuse(self, measurement: Measurement) -> OneCorrection:
-        index = insertion(
-            [each.stamp_ns for each in self.steps], [each.measurement for each in self.steps], measurement
-        )
+        stamp_ns = measurement.stamp_ns  # it comes by stamp and, at one stamp, by content; never before the first
+        index = max(bisect.bisect_right(self.steps, stamp_ns, key=_stamp), 1)
+        while index > 1 and self.steps[index - 1].stamp_ns == stamp_ns:
+            last = self.steps[index - 1].measurement
+            if last is None or last.content <= measurement.content:
+                break
+            index -= 1
         later, (step, correction) = self.steps[index:], self._step(self.steps[index - 1], measurement)
         if later and self.retrodicts:
             expected = self.correct(*self._retrodicted(step, later), measurement)
@@ -146,14 +150,3 @@ class ReplayEkf(WindowedFilter):
             shift = wrapped(self._motion, mean - predicted.mean)
             mean, covariance, _ = rts_step(before.mean, before.covariance, predicted, shift, covariance)
         return mean, covariance
-
-
-def insertion(stamps_ns: Sequence[int], measurements: Sequence[Measurement | None], new: Measurement) -> int:
-    """Index of `new` among measurements: by stamp, and at one stamp by content; never before the first."""
-    index = max(bisect.bisect_right(stamps_ns, new.stamp_ns), 1)
-    while index > 1 and stamps_ns[index - 1] == new.stamp_ns:
-        last = measurements[index - 1]
-        if last is None or last.content <= new.content:
-            break
-        index -= 1
-    return index

@@ -52,10 +52,7 @@ def _joined(group: list[Message]) -> Message:
     objects: list[Detection] = []
     is_own = any(each.stamp_ns != first_ns for each in lists)
     for each in lists:
-        objects += [_stamped(item, each.stamp_ns) for item in each.objects] if is_own else each.objects
+        for item in each.objects:
+            objects.append(replace(item, stamp_ns=each.stamp_ns) if is_own and item.stamp_ns is None else item)
     left_out = tuple(chain.from_iterable(each.left_out for each in lists))
     return replace(lists[-1], stamp_ns=mean_ns, objects=objects, left_out=left_out)
-
-
-def _stamped(item: Detection, stamp_ns: int) -> Detection:
-    return item if item.stamp_ns is not None else replace(item, stamp_ns=stamp_ns)

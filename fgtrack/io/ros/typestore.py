@@ -224,7 +224,8 @@ def check_definition(name: str, definition: tuple[Constdefs, Fielddefs]) -> None
     if len(set(map(normalize_fieldname, names))) < len(names):
         raise ValueError(f"{name} has two members of one name")
     for member, kind, value in constants:
-        if not _is_plain(value) or not _BASE_NAME.fullmatch(kind):
+        is_number = value in _INTEGERS if type(value) is int else type(value) is float and math.isfinite(value)
+        if not (is_number or type(value) in (bool, str)) or not _BASE_NAME.fullmatch(kind):
             raise ValueError(f"the constant {member} is not a plain value")
     for member, description in members:
         node, inner = _innermost(description)
@@ -237,12 +238,6 @@ def check_definition(name: str, definition: tuple[Constdefs, Fielddefs]) -> None
 def _check_type_name(name: str) -> None:
     if not _TYPE_NAME.fullmatch(name):
         raise ValueError(f"{name!a:.200} is not a name of a message type")
-
-
-def _is_plain(value: object) -> bool:
-    if type(value) is int:
-        return value in _INTEGERS
-    return math.isfinite(value) if type(value) is float else type(value) in (bool, str)
 
 
 def _innermost(description: FieldDesc) -> FieldDesc:
