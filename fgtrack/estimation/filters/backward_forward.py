@@ -45,7 +45,10 @@ class _Storage:
 
     def at(self, grid: int) -> Anchor:
         """The anchor that the state at `grid` is predicted from."""
-        return next((each for each in reversed(self.anchors) if each.visible_from <= grid), self.anchors[0])
+        for anchor in reversed(self.anchors):
+            if anchor.visible_from <= grid:
+                return anchor
+        return self.anchors[0]
 
     def trim(self, oldest: int) -> None:
         """Forget what is older than `oldest`."""
@@ -184,8 +187,9 @@ class BackwardForwardBank:
                 continue
             storage = self._objects[track_id]
             anchor = Anchor(self._grid - back, self._visible_from(back), wrapped[row], corrected.covariance[row])
-            kept = [each for each in storage.anchors if each.visible_from < anchor.visible_from]
-            storage.anchors = [*kept, anchor]  # it replaces all that was stored at and after it
+            while storage.anchors and storage.anchors[-1].visible_from >= anchor.visible_from:
+                storage.anchors.pop()  # it replaces all that was stored at and after it
+            storage.anchors.append(anchor)
             late = storage.newest_fused_ns > measurement.stamp_ns
             storage.newest_fused_ns = max(storage.newest_fused_ns, measurement.stamp_ns)
             status = UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE
