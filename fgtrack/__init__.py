@@ -68,7 +68,6 @@ _HOMES = {
     "replay": "fgtrack.pipeline.public",
     "robust_weight": "fgtrack.estimation.filters.ekf",
     "simulate": "fgtrack.pipeline.public",
-    "starts": "fgtrack.estimation",
     "study": "fgtrack.calibration.study",
     "testing": "fgtrack",
     "tune": "fgtrack.calibration.tune",
@@ -98,7 +97,6 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.core.types import TrackState as TrackState
     from fgtrack.core.types import TruthState as TruthState
     from fgtrack.core.types import UpdateRecord as UpdateRecord
-    from fgtrack.estimation import starts as starts
     from fgtrack.estimation.base import Estimator as Estimator
     from fgtrack.estimation.base import Measurement as Measurement
     from fgtrack.estimation.base import Start as Start

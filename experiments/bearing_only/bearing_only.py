@@ -24,7 +24,6 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.registry import ESTIMATORS, estimator
-from fgtrack.estimation.starts import distances
 from fgtrack.evaluation.intervals import average, paired
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CV
@@ -93,8 +92,6 @@ WORLDS = {
 }
 
 Options = Mapping[str, object]
-#: Hypotheses of the range at the start, in the cases that say so.
-RANGES = 5
 #: Name in the table: estimator and its options. One that is not registered is left out.
 CASES: dict[str, tuple[str, Options]] = {
     "ekf-replay": ("ekf-replay", {}),
@@ -102,8 +99,6 @@ CASES: dict[str, tuple[str, Options]] = {
     "ukf-replay": ("ukf-replay", {}),
     "iplf-replay": ("iplf-replay", {}),
     "smoother": ("smoother", {}),
-    f"ekf-replay, {RANGES} ranges": ("ekf-replay", {}),
-    f"smoother, {RANGES} ranges": ("smoother", {}),
 }
 
 
@@ -115,8 +110,6 @@ class Pursuit(NamedTuple):
     measurements: list[Measurement]
     receipts_s: FloatArray
     start: Start
-    ranges: list[Start]
-    """The same in several hypotheses of the range."""
 
 
 class Errors(NamedTuple):
@@ -150,20 +143,13 @@ def pursuit(world: World, rng: np.random.Generator, last_s: float) -> Pursuit:
         speed_std_mps=world.velocity_std_mps,
     )
     receipts_s = world.step_s * np.arange(steps) + rng.uniform(0.0, world.latest_s, steps)
-    return Pursuit(np.array(truth), measurements, receipts_s, start, _ranges(world, start, float(measurements[0].z[0])))
-
-
-def _ranges(world: World, start: Start, bearing_rad: float) -> list[Start]:
-    nearest_m = max(world.range_m - 2.5 * world.range_std_m, NEAREST * world.range_m)
-    farthest_m = world.range_m + 2.5 * world.range_std_m
-    return distances(start, (0.0, 0.0), bearing_rad, world.bearing_std_rad, nearest_m, farthest_m, RANGES)
+    return Pursuit(np.array(truth), measurements, receipts_s, start)
 
 
 def errors(world: World, name: str, drawn: Pursuit) -> Errors:
     """Errors of the present state of the case `name`, from what has been received at every step."""
     entry, options = CASES[name]
-    several = {"hypotheses": drawn.ranges} if name.endswith("ranges") else {}
-    one = estimator(entry, world.motion, drawn.start, lag_s=2.0 * world.last_s, **options, **several)
+    one = estimator(entry, world.motion, drawn.start, lag_s=2.0 * world.last_s, **options)
     order = np.argsort(drawn.receipts_s[1:]) + 1  # the first bearing is in the start
     heard, distance_m, nees = 0, [], []
     for k in range(1, len(drawn.truth)):

@@ -7,7 +7,9 @@ measurements.
 """
 
 import csv
+import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -17,8 +19,12 @@ import typer
 from joblib import Parallel, delayed
 
 import fgtrack
-from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Measurement, Start
+from fgtrack.core.geometry import wrap_angle
+from fgtrack.core.linalg import congruence, identity, mahalanobis_squared, psd_solve, symmetrise
+from fgtrack.core.types import FloatArray, TrackState
+from fgtrack.estimation.base import Estimator, Measurement, Start
+from fgtrack.estimation.filters.ekf import linearised
+from fgtrack.estimation.filters.propagation import wrapped
 from fgtrack.evaluation.intervals import Estimate, paired
 from fgtrack.models.measurement import SensorPose, measured_position, measurement_model
 from fgtrack.models.motion import CTRV
@@ -32,6 +38,10 @@ NUM_HEADINGS = 8
 RANGE_STD_M, ANCHORS_M = 0.3, ((0.0, 0.0), (20.0, 0.0))
 FAR_M = 3.0
 WINDOW_S = 2.0
+#: A hypothesis is dropped once it is so much less likely than the best.
+LEAST_WEIGHT = 1e-4
+#: Two are the same once the squared Mahalanobis distance of their means is less than this.
+SAME = 1.0
 
 
 class Scene(NamedTuple):
@@ -40,11 +50,99 @@ class Scene(NamedTuple):
     start: Start
     first: list[Measurement]
     """At the stamp of the start; the hypotheses are made of them already."""
-    hypotheses: list[Start] | int
+    hypotheses: list[Start]
     truth: FloatArray
     """After the start, shape (num, 5)."""
     measurements: list[list[Measurement]]
     """Those of each of these stamps."""
+
+
+class Hypotheses:
+    """One estimator for each of several starts, until one is left; the state is that of the likeliest.
+
+    After measurements z_1, z_2, ... log w = sum of log N(y_k; 0, S_k), with the innovation y_k against everything
+    fused before (Bar-Shalom, Li and Kirubarajan 2001, section 11.6.2, the static multiple model estimator). What is
+    less likely than `LEAST_WEIGHT` times the best is dropped, and the less likely of two that are the `SAME`.
+    """
+
+    def __init__(self, estimators: list[Estimator]) -> None:
+        self.weighted = [(0.0, each) for each in estimators]
+        """Log-weights and estimators, the likeliest first."""
+
+    def update(self, measurement: Measurement) -> None:
+        """Fuse `measurement` with all, weigh them, and drop some."""
+        if len(self.weighted) == 1:
+            self.weighted[0][1].update(measurement)
+            return
+        fused: list[tuple[float, Estimator]] = []
+        for log_weight, each in self.weighted:
+            state = each.state_at(measurement.stamp_ns)
+            y, H = linearised(measurement.z, state.mean, measurement.model, measurement.pose)
+            S = congruence(H, state.covariance) + measurement.R
+            result = each.update(measurement)
+            if result.innovation is not None:
+                if result.innovation_covariance is not None:
+                    y, S = result.innovation, result.innovation_covariance
+                density = -0.5 * float(mahalanobis_squared(y, S) + np.linalg.slogdet(S)[1])
+                fused.append((log_weight + density, each))
+        ordered, self.weighted = sorted(fused or self.weighted, key=lambda each: -each[0]), []
+        for log_weight, each in ordered:
+            if log_weight < ordered[0][0] + math.log(LEAST_WEIGHT):
+                break
+            state = each.state_at(measurement.stamp_ns)
+            for index, (other, better) in enumerate(self.weighted):
+                kept = better.state_at(measurement.stamp_ns)
+                if mahalanobis_squared(wrapped(MOTION, state.mean - kept.mean), kept.covariance) < SAME:
+                    self.weighted[index] = float(np.logaddexp(other, log_weight)), better
+                    break
+            else:
+                self.weighted.append((log_weight, each))
+        self.weighted.sort(key=lambda each: -each[0])
+
+    def state_at(self, stamp_ns: int) -> TrackState:
+        """State of the likeliest hypothesis."""
+        return self.weighted[0][1].state_at(stamp_ns)
+
+
+def headings(start: Start, count: int) -> list[Start]:
+    """`count` starts that head for equal sectors of the circle, each as uncertain as its sector is wide.
+
+    The direction holds the sign of the speed, so the speed has the folded normal distribution.
+    """
+    mean, std = start.speed_mps, start.speed_std_mps
+    speed_mps = std * math.sqrt(2.0 / math.pi) * math.exp(-0.5 * (mean / std) ** 2)
+    speed_mps += mean * math.erf(mean / (std * math.sqrt(2.0)))
+    sector_rad = math.tau / count
+    turned = replace(
+        start,
+        yaw_std_rad=sector_rad / math.sqrt(12.0),
+        speed_mps=speed_mps,
+        speed_std_mps=math.sqrt(max(mean**2 + std**2 - speed_mps**2, 0.0)),
+    )
+    return [replace(turned, yaw_rad=wrap_angle(k * sector_rad)) for k in range(count)]
+
+
+def intersections(start: Start, ranges_m: list[float]) -> list[Start]:
+    """Both intersections of the circles of two ranges around `ANCHORS_M`, or where they nearly touch.
+
+    The covariance is that of the two ranges, to first order; it is limited to the mean range.
+    """
+    first, second = (np.array(each) for each in ANCHORS_M)
+    apart_m = float(np.hypot(*(second - first)))
+    along = (second - first) / apart_m
+    across = np.array([-along[1], along[0]])
+    near_m, far_m = ranges_m
+    foot_m = (near_m**2 - far_m**2 + apart_m**2) / (2.0 * apart_m)
+    height_m = math.sqrt(max(near_m**2 - foot_m**2, 0.0))
+    found = []
+    for side in (1.0, -1.0) if height_m > 0.0 else (1.0,):
+        position_m = first + foot_m * along + side * height_m * across
+        offsets_m = [position_m - each for each in (first, second)]
+        H = np.array([each / max(float(np.hypot(*each)), 1e-9) for each in offsets_m])
+        vague = identity(2) / (0.5 * (near_m + far_m)) ** 2
+        covariance = symmetrise(psd_solve(H.T @ H / RANGE_STD_M**2 + vague, identity(2)))
+        found.append(replace(start, position_m=position_m, position_covariance=covariance))
+    return found
 
 
 def driven(x: FloatArray, rng: np.random.Generator) -> Iterator[tuple[int, FloatArray]]:
@@ -69,7 +167,7 @@ def doppler(rng: np.random.Generator) -> Scene:
     (first,) = measurements.pop(0)
     position_m, covariance = measured_position(DOPPLER.components, first.z, R, first.pose) or (first.z, R)
     start = Start(position_m=position_m, position_covariance=covariance, speed_std_mps=20.0)
-    return Scene(start, [], NUM_HEADINGS, np.array(truth[1:]), measurements)
+    return Scene(start, [], headings(start, NUM_HEADINGS), np.array(truth[1:]), measurements)
 
 
 def ranging(rng: np.random.Generator) -> Scene:
@@ -95,7 +193,7 @@ def ranging(rng: np.random.Generator) -> Scene:
         speed_mps=float(x[3] + rng.standard_normal()),
         speed_std_mps=1.0,
     )
-    both = fgtrack.starts.intersections(known, ANCHORS_M, [float(each.z[0]) for each in first], RANGE_STD_M)
+    both = intersections(known, [float(each.z[0]) for each in first])
     return Scene(known, first, both, np.array(truth[1:]), measurements)
 
 
@@ -119,9 +217,8 @@ def errors_m(scene_name: str, name: str, how: str, seed: int, run: int) -> Float
     if name == "smoother":
         options |= {"lagged_s": (), "final": False}
     several = how in ("8 headings", "two intersections")
-    if several:
-        options["hypotheses"] = scene.hypotheses
-    estimator = fgtrack.estimator(name, MOTION, scene.start, lag_s=WINDOW_S, **options)
+    starts = scene.hypotheses if several else [scene.start]
+    estimator = Hypotheses([fgtrack.estimator(name, MOTION, each, lag_s=WINDOW_S, **options) for each in starts])
     for measurement in [] if several else scene.first:
         estimator.update(measurement)
     found = []

@@ -18,7 +18,6 @@ from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.filters.replay_bank import ReplayBank
 from fgtrack.estimation.filters.track_initiation import initiated
-from fgtrack.estimation.hypotheses import hypotheses
 from fgtrack.estimation.object_bank import ObjectBank, OneObject
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel, WhiteNoise
 
@@ -137,8 +136,7 @@ def estimator(name: str, motion: MotionModel, start: Start, *, lag_s: float = 1.
     lag_s
         Length of the window behind the newest stamp or the clock.
     options
-        Keyword parameters of that estimator; and of every estimator `initiation`, see `Initiation`, and `hypotheses`:
-        as many headings, where `start` has none, or starts such as those of `fgtrack.starts`, of which one is right.
+        Keyword parameters of that estimator; and of every estimator `initiation`, see `Initiation`.
 
     Raises
     ------
@@ -158,18 +156,15 @@ def start_estimator(
 ) -> Estimator:
     """`estimator` of a factory that need not be registered; `name` stands in errors."""
     claims, own = Claims.of(factory), dict(options)
-    wanted, method = own.pop("hypotheses", 1), DEFAULT if claims.initiates else own.pop("initiation", DEFAULT)
+    method = "one-point" if claims.initiates else own.pop("initiation", DEFAULT)
 
-    def plain(start: Start) -> Estimator:
+    def made(start: Start) -> Estimator:
         if claims.bank:
             return OneObject(motion, _made_as(TrackBank, name, factory, motion, lag_s, **own), start)
         one: Estimator = _made_as(Estimator, name, factory, motion, start, lag_s, **own)
         return one
 
-    def made(start: Start) -> Estimator:
-        return plain(start) if claims.initiates else initiated(motion, start, method, plain)
-
-    return hypotheses(motion, start, wanted, made)
+    return initiated(motion, start, method, made)
 
 
 def estimator_bank(
