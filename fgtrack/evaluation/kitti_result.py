@@ -145,7 +145,7 @@ def _line(
     place, turned_rad = view.rectified(bottom, yaw_rad - ego.yaw_rad)
     right_m, down_m, forward_m = place.tolist()
     box = Box(height_m, width_m, length_m, right_m, down_m, forward_m, turned_rad)
-    image = box.image_px(view.calibration)
+    image = box.image_px(view.projection)
     if image is None:
         return None
     alpha_rad = wrap_angle(turned_rad - math.atan2(box.x_m, box.z_m))

@@ -38,12 +38,12 @@ def sequence(at: Path, **files: list[str]) -> Path:
     ]
     seen = [line(frame, car, score=" 7.75") for frame in FRAMES for car in (0, 1)]
     folder(at, oxts=ego, pointrcnn_car=seen, **files)
-    views = list(read_views(at / "oxts/0001.txt", at / "calib/0001.txt"))
+    views, _ = read_views(at / "oxts/0001.txt", at / "calib/0001.txt")
     labels = []
     for frame in FRAMES:
         for car in (0, 1):
             numbers = list(map(float, line(frame, car).split()[10:17]))
-            image = Box(*numbers).image_px(views[frame].calibration)
+            image = Box(*numbers).image_px(views[frame].projection)
             labels.append(line(frame, car, image=" ".join(map(str, image))))
     (at / "label_02").mkdir(exist_ok=True)
     (at / "label_02/0001.txt").write_text("\n".join(labels))

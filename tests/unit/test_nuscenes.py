@@ -118,11 +118,11 @@ def test_classes_scores_and_ids_of_trackers(tmp_path):
 
 def test_of_several_scenes_one_is_named(tmp_path):
     path = data(tmp_path, {"other": []})
-    with pytest.raises(CallError, match=r"of 2 scenes \(scene-0001, scene-0002\), name one as input\.nuscenes\.scene"):
+    with pytest.raises(CallError, match=r"2 scenes, name one as input\.nuscenes\.scene: scene-0001, scene-0002"):
         messages(path)
     assert len(messages(path, scene="scene-0001")) == 6
     assert [type(item).__name__ for item in messages(path, scene="b")] == ["EgoState", "DetectionList"]
-    with pytest.raises(CallError, match="has no scene scene-9, but scene-0001"):
+    with pytest.raises(CallError, match=r"0 scenes, name one .*: scene-0001"):
         messages(path, scene="scene-9")
 
 

@@ -38,13 +38,12 @@ import numpy as np
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.types import Detection, DetectionList, Frame, Message, TruthState
-from fgtrack.io.adapters.common import split
-from fgtrack.io.adapters.kitti_view import PERIOD_NS, View, parsed, read_views
+from fgtrack.io.adapters.common import reported_as, split
+from fgtrack.io.adapters.kitti_view import View, lines_of, read_views
 from fgtrack.io.config import KittiInput
-from fgtrack.io.errors import UntilBreak
 from fgtrack.io.source import FileFormat
 
-__all__ = ["CLASS_NAMES", "FORMAT", "PERIOD_NS", "is_sequence", "read_sequence", "view_of_sequence"]
+__all__ = ["CLASS_NAMES", "FORMAT", "is_sequence", "read_sequence", "view_of_sequence"]
 
 _TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
 CLASS_NAMES: Mapping[str, str] = {name.lower(): name for name in _TYPES}
@@ -68,9 +67,8 @@ def read_sequence(folder: Path, sequence: str, settings: KittiInput) -> Iterator
     Raises `DataError`, with file and line, where a file is missing, and, after all messages of earlier frames, where a
     line is damaged: the file may have been cut off there.
     """
-    readable = UntilBreak(_views(folder, sequence))
-    views = list(readable)
-    damages = [] if readable.error is None else [(len(views), readable.error)]
+    views, error = _views(folder, sequence)
+    damages = [] if error is None else [(len(views), error)]
     labels = folder / _LABELS / f"{sequence}.txt"
     truth = _by_frame(labels, views, partial(_truth, settings), damages) if labels.exists() else {}
     sensors = {
@@ -102,20 +100,19 @@ def _by_frame(
     Lines are in the order of their frames, so a damaged frame number is not before that of the line above.
     """
     latest, by_frame = 0, defaultdict(list)
-
-    def at_frame(fields: list[str]) -> tuple[int, Item]:
-        nonlocal latest
-        frame = int(fields[0])
-        latest = max(latest, frame)
-        if not 0 <= frame < len(views):
-            raise ValueError(f"of frame {frame}, but {_OXTS} has {len(views)} frames")
-        return frame, parse(views[frame], fields)
-
-    lines = UntilBreak(parsed(file, at_frame))
-    for frame, item in lines:
-        by_frame[frame].append(item)
-    if lines.error is not None:
-        damages.append((latest, lines.error))
+    try:
+        for where, fields in lines_of(file):
+            with (
+                reported_as(where),
+                np.errstate(all="ignore"),
+            ):  # of values that are not finite: the tracker counts them
+                frame = int(fields[0])
+                latest = max(latest, frame)
+                if not 0 <= frame < len(views):
+                    raise ValueError(f"of frame {frame}, but {_OXTS} has {len(views)} frames")
+                by_frame[frame].append(parse(views[frame], fields))
+    except DataError as error:
+        damages.append((latest, error))
     return by_frame
 
 
@@ -129,10 +126,13 @@ def _in_image(detector: Path, frames: Mapping[int, list[Detection | str]]) -> bo
 
 def view_of_sequence(path: Path) -> list[View]:
     """The ego at every frame of the sequence that `path`, a folder or a file of `oxts/`, means; raises as a reader."""
-    return list(_views(*_located(path)))
+    views, error = _views(*_located(path))
+    if error is not None:
+        raise error
+    return views
 
 
-def _views(folder: Path, sequence: str) -> Iterator[View]:
+def _views(folder: Path, sequence: str) -> tuple[list[View], DataError | None]:
     return read_views(folder / _OXTS / f"{sequence}.txt", folder / _CALIB / f"{sequence}.txt")
 
 
@@ -179,13 +179,12 @@ def _truth(settings: KittiInput, view: View, fields: list[str]) -> TruthState | 
 
 
 def _region(view: View, left_px: float, top_px: float, right_px: float, bottom_px: float) -> TruthState:
-    near_m = _CAR_HEIGHT_M * _INSIDE * view.calibration.projection[1, 1] / max(bottom_px - top_px, 1.0)
+    near_m = _CAR_HEIGHT_M * _INSIDE * view.projection[1, 1] / max(bottom_px - top_px, 1.0)
     near_m, far_m = min(near_m, 0.5 * _FAR_M), _FAR_M
     v_px = 0.5 * (top_px + bottom_px)
     sides = np.array([view.bearing_rad(u_px, v_px) for u_px in (left_px, right_px)])
     rays = np.column_stack([np.cos(sides), np.sin(sides)])
-    camera_m = (view.levelled_from_imu @ view.calibration.camera_m)[:2]
-    corners = view.in_map(camera_m + np.vstack([near_m * rays, far_m * rays[::-1]]))
+    corners = view.in_map(view.camera_m[:2] + np.vstack([near_m * rays, far_m * rays[::-1]]))
     x_m, y_m = corners.mean(axis=0).tolist()
     outline_m = tuple(corners.ravel().tolist())
     return TruthState(view.ego.stamp_ns, view.ego.receipt_ns, -2, x_m, y_m, ignored=True, outline_m=outline_m)

@@ -1,9 +1,9 @@
 """Where things of a KITTI sequence are: calibration, the ego at every frame, from camera to ego frame and back."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.files import read_whole
 from fgtrack.core.geometry import rotation, wrap_angle
 from fgtrack.core.types import EgoState, FloatArray
+from fgtrack.io.adapters.common import reported_as
 
 PERIOD_NS = 100_000_000
 IMAGE_PX = (1242.0, 375.0)
@@ -18,30 +19,6 @@ IMAGE_PX = (1242.0, 375.0)
 
 _LARGEST_MB = 16.0  # those of the data set have a few
 _EARTH_RADIUS_M = 6_378_137.0
-
-Item = TypeVar("Item")
-
-
-class Calibration(NamedTuple):
-    """Poses of camera 2 and of the frame of labels and detections in the frame of the inertial unit."""
-
-    projection: FloatArray
-    """Image point, homogeneous, from a point in the rectified frame of camera 0, shape (3, 4)."""
-    rectified_from_imu: FloatArray
-    """Shape (4, 4)."""
-
-    def point(self, rectified_m: Sequence[float]) -> FloatArray:
-        """Point in the frame of the inertial unit, shape (3,)."""
-        return np.asarray(np.linalg.solve(self.rectified_from_imu, [*rectified_m, 1.0])[:3])
-
-    def direction(self, rectified: Sequence[float]) -> FloatArray:
-        """Direction in the frame of the inertial unit, shape (3,)."""
-        return np.asarray(np.linalg.solve(self.rectified_from_imu[:3, :3], rectified))
-
-    @property
-    def camera_m(self) -> FloatArray:
-        """Camera 2 in the frame of the inertial unit, shape (3,)."""
-        return self.point((-np.linalg.solve(self.projection[:, :3], self.projection[:, 3])).tolist())
 
 
 class Box(NamedTuple):
@@ -55,13 +32,13 @@ class Box(NamedTuple):
     z_m: float
     rotation_y_rad: float
 
-    def image_px(self, calibration: Calibration) -> tuple[float, float, float, float] | None:
-        """Left, top, right and bottom of what camera 2 sees of it; None where it does not."""
+    def image_px(self, projection: FloatArray) -> tuple[float, float, float, float] | None:
+        """Left, top, right and bottom of what camera 2, of that `projection`, sees of it; None where it does not."""
         signs = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-1.0, 0.0) for c in (-0.5, 0.5)])
         corners = signs * np.array([self.length_m, self.height_m, self.width_m])
         corners[:, ::2] = corners[:, ::2] @ rotation(self.rotation_y_rad)  # about y, which points down
         corners += np.array([self.x_m, self.y_m, self.z_m])
-        points = np.column_stack([corners, np.ones(8)]) @ calibration.projection.T
+        points = np.column_stack([corners, np.ones(8)]) @ projection.T
         points = points[points[:, 2] > 0.1]
         if not len(points):
             return None
@@ -76,86 +53,92 @@ class View(NamedTuple):
     ego: EgoState
     levelled_from_imu: FloatArray
     """Shape (3, 3)."""
-    calibration: Calibration
+    projection: FloatArray
+    """Image point of camera 2, homogeneous, from a point in the rectified frame of camera 0, shape (3, 4)."""
+    rectified_from_imu: FloatArray
+    """Shape (4, 4)."""
+
+    def position_m(self, rectified_m: list[float]) -> FloatArray:
+        """Point in the ego frame, shape (3,)."""
+        return self.levelled_from_imu @ np.linalg.solve(self.rectified_from_imu, [*rectified_m, 1.0])[:3]
+
+    @property
+    def camera_m(self) -> FloatArray:
+        """Camera 2 in the ego frame, shape (3,)."""
+        return self.position_m((-np.linalg.solve(self.projection[:, :3], self.projection[:, 3])).tolist())
 
     def pose(self, x_m: float, y_m: float, z_m: float, rotation_y_rad: float) -> tuple[FloatArray, float]:
         """Position (3,) and yaw in the ego frame of an object given in the rectified camera frame."""
-        heading = self.calibration.direction([math.cos(rotation_y_rad), 0.0, -math.sin(rotation_y_rad)])
-        return self.levelled_from_imu @ self.calibration.point([x_m, y_m, z_m]), self._azimuth_rad(heading)
+        heading = [math.cos(rotation_y_rad), 0.0, -math.sin(rotation_y_rad)]
+        return self.position_m([x_m, y_m, z_m]), self._azimuth_rad(heading)
 
     def rectified(self, position_m: FloatArray, yaw_rad: float) -> tuple[FloatArray, float]:
         """Position (3,) and rotation about y in the rectified camera frame, the inverse of `pose`."""
-        turn = self.calibration.rectified_from_imu[:3, :3] @ self.levelled_from_imu.T
+        turn = self.rectified_from_imu[:3, :3] @ self.levelled_from_imu.T
         heading = turn @ [math.cos(yaw_rad), math.sin(yaw_rad), 0.0]
-        return turn @ position_m + self.calibration.rectified_from_imu[:3, 3], math.atan2(-heading[2], heading[0])
+        return turn @ position_m + self.rectified_from_imu[:3, 3], math.atan2(-heading[2], heading[0])
 
     def bearing_rad(self, u_px: float, v_px: float) -> float:
         """Bearing of an image point from camera 2, 0 along the ego's heading."""
-        ray = np.linalg.solve(self.calibration.projection[:, :3], [u_px, v_px, 1.0])
-        return self._azimuth_rad(self.calibration.direction(ray.tolist()))
+        return self._azimuth_rad(np.linalg.solve(self.projection[:, :3], [u_px, v_px, 1.0]).tolist())
 
     def in_map(self, position_m: FloatArray) -> FloatArray:
         """Points in the map, shape (..., 2), from those in the ego frame."""
         return np.array([self.ego.x_m, self.ego.y_m]) + position_m[..., :2] @ rotation(self.ego.yaw_rad).T
 
-    def _azimuth_rad(self, imu: FloatArray) -> float:
-        ahead, aside, _ = (self.levelled_from_imu @ imu).tolist()
+    def _azimuth_rad(self, rectified: list[float]) -> float:
+        direction = np.linalg.solve(self.rectified_from_imu[:3, :3], rectified)
+        ahead, aside, _ = (self.levelled_from_imu @ direction).tolist()
         return math.atan2(aside, ahead)
 
 
-def parsed(file: Path, parse: Callable[[list[str]], Item]) -> Iterator[Item]:
-    """Results of `parse` for the fields of every line of `file`, which blanks or commas separate.
-
-    Raises `DataError`, with file and line, where `parse` raises a `ValueError` or `IndexError`.
-    """
+def lines_of(file: Path) -> Iterator[tuple[str, list[str]]]:
+    """What an error in a line of `file` says, and the fields of the line, which blanks or commas separate."""
     text = read_whole(file, _LARGEST_MB).decode(errors="replace").rstrip()
     for number, line in enumerate(text.splitlines(), 1):
-        try:
-            with np.errstate(all="ignore"):  # of values that are not finite: the tracker counts them
-                yield parse(line.strip().split(",") if "," in line else line.split())
-        except (ValueError, IndexError) as error:
-            raise DataError(f"{file}:{number}: is not a line of the data set ({error})") from error
+        fields = line.strip().split(",") if "," in line else line.split()
+        yield f"{file}:{number}: is not a line of the data set", fields
 
 
-def _calibration(file: Path) -> Calibration:
-    matrices = dict(parsed(file, lambda fields: (fields[0].strip(":"), np.array(fields[1:], dtype=np.float64))))
-    matrices = {name.replace("R0_", "R_").replace("_to_", "_"): values for name, values in matrices.items()}
-    try:
+def _calibration(file: Path) -> tuple[FloatArray, FloatArray]:
+    """Return `projection` and `rectified_from_imu` of a view."""
+    matrices = {}
+    for where, (name, *values) in lines_of(file):
+        with reported_as(where):
+            matrices[name.strip(":").replace("R0_", "R_").replace("_to_", "_")] = np.array(values, dtype=np.float64)
+    with reported_as(f"{file}: is not a calibration of the data set"):
         rectified_from_camera = np.eye(4)
         rectified_from_camera[:3, :3] = matrices["R_rect"].reshape(3, 3)
         camera_from_velodyne, velodyne_from_imu = (
             np.vstack([matrices[name].reshape(3, 4), [0.0, 0.0, 0.0, 1.0]]) for name in ("Tr_velo_cam", "Tr_imu_velo")
         )
-        projection = matrices["P2"].reshape(3, 4)
-    except (KeyError, ValueError) as error:
-        raise DataError(f"{file}: is not a calibration of the data set ({error!r})") from error
-    return Calibration(projection, rectified_from_camera @ camera_from_velodyne @ velodyne_from_imu)
+        return matrices["P2"].reshape(3, 4), rectified_from_camera @ camera_from_velodyne @ velodyne_from_imu
 
 
-def read_views(file: Path, calibration_file: Path) -> Iterator[View]:
-    """Ego at every frame of the `oxts` file; raises `DataError` at a line that is not one of the data set."""
+def read_views(file: Path, calibration_file: Path) -> tuple[list[View], DataError | None]:
+    """Ego at every frame of the `oxts` file, up to a line that is not one of the data set, and the error of that."""
     calibration = _calibration(calibration_file)
     views: list[View] = []
     scale, origin_m = 1.0, np.zeros(2)
-
-    def view(fields: list[str]) -> View:
-        nonlocal scale, origin_m
-        latitude_deg, longitude_deg, roll_rad, pitch_rad, yaw_rad, speed_mps, accel_mps2, yaw_rate_radps = (
-            float(fields[index]) for index in (0, 1, 3, 4, 5, 8, 14, 22)
-        )
-        if not views:
-            scale = math.cos(math.radians(latitude_deg))
-            origin_m = _mercator(latitude_deg, longitude_deg, scale)
-        x_m, y_m = (_mercator(latitude_deg, longitude_deg, scale) - origin_m).tolist()
-        stamp_ns = len(views) * PERIOD_NS
-        ego = EgoState(stamp_ns, stamp_ns, x_m, y_m, wrap_angle(yaw_rad), speed_mps, yaw_rate_radps, accel_mps2)
-        about_x, about_y = np.eye(3), np.eye(3)
-        about_x[1:, 1:] = rotation(roll_rad)
-        about_y[::2, ::2] = rotation(-pitch_rad)  # rows and columns x and z, which y turns from z to x
-        views.append(View(ego, np.asarray(about_y @ about_x), calibration))
-        return views[-1]
-
-    return parsed(file, view)
+    try:
+        for where, fields in lines_of(file):
+            with reported_as(where):
+                latitude_deg, longitude_deg, roll_rad, pitch_rad, yaw_rad, speed_mps, accel_mps2, yaw_rate_radps = (
+                    float(fields[index]) for index in (0, 1, 3, 4, 5, 8, 14, 22)
+                )
+                if not views:
+                    scale = math.cos(math.radians(latitude_deg))
+                    origin_m = _mercator(latitude_deg, longitude_deg, scale)
+                x_m, y_m = (_mercator(latitude_deg, longitude_deg, scale) - origin_m).tolist()
+                stamp_ns = len(views) * PERIOD_NS
+                ego = EgoState(stamp_ns, stamp_ns, x_m, y_m, wrap_angle(yaw_rad), speed_mps, yaw_rate_radps, accel_mps2)
+                about_x, about_y = np.eye(3), np.eye(3)
+                about_x[1:, 1:] = rotation(roll_rad)
+                about_y[::2, ::2] = rotation(-pitch_rad)  # rows and columns x and z, which y turns from z to x
+                views.append(View(ego, about_y @ about_x, *calibration))
+    except DataError as error:
+        return views, error
+    return views, None
 
 
 def _mercator(latitude_deg: float, longitude_deg: float, scale: float) -> FloatArray:

@@ -33,7 +33,7 @@ from fgtrack.io.source import FileFormat
 __all__ = ["FORMAT", "read_scene"]
 
 _RESULTS = re.compile(rb'\s*\{\s*"(meta|results)"\s*:')
-_A_LIST, _OF_RESULTS = re.compile(r"\s*\["), re.compile(r'.*?"results"\s*:\s*\{', re.DOTALL)
+_A_LIST, _OF_RESULTS = re.compile(r"\s*\[\s*"), re.compile(r'.*?"results"\s*:\s*\{\s*', re.DOTALL)
 _BETWEEN = re.compile(r"[\s,:]*")
 _LARGEST_MB = 2000.0
 _NS_PER_US = 1000
@@ -62,7 +62,7 @@ def read_scene(file: Path, settings: NuscenesInput) -> Iterator[Message]:
     tables = _tables(file, settings)
     with reported_as(f"{file}: it or its tables in {tables} are not those of nuScenes"):
         samples = _samples(tables, file, settings)
-        boxes = {token: of for token, of in _entries(file, _OF_RESULTS) if token in samples}
+        boxes = {token: listed for token, listed in _results(file) if token in samples}
         egos = _egos(tables, samples)
         truth = _truth(tables, samples, settings)
         lists = [
@@ -76,30 +76,25 @@ def read_scene(file: Path, settings: NuscenesInput) -> Iterator[Message]:
 
 
 def _entries(file: Path, begin: re.Pattern[str] = _A_LIST) -> Iterator[Json]:
-    """Values of the list or object that follows `begin` in the JSON `file`; those of an object with their keys.
+    """Values of the list that follows `begin` in the JSON `file`, or keys and values of the object.
 
     One after the other: the text of such a table has up to a gigabyte, and its values take five times as much.
     """
-    decode = json.JSONDecoder().raw_decode
     with reported_as(f"{file}: is not JSON of the expected form, fetch it again"):
         text = read_whole(file, _LARGEST_MB).decode()
-        start = begin.match(text)
-        if start is None:
-            raise ValueError("does not begin so")
-        at = _next(text, start.end())
-        while text[at] not in "]}":
-            value, at = decode(text, at)
-            at = _next(text, at)
-            if begin is _OF_RESULTS:
-                inner, at = decode(text, at)
-                value, at = (value, inner), _next(text, at)
+        gap = begin.match(text)
+        if gap is None:
+            raise ValueError("another beginning")
+        while gap is not None and text[gap.end()] not in "]}":
+            value, end = json.JSONDecoder().raw_decode(text, gap.end())
             yield value
+            gap = _BETWEEN.match(text, end)
 
 
-def _next(text: str, at: int) -> int:
-    """Return where the next value begins, from `at` on."""
-    found = _BETWEEN.match(text, at)
-    return found.end() if found else at
+def _results(file: Path) -> Iterator[tuple[str, Json]]:
+    """Sample and its boxes, one after the other."""
+    entries = _entries(file, _OF_RESULTS)
+    return zip(entries, entries, strict=True)
 
 
 def _tables(file: Path, settings: NuscenesInput) -> Path:
@@ -116,23 +111,15 @@ def _tables(file: Path, settings: NuscenesInput) -> Path:
 def _samples(tables: Path, file: Path, settings: NuscenesInput) -> dict[str, int]:
     """Stamps of the samples of the scene, by token, in the order of time."""
     names = {each["token"]: each["name"] for each in _entries(tables / "scene.json")}
-    judged = {token for token, _ in _entries(file, _OF_RESULTS)}
-    scenes = {each["scene_token"] for each in _entries(tables / "sample.json") if each["token"] in judged}
+    judged = {token for token, _ in _results(file)}
+    samples = [(each["timestamp"], each["token"], each["scene_token"]) for each in _entries(tables / "sample.json")]
+    scenes = {scene for _, token, scene in samples if token in judged}
     if settings.scene is not None:
         scenes = {token for token, name in names.items() if settings.scene in (token, name)}
-        if not scenes:
-            raise CallError(f"{tables}: has no scene {settings.scene}, but {_some(names.values())}")
     if len(scenes) != 1:
-        has = _some(names[token] for token in scenes) if scenes else "none of these tables"
-        raise CallError(f"{file}: the results are of {len(scenes)} scenes ({has}), name one as input.nuscenes.scene")
-    entries = _entries(tables / "sample.json")
-    chosen = sorted((each["timestamp"], each["token"]) for each in entries if each["scene_token"] in scenes)
-    return {token: int(time_us) * _NS_PER_US for time_us, token in chosen}
-
-
-def _some(names: Any) -> str:
-    names = sorted(names)
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+        choice = ", ".join(sorted(names[token] for token in scenes or names)[:5])
+        raise CallError(f"{file}: {len(scenes)} scenes, name one as input.nuscenes.scene: {choice} ...")
+    return {token: int(time_us) * _NS_PER_US for time_us, token, scene in sorted(samples) if scene in scenes}
 
 
 def _egos(tables: Path, samples: Mapping[str, int]) -> list[EgoState]:
