@@ -1,6 +1,6 @@
 """Arguments that several commands share, and the names that the shell offers for them."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -8,14 +8,14 @@ import typer
 
 from fgtrack.io.recording import Storage
 
-Completion = Callable[[str], list[str]]
+Completion = Callable[[], list[str]]
 
 
 def _shipped(kind: str) -> Completion:
-    def names(incomplete: str) -> list[str]:
+    def names() -> list[str]:
         from fgtrack.pipeline.shipped import shipped  # loads much, and is only needed here
 
-        return _beginning(shipped(kind), incomplete)  # type: ignore[arg-type]  # a kind of `shipped`
+        return list(shipped(kind))  # type: ignore[arg-type]  # a kind of `shipped`
 
     return names
 
@@ -27,12 +27,8 @@ def estimators(incomplete: str) -> list[str]:
     """Names of estimators, of several with commas between them the last."""
     from fgtrack.estimation.registry import ESTIMATORS
 
-    before, comma, last = incomplete.rpartition(",")
-    return [f"{before}{comma}{name}" for name in _beginning(ESTIMATORS, last)]
-
-
-def _beginning(names: Iterable[str], start: str) -> list[str]:
-    return [name for name in names if name.startswith(start)]
+    before, comma, _ = incomplete.rpartition(",")
+    return [f"{before}{comma}{name}" for name in ESTIMATORS]
 
 
 Input = Annotated[

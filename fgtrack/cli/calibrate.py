@@ -13,8 +13,8 @@ from fgtrack.calibration.clock_offsets import OffsetReport, estimate_offsets
 from fgtrack.calibration.clocks import clock_text
 from fgtrack.calibration.starting import starting_config
 from fgtrack.calibration.trial import TRIAL_S, Trial, try_out
-from fgtrack.cli.arguments import ConfigFile, FormOption, Input, Json, Overwrite, PitMap, Reference, Settings, TrackMap
-from fgtrack.cli.show import chosen_form, progress, say, sentences, show, warn
+from fgtrack.cli.arguments import ConfigFile, Input, Json, Overwrite, PitMap, Reference, Settings, TrackMap
+from fgtrack.cli.show import progress, say, sentences, show, warn
 from fgtrack.core.errors import CallError, DataError, FgtrackError
 from fgtrack.evaluation.diagnostics import excluded_lines
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Value
@@ -40,14 +40,12 @@ def info(
     ] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
-    form: FormOption = None,
 ) -> None:
     """Show topics, rates and delays of a recording.
 
     With a configuration (or with the one of --write, which guesses what topics, fields and columns are) also what it
     would take from them, what a message of each is read as, and what a replay of the first seconds makes of them.
     """
-    form = chosen_form(as_json, form)
     if write is not None:
         if config_file is not None:
             raise CallError("--write, -c: a starting configuration is made from the recording alone, give one of them")
@@ -56,7 +54,7 @@ def info(
         text = starting_config(recording)
         with new_file(write, overwrite) as file:
             file.write(text.encode())
-        if form is None:
+        if not as_json:
             say(f"{write}: written; check its guesses, they are applied below")
         config_file = str(write)
     config = None if config_file is None else read_config(config_file)
@@ -70,13 +68,13 @@ def info(
         "duration_s": found.duration_s,
     }
     values |= {"problem": found.problem, "topics": topics.plain()}
-    show(topics, form, {**values, "effective": plain(comes_to)})
-    if form is None:
+    show(topics, "json" if as_json else None, {**values, "effective": plain(comes_to)})
+    if not as_json:
         sentences([f"{config_file or 'without a configuration'}: {comes_to}"])
     trial = None
-    if config is not None and found.problem is None and form is None:
+    if config is not None and found.problem is None and not as_json:
         trial = _try_out(recording, config)
-    elif form is None:
+    elif not as_json:
         with suppress(FgtrackError), progress("detections"):  # whose topics and columns nothing names
             sentences(assumed(Config(), open_input(recording)).lines())
     problem = found.problem if trial is None else trial.problem
@@ -152,16 +150,14 @@ def advise(
     settings: Settings = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
-    form: FormOption = None,
 ) -> None:
     """Report what is late or wrong, and which settings correct it.
 
     Sentences in order of importance, and the lateness of each sensor.
     """
-    form = chosen_form(as_json, form)
     if out is not None:
         check_output(out, overwrite)
-    config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
+    config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
     if out is not None:
         check_apart(out, [recording, config_file])
     with progress("advise") as tell:
@@ -170,8 +166,8 @@ def advise(
         head = [f"Settings for {recording} (fgtrack advise).", "", *advice.comments(), ""]
         with new_file(out, overwrite) as file:
             file.write(Assumed(advice.config, ()).to_yaml(head).encode())
-    show(advice.tables, form, advice.as_dict())
-    if out is not None and form is None:
+    show(advice.tables, "json" if as_json else None, advice.as_dict())
+    if out is not None and not as_json:
         again = shlex.join(["fgtrack", "replay", str(recording), "-c", str(out), "-o", "RUN"])
         say(f"{out}: written; follow it by `{again}`")
     if advice.broken is not None:
@@ -186,24 +182,22 @@ def offsets(
     pit_map: PitMap = None,
     settings: Settings = None,
     as_json: Json = False,
-    form: FormOption = None,
 ) -> None:
     """Estimate constant clock offsets of sensors.
 
     Says which ones are not identifiable.
     """
-    form = chosen_form(as_json, form)
-    config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
+    config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
     source = open_input(recording, config.input)
     with progress("offsets"):
         found = assumed(config, source)
         readable = UntilBreak(source.messages())
         report = estimate_offsets(list(readable), found.config, reference)
-    for line in found.lines() if form is None else ():
+    for line in found.lines() if not as_json else ():
         say(line)
     verdicts = {one.sensor: clock_text(one, report) for one in report.others}
-    show(_offsets(report), form, report.as_dict() | {"verdicts": verdicts})
-    if form is None:
+    show(_offsets(report), "json" if as_json else None, report.as_dict() | {"verdicts": verdicts})
+    if not as_json:
         sentences(f"{name}: {text}" for name, text in verdicts.items())
     if readable.error is not None:
         raise DataError(f"{located(str(readable.error), str(recording))}; used up to there")

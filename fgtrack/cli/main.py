@@ -6,10 +6,10 @@ import os
 import resource
 import sys
 import traceback
-import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,11 +18,8 @@ from typer.core import TyperGroup
 
 import fgtrack
 from fgtrack.cli.entry import INTERRUPTED
-from fgtrack.cli.streams import standard_streams
-from fgtrack.core.errors import CallError, DataError, FgtrackError, one_line
+from fgtrack.core.errors import CallError, FgtrackError, one_line
 from fgtrack.io.output import FULL
-
-_logger = logging.getLogger(__name__)
 
 DONE, BAD_DATA, BAD_CALL = 0, 1, 2
 
@@ -50,13 +47,6 @@ _STYLE: dict[str, Any] = {"add_completion": False, "rich_markup_mode": None, "pr
 
 class _LazyCommands(TyperGroup):
     """Imports a command's module when the command is called; the help needs none of them."""
-
-    def invoke(self, ctx: Any) -> Any:
-        """Run the command; Typer would end the program at a closed pipe without a message."""
-        try:
-            return super().invoke(ctx)
-        except BrokenPipeError as error:
-            raise DataError(f"{error.filename or 'an output'}: output pipe closed") from error
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         name, _, rest = super().resolve_command(ctx, args)
@@ -113,7 +103,7 @@ def _options(
 
 
 class _OneLine(logging.Formatter):
-    """Warnings of readers name what is in files."""
+    """Warnings of readers, libraries and plug-ins contain names from files."""
 
     def format(self, record: logging.LogRecord) -> str:
         """See `logging.Formatter.format`; as a terminal can show it."""
@@ -125,30 +115,23 @@ def run(arguments: Sequence[str]) -> int:
     debug = "--debug" in arguments
     words = [word for word in arguments if word != "--debug"]
     memory = resource.getrlimit(resource.RLIMIT_AS)
-    try:
-        with standard_streams(), warnings.catch_warnings():
-            warnings.showwarning = _log  # type: ignore[assignment]  # the rest is of no use here
-            return _run(words, debug)
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, memory)  # of whoever calls this from Python
-
-
-def _log(message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: object) -> None:
-    """Log a warning of a library or a plug-in as a line."""
-    _logger.warning("%s:%d: %s: %s", filename, lineno, category.__name__, message)
-
-
-def _run(words: Sequence[str], debug: bool) -> int:
     logged = logging.StreamHandler()
     logged.setFormatter(_OneLine("fgtrack: %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[logged], force=True)
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # figures need nothing of what it looks for in the system
+    logging.captureWarnings(True)
+    try:
+        return _run(words, debug)
+    finally:
+        logging.captureWarnings(False)
+        resource.setrlimit(resource.RLIMIT_AS, memory)  # of whoever calls this from Python
+
+
+def _run(words: Sequence[str], debug: bool) -> int:
     try:
         outcome = typer.main.get_command(app).main([*words] or ["--help"], prog_name="fgtrack", standalone_mode=False)
         if outcome == INTERRUPTED:  # typer turns the exception into this code
             return _failed("interrupted; what was computed so far is in the output folder", INTERRUPTED, debug)
-        if sys.stdout is not None:
-            sys.stdout.flush()
         return BAD_CALL if not words else outcome if isinstance(outcome, int) else DONE
     except typer.TyperException as error:
         context = getattr(error, "ctx", None)
@@ -158,13 +141,14 @@ def _run(words: Sequence[str], debug: bool) -> int:
         return _failed(str(error), BAD_CALL if isinstance(error, CallError) else BAD_DATA, debug)
     except MemoryError:
         return _failed("more memory needed than --max-memory allows: raise it, or split the input", BAD_DATA, debug)
+    except OSError as error:  # of a path that was given, there or in a file, else of stdout
+        code = BAD_DATA if error.errno in FULL else BAD_CALL
+        if error.filename is None:
+            sys.stdout = None  # so that the end of the process does not fail on it, too
+        path = error.filename or "standard output"
+        return _failed(f"{path}: cannot be used, the system says: {error.strerror}", code, debug)
     except Exception as error:  # the last line of defence: a bug must not look like bad data
-        message, code = f"internal error: {type(error).__name__}: {error} (run with --debug)", BAD_DATA
-        if isinstance(error, OSError) and error.errno in FULL:  # of files, the library makes its own errors
-            message = f"what was to be printed cannot be written ({error.strerror}), free some space"
-        elif isinstance(error, OSError) and error.filename is not None:  # of a path that was given, there or in a file
-            message, code = f"{error.filename}: cannot be used, the system says: {error.strerror}", BAD_CALL
-        return _failed(message, code, debug)
+        return _failed(f"internal error: {type(error).__name__}: {error} (run with --debug)", BAD_DATA, debug)
 
 
 def _failed(message: str, code: int, debug: bool) -> int:
@@ -178,5 +162,6 @@ def _failed(message: str, code: int, debug: bool) -> int:
 def main() -> int:
     """Run the command line of this process; gives the exit code."""
     os.environ["MPLBACKEND"] = "agg"  # nothing is shown in a window, so none of the system's is needed
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, each thread would reserve memory
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # for a letter that the terminal does not have
     return run(sys.argv[1:])

@@ -11,7 +11,7 @@ from rich.table import Table as Grid
 from rich.text import Text
 
 from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, Settings, StorageOption, scenarios
-from fgtrack.cli.show import console, counted, progress, say
+from fgtrack.cli.show import console, progress, say
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.diagnostics import excluded_lines
@@ -46,8 +46,8 @@ def simulate(
     scenario = read_scenario(scenario_file, duration_s=duration_s)
     check_apart(out, [scenario_file, scenario.map])
     check_recording(out, overwrite)
-    with progress("simulate") as tell:
-        messages = counted(simulated(scenario, np.random.default_rng(seed)), tell)
+    with progress("simulate"):
+        messages = simulated(scenario, np.random.default_rng(seed))
         count = write_recording(out, messages, storage, settings=recorded_of(scenario), overwrite=overwrite)
     say(f"{out}: {count} messages")
 
@@ -60,22 +60,18 @@ def convert(
         Path | None,
         typer.Option("--delays", help="Give detections other delays, losses and clock errors by sensor (YAML)."),
     ] = None,
-    seed: Annotated[
-        int | None, typer.Option("--seed", min=0, help="Seed of the random generator of --delays.", show_default="0")
-    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random generator of --delays.")] = 0,
     storage: StorageOption = "mcap",
     overwrite: Overwrite = False,
 ) -> None:
     """Convert a recording into a stream or a rosbag2 folder."""
-    if seed is not None and delays_file is None:
-        raise CallError("--seed: only --delays draws random numbers, name its file")
     config = read_config(config_file)
     check_apart(out, [recording, config_file, delays_file])
     check_recording(out, overwrite)
     source = open_input(recording, config.input)
     unread: dict[str, Counter[str]] = {}
     with progress("convert"):
-        messages = source.messages() if delays_file is None else _redelayed(source.messages, delays_file, seed or 0)
+        messages = source.messages() if delays_file is None else _redelayed(source.messages, delays_file, seed)
         kept = _with_unread(messages, unread)
         count = write_recording(out, kept, storage, settings=source.settings(), overwrite=overwrite)
     lost = messages.num_lost if isinstance(messages, Redelayed) else {}
@@ -110,7 +106,7 @@ def config(
 ) -> None:
     """Print the resolved configuration, or list the shipped ones."""
     if not listed:
-        print(dump(read_config(config_file, settings or [])), end="")
+        say(dump(read_config(config_file, settings)).removesuffix("\n"))
         return
     for kind in get_args(Kind):
         say(f"{kind}s")

@@ -8,7 +8,7 @@ import typer
 
 from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, PitMap, Settings, TrackMap, estimators
 from fgtrack.cli.show import progress, say, warn
-from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.errors import DataError
 from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.evaluation.diagnostics import diagnostics, excluded_lines, noise_diagnostics, unused
 from fgtrack.io.output import check_apart
@@ -38,11 +38,9 @@ def replay(
     overwrite: Overwrite = False,
 ) -> None:
     """Replay a recording through the tracker."""
-    config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
+    config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
     given = (config.estimator if estimators is None else estimators).split(",")
-    names = tuple(ESTIMATORS.resolve(name.strip()) for name in given)
-    if len(set(names)) < len(names):
-        raise CallError(f"estimator {max(names, key=names.count)!r} is named twice")
+    names = tuple(dict.fromkeys(ESTIMATORS.resolve(name.strip()) for name in given))
     folders = {name: out / name for name in names} if len(names) > 1 else {names[0]: out}
     for folder in folders.values():
         check_apart(folder, [recording, config_file])

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from fgtrack.cli.arguments import All, FormOption, Json, Overwrite, Runs
-from fgtrack.cli.show import chosen_form, progress, say, show, warn
+from fgtrack.cli.show import progress, say, show, warn
 from fgtrack.core.errors import CallError, FgtrackError
 from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.evaluation.kitti_result import write_kitti_result
@@ -28,7 +28,7 @@ def compare(
     ] = False,
 ) -> None:
     """Compare runs in tables, and write metrics.json into each."""
-    form = chosen_form(as_json, form)
+    form = "json" if as_json else form
     every = evaluated(runs)
     of_each = dict.fromkeys(f"{one.label}: {line}" for one in every for line in diagnostics(one.run))
     for line in (*recordings_warning(every), *of_each):

@@ -11,7 +11,7 @@ import typer
 from fgtrack.calibration.study import Study, outputs
 from fgtrack.calibration.study import study as studied
 from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, PitMap, Settings, TrackMap
-from fgtrack.cli.show import counted, progress, say, sentences, show, warn
+from fgtrack.cli.show import progress, say, sentences, show, warn
 from fgtrack.core.errors import DataError
 from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.io.output import check_apart, claimed
@@ -38,7 +38,7 @@ def study(
     No configuration is needed: what is assumed is printed with its reason, and written to settings.yaml, to be changed
     and run again.
     """
-    config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
+    config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
     for path in outputs(out):
         check_apart(path, [recording, config_file])
     with progress("study") as tell:
@@ -79,8 +79,8 @@ def demo(
     with claimed(out):
         bag = out / "recording"
         check_recording(bag, overwrite)
-        with progress("simulate") as tell:
-            messages = counted(simulate(scenario, np.random.default_rng(seed)), tell)
+        with progress("simulate"):
+            messages = simulate(scenario, np.random.default_rng(seed))
             write_recording(bag, messages, overwrite=overwrite, settings=recorded_of(scenario))
         config = read_config(_CONFIG, track_map=OVAL, pit_map=OVAL)
     with progress("study") as tell:

@@ -11,8 +11,8 @@ import typer
 from fgtrack.calibration.outcome import noise_fits
 from fgtrack.calibration.tune import tuned
 from fgtrack.calibration.tune_space import HeldOut, TunedParameter, TuneReport, TuneRules
-from fgtrack.cli.arguments import ConfigFile, FormOption, Json, Overwrite, PitMap, Settings, TrackMap
-from fgtrack.cli.show import chosen_form, progress, say, show
+from fgtrack.cli.arguments import ConfigFile, Json, Overwrite, PitMap, Settings, TrackMap
+from fgtrack.cli.show import progress, say, show
 from fgtrack.core.errors import DataError
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
 from fgtrack.io.output import check_apart, check_output, new_file
@@ -37,15 +37,13 @@ def tune(
     ] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
-    form: FormOption = None,
 ) -> None:
     """Fit process and measurement noise to recordings.
 
     Maximum likelihood of the innovations; truth is not needed. Says which parameters are not identifiable.
     """
-    form = chosen_form(as_json, form)
     check_output(out, overwrite)
-    config = read_config(config_file, settings or [], track_map=track_map, pit_map=pit_map)
+    config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
     check_apart(out, [*recordings, config_file])
     sources = {str(path): open_input(path, config.input) for path in recordings}
     with progress("tune") as tell:
@@ -59,8 +57,8 @@ def tune(
     head = [title, "", *str(tables).splitlines(), "", *found, ""]
     with new_file(out, overwrite) as file:
         file.write(Assumed(of_recordings, ()).to_yaml(head).encode())
-    show(tables, form, report.as_dict())
-    if form is None:
+    show(tables, "json" if as_json else None, report.as_dict())
+    if not as_json:
         say("\n".join(["", *found, f"{out}: written"]))
     if report.broken:
         raise DataError(f"{next(iter(report.broken.values()))}; used up to there")

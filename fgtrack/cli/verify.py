@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from fgtrack.cli.arguments import FormOption, Json, estimators
-from fgtrack.cli.show import chosen_form, progress, say, show
+from fgtrack.cli.arguments import Json, estimators
+from fgtrack.cli.show import progress, say, show
 from fgtrack.estimation.registry import ESTIMATORS, MOTION_MODELS, Claims
 from fgtrack.evaluation.tables import Column, Table
 from fgtrack.testing import BrokenPromiseError, estimator_checks, motion_model_checks
@@ -23,7 +23,6 @@ _COLUMNS = (
 
 def verify(
     as_json: Json = False,
-    form: FormOption = None,
     name: Annotated[
         str | None, typer.Option("-e", "--estimator", help="This one alone.", autocompletion=estimators)
     ] = None,
@@ -33,7 +32,6 @@ def verify(
     All estimators and motion models that are installed, plug-ins included, on simulated streams, against plain
     calculations. Exit code 1 where a promise is broken.
     """
-    form = chosen_form(as_json, form)
     names = list(ESTIMATORS.loaded()) if name is None else [ESTIMATORS.resolve(name)]
     with progress("verify"):
         suites = {
@@ -51,8 +49,12 @@ def verify(
     broken = {each: found for each, found in found_broken.items() if found}
     promises = sum(len(checks) for _, checks in suites.values())
     values = {"met": not broken, "promises": promises, "checked": list(suites), "broken": broken}
-    show(Table("Contract of estimators and motion models", records, _COLUMNS, ("name",)), form, values)
-    if form is None:
+    show(
+        Table("Contract of estimators and motion models", records, _COLUMNS, ("name",)),
+        "json" if as_json else None,
+        values,
+    )
+    if not as_json:
         for each, found in broken.items():
             for promise, what in found.items():
                 say(f"{each}: broken promise: it {promise}\n{what}\n")

@@ -179,7 +179,6 @@ def foreign_folder(path: Path) -> None:
         (("replay", "drive.jsonl", "-o", "drive.jsonl"), "drive.jsonl: is the input or holds it"),
         (("replay", "drive.jsonl", "-o", "foreign"), "foreign: exists and is not a run folder"),
         (("replay", "drive.jsonl", "-o", "run", "-e", "magic"), "estimator 'magic' is unknown"),
-        (("replay", "drive.jsonl", "-o", "run", "-e", "ekf-replay,ekf-replay"), "named twice"),
         (
             ("replay", "drive.jsonl", "-o", "run", "-c", "missing.yaml"),
             "missing.yaml: there is no such configuration file",
@@ -327,7 +326,7 @@ def test_a_warning_of_a_plug_in_is_a_line(fgtrack: Command, stream: Path, monkey
     monkeypatch.setattr("fgtrack.cli.replay.replay_each", warns)
     called = fgtrack("replay", stream, "-o", "run")
     warned, _ = called.err.splitlines()
-    assert warned.endswith("RuntimeWarning: \\x1b[31mdivide by zero")
+    assert "RuntimeWarning: \\x1b[31mdivide by zero" in warned
     assert "test_cli.py:" in warned
 
 

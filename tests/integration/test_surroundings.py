@@ -52,7 +52,7 @@ def test_closed_streams_are_no_error(folder: Path, words: str) -> None:
 def test_a_stream_that_cannot_be_written_to_is_a_line(folder: Path) -> None:
     done = shell(folder, "fgtrack info drive.jsonl 1</dev/null")
     assert done.returncode == 2
-    assert done.stderr.startswith("fgtrack: error: standard output or error: cannot be used")
+    assert done.stderr.startswith("fgtrack: error: standard output: cannot be used")
 
 
 @pytest.mark.parametrize(
