@@ -1,21 +1,21 @@
 """Figures of a sweep: a metric over the grid, mean and 95 % interval over the seeds; and error against delay."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from fnmatch import fnmatchcase
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any, Unpack
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.special import stdtrit
 
 from fgtrack.core.errors import DataError
-from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.palette import look, looks
-from fgtrack.evaluation.tables.seeds import PointMean, SweepTable, number, read_sweep
+from fgtrack.evaluation.tables.seeds import SweepTable, number, read_sweep
 from fgtrack.plotting.paper import Paper, Sheet, styled
 from fgtrack.plotting.style import legend_above, log_axis
 
@@ -60,9 +60,7 @@ def sweep_metrics(table: SweepTable) -> tuple[list[str], list[str]]:
 
 
 @styled
-def sweep(
-    table: SweepTable | Path | str, metric: str = "truth.overall.errors.position_m.rmse", **paper: Unpack[Paper]
-) -> Figure:
+def sweep(table: SweepTable | Path | str, metric: str = _POSITION, **paper: Unpack[Paper]) -> Figure:
     """A metric of a sweep over its grid: mean over the seeds and 95 % interval, a line for each estimator.
 
     The axis with the most numbers is the horizontal one; of the others every combination has a panel. `table` is the
@@ -70,58 +68,55 @@ def sweep(
     `DataError` if it has no value.
     """
     table = table if isinstance(table, SweepTable) else read_sweep(table)
-    names = table.shown_axes
-    means = table.means(metric, names)
-    if not means:
+    names, means = table.shown_axes or ("",), _means(table, metric)
+    if means.empty:
         raise DataError(f"{metric}: no cell of the sweep has a value, so there is nothing to draw")
-    cells = [list(dict.fromkeys(row[name] for row in table.rows)) for name in names] or [[""]]
-    are_numbers = [all(math.isfinite(number(cell)) for cell in each) for each in cells]
-    across = max(range(len(cells)), key=lambda k: (are_numbers[k], len(cells[k])))
-    places = map(number, cells[across]) if are_numbers[across] else range(len(cells[across]))
-    ticks = dict(zip(cells[across], map(float, places), strict=True))
+    are_numbers = {name: all(math.isfinite(number(cell)) for cell in means[name]) for name in names}
+    across = max(names, key=lambda name: (are_numbers[name], means[name].nunique()))
+    ticks = {cell: number(cell) if are_numbers[across] else k for k, cell in enumerate(means[across].unique())}
+    means["at"] = means[across].map(ticks)
     width = max(ticks.values()) - min(ticks.values()) or 1.0
-    rest = [k for k in range(len(names)) if k != across]
-    panels = {tuple(one.point[k] for k in rest): None for one in means}
+    rest = [name for name in names if name != across]
+    panels = list(means.groupby(rest, sort=False)) if rest else [((), means)]
     columns = min(_WIDE, len(panels))
     rows = math.ceil(len(panels) / columns)
     sheet = Sheet(max(7.0, 1.2 + 3.8 * columns), 1.5 + 3.0 * rows, paper)
     grid = sheet.plots(rows, columns, sharex=True, sharey=True)
-    estimators = list(dict.fromkeys(one.estimator for one in means))
-    for axes, point in zip(grid.flat, panels, strict=False):
+    estimators = means["estimator"].unique().tolist()
+    for axes, (point, panel) in zip(grid.flat, panels, strict=False):
         for k, (estimator, its) in enumerate(zip(estimators, looks(estimators), strict=True)):
-            mine = [one for one in means if one.estimator == estimator and tuple(one.point[k] for k in rest) == point]
-            at = np.array([ticks[one.point[across] if names else ""] for one in mine])
-            order = np.argsort(at, kind="stable")
-            at = at[order] + _DODGE * width * (k - (len(estimators) - 1) / 2.0)  # so that bars do not hide each other
-            mean, line = np.array([one.mean for one in mine])[order], its.line if are_numbers[across] else "none"
-            given: dict[str, Any] = {"color": its.colour, "ls": line, "marker": its.marker, "ms": 4, "lw": 1.2}
-            axes.errorbar(at, mean, half_widths(mine)[order], capsize=3.0, label=estimator if mine else "", **given)
-        axes.set_title("\n".join(f"{words(names[k])}: {c}" for k, c in zip(rest, point, strict=True)), loc="left")
+            mine = panel[panel["estimator"] == estimator].sort_values("at", kind="stable")
+            at = mine["at"] + _DODGE * width * (k - (len(estimators) - 1) / 2.0)  # so that bars do not hide each other
+            line = {"color": its.colour, "ls": its.line if are_numbers[across] else "none", "marker": its.marker}
+            label = "" if mine.empty else estimator
+            axes.errorbar(at, mine["mean"], mine["half"], capsize=3.0, ms=4, lw=1.2, label=label, **line)
+        axes.set_title("\n".join(f"{words(name)}: {c}" for name, c in zip(rest, point, strict=True)), loc="left")
         if metric in _EXPECTED:
             axes.axhline(_EXPECTED[metric], color="black", lw=0.9, ls="--", label="expected")
     for k, axes in enumerate(grid.flat):
         axes.set_visible(k < len(panels))
         if len(panels) - columns <= k < len(panels):
-            axes.set_xlabel(words(names[across]) if names else "")
+            axes.set_xlabel(words(across))
             axes.tick_params(labelbottom=True)
-    values = np.array([one.mean for one in means])
-    if (values > 0.0).all() and values.max() > _LOG_FROM * values.min():
-        grid[0, 0].set_yscale("log")
-        log_axis(grid[0, 0].yaxis)
-    elif (values >= 0.0).all():
-        grid[0, 0].set_ylim(0.0, None if values.any() else 1.0)
+    first: Axes = grid[0, 0]
+    low, high = means["mean"].min(), means["mean"].max()
+    if low > 0.0 and high > _LOG_FROM * low:
+        first.set_yscale("log")
+        log_axis(first.yaxis)
+    elif low >= 0.0:
+        first.set_ylim(0.0, None if high else 1.0)
     if len(ticks) <= _NAMED_STEPS or not are_numbers[across]:
-        grid[0, 0].set_xticks(list(ticks.values()), list(ticks))
-    grid[0, 0].set_xlim(min(ticks.values()) - 0.08 * width, max(ticks.values()) + 0.08 * width)
+        first.set_xticks(list(ticks.values()), list(ticks))
+    first.set_xlim(min(ticks.values()) - 0.08 * width, max(ticks.values()) + 0.08 * width)
     for axes in grid[:, 0]:
         axes.set_ylabel(metric_words(metric))
     if len(panels) == 1:
-        legend_above(grid[0, 0])
+        legend_above(first)
     else:
-        sheet.figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
-    seeds = [one.seeds for one in means]
-    of = f"{min(seeds)} to {max(seeds)}" if min(seeds) < max(seeds) else str(max(seeds))
-    bars = f"mean over {of} seeds, bars: 95 % interval" if max(seeds) > 1 else "one seed"
+        sheet.figure.legend(*first.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    few, most = means["seeds"].min(), means["seeds"].max()
+    of = f"{few} to {most}" if few < most else str(most)
+    bars = f"mean over {of} seeds, bars: 95 % interval" if most > 1 else "one seed"
     sheet.title(f"{metric_words(metric).partition(' [')[0]}: {bars}")
     return sheet.figure
 
@@ -138,46 +133,39 @@ def error_against_delay(table: SweepTable | Path | str | None = None, **paper: U
         with as_file(files(__package__) / "error_against_delay") as folder:
             table = read_sweep(folder)
     table = table if isinstance(table, SweepTable) else read_sweep(table)
-    means = table.means(_POSITION)
-    if len(table.shown_axes) != 1 or not means or not all(math.isfinite(number(one.point[0])) for one in means):
+    waits = [name for name in table.metrics if fnmatchcase(name, _LAGGED)][:1]
+    curves = {metric: _means(table, metric) for metric in (_POSITION, *waits)}
+    (delay, *others), points = table.shown_axes or ("",), curves[_POSITION]
+    if others or points.empty or not all(math.isfinite(number(cell)) for cell in points[delay]):
         raise DataError(
             "the sweep is not over one axis of delays with position errors, so it is not drawn against delay"
         )
     sheet = Sheet(7.0, 4.2, paper)
     axes: Axes = sheet.plots()[0, 0]
-    waits = [name for name in table.metrics if fnmatchcase(name, _LAGGED)][:1]
-    curves = [
-        (metric, name) for metric in (_POSITION, *waits) for name in dict.fromkeys(one.estimator for one in means)
-    ]
-    for metric, name in curves:
-        mine = sorted(
-            (one for one in table.means(metric) if one.estimator == name), key=lambda one: number(one.point[0])
-        )
-        if not mine:
-            continue
-        delay_ms = np.array([1e3 * number(one.point[0]) for one in mine])
-        mean, half, its = np.array([one.mean for one in mine]), half_widths(mine), look(name)
-        line, marker, label = its.line, its.marker, name
-        if metric != _POSITION:
-            line, marker, label = ":", ".", f"{name}, {metric_words(metric).partition(', ')[2]}"
-        axes.fill_between(delay_ms, mean - half, mean + half, color=its.colour, alpha=0.18, lw=0)
-        axes.plot(delay_ms, mean, ls=line, marker=marker, ms=4, lw=1.6, color=its.colour, label=label)
-    axes.set(
-        xlabel=f"{words(table.shown_axes[0]).partition(' [')[0]}, mean [ms]",
-        ylabel="position RMSE [m]",
-        ylim=(0.0, None),
-    )
+    for metric, means in curves.items():
+        means["ms"] = 1e3 * means[delay].map(number)
+        for name, mine in means.sort_values("ms", kind="stable").groupby("estimator", sort=False):
+            its, later = look(name), metric_words(metric).partition(", ")[2]
+            line, marker, label = (":", ".", f"{name}, {later}") if later else (its.line, its.marker, name)
+            low, high = mine["mean"] - mine["half"], mine["mean"] + mine["half"]
+            axes.fill_between(mine["ms"], low, high, color=its.colour, alpha=0.18, lw=0)
+            axes.plot(mine["ms"], mine["mean"], ls=line, marker=marker, ms=4, lw=1.6, color=its.colour, label=label)
+    axes.set(xlabel=f"{words(delay).partition(' [')[0]}, mean [ms]", ylabel="position RMSE [m]", ylim=(0.0, None))
     axes.margins(x=0.02)
     legend_above(axes)
     sheet.title("Error against delay (shaded: 95 % interval over the seeds)")
     return sheet.figure
 
 
-def half_widths(means: Sequence[PointMean]) -> FloatArray:
-    """Half widths of the 95 % intervals (t) of `means`, shape (n,); 0 of one seed, which has none."""
-    seeds = np.array([one.seeds for one in means])
+def _means(table: SweepTable, metric: str) -> Any:  # Any: a DataFrame, whose columns have no types
+    """Return the axes, estimator, mean, seeds and half width of the 95 % interval (t; 0 of one seed) of every point."""
+    means = table.means(metric)
+    frame = pd.DataFrame([one.point or ("",) for one in means], columns=list(table.shown_axes or ("",)))
+    for name in ("estimator", "mean", "seeds"):
+        frame[name] = [getattr(one, name) for one in means]
     errors = np.array([one.standard_error for one in means])
-    return np.asarray(np.nan_to_num(stdtrit(np.maximum(seeds - 1, 1), 0.975) * errors))
+    frame["half"] = np.nan_to_num(stdtrit(np.maximum(frame["seeds"] - 1, 1), 0.975) * errors)
+    return frame
 
 
 def metric_words(metric: str) -> str:
