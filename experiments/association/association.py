@@ -41,10 +41,11 @@ from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.estimation.smoothing.bank import SmootherBank
 from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
 from fgtrack.estimation.smoothing.settings import SmootherSettings
+from fgtrack.evaluation.palette import PALETTE
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.plotting.paper import styled
-from fgtrack.plotting.style import colour, log_axis, save
+from fgtrack.plotting.style import log_axis, save
 from fgtrack.sim.vehicles import drawn
 from fgtrack.tracking.association import Association, GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.preprocess import Candidate
@@ -357,10 +358,10 @@ def draw(rows: Sequence[Row], path: Path) -> None:
             own = [row for row in rows if row["kind"] == kind and row["variant"] == variant]
             delays = [row for row in own if row["period_s"] == 0.4]
             if place == 0 and variant != "present":  # metres away
-                look = {"color": colour(index), "marker": "os^"[index], "label": variant, "linewidth": 3.0 - index}
+                look = {"color": PALETTE[index], "marker": "os^"[index], "label": variant, "linewidth": 3.0 - index}
                 left.plot([1e3 * row["delay_s"] for row in delays], [row["offset_m"] for row in delays], **look)
             x, late = index + 0.4 * place, own[-1]
-            fill = {"color": colour(index), "alpha": 1.0 - 0.5 * place}
+            fill = {"color": PALETTE[index], "alpha": 1.0 - 0.5 * place}
             right.bar(x, 100.0 * late["wrong"], 0.36, yerr=200.0 * late["wrong_error"], capsize=3.0, **fill)
             if late["refused"] > 0.01:
                 right.text(x, 130.0 * late["wrong"], f"{late['refused']:.0%}\nrefused", ha="center", fontsize=7)

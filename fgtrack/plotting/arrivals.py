@@ -15,7 +15,7 @@ from fgtrack.evaluation.runs import OneRun, one_evaluated, start_ns
 from fgtrack.io.run import Table
 from fgtrack.io.run.schema import Column
 from fgtrack.plotting.paper import Paper, Sheet, styled
-from fgtrack.plotting.style import legend_above, titled, usual_step_ns
+from fgtrack.plotting.style import legend_above, usual_step_ns
 
 #: None is the colour of an estimator that is compared often.
 _COLOURS = {
@@ -75,7 +75,7 @@ def arrivals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     rows[len(rows) // 2].set_ylabel("delay [ms]")
     rows[-1].set_xlabel("time of receipt [s]")
     legend_above(flow)
-    sheet.title(titled(one.label, "detections from stamp to receipt"))
+    sheet.title(f"{one.label}: detections from stamp to receipt")
     return sheet.figure
 
 

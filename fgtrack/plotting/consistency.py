@@ -21,7 +21,6 @@ from fgtrack.plotting.style import (
     log_axis,
     run_looks,
     sensor_colour,
-    titled,
     usual_step_ns,
 )
 
@@ -76,7 +75,7 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
             axes.plot([], color="black", lw=0.9, ls="--", label="expected")
         legend_above(axes)
     rows[-1].set_xlabel("time [s]")
-    sheet.title(titled(one.label, "consistency: normalised squares of errors and innovations, with their 95 % bands"))
+    sheet.title(f"{one.label}: consistency: normalised squares of errors and innovations, with their 95 % bands")
     return sheet.figure
 
 

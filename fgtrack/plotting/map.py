@@ -9,21 +9,20 @@ from matplotlib.figure import Figure
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.evaluation.matching import confirmed
+from fgtrack.evaluation.palette import PALETTE
 from fgtrack.evaluation.placement import placed
 from fgtrack.evaluation.roads import road_lines, roads
 from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_ns
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run import Run, Table
 from fgtrack.plotting.paper import Paper, Sheet, styled
-from fgtrack.plotting.ranges import bulk
-from fgtrack.plotting.style import GREY, WRONG, broken_line, colour, legend_above, titled, usual_step_ns
+from fgtrack.plotting.style import GREY, WRONG, broken_line, bulk, legend_above, usual_step_ns
 
 _NAMED_OBJECTS = 8  # more objects than these share two entries of the legend
 
 
 _AROUND_S = 0.4  # of the life of a track before and after the moment of the close-up
 _LEAST_M = 4.0  # half a side of the close-up
-_WORTHWHILE = 3.0  # times the size of the close-up that the whole must have
 _DETECTIONS = "#8C7A1F"
 
 
@@ -48,8 +47,6 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     edges = [bulk([each[:, k] for each in samples_m], [each[:, k] for each in required]) for k in range(2)]
     lows_m, highs_m = np.transpose(edges)
     window = _window(one.run)
-    if window is not None and (highs_m - lows_m).max() <= _WORTHWHILE * 2.0 * window.half_m:
-        window = None
     sheet = Sheet(8.0 if window is None else 11.0, 6.0, paper)
     overview, *close_ups = sheet.plots(1, 1 if window is None else 2)[0]
     for axes, near in ((overview, None), *((axes, window) for axes in close_ups)):
@@ -64,7 +61,7 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
             axes.plot(
                 *detections_m[shown].T, "x", ms=size, mew=0.2 * size, color=_DETECTIONS, label=label, zorder=above
             )
-        _draw_objects(axes, one, tracks.where(_near(tracks["stamp_ns"], near)), near)
+        _draw_objects(axes, one, tracks, near)
         axes.set(xlabel="x, east [m]", ylabel="y, north [m]")
         axes.set_aspect("equal", adjustable="datalim")
         corners = (lows_m, highs_m) if near is None else (near.middle_m - near.half_m, near.middle_m + near.half_m)
@@ -75,11 +72,7 @@ def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
             at_s = (near.middle_ns - start_ns([one])) / NS_PER_S
             axes.set_title(f"close-up: {2 * _AROUND_S:g} s around {at_s:.1f} s", loc="left")
             overview.plot(*near.middle_m, "s", ms=14, mfc="none", mec="black", mew=1.2, label="close-up", zorder=6)
-    text = [titled(one.label, "on the map")]
-    if notes:
-        text.append("the map file is not there any more")
-    if one.matching is None:
-        text.append(f"{len(np.unique(tracks['track_id']))} confirmed tracks, no truth")
+    text = [f"{one.label}: on the map", *notes]
     outside = sum(int(((each < lows_m) | (each > highs_m)).any(axis=-1).sum()) for each in samples_m)
     if outside:
         text.append(f"{outside} rows of tracks and detections are outside of the picture")
@@ -128,30 +121,25 @@ def _positions(table: Table) -> FloatArray:
 
 
 def _draw_objects(axes: Axes, one: EvaluatedRun, tracks: Table, window: _Window | None) -> None:
-    """Truth and tracks, in their colours."""
-    step_ns = usual_step_ns(one.run.tables["tracks"]["now_ns"])
-    matching = one.matching
-    if matching is None:
-        for k, track_id in enumerate(np.unique(one.run.tables["tracks"]["track_id"]).tolist()):
-            _draw_tracks(axes, tracks.where(tracks["track_id"] == track_id), step_ns, colour(k), "")
-        return
-    paths = true_paths(one.run.tables["truth"])
-    few, index_of = len(paths) <= _NAMED_OBJECTS, matching.object_index[_near(matching.tracks["stamp_ns"], window)]
-    for index, path in enumerate(paths):
-        name = f"object {path.object_id}" if few else "objects"
-        rows = _near(path.stamps_ns, window)
-        x_m, y_m = path.states[rows, :2].T
-        stamps_ns: IntArray = path.stamps_ns[rows]
-        line = broken_line(stamps_ns, x_m, y_m, usual_step_ns(path.stamps_ns))
-        axes.plot(*line, color=colour(index), lw=4.0, alpha=0.3, label=f"{name}, truth" if few or not index else "")
-        label = f"{name}, track" if few or not index else ""
-        _draw_tracks(axes, tracks.where(index_of == index), step_ns, colour(index), label)
-    _draw_tracks(axes, tracks.where(index_of < 0), step_ns, WRONG, "paired with no object")
-
-
-def _draw_tracks(axes: Axes, tracks: Table, step_ns: float, color: str, label: str) -> None:
-    for track_id in np.unique(tracks["track_id"]).tolist():
-        rows = tracks.where(tracks["track_id"] == track_id)
-        line = broken_line(rows["stamp_ns"], rows["x_m"], rows["y_m"], step_ns)
-        axes.plot(*line, color=color, lw=1.2, label=label, zorder=4)
-        label = ""
+    """Truth and tracks, in their colours; without truth every track has one of its own."""
+    ids, step_ns = one.run.tables["tracks"]["track_id"], usual_step_ns(one.run.tables["tracks"]["now_ns"])
+    owners = np.searchsorted(np.unique(ids), tracks["track_id"]) if one.matching is None else one.matching.object_index
+    near = _near(tracks["stamp_ns"], window)
+    paths = [] if one.matching is None else true_paths(one.run.tables["truth"])
+    few = len(paths) <= _NAMED_OBJECTS
+    for index in (*range(max(len(paths), owners.max(initial=-1) + 1)), -1):
+        color, label = (PALETTE[index % len(PALETTE)], "") if index >= 0 else (WRONG, "paired with no object")
+        if 0 <= index < len(paths):
+            path = paths[index]
+            name = f"object {path.object_id}" if few else "objects" if index == 0 else ""
+            rows = _near(path.stamps_ns, window)
+            x_m, y_m = path.states[rows, :2].T
+            line = broken_line(path.stamps_ns[rows], x_m, y_m, usual_step_ns(path.stamps_ns))
+            axes.plot(*line, color=color, lw=4.0, alpha=0.3, label=f"{name}, truth" if name else "")
+            label = f"{name}, track" if name else ""
+        mine = tracks.where(near & (owners == index))
+        for track_id in np.unique(mine["track_id"]).tolist():
+            track = mine.where(mine["track_id"] == track_id)
+            line = broken_line(track["stamp_ns"], track["x_m"], track["y_m"], step_ns)
+            axes.plot(*line, color=color, lw=1.2, label=label, zorder=4)
+            label = ""

@@ -11,8 +11,7 @@ from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_n
 from fgtrack.evaluation.scores import innovations
 from fgtrack.evaluation.scores.innovations import RESIDUAL_NAMES
 from fgtrack.plotting.paper import Paper, Sheet, styled
-from fgtrack.plotting.ranges import bulk
-from fgtrack.plotting.style import legend_above, sensor_colour, titled
+from fgtrack.plotting.style import bulk, legend_above, sensor_colour
 
 _RESIDUALS = {
     "along_m": "along track [m]",
@@ -68,7 +67,7 @@ def residuals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         over_time.sharex(rows[0][0])
         over_time.tick_params(labelbottom=name == names[-1])
         legend_above(over_time, 2.0 / 3.0, markerscale=3.0)
-    sheet.title(titled(one.label, "innovations (measured minus predicted)"))
+    sheet.title(f"{one.label}: innovations (measured minus predicted)")
     return sheet.figure
 
 

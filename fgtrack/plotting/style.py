@@ -13,17 +13,15 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.text import Text
 from matplotlib.ticker import LogLocator, NullFormatter
 from PIL import Image
-from PIL.PngImagePlugin import PngInfo
 
 from fgtrack.core.errors import CallError, printable_lines
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.palette import PALETTE, SENSORS, Look, looks
+from fgtrack.evaluation.palette import SENSORS, Look, looks
 from fgtrack.evaluation.runs import EvaluatedRun
 
 _RC: Any = mpl.rcParams  # Any: its keys are a Literal of all names
@@ -32,11 +30,14 @@ GREY = "#777777"
 
 _PAUSE_STEPS = 3  # a line is not drawn across a pause that is longer than as many usual steps
 
-_LETTER = 0.58  # width of a letter over the size of the font
+_LETTER, _LINE = 0.58, 1.5  # width of a letter and height of a line over the size of the font
 _MOST_ENTRIES = 12  # of a legend
 _HANDLE = 8  # characters that the line before an entry and the space around it take
 _BESIDE_IN = 0.6  # what the labels of an axis take of the width
 _FREE_LINES = 2  # of a legend for which figures have room
+
+_BEYOND = 3.0  # interquartile ranges beyond the quartiles that still belong to the bulk
+_MARGIN = 0.05
 
 _MARK = "fgtrack figure"
 #: Formats of files, with who made them and without what would differ from one writing to the next.
@@ -68,14 +69,7 @@ class StyledFigure(Figure):
             super().savefig(*args, **kwargs)
 
     def _repr_html_(self) -> str:
-        picture = io.BytesIO()
-        self.savefig(picture, format="png")
-        return f'<img src="data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}">'
-
-
-def colour(index: int) -> str:
-    """Colour of the object or track number `index`."""
-    return PALETTE[index % len(PALETTE)]
+        return f'<img src="data:image/png;base64,{base64.b64encode(png(self)).decode()}">'
 
 
 def sensor_colour(index: int) -> str:
@@ -94,12 +88,7 @@ def title(figure: Figure, text: str) -> None:
     width = max(10, int(figure.get_figwidth() / (_LETTER * _size_in("figure.titlesize"))))
     lines = [line for part in text.split("\n") for line in textwrap.wrap(part, width)]
     figure.suptitle("\n".join(lines))
-    _grow(figure, _line_in("figure.titlesize") * (len(lines) - 1))
-
-
-def titled(label: str, what: str) -> str:
-    """Title of a figure that shows `what` of the run `label`, or of all runs where that is empty."""
-    return f"{label}: {what}" if label else what[0].upper() + what[1:]
+    _grow(figure, "figure.titlesize", len(lines) - 1)
 
 
 def legend_above(axes: Axes, share: float = 1.0, markerscale: float = 1.0) -> None:
@@ -131,24 +120,18 @@ def legend_above(axes: Axes, share: float = 1.0, markerscale: float = 1.0) -> No
         columnspacing=1.2,
         handlelength=1.8,
     )
-    num_lines = math.ceil(sum(map(len, broken)) / columns)
     if isinstance(figure, StyledFigure):
-        _grow(figure, _line_in("legend.fontsize") * max(0, num_lines - _FREE_LINES))
+        _grow(figure, "legend.fontsize", math.ceil(sum(map(len, broken)) / columns) - _FREE_LINES)
 
 
 def _size_in(name: str) -> float:
     """Return the size in inches of the texts of this setting."""
-    size_pt = FontProperties(size=_RC[name]).get_size_in_points()
-    return float(size_pt) / 72.0
+    return float(FontProperties(size=_RC[name]).get_size_in_points()) / 72.0
 
 
-def _line_in(name: str) -> float:
-    return 1.5 * _size_in(name)
-
-
-def _grow(figure: Figure, more_in: float) -> None:
-    """Make `figure` higher, so that what is written above its plots takes nothing from them."""
-    figure.set_figheight(figure.get_figheight() + max(0.0, more_in))
+def _grow(figure: Figure, name: str, lines: int) -> None:
+    """Make room for `lines` of the texts of this setting above the plots."""
+    figure.set_figheight(figure.get_figheight() + max(0, lines) * _LINE * _size_in(name))
 
 
 def log_axis(axis: Axis) -> None:
@@ -171,6 +154,23 @@ def broken_line(stamps_ns: IntArray, x: FloatArray, y: FloatArray, step_ns: floa
     return np.insert(x[order], pauses, np.nan), np.insert(y[order], pauses, np.nan)
 
 
+def bulk(samples: Iterable[FloatArray], required: Iterable[FloatArray] = ()) -> tuple[float, float]:
+    """Range with the bulk of each of `samples` and all of `required`, and a margin; (0, 1) without finite values."""
+    lows, highs = [], []
+    for values, is_required in (*((each, False) for each in samples), *((each, True) for each in required)):
+        known = values[np.isfinite(values)]
+        if len(known):
+            first, third = np.quantile(known, (0.25, 0.75)).tolist()
+            reach = np.inf if is_required else _BEYOND * (third - first)
+            lows.append(max(float(known.min()), first - reach))
+            highs.append(min(float(known.max()), third + reach))
+    if not lows:
+        return 0.0, 1.0
+    low, high = min(lows), max(highs)
+    margin = max(_MARGIN * (high - low), 1e-6, 1e-9 * max(abs(low), abs(high)))  # wide enough for bins of it
+    return low - margin, high + margin
+
+
 def save_pages(figures: Iterable[Figure], file: BinaryIO) -> None:
     """Write `figures` as the pages of one PDF, without date and version."""
     from matplotlib.backends.backend_pdf import PdfPages
@@ -182,15 +182,10 @@ def save_pages(figures: Iterable[Figure], file: BinaryIO) -> None:
 
 def png(figure: Figure, dpi: float = 150.0) -> bytes:
     """`figure` as a small PNG of 256 colours, without date and version."""
-    canvas: Any = FigureCanvasAgg(figure)  # Any: matplotlib has no types for it
-    before, small, made_by = figure.dpi, io.BytesIO(), PngInfo()
-    figure.set_dpi(dpi)
-    canvas.draw()
-    picture = Image.fromarray(np.asarray(canvas.buffer_rgba()))
-    figure.set_dpi(before)
-    made_by.add_text("Creator", _MARK)
-    few = picture.convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    few.save(small, "PNG", pnginfo=made_by)
+    full, small = io.BytesIO(), io.BytesIO()
+    figure.savefig(full, format="png", dpi=dpi)
+    picture = Image.open(full).convert("RGB")
+    picture.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(small, "PNG")
     return small.getvalue()
 
 

@@ -74,7 +74,7 @@ def sweep(table: SweepTable | Path | str, metric: str = _POSITION, **paper: Unpa
     are_numbers = {name: all(math.isfinite(number(cell)) for cell in means[name]) for name in names}
     across = max(names, key=lambda name: (are_numbers[name], means[name].nunique()))
     ticks = {cell: number(cell) if are_numbers[across] else k for k, cell in enumerate(means[across].unique())}
-    means["at"] = means[across].map(ticks)
+    means["at"] = [ticks[cell] for cell in means[across]]
     width = max(ticks.values()) - min(ticks.values()) or 1.0
     rest = [name for name in names if name != across]
     panels = list(means.groupby(rest, sort=False)) if rest else [((), means)]
@@ -86,10 +86,11 @@ def sweep(table: SweepTable | Path | str, metric: str = _POSITION, **paper: Unpa
     for axes, (point, panel) in zip(grid.flat, panels, strict=False):
         for k, (estimator, its) in enumerate(zip(estimators, looks(estimators), strict=True)):
             mine = panel[panel["estimator"] == estimator].sort_values("at", kind="stable")
-            at = mine["at"] + _DODGE * width * (k - (len(estimators) - 1) / 2.0)  # so that bars do not hide each other
+            at, mean, half = mine[["at", "mean", "half"]].to_numpy().T
+            at += _DODGE * width * (k - (len(estimators) - 1) / 2.0)  # so that bars do not hide each other
             line = {"color": its.colour, "ls": its.line if are_numbers[across] else "none", "marker": its.marker}
             label = "" if mine.empty else estimator
-            axes.errorbar(at, mine["mean"], mine["half"], capsize=3.0, ms=4, lw=1.2, label=label, **line)
+            axes.errorbar(at, mean, half, capsize=3.0, ms=4, lw=1.2, label=label, **line)
         axes.set_title("\n".join(f"{words(name)}: {c}" for name, c in zip(rest, point, strict=True)), loc="left")
         if metric in _EXPECTED:
             axes.axhline(_EXPECTED[metric], color="black", lw=0.9, ls="--", label="expected")

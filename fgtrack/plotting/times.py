@@ -14,7 +14,7 @@ from fgtrack.evaluation.scores.innovations import message_delays
 from fgtrack.evaluation.scores.statistics import Distribution
 from fgtrack.io.run import Run
 from fgtrack.plotting.paper import Paper, Sheet, styled
-from fgtrack.plotting.style import legend_above, log_axis, run_looks, sensor_colour, titled
+from fgtrack.plotting.style import legend_above, log_axis, run_looks, sensor_colour
 
 _MS = 1e3
 
@@ -34,7 +34,7 @@ def delays(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         label = f"{sensor}: mean {spread.mean:.0f} ms, 90 % within {spread.p90:.0f} ms, all within {spread.max:.0f} ms"
         curves.append((_MS * delay_s, label, {"color": sensor_colour(k)}))
     texts = {"xlabel": "delay from stamp to receipt [ms]", "ylabel": "share of the messages received"}
-    return _distributions(curves, texts, titled(one.label, "delay of the messages with detections"), paper)
+    return _distributions(curves, texts, f"{one.label}: delay of the messages with detections", paper)
 
 
 def sensor_delays(run: Run) -> dict[str, tuple[IntArray, FloatArray]]:
