@@ -93,7 +93,7 @@ def topic_parts(bag: Bag, topics: Sequence[TopicInfo]) -> tuple[list[Part], list
 def _mapped(bag: Bag, item: TopicInput, type_name: str, sensor: str) -> tuple[Part | None, str]:
     """The guess for a topic of an unknown type; without one a line of what is in it."""
     try:
-        messages = [one.data for one in islice(bag.messages({item.topic}), _MESSAGES) if one.type == type_name]
+        messages = [one for topic, _, one in islice(bag.messages({item.topic}), _MESSAGES) if topic.type == type_name]
     except DataError as error:
         return None, str(error)
     found = [fields_of(message) for message in messages]

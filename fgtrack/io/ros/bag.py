@@ -2,16 +2,16 @@
 
 import heapq
 import struct
-from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from operator import itemgetter
+from itertools import groupby
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any
 
 import zstandard
-from rosbags.interfaces import Connection, ConnectionExtRosbag2
+from rosbags.interfaces import Connection
 
 from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.time import NS_PER_S
@@ -19,8 +19,6 @@ from fgtrack.io.errors import TruncatedInput, one_line
 from fgtrack.io.ros.bag_files import ZSTD_MAGIC, BagFile, bags_in, decompressed, files_of, storage_of
 from fgtrack.io.ros.rosbag1_file import Rosbag1File
 from fgtrack.io.ros.typestore import Key, MessageTypes, type_name
-
-HEADER = "std_msgs/msg/Header"
 
 
 @dataclass(frozen=True)
@@ -32,18 +30,6 @@ class BagTopic:
     count: int
     problem: str | None
     """Why its messages cannot be decoded; None when they can."""
-
-
-@dataclass(frozen=True)
-class BagMessage:
-    """A decoded message."""
-
-    topic: str
-    type: str
-    log_ns: int
-    """When the recorder received it."""
-    # A message has the attributes of its type, which is known only when the recording is read.
-    data: Any
 
 
 class Bag:
@@ -59,51 +45,47 @@ class Bag:
         with _as_data_error(self.path):
             self._paths = files_of(self.path)
         with self._files() as files:
-            connections = [item for file in files for item in file.connections]
-            for item in connections:
-                kind = item.ext.serialization_format if isinstance(item.ext, ConnectionExtRosbag2) else "cdr"
-                if kind != "cdr":
-                    raise DataError(
-                        f"{self.path}: topic {item.topic} is serialized as {kind!r}, only 'cdr' can be read"
-                    )
+            connections = sorted((item for file in files for item in file.connections), key=_topic_and_type)
             self._ros1 = any(isinstance(file, Rosbag1File) for file in files)
-            self._types = MessageTypes(map(_key, connections), self._ros1, message_definitions)
-            first = {key: types[key[0]][1][:1] for key, types in self._types.types.items()}
-            self._stamped = {key for key, members in first.items() if members and members[0][1][1] == HEADER}
             self.break_off = self._break_off(files)
-        self.topics = _topics(connections, self._types.problems)
+        for item in connections:
+            if (kind := getattr(item.ext, "serialization_format", "cdr")) != "cdr":
+                raise DataError(f"{self.path}: topic {item.topic} is serialized as {kind!r}, only 'cdr' can be read")
+        self._types = MessageTypes(map(_key, connections), self._ros1, message_definitions)
+        self._topics: dict[tuple[str, str], BagTopic] = {}
+        for name, group in groupby(connections, _topic_and_type):
+            same = list(group)
+            problems = [self._types.problems[_key(item)] for item in same if _key(item) in self._types.problems]
+            self._topics[name] = BagTopic(*name, sum(item.msgcount for item in same), next(iter(problems), None))
+        self.topics = tuple(self._topics.values())
         """Topics by name; a topic with two types is listed twice."""
 
-    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
-        """Decoded messages on `topics` in log-time order; equal times keep the order of the recording.
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[BagTopic, int, Any]]:
+        """Topic, log time and decoded message of every message on `topics`, in log-time order.
 
-        Raises `TruncatedInput` after every message before a break, and `DataError` for what cannot be decoded.
+        A message has the attributes of its type. Equal times keep the order of the recording. Raises `TruncatedInput`
+        after every message before a break, and `DataError` for what cannot be decoded.
         """
         for topic in self.topics:
             if topic.name in topics and topic.problem:
                 raise DataError(f"{self.path}: topic {topic.name} cannot be read: {topic.problem}")
         for connection, log_ns, data in self._records(topics):
             what = f"{self.path}: the message on {connection.topic} at {log_ns} ns"
-            message = self._types.decode(_key(connection), data, what)
-            yield BagMessage(connection.topic, connection.msgtype, log_ns, message)
+            yield self._topics[_topic_and_type(connection)], log_ns, self._types.decode(_key(connection), data, what)
 
     def stamps(self) -> Iterator[tuple[BagTopic, int, int | None]]:
         """Topic, log time and header stamp of every message, without decoding it.
 
         The stamp is None where the type does not start with a header or is not known.
         """
-        by_key = {(topic.name, topic.type): topic for topic in self.topics}
-        for connection, log_ns, data in self._records({topic.name for topic in self.topics}):
-            topic = by_key[connection.topic, connection.msgtype]
-            yield topic, log_ns, self._stamp_ns(data) if _key(connection) in self._stamped else None
-
-    def _stamp_ns(self, data: bytes) -> int | None:
-        """Stamp of the header with which the message `data` begins."""
         offset = 4  # behind the CDR header, or in ROS 1 behind the sequence number
-        if len(data) < offset + 8:
-            return None
-        sec, nanosec = struct.unpack_from(">iI" if not self._ros1 and data[1] == 0 else "<iI", data, offset)
-        return int(sec * NS_PER_S + nanosec)
+        for connection, log_ns, data in self._records({topic.name for topic in self.topics}):
+            stamp_ns = None
+            if self._types.starts_with_header(_key(connection)) and len(data) >= offset + 8:
+                order = ">iI" if not self._ros1 and data[1] == 0 else "<iI"
+                sec, nanosec = struct.unpack_from(order, data, offset)
+                stamp_ns = sec * NS_PER_S + nanosec
+            yield self._topics[_topic_and_type(connection)], log_ns, stamp_ns
 
     @contextmanager
     def _files(self) -> Iterator[list[BagFile]]:
@@ -154,18 +136,11 @@ def is_bag(path: Path) -> bool:
     return storage_of(path) is not None
 
 
+_topic_and_type = attrgetter("topic", "msgtype")
+
+
 def _key(connection: Connection) -> Key:
     return connection.msgtype, connection.msgdef
-
-
-def _topics(connections: list[Connection], problems: Mapping[Key, str]) -> tuple[BagTopic, ...]:
-    counts: Counter[tuple[str, str]] = Counter()
-    found: dict[tuple[str, str], str] = {}
-    for item in connections:
-        counts[item.topic, item.msgtype] += item.msgcount
-        if _key(item) in problems:
-            found.setdefault((item.topic, item.msgtype), problems[_key(item)])
-    return tuple(BagTopic(*topic, count, found.get(topic)) for topic, count in sorted(counts.items()))
 
 
 @contextmanager
@@ -178,4 +153,4 @@ def _as_data_error(path: Path) -> Iterator[None]:
         raise DataError(f"{path}: cannot be read as a recording ({one_line(error)})") from error
 
 
-__all__ = ["Bag", "BagMessage", "BagTopic", "is_bag", "type_name"]
+__all__ = ["Bag", "BagTopic", "is_bag", "type_name"]

@@ -2,7 +2,6 @@
 
 import filecmp
 import json
-import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from itertools import combinations
@@ -15,7 +14,6 @@ from ruamel.yaml.error import YAMLError
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.files import open_file, read_whole
-from fgtrack.io.errors import one_line
 from fgtrack.io.ros.mcap_file import MCAP_MAGIC, McapFile
 from fgtrack.io.ros.rosbag1_file import Rosbag1File
 from fgtrack.io.ros.sqlite3_file import Sqlite3File
@@ -28,7 +26,6 @@ METADATA = "metadata.yaml"
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 SETTINGS = "fgtrack"
 """Entry of its custom data with what the recording carries of a configuration, as JSON."""
-_BAG_SUFFIXES = (".mcap", ".db3")
 _READERS: Mapping[bytes, type[BagFile]] = {
     MCAP_MAGIC: McapFile,
     b"SQLite format 3\x00": Sqlite3File,
@@ -50,14 +47,16 @@ def decompressed(file: Path) -> Iterator[Path]:
         yield target
 
 
-def files_of(path: Path) -> tuple[Path, ...]:
+def files_of(path: Path) -> list[Path]:
     """Files of the recording at `path`: itself, those that metadata.yaml names, or those of the folder.
 
-    Raises `DataError` for an invalid metadata.yaml, and for copies of one file.
+    Raises `DataError` for copies of one file, and whatever a damaged metadata.yaml makes of itself.
     """
-    files = tuple(bags_in(path)) if path.is_dir() else (path,)
+    files = [path]
     if (path / METADATA).is_file():
-        files = _named_files(path)
+        files = [path / PurePath(name).name for name in _metadata(path)["relative_file_paths"]]
+    elif path.is_dir():
+        files = bags_in(path)
     for one, other in combinations(files, 2):
         if one.stat().st_size and filecmp.cmp(one, other, shallow=False):
             raise DataError(f"{path}: {one.name} and {other.name} are copies of one recording: remove or name one")
@@ -76,29 +75,12 @@ def settings_of(path: Path) -> Mapping[str, object]:
 
 
 def bags_in(path: Path) -> list[Path]:
-    """Storage files of a folder, `x_2` before `x_10`."""
-
-    def natural(file: Path) -> list[tuple[int, str]]:
-        return [(int(part), "") if part.isdecimal() else (0, part) for part in re.split(r"([0-9]+)", file.name)]
-
-    return sorted((file for file in path.iterdir() if file.suffix in _BAG_SUFFIXES), key=natural)
+    """Storage files of a folder."""
+    return sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
 
 
 def _metadata(path: Path) -> Any:  # Any: YAML values, checked by who reads them
     return safe_yaml(read_whole(path / METADATA, 1.0).decode())["rosbag2_bagfile_information"]
-
-
-def _named_files(path: Path) -> tuple[Path, ...]:
-    file = path / METADATA
-    try:
-        files = tuple(path / PurePath(name).name for name in _metadata(path)["relative_file_paths"])
-    except (KeyError, TypeError, ValueError, AttributeError, RecursionError, YAMLError) as error:
-        raise DataError(
-            f"{file}: is not the metadata of a recording ({type(error).__name__}: {one_line(error)})"
-        ) from error
-    if missing := [each for each in files if not each.is_file()]:
-        raise DataError(f"{missing[0]}: is missing, {file} names it")
-    return files
 
 
 def storage_of(path: Path) -> type[BagFile] | None:

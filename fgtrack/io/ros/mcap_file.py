@@ -21,6 +21,7 @@ _FORMATS = {
     "omgidl": MessageDefinitionFormat.IDL,
 }
 _NO_SCHEMA = Schema(data=b"", encoding="", id=0, name="")
+_Contents = tuple[dict[int, Schema], dict[int, Channel], dict[int, int]]  # and the number of messages by channel
 
 
 class McapFile:
@@ -31,23 +32,23 @@ class McapFile:
         self.connections: list[Connection] = []
         self.break_off: str | None = None
         self._file: BinaryIO | None = None
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
-        self._counts: Counter[int] = Counter()
-        self._is_indexed = False
+        self._is_indexed = True
 
     def open(self) -> None:
         """Open the file and read which connections it holds."""
         self._file = self.path.open("rb")
-        self._is_indexed = self._read_summary()
-        for record in () if self._is_indexed else self._records():
-            if isinstance(record, Schema):
-                self._schemas[record.id] = record
-            elif isinstance(record, Channel):
-                self._channels.setdefault(record.id, record)
-            elif isinstance(record, Message):
-                self._counts[record.channel_id] += 1
-        self.connections = [self._connection(channel) for channel in self._channels.values()]
+        contents = self._indexed()
+        self._is_indexed = contents is not None
+        schemas, channels, counts = contents or self._scanned()
+        for channel in channels.values():
+            schema = schemas.get(channel.schema_id, _NO_SCHEMA)
+            form = _FORMATS.get(schema.encoding, MessageDefinitionFormat.NONE)
+            definition = MessageDefinition(form, schema.data.decode() if form != MessageDefinitionFormat.NONE else "")
+            ext = ConnectionExtRosbag2(channel.message_encoding, [])
+            count = counts.get(channel.id, 0)
+            self.connections.append(
+                Connection(channel.id, channel.topic, schema.name, definition, "", count, ext, self)
+            )
 
     def close(self) -> None:
         """Close the file."""
@@ -71,20 +72,31 @@ class McapFile:
         assert self._file
         return SeekingReader(self._file, validate_crcs=True, record_size_limit=_LARGEST_BYTES)
 
-    def _read_summary(self) -> bool:
-        """Read channels and counts from the end of the file; False unless all messages are in chunks of its index."""
+    def _indexed(self) -> _Contents | None:
+        """Contents by the end of the file; None unless all messages are in chunks of its index."""
         try:
             summary = self._reader().get_summary()
         except Exception:  # whatever the end of a truncated file raises
-            return False
+            return None
         known = None if summary is None else summary.statistics
         if summary is None or known is None or not 0 < known.chunk_count == len(summary.chunk_indexes):
-            return False
+            return None
         if known.channel_count > len(summary.channels):
-            return False
-        self._schemas, self._channels = summary.schemas, summary.channels
-        self._counts = Counter({number: min(n, 1 << 62) for number, n in known.channel_message_counts.items()})
-        return True
+            return None
+        return summary.schemas, summary.channels, known.channel_message_counts
+
+    def _scanned(self) -> _Contents:
+        """Contents of the file up to its end, or to where it breaks off."""
+        schemas, channels, counts = dict[int, Schema](), dict[int, Channel](), Counter[int]()
+        for record in self._records():
+            match record:
+                case Schema():
+                    schemas[record.id] = record
+                case Channel():
+                    channels.setdefault(record.id, record)
+                case Message():
+                    counts[record.channel_id] += 1
+        return schemas, channels, counts
 
     def _records(self) -> Iterator[McapRecord]:
         """Records from the beginning of the file to its end, or to where it breaks off."""
@@ -99,10 +111,3 @@ class McapFile:
             return
         if self._file.read(1):
             self.break_off = f"is followed by something else from byte {self._file.tell() - 1} on, split it there"
-
-    def _connection(self, channel: Channel) -> Connection:
-        schema = self._schemas.get(channel.schema_id, _NO_SCHEMA)
-        form = _FORMATS.get(schema.encoding, MessageDefinitionFormat.NONE)
-        definition = MessageDefinition(form, schema.data.decode() if form != MessageDefinitionFormat.NONE else "")
-        ext = ConnectionExtRosbag2(channel.message_encoding, [])
-        return Connection(channel.id, channel.topic, schema.name, definition, "", self._counts[channel.id], ext, self)

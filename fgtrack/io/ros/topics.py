@@ -103,17 +103,12 @@ def bag_messages(bag: Bag, uses: tuple[TopicUse, ...]) -> Iterator[Message]:
 
     Raises `TruncatedInput` after everything before a break, and `DataError` for a message that does not fit its use.
     """
-    by_topic: dict[tuple[str, str], list[TopicUse]] = {}
-    for use in uses:
-        by_topic.setdefault((use.topic.name, use.topic.type), []).append(use)
-    for message in bag.messages({use.topic.name for use in uses}):
-        for use in by_topic.get((message.topic, message.type), ()):
+    for topic, log_ns, data in bag.messages({use.topic.name for use in uses}):
+        for use in [use for use in uses if use.topic is topic]:
             try:
-                yield from use.convert(message.data, message.log_ns)
+                yield from use.convert(data, log_ns)
             except (FieldError, AttributeError, TypeError, ValueError, OverflowError) as error:
-                raise DataError(
-                    f"{bag.path}: topic {message.topic} ({message.type}) at {message.log_ns} ns: {error}"
-                ) from error
+                raise DataError(f"{bag.path}: topic {topic.name} ({topic.type}) at {log_ns} ns: {error}") from error
 
 
 def _find(bag: Bag, item: TopicInput) -> BagTopic:

@@ -74,14 +74,16 @@ class MessageTypes:
                 embedded[key] = _embedded(*key)
             except Exception as error:  # whatever an invalid definition makes the parser raise
                 self.problems[key] = f"its embedded definition cannot be read ({one_line(error)})"
-        shared: Typesdict = {}
-        for types in embedded.values():
-            shared = types | shared
         for key, types in embedded.items():
             try:
-                self.types[key] = _closure(key[0], (types, shared, known))
+                self.types[key] = _closure(key[0], (types, *embedded.values(), known))
             except (ValueError, RecursionError) as error:
                 self.problems[key] = str(error)
+
+    def starts_with_header(self, key: Key) -> bool:
+        """True if messages of the type start with a header, and can be decoded."""
+        members = self.types[key][key[0]][1] if key in self.types else []
+        return bool(members) and members[0][1][1] == "std_msgs/msg/Header"
 
     def decode(self, key: Key, data: bytes, what: str) -> Any:  # a message has the attributes of its type
         """Message that is serialized in `data`; `what` names it in the `DataError` of a huge or wrong one."""
@@ -164,10 +166,7 @@ def _shipped_types(ros1: bool) -> Typesdict:
 
 def _user_types(path: Path) -> Typesdict:
     types: Typesdict = {}
-    files = sorted(path.rglob("*.msg")) if path.is_dir() else [path]
-    if not files:
-        raise CallError(f"{path}: holds no .msg file")
-    for file in files:
+    for file in sorted(path.rglob("*.msg")) if path.is_dir() else [path]:
         package = file.parent.parent.name if file.parent.name == "msg" else file.parent.name
         try:
             types |= _checked(get_types_from_msg(read_whole(file, 1.0).decode(), f"{package}/msg/{file.stem}"))
