@@ -23,7 +23,7 @@ from bench_report import plural, progress, put_into, short_machine
 from bench_tracker import SPEED_MPS, scenario, yardstick_us
 
 from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import Message
+from fgtrack.core.types import Message, TickReport
 from fgtrack.io.recording import write_recording
 from fgtrack.io.source import open_input
 from fgtrack.models.oval import make_oval
@@ -97,10 +97,10 @@ def main(
     config = read_config("smoother", track_map="oval", pit_map="oval", estimator=estimator)
     rows: list[tuple[float, float, float, int]] = []  # recording in s, memory in MB, computed in s, tracks
 
-    def look(now_ns: int, num_tracks: int) -> None:
-        passed_s = (now_ns - LAPS_START_NS) / 1e9
+    def look(report: TickReport) -> None:
+        passed_s = (report.now_ns - LAPS_START_NS) / 1e9
         if len(rows) < parts and passed_s >= duration_s * (len(rows) + 1) / parts:
-            rows.append((passed_s, memory_mb(), time.perf_counter() - began, num_tracks))
+            rows.append((passed_s, memory_mb(), time.perf_counter() - began, len(report.tracks)))
 
     with tempfile.TemporaryDirectory(dir=out) as folder:
         drive, run = Path(folder) / recording, Path(folder) / "run"
@@ -108,7 +108,7 @@ def main(
         write_recording(drive, laps(objects, duration_s))
         progress("replay it")
         began = time.perf_counter()
-        replay(open_input(drive, config.input).messages(), config, run, on_tick=look)
+        replay(open_input(drive, config.input).messages, config, {estimator: run}, on_tick=look)
         sizes_mb = [sum(file.stat().st_size for file in path.rglob("*")) / _MB for path in (run, Path(folder))]
     lines = [
         short_machine([yardstick_us()]),

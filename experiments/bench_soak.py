@@ -33,7 +33,7 @@ from fgtrack.core.types import DetectionList, Disposition, EgoState, Message, Tr
 from fgtrack.estimation.failures import Failure
 from fgtrack.io.run.rows import Row, text
 from fgtrack.io.run.sink import RunSink
-from fgtrack.pipeline.clock import node_ticks
+from fgtrack.pipeline.clock import clock_ticks
 from fgtrack.sim.clocks import ArrivalClock, DriftClock, JitterClock, OffsetClock
 from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY, ConstantDelay, LossyDelay, MarkovTimeDelay
 from fgtrack.sim.scenario import Scenario
@@ -187,7 +187,7 @@ def soak(hours: float, parts: int, estimator: str, seed: int, file: Path) -> lis
     spent_us, tracked, detections = np.empty(int(3600.0 * hours * NODE_HZ / parts) + 2), 0, 0
     ticks = with_lists = 0
     began_s = time.perf_counter()
-    for tick in node_ticks(messages(hours, seed), NODE_HZ):
+    for tick in clock_ticks(messages(hours, seed), NODE_HZ):
         lists = sum(len(message.objects) for message in tick.messages if isinstance(message, DetectionList))
         before_ns = time.thread_time_ns()
         for message in tick.messages:

@@ -25,7 +25,7 @@ import numpy as np
 
 from fgtrack.core.types import DetectionList, Message, TruthState
 from fgtrack.pipeline.build import build_tracker
-from fgtrack.pipeline.clock import Tick, node_ticks
+from fgtrack.pipeline.clock import Tick, clock_ticks
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY, ConstantDelay
@@ -103,7 +103,7 @@ class Measured:
 
 def traffic(count: int, duration_s: float = 5.0, delay_s: float | None = None) -> list[Tick]:
     """Ticks of `duration_s` with `count` cars in two lanes, 12 m apart, all seen by both sensors."""
-    return list(node_ticks([m for m in scene(count, duration_s, delay_s) if not isinstance(m, TruthState)], NODE_HZ))
+    return list(clock_ticks([m for m in scene(count, duration_s, delay_s) if not isinstance(m, TruthState)], NODE_HZ))
 
 
 def scene(count: int, duration_s: float, delay_s: float | None = None) -> list[Message]:

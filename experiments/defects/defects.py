@@ -13,11 +13,10 @@ from typing import Annotated
 import typer
 
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.io.run import Run, load_run
-from fgtrack.io.stream import read_stream
+from fgtrack.io.run import Run
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
-from fgtrack.pipeline.replay import replay
+from fgtrack.pipeline.public import replay
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -99,8 +98,8 @@ def main(
     )
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     for number, (name, config) in enumerate(variants(published, clean).items()):
-        result = replay(read_stream(stream), config, out / f"{number:02d}", origin=str(stream), kind="stream")
-        print(row(name, load_run(result.path)), flush=True)
+        run = replay(stream, config, out=out / f"{number:02d}")
+        print(row(name, run), flush=True)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ The tracker ticks at every message: between ticks it sorts what came in, and a t
 """
 
 import csv
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -18,9 +17,9 @@ import numpy as np
 import typer
 
 from fgtrack.core.types import FloatArray
-from fgtrack.io.run import Run, load_run
+from fgtrack.io.run import Run
 from fgtrack.pipeline.config import ClockConfig
-from fgtrack.pipeline.replay import replay
+from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.sim.delays import ConstantDelay
 from fgtrack.sim.scenario import Scenario
@@ -83,9 +82,7 @@ def main(
     for rate_hz in LIDAR_RATES_HZ:
         for delay_s in LIDAR_DELAYS_S:
             messages = simulate(scenario(delay_s, rate_hz, duration_s), np.random.default_rng(seed))
-            with tempfile.TemporaryDirectory() as folder:
-                replay(messages, config, Path(folder) / "run")
-                measured = wiped_share(load_run(Path(folder) / "run"))
+            measured = wiped_share(replay_in_memory(messages, config))
             rows.append((rate_hz, delay_s, measured, float(expected_share(delay_s, rate_hz))))
     with (out / "survival.csv").open("w", newline="") as file:
         writer = csv.writer(file)

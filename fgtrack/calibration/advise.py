@@ -313,7 +313,7 @@ class Adviser:
         if config.estimator.startswith("smoother"):
             fast = replace(fast, estimator="ekf-replay", filter=replace(config.filter, storage_s=storage_s))
         try:
-            found = replay_in_memory(self._tracked, fast)[0]
+            found = replay_in_memory(self._tracked, fast)
         except DataError:
             found = None
         self._runs.append((config, found))

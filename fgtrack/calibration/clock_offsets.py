@@ -199,7 +199,7 @@ def estimate_offsets(
             f"reference {reference!r} is no sensor of the input, which has {', '.join(sorted(counts))}{hint}"
         )
     needs_ego = any(one.frame != "map" for one in lists)
-    run = replay_in_memory(heard, config)[0] if run is None else run
+    run = replay_in_memory(heard, config) if run is None else run
     ego = EgoPath(one for one in heard if isinstance(one, EgoState)) if needs_ego else None
     seen = sightings_of(run, lists, config, ego)
     sensors = [name for name in config.sensors if name in counts]

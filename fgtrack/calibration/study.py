@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import chain
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from fgtrack.io.run import Run, check_run, load_run, write_metrics
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumptions.assumed import Assumed, assumed
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.replay import replay_each, tick_progress
+from fgtrack.pipeline.replay import replay
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.plotting.close_up import CloseUp
 from fgtrack.plotting.late_detection import drawn_close_up
@@ -124,6 +124,8 @@ ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
 _MARK = "(fgtrack study)"
 #: Share of the work that is done when a step begins.
 _ADVICE, _REPLAY, _COMPARE, _DRAW, _DONE = 0.02, 0.3, 0.85, 0.9, 1.0
+
+_MESSAGES = 1000  # between two signs of progress
 
 OnStep = Callable[[str, float], None]
 
@@ -234,25 +236,20 @@ def study(
             head = [f"Settings of {source_path.name} {_MARK}: change them and run again with -c."]
             file.write(known.to_yaml([*head, *([] if advised is None else advised.comments())]).encode())
 
+        taken = count()
+
         def repeated() -> Iterator[Message]:
-            yield from messages
+            for message in messages:
+                if (number := next(taken)) % _MESSAGES == 0:
+                    done = number / len(messages)
+                    share = _REPLAY + (_COMPARE - _REPLAY) * done / len(ESTIMATORS)
+                    on_step(f"replay, {ESTIMATORS[int(done)]}", share)
+                yield message
             readable.raise_error()
 
-        def replayed(text: str, share: float | None) -> None:
-            on_step(f"replay, {text}", _REPLAY + (_COMPARE - _REPLAY) * (share or 0.0))
-
-        end_ns = messages[-1].receipt_ns if messages else 0
-        results = replay_each(
-            repeated,
-            known.config,
-            folders,
-            origin=str(source.path),
-            kind=source.kind,
-            on_tick=tick_progress(replayed, end_ns, ESTIMATORS),
-            overwrite=overwrite,
-        )
+        replay(repeated, known.config, folders, origin=str(source.path), kind=source.kind, overwrite=overwrite)
         on_step("compare", _COMPARE)
-        every = evaluated([load_run(result.path) for result in results])
+        every = evaluated([load_run(folder) for folder in folders.values()])
         tables = compare(*every)
         for one in every:
             if one.run.path is not None:
@@ -266,7 +263,8 @@ def study(
         )
         _pictured(every, tables, report_head, figures or {}, pictures, page, overwrite)
         on_step("done", _DONE)
-    return Study(out, lines, tuple(known.lines()), advised, tuple(o.run for o in every), tables, results[0].broken)
+    found = tuple(one.run for one in every)
+    return Study(out, lines, tuple(known.lines()), advised, found, tables, found[0].meta["broken_off"])
 
 
 def outputs(out: Path) -> list[Path]:

@@ -48,8 +48,8 @@ def try_out(messages: Iterable[Message], config: Config) -> Trial:
     problem = None if readable.error is None else str(readable.error)
     run = None
     try:
-        run, broken = replay_in_memory(found, config)
-        problem = problem or broken
+        run = replay_in_memory(found, config)
+        problem = problem or run.meta["broken_off"]
     except DataError as error:
         problem = problem or str(error)
     return Trial(_samples(found), tuple(suspicions(found, config)), run, problem)

@@ -45,7 +45,7 @@ def recorded(
             association = _OpenedGate(association, gate_stds)
         return replace(parts, preprocess=preprocess, bank=banks[0], association=association)
 
-    run, _ = replay_in_memory(messages, config, origin=origin, observed=observed)
+    run = replay_in_memory(messages, config, origin=origin, observed=observed)
     motion, method = config.motion_model(), config.initiation.method
     return [series.initiated(motion, method) for series in banks[0].series()], run
 

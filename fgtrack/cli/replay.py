@@ -14,8 +14,8 @@ from fgtrack.evaluation.diagnostics import diagnostics, excluded_lines, noise_di
 from fgtrack.io.output import check_apart
 from fgtrack.io.run import load_run
 from fgtrack.io.source import open_input
+from fgtrack.pipeline import replay as pipeline
 from fgtrack.pipeline.assumptions.assumed import assumed
-from fgtrack.pipeline.replay import located, replay_each, tick_progress
 from fgtrack.pipeline.shipped import read_config
 
 
@@ -47,31 +47,31 @@ def replay(
     source = open_input(recording, config.input)
     with progress("replay") as tell:
         found = assumed(config, source)
-        results = replay_each(
+        pipeline.replay(
             source.messages,
             found.config,
             folders,
             origin=str(recording),
             kind=source.kind,
-            on_tick=tick_progress(tell, None, names),
+            on_tick=lambda report: tell(f"tick {report.tick}, {len(report.tracks)} tracks"),
             overwrite=overwrite,
         )
     for line in dict.fromkeys(str(replace(found.config, estimator=name).effective) for name in names):
         say(line)
-    runs = [load_run(result.path) for result in results]
+    runs = [load_run(folder) for folder in folders.values()]
     for line in found.lines():
         say(line)
-    for result in results:
+    for run in runs:
         what = "{estimator}, {detections_received} detections, {wall_s:.1f} s, digest {digest:.12}"
-        say(f"{result.path}: {what.format_map(result.meta)}")
-    for line in excluded_lines(results[0].meta):  # the same of all
+        say(f"{run.path}: {what.format_map(run.meta)}")
+    for line in excluded_lines(runs[0].meta):  # the same of all
         say(line)
     for line in dict.fromkeys(
         map(str, [*(one for run in runs for one in diagnostics(run)), *noise_diagnostics(runs[0])])
     ):
         warn(line)
-    if results[0].broken is not None:  # the others break off at the same place
-        raise DataError(f"{located(results[0].broken, str(recording))}; replayed up to there")
+    if (broken := runs[0].meta["broken_off"]) is not None:  # the others break off at the same message
+        raise DataError(f"{pipeline.located(broken, str(recording))}; replayed up to there")
     reason = unused(runs[0])
     if reason is not None:
         raise DataError(f"{recording}: {reason}")

@@ -20,24 +20,19 @@ class Tick(NamedTuple):
     messages: list[Delivered]
 
 
-def node_ticks(messages: Iterable[Delivered], node_hz: float) -> Iterator[Tick]:
+def clock_ticks(messages: Iterable[Delivered], node_hz: float | None) -> Iterator[Tick]:
     """Yield ticks on multiples of the node period, from the first at or after the first receipt until all is delivered.
 
-    What was received at or before a tick is delivered with it.
+    Messages received at or before a tick are delivered with it. Without `node_hz` every receipt is a tick.
     """
-    step_ns = period_ns(node_hz)
+    step_ns = 1 if node_hz is None else period_ns(node_hz)
     next_ns: int | None = None
     for due_ns, delivered in groupby(messages, lambda message: -(-message.receipt_ns // step_ns) * step_ns):
-        for now_ns in range(due_ns if next_ns is None else next_ns, due_ns, step_ns):
-            yield Tick(now_ns, [])
+        if node_hz is not None and next_ns is not None:
+            for now_ns in range(next_ns, due_ns, step_ns):
+                yield Tick(now_ns, [])
         yield Tick(due_ns, list(delivered))
         next_ns = due_ns + step_ns
-
-
-def message_ticks(messages: Iterable[Delivered]) -> Iterator[Tick]:
-    """Yield a tick at every receipt; what was received at the same nanosecond shares one."""
-    for now_ns, delivered in groupby(messages, lambda message: message.receipt_ns):
-        yield Tick(now_ns, list(delivered))
 
 
 def corrected(message: DetectionList, sensors: Mapping[str, SensorModel]) -> DetectionList:

@@ -73,11 +73,13 @@ def replay(
     else:
         messages = _messages(recording)
     if out is None:
-        run, broken = pipeline.replay_in_memory(messages, resolved, origin=origin, kind=kind)
+        run = pipeline.replay_in_memory(messages, resolved, origin=origin, kind=kind)
     else:
-        result = pipeline.replay(messages, resolved, Path(out), origin=origin, kind=kind, overwrite=overwrite)
-        run, broken = load_run(result.path), result.broken
-    if broken is not None:
+        repeatable = pipeline.repeatable(messages, resolved)
+        folders = {resolved.estimator: Path(out)}
+        pipeline.replay(repeatable, resolved, folders, origin=origin, kind=kind, overwrite=overwrite)
+        run = load_run(out)
+    if (broken := run.meta["broken_off"]) is not None:
         warnings.warn(f"the input broke off, replayed up to there: {broken}", stacklevel=2)
     return run
 

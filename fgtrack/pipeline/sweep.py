@@ -238,9 +238,9 @@ def read_messages(recipe: Recipe, config: Config) -> list[Message]:
 def _cell(messages: Sequence[Message], config: Config, score: Score, source_s: float) -> Cell:
     started = time.perf_counter()
     try:
-        run, broken = replay_in_memory(messages, config)
-        if broken is not None:
-            raise DataError(broken)
+        run = replay_in_memory(messages, config)
+        if run.meta["broken_off"] is not None:
+            raise DataError(str(run.meta["broken_off"]))
         replayed = time.perf_counter()
         values, score_times = score(run)
     except (Exception, SystemExit) as error:  # as in `run_job`

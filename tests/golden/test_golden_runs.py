@@ -58,16 +58,17 @@ def golden(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         build = pipeline.build_tracker
         if request.param == "jitter10":
             ticks_ns = [tick["now_ns"] for tick in expected]
-            patch.setattr(pipeline, "node_ticks", lambda messages, node_hz: listed_ticks(messages, ticks_ns))
+            patch.setattr(pipeline, "clock_ticks", lambda messages, node_hz: listed_ticks(messages, ticks_ns))
         patch.setattr(pipeline, "build_tracker", lambda config: trackers.append(build(config)) or trackers[0])
-        result = pipeline.replay(
-            read_stream(shared(f"reference/{request.param}/stream.jsonl.gz")),
+        run = tmp_path_factory.mktemp(request.param) / "run"
+        [meta] = pipeline.replay(
+            lambda: read_stream(shared(f"reference/{request.param}/stream.jsonl.gz")),
             config,
-            tmp_path_factory.mktemp(request.param) / "run",
+            {config.estimator: run},
             on_tick=lambda *_: lives.append(counted(trackers[0]._parts.lifecycle.lives)),
         )
-    assert result.broken is None
-    return Golden(expected, load_run(result.path), lives)
+    assert meta["broken_off"] is None
+    return Golden(expected, load_run(run), lives)
 
 
 def test_the_ticks_are_those_of_the_published_node(golden: Golden) -> None:

@@ -310,7 +310,7 @@ def test_a_bug_is_one_line_and_shows_its_traceback_on_demand(
     def broken(*_: object, **__: object) -> None:
         raise ZeroDivisionError("oh")
 
-    monkeypatch.setattr("fgtrack.cli.replay.replay_each", broken)
+    monkeypatch.setattr("fgtrack.pipeline.replay.replay", broken)
     called = fgtrack("replay", stream, "-o", "run")
     assert called.err == "fgtrack: error: internal error: ZeroDivisionError: oh (run with --debug)\n"
     assert called.code == 1
@@ -323,7 +323,7 @@ def test_a_warning_of_a_plug_in_is_a_line(fgtrack: Command, stream: Path, monkey
         warnings.warn("\x1b[31mdivide\nby zero", RuntimeWarning, stacklevel=1)
         raise DataError("not this time")
 
-    monkeypatch.setattr("fgtrack.cli.replay.replay_each", warns)
+    monkeypatch.setattr("fgtrack.pipeline.replay.replay", warns)
     called = fgtrack("replay", stream, "-o", "run")
     warned, _ = called.err.splitlines()
     assert "RuntimeWarning: \\x1b[31mdivide by zero" in warned
@@ -334,7 +334,7 @@ def test_an_interrupt_is_exit_code_130(fgtrack: Command, stream: Path, monkeypat
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("fgtrack.cli.replay.replay_each", interrupted)
+    monkeypatch.setattr("fgtrack.pipeline.replay.replay", interrupted)
     called = fgtrack("replay", stream, "-o", "run")
     assert "interrupted" in called.error
     assert called.code == 130

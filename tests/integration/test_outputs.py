@@ -19,7 +19,7 @@ from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.run import RunWriter, load_run
 from fgtrack.io.source import open_input
 from fgtrack.io.stream import write_stream
-from fgtrack.pipeline.replay import replay_each
+from fgtrack.pipeline.replay import replay
 from fgtrack.pipeline.shipped import shipped_folder
 
 MS = 1_000_000
@@ -227,7 +227,7 @@ def test_a_replay_that_is_under_way_holds_all_its_folders(here: Path) -> None:
                 RunWriter(folder, overwrite=True)
         yield from drive(10)[10:]
 
-    assert len(replay_each(messages, paper(), folders)) == 2
+    assert len(replay(messages, paper(), folders)) == 2
 
 
 #: Commands whose output is an input, holds one or lies in one, and which.

@@ -126,8 +126,8 @@ def sabotaged(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Config]:
 
 def run_of(config: Config, folder: Path) -> Run:
     """The run of these messages, which is complete."""
-    result = replay(messages(), config, folder / "run")
-    assert result.broken is None
+    [meta] = replay(messages, config, {config.estimator: folder / "run"})
+    assert meta["broken_off"] is None
     return load_run(folder / "run")
 
 

@@ -16,7 +16,7 @@ from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.models.oval import make_oval
 from fgtrack.models.sensors import Mount, SensorModel
 from fgtrack.pipeline.build import build_tracker
-from fgtrack.pipeline.clock import Delivered, node_ticks
+from fgtrack.pipeline.clock import Delivered, clock_ticks
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
 
@@ -153,7 +153,7 @@ def streams(draw: st.DrawFn) -> list[Delivered]:
 def run(config: Config, messages: list[Delivered]) -> list[TickReport]:
     tracker = build_tracker(config)
     reports = []
-    for tick in node_ticks(messages, config.clock.node_hz or 50.0):
+    for tick in clock_ticks(messages, config.clock.node_hz or 50.0):
         for message in tick.messages:
             tracker.receive(message)
         reports.append(tracker.tick(tick.now_ns))

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from fgtrack.core.types import Detection, DetectionList, EgoState
 from fgtrack.models.sensors import SensorModel
-from fgtrack.pipeline.clock import Delivered, corrected, message_ticks, node_ticks
+from fgtrack.pipeline.clock import Delivered, clock_ticks, corrected
 
 MS = 1_000_000
 receipts = st.lists(st.integers(0, 300 * MS), max_size=20).map(sorted)
@@ -18,37 +18,37 @@ def received(*receipts_ns: int) -> list[Delivered]:
     return [DetectionList("lidar", 0, receipt_ns, ()) for receipt_ns in receipts_ns]
 
 
-def told(ticks) -> list[tuple[int, list[int]]]:
-    return [(tick.now_ns, [message.receipt_ns for message in tick.messages]) for tick in ticks]
+def told(found) -> list[tuple[int, list[int]]]:
+    return [(tick.now_ns, [message.receipt_ns for message in tick.messages]) for tick in found]
 
 
 def test_ticks_lie_on_multiples_of_the_period_from_the_first_receipt_to_the_last() -> None:
-    found = told(node_ticks(received(25 * MS, 30 * MS, 81 * MS), 50.0))
+    found = told(clock_ticks(received(25 * MS, 30 * MS, 81 * MS), 50.0))
     assert found == [(40 * MS, [25 * MS, 30 * MS]), (60 * MS, []), (80 * MS, []), (100 * MS, [81 * MS])]
 
 
 def test_what_is_received_at_a_tick_is_delivered_with_it() -> None:
-    found = told(node_ticks(received(40 * MS, 60 * MS, 60 * MS + 1), 50.0))
+    found = told(clock_ticks(received(40 * MS, 60 * MS, 60 * MS + 1), 50.0))
     assert found == [(40 * MS, [40 * MS]), (60 * MS, [60 * MS]), (80 * MS, [60 * MS + 1])]
 
 
 @given(receipts_ns=receipts, node_hz=st.sampled_from([7.0, 20.0, 50.0, 333.0]))
 def test_every_message_is_delivered_once_at_the_first_tick_after_it(receipts_ns: list[int], node_hz: float) -> None:
     step_ns = int(1e9 / node_hz)
-    ticks = list(node_ticks(received(*receipts_ns), node_hz))
-    assert [m.receipt_ns for tick in ticks for m in tick.messages] == receipts_ns
-    for tick in ticks:
+    found = list(clock_ticks(received(*receipts_ns), node_hz))
+    assert [m.receipt_ns for tick in found for m in tick.messages] == receipts_ns
+    for tick in found:
         assert tick.now_ns % step_ns == 0
         assert all(tick.now_ns - step_ns < m.receipt_ns <= tick.now_ns for m in tick.messages)
-    assert (
-        [tick.now_ns for tick in ticks] == [ticks[0].now_ns + k * step_ns for k in range(len(ticks))] if ticks else True
-    )
-    assert not ticks or (ticks[0].messages and ticks[-1].messages)
+    if found:
+        assert [tick.now_ns for tick in found] == [found[0].now_ns + k * step_ns for k in range(len(found))]
+        assert found[0].messages
+        assert found[-1].messages
 
 
 def test_without_a_period_every_receipt_is_a_tick() -> None:
     messages = [*received(5), EgoState(0, 5, 0.0, 0.0, 0.0, 0.0), *received(7, 7, 9)]
-    assert told(message_ticks(messages)) == [(5, [5, 5]), (7, [7, 7]), (9, [9])]
+    assert told(clock_ticks(messages, None)) == [(5, [5, 5]), (7, [7, 7]), (9, [9])]
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ def test_what_a_reader_leaves_out_is_counted_and_stays_with_its_scan() -> None:
     (scan,) = grouped([one, other], {"radar": ms(5.0)})
     assert scan.left_out == ("filters.rcs",) * 4
     config = replace(Config(), sensors={"radar": replace(RADAR, filters={})})
-    run, _ = replay_in_memory([scan], config)
+    run = replay_in_memory([scan], config)
     assert run.meta["left_out"] == {"radar": {"filters.rcs": 4}}
     assert list(excluded_lines(run.meta)) == ["radar: 4 left out when read (4 by filters.rcs)"]
 

@@ -96,8 +96,8 @@ def test_it_gives_what_the_replay_of_the_same_messages_gives() -> None:
     config = read_config("smoother", ["clock.node_hz=null"], track_map="oval", pit_map="oval")
     scenario = replace(read_scenario("default"), duration_s=3.0)
     messages = [m for m in simulate(scenario, np.random.default_rng(3)) if not isinstance(m, TruthState)]
-    run, broken = replay_in_memory(messages, config)
-    assert broken is None
+    run = replay_in_memory(messages, config)
+    assert run.meta["broken_off"] is None
     tracker = Tracker(config)
     rows: list[tuple[float, ...]] = []
     for receipt_ns in sorted({m.receipt_ns for m in messages}):

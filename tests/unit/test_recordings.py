@@ -32,8 +32,7 @@ def drive(offset_m: float = 0.0, delay_ms: int = 50, ego_x_m: float = 0.0, senso
 
 
 def run_of(messages: list[Message], *settings: str) -> Run:
-    run, _ = replay_in_memory(messages, read_config(None, settings))
-    return run
+    return replay_in_memory(messages, read_config(None, settings))
 
 
 def test_a_recording_is_the_same_whatever_the_configuration_and_the_estimator() -> None:
@@ -79,7 +78,7 @@ def test_the_recording_of_a_run_is_found_from_elsewhere_and_after_a_move(
     (tmp_path / "work").mkdir()
     monkeypatch.chdir(tmp_path / "work")
     write_stream(Path("drive.jsonl"), drive())
-    replay(drive(), Config(), Path("out/run"), origin="drive.jsonl", kind="stream")
+    replay(drive, Config(), {"ekf-replay": Path("out/run")}, origin="drive.jsonl", kind="stream")
     monkeypatch.chdir(tmp_path)
     place = load_run("work/out/run").recording
     assert place is not None

@@ -170,8 +170,8 @@ def test_a_damaged_file_is_one_line_and_what_is_before_it_is_replayed(tmp_path, 
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 300
     if text.startswith(RADAR_TEXT):
-        run, broken = replay_in_memory(open_input(tmp_path, config).messages(), Config())
-        assert broken == str(caught.value)
+        run = replay_in_memory(open_input(tmp_path, config).messages(), Config())
+        assert run.meta["broken_off"] == str(caught.value)
         assert run.tables["detections"].num_rows == 3
 
 

@@ -139,8 +139,8 @@ def test_a_damaged_input_is_replayed_converted_and_described_up_to_there(tmp_pat
     problem = describe(path).problem
     assert problem is not None
     assert "\n" not in problem
-    run, broken = replay_in_memory(open_input(path).messages(), Config(ignore_sensors=("lidar_",)))
-    assert broken == str(readable.error)
+    run = replay_in_memory(open_input(path).messages(), Config(ignore_sensors=("lidar_",)))
+    assert run.meta["broken_off"] == str(readable.error)
     assert run.meta["complete"]
     with pytest.raises(DataError, match=complaint):
         write_stream(tmp_path / "out.jsonl", open_input(path).messages())
