@@ -9,7 +9,7 @@ import fgtrack
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import ACCEL, FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.filters.imm import ImmReplay, Sojourns
+from fgtrack.estimation.filters.imm import ImmReplay
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.models.correlated_errors import CorrelatedErrors
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
@@ -33,19 +33,13 @@ def fed(estimator: ImmReplay | ReplayEkf, measurements: list[Measurement]) -> No
         assert estimator.update(measurement).innovation is not None
 
 
-@pytest.mark.parametrize("stay_s", [(5.0,), (5.0, 1.0), (0.1, 20.0, 3.0)])
-def test_transitions_are_those_of_the_generator_and_compose(stay_s: tuple[float, ...]) -> None:
-    chain, m = Sojourns(stay_s), len(stay_s)
-    G = (
-        np.array([[-1.0 if i == j else 1.0 / (m - 1) for j in range(m)] for i in range(m)])
-        if m > 1
-        else np.zeros((1, 1))
-    )
-    G = G / np.array(stay_s)[:, None]
+def test_transitions_are_those_of_the_generator_and_compose() -> None:
+    chain = ImmReplay(CTRV(), START, 1.0, stay_s=5.0, other_stay_s=0.8)
+    G = np.array([[-0.2, 0.2], [1.25, -1.25]])
     for dt_s in (0.0, 1e-6, 0.05, 3.0, 400.0):
         assert_allclose(chain.transition(dt_s), expm(G * dt_s), atol=1e-12)
     assert_allclose(chain.transition(0.4), chain.transition(0.15) @ chain.transition(0.25), atol=1e-14)
-    assert_allclose(chain.share @ chain.transition(0.7), chain.share, atol=1e-14)
+    assert_allclose(chain.probabilities, [5.0 / 5.8, 0.8 / 5.8])
 
 
 def test_a_model_that_is_never_or_always_left_is_refused() -> None:

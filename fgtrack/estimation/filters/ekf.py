@@ -113,9 +113,9 @@ class OneCorrection(NamedTuple):
     """Shape (k,)."""
     nis: float
     """Normalised innovation squared."""
-    weight: float = 1.0
+    weight: float
     """Weight of the measurement under its loss; 1 at most."""
-    S: FloatArray | None = None
+    S: FloatArray
     """Covariance of the innovation, shape (k, k), before any loss."""
 
 

@@ -1,14 +1,12 @@
 """The interacting multiple model filter, in continuous time, so that late measurements can be rewound to."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import NamedTuple
+from dataclasses import asdict, replace
 
 import numpy as np
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.linalg import mahalanobis_squared, symmetrise
+from fgtrack.core.linalg import identity, mahalanobis_squared, symmetrise
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
@@ -16,7 +14,7 @@ from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import OneCorrection, Prediction, correct_one, predict
 from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.filters.propagation import wrapped
-from fgtrack.estimation.filters.replay import ReplayEkf, Step
+from fgtrack.estimation.filters.replay import Mixture, ReplayEkf, Step
 from fgtrack.estimation.registry import motion_model
 from fgtrack.models.correlated_errors import CorrelatedErrors
 from fgtrack.models.motion import CTRA, CTRV, MotionModel
@@ -26,64 +24,13 @@ from fgtrack.models.robust import penalty
 _LEAST = 1e-12
 
 
-class Sojourns:
-    """Which motion model an object follows, as a Markov chain in continuous time.
-
-    A model is left after an exponentially distributed time, for each of the others alike. The probabilities of a
-    transition over dt, exp(G dt) with the generator G, compose: exp(G (a + b)) = exp(G a) exp(G b), so a stretch of
-    time may be split anywhere.
-
-    Parameters
-    ----------
-    stay_s
-        Mean time that an object stays with each of the m models.
-    """
-
-    def __init__(self, stay_s: Sequence[float]) -> None:
-        stay = np.array(stay_s, dtype=np.float64)
-        if not (np.isfinite(stay).all() and (stay > 0.0).all()):
-            raise ValueError(f"the mean time with a model must be positive and finite, is {stay.tolist()} s")
-        m = len(stay)
-        self.share = stay / stay.sum()
-        """Probabilities of the models in the long run, shape (m,)."""
-        root = np.sqrt(self.share)
-        # The chain is reversible, so root_i G_ij / root_j is symmetric and has real eigenvalues.
-        G = np.repeat(1.0 / (max(m - 1, 1) * stay)[:, None], m, axis=1)
-        np.fill_diagonal(G, -1.0 / stay if m > 1 else 0.0)
-        self._rates_hz, vectors = np.linalg.eigh(symmetrise(root[:, None] * G / root))
-        self._left, self._right = vectors / root[:, None], vectors.T * root
-
-    def transition(self, dt_s: float) -> FloatArray:
-        """Probability of model j (columns) `dt_s` after model i (rows), shape (m, m)."""
-        found = (self._left * np.exp(np.minimum(self._rates_hz, 0.0) * dt_s)) @ self._right
-        found = np.maximum(found, 0.0)  # rounding
-        return np.asarray(found / found.sum(axis=1, keepdims=True))
-
-
-class Mixture(NamedTuple):
-    """A Gaussian for each motion model, in the state of that model, and how probable the models are."""
-
-    means: tuple[FloatArray, ...]
-    covariances: tuple[FloatArray, ...]
-    probabilities: FloatArray
-    """Shape (m,)."""
-
-
-@dataclass(slots=True)
-class ImmStep(Step):
-    """A `Step` and the states by each of the models after it; mean and covariance are those of the mixture."""
-
-    mixture: Mixture | None = None
-
-
 class ImmReplay(ReplayEkf):
     """Interacting multiple model filter that rewinds and replays: `motion` and another model, weighed by what they say.
 
     Blom and Bar-Shalom, The interacting multiple model algorithm for systems with Markovian switching coefficients,
-    IEEE Transactions on Automatic Control 33(8), 1988, with a Markov chain in continuous time (see `Sojourns`). Each
-    step of the window keeps the states by both models and their probabilities, so a late measurement gives what it
-    would have given in time. With one model it is `ReplayEkf`. The innovation of a late measurement is that before
-    what was sensed after it.
+    IEEE Transactions on Automatic Control 33(8), 1988, with a Markov chain in continuous time (see `transition`). Each
+    step of the window keeps the states by both models and their probabilities, so the order of arrival does not matter.
+    With one model it is `ReplayEkf`. The innovation of a late measurement is predicted from those before it alone.
 
     Parameters
     ----------
@@ -115,14 +62,28 @@ class ImmReplay(ReplayEkf):
         super().__init__(motion, prior, lag_s, initiation)
         beside = _beside(motion, other, accel_density_m2ps5)
         self._models = (motion,) if beside is None else (motion, beside)
-        self._sojourns = Sojourns((stay_s, other_stay_s)[: len(self._models)])
+        stay = np.array([stay_s, other_stay_s][: len(self._models)])
+        if not (np.isfinite(stay).all() and (stay > 0.0).all()):
+            raise ValueError(f"the mean time with a model must be positive and finite, is {stay.tolist()} s")
+        self._share, self._rate_hz = stay / stay.sum(), float((1.0 / stay).sum())
         means, covariances = zip(*(initial_state(model, prior) for model in self._models), strict=True)
-        self.steps = [_with(self.steps[0], Mixture(means, covariances, self._sojourns.share))]
+        self.steps = [replace(self.steps[0], mixture=Mixture(means, covariances, self._share))]
 
     @property
     def probabilities(self) -> FloatArray:
         """Probabilities of `motion` and the other model after the newest measurement, shape (m,)."""
-        return _mixture(self.steps[-1]).probabilities.copy()
+        mixture = self.steps[-1].mixture
+        assert mixture is not None  # every step of this filter has one
+        return mixture.probabilities
+
+    def transition(self, dt_s: float) -> FloatArray:
+        """Probability of model j (columns) `dt_s` after model i (rows), shape (m, m).
+
+        exp(G dt) = exp(-r dt) I + (1 - exp(-r dt)) 1 s', with the sum r of the rates at which the models are left and
+        their stationary probabilities s. It composes, so time may be split anywhere.
+        """
+        same = math.exp(-self._rate_hz * dt_s)
+        return np.asarray(same * identity(len(self._share)) + (1.0 - same) * self._share)
 
     def _ahead(self, before: Step, stamp_ns: int) -> Prediction:
         """See `ReplayEkf._ahead`; the cross-covariance, which is not used, is the covariance."""
@@ -137,10 +98,13 @@ class ImmReplay(ReplayEkf):
             correct_one(mean, covariance, measurement.seen_by(model))
             for model, mean, covariance in zip(self._models, prior.means, prior.covariances, strict=True)
         ]
+        logs = np.log(np.maximum(prior.probabilities, _LEAST))
+        logs += [_log_likelihood(each, measurement) for each in corrected]
+        found = np.maximum(np.exp(logs - logs.max()), _LEAST)
         posterior = Mixture(
             tuple(wrapped(model, each.mean) for model, each in zip(self._models, corrected, strict=True)),
             tuple(each.covariance for each in corrected),
-            _weighed(prior.probabilities, [_log_likelihood(each, measurement) for each in corrected]),
+            found / found.sum(),
         )
         x, P = self._moments(posterior, posterior.probabilities, self._motion)
         weight = float(posterior.probabilities @ [each.weight for each in corrected])
@@ -150,7 +114,7 @@ class ImmReplay(ReplayEkf):
             alike = [_converted(self._motion, model, step.mean, step.covariance) for model in self._models]
             means, covariances = zip(*alike, strict=True)
             posterior = posterior._replace(means=means, covariances=covariances)
-        return _with(step, posterior), correction
+        return replace(step, mixture=posterior), correction
 
     def _mixed(self, before: Step, stamp_ns: int) -> Mixture:
         """The mixture at `stamp_ns`, from the step before it.
@@ -158,11 +122,12 @@ class ImmReplay(ReplayEkf):
         Each model starts from the mixture of what the object may have followed before, given that it follows that model
         now; all of these together have the moments of the mixture before.
         """
-        old = _mixture(before)
+        old = before.mixture
+        assert old is not None
         if stamp_ns == before.stamp_ns:
             return old
         dt_s = seconds(stamp_ns - before.stamp_ns)
-        joint = old.probabilities[:, None] * self._sojourns.transition(dt_s)
+        joint = old.probabilities[:, None] * self.transition(dt_s)
         probabilities = joint.sum(axis=0)
         states = [
             predict(*self._moments(old, shares / total, model), model, dt_s)
@@ -211,27 +176,7 @@ def _beside(motion: MotionModel, other: str | MotionModel, accel_density_m2ps5: 
     return motion_model(name, {})
 
 
-def _weighed(probabilities: FloatArray, log_likelihoods: Sequence[float]) -> FloatArray:
-    """The probabilities (m,) after a measurement of these likelihoods; of no model it is ever 0."""
-    logs = np.log(np.maximum(probabilities, _LEAST)) + log_likelihoods
-    found = np.maximum(np.exp(logs - logs.max()), _LEAST)
-    return np.asarray(found / found.sum())
-
-
 def _log_likelihood(found: OneCorrection, measurement: Measurement) -> float:
     """Log-likelihood of the innovation by one model, under the loss of the measurement, without common terms."""
-    if found.S is None or not np.isfinite(found.S).all():
-        raise np.linalg.LinAlgError("an innovation without a finite covariance")
     distance = math.sqrt(max(float(mahalanobis_squared(found.innovation, found.S)), 0.0))
     return -penalty(measurement.loss, distance) - 0.5 * float(np.linalg.slogdet(found.S)[1])
-
-
-def _with(step: Step, mixture: Mixture) -> ImmStep:
-    plain = step.stamp_ns, step.measurement, step.mean, step.covariance, step.predicted, step.search
-    return ImmStep(*plain, mixture)
-
-
-def _mixture(step: Step) -> Mixture:
-    assert isinstance(step, ImmStep)  # every step of this filter is one
-    assert step.mixture is not None
-    return step.mixture

@@ -4,6 +4,7 @@ import bisect
 from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import attrgetter
+from typing import NamedTuple
 
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
@@ -16,6 +17,15 @@ from fgtrack.estimation.filters.track_initiation import TrackInitiation
 from fgtrack.estimation.filters.windowed import WindowedFilter
 from fgtrack.estimation.rts import rts_step
 from fgtrack.models.motion import MotionModel
+
+
+class Mixture(NamedTuple):
+    """A Gaussian for each of several motion models, in the state of that model, and their probabilities."""
+
+    means: tuple[FloatArray, ...]
+    covariances: tuple[FloatArray, ...]
+    probabilities: FloatArray
+    """Shape (m,)."""
 
 
 @dataclass(slots=True)
@@ -31,6 +41,8 @@ class Step:
     """The state before it, predicted from the step before."""
     search: TrackInitiation | None = None
     """Measurements up to here, where the direction of travel was sought."""
+    mixture: Mixture | None = None
+    """States by each model of `imm-replay`; mean and covariance are their moments."""
 
     @property
     def along(self) -> bool:

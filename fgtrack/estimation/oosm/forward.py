@@ -31,7 +31,7 @@ class _ForwardEkf(LateEkf):
         x, P = self._fused((now.mean, now.covariance), late, common)
         np.linalg.cholesky(P)
         self._absorb(x, P)
-        return OneCorrection(x, P, at_tau.innovation, at_tau.nis, S=at_tau.S)
+        return OneCorrection(x, P, at_tau.innovation, at_tau.nis, at_tau.weight, at_tau.S)
 
     @abstractmethod
     def _fused(self, now: _Estimate, late: _Estimate, common: _Estimate) -> _Estimate:
