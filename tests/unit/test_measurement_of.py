@@ -8,7 +8,9 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.filters.replay import ReplayEkf
-from fgtrack.estimation.oosm import AccumulatedStateDensity, Al1, ReorderBuffer
+from fgtrack.estimation.oosm.asd import AccumulatedStateDensity
+from fgtrack.estimation.oosm.buffers import ReorderBuffer
+from fgtrack.estimation.oosm.crossing import Al1
 from fgtrack.estimation.smoothing.bank import FixedLagSmoother
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.models.measurement import SensorPose, measurement_model

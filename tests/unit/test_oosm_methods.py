@@ -31,12 +31,9 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
-from fgtrack.estimation.oosm import (
-    A1,
-    CovarianceIntersection,
-    DelayedHorizon,
-    ReorderBuffer,
-)
+from fgtrack.estimation.oosm.buffers import DelayedHorizon, ReorderBuffer
+from fgtrack.estimation.oosm.crossing import A1
+from fgtrack.estimation.oosm.forward import CovarianceIntersection
 from fgtrack.estimation.registry import estimator
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV

@@ -9,7 +9,7 @@ from support.examples import slow
 from fgtrack.core.time import nanoseconds
 from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.filters.replay import ReplayEkf
-from fgtrack.estimation.oosm import ReorderBuffer
+from fgtrack.estimation.oosm.buffers import ReorderBuffer
 from fgtrack.estimation.registry import estimator, estimator_bank
 from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import CTRV

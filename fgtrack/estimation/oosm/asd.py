@@ -1,7 +1,6 @@
 """The joint density of all states in the window."""
 
 import bisect
-from typing import NamedTuple
 
 import numpy as np
 
@@ -13,18 +12,11 @@ from fgtrack.estimation.filters.ekf import OneCorrection, propagated
 from fgtrack.estimation.filters.propagation import track_state
 from fgtrack.estimation.filters.windowed import WindowedFilter
 from fgtrack.estimation.interpolation import between
-from fgtrack.estimation.oosm.crossing import Past, fuse_across
+from fgtrack.estimation.oosm.crossing import fuse_across
 from fgtrack.models.motion import MotionModel
 
-
-class _Stack(NamedTuple):
-    """States of N stamps, oldest first; yaws run on from state to state and are not wrapped."""
-
-    stamps_ns: tuple[int, ...]
-    mean: FloatArray
-    """Shape (N n,)."""
-    covariance: FloatArray
-    """Shape (N n, N n)."""
+_Stack = tuple[tuple[int, ...], FloatArray, FloatArray]
+"""N stamps, oldest first, mean (N n,) and covariance (N n, N n) of their states; yaws are continuous, not wrapped."""
 
 
 class AccumulatedStateDensity(WindowedFilter):
@@ -53,25 +45,25 @@ class AccumulatedStateDensity(WindowedFilter):
 
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
         super().__init__(motion, prior, lag_s)
-        self._stack = _Stack((prior.stamp_ns,), *initial_state(motion, prior))
+        self._stack: _Stack = ((prior.stamp_ns,), *initial_state(motion, prior))
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: smoothed, from all measurements."""
-        stack, block = self._with_state(stamp_ns)
-        return track_state(self._motion, stamp_ns, stack.mean[block].copy(), stack.covariance[block, block].copy())
+        (_, mean, covariance), block = self._with_state(stamp_ns)
+        return track_state(self._motion, stamp_ns, mean[block].copy(), covariance[block, block].copy())
 
     def _forget_before(self, stamp_ns: int) -> None:
         stamps_ns, mean, covariance = self._stack
         gone = bisect.bisect_right(stamps_ns, stamp_ns) - 1
         if gone > 0:
             kept = slice(gone * self._motion.dim, None)
-            self._stack = _Stack(stamps_ns[gone:], mean[kept], covariance[kept, kept])
+            self._stack = stamps_ns[gone:], mean[kept], covariance[kept, kept]
 
     def _fuse(self, measurement: Measurement) -> OneCorrection:
-        stack, block = self._with_state(measurement.stamp_ns)
-        past = Past(stack.mean[block], stack.covariance[block, block], stack.covariance[:, block])
-        result = fuse_across(stack.mean, stack.covariance, past, measurement)
-        self._stack = _Stack(stack.stamps_ns, result.mean, result.covariance)
+        (stamps_ns, mean, covariance), block = self._with_state(measurement.stamp_ns)
+        past = mean[block], covariance[block, block], covariance[:, block]
+        result = fuse_across(mean, covariance, past, measurement)
+        self._stack = stamps_ns, result.mean, result.covariance
         return result
 
     def _with_state(self, stamp_ns: int) -> tuple[_Stack, slice]:
@@ -90,7 +82,7 @@ class AccumulatedStateDensity(WindowedFilter):
         grown[others, at : at + n] = cross.T
         grown[at : at + n, at : at + n] = propagated(A, covariance[neighbours, neighbours], noise)
         stamps_ns = (*stamps_ns[: index + 1], stamp_ns, *stamps_ns[index + 1 :])
-        return _Stack(stamps_ns, np.insert(mean, at, own), grown), slice(at, at + n)
+        return (stamps_ns, np.insert(mean, at, own), grown), slice(at, at + n)
 
     def _given_neighbours(self, index: int, stamp_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Mean (n,), A and noise (n, n) of x = A [neighbours] + noise after the state at `index`.

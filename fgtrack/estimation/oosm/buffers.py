@@ -1,7 +1,5 @@
 """Hold measurements back until the late ones have come, as in industry."""
 
-from abc import ABC, abstractmethod
-
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import TrackState
@@ -13,21 +11,37 @@ from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.models.motion import MotionModel
 
 
-class BufferedEkf(ABC):
-    """An EKF whose state ends at a front; measurements after the front are held and do not count yet.
+class DelayedHorizon:
+    """Run the filter at now - D, and predict from there to now.
 
-    Until the front has passed them they are kept in order of their stamps, so a measurement that comes before the
-    front has passed its stamp is in time. One behind the front is too old. Innovation and NIS are those against
-    everything that was known of that stamp when the measurement came, held measurements included.
+    Now is the clock, or the newest stamp where that is ahead, so D has to cover the longest delay. As in flight
+    controllers (the delayed fusion horizon of the PX4 EKF). Later measurements are held in order of their stamps,
+    earlier ones are too old. Innovation and NIS are predicted from all measurements that have come, held ones included.
+
+    Exact for: the state at now - D, linear model, any number of measurements with delays up to D. At now it is the
+    prediction over D, however little was late.
+
+    Parameters
+    ----------
+    motion, prior, lag_s
+        See `WindowedFilter`.
+    horizon_s
+        D, at most `lag_s`. Raises `CallError` otherwise.
+    initiation
+        See `ReplayEkf`.
     """
 
+    exact = "up to now - D: any lag, any number"
+    held_s = 0.2
     initiates = True
 
-    def __init__(self, motion: MotionModel, prior: Start, lag_s: float, hold_s: float, initiation: str) -> None:
-        if not 0.0 <= hold_s <= lag_s:
-            raise CallError(f"measurements held for {hold_s} s: give a time from 0 to the window's {lag_s} s")
+    def __init__(
+        self, motion: MotionModel, prior: Start, lag_s: float, horizon_s: float = 0.2, initiation: str = DEFAULT
+    ) -> None:
+        if not 0.0 <= horizon_s <= lag_s:
+            raise CallError(f"measurements held for {horizon_s} s: give a time from 0 to the window's {lag_s} s")
         self._motion = motion
-        self._hold_ns = nanoseconds(hold_s)
+        self._hold_ns = nanoseconds(horizon_s)
         self._now_ns = prior.stamp_ns
         self._ordered = ReplayEkf(motion, prior, lag_s, initiation)
 
@@ -37,9 +51,9 @@ class BufferedEkf(ABC):
         return self._ordered.window_ns
 
     @property
-    @abstractmethod
     def _front_ns(self) -> int:
         """Stamp up to which measurements count."""
+        return self._now_ns - self._hold_ns
 
     def advance(self, now_ns: int) -> None:
         """See `Estimator.advance`."""
@@ -65,39 +79,7 @@ class BufferedEkf(ABC):
         return track_state(self._motion, stamp_ns, *predict(front.mean, front.covariance, self._motion, dt_s))
 
 
-class DelayedHorizon(BufferedEkf):
-    """Run the filter at now - D, and predict from there to now.
-
-    Now is the clock, or the newest stamp where that is ahead, so D has to cover the longest delay. As in flight
-    controllers (the delayed fusion horizon of the PX4 EKF).
-
-    Exact for: the state at now - D, linear model, any number of measurements with delays up to D. At now it is the
-    prediction over D, however little was late.
-
-    Parameters
-    ----------
-    motion, prior, lag_s
-        See `WindowedFilter`.
-    horizon_s
-        D, at most `lag_s`. Raises `CallError` otherwise.
-    initiation
-        See `ReplayEkf`.
-    """
-
-    exact = "up to now - D: any lag, any number"
-    held_s = 0.2
-
-    def __init__(
-        self, motion: MotionModel, prior: Start, lag_s: float, horizon_s: float = 0.2, initiation: str = DEFAULT
-    ) -> None:
-        super().__init__(motion, prior, lag_s, horizon_s, initiation)
-
-    @property
-    def _front_ns(self) -> int:
-        return self._now_ns - self._hold_ns
-
-
-class ReorderBuffer(BufferedEkf):
+class ReorderBuffer(DelayedHorizon):
     """Hold every measurement until one has come whose stamp is D later, and fuse in order of stamps.
 
     The stamps push the front and the clock does not, so D has to cover only how much later than its successors a

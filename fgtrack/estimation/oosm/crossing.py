@@ -1,29 +1,20 @@
 """Methods by which the past corrects the present through their cross-covariance, and that update itself."""
 
 from abc import abstractmethod
-from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from fgtrack.core.linalg import congruence, psd_solve, symmetrise
+from fgtrack.core.linalg import congruence, identity, psd_solve, symmetrise
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.filters.ekf import OneCorrection, Prediction, linearised, propagated, robust_weight
-from fgtrack.estimation.oosm.late import FilterStep, LateEkf
+from fgtrack.estimation.oosm.late import FilterStep, RewindForget
 from fgtrack.estimation.rts import rts_step
-from fgtrack.models.motion import MotionModel
 
-
-class Past(NamedTuple):
-    """A method's estimate of the state at the stamp tau of a late measurement."""
-
-    mean: FloatArray
-    """x_tau, shape (n,)."""
-    covariance: FloatArray
-    """P_tau, shape (n, n)."""
-    cross: FloatArray
-    """Cov(x, x_tau) of the state x to be corrected, shape (m, n)."""
+Past = tuple[FloatArray, FloatArray, FloatArray]
+"""Mean x_tau (n,) and covariance P_tau (n, n) by a method at the stamp tau of a late measurement, and the covariance
+(m, n) of the state to be corrected with the state at tau."""
 
 
 def fuse_across(mean: FloatArray, covariance: FloatArray, past: Past, measurement: Measurement) -> OneCorrection:
@@ -33,14 +24,15 @@ def fuse_across(mean: FloatArray, covariance: FloatArray, past: Past, measuremen
     2002, see `A1`), with the weight that a robust loss gives R (see `robust_weight`). Raises
     `numpy.linalg.LinAlgError` where S is not positive definite or the result is not finite.
     """
-    y, H = linearised(measurement.z, past.mean, measurement.model, measurement.pose)
-    S = propagated(H, past.covariance, measurement.R)
+    x_tau, P_tau, cross = past
+    y, H = linearised(measurement.z, x_tau, measurement.model, measurement.pose)
+    S = propagated(H, P_tau, measurement.R)
     np.linalg.cholesky(S)  # raises where S is not positive definite
     expected, nis = S, measurement.nis(y, S)
-    w = robust_weight(measurement.loss, y, congruence(H, past.covariance), measurement.R)
+    w = robust_weight(measurement.loss, y, congruence(H, P_tau), measurement.R)
     if w < 1.0:
-        S = propagated(H, past.covariance, measurement.R / w)
-    across = past.cross @ H.T
+        S = propagated(H, P_tau, measurement.R / w)
+    across = cross @ H.T
     gain = psd_solve(S, across.T).T
     result = OneCorrection(mean + gain @ y, symmetrise(covariance - gain @ across.T), y, nis, w, expected)
     if not (np.isfinite(result.mean).all() and np.isfinite(result.covariance).all()):
@@ -48,8 +40,8 @@ def fuse_across(mean: FloatArray, covariance: FloatArray, past: Past, measuremen
     return result
 
 
-class CrossingEkf(LateEkf):
-    """A `LateEkf` that corrects the present through its cross-covariance with the past (see `fuse_across`).
+class CrossingEkf(RewindForget):
+    """An EKF that corrects the present through its cross-covariance with the past (see `fuse_across`).
 
     The corrected present enters the history with an equivalent measurement there (see `_absorb`), so a second
     late measurement finds the state that the first one made. What lies between the first one's stamp and the present
@@ -68,64 +60,29 @@ class CrossingEkf(LateEkf):
     def _past(self, stamp_ns: int) -> Past:
         """Estimate of the state at `stamp_ns`, and its cross-covariance with the present."""
 
-    def _before(self, stamp_ns: int) -> tuple[int, FloatArray, FloatArray, FloatArray]:
-        """Return the index m of the last step before `stamp_ns`; x_{tau|m}, P_{tau|m} and F(m + 1, tau)."""
-        index = self._left(stamp_ns)
-        mean, covariance = self._predicted(index, stamp_ns)
-        F = self._motion.jacobian(mean, seconds(self._steps[index + 1].stamp_ns - stamp_ns))
-        return index, mean, covariance, F
+    def _since(self, stamp_ns: int) -> tuple[FloatArray, FloatArray, list[tuple[FilterStep, FloatArray]]]:
+        """Return x_{tau|m}, P_{tau|m}, and each step after `stamp_ns` with F (n, n) to it."""
+        left = self._left(stamp_ns)
+        mean, covariance = self._predicted(left, stamp_ns)
+        since, x, at_ns = [], mean, stamp_ns
+        for step in self._steps[left + 1 :]:
+            since.append((step, self._motion.jacobian(x, seconds(step.stamp_ns - at_ns))))
+            x, at_ns = step.mean, step.stamp_ns
+        return mean, covariance, since
 
 
-def retrodicted(
-    motion: MotionModel, now: FilterStep, before: tuple[FloatArray, FloatArray], back_s: float, noise_in_state: bool
-) -> Past:
-    """The state `back_s` before `now`, from `now` and the state `before` the measurements that made it.
+class A1(CrossingEkf):
+    """Algorithm A for one lag: retrodict the state with the process noise estimated from the last innovation.
 
-    Mean (n,) and covariance (n, n) of `before` are x and P, those of `now` x_k and P_k; Q is the process noise since
-    tau, v its value. What was measured since enters as H' S^-1 y = P^-1 (x_k - x) and H' S^-1 H = P^-1 (P - P_k) P^-1:
+    Bar-Shalom, Update with out-of-sequence measurements in tracking: exact solution, IEEE Transactions on Aerospace and
+    Electronic Systems 38(3), 2002. With x and P = x_{k|k-1}, P_{k|k-1}, the process noise Q since tau and its value v,
+    the last measurement enters as H' S^-1 y = P^-1 (x_k - x) and H' S^-1 H = P^-1 (P - P_k) P^-1:
 
         x_tau = F(tau, k) (x_k - Q H' S^-1 y)
         P_vv = Q - Q H' S^-1 H Q,   P_xv = Q - P H' S^-1 H Q
         P_tau = F(tau, k) (P_k + P_vv - P_xv - P_xv') F(tau, k)',   P_k,tau = (P_k - P_xv) F(tau, k)'
 
-    Without the noise in the state x_tau = F(tau, k) x_k and P_vv = Q, for then v is not estimated; P_xv stays. See
-    Bar-Shalom 2002 for one step, Bar-Shalom, Chen and Mallick 2004 for several taken as one.
-    """
-    mean, covariance = before
-    Q = motion.process_noise(motion.predict(now.mean, -back_s), back_s)
-    weighted = psd_solve(covariance, Q)  # P^-1 Q
-    gained = covariance - now.covariance
-    seen = gained @ weighted  # P H' S^-1 H Q
-    P_vv, P_xv, end = Q, Q - seen, now.mean
-    if noise_in_state:
-        P_vv, end = Q - weighted.T @ seen, now.mean - weighted.T @ (now.mean - mean)
-    start, back = motion.predict(end, -back_s), motion.jacobian(end, -back_s)
-    spread = back @ (now.covariance + P_vv - P_xv - P_xv.T) @ back.T
-    return Past(start, symmetrise(spread), (now.covariance - P_xv) @ back.T)
-
-
-class _OneLag(CrossingEkf):
-    """Retrodiction as one lag: through the measurements of the newest stamp, or all since the step m before tau."""
-
-    noise_in_state: ClassVar[bool]
-    equivalent: ClassVar[bool] = False
-
-    def _past(self, stamp_ns: int) -> Past:
-        now = self._steps[-1]
-        if self.equivalent:
-            before = self._predicted(self._left(stamp_ns), now.stamp_ns)
-        else:
-            first = next(step for step in self._steps if step.stamp_ns == now.stamp_ns)
-            before = first.predicted_mean, first.predicted_covariance
-        return retrodicted(self._motion, now, before, seconds(now.stamp_ns - stamp_ns), self.noise_in_state)
-
-
-class A1(_OneLag):
-    """Algorithm A for one lag: retrodict the state with the process noise estimated from the last innovation.
-
-    Bar-Shalom, Update with out-of-sequence measurements in tracking: exact solution, IEEE Transactions on Aerospace and
-    Electronic Systems 38(3), 2002. The equations are those of `retrodicted`, with x and P = x_{k|k-1}, P_{k|k-1}, then
-    `fuse_across`. It stores nothing of older steps, so at l lags the same equations are used with the whole noise
+    then `fuse_across`. It stores nothing of older steps, so at l lags the same equations are used with the whole noise
     Q(k, tau) and the last innovation alone, and an earlier late measurement counts as one of the newest stamp.
 
     Exact for: one lag, the first late measurement since the newest stamp. At several lags it takes away more
@@ -133,11 +90,29 @@ class A1(_OneLag):
     """
 
     exact = "one lag, first late measurement"
+    noise_in_state, equivalent = True, False
+    """False: v is not estimated. True: by the measurements of all steps since m, not of the newest stamp alone."""
 
-    noise_in_state = True
+    def _past(self, stamp_ns: int) -> Past:
+        now, motion = self._steps[-1], self._motion
+        back_s = seconds(now.stamp_ns - stamp_ns)
+        if self.equivalent:
+            mean, covariance = self._predicted(self._left(stamp_ns), now.stamp_ns)
+        else:
+            first = next(step for step in self._steps if step.stamp_ns == now.stamp_ns)
+            mean, covariance = first.predicted_mean, first.predicted_covariance
+        Q = motion.process_noise(motion.predict(now.mean, -back_s), back_s)
+        weighted = psd_solve(covariance, Q)  # P^-1 Q
+        seen = (covariance - now.covariance) @ weighted  # P H' S^-1 H Q
+        P_vv, P_xv, end = Q, Q - seen, now.mean
+        if self.noise_in_state:
+            P_vv, end = Q - weighted.T @ seen, now.mean - weighted.T @ (now.mean - mean)
+        start, back = motion.predict(end, -back_s), motion.jacobian(end, -back_s)
+        spread = back @ (now.covariance + P_vv - P_xv - P_xv.T) @ back.T
+        return start, symmetrise(spread), (now.covariance - P_xv) @ back.T
 
 
-class B1(_OneLag):
+class B1(A1):
     """Algorithm B for one lag: A1 without the noise in the retrodicted state.
 
     Hilton, Martin and Blair, Tracking with time-delayed data in multisensor systems, NSWCDD technical report, 1993;
@@ -148,6 +123,7 @@ class B1(_OneLag):
     Exact for: nothing, but close at one lag. Overconfident at many.
     """
 
+    exact = ""
     noise_in_state = False
 
 
@@ -167,14 +143,14 @@ class C(CrossingEkf):
         dt_s = seconds(stamp_ns - now.stamp_ns)
         mean, back = self._motion.predict(now.mean, dt_s), self._motion.jacobian(now.mean, dt_s)
         cross = now.covariance @ back.T
-        return Past(mean, symmetrise(back @ cross), cross)
+        return mean, symmetrise(back @ cross), cross
 
 
-class Al1(_OneLag):
+class Al1(A1):
     """Algorithm Al1: A1 with the equivalent measurement of the last l steps.
 
     Bar-Shalom, Chen and Mallick, One-step solution for the multistep out-of-sequence-measurement problem in tracking,
-    IEEE Transactions on Aerospace and Electronic Systems 40(1), 2004. The equations of `retrodicted` with the
+    IEEE Transactions on Aerospace and Electronic Systems 40(1), 2004. The equations of `A1` with the
     prediction of step m to the present as x and P: S*^-1 = P^-1 - P^-1 P_k P^-1, S*^-1 y* = P^-1 (x_k - x). It stores
     mean and covariance of the steps. They are not repaired after a late measurement; that one is part of the
     equivalent measurement, like all that came since m.
@@ -182,12 +158,10 @@ class Al1(_OneLag):
     Exact for: one lag, the first late measurement since step m. Numerically the same as `Fpfd` in a linear model.
     """
 
-    exact = "one lag, first late measurement"
-
-    noise_in_state, equivalent = True, True
+    equivalent = True
 
 
-class Bl1(_OneLag):
+class Bl1(B1):
     """Algorithm Bl1: Al1 without the noise in the retrodicted state.
 
     Bar-Shalom, Chen and Mallick 2004 (see `Al1`): x_tau = F(tau, k) x_k and P_vv = Q, so that of the steps only the
@@ -196,7 +170,7 @@ class Bl1(_OneLag):
     Exact for: nothing, but close to `Al1`.
     """
 
-    noise_in_state, equivalent = False, True
+    equivalent = True
 
 
 class RtsCrossCovariance(CrossingEkf):
@@ -218,18 +192,14 @@ class RtsCrossCovariance(CrossingEkf):
     exact = "any lag, first late measurement"
 
     def _past(self, stamp_ns: int) -> Past:
-        steps = self._steps
-        left, mean, covariance, F = self._before(stamp_ns)
-        smoothed, P, path = steps[-1].mean, steps[-1].covariance, steps[-1].covariance
-        for index in range(len(steps) - 1, left, -1):
-            after, before = steps[index], steps[index - 1]
-            at_tau = index == left + 1
-            x, P_x = (mean, covariance) if at_tau else (before.mean, before.covariance)
-            transition = F if at_tau else self._transition_to(index)
-            predicted = Prediction(after.predicted_mean, after.predicted_covariance, transition @ P_x)
+        x, P_x, since = self._since(stamp_ns)
+        before = [(x, P_x), *((step.mean, step.covariance) for step, _ in since)]
+        smoothed, P, path = self._steps[-1].mean, self._steps[-1].covariance, self._steps[-1].covariance
+        for (x, P_x), (after, F) in zip(reversed(before[:-1]), reversed(since), strict=True):
+            predicted = Prediction(after.predicted_mean, after.predicted_covariance, F @ P_x)
             smoothed, P, gain = rts_step(x, P_x, predicted, smoothed - after.predicted_mean, P)
             path = gain @ path
-        return Past(smoothed, P, path.T)
+        return smoothed, P, path.T
 
 
 class FixedPoint(CrossingEkf):
@@ -249,17 +219,15 @@ class FixedPoint(CrossingEkf):
     exact = "any lag, first late measurement"
 
     def _past(self, stamp_ns: int) -> Past:
-        steps = self._steps
-        left, mean, covariance, F = self._before(stamp_ns)
+        mean, covariance, since = self._since(stamp_ns)
         cross = covariance
-        for index in range(left + 1, len(steps)):
-            step = steps[index]
-            cross = (F if index == left + 1 else self._transition_to(index)) @ cross
+        for step, F in since:
+            cross = F @ cross
             weighted = step.weight @ cross
             mean = mean + cross.T @ step.score
             covariance = symmetrise(covariance - cross.T @ weighted)
             cross = cross - step.predicted_covariance @ weighted
-        return Past(mean, covariance, cross)
+        return mean, covariance, cross
 
 
 class Larsen(CrossingEkf):
@@ -280,11 +248,9 @@ class Larsen(CrossingEkf):
     """
 
     def _past(self, stamp_ns: int) -> Past:
-        steps = self._steps
-        left, mean, covariance, M = self._before(stamp_ns)
-        for index in range(left + 1, len(steps)):
-            step = steps[index]
-            if index > left + 1:
-                M = self._transition_to(index) @ M
+        mean, covariance, since = self._since(stamp_ns)
+        M = identity(len(mean))
+        for step, F in since:
+            M = F @ M
             M = M - step.predicted_covariance @ (step.weight @ M)
-        return Past(mean, covariance, np.asarray(M @ covariance))
+        return mean, covariance, M @ covariance

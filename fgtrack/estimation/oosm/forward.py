@@ -1,7 +1,5 @@
 """Predict the late measurement forward as an estimate of its own, and fuse it with the present one."""
 
-from abc import abstractmethod
-
 import numpy as np
 from scipy.optimize import minimize_scalar
 
@@ -9,18 +7,28 @@ from fgtrack.core.linalg import identity, psd_solve, symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.filters.ekf import OneCorrection, correct_one
-from fgtrack.estimation.oosm.late import LateEkf
+from fgtrack.estimation.oosm.late import RewindForget
 
 _Estimate = tuple[FloatArray, FloatArray]
 """Mean (n,) and covariance (n, n) at the present stamp."""
 
 
-class _ForwardEkf(LateEkf):
-    """Fuses the present x_k, P_k with the late estimate x_1, P_1, both of which contain x_m.
+class Fpfd(RewindForget):
+    """Forward prediction, fusion, and decorrelation: fuse both estimates and subtract their common information once.
 
-    x_1 is step m predicted to tau, corrected there and predicted to now; x_0, P_0 is step m predicted to now. The steps
-    are not repaired after a late measurement; x_k holds all that came since m, late or not.
+    Rheaume and Benaskeur, Forward prediction-based approach to target-tracking with out-of-sequence measurements, IEEE
+    Conference on Decision and Control, 2008:
+
+        P^-1 = P_k^-1 + P_1^-1 - P_0^-1,   P^-1 x = P_k^-1 x_k + P_1^-1 x_1 - P_0^-1 x_0
+
+    with the present x_k, P_k; step m predicted to tau, corrected there and predicted to now, x_1, P_1; and step m
+    predicted to now, x_0, P_0. That is, both are taken as if they shared x_0 and nothing else; they share the process
+    noise since tau. The steps are not repaired after a late measurement; x_k holds all that came since m.
+
+    Exact for: one lag, the first late measurement since step m. Numerically the same as `Al1` in a linear model.
     """
+
+    exact = "one lag, first late measurement"
 
     def _fuse_late(self, measurement: Measurement) -> OneCorrection:
         stamp_ns, now = measurement.stamp_ns, self._steps[-1]
@@ -33,34 +41,15 @@ class _ForwardEkf(LateEkf):
         self._absorb(x, P)
         return OneCorrection(x, P, at_tau.innovation, at_tau.nis, at_tau.weight, at_tau.S)
 
-    @abstractmethod
     def _fused(self, now: _Estimate, late: _Estimate, common: _Estimate) -> _Estimate:
         """One estimate from `now` and `late`, which share the information of `common`."""
-
-
-class Fpfd(_ForwardEkf):
-    """Forward prediction, fusion, and decorrelation: fuse both estimates and subtract their common information once.
-
-    Rheaume and Benaskeur, Forward prediction-based approach to target-tracking with out-of-sequence measurements, IEEE
-    Conference on Decision and Control, 2008:
-
-        P^-1 = P_k^-1 + P_1^-1 - P_0^-1,   P^-1 x = P_k^-1 x_k + P_1^-1 x_1 - P_0^-1 x_0
-
-    that is, both estimates are taken as if they shared x_0 and nothing else; they share the process noise since tau.
-
-    Exact for: one lag, the first late measurement since step m. Numerically the same as `Al1` in a linear model.
-    """
-
-    exact = "one lag, first late measurement"
-
-    def _fused(self, now: _Estimate, late: _Estimate, common: _Estimate) -> _Estimate:
         P_k, P_1, P_0 = (information(P) for _, P in (now, late, common))
         covariance = symmetrise(information(P_k + P_1 - P_0))
         pull = P_1 @ (late[0] - now[0]) - P_0 @ (common[0] - now[0])
         return now[0] + covariance @ pull, covariance
 
 
-class CovarianceIntersection(_ForwardEkf):
+class CovarianceIntersection(Fpfd):
     """Fuse both estimates without knowing what they share.
 
     Julier and Uhlmann, Fusion of time delayed measurements with uncertain time delays, American Control Conference,
@@ -73,6 +62,8 @@ class CovarianceIntersection(_ForwardEkf):
     Exact for: nothing; never overconfident. Where one estimate is better than the other in all, it takes that one and
     loses the other.
     """
+
+    exact = ""
 
     def _fused(self, now: _Estimate, late: _Estimate, common: _Estimate) -> _Estimate:
         P_k, P_1 = information(now[1]), information(late[1])

@@ -1,7 +1,6 @@
 """EKFs that step through what arrives in sequence: ignore late measurements, take them as current, or rewind."""
 
 import bisect
-from abc import abstractmethod
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,11 +35,16 @@ class FilterStep:
     """H' S^-1 H, shape (n, n); with it I - K H = I - P_{j|j-1} weight."""
 
 
-class LateEkf(WindowedFilter):
-    """An EKF for measurements in sequence; `_fuse_late` defines what becomes of the others.
+class RewindForget(WindowedFilter):
+    """Update at the late stamp, and forget what was fused after it.
 
-    Exact and approximate are meant for a linear model throughout the package; in a nonlinear one all is linearised at
-    the stored means.
+    Karle, Fent, Huch, Sauerbeck and Lienkamp, Multi-modal sensor fusion and object tracking for autonomous racing, IEEE
+    Transactions on Intelligent Vehicles, 2023, section III-G: x_1 = f(x_{tau|tau}), P_1 = F P_{tau|tau} F' + Q from tau
+    to now. Here at the stamp itself; `fgtrack.estimation.filters.backward_forward` has the paper's time grid. The other
+    methods override `_fuse_late`; all are linearised at the stored means.
+
+    Exact for: nothing. For what it keeps it is the filter in order of stamps, so it stays consistent, but all
+    measurements between the late stamp and the present are lost.
 
     Parameters
     ----------
@@ -79,12 +83,9 @@ class LateEkf(WindowedFilter):
         self._steps[index + 1 :] = [step]
         return result
 
-    @abstractmethod
     def _fuse_late(self, measurement: Measurement) -> OneCorrection | None:
-        """Fuse a measurement that is older than the newest; None where the method ignores it.
-
-        Raises `numpy.linalg.LinAlgError`, with all as it was, for one that cannot be fused.
-        """
+        """Fuse a measurement older than the newest, as `_fuse`."""
+        return self._fuse_next(measurement)
 
     def _left(self, stamp_ns: int) -> int:
         """Return the index of the last step that is not after `stamp_ns`, or of the first step, where all are."""
@@ -103,11 +104,6 @@ class LateEkf(WindowedFilter):
             return mean, covariance
         return predict(mean, covariance, self._motion, seconds(to_ns - from_ns))
 
-    def _transition_to(self, index: int) -> FloatArray:
-        """Return F_j, shape (n, n), from the step before `index` to the one there."""
-        before = self._steps[index - 1]
-        return self._motion.jacobian(before.mean, seconds(self._steps[index].stamp_ns - before.stamp_ns))
-
     def _absorb(self, mean: FloatArray, covariance: FloatArray) -> None:
         """Add `mean` (n,) and `covariance` (n, n) of the present, into which a late measurement turned its state.
 
@@ -122,7 +118,7 @@ class LateEkf(WindowedFilter):
         self._steps.append(FilterStep(now.stamp_ns, mean, covariance, now.mean, now.covariance, score, weight))
 
 
-class Drop(LateEkf):
+class Drop(RewindForget):
     """Ignore a late measurement: it is `too_old`.
 
     The floor of every comparison ("neglect" in the Sensor Fusion and Tracking Toolbox of MathWorks).
@@ -134,7 +130,7 @@ class Drop(LateEkf):
         """Nothing."""
 
 
-class AsCurrent(LateEkf):
+class AsCurrent(RewindForget):
     """Take a late measurement as if it had been made at the newest stamp fused.
 
     What a filter without stamps does (no source): x+ = x_k + K (z - h(x_k)). The object has moved on by speed times
@@ -145,18 +141,3 @@ class AsCurrent(LateEkf):
 
     def _fuse_late(self, measurement: Measurement) -> OneCorrection:
         return self._fuse_next(replace(measurement, stamp_ns=self._newest_ns))
-
-
-class RewindForget(LateEkf):
-    """Update at the late stamp, and forget what was fused after it.
-
-    Karle, Fent, Huch, Sauerbeck and Lienkamp, Multi-modal sensor fusion and object tracking for autonomous racing, IEEE
-    Transactions on Intelligent Vehicles, 2023, section III-G: x_1 = f(x_{tau|tau}), P_1 = F P_{tau|tau} F' + Q from tau
-    to now. Here at the stamp itself; `fgtrack.estimation.filters.backward_forward` has the paper's time grid.
-
-    Exact for: nothing. For what it keeps it is the filter in order of stamps, so it stays consistent, but all
-    measurements between the late stamp and the present are lost.
-    """
-
-    def _fuse_late(self, measurement: Measurement) -> OneCorrection:
-        return self._fuse_next(measurement)
