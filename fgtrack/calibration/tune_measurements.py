@@ -23,7 +23,7 @@ from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.guarded_bank import GuardedBank
 from fgtrack.tracking.inbox import Batch
 from fgtrack.tracking.objects import Apart
-from fgtrack.tracking.preprocess import Candidate, Preprocess
+from fgtrack.tracking.preprocess import Candidate, Candidates, Preprocess
 from fgtrack.tracking.tracker import TrackerParts
 
 
@@ -57,7 +57,7 @@ class _OpenedGate:
     association: GatedEuclidean | GatedMahalanobis
     stds: float
 
-    def __call__(self, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None) -> Assignment:
+    def __call__(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Assignment:
         needed_m = self.stds * np.array([self._stds_m(candidate, states.means) for candidate in candidates])
         needed_m = needed_m.reshape(len(candidates), len(states.means))
         if isinstance(self.association, GatedEuclidean):
@@ -83,16 +83,14 @@ class _WatchedPreprocess(Preprocess):
     def __init__(self, watched: Preprocess) -> None:
         self._watched = watched
         self._sensor: tuple[str, SensorModel] | None = None
-        self._own: dict[int, bool] = {}
+        self._own: dict[bytes, bool] = {}  # by what is measured
 
-    def __call__(
-        self, batch: Batch, sensor: SensorModel, ego: EgoPose | None
-    ) -> tuple[list[Candidate], list[UpdateRecord]]:
+    def __call__(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> tuple[Candidates, list[UpdateRecord]]:
         candidates, records = self._watched(batch, sensor, ego)
         objects = batch.message.objects
         self._sensor = batch.message.sensor, sensor
         self._own = {
-            id(one.measurement): sensor.message_covariance
+            one.measurement.z.tobytes(): sensor.message_covariance
             and any(objects[index].covariance is not None for index in (one.leader, *one.merged))
             for one in candidates
         }
@@ -102,7 +100,7 @@ class _WatchedPreprocess(Preprocess):
         """Return a measurement of the newest batch with its noise in parts."""
         assert self._sensor is not None  # a batch is preprocessed before anything of it is fused
         name, sensor = self._sensor
-        return observation(name, sensor, measurement, self._own[id(measurement)])
+        return observation(name, sensor, measurement, self._own[measurement.z.tobytes()])
 
 
 def observation(name: str, sensor: SensorModel, measurement: Measurement, own: bool) -> Observation:

@@ -1,16 +1,16 @@
 """The protocols of estimators and their banks."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from fgtrack.core.checks import LARGEST, LARGEST_NS, is_number, is_stamp
 from fgtrack.core.errors import CallError
-from fgtrack.core.linalg import mahalanobis_squared
+from fgtrack.core.linalg import equal_ones, mahalanobis_squared
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.models.measurement import COMPONENTS, MeasurementModel, SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, MotionModel
@@ -34,9 +34,9 @@ class Measurement:
     stamp_ns: int
     model: MeasurementModel
     z: FloatArray
-    """Measured components, shape (k,)."""
+    """Measured components, shape (k,); (m, k) of a stack."""
     R: FloatArray
-    """Covariance, shape (k, k)."""
+    """Covariance, shape (k, k); (m, k, k) of a stack."""
     pose: SensorPose = _AT_ORIGIN
     loss: RobustLoss | None = None
     """Robust loss; None is the Gaussian."""
@@ -123,6 +123,31 @@ class Measurement:
         `numpy.linalg.LinAlgError` for a singular `S`.
         """
         return float(mahalanobis_squared(innovation, S, self.measured))
+
+
+class Measurements(Sequence[Measurement]):
+    """Measurements of several objects that differ in their numbers alone; each is made when it is asked for."""
+
+    def __init__(self, stack: Measurement) -> None:
+        self.stack = stack
+        """All of them: z (m, k) and R (m, k, k)."""
+
+    def __len__(self) -> int:
+        return len(self.stack.z)
+
+    def __getitem__(self, index: Any) -> Any:  # Any: there are no slices
+        own = self.stack
+        return Measurement(own.stamp_ns, own.model, own.z[index], own.R[index], own.pose, own.loss, own.assumed)
+
+
+def stacks(measurements: Sequence[Measurement]) -> Iterator[tuple[Sequence[int], Measurement]]:
+    """Yield the indices of measurements that differ in their numbers alone, and the stack of these."""
+    if isinstance(measurements, Measurements):
+        yield range(len(measurements)), measurements.stack
+        return
+    for rows in equal_ones([(id(one.model), one.pose, one.assumed, one.loss) for one in measurements]):
+        z, R = (np.array([getattr(measurements[row], name) for row in rows]) for name in ("z", "R"))
+        yield rows, replace(measurements[rows[0]], z=z, R=R)
 
 
 class UpdateStatus(StrEnum):

@@ -10,14 +10,13 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 from scipy.special import gammaincinv
 
-from fgtrack.core.linalg import equal_ones, kernels, symmetrise
+from fgtrack.core.linalg import kernels, symmetrise
 from fgtrack.core.settings import OpenProbability, settings
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.estimation.base import Measurement, StatesAt
+from fgtrack.estimation.base import StatesAt
 from fgtrack.estimation.filters.ekf import linearised
-from fgtrack.tracking.detections import PoseError
 from fgtrack.tracking.objects import Apart
-from fgtrack.tracking.preprocess import Candidate
+from fgtrack.tracking.preprocess import Candidates, Group
 
 _OUTSIDE = 1e9  # cost outside the gate: any number of pairs inside is cheaper
 MOST_NEAR = 128
@@ -40,21 +39,6 @@ class Pairs(NamedTuple):
         return Pairs(self.rows[chosen], self.columns[chosen], self.values[chosen])
 
 
-class Group(NamedTuple):
-    """Candidates of one measurement model, seen from one pose."""
-
-    rows: IntArray
-    """Indices of the candidates, shape (m,)."""
-    example: Measurement
-    """Any of them."""
-    z: FloatArray
-    """Shape (m, k)."""
-    R: FloatArray
-    """Shape (m, k, k)."""
-    error: PoseError | None
-    """Error of the ego where its effect depends on the track: of all, stacked."""
-
-
 class Assignment(NamedTuple):
     """Outcome of an association."""
 
@@ -71,7 +55,7 @@ class Assignment(NamedTuple):
 class Association(Protocol):
     """Assigns candidates to tracks at least cost."""
 
-    def __call__(self, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None) -> Assignment:
+    def __call__(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Assignment:
         """The states are those of the tracks at the candidates' stamp; pairs that are `apart` are not made."""
 
 
@@ -90,12 +74,12 @@ class GatedEuclidean:
     max_nis: PositiveFloat | None = None
     """Largest NIS of a pair; null for no limit."""
 
-    def __call__(self, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None) -> Assignment:
+    def __call__(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Assignment:
         """See `Association`."""
         return self.within(self.gate_m, candidates, states, apart)
 
     def within(
-        self, gates_m: float | FloatArray, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None
+        self, gates_m: float | FloatArray, candidates: Candidates, states: StatesAt, apart: Apart | None = None
     ) -> Assignment:
         """Return the assignment with other gates; `gates_m` broadcasts to (candidates, tracks)."""
         is_one = isinstance(gates_m, float)
@@ -107,7 +91,7 @@ class GatedEuclidean:
         if self.max_nis is not None and len(pairs.rows):
             suspects = set(pairs.rows.tolist())
             nis = np.empty(len(pairs.rows))
-            for chosen, chosen_nis, _, _ in innovations(pairs, grouped(candidates), len(candidates), states):
+            for chosen, chosen_nis, _, _ in innovations(pairs, candidates, states):
                 nis[chosen] = chosen_nis
             pairs = pairs.at(nis <= self.max_nis)
         return _refusing(suspects, assigned(pairs, len(candidates), len(states.means)))
@@ -129,14 +113,12 @@ class GatedMahalanobis:
     claim_m: NonNegativeFloat = 0.0
     """A candidate that belongs to no track starts none nearer than this to one: it is the other end of a long hull."""
 
-    def __call__(self, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None) -> Assignment:
+    def __call__(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Assignment:
         """See `Association`; the cost adds log det S, so that a vague track does not win by being vague."""
-        groups = grouped(candidates)
-        quantiles = [chi_square_quantile(self.gate_probability, group.z.shape[-1]) for group in groups]
-        reach_m = reaches_m(groups, states, quantiles, self.max_distance_m)
+        reach_m = reaches_m(candidates.groups, states, self.gate_probability, self.max_distance_m)
         pairs = near(candidates, states.means, reach_m, apart)
         cost, inside = np.empty(len(pairs.rows)), np.empty(len(pairs.rows), dtype=bool)
-        for chosen, nis, logdet, k in innovations(pairs, groups, len(candidates), states) if len(cost) else ():
+        for chosen, nis, logdet, k in innovations(pairs, candidates, states) if len(cost) else ():
             cost[chosen] = nis + logdet
             inside[chosen] = nis <= chi_square_quantile(self.gate_probability, k)
         result = assigned(pairs._replace(values=cost).at(inside), len(candidates), len(states.means))
@@ -189,89 +171,54 @@ def _least_cost(
     return np.asarray(rows[inside], dtype=np.int64), np.asarray(columns[inside], dtype=np.int64)
 
 
-def grouped(candidates: Sequence[Candidate]) -> list[Group]:
-    """Return `candidates` in groups that can be compared with tracks at once."""
-    kinds = []
-    for candidate in candidates:
-        own, error = candidate.measurement, candidate.pose_error
-        kinds.append((id(own.model), id(own.pose), 0 if error is None else id(error.covariance)))
-    groups = []
-    for rows in equal_ones(kinds):
-        z, R, errors = [], [], []
-        for row in rows:
-            z.append(candidates[row].measurement.z)
-            R.append(candidates[row].measurement.R)
-            errors.append(candidates[row].pose_error)
-        example, first = candidates[rows[0]].measurement, errors[0]
-        error = None
-        if first is not None and example.model.relative:
-            parts = zip(*((each.placement, each.R) for each in errors if each is not None), strict=True)
-            error = PoseError(first.covariance, *map(np.array, parts))
-        groups.append(Group(np.array(rows), example, np.array(z), np.array(R), error))
-    return groups
-
-
 def near(
-    candidates: Sequence[Candidate], means: FloatArray, reach_m: float | FloatArray, excluded: Apart | None = None
+    candidates: Candidates, means: FloatArray, reach_m: float | FloatArray, excluded: Apart | None = None
 ) -> Pairs:
     """Return the pairs, with distances, at most `reach_m` (a number or one for each track) apart and not `excluded`.
 
     Of a candidate with more than `MOST_NEAR` tracks so near, the nearest of them. Distances are in the map; that of a
     bearing is from the track to the line of sight.
     """
-    points = np.full((len(candidates), 3), np.nan)
-    for point, candidate in zip(points, candidates, strict=True):
-        if candidate.position_m is not None:
-            point[:2] = candidate.position_m
-        else:
-            pose = candidate.measurement.pose
-            point[:] = pose.x_m, pose.y_m, pose.yaw_rad + candidate.values["bearing_rad"]
     limits_m = np.full(len(means), reach_m, dtype=np.float64)
     find_near = kernels("fgtrack.tracking.kernels").near
-    pairs = Pairs(*find_near(points, np.ascontiguousarray(means), limits_m, MOST_NEAR))
+    pairs = Pairs(*find_near(candidates.lines, np.ascontiguousarray(means), limits_m, MOST_NEAR))
     return pairs if excluded is None else pairs.at(~excluded(pairs.rows, pairs.columns))
 
 
 def innovations(
-    pairs: Pairs, groups: Sequence[Group], num_candidates: int, states: StatesAt
+    pairs: Pairs, candidates: Candidates, states: StatesAt
 ) -> Iterator[tuple[IntArray, FloatArray, FloatArray, int]]:
-    """Yield the innovations of `pairs` of candidates, which are in `groups`, and tracks with these states.
+    """Yield the innovations of `pairs` of `candidates` and tracks with these states.
 
     Indices of pairs that measure the same, assumed components included, with NIS and log det S, shapes (p,), and the
     number k of components. NaN where S has no root.
     """
     P = np.array(states.covariances, dtype=np.float64, order="C")
-    member, number = np.empty((2, num_candidates), dtype=np.int64)
-    for k, group in enumerate(groups):
-        member[group.rows], number[group.rows] = np.arange(len(group.rows)), k
-    for k, group in enumerate(groups):
-        chosen = np.flatnonzero(number[pairs.rows] == k)
-        if not len(chosen):
-            continue
-        members, columns = member[pairs.rows[chosen]], pairs.columns[chosen]
+    for group, members, chosen in candidates.split(pairs.rows):
+        columns = pairs.columns[chosen]
         x = states.means[columns]
-        y, H = linearised(group.z[members], x, group.example.model, group.example.pose)
-        R = group.R[members]
-        if group.error is not None:
-            error = PoseError(group.error.covariance, group.error.placement[members], group.error.R[members])
-            R = error.noise(group.example.model, group.example.pose, x)
+        own = group.seen_at(members, x)
+        y, H = linearised(own.z, x, own.model, own.pose)
         H = np.array(H, ndmin=3, order="C")
-        yield chosen, *kernels("fgtrack.tracking.kernels").innovations(y, H, P, columns, R), y.shape[-1]
+        yield chosen, *kernels("fgtrack.tracking.kernels").innovations(y, H, P, columns, own.R), y.shape[-1]
 
 
-def reaches_m(groups: Sequence[Group], states: StatesAt, quantiles: Sequence[float], limit_m: float) -> FloatArray:
-    """Largest distance from each track of a candidate with a NIS up to its group's quantile, shape (tracks,).
+def reaches_m(groups: Sequence[Group], states: StatesAt, probability: float, limit_m: float) -> FloatArray:
+    """Largest distance from each track of a candidate with a NIS up to the quantile of `probability`, shape (tracks,).
 
     The NIS is at least that of the position alone, which is at least the squared distance over the largest variance of
     S = P + R in any direction. At most `limit_m`, and just that where it is not the position that is measured.
     """
     squared_m2 = np.zeros(len(states.means))
-    for group, quantile in zip(groups, quantiles, strict=True):
-        model, pose = group.example.model, group.example.pose
+    for group in groups:
+        model, pose = group.stack.model, group.stack.pose
         plain = model.components[:2] == ("x_m", "y_m")
         if not plain or not np.array_equal(model.predict(states.means, pose)[:, :2], states.means[:, :2]):
             return np.full(len(states.means), limit_m)
-        own_m2 = _largest_variances(group.R).max()
+        own_m2, quantile = (
+            _largest_variances(group.stack.R).max(),
+            chi_square_quantile(probability, len(model.components)),
+        )
         squared_m2 = np.maximum(squared_m2, quantile * (_largest_variances(states.covariances) + own_m2))
     return np.minimum(np.sqrt(squared_m2) * _MARGIN, limit_m)
 

@@ -199,6 +199,10 @@ class PoseError(NamedTuple):
     R: FloatArray
     """Covariance of the detection itself, without e, shape (k, k) or (m, k, k)."""
 
+    def at(self, rows: IntArray | list[int]) -> "PoseError":
+        """Return that of some detections."""
+        return PoseError(self.covariance, self.placement[rows], self.R[rows])
+
     def noise(self, model: MeasurementModel, pose: SensorPose, x: FloatArray) -> FloatArray:
         """R + G P_e G' at the states `x` (..., n), shape (..., k, k), or (k, k) where it is the same at all."""
         G = self.placement - model.pose_jacobian(x, pose) if model.relative else self.placement

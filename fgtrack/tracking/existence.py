@@ -26,8 +26,10 @@ from fgtrack.core.linalg import mahalanobis_squared
 from fgtrack.core.settings import OpenProbability, settings
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray, TrackStatus
+from fgtrack.estimation.base import StatesAt
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.lifecycle import CountingLifecycle, MatchedDetection, Scan
+from fgtrack.tracking.lifecycle import CountingLifecycle, Scan
+from fgtrack.tracking.preprocess import Candidate, Candidates
 
 #: Bounds of log-odds: a probability that differs from 0 or 1 by less says nothing more.
 _LARGEST_LOG_ODDS = 30.0
@@ -139,31 +141,32 @@ class ExistenceLifecycle:
         self.lives: dict[int, Existence] = {}
         """Existence by track id."""
 
-    def born(self, track_id: int, scan: Scan, matched: MatchedDetection) -> None:
+    def born(self, track_id: int, scan: Scan, candidate: Candidate) -> None:
         """See `CountingLifecycle.born`."""
         odds = self._rules.birth_probability / (1.0 - self._rules.birth_probability)
-        log_odds = _bounded(math.log(odds) + self._score(scan, matched))
+        log_odds = _bounded(math.log(odds) + self._score(scan, candidate))
         self.lives[track_id] = life = Existence(
             self._rules.lifetime_s, [scan.stamp_ns], [log_odds], [log_odds], in_view_ns=scan.stamp_ns
         )
-        life.first_m, life.travelled = matched.candidate.position_m, self._rules.min_travel_m == 0.0
+        life.first_m, life.travelled = candidate.position_m, self._rules.min_travel_m == 0.0
         self._confirm(life)
 
-    def matched(self, track_id: int, scan: Scan, matched: MatchedDetection) -> None:
+    def matched(self, scan: Scan, candidates: Candidates, pairs: Sequence[tuple[int, int]], states: StatesAt) -> None:
         """See `CountingLifecycle.matched`."""
-        life = self.lives[track_id]
-        life.misses = 0
-        if not life.travelled and matched.mean is not None and life.first_m is not None:
-            travel_m = math.dist(matched.mean[:2].tolist(), life.first_m.tolist())
-            life.travelled = travel_m >= self._rules.min_travel_m
-        density = _position_density(matched)
-        if density is None:
-            return
         sensor = self._sensors[scan.sensor]
-        ratio = density / sensor.clutter_per_m2 * math.exp(self._score(scan, matched))
         P_D = sensor.detection_probability
-        life.learn(scan.stamp_ns, math.log(1.0 - P_D + P_D * ratio))
-        self._confirm(life)
+        for position, track in pairs:
+            if not candidates.placed[position]:
+                continue
+            life, mean, candidate = self.lives[states.track_ids[track]], states.means[track], candidates[position]
+            life.misses = 0
+            if not life.travelled and life.first_m is not None:
+                life.travelled = math.dist(mean[:2].tolist(), life.first_m.tolist()) >= self._rules.min_travel_m
+            density = _position_density(candidate, mean, states.covariances[track])
+            if density is not None:
+                ratio = density / sensor.clutter_per_m2 * math.exp(self._score(scan, candidate))
+                life.learn(scan.stamp_ns, math.log(1.0 - P_D + P_D * ratio))
+                self._confirm(life)
 
     def fused(self, track_id: int) -> None:
         """See `CountingLifecycle.fused`; the match has counted already."""
@@ -210,12 +213,12 @@ class ExistenceLifecycle:
             return True
         return life.probability(self._present_ns) < self._rules.delete_probability
 
-    def _score(self, scan: Scan, matched: MatchedDetection) -> float:
+    def _score(self, scan: Scan, candidate: Candidate) -> float:
         """Logarithm of p(score | object) / p(score | clutter) of the best detection; 0 where there is none."""
         model = self._sensors[scan.sensor].score
         if model is None or not scan.objects:
             return 0.0
-        indices = (matched.candidate.leader, *matched.candidate.merged)
+        indices = (candidate.leader, *candidate.merged)
         scores = [score for index in indices if (score := scan.objects[index].score) is not None]
         return min(max((max(scores) - model.even) / model.scale, -10.0), 10.0) if scores else 0.0
 
@@ -223,10 +226,9 @@ class ExistenceLifecycle:
 Lifecycle = CountingLifecycle | ExistenceLifecycle
 
 
-def _position_density(matched: MatchedDetection) -> float | None:
+def _position_density(candidate: Candidate, mean: FloatArray, P: FloatArray) -> float | None:
     """N(z - h(x); 0, S) of the position in 1/m^2; None where the detection gives none, or S is singular to rounding."""
-    candidate, mean, P = matched
-    if candidate.position_m is None or candidate.position_covariance is None or mean is None or P is None:
+    if candidate.position_m is None or candidate.position_covariance is None:
         return None
     S = P[:2, :2] + candidate.position_covariance
     variances = float(S[0, 0] * S[1, 1])

@@ -9,9 +9,10 @@ from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 from fgtrack.core.settings import settings
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Detection, FloatArray, TrackStatus
+from fgtrack.estimation.base import StatesAt
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.ego import EgoPose
-from fgtrack.tracking.preprocess import Candidate
+from fgtrack.tracking.preprocess import Candidate, Candidates
 
 
 class Scan(NamedTuple):
@@ -24,14 +25,6 @@ class Scan(NamedTuple):
     """At `stamp_ns`; None where it is not known."""
     objects: Sequence[Detection] = ()
     """All detections of the message."""
-
-
-class MatchedDetection(NamedTuple):
-    """A detection that belongs to a track, and the track's state at its stamp; None of one that starts with it."""
-
-    candidate: Candidate
-    mean: FloatArray | None = None
-    covariance: FloatArray | None = None
 
 
 @dataclass(slots=True)
@@ -80,16 +73,19 @@ class CountingLifecycle:
         self.lives: dict[int, Life] = {}
         """Counters by track id."""
 
-    def born(self, track_id: int, scan: Scan, matched: MatchedDetection | None = None) -> None:
+    def born(self, track_id: int, scan: Scan, candidate: Candidate) -> None:
         """A detection started a track."""
         self.lives[track_id] = Life(self._sensors[scan.sensor].counter_init, scan.stamp_ns)
 
-    def matched(self, track_id: int, scan: Scan, matched: MatchedDetection | None = None) -> None:
-        """A detection was associated."""
-        life = self.lives[track_id]
-        life.counter = min(life.counter + self._sensors[scan.sensor].counter_add, self._rules.counter_cap)
-        life.last_seen_ns = max(life.last_seen_ns, scan.stamp_ns)
-        life.misses = 0
+    def matched(self, scan: Scan, candidates: Candidates, pairs: Sequence[tuple[int, int]], states: StatesAt) -> None:
+        """Candidates were associated with tracks, which had these `states` at the stamp."""
+        add, cap = self._sensors[scan.sensor].counter_add, self._rules.counter_cap
+        for position, track in pairs:
+            if candidates.placed[position]:
+                life = self.lives[states.track_ids[track]]
+                life.counter = min(life.counter + add, cap)
+                life.last_seen_ns = max(life.last_seen_ns, scan.stamp_ns)
+                life.misses = 0
 
     def fused(self, track_id: int) -> None:
         """The associated detection, which gives a position, changed the state."""

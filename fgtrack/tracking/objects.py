@@ -21,8 +21,9 @@ _ALIKE = (
 _UNKNOWN = 0
 _GROUPS = {name: -1 - number for number, group in enumerate(_ALIKE) for name in group}
 _SIZES = ("length_m", "width_m", "height_m")
-_NO_SIZES = None, None, None
 _sizes_m = attrgetter(*_SIZES)
+_description = attrgetter("class_name", *_SIZES)
+_NO_DESCRIPTION = None, None, None, None
 
 
 @dataclass(slots=True)
@@ -46,24 +47,28 @@ class Objects:
     def __init__(self) -> None:
         self._seen: dict[int, _Seen] = {}
 
+    def describes(self, detections: Iterable[Detection]) -> bool:
+        """True if one of `detections` has a class or size."""
+        return bool(set(map(_description, detections)) - {_NO_DESCRIPTION})
+
     def learn(self, track_id: int, detections: Iterable[Detection]) -> None:
         """Add detections of the track."""
         for detection in detections:
-            sizes_m = _sizes_m(detection)
-            if detection.class_name is None and sizes_m == _NO_SIZES:
+            if not self.describes([detection]):
                 continue
             seen = self._seen.setdefault(track_id, _Seen())
             if detection.class_name is not None:
                 seen.classes[detection.class_name] += 1
-            for name, value in zip(_SIZES, sizes_m, strict=True):
+            for name, value in zip(_SIZES, _sizes_m(detection), strict=True):
                 if value is not None:
                     seen.num_sizes[name] += 1
                     mean = seen.sizes_m.get(name, 0.0)
                     seen.sizes_m[name] = mean + 1.0 / seen.num_sizes[name] * (value - mean)
 
-    def apart(self, named: Sequence[str | None], track_ids: Sequence[int]) -> Apart | None:
-        """Return a test of pairs for different classes; None if no pair is excluded."""
-        if not self._seen or not any(named):
+    def apart(self, detections: Iterable[Detection], track_ids: Sequence[int]) -> Apart | None:
+        """Return a test of pairs of detections and tracks for different classes; None if no pair is excluded."""
+        named = [each.class_name for each in detections] if self._seen else []
+        if not any(named):
             return None
         classes = [self._class(track_id) for track_id in track_ids]
         if not any(classes):

@@ -1,17 +1,17 @@
 """From the detections of one batch to candidates for association: map frame, on the road, merged."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, partial
-from typing import NamedTuple
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fgtrack.core.geometry import body_point, body_point_jacobian
 from fgtrack.core.linalg import congruence, equal_ones
-from fgtrack.core.types import BoolArray, Disposition, FloatArray, UpdateRecord
-from fgtrack.estimation.base import Measurement
+from fgtrack.core.types import BoolArray, Disposition, FloatArray, IntArray, UpdateRecord
+from fgtrack.estimation.base import Measurement, Measurements
 from fgtrack.models.correlated_errors import split_error
 from fgtrack.models.measurement import (
     COMPONENTS,
@@ -24,6 +24,7 @@ from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.detections import (
+    BEARING,
     CURVATURE,
     YAW,
     MapDetections,
@@ -53,21 +54,81 @@ class Candidate(NamedTuple):
     """Position in the map, shape (2,); None where only a bearing was measured."""
     position_covariance: FloatArray | None
     """Shape (2, 2)."""
-    pose_error: PoseError | None = None
-    """Error of the ego in the measurement; None where it is not considered. `measurement.R` includes it
-    as far as the detection alone tells."""
 
     @property
     def values(self) -> dict[str, float]:
         """Measured components by name, in the map frame."""
         return dict(zip(self.measurement.model.components, self.measurement.z.tolist(), strict=True))
 
-    def measurement_at(self, x: FloatArray) -> Measurement:
-        """The measurement of an object at the state `x` (n,); its R is (..., k, k) at states (..., n)."""
-        own = self.measurement
-        if self.pose_error is None or not own.model.relative:
-            return own
-        return replace(own, R=self.pose_error.noise(own.model, own.pose, x))
+
+class Group(NamedTuple):
+    """Candidates that differ in their numbers alone."""
+
+    rows: IntArray
+    """Indices of the candidates, ascending, shape (m,)."""
+    stack: Measurement
+    """z (m, k), and R (m, k, k) with the error of the ego as far as the detections alone tell."""
+    spread: FloatArray
+    """Covariances of the detections with all their errors, shape (m, k, k)."""
+    error: PoseError | None
+    """Error of the ego in them, stacked; None where it is not considered."""
+
+    def seen_at(self, members: IntArray, x: FloatArray) -> Measurement:
+        """The stack of some `members` (p,), of objects at the states `x` (p, n)."""
+        own, R = self.stack, self.stack.R[members]
+        if self.error is not None and own.model.relative:
+            R = self.error.at(members).noise(own.model, own.pose, x)
+        return Measurement(own.stamp_ns, own.model, own.z[members], R, own.pose, own.loss, own.assumed)
+
+
+class Candidates(Sequence[Candidate]):
+    """The candidates of a batch, in the order of the merge; each is made when it is asked for."""
+
+    def __init__(
+        self, leaders: list[int], merged: Mapping[int, tuple[int, ...]], lines: FloatArray, groups: list[Group]
+    ) -> None:
+        self.leaders, self.merged = leaders, merged
+        """See `Candidate`; by leader."""
+        self.lines = lines
+        """Positions in the map and NaN, or the position of the sensor and the direction of a bearing, shape (m, 3)."""
+        self.placed: list[bool] = np.isnan(lines[:, 2]).tolist()
+        """True of those with a position."""
+        self.groups = groups
+
+    def __len__(self) -> int:
+        return len(self.leaders)
+
+    def __getitem__(self, index: Any) -> Any:  # Any: there are no slices
+        leader, point = self.leaders[index], self.lines[index]
+        [(group, members, _)] = self.split(np.array([index]))
+        own = Measurements(group.stack)[members[0]]
+        position = measured_position(own.model.components, own.z, group.spread[members[0]], own.pose)
+        return Candidate(
+            leader,
+            self.merged.get(leader, ()),
+            own,
+            point[:2] if self.placed[index] else None,
+            None if position is None else position[1],
+        )
+
+    def split(self, chosen: IntArray) -> Iterator[tuple[Group, IntArray, IntArray]]:
+        """Yield each group, and of those of the candidates `chosen` (p,) that are in it the indices there and here."""
+        for group in self.groups:
+            if len(self.groups) == 1:
+                yield group, chosen, np.arange(len(chosen))
+                return
+            members = np.searchsorted(group.rows, chosen)
+            here = np.flatnonzero(group.rows.take(members, mode="clip") == chosen)
+            if len(here):
+                yield group, members[here], here
+
+    def at(self, indices: Sequence[int]) -> "Candidates":
+        """Return the candidates at `indices`."""
+        groups = [
+            Group(here, replace(own, z=own.z[m], R=own.R[m]), spread[m], error and error.at(m))
+            for (_, own, spread, error), m, here in self.split(np.array(indices))
+        ]
+        return Candidates([self.leaders[i] for i in indices], self.merged, self.lines[indices], groups)
 
 
 class Preprocess:
@@ -92,9 +153,7 @@ class Preprocess:
         self._origin_m = detection_origin_m
         self._assumes_map_yaw = assumes_map_yaw
 
-    def __call__(
-        self, batch: Batch, sensor: SensorModel, ego: EgoPose | None
-    ) -> tuple[list[Candidate], list[UpdateRecord]]:
+    def __call__(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> tuple[Candidates, list[UpdateRecord]]:
         """Candidates in the order of the merge, and the records of detections that are out of bounds.
 
         `ego` is the pose at the batch's stamp; it may be None for detections in the map frame.
@@ -148,19 +207,24 @@ class Preprocess:
         outside[placed] = view.outside
         return _without(items, outside, "map.track", lost)
 
-    def _candidates(self, items: MapDetections, pose_covariance: FloatArray | None) -> list[Candidate]:
-        """Candidates of `items` in their order; those that measure the same components are made together."""
-        measured = ~np.isnan(items.values)
-        kinds = list(zip(map(tuple, measured.tolist()), (items.map_yaw & measured[:, YAW]).tolist(), strict=True))
-        if len(set(kinds)) <= 1:
-            return self._alike(items, pose_covariance) if kinds else []
-        candidates: dict[int, Candidate] = {}
-        for rows in equal_ones(kinds):
-            candidates.update(zip(rows, self._alike(items.at(np.array(rows)), pose_covariance), strict=True))
-        return [candidates[row] for row in range(len(kinds))]
+    def _candidates(self, items: MapDetections, pose_covariance: FloatArray | None) -> Candidates:
+        """Candidates of `items` in their order; those that measure the same components are one group."""
+        kinds = ~np.isnan(items.values)
+        kinds = np.column_stack([kinds, items.map_yaw & kinds[:, YAW]])
+        if (kinds == kinds[:1]).all():
+            groups = list(self._groups(items, np.arange(len(kinds)), pose_covariance))
+        else:
+            alike = map(np.array, equal_ones(list(map(tuple, kinds.tolist()))))
+            groups = [group for rows in alike for group in self._groups(items.at(rows), rows, pose_covariance)]
+        pose, lines = items.pose, np.column_stack([items.points_m, np.full(len(kinds), np.nan)])
+        for row in np.isnan(lines[:, 0]).nonzero()[0].tolist():
+            lines[row] = pose.x_m, pose.y_m, pose.yaw_rad + items.values[row, BEARING]
+        return Candidates(items.indices.tolist(), items.merged, lines, groups)
 
-    def _alike(self, items: MapDetections, pose_covariance: FloatArray | None) -> list[Candidate]:
-        """Candidates of `items`, which all measure the same components; `pose_covariance` is that of the pose."""
+    def _groups(self, items: MapDetections, rows: IntArray, pose_covariance: FloatArray | None) -> Iterator[Group]:
+        """Yield `items`, which are the candidates `rows` and all measure the same; one by one where errors last."""
+        if not len(rows):
+            return
         batch, sensor, pose, points_m = items.batch, items.sensor, items.pose, items.points_m
         columns = (items.values[0] == items.values[0]).nonzero()[0]  # NaN is not equal to itself
         names = _names(tuple(columns.tolist()))
@@ -171,32 +235,29 @@ class Preprocess:
             covariances(items, names),
             measurement_model(names, self._motion),
         )
-        models, white = [model] * len(z), R
+        models, white = [model], R
         if sensor.correlation is not None:
             split = [split_error(batch.message.sensor, sensor, model, one, self._motion.state_names) for one in R]
             models, white = [each for each, _ in split], np.array([noise for _, noise in split])
-        total, is_placed = white, not math.isnan(points_m[0, 0])  # all or none
-        own: Iterable[PoseError | None] = [None] * len(z)
+        total, error = white, None
         if pose_covariance is not None:
             G = np.zeros((len(z), len(names), len(pose)))
             if batch.message.frame != "map":
                 G = placement(names, points_m - np.array(pose[:2]), assumed)
             x = points_m
-            if models[0].relative:
-                x = np.zeros((len(z), self._motion.dim))
+            if model.relative:
+                x, is_placed = np.zeros((len(z), self._motion.dim)), not math.isnan(points_m[0, 0])  # all or none
                 x[:, :2] = points_m if is_placed else _far_along(z[:, names.index("bearing_rad")], pose)
-            total = PoseError(pose_covariance, G, white).noise(models[0], pose, x)
-            R, own = R + (total - white), map(partial(PoseError, pose_covariance), G, white)
-        spreads: Iterable[FloatArray | None]
-        spreads = R[:, :2, :2] if names[:2] == ("x_m", "y_m") else map(partial(_spread, names, pose), z, R)
-        positions_m: Iterable[FloatArray | None] = points_m if is_placed else [None] * len(z)
-        candidates, indices = [], items.indices.tolist()
-        for index, each, mean, noise, point_m, spread, error in zip(
-            indices, models, z, total, positions_m, spreads, own, strict=True
-        ):
-            measurement = Measurement(batch.stamp_ns, each, mean, noise, pose, sensor.loss, assumed)
-            candidates.append(Candidate(index, items.merged.get(index, ()), measurement, point_m, spread, error))
-        return candidates
+            error = PoseError(pose_covariance, G, white)
+            total = error.noise(models[0], pose, x)
+            R = R + (total - white)
+        whole = Group(rows, Measurement(batch.stamp_ns, models[0], z, total, pose, sensor.loss, assumed), R, error)
+        if sensor.correlation is None:
+            yield whole
+            return
+        for k, each in enumerate(models):
+            one, m = Measurement(batch.stamp_ns, each, z[k : k + 1], total[k : k + 1], pose, sensor.loss, assumed), [k]
+            yield Group(rows[m], one, R[m], error and error.at(m))
 
 
 def _without(items: MapDetections, outside: BoolArray, reason: str, lost: dict[int, str]) -> MapDetections:
@@ -210,11 +271,6 @@ def _without(items: MapDetections, outside: BoolArray, reason: str, lost: dict[i
 @cache
 def _names(columns: tuple[int, ...]) -> tuple[str, ...]:
     return tuple(COMPONENTS[column] for column in columns)
-
-
-def _spread(names: tuple[str, ...], pose: SensorPose, z: FloatArray, R: FloatArray) -> FloatArray | None:
-    position = measured_position(names, z, R, pose)
-    return None if position is None else position[1]
 
 
 def _pose_covariance(pose: SensorPose, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> FloatArray | None:

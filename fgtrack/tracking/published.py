@@ -17,9 +17,9 @@ from fgtrack.tracking.association import Assignment, assigned, near
 from fgtrack.tracking.detections import Merge
 from fgtrack.tracking.ego import EgoPose, EgoStd, EgoTrajectory
 from fgtrack.tracking.inbox import Batch, Inbox, is_valid_covariance, record, records
-from fgtrack.tracking.lifecycle import CountingLifecycle, Life, MatchedDetection, Scan
+from fgtrack.tracking.lifecycle import CountingLifecycle, Life, Scan
 from fgtrack.tracking.objects import Apart
-from fgtrack.tracking.preprocess import Candidate
+from fgtrack.tracking.preprocess import Candidate, Candidates
 from fgtrack.tracking.tracker import Tracker, TrackerParts
 
 
@@ -173,7 +173,7 @@ class UngatedEuclidean:
     gate_m: float = 5.0
     """Largest distance of a pair that is kept."""
 
-    def __call__(self, candidates: Sequence[Candidate], states: StatesAt, apart: Apart | None = None) -> Assignment:
+    def __call__(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Assignment:
         """See `Association`; torn pairs are born after the detections that had no partner. Nothing is `apart`."""
         pairs = near(candidates, states.means, np.inf)
         rows, columns, distances_m = (array.tolist() for array in pairs)
@@ -192,17 +192,18 @@ class PublishedLifecycle(CountingLifecycle):
     The range is that of a state which is one batch old; see `PublishedTracker`.
     """
 
-    def born(self, track_id: int, scan: Scan, matched: MatchedDetection | None = None) -> None:
+    def born(self, track_id: int, scan: Scan, candidate: Candidate) -> None:
         """See `CountingLifecycle.born`."""
-        super().born(track_id, scan._replace(stamp_ns=scan.present_ns))
+        super().born(track_id, scan._replace(stamp_ns=scan.present_ns), candidate)
 
-    def matched(self, track_id: int, scan: Scan, matched: MatchedDetection | None = None) -> None:
+    def matched(self, scan: Scan, candidates: Candidates, pairs: Sequence[tuple[int, int]], states: StatesAt) -> None:
         """See `CountingLifecycle.matched`."""
-        life = self.lives[track_id]
-        if life.counter < self._rules.counter_cap:
-            life.counter += self._sensors[scan.sensor].counter_add
-        life.last_seen_ns = scan.stamp_ns
-        life.misses = 0
+        for _, track in pairs:
+            life = self.lives[states.track_ids[track]]
+            if life.counter < self._rules.counter_cap:
+                life.counter += self._sensors[scan.sensor].counter_add
+            life.last_seen_ns = scan.stamp_ns
+            life.misses = 0
 
     def _ages(self, sensor: str, range_m: float) -> bool:
         return self._sensors[sensor].ages != "always" and super()._ages(sensor, range_m)

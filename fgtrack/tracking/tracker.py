@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import repeat
 
 import numpy as np
@@ -22,7 +22,7 @@ from fgtrack.core.types import (
     TrackState,
     UpdateRecord,
 )
-from fgtrack.estimation.base import Start, StatesAt, TrackBank, UpdateResult, UpdateStatus
+from fgtrack.estimation.base import Measurement, Measurements, Start, StatesAt, TrackBank, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.ekf import correct_one, propagated
 from fgtrack.estimation.filters.propagation import kinematic_states
@@ -36,9 +36,9 @@ from fgtrack.tracking.ego import EgoPose, EgoTrajectory
 from fgtrack.tracking.existence import Lifecycle
 from fgtrack.tracking.guarded_bank import faults
 from fgtrack.tracking.inbox import Batch, Inbox, record
-from fgtrack.tracking.lifecycle import MatchedDetection, Scan
+from fgtrack.tracking.lifecycle import Scan
 from fgtrack.tracking.objects import Objects
-from fgtrack.tracking.preprocess import Candidate, Preprocess
+from fgtrack.tracking.preprocess import Candidates, Preprocess
 
 _DISPOSITIONS = {status: Disposition(status.value) for status in UpdateStatus}
 
@@ -183,30 +183,28 @@ class Tracker:
         candidates, out_of_bounds = parts.preprocess(batch, parts.sensors[message.sensor], ego)
         self._records += out_of_bounds
         if self._is_too_old(batch):
-            for candidate in candidates:
-                self._conclude(batch, candidate, Disposition.TOO_OLD)
+            for position in range(len(candidates)):
+                self._conclude(batch, candidates, position, Disposition.TOO_OLD)
             return
         states = self._offered(batch)
         assignment = self._assigned(batch, candidates, states)
         self._count(batch, candidates, assignment, states, scan)
-        self._estimate(batch, candidates, assignment, states)
+        if assignment.pairs:
+            self._estimate(batch, candidates, assignment, states)
         for position in assignment.refused:
-            self._conclude(batch, candidates[position], Disposition.GATED)
+            self._conclude(batch, candidates, position, Disposition.GATED)
         new = assignment.new
         if new and parts.suppress_births_near_newer_tracks:
             new = self._unclaimed(batch, candidates, new, states)
         for position in new:
-            self._give_birth(batch, candidates[position], scan)
+            self._give_birth(batch, candidates, position, scan)
 
-    def _assigned(self, batch: Batch, candidates: Sequence[Candidate], states: StatesAt) -> Assignment:
+    def _assigned(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Assignment:
         """Return the assignment of candidates to tracks of the same class."""
-        objects = batch.message.objects
-        names = [objects[candidate.leader].class_name for candidate in candidates]
-        return self._parts.association(candidates, states, self._parts.objects.apart(names, states.track_ids))
+        described = map(batch.message.objects.__getitem__, candidates.leaders)
+        return self._parts.association(candidates, states, self._parts.objects.apart(described, states.track_ids))
 
-    def _unclaimed(
-        self, batch: Batch, candidates: Sequence[Candidate], new: Sequence[int], states: StatesAt
-    ) -> list[int]:
+    def _unclaimed(self, batch: Batch, candidates: Candidates, new: Sequence[int], states: StatesAt) -> list[int]:
         """Return those of `new` that belong to no track which began after the batch's stamp.
 
         The detection that started it has overtaken them. They are too old for it, and not another object. Compared are
@@ -221,11 +219,11 @@ class Tracker:
         P = propagated(F, now.covariances[rows], motion.process_noise(x, back_s))
         moved = StatesAt(tuple(now.track_ids[row] for row in rows), motion.predict(x, -back_s), P)
         younger = in_any_direction(moved, batch.stamp_ns, self._undirected)
-        claims = self._assigned(batch, [candidates[position] for position in new], younger)
+        claims = self._assigned(batch, candidates.at(new), younger)
         for k, track in claims.pairs:
-            self._conclude(batch, candidates[new[k]], Disposition.TOO_OLD, younger.track_ids[track])
+            self._conclude(batch, candidates, new[k], Disposition.TOO_OLD, younger.track_ids[track])
         for k in claims.refused:
-            self._conclude(batch, candidates[new[k]], Disposition.GATED)
+            self._conclude(batch, candidates, new[k], Disposition.GATED)
         return [new[k] for k in claims.new]
 
     def _is_too_old(self, batch: Batch) -> bool:
@@ -243,27 +241,19 @@ class Tracker:
         return np.asarray(np.hypot(positions_m[:, 0] - ego.x_m, positions_m[:, 1] - ego.y_m))
 
     def _count(
-        self,
-        batch: Batch,
-        candidates: Sequence[Candidate],
-        assignment: Assignment,
-        states: StatesAt,
-        scan: Scan,
+        self, batch: Batch, candidates: Candidates, assignment: Assignment, states: StatesAt, scan: Scan
     ) -> None:
         """Lives of matched and missed tracks, where it is positions that are seen; tracks that run out end here.
 
         A track is missed by a message as a whole, so only its last batch counts.
         """
-        lifecycle = self._parts.lifecycle
+        lifecycle, sensor = self._parts.lifecycle, self._parts.sensors[batch.message.sensor]
         seen = self._seen.setdefault(id(batch.message), set())
-        for position, track in assignment.pairs:
-            candidate, track_id = candidates[position], states.track_ids[track]
-            seen.add(track_id)
-            if candidate.position_m is not None:
-                matched = MatchedDetection(candidate, states.means[track], states.covariances[track])
-                lifecycle.matched(track_id, scan, matched)
-            self._describe(batch, candidate, track_id)
-        sensor = self._parts.sensors[batch.message.sensor]
+        seen.update(states.track_ids[track] for _, track in assignment.pairs)
+        lifecycle.matched(scan, candidates, assignment.pairs, states)
+        if self._parts.objects.describes(scan.objects):
+            for position, track in assignment.pairs:
+                self._describe(batch, candidates, position, states.track_ids[track])
         if not assignment.missed or not batch.last or not (sensor.gives_position and sensor.scan):
             return
         rows = [track for track in assignment.missed if states.track_ids[track] not in seen]
@@ -271,19 +261,22 @@ class Tracker:
             missed, positions_m = [states.track_ids[track] for track in rows], states.means[rows, :2]
             self._end(lifecycle.missed(scan, missed, positions_m, self._ranges_m(missed, positions_m, scan.ego)))
 
-    def _estimate(
-        self, batch: Batch, candidates: Sequence[Candidate], assignment: Assignment, states: StatesAt
-    ) -> None:
-        if not assignment.pairs:
-            return
-        track_ids = [states.track_ids[track] for _, track in assignment.pairs]
-        measurements = [candidates[i].measurement_at(states.means[track]) for i, track in assignment.pairs]
-        results = self._parts.bank.update(batch.stamp_ns, track_ids, measurements)
-        for (position, track), measurement, result in zip(assignment.pairs, measurements, results, strict=True):
-            candidate, track_id = candidates[position], states.track_ids[track]
+    def _estimate(self, batch: Batch, candidates: Candidates, assignment: Assignment, states: StatesAt) -> None:
+        """Fuse the matched candidates, group by group; the records are in the order of the candidates."""
+        bank, results = self._parts.bank, dict[int, tuple[Measurement, UpdateResult]]()
+        chosen, tracks = np.array(assignment.pairs).T
+        for group, members, here in candidates.split(chosen):
+            of = tracks[here]
+            measurements = Measurements(group.seen_at(members, states.means[of]))
+            track_ids = [states.track_ids[track] for track in of.tolist()]
+            updated = bank.update(batch.stamp_ns, track_ids, measurements)
+            results.update(zip(here.tolist(), zip(measurements, updated, strict=True), strict=True))
+        for k, (position, track) in enumerate(assignment.pairs):
+            (measurement, result), track_id, innovation = results[k], states.track_ids[track], dict[str, float]()
+            nis = result.nis
             if result.innovation is not None:
                 self._num_measured[track_id] += 1
-                is_placed = candidate.position_m is not None
+                is_placed = candidates.placed[position]
                 if is_placed:
                     self._parts.lifecycle.fused(track_id)
                 if is_placed and self._undirected.pop(track_id, None) is not None:
@@ -291,51 +284,51 @@ class Tracker:
                     seen = measurement.seen_by(self._parts.motion)
                     with suppress(np.linalg.LinAlgError):
                         nis = correct_one(states.means[track], states.covariances[track], seen).nis
-                        result = replace(result, nis=nis)
-            self._conclude(batch, candidate, _DISPOSITIONS[result.status], track_id, result)
+                innovation = dict(zip(measurement.model.components, result.innovation.tolist(), strict=True))
+                for name in measurement.assumed:
+                    del innovation[name]
+            self._conclude(batch, candidates, position, _DISPOSITIONS[result.status], track_id, nis, innovation)
 
-    def _give_birth(self, batch: Batch, candidate: Candidate, scan: Scan) -> None:
-        parts, prior = self._parts, None
+    def _give_birth(self, batch: Batch, candidates: Candidates, position: int, scan: Scan) -> None:
+        parts, prior, candidate = self._parts, None, candidates[position]
         if parts.sensors[scan.sensor].births:
             prior = parts.birth.prior(candidate, parts.road, parts.ego.current, parts.ego.in_pit)
         if prior is None:
-            self._conclude(batch, candidate, Disposition.GATED)
+            self._conclude(batch, candidates, position, Disposition.GATED)
             return
         track_id = self._next_id
         self._next_id += 1
         parts.bank.birth(track_id, prior)
         if track_id not in parts.bank.track_ids:
-            self._conclude(batch, candidate, Disposition.FAILED)
+            self._conclude(batch, candidates, position, Disposition.FAILED)
             return
         if prior.yaw_rad is None and not parts.motion.cartesian:
             self._undirected[track_id] = prior
         self._seen.setdefault(id(batch.message), set()).add(track_id)
         self._num_measured[track_id] = 1
-        parts.lifecycle.born(track_id, scan, MatchedDetection(candidate))
-        self._describe(batch, candidate, track_id)
-        self._conclude(batch, candidate, Disposition.BIRTH, track_id)
+        parts.lifecycle.born(track_id, scan, candidate)
+        self._describe(batch, candidates, position, track_id)
+        self._conclude(batch, candidates, position, Disposition.BIRTH, track_id)
 
-    def _describe(self, batch: Batch, candidate: Candidate, track_id: int) -> None:
-        indices = candidate.leader, *candidate.merged
+    def _describe(self, batch: Batch, candidates: Candidates, position: int, track_id: int) -> None:
+        leader = candidates.leaders[position]
+        indices = leader, *candidates.merged.get(leader, ())
         self._parts.objects.learn(track_id, map(batch.message.objects.__getitem__, indices))
 
     def _conclude(
         self,
         batch: Batch,
-        candidate: Candidate,
+        candidates: Candidates,
+        position: int,
         disposition: Disposition,
         track_id: int | None = None,
-        result: UpdateResult | None = None,
+        nis: float | None = None,
+        innovation: Mapping[str, float] | None = None,
     ) -> None:
         """Record the outcome of a candidate, and of the detections that were merged into it."""
-        nis, innovation = None, dict[str, float]()
-        if result is not None and result.innovation is not None:
-            nis, measurement = result.nis, candidate.measurement
-            innovation = dict(zip(measurement.model.components, result.innovation.tolist(), strict=True))
-            for name in measurement.assumed:
-                innovation.pop(name, None)
-        self._records.append(record(batch.message, candidate.leader, disposition, track_id, nis, innovation))
-        for index in candidate.merged:
+        leader = candidates.leaders[position]
+        self._records.append(record(batch.message, leader, disposition, track_id, nis, innovation))
+        for index in candidates.merged.get(leader, ()):
             self._records.append(record(batch.message, index, Disposition.MERGED, track_id))
 
     def _end(self, track_ids: Sequence[int]) -> None:

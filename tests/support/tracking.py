@@ -1,6 +1,7 @@
 """Shortcuts for tests of the tracking floor."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,9 +11,12 @@ from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.models.road import Road
 from fgtrack.models.track_map import RoadView
+from fgtrack.tracking.existence import Lifecycle
 from fgtrack.tracking.inbox import Batch
-from fgtrack.tracking.preprocess import Candidate
+from fgtrack.tracking.lifecycle import Scan
+from fgtrack.tracking.preprocess import Candidate, Candidates, Group
 
+ZEROS, UNIT = np.zeros(5), np.eye(5)
 START_NS = 1_600_000_000_000_000_000
 
 
@@ -47,6 +51,26 @@ def bearing(bearing_rad: float, pose: SensorPose, std_rad: float = 0.02) -> Cand
     model = measurement_model(("bearing_rad",), CTRV())
     measurement = Measurement(START_NS, model, np.array([bearing_rad]), np.array([[std_rad**2]]), pose)
     return Candidate(0, (), measurement, None, None)
+
+
+def candidates_of(items: Sequence[Candidate]) -> Candidates:
+    """The `items`, each in a group of its own."""
+    lines, groups = np.full((len(items), 3), np.nan), []
+    for i, one in enumerate(items):
+        own, pose = one.measurement, one.measurement.pose
+        lines[i] = pose.x_m, pose.y_m, pose.yaw_rad + one.values.get("bearing_rad", 0.0)
+        if one.position_m is not None:
+            lines[i] = *one.position_m, np.nan
+        spread = own.R if one.position_covariance is None else one.position_covariance
+        groups.append(Group(np.array([i]), replace(own, z=own.z[None], R=own.R[None]), spread[None], None))
+    return Candidates(list(range(len(items))), {}, lines, groups)
+
+
+def match(
+    life: Lifecycle, track_id: int, scan: Scan, item: Candidate, mean: FloatArray = ZEROS, P: FloatArray = UNIT
+) -> None:
+    """`item` is matched with a track of this state."""
+    life.matched(scan, candidates_of([item]), [(0, 0)], StatesAt((track_id,), mean[None], P[None]))
 
 
 def states(positions_m: Sequence[tuple[float, float]], variance_m2: float = 0.09) -> StatesAt:

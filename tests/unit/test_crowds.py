@@ -6,21 +6,24 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
-from support.tracking import bearing, candidate, states
+from support.tracking import batch, bearing, candidate, candidates_of, states
 
-from fgtrack.core.types import BoolArray, FloatArray
+from fgtrack.core.types import BoolArray, Detection, FloatArray
 from fgtrack.models.measurement import SensorPose
+from fgtrack.models.motion import CTRV
+from fgtrack.models.road import Road
+from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import (
     Assignment,
     GatedEuclidean,
     GatedMahalanobis,
     Pairs,
     assigned,
-    grouped,
     innovations,
     near,
 )
-from fgtrack.tracking.preprocess import Candidate
+from fgtrack.tracking.detections import NoMerge
+from fgtrack.tracking.preprocess import Candidate, Preprocess
 
 MB = 1e6
 
@@ -81,12 +84,12 @@ def mixed(rng: np.random.Generator, count: int, side_m: float) -> list[Candidate
 @pytest.mark.parametrize(("bearings", "seed"), [(False, 0), (True, 1)])
 def test_an_association_is_that_of_all_pairs(bearings: bool, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    candidates = [each for each in mixed(rng, 60, 40.0) if bearings or each.position_m is not None]
+    candidates = candidates_of([each for each in mixed(rng, 60, 40.0) if bearings or each.position_m is not None])
     tracks = states([(x, y) for x, y in rng.uniform(0.0, 40.0, size=(30, 2))])
     tracks.covariances[:] *= rng.uniform(0.1, 30.0, size=(30, 1, 1))
     pairs, shape = near(candidates, tracks.means, np.inf), (len(candidates), 30)
     cost, inside = np.empty(len(pairs.rows)), np.empty(len(pairs.rows), dtype=bool)
-    for chosen, nis, logdet, k in innovations(pairs, grouped(candidates), len(candidates), tracks):
+    for chosen, nis, logdet, k in innovations(pairs, candidates, tracks):
         cost[chosen] = nis + logdet
         limit = {1: 10.8275661707, 2: 13.8155105580}[k]  # chi-square quantiles of 0.999
         inside[chosen] = (nis <= limit) & (pairs.values[chosen] <= 9.0)
@@ -100,7 +103,12 @@ def test_detections_and_tracks_all_in_one_place_are_not_all_compared(
 ) -> None:
     """3,000 of each: one matrix of distances has 72 MB."""
     rng = np.random.default_rng(0)
-    candidates = [candidate(x, y) for x, y in rng.normal(0.0, 0.3, size=(3_000, 2)).tolist()]
+    points = rng.normal(0.0, 0.3, size=(3_000, 2))
+    candidates = Preprocess(Road(), NoMerge(), CTRV(), (0.0, 0.0))(
+        batch(*(Detection(x_m=x, y_m=y) for x, y in points.tolist()), frame="map"),
+        SensorModel({"x_m": 0.3, "y_m": 0.3}),
+        None,
+    )[0]
     tracks = states([(x, y) for x, y in rng.normal(0.0, 0.3, size=(3_000, 2)).tolist()])
     found: list[Assignment] = []
     peak = peak_bytes(lambda: found.append(association(candidates, tracks)))

@@ -6,7 +6,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from support.tracking import START_NS, candidate, ms
+from support.tracking import START_NS, candidate, match, ms
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Detection, DetectionList, TrackStatus
@@ -16,7 +16,7 @@ from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
 from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.existence import Existence, ExistenceLifecycle, ExistenceRules
-from fgtrack.tracking.lifecycle import MatchedDetection, Scan
+from fgtrack.tracking.lifecycle import Scan
 
 SENSORS = {
     "lidar": SensorModel(std={"x_m": 0.3, "y_m": 0.3}, detection_probability=0.8, clutter_per_m2=1e-3),
@@ -50,12 +50,12 @@ def probability(life: ExistenceLifecycle, at_ms: float = 0.0) -> float:
 
 def test_a_miss_and_a_match_change_the_probability_as_integrated_data_association_says() -> None:
     life = lifecycle()
-    life.born(0, scan(), MatchedDetection(HERE))
+    life.born(0, scan(), HERE)
     r = 0.2
     life.missed(scan(at_ms=10.0), [0], np.array([[10.0, 0.0]]), np.array([10.0]))
     r = 0.2 * r / (1.0 - 0.8 * r)
     assert probability(life, 10.0) == pytest.approx(r, rel=1e-6)
-    life.matched(0, scan(at_ms=20.0), MatchedDetection(candidate(10.3, 0.0), MEAN, P))
+    match(life, 0, scan(at_ms=20.0), candidate(10.3, 0.0), MEAN, P)
     S = 0.09 + 0.01
     density = math.exp(-0.5 * 0.3**2 / S) / (2.0 * math.pi * S)
     delta = 0.8 - 0.8 * density / 1e-3
@@ -74,7 +74,7 @@ def test_nothing_survives_a_gap_of_many_lifetimes(gap_s: float) -> None:
     one = existing(10.0, START_NS, math.log(3.0))
     assert one.probability(START_NS + ms(1e3 * gap_s)) < 1e-9
     life = lifecycle(ExistenceRules())
-    life.born(0, scan(), MatchedDetection(HERE))
+    life.born(0, scan(), HERE)
     assert life.expired(START_NS + ms(1e3 * gap_s)) == [0]
     one.learn(START_NS + ms(1e3 * gap_s), 20.0)
     assert 0.0 < one.probability(START_NS + ms(1e3 * gap_s)) < 1e-4
@@ -112,7 +112,7 @@ def test_what_is_forgotten_changes_nothing_and_what_is_older_counts_as_the_oldes
 )
 def test_a_list_says_nothing_of_what_its_sensor_cannot_see(place: tuple[float, float], counts: bool) -> None:
     life = lifecycle()
-    life.born(0, scan("ahead"), MatchedDetection(HERE))
+    life.born(0, scan("ahead"), HERE)
     before = probability(life)
     life.missed(scan("ahead", ego=ego()), [0], np.array([place]), np.array([20.0]))
     assert (probability(life) < before) is counts
@@ -121,9 +121,9 @@ def test_a_list_says_nothing_of_what_its_sensor_cannot_see(place: tuple[float, f
 
 def test_a_track_that_left_the_view_of_all_sensors_ends_although_it_is_believed() -> None:
     life = lifecycle(replace(STILL, out_of_view_s=0.5))
-    life.born(0, scan("ahead"), MatchedDetection(HERE))
+    life.born(0, scan("ahead"), HERE)
     for k in range(5):
-        life.matched(0, scan("ahead", 10.0 * k, ego=ego()), MatchedDetection(HERE, MEAN, P))
+        match(life, 0, scan("ahead", 10.0 * k, ego=ego()), HERE, MEAN, P)
     for at_ms in (100.0, 540.0, 541.0):
         assert life.expired(START_NS + ms(5000)) == []  # nobody looked
         ended = life.missed(scan("ahead", at_ms, ego=ego(x_m=100.0)), [0], np.array([[10.0, 0.0]]), np.array([90.0]))
@@ -134,18 +134,18 @@ def test_a_track_that_left_the_view_of_all_sensors_ends_although_it_is_believed(
 def test_a_position_on_an_endless_line_proves_nothing(angle_rad: float) -> None:
     """As of a RADAR whose range is good to 1e9 m."""
     life = lifecycle()
-    life.born(0, scan(), MatchedDetection(HERE))
+    life.born(0, scan(), HERE)
     along = np.array([math.cos(angle_rad), math.sin(angle_rad)])
     far = candidate(10.0, 0.0)._replace(position_covariance=1e18 * np.outer(along, along) + 0.01 * np.eye(2))
-    life.matched(0, scan(at_ms=20.0), MatchedDetection(far, MEAN, P))
+    match(life, 0, scan(at_ms=20.0), far, MEAN, P)
     assert 0.0 < probability(life, 20.0) < 0.2001
 
 
 def test_a_late_list_takes_nothing_back_of_when_the_track_was_last_in_view() -> None:
     life = lifecycle(replace(STILL, out_of_view_s=0.5))
-    life.born(0, scan("ahead"), MatchedDetection(HERE))
+    life.born(0, scan("ahead"), HERE)
     for at_ms in (400.0, 100.0):  # the second one late
-        life.matched(0, scan("ahead", at_ms, ego=ego()), MatchedDetection(HERE, MEAN, P))
+        match(life, 0, scan("ahead", at_ms, ego=ego()), HERE, MEAN, P)
     elsewhere = scan("ahead", 800.0, ego=ego(x_m=100.0))
     assert life.missed(elsewhere, [0], np.array([[10.0, 0.0]]), np.array([90.0])) == []
 
@@ -154,9 +154,9 @@ def test_the_score_of_a_match_counts_as_much_as_its_place() -> None:
     found = []
     for score in (3.0, 2.5):
         life = lifecycle()
-        life.born(0, scan("scored"), MatchedDetection(HERE))
+        life.born(0, scan("scored"), HERE)
         seen = (Detection(x_m=12.0, y_m=0.0, score=score),)
-        life.matched(0, scan("scored", 10.0, objects=seen), MatchedDetection(candidate(12.0, 0.0), MEAN, P))
+        match(life, 0, scan("scored", 10.0, objects=seen), candidate(12.0, 0.0), MEAN, P)
         found.append(probability(life, 10.0))
     odds = [4.0 * p / (1.0 - p) for p in found]  # at birth 1 / 4
     missed = 1.0 - SENSORS["scored"].detection_probability
@@ -167,7 +167,7 @@ def test_a_better_score_makes_an_object_more_probable() -> None:
     found = []
     for score in (2.0, None, 3.0, 5.0):
         life = lifecycle()
-        life.born(0, scan("scored", objects=(Detection(x_m=10.0, y_m=0.0, score=score),)), MatchedDetection(HERE))
+        life.born(0, scan("scored", objects=(Detection(x_m=10.0, y_m=0.0, score=score),)), HERE)
         found.append(probability(life))
     low, none, even, high = found
     assert low < none < high
@@ -177,9 +177,9 @@ def test_a_better_score_makes_an_object_more_probable() -> None:
 
 def test_a_confirmed_track_is_coasting_when_missed_tentative_when_doubted_and_confirmed_again_when_seen() -> None:
     life = lifecycle(replace(STILL, doubt_probability=0.6))
-    life.born(0, scan(), MatchedDetection(HERE))
+    life.born(0, scan(), HERE)
     assert life.status(0) is TrackStatus.TENTATIVE
-    life.matched(0, scan(at_ms=10.0), MatchedDetection(HERE, MEAN, P))
+    match(life, 0, scan(at_ms=10.0), HERE, MEAN, P)
     life.expired(START_NS + ms(10))
     assert life.status(0) is TrackStatus.CONFIRMED
     found = []
@@ -189,18 +189,18 @@ def test_a_confirmed_track_is_coasting_when_missed_tentative_when_doubted_and_co
         found.append(life.status(0))
     assert found[0] is TrackStatus.COASTING
     assert found[-1] is TrackStatus.TENTATIVE
-    life.matched(0, scan(at_ms=60.0), MatchedDetection(HERE, MEAN, P))
+    match(life, 0, scan(at_ms=60.0), HERE, MEAN, P)
     life.expired(START_NS + ms(60))
     assert life.status(0) is TrackStatus.CONFIRMED
 
 
 def test_what_never_moves_is_not_confirmed_and_what_has_moved_stays_so() -> None:
     life = lifecycle(replace(STILL, min_travel_m=5.0))
-    life.born(0, scan(), MatchedDetection(HERE))
+    life.born(0, scan(), HERE)
     found = []
     for k, x_m in enumerate((10.0, 14.9, 15.1, 10.0)):
         mean = np.array([x_m, 0.0, 0.0, 0.0, 0.0])
-        life.matched(0, scan(at_ms=10.0 * k), MatchedDetection(candidate(x_m, 0.0), mean, P))
+        match(life, 0, scan(at_ms=10.0 * k), candidate(x_m, 0.0), mean, P)
         life.expired(START_NS + ms(10 * k))
         found.append(life.status(0))
     assert found == [TrackStatus.TENTATIVE, TrackStatus.TENTATIVE, TrackStatus.CONFIRMED, TrackStatus.CONFIRMED]

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from support.tracking import START_NS, ms
+from support.tracking import START_NS, candidate, match, ms
 
 from fgtrack.core.types import TrackStatus
 from fgtrack.models.sensors import SensorModel
@@ -14,6 +14,7 @@ SENSORS = {
     "both": SensorModel(std=STD, counter_init=2, counter_add=2, ages="always"),
     "blind": SensorModel(std=STD, counter_init=4, counter_add=0, ages="never"),
 }
+HERE = candidate(0.0, 0.0)
 NOWHERE = np.zeros((2, 2))
 KINDS = [CountingLifecycle, PublishedLifecycle]
 
@@ -26,7 +27,7 @@ def lifecycle(kind=CountingLifecycle, **rules) -> CountingLifecycle:
 def test_a_track_starts_with_the_counter_of_the_sensor_that_found_it(kind) -> None:
     life = lifecycle(kind)
     for track_id, sensor in enumerate(SENSORS):
-        life.born(track_id, Scan(sensor, START_NS, START_NS))
+        life.born(track_id, Scan(sensor, START_NS, START_NS), HERE)
     assert [life.lives[i].counter for i in range(4)] == [3, 5, 2, 4]
 
 
@@ -42,7 +43,7 @@ def test_a_track_starts_with_the_counter_of_the_sensor_that_found_it(kind) -> No
 def test_a_sensor_ages_only_what_it_is_responsible_for(ages, near: bool, at_limit: bool, far: bool) -> None:
     life = CountingLifecycle(LifecycleRules(short_range_m=60.0), {"one": SensorModel(std=STD, ages=ages)})
     for track_id in range(3):
-        life.born(track_id, Scan("one", START_NS, START_NS))
+        life.born(track_id, Scan("one", START_NS, START_NS), HERE)
     life.missed(Scan("one", START_NS, START_NS), [0, 1, 2], NOWHERE, np.array([10.0, 60.0, 60.1]))
     assert [life.lives[i].misses == 1 for i in range(3)] == [near, at_limit, far]
 
@@ -50,8 +51,8 @@ def test_a_sensor_ages_only_what_it_is_responsible_for(ages, near: bool, at_limi
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_missed_track_counts_down_and_ends_at_zero(kind) -> None:
     life = lifecycle(kind)
-    life.born(0, Scan("near", START_NS, START_NS))
-    life.born(1, Scan("near", START_NS, START_NS))
+    life.born(0, Scan("near", START_NS, START_NS), HERE)
+    life.born(1, Scan("near", START_NS, START_NS), HERE)
     ranges_m = np.array([10.0, 61.0])
     assert life.missed(Scan("near", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == []
     assert life.missed(Scan("far", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == []
@@ -65,7 +66,7 @@ def test_a_missed_track_counts_down_and_ends_at_zero(kind) -> None:
 def test_only_the_clean_life_cycle_knows_sensors_that_age_always() -> None:
     clean, published = lifecycle(), lifecycle(PublishedLifecycle)
     for life in (clean, published):
-        life.born(0, Scan("both", START_NS, START_NS))
+        life.born(0, Scan("both", START_NS, START_NS), HERE)
         life.missed(Scan("both", START_NS, START_NS), [0], NOWHERE, np.array([10.0]))
     assert (clean.lives[0].counter, published.lives[0].counter) == (1, 2)
 
@@ -73,21 +74,21 @@ def test_only_the_clean_life_cycle_knows_sensors_that_age_always() -> None:
 def test_the_counter_stops_at_its_cap_but_the_published_one_may_pass_it() -> None:
     clean, published = lifecycle(counter_cap=6), lifecycle(PublishedLifecycle, counter_cap=6)
     for life in (clean, published):
-        life.born(0, Scan("far", START_NS, START_NS))
+        life.born(0, Scan("far", START_NS, START_NS), HERE)
         for _ in range(3):
-            life.matched(0, Scan("far", START_NS, START_NS))
+            match(life, 0, Scan("far", START_NS, START_NS), HERE)
     assert (clean.lives[0].counter, published.lives[0].counter) == (6, 7)
 
 
 def test_the_last_sight_is_the_newest_stamp_and_in_the_published_one_the_last() -> None:
     clean, published = lifecycle(), lifecycle(PublishedLifecycle)
     for life in (clean, published):
-        life.born(0, Scan("near", START_NS, START_NS + ms(100)))
+        life.born(0, Scan("near", START_NS, START_NS + ms(100)), HERE)
     assert clean.lives[0].last_seen_ns == START_NS
     assert published.lives[0].last_seen_ns == START_NS + ms(100)
     for life in (clean, published):
-        life.matched(0, Scan("near", START_NS + ms(50), START_NS + ms(50)))
-        life.matched(0, Scan("near", START_NS + ms(20), START_NS + ms(20)))
+        match(life, 0, Scan("near", START_NS + ms(50), START_NS + ms(50)), HERE)
+        match(life, 0, Scan("near", START_NS + ms(20), START_NS + ms(20)), HERE)
     assert clean.lives[0].last_seen_ns == START_NS + ms(50)
     assert published.lives[0].last_seen_ns == START_NS + ms(20)
 
@@ -96,7 +97,7 @@ def test_time_alone_ends_a_track_but_the_published_one_needs_a_list() -> None:
     clean, published = lifecycle(forget_s=2.0), lifecycle(PublishedLifecycle, forget_s=2.0)
     late_ns = START_NS + ms(2000) + 1
     for life in (clean, published):
-        life.born(0, Scan("blind", START_NS, START_NS))
+        life.born(0, Scan("blind", START_NS, START_NS), HERE)
         assert life.expired(late_ns - 1) == []
     assert clean.expired(late_ns) == [0]
     assert published.expired(late_ns) == []
@@ -106,15 +107,15 @@ def test_time_alone_ends_a_track_but_the_published_one_needs_a_list() -> None:
 
 def test_the_status_tells_unconfirmed_from_seen_from_missed() -> None:
     life = lifecycle(confirm_count=3)
-    life.born(0, Scan("both", START_NS, START_NS))
+    life.born(0, Scan("both", START_NS, START_NS), HERE)
     status = []
     for _ in range(2):
-        life.matched(0, Scan("both", START_NS, START_NS))
+        match(life, 0, Scan("both", START_NS, START_NS), HERE)
         life.fused(0)
         status.append(life.status(0))
     life.missed(Scan("both", START_NS, START_NS), [0], NOWHERE, np.array([1.0]))
     status.append(life.status(0))
-    life.matched(0, Scan("both", START_NS, START_NS))
+    match(life, 0, Scan("both", START_NS, START_NS), HERE)
     status.append(life.status(0))
     assert status == [
         TrackStatus.TENTATIVE,

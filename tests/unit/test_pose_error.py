@@ -18,7 +18,7 @@ from fgtrack.models.road import Road
 from fgtrack.models.sensors import Correlation, Mount, SensorModel
 from fgtrack.tracking.detections import ConnectedMerge, NoMerge
 from fgtrack.tracking.ego import EgoPose
-from fgtrack.tracking.preprocess import Candidate, Preprocess
+from fgtrack.tracking.preprocess import Candidates, Preprocess
 
 MOUNT = Mount(2.0, 1.0, 0.7)
 ORIGIN_M = (-1.74, 0.3)
@@ -46,13 +46,18 @@ def candidates(
     frame: Frame = "ego",
     road: Road | None = None,
     motion: MotionModel | None = None,
-) -> list[Candidate]:
+) -> Candidates:
     sensor = SensorModel(std={name: STD[name] for name in seen[0]}, mount=MOUNT)
     if road is not None:
         sensor = replace(sensor, yaw_from_map_std_rad=0.3)
     merge = ConnectedMerge(5.1) if len(seen) > 1 else NoMerge()
     preprocess = Preprocess(road or Road(), merge, motion or CTRV(), ORIGIN_M)
     return preprocess(batch(*(Detection(**values) for values in seen), frame=frame), sensor, ego)[0]
+
+
+def noise_at(found: Candidates, x: FloatArray) -> FloatArray:
+    """R of the first candidate at the states `x` (p, n)."""
+    return found.groups[0].seen_at(np.zeros(len(x), dtype=int), x).R
 
 
 def innovation(measurement: Measurement, x: FloatArray) -> FloatArray:
@@ -80,15 +85,14 @@ def test_the_noise_grows_by_the_numeric_derivative(seen: dict[str, float], frame
     """Of all components together, signs and correlations included, at a state that is not where the detection is."""
     x = np.zeros(motion.dim)
     x[:4] = (130.0, 70.0, 2.0, 15.0) if motion.dim == 5 else (130.0, 70.0, -6.0, 13.0)
-    [plain] = candidates(EGO, seen, frame=frame, motion=motion)
-    [found] = candidates(EGO._replace(covariance=P), seen, frame=frame, motion=motion)
+    plain = candidates(EGO, seen, frame=frame, motion=motion)[0]
+    found = candidates(EGO._replace(covariance=P), seen, frame=frame, motion=motion)
     J = by_the_ego(x, [seen], frame, motion=motion)
     assert np.abs(J).max() > 0.5
-    np.testing.assert_allclose(found.measurement_at(x).R - plain.measurement.R, J @ P @ J.T, rtol=1e-5, atol=1e-9)
-    several = np.array([x, x + 1.0, x - 2.0])
-    stacked = np.broadcast_to(found.measurement_at(several).R, (3, len(J), len(J)))
-    np.testing.assert_allclose(stacked, [found.measurement_at(one).R for one in several], rtol=1e-12)
-    np.testing.assert_array_equal(found.measurement.z, plain.measurement.z)
+    R = noise_at(found, np.array([x, x + 1.0]))
+    np.testing.assert_allclose(R[0] - plain.measurement.R, J @ P @ J.T, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(R[1], noise_at(found, x[None] + 1.0)[0], rtol=1e-12)
+    np.testing.assert_array_equal(found[0].measurement.z, plain.measurement.z)
 
 
 def test_ten_milliradians_at_sixty_metres_are_sixty_centimetres_across() -> None:
@@ -116,22 +120,21 @@ def test_a_heading_from_the_map_is_not_turned_by_the_ego() -> None:
 
 def test_a_bearing_alone_knows_the_error_of_the_yaw_and_at_a_state_that_of_the_place() -> None:
     covariance = np.diag([0.25, 0.25, 1e-4, 0.0, 0.0])
-    [found] = candidates(EGO._replace(covariance=covariance), {"bearing_rad": 0.3}, frame="sensor")
-    assert found.measurement.R[0] == pytest.approx([1e-4 + 1e-4], rel=1e-5)
-    pose = found.measurement.pose
+    found = candidates(EGO._replace(covariance=covariance), {"bearing_rad": 0.3}, frame="sensor")
+    assert found[0].measurement.R[0] == pytest.approx([1e-4 + 1e-4], rel=1e-5)
+    pose = found[0].measurement.pose
     at = np.array([pose.x_m + 10.0, pose.y_m, 0.0, 0.0, 0.0])
-    assert float(found.measurement_at(at).R[0, 0]) > 1e-4 + 0.0025 + 1e-4 * (1.0 - 0.4) ** 2
+    assert float(noise_at(found, at[None])[0, 0, 0]) > 1e-4 + 0.0025 + 1e-4 * (1.0 - 0.4) ** 2
 
 
 @pytest.mark.parametrize("covariance", [None, P])
 def test_positions_in_the_map_and_an_ego_without_covariance_are_left_as_they_are(covariance: FloatArray | None) -> None:
     ego = EGO._replace(covariance=covariance)
-    [found] = candidates(ego, PLACE, frame="map")
-    assert found.pose_error is None
-    assert found.measurement_at(np.zeros(5)) is found.measurement
-    assert candidates(None, PLACE, frame="map")[0].pose_error is None
-    if covariance is None:
-        assert candidates(ego, PLACE)[0].pose_error is None
+    found = [candidates(ego, PLACE, frame="map"), candidates(None, PLACE, frame="map")]
+    found += [candidates(ego, PLACE)] if covariance is None else []
+    for each in found:
+        assert each.groups[0].error is None
+        np.testing.assert_array_equal(noise_at(each, np.zeros((1, 5)))[0], each[0].measurement.R)
 
 
 @given(yaw=st.floats(-3.1, 3.1))
@@ -146,10 +149,10 @@ def test_a_yaw_comes_to_the_map_with_a_range_and_a_bearing_too(yaw: float) -> No
 def test_a_lasting_error_of_the_sensor_and_that_of_the_ego_stand_side_by_side(seen: dict[str, float]) -> None:
     lasting = SensorModel(std={name: STD[name] for name in seen}, mount=MOUNT, correlation=Correlation())
     motion = with_correlated_errors(CTRV(), {"lidar": lasting})
-    [plain] = candidates(EGO._replace(covariance=P), seen)
+    plain = candidates(EGO._replace(covariance=P), seen)
     preprocess = Preprocess(Road(), NoMerge(), motion, ORIGIN_M)
-    [[found], _] = preprocess(batch(Detection(**seen)), lasting, EGO._replace(covariance=P))
+    found, _ = preprocess(batch(Detection(**seen)), lasting, EGO._replace(covariance=P))
     x = np.array([130.0, 70.0, 2.0, 15.0, 0.1, 0.5, -0.5])
-    whole = whole_error(found.measurement.model, found.measurement_at(x).R)
-    np.testing.assert_allclose(whole, plain.measurement_at(x[:5]).R, rtol=1e-12)
-    np.testing.assert_allclose(found.position_covariance, plain.position_covariance, rtol=1e-12)
+    whole = whole_error(found[0].measurement.model, noise_at(found, x[None])[0])
+    np.testing.assert_allclose(whole, noise_at(plain, x[None, :5])[0], rtol=1e-12)
+    np.testing.assert_allclose(found[0].position_covariance, plain[0].position_covariance, rtol=1e-12)

@@ -14,7 +14,7 @@ from fgtrack.models.road import Road
 from fgtrack.models.sensors import Mount, SensorModel
 from fgtrack.tracking.detections import ConnectedMerge, Merge, NoMerge
 from fgtrack.tracking.ego import EgoPose
-from fgtrack.tracking.preprocess import Candidate, Preprocess
+from fgtrack.tracking.preprocess import Candidates, Preprocess
 from fgtrack.tracking.published import NeighbourhoodMerge
 
 LIDAR = SensorModel(std={"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.4}, mount=Mount(2.0, 1.0, math.pi / 2))
@@ -32,7 +32,7 @@ def candidates(
     merge: Merge = ALONE,
     road: Road = OPEN,
     ego: EgoPose | None = EGO,
-) -> list[Candidate]:
+) -> Candidates:
     found, records = Preprocess(road, merge, CTRV(), ORIGIN_M)(batch(*objects, frame=frame), sensor, ego)
     assert records == []
     return found

@@ -13,10 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.linalg import equal_ones
 from fgtrack.core.time import nanoseconds, period_ns, seconds
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
-from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states
+from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states, stacks
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import correct, linearised
 from fgtrack.estimation.filters.propagation import ExactPropagator, kinematic_states
@@ -148,52 +147,24 @@ class BackwardForwardBank:
         """Correct the stored states nearest to `stamp_ns`; the present is predicted from them."""
         states = self.states_at(stamp_ns)
         rows = {track_id: row for row, track_id in enumerate(states.track_ids)}
-        results: dict[int, UpdateResult] = {}
-        for positions in equal_ones([(id(one.model), id(one.pose), one.assumed) for one in measurements]):
-            chosen = [rows[track_ids[position]] for position in positions]
-            part = self._update_alike(
-                [track_ids[position] for position in positions],
-                states.means.take(chosen, axis=0),
-                states.covariances.take(chosen, axis=0),
-                [measurements[position] for position in positions],
-                self.steps_back(stamp_ns),
-            )
-            results.update(zip(positions, part, strict=True))
+        back, results = self.steps_back(stamp_ns), [UpdateResult(UpdateStatus.FAILED)] * len(track_ids)
+        for indices, alike in stacks(measurements):
+            chosen = [rows[track_ids[i]] for i in indices]
+            x, P = states.means.take(chosen, axis=0), states.covariances.take(chosen, axis=0)
+            y, H = linearised(alike.z, x, alike.model, alike.pose, partial(self._propagator.residual, alike.model))
+            corrected = correct(x, P, y, H, alike.R, alike.measured, alike.loss)
+            wrapped, nis = self._propagator.wrap(corrected.mean), corrected.nis.tolist()
+            for k in corrected.fused.nonzero()[0].tolist():
+                storage = self._objects[track_ids[indices[k]]]
+                anchor = Anchor(self._grid - back, self._visible_from(back), wrapped[k], corrected.covariance[k])
+                while storage.anchors and storage.anchors[-1].visible_from >= anchor.visible_from:
+                    storage.anchors.pop()  # it replaces all that was stored at and after it
+                storage.anchors.append(anchor)
+                late = storage.newest_fused_ns > stamp_ns
+                storage.newest_fused_ns = max(storage.newest_fused_ns, stamp_ns)
+                status = UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE
+                results[indices[k]] = UpdateResult(status, corrected.innovation[k], nis[k])
         self._cached.clear()
-        return [results[position] for position in range(len(measurements))]
-
-    def _update_alike(
-        self,
-        track_ids: Sequence[int],
-        means: FloatArray,
-        covariances: FloatArray,
-        measurements: Sequence[Measurement],
-        back: int,
-    ) -> list[UpdateResult]:
-        """Update with measurements that share a model, a sensor pose, a stamp and what is assumed."""
-        z = np.array([measurement.z for measurement in measurements])
-        R = np.array([measurement.R for measurement in measurements])
-        model, pose, measured = measurements[0].model, measurements[0].pose, measurements[0].measured
-        residual = partial(self._propagator.residual, model)
-        losses = [measurement.loss for measurement in measurements]
-        y, H = linearised(z, means, model, pose, residual)
-        corrected = correct(means, covariances, y, H, R, measured, losses)
-        wrapped = self._propagator.wrap(corrected.mean)
-        fused = corrected.fused.tolist()
-        results = []
-        for row, (track_id, measurement) in enumerate(zip(track_ids, measurements, strict=True)):
-            if not fused[row]:
-                results.append(UpdateResult(UpdateStatus.FAILED))
-                continue
-            storage = self._objects[track_id]
-            anchor = Anchor(self._grid - back, self._visible_from(back), wrapped[row], corrected.covariance[row])
-            while storage.anchors and storage.anchors[-1].visible_from >= anchor.visible_from:
-                storage.anchors.pop()  # it replaces all that was stored at and after it
-            storage.anchors.append(anchor)
-            late = storage.newest_fused_ns > measurement.stamp_ns
-            storage.newest_fused_ns = max(storage.newest_fused_ns, measurement.stamp_ns)
-            status = UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE
-            results.append(UpdateResult(status, corrected.innovation[row], float(corrected.nis[row])))
         return results
 
     def _visible_from(self, back: int) -> int:

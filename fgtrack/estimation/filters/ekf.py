@@ -158,12 +158,12 @@ def correct(
     H: FloatArray,
     R: FloatArray,
     measured: Sequence[int] | None = None,
-    losses: Sequence[RobustLoss | None] = (),
+    loss: RobustLoss | None = None,
 ) -> Correction:
     """Fuse innovations y (m, k) of measurements with Jacobians H (m, k, n) or (k, n) and covariances R (m, k, k).
 
-    Karle et al. 2023, eqs. 5 to 9, on m states. `measured` is `Measurement.measured`, for the NIS; `losses`, none or m
-    of them, are those of the measurements (see `robust_weight`). The posterior covariance is in Joseph form.
+    Karle et al. 2023, eqs. 5 to 9, on m states. `measured` is `Measurement.measured`, for the NIS, `loss` the
+    robust loss of all (see `robust_weight`). The posterior covariance is in Joseph form.
     """
     rows = np.arange(y.shape[-1]) if measured is None else np.array(measured, dtype=np.int64)
     x, P, y, R = (np.array(each, dtype=np.float64, order="C") for each in (mean, covariance, y, R))
@@ -171,10 +171,10 @@ def correct(
     S, nis, w, fused = np.empty(R.shape), np.empty(len(x)), np.ones(len(x)), np.empty(len(x), dtype=bool)
     fuse = kernels(_KALMAN).correct
     fuse(x, P, y, H, R, rows, S, nis, fused)
-    if any(losses):
+    if loss is not None:
         x, P = (np.array(each, dtype=np.float64, order="C") for each in (mean, covariance))
         spread = congruence(H, P)
-        for row, loss in enumerate(losses):
+        for row in range(len(x)):
             w[row] = robust_weight(loss, y[row], spread[row], R[row]) if fused[row] else 1.0
         fuse(x, P, y, H, R / w[:, None, None], rows, np.empty(R.shape), np.empty(len(x)), fused)
     return Correction(x, P, y, nis, w, S, fused)
@@ -193,7 +193,7 @@ def updated_one(
 
     Raises `numpy.linalg.LinAlgError` for one that cannot be fused.
     """
-    x, P, y, nis, w, S, fused = correct(mean[None], covariance[None], y[None], H, R[None], measured, [loss])
+    x, P, y, nis, w, S, fused = correct(mean[None], covariance[None], y[None], H, R[None], measured, loss)
     if not fused[0]:
         raise np.linalg.LinAlgError("innovation covariance not positive definite, or posterior not finite")
     return OneCorrection(x[0], P[0], y[0], float(nis[0]), float(w[0]), S[0])

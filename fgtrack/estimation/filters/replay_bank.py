@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from fgtrack.core.checks import LARGEST_NS
-from fgtrack.core.linalg import equal_ones, kernels
+from fgtrack.core.linalg import kernels
 from fgtrack.core.types import FloatArray, TrackState
-from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus
+from fgtrack.estimation.base import Measurement, Measurements, Start, StatesAt, UpdateResult, UpdateStatus, stacks
 from fgtrack.estimation.filters.ekf import Prediction
 from fgtrack.estimation.filters.propagation import kinematic_states
 from fgtrack.estimation.filters.replay import ReplayEkf, Step
@@ -81,23 +81,20 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
-        kinds, found = list[Any](), dict[int, UpdateResult]()
-        seen = [one.seen_by(self._motion) for one in measurements]
-        for track_id, one in zip(track_ids, seen, strict=True):
-            is_plain = track_id in self._rows and _is_plain(one)
-            kinds.append((id(one.model), one.assumed) if is_plain else None)
-        for indices in equal_ones(kinds):
-            ids, alike = [track_ids[i] for i in indices], [seen[i] for i in indices]
-            if kinds[indices[0]] is not None:
-                results = self._fused(stamp_ns, [self._rows[track_id] for track_id in ids], alike)
+        results = [UpdateResult(UpdateStatus.FAILED)] * len(track_ids)
+        for indices, alike in stacks(measurements):
+            seen, ids = alike.seen_by(self._motion), [track_ids[i] for i in indices]
+            if _is_plain(seen) and self._rows.keys() >= set(ids):
+                found = self._fused(stamp_ns, [self._rows[track_id] for track_id in ids], seen)
             else:
                 for track_id in ids:
                     self._take_out(track_id)
-                results = super().update(stamp_ns, ids, alike)
+                found = super().update(stamp_ns, ids, Measurements(seen))
                 for track_id in ids:
                     self._put_in(track_id)
-            found.update(zip(ids, results, strict=True))
-        return [found[track_id] for track_id in track_ids]
+            for i, result in zip(indices, found, strict=True):
+                results[i] = result
+        return results
 
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`."""
@@ -117,14 +114,13 @@ class ReplayBank(ObjectBank[ReplayEkf]):
             one.window_ns[0] if i not in self._rows else starts_ns[self._rows[i]] for i, one in self._estimators.items()
         ]
 
-    def _fused(self, stamp_ns: int, rows: Sequence[int], measurements: Sequence[Measurement]) -> list[UpdateResult]:
-        """Outcomes of measurements of the same entries of the state."""
-        one = measurements[0]
-        m, k = len(rows), len(one.z)
+    def _fused(self, stamp_ns: int, rows: Sequence[int], one: Measurement) -> list[UpdateResult]:
+        """Outcomes of a stack of measurements of entries of the state."""
+        m, k = one.z.shape
         self._make_room(rows, k)
         measured = np.arange(k) if one.measured is None else np.array(one.measured)
         new, label = np.empty((m, k + 1, k)), np.array([stamp_ns, k, *one.model.selected])
-        new[:, 0], new[:, 1:] = [each.z for each in measurements], [each.R for each in measurements]
+        new[:, 0], new[:, 1:] = one.z, one.R
         y, S, nis, status = np.empty((m, k)), np.empty((m, k, k)), np.empty(m), np.empty(m, dtype=np.int64)
         lags_ns = self._lag_ns, self._start_ns
         self._kernels.fuse(

@@ -1,16 +1,16 @@
 """The fixed-lag smoothers of all objects, and that of one."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import compress, repeat
 from typing import Any
 
 import numpy as np
 
-from fgtrack.core.linalg import equal_ones
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import BoolArray, FloatArray, IntArray, SmoothedReport, TrackState
-from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus
+from fgtrack.estimation.base import Measurement, Measurements, Start, StatesAt, UpdateResult, UpdateStatus, stacks
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
@@ -111,17 +111,20 @@ class SmootherBank:
         tracks = np.array([self._tracks[track_id] for track_id in track_ids], dtype=np.int64)
         newest_ns, start_ns, reach_ns, oldest_ns = self._times().take(tracks, axis=1)
         results = [_TOO_OLD] * len(tracks)
-        rows = (oldest_ns <= stamp_ns).nonzero()[0]
-        chosen = [measurements[row].seen_by(self._motion) for row in rows]
         states = self.states_at(stamp_ns)
         positions = dict(zip(states.track_ids, range(len(states.track_ids)), strict=True))
-        for alike in equal_ones([(id(m.model), id(m.pose), m.assumed, m.loss) for m in chosen]):
-            group = rows[alike]
-            at = [positions[track_ids[row]] for row in group]
-            measured, means = [chosen[k] for k in alike], states.means[at]
-            innovations = Innovations.of(measured, means, states.covariances[at])
+        for indices, stack in stacks(measurements):
+            inside = (oldest_ns[np.array(indices)] <= stamp_ns).nonzero()[0]
+            if not len(inside):
+                continue
+            group, alike = np.array(indices)[inside], stack.seen_by(self._motion)
+            alike = replace(alike, z=alike.z[inside], R=alike.R[inside])
+            at = [positions[track_ids[row]] for row in group.tolist()]
+            means = states.means[at]
+            innovations = Innovations.of(alike, means, states.covariances[at])
             window_ns = start_ns[group], reach_ns[group]
             is_fused = np.isfinite(innovations.nis)
+            measured = [*Measurements(alike)]
             self._fuse(stamp_ns, tracks[group], measured, innovations, means, *window_ns, is_fused)
             late = (stamp_ns < newest_ns[group]) + (stamp_ns < start_ns[group]).astype(int)
             for k, (row, fused) in enumerate(zip(group.tolist(), is_fused.tolist(), strict=True)):

@@ -122,14 +122,12 @@ class Innovations(NamedTuple):
         return Innovations(self.y[rows], self.H[rows], self.R[rows], self.S[rows], self.nis[rows])
 
     @classmethod
-    def of(cls, measurements: Sequence[Measurement], means: FloatArray, covariances: FloatArray) -> "Innovations":
-        """Return those of measurements with one model, sensor pose and loss at the states (m, n), (m, n, n)."""
-        first = measurements[0]
-        z, R = np.array([each.z for each in measurements]), np.array([each.R for each in measurements])
-        y, H = ekf.linearised(z, means, first.model, first.pose)
-        S = congruence(H, covariances) + R
+    def of(cls, stack: Measurement, means: FloatArray, covariances: FloatArray) -> "Innovations":
+        """Return those of a stack of measurements at the states (m, n), (m, n, n)."""
+        y, H = ekf.linearised(stack.z, means, stack.model, stack.pose)
+        S = congruence(H, covariances) + stack.R
         H = np.broadcast_to(H, (*y.shape, means.shape[1])).copy()
-        return cls(y, H, R, S, _nis(y, S, first.measured))
+        return cls(y, H, stack.R, S, _nis(y, S, stack.measured))
 
 
 def _nis(y: FloatArray, S: FloatArray, entries: Sequence[int] | None) -> FloatArray:
