@@ -21,7 +21,8 @@ from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.assumptions.assumed import Assumed, assumed, source_of
+from fgtrack.pipeline.assumptions.assumed import assumed, source_of
+from fgtrack.pipeline.assumptions.assumption import Assumed
 from fgtrack.pipeline.clock import corrected
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_in_memory

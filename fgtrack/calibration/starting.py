@@ -26,7 +26,8 @@ from fgtrack.io.info import OTHER_CLOCK_S, InputInfo, TopicInfo, describe
 from fgtrack.io.ros.bag import Bag
 from fgtrack.io.source import input_kind, open_input
 from fgtrack.models.sensors import Filter
-from fgtrack.pipeline.assumptions.assumed import Assumed, assumed, departures
+from fgtrack.pipeline.assumptions.assumed import assumed
+from fgtrack.pipeline.assumptions.assumption import Assumed, departures
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import validate
 

@@ -24,7 +24,8 @@ from fgtrack.io.errors import UntilBreak
 from fgtrack.io.output import check_apart, check_output, claimed, new_file, new_files
 from fgtrack.io.run import Run, check_run, load_run, write_metrics
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.assumptions.assumed import Assumed, assumed
+from fgtrack.pipeline.assumptions.assumed import assumed
+from fgtrack.pipeline.assumptions.assumption import Assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay
 from fgtrack.pipeline.shipped import read_config

@@ -22,7 +22,8 @@ from fgtrack.io.errors import UntilBreak
 from fgtrack.io.info import OTHER_CLOCK_S, InputInfo, describe
 from fgtrack.io.output import check_apart, check_output, new_file
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.assumptions.assumed import Assumed, assumed
+from fgtrack.pipeline.assumptions.assumed import assumed
+from fgtrack.pipeline.assumptions.assumption import Assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import plain
 from fgtrack.pipeline.replay import located

@@ -17,7 +17,7 @@ from fgtrack.core.errors import DataError
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
 from fgtrack.io.output import check_apart, check_output, new_file
 from fgtrack.io.source import open_input
-from fgtrack.pipeline.assumptions.assumed import Assumed
+from fgtrack.pipeline.assumptions.assumption import Assumed
 from fgtrack.pipeline.shipped import read_config
 
 _KNOWN = {"yes": "yes", "roughly": "roughly", "limit": "a limit", "no": "not identifiable"}

@@ -7,7 +7,7 @@ from support.paper import paper
 from support.tracking import START_NS, message
 
 from fgtrack.core.errors import DataError
-from fgtrack.core.types import Detection, EgoState
+from fgtrack.core.types import Detection, DetectionList, EgoState
 from fgtrack.io.config import InputConfig, TopicInput
 from fgtrack.io.recording import write_recording
 from fgtrack.io.source import open_input
@@ -254,19 +254,20 @@ def test_errors_that_differ_from_list_to_list_are_no_offset() -> None:
     assert assumed(Config(), source_of(noisy)).config.sensors["lidar"].correlation is None
 
 
-def test_windows_hold_two_lists_of_the_slowest_sensor() -> None:
+@pytest.mark.parametrize(("every", "lag_s"), [(30, 3.0), (250, 25.0), (600, 58.0)])
+def test_windows_hold_two_lists_of_the_slowest_sensor_up_to_a_minute(every: int, lag_s: float) -> None:
     def seldom():
-        every = 0
-        for one in forward():
+        scans = 0
+        for one in forward(1300):
             yield one
-            if getattr(one, "objects", ()):
-                every += 1
-                if every % 30 == 0:
+            if isinstance(one, DetectionList):
+                scans += 1
+                if scans % every == 0:
                     yield replace(one, sensor="slow")
 
-    config = assumed(Config(), source_of(seldom)).config
-    assert config.smoother.lag_s >= 2.0
-    assert config.filter.storage_s == config.smoother.lag_s + config.smoother.ring_s
+    found = assumed(Config(), source_of(seldom))
+    assert (found.config.smoother.lag_s, found.config.filter.storage_s) == (lag_s, lag_s + 2.0)
+    assert ("longer than windows may be" in found.lines()[-1]) == (lag_s == 58.0)
 
 
 def test_boxes_are_taken_to_be_more_exact_than_points() -> None:

@@ -7,17 +7,17 @@ import pytest
 
 import fgtrack
 from fgtrack.core.types import Detection, DetectionList
-from fgtrack.pipeline.assumptions.revisits import ListStatistics
+from fgtrack.pipeline.assumptions.coverage import Coverage, coverages
 
 SECOND_NS = 10**9
 
 
-def statistics(*sizes: int) -> ListStatistics:
-    found = ListStatistics()
+def coverage(*sizes: int) -> Coverage:
+    lists = []
     for number, size in enumerate(sizes):
         objects = [Detection(x_m=10.0 * number, y_m=float(k + number % 2)) for k in range(size)]
-        found.add(DetectionList("any", number, number, objects))
-    return found
+        lists.append(DetectionList("any", number, number, objects))
+    return coverages(lists)["any"]
 
 
 @pytest.mark.parametrize(
@@ -25,16 +25,14 @@ def statistics(*sizes: int) -> ListStatistics:
     [([1] * 20, False), ([1] * 18 + [2] * 2, False), ([1] * 19 + [0], True), ([1, 2] * 10, True), ([1] * 9, True)],
 )
 def test_lists_of_one_object_are_no_scans_unless_one_is_empty(sizes: list[int], scans: bool) -> None:
-    assert statistics(*sizes).scans == scans
+    assert coverage(*sizes).scans == scans
 
 
 def test_clutter_is_at_most_as_dense_as_all_detections() -> None:
-    assert statistics(*[1] * 11).largest_clutter_per_m2 == pytest.approx(1.0 / 100.0)
-    assert statistics(*[1] * 9).largest_clutter_per_m2 == math.inf
-    on_a_line = ListStatistics()
-    for k in range(20):
-        on_a_line.add(DetectionList("any", k, k, [Detection(range_m=float(k), bearing_rad=0.0)]))
-    assert on_a_line.largest_clutter_per_m2 == math.inf
+    assert coverage(*[1] * 11).density_per_m2 == pytest.approx(1.0 / 100.0)
+    assert coverage(*[1] * 9).density_per_m2 == math.inf
+    line = [DetectionList("any", k, k, [Detection(range_m=float(k), bearing_rad=0.0)]) for k in range(20)]
+    assert coverages(line)["any"].density_per_m2 == math.inf
 
 
 def reports() -> list[DetectionList]:

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -24,7 +26,7 @@ def cars(
             false_m = np.concatenate([false_m, np.array([[5000.0, 100.0 * (k // 10)]])])
         points_m.append(np.concatenate([true_m, false_m]))
         scores.append(np.concatenate([rng.normal(4.0, 1.0, len(true_m)), rng.normal(0.0, 1.0, len(false_m))]))
-    return persistence(stamps_s, points_m, scores, [np.hypot(*one.T) for one in points_m])
+    return persistence(Lists(stamps_s, points_m, scores, [np.hypot(*one.T) for one in points_m]))
 
 
 @pytest.mark.parametrize("clutter", [0.0, 2.0])
@@ -83,5 +85,6 @@ def test_sensors_disagree_by_how_far_they_see_an_object_apart(
     own = [np.concatenate([state[stamps_s == one], state[stamps_s == one] + 40.0]) for one in stamps_s]
     rng = np.random.default_rng(0)
     other = [each[rng.random(len(each)) >= missed] + aside_m for each in own]
-    measured_m = disagreement_m(found, Lists(stamps_s, own), Lists(stamps_s, other))
+    found = replace(found, lists=found.lists._replace(stamps_s=stamps_s, points_m=own))
+    measured_m = disagreement_m(found, found.lists._replace(points_m=other))
     assert measured_m == (None if expected_m is None else pytest.approx(1.41 * aside_m / 1.18, rel=0.1))

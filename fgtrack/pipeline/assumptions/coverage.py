@@ -1,14 +1,17 @@
-"""Coverage of a sensor: its field of view, its range and its rate, estimated from a recording."""
+"""Coverage of a sensor: its field of view, range and rate, and the kind of its lists, estimated from a recording."""
 
 import math
 from array import array
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from statistics import median
 
 import numpy as np
 
 from fgtrack.core.geometry import wrap_angle, wrap_angles
-from fgtrack.core.time import NS_PER_S
+from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
 from fgtrack.core.types import BoolArray, Detection, DetectionList, EgoState, FloatArray, IntArray, Message
 from fgtrack.models.sensors import Mount
 from fgtrack.pipeline.assumptions.persistence import Lists, Persistence, disagreement_m, persistence
@@ -25,36 +28,48 @@ _LINK_RAD, _RANGE_FACTOR = 0.2, 1.1
 _NARROWEST_RAD, _WIDEST_RAD = 0.35, 2.8
 #: Axes are multiples of 45 degrees, where the middle of the sector is so near to one.
 _AXES_RAD, _AXIS_TOLERANCE_RAD = math.pi / 4.0, 0.15
-
+#: Lists with one object, as a share of all, that show a sensor to report objects one by one; and the fewest lists.
+_REPORTS_SHARE, _FEWEST_LISTS = 0.75, 10
+#: No vehicle is faster than an airliner [m/s], and no position of one is worse than this [m].
+_FASTEST_MPS, _POSITION_M = 300.0, 10.0
+#: Memory of earlier detections, and the most and fewest revisits that count.
+_MEMORY_S, _MOST_REVISITS, _FEWEST_REVISITS = 60.0, 5000, 20
 _OUTAGE_S = 2.0
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """Rate, field of view and range of a sensor, estimated from a recording."""
+    """Lists of a sensor and where it detects; by default those of a sensor without messages."""
 
-    measured: frozenset[str]
+    measured: frozenset[str] = frozenset()
     """Components that its detections hold."""
-    num_lists: int
-    num_detections: int
-    rate_hz: float | None
+    num_lists: int = 0
+    num_detections: int = 0
+    boxes: bool = False
+    """True if its detections have a length and a width."""
+    rate_hz: float | None = None
     """Lists per second; None of fewer than two."""
+    silence_s: float = 0.0
+    """Longest time between two successive lists, up to `_OUTAGE_S`: after longer ones objects are new."""
+    scans: bool = True
+    """False if it reports objects one by one, as ADS-B, AIS and V2X do: its lists hold one object, now and then several
+    by coincidence, and none is empty."""
+    density_per_m2: float = math.inf
+    """All detections of a list over the rectangle that holds those of all; infinite if unknown."""
+    revisit_s: float | None = None
+    """Median time between two detections of an object; None without positions, or of too few."""
+    persistence: Persistence | None = None
+    """Persistence of its detections from list to list; None where too few do."""
+    disagreement_m: float | None = None
+    """Least standard deviation of its positions against those of another sensor; None where none sees the same."""
+    area_m2: float | None = None
+    """Area over which its detections with a range are spread, at least that of the narrowest sector up to there."""
     axis_rad: float = 0.0
     """Direction of the middle of its sector, 0 along the axis of the frame of its detections."""
     field_of_view_rad: float | None = None
     """Full angle of its sector; None where it detects all around, or too seldom to tell."""
     range_m: float | None = None
     """Up to where it detects; None where it measures no range, or too seldom."""
-    persistence: Persistence | None = None
-    """Persistence of its detections from list to list; None where too few do."""
-    disagreement_m: float | None = None
-    """Least standard deviation of its positions against those of another sensor; None where none sees the same."""
-    boxes: bool = False
-    """True if its detections have a length and a width."""
-    area_m2: float | None = None
-    """Area over which its detections with a range are spread, at least that of the narrowest sector up to there."""
-    silence_s: float = 0.0
-    """Longest time between two lists running, up to `_OUTAGE_S`: after longer ones objects are new."""
 
     def __str__(self) -> str:
         rate = "" if self.rate_hz is None else f" at {self.rate_hz:.3g} Hz"
@@ -70,62 +85,51 @@ def coverages(messages: Iterable[Message], mounts: Mapping[str, Mount] | None = 
     - Only a detection that comes back counts: another list of the sensor has one close by and soon. Clutter that is
       spread over space and time seldom does, an object does at nearly every list.
     - The sector is the rest of the circle beside the widest arc with at most 1 % of these detections. It is taken up
-      to 160 degrees: one car that overtakes has a sensor which looks all around detect in nearly half a circle, so
-      that a wider sector cannot be told from traffic on one side.
+      to 160 degrees: one car that overtakes has a sensor which looks all around detect in nearly half a circle.
     - Cars pass its edges within a few lists. So it goes on as far as the detections in that arc follow one another
-      within 12 degrees and a third of what they would if they were spread evenly over it, as clutter is. The noise
-      of the outermost ones is its margin.
+      within 12 degrees and a third of what they would if they were spread evenly over it, as clutter is.
     - The range is the quantile of 99 %, and a tenth more.
     - With fewer than 100 such detections, of which 1 % is not one, nothing is estimated.
 
     Detections in the map are seen from the ego, interpolated; without an ego they give no sector and no range.
     """
-    ego, found = array("d"), dict[str, _Detections]()
+    ego, received = array("d"), defaultdict[str, _Detections](_Detections)
     first_ns: int | None = None
     for message in messages:
         first_ns = message.receipt_ns if first_ns is None else first_ns
         if isinstance(message, EgoState):
             ego.extend(((message.stamp_ns - first_ns) / NS_PER_S, message.x_m, message.y_m, message.yaw_rad))
         elif isinstance(message, DetectionList):
-            found.setdefault(message.sensor, _Detections()).add(message, first_ns)
+            received[message.sensor].add(message)
     path = np.array(ego).reshape(-1, 4)
     path = path[np.isfinite(path).all(axis=1)]
     path = path[np.argsort(path[:, 0], kind="stable")]
     path[:, 3] = np.unwrap(path[:, 3])
-    seen = {name: one.coverage(path, (mounts or {}).get(name)) for name, one in sorted(found.items())}
-    measured = {name: one.persistence for name, one in seen.items() if one.persistence is not None}
-    lists = {
-        name: Lists(stamps_s, points_m) for name in measured for stamps_s, (points_m,) in [found[name].lists(path)]
+    found = {
+        name: one.coverage(first_ns or 0, path, (mounts or {}).get(name)) for name, one in sorted(received.items())
     }
-    for name, own in lists.items():
-        pairs = [(measured[other], lists[other], own) for other in lists if other != name]
-        apart_m = [m for each in pairs if (m := disagreement_m(*each)) is not None]
-        seen[name] = replace(seen[name], disagreement_m=min(apart_m, default=None))
-    return seen
+    measured = {name: one.persistence for name, one in found.items() if one.persistence is not None}
+    for name, own in measured.items():
+        apart_m = [disagreement_m(one, own.lists) for other, one in measured.items() if other != name]
+        found[name] = replace(found[name], disagreement_m=min(filter(None, apart_m), default=None))
+    return found
 
 
-@dataclass
 class _Detections:
-    """The detections of one sensor."""
+    """The detections of one sensor, in order of receipt."""
 
-    measured: set[str] = field(default_factory=set)
-    num_detections: int = 0
-    boxes: bool = False
-    receipts_s: "array[float]" = field(default_factory=lambda: array("d"))
-    """Receipt of every list, in s."""
-    stamps_s: "array[float]" = field(default_factory=lambda: array("d"))
-    """Stamp of every list, in s."""
-    rows: "array[float]" = field(default_factory=lambda: array("d"))
-    """Rows of detections with a bearing: number of its list, stamp, x, y (of a bearing alone those of a unit vector),
-    whether it has a range, score (NaN without one)."""
-    frames: set[str] = field(default_factory=set)
+    def __init__(self) -> None:
+        self.measured, self.frames, self.boxes = set[str](), set[str](), False
+        self.lists = array("q")
+        """Stamp, receipt and number of detections of each list."""
+        self.rows = array("d")
+        """Index of its list, x, y (of a bearing alone those of a unit vector), whether it has a range, and score (NaN
+        without one) of each detection with a bearing."""
 
-    def add(self, message: DetectionList, first_ns: int) -> None:
-        """Take the detections of a list; stamps are seconds since `first_ns`."""
-        number, stamp_s = len(self.receipts_s), (message.stamp_ns - first_ns) / NS_PER_S
-        self.receipts_s.append((message.receipt_ns - first_ns) / NS_PER_S)
-        self.stamps_s.append(stamp_s)
-        self.num_detections += len(message.objects)
+    def add(self, message: DetectionList) -> None:
+        """Take the detections of a list."""
+        index = len(self.lists) // 3
+        self.lists.extend((message.stamp_ns, message.receipt_ns, len(message.objects)))
         if message.objects:
             self.frames.add(message.frame)
         for detection in message.objects:
@@ -134,69 +138,83 @@ class _Detections:
             x_m, y_m, has_range = _position(detection)
             if math.isfinite(x_m) and math.isfinite(y_m):
                 score = math.nan if detection.score is None else detection.score
-                self.rows.extend((number, stamp_s, x_m, y_m, has_range, score))
+                self.rows.extend((index, x_m, y_m, has_range, score))
 
-    def coverage(self, path: FloatArray, mount: Mount | None) -> Coverage:
-        """Return the coverage, with the ego's `path`: times, x, y and yaw, shape (n, 4)."""
-        receipts_s = np.array(self.receipts_s)
-        span_s = float(np.ptp(receipts_s))
-        rate_hz = (len(receipts_s) - 1) / span_s if span_s > 0.0 else None
-        gaps_s = np.diff(np.sort(self.stamps_s))
-        silence_s = float(gaps_s[gaps_s <= _OUTAGE_S].max(initial=0.0))
-        measured, count = frozenset(self.measured), len(receipts_s)
-        found = Coverage(measured, count, self.num_detections, rate_hz, boxes=self.boxes, silence_s=silence_s)
-        rows = np.array(self.rows).reshape(-1, 6)
-        has_range = rows[:, 4] > 0.0
-        rows = rows[has_range] if has_range.any() else rows
-        if len(self.frames) != 1 or len(rows) < _FEWEST or ("map" in self.frames and not len(path)):
+    def coverage(self, first_ns: int, path: FloatArray, mount: Mount | None) -> Coverage:
+        """Return the coverage, with the ego's `path`: seconds since `first_ns`, x, y and yaw, shape (n, 4)."""
+        stamps_ns, receipts_ns, counts = np.array(self.lists).reshape(-1, 3).T
+        stamps_s, receipts_s = (stamps_ns - first_ns) / NS_PER_S, (receipts_ns - first_ns) / NS_PER_S
+        rows = np.array(self.rows).reshape(-1, 5)
+        ranged = rows[rows[:, 3] > 0.0]
+        begins = np.searchsorted(ranged[:, 0], np.arange(len(counts) + 1))  # rows stand list by list
+        parts = [slice(*ends) for ends in pairwise(begins)]
+        num_lists, gaps_s, span_s = len(counts), np.diff(np.sort(stamps_s)), float(np.ptp(receipts_s))
+        sides_m = np.ptp(ranged[:, 1:3], axis=0) if len(ranged) else np.zeros(2)
+        enough, has_area = num_lists >= _FEWEST_LISTS, bool(sides_m.all())
+        singles = np.count_nonzero(counts == 1)
+        found = Coverage(
+            frozenset(self.measured),
+            num_lists,
+            int(counts.sum()),
+            self.boxes,
+            rate_hz=(num_lists - 1) / span_s if span_s > 0.0 else None,
+            silence_s=float(gaps_s[gaps_s <= _OUTAGE_S].max(initial=0.0)),
+            scans=not enough or not counts.all() or bool(singles < _REPORTS_SHARE * num_lists),
+            density_per_m2=float(counts.sum() / num_lists / np.prod(sides_m)) if enough and has_area else math.inf,
+            revisit_s=_revisit_s(stamps_ns.tolist(), [ranged[part, 1:3] for part in parts]),
+        )
+        rows, in_map = ranged if len(ranged) else rows, "map" in self.frames
+        if len(self.frames) != 1 or len(rows) < _FEWEST or (in_map and not len(path)):
             return found
-        numbers, offsets_m = rows[:, 0].astype(np.int64), self._offsets_m(rows, path, mount)
-        if has_range.any():
-            extent_m = np.quantile(offsets_m, 1.0 - _OUTSIDE, axis=0) - np.quantile(offsets_m, _OUTSIDE, axis=0)
-            reach_m = float(np.quantile(np.hypot(*offsets_m.T), 1.0 - _OUTSIDE))
+        numbers, seen_m = rows[:, 0].astype(np.int64), rows[:, 1:3]
+        placed_m = seen_m
+        if len(path):
+            x_m, y_m, yaw_rad = (np.interp(stamps_s[numbers], path[:, 0], column) for column in path[:, 1:].T)
+            if not in_map:
+                placed_m = _turned(seen_m, yaw_rad) + np.column_stack([x_m, y_m])
+            elif len(ranged):
+                seen_m = _turned(seen_m - np.column_stack([x_m, y_m]), -yaw_rad)
+        if mount is not None and "sensor" not in self.frames:
+            seen_m = seen_m - np.array([mount.x_m, mount.y_m]) if len(ranged) else seen_m
+            seen_m = _turned(seen_m, np.full(len(seen_m), -mount.yaw_rad))
+        if len(ranged):
+            extent_m = np.quantile(seen_m, 1.0 - _OUTSIDE, axis=0) - np.quantile(seen_m, _OUTSIDE, axis=0)
+            ranges_m = np.hypot(*seen_m.T)
+            reach_m = float(np.quantile(ranges_m, 1.0 - _OUTSIDE))
             area_m2 = max(float(np.prod(extent_m)), 0.5 * _NARROWEST_RAD * reach_m**2)  # one object may keep its place
-            stamps_s, columns = self.lists(path, rows[:, 5], np.hypot(*offsets_m.T))
-            found = replace(found, persistence=persistence(stamps_s, *columns), area_m2=area_m2)
-        period_s = float(np.median(np.diff(receipts_s))) if len(receipts_s) > 1 else 0.0
-        span_s = max(_CELL_S, _CELL_PERIODS * period_s)
-        reach = _CELL_M + _CELL_MPS * span_s if has_range.any() else _CELL_BEARING
-        back = _comes_back(np.column_stack([offsets_m / reach, receipts_s[numbers] / span_s]), numbers)
-        offsets_m = offsets_m[back]
-        if len(offsets_m) < _FEWEST:
+            order = np.argsort(stamps_s, kind="stable")
+            columns = ([column[parts[k]] for k in order] for column in (placed_m, rows[:, 4], ranges_m))
+            found = replace(found, persistence=persistence(Lists(stamps_s[order], *columns)), area_m2=area_m2)
+        period_s = float(np.median(np.diff(receipts_s))) if num_lists > 1 else 0.0
+        cell_s = max(_CELL_S, _CELL_PERIODS * period_s)
+        cell = _CELL_M + _CELL_MPS * cell_s if len(ranged) else _CELL_BEARING
+        seen_m = seen_m[_comes_back(np.column_stack([seen_m / cell, receipts_s[numbers] / cell_s]), numbers)]
+        if len(seen_m) < _FEWEST:
             return found
-        sector = _sector(np.arctan2(offsets_m[:, 1], offsets_m[:, 0]), "sensor" in self.frames or mount is not None)
-        range_m = float(np.quantile(np.hypot(*offsets_m.T), 1.0 - _OUTSIDE)) if has_range.any() else None
+        sector = _sector(np.arctan2(seen_m[:, 1], seen_m[:, 0]), "sensor" in self.frames or mount is not None)
         axis_rad, full_rad = sector or (0.0, None)
-        limit_m = None if range_m is None else float(round(_RANGE_FACTOR * range_m))
+        range_m = _RANGE_FACTOR * float(np.quantile(np.hypot(*seen_m.T), 1.0 - _OUTSIDE))
+        limit_m = float(round(range_m)) if len(ranged) else None
         return replace(found, axis_rad=axis_rad, field_of_view_rad=full_rad, range_m=limit_m)
 
-    def lists(self, path: FloatArray, *columns: FloatArray) -> tuple[FloatArray, list[list[FloatArray]]]:
-        """Stamps of the lists, rising, and of each list its positions and its part of `columns`.
 
-        Positions are in the map where the ego's `path` is known. Detections without a range are left out.
-        """
-        rows = np.array(self.rows).reshape(-1, 6)
-        rows = rows[rows[:, 4] > 0.0]
-        points_m = rows[:, 2:4]
-        if "map" not in self.frames and len(path):
-            x_m, y_m, yaw_rad = (np.interp(rows[:, 1], path[:, 0], column) for column in path[:, 1:].T)
-            points_m = _turned(points_m, yaw_rad) + np.column_stack([x_m, y_m])
-        stamps_s = np.array(self.stamps_s)
-        begins = np.searchsorted(rows[:, 0], np.arange(len(stamps_s) + 1))  # rows stand list by list
-        parts = [slice(begins[k], begins[k + 1]) for k in np.argsort(stamps_s, kind="stable")]
-        return np.sort(stamps_s), [[column[one] for one in parts] for column in (points_m, *columns)]
-
-    def _offsets_m(self, rows: FloatArray, path: FloatArray, mount: Mount | None) -> FloatArray:
-        """Positions seen from the sensor or, where its mount is not known, from the ego, shape (n, 2)."""
-        points_m, ranged = rows[:, 2:4], bool(rows[0, 4])
-        if "map" in self.frames and ranged:
-            x_m, y_m, yaw_rad = (np.interp(rows[:, 1], path[:, 0], column) for column in path[:, 1:].T)
-            points_m = _turned(points_m - np.column_stack([x_m, y_m]), -yaw_rad)
-        if mount is None or "sensor" in self.frames:
-            return points_m
-        if ranged:
-            points_m = points_m - np.array([mount.x_m, mount.y_m])
-        return _turned(points_m, np.full(len(points_m), -mount.yaw_rad))
+def _revisit_s(stamps_ns: Sequence[int], points_m: Sequence[FloatArray]) -> float | None:
+    """Median time since the last list with a detection that could be the same object, in lists in order of receipt."""
+    lists = [(stamp_ns, points) for stamp_ns, points in zip(stamps_ns, points_m, strict=True) if len(points)]
+    found, first = list[float](), 0
+    for k, (stamp_ns, points) in enumerate(lists):
+        if len(found) >= _MOST_REVISITS:
+            break
+        while lists[first][0] < stamp_ns - nanoseconds(_MEMORY_S):
+            first += 1
+        for point_m in points:
+            for earlier_ns, earlier_m in reversed(lists[first:k]):
+                elapsed_s = seconds(stamp_ns - earlier_ns)
+                reach_m = _FASTEST_MPS * elapsed_s + _POSITION_M
+                if elapsed_s > 0.0 and (np.abs(earlier_m - point_m).max(axis=1) <= reach_m).any():
+                    found.append(elapsed_s)
+                    break
+    return median(found) if len(found) >= _FEWEST_REVISITS else None
 
 
 def _position(detection: Detection) -> tuple[float, float, float]:
@@ -218,7 +236,7 @@ def _turned(vectors_m: FloatArray, angles_rad: FloatArray) -> FloatArray:
 
 
 def _comes_back(points: FloatArray, numbers: IntArray) -> BoolArray:
-    """Which of `points`, shape (n, 3), share a unit cell with one of another list, of `numbers` (n,), shape (n,).
+    """True for `points`, shape (n, 3), that share a unit cell with one of another list, of `numbers` (n,); shape (n,).
 
     Two grids, half a cell apart: what crosses a border of one is inside a cell of the other.
     """

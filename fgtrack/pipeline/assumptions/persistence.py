@@ -27,8 +27,6 @@ _BESIDE_M = np.array([20.0, 20.0])
 """Farther than the hull of any object but large ships."""
 _CORE = 3.5
 """Second differences up to so many times their scale belong to one object: all but 0.2 % of a Rayleigh distribution."""
-_Line = tuple[FloatArray, FloatArray]
-"""Position and velocity, shape (2,) each."""
 _PROBABILITY = (0.1, 0.9)
 """Bounds of the detection probability: what hides an object hides it from several lists in a row."""
 
@@ -40,6 +38,10 @@ class Lists(NamedTuple):
     """Rising, shape (n,)."""
     points_m: Sequence[FloatArray]
     """Shape (m, 2) each."""
+    scores: Sequence[FloatArray]
+    """NaN where absent, shape (m,) each."""
+    ranges_m: Sequence[FloatArray]
+    """From the sensor, NaN where unknown, shape (m,) each."""
 
 
 @dataclass(frozen=True)
@@ -64,21 +66,18 @@ class Persistence:
     """Range beyond which most triples do not go on, so that clutter outweighs objects; None where they do at any."""
     lines: FloatArray
     """Stamp, position and velocity at the end of each triple, shape (n, 5)."""
-    std_m: float = 0.0
+    std_m: float
     """Standard deviation of a detection, per axis, of errors that differ from list to list."""
+    lists: Lists
 
 
-def disagreement_m(one: Persistence, own: Lists, other: Lists) -> float | None:
-    """Standard deviation, per axis, of where another sensor sees the objects of `one`, in its lists; None if unknown.
+def disagreement_m(one: Persistence, other: Lists) -> float | None:
+    """Standard deviation, per axis, of where another sensor, with the lists `other`, sees the objects of `one`.
 
-    A sensor alone does not show time-correlated errors, as on an object that is larger than what it sees of it.
-    Two detections are of one object if each is the nearest to the other: its neighbour is nearest where it is missed.
-    Both sensors see the same objects only if detections are nearer to where these are than to places beside them.
-
-    Parameters
-    ----------
-    own, other
-        Lists of the sensor of `one`, and of the other sensor.
+    None if unknown. A sensor alone does not show time-correlated errors, as on an object that is larger than what it
+    sees of it. Two detections are of one object if each is the nearest to the other: its neighbour is nearest where it
+    is missed. Both sensors see the same objects only if detections are nearer to where these are than to places beside
+    them.
     """
     distances_m, beside_m = [], []
     for stamp_s, *state in one.lines.tolist():
@@ -88,7 +87,7 @@ def disagreement_m(one: Persistence, own: Lists, other: Lists) -> float | None:
         if not len(points_m):
             continue
         nearest_m = points_m[np.argmin(np.hypot(*(points_m - at_m).T))]
-        rivals_m = own.points_m[int(np.searchsorted(own.stamps_s, stamp_s))]
+        rivals_m = one.lists.points_m[int(np.searchsorted(one.lists.stamps_s, stamp_s))]
         if np.hypot(*(rivals_m - nearest_m).T).min() < np.hypot(*(at_m - nearest_m)):
             continue
         distances_m.append(np.hypot(*(nearest_m - at_m)))
@@ -99,38 +98,24 @@ def disagreement_m(one: Persistence, own: Lists, other: Lists) -> float | None:
     return scale_m if scale_m < 0.5 * _scale(np.array(beside_m)) else None
 
 
-def persistence(
-    stamps_s: FloatArray,
-    points_m: Sequence[FloatArray],
-    scores: Sequence[FloatArray],
-    ranges_m: Sequence[FloatArray],
-) -> Persistence | None:
-    """Persistence of detections; None where too few detections follow one another.
-
-    Parameters
-    ----------
-    stamps_s
-        Stamps of the lists, rising, shape (n,).
-    points_m
-        Positions of each list in a frame that does not turn, shape (m, 2) each.
-    scores
-        Scores of each list, NaN where absent, shape (m,) each.
-    ranges_m
-        Ranges of each list from the sensor, NaN where unknown, shape (m,) each.
-    """
-    trees = [cKDTree(points) if len(points) else None for points in points_m]
+def persistence(lists: Lists) -> Persistence | None:
+    """Persistence of detections; None where too few detections follow one another."""
+    stamps_s, points_m = lists.stamps_s, lists.points_m
+    trees = [cKDTree(points) for points in points_m]
     every = max(1, math.ceil(sum(map(len, points_m)) / _MOST_CENTRES))
-    misfits, lines, found_scores, found_ranges_m = [], [], [], []
-    for k in range(1, len(stamps_s) - 3, every):
+    centres = range(1, len(stamps_s) - 3, every)
+    misfits, scores, ranges_m = list[float](), list[float](), list[float]()
+    lines: list[tuple[int, FloatArray, FloatArray]] = []
+    for k in centres:
         before_s, after_s = float(stamps_s[k] - stamps_s[k - 1]), float(stamps_s[k + 1] - stamps_s[k])
         if min(before_s, after_s) <= 0.0:
             continue
-        found_ranges_m += ranges_m[k].tolist()
-        for centre_m, score in zip(points_m[k], scores[k], strict=True):
-            best = _best(centre_m, trees[k - 1], trees[k + 1], before_s, after_s)
-            misfits.append(math.inf if best is None else best[0])
-            lines.append((k, None if best is None else best[1]))
-            found_scores.append(score)
+        scores += lists.scores[k].tolist()
+        ranges_m += lists.ranges_m[k].tolist()
+        for centre_m in points_m[k]:
+            misfit_m, end_m, velocity_mps = _best(centre_m, trees[k - 1], trees[k + 1], before_s, after_s)
+            misfits.append(misfit_m)
+            lines.append((k, end_m, velocity_mps))
     misfit = np.array(misfits)
     scale = _scale(misfit[np.isfinite(misfit)])
     in_triple = misfit <= _CORE * scale
@@ -139,23 +124,21 @@ def persistence(
         return None
     hits, of_object = 0, np.zeros(len(misfit), dtype=bool)
     for row in np.flatnonzero(in_triple).tolist():
-        k, line = lines[row]
-        if line is not None:
-            seen = _continued(line, stamps_s[k + 2 : k + 4] - stamps_s[k + 1], trees[k + 2 : k + 4], reach_m)
-            hits += sum(seen)
-            of_object[row] = all(seen)
+        k, end_m, velocity_mps = lines[row]
+        ahead_m = [end_m + velocity_mps * float(stamps_s[k + n] - stamps_s[k + 1]) for n in (2, 3)]
+        seen = [bool(trees[k + n].query(at_m)[0] <= (n - 1) * reach_m) for n, at_m in enumerate(ahead_m, start=2)]
+        hits += sum(seen)
+        of_object[row] = all(seen)
     share = (hits + 1) / (2 * num_triples + 2)
     probability = float(np.clip(share, *_PROBABILITY))
     of_objects = min(num_triples / probability**2, float(len(misfit)))  # the others' neighbours were missed
-    clutter = (len(misfit) - of_objects) / len(range(1, len(stamps_s) - 3, every))
-    score_model = _score(np.array(found_scores), of_object, ~in_triple)
-    near = None
-    if score_model is not None:
-        odds = len(misfit) / max(of_objects, 1.0) - 1.0
-        near = _near_clutter_per_m2(trees, [_of_clutter(one, score_model, odds) for one in scores])
-    max_range_m = _max_range_m(np.array(found_ranges_m)[in_triple], of_object[in_triple] / probability**2)
-    ends = [(stamps_s[k + 1], *line[0], *line[1]) for k, line in compress(lines, in_triple) if line is not None]
-    return Persistence(probability, clutter, near, score_model, max_range_m, np.array(ends), scale)
+    model, near = _score(np.array(scores), of_object, ~in_triple), None
+    if model is not None:
+        near = _near_clutter_per_m2(trees, lists.scores, model, len(misfit) / max(of_objects, 1.0) - 1.0)
+    max_range_m = _max_range_m(np.array(ranges_m)[in_triple], of_object[in_triple] / probability**2)
+    ends = [(stamps_s[k + 1], *end_m, *velocity_mps) for k, end_m, velocity_mps in compress(lines, in_triple)]
+    clutter = (len(misfit) - of_objects) / len(centres)
+    return Persistence(probability, clutter, near, model, max_range_m, np.array(ends), scale, lists)
 
 
 def _max_range_m(ranges_m: FloatArray, objects: FloatArray) -> float | None:
@@ -167,52 +150,34 @@ def _max_range_m(ranges_m: FloatArray, objects: FloatArray) -> float | None:
     return float(ranges_m[known][order][best]) if len(surplus) - best > _FEWEST_FAR else None
 
 
-def _of_clutter(scores: FloatArray, model: Score, odds: float) -> FloatArray:
-    """Probability that detections of these scores are clutter, before which the odds for it are `odds`."""
-    ratio = np.exp((np.nan_to_num(scores, nan=model.even) - model.even) / model.scale)
-    return odds / (odds + ratio)
-
-
-def _near_clutter_per_m2(trees: Sequence[cKDTree | None], of_clutter: Sequence[FloatArray]) -> float:
-    """Density of clutter of the next list around that of each, which are so with the probabilities `of_clutter`."""
-    together, total = 0.0, 0.0
-    for k, (tree, after) in enumerate(pairwise(trees)):
-        if tree is not None:
-            total += float(of_clutter[k].sum())
-        if tree is not None and after is not None:
-            for i, near in enumerate(tree.query_ball_tree(after, _LARGEST_ERROR_M)):
-                together += float(of_clutter[k][i] * of_clutter[k + 1][near].sum())
+def _near_clutter_per_m2(trees: Sequence[cKDTree], scores: Sequence[FloatArray], model: Score, odds: float) -> float:
+    """Density of clutter of the next list around that of each; before their scores the odds for clutter are `odds`."""
+    ratios = [np.exp((np.nan_to_num(one, nan=model.even) - model.even) / model.scale) for one in scores]
+    of_clutter = [odds / (odds + ratio) for ratio in ratios]
+    total, together = sum(float(one.sum()) for one in of_clutter[:-1]), 0.0
+    for (tree, own), (after, others) in pairwise(zip(trees, of_clutter, strict=True)):
+        for i, near in enumerate(tree.query_ball_tree(after, _LARGEST_ERROR_M)):
+            together += float(own[i] * others[near].sum())
     return together / (total * math.pi * _LARGEST_ERROR_M**2) if total else 0.0
 
 
-def _continued(line: _Line, ahead_s: FloatArray, trees: Sequence[cKDTree | None], reach_m: float) -> list[bool]:
-    """True for each of the next lists, `ahead_s` after the triple, that has a detection on its line."""
-    point_m, velocity_mps = line
-    return [
-        tree is not None and float(np.min(tree.query(point_m + velocity_mps * dt_s)[0])) <= n * reach_m
-        for n, (dt_s, tree) in enumerate(zip(ahead_s.tolist(), trees, strict=True), start=1)
-    ]
-
-
 def _best(
-    centre_m: FloatArray, before: cKDTree | None, after: cKDTree | None, before_s: float, after_s: float
-) -> tuple[float, _Line] | None:
-    """Misfit of the straightest triple about a detection, and the position and velocity at its end; None without one.
+    centre_m: FloatArray, before: cKDTree, after: cKDTree, before_s: float, after_s: float
+) -> tuple[float, FloatArray, FloatArray]:
+    """Misfit of the straightest triple about a detection, infinite without one; position and velocity at its end.
 
     The misfit has the standard deviation of a detection, per axis.
     """
-    if before is None or after is None:
-        return None
     near = before.query_ball_point(centre_m, _FASTEST_MPS * before_s + _LARGEST_ERROR_M)
-    if not near:
-        return None
+    if not near or not after.n:
+        return math.inf, centre_m, centre_m
     firsts_m, ratio = np.asarray(before.data)[near], after_s / before_s
     found = after.query(centre_m + ratio * (centre_m - firsts_m))
     distances_m, ends = np.asarray(found[0]), np.asarray(found[1])
     best = int(np.argmin(distances_m))
     end_m = np.asarray(after.data)[ends[best]]
     velocity_mps = (end_m - firsts_m[best]) / (before_s + after_s)
-    return float(distances_m[best]) / math.sqrt(1.0 + ratio**2 + (1.0 + ratio) ** 2), (end_m, velocity_mps)
+    return float(distances_m[best]) / math.sqrt(1.0 + ratio**2 + (1.0 + ratio) ** 2), end_m, velocity_mps
 
 
 def _scale(misfits: FloatArray, start: float = 0.5) -> float:
