@@ -15,14 +15,12 @@ from fgtrack.evaluation.diagnostics import (
     FEWEST,
     MOST_BREAKS_PER_MINUTE,
     USED,
-    Fragmentation,
-    innovation_lag1,
     misfits,
 )
 from fgtrack.evaluation.intervals import Estimate, by_stamp, mean_square
 from fgtrack.evaluation.metrics import ObjectMetrics, evaluate
 from fgtrack.evaluation.runs import EvaluatedRun
-from fgtrack.evaluation.scores.innovations import num_measured
+from fgtrack.evaluation.scores.innovations import autocorrelation, num_measured
 from fgtrack.io.run import Run
 
 __all__ = ["NoiseFit", "Outcome", "harm", "noise_findings", "noise_fits", "objection"]
@@ -67,7 +65,8 @@ def noise_fits(run: Run) -> list[NoiseFit]:
             continue
         samples = np.stack([updates["nis"][mine], dof[mine].astype(np.float64)], axis=-1)
         ratio = mean_square(by_stamp(updates["stamp_ns"][mine], samples), np.random.default_rng(0))
-        fits.append(NoiseFit(sensor, int(mine.sum()), ratio, innovation_lag1(run, sensor)))
+        white = autocorrelation(updates.where(updates["sensor"] == sensor))
+        fits.append(NoiseFit(sensor, int(mine.sum()), ratio, None if white is None else white.lag1))
     return fits
 
 
@@ -130,13 +129,13 @@ class Outcome:
         """Return the numbers of `run`."""
         counts = dict(run.meta["counts"])
         used = {name: sum(one.get(fate, 0) for fate in USED) / (sum(one.values()) or 1) for name, one in counts.items()}
-        truth, ticks_ns = evaluate(run).truth, run.tables["timing"]["now_ns"]
+        metrics, ticks_ns = evaluate(run), run.tables["timing"]["now_ns"]
         return cls(
             births=int(np.count_nonzero(run.tables["updates"]["disposition"] == "birth")),
-            confirmed=len(Fragmentation.of(run).lifetimes_s),
+            confirmed=metrics.num_confirmed,
             used=used,
             noise=tuple(noise_fits(run)),
-            truth=None if truth is None else truth.overall,
+            truth=None if metrics.truth is None else metrics.truth.overall,
             tick_s=float(np.ptp(ticks_ns)) / NS_PER_S / max(len(ticks_ns) - 1, 1) if len(ticks_ns) else 0.0,
         )
 

@@ -1,8 +1,8 @@
 """Diagnostics to read before a run is trusted: unused detections and why, inconsistent noise, broken tracks."""
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -55,54 +55,15 @@ _STANDING = {"birth.ego_speed_factor": 0.0}
 _NAME_EGO = "name its topic in the configuration (`fgtrack info` lists the topics)"
 
 
-@dataclass(frozen=True)
-class Fragmentation:
-    """Lifetimes and breaks of the tracks of a run that were ever confirmed: without truth."""
-
-    lifetimes_s: FloatArray
-    """From birth to end, shape (tracks,)."""
-    breaks: int
-    """Tracks that begin where and when another one ends, within the distance that the object can have travelled."""
-
-    @classmethod
-    def of(cls, run: Run) -> "Fragmentation":
-        """Return the fragmentation of `run`."""
-        tracks = run.tables["tracks"]
-        ids = np.unique(tracks["track_id"][confirmed(tracks)])
-        order = np.argsort(tracks["track_id"], kind="stable")
-        births, ends = (np.searchsorted(tracks["track_id"][order], ids, side) for side in ("left", "right"))
-        births, ends = order[births], order[ends - 1]
-        born_s, ended_s = ((tracks["now_ns"][each] - tracks["now_ns"][:1]) / NS_PER_S for each in (births, ends))
-        positions_m, speed_mps = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1), tracks["speed_mps"][ends]
-        velocities_mps = cartesian(np.stack([tracks["yaw_rad"][ends], speed_mps], axis=-1))
-        free, breaks = np.ones(len(ids), dtype=bool), 0
-        for k in np.argsort(born_s, kind="stable").tolist():
-            gap_s = born_s[k] - ended_s
-            late = (born_s < born_s[k]) & (ended_s < ended_s[k]) & (gap_s >= -_OVERLAP_S) & (gap_s <= _GAP_S)
-            before = np.flatnonzero(free & late)
-            expected_m = positions_m[ends[before]] + velocities_mps[before] * gap_s[before, None]
-            apart_m = np.linalg.norm(positions_m[births[k]] - expected_m, axis=-1)
-            near = apart_m <= _NEAR_M + _DEPARTURE * np.abs(speed_mps[before] * gap_s[before])
-            if near.any():
-                free[before[near][apart_m[near].argmin()]] = False
-                breaks += 1
-        return cls(ended_s - born_s, breaks)
-
-    @property
-    def median_s(self) -> float:
-        """Median lifetime; NaN without tracks."""
-        return float(np.median(self.lifetimes_s)) if len(self.lifetimes_s) else math.nan
-
-
 def diagnostics(run: Run) -> list[Diagnostic]:
     """Defects of `run`, as far as its files show them."""
-    kinds = (_stamps, _angles, _ego, _map, _unused, _failures, _fragmentation)
+    kinds = (_angles, _ego, _map, _sensors, _failures, _fragmentation)
     return [diagnostic for kind in kinds for diagnostic in kind(run)]
 
 
 def noise_diagnostics(run: Run) -> list[Diagnostic]:
     """Sensors whose innovations are inconsistent with the noise; see also the verdict of `compare`."""
-    result = []
+    updates, result = run.tables["updates"], []
     for sensor, nis in misfits(run):
         size = "small" if nis.mean > nis.dof else "large"
         factor = math.sqrt(max(nis.mean, 0.0) / nis.dof)  # below 0 by rounding, where one std is 1e9 of another
@@ -110,22 +71,12 @@ def noise_diagnostics(run: Run) -> list[Diagnostic]:
             f"mean NIS {nis.mean:.3g}, expected {nis.dof:.3g}: the configured noise is too {size}, as if "
             f"errors were {factor:.2g} times what is configured"
         )
-        lag1 = innovation_lag1(run, sensor)
-        if lag1 is not None and lag1 > CORRELATED:
-            text += f", and errors are correlated in time ({lag1:.2f}), which fitted white noise cannot express"
+        white = autocorrelation(updates.where(updates["sensor"] == sensor))
+        if white is not None and white.lag1 > CORRELATED:
+            text += f", and errors are correlated in time ({white.lag1:.2f}), which fitted white noise cannot express"
         fit = _advise(run, " --tune -o advised.yaml")
         result.append(Diagnostic(sensor, f"{text}; `{fit}` fits it, or reports what has to be done first"))
     return result
-
-
-def innovation_lag1(run: Run, sensor: str) -> float | None:
-    """Return the autocorrelation of the innovations of a sensor at lag 1; near 0 where white and the noise is tuned.
-
-    None where no track has enough of them.
-    """
-    updates = run.tables["updates"]
-    white = autocorrelation(updates.where(updates["sensor"] == sensor))
-    return None if white is None else white.lag1
 
 
 def misfits(run: Run) -> Iterator[tuple[str, ChiSquareMean]]:
@@ -133,12 +84,10 @@ def misfits(run: Run) -> Iterator[tuple[str, ChiSquareMean]]:
 
     The mean alone may be that of a few outliers, or of the first innovations of new tracks.
     """
-    updates = run.tables["updates"]
-    measured = num_measured(updates)
-    for sensor, mine in _by_sensor(updates):
-        nis = ChiSquareMean.of(updates["nis"][mine], measured[mine])
+    for sensor, mine in _by_sensor(run.tables["updates"]):
+        nis = ChiSquareMean.of(mine["nis"], num_measured(mine))
         if nis.count >= FEWEST and is_far_off(nis):
-            ratio = float(np.nanmedian(updates["nis"][mine])) / float(chdtri(nis.dof, 0.5))
+            ratio = float(np.nanmedian(mine["nis"])) / float(chdtri(nis.dof, 0.5))
             if ratio > FAR_OFF if nis.mean > nis.dof else ratio < 1.0 / FAR_OFF:
                 yield sensor, nis
 
@@ -150,11 +99,11 @@ def is_far_off(square: ChiSquareMean) -> bool:
 
 def unused(run: Run) -> str | None:
     """Line on the dispositions of a run that used no detection; None where one was used, or none was received."""
-    dispositions = run.tables["updates"]["disposition"]
-    if not len(dispositions) or np.isin(dispositions, USED).any():
+    counts = Counter(run.tables["updates"]["disposition"].tolist())
+    if not counts or counts.keys() & set(USED):
         return None
-    counts = zip(*np.unique(dispositions, return_counts=True), strict=True)
-    return f"none of the {len(dispositions)} detections was used ({', '.join(f'{n} {name}' for name, n in counts)})"
+    names = ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))
+    return f"none of the {counts.total()} detections was used ({names})"
 
 
 def reasons(counts: Mapping[str, int]) -> str:
@@ -182,22 +131,9 @@ def _advise(run: Run, options: str = "") -> str:
     return f"fgtrack advise{named}{options}"
 
 
-def _stamps(run: Run) -> Iterator[Diagnostic]:
-    updates = run.tables["updates"]
-    for sensor, mine in _by_sensor(updates):
-        if (updates["stamp_ns"][mine] == 0).all():
-            text = (
-                "all stamps are 0: its driver does not set them, so its delay is unknown; "
-                f"`stamp_from: receipt` on its topic, or sensors.{sensor}.stamp_from, takes the receipt for the stamp"
-            )
-            yield Diagnostic(sensor, text, {f"sensors.{sensor}.stamp_from": "receipt"})
-
-
 def _angles(run: Run) -> Iterator[Diagnostic]:
     """Angles that were recorded in degrees and read as radians."""
-    detections = run.tables["detections"]
-    by_sensor = ((sensor, detections.where(mine)) for sensor, mine in _by_sensor(detections))
-    for about, table in [(EGO, run.tables["ego"]), *by_sensor]:
+    for about, table in [(EGO, run.tables["ego"]), *_by_sensor(run.tables["detections"])]:
         for name in ANGULAR:
             finite = [value for value in table.get(name, np.empty(0)).tolist() if math.isfinite(value)]
             if wrong := in_degrees(about, name, min(finite, default=0.0), max(finite, default=0.0)):
@@ -206,11 +142,9 @@ def _angles(run: Run) -> Iterator[Diagnostic]:
 
 def _ego(run: Run) -> Iterator[Diagnostic]:
     """No ego where it is needed, or reasons for which more than half of its states were refused."""
-    failed = [f"{count} of {total} of {sensor}" for sensor, name, count, total in _mostly(run) if name == "failed"]
     num_states = run.tables["ego"].num_rows
-    if not num_states and failed:
-        text = f"no state was received, so nothing in its frame can be placed ({', '.join(failed)} failed)"
-        yield Diagnostic(EGO, f"{text}: {_NAME_EGO}")
+    if not num_states and any(name == "failed" for _, _, name, _ in _mostly(run)):
+        yield Diagnostic(EGO, f"no state was received, so nothing in its frame can be placed: {_NAME_EGO}")
     elif not num_states and _ego_speeds_births(run):
         text = (
             "no state was received, so new objects are assumed to stand still, and what the sensors could see is not "
@@ -235,7 +169,7 @@ def _map(run: Run) -> Iterator[Diagnostic]:
     if not _ego_speeds_births(run) or _section(run, "map").get("track") not in (None, OPEN_SPACE):
         return
     detections = run.tables["detections"]
-    blind = [name for name, mine in _by_sensor(detections) if not np.isfinite(detections["yaw_rad"][mine]).any()]
+    blind = [name for name, mine in _by_sensor(detections) if not np.isfinite(mine["yaw_rad"]).any()]
     if blind:
         text = (
             f"there is none, and no heading from {', '.join(blind)}: new objects may drive in any direction; name the "
@@ -249,43 +183,39 @@ def _ego_speeds_births(run: Run) -> bool:
     return bool(run.tables["updates"].num_rows and _section(run, "birth").get("ego_speed_factor"))
 
 
-def _mostly(run: Run) -> Iterator[tuple[str, str, int, int]]:
-    """Sensors of which more than half of the detections were not used for one reason: it, the count, and the total."""
-    updates = run.tables["updates"]
-    for sensor, mine in _by_sensor(updates):
-        for name, count in zip(*np.unique(updates["disposition"][mine], return_counts=True), strict=True):
-            if name not in USED and 2 * count > mine.sum():
-                yield sensor, str(name), int(count), int(mine.sum())
+def _mostly(run: Run) -> Iterator[tuple[str, Table, str, int]]:
+    """Sensors and their updates, of which more than half were not used for one reason: it, and their number."""
+    for sensor, mine in _by_sensor(run.tables["updates"]):
+        name, count = Counter(mine["disposition"].tolist()).most_common(1)[0]
+        if name not in USED and 2 * count > mine.num_rows:
+            yield sensor, mine, name, count
 
 
-def _unused(run: Run) -> Iterator[Diagnostic]:
-    """Dispositions of more than half of the detections of a sensor, where no other diagnostic has them."""
-    updates = run.tables["updates"]
-    for sensor, name, count, total in _mostly(run):
-        unset = name == "too_old" and not updates["stamp_ns"][updates["sensor"] == sensor].any()
-        if unset or (name == "failed" and not run.tables["ego"].num_rows):
+def _sensors(run: Run) -> Iterator[Diagnostic]:
+    """Stamps that no driver sets, and the disposition of most detections, where no other diagnostic explains it."""
+    unset = [name for name, mine in _by_sensor(run.tables["updates"]) if not mine["stamp_ns"].any()]
+    for sensor in unset:
+        text = (
+            "all stamps are 0: its driver does not set them, so its delay is unknown; "
+            f"`stamp_from: receipt` on its topic, or sensors.{sensor}.stamp_from, takes the receipt for the stamp"
+        )
+        yield Diagnostic(sensor, text, {f"sensors.{sensor}.stamp_from": "receipt"})
+    for sensor, mine, name, count in _mostly(run):
+        if (name == "too_old" and sensor in unset) or (name == "failed" and not run.tables["ego"].num_rows):
             continue
         by = reasons((run.meta.get("out_of_bounds") or {}).get(sensor, {}))
-        cure = _too_old(run, sensor) if name == "too_old" else _CURES[name].format(sensor=sensor, reasons=by)
-        yield Diagnostic(sensor, f"{count} of {total} {name}: {cure}")
+        cure = _too_old(run, sensor, mine) if name == "too_old" else _CURES[name].format(sensor=sensor, reasons=by)
+        yield Diagnostic(sensor, f"{count} of {mine.num_rows} {name}: {cure}")
 
 
-def _too_old(run: Run, sensor: str) -> str:
-    updates = run.tables["updates"].where(run.tables["updates"]["sensor"] == sensor)
+def _too_old(run: Run, sensor: str, updates: Table) -> str:
     delay_s = float(np.median(updates["receipt_ns"] - updates["stamp_ns"])) / NS_PER_S
-    limit_s = (_section(run, "sensors").get(sensor) or {}).get("max_delay_s")
-    if limit_s is not None and delay_s > limit_s:
-        cure = f"raise sensors.{sensor}.max_delay_s or correct its clock"
-        return f"median delay {delay_s:.3g} s, allowed {limit_s:g} s: {cure}"
-    reported = run.meta.get("effective") or {}
-    lag_s = float(reported.get("lag_s", np.inf))
-    window = f"the window ({reported.get('lag_key')} {lag_s:g} s)"
-    if delay_s > lag_s:
-        return f"median delay {delay_s:.3g} s, older than {window}: raise it, or correct the clock"
-    return (
-        f"median delay {delay_s:.3g} s, within {window}: no track is as old as these detections, check births, gate "
-        "and clock"
-    )
+    window = run.meta.get("effective") or {}
+    own = f"sensors.{sensor}.max_delay_s", (_section(run, "sensors").get(sensor) or {}).get("max_delay_s")
+    for key, limit_s in (own, (window.get("lag_key"), window.get("lag_s"))):
+        if limit_s is not None and delay_s > limit_s:
+            return f"median delay {delay_s:.3g} s, allowed {limit_s:g} s: raise {key}, or correct the clock"
+    return f"median delay {delay_s:.3g} s, but no track is as old as these detections: check births, gate and clock"
 
 
 def _failures(run: Run) -> Iterator[Diagnostic]:
@@ -300,16 +230,14 @@ def _failures(run: Run) -> Iterator[Diagnostic]:
 
 def _fragmentation(run: Run) -> Iterator[Diagnostic]:
     """Tracks that break off and begin again, and births that die unconfirmed: bad tracking that needs no truth."""
-    lives, now_ns = Fragmentation.of(run), run.tables["timing"]["now_ns"]
-    total, recorded_s = len(lives.lifetimes_s), float(np.ptp(now_ns)) / NS_PER_S if len(now_ns) else 0.0
-    minutes = float(lives.lifetimes_s.sum()) / 60.0
-    enough = lives.breaks >= max(_FEWEST_BREAKS, _BREAKS_SHARE * total)
-    if enough and lives.breaks > MOST_BREAKS_PER_MINUTE * minutes:
+    (lifetimes_s, num_breaks), now_ns = lifetimes_and_breaks(run), run.tables["timing"]["now_ns"]
+    total, minutes = len(lifetimes_s), float(lifetimes_s.sum()) / 60.0
+    if num_breaks >= max(_FEWEST_BREAKS, _BREAKS_SHARE * total) and num_breaks > MOST_BREAKS_PER_MINUTE * minutes:
         text = (
-            f"{lives.breaks} of {total} confirmed tracks begin where another one has just ended: "
-            f"{lives.breaks / minutes:.2g} breaks per object and minute, median life {lives.median_s:.2g} of "
-            f"{recorded_s:.3g} s; likely causes: a field of view or range larger than what a sensor covers, "
-            f"detection_probability, lifecycle.lifetime_s, noise; `{_advise(run)}` looks for them"
+            f"{num_breaks} of {total} confirmed tracks begin where another one has just ended: "
+            f"{num_breaks / minutes:.2g} breaks per object and minute, median life {np.median(lifetimes_s):.2g} of "
+            f"{float(np.ptp(now_ns)) / NS_PER_S:.3g} s; likely causes: a field of view or range larger than what a "
+            f"sensor covers, detection_probability, lifecycle.lifetime_s, noise; `{_advise(run)}` looks for them"
         )
         yield Diagnostic("tracks", text)
     dispositions = run.tables["updates"]["disposition"]
@@ -323,10 +251,36 @@ def _fragmentation(run: Run) -> Iterator[Diagnostic]:
         yield Diagnostic("tracks", text)
 
 
+def lifetimes_and_breaks(run: Run) -> tuple[FloatArray, int]:
+    """Return the lifetimes [s] of the confirmed tracks, shape (tracks,), and how many of them continue another one.
+
+    Such a track begins where and when another one ends, within the distance that the object can have travelled.
+    """
+    tracks = run.tables["tracks"]
+    tracks = tracks.where(np.isin(tracks["track_id"], tracks["track_id"][confirmed(tracks)]))
+    births = np.unique(tracks["track_id"], return_index=True)[1]
+    ends = tracks.num_rows - 1 - np.unique(tracks["track_id"][::-1], return_index=True)[1]
+    born_s, ended_s = ((tracks["now_ns"][each] - tracks["now_ns"][:1]) / NS_PER_S for each in (births, ends))
+    positions_m, speed_mps = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1), tracks["speed_mps"][ends]
+    velocities_mps = cartesian(np.stack([tracks["yaw_rad"][ends], speed_mps], axis=-1))
+    free, num_breaks = np.ones(len(births), dtype=bool), 0
+    for k in np.argsort(born_s, kind="stable").tolist():
+        gap_s = born_s[k] - ended_s
+        late = (born_s < born_s[k]) & (ended_s < ended_s[k]) & (gap_s >= -_OVERLAP_S) & (gap_s <= _GAP_S)
+        before = np.flatnonzero(free & late)
+        expected_m = positions_m[ends[before]] + velocities_mps[before] * gap_s[before, None]
+        apart_m = np.linalg.norm(positions_m[births[k]] - expected_m, axis=-1)
+        near = apart_m <= _NEAR_M + _DEPARTURE * np.abs(speed_mps[before] * gap_s[before])
+        if near.any():
+            free[before[near][apart_m[near].argmin()]] = False
+            num_breaks += 1
+    return ended_s - born_s, num_breaks
+
+
 def _section(run: Run, name: str) -> Mapping[str, Any]:
     return run.config.get(name) or {}
 
 
-def _by_sensor(table: Table) -> Iterator[tuple[str, Any]]:
+def _by_sensor(table: Table) -> Iterator[tuple[str, Table]]:
     for sensor in np.unique(table["sensor"]).tolist():
-        yield sensor, table["sensor"] == sensor
+        yield sensor, table.where(table["sensor"] == sensor)

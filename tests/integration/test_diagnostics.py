@@ -68,7 +68,7 @@ def test_no_ego(call: Call) -> None:
     code, (line,), _ = replayed(call, drive(ego=False))
     assert (
         code,
-        "ego: no state was received, so nothing in its frame can be placed (100 of 100" in line,
+        "ego: no state was received, so nothing in its frame can be placed: name its topic" in line,
     ) == (1, True)
     code, (line,), _ = replayed(call, drive(ego=False, frame="map"))
     assert (code, line.startswith("ego: no state was received, so new objects")) == (0, True)
