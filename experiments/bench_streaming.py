@@ -90,8 +90,7 @@ def main(
             for line in tables.verdict
             if any(part in line for part in ("evaluated when", "users also", "falls behind"))
         ]
-        few = [note for note in tables.tables["streaming"].notes if "samples" in note]
-        parts += [table(title, tables), *said, *few]
+        parts += [table(title, tables), *said]
     text = "\n\n".join(parts) + "\n"
     (out / "streaming.md").write_text(text, encoding="utf-8")
     if page is not None:

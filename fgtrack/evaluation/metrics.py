@@ -18,7 +18,6 @@ from fgtrack.evaluation.scores.innovations import (
     local_innovations,
     message_delays,
     moments_of,
-    num_measured,
     residuals,
 )
 from fgtrack.evaluation.scores.lagged import LagMetrics, lag_metrics
@@ -102,10 +101,6 @@ class SensorMetrics:
     """Receipt minus stamp of the messages that held a detection."""
     residuals: Mapping[str, Moments]
     """Innovations by name of `RESIDUAL_NAMES`, those that occur."""
-    nis: Moments
-    """Normalised innovation squared."""
-    nis_dof: Moments
-    """Number of measured components of the updates with a NIS: a consistent filter has this mean NIS."""
 
     @property
     def detections(self) -> int:
@@ -234,19 +229,15 @@ def _truth_metrics(run: Run, matching: Matching, options: EvaluationConfig) -> T
 
 def _sensor_metrics(run: Run) -> dict[str, SensorMetrics]:
     updates, values = run.tables["updates"], residuals(run)
-    measured = num_measured(updates)
     sensors = {}
     for sensor in np.unique(updates["sensor"]).tolist():
         mine = updates["sensor"] == sensor
-        with_nis = mine & np.isfinite(updates["nis"])
         moments = {name: moments_of(name, values[name][mine]) for name in RESIDUAL_NAMES}
         dispositions = updates["disposition"][mine].tolist()
         sensors[sensor] = SensorMetrics(
             dispositions={name.value: dispositions.count(name.value) for name in Disposition},
             delay_s=Distribution.of(message_delays(updates.where(mine))[1]),
             residuals={name: value for name, value in moments.items() if value.count},
-            nis=Moments.of(updates["nis"][with_nis]),
-            nis_dof=Moments.of(measured[with_nis].astype(np.float64)),
         )
     return sensors
 

@@ -82,7 +82,7 @@ def _page(runs: Sequence[EvaluatedRun], tables: Tables, pictures: Iterable[tuple
     folded_parts = {
         "Assumptions": _list(head.assumptions),
         "Advice": _list(head.advice),
-        "Tables": "".join(_wide(one.title, one.to_html()) + _list(one.shown_notes, "soft") for one in shown),
+        "Tables": "".join(_wide(one.title, one.to_html()) + _list(one.notes, "soft") for one in shown),
         "More figures": _figures(text for name, text in figures.items() if name not in first),
         "Configuration": _configuration(runs),
         "Runs": _grid("Sources", [_facts(one) for one in runs]),
@@ -118,7 +118,7 @@ def _template(name: str) -> str:
 
 
 def _list(lines: Iterable[str], kind: str = "") -> str:
-    items = "".join(f"<li>{escape(line)}</li>\n" for line in lines)
+    items = "".join(f"<li>{escape(printable(line))}</li>\n" for line in lines)
     name = f' class="{kind}"' if kind else ""
     return f"<ul{name}>\n{items}</ul>\n" if items else ""
 

@@ -131,7 +131,7 @@ def test_the_numbers_are_those_of_simulate_replay_and_compare(
         metrics = runs[row["estimator"]]
         error = metrics["truth"]["overall"]["errors"]["position_m"]["rmse"]
         assert row["truth.overall.errors.position_m.rmse"] == repr(error)
-        assert row["sensors.radar.nis.mean"] == repr(metrics["sensors"]["radar"]["nis"]["mean"])
+        assert row["consistency.nis.radar.mean"] == repr(metrics["consistency"]["nis"]["radar"]["mean"])
         received = metrics["sensors"]["lidar_cluster"]["detections"]
         assert row["sensors.lidar_cluster.detections"] == str(received)
 

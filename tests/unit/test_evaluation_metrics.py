@@ -125,12 +125,13 @@ def test_residuals_and_nis_are_summed_by_sensor(tmp_path: Path) -> None:
             update("radar", tick=1, nis=4.0, speed_mps=-2.0),
         ],
     }
-    sensors = evaluate(write_run(tmp_path / "run", updates=updates)).sensors
+    metrics = evaluate(write_run(tmp_path / "run", updates=updates))
+    sensors, nis = metrics.sensors, metrics.consistency.nis["lidar"]
     lidar = sensors["lidar"]
     assert (lidar.residuals["x_m"].mean, lidar.residuals["x_m"].std) == (2.0, 1.0)
     assert abs(lidar.residuals["yaw_rad"].mean) == pytest.approx(math.pi)
     assert lidar.residuals["yaw_rad"].std == pytest.approx(0.1)
-    assert (lidar.nis.mean, lidar.nis_dof.mean, lidar.nis.count) == (2.0, 3.0, 2)
+    assert (nis.mean, nis.dof, nis.count) == (2.0, 3.0, 2)
     assert set(sensors["radar"].residuals) == {"speed_mps"}
     assert "along_m" not in lidar.residuals  # track 1 was never published
 

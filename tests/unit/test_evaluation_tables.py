@@ -35,7 +35,6 @@ TABLES = {
     "consistency": ("run", "of"),
     **{f"residuals_{sensor}": ("run",) for sensor in SENSORS},
     "dispositions": ("run", "sensor"),
-    "failures": ("run",),
 }
 
 
@@ -50,8 +49,7 @@ def a_run(folder: Path, estimator: str, *, truth: bool = True) -> Run:
     }
     rows = [*WEST.truth(range(4)), *ROUND.truth(range(4))] if truth else []
     smoothed = {3: [WEST.later(k, 1, along_m=0.1) for k in range(2)]} if estimator == "smoother" else {}
-    meta = {"estimator": estimator, "failures": {"not finite": 0}}
-    return write_run(folder, tracks, truth=rows, updates=updates, smoothed=smoothed, meta=meta)
+    return write_run(folder, tracks, truth=rows, updates=updates, smoothed=smoothed, meta={"estimator": estimator})
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +66,7 @@ def tables(runs: dict[str, Run]) -> Tables:
 def rows_of(tables: Tables, name: str) -> list[str]:
     """Rows as they are shown in full."""
     table = tables.tables[name].in_full()
-    return [" ".join(column.cell(record) for column in table.columns) for record in table.records]
+    return [" ".join(column.cell(record) for column in table.shown) for record in table.records]
 
 
 def evaluated(label: str, run: Run, metrics: Metrics) -> EvaluatedRun:
@@ -119,8 +117,8 @@ def test_markdown_and_latex_have_a_cell_for_every_column(tables: Tables, name: s
     table = tables.tables[name].in_full()
     lines = [line for line in table.to_markdown().splitlines() if line.startswith("|")]
     head, _, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    assert len(head) == len(table.columns)
-    shown = [[column.cell(record) for column in table.columns] for record in table.records]
+    assert len(head) == len(table.shown)
+    shown = [[column.cell(record) for column in table.shown] for record in table.records]
     assert [row[1:] for row in rows] == [row[1:] for row in shown]
     assert [row[0] for row in rows if row[0]] == list(dict.fromkeys(row[0] for row in shown))
     lines = table.to_latex().splitlines()
@@ -168,7 +166,7 @@ def test_a_column_has_several_numbers_in_a_cell_and_a_dash_for_none() -> None:
 
 def test_few_tables_columns_and_rows_are_shown_unless_all_are_asked_for(tables: Tables) -> None:
     few, full = str(tables), str(tables.in_full())
-    for detail in ("Multi-object metrics", "Consistency (", "Residuals of", "preci-", "speed [m/s]", "precision:"):
+    for detail in ("Multi-object metrics", "Consistency (", "Residuals of", "preci-", "speed [m/s]"):
         assert detail not in few
         assert detail in full
     assert "tracked:" in few
@@ -176,8 +174,8 @@ def test_few_tables_columns_and_rows_are_shown_unless_all_are_asked_for(tables: 
     assert "across" in tables.in_full().to_markdown()
     assert "across" in tables.to_csv() == tables.in_full().to_csv(), "files with all digits have everything"
     assert tables.to_dict() == tables.in_full().to_dict()
-    assert list(tables[["lag", "failures"]]) == ["lag", "failures"]
-    assert "Failures" in str(tables[["failures"]])
+    assert list(tables[["lag", "consistency"]]) == ["lag", "consistency"]
+    assert "Consistency (" in str(tables[["consistency"]])
     assert str(tables.tables["lag"]) in few
 
 
@@ -221,7 +219,6 @@ def test_the_best_value_is_bold_in_every_form_that_has_bold() -> None:
 def test_the_verdict_stands_first_in_every_form(tables: Tables) -> None:
     for text in (str(tables), tables.to_markdown(), tables.to_latex()):
         assert text.lstrip("-% ").startswith(tables.verdict[0].split(" (")[0])
-    assert tables._repr_html_().startswith("<ul><li>")
 
 
 @pytest.mark.parametrize(
@@ -274,7 +271,6 @@ def test_the_multi_object_table_has_gospa_scores_switches_and_the_time_to_confir
     # a similarity of 0.725 passes 14 of 19 bounds: DetA 14/19 * 4/12, AssA 14/19 * 1/2, HOTA 14/19 sqrt(1/6)
     assert rows_of(tables, "multi_object") == [
         "run 5.71 2.75 3.54 3.54 0.000 5.71 -12.5 25.0 30.1 24.6 36.8 1 0.060",
-        f"plain{' -' * 13}",
     ]
     table = tables["multi_object"]
     assert (table["mota"][0], table["assa"][0]) == pytest.approx((-0.125, 7 / 19))
@@ -282,8 +278,8 @@ def test_the_multi_object_table_has_gospa_scores_switches_and_the_time_to_confir
 
 def test_the_lag_table_shows_the_gain_of_waiting(tables: Tables) -> None:
     assert rows_of(tables, "lag")[2:] == [
-        "smoother 0 8 0.354 - - 0.000 - 0.000 - 0.125",
-        "smoother window 2 0.100 80.0 - 0.000 - 0.000 - 0.010",  # too short for an interval
+        "smoother 0 8 0.354 - 0.000 0.000 0.125",
+        "smoother window 2 0.100 80.0 0.000 0.000 0.010",  # too short for an interval
     ]
     assert tables["lag"]["lag"].tolist() == ["0", "0", "0", "window"]
     np.testing.assert_array_equal(tables["lag"]["lag_s"], [0.0, 0.0, 0.0, math.nan])
@@ -312,18 +308,9 @@ def test_residuals_have_moments_nis_and_delay_and_dispositions_add_up(tables: Ta
         "smoother lidar_cluster 2 0 0 1 1 2",
         "smoother radar_long_range 1 0 0 0 1 1",
     ]
-    assert tables.tables["dispositions"].notes[0].startswith("no detection was out of sequence or beyond window or too")
+    assert tables.tables["dispositions"].notes[0].startswith("fused:")
     assert sum(int(table[name.value].sum()) for name in Disposition) == table["detections"].sum() == 9
     assert (table["fused"] + table["merged"] + table["refused"] == table["detections"]).all()
-
-
-def test_failures_are_shown_by_kind_where_there_are_any(tmp_path: Path, tables: Tables) -> None:
-    failures = {"not finite": 2, "update failed": 0}
-    run = write_run(tmp_path / "run", [[WEST.track(0, 1)]], meta={"failures": failures})
-    found = compare({"run": run})
-    assert (found.tables["failures"].is_detail, tables.tables["failures"].is_detail) == (False, True)
-    assert rows_of(found, "failures") == ["run 2 0 2"]
-    assert found["failures"]["update_failed"].tolist() == [0]
 
 
 def test_runs_without_truth_or_detections_have_no_errors_and_no_empty_tables(
@@ -331,7 +318,7 @@ def test_runs_without_truth_or_detections_have_no_errors_and_no_empty_tables(
 ) -> None:
     without = a_run(tmp_path / "without", "smoother", truth=False)
     alone = compare({"a": without})
-    headings = [column.heading for column in alone.tables["tracking"].columns]
+    headings = [column.heading for column in alone.tables["tracking"].shown]
     assert headings == ["run", "tracks all/\nconfirmed", "ms/tick\np50/p99"]
     assert "position_rmse_m" not in alone["tracking"]
     assert alone["consistency"]["of"].tolist() == [f"NIS {sensor}" for sensor in SENSORS]

@@ -1,13 +1,12 @@
 """Tables: records of numbers in SI units, printed on a terminal, as Markdown, LaTeX, HTML and CSV."""
 
-import csv
 import io
 import math
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
-from typing import Any, overload
+from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -26,6 +25,7 @@ PERCENT = 100.0
 MS = 1e3
 
 _WIDTH = 120  # of a table as text
+_ANY = 10_000  # wider than any cell
 _LONG = 40  # characters of an HTML cell that may be broken
 _MARKDOWN = str.maketrans({"\\": r"\\", "|": r"\|", "<": r"\<"})
 _LATEX = str.maketrans(
@@ -71,8 +71,6 @@ class Column:
     is_extra: bool = False
     """True if the column is shown only where the table is shown in full."""
     bold: Callable[[Record], bool] = lambda record: False
-    note: str = ""
-    """A line below the table where the column is shown."""
 
     def cell(self, record: Record) -> str:
         """Text of the numbers of `record`; a dash without any."""
@@ -87,7 +85,7 @@ class Column:
     @property
     def line(self) -> str:
         """The heading in one line."""
-        return printable(self.heading.replace("-\n", "").replace("/\n", "/").replace("\n", " "))
+        return self.heading.replace("-\n", "").replace("/\n", "/").replace("\n", " ")
 
 
 RUN = Column("run", left=True)
@@ -97,6 +95,13 @@ def named(name: str, moment: str) -> str:
     """Return `name` of a quantity with the `moment` before its unit: position_rmse_m."""
     quantity, _, unit = name.rpartition("_")
     return f"{quantity}_{moment}_{unit}"
+
+
+def _text(shown: object) -> str:
+    console = Console(file=io.StringIO(), width=_WIDTH, color_system=None, force_terminal=False)
+    with console.capture() as capture:
+        console.print(shown)
+    return capture.get().removesuffix("\n")
 
 
 @dataclass(frozen=True)
@@ -116,48 +121,37 @@ class Table:
     is_main: Callable[[Record], bool] = lambda record: True
     """True for the records that are shown unless the table is shown in full."""
 
+    __str__ = _text
+
     def in_full(self) -> "Table":
         """Return the table with all columns and records shown."""
         columns = [replace(column, is_extra=False) for column in self.columns]
         return Table(self.title, self.records, columns, self.keys, self.notes)
 
     @property
-    def names(self) -> list[str]:
-        """Names of all numbers."""
-        return list(dict.fromkeys(name for record in self.records for name in record))
-
-    @property
     def data(self) -> DataFrame:
         """All numbers as a pandas DataFrame."""
         import pandas as pd  # slow to load, and no command needs it
 
-        return pd.DataFrame([dict(record) for record in self.records], columns=self.names)
+        return pd.DataFrame([dict(record) for record in self.records])
 
     def plain(self) -> list[dict[str, Value | None]]:
         """Return the records as JSON values: None where there is no value."""
-        names = self.names
+        names = dict.fromkeys(name for record in self.records for name in record)
         return [{name: _plain(record.get(name)) for name in names} for record in self.records]
 
     def to_csv(self) -> str:
         """Return all numbers with all digits; an empty cell where there is no value."""
-        return csv_text([self.names, *(record.values() for record in self.plain())])
+        return _csv(self.plain())
 
     @property
     def shown(self) -> list[Column]:
-        """Columns shown."""
-        return [column for column in self.columns if not column.is_extra]
-
-    @property
-    def shown_notes(self) -> list[str]:
-        """Notes of the columns shown, and of the table."""
-        of_columns = (column.note for column in self.shown if column.note)
-        return list(dict.fromkeys(map(printable, (*of_columns, *self.notes))))
+        """Columns shown: those with a value, unless extra."""
+        shown = [column for column in self.columns if not column.is_extra]
+        return [column for column in shown if any(column.cell(record) != NO_VALUE for record in self.records)]
 
     def rows(self, text: Callable[[str], str] = str, bold: str = "{}") -> list[list[str]]:
-        """Return the cells shown, each as `text` of it, `bold` ones in that format; a first cell that repeats is empty.
-
-        A row has an entry for each of `shown`.
-        """
+        """Return a row of cells for each record shown, `bold` ones in that format; a repeated first cell is empty."""
         rows = [
             [
                 bold.format(text(column.cell(record))) if column.bold(record) else text(column.cell(record))
@@ -176,19 +170,19 @@ class Table:
         head = [_markdown(column.line) for column in self.shown]
         rule = [":---" if column.left else "---:" for column in self.shown]
         rows = [f"| {' | '.join(row)} |" for row in (head, rule, *self.rows(_markdown, "**{}**"))]
-        notes = [f"- {_markdown(note)}" for note in self.shown_notes]
-        return "\n".join([f"### {_markdown(printable(self.title))}", "", *rows, "", *notes, *([""] if notes else [])])
+        notes = [f"- {_markdown(note)}" for note in self.notes]
+        return "\n".join([f"### {_markdown(self.title)}", "", *rows, "", *notes, *([""] if notes else [])])
 
     def to_latex(self) -> str:
         """Return a table environment with the rules of package booktabs; notes as comments."""
         rows = [f"{' & '.join(row)} \\\\" for row in self.rows(_latex, r"\textbf{{{}}}")]
         return "\n".join(
             [
-                *(r"\begin{table}", r"\centering", f"\\caption{{{_latex(printable(self.title))}}}"),
+                *(r"\begin{table}", r"\centering", f"\\caption{{{_latex(self.title)}}}"),
                 f"\\begin{{tabular}}{{{''.join('l' if column.left else 'r' for column in self.shown)}}}",
                 *(r"\toprule", f"{' & '.join(_latex(column.line) for column in self.shown)} \\\\", r"\midrule"),
                 *(*rows, r"\bottomrule", r"\end{tabular}"),
-                *(*(f"% {note}" for note in self.shown_notes), r"\end{table}", ""),
+                *(*(f"% {printable(note)}" for note in self.notes), r"\end{table}", ""),
             ]
         )
 
@@ -202,27 +196,25 @@ class Table:
         body = "".join(f"<tr>{row}</tr>\n" for row in rows)
         return f"<thead><tr>{''.join(head)}</tr></thead>\n<tbody>\n{body}</tbody>\n"
 
-    def __str__(self) -> str:
-        return _text(self)
-
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Grids in the width: columns without room stand in further ones below, with the names of the rows."""
         yield Text(f"\n{printable(self.title)}")
-        yield from self._grids(options.max_width)
-        yield from map(Text, self.shown_notes)
-
-    def _grids(self, width: int) -> Iterator[Grid | Text]:
-        """Grids of at most `width`: columns without room stand in further ones below, with the names of the rows."""
         shown = self.shown
         rows = [[Text.from_markup(cell, emoji=False) for cell in row] for row in self.rows(rich_escape, "[bold]{}[/]")]
-        heads = [Text(printable_lines(column.heading)) for column in shown]
-        sizes = [
-            2
-            + max(line.cell_len for text in (head, *(row[k] for row in rows)) for line in text.split(allow_blank=True))
-            for k, head in enumerate(heads)
-        ]
+
+        def grid(indices: Sequence[int]) -> Grid:
+            result = Grid(box=SIMPLE_HEAD, show_edge=False, padding=(0, 0, 0, 1), header_style="")
+            for k in indices:
+                left, heading = shown[k].left, Text(printable_lines(shown[k].heading))
+                justify: Any = "left" if left else "right"  # Any: rich has a Literal
+                result.add_column(heading, justify=justify, vertical="bottom", no_wrap=not left, overflow="fold")
+            for row in rows:
+                result.add_row(*(row[k] for k in indices))
+            return result
+
+        sizes = [1 + console.measure(grid([k]), options=options.update_width(_ANY)).maximum for k in range(len(shown))]
         num_names = next((k for k, column in enumerate(shown) if not column.left), len(shown))
-        names = list(range(num_names))
-        free = width + 1 - min(sum(sizes[:num_names]), width // 2)  # longer names are broken
+        free = options.max_width + 1 - min(sum(sizes[:num_names]), options.max_width // 2)  # longer names are broken
         parts: list[list[int]] = [[]]
         for k in range(num_names, len(shown)):
             if parts[-1] and sum(sizes[each] for each in (*parts[-1], k)) > free:
@@ -231,14 +223,8 @@ class Table:
         for number, part in enumerate(parts):
             if number:
                 yield Text("continued:")
-            grid = Grid(box=SIMPLE_HEAD, show_edge=False, padding=(0, 0, 0, 1), header_style="")
-            for k in (*names, *part):
-                left = shown[k].left
-                justify: Any = "left" if left else "right"  # Any: rich has a Literal
-                grid.add_column(heads[k], justify=justify, vertical="bottom", no_wrap=not left, overflow="fold")
-            for row in rows:
-                grid.add_row(*(row[k] for k in (*names, *part)))
-            yield grid
+            yield grid([*range(num_names), *part])
+        yield from (Text(printable(note)) for note in self.notes)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -258,12 +244,6 @@ class Tables(Mapping[str, DataFrame]):
         """Return the tables, all of them shown with all columns and records."""
         return replace(self, tables={name: table.in_full() for name, table in self.tables.items()})
 
-    @overload
-    def __getitem__(self, name: str) -> DataFrame: ...
-
-    @overload
-    def __getitem__(self, name: list[str]) -> "Tables": ...
-
     def __getitem__(self, name: str | list[str]) -> DataFrame:
         if isinstance(name, list):
             return Tables({each: self.tables[each].in_full() for each in name})
@@ -275,16 +255,10 @@ class Tables(Mapping[str, DataFrame]):
     def __len__(self) -> int:
         return len(self.tables)
 
-    def __str__(self) -> str:
-        return _text(self)
+    __str__ = _text
 
     def __repr__(self) -> str:
         return "\n  ".join(["Tables", *self.verdict, ", ".join(self.tables)])
-
-    def _repr_html_(self) -> str:
-        verdict = "".join(f"<li>{escape(printable(line))}</li>" for line in self.verdict)
-        tables = (f"<table><caption>{escape(one.title)}</caption>{one.to_html()}</table>" for one in self._filled())
-        return f"<ul>{verdict}</ul>{''.join(tables)}"
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         yield from bulleted(self.verdict, options.max_width)
@@ -292,7 +266,7 @@ class Tables(Mapping[str, DataFrame]):
 
     def to_markdown(self) -> str:
         """Return verdict and tables, as far as they are shown."""
-        verdict = "".join(f"- {_markdown(printable(line))}\n" for line in self.verdict)
+        verdict = "".join(f"- {_markdown(line)}\n" for line in self.verdict)
         return f"{verdict}\n" * bool(verdict) + "\n".join(table.to_markdown() for table in self._filled())
 
     def to_latex(self) -> str:
@@ -302,12 +276,13 @@ class Tables(Mapping[str, DataFrame]):
 
     def to_csv(self) -> str:
         """Return all numbers, one in a row of five columns: table, run, part (sensor, lag), quantity, value."""
-        rows: list[Sequence[Value | None]] = [("table", "run", "part", "quantity", "value")]
+        rows = []
         for name, table in self.tables.items():
             for record in table.plain():
-                run, *part = (record[key] for key in table.keys)
-                rows += [(name, run, *(part or [""]), k, v) for k, v in record.items() if k not in table.keys]
-        return csv_text(rows)
+                run, part = (*(record.pop(key) for key in table.keys), "")[:2]
+                head = {"table": name, "run": run, "part": part}
+                rows += [{**head, "quantity": quantity, "value": value} for quantity, value in record.items()]
+        return _csv(rows)
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON values: the verdict, the details, and the tables as lists of records."""
@@ -334,27 +309,20 @@ def html_cell(tag: str, content: str, is_left: bool) -> str:
     return f'<{tag} class="{kind}">{lines}</{tag}>' if kind else f"<{tag}>{lines}</{tag}>"
 
 
-def csv_text(rows: Iterable[Iterable[Value | None]]) -> str:
-    """Return rows as CSV; None and NaN are empty cells."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(map(_plain, row) for row in rows)
-    return text.getvalue()
+def _csv(records: Sequence[Record]) -> str:
+    import pandas as pd
 
-
-def _text(shown: Table | Tables) -> str:
-    console = Console(file=io.StringIO(), width=_WIDTH, color_system=None, force_terminal=False)
-    with console.capture() as capture:
-        console.print(shown)
-    return capture.get().removesuffix("\n")
+    text: str = pd.DataFrame(records, dtype=object).to_csv(index=False, lineterminator="\n")
+    return text
 
 
 def _markdown(text: str) -> str:
     """Return `text` without anything that Markdown, or HTML in it, would interpret: cells, elements, links."""
-    return text.translate(_MARKDOWN).replace("](", r"]\(")
+    return printable(text).translate(_MARKDOWN).replace("](", r"]\(")
 
 
 def _latex(text: str) -> str:
-    return text.translate(_LATEX)
+    return printable(text).translate(_LATEX)
 
 
 def _plain(value: Any) -> Any:

@@ -7,7 +7,6 @@ published. Times come from timing.csv, so nothing here depends on the machine th
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -23,7 +22,8 @@ from fgtrack.evaluation.comparison import (
     entry_columns,
     entry_record,
 )
-from fgtrack.evaluation.intervals import UNKNOWN, by_stamp
+from fgtrack.evaluation.intervals import by_stamp
+from fgtrack.evaluation.matching import Matching
 from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.scores.statistics import Distribution
 from fgtrack.evaluation.tables import MS, PERCENT, RUN, Column, Table
@@ -36,21 +36,18 @@ from fgtrack.io.run import Node, Run, ready_times
 ASKED, READY, PREDICTED = "asked", "ready", "predicted"
 
 _TITLES = {ASKED: "at its stamp", READY: "when ready", PREDICTED: "predicted to then"}
-_LARGE_SHARE = 0.9
 
 
-def streaming_errors(one: EvaluatedRun) -> dict[str, FloatArray]:
-    """Return distances to the truth of the paired rows of `one`, by when they are evaluated, shape (p,) each.
+def streaming_errors(run: Run, matching: Matching) -> dict[str, FloatArray]:
+    """Return distances to the truth of the paired rows, by when they are evaluated, shape (p,) each.
 
     Predictions move the published position along the published yaw at the published speed; a state without yaw or
     speed stays. NaN where there is no truth then.
     """
-    matching = one.matching
-    assert matching is not None
     rows = np.flatnonzero(matching.paired)
-    tracks, ticks = matching.tracks.where(matching.paired), matching.tick_index[rows]
-    object_index, ready_ns = matching.object_index[rows], _ready(one.run)[0][ticks]
-    truth = true_states(one.run.tables["truth"], object_index, ready_ns)[:, :2]
+    tracks, object_index = matching.tracks.where(matching.paired), matching.object_index[rows]
+    ready_ns = _ready(run)[0][matching.tick_index[rows]]
+    truth = true_states(run.tables["truth"], object_index, ready_ns)[:, :2]
     published = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
     way_m = tracks["speed_mps"] * (ready_ns - tracks["stamp_ns"]) / NS_PER_S
     moved = published + np.nan_to_num(cartesian(np.stack([tracks["yaw_rad"], way_m], axis=-1)))
@@ -64,36 +61,25 @@ def streaming_errors(one: EvaluatedRun) -> dict[str, FloatArray]:
 def streaming_tables(runs: Sequence[EvaluatedRun]) -> tuple[dict[str, Table], list[str]]:
     """Return tables `streaming` and `load` of `runs`, and sentences on the best run when each pays for its time.
 
-    A run with a load above 1 is not ranked beside others that keep up: its loss has no bound, and the few samples
-    before the truth ends would decide.
+    A run with a load above 1 is not ranked: its loss has no bound, and the few samples before the truth ends would
+    decide.
     """
-    records: list[dict[str, Any]] = []
-    notes, sentences = [], []
-    load = _load(runs)
-    loads = {record["run"]: record["load"] for record in load.records}
-    for group in comparable(runs):
-        late = [one for one in group if loads[one.label] > 1.0]
-        ranked = [one for one in group if one not in late] or group
-        entries, share = _compared(ranked)
-        if share < _LARGE_SHARE:
-            names = ", ".join(one.label for one in ranked)
-            notes.append(f"{names}: {share:.0%} of the samples count: the truth ends before the others are ready")
-        if len(ranked) > 1 and entries:
+    load, records, sentences = _load(runs), [], []
+    late = {record["run"]: record["load"] for record in load.records if record["load"] > 1.0}
+    for group in comparable([one for one in runs if one.label not in late]):
+        entries = _compared(group)
+        if len(group) > 1 and entries:
             sentences += [
                 who_is_best(entries[READY], "where each is evaluated when it is ready"),
                 who_is_best(entries[PREDICTED], "where users also predict what they get to that moment"),
             ]
-        for one in late:
-            behind = f"{one.label} falls behind for good (load {loads[one.label]:.0%})"
-            sentences.append(f"{behind}: the longer the run, the worse.")
-            if one not in ranked:
-                alone, share = _compared([one])
-                notes.append(f"{behind}: not ranked, evaluated at {share:.0%} of its samples, until the truth ends")
-                for when, (entry,) in alone.items():
-                    entries[when] = (*entries.get(when, ()), Entry(entry.name, entry.value, UNKNOWN, "worse"))
         for when, of_runs in entries.items():
             records += [{"judged": when, **entry_record(entry, "position_rmse_m")} for entry in of_runs]
-    own = [
+    for label, share in late.items():
+        sentences.append(
+            f"{label} falls behind for good (load {share:.0%}): not ranked, the longer the run, the worse."
+        )
+    notes = [
         "when ready: as published, against the truth when its computation was done",
         "predicted: the same, moved straight on to then at its own speed by its user",
         STANDING_NOTE,
@@ -101,33 +87,24 @@ def streaming_tables(runs: Sequence[EvaluatedRun]) -> tuple[dict[str, Table], li
     evaluated = Column("evaluated", "judged", text=lambda name: _TITLES[str(name)], left=True)
     columns = [evaluated, RUN, *entry_columns("pos. [m]", "position_rmse_m")]
     title = "Streaming accuracy (position RMSE, each run paying for its time)"
-    streaming = Table(title, records, columns, ("run", "judged"), [*own, *notes])
-    return {"streaming": streaming, "load": load}, sentences
+    return {"streaming": Table(title, records, columns, ("run", "judged"), notes), "load": load}, sentences
 
 
-def _compared(group: Sequence[EvaluatedRun]) -> tuple[dict[str, tuple[Entry, ...]], float]:
-    """Runs of one recording by when they are evaluated, and the least share of a run's samples that counts.
-
-    All numbers are of the objects and ticks that all runs have, with truth when they are ready.
-    """
-    every, objects, ticks_ns, most = [], [], [], 0
-    for one in group:
-        errors_m, matching = streaming_errors(one), one.matching
-        assert matching is not None
-        known = np.isfinite(errors_m[READY])
-        every.append({name: values[known] for name, values in errors_m.items()})
-        objects.append(matching.object_index[matching.paired][known])
-        ticks_ns.append(matching.now_ns[matching.tick_index[matching.paired][known]])
-        most = max(most, len(known))
+def _compared(group: Sequence[EvaluatedRun]) -> dict[str, tuple[Entry, ...]]:
+    """Runs of one recording by when they are evaluated, at the objects and ticks that all have, with truth then."""
+    pairs = [(one.run, one.matching) for one in group if one.matching is not None]
+    errors_m = [streaming_errors(run, matching) for run, matching in pairs]
+    objects = [matching.object_index[matching.paired] for _, matching in pairs]
+    ticks_ns = [matching.now_ns[matching.tick_index[matching.paired]] for _, matching in pairs]
     _, at_ns, rows = common_samples(objects, ticks_ns)
-    if not len(at_ns):
-        return {}, 0.0
-    entries = {}
-    for name in (ASKED, READY, PREDICTED):
-        squares_m2 = [np.square(one[name][row]) for one, row in zip(every, rows, strict=True)]
-        sums = by_stamp(at_ns, np.stack(squares_m2, axis=-1))
-        entries[name] = compared(name, [one.label for one in group], sums)
-    return entries, len(at_ns) / most
+    every_m = {
+        when: np.stack([one[when][row] for one, row in zip(errors_m, rows, strict=True)], axis=-1) for when in _TITLES
+    }
+    known = np.isfinite(every_m[READY]).all(axis=1)
+    if not known.any():
+        return {}
+    labels = [one.label for one in group]
+    return {when: compared(when, labels, by_stamp(at_ns[known], np.square(m[known]))) for when, m in every_m.items()}
 
 
 def _ready(run: Run) -> tuple[IntArray, Node]:
@@ -139,16 +116,15 @@ def _ready(run: Run) -> tuple[IntArray, Node]:
 
 def _load(runs: Sequence[EvaluatedRun]) -> Table:
     """A row for each run: time from its tick until an output was ready, late ticks, load."""
-    records: list[dict[str, Any]] = []
+    records = []
     for one in runs:
         timing, (ready_ns, node) = one.run.tables["timing"], _ready(one.run)
-        now_ns = timing["now_ns"]
-        delay, length_ns = Distribution.of((ready_ns - now_ns) / NS_PER_S), int(np.ptp(now_ns)) if len(now_ns) else 0
-        record = {"run": one.label, "ready_after_p50_s": delay.p50, "ready_after_p99_s": delay.p99}
-        record |= {"ready_after_max_s": delay.max}
-        misses, ticks = (node.misses, len(now_ns)) if node.period_ns is not None else (None, None)
+        now_ns, is_periodic = timing["now_ns"], node.period_ns is not None
+        delay, length_ns = Distribution.of((ready_ns - now_ns) / NS_PER_S), np.ptp(now_ns) if len(now_ns) else 0
+        times = {"ready_after_p50_s": delay.p50, "ready_after_p99_s": delay.p99, "ready_after_max_s": delay.max}
+        misses = {"deadline_misses": node.misses, "ticks": len(now_ns)} if is_periodic else {}
         load = float(timing["process_ns"].sum() / length_ns) if length_ns else np.nan
-        records.append(record | {"deadline_misses": misses, "ticks": ticks, "load": load})
+        records.append({"run": one.label, **times, "deadline_misses": None, "ticks": None, **misses, "load": load})
     columns = [
         RUN,
         Column("ready after\n[ms] p50/p99", "ready_after_p50_s ready_after_p99_s", "{}/{}", MS),
