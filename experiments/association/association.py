@@ -38,9 +38,7 @@ from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.object_bank import ObjectBank
-from fgtrack.estimation.smoothing.bank import SmootherBank
-from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
-from fgtrack.estimation.smoothing.settings import SmootherSettings
+from fgtrack.estimation.registry import estimator_bank
 from fgtrack.evaluation.palette import PALETTE
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
@@ -164,8 +162,7 @@ def replaying() -> TrackBank:
 
 def smoothing() -> TrackBank:
     """The bank of `smoother`."""
-    settings = SmootherSettings(lag_s=LAG_S, lagged_s=(), final=False)
-    return SmootherBank(MOTION, settings, IncrementalSolver)
+    return estimator_bank("smoother", MOTION, LAG_S, {})
 
 
 def at_stamp(bank: TrackBank, stamp_ns: int) -> StatesAt:

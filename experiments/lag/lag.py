@@ -15,12 +15,10 @@ import numpy as np
 import typer
 from scipy.stats import chi2
 
+import fgtrack
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.smoothing.bank import FixedLagSmoother
-from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
-from fgtrack.estimation.smoothing.settings import SmootherSettings
+from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.sim.vehicles import drawn
@@ -56,7 +54,7 @@ def stamp(k: int) -> int:
     return START_NS + round(k * STEP_S * NS_PER_S)
 
 
-def smoother(start: FloatArray, lag_s: float) -> FixedLagSmoother:
+def smoother(start: FloatArray, lag_s: float) -> Estimator:
     x_m, y_m, yaw_rad, speed_mps, yaw_rate_radps = start.tolist()
     prior = Start(
         stamp_ns=START_NS,
@@ -69,8 +67,7 @@ def smoother(start: FloatArray, lag_s: float) -> FixedLagSmoother:
         yaw_rate_radps=yaw_rate_radps,
         yaw_rate_std_radps=PRIOR_STD[4],
     )
-    settings = SmootherSettings(lag_s=lag_s, lagged_s=(), final=False)
-    return FixedLagSmoother(MOTION, prior, settings, IncrementalSolver)
+    return fgtrack.estimator("smoother", MOTION, prior, lag_s=lag_s)
 
 
 def judged(run: Run, lag_s: float) -> tuple[FloatArray, FloatArray, float]:

@@ -148,7 +148,7 @@ class OneObject:
 
     def __init__(self, motion: MotionModel, bank: TrackBank, start: Start) -> None:
         self._motion = motion
-        self._bank = bank
+        self.bank = bank
         self._first_ns = self._newest_ns = start.stamp_ns
         bank.advance(start.stamp_ns)
         bank.birth(0, start)
@@ -156,12 +156,12 @@ class OneObject:
     @property
     def window_ns(self) -> tuple[int, int]:
         """See `Estimator.window_ns`."""
-        return max(self._bank.window_start_ns, self._first_ns), self._newest_ns
+        return max(self.bank.window_start_ns, self._first_ns), self._newest_ns
 
     def advance(self, now_ns: int) -> None:
         """See `Estimator.advance`."""
-        if now_ns > self._bank.present_ns:
-            self._bank.advance(now_ns)
+        if now_ns > self.bank.present_ns:
+            self.bank.advance(now_ns)
 
     def update(self, measurement: Measurement) -> UpdateResult:
         """See `Estimator.update`."""
@@ -171,14 +171,14 @@ class OneObject:
         if not (np.isfinite(measurement.z).all() and np.isfinite(measurement.R).all()):
             return UpdateResult(UpdateStatus.FAILED)  # before the clock moves
         self.advance(stamp_ns)
-        result = self._bank.update(stamp_ns, [0], [measurement.seen_by(self._motion)])[0]
+        result = self.bank.update(stamp_ns, [0], [measurement.seen_by(self._motion)])[0]
         if result.status is not UpdateStatus.FAILED:
             self._newest_ns = max(self._newest_ns, stamp_ns)
         return result
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`."""
-        return state_of(self._bank, self._motion, 0, stamp_ns)
+        return state_of(self.bank, self._motion, 0, stamp_ns)
 
 
 def states_of(bank: TrackBank, motion: MotionModel, stamp_ns: int) -> StatesAt:

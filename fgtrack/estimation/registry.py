@@ -34,9 +34,9 @@ ESTIMATORS = Registry(
             "iekf-replay": "fgtrack.estimation.filters.iekf:IekfReplay",
             "imm-replay": "fgtrack.estimation.filters.imm:ImmReplay",
             "iplf-replay": "fgtrack.estimation.filters.ukf:IplfReplay",
-            "smoother": "fgtrack.estimation.smoothing.gtsam.incremental:smoother",
-            "smoother-batch": "fgtrack.estimation.smoothing.gtsam.batch:smoother_batch",
-            "smoother-banded": "fgtrack.estimation.smoothing.bank:smoother_banded",
+            "smoother": "fgtrack.estimation.smoothing.gtsam.incremental:IncrementalBank",
+            "smoother-batch": "fgtrack.estimation.smoothing.gtsam.batch:BatchBank",
+            "smoother-banded": "fgtrack.estimation.smoothing.bank:SmootherBank",
             "ukf-replay": "fgtrack.estimation.filters.ukf:UkfReplay",
         },
         OOSM_GROUP: {
@@ -76,8 +76,8 @@ class Claims:
     """For which late measurements a linear model gives the dense joint posterior of all accepted ones; empty for none.
     One that says `any lag, any number` is held to it by `fgtrack verify` and `check_estimator`."""
     nonlinear: Literal["at once", "at convergence", "never"] = "at once"
-    """When, in a nonlinear model, estimates do not depend on the order of arrival: by themselves, after the estimator's
-    own method `converge()`, or never, where an estimate keeps its linearisation."""
+    """When, in a nonlinear model, estimates do not depend on the order of arrival: by themselves, after the method
+    `converge()` of the estimator or bank, or never, where an estimate keeps its linearisation."""
     smooths: bool = False
     """True if states of the past contain later measurements; a filter's do not."""
     tolerance: float = 1e-9

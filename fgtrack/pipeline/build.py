@@ -1,8 +1,8 @@
 """From a configuration to a tracker."""
 
-from collections.abc import Callable, Collection, Mapping
-from importlib import import_module
+from collections.abc import Callable, Collection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
 from fgtrack.models.published_map import PublishedMap
 from fgtrack.models.road import Road
 from fgtrack.models.track_map import TrackMap
-from fgtrack.pipeline.config import NOISE_HZ, Config, Defect, MapConfig
+from fgtrack.pipeline.config import NOISE_HZ, SMOOTHERS, Config, Defect, MapConfig
 from fgtrack.tracking.ego import EgoStd, EgoTrajectory
 from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules, Lifecycle
 from fgtrack.tracking.guarded_bank import GuardedBank
@@ -101,7 +101,7 @@ def _read_map(name: str, built_in: Callable[[], TrackMap]) -> TrackMap:
     return TrackMap.read(Path(name))
 
 
-def _build_backward_forward(config: Config, failures: Failures) -> TrackBank:
+def _build_backward_forward(config: Config) -> TrackBank:
     step_ns = period_ns(config.filter.frequency_hz)
     leads, is_stale = "leading_clock" in config.defects, "stale_present" in config.defects
     steps = round(config.filter.storage_s * config.filter.frequency_hz)
@@ -122,38 +122,22 @@ def _build_backward_forward(config: Config, failures: Failures) -> TrackBank:
     return ObjectBank(motion, one, config.filter.storage_s)
 
 
-def _smoother(module: str, solver: str) -> Callable[[Config, Failures], TrackBank]:
-    def build(config: Config, failures: Failures) -> TrackBank:
-        from fgtrack.estimation.smoothing.bank import SmootherBank  # half a second with its kernels and gtsam
-
-        make_solver = getattr(import_module(f"fgtrack.estimation.smoothing.{module}"), solver)
-        return SmootherBank(config.motion_model(), config.smoother, make_solver, config.initiation.method, failures)
-
-    return build
-
-
-#: Banks that are built from settings of their own.
-_BANKS: Mapping[str, Callable[[Config, Failures], TrackBank]] = {
-    "ekf-backward-forward": _build_backward_forward,
-    "smoother": _smoother("gtsam.incremental", "IncrementalSolver"),
-    "smoother-batch": _smoother("gtsam.batch", "BatchSolver"),
-    "smoother-banded": _smoother("solver", "Solver"),
-}
-
-
 def build_bank(config: Config, failures: Failures | None = None) -> TrackBank:
     """The estimators of all objects, which add to `failures`.
 
     Raises `CallError` for options that the estimator does not take.
     """
-    build, options = _BANKS.get(config.estimator), config.options.get(config.estimator, {})
-    if build is None:
-        options = {"initiation": config.initiation.method, **options}
-        lag_s = config.effective.lag_s
-        return estimator_bank(config.estimator, config.motion_model(), lag_s, options)
-    if options:
-        raise CallError(f"options.{config.estimator}: set the keys of smoother or filter instead")
-    return build(config, failures or Failures())
+    name, given = config.estimator, config.options.get(config.estimator, {})
+    is_filter = name == "ekf-backward-forward"
+    if given and (is_filter or name in SMOOTHERS):
+        raise CallError(f"options.{name}: set the keys of smoother or filter instead")
+    if is_filter:
+        return _build_backward_forward(config)
+    options: dict[str, Any] = {"initiation": config.initiation.method, **given}  # Any: of the estimator's own
+    if name in SMOOTHERS:
+        options |= {**vars(config.smoother), "failures": failures}
+        del options["lag_s"]
+    return estimator_bank(name, config.motion_model(), config.effective.lag_s, options)
 
 
 def build_propagator(config: Config, step_s: float) -> ExactPropagator:

@@ -201,7 +201,7 @@ class MotionConfig:
 
 
 #: Estimators that take all settings of `smoother`.
-_SMOOTHERS = ("smoother", "smoother-batch", "smoother-banded")
+SMOOTHERS = ("smoother", "smoother-batch", "smoother-banded")
 
 
 @dataclass(frozen=True)
@@ -305,7 +305,7 @@ class Config:
     def effective(self) -> Effective:
         """Settings that are easily overlooked, as a run has them."""
         key, lag_s, behind_s = "filter.storage_s", self.filter.storage_s, 0.0
-        if self.estimator in _SMOOTHERS:
+        if self.estimator in SMOOTHERS:
             key, lag_s, behind_s = "smoother.lag_s", self.smoother.lag_s, self.smoother.behind_s
         distance_m = None if isinstance(self.merge, NoMerge) else self.merge.distance_m
         return Effective(self.ego.detection_origin_m, distance_m, key, lag_s, lag_s + behind_s)

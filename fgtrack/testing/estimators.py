@@ -287,7 +287,7 @@ def _converged(subject: Subject, *estimators: Any) -> bool:  # Any: the claim pr
     """True if the estimators have to converge first, which they do."""
     needed = subject.claims.nonlinear == "at convergence"
     for estimator in estimators if needed else ():
-        estimator.converge()
+        getattr(estimator, "bank", estimator).converge()
     return needed
 
 

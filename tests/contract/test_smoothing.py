@@ -1,6 +1,6 @@
 """What the fixed-lag smoothers promise beyond the contract of all estimators, with each solver."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -11,12 +11,11 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateStatus
 from fgtrack.estimation.failures import Failure
+from fgtrack.estimation.object_bank import OneObject, state_of
 from fgtrack.estimation.registry import estimator
-from fgtrack.estimation.smoothing.bank import FixedLagSmoother, SmootherBank
-from fgtrack.estimation.smoothing.gtsam.batch import BatchSolver
-from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
-from fgtrack.estimation.smoothing.settings import SmootherSettings
-from fgtrack.estimation.smoothing.solver import Solver
+from fgtrack.estimation.smoothing.bank import SmootherBank
+from fgtrack.estimation.smoothing.gtsam.batch import BatchBank
+from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalBank
 from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import RobustLoss
@@ -26,14 +25,16 @@ from fgtrack.testing.streams import COMPONENTS, MS, START, measured, shuffled
 START_NS = START.stamp_ns
 LINEAR = (("x_m", "y_m"), ("x_m", "y_m", "speed_mps"), ("x_m", "y_m", "yaw_rad"))
 KINDS = ("huber", "cauchy", "tukey", "geman_mcclure", "dcs")
-SOLVERS: dict[str, type[Solver]] = {"banded": Solver, "incremental": IncrementalSolver, "batch": BatchSolver}
-TOLERANCES = {"banded": 1e-9, "incremental": 1e-9, "batch": 1e-6}
-every_solver = pytest.mark.parametrize("name", SOLVERS)
+TOLERANCES: dict[type[SmootherBank], float] = {SmootherBank: 1e-9, IncrementalBank: 1e-9, BatchBank: 1e-6}
 
 
-def smoother(motion: MotionModel, name: str, lag_s: float = 0.3, **settings: Any) -> FixedLagSmoother:
-    own = SmootherSettings(lag_s=lag_s, **{"ring_s": 10.0, "lagged_s": (), **settings})
-    return FixedLagSmoother(motion, START, own, SOLVERS[name])
+def smoother(motion: MotionModel, make: type[SmootherBank], lag_s: float = 0.3) -> tuple[OneObject, SmootherBank]:
+    bank = make(motion, lag_s, ring_s=10.0, final=True)
+    return OneObject(motion, bank, START), bank
+
+
+def final(bank: SmootherBank) -> list[TrackState]:
+    return [report.state for report in bank.smoothed()]
 
 
 def fill(motion: MotionModel, rng: np.random.Generator, *estimators: Estimator, num: int = 9) -> None:
@@ -140,23 +141,24 @@ class Fuse:
 
 
 @pytest.mark.parametrize("when", ["before", "after"])
-@every_solver
+@pytest.mark.parametrize("make", TOLERANCES)
 def test_a_solver_that_gives_up_once_fails_one_measurement_and_the_rest_is_as_if_nothing_had_happened(
-    name: str, when: Literal["before", "after"]
+    make: type[SmootherBank], when: Literal["before", "after"]
 ) -> None:
     """The measurement comes ahead, on the newest node, into a segment, beyond the window, or moves the window on."""
-    motion, tolerance = CV(), TOLERANCES[name]
+    motion, tolerance = CV(), TOLERANCES[make]
     for ms in (500, 475, 450, 345, 120, 1000):
         rng = np.random.default_rng(8)
-        hit, spared = smoother(motion, name), smoother(motion, name)
+        (hit, bank), (spared, spared_bank) = smoother(motion, make), smoother(motion, make)
         fill(motion, rng, hit, spared)
-        left = [state.stamp_ns for state in spared.take_final()]
-        assert [state.stamp_ns for state in hit.take_final()] == left
+        left = [state.stamp_ns for state in final(spared_bank)]
+        assert [state.stamp_ns for state in final(bank)] == left
 
-        fuse = Fuse(hit.bank, when)
+        fuse = Fuse(bank, when)
         assert hit.update(measured(rng, motion, ms * MS)).status is UpdateStatus.FAILED
+        spared.advance(START_NS + ms * MS)
         assert fuse.blown
-        assert hit.bank.windows.failures.counts == {Failure.GRAPH_REBUILT: 1}
+        assert bank.windows.failures.counts == {Failure.GRAPH_REBUILT: 1}
         assert hit.window_ns == spared.window_ns
         assert apart(hit, spared) < tolerance
 
@@ -164,19 +166,21 @@ def test_a_solver_that_gives_up_once_fails_one_measurement_and_the_rest_is_as_if
             measurement = measured(rng, motion, late_ms * MS)
             assert hit.update(measurement).status is spared.update(measurement).status
             assert apart(hit, spared) < tolerance
-        assert hit.bank.windows.failures.counts == {Failure.GRAPH_REBUILT: 1}
-        for found, expected in zip(hit.take_rest(), spared.take_rest(), strict=True):
+        assert bank.windows.failures.counts == {Failure.GRAPH_REBUILT: 1}
+        for each in (bank, spared_bank):
+            each.remove(0)
+        for found, expected in zip(final(bank), final(spared_bank), strict=True):
             assert found.stamp_ns == expected.stamp_ns
-            assert max(difference(found, expected)) < tolerance
+            assert max(known_apart(found, expected)) < tolerance
 
 
-@pytest.mark.parametrize("make", [Solver, IncrementalSolver])
+@pytest.mark.parametrize("make", [SmootherBank, IncrementalBank])
 @pytest.mark.parametrize("what", ["R", "z", "solver"])
-def test_of_several_tracks_the_one_that_cannot_be_updated_fails_alone(make: type[Solver], what: str) -> None:
+def test_of_several_tracks_the_one_that_cannot_be_updated_fails_alone(make: type[SmootherBank], what: str) -> None:
     """By a covariance that is none, by what is no number, and by a solver that gives up once more on it alone."""
     motion, rng = CTRV(), np.random.default_rng(3)
-    settings = SmootherSettings(lag_s=0.3, ring_s=5.0, relinearise=dict.fromkeys(motion.state_names, 1e9))
-    hit, spared = (SmootherBank(motion, settings, make) for _ in range(2))
+    settings = {"ring_s": 5.0, "relinearise": dict.fromkeys(motion.state_names, 1e9)}
+    hit, spared = (make(motion, 0.3, **settings) for _ in range(2))
     for bank in (hit, spared):
         for track_id in range(3):
             bank.birth(track_id, START)
@@ -209,27 +213,31 @@ def test_of_several_tracks_the_one_that_cannot_be_updated_fails_alone(make: type
         for before, after in zip(spared.present(), hit.present(), strict=True):
             assert max(known_apart(after, before)) < 1e-6
         for at_ms in (250, 320):
-            before, after = (bank.state_at(0, START_NS + at_ms * MS) for bank in (spared, hit))
+            before, after = (state_of(bank, motion, 0, START_NS + at_ms * MS) for bank in (spared, hit))
             assert max(difference(after, before)) < 1e-6
 
 
 # --- outputs
 
 
-@every_solver
-def test_final_states_are_the_dense_joint_of_what_had_arrived_when_the_node_left(name: str) -> None:
+@pytest.mark.parametrize("make", TOLERANCES)
+def test_final_states_are_the_dense_joint_of_what_had_arrived_when_the_node_left(make: type[SmootherBank]) -> None:
     """Without the measurements that come 1 us after another, which cost digits."""
     motion = CV()
     for seed in range(3):
         stream = shuffled(motion, np.random.default_rng([11, seed]), span_s=2.0)
-        one, arrived, stamps_ns = smoother(motion, name), list[Measurement](), list[int]()
+        (one, bank), arrived, stamps_ns = smoother(motion, make), list[Measurement](), list[int]()
         for measurement in (*(m for m in stream.measurements if (m.stamp_ns - START_NS) % (2 * MS) == 0), None):
-            if measurement is not None:
+            if measurement is None:
+                bank.remove(0)
+            else:
                 one.update(measurement)
-            states = one.take_rest() if measurement is None else one.take_final()
+            states = final(bank)
             joint = dense_joint(motion, START, arrived, [state.stamp_ns for state in states])
             for state in states:
-                assert max(difference(state, joint[state.stamp_ns])) < TOLERANCES[name]
+                expected = joint[state.stamp_ns]
+                mean, covariance = motion.kinematic(expected.mean, expected.covariance)
+                assert max(known_apart(state, TrackState(state.stamp_ns, mean, covariance))) < TOLERANCES[make]
             stamps_ns += [state.stamp_ns for state in states]
             arrived += [] if measurement is None else [measurement]
         assert stamps_ns == sorted(set(stamps_ns))
@@ -241,12 +249,12 @@ def test_final_states_of_a_nonlinear_model_are_near_the_optimum_of_what_had_arri
     motion, differences = CTRV(), list[float]()
     for seed in (1, 3):
         rng = np.random.default_rng(seed)
-        one, whole = smoother(motion, "incremental", 1.0), smoother(motion, "banded", 99.0)
+        (one, bank), (whole, every) = smoother(motion, IncrementalBank, 1.0), smoother(motion, SmootherBank, 99.0)
         for k in range(1, 90):
             measurement = measured(rng, motion, k * 50 * MS)
-            whole.converge()
+            every.converge()
             one.update(measurement)
-            differences += [max(difference(state, whole.state_at(state.stamp_ns))) for state in one.take_final()]
+            differences += [max(difference(state, whole.state_at(state.stamp_ns))) for state in final(bank)]
             whole.update(measurement)
     assert np.median(differences) < 0.008
 
@@ -262,10 +270,10 @@ def known_apart(found: TrackState, expected: TrackState) -> Difference:
 
 
 class Alone:
-    """As a bank, smoothers of one object each."""
+    """As a bank, one bank for each object."""
 
-    def __init__(self, motion: MotionModel, settings: SmootherSettings, make: Callable[..., Solver]) -> None:
-        self.make = lambda start: FixedLagSmoother(motion, start, settings, make).bank
+    def __init__(self, motion: MotionModel, settings: dict[str, Any]) -> None:
+        self.make = lambda: SmootherBank(motion, **settings)
         self.banks: dict[int, SmootherBank] = {}
         self.ended: list[SmoothedReport] = []
         self.now_ns = 0
@@ -276,7 +284,8 @@ class Alone:
             bank.advance(now_ns)
 
     def birth(self, track_id: int, start: Start) -> None:
-        self.banks[track_id] = self.make(start)
+        self.banks[track_id] = self.make()
+        self.banks[track_id].birth(0, start)
         self.banks[track_id].advance(self.now_ns)
 
     def remove(self, track_id: int) -> None:
@@ -295,17 +304,17 @@ class Alone:
 
     def smoothed(self) -> list[SmoothedReport]:
         reports, self.ended = self.ended, []
-        each = [replace(r, track_id=track_id) for track_id, bank in self.banks.items() for r in bank.smoothed()]
-        return reports + sorted(each, key=lambda report: report.lag_s or 0.0)
+        return reports + [replace(r, track_id=i) for i, bank in self.banks.items() for r in bank.smoothed()]
 
 
 class Traffic:
     """Object lists of tracks that begin, end and are missed, delivered to a bank and to single smoothers."""
 
-    def __init__(self, seed: int, settings: SmootherSettings, motion: MotionModel, make: type[Solver]) -> None:
+    def __init__(self, seed: int, motion: MotionModel, make: type[SmootherBank]) -> None:
         self.rng = np.random.default_rng(seed)
         self.motion = motion
-        self.bank, self.alone = SmootherBank(motion, settings, make), Alone(motion, settings, Solver)
+        settings: dict[str, Any] = {"lag_s": 0.4, "ring_s": 0.5, "lagged_s": (0.2, 0.4), "final": True}
+        self.bank, self.alone = make(motion, **settings), Alone(motion, settings)
         self.statuses: set[UpdateStatus] = set()
         self.smoothed: list[tuple[SmoothedReport, SmoothedReport]] = []
         self.largest = 0.0
@@ -326,7 +335,12 @@ class Traffic:
             self._list(now_ns - int(self.rng.choice([0, 40, 150, 150, 150, latest_ms])) * MS)
             for found, expected in zip(self.bank.present(), self.alone.present(), strict=True):
                 self.largest = max(self.largest, *known_apart(found, expected))
-            self.smoothed += zip(self.bank.smoothed(), self.alone.smoothed(), strict=True)
+            reports = (sorted(each.smoothed(), key=self._order) for each in (self.bank, self.alone))
+            self.smoothed += zip(*reports, strict=True)
+
+    @staticmethod
+    def _order(report: SmoothedReport) -> tuple[float, int, int]:
+        return report.lag_s or 0.0, report.track_id, report.state.stamp_ns
 
     def _birth(self, stamp_ns: int) -> None:
         unknown = self.rng.random() < 0.3
@@ -357,11 +371,11 @@ class Traffic:
                 )
 
 
-@pytest.mark.parametrize("make", [Solver, IncrementalSolver])
+@pytest.mark.parametrize("make", [SmootherBank, IncrementalBank])
 @pytest.mark.parametrize("motion", [CTRV(), CV()], ids=["ctrv", "cv"])
-def test_a_bank_of_tracks_of_all_ages_is_a_bank_of_single_smoothers(make: type[Solver], motion: MotionModel) -> None:
+def test_a_bank_of_tracks_of_all_ages_is_banks_of_single_ones(make: type[SmootherBank], motion: MotionModel) -> None:
     """Also of both solvers: the single ones are solved by the compiled loops."""
-    traffic = Traffic(9, SmootherSettings(lag_s=0.4, ring_s=0.5, lagged_s=(0.2, 0.4)), motion, make)
+    traffic = Traffic(9, motion, make)
     traffic.run(latest_ms=600 if motion.linear else 450)
     assert traffic.largest < 1e-8
     assert UpdateStatus.OUT_OF_SEQUENCE in traffic.statuses

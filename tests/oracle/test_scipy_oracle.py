@@ -56,7 +56,7 @@ def fed(estimator: Estimator, stream: Stream) -> Estimator:
     """`estimator` after all of `stream`, every measurement fused, converged where it has to be asked for that."""
     for place in stream.orders["random"]:
         assert estimator.update(stream.measurements[place]).innovation is not None
-    converge = getattr(estimator, "converge", None)
+    converge = getattr(getattr(estimator, "bank", None), "converge", None)
     if converge is not None:
         converge(100)
     return estimator

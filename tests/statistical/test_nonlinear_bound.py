@@ -10,9 +10,7 @@ from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.replay import ReplayEkf
-from fgtrack.estimation.smoothing.bank import FixedLagSmoother
-from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
-from fgtrack.estimation.smoothing.settings import SmootherSettings
+from fgtrack.estimation.registry import estimator
 from fgtrack.evaluation.bounds import Bounds, ScheduledMeasurement, bounds, bounds_along
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, MotionModel
@@ -41,8 +39,7 @@ NAMES = ("ekf-replay", "smoother")
 def make(name: str, motion: MotionModel) -> Estimator:
     if name == "ekf-replay":
         return ReplayEkf(motion, PRIOR, 1.0)
-    settings = SmootherSettings(lag_s=1.0, lagged_s=(), final=False)
-    return FixedLagSmoother(motion, PRIOR, settings, IncrementalSolver)
+    return estimator("smoother", motion, PRIOR, lag_s=1.0)
 
 
 def late_positions(motion: MotionModel, start_ns: int, num_steps: int) -> list[ScheduledMeasurement]:

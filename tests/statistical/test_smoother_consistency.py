@@ -10,9 +10,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.filters.replay import ReplayEkf
-from fgtrack.estimation.smoothing.bank import FixedLagSmoother
-from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
-from fgtrack.estimation.smoothing.settings import SmootherSettings
+from fgtrack.estimation.registry import estimator as estimator_of
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.sim.vehicles import drawn
@@ -42,9 +40,8 @@ def prior(mean: FloatArray) -> Start:
     )
 
 
-def smoother(motion: MotionModel, start: Start) -> FixedLagSmoother:
-    settings = SmootherSettings(lag_s=1.0, lagged_s=(), final=False)
-    return FixedLagSmoother(motion, start, settings, IncrementalSolver)
+def smoother(motion: MotionModel, start: Start) -> Estimator:
+    return estimator_of("smoother", motion, start, lag_s=1.0)
 
 
 def replay(motion: MotionModel, start: Start) -> ReplayEkf:

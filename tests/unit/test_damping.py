@@ -6,18 +6,16 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.failures import Failure
+from fgtrack.estimation.object_bank import state_of
 from fgtrack.estimation.smoothing.bank import SmootherBank
-from fgtrack.estimation.smoothing.gtsam.batch import BatchSolver
-from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
-from fgtrack.estimation.smoothing.settings import SmootherSettings
-from fgtrack.estimation.smoothing.solver import Solver
+from fgtrack.estimation.smoothing.gtsam.batch import BatchBank
+from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalBank
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CV
 
 STD_RAD, RANGE_STD_M, STEP_S = np.deg2rad(0.1), 60.0, 0.2
 MOTION = CV(velocity_density_m2ps3=0.05)
 MODEL = measurement_model(("bearing_rad",), MOTION)
-SETTINGS = SmootherSettings(lag_s=20.0, lagged_s=(), final=False)
 
 
 def heard(rng: np.random.Generator) -> tuple[list[Measurement], FloatArray]:
@@ -38,9 +36,9 @@ SPREAD = np.diag([RANGE_STD_M**2, (100.0 * STD_RAD) ** 2])
 BIRTH = Start(position_m=(100.0, 0.0), position_covariance=SPREAD, speed_std_mps=10.0)
 
 
-def tracked(streams: list[list[Measurement]], make: type[Solver]) -> SmootherBank:
+def tracked(streams: list[list[Measurement]], make: type[SmootherBank]) -> SmootherBank:
     """All objects in one bank."""
-    bank = SmootherBank(MOTION, SETTINGS, make)
+    bank = make(MOTION, 20.0)
     for track_id in range(len(streams)):
         bank.birth(track_id, BIRTH)
     for measurements in zip(*(stream[1:] for stream in streams), strict=True):
@@ -51,12 +49,12 @@ def tracked(streams: list[list[Measurement]], make: type[Solver]) -> SmootherBan
 def test_bearings_alone_lead_where_levenberg_marquardt_does() -> None:
     found = [heard(np.random.default_rng(seed)) for seed in (2,)]
     streams = [stream for stream, _ in found]
-    slow, *banks = (tracked(streams, each) for each in (BatchSolver, Solver, IncrementalSolver))
+    slow, *banks = (tracked(streams, each) for each in (BatchBank, SmootherBank, IncrementalBank))
     assert not slow.windows.failures.counts
     for bank in banks:
         assert bank.windows.failures.counts[Failure.STEP_DAMPED] > 0
         for track_id, (measurements, truth) in enumerate(found):
-            state, expected = (each.state_at(track_id, measurements[-1].stamp_ns) for each in (bank, slow))
+            state, expected = (state_of(each, MOTION, track_id, measurements[-1].stamp_ns) for each in (bank, slow))
             std = np.sqrt(np.diag(expected.covariance))
             assert np.abs((state.mean - expected.mean) / std).max() < 0.1
             d = state.mean - truth
@@ -66,4 +64,4 @@ def test_bearings_alone_lead_where_levenberg_marquardt_does() -> None:
 def test_positions_need_none() -> None:
     model = measurement_model(("x_m", "y_m"), MOTION)
     fixes = [Measurement(k * NS_PER_S, model, np.array([5.0 * k, 1.0]), np.eye(2)) for k in range(5)]
-    assert not tracked([fixes], Solver).windows.failures.counts
+    assert not tracked([fixes], SmootherBank).windows.failures.counts

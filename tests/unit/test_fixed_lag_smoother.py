@@ -1,16 +1,17 @@
 """What a smoother promises of its window, its relinearisation and its outputs."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from fgtrack.core.types import IntArray
 from fgtrack.estimation.base import Measurement, SensorPose, Start, UpdateStatus
-from fgtrack.estimation.smoothing.bank import FixedLagSmoother, SmootherBank
-from fgtrack.estimation.smoothing.gtsam.batch import BatchSolver
-from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
-from fgtrack.estimation.smoothing.settings import SmootherSettings
-from fgtrack.estimation.smoothing.solver import Solver
-from fgtrack.models.motion import CTRV, CV
+from fgtrack.estimation.object_bank import OneObject
+from fgtrack.estimation.smoothing.bank import SmootherBank
+from fgtrack.estimation.smoothing.gtsam.batch import BatchBank
+from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalBank, IncrementalSolver
+from fgtrack.models.motion import CTRV, CV, MotionModel
 
 MS = 1_000_000
 STD = {"x_m": 0.3, "y_m": 0.3}
@@ -20,24 +21,29 @@ def at(ms: int, x_m: float, y_m: float = 0.0) -> Measurement:
     return Measurement.of(ms * MS, x_m=x_m, y_m=y_m, std=STD)
 
 
-def largest_step_to_convergence(smoother: FixedLagSmoother, ms: int) -> float:
+def one_of(motion: MotionModel, start: Start, make: type[SmootherBank] = SmootherBank, **options: Any) -> OneObject:
+    return OneObject(motion, make(motion, **{"lag_s": 1.0, **options}), start)
+
+
+def largest_step_to_convergence(smoother: OneObject, ms: int) -> float:
     """How far the state at `ms` is from that of convergence, in standard deviations."""
     found = smoother.state_at(ms * MS)
-    smoother.converge()
+    assert isinstance(smoother.bank, SmootherBank)
+    smoother.bank.converge()
     return float((np.abs(found.mean - smoother.state_at(ms * MS).mean) / np.sqrt(np.diag(found.covariance))).max())
 
 
 # --- relinearisation
 
 
-@pytest.mark.parametrize("make", [Solver, IncrementalSolver, BatchSolver])
-def test_the_process_noise_follows_the_states_that_move(make: type[Solver]) -> None:
+@pytest.mark.parametrize("make", [SmootherBank, IncrementalBank, BatchBank])
+def test_the_process_noise_follows_the_states_that_move(make: type[SmootherBank]) -> None:
     """The speed starts far off, and with it the noise across the direction of travel."""
     names, start = CTRV().state_names, Start(yaw_rad=0.4, yaw_std_rad=0.5, speed_mps=5.0, speed_std_mps=50.0)
     apart = {}
     for threshold in (1e-7, 1e9):
-        settings = SmootherSettings(lag_s=9.0, relinearise=dict.fromkeys(names, threshold), max_iterations=50)
-        smoother = FixedLagSmoother(CTRV(), start, settings, make)
+        thresholds = dict.fromkeys(names, threshold)
+        smoother = one_of(CTRV(), start, make, lag_s=9.0, relinearise=thresholds, max_iterations=50)
         for k in range(1, 6):
             smoother.update(at(500 * k, 15.0 * k, 0.8 * k * k))
         apart[threshold] = largest_step_to_convergence(smoother, 2500)
@@ -48,12 +54,11 @@ def test_the_process_noise_follows_the_states_that_move(make: type[Solver]) -> N
 def test_a_sensor_that_is_not_linear_brings_the_thresholds_of_the_position() -> None:
     """Bearings from the side, of an object that starts far from where it is."""
     pose, start = SensorPose(0.0, -20.0), Start(position_m=(8.0, 6.0), position_std_m=10.0, speed_std_mps=1.0)
-    smoother = FixedLagSmoother(CV(), start, SmootherSettings(lag_s=9.0))
+    smoother = one_of(CV(), start, lag_s=9.0)
     smoother.update(at(100, 7.0, 6.0))
     for k in range(2, 8):
         std = {"range_m": 0.2, "bearing_rad": 0.02}
         smoother.update(Measurement.of(100 * k * MS, range_m=20.0, bearing_rad=np.pi / 2, std=std, pose=pose))
-    assert not smoother.bank.windows.failures.counts
     assert largest_step_to_convergence(smoother, 700) < 0.1
 
 
@@ -65,13 +70,17 @@ class Counted(IncrementalSolver):
         super()._update(*windows)
 
 
+class CountedBank(IncrementalBank):
+    make_solver = Counted
+
+
 def test_further_iterations_are_taken_only_while_a_state_moves() -> None:
-    smoother = FixedLagSmoother(CV(), Start(), SmootherSettings(max_iterations=5), Counted)
+    smoother = one_of(CV(), Start(), CountedBank, max_iterations=5)
     Counted.num_updates = 0
     smoother.update(at(100, 3.0))
     assert Counted.num_updates == 1
-    settings = SmootherSettings(max_iterations=5, relinearise=dict.fromkeys(CTRV().state_names, 1e-9))
-    smoother = FixedLagSmoother(CTRV(), Start(yaw_rad=0.5, speed_mps=20.0), settings, Counted)
+    exact = dict.fromkeys(CTRV().state_names, 1e-9)
+    smoother = one_of(CTRV(), Start(yaw_rad=0.5, speed_mps=20.0), CountedBank, max_iterations=5, relinearise=exact)
     Counted.num_updates = 0
     smoother.update(at(100, 3.0))
     assert Counted.num_updates == 5
@@ -81,9 +90,9 @@ def test_an_object_that_is_never_seen_again_has_no_graph() -> None:
     """So 10^5 detections of clutter in one list are 10^5 states."""
     start = Start(yaw_rad=0.5, speed_mps=20.0)
     Counted.num_updates = 0
-    states = [FixedLagSmoother(CTRV(), start, SmootherSettings(), Counted).state_at(k * MS) for k in (0, 100)]
+    states = [one_of(CTRV(), start, CountedBank).state_at(k * MS) for k in (0, 100)]
     assert Counted.num_updates == 0
-    smoother = FixedLagSmoother(CTRV(), start, SmootherSettings(), IncrementalSolver)
+    smoother = one_of(CTRV(), start, IncrementalBank)
     smoother.update(Measurement.of(200 * MS, x_m=4.0, y_m=0.0, std={"x_m": 1e7, "y_m": 1e7}))
     for state, seen in zip(states, [smoother.state_at(state.stamp_ns) for state in states], strict=True):
         np.testing.assert_allclose(state.mean, seen.mean, atol=1e-9)
@@ -94,7 +103,7 @@ def test_an_object_that_is_never_seen_again_has_no_graph() -> None:
 
 
 def test_the_window_is_as_long_as_it_says() -> None:
-    smoother = FixedLagSmoother(CV(), Start(), SmootherSettings(lag_s=0.3, late="drop"))
+    smoother = one_of(CV(), Start(), lag_s=0.3, late="drop")
     for k in range(1, 11):
         smoother.update(at(100 * k, 1.0 * k))
     assert smoother.window_ns == (700 * MS, 1000 * MS)
@@ -107,7 +116,7 @@ def test_the_window_is_as_long_as_it_says() -> None:
 
 
 def test_what_lies_behind_the_ring_is_forgotten() -> None:
-    smoother = FixedLagSmoother(CV(), Start(), SmootherSettings(lag_s=0.3, ring_s=0.2))
+    smoother = one_of(CV(), Start(), lag_s=0.3, ring_s=0.2)
     for k in range(1, 31):
         smoother.update(at(100 * k, 1.0 * k))
     assert smoother.window_ns == (2500 * MS, 3000 * MS)
@@ -116,20 +125,19 @@ def test_what_lies_behind_the_ring_is_forgotten() -> None:
 
 
 def test_final_states_come_once_and_the_rest_when_the_track_ends() -> None:
-    smoother = FixedLagSmoother(CV(), Start(), SmootherSettings(lag_s=0.25, lagged_s=()))
-    for k in range(1, 7):
-        smoother.update(at(100 * k, 1.0 * k))
-    assert [state.stamp_ns for state in smoother.take_final()] == [k * 100 * MS for k in (0, 1)]
-    assert smoother.take_final() == []
-    assert [state.stamp_ns for state in smoother.take_rest()] == [k * 100 * MS for k in (2, 3, 4, 5, 6)]
-    silent = FixedLagSmoother(CV(), Start(), SmootherSettings(lag_s=0.25, lagged_s=(), final=False))
-    for k in range(1, 7):
-        silent.update(at(100 * k, 1.0 * k))
-    assert silent.take_rest() == []
+    for final, left, rest in ((True, [0, 1, 2], [3, 4, 5, 6]), (False, [], [])):
+        bank = SmootherBank(CV(), 0.25, final=final)
+        smoother = OneObject(CV(), bank, Start())
+        for k in range(1, 7):
+            smoother.update(at(100 * k, 1.0 * k))
+        assert [report.state.stamp_ns for report in bank.smoothed()] == [k * 100 * MS for k in left]
+        assert bank.smoothed() == []
+        bank.remove(0)
+        assert [report.state.stamp_ns for report in bank.smoothed()] == [k * 100 * MS for k in rest]
 
 
 def test_a_bank_reports_lagged_and_final_states() -> None:
-    bank = SmootherBank(CV(), SmootherSettings(lag_s=0.3, ring_s=0.5, lagged_s=(0.2,)))
+    bank = SmootherBank(CV(), 0.3, ring_s=0.5, lagged_s=(0.2,), final=True)
     bank.advance(100 * MS)
     bank.birth(7, Start(stamp_ns=100 * MS))
     assert bank.smoothed() == []  # 0.2 s ago there was no track

@@ -6,8 +6,8 @@ import pytest
 from fgtrack.core.geometry import rotation
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.filters.initiation import Fix, Line, Search, fixes_of, over
-from fgtrack.estimation.smoothing.bank import FixedLagSmoother
-from fgtrack.estimation.smoothing.settings import SmootherSettings
+from fgtrack.estimation.object_bank import OneObject
+from fgtrack.estimation.smoothing.bank import SmootherBank
 from fgtrack.estimation.smoothing.windows import Windows
 from fgtrack.models.motion import CTRV
 from fgtrack.models.sensors import RobustLoss
@@ -15,16 +15,17 @@ from fgtrack.models.sensors import RobustLoss
 STD_M = 0.5
 STD = {"x_m": STD_M, "y_m": STD_M}
 PERIOD_NS = 20_000_000  # in which the object moves hardly further than a standard deviation
-EXACT = SmootherSettings(relinearise=dict.fromkeys(CTRV.state_names, 1e-6))
+EXACT = dict.fromkeys(CTRV.state_names, 1e-6)
 
 
 def start() -> Start:
     return Start(position_std_m=STD_M, yaw_std_rad=np.pi, speed_std_mps=40.0)
 
 
-def fused(yaw_rad: float, num: int, seed: int = 0, loss: RobustLoss | None = None) -> FixedLagSmoother:
+def fused(yaw_rad: float, num: int, seed: int = 0, loss: RobustLoss | None = None) -> OneObject:
     """A smoother after `num` positions of an object at 30 m/s; the same but for the direction."""
-    rng, smoother = np.random.default_rng(seed), FixedLagSmoother(CTRV(), start(), EXACT)
+    rng = np.random.default_rng(seed)
+    smoother = OneObject(CTRV(), SmootherBank(CTRV(), 1.0, relinearise=EXACT), start())
     for k in range(1, num + 1):
         along_across = np.array([30.0 * k * PERIOD_NS / 1e9, 0.0]) + STD_M * rng.standard_normal(2)
         x_m, y_m = (rotation(yaw_rad) @ along_across).tolist()
@@ -54,7 +55,7 @@ def test_while_the_direction_is_uncertain_every_measurement_is_solved_to_converg
     for num in (1, 2):
         smoother = fused(-2.5, num, seed, loss)
         found = smoother.state_at(num * PERIOD_NS)
-        smoother.converge()
+        smoother.bank.converge()  # type: ignore[attr-defined]  # a smoother's
         off = found.mean - smoother.state_at(num * PERIOD_NS).mean
         assert np.abs(off / np.sqrt(np.diag(found.covariance))).max() < 1e-3
 
@@ -71,12 +72,12 @@ def test_a_certain_direction_is_not_sought_again(monkeypatch: pytest.MonkeyPatch
     assert not any(line.certainty > 3.0 for line in restarts[:-1])
     assert 1 < len(restarts) < 20
     restarts.clear()
-    standing = FixedLagSmoother(CTRV(), start(), SmootherSettings(lag_s=0.1, lagged_s=()))
+    standing = OneObject(CTRV(), SmootherBank(CTRV(), 0.1), start())
     for k in range(1, 20):
         standing.update(Measurement.of(k * PERIOD_NS, x_m=0.0, y_m=0.0, std=STD))
-    assert len(restarts) == 6  # until the first node left the window
+    assert len(restarts) == 5  # until the first node left the window
     restarts.clear()
-    smoother = FixedLagSmoother(CTRV(), Start(yaw_rad=0.0), EXACT)
+    smoother = OneObject(CTRV(), SmootherBank(CTRV(), 1.0, relinearise=EXACT), Start(yaw_rad=0.0))
     smoother.update(Measurement.of(PERIOD_NS, x_m=1.0, y_m=0.0, std=STD))
     assert not restarts
 

@@ -43,7 +43,7 @@ def fed(name: str, measurements: list[Measurement], order: FloatArray | None = N
         result = estimator.update(measurements[place])
         assert result.innovation is not None
     if smooths:
-        estimator.converge(30)  # type: ignore[attr-defined]  # smoothers have it
+        estimator.bank.converge(30)  # type: ignore[attr-defined]  # smoothers have it
     return estimator
 
 

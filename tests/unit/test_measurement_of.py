@@ -6,13 +6,12 @@ from support.models import MODELS
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import TrackState
-from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.oosm.asd import AccumulatedStateDensity
 from fgtrack.estimation.oosm.buffers import ReorderBuffer
 from fgtrack.estimation.oosm.crossing import Al1
-from fgtrack.estimation.smoothing.bank import FixedLagSmoother
-from fgtrack.estimation.smoothing.settings import SmootherSettings
+from fgtrack.estimation.registry import estimator
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.sensors import RobustLoss
 
@@ -58,7 +57,7 @@ def test_what_makes_no_sense_is_one_line(given: dict, message: str) -> None:
 
 @pytest.mark.parametrize("motion", MODELS, ids=lambda motion: type(motion).__name__)
 def test_every_kind_of_estimator_sees_it_in_its_own_state(motion) -> None:
-    start, settings = Start(yaw_rad=0.5, speed_mps=20.0), SmootherSettings()
+    start = Start(yaw_rad=0.5, speed_mps=20.0)
     values = {"x_m": 1.5, "y_m": 0.8, "yaw_rad": 0.5, "speed_mps": 21.0}
     std = {"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.1, "speed_mps": 1.0}
     stamp_ns = 100_000_000
@@ -66,8 +65,8 @@ def test_every_kind_of_estimator_sees_it_in_its_own_state(motion) -> None:
     named = Measurement.of(stamp_ns, std=std, **values)
     bound = Measurement(stamp_ns, own, np.array(list(values.values())), np.diag(np.square(list(std.values()))))
 
-    def smoother(motion, start: Start, lag_s: float) -> FixedLagSmoother:
-        return FixedLagSmoother(motion, start, settings)
+    def smoother(motion, start: Start, lag_s: float) -> Estimator:
+        return estimator("smoother-banded", motion, start, lag_s=lag_s)
 
     for make in (ReplayEkf, AccumulatedStateDensity, Al1, ReorderBuffer, smoother):
         found, expected = make(motion, start, 1.0), make(motion, start, 1.0)

@@ -23,7 +23,7 @@ def present(name: str, motion: CTRV, speed_mps: float, order: np.ndarray) -> Tra
         x_m, y_m = places[k].tolist()
         measurement = Measurement.of((k + 1) * STEP_NS, x_m=x_m, y_m=y_m, std={"x_m": 0.3, "y_m": 0.3})
         assert tracked.update(measurement).innovation is not None
-    tracked.converge()
+    tracked.bank.converge()
     return tracked.state_at(14 * STEP_NS)
 
 

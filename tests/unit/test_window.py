@@ -11,10 +11,9 @@ from support.models import MODELS, MOTIONS
 from fgtrack.core.time import seconds
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
 from fgtrack.estimation.interpolation import between
-from fgtrack.estimation.smoothing.bank import FixedLagSmoother
-from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
-from fgtrack.estimation.smoothing.settings import SmootherSettings
-from fgtrack.estimation.smoothing.solver import Solver
+from fgtrack.estimation.object_bank import OneObject
+from fgtrack.estimation.smoothing.bank import SmootherBank
+from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalBank
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV, MotionModel
 from fgtrack.models.sensors import RobustLoss
@@ -38,8 +37,8 @@ def position(offset_ns: int, x_m: float, y_m: float, loss: RobustLoss | None = N
     return Measurement(START_NS + offset_ns, model, np.array([x_m, y_m]), 0.09 * np.eye(2), loss=loss)
 
 
-def smoother(make: type[Solver], *measurements: Measurement) -> FixedLagSmoother:
-    one = FixedLagSmoother(CV(), START, SmootherSettings(lag_s=0.1, ring_s=9.0, lagged_s=()), make)
+def smoother(make: type[SmootherBank], *measurements: Measurement) -> OneObject:
+    one = OneObject(CV(), make(CV(), 0.1, ring_s=9.0, final=True), START)
     for measurement in measurements:
         one.update(measurement)
     return one
@@ -48,9 +47,11 @@ def smoother(make: type[Solver], *measurements: Measurement) -> FixedLagSmoother
 # --- behind the window
 
 
-@pytest.mark.parametrize("make", [Solver, IncrementalSolver])
+@pytest.mark.parametrize("make", [SmootherBank, IncrementalBank])
 @pytest.mark.parametrize("gap_ns", [1 * US, 50 * MS])
-def test_detections_close_together_behind_the_window_are_exact_in_any_order(gap_ns: int, make: type[Solver]) -> None:
+def test_detections_close_together_behind_the_window_are_exact_in_any_order(
+    gap_ns: int, make: type[SmootherBank]
+) -> None:
     """A velocity between two positions 1 us apart magnifies their rounding a million times; nothing else does."""
     inside = [position(ms * MS, 3.0 + 0.018 * ms, -2.0 + 0.008 * ms) for ms in (300, 700, 1200)]
     offsets = (500 * MS, 500 * MS + gap_ns, 500 * MS + 2 * gap_ns, 700 * MS - gap_ns)
@@ -71,7 +72,7 @@ def test_an_outlier_weighs_as_little_behind_the_window_as_its_loss_says(kind: st
     """Both when its node leaves, and when it comes too late for it."""
     outlier = position(300 * MS, 58.0, 0.6, RobustLoss(kind, 2.0))
     newest = position(700 * MS, 15.6, 3.6)
-    plain, left, late = (smoother(Solver, *each) for each in ([newest], [outlier, newest], [newest, outlier]))
+    plain, left, late = (smoother(SmootherBank, *each) for each in ([newest], [outlier, newest], [newest, outlier]))
     expected = plain.state_at(START_NS + 700 * MS)
     for one in (left, late):
         off = one.state_at(START_NS + 700 * MS).mean - expected.mean
@@ -79,13 +80,13 @@ def test_an_outlier_weighs_as_little_behind_the_window_as_its_loss_says(kind: st
 
 
 @pytest.mark.parametrize("offset_ns", [-US, US, 1])
-@pytest.mark.parametrize("make", [Solver, IncrementalSolver])
-def test_a_stamp_up_to_a_microsecond_from_a_node_shares_it(offset_ns: int, make: type[Solver]) -> None:
+@pytest.mark.parametrize("make", [SmootherBank, IncrementalBank])
+def test_a_stamp_up_to_a_microsecond_from_a_node_shares_it(offset_ns: int, make: type[SmootherBank]) -> None:
     near, apart = position(300 * MS + offset_ns, 8.5, 0.5), position(300 * MS + 3 * offset_ns, 8.5, 0.5)
-    one = smoother(make, position(300 * MS, 8.4, 0.4), near)
-    assert len(one.take_rest()) == 2
-    assert one.update(apart).status is not UpdateStatus.FAILED
-    assert len(one.take_rest()) == (3 if abs(offset_ns) == US else 2)
+    for last, num in ((near, 2), (apart, 3 if abs(offset_ns) == US else 2)):
+        one = smoother(make, position(300 * MS, 8.4, 0.4), near, last)
+        one.bank.remove(0)
+        assert len(one.bank.smoothed()) == num
 
 
 # --- the state between two nodes

@@ -1,13 +1,13 @@
 """Propagators of many objects through equal time steps, and the kinematic states that a bank gives."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.linalg import kernels
-from fgtrack.core.types import YAW, FloatArray, IntArray, SmoothedReport, TrackState
+from fgtrack.core.types import YAW, FloatArray, IntArray, TrackState
 from fgtrack.estimation.filters.ekf import predict
 from fgtrack.models.measurement import MeasurementModel
 from fgtrack.models.motion import MotionModel
@@ -97,13 +97,3 @@ def kinematic_states(
     """Kinematic states of m states of `motion`, shapes (m, n) and (m, n, n), at these stamps."""
     means, covariances = motion.kinematic(means, covariances)
     return list(map(TrackState, stamps_ns, wrapped_yaw(means), covariances))
-
-
-def final_reports(motion: MotionModel, states: Sequence[tuple[int, TrackState]]) -> list[SmoothedReport]:
-    """Reports of final states in the form of `motion`, each with its track."""
-    if not states:
-        return []
-    track_ids, final = zip(*states, strict=True)
-    means, covariances = np.array([each.mean for each in final]), np.array([each.covariance for each in final])
-    shown = kinematic_states(motion, [each.stamp_ns for each in final], means, covariances)
-    return [SmoothedReport(track_id, state, None) for track_id, state in zip(track_ids, shown, strict=True)]

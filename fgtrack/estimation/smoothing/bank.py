@@ -1,10 +1,10 @@
-"""The fixed-lag smoothers of all objects, and that of one."""
+"""The fixed-lag smoothers of all objects."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import compress, repeat
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from fgtrack.estimation.base import Measurement, Measurements, Start, StatesAt, 
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
-from fgtrack.estimation.filters.propagation import final_reports, kinematic_states, track_state
+from fgtrack.estimation.filters.propagation import kinematic_states
 from fgtrack.estimation.smoothing.nodes import grown
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver
@@ -22,48 +22,52 @@ from fgtrack.estimation.smoothing.terms import Innovations
 from fgtrack.estimation.smoothing.windows import Windows
 from fgtrack.models.motion import MotionModel
 
-MakeSolver = Callable[[MotionModel, SmootherSettings], Solver]
-
 _TOO_OLD, _FAILED = UpdateResult(UpdateStatus.TOO_OLD), UpdateResult(UpdateStatus.FAILED)
 _STATUSES = UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE, UpdateStatus.BEYOND_WINDOW
 
 
 class SmootherBank:
-    """The fixed-lag smoothers of all objects, whose windows are in arrays; see `TrackBank`.
+    """Fixed-lag smoother, solved in covariance form by compiled code, all objects of a tracker together.
+
+    Measurements may arrive in any order: each is fused at a node at its own stamp. The oldest node of a window is the
+    newest one at or before its start, so every stamp inside has a left neighbour.
 
     Parameters
     ----------
     motion
-        The motion model of all objects.
-    settings
-        Window, late policy, relinearisation and outputs.
-    make_solver
-        Makes what solves the windows: `Solver`, or one of `smoothing.gtsam`.
+        Motion model; its process noise composes, so a late measurement may split a segment.
+    lag_s
+        Length of the windows.
     initiation
         How the direction of travel of a new object is found where nothing else gives one, see `Initiation`.
     failures
         Counts how often windows are rebuilt and steps are damped.
+    options
+        Further `SmootherSettings`; lagged and final states are reported on request.
     """
+
+    make_solver: ClassVar[type[Solver]] = Solver
+    bank, exact, nonlinear, smooths, initiates = True, "any lag, any number", "at convergence", True, True
 
     def __init__(
         self,
         motion: MotionModel,
-        settings: SmootherSettings,
-        make_solver: MakeSolver = Solver,
+        lag_s: float,
         initiation: str = DEFAULT,
         failures: Failures | None = None,
+        **options: Any,  # any value that a setting takes
     ) -> None:
         self._motion = motion
-        self._settings = settings
+        self._settings = settings = SmootherSettings.of_options(lag_s, options)
         self._lag_ns, self._behind_ns = nanoseconds(settings.lag_s), nanoseconds(settings.behind_s)
-        self.windows = Windows(make_solver(motion, settings), settings.final, failures or Failures())
+        self.windows = Windows(self.make_solver(motion, settings), settings.final, failures or Failures())
         self._tracks: dict[int, int] = {}
         """Row of the arrays that holds each track, by track id in order of birth."""
         self._free: list[int] = []
         self.present_ns = 0
         """See `TrackBank.present_ns`."""
-        self._clock_ns: IntArray = np.zeros(0, dtype=np.int64)
-        self._first_ns: IntArray = np.zeros(0, dtype=np.int64)
+        self._clock_ns, self._first_ns, self._ids = np.zeros((3, 0), dtype=np.int64)
+        """Clock, stamp of the start and track id of each row."""
         self._initiation = checked_initiation(initiation)
         self._searches: dict[int, Search] = {}
         """Initiations of the tracks whose direction is sought, by row."""
@@ -71,11 +75,8 @@ class SmootherBank:
         """By stamp, until something changes."""
         self._known_times: IntArray | None = None
         """See `_times`, until something changes."""
-        self._final: dict[int, list[TrackState]] = {}
-        """States of nodes that have left, by row."""
-        self._ended: list[SmoothedReport] = []
-
-    # --- a `TrackBank`
+        self._final: list[SmoothedReport] = []
+        """States of nodes that have left the windows since the last call of `smoothed`."""
 
     @property
     def window_start_ns(self) -> int:
@@ -98,7 +99,7 @@ class SmootherBank:
         known = self._known.get(stamp_ns)
         if known is None:
             tracks = np.array([*self._tracks.values()], dtype=np.int64)
-            is_known = self._times()[3, tracks] <= stamp_ns
+            is_known = self._times()[2, tracks] <= stamp_ns
             track_ids, tracks = tuple(compress(self._tracks, is_known.tolist())), tracks[is_known]
             states = self.windows.states_at(tracks, np.full(len(tracks), stamp_ns))
             known = self._known[stamp_ns] = StatesAt(track_ids, *states)
@@ -109,12 +110,12 @@ class SmootherBank:
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
         tracks = np.array([self._tracks[track_id] for track_id in track_ids], dtype=np.int64)
-        newest_ns, start_ns, reach_ns, oldest_ns = self._times().take(tracks, axis=1)
+        newest_ns, start_ns, reach_ns = self._times().take(tracks, axis=1)
         results = [_TOO_OLD] * len(tracks)
         states = self.states_at(stamp_ns)
         positions = dict(zip(states.track_ids, range(len(states.track_ids)), strict=True))
         for indices, stack in stacks(measurements):
-            inside = (oldest_ns[np.array(indices)] <= stamp_ns).nonzero()[0]
+            inside = (reach_ns[np.array(indices)] <= stamp_ns).nonzero()[0]
             if not len(inside):
                 continue
             group, alike = np.array(indices)[inside], stack.seen_by(self._motion)
@@ -138,8 +139,10 @@ class SmootherBank:
         self.windows.solver.begin(track, prior.stamp_ns, *initial_state(self._motion, prior))
         if track >= len(self._clock_ns):
             size = len(self.windows.nodes.first)
-            self._clock_ns, self._first_ns = grown(self._clock_ns, size), grown(self._first_ns, size)
+            rows = self._clock_ns, self._first_ns, self._ids
+            self._clock_ns, self._first_ns, self._ids = (grown(each, size) for each in rows)
         self._clock_ns[track] = self._first_ns[track] = prior.stamp_ns
+        self._ids[track] = track_id
         self._searches.pop(track, None)
         search = Search.of(self._motion, prior, self._initiation)
         if search is not None:
@@ -149,8 +152,12 @@ class SmootherBank:
 
     def remove(self, track_id: int) -> None:
         """See `TrackBank.remove`; what was still inside the window becomes final."""
-        self._ended += final_reports(self._motion, [(track_id, state) for state in self.take_rest(track_id)])
-        self._free.append(self._tracks.pop(track_id))
+        track = self._tracks.pop(track_id)
+        if self._settings.final:
+            stamps_ns = self.windows.nodes.window_stamps_ns(track)
+            states = self.windows.states_at(np.full(len(stamps_ns), track), stamps_ns)
+            self._final += self._reports(repeat(track_id), stamps_ns.tolist(), *states)
+        self._free.append(track)
         self._changed()
 
     def present(self) -> list[TrackState]:
@@ -158,43 +165,34 @@ class SmootherBank:
         if not self._tracks:
             return []
         tracks = np.array([*self._tracks.values()], dtype=np.int64)
-        states = self.windows.states_at(tracks, np.maximum(self.present_ns, self._times()[3, tracks]))
+        states = self.windows.states_at(tracks, np.maximum(self.present_ns, self._times()[2, tracks]))
         return kinematic_states(self._motion, repeat(self.present_ns), *states)
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`."""
-        reports, self._ended = self._ended, []
-        reports += final_reports(
-            self._motion,
-            [(track_id, state) for track_id, track in self._tracks.items() for state in self._final.get(track, ())],
-        )
-        self._final.clear()
+        reports, self._final = self._final, []
         for lag_s in self._settings.lagged_s:
             stamp_ns = self.present_ns - nanoseconds(lag_s)
             states = self.states_at(stamp_ns)
-            shown = kinematic_states(self._motion, repeat(stamp_ns), states.means, states.covariances)
-            reports += [SmoothedReport(i, state, lag_s) for i, state in zip(states.track_ids, shown, strict=True)]
+            reports += self._reports(states.track_ids, repeat(stamp_ns), states.means, states.covariances, lag_s)
         return reports
 
-    # --- one track
+    def converge(self, max_iterations: int = 50) -> None:
+        """Relinearise until nothing moves; for comparisons."""
+        for track in self._tracks.values():
+            self.windows.solver.converge(track, max_iterations)
+        self._changed()
 
-    def state_at(self, track_id: int, stamp_ns: int) -> TrackState:
-        """See `Estimator.state_at`: smoothed in the past, interpolated under the motion model, predicted ahead."""
-        means, covariances = self.windows.states_at(np.array([self._tracks[track_id]]), np.array([stamp_ns]))
-        return track_state(self._motion, stamp_ns, means[0], covariances[0])
-
-    def take_final(self, track_id: int) -> list[TrackState]:
-        """Return smoothed states of the nodes that have left the window since the last call, in order."""
-        return self._final.pop(self._tracks[track_id], [])
-
-    def take_rest(self, track_id: int) -> list[TrackState]:
-        """Return `take_final`, and the states of the nodes that are still inside."""
-        if not self._settings.final:
-            return []
-        stamps_ns = self.windows.nodes.window_stamps_ns(self._tracks[track_id]).tolist()
-        return self.take_final(track_id) + [self.state_at(track_id, stamp_ns) for stamp_ns in stamps_ns]
-
-    # --- inside
+    def _reports(
+        self,
+        track_ids: Iterable[int],
+        stamps_ns: Iterable[int],
+        means: FloatArray,
+        covariances: FloatArray,
+        lag_s: float | None = None,
+    ) -> list[SmoothedReport]:
+        states = kinematic_states(self._motion, stamps_ns, means, covariances)
+        return list(map(SmoothedReport, track_ids, states, repeat(lag_s)))
 
     def _fuse(
         self,
@@ -226,8 +224,8 @@ class SmootherBank:
                 self._fuse(stamp_ns, tracks, measurements, innovations, guesses, start_ns, reach_ns, alone)
                 is_fused[row] = alone[row]
             return
-        for track, state in left:
-            self._final.setdefault(track, []).append(state)
+        if left is not None:
+            self._final += self._reports(self._ids[left[0]].tolist(), *left[1:])
         for track in self._searches.keys() & set(of.tolist()):
             self._initiate(track, stamp_ns)
         self.windows.damp(of)
@@ -250,85 +248,11 @@ class SmootherBank:
         self._known_times = None
 
     def _times(self) -> IntArray:
-        """Return four stamps of each row, shape (4, rows).
-
-        Those of the newest nodes, where the windows start, the oldest that may be fused, and the oldest that can be.
-        """
+        """Return stamps of the newest nodes, of the starts of the windows, and the oldest that are fused, (3, rows)."""
         if self._known_times is None:
             nodes, first = self.windows.nodes, self._first_ns
             newest = nodes.stamps_ns[np.arange(len(first)), nodes.count[: len(first)] - 1]
             start = np.maximum(np.maximum(self._clock_ns, newest) - self._lag_ns, first)
             reach = np.maximum(start - self._behind_ns, first)
-            self._known_times = np.array([newest, start, reach, np.maximum(reach, nodes.stamps_ns[: len(first), 0])])
+            self._known_times = np.array([newest, start, reach])
         return self._known_times
-
-
-class FixedLagSmoother:
-    """The fixed-lag smoother of one object; see `Smoother`.
-
-    Measurements may arrive in any order: each is fused at a node at its own stamp. The oldest node is the newest one
-    at or before the window's start, so every stamp inside the window has a left neighbour.
-
-    Parameters
-    ----------
-    motion
-        Motion model; its process noise composes, so a late measurement may split a segment.
-    start
-        First state; nothing older than it can be fused.
-    settings, make_solver, initiation, failures
-        See `SmootherBank`.
-    """
-
-    def __init__(
-        self,
-        motion: MotionModel,
-        start: Start,
-        settings: SmootherSettings,
-        make_solver: MakeSolver = Solver,
-        initiation: str = DEFAULT,
-        failures: Failures | None = None,
-    ) -> None:
-        self.bank = SmootherBank(motion, settings, make_solver, initiation, failures)
-        self.bank.birth(0, start)
-
-    @property
-    def window_ns(self) -> tuple[int, int]:
-        """See `Estimator.window_ns`."""
-        newest_ns, _, _, oldest_ns = self.bank._times()[:, 0].tolist()
-        return oldest_ns, newest_ns
-
-    def advance(self, now_ns: int) -> None:
-        """See `Estimator.advance`; the nodes that leave are marginalised at the next update."""
-        self.bank.advance(now_ns)
-
-    def update(self, measurement: Measurement) -> UpdateResult:
-        """See `Estimator.update`."""
-        return self.bank.update(measurement.stamp_ns, [0], [measurement])[0]
-
-    def state_at(self, stamp_ns: int) -> TrackState:
-        """See `SmootherBank.state_at`."""
-        return self.bank.state_at(0, stamp_ns)
-
-    def take_final(self) -> list[TrackState]:
-        """See `SmootherBank.take_final`."""
-        return self.bank.take_final(0)
-
-    def take_rest(self) -> list[TrackState]:
-        """See `SmootherBank.take_rest`: for when the track ends."""
-        return self.bank.take_rest(0)
-
-    def converge(self, max_iterations: int = 50) -> None:
-        """Relinearise until nothing moves; for comparisons."""
-        self.bank.windows.solver.converge(0, max_iterations)
-        self.bank._changed()
-
-
-# Any: an option may be any value that `SmootherSettings` takes.
-def smoother_banded(
-    motion: MotionModel, start: Start, lag_s: float, initiation: str = DEFAULT, **options: Any
-) -> FixedLagSmoother:
-    """Fixed-lag smoother, solved in covariance form by compiled code, all objects of a tracker together."""
-    return FixedLagSmoother(motion, start, SmootherSettings.of_options(lag_s, options), initiation=initiation)
-
-
-vars(smoother_banded).update(exact="any lag, any number", nonlinear="at convergence", smooths=True, initiates=True)

@@ -56,14 +56,14 @@ class SmootherSettings:
 
     @classmethod
     def of_options(cls, lag_s: float, options: Mapping[str, Any]) -> "SmootherSettings":
-        """The settings of the estimator of one object, which gives no lagged output unless told to.
+        """Settings that report no lagged and no final states unless `options` ask for them.
 
         Raises `CallError` for an option that does not exist.
         """
         taken = [each.name for each in fields(cls)]
         if unknown := set(options).difference(taken):
             raise CallError(f"unknown option {min(unknown)!r}; its options are {', '.join(taken[1:])}, initiation")
-        return cls(lag_s=lag_s, **{"lagged_s": (), **options})
+        return cls(lag_s=lag_s, **{"lagged_s": (), "final": False, **options})
 
     def thresholds(self, motion: MotionModel, nonlinear: bool) -> FloatArray:
         """Relinearisation thresholds of the state of `motion`, shape (n,).

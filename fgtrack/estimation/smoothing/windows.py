@@ -6,11 +6,10 @@ from contextlib import suppress
 import numpy as np
 
 from fgtrack.core.time import NS_PER_S, seconds
-from fgtrack.core.types import YAW, BoolArray, FloatArray, IntArray, TrackState
+from fgtrack.core.types import YAW, BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.initiation import Fix, Line, along, fixes_of
-from fgtrack.estimation.filters.propagation import track_state
 from fgtrack.estimation.kernels import kalman
 from fgtrack.estimation.smoothing import kernels, node_kernels
 from fgtrack.estimation.smoothing.damping import damped
@@ -22,6 +21,9 @@ from fgtrack.estimation.smoothing.terms import Innovations, NearMeasurement, is_
 _MANY = 16
 #: Later than any index.
 _NEVER = np.iinfo(np.int64).max
+
+_Leaving = tuple[IntArray, list[int], FloatArray, FloatArray]
+"""Tracks, stamps, means (m, n) and covariances (m, n, n) of nodes that leave, oldest first for each track."""
 
 
 class Windows:
@@ -87,12 +89,12 @@ class Windows:
         guesses: FloatArray,
         start_ns: IntArray,
         reach_ns: IntArray,
-    ) -> list[tuple[int, TrackState]]:
+    ) -> _Leaving | None:
         """Fuse one measurement of each of `tracks`, all at `stamp_ns`, and move the windows up to `start_ns`.
 
         `innovations` are those at `guesses`, shape (m, n), the states at `stamp_ns`. One node at or before `start_ns`
         stays in each window; behind it, what `reach_ns` needs is kept. Returns the smoothed states of the nodes
-        that left, oldest first for each track. Raises `numpy.linalg.LinAlgError` if it fails; all is as before then.
+        that left, if wanted. Raises `numpy.linalg.LinAlgError` if it fails; all is as before then.
         """
         nodes, solver = self.nodes, self.solver
         guesses = self._relinearised(tracks, stamp_ns, measurements, guesses)
@@ -172,18 +174,17 @@ class Windows:
             guesses[first] = self.states_at(tracks[first], np.full(len(first), stamp_ns))[0]
         return guesses
 
-    def _leaving(self, tracks: IntArray, anchors: IntArray) -> list[tuple[int, TrackState]]:
+    def _leaving(self, tracks: IntArray, anchors: IntArray) -> _Leaving | None:
         nodes = self.nodes
         num = anchors - nodes.first[tracks]
         if not self._final or not num.any():
-            return []
+            return None
         self.solver.prepare_leaving(tracks[num > 0], anchors[num > 0])
         rows, columns = np.nonzero(np.arange(int(num.max())) < num[:, None])
         tracks, indices = tracks[rows], nodes.first[tracks[rows]] + columns
         steps, covariances = self.solver.smoothed(tracks, indices)
         means = nodes.origin[nodes.numbers[tracks, indices]] + steps
-        leaving = zip(tracks.tolist(), nodes.stamps_ns[tracks, indices].tolist(), means, covariances, strict=True)
-        return [(track, track_state(self._motion, stamp_ns, x, P)) for track, stamp_ns, x, P in leaving]
+        return tracks, nodes.stamps_ns[tracks, indices].tolist(), means, covariances
 
     def _insert(
         self,

@@ -1,7 +1,7 @@
 """The slow check: Levenberg-Marquardt on the whole window at every update, with factors that call the models."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import gtsam
 import numpy as np
@@ -11,10 +11,8 @@ from scipy.linalg.lapack import dtrtri
 from fgtrack.core.linalg import identity, inverse_roots, noise_roots
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.base import Start
-from fgtrack.estimation.filters.initiation import DEFAULT
-from fgtrack.estimation.smoothing.bank import FixedLagSmoother
-from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver, smoother
+from fgtrack.estimation.smoothing.bank import SmootherBank
+from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.terms import (
     EquivalentMeasurement,
@@ -139,14 +137,9 @@ def _gaussian(root: FloatArray) -> gtsam.noiseModel.Base:
     return gtsam.noiseModel.Gaussian.SqrtInformation(root, smart=False)
 
 
-# Any: an option may be any value that `SmootherSettings` takes.
-def smoother_batch(
-    motion: MotionModel, start: Start, lag_s: float, initiation: str = DEFAULT, **options: Any
-) -> FixedLagSmoother:
+class BatchBank(SmootherBank):
     """Fixed-lag smoother, a factor graph that Levenberg-Marquardt solves at every update: slow, for checks."""
-    settings = SmootherSettings.of_options(lag_s, options)
-    return FixedLagSmoother(motion, start, settings, BatchSolver, initiation)
 
-
-# It compares errors at absolute positions: eps W of 50 m instead of the standard deviation, 0.5 m.
-vars(smoother_batch).update(vars(smoother), rounding=100.0, tolerance=1e-6)
+    make_solver = BatchSolver
+    tolerance = 1e-6  # it compares errors at absolute positions: eps W of 50 m instead of the standard deviation, 0.5 m
+    rounding = 100.0

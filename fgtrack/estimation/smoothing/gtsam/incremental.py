@@ -2,17 +2,14 @@
 
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
 
 import gtsam
 import numpy as np
 
 from fgtrack.core.linalg import inverse_roots, psd_solve, symmetrise
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.estimation.base import Start
-from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.smoothing import node_kernels
-from fgtrack.estimation.smoothing.bank import FixedLagSmoother
+from fgtrack.estimation.smoothing.bank import SmootherBank
 from fgtrack.estimation.smoothing.nodes import grown
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver
@@ -224,15 +221,8 @@ def _unit(size: int) -> gtsam.noiseModel.Unit:
     return gtsam.noiseModel.Unit.Create(size)
 
 
-# Any: an option may be any value that `SmootherSettings` takes.
-def smoother(
-    motion: MotionModel, start: Start, lag_s: float, initiation: str = DEFAULT, **options: Any
-) -> FixedLagSmoother:
+class IncrementalBank(SmootherBank):
     """Fixed-lag smoother, a factor graph that iSAM2 solves incrementally."""
-    settings = SmootherSettings.of_options(lag_s, options)
-    return FixedLagSmoother(motion, start, settings, IncrementalSolver, initiation)
 
-
-vars(smoother).update(
-    exact="any lag, any number", nonlinear="at convergence", smooths=True, initiates=True, rounding=1.0
-)
+    make_solver = IncrementalSolver
+    rounding = 1.0
