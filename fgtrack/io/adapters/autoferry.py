@@ -15,7 +15,6 @@ Choices that the data leave open:
   the cameras stay relative to the ego.
 """
 
-import json
 import math
 from collections.abc import Iterator
 from decimal import Decimal
@@ -25,25 +24,17 @@ from pathlib import Path
 from typing import Any
 
 from fgtrack.core.checks import LARGEST_NS
-from fgtrack.core.errors import DataError
-from fgtrack.core.files import read_whole
 from fgtrack.core.geometry import wrap_angle
-from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
-from fgtrack.io.adapters.common import reported_as
+from fgtrack.io.adapters.common import exact_ns, json_values, reported_as
 from fgtrack.io.source import FileFormat
 
 SENSORS = {1: "lidar", 2: "radar", 3: "infrared", 4: "daylight"}
 _CAMERAS = {3, 4}
-_LARGEST_MB = 20.0  # those of the data set have less than one
+_DETECTIONS = "*_detections.json"
 
 # Parsed JSON, checked while it is read.
 Json = Any
-
-
-def detections_file(folder: Path) -> Path | None:
-    """The file of detections of a scenario folder; None where `folder` is not one."""
-    return next(iter(sorted(folder.glob("*_detections.json"))), None)
 
 
 def read_scenario(folder: Path) -> Iterator[Message]:
@@ -51,9 +42,7 @@ def read_scenario(folder: Path) -> Iterator[Message]:
 
     At equal receipts the truth comes first and the ego before the detections. Raises `DataError`, with file and record.
     """
-    file = detections_file(folder)
-    if file is None:
-        raise DataError(f"{folder}: holds no *_detections.json, so it is not an Autoferry scenario")
+    file = min(folder.glob(_DETECTIONS))
     truth = file.with_name(file.name.replace("_detections", "_groundTruth"))
     states = _truth(truth) if truth.exists() else []
     return merge(states, _sensed(file), key=lambda message: message.receipt_ns)
@@ -61,16 +50,16 @@ def read_scenario(folder: Path) -> Iterator[Message]:
 
 FORMAT = FileFormat(
     "an Autoferry scenario folder (*_detections.json)",
-    lambda path: path.is_dir() and detections_file(path) is not None,
+    lambda path: path.is_dir() and any(path.glob(_DETECTIONS)),
     lambda path, config: partial(read_scenario, path),
 )
 
 
 def _sensed(file: Path) -> Iterator[EgoState | DetectionList]:
     newest_ns = -LARGEST_NS
-    for index, record in enumerate(_records(file)):
+    for index, record in enumerate(json_values(file, parse_float=Decimal)):
         with reported_as(f"{file}: record {index} is not one of the data set"):
-            stamp_ns = _nanoseconds(record["time"])
+            stamp_ns = exact_ns(record["time"])
             north_m, east_m = map(float, record["ownshipPosition"])
             sensor = record["sensorID"]
             name = SENSORS[sensor]
@@ -108,24 +97,11 @@ def _bearings(measurement: Json) -> tuple[Detection, ...]:
 def _truth(file: Path) -> list[TruthState]:
     """GNSS fixes, each once: the file repeats the nearest fix for every record."""
     states: dict[tuple[int, int], TruthState] = {}
-    for index, fixes in enumerate(_records(file)):
+    for index, fixes in enumerate(json_values(file, parse_float=Decimal)):
         with reported_as(f"{file}: record {index} is not one of the data set"):
             for fix in fixes if isinstance(fixes, list) else [fixes]:
-                stamp_ns, target = _nanoseconds(fix["time"]), int(fix["targetID"])
+                stamp_ns, target = exact_ns(fix["time"]), int(fix["targetID"])
                 north_m, east_m = map(float, fix["position"][:2])
                 state = TruthState(stamp_ns, stamp_ns, target, x_m=east_m, y_m=north_m)
                 states.setdefault((stamp_ns, target), state)
     return [states[key] for key in sorted(states)]
-
-
-def _records(file: Path) -> list[Json]:
-    with reported_as(f"{file}: is not JSON, fetch it again"):
-        records = json.loads(read_whole(file, _LARGEST_MB), parse_float=Decimal)
-    if not isinstance(records, list):
-        raise DataError(f"{file}: is not a list of records")
-    return records
-
-
-def _nanoseconds(time_s: Decimal | int) -> int:
-    """Integer nanoseconds of the decimal text; a float would lose the last hundred of them."""
-    return round(Decimal(time_s) * NS_PER_S)

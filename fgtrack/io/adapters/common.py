@@ -1,21 +1,30 @@
 """Common parts of the adapters: headers, quaternions, speeds and covariances of ROS messages."""
 
+import json
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from decimal import Context, Decimal
 from hashlib import blake2b
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from fgtrack.core.checks import is_stamp
 from fgtrack.core.errors import DataError, FgtrackError
-from fgtrack.core.time import NS_PER_S
+from fgtrack.core.files import read_whole
+from fgtrack.core.time import NS_PER_S, NS_PER_UNIT
 from fgtrack.core.types import MEASURABLE, Detection, FloatArray, Frame
 
 PLANAR = [0, 1, 5]
 """Indices of x, y and the rotation about z in a covariance of ROS."""
 
+_DECIMAL = Context(Emax=40)  # no exponent makes a number of a million digits
+_LARGEST_MB = 2000.0
+A_LIST, _BETWEEN = re.compile(r"\s*\[\s*"), re.compile(r"[\s,:]*")
 _INT64 = range(-(1 << 63), 1 << 63)
 
 # A message is known by its attributes only: its class is made when a recording is read.
@@ -49,6 +58,23 @@ def reported_as(text: str) -> Iterator[None]:
         raise DataError(f"{text} ({type(error).__name__}: {str(error)[:200]})") from error
 
 
+def json_values(file: Path, begin: re.Pattern[str] = A_LIST, **form: Any) -> Iterator[Any]:  # Any: parsed JSON
+    """Values of the list that follows `begin` in the JSON `file`, or keys and values of the object.
+
+    One after the other: the text of a table may have a gigabyte, and its values take five times as much. `form` is that
+    of a `JSONDecoder`. Raises `DataError` where it is not such a file.
+    """
+    with reported_as(f"{file}: is not JSON of the expected form, fetch it again"):
+        text = read_whole(file, _LARGEST_MB).decode()
+        gap = begin.match(text)
+        if gap is None:
+            raise ValueError("another beginning")
+        while gap is not None and text[gap.end()] not in "]}":
+            value, end = json.JSONDecoder(**form).raw_decode(text, gap.end())
+            yield value
+            gap = _BETWEEN.match(text, end)
+
+
 def split(items: Iterable[Detection | str]) -> tuple[tuple[Detection, ...], tuple[str, ...]]:
     """The detections among `items`, and for each other object the setting that excludes it."""
     every = tuple(items)
@@ -65,6 +91,17 @@ def object_id(value: object) -> int | None:
     if text.removeprefix("-").isdecimal() and text.isascii() and len(text) < 20 and int(text) in _INT64:
         return int(text)
     return int.from_bytes(blake2b(text.encode(errors="replace"), digest_size=6).digest(), "big") if text else None
+
+
+def exact_ns(time: Decimal | int | str, unit: str = "s") -> int:
+    """Integer nanoseconds of a decimal text; a float would lose the last hundred of them.
+
+    Raises `ArithmeticError` or `ValueError` where it is not a time.
+    """
+    time_ns = round(_DECIMAL.create_decimal(time) * NS_PER_UNIT[unit])
+    if not is_stamp(time_ns):
+        raise ValueError("beyond the year 2096")
+    return time_ns
 
 
 def stamp_ns(time: RosMessage) -> int:

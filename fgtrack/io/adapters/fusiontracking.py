@@ -42,25 +42,22 @@ def read_log(folder: Path, frames: Mapping[str, Frame]) -> Iterator[Message]:
     a break, and `DataError`, with the line, where it is not such a log.
     """
     file = folder / LOG_NAME
-    try:
-        with open_file(file) as lines:
-            header = next(lines, b"").decode(errors="replace").rstrip("\n").split(";")
-            if missing := [name for name in _COLUMNS if name not in header]:
-                raise DataError(f"{file}:1: has no column {missing[0]}, so it is not a log of FusionTracking")
-            last_ego_ns: int | None = None
-            for number, line in enumerate(lines, 2):
-                if line.count(b";") < len(header) - 1 and not line.endswith(b"\n"):
-                    raise TruncatedInput(f"{file}:{number}: breaks off in the middle of a row")
-                with reported_as(f"{file}:{number}: is not a row of such a log"):
-                    row = dict(zip(header, line.decode().rstrip("\n").split(";"), strict=True))
-                    receipt_ns, detections, ego = (json.loads(row[name]) for name in _COLUMNS)
-                    messages: list[Message] = list(_lists(detections or {}, receipt_ns, frames))
-                    if "state" in ego and ego["t"] != last_ego_ns:
-                        last_ego_ns = ego["t"]
-                        messages.insert(0, _ego(ego, receipt_ns))
-                yield from messages
-    except OSError as error:
-        raise DataError(f"{file}: cannot be read ({error.strerror})") from error
+    with open_file(file) as lines:
+        header = next(lines, b"").decode(errors="replace").rstrip("\n").split(";")
+        if missing := [name for name in _COLUMNS if name not in header]:
+            raise DataError(f"{file}:1: has no column {missing[0]}, so it is not a log of FusionTracking")
+        last_ego_ns: int | None = None
+        for number, line in enumerate(lines, 2):
+            if line.count(b";") < len(header) - 1 and not line.endswith(b"\n"):
+                raise TruncatedInput(f"{file}:{number}: breaks off in the middle of a row")
+            with reported_as(f"{file}:{number}: is not a row of such a log"):
+                row = dict(zip(header, line.decode().rstrip("\n").split(";"), strict=True))
+                receipt_ns, detections, ego = (json.loads(row[name]) for name in _COLUMNS)
+                messages: list[Message] = list(_lists(detections or {}, receipt_ns, frames))
+                if "state" in ego and ego["t"] != last_ego_ns:
+                    last_ego_ns = ego["t"]
+                    messages.insert(0, _ego(ego, receipt_ns))
+            yield from messages
 
 
 FORMAT = FileFormat(

@@ -11,7 +11,6 @@ stand in a folder of the version, `v1.0-...`, beside it. Choices that the data l
 - Truth that no sensor has a point of is ignored, as in the data set's own evaluation.
 """
 
-import json
 import math
 import re
 from collections.abc import Iterator, Mapping
@@ -22,20 +21,17 @@ from pathlib import Path
 from typing import Any
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.files import read_whole
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import seconds
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
-from fgtrack.io.adapters.common import object_id, reported_as, signed_speed_mps, split
+from fgtrack.io.adapters.common import json_values, object_id, reported_as, signed_speed_mps, split
 from fgtrack.io.config import NuscenesInput
 from fgtrack.io.source import FileFormat
 
 __all__ = ["FORMAT", "read_scene"]
 
 _RESULTS = re.compile(rb'\s*\{\s*"(meta|results)"\s*:')
-_A_LIST, _OF_RESULTS = re.compile(r"\s*\[\s*"), re.compile(r'.*?"results"\s*:\s*\{\s*', re.DOTALL)
-_BETWEEN = re.compile(r"[\s,:]*")
-_LARGEST_MB = 2000.0
+_OF_RESULTS = re.compile(r'.*?"results"\s*:\s*\{\s*', re.DOTALL)
 _NS_PER_US = 1000
 _CATEGORIES = {
     "movable_object.barrier": "barrier",
@@ -75,25 +71,9 @@ def read_scene(file: Path, settings: NuscenesInput) -> Iterator[Message]:
     yield from sorted(messages, key=attrgetter("receipt_ns"))
 
 
-def _entries(file: Path, begin: re.Pattern[str] = _A_LIST) -> Iterator[Json]:
-    """Values of the list that follows `begin` in the JSON `file`, or keys and values of the object.
-
-    One after the other: the text of such a table has up to a gigabyte, and its values take five times as much.
-    """
-    with reported_as(f"{file}: is not JSON of the expected form, fetch it again"):
-        text = read_whole(file, _LARGEST_MB).decode()
-        gap = begin.match(text)
-        if gap is None:
-            raise ValueError("another beginning")
-        while gap is not None and text[gap.end()] not in "]}":
-            value, end = json.JSONDecoder().raw_decode(text, gap.end())
-            yield value
-            gap = _BETWEEN.match(text, end)
-
-
 def _results(file: Path) -> Iterator[tuple[str, Json]]:
     """Sample and its boxes, one after the other."""
-    entries = _entries(file, _OF_RESULTS)
+    entries = json_values(file, _OF_RESULTS)
     return zip(entries, entries, strict=True)
 
 
@@ -110,9 +90,9 @@ def _tables(file: Path, settings: NuscenesInput) -> Path:
 
 def _samples(tables: Path, file: Path, settings: NuscenesInput) -> dict[str, int]:
     """Stamps of the samples of the scene, by token, in the order of time."""
-    names = {each["token"]: each["name"] for each in _entries(tables / "scene.json")}
+    names = {each["token"]: each["name"] for each in json_values(tables / "scene.json")}
     judged = {token for token, _ in _results(file)}
-    samples = [(each["timestamp"], each["token"], each["scene_token"]) for each in _entries(tables / "sample.json")]
+    samples = [(each["timestamp"], each["token"], each["scene_token"]) for each in json_values(tables / "sample.json")]
     scenes = {scene for _, token, scene in samples if token in judged}
     if settings.scene is not None:
         scenes = {token for token, name in names.items() if settings.scene in (token, name)}
@@ -125,10 +105,10 @@ def _samples(tables: Path, file: Path, settings: NuscenesInput) -> dict[str, int
 def _egos(tables: Path, samples: Mapping[str, int]) -> list[EgoState]:
     """The poses at the data of the samples, with the motion between them."""
     wanted = {
-        each["ego_pose_token"] for each in _entries(tables / "sample_data.json") if each["sample_token"] in samples
+        each["ego_pose_token"] for each in json_values(tables / "sample_data.json") if each["sample_token"] in samples
     }
     poses = {}
-    for each in _entries(tables / "ego_pose.json"):
+    for each in json_values(tables / "ego_pose.json"):
         if each["token"] in wanted:
             x_m, y_m, _ = map(float, each["translation"])
             poses[int(each["timestamp"]) * _NS_PER_US] = (x_m, y_m, _yaw_rad(each["rotation"]))
@@ -181,11 +161,11 @@ def _truth(tables: Path, samples: Mapping[str, int], settings: NuscenesInput) ->
         return []
     categories = {
         each["token"]: next((name for begin, name in _CATEGORIES.items() if each["name"].startswith(begin)), None)
-        for each in _entries(tables / "category.json")
+        for each in json_values(tables / "category.json")
     }
-    kinds = {each["token"]: categories[each["category_token"]] for each in _entries(tables / "instance.json")}
+    kinds = {each["token"]: categories[each["category_token"]] for each in json_values(tables / "instance.json")}
     states = []
-    for each in _entries(tables / "sample_annotation.json"):
+    for each in json_values(tables / "sample_annotation.json"):
         stamp_ns = samples.get(each["sample_token"])
         kind = kinds[each["instance_token"]]
         if stamp_ns is None or kind is None or (settings.classes and kind not in settings.classes):

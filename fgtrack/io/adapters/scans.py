@@ -5,7 +5,7 @@ from dataclasses import replace
 from itertools import chain
 
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import Detection, DetectionList, Message
+from fgtrack.core.types import DetectionList, Message
 from fgtrack.io.errors import UntilBreak
 
 __all__ = ["grouped"]
@@ -49,10 +49,11 @@ def _joined(group: list[Message]) -> Message:
         return group[0]
     first_ns = lists[0].stamp_ns
     mean_ns = first_ns + sum(each.stamp_ns - first_ns for each in lists) // len(lists)
-    objects: list[Detection] = []
     is_own = any(each.stamp_ns != first_ns for each in lists)
-    for each in lists:
-        for item in each.objects:
-            objects.append(replace(item, stamp_ns=each.stamp_ns) if is_own and item.stamp_ns is None else item)
+    objects = [
+        replace(item, stamp_ns=each.stamp_ns) if is_own and item.stamp_ns is None else item
+        for each in lists
+        for item in each.objects
+    ]
     left_out = tuple(chain.from_iterable(each.left_out for each in lists))
     return replace(lists[-1], stamp_ns=mean_ns, objects=objects, left_out=left_out)

@@ -9,19 +9,18 @@ import csv
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
-from decimal import Decimal
 from functools import partial
 from io import TextIOWrapper
-from itertools import chain, groupby
+from itertools import chain
 from operator import itemgetter
 from pathlib import Path
+from typing import Any
 
-from fgtrack.core.checks import is_stamp
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.files import open_file
-from fgtrack.core.time import NS_PER_UNIT, epoch_unit, wrong_unit
+from fgtrack.core.time import wrong_unit
 from fgtrack.core.types import MEASURABLE, STATE_NAMES, Detection, DetectionList, EgoState, Message, TruthState
+from fgtrack.io.adapters.common import exact_ns
 from fgtrack.io.adapters.fields import COMPONENTS, FieldError, mapped, paths_of, single_path
 from fgtrack.io.adapters.fusiontracking import LOG_NAME
 from fgtrack.io.config import CsvTable, InputConfig
@@ -32,12 +31,11 @@ __all__ = ["FORMAT", "headers", "read_tables", "rows"]
 _ENDINGS = (".csv", ".tsv")
 _LONGEST_HEADER = 1_000_000
 _TIMES = ("stamp", "receipt")
-_EGO_NEEDS = ("x_m", "y_m", "yaw_rad", "speed_mps")
-#: Components of the rows of the ego and of truth; all others are of detections.
+#: Components of the rows of the ego and of truth, and those that must be there; all others are of detections.
 _NAMES = {"ego": STATE_NAMES, "truth": ("object_id", *STATE_NAMES)}
+_NEEDS = {"ego": STATE_NAMES[:4], "truth": STATE_NAMES[:2]}
 
-Row = tuple[str, dict[str, str]]
-"""File and line, for messages, and cells by column."""
+Cells = Mapping[str, str]
 
 
 def read_tables(tables: Sequence[tuple[Path, CsvTable, str]]) -> Iterator[Message]:
@@ -47,61 +45,67 @@ def read_tables(tables: Sequence[tuple[Path, CsvTable, str]]) -> Iterator[Messag
     not match the mapping, after all messages up to the last receipt before that row.
     """
     keyed: list[tuple[tuple[int, int, int], Message]] = []
-    until_ns, broken = math.inf, None
+    breaks: list[tuple[float, DataError]] = []
     for number, table in enumerate(tables):
         messages, error = _read(*table)
         keyed += [((each.receipt_ns, number, each.stamp_ns), each) for each in messages]
-        last_ns = max((each.receipt_ns for each in messages), default=-math.inf)
-        if error is not None and last_ns < until_ns:
-            until_ns, broken = last_ns, error
-    keyed = sorted((each for each in keyed if each[0][0] <= until_ns), key=itemgetter(0))
-    for _, group in groupby(keyed, key=itemgetter(0)):
-        messages = [message for _, message in group]
-        lists = [message for message in messages if isinstance(message, DetectionList)]
-        objects = [item for each in lists for item in each.objects]
-        left_out = tuple(item for each in lists for item in each.left_out)
-        yield from [replace(lists[0], objects=objects, left_out=left_out)] if lists else messages
+        if error is not None:
+            breaks.append((max((each.receipt_ns for each in messages), default=-math.inf), error))
+    until_ns, broken = min(breaks, key=itemgetter(0), default=(math.inf, None))
+    for _, message in sorted(keyed, key=itemgetter(0)):
+        if message.receipt_ns <= until_ns:
+            yield message
     if broken is not None:
         raise broken
 
 
 def _read(file: Path, table: CsvTable, role: str) -> tuple[list[Message], DataError | None]:
-    """A message of every row of a table that passes the filters, and the error that ends it."""
+    """Messages of the rows of a table that pass the filters, and the error that ends it."""
     messages: list[Message] = []
+    scans: dict[tuple[int, int], list[Detection]] = {}
+    stamps_ns: list[int] = []
     left_out: list[str] = []
-    first: Row | None = None
-    skipped: Row | None = None
-    times = {name: path for name, path in table.columns.items() if name in _TIMES}
+    skipped, error = None, None
+    where = str(file)
     try:
         found = rows(file, table.delimiter)
         where, header = next(found)
         for column in [*chain.from_iterable(map(paths_of, table.columns.values())), *table.filters]:
             if column not in header:
                 raise DataError(f"{where}: has no column {column!r}, but {', '.join(header)}")
-        for row in found:
-            if (name := _excluding_filter(table, row[1])) is not None:
+        for where, cells in found:  # noqa: B007 - an error below names it
+            if (name := _excluding_filter(table, cells)) is not None:
                 left_out.append(f"filters.{name}")
-                skipped = skipped or row
+                skipped = skipped or cells
                 continue
-            messages.append(_message(row, table, role))
-            first = first or row
-        if first is None and skipped is not None and role not in _NAMES:  # an empty list reports what was left out
-            messages.append(_message(skipped, replace(table, columns=times), role))
-    except DataError as error:
-        return messages, error
-    if messages and isinstance(messages[0], DetectionList):
-        messages[0] = replace(messages[0], left_out=tuple(left_out))
-    stamps_ns = [each.stamp_ns for each in messages]
-    if first is not None and (text := wrong_unit(len(stamps_ns), min(stamps_ns), max(stamps_ns), table.time_unit)):
-        column = single_path(table.columns["stamp"])
-        return [], DataError(f"{first[0]}: {column}: {text}: change `time_unit` (input.csv.{role})")
-    return messages, None
+            times, values = _times(cells, table), _values(cells, table, role)
+            stamps_ns.append(times[0])
+            if role == "ego":
+                messages.append(EgoState(*times, **values))
+            elif role == "truth":
+                messages.append(TruthState(*times, **{"object_id": 0} | values))
+            else:
+                is_measured = not values.keys().isdisjoint(MEASURABLE)
+                scans.setdefault(times, []).extend([Detection(**values)] if is_measured else [])
+        if skipped is not None and not scans and role not in _NAMES:  # an empty list reports what was left out
+            scans[_times(skipped, table)] = []
+    except FieldError as wrong:
+        error = DataError(f"{where}: {wrong}")
+    except DataError as broken:
+        error = broken
+    if stamps_ns and (text := wrong_unit(len(stamps_ns), min(stamps_ns), max(stamps_ns), table.time_unit)):
+        return [], DataError(f"{file}: {text}: change `time_unit` (input.csv.{role})")
+    for (stamp_ns, receipt_ns), objects in scans.items():
+        counted, left_out = tuple(left_out), []
+        sensor = role.removeprefix("detections.")
+        messages.append(DetectionList(sensor, stamp_ns, receipt_ns, objects, table.frame or "ego", counted))
+    return messages, error
 
 
-def rows(file: Path, delimiter: str | None = None) -> Iterator[Row]:
-    """Rows of `file`, the header first; without a delimiter the most frequent of `,`, `;` and tab in the header.
+def rows(file: Path, delimiter: str | None = None) -> Iterator[tuple[str, Cells]]:
+    """File and line, and cells by column, of the rows of `file`, the header first.
 
-    Raises `DataError` where the file is not a table.
+    Without a delimiter the most frequent of `,`, `;` and tab in the header. Raises `DataError` where it is not a table.
     """
     where = f"{file}:1"
     try:
@@ -113,19 +117,16 @@ def rows(file: Path, delimiter: str | None = None) -> Iterator[Row]:
             if len(set(header)) < len(header):
                 raise DataError(f"{where}: has a column twice: {', '.join(header)}")
             yield where, dict(zip(header, header, strict=True))
-            for cells in reader:
+            for cells in filter(any, reader):
                 where = f"{file}:{reader.line_num}"
-                if any(cells) and len(cells) != len(header):
+                if len(cells) != len(header):
                     raise DataError(f"{where}: has {len(cells)} cells, the header has {len(header)}")
-                if any(cells):
-                    yield where, dict(zip(header, map(str.strip, cells), strict=True))
-    except OSError as error:
-        raise DataError(f"{file}: cannot be read ({error.strerror})") from error
-    except csv.Error as error:
-        raise DataError(f"{file}:{reader.line_num}: is not CSV ({error})") from error
+                yield where, dict(zip(header, map(str.strip, cells), strict=True))
+    except (OSError, csv.Error) as error:
+        raise DataError(f"{where}: cannot be read any further ({error})") from error
 
 
-def _excluding_filter(table: CsvTable, cells: Mapping[str, str]) -> str | None:
+def _excluding_filter(table: CsvTable, cells: Cells) -> str | None:
     """First filter that a row does not pass; a text that is a number is compared as one."""
     for name, each in table.filters.items():
         value: float | str = cells[name]
@@ -136,41 +137,26 @@ def _excluding_filter(table: CsvTable, cells: Mapping[str, str]) -> str | None:
     return None
 
 
-def _message(row: Row, table: CsvTable, role: str) -> Message:
-    """The state in a row, or a list of its detection; empty where nothing is measured."""
-    where, cells = row
-    try:
-        times = {name: _time(cells, table, name) for name in _TIMES if name in table.columns}
-        values = mapped(table.columns, _NAMES.get(role, COMPONENTS), lambda column: cells[column] or None)
-    except FieldError as error:
-        raise DataError(f"{where}: {error}") from error
+def _values(cells: Cells, table: CsvTable, role: str) -> dict[str, Any]:  # Any: as of `mapped`
+    """Values that a row gives; NaN for a state that must be there, which the tracker counts."""
+    values = mapped(table.columns, _NAMES.get(role, COMPONENTS), lambda column: cells[column] or None)
+    values |= {name: math.nan for name in _NEEDS.get(role, ()) if values[name] is None}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _times(cells: Cells, table: CsvTable) -> tuple[int, int]:
+    """Stamp and receipt of a row in integer nanoseconds."""
+    times: dict[str, int] = {}
+    for name in _TIMES:
+        if name in table.columns:
+            column = single_path(table.columns[name])
+            try:
+                times[name] = exact_ns(cells[column], table.time_unit)
+            except (ArithmeticError, ValueError) as error:
+                text = f"{cells[column]!r:.40} is not a time in {table.time_unit}"
+                raise FieldError(f"{column}: {text}, or change `time_unit`") from error
     receipt_ns = times.get("receipt", times["stamp"])
-    stamp_ns = receipt_ns if table.stamp_from == "receipt" else times["stamp"]
-    if role in _NAMES:  # a state that is not finite is counted by the tracker
-        values |= {name: math.nan for name in _EGO_NEEDS[: 4 if role == "ego" else 2] if values[name] is None}
-    if role == "ego":
-        return EgoState(stamp_ns, receipt_ns, **{name: value for name, value in values.items() if value is not None})
-    if role == "truth":
-        return TruthState(stamp_ns, receipt_ns, **values | {"object_id": values.get("object_id") or 0})
-    is_measured = any(values.get(name) is not None for name in MEASURABLE)
-    objects = (Detection(**values),) if is_measured else ()
-    return DetectionList(role.removeprefix("detections."), stamp_ns, receipt_ns, objects, table.frame or "ego")
-
-
-def _time(cells: Mapping[str, str], table: CsvTable, name: str) -> int:
-    """Integer nanoseconds of the decimal text; a float would lose the last hundred of them."""
-    column = single_path(table.columns[name])
-    text = cells[column][:40]
-    try:
-        time_ns = round(Decimal(text) * NS_PER_UNIT[table.time_unit]) if abs(Decimal(text)) < 1e25 else None
-    except ArithmeticError:  # of `decimal`
-        time_ns = None
-    if time_ns is None:
-        raise FieldError(f"{column}: {text!r} is not a time")
-    if not is_stamp(time_ns):
-        unit = epoch_unit(float(text)) or "of another unit"
-        raise FieldError(f"{column}: {text} {table.time_unit} is beyond the year 2096: set `time_unit: {unit}`")
-    return time_ns
+    return receipt_ns if table.stamp_from == "receipt" else times["stamp"], receipt_ns
 
 
 def _recognises(path: Path) -> bool:
@@ -201,7 +187,7 @@ def _file(path: Path, table: CsvTable, role: str) -> Path:
     """File of `table`, whose columns are checked."""
     where, columns = f"input.csv.{role}", table.columns.keys()
     known = {*_TIMES, *_NAMES.get(role, COMPONENTS)}
-    needed = {"stamp", *(_EGO_NEEDS if role == "ego" else _EGO_NEEDS[:2] if role == "truth" else ())}
+    needed = {"stamp", *_NEEDS.get(role, ())}
     if columns - known:
         raise CallError(
             f"{where}.columns: unknown column {min(columns - known)!r}, known are {', '.join(sorted(known))}"
