@@ -1,7 +1,7 @@
 """`fgtrack simulate`, `convert` and `config`: recordings that are made, and the configuration of a replay."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, get_args
 
@@ -12,7 +12,6 @@ from rich.text import Text
 
 from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, Settings, StorageOption, scenarios
 from fgtrack.cli.show import console, progress, say
-from fgtrack.core.errors import CallError
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.diagnostics import excluded_lines
 from fgtrack.io.output import check_apart
@@ -71,7 +70,10 @@ def convert(
     source = open_input(recording, config.input)
     unread: dict[str, Counter[str]] = {}
     with progress("convert"):
-        messages = source.messages() if delays_file is None else _redelayed(source.messages, delays_file, seed)
+        messages: Iterable[Message] = source.messages()
+        if delays_file is not None:
+            delays = load(dict[str, SensorDelays], delays_file)
+            messages = redelay(source.messages, delays, np.random.default_rng(seed))
         kept = _with_unread(messages, unread)
         count = write_recording(out, kept, storage, settings=source.settings(), overwrite=overwrite)
     lost = messages.num_lost if isinstance(messages, Redelayed) else {}
@@ -87,14 +89,6 @@ def _with_unread(messages: Iterable[Message], unread: dict[str, Counter[str]]) -
         if isinstance(message, DetectionList) and message.left_out:
             unread.setdefault(message.sensor, Counter()).update(message.left_out)
         yield message
-
-
-def _redelayed(read: Callable[[], Iterator[Message]], delays_file: Path, seed: int) -> Redelayed:
-    delays = load(dict[str, SensorDelays], delays_file)
-    try:
-        return redelay(read, delays, np.random.default_rng(seed))
-    except CallError as error:
-        raise CallError(f"{delays_file}: {error}") from error
 
 
 def config(

@@ -1,6 +1,5 @@
 """`fgtrack compare` and `export`: tables of runs, and runs for other programs."""
 
-import logging
 from pathlib import Path
 from typing import Annotated
 
@@ -61,22 +60,17 @@ def export(
 ) -> None:
     """Export runs for Foxglove, Lichtblick, RViz; or a KITTI result."""
     if kitti is not None:
-        _export_kitti(runs, kitti, out, overwrite)
+        if len(runs) != 1:
+            raise CallError(f"--kitti: writes one run, these are {len(runs)}")
+        boxes, tracks, without_size = write_kitti_result(load_run(runs[0]), kitti, out, overwrite=overwrite)
+        if without_size:
+            warn(f"{without_size} tracks are left out: none of their detections has a size")
+        say(f"{out}: {boxes} boxes of {tracks} tracks")
         return
     with progress("export"):
         counts, notes = written(runs, out, ros2=ros2, overwrite=overwrite)
     for note in notes:
-        logging.getLogger(__name__).warning(note)
+        warn(note)
     say(f"{out}: {sum(counts.values())} messages on {len(counts)} topics")
     if not ros2:
         say(f"layout to import: {shipped_folder() / 'foxglove_layout.json'}")
-
-
-def _export_kitti(runs: list[Path], sequence: Path, out: Path, overwrite: bool) -> None:
-    if len(runs) != 1:
-        raise CallError(f"--kitti: writes one run, these are {len(runs)}")
-    boxes, tracks, without_size = write_kitti_result(load_run(runs[0]), sequence, out, overwrite=overwrite)
-    if without_size:
-        log = logging.getLogger(__name__)
-        log.warning(f"{without_size} tracks are left out: none of their detections has a size")
-    say(f"{out}: {boxes} boxes of {tracks} tracks")

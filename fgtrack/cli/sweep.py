@@ -1,6 +1,5 @@
 """`fgtrack sweep`: settings x seeds x estimators into one table."""
 
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,9 +8,9 @@ from typing import Annotated
 import pandas as pd
 import typer
 
-from fgtrack.cli.arguments import All, Form, FormOption, Overwrite, sweeps
+from fgtrack.cli.arguments import All, Form, FormOption, Overwrite, Settings, sweeps
 from fgtrack.cli.show import progress, say, show
-from fgtrack.core.errors import CallError, one_line
+from fgtrack.core.errors import DataError
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.tables.seeds import (
     SweepTable,
@@ -29,7 +28,6 @@ from fgtrack.pipeline.sweep import (
     PRODUCTS,
     SUMMARY_TABLE,
     SWEEP_TABLE,
-    Cell,
     Scalar,
     Sweep,
 )
@@ -59,20 +57,16 @@ def sweep(
     recording: Annotated[
         Path | None, typer.Option("--input", metavar="INPUT", help="Replay this instead of the sweep's input.")
     ] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a key in every run; may be repeated.")
-    ] = None,
+    settings: Settings = None,
     form: FormOption = None,
     everything: All = False,
     overwrite: Overwrite = False,
-) -> int:
+) -> None:
     """Run settings x seeds x estimators into one table; resumes.
 
     Ends with mean and standard error at each point of the grid, and who is better.
     """
     tell = say if form is None else lambda line: None
-    if jobs is not None and dask is not None:
-        raise CallError("--jobs, --dask: the cluster has its own number of workers, give one of them")
     sweep_file = find_file("sweep", sweep_name)
     plan = load_plan(sweep_file, recording, settings or ())
     for name in PRODUCTS:  # what else is in the folder stays
@@ -80,28 +74,16 @@ def sweep(
     work = Sweep.open(plan, out, overwrite)
     left = len(work.todo)
     tell(f"jobs: {len(work.plan.jobs)}, each of {len(work.plan.estimators)} estimators; to do: {left}")
-    bad: list[Cell] = []
     with progress("sweep", left) as moved:
-
-        def count(cells: Sequence[Cell]) -> None:
-            bad.extend(cell for cell in cells if cell.error is not None)
-            moved(f"{len(bad)} bad cells" if bad else "")
-
-        result = work.run(score, jobs=jobs or -1, dask=dask, on_job=count)
+        result = work.run(score, jobs=jobs or -1, dask=dask, on_job=lambda cells: moved())
     tell(f"{out / SWEEP_TABLE}: {result.num_good} of {result.num_cells} cells")
     if result.num_good:
         _summarise(read_sweep(out), out, form, everything)
-    if recording is not None:  # the metrics were chosen for another input: of this one, all that it has are taken
-        result = replace(result, unknown_metrics=())
-    problems = []
     if result.num_bad:
-        problems.append(f"{out / ERROR_TABLE}: {result.num_bad} bad cells, the first: {result.first_error}")
-    if result.unknown_metrics:
+        raise DataError(f"{out / ERROR_TABLE}: {result.num_bad} bad cells, the first: {result.first_error}")
+    if result.unknown_metrics and recording is None:  # the metrics were not chosen for another input
         names = ", ".join(result.unknown_metrics)
-        problems.append(f"{sweep_file}: metrics: no column fits {names}; without `metrics` {SWEEP_TABLE} has all")
-    for problem in problems:
-        print(f"fgtrack: error: {one_line(problem)}", file=sys.stderr)
-    return 1 if problems else 0
+        raise DataError(f"{sweep_file}: metrics: no column fits {names}; without `metrics` {SWEEP_TABLE} has all")
 
 
 def swept(sweep_file: Path, out: Path, num_seeds: int | None = None) -> list[dict[str, str]]:

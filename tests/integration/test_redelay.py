@@ -100,7 +100,7 @@ def test_what_is_lost_is_said(fgtrack: Command) -> None:
             "radar: {dely: {kind: none}}",
             "bad.yaml: radar.dely: unknown key, did you mean 'delay', known here: delay, clock",
         ),
-        ("sonar: {delay: {kind: none}}", "bad.yaml: sensor 'sonar' is not in the input, whose sensors are: lidar"),
+        ("sonar: {delay: {kind: none}}", "sensor 'sonar' is not in the input, whose sensors are: lidar"),
         ("radar: [", "bad.yaml:1: invalid YAML"),
     ],
 )
