@@ -145,7 +145,7 @@ def _run(words: Sequence[str], debug: bool) -> int:
         code = BAD_DATA if error.errno in FULL else BAD_CALL
         if error.filename is None:
             sys.stdout = None  # so that the end of the process does not fail on it, too
-        return _failed(f"{error.filename or 'standard output'}: cannot be used, the system says: {error.strerror}", code, debug)
+        return _failed(f"{error.filename or 'standard output'}: cannot be used ({error.strerror})", code, debug)
     except Exception as error:  # the last line of defence: a bug must not look like bad data
         return _failed(f"internal error: {type(error).__name__}: {error} (run with --debug)", BAD_DATA, debug)
 
