@@ -1,18 +1,15 @@
 """Close-ups of runs: which late detection to look at, and its track just before and just after it was fused."""
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
-from itertools import tee
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple, Unpack
+from typing import Any, Unpack
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import NS_PER_S, nanoseconds
-from fgtrack.core.types import FUSED, DetectionList, Disposition, Message
-from fgtrack.evaluation.matching import published_rows
+from fgtrack.core.types import FUSED, DetectionList, Disposition
 from fgtrack.evaluation.runs import EvaluatedRun, by_recording
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run import Run, load_run
@@ -28,7 +25,8 @@ from fgtrack.plotting.paper import Paper
 from fgtrack.tracking.tracker import Tracker
 
 _BACK_S = 0.15  # before the detection the estimates begin
-_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
+_STATE = ["x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps"]
+_DETECTION = ["sensor", "stamp_ns", "receipt_ns", "index"]
 _SETTLED = 20  # measurements of a track before which it moves for want of a good start
 _EARLY_S = 20.0  # what the choice is restricted to: the recording is replayed up to the detection for every run
 
@@ -36,30 +34,14 @@ _EARLY_S = 20.0  # what the choice is restricted to: the recording is replayed u
 def close_ups(runs: Sequence[Run | Path | str], stamp_ns: int | None = None) -> list[CloseUp]:
     """Return one late detection in slow motion, in each of `runs`: its track before and after it was fused.
 
-    The detection is a typical one of those that lower the error of the first run's present, see `chosen`; `rule` of
-    the result is the rule of the choice. The recording is replayed up to there for every run; `fgtrack.plot.close_up`
-    draws the result.
-
-    Parameters
-    ----------
-    runs
-        Runs of one recording, or their folders.
-    stamp_ns
-        Choose the detection with the stamp nearest to this one.
-
-    Raises
-    ------
-    CallError
-        A folder holds no run.
-    DataError
-        The first run fused no such detection, a run did not fuse it, or a recording is not there any more.
+    The detection is a typical one of those that lower the error of the first run's present, see `chosen`, or that with
+    the stamp nearest to `stamp_ns`. `runs` are of one recording, or their folders; it is replayed up to there for every
+    run. `fgtrack.plot.close_up` draws the result. Raises `CallError` if a folder holds no run, and `DataError` if the
+    first run fused no such detection, a run did not fuse it, or a recording is not there any more.
     """
     read = [run if isinstance(run, Run) else load_run(Path(run)) for run in runs]
     arrival, rule = chosen(read, stamp_ns)
-    recordings = [(run.recording, run.config.get("input")) for run in read]
-    same = recordings.count(recordings[0]) == len(read)
-    recorded = tee(_recorded(read[0]), len(read)) if same else map(_recorded, read)  # a recording is read once
-    return [replace(close_up_of(run, arrival, one), rule=rule) for run, one in zip(read, recorded, strict=True)]
+    return [close_up_of(run, arrival, rule) for run in read]
 
 
 def drawn_close_up(
@@ -77,33 +59,26 @@ def drawn_close_up(
     return [("close_up", figure_of(same, late, **paper))], late[0]
 
 
-def _recorded(run: Run) -> Iterator[Message]:
-    """Return the messages of its recording. Raises `DataError` where that is not there any more."""
+def close_up_of(run: Run, arrival: Arrival, rule: str = "") -> CloseUp:
+    """Return the track of `run` that fused `arrival`, before and after: its recording is replayed up to there.
+
+    What came with the same tick before the list is processed first, by itself; what came after it is left out. Raises
+    `DataError` if the recording or a file that the configuration names is not there any more, the recording does not
+    hold the detection, or no track fused it.
+    """
     if run.recording is None:
         given = (run.meta.get("input") or {}).get("path") or "messages in memory"
         raise DataError(f"{given}: the recording of the run is not there, so no close-up")
     try:
-        return open_input(run.recording, validate(Config, run.config, str(run.config_path)).input).messages()
-    except CallError as error:  # nobody has called with it: the run names it
-        raise DataError(f"{error}, so no close-up") from error
-
-
-def close_up_of(run: Run, arrival: Arrival, messages: Iterable[Message] | None = None) -> CloseUp:
-    """Return the track of `run` that fused `arrival`, before and after: its recording is replayed up to there.
-
-    `messages` are by default read from it. What came with the same tick before the list is processed first, by itself;
-    what came after it is left out. Raises `DataError` if the recording or a file that the configuration names is not
-    there any more, the recording does not hold the detection, or no track fused it.
-    """
-    try:
         config = validate(Config, run.config, str(run.config_path))
         tracker = build_tracker(config)
-    except CallError as error:  # as above
+        messages = open_input(run.recording, config.input).messages()
+    except CallError as error:  # nobody has called with it: the run names it
         raise DataError(f"{error}, so no close-up") from error
     key = arrival.sensor, arrival.receipt_ns, arrival.index
     start_ns, fused_ns = arrival.stamp_ns - nanoseconds(_BACK_S), list[tuple[int | None, int]]()
     name = f"detection {arrival.index} of {arrival.sensor} received at {arrival.receipt_ns} ns"
-    for now_ns, batch in delivered(_recorded(run) if messages is None else messages, config):
+    for now_ns, batch in delivered(messages, config):
         lists = (
             k
             for k, message in enumerate(batch)
@@ -125,7 +100,7 @@ def close_up_of(run: Run, arrival: Arrival, messages: Iterable[Message] | None =
             raise DataError(f"{name}: no track has fused it ({taken.disposition if taken else 'no such detection'})")
         track_id, after = taken.track_id, _estimates(tracker, taken.track_id, stamps_ns)
         since_ns = sorted(stamp for track, stamp in fused_ns if track == track_id and stamp >= start_ns)
-        return CloseUp(arrival, now_ns, track_id, before[track_id], after, np.array(since_ns, dtype=np.int64))
+        return CloseUp(arrival, now_ns, track_id, before[track_id], after, np.array(since_ns, dtype=np.int64), rule)
     raise DataError(f"{name}: there is no such list")
 
 
@@ -141,17 +116,6 @@ def _estimates(tracker: Tracker, track_id: int, stamps_ns: Iterable[int]) -> Est
     return Estimates(np.array([state.stamp_ns for state in states]), np.array([state.mean for state in states]))
 
 
-class _Late(NamedTuple):
-    """A late detection that its track fused by itself: its effect on the present of one run."""
-
-    track_id: int
-    moved_m: float
-    """From where the tick before it predicted the present."""
-    before_m: float
-    """Error of the present before it; NaN without truth."""
-    after_m: float
-
-
 def chosen(runs: Sequence[Run], stamp_ns: int | None = None) -> tuple[Arrival, str]:
     """Return a typical out-of-sequence detection that every run fused, and a sentence with the rule of the choice.
 
@@ -162,56 +126,61 @@ def chosen(runs: Sequence[Run], stamp_ns: int | None = None) -> tuple[Arrival, s
     with the nearest stamp. Raises `DataError` if there is none.
     """
     first, *others = (_late_detections(run) for run in runs)
-    common = [one for one in first if all(one in other for other in others)]
-    if not common:
+    late = first[np.all([first.index.isin(other.index) for other in (first, *others)], axis=0)]
+    if late.empty:
         raise DataError(
             f"{runs[0].path or 'the run'}: no late detection was fused by itself after {_SETTLED} others, so there is "
             "no close-up"
         )
+    arrivals = [Arrival(*key) for key in late.index.tolist()]
     if stamp_ns is not None:
-        return min(common, key=lambda one: abs(one.stamp_ns - stamp_ns)), "Chosen by its stamp."
-    errors_m = np.array(
-        [[first[one].before_m, first[one].after_m, *(late[one].after_m for late in others)] for one in common]
+        return min(arrivals, key=lambda one: abs(one.stamp_ns - stamp_ns)), "Chosen by its stamp."
+    errors_m = np.column_stack(
+        [late["before_m"], late["after_m"], *(other.loc[late.index, "after_m"] for other in others)]
     )
     lowered = errors_m[:, 1] < errors_m[:, 0]
     if not lowered.any():
-        moved_m = np.array([first[one].moved_m for one in common])
-        row = int(np.abs(moved_m - np.median(moved_m)).argmin())
-        return common[row], f"Of {len(common)} late detections, the one that moves the present by the median."
-    rms_m = np.sqrt(np.nanmean(errors_m[lowered] ** 2, axis=0))
+        row = int((late["moved_m"] - late["moved_m"].median()).abs().argmin())
+        return arrivals[row], f"Of {len(late)} late detections, the one that moves the present by the median."
+    rms_m, (rms_before_m, rms_after_m, *_) = (
+        np.sqrt(np.nanmean(rows_m**2, axis=0)) for rows_m in (errors_m[lowered], errors_m)
+    )
     with np.errstate(divide="ignore"):
         apart = np.abs(np.log(errors_m / rms_m)).max(axis=1)
     candidates = lowered & np.isfinite(apart)
-    receipts_ns = np.array([one.receipt_ns for one in common])
+    receipts_ns = np.array([one.receipt_ns for one in arrivals])
     early = candidates & (receipts_ns - receipts_ns.min() <= nanoseconds(_EARLY_S))
     row = int(np.where(early if early.any() else candidates, apart, np.inf).argmin())
-    rms_all_m = np.sqrt(np.nanmean(errors_m[:, :2] ** 2, axis=0))
-    return common[row], (
-        f"{100.0 * float(lowered.mean()):.0f} % of {len(common)} late detections lower the error of the present; this "
+    return arrivals[row], (
+        f"{100.0 * float(lowered.mean()):.0f} % of {len(late)} late detections lower the error of the present; this "
         f"one, of the first {_EARLY_S:g} s, is nearest to their root mean square ({rms_m[0]:.2f} to {rms_m[1]:.2f} m; "
-        f"of all {rms_all_m[0]:.2f} to {rms_all_m[1]:.2f} m)."
+        f"of all {rms_before_m:.2f} to {rms_after_m:.2f} m)."
     )
 
 
-def _late_detections(run: Run) -> dict[Arrival, _Late]:
-    updates, tracks, paths = run.tables["updates"], run.tables["tracks"], true_paths(run.tables["truth"])
-    used = np.isin(updates["disposition"], FUSED[1:])
-    pairs = np.stack([updates["tick"], updates["track_id"]], axis=-1)
-    _, group, sizes = np.unique(pairs[used], axis=0, return_inverse=True, return_counts=True)
-    alone = np.zeros(len(used), dtype=bool)
-    alone[used] = sizes[group.reshape(-1)] == 1
-    late = np.flatnonzero(alone & (updates["disposition"] == Disposition.OUT_OF_SEQUENCE))
-    rows, before = (published_rows(tracks, pairs[late, 0] - back, pairs[late, 1]) for back in (0, 1))
-    known = (rows >= 0) & (before >= 0) & (tracks["num_measured"][rows] >= _SETTLED)
-    late, rows, before = late[known], rows[known], before[known]
-    states, now_ns = np.stack([tracks[name] for name in _STATE], axis=-1), tracks["now_ns"][rows]
-    dt_s = (now_ns - tracks["now_ns"][before]) / NS_PER_S
-    at_m, predicted_m = states[rows, :2], CTRV().predict(states[before], dt_s)[:, :2]
-    true_m = np.stack([path.at(now_ns)[:, :2] for path in paths] or [np.full_like(at_m, np.nan)], axis=1)
-    apart_m = np.linalg.norm(true_m - at_m[:, None], axis=-1)
-    nearest_m = true_m[np.arange(len(late)), np.where(np.isnan(apart_m), np.inf, apart_m).argmin(axis=1)]
-    ends_m = ((at_m, predicted_m), (predicted_m, nearest_m), (at_m, nearest_m))
-    lengths_m = [np.linalg.norm(one - other, axis=-1).tolist() for one, other in ends_m]
-    columns = (updates[name][late].tolist() for name in ("sensor", "stamp_ns", "receipt_ns", "index"))
-    keys = (Arrival(*key) for key in zip(*columns, strict=True))
-    return dict(zip(keys, map(_Late, pairs[late, 1].tolist(), *lengths_m), strict=True))
+def _late_detections(run: Run) -> Any:  # Any: a DataFrame, whose columns have no types
+    """Late detections that a settled track fused by themselves, by `_DETECTION`.
+
+    Columns are the shift of the present from its prediction and its error before and after, NaN without truth, in m.
+    """
+    both = ["tick", "track_id"]
+    fused = run.updates[run.updates["disposition"].isin(FUSED[1:])]
+    late = fused[(fused["disposition"] == Disposition.OUT_OF_SEQUENCE) & ~fused.duplicated(both, keep=False)]
+    tracks = run.tracks[[*both, "now_ns", "num_measured", *_STATE]]
+    late = late[[*both, *_DETECTION]].merge(tracks[tracks["num_measured"] >= _SETTLED], on=both)
+    late = late.merge(tracks.assign(tick=tracks["tick"] + 1), on=both, suffixes=("", "_before"))
+    late = late.drop_duplicates(_DETECTION)
+    now_ns, at_m = late["now_ns"].to_numpy(), late[["x_m", "y_m"]].to_numpy()
+    dt_s = (now_ns - late["now_ns_before"].to_numpy()) / NS_PER_S
+    predicted_m = CTRV().predict(late[[f"{name}_before" for name in _STATE]].to_numpy(), dt_s)[:, :2]
+    paths = true_paths(run.tables["truth"])
+    true_m = np.stack([path.at(now_ns)[:, :2] for path in paths] or [np.full_like(at_m, np.nan)])
+    apart_m = np.linalg.norm(true_m - at_m, axis=-1)
+    nearest_m = true_m[np.where(np.isnan(apart_m), np.inf, apart_m).argmin(axis=0), np.arange(len(late))]
+    for name, one, other in (
+        ("moved_m", at_m, predicted_m),
+        ("before_m", predicted_m, nearest_m),
+        ("after_m", at_m, nearest_m),
+    ):
+        late[name] = np.linalg.norm(one - other, axis=-1)
+    return late.set_index(_DETECTION)
