@@ -1,8 +1,8 @@
 """Figures of errors against truth: over time, and against the lag."""
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Unpack
+from collections.abc import Mapping
+from typing import Any, Unpack
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.matching import track_errors
+from fgtrack.evaluation.matching import Matching, track_errors
 from fgtrack.evaluation.palette import Look
 from fgtrack.evaluation.runs import EvaluatedRun, Runs, by_recording, evaluated, start_ns
 from fgtrack.evaluation.scores.lagged import final_errors
@@ -29,17 +29,6 @@ _WINDOWS = 60  # moving means in the time that is shown
 _SHORTEST_S = 0.2  # of these
 
 
-class _Curve(NamedTuple):
-    """The errors of one run by rising stamp; its time axis starts at `first_ns`, ticks are `step_ns` apart."""
-
-    label: str
-    look: Look
-    first_ns: int
-    step_ns: float
-    stamps_ns: IntArray
-    values: Mapping[str, FloatArray]
-
-
 @styled
 def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> Figure:
     """Moving RMS error in position, speed and yaw over time, a line for each run; in the legend the RMSE of all.
@@ -50,24 +39,35 @@ def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> 
 
     Raises `DataError` if no run has truth, or none of this object.
     """
-    every = [one for one in evaluated(runs) if one.matching is not None]
-    known = sorted({k for one in every if one.matching for k in one.matching.object_ids})
+    read = evaluated(runs)
+    every = {one: one.matching for one in read if one.matching is not None}
+    known = sorted({k for matching in every.values() for k in matching.object_ids})
     if not known:
         raise DataError("no run has truth, so there are no errors to draw")
     if object_id is not None and object_id not in known:
         raise DataError(f"object {object_id}: no run has truth of it, there are {', '.join(map(str, known))}")
     wanted = known[0] if len(known) == 1 else object_id
     curves = _curves(every, wanted)
-    names = [name for name in _QUANTITIES if any(np.isfinite(one.values[name]).any() for one in curves)]
+    names = [name for name in _QUANTITIES if any(np.isfinite(one[name]).any() for *_, one in curves)]
     names = names or ["position_m"]
-    longest_ns = max((float(np.ptp(one.stamps_ns)) for one in curves if len(one.stamps_ns)), default=0.0)
-    window_s = max(longest_ns / NS_PER_S / _WINDOWS, _SHORTEST_S)
+    longest_s = max((float(np.ptp(times_ns)) / NS_PER_S for *_, times_ns, _ in curves if len(times_ns)), default=0.0)
+    window_s = max(longest_s / _WINDOWS, _SHORTEST_S)
     sheet = Sheet(9.0, 1.5 + 2.0 * len(names), paper)
     rows = sheet.plots(len(names), sharex=True)[:, 0]
     for axes, name in zip(rows, names, strict=True):
         what, unit, factor = _QUANTITIES[name]
-        for one in curves:
-            _draw_moving(axes, one, factor * one.values[name], unit, nanoseconds(window_s), has_label=axes is rows[0])
+        for label, look, step_ns, times_ns, values in curves:
+            moments = Moments.of(factor * values[name])
+            text = f"RMSE {moments.rmse:.3g} {unit}" if moments.count else "never tracked"
+            at_ns, rms = moving_rms(times_ns, factor * values[name], nanoseconds(window_s))
+            axes.plot(
+                *broken_line(at_ns, at_ns / NS_PER_S, rms, step_ns),
+                color=look.colour,
+                ls=look.line,
+                lw=1.4,
+                label=f"{label}: {text}" if axes is rows[0] else text,
+                zorder=2.0 if look.line == "-" else 2.5,  # a dashed line shows what it lies on
+            )
         axes.set_ylabel(f"{what} error [{unit}]")
         axes.set_ylim(0.0, None)
         legend_above(axes)
@@ -77,36 +77,32 @@ def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> 
     return sheet.figure
 
 
-def _curves(runs: Sequence[EvaluatedRun], object_id: int | None) -> list[_Curve]:
+_Curve = tuple[str, Look, float, IntArray, Mapping[str, FloatArray]]
+"""Label, look, usual step in ns, rising times in ns since the start of the recording, and errors."""
+
+
+def _curves(runs: Mapping[EvaluatedRun, Matching], object_id: int | None) -> list[_Curve]:
     """Errors of the present states of every run, then of the final ones of those that have them."""
-    styles = run_looks(runs)
-    first_ns = {one.label: start_ns(group) for group in by_recording(runs) for one in group}
-    known = [(one, one.matching) for one in runs if one.matching is not None]
-    if object_id is not None:
-        known = [(one, matching) for one, matching in known if object_id in matching.object_ids]
-    every = [(one, matching, track_errors(matching), "") for one, matching in known]
-    every += [(one, matching, final_errors(one.run, matching), ", final state") for one, matching in known]
-    curves = []
-    for one, matching, its_errors, more in every:
-        rows = np.argsort(its_errors.stamps_ns, kind="stable")
-        if object_id is not None:
-            rows = rows[its_errors.object_index[rows] == matching.object_ids.index(object_id)]
-        look = styles[one.label]._replace(line=":") if more else styles[one.label]
+    looks = run_looks(list(runs))
+    first_ns = {one: start_ns(group) for group in by_recording(list(runs)) for one in group}
+    both = [(one, its, "", track_errors(its)) for one, its in runs.items()]
+    both += [(one, its, ", final state", final_errors(one.run, its)) for one, its in runs.items()]
+    curves = list[_Curve]()
+    for one, its, more, found in both:
+        if object_id is None:
+            wanted = np.ones(len(found.stamps_ns), dtype=bool)
+        elif object_id in its.object_ids:
+            wanted = found.object_index == its.object_ids.index(object_id)
+        else:
+            continue
+        rows = np.flatnonzero(wanted)
+        rows = rows[np.argsort(found.stamps_ns[rows], kind="stable")]
+        look = looks[one.label]._replace(line=":") if more else looks[one.label]
         if len(rows) or not more:
-            values = {name: each[rows] for name, each in its_errors.values.items()}
-            step_ns, stamps_ns = usual_step_ns(matching.tracks["now_ns"]), its_errors.stamps_ns[rows]
-            curves.append(_Curve(one.label + more, look, first_ns[one.label], step_ns, stamps_ns, values))
+            values = {name: each[rows] for name, each in found.values.items()}
+            times_ns, step_ns = found.stamps_ns[rows] - first_ns[one], usual_step_ns(its.tracks["now_ns"])
+            curves.append((one.label + more, look, step_ns, times_ns, values))
     return curves
-
-
-def _draw_moving(axes: Axes, one: _Curve, values: FloatArray, unit: str, window_ns: int, has_label: bool) -> None:
-    moments = Moments.of(values)
-    rmse = f"RMSE {moments.rmse:.3g} {unit}" if moments.count else "never tracked"
-    stamps_ns, rms = moving_rms(one.stamps_ns, values, window_ns)
-    points = broken_line(stamps_ns, (stamps_ns - one.first_ns) / NS_PER_S, rms, one.step_ns)
-    label = f"{one.label}: {rmse}" if has_label else rmse
-    above = 2.0 if one.look.line == "-" else 2.5  # a dashed line shows what it lies on
-    axes.plot(*points, color=one.look.colour, ls=one.look.line, lw=1.4, label=label, zorder=above)
 
 
 def moving_rms(stamps_ns: IntArray, values: FloatArray, window_ns: int) -> tuple[IntArray, FloatArray]:

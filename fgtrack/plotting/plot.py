@@ -21,10 +21,10 @@ from fgtrack.plotting.consistency import consistency, has_squares
 from fgtrack.plotting.errors import errors, lag
 from fgtrack.plotting.map import tracks_on_map as map  # noqa: A004  # the public name
 from fgtrack.plotting.paper import Paper
-from fgtrack.plotting.residuals import has_residuals, residuals
+from fgtrack.plotting.residuals import residuals
 from fgtrack.plotting.style import save
 from fgtrack.plotting.sweep import error_against_delay, sweep, sweep_metrics
-from fgtrack.plotting.times import delays, sensor_delays, timing
+from fgtrack.plotting.times import delays, timing
 
 __all__ = [
     "arrivals",
@@ -48,7 +48,6 @@ def __dir__() -> list[str]:
 
 _FEW = 3  # of objects, and of runs where they are many: the worst are drawn
 _MOST_RUNS = 6  # that have figures of their own
-_DETECTION = ("index", "sensor", "stamp_ns", "receipt_ns")  # the same of a detection in all runs
 
 
 @dataclass(frozen=True)
@@ -69,39 +68,30 @@ def planned(runs: Sequence[EvaluatedRun]) -> list[Planned]:
     plans = []
     for name, draw, has_data in (
         ("map", map, lambda one: one.run.tables["tracks"].num_rows),
-        ("residuals", residuals, has_residuals),
+        ("residuals", residuals, lambda one: any(each.residuals for each in one.metrics.sensors.values())),
         ("consistency", consistency, has_squares),
     ):
         mine = [one for one in runs if has_data(one)]
         plans += [Planned(f"{name}_{one.label}", partial(draw, one), one.label in extra) for one in mine]
-    groups = _alike(runs)
-    for k, (one, *_) in enumerate(groups):
-        ending, is_extra = f"_{one.label}" if len(groups) > 1 else "", len(groups) > _MOST_RUNS and k >= _FEW
+    streams: dict[bytes, EvaluatedRun] = {}  # estimators of one stream share these figures
+    for one in runs:
+        if (receipts_ns := one.run.tables["updates"]["receipt_ns"]).size:
+            streams.setdefault(np.sort(receipts_ns).tobytes(), one)
+    for k, one in enumerate(streams.values()):
+        ending, is_extra = f"_{one.label}" if len(streams) > 1 else "", len(streams) > _MOST_RUNS and k >= _FEW
         plans.append(Planned(f"arrivals{ending}", partial(arrivals, one), is_extra))
-        if any(delay_s.any() for _, delay_s in sensor_delays(one.run).values()):
+        if any(each.delay_s.max for each in one.metrics.sensors.values()):
             plans.append(Planned(f"delays{ending}", partial(delays, one), is_extra))
     ids = sorted({k for one in runs if one.matching for k in one.matching.object_ids})
-    many = len(ids) > _FEW
-    if many:
+    worst = sorted(ids, key=lambda object_id: max(_rmse_m(one, object_id) for one in runs))[-_FEW:]
+    if len(ids) > _FEW:
         plans.append(Planned("errors_all_objects", partial(errors, runs)))
-        by_error = sorted(ids, key=lambda object_id: max(_rmse_m(one, object_id) for one in runs), reverse=True)
-    for k in ids:
-        plans.append(Planned(f"errors_object_{k}", partial(errors, runs, k), many and k not in by_error[:_FEW]))
+    plans += [Planned(f"errors_object_{k}", partial(errors, runs, k), k not in worst) for k in ids]
     if any(entry.is_lagged for one in runs for entry in one.metrics.lagged):
         plans.append(Planned("error_against_lag", partial(lag, runs)))
     if any((one.run.tables["timing"]["num_detections"] > 0).any() for one in runs):
         plans.append(Planned("timing", partial(timing, runs)))
     return plans
-
-
-def _alike(runs: Sequence[EvaluatedRun]) -> list[list[EvaluatedRun]]:
-    """Runs with detections, together those with the same detections at the same times."""
-    groups: dict[bytes, list[EvaluatedRun]] = {}
-    for one in runs:
-        if (updates := one.run.tables["updates"]).num_rows:
-            order = np.lexsort([updates[name] for name in _DETECTION])  # estimators may take them in another order
-            groups.setdefault(b"".join(updates[name][order].tobytes() for name in _DETECTION), []).append(one)
-    return list(groups.values())
 
 
 def _rmse_m(one: EvaluatedRun, object_id: int | None = None) -> float:

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
-from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_ns
+from fgtrack.evaluation.runs import OneRun, one_evaluated, start_ns
 from fgtrack.evaluation.scores import innovations
 from fgtrack.evaluation.scores.innovations import RESIDUAL_NAMES
 from fgtrack.plotting.paper import Paper, Sheet, styled
@@ -69,8 +69,3 @@ def residuals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         legend_above(over_time, 2.0 / 3.0, markerscale=3.0)
     sheet.title(f"{one.label}: innovations (measured minus predicted)")
     return sheet.figure
-
-
-def has_residuals(one: EvaluatedRun) -> bool:
-    """True if `residuals` has anything to show."""
-    return any(np.isfinite(values).any() for values in innovations.residuals(one.run).values())

@@ -8,11 +8,10 @@ from matplotlib.figure import Figure
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.runs import OneRun, Runs, evaluated, one_evaluated
 from fgtrack.evaluation.scores.innovations import message_delays
 from fgtrack.evaluation.scores.statistics import Distribution
-from fgtrack.io.run import Run
 from fgtrack.plotting.paper import Paper, Sheet, styled
 from fgtrack.plotting.style import legend_above, log_axis, run_looks, sensor_colour
 
@@ -26,21 +25,17 @@ def delays(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     Raises `DataError` if the run has no detections.
     """
     one = one_evaluated(run)
-    if not one.run.tables["updates"].num_rows:
+    updates = one.run.tables["updates"]
+    if not updates.num_rows:
         raise DataError(f"{one.label}: has no detections, so there are no delays to draw")
     curves = []
-    for k, (sensor, (_, delay_s)) in enumerate(sensor_delays(one.run).items()):
-        spread = Distribution.of(_MS * delay_s)
+    for k, sensor in enumerate(np.unique(updates["sensor"]).tolist()):
+        delay_ms = _MS * message_delays(updates.where(updates["sensor"] == sensor))[1]
+        spread = Distribution.of(delay_ms)
         label = f"{sensor}: mean {spread.mean:.0f} ms, 90 % within {spread.p90:.0f} ms, all within {spread.max:.0f} ms"
-        curves.append((_MS * delay_s, label, {"color": sensor_colour(k)}))
+        curves.append((delay_ms, label, {"color": sensor_colour(k)}))
     texts = {"xlabel": "delay from stamp to receipt [ms]", "ylabel": "share of the messages received"}
     return _distributions(curves, texts, f"{one.label}: delay of the messages with detections", paper)
-
-
-def sensor_delays(run: Run) -> dict[str, tuple[IntArray, FloatArray]]:
-    """Return receipt in ns and delay in s of the messages of every sensor, see `message_delays`."""
-    sensors = run.tables["updates"]["sensor"]
-    return {name: message_delays(run.tables["updates"].where(sensors == name)) for name in np.unique(sensors).tolist()}
 
 
 @styled
