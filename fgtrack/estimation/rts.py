@@ -1,8 +1,16 @@
 """The backward step of the smoother of Rauch, Tung and Striebel."""
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 from fgtrack.core.linalg import applied, congruence, psd_solve, symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.filters.ekf import Prediction
+from fgtrack.estimation.filters.propagation import wrapped
+from fgtrack.models.motion import MotionModel
+
+Link = tuple[int, FloatArray, FloatArray, Prediction]
+"""Stamp, mean (n,) and covariance (n, n) of a state, and its prediction from the link before."""
 
 
 def rts_step(
@@ -18,3 +26,13 @@ def rts_step(
     C = psd_solve(predicted.covariance, predicted.cross).mT
     P = covariance + congruence(C, after - predicted.covariance)
     return mean + applied(C, shift), symmetrise(P), C
+
+
+def smoothed_back(
+    motion: MotionModel, links: Sequence[Link], mean: FloatArray, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return mean (n,) and covariance (n, n) at the first of `links`, of those at the last, by `rts_step`."""
+    for (before_ns, x, P, _), (after_ns, _, _, predicted) in reversed(list(pairwise(links))):
+        if before_ns < after_ns:  # else the same state
+            mean, covariance, _ = rts_step(x, P, predicted, wrapped(motion, mean - predicted.mean), covariance)
+    return mean, covariance

@@ -1,7 +1,7 @@
 """Where a new object heads and how fast, from its first positions: one component for smoothers and filters."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, cast, get_args
 
@@ -48,11 +48,6 @@ class Fix(NamedTuple):
     covariance: FloatArray
     """Shape (2, 2)."""
 
-    @property
-    def order(self) -> tuple[float, ...]:
-        """Place among fixes: by time, and at one time by content, so that arrival does not matter."""
-        return self.time_s, *self.position_m.tolist(), *self.covariance.ravel().tolist()
-
 
 class Line(NamedTuple):
     """Position and velocity at time 0, and how well the velocity is known."""
@@ -80,34 +75,22 @@ def fixes_of(mean: FloatArray, covariance: FloatArray, later: Iterable[tuple[flo
     return [Fix(0.0, mean[:2], covariance[:2, :2]), *(fix for fix in found if fix is not None)]
 
 
-class _Sums:
-    """Normal equations of a straight line at constant velocity, x = (position at time 0, velocity)."""
-
-    def __init__(self) -> None:
-        self._information, self._vector = np.zeros((4, 4)), np.zeros(4)
-
-    def add(self, fix: Fix) -> None:
-        H = np.hstack([np.eye(2), fix.time_s * np.eye(2)])
-        weighted = psd_solve(fix.covariance, H).T
-        self._information += weighted @ H
-        self._vector += weighted @ fix.position_m
-
-    def line(self) -> Line:
-        spread = psd_solve(self._information, np.eye(4))
-        solution = spread @ self._vector
-        return Line(solution[:2], solution[2:], spread[2:, 2:])
-
-
-def straight_line(fixes: Iterable[Fix]) -> Line:
-    """Weighted least squares of a straight line at constant velocity through at least two fixes at different times.
+def straight_lines(fixes: Sequence[Fix], least: int) -> Iterator[Line]:
+    """Weighted least squares lines at constant velocity through the first `least` fixes, and through each one more.
 
     With two fixes this is two-point initiation: the velocity is their difference over their time. Raises
-    `numpy.linalg.LinAlgError` where all are of one time.
+    `numpy.linalg.LinAlgError` where all are of one time, or one has no uncertainty.
     """
-    sums = _Sums()
-    for fix in fixes:
-        sums.add(fix)
-    return sums.line()
+    information, vector = np.zeros((4, 4)), np.zeros(4)  # of the position at time 0 and the velocity
+    for count, fix in enumerate(fixes, start=1):
+        H = np.hstack([np.eye(2), fix.time_s * np.eye(2)])
+        weighted = psd_solve(fix.covariance, H).T
+        information += weighted @ H
+        vector += weighted @ fix.position_m
+        if count >= least:
+            spread = psd_solve(information, np.eye(4))
+            solution = spread @ vector
+            yield Line(solution[:2], solution[2:], spread[2:, 2:])
 
 
 @dataclass(frozen=True)
@@ -139,16 +122,14 @@ class Search:
         """
         if self.until_ns is not None and oldest_ns > self.until_ns:
             return None
-        sums, line, until_ns = _Sums(), None, None
-        ordered = sorted(fixes(), key=lambda fix: fix.order)
+        line, until_ns = None, None
+        ordered = sorted(fixes(), key=lambda fix: (fix.time_s, *fix.position_m.tolist(), *fix.covariance.flat))
+        simultaneous = sum(fix.time_s == ordered[0].time_s for fix in ordered)
         try:
-            for fix in ordered:
-                sums.add(fix)
-                if fix.time_s > ordered[0].time_s:
-                    line = sums.line()
-                    if over(line, self.method, CERTAIN_TO_SMOOTHER):
-                        until_ns = self.first_ns + nanoseconds(fix.time_s)
-                        break
+            for fix, line in zip(ordered[simultaneous:], straight_lines(ordered, simultaneous + 1), strict=True):
+                if over(line, self.method, CERTAIN_TO_SMOOTHER):
+                    until_ns = self.first_ns + nanoseconds(fix.time_s)
+                    break
         except np.linalg.LinAlgError:
             return None
         return None if line is None else (line, replace(self, until_ns=until_ns))

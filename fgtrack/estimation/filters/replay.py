@@ -15,7 +15,7 @@ from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.filters.propagation import track_state, wrapped
 from fgtrack.estimation.filters.track_initiation import TrackInitiation
 from fgtrack.estimation.filters.windowed import WindowedFilter
-from fgtrack.estimation.rts import rts_step
+from fgtrack.estimation.rts import Link, smoothed_back
 from fgtrack.models.motion import MotionModel
 
 
@@ -148,17 +148,17 @@ class ReplayEkf(WindowedFilter):
     def _retrodicted(self, new: Step, later: Sequence[Step]) -> tuple[FloatArray, FloatArray]:
         """State (n,), (n, n) at the `new` measurement, given all that was fused before it, also the `later` steps.
 
-        From the newest step back (see `rts_step`), each as it was when the new measurement was unknown.
+        From the newest step back (see `smoothed_back`), each as it was when the new measurement was unknown.
         """
-        without = Step(new.stamp_ns, None, *new.predicted[:2], new.predicted)
+        links: list[Link] = [(each.stamp_ns, each.mean, each.covariance, each.predicted) for each in later]
         mean, covariance = later[-1].mean, later[-1].covariance
         for index in range(len(later) - 1, -1, -1):
-            after, before = later[index], later[index - 1] if index else without
-            if after.along and after.search is not None:
-                return after.search.retrodicted(new.stamp_ns, mean, covariance)
-            if before.stamp_ns == after.stamp_ns:  # the same state
-                continue
-            predicted = after.predicted if index else self._ahead(without, after.stamp_ns)
-            shift = wrapped(self._motion, mean - predicted.mean)
-            mean, covariance, _ = rts_step(before.mean, before.covariance, predicted, shift, covariance)
-        return mean, covariance
+            search = later[index].search
+            if search is not None and search.line is not None:
+                mean, covariance = smoothed_back(self._motion, links[index:], mean, covariance)
+                return search.retrodicted(new.stamp_ns, mean, covariance)
+        without = Step(new.stamp_ns, None, *new.predicted[:2], new.predicted)
+        stamp_ns, x, P, _ = links[0]
+        links[0] = stamp_ns, x, P, self._ahead(without, stamp_ns)
+        first = new.stamp_ns, without.mean, without.covariance, without.predicted
+        return smoothed_back(self._motion, [first, *links], mean, covariance)

@@ -4,7 +4,6 @@ import bisect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -23,10 +22,9 @@ from fgtrack.estimation.filters.initiation import (
     fix_of,
     over,
     sought,
-    straight_line,
+    straight_lines,
 )
-from fgtrack.estimation.filters.propagation import wrapped
-from fgtrack.estimation.rts import rts_step
+from fgtrack.estimation.rts import Link, smoothed_back
 from fgtrack.models.motion import MotionModel
 
 #: What a filter linearises in this direction stays good.
@@ -35,16 +33,6 @@ CERTAIN = 1.0 / KNOWN_YAW_STD_RAD
 #: After this time, and after so many measurements, a filter does not seek the direction any more: the object may be at
 #: rest, and each further measurement costs as much as all before it.
 LONGEST_S, MOST_MEASUREMENTS = 2.0, 25
-
-
-class _Link(NamedTuple):
-    """One stamp of the first measurements."""
-
-    stamp_ns: int
-    mean: FloatArray
-    covariance: FloatArray
-    predicted: Prediction
-    """From the link before, or what it was before where that has the same stamp."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +70,7 @@ class TrackInitiation:
         line = self.line
         if fix is not None and time_s > 0.0:
             try:
-                line = straight_line(fixes)
+                [line] = straight_lines(fixes, len(fixes))
             except np.linalg.LinAlgError:  # of a position that is known without error, no line can be weighted
                 line = None
         return replace(self, measurements=(*self.measurements, measurement), fixes=fixes, line=line)
@@ -107,10 +95,10 @@ class TrackInitiation:
 
         Raises `numpy.linalg.LinAlgError` where it is not finite, and where there is no line.
         """
-        last = self._filtered()[-1]
-        if not (np.isfinite(last.mean).all() and np.isfinite(last.covariance).all()):
+        _, mean, covariance, _ = self._filtered()[-1]
+        if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
             raise np.linalg.LinAlgError("the state of a new object is not finite")
-        return last.mean, last.covariance
+        return mean, covariance
 
     def turned(self) -> Start:
         """The start, turned along the line and as fast, but as uncertain as before: the measurements count from there.
@@ -128,16 +116,10 @@ class TrackInitiation:
 
         `mean` (n,) and `covariance` (n, n) are those at the newest measurement, given the same. Raises as `state`.
         """
-        links = self._filtered(stamp_ns)
-        for before, after in zip(reversed(links[:-1]), reversed(links), strict=False):
-            if after.stamp_ns == stamp_ns:
-                break
-            if before.stamp_ns < after.stamp_ns:
-                shift = wrapped(self.motion, mean - after.predicted.mean)
-                mean, covariance, _ = rts_step(before.mean, before.covariance, after.predicted, shift, covariance)
-        return mean, covariance
+        links = [link for link in self._filtered(stamp_ns) if link[0] >= stamp_ns]
+        return smoothed_back(self.motion, links, mean, covariance)
 
-    def _filtered(self, extra_ns: int | None = None) -> list[_Link]:
+    def _filtered(self, extra_ns: int | None = None) -> list[Link]:
         """The start, and the state after each measurement; with one at `extra_ns`, where nothing is measured."""
         x, P = initial_state(self.motion, self.start)
         nominal = self.nominal(x)
@@ -145,7 +127,7 @@ class TrackInitiation:
             x = x.copy()
             x[YAW] = nominal[YAW]
         at_ns = self.start.stamp_ns
-        links = [_Link(at_ns, x, P, Prediction(x, P, P))]
+        links: list[Link] = [(at_ns, x, P, Prediction(x, P, P))]
         wanted: list[tuple[int, Measurement | None]] = [(each.stamp_ns, each) for each in self.measurements]
         if extra_ns is not None:
             wanted.append((extra_ns, None))
@@ -162,7 +144,7 @@ class TrackInitiation:
             x, P = predicted.mean, predicted.covariance
             if measurement is not None:
                 x, P = correct_one(x, P, measurement)[:2]
-            links.append(_Link(stamp_ns, x, P, predicted))
+            links.append((stamp_ns, x, P, predicted))
         return links
 
     def nominal(self, x: FloatArray) -> FloatArray:
