@@ -170,13 +170,14 @@ def settings_page(target: str) -> str:
 
 def estimators_page() -> str:
     """A table of all estimators that come with fgtrack."""
-    from fgtrack.estimation.registry import ESTIMATORS, Claims, summary
+    from fgtrack.estimation.registry import ESTIMATORS, Claims
 
     lines = ["| name | method | exact in a linear model for |", "|---|---|---|"]
     for name in ESTIMATORS:
-        if name not in ESTIMATORS.plugins():
+        if name not in ESTIMATORS.sources():
             factory = ESTIMATORS.load(name)
-            lines.append(f"| `{name}` | {_one_line(summary(factory))} | {Claims.of(factory).exact or '-'} |")
+            summary = _one_line((inspect.getdoc(factory) or "").partition("\n\n")[0])
+            lines.append(f"| `{name}` | {summary} | {Claims.of(factory).exact or '-'} |")
     return "\n".join(lines)
 
 

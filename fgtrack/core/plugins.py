@@ -34,12 +34,6 @@ class Registry:
     def __iter__(self) -> Iterator[str]:
         return iter(self._entries)
 
-    def __len__(self) -> int:
-        return len(self._entries)
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._entries or name in self._aliases
-
     def loaded(self, group: str | None = None) -> dict[str, Any]:  # Any: see `load`
         """All parts, or those of `group`, by name; a plug-in that cannot be loaded is left out with a warning."""
         parts = {}
@@ -51,13 +45,10 @@ class Registry:
                     _logger.warning("%s", error)
         return parts
 
-    def plugins(self) -> dict[str, str]:
-        """Names of the plug-ins, and the package of each."""
-        return {name: _package(entry) for name, entry in self._entries.items() if entry.dist is not None}
-
     def sources(self) -> dict[str, str]:
         """Names of the plug-ins, with the package of each and a hash of the code of that package or module."""
-        return {name: f"{package} {_hash_of(self._entries[name])}" for name, package in self.plugins().items()}
+        plugins = {name: entry for name, entry in self._entries.items() if entry.dist is not None}
+        return {name: f"{_package(entry)} {_hash_of(entry)}" for name, entry in plugins.items()}
 
     def resolve(self, name: str) -> str:
         """The present form of `name`. Raises `CallError` for one that does not exist."""

@@ -208,12 +208,11 @@ class Start:
 
     def __post_init__(self) -> None:
         _check("Start: stamp_ns", self.stamp_ns, _STAMP, is_stamp(self.stamp_ns))
-        given = {name: getattr(self, name) for name in _START_NAMES}
-        given |= {f"position_cross of {name}": pair for name, pair in self.position_cross.items()}
-        for name, value in given.items():
-            if value is None and name in _MAY_BE_NONE:
+        for each in fields(self):
+            name, value = each.name, getattr(self, each.name)
+            if value is each.default or name in ("stamp_ns", "position_cross"):
                 continue
-            shape = _SHAPES.get(name.partition(" ")[0], ())
+            shape = _SHAPES.get(name, ())
             least = 0.0 if "_std_" in name else -_MOST
             rule = f"finite{'' if least else ' and not negative'}, of shape {shape} and at most {_MOST:g}"
             _check(f"Start: {name}", value, rule, _is_array(value, shape, least))
@@ -221,9 +220,7 @@ class Start:
 
 _MOST = LARGEST**4
 """No number of a start is larger: products of what is measured and configured are not, and its square is finite."""
-_START_NAMES = tuple(each.name for each in fields(Start) if each.name not in ("stamp_ns", "position_cross"))
-_SHAPES = {"position_m": (2,), "position_covariance": (2, 2), "position_cross": (2,)}
-_MAY_BE_NONE = ("position_covariance", "yaw_rad", "yaw_std_rad")
+_SHAPES = {"position_m": (2,), "position_covariance": (2, 2)}
 
 
 def _check(name: str, value: object, rule: str, holds: bool) -> None:

@@ -116,11 +116,6 @@ def list_estimators() -> list[str]:
     return list(ESTIMATORS)
 
 
-def summary(factory: Factory) -> str:
-    """The first paragraph of a docstring, in one line."""
-    return " ".join((inspect.getdoc(factory) or "").split("\n\n")[0].split())
-
-
 # Any: options are the estimator's own.
 def estimator(name: str, motion: MotionModel, start: Start, *, lag_s: float = 1.0, **options: Any) -> Estimator:
     """The estimator `name` of one object.
@@ -160,8 +155,8 @@ def start_estimator(
 
     def made(start: Start) -> Estimator:
         if claims.bank:
-            return OneObject(motion, _made_as(TrackBank, name, factory, motion, lag_s, **own), start)
-        one: Estimator = _made_as(Estimator, name, factory, motion, start, lag_s, **own)
+            return OneObject(motion, _made(ESTIMATORS, TrackBank, name, factory, motion, lag_s, **own), start)
+        one: Estimator = _made(ESTIMATORS, Estimator, name, factory, motion, start, lag_s, **own)
         return one
 
     return initiated(motion, start, method, made)
@@ -178,7 +173,7 @@ def estimator_bank(
     claims = Claims.of(factory)
     own = {key: options[key] for key in options if claims.initiates or key != "initiation"}
     if claims.bank:
-        bank: TrackBank = _made_as(TrackBank, name, factory, motion, lag_s, **own)
+        bank: TrackBank = _made(ESTIMATORS, TrackBank, name, factory, motion, lag_s, **own)
         return bank
     _check_options(name, factory, 3, own)
     if factory is ReplayEkf and isinstance(motion, WhiteNoise) and type(motion) in (CTRV, CTRA, CV):
@@ -188,27 +183,21 @@ def estimator_bank(
 
 def motion_model(name: str, parameters: Mapping[str, Any]) -> MotionModel:
     """The motion model `name`. Raises `CallError` for an unknown name and for parameters that it does not take."""
-    model = _made(MOTION_MODELS, name, MOTION_MODELS.load(name), **parameters)
-    if not isinstance(model, MotionModel):
-        raise CallError(f"motion model {name!r}: is a {type(model).__name__}, not a MotionModel")
+    model: MotionModel = _made(MOTION_MODELS, MotionModel, name, MOTION_MODELS.load(name), **parameters)
     return model
 
 
-def _made_as(protocol: type, name: str, factory: Factory, *arguments: Any, **options: Any) -> Any:
-    """Return what the estimator `name` makes. Raises `CallError` where that lacks something of `protocol`."""
-    made = _made(ESTIMATORS, name, factory, *arguments, **options)
-    if not isinstance(made, protocol):
-        raise CallError(f"estimator {name!r}: {type(made).__name__} lacks a member of {protocol.__name__}, see there")
-    return made
-
-
-def _made(registry: Registry, name: str, factory: Factory, *arguments: Any, **options: Any) -> Any:
+def _made(registry: Registry, kind: type, name: str, factory: Factory, *arguments: Any, **options: Any) -> Any:
+    """Return what the part `name` makes. Raises `CallError` where that is not of its `kind`."""
     _check_options(name, factory, len(arguments), options)
     with registry.blamed(name, "cannot be made"):
         try:
-            return factory(*arguments, **options)
+            made = factory(*arguments, **options)
         except ValueError as error:
             raise CallError(f"{name}: {error}") from error
+    if not isinstance(made, kind):
+        raise CallError(f"{name!r} makes a {type(made).__name__}, which lacks a member of {kind.__name__}")
+    return made
 
 
 def _check_options(name: str, factory: Factory, num_arguments: int, options: Mapping[str, Any]) -> None:

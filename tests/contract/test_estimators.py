@@ -21,7 +21,7 @@ VARIANTS: tuple[tuple[str, dict[str, Any]], ...] = (
 )
 
 
-@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("name", list(ESTIMATORS))
 def test_every_estimator_keeps_the_contract(name: str) -> None:
     check_estimator(name, num_streams=3 if name.startswith("smoother") else 6)
 

@@ -9,7 +9,7 @@ from fgtrack.models.motion import CTRV, CV, MotionModel, Transition
 from fgtrack.testing import BrokenPromiseError, check_motion_model, motion_model_checks
 
 
-@pytest.mark.parametrize("kind", MOTION_MODELS)
+@pytest.mark.parametrize("kind", list(MOTION_MODELS))
 def test_every_motion_model_keeps_the_contract(kind: str) -> None:
     check_motion_model(MOTION_MODELS.load(kind)())
 

@@ -277,7 +277,7 @@ def test_every_delay_and_clock_model_has_a_row_with_its_parameters(model: Any) -
 @pytest.mark.parametrize(
     ("page", "mark", "names"),
     [
-        ("estimators", "`{}`", [name for name in ESTIMATORS if name not in ESTIMATORS.plugins()]),
+        ("estimators", "`{}`", [name for name in ESTIMATORS if name not in ESTIMATORS.sources()]),
         ("api", "`{}`", [name for name in dir(fgtrack) if not name.startswith("_")]),
         ("configuration", "| `{}` |", [field.name for field in fields(Config)]),
     ],

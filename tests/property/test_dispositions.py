@@ -205,7 +205,7 @@ def test_every_detection_ends_in_exactly_one_row_and_every_state_is_sound(name: 
             assert np.linalg.eigvalsh(normalised).min() >= -1e-8
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("estimator", list(ESTIMATORS))
 def test_a_detection_stamped_ahead_of_the_clock_starts_a_track_at_once(estimator: str) -> None:
     ahead = DetectionList("lidar", START_NS + 900 * MS, START_NS, (Detection(20.0, 1.0, 0.0),), "map")
     [report] = run(replace(paper(), estimator=estimator), [ahead])

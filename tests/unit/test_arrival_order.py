@@ -67,7 +67,7 @@ def test_of_two_fixes_in_one_place_at_one_time_the_line_takes_the_same_first() -
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("name", list(ESTIMATORS))
 def test_a_yaw_that_is_handed_out_has_one_turn(name: str) -> None:
     start = replace(START, position_m=(0.0, 0.0), yaw_rad=3.0, speed_mps=10.0, yaw_rate_radps=1.0)
     one = estimator(name, CTRV(), start)

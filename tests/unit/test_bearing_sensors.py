@@ -48,7 +48,7 @@ def look(tracker: Tracker, sensor: str, at_ms: float) -> TickReport:
 
 
 @pytest.mark.parametrize("lifecycle", LIVES, ids=["counting", "published", "existence"])
-@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("estimator", list(ESTIMATORS))
 def test_a_bearing_alone_starts_no_track(lifecycle, estimator: str) -> None:
     one = tracker(lifecycle, estimator)
     for k in range(5):

@@ -93,7 +93,7 @@ def test_every_configuration_can_be_built(path: Path) -> None:
     assert type(tracker) is (PublishedTracker if config.lifecycle.kind == "published" else Tracker)
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("estimator", list(ESTIMATORS))
 def test_every_estimator_starts_an_object(estimator: str) -> None:
     bank = build_bank(load(Config, None, [f"estimator={estimator}", "motion={kind: cv, std_per_s: {velocity: 1.0}}"]))
     bank.advance(10**9)

@@ -17,7 +17,6 @@ from fgtrack.estimation.registry import (
     estimator,
     estimator_bank,
     motion_model,
-    summary,
 )
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
@@ -49,7 +48,7 @@ def test_built_in_parts_come_first_and_plug_ins_are_loaded_by_name(registry: Reg
     assert list(registry) == ["ours", "part", "wrong", "zero"]
     assert registry.load("ours") is Path
     assert registry.load("part").__module__ == "sound_plugin"
-    assert registry.plugins() == {"part": "sound 1.0", "wrong": "wrecked 1.0", "zero": "wrecked 1.0"}
+    assert list(registry.sources()) == ["part", "wrong", "zero"]
 
 
 def test_the_source_of_a_plug_in_follows_its_code(
@@ -89,12 +88,10 @@ def test_an_unknown_name_gives_the_nearest_and_all(registry: Registry) -> None:
     with pytest.raises(CallError, match=r"^part 'prt' is unknown, did you mean 'part': there are ours, part, wrong"):
         registry.resolve("prt")
     assert registry.resolve("old") == "ours"
-    assert "old" in registry
-    assert "prt" not in registry
 
 
-@pytest.mark.parametrize("name", ESTIMATORS)
-def test_every_estimator_is_made_by_name_and_says_what_it_is(name: str) -> None:
+@pytest.mark.parametrize("name", list(ESTIMATORS))
+def test_every_estimator_is_made_by_name(name: str) -> None:
     motion = CV()
     one = estimator(name, motion, Start(position_m=(1.0, 2.0)), lag_s=1.0)
     z = one.state_at(0).mean[:2]
@@ -102,7 +99,6 @@ def test_every_estimator_is_made_by_name_and_says_what_it_is(name: str) -> None:
     measurement = Measurement(10**9 // 2, measurement_model(("x_m", "y_m"), motion), z, np.eye(2))
     assert one.update(measurement).status is UpdateStatus.IN_SEQUENCE
     assert one.window_ns[1] == 10**9 // 2
-    assert 0 < len(summary(ESTIMATORS.load(name))) < 300
 
 
 def test_options_that_an_estimator_does_not_take_are_refused() -> None:
@@ -146,7 +142,7 @@ class LackingBank:
         (Raising, r"plug-in x:Y of odd 1\.0 cannot be made \(RuntimeError: oh\)"),
         (Leaving, r"plug-in x:Y of odd 1\.0 cannot be made \(SystemExit: 0\)"),
         (5, r"odd: 5 is no class or function of Python"),
-        (LackingBank, r"estimator 'odd': LackingBank lacks a member of TrackBank"),
+        (LackingBank, r"'odd' makes a LackingBank, which lacks a member of TrackBank"),
     ],
     ids=["raises", "leaves", "number", "bank"],
 )

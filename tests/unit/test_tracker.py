@@ -91,7 +91,7 @@ def test_a_detection_that_no_noise_explains_is_gated_and_starts_no_track() -> No
     assert ids(report) == [1]  # and the track that it was near was not seen
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("estimator", list(ESTIMATORS))
 def test_detections_that_the_first_one_has_overtaken_start_no_second_track(estimator: str) -> None:
     one = build_tracker(
         replace(paper(), sensors={"lidar": POINTS, "radar": POINTS}, estimator=estimator, lifecycle=CLAIMING)
