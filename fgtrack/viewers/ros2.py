@@ -8,20 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import DetectionList, EgoState
 from fgtrack.io.adapters.common import RosMessage
-from fgtrack.io.errors import one_line
-from fgtrack.io.output import new_file, new_folder, write_error
-from fgtrack.io.ros.bag_writer import RECORDING, is_recording
+from fgtrack.io.output import new_file, new_folder
+from fgtrack.io.ros.bag_writer import RECORDING, BagTopics, as_write_error, is_recording
 from fgtrack.io.ros.messages import MARKER_ARRAY, TRANSFORMS, MessageFactory
 from fgtrack.viewers.shapes import Entity, Scene, Shape, ViewerMessage
 
-_LATEST_NS = 1 << 63
 _FRAME_IDS = {"map": "map", "ego": "base_link"}
 _KINDS = {"arrow": 0, "cube": 1, "sphere": 2, "cylinder": 3, "line": 4, "text": 9}  # of Marker.msg
 _ADD, _DELETE = 0, 2
@@ -34,7 +31,7 @@ def write_ros2(path: Path, messages: Iterable[ViewerMessage], overwrite: bool = 
     `path` becomes a rosbag2 folder, or its MCAP file alone where the name ends in `.mcap`. It appears when it is
     complete. Outcomes have no standard message and are left out. Raises as `write_bag`.
     """
-    try:
+    with as_write_error(path):
         if path.suffix != ".mcap":
             with new_folder(path, overwrite, is_recording, RECORDING) as folder:
                 return _write(folder, messages)
@@ -46,43 +43,30 @@ def write_ros2(path: Path, messages: Iterable[ViewerMessage], overwrite: bool = 
             with (Path(part) / path.stem / f"{path.stem}.mcap").open("rb") as written:
                 shutil.copyfileobj(written, file)
             return counts
-    except FgtrackError:
-        raise
-    except OSError as error:
-        raise write_error(path, error) from error
-    except Exception as error:  # rosbags lets struct errors and its own through
-        raise DataError(f"{path}: cannot be written ({one_line(error)})") from error
 
 
 def _write(folder: Path, messages: Iterable[ViewerMessage]) -> dict[str, int]:
     factory = _MarkerFactory()
-    connections: dict[str, Connection] = {}
     counts: Counter[str] = Counter()
     bag = Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
     bag.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     with bag:
+        topics = BagTopics(bag, factory)
         for message in messages:
-            if not 0 <= message.log_ns < _LATEST_NS:
-                raise DataError(f"the time {message.log_ns} ns lies outside what a recording holds")
+            latched = isinstance(message.content, Scene) and message.content.latched
+            quality = Qos(
+                QosHistory.KEEP_LAST,
+                10,
+                QosReliability.RELIABLE,
+                QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+                _FOREVER,
+                _FOREVER,
+                QosLiveliness.SYSTEM_DEFAULT,
+                _FOREVER,
+                False,
+            )
             for topic, made in factory.messages(message):
-                if topic not in connections:
-                    latched = isinstance(message.content, Scene) and message.content.latched
-                    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
-                    quality = Qos(
-                        QosHistory.KEEP_LAST,
-                        10,
-                        QosReliability.RELIABLE,
-                        durability,
-                        _FOREVER,
-                        _FOREVER,
-                        QosLiveliness.SYSTEM_DEFAULT,
-                        _FOREVER,
-                        False,
-                    )
-                    connections[topic] = bag.add_connection(
-                        topic, made.__msgtype__, typestore=factory.typestore, offered_qos_profiles=[quality]
-                    )
-                bag.write(connections[topic], message.log_ns, factory.serialize(made))
+                topics.put(topic, made, message.log_ns, [quality])
                 counts[topic] += 1
     return dict(counts)
 

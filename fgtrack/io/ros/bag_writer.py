@@ -2,11 +2,12 @@
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
-from rosbags.interfaces import Connection
+from rosbags.interfaces import Connection, Qos
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
@@ -23,7 +24,6 @@ _CHECKPOINT = 1000  # messages; a killed writer loses no more than that
 _PLUGINS = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 _INT64_LIMIT = 1 << 63
 RECORDING = "a rosbag2 folder with nothing else in it"
-_JOURNALS = ("-wal", "-shm", "-journal")  # that SQLite may leave beside a file
 
 
 def write_bag(
@@ -44,27 +44,71 @@ def write_bag(
     Raises `TruncatedInput` where `messages` broke off, after writing what came before; as `new_folder`; and `DataError`
     for a time outside what ROS messages hold.
     """
-    path = Path(path)
+    path, count = Path(path), 0
+    with (
+        as_write_error(path),
+        new_folder(path, overwrite, is_recording, RECORDING) as folder,
+        Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=_PLUGINS[storage]) as bag,
+    ):
+        if settings:
+            bag.set_custom_data(SETTINGS, json.dumps(settings))
+        factory = MessageFactory()
+        topics = BagTopics(bag, factory)
+        readable = UntilBreak(messages)
+        for message in readable:
+            match message:
+                case EgoState():
+                    topics.put("/fgtrack/ego", factory.ego(message), message.receipt_ns)
+                    topics.put("/ego/odometry", factory.odometry(message), message.receipt_ns)
+                case DetectionList():
+                    topic = f"/detections/{token(message.sensor)}"
+                    topics.put(f"/fgtrack{topic}", factory.detections(message), message.receipt_ns)
+                    topics.put(topic, factory.detection3d_array(message), message.receipt_ns)
+                case TruthState():
+                    topics.put("/fgtrack/truth", factory.truth(message), message.receipt_ns)
+            count += 1
+            if count % _CHECKPOINT == 0:
+                match bag.storage:
+                    case McapWriter() as opened:
+                        opened.close_chunk()
+                        opened.bio.flush()
+                    case Sqlite3Writer() as opened:
+                        opened.conn.commit()
+        readable.raise_before_replacing(path)
+    readable.raise_error()
+    return count
+
+
+class BagTopics:
+    """Topics of a recording that is written, each added with its first message."""
+
+    def __init__(self, bag: Writer, factory: MessageFactory) -> None:
+        self._bag = bag
+        self._factory = factory
+        self._connections: dict[str, Connection] = {}
+
+    def put(self, topic: str, message: RosMessage, log_ns: int, qos: Sequence[Qos] = ()) -> None:
+        """Write `message`, and the `qos` profiles that are offered with a new topic."""
+        if not 0 <= log_ns < _INT64_LIMIT:
+            raise DataError(f"the time {log_ns} ns lies outside what a recording holds")
+        if topic not in self._connections:
+            self._connections[topic] = self._bag.add_connection(
+                topic, message.__msgtype__, typestore=self._factory.typestore, offered_qos_profiles=qos
+            )
+        self._bag.write(self._connections[topic], log_ns, self._factory.serialize(message))
+
+
+@contextmanager
+def as_write_error(path: Path) -> Iterator[None]:
+    """Raise `DataError` for whatever rosbags raises in the block that writes `path`: also SQLite and struct errors."""
     try:
-        with (
-            new_folder(path, overwrite, is_recording, RECORDING) as folder,
-            Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=_PLUGINS[storage]) as bag,
-        ):
-            if settings:
-                bag.set_custom_data(SETTINGS, json.dumps(settings))
-            writer = _MessageWriter(bag)
-            readable = UntilBreak(messages)
-            for message in readable:
-                writer.write(message)
-            readable.raise_before_replacing(Path(path))
+        yield
     except FgtrackError:
         raise
-    except Exception as error:  # rosbags lets SQLite and struct errors through
+    except Exception as error:
         raise DataError(
             f"{path}: cannot be written ({one_line(error)}), free some space or choose another place"
         ) from error
-    readable.raise_error()
-    return writer.count
 
 
 def token(name: str) -> str:
@@ -79,52 +123,9 @@ def check_bag(path: Path, overwrite: bool) -> None:
 
 def is_recording(path: Path) -> bool:
     """True if `path` is a folder of what its metadata.yaml lists, and of nothing else."""
-    if not (path / METADATA).is_file():
-        return False
     try:
-        listed = [file.name for file in files_of(path)]
-    except DataError:
+        listed = [file.name for file in files_of(path)] if (path / METADATA).is_file() else []
+    except Exception:  # whatever a damaged metadata.yaml raises
         return False
-    known = {METADATA, *listed, *(f"{name}{journal}" for name in listed for journal in _JOURNALS)}
-    return bool(listed) and all(file.name in known and file.is_file() for file in path.iterdir())
-
-
-class _MessageWriter:
-    """Puts messages on their topics."""
-
-    def __init__(self, bag: Writer) -> None:
-        self._bag = bag
-        self._factory = MessageFactory()
-        self._connections: dict[str, Connection] = {}
-        self.count = 0
-
-    def write(self, message: Message) -> None:
-        match message:
-            case EgoState():
-                self._put("/fgtrack/ego", self._factory.ego(message), message.receipt_ns)
-                self._put("/ego/odometry", self._factory.odometry(message), message.receipt_ns)
-            case DetectionList():
-                topic = f"/detections/{token(message.sensor)}"
-                self._put(f"/fgtrack{topic}", self._factory.detections(message), message.receipt_ns)
-                self._put(topic, self._factory.detection3d_array(message), message.receipt_ns)
-            case TruthState():
-                self._put("/fgtrack/truth", self._factory.truth(message), message.receipt_ns)
-        self.count += 1
-        if self.count % _CHECKPOINT == 0:
-            match self._bag.storage:
-                case McapWriter() as storage:
-                    storage.close_chunk()
-                    storage.bio.flush()
-                case Sqlite3Writer() as storage:
-                    storage.conn.commit()
-
-    def _put(self, topic: str, message: RosMessage, log_ns: int) -> None:
-        if not 0 <= log_ns < _INT64_LIMIT:
-            raise DataError(f"receipt {log_ns} ns lies outside what a recording holds")
-        msgtype = message.__msgtype__
-        key = f"{topic} {msgtype}"
-        connection = self._connections.get(key)
-        if connection is None:
-            connection = self._bag.add_connection(topic, msgtype, typestore=self._factory.typestore)
-            self._connections[key] = connection
-        self._bag.write(connection, log_ns, self._factory.serialize(message))
+    journals = [f"{name}{suffix}" for name in listed for suffix in ("-wal", "-shm", "-journal")]  # of SQLite
+    return bool(listed) and {file.name for file in path.iterdir()} <= {METADATA, *listed, *journals}
