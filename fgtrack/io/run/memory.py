@@ -2,16 +2,11 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from operator import itemgetter
 
-import numpy as np
-
-from fgtrack.io.run.reader import Run, Table
+from fgtrack.io.run.reader import Run, parsed
 from fgtrack.io.run.rows import Row, text, text_header
-from fgtrack.io.run.schema import COLUMNS, Column, column
+from fgtrack.io.run.schema import COLUMNS
 from fgtrack.io.run.sink import RunSink
-
-_CHUNK = 4096  # rows that wait for becoming columns, which take a tenth of the memory
 
 
 class MemoryRun(RunSink):
@@ -24,40 +19,16 @@ class MemoryRun(RunSink):
         smoothed_lag_s: float | None = None,
     ) -> None:
         super().__init__(config_text, meta, smoothed_lag_s)
-        self._waiting: dict[str, list[Row]] = {table: [] for table in COLUMNS}
-        self._columns: dict[str, dict[str, list[Column]]] = {
-            table: {name: [column(name, ())] for name in names} for table, names in COLUMNS.items()
-        }
-        # The digest is that of tracks.csv and then updates.csv, so only the text of the second has to wait.
-        self._tracks = hashlib.sha256(text_header("tracks"))
-        self._updates = bytearray(text_header("updates"))
+        self._files = {table: bytearray(text_header(table)) for table in COLUMNS}
 
     @property
     def run(self) -> Run:
         """The run; it has no path."""
-        tables = {}
-        for table in COLUMNS:
-            self._pack(table)
-            tables[table] = Table({name: np.concatenate(parts) for name, parts in self._columns[table].items()})
+        tables = {table: parsed(table, content) for table, content in self._files.items()}
         return Run(None, dict(self._meta), self._config_text, tables)
 
     def _append(self, table: str, rows: Sequence[Row]) -> None:
-        if table == "tracks":
-            self._tracks.update(text(table, rows).encode())
-        elif table == "updates":
-            self._updates += text(table, rows).encode()
-        self._waiting[table] += rows
-        if len(self._waiting[table]) >= _CHUNK:
-            self._pack(table)
-
-    def _pack(self, table: str) -> None:
-        waiting = self._waiting[table]
-        if waiting:
-            for place, (name, parts) in enumerate(self._columns[table].items()):
-                parts.append(column(name, list(map(itemgetter(place), waiting))))
-            waiting.clear()
+        self._files[table] += text(table, rows).encode()
 
     def _digest(self) -> str:
-        sha = self._tracks.copy()
-        sha.update(self._updates)
-        return sha.hexdigest()
+        return hashlib.sha256(self._files["tracks"] + self._files["updates"]).hexdigest()

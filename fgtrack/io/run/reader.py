@@ -19,8 +19,9 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.files import open_file, read_whole
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray
+from fgtrack.io.run.rows import text_header
 from fgtrack.io.run.schema import COLUMNS, NO_TRACK, OPTIONAL_TABLES, RUN_FORMAT, Column, column, column_type
-from fgtrack.io.run.writer import LARGEST_META_MB, path_from_run, save_run
+from fgtrack.io.run.writer import LARGEST_META_MB, RunWriter, path_from_run
 from fgtrack.io.yaml_text import safe_yaml
 
 if TYPE_CHECKING:  # takes half a second to import
@@ -189,7 +190,11 @@ class Run:
         meta = dict(self.meta)
         if self.recording is not None:
             meta["input"] = {**meta["input"], "path_from_run": path_from_run(str(self.recording), Path(path))}
-        save_run(Path(path), self.tables, self.config_text, meta, overwrite)
+        with RunWriter(path, self.config_text, meta, overwrite=overwrite) as writer:
+            for table, columns in self.tables.items():
+                if columns.num_rows:
+                    writer.write_rows(table, _lines(table, columns))
+            writer.finish(meta)
 
 
 _parsed = lru_cache(maxsize=64)(safe_yaml)
@@ -207,68 +212,65 @@ def load_run(path: Path | str) -> Run:
         A file is missing or damaged; the message names it.
     """
     path = Path(path)
-    meta = _read_meta(path)
-    complete = bool(meta.get("complete"))
-    tables = {name: _read_table(path / f"{name}.csv", name, complete) for name in COLUMNS}
-    if (np.diff(tables["timing"]["tick"]) <= 0).any():
-        raise DataError(f"{path / 'timing.csv'}: its ticks do not increase, repeat the run")
-    config = path / "config.yaml"
-    return Run(path, meta, _read_text(config) if complete or config.exists() else "", tables)
-
-
-def _read_text(path: Path) -> str:
+    file, config = path / "meta.json", path / "config.yaml"
     try:
-        return read_whole(path, LARGEST_META_MB).decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: is not UTF-8 text ({error.reason}), repeat the run") from error
-
-
-def _read_meta(path: Path) -> Mapping[str, Any]:
-    file = path / "meta.json"
-    try:
-        meta = json.loads(_read_text(file))
+        meta = json.loads(read_whole(file, LARGEST_META_MB))
     except (ValueError, RecursionError) as error:
         raise DataError(f"{file}: is not JSON ({error}), repeat the run") from error
     if not isinstance(meta, dict) or meta.get("format") != RUN_FORMAT:
         raise DataError(f"{file}: does not say format {RUN_FORMAT!r}, so this is not a run folder")
-    return meta
+    complete = bool(meta.get("complete"))
+    tables = {name: _read_table(path / f"{name}.csv", name, complete) for name in COLUMNS}
+    if (np.diff(tables["timing"]["tick"]) <= 0).any():
+        raise DataError(f"{path / 'timing.csv'}: its ticks do not increase, repeat the run")
+    has_config = complete or config.exists()
+    return Run(path, meta, read_whole(config, LARGEST_META_MB).decode(errors="replace") if has_config else "", tables)
 
 
 def _read_table(path: Path, table: str, complete: bool) -> Table:
+    if (table in OPTIONAL_TABLES or not complete) and not path.exists():  # or killed while it was begun
+        return parsed(table, text_header(table))
+    try:
+        with open_file(path) as file:
+            content = file.read()
+        if complete and not content.endswith(b"\n"):
+            raise DataError(f"{path}: breaks off in its last row, repeat the run")
+        return parsed(table, content[: content.rfind(b"\n") + 1] or text_header(table))
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}), is this a run folder?") from error
+    except (ValueError, OverflowError) as error:
+        raise DataError(f"{path}: cannot be read ({' '.join(str(error).split())}), repeat the run") from error
+
+
+def parsed(table: str, content: bytes | bytearray) -> Table:
+    """The table whose CSV file has this `content`. Raises `ValueError` for another one."""
     import pandas
 
     names = COLUMNS[table]
-    empty = Table({name: column(name, ()) for name in names})
-    may_miss = table in OPTIONAL_TABLES or not complete  # killed while it was begun
-    if may_miss and not path.exists():
-        return empty
     types = {
         name: "Int64" if name == "track_id" else {str: object, int: "int64"}.get(column_type(name)) for name in names
     }
     numbers = {name: ["", "nan"] for name in names if column_type(name) is float}
-    try:
-        with open_file(path) as file:
-            content = file.read()
-        if complete and content and not content.endswith(b"\n"):
-            raise DataError(f"{path}: breaks off in its last row, repeat the run")
-        frame = pandas.read_csv(
-            BytesIO(content[: content.rfind(b"\n") + 1]),
-            dtype=types,
-            na_values=numbers | {"track_id": [""]},
-            keep_default_na=False,
-            skip_blank_lines=False,
-            low_memory=False,
-        )
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}), is this a run folder?") from error
-    except pandas.errors.EmptyDataError as error:
-        if not complete:
-            return empty
-        raise DataError(f"{path}: is empty, repeat the run") from error
-    except (ValueError, OverflowError) as error:
-        raise DataError(f"{path}: cannot be read ({' '.join(str(error).split())}), repeat the run") from error
+    frame = pandas.read_csv(
+        BytesIO(content),
+        dtype=types,
+        na_values=numbers | {"track_id": [""]},
+        keep_default_na=False,
+        skip_blank_lines=False,
+        low_memory=False,
+    )
     if tuple(frame.columns) != names or not isinstance(frame.index, pandas.RangeIndex):
-        raise DataError(f"{path}: the columns must be {','.join(names)}")
+        raise ValueError(f"the columns must be {','.join(names)}")
     if "track_id" in names:
         frame["track_id"] = frame["track_id"].fillna(NO_TRACK)
     return Table({name: column(name, frame[name].to_numpy()) for name in names})
+
+
+def _lines(table: str, columns: Table) -> str:
+    """Lines of the CSV file of `table`, floats with 17 significant digits."""
+    import pandas
+
+    frame = pandas.DataFrame(columns)
+    if table == "updates":
+        frame["track_id"] = frame["track_id"].astype("Int64").replace(NO_TRACK, pandas.NA)
+    return str(frame.to_csv(header=False, index=False, float_format="%.17g", lineterminator="\n"))

@@ -15,12 +15,12 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.files import open_file, read_whole
 from fgtrack.io.output import check_output, claimed, write_error, write_file
 from fgtrack.io.run.rows import Row, text, text_header
-from fgtrack.io.run.schema import COLUMNS, NO_TRACK, OPTIONAL_TABLES, RUN_FORMAT, Column
+from fgtrack.io.run.schema import COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
 from fgtrack.io.run.sink import RunSink
 
 LARGEST_META_MB = 16.0
 """Largest meta.json and config.yaml, which have some kB."""
-_META, _OLD_META, _STAGE = "meta.json", "meta.json.part", "new.part"
+_META, _STAGE = "meta.json", "new.part"
 _FILES = (*(f"{table}.csv" for table in COLUMNS), "metrics.json", "config.yaml", _META)
 
 
@@ -92,46 +92,45 @@ class RunWriter(RunSink):
         return finished
 
     def _replace(self, folder: Path) -> None:
-        with suppress(FileNotFoundError):  # a killed command had begun with this
-            os.replace(self.path / _META, self.path / _OLD_META)  # until the end of the exchange there is no run
+        (self.path / _META).unlink(missing_ok=True)  # until the end of the exchange there is no run
         for name in _FILES:
             if (folder / name).exists():
                 os.replace(folder / name, self.path / name)
             else:
                 (self.path / name).unlink(missing_ok=True)
         folder.rmdir()
-        (self.path / _OLD_META).unlink(missing_ok=True)
 
     def _append(self, table: str, rows: Sequence[Row]) -> None:
         if rows:
-            self._begin()
-            self._write(table, text(table, rows))
+            self.write_rows(table, text(table, rows))
+
+    def write_rows(self, table: str, lines: str) -> None:
+        """Append `lines` to the CSV file of `table`."""
+        path = self._begin() / f"{table}.csv"
+        try:
+            if table not in self._files:
+                self._files[table] = FileIO(path, "w")
+                _write_all(self._files[table], text_header(table))
+            _write_all(self._files[table], lines.encode())
+        except OSError as error:
+            raise write_error(path, error) from error
 
     def _begin(self) -> Path:
         """Make the files, with the first tick: a run that fails before leaves nothing."""
         if self._folder is None:
-            self._folder = self.path / _STAGE if any(self.path.iterdir()) else self.path
-            if self._folder != self.path:
-                shutil.rmtree(self._folder, ignore_errors=True)  # of a killed command
+            folder = self.path / _STAGE if any(self.path.iterdir()) else self.path
+            if folder != self.path:
+                shutil.rmtree(folder, ignore_errors=True)  # of a killed command
                 try:
-                    self._folder.mkdir()
+                    folder.mkdir()
                 except OSError as error:
                     raise write_error(self.path, error) from error
-            self._write_meta(self._folder)  # the first, so that a folder with a table is known as a run
-            write_file(self._folder / "config.yaml", self._config_text)
+            self._folder = folder
+            self._write_meta(folder)  # the first, so that a folder with a table is known as a run
+            write_file(folder / "config.yaml", self._config_text)
             for table in COLUMNS.keys() - OPTIONAL_TABLES:
-                self._write(table, "")
+                self.write_rows(table, "")
         return self._folder
-
-    def _write(self, table: str, lines: str) -> None:
-        file, path = self._files.get(table), (self._folder or self.path) / f"{table}.csv"
-        try:
-            if file is None:
-                file = self._files[table] = FileIO(path, "w")
-                _write_all(file, text_header(table))
-            _write_all(file, lines.encode())
-        except OSError as error:
-            raise write_error(path, error) from error
 
     def _write_meta(self, folder: Path) -> None:
         write_file(folder / _META, json.dumps(self._meta, indent=2) + "\n")
@@ -143,27 +142,6 @@ class RunWriter(RunSink):
 def check_run(path: Path, overwrite: bool) -> None:
     """Raise `CallError` where `RunWriter` would for what is at `path`."""
     check_output(path, overwrite, is_run_folder, "a run folder")
-
-
-def save_run(
-    path: Path,
-    tables: Mapping[str, Mapping[str, Column]],
-    config_text: str,
-    meta: Mapping[str, object],
-    overwrite: bool,
-) -> None:
-    """Write a run that is complete; raises as `RunWriter`."""
-    with RunWriter(path, config_text, meta, overwrite=overwrite) as writer:
-        for table, columns in tables.items():
-            empty = {NO_TRACK: None} if table == "updates" else {}
-            cells = [
-                [None if cell != cell or cell == "" else cell for cell in values.tolist()]
-                if name != "track_id"
-                else [empty.get(cell, cell) for cell in values.tolist()]
-                for name, values in columns.items()
-            ]
-            writer._append(table, list(zip(*cells, strict=True)))
-        writer.finish(meta)
 
 
 def path_from_run(origin: str, folder: Path) -> str | None:
@@ -189,16 +167,12 @@ def digest(path: Path) -> str:
 
 
 def is_run_folder(path: Path) -> bool:
-    """True if `path` holds a run: its `meta.json` names the format."""
-    return any(_is_meta(path / name) for name in (_META, _OLD_META))
-
-
-def _is_meta(file: Path) -> bool:
-    try:
-        meta = json.loads(read_whole(file, LARGEST_META_MB))
-    except (DataError, ValueError, RecursionError):
-        return False
-    return isinstance(meta, dict) and meta.get("format") == RUN_FORMAT
+    """True if `path` holds a run, or one that was to replace it: a `meta.json` that names the format."""
+    for file in (path / _META, path / _STAGE / _META):
+        with suppress(DataError, LookupError, TypeError, ValueError, RecursionError):
+            if json.loads(read_whole(file, LARGEST_META_MB))["format"] == RUN_FORMAT:
+                return True
+    return False
 
 
 def _write_all(file: FileIO, data: bytes) -> None:
