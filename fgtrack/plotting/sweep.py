@@ -15,7 +15,7 @@ from scipy.special import stdtrit
 
 from fgtrack.core.errors import DataError
 from fgtrack.evaluation.palette import look, looks
-from fgtrack.evaluation.tables.seeds import SweepTable, number, read_sweep
+from fgtrack.evaluation.tables.seeds import SweepTable, read_sweep
 from fgtrack.plotting.paper import Paper, Sheet, styled
 from fgtrack.plotting.style import legend_above, log_axis
 
@@ -52,7 +52,7 @@ _NAMED_STEPS = 8  # more values of the horizontal axis than these have no tick e
 
 def sweep_metrics(table: SweepTable) -> tuple[list[str], list[str]]:
     """The metrics of `table` to draw: the first ones, and the rest."""
-    known = [name for name in table.metrics if table.means(name)]
+    known = [name for name in table.metrics if not table.means(name).empty]
     ordered = [name for pattern in _REST for name in known if fnmatchcase(name, pattern)]
     ordered = list(dict.fromkeys(ordered)) or known
     first = [name for name in _FIRST if name in ordered] or ordered[:3]
@@ -68,12 +68,12 @@ def sweep(table: SweepTable | Path | str, metric: str = _POSITION, **paper: Unpa
     `DataError` if it has no value.
     """
     table = table if isinstance(table, SweepTable) else read_sweep(table)
-    names, means = table.shown_axes or ("",), _means(table, metric)
+    names, means = table.shown_axes or [""], _means(table, metric)
     if means.empty:
         raise DataError(f"{metric}: no cell of the sweep has a value, so there is nothing to draw")
-    are_numbers = {name: all(math.isfinite(number(cell)) for cell in means[name]) for name in names}
+    are_numbers = {name: _are_numbers(means[name]) for name in names}
     across = max(names, key=lambda name: (are_numbers[name], means[name].nunique()))
-    ticks = {cell: number(cell) if are_numbers[across] else k for k, cell in enumerate(means[across].unique())}
+    ticks = {cell: float(cell) if are_numbers[across] else k for k, cell in enumerate(means[across].unique())}
     means["at"] = [ticks[cell] for cell in means[across]]
     width = max(ticks.values()) - min(ticks.values()) or 1.0
     rest = [name for name in names if name != across]
@@ -136,15 +136,15 @@ def error_against_delay(table: SweepTable | Path | str | None = None, **paper: U
     table = table if isinstance(table, SweepTable) else read_sweep(table)
     waits = [name for name in table.metrics if fnmatchcase(name, _LAGGED)][:1]
     curves = {metric: _means(table, metric) for metric in (_POSITION, *waits)}
-    (delay, *others), points = table.shown_axes or ("",), curves[_POSITION]
-    if others or points.empty or not all(math.isfinite(number(cell)) for cell in points[delay]):
+    (delay, *others), points = table.shown_axes or [""], curves[_POSITION]
+    if others or points.empty or not _are_numbers(points[delay]):
         raise DataError(
             "the sweep is not over one axis of delays with position errors, so it is not drawn against delay"
         )
     sheet = Sheet(7.0, 4.2, paper)
     axes: Axes = sheet.plots()[0, 0]
     for metric, means in curves.items():
-        means["ms"] = 1e3 * means[delay].map(number)
+        means["ms"] = 1e3 * means[delay].astype(float)
         for name, mine in means.sort_values("ms", kind="stable").groupby("estimator", sort=False):
             its, later = look(name), metric_words(metric).partition(", ")[2]
             line, marker, label = (":", ".", f"{name}, {later}") if later else (its.line, its.marker, name)
@@ -159,14 +159,14 @@ def error_against_delay(table: SweepTable | Path | str | None = None, **paper: U
 
 
 def _means(table: SweepTable, metric: str) -> Any:  # Any: a DataFrame, whose columns have no types
-    """Return the axes, estimator, mean, seeds and half width of the 95 % interval (t; 0 of one seed) of every point."""
-    means = table.means(metric)
-    frame = pd.DataFrame([one.point or ("",) for one in means], columns=list(table.shown_axes or ("",)))
-    for name in ("estimator", "mean", "seeds"):
-        frame[name] = [getattr(one, name) for one in means]
-    errors = np.array([one.standard_error for one in means])
-    frame["half"] = np.nan_to_num(stdtrit(np.maximum(frame["seeds"] - 1, 1), 0.975) * errors)
-    return frame
+    """Return the means of `table` with `half`, that of the 95 % interval (t; 0 of one seed)."""
+    frame = table.means(metric)
+    frame["half"] = np.nan_to_num(stdtrit(np.maximum(frame["seeds"] - 1, 1), 0.975) * frame["standard_error"])
+    return frame if table.shown_axes else frame.assign(**{"": ""})
+
+
+def _are_numbers(cells: Any) -> bool:
+    return bool(np.isfinite(pd.to_numeric(cells, errors="coerce")).all())
 
 
 def metric_words(metric: str) -> str:

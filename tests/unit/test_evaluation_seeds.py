@@ -3,15 +3,20 @@
 import csv
 import io
 from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from fgtrack.evaluation.intervals import paired
 from fgtrack.evaluation.tables.seeds import (
+    SWEEP_FILE,
     SeedComparison,
     SweepTable,
     difference_table,
+    read_sweep,
     seed_comparisons,
     summary_table,
 )
@@ -33,8 +38,15 @@ def noisy(seed: int, mean: float) -> list[float]:
     return list(np.random.default_rng(seed).normal(mean, 0.01, SEEDS))
 
 
-def only(rows: list[dict[str, str]], axes: Sequence[str] = ()) -> SeedComparison:
-    (found,) = seed_comparisons(rows, axes)
+def sweep_of(rows: list[dict[str, str]]) -> SweepTable:
+    """The table, read from a file."""
+    with TemporaryDirectory() as folder:
+        pd.DataFrame(rows).to_csv(Path(folder) / SWEEP_FILE, index=False)
+        return read_sweep(folder)
+
+
+def only(rows: list[dict[str, str]]) -> SeedComparison:
+    (found,) = seed_comparisons(sweep_of(rows))
     return found
 
 
@@ -73,10 +85,12 @@ def test_only_seeds_that_all_estimators_have_count() -> None:
 
 
 def test_one_estimator_no_common_seed_or_an_unknown_metric_make_no_contest() -> None:
-    assert seed_comparisons(rows_of({"a": [1.0, 2.0]}), ()) == []
-    assert seed_comparisons(rows_of({"a": [1.0, None], "b": [None, 1.0]}), ()) == []
-    assert seed_comparisons(rows_of({"a": [1.0, 2.0], "b": [1.0, 2.0]}, "num_tracks"), ()) == []
-    assert seed_comparisons([], ()) == []
+    for values, metric in (
+        ({"a": [1.0, 2.0]}, RMSE),
+        ({"a": [1.0, None], "b": [None, 1.0]}, RMSE),
+        ({"a": [1.0, 2.0], "b": [1.0, 2.0]}, "num_tracks"),
+    ):
+        assert seed_comparisons(sweep_of(rows_of(values, metric))) == []
 
 
 def test_every_point_is_a_contest_and_csv_gives_the_numbers_back() -> None:
@@ -85,7 +99,7 @@ def test_every_point_is_a_contest_and_csv_gives_the_numbers_back() -> None:
         for delay in ("0.1", "0.2")
         for row in rows_of({"a": noisy(1, 0.4), "b": noisy(2, 0.5 + float(delay))}, delay_s=delay)
     ]
-    found = seed_comparisons(rows, ("delay_s",))
+    found = seed_comparisons(sweep_of(rows))
     read = list(csv.DictReader(io.StringIO(difference_table(found, ("delay_s",)).to_csv())))
     assert [(row["delay_s"], row["estimator"], row["standing"], row["seeds"]) for row in read] == [
         *(("0.1", "a", "best", "6"), ("0.1", "b", "worse", "6")),
@@ -100,7 +114,7 @@ def test_every_point_is_a_contest_and_csv_gives_the_numbers_back() -> None:
 def test_few_points_are_shown_in_full_under_the_labels_of_their_axes() -> None:
     cells = {"late": "much", "sensors.radar.delay": '{"kind": "constant"}', "association.gate_m": "5.0"}
     rows = rows_of({"a": noisy(1, 0.4), "b": noisy(2, 0.5)}, **cells)
-    table = difference_table(seed_comparisons(rows, tuple(cells)), tuple(cells))
+    table = difference_table(seed_comparisons(sweep_of(rows)), tuple(cells))
     assert [row[0] for row in table.rows()] == ["much, 5.0", ""]
     assert table.columns[0].heading == "late,\ngate_m"
     assert table.data["standing"].tolist() == ["best", "worse"]
@@ -112,8 +126,8 @@ def test_a_summary_has_mean_and_standard_error_of_each_point_and_estimator() -> 
     cells = {"late": "much", "delay": '{"kind": "none"}'}
     rows = [row | {"truth.false_tracks": "3"} for row in rows_of({k: values[k] for k in values}, **cells)]
     rows += [row | {"truth.false_tracks": ""} for row in rows_of({"a": [0.7]}, **{**cells, "late": "little"})]
-    sweep = SweepTable(tuple(cells), (RMSE, "truth.false_tracks"), rows)
-    shown = summary_table(sweep, seed_comparisons(rows, tuple(cells)))
+    sweep = sweep_of(rows)
+    shown = summary_table(sweep, seed_comparisons(sweep))
     table = shown.data
     assert table[RMSE].tolist() == pytest.approx([0.5, 1.0, 0.7])
     assert table[f"{RMSE}.standard_error"][:2].tolist() == pytest.approx([np.std(values["a"], ddof=1) / 2] * 2)

@@ -1,21 +1,21 @@
 """The table of a sweep over its seeds: means at every point of the grid, and paired differences of the estimators."""
 
-import csv
-import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
+import pandas as pd
 
 from fgtrack.core.errors import CallError, DataError, did_you_mean
 from fgtrack.core.files import open_text
+from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.comparison import Entry, entry_columns, entry_record, ranked
 from fgtrack.evaluation.intervals import paired
-from fgtrack.evaluation.tables import PERCENT, Column, Record, Table
+from fgtrack.evaluation.tables import PERCENT, Column, DataFrame, Record, Table
 
 SWEEP_FILE = "sweep.csv"
 
@@ -50,56 +50,32 @@ _INTERVALS = "t intervals of paired differences over seeds; tie with the best: 0
 
 
 @dataclass(frozen=True)
-class PointMean:
-    """Mean and standard error over the seeds of a metric, of one estimator at one point of the grid."""
-
-    point: tuple[str, ...]
-    """Cells of the axes."""
-    estimator: str
-    mean: float
-    standard_error: float
-    """NaN of one seed."""
-    seeds: int
-    """Seeds with a value."""
-
-
-@dataclass(frozen=True)
 class SweepTable:
     """The rows of sweep.csv."""
 
     axes: tuple[str, ...]
     """Columns that make a point of the grid."""
     metrics: tuple[str, ...]
-    rows: Sequence[Mapping[str, str]]
-    """Cells by column."""
+    rows: DataFrame
+    """Axes, `seed` and `estimator` as text, metrics as numbers; NaN where a cell is empty or not finite."""
 
     @property
-    def shown_axes(self) -> tuple[str, ...]:
+    def shown_axes(self) -> list[str]:
         """Axes that vary and distinguish the points, without those of whole mappings where labels do it."""
-        varying = [axis for axis in self.axes if len({row[axis] for row in self.rows}) > 1]
-        points = [tuple(row[axis] for axis in varying) for row in self.rows]
-        return tuple(varying[k] for k in distinguishing(points, len(varying)))
+        varying = [axis for axis in self.axes if self.rows[axis].nunique() > 1]
+        return distinguishing(self.rows[varying])
 
-    def means(self, metric: str, axes: Sequence[str] | None = None) -> list[PointMean]:
-        """Return the means of `metric` at every point and of every estimator, in the order of the table.
+    def means(self, metric: str) -> DataFrame:
+        """Return the mean over the seeds at every point and of every estimator, in the order of the table.
 
-        `axes` are those that make a point, by default `shown_axes`. Cells that are empty or not finite are ignored.
+        Columns are `shown_axes`, `estimator`, `mean`, `standard_error` (NaN of one seed) and `seeds` with a value.
         Raises `CallError` if there is no such metric.
         """
         if metric not in self.metrics:
             hint = did_you_mean(metric, self.metrics) or f", there are {', '.join(self.metrics[:5])} ..."
             raise CallError(f"{metric}: the sweep has no such metric{hint}")
-        axes = self.shown_axes if axes is None else axes
-        values: dict[tuple[tuple[str, ...], str], list[float]] = {}
-        for row in self.rows:
-            value = number(row[metric])
-            if math.isfinite(value):
-                values.setdefault((tuple(row[axis] for axis in axes), row["estimator"]), []).append(value)
-        return [
-            PointMean(*key, float(np.mean(of)), float(np.std(of, ddof=1)) / math.sqrt(n) if n > 1 else math.nan, n)
-            for key, of in values.items()
-            for n in [len(of)]
-        ]
+        groups = self.rows.dropna(subset=[metric]).groupby([*self.shown_axes, "estimator"], sort=False)[metric]
+        return groups.agg(mean="mean", standard_error="sem", seeds="count").reset_index()
 
 
 @dataclass(frozen=True)
@@ -122,17 +98,18 @@ def read_sweep(folder: Path | str) -> SweepTable:
     """
     path = Path(folder) / SWEEP_FILE
     try:
-        with open_text(path, newline="") as file:
-            rows = list(csv.DictReader(file))
+        with open_text(path) as file:
+            rows = pd.read_csv(file, dtype=str, keep_default_na=False, index_col=False)
     except OSError as error:
         raise CallError(f"{path}: cannot be read ({error.strerror}), make one with `fgtrack sweep`") from error
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: is not a table ({error}), repeat the sweep") from error
-    columns = list(rows[0]) if rows else []
-    if "seed" not in columns or "estimator" not in columns or any(None in row.values() for row in rows):
+    except ValueError as error:
+        raise DataError(f"{path}: is not a table ({' '.join(str(error).split())}), repeat the sweep") from error
+    if not {"seed", "estimator"} <= set(rows) or rows.empty or rows.isna().any(axis=None):
         raise DataError(f"{path}: holds no rows of a sweep, repeat it")
-    seed = columns.index("seed")
-    return SweepTable(tuple(columns[:seed]), tuple(columns[seed + 2 :]), rows)
+    seed = rows.columns.get_loc("seed")
+    cells, values = rows.iloc[:, : seed + 2], rows.iloc[:, seed + 2 :].apply(pd.to_numeric, errors="coerce")
+    numbers = values.astype(float).replace([np.inf, -np.inf], np.nan)
+    return SweepTable(tuple(rows.columns[:seed]), tuple(numbers), pd.concat([cells, numbers], axis=1))
 
 
 def is_sweep(folder: Path) -> bool:
@@ -140,32 +117,35 @@ def is_sweep(folder: Path) -> bool:
     return (folder / SWEEP_FILE).is_file()
 
 
-def distinguishing(points: Iterable[tuple[str, ...]], num_axes: int) -> list[int]:
-    """Axes that distinguish `points`, without those of whole mappings where labels do it."""
-    distinct = set(points)
-    plain = [k for k in range(num_axes) if not any(point[k].startswith(("{", "[")) for point in distinct)]
-    return plain if len({tuple(point[k] for k in plain) for point in distinct}) == len(distinct) else [*range(num_axes)]
+def distinguishing(points: DataFrame) -> list[str]:
+    """Columns that distinguish `points`, without those of whole mappings where labels do it."""
+    distinct = points.drop_duplicates()
+    plain = [axis for axis in points if not distinct[axis].str.startswith(("{", "[")).any()]
+    return plain if plain and not distinct.duplicated(plain).any() else list(points)
 
 
-def number(cell: str) -> float:
-    """The number in a cell; NaN where there is none."""
-    try:
-        return float(cell)
-    except ValueError:
-        return math.nan
+def seed_comparisons(sweep: SweepTable) -> list[SeedComparison]:
+    """Return a comparison for every metric with a better and a worse, and every point with several estimators."""
+    rows, result = sweep.rows, []
+    cells = [tuple(row) for row in rows[list(sweep.axes)].to_numpy()]
+    points = {point: k for k, point in enumerate(dict.fromkeys(cells))}
+    (estimator, names), (seed, seeds) = (pd.factorize(rows[name]) for name in ("estimator", "seed"))
+    at = [points[cell] for cell in cells], estimator, seed
+    for metric in [name for pattern in _BETTER for name in sweep.metrics if fnmatchcase(name, pattern)]:
+        values, costs = np.full((2, len(points), len(names), len(seeds)), np.nan)
+        values[at], costs[at] = rows[metric], _cost(rows, metric)
+        for point, value, cost in zip(points, values, costs, strict=True):
+            some = np.isfinite(cost).any(axis=1)
+            common = np.isfinite(cost[some]).all(axis=0)
+            if some.sum() > 1 and common.any():
+                entries = _ranked(names[some], value[some][:, common], cost[some][:, common])
+                result.append(SeedComparison(point, metric, int(common.sum()), entries))
+    return result
 
 
-def seed_comparisons(rows: Sequence[Mapping[str, str]], axes: Sequence[str]) -> list[SeedComparison]:
-    """Return a comparison for every metric with a better and a worse, and every point with several estimators.
-
-    `rows` are those of sweep.csv, by column; `axes` the columns that make a point.
-    """
-    points: dict[tuple[str, ...], list[Mapping[str, str]]] = {}
-    for row in rows:
-        points.setdefault(tuple(row[axis] for axis in axes), []).append(row)
-    metrics = [name for pattern in _BETTER for name in (rows[0] if rows else ()) if fnmatchcase(name, pattern)]
-    every = (_compared(point, metric, mine) for metric in metrics for point, mine in points.items())
-    return [one for one in every if one is not None]
+def _ranked(names: Sequence[str], values: FloatArray, costs: FloatArray) -> tuple[Entry, ...]:
+    means = values.mean(axis=1).tolist()
+    return ranked(names, means, costs.mean(axis=1), lambda one, best: paired(costs[one], costs[best]))
 
 
 def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) -> Table:
@@ -178,7 +158,8 @@ def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) ->
         for entry in one.entries
     ]
     first, keys = compared[0].metric if compared else "", (*axes, "metric", "estimator")
-    columns = [_point_column({one.point for one in compared}, axes), Column("estimator", left=True)]
+    points = pd.DataFrame([one.point for one in compared], columns=list(axes))
+    columns = [_point_column(points), Column("estimator", left=True)]
     columns += [*entry_columns("mean", "mean"), Column("seeds")]
     notes = [_INTERVALS, "+: best; =: ties with the best"]
     return Table(first, records, columns, keys, notes, is_main=lambda row: row["metric"] == first and row["seeds"] > 1)
@@ -189,66 +170,42 @@ def summary_table(sweep: SweepTable, compared: Sequence[SeedComparison]) -> Tabl
 
     The best value at a point is bold where `compared`, those of the sweep, have no tie.
     """
-    means = {metric: of for metric in sweep.metrics if (of := sweep.means(metric, sweep.axes))}
-    values = {(one.point, one.estimator, metric): one for metric, of in means.items() for one in of}
+    metrics = [name for name in sweep.metrics if sweep.rows[name].notna().any()]
+    main = [name for name in _MAIN if name in metrics] or metrics[: len(_MAIN)]
+    metrics = list(dict.fromkeys((*main, *metrics)))
+    groups = sweep.rows.groupby([*sweep.axes, "estimator"], sort=False)[metrics]
+    errors, seeds = groups.sem().add_suffix(".standard_error"), groups.count().max(axis=1).rename("seeds")
+    names = [name for metric in metrics for name in (metric, f"{metric}.standard_error")]
+    records = pd.concat([groups.mean(), errors], axis=1)[names].join(seeds).reset_index().to_dict("records")
     best = {
         (one.point, entry.name, one.metric) for one in compared for entry in one.entries if entry.standing == "best"
     }
-    rows = list(dict.fromkeys((tuple(row[axis] for axis in sweep.axes), row["estimator"]) for row in sweep.rows))
-    main = [name for name in _MAIN if name in means] or list(means)[: len(_MAIN)]
-    metrics = [*main, *(name for name in means if name not in main)]
-    records = []
-    for point, estimator in rows:
-        record: dict[str, Any] = {**dict(zip(sweep.axes, point, strict=True)), "estimator": estimator}
-        for metric in metrics:
-            one = values.get((point, estimator, metric))
-            record[metric], record[f"{metric}.standard_error"] = (one.mean, one.standard_error) if one else (None, None)
-        seeds = [values[key].seeds for metric in metrics if (key := (point, estimator, metric)) in values]
-        records.append(record | {"seeds": max(seeds, default=0)})
 
     def is_best(metric: str) -> Callable[[Record], bool]:
         return lambda record: (tuple(record[axis] for axis in sweep.axes), record["estimator"], metric) in best
 
-    columns = [_point_column({point for point, _ in rows}, sweep.axes), Column("estimator", left=True)]
+    columns = [_point_column(sweep.rows[list(sweep.axes)]), Column("estimator", left=True)]
     for name in metrics:
         heading = _MAIN.get(name) or re.sub(r"\.(?!\d)", "\n", name)
         both, scale = (name, f"{name}.standard_error"), PERCENT if name in _SHARES else 1.0
         columns.append(Column(heading, both, "{} ± {}", scale, bold=is_best(name), is_extra=name not in main))
     notes = ["± standard error of the mean over the seeds"]
-    if any((*row, metric) in best for row in rows for metric in main):
+    if any(metric in main for *_, metric in best):
         notes.append("bold: the best estimator of its point in this, with 95 % confidence")
     return Table("Summary", records, [*columns, Column("seeds")], (*sweep.axes, "estimator"), notes)
 
 
-def _point_column(points: Iterable[tuple[str, ...]], axes: Sequence[str]) -> Column:
+def _point_column(points: DataFrame) -> Column:
     """The axes that distinguish `points`, under the last parts of their names."""
-    shown = [axes[k] for k in distinguishing(points, len(axes))]
+    shown = distinguishing(points)
     heading = ",\n".join(axis.rpartition(".")[2] for axis in shown) or "point"
     return Column(heading, shown, ", ".join(["{}"] * len(shown)) or "{}", left=True)
 
 
-def _compared(point: tuple[str, ...], metric: str, rows: Sequence[Mapping[str, str]]) -> SeedComparison | None:
-    """The estimators over the seeds that all of them have; None of fewer than two, or without such a seed."""
-    cost_of = _cost_of(metric)
-    values: dict[str, dict[str, tuple[float, float]]] = {}
-    for row in rows:
-        value, cost = number(row[metric]), cost_of(row)
-        if math.isfinite(cost):
-            values.setdefault(row["estimator"], {})[row["seed"]] = (value, cost)
-    seeds = sorted(set.intersection(*map(set, values.values())), key=int) if len(values) > 1 else []
-    if not seeds:
-        return None
-    table = np.array([[of[seed] for seed in seeds] for of in values.values()])
-    means, costs = table[..., 0].mean(axis=1), table[..., 1]
-    entries = ranked(list(values), means, costs.mean(axis=1), lambda one, best: paired(costs[one], costs[best]))
-    return SeedComparison(point, metric, len(seeds), entries)
-
-
-def _cost_of(metric: str) -> Callable[[Mapping[str, str]], float]:
-    """The number that should be small in a row: the metric, its negative, or its distance from the expected value."""
+def _cost(rows: DataFrame, metric: str) -> DataFrame:
+    """The number that should be small: the metric, its negative, or its distance from the expected value."""
     better = next(better for pattern, better in _BETTER.items() if fnmatchcase(metric, pattern))
     if better == "nearer":
-        dof, default = metric.removesuffix("mean") + "dof", "2" if "position_nees" in metric else ""
-        return lambda row: abs(number(row[metric]) - number(row.get(dof, default)))
-    sign = 1.0 if better == "less" else -1.0
-    return lambda row: sign * number(row[metric])
+        default = 2.0 if "position_nees" in metric else np.nan
+        return (rows[metric] - rows.get(metric.removesuffix("mean") + "dof", default)).abs()
+    return rows[metric] if better == "less" else -rows[metric]
