@@ -42,11 +42,9 @@ _HOMES = {
     "TickReport": "fgtrack.core.types",
     "TickTiming": "fgtrack.pipeline.live",
     "TrackBank": "fgtrack.estimation.base",
-    "TrackOutput": "fgtrack.pipeline.live",
     "TrackReport": "fgtrack.core.types",
     "TrackState": "fgtrack.core.types",
     "Tracker": "fgtrack.pipeline.live",
-    "TracksAt": "fgtrack.pipeline.live",
     "TruthState": "fgtrack.core.types",
     "TuneReport": "fgtrack.calibration.tune_space",
     "UpdateRecord": "fgtrack.core.types",
@@ -131,8 +129,6 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.pipeline.live import Lateness as Lateness
     from fgtrack.pipeline.live import TickTiming as TickTiming
     from fgtrack.pipeline.live import Tracker as Tracker
-    from fgtrack.pipeline.live import TrackOutput as TrackOutput
-    from fgtrack.pipeline.live import TracksAt as TracksAt
     from fgtrack.pipeline.public import replay as replay
     from fgtrack.pipeline.public import simulate as simulate
     from fgtrack.plotting import plot as plot

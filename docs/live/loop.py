@@ -19,13 +19,12 @@ Received = fgtrack.EgoState | fgtrack.DetectionList
 def run(
     tracker: fgtrack.Tracker,
     source: Iterable[Received],
-    publish: Callable[[fgtrack.TracksAt], None],
+    publish: Callable[[int, tuple[fgtrack.TrackReport, ...]], None],
     now_ns: Callable[[], int] = time.time_ns,
 ) -> None:
     """Track until the source ends; what it gives is stamped with its receipt by the clock `now_ns`."""
     receiver = threading.Thread(target=lambda: [tracker.receive(message) for message in source], daemon=True)
     receiver.start()
-    output = tracker.output()
     while now_ns() == 0 and receiver.is_alive():  # simulated time has not begun
         time.sleep(0.001)
     due_ns = now_ns() // PERIOD_NS * PERIOD_NS
@@ -36,8 +35,7 @@ def run(
         if left_ns > 0:
             break
         tracker.tick(due_ns)
-        if (published := output.at(due_ns - PUBLISHED_AGO_NS)) is not None:
-            publish(published)
+        publish(due_ns - PUBLISHED_AGO_NS, tracker.tracks_at(due_ns - PUBLISHED_AGO_NS))
     tracker.tick(due_ns)  # what came last
 
 
@@ -52,10 +50,10 @@ def drive(duration_s: float) -> Iterator[Received]:
         yield replace(message, stamp_ns=message.stamp_ns + shift_ns, receipt_ns=time.time_ns())
 
 
-def show(published: fgtrack.TracksAt) -> None:
+def show(stamp_ns: int, tracks: tuple[fgtrack.TrackReport, ...]) -> None:
     """In place of your topic."""
-    for track in published.tracks:
-        print(f"{published.stamp_ns} track {track.track_id}: {track.x_m:.1f} m, {track.y_m:.1f} m, {track.status}")
+    for track in tracks:
+        print(f"{stamp_ns} track {track.track_id}: {track.x_m:.1f} m, {track.y_m:.1f} m, {track.status}")
 
 
 if __name__ == "__main__":

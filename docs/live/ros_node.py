@@ -69,7 +69,6 @@ class TrackerNode(Node):
     def _begin(self) -> None:
         """Everything that knows of the past."""
         self.tracker = fgtrack.Tracker.from_config(self._set["config"], map=self._set["map"] or None)
-        self._output = self.tracker.output()
         self._waiting: list[Waiting] = []
         self._poses: deque[int] = deque(maxlen=1000)  # stamps at which the tracker knows the ego from TF
         self._odometry: Odometry | None = None
@@ -98,9 +97,8 @@ class TrackerNode(Node):
         self._give_pose(Time())  # the newest
         self._waiting = [waiting for waiting in self._waiting if not self._give(waiting, now_ns)]
         self.tracker.tick(now_ns)
-        published = self._output.at(now_ns - round(1e9 * self._set["published_ago_s"]))
-        if published is not None:
-            self._tracks.publish(self._message(published))
+        stamp_ns = now_ns - round(1e9 * self._set["published_ago_s"])
+        self._tracks.publish(self._message(stamp_ns, self.tracker.tracks_at(stamp_ns)))
 
     def _give(self, waiting: Waiting, now_ns: int) -> bool:
         """Give a list to the tracker, unless it is worth waiting for the pose at its stamp."""
@@ -135,11 +133,11 @@ class TrackerNode(Node):
             self.tracker.receive(fgtrack.EgoState(stamp_ns, self._now_ns(), where.x, where.y, yaw_rad, *twist))
         return True
 
-    def _message(self, published: fgtrack.TracksAt) -> Detection3DArray:
+    def _message(self, stamp_ns: int, tracks: tuple[fgtrack.TrackReport, ...]) -> Detection3DArray:
         message = Detection3DArray()
-        message.header.stamp = Time(nanoseconds=published.stamp_ns).to_msg()
+        message.header.stamp = Time(nanoseconds=stamp_ns).to_msg()
         message.header.frame_id = self._set["map_frame"]
-        for track in published.tracks:
+        for track in tracks:
             found, hypothesis = Detection3D(), ObjectHypothesisWithPose()
             pose, P = found.bbox.center, track.covariance
             pose.position.x, pose.position.y = track.x_m, track.y_m

@@ -72,9 +72,9 @@ def main() -> None:
     with zenoh.open(config) as session:
         tracks = session.declare_publisher("tracks", congestion_control=zenoh.CongestionControl.BLOCK)
 
-        def publish(published: fgtrack.TracksAt) -> None:
-            found = [(str(track.track_id), track.x_m, track.y_m, track.yaw_rad) for track in published.tracks]
-            tracks.put(objects_to_cdr(published.stamp_ns, "map", found))
+        def publish(stamp_ns: int, reports: tuple[fgtrack.TrackReport, ...]) -> None:
+            found = [(str(track.track_id), track.x_m, track.y_m, track.yaw_rad) for track in reports]
+            tracks.put(objects_to_cdr(stamp_ns, "map", found))
 
         # a full channel makes the vehicle wait
         with session.declare_subscriber("vehicle/**", zenoh.handlers.FifoChannel(1000)) as subscriber:
@@ -85,7 +85,6 @@ def main() -> None:
             "lost": {topic: len(numbers.missing) for topic, numbers in inlet.numbers.items()},
             "repeated": {topic: numbers.repeated for topic, numbers in inlet.numbers.items()},
             "unreadable": inlet.unreadable,
-            "detections": {sensor: late.detections for sensor, late in tracker.lateness.items()},
             "counts": tracker.counts,
             "refused": tracker.refused,
             "failures": tracker.failures,

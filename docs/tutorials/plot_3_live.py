@@ -41,9 +41,8 @@ past = tracker.state_at(track.track_id, now_ns - 300_000_000)
 print(np.round(past.state.mean, 2))
 
 # %%
-# All tracks for a time of your choice, here 0.1 s ago: an output's stamps never go back.
-output = tracker.output()
-print(len(output.at(now_ns - 100_000_000).tracks), output.at(now_ns - 200_000_000))
+# All tracks for a time of your choice, here 0.1 s ago.
+print(len(tracker.tracks_at(now_ns - 100_000_000)))
 
 # %%
 # A sensor that the configuration does not know, and a clock that runs backwards: counted, with a reason.

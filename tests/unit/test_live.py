@@ -117,7 +117,7 @@ def test_it_gives_what_the_replay_of_the_same_messages_gives() -> None:
 def test_what_is_no_time_is_refused_at_once_and_changes_nothing(now_ns: object) -> None:
     tracker = Tracker.from_config("smoother")
     first = tracker.tick(NOW_NS)
-    for ask in (tracker.tick, tracker.tracks_at, tracker.output().at, lambda stamp_ns: tracker.state_at(0, stamp_ns)):
+    for ask in (tracker.tick, tracker.tracks_at, lambda stamp_ns: tracker.state_at(0, stamp_ns)):
         with pytest.raises(CallError, match=r"(now|stamp)_ns: must be integer nanoseconds since 1970, is"):
             ask(now_ns)  # type: ignore[arg-type]  # wrong on purpose
     assert tracker.tick(np.int64(NOW_NS + 1)).tick == first.tick + 1

@@ -72,27 +72,6 @@ def test_all_tracks_can_be_asked_for_at_any_time_as_one_can(estimator: str) -> N
     assert tracker_of(estimator).tracks_at(now_ns) == ()
 
 
-def test_an_output_never_goes_back_whatever_the_host_asks_for() -> None:
-    tracker = tracker_of()
-    run(tracker)
-    output, other = tracker.output(), tracker.output()
-    now_ns = NOW_NS + 1_000 * MS
-    published = [output.at(now_ns + shift * MS) for shift in (-300, -300, -310, -250, 200, 100)]
-    assert [one and one.stamp_ns - now_ns for one in published] == [
-        -300 * MS,
-        -300 * MS,
-        None,
-        -250 * MS,
-        200 * MS,
-        None,
-    ]
-    assert output.refused == 2
-    past = other.at(now_ns - 300 * MS)
-    assert past is not None
-    assert [track.stamp_ns for track in past.tracks] == [now_ns - 300 * MS] * 2
-    assert other.refused == 0
-
-
 # What cannot be used
 
 
@@ -239,12 +218,8 @@ def test_messages_may_be_received_by_many_threads_while_others_tick_and_ask() ->
                 time.sleep(0.001)  # let a tick pass
 
     def ask() -> None:
-        output, last_ns = tracker.output(), 0
         while not over.is_set():
-            found = output.at(NOW_NS + time.monotonic_ns())
-            assert found is not None
-            assert found.stamp_ns >= last_ns
-            last_ns = found.stamp_ns
+            assert len({track.stamp_ns for track in tracker.tracks_at(NOW_NS + time.monotonic_ns())}) <= 1
             assert tracker.lateness["radar"].messages <= counts["radar"]
             assert tracker.timing.ticks >= 0
             assert sum(tracker.refused.values()) <= 10_000
@@ -292,23 +267,21 @@ def test_it_says_how_late_every_sensor_is() -> None:
     tracker.tick(NOW_NS)
     tracker.tick(NOW_NS + 20_000 * MS)
     late = tracker.lateness["radar"]
-    newest_s = delays_ms[-1000:] / 1e3
-    assert (late.messages, late.detections, late.delay_worst_s) == (1100, 2200, 1.1)
-    assert (late.delay_median_s, late.delay_p99_s) == pytest.approx(tuple(np.quantile(newest_s, (0.5, 0.99))))
+    spread_s = np.quantile(delays_ms[-1000:] / 1e3, (0.5, 0.99, 1.0))
+    assert late.messages == 1100
+    assert (late.delay_median_s, late.delay_p99_s, late.delay_worst_s) == pytest.approx(tuple(spread_s))
     receipts_ns = NOW_NS + MS * (10 * np.arange(1100) + delays_ms)
-    assert late.last_receipt_ns == receipts_ns.max()
     assert late.silent_s == pytest.approx((NOW_NS + 20_000 * MS - receipts_ns.max()) / 1e9)
-    assert late.too_late == tracker.counts["radar"].get("too_old", 0) > 0
 
 
 def test_a_sensor_that_has_said_nothing_is_silent_since_the_first_tick() -> None:
     tracker = tracker_of()
     run(tracker)
     none = tracker.lateness["radar"]
-    assert (none.messages, none.delay_median_s, none.delay_worst_s, none.last_receipt_ns) == (0, None, None, None)
+    assert (none.messages, none.delay_median_s, none.delay_worst_s) == (0, None, None)
     assert none.silent_s == pytest.approx(19 * 0.05 + 0.04 - 0.005)
     ego = tracker.lateness[EGO]
-    assert (ego.messages, ego.detections, ego.delay_median_s) == (20, 0, pytest.approx(0.005))
+    assert (ego.messages, ego.delay_median_s) == (20, pytest.approx(0.005))
     assert set(tracker.lateness) == {*tracker.config.sensors, EGO}
 
 
