@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, compress
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,7 @@ from fgtrack.calibration.tune_space import (
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import BoolArray, FloatArray, Message
 from fgtrack.estimation.likelihood.contaminated import outlier_share
-from fgtrack.estimation.likelihood.fit import FitSettings, Likelihood, Problem
+from fgtrack.estimation.likelihood.fit import Likelihood, Problem
 from fgtrack.estimation.likelihood.reference import filtered, without_mixed
 from fgtrack.estimation.likelihood.series import Series
 from fgtrack.io.errors import UntilBreak
@@ -162,7 +162,7 @@ class _Tuning:
                 series = [[without_mixed(one, self._space, values) for one in tracks] for tracks in series]
             rounds += 1
             first = [
-                replace(one, until_ns=None if splits is None else splits[k])
+                replace(one, until_ns=math.inf if splits is None else splits[k])
                 for k, tracks in enumerate(series)
                 for one in tracks
             ]
@@ -342,15 +342,13 @@ class _Tuning:
         """Return log-likelihoods of the innovations that count, and squares over variances by sensor and component."""
         terms: list[float] = []
         squares: dict[tuple[str, str], list[float]] = {}
-        settings = FitSettings()
         for one in series:
-            for k, step in enumerate(filtered(one, self._space, values)):
-                if settings.counts(one, k):
-                    terms.append(float(step.update.log_likelihood))
-                    observation = step.observation
-                    names = [observation.measurement.model.components[i] for i in observation.measured]
-                    for name, square in zip(names, np.square(step.y) / np.diag(step.update.S), strict=True):
-                        squares.setdefault((observation.sensor, name), []).append(float(square))
+            for step in compress(filtered(one, self._space, values), one.counted):
+                terms.append(float(step.update.log_likelihood))
+                observation = step.observation
+                names = [observation.measurement.model.components[i] for i in observation.measured]
+                for name, square in zip(names, np.square(step.y) / np.diag(step.update.S), strict=True):
+                    squares.setdefault((observation.sensor, name), []).append(float(square))
         return terms, squares
 
     def _parameters(self, config: Config, fitted: _Fitted) -> tuple[TunedParameter, ...]:

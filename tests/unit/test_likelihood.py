@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 import pytest
@@ -17,10 +18,9 @@ from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.likelihood import contaminated
-from fgtrack.estimation.likelihood.fit import FitSettings, Problem
-from fgtrack.estimation.likelihood.noise import NoiseSpace
+from fgtrack.estimation.likelihood.fit import Likelihood, Problem
 from fgtrack.estimation.likelihood.reference import filtered, without_mixed
-from fgtrack.estimation.likelihood.series import Observation, Series
+from fgtrack.estimation.likelihood.series import NoiseSpace, Observation, Series
 from fgtrack.models.correlated_errors import split_error
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, CV
@@ -33,7 +33,13 @@ SPACE = NoiseSpace(
 )
 #: Of the velocity, of x and y of each sensor, and odds of outliers too small to count.
 VALUES = np.array([0.8, 0.5, 0.3, 1.5, 1.0, 1e-60, 1e-60])
-EVERYTHING = FitSettings(settle_s=0.0, settle_steps=0)
+
+
+def unsettled(series: Series) -> Series:
+    """The series whose first innovations count, too."""
+    return replace(series, settle_s=0.0, settle_steps=0)
+
+
 #: The same sensors, and objects that turn.
 TURNING = replace(
     SPACE,
@@ -102,8 +108,7 @@ def dense(series: Series, values: FloatArray) -> float:
 def test_the_likelihood_of_a_linear_model_is_that_of_the_joint_gaussian_at_any_parameters() -> None:
     rng = np.random.default_rng(0)
     tracks = [drawn(rng, VALUES, 30), drawn(rng, VALUES, 17)]
-    problem = Problem(tracks, SPACE, VALUES, EVERYTHING)
-    likelihood = problem.likelihood(VALUES, np.ones(7, dtype=bool))
+    likelihood = Likelihood(Problem(list(map(unsettled, tracks)), SPACE, VALUES), VALUES, np.ones(7, dtype=bool))
     rows = VALUES * np.exp(0.5 * rng.standard_normal((4, 7)))
     rows[:, 5:] = 1e-60
     expected = [sum(dense(track, row) for track in tracks) for row in rows]
@@ -112,11 +117,11 @@ def test_the_likelihood_of_a_linear_model_is_that_of_the_joint_gaussian_at_any_p
 
 def test_what_has_settled_counts_and_what_lies_in_the_limits() -> None:
     track = drawn(np.random.default_rng(1), VALUES, 30)
-    settings = FitSettings(settle_s=0.5, settle_steps=8)
+    track = replace(track, settle_s=0.5, settle_steps=8)
     stamps_s = [one.measurement.stamp_ns / NS_PER_S for one in track.observations]
-    assert [k for k in range(30) if settings.counts(track, k)] == [k for k in range(8, 30) if stamps_s[k] >= 0.5]
+    assert np.flatnonzero(track.counted).tolist() == [k for k in range(8, 30) if stamps_s[k] >= 0.5]
     inside = replace(track, from_ns=nanoseconds(1.0), until_ns=nanoseconds(2.0))
-    assert {stamps_s[k] >= 1.0 and stamps_s[k] < 2.0 for k in range(30) if settings.counts(inside, k)} == {True}
+    assert np.flatnonzero(inside.counted).tolist() == [k for k in range(8, 30) if 1.0 <= stamps_s[k] < 2.0]
 
 
 def test_the_contaminated_update_has_the_moments_of_the_exact_posterior() -> None:
@@ -165,8 +170,7 @@ def test_what_a_track_fuses_of_another_object_says_nothing_of_the_noise() -> Non
     seen[100:130] = [moved(one, 9.0) for one in seen[100:130]]
     found = without_mixed(replace(track, observations=seen), SPACE, values)
     assert set(range(100, 125)) <= found.mixed <= set(range(75, 165))
-    counted = [place for place in range(300) if EVERYTHING.counts(found, place)]
-    assert counted == [place for place in range(300) if place not in found.mixed]
+    assert set(np.flatnonzero(~unsettled(found).counted).tolist()) == found.mixed
 
 
 def test_a_nonlinear_model_is_linearised_about_the_filter() -> None:
@@ -174,9 +178,9 @@ def test_a_nonlinear_model_is_linearised_about_the_filter() -> None:
     track = drawn(np.random.default_rng(3), VALUES, 40)
     seen = [replace(one, measurement=one.measurement.seen_by(CTRV())) for one in track.observations]
     values = np.array([0.1, 0.1, 0.5, 0.2, *VALUES[1:5], 0.01, 0.01])
-    problem = Problem([replace(track, observations=seen)], TURNING, values, EVERYTHING)
-    likelihood = problem.likelihood(values, np.ones(10, dtype=bool))
-    steps = filtered(problem.series[0], TURNING, values)
+    track = unsettled(replace(track, observations=seen))
+    likelihood = Likelihood(Problem([track], TURNING, values), values, np.ones(10, dtype=bool))
+    steps = filtered(track, TURNING, values)
     assert likelihood.totals(values[None])[0] == pytest.approx(
         sum(step.update.log_likelihood for step in steps), abs=1e-8
     )
@@ -205,22 +209,19 @@ def test_a_track_of_unknown_direction_is_linearised_along_its_first_positions() 
     for step, about in zip(steps, opened.nominal[:-1], strict=False):
         assert np.array_equal(step.about, about)
     assert abs(wrap_angle(steps[opened.num_initial].after[2] - 2.5)) < 0.3
-    counted = [step for place, step in enumerate(steps) if FitSettings().counts(opened, place)]
+    counted = list(compress(steps, opened.counted))
     assert len(counted) > 150
     assert np.mean([mahalanobis_squared(one.y, one.update.S) for one in counted]) == pytest.approx(2.0, abs=0.4)
     assert track.initiated(TURNING.motion_model(values), "one-point") is track
-    likelihood = Problem([opened], TURNING, values, EVERYTHING).likelihood(values, np.ones(10, dtype=bool))
-    place = opened.num_initial
-    assert likelihood.totals(values[None])[0] == pytest.approx(
-        sum(step.update.log_likelihood for step in steps[place:]), abs=1e-8
-    )
+    likelihood = Likelihood(Problem([unsettled(opened)], TURNING, values), values, np.ones(10, dtype=bool))
+    expected = sum(step.update.log_likelihood for step in steps[opened.num_initial :])
+    assert likelihood.totals(values[None])[0] == pytest.approx(expected, abs=1e-8)
 
 
 def test_innovations_count_from_where_the_direction_is_known() -> None:
     values, track = turning(6, 100)
     opened = track.initiated(TURNING.motion_model(values), "regression")
-    settings = FitSettings(settle_s=1.0, settle_steps=5)
-    first = next(place for place in range(100) if settings.counts(opened, place))
+    first = int(np.argmax(opened.counted))
     since_s = (opened.observations[first].measurement.stamp_ns - opened.initiated_ns) / NS_PER_S
     assert opened.initiated_ns == opened.observations[opened.num_initial - 1].measurement.stamp_ns
     assert first >= opened.num_initial + 5
@@ -254,8 +255,8 @@ def test_time_correlated_errors_are_in_the_state_and_their_noise_is_fixed() -> N
         measurement = replace(one.measurement, model=erring, R=white, pose=pose)
         seen.append(observation(one.sensor, sensor, measurement, own=False))
         assert seen[-1].tuned == (one.sensor != "lidar")
-    problem = Problem([Series(START, seen)], noise.space, noise.values, EVERYTHING)
-    likelihood = problem.likelihood(noise.values, np.ones(len(noise.values), dtype=bool))
+    problem = Problem([unsettled(Series(START, seen))], noise.space, noise.values)
+    likelihood = Likelihood(problem, noise.values, np.ones(len(noise.values), dtype=bool))
     rows = noise.values * np.exp(0.4 * rng.standard_normal((3, len(noise.values))))
     rows[:, -3:] = 1e-60
     expected = [

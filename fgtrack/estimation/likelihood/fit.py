@@ -2,25 +2,21 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cache
+from itertools import compress
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
 
 from fgtrack.core.linalg import psd_solve, symmetrise
-from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.likelihood.innovations import Evaluation, Innovations
-from fgtrack.estimation.likelihood.noise import NoiseSpace
-from fgtrack.estimation.likelihood.reference import filtered
-from fgtrack.estimation.likelihood.series import Series
+from fgtrack.estimation.likelihood.series import NoiseSpace, Series
 
-_PRIOR_LOG_STD = 3.0  # weak, but it keeps what the data do not determine from running away ...
-_SHARE_LOG_STD = 1.5  # ... and of the share of outliers
-_MOST_LOG = (
-    9.2  # beyond a factor of 10^4 there is no maximum: errors that are exactly 0 are likelier the smaller std is
-)
+_PRIOR_LOG_STDS = 3.0, 1.5  # weak, but keep what the data do not determine from running away; of shares of outliers
+_MOST_LOG = 9.2  # beyond a factor of 10^4 there is no maximum: errors of exactly 0 are likelier the smaller std is
 _BLOCK_S = 2.0  # scores are taken as independent between blocks of this length of a track
 _DIFFERENCE, _CURVATURE_DIFFERENCE = 1e-4, 0.05  # of logarithms, for first and second derivatives
 _MAX_LINEARISATIONS = 6
@@ -30,25 +26,6 @@ _FLOOR = 1e-3  # curvature of a flat direction: its standard error is above 30 i
 _ROWS = 24  # parameter vectors that are evaluated at once
 # Any: scipy's options have different types.
 _TRUST_REGION: Any = {"gtol": 1e-6, "maxiter": 40, "initial_trust_radius": 1.0, "max_trust_radius": 4.0}
-
-
-@dataclass(frozen=True)
-class FitSettings:
-    """Innovations that count."""
-
-    settle_s: float = 1.0
-    """Innovations in the first seconds of a track do not count: they are those of its first state. These seconds begin
-    where its direction of travel is known."""
-    settle_steps: int = 5
-    """Nor do as many of the first innovations."""
-
-    def counts(self, series: Series, k: int) -> bool:
-        """Return True if observation `k` is settled, within the limits of its series, and of one object."""
-        stamp_ns = series.observations[k].measurement.stamp_ns
-        settled = k >= series.num_initial + self.settle_steps and k not in series.mixed
-        settled &= stamp_ns - series.initiated_ns >= NS_PER_S * self.settle_s
-        after, before = series.from_ns, series.until_ns
-        return settled and (after is None or stamp_ns >= after) and (before is None or stamp_ns < before)
 
 
 class Cost(NamedTuple):
@@ -66,21 +43,18 @@ class Cost(NamedTuple):
 
 
 class Likelihood:
-    """The log-likelihood of all series as a function of the free logarithms, and its scores."""
+    """The log-likelihood of the series of a problem about the trajectory at `values` (p,), and its scores.
 
-    def __init__(
-        self,
-        innovations: Innovations,
-        names: Sequence[tuple[str, str]],
-        start: FloatArray,
-        free: BoolArray,
-        prior_log: FloatArray,
-    ) -> None:
-        self._innovations, self._start, self._free = innovations, start, free
-        prior_log_std = [_PRIOR_LOG_STD if name else _SHARE_LOG_STD for _, name in names]
-        self._prior_log, self._prior_log_std = prior_log[free], np.array(prior_log_std)[free]
-        self._shares = np.flatnonzero([not name for (_, name), one in zip(names, free, strict=True) if one])
-        self._costs: dict[bytes, Cost] = {}
+    A function of the logarithms of the parameters `free`, shape (p,); others are those of `values`.
+    """
+
+    def __init__(self, problem: "Problem", values: FloatArray, free: BoolArray) -> None:
+        self._innovations = Innovations(problem.space, values, problem.series)
+        self._start, self._free = values, free
+        named = np.array([bool(name) for _, name in problem.space.names])[free]
+        self._prior_log, self._prior_log_std = np.log(problem.prior)[free], np.where(named, *_PRIOR_LOG_STDS)
+        self._shares = np.flatnonzero(~named)
+        self._cost = cache(lambda data: self._cost_at(np.frombuffer(data)))  # the search asks twice
 
     def values(self, logs: FloatArray) -> FloatArray:
         """Return rows of parameters (..., p) of the free logarithms (..., f)."""
@@ -93,11 +67,8 @@ class Likelihood:
         return np.asarray(self._innovations.evaluate(values).log_likelihoods.sum(axis=1))
 
     def cost(self, logs: FloatArray) -> Cost:
-        """Return the cost at the free logarithms, shape (f,); kept, for the search asks twice."""
-        key = logs.tobytes()
-        if key not in self._costs:
-            self._costs[key] = self._cost(logs)
-        return self._costs[key]
+        """Return the cost at the free logarithms, shape (f,)."""
+        return self._cost(logs.tobytes())
 
     def stop_where_flat(self, logs: FloatArray) -> None:
         """Raise `StopIteration` where the next step would gain next to nothing."""
@@ -109,7 +80,7 @@ class Likelihood:
         """Return standard deviations of the free logarithms where the model is right, and the prior, shape (f,)."""
         return np.sqrt(np.diag(psd_solve(self.cost(logs).information, np.eye(len(logs)))))
 
-    def _cost(self, logs: FloatArray) -> Cost:
+    def _cost_at(self, logs: FloatArray) -> Cost:
         evaluation, scores = self._differentiated(logs)
         middle = evaluation.log_likelihoods[0]
         if not np.isfinite(middle).all():
@@ -138,11 +109,15 @@ class Likelihood:
         likelihood estimation of misspecified models", Econometrica 50(1)).
         """
         _, scores = self._differentiated(logs)
-        curvature, groups = self._curvature(logs), self._groups()
+        counted = self._innovations.counted
+        blocks = (self._innovations.since_start_s / _BLOCK_S).astype(np.int64)
+        series = np.broadcast_to(np.arange(blocks.shape[1]), blocks.shape)
+        keys = np.stack([blocks[counted], series[counted]], axis=-1)
+        groups = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
         clusters = np.zeros((groups.max() + 1, len(logs)))
         np.add.at(clusters, groups, scores.T)
         meat = clusters.T @ clusters * len(clusters) / max(len(clusters) - 1, 1)
-        values, vectors = np.linalg.eigh(curvature)
+        values, vectors = np.linalg.eigh(self._curvature(logs))
         inverse = vectors @ np.diag(1.0 / np.maximum(values, _FLOOR)) @ vectors.T
         return np.sqrt(np.maximum(np.diag(inverse), np.diag(inverse @ meat @ inverse)))
 
@@ -161,14 +136,6 @@ class Likelihood:
         H = np.zeros((f, f))
         H[first, second] = H[second, first] = -mixed / (2.0 * h * h)
         return symmetrise(H)
-
-    def _groups(self) -> IntArray:
-        """Return the block of time and series that each innovation that counts belongs to, shape (N,)."""
-        counted = self._innovations.counted
-        blocks = (self._innovations.since_start_s / _BLOCK_S).astype(np.int64)
-        series = np.broadcast_to(np.arange(blocks.shape[1]), blocks.shape)
-        keys = np.stack([blocks[counted], series[counted]], axis=-1)
-        return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _difference(values: FloatArray) -> FloatArray:
@@ -194,31 +161,20 @@ class Problem:
     space: NoiseSpace
     prior: FloatArray
     """Centre of the weak prior, shape (p,)."""
-    settings: FitSettings = field(default_factory=FitSettings)
 
     def counts(self) -> IntArray:
         """Return the number of measured components that count, by parameter, shape (p,); all for the motion."""
         columns = {name: column for column, name in enumerate(self.space.names)}
         counts = np.zeros(len(columns), dtype=np.int64)
         for one in self.series:
-            for k, observation in enumerate(one.observations):
-                if self.settings.counts(one, k):
-                    counts[: self.space.num_motion] += 1
-                    counts[columns[observation.sensor, ""]] += 1
-                    if observation.tuned:
-                        names = observation.measurement.model.components
-                        counts[[columns[observation.sensor, names[i]] for i in observation.measured]] += 1
+            for observation in compress(one.observations, one.counted):
+                counts[: self.space.num_motion] += 1
+                counts[[columns[name] for name in [(observation.sensor, ""), *observation.parameters]]] += 1
         return counts
 
     def endless(self, values: FloatArray) -> BoolArray:
         """Return True, shape (p,), for parameters that have no maximum, as they have run off at `values` (p,)."""
         return np.asarray(np.abs(np.log(values / self.prior)) >= _MOST_LOG)
-
-    def likelihood(self, values: FloatArray, free: BoolArray) -> Likelihood:
-        """Return the likelihood of the parameters `free`, shape (p,), about the trajectory at `values`, shape (p,)."""
-        steps = [filtered(one, self.space, values) for one in self.series]
-        innovations = Innovations(self.space, values, self.series, steps, self.settings.counts)
-        return Likelihood(innovations, self.space.names, values, free, np.log(self.prior))
 
     def maximum(self, start: FloatArray, free: BoolArray) -> tuple[FloatArray, Likelihood]:
         """Return parameters, shape (p,), at the maximum next to `start`, and the likelihood about the trajectory there.
@@ -226,7 +182,7 @@ class Problem:
         What is not `free` stays as in `start`.
         """
         values = start.copy()
-        likelihood = self.likelihood(values, free)
+        likelihood = Likelihood(self, values, free)
         for _ in range(_MAX_LINEARISATIONS):
             logs, current = np.log(values[free]), likelihood
             best = minimize(  # type: ignore[call-overload]  # scipy-stubs know no callback of two results
@@ -243,7 +199,7 @@ class Problem:
                 break
             values = likelihood.values(best.x)
             settled = (moved <= _TOLERANCE * likelihood.spread(best.x)).all()
-            likelihood = self.likelihood(values, free)
+            likelihood = Likelihood(self, values, free)
             if settled:
                 break
         return values, likelihood

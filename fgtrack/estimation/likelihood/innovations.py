@@ -7,19 +7,19 @@ score then has mean zero at the true parameters where the model is right, as tha
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from fgtrack.core.time import seconds
+from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import joseph, kalman_gain, propagated
 from fgtrack.estimation.likelihood.contaminated import update
-from fgtrack.estimation.likelihood.noise import NoiseSpace
-from fgtrack.estimation.likelihood.reference import Step
-from fgtrack.estimation.likelihood.series import Series
+from fgtrack.estimation.likelihood.reference import Step, filtered
+from fgtrack.estimation.likelihood.series import NoiseSpace, Series
 
 
 class Evaluation(NamedTuple):
@@ -34,72 +34,59 @@ class Evaluation(NamedTuple):
 
 
 class Innovations:
-    """Linearised series, side by side: step k of each of t series, padded where a series is shorter."""
+    """Series linearised at `values`, shape (p,), side by side: step k of each of t series, padded at the end."""
 
-    def __init__(
-        self,
-        space: NoiseSpace,
-        values: FloatArray,
-        series: Sequence[Series],
-        steps: Sequence[Sequence[Step]],
-        counts: Callable[[Series, int], bool],
-    ) -> None:
-        """`steps`: those of `filtered` along each of the `series` at `values`, shape (p,).
-
-        `counts`: True if observation k of a series has a part in the likelihood; every one moves the state.
-        """
+    def __init__(self, space: NoiseSpace, values: FloatArray, series: Sequence[Series]) -> None:
         self._space = space
+        steps = [filtered(one, space, values) for one in series]
         motion = space.motion_model(values)
         self._start = np.array([initial_state(motion, one.start)[1] for one in series])
-        shape = max(map(len, steps)), len(series)
+        n, columns = motion.dim, {name: column for column, name in enumerate(space.names)}
         d = max(len(step.y) for track in steps for step in track)
         a = max(len(step.assumed[0]) for track in steps for step in track)
-        n, columns = motion.dim, {name: column for column, name in enumerate(space.names)}
-        none = len(columns)  # a last column of zeros
-        self.counted: BoolArray = np.zeros(shape, dtype=np.bool_)
+
+        def padded(value: Callable[[Step], ArrayLike], *size: int, fill: ArrayLike = 0.0) -> FloatArray:
+            """A value of each step, shape (k, t, *size)."""
+            array = np.full((max(map(len, steps)), len(steps), *size), fill)
+            for t, track in enumerate(steps):
+                for k, step in enumerate(track):
+                    entry = np.asarray(value(step))
+                    index: tuple[int | slice, ...] = (k, t, *map(slice, entry.shape))
+                    array[index] = entry
+            return array
+
+        since_s = padded(lambda step: step.since_s, fill=math.nan)
+        self._there = np.isfinite(since_s)
+        self.counted: BoolArray = np.zeros(since_s.shape, dtype=np.bool_)
         """True for steps that have a part in the likelihood, shape (k, t)."""
-        self.since_start_s = np.zeros(shape)
+        self.since_start_s = np.zeros(since_s.shape)
         """Time of each step since the first state, shape (k, t)."""
-        self._since_s = np.full(shape, np.nan)
-        self._about, self._offset = np.zeros((*shape, n)), np.zeros((*shape, n))
-        self._predicted, self._after = np.zeros((*shape, n)), np.zeros((*shape, n))
-        self._y, self._H = np.zeros((*shape, d)), np.zeros((*shape, d, n))
-        self._axes, self._own = np.zeros((*shape, d, d)), np.zeros((*shape, d, d))
-        self._foreign = np.broadcast_to(np.eye(d), (*shape, d, d)).copy()
-        self._std: IntArray = np.full((*shape, d), none)
-        self._odds: IntArray = np.full(shape, none)
-        self._padding = np.full(shape, d)
-        self._assumed = np.zeros((*shape, a)), np.zeros((*shape, a, n)), np.zeros((*shape, a, a))
-        self._assumed[2][:] = np.eye(a)
-        for t, (track, one) in enumerate(zip(steps, series, strict=True)):
-            for k, step in enumerate(track):
-                self.counted[k, t] = counts(one, k)
-                self.since_start_s[k, t] = seconds(step.observation.measurement.stamp_ns - one.start.stamp_ns)
-                self._set(k, t, step, columns)
-        self._there = np.isfinite(self._since_s)
-        self._since_s = np.where(self._there, self._since_s, 0.0)
+        for t, one in enumerate(series):
+            stamps_ns = np.array([each.measurement.stamp_ns for each in one.observations])
+            self.counted[: len(stamps_ns), t] = one.counted
+            self.since_start_s[: len(stamps_ns), t] = (stamps_ns - one.start.stamp_ns) / NS_PER_S
+        self._since_s = np.nan_to_num(since_s)
+        self._about, self._offset = padded(lambda step: step.about, n), padded(lambda step: step.before - step.about, n)
+        self._predicted, self._after = padded(lambda step: step.predicted, n), padded(lambda step: step.after, n)
+        self._y, self._H = padded(lambda step: step.y, d), padded(lambda step: step.H, d, n)
+        self._axes = padded(lambda step: step.observation.axes * step.observation.tuned, d, d)
+        self._own = padded(lambda step: step.observation.own, d, d)
+        self._foreign = padded(lambda step: step.observation.foreign, d, d, fill=np.eye(d))
+        none = len(columns)  # a last column of zeros
+        self._std: IntArray = padded(
+            lambda step: [columns[name] for name in step.observation.parameters], d, fill=none
+        ).astype(np.int64)
+        odds = padded(lambda step: columns[step.observation.sensor, ""], fill=none)
+        self._odds: IntArray = odds.astype(np.int64)
+        self._padding = d - padded(lambda step: len(step.y))
+        self._assumed = (
+            padded(lambda step: step.assumed[0], a),
+            padded(lambda step: step.assumed[1], a, n),
+            padded(lambda step: step.assumed[2], a, a, fill=np.eye(a)),
+        )
         self._F = motion.jacobian(self._about, self._since_s)
         self._parts = space.noise_parts(self._about, self._since_s)
         self._has_assumed: list[bool] = np.any(self._assumed[1], axis=(1, 2, 3)).tolist()
-
-    def _set(self, k: int, t: int, step: Step, columns: Mapping[tuple[str, str], int]) -> None:
-        """Set step k of series t; `columns` are those of the parameters."""
-        observation, size = step.observation, len(step.y)
-        sensor, names = observation.sensor, observation.measurement.model.components
-        self._since_s[k, t] = step.since_s
-        self._about[k, t], self._offset[k, t] = step.about, step.before - step.about
-        self._predicted[k, t], self._after[k, t] = step.predicted, step.after
-        self._y[k, t, :size], self._H[k, t, :size] = step.y, step.H
-        self._foreign[k, t, :size, :size] = observation.foreign
-        if observation.tuned:
-            self._axes[k, t, :size, :size] = observation.axes
-            self._std[k, t, :size] = [columns[sensor, names[i]] for i in observation.measured]
-        self._own[k, t, :size, :size] = observation.own
-        self._odds[k, t] = columns[sensor, ""]
-        self._padding[k, t] -= size
-        y, H, R = step.assumed
-        self._assumed[0][k, t, : len(y)], self._assumed[1][k, t, : len(y)] = y, H
-        self._assumed[2][k, t, : len(y), : len(y)] = R
 
     def evaluate(self, values: FloatArray) -> Evaluation:
         """Return the N innovations that count, at each row of `values`, (b, p)."""

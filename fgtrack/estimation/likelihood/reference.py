@@ -12,8 +12,7 @@ from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import joseph, kalman_gain, linearised, propagated
 from fgtrack.estimation.likelihood.contaminated import Update, update
-from fgtrack.estimation.likelihood.noise import NoiseSpace
-from fgtrack.estimation.likelihood.series import Observation, Series
+from fgtrack.estimation.likelihood.series import NoiseSpace, Observation, Series
 
 _WINDOW, _MOST = 20, 0.5  # of so many successive innovations at most this share may be outliers
 _MARGIN_S = 1.0  # what is nearer to such a stretch is left out as well
@@ -62,7 +61,7 @@ def filtered(series: Series, space: NoiseSpace, values: Sequence[float] | FloatA
         here, there = list(observation.measured), list(observation.assumed)
         R = observation.own
         if observation.tuned:
-            stds = np.array([by_name[sensor, measurement.model.components[i]] for i in here])
+            stds = np.array([by_name[name] for name in observation.parameters])
             R = congruence(observation.axes, np.diag(np.square(stds)))
         seen_from = series.nominal[k + 1] if initial else predicted
         y, H = linearised(measurement.z, seen_from, measurement.model, measurement.pose)

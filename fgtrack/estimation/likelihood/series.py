@@ -1,18 +1,63 @@
-"""Measurements of one object, with the noise of each in parts: fitted, and not fitted."""
+"""Measurements of one object with the noise of each in parts, fitted and not fitted, and the parameters of a fit."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fgtrack.core.linalg import congruence, symmetrise
-from fgtrack.core.time import seconds
-from fgtrack.core.types import YAW, FloatArray
+from fgtrack.core.time import NS_PER_S, seconds
+from fgtrack.core.types import YAW, BoolArray, FloatArray
 from fgtrack.estimation.base import UNKNOWN_YAW_STD_RAD, Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.initiation import Initiation
 from fgtrack.estimation.filters.track_initiation import TrackInitiation
-from fgtrack.models.motion import MotionModel
+from fgtrack.models.correlated_errors import CorrelatedErrors
+from fgtrack.models.motion import MotionModel, WhiteNoise
+
+
+@dataclass(frozen=True)
+class NoiseSpace:
+    """The parameters in one vector: noise of the motion, then of each sensor, then the share of its outliers.
+
+    All are positive.
+    """
+
+    motion_names: tuple[str, ...]
+    motion: Callable[[Mapping[str, float]], MotionModel]
+    """The motion model with these parameters, by name of `motion_names`; where its noise is white they are standard
+    deviations."""
+    sensors: Mapping[str, tuple[str, ...]]
+    """Components by sensor."""
+
+    @property
+    def names(self) -> tuple[tuple[str, str], ...]:
+        """(sensor, component) of each standard deviation; ("", name) for the motion, (sensor, "") for outliers."""
+        motion = [("", name) for name in self.motion_names]
+        stds = [(sensor, name) for sensor, components in self.sensors.items() for name in components]
+        return (*motion, *stds, *((sensor, "") for sensor in self.sensors))
+
+    @property
+    def num_motion(self) -> int:
+        """Number of leading parameters that belong to the motion."""
+        return len(self.motion_names)
+
+    def motion_model(self, values: Sequence[float] | FloatArray) -> MotionModel:
+        """The motion model of `values`, shape (p,)."""
+        return self.motion(dict(zip(self.motion_names, map(float, values), strict=False)))
+
+    def noise_parts(self, x: FloatArray, dt_s: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        """Q = rest + sum of value_i^2 part_i at states `x` (..., n) over `dt_s` (...); None if the noise is not white.
+
+        The rest has shape (..., n, n), the parts have shape (q, ..., n, n).
+        """
+        model = self.motion_model(np.ones(self.num_motion))
+        if not isinstance(model.base if isinstance(model, CorrelatedErrors) else model, WhiteNoise):
+            return None
+        rest = self.motion_model(np.zeros(self.num_motion)).process_noise(x, dt_s)
+        units = np.eye(self.num_motion)
+        return rest, np.array([self.motion_model(unit).process_noise(x, dt_s) - rest for unit in units])
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +86,12 @@ class Observation:
         """True if the standard deviations of the sensor apply."""
         return not self.own.any()
 
+    @property
+    def parameters(self) -> list[tuple[str, str]]:
+        """Names in `NoiseSpace.names` of the standard deviations that apply."""
+        components = self.measurement.model.components
+        return [(self.sensor, components[i]) for i in self.measured] if self.tuned else []
+
 
 @dataclass(frozen=True, slots=True)
 class Series:
@@ -48,15 +99,19 @@ class Series:
 
     start: Start
     observations: Sequence[Observation]
-    from_ns: int | None = None
-    """Innovations before this stamp have no part in the likelihood; None for no limit."""
-    until_ns: int | None = None
+    from_ns: float = -math.inf
+    """Innovations before this stamp have no part in the likelihood."""
+    until_ns: float = math.inf
     """Nor have those from this stamp on."""
     nominal: tuple[FloatArray, ...] = ()
     """States (n,) of a nominal trajectory at the start and at each of the first observations, about which these are
     linearised; empty where the filter is linearised at its own estimates from the start."""
     mixed: frozenset[int] = frozenset()
     """Indices of observations whose innovations have no part in the likelihood either; see `without_mixed`."""
+    settle_s: float = 1.0
+    """Nor have those of the first seconds with a known direction of travel, which are those of the first state."""
+    settle_steps: int = 5
+    """Nor have as many of the first ones."""
 
     @property
     def num_initial(self) -> int:
@@ -67,6 +122,16 @@ class Series:
     def initiated_ns(self) -> int:
         """Stamp of the last of these, or of the start where there are none."""
         return self.observations[self.num_initial - 1].measurement.stamp_ns if self.nominal else self.start.stamp_ns
+
+    @property
+    def counted(self) -> BoolArray:
+        """True for observations whose innovations have a part in the likelihood, shape (k,)."""
+        stamps_ns = np.array([one.measurement.stamp_ns for one in self.observations])
+        counted = (stamps_ns - self.initiated_ns >= NS_PER_S * self.settle_s) & (stamps_ns >= self.from_ns)
+        counted &= stamps_ns < self.until_ns
+        counted[: self.num_initial + self.settle_steps] = False
+        counted[list(self.mixed)] = False
+        return counted
 
     def initiated(self, motion: MotionModel, method: Initiation) -> "Series":
         """Return it with a nominal trajectory along the first positions, where `start` has no direction of travel.
