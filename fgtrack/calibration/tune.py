@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain, compress
 from pathlib import Path
 
@@ -32,14 +32,13 @@ from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import located
 from fgtrack.pipeline.shipped import read_config
-from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
 
 _MIN_OBSERVATIONS = 20  # of a track: most of the shorter ones are clutter
 _MIN_COUNT = 30  # measured components that a parameter needs at least
 _SETTLED = 0.2  # share of its standard deviation by which no parameter moves in the last round
 _KNOWN, _ROUGHLY_KNOWN = 0.05, 0.5  # largest standard errors, as shares of the value
 _REJECTED = 1.92  # loss of log-likelihood at the border of a 95 % interval
-_GATE_PROBABILITY, _GATE_STDS = 0.9999, 4.0  # at least, else what the gate cuts off is missing in the noise
+_GATE_STDS = 4.0  # at least, else what the gate cuts off is missing in the noise
 _START_FACTOR = 5.0  # further starts have a motion noise larger, and smaller, by this
 _START_TRACKS, _START_OBSERVATIONS = 3, 200  # that are used to compare starts
 _ENDLESS = "no maximum: the likelihood still rises 10^4 times away, as where all errors are 0"
@@ -100,36 +99,6 @@ def tuned(
     return _Tuning(ConfigNoise(config), messages, rules or TuneRules(), on_step).report(broken)
 
 
-def _for_tuning(config: Config) -> Config:
-    """Return `config` with an estimator that keeps late data, and a gate that does not cut off the noise."""
-    stds_m = [
-        sensor.std.get(axis, 0.0) for sensor in config.used_sensors.values() for axis in ("x_m", "y_m", "range_m")
-    ]
-    needed_m, association = _GATE_STDS * max(stds_m, default=0.0), config.association
-    if isinstance(association, GatedEuclidean):
-        association = replace(association, gate_m=max(association.gate_m, needed_m))
-    elif isinstance(association, GatedMahalanobis):
-        probability, limit_m = association.gate_probability, association.max_distance_m
-        association = replace(
-            association,
-            gate_probability=max(probability, _GATE_PROBABILITY),
-            max_distance_m=max(limit_m, needed_m),
-        )
-    return replace(config, estimator="ekf-replay", association=association)
-
-
-@dataclass(frozen=True)
-class _Fitted:
-    """Parameters and how well they are known."""
-
-    values: FloatArray
-    log_std: FloatArray
-    """Standard errors of their logarithms; NaN where they are not known."""
-    known: tuple[Known, ...]
-    why: tuple[str, ...]
-    likelihood: Likelihood
-
-
 class _Tuning:
     """The steps of `tuned`."""
 
@@ -143,6 +112,7 @@ class _Tuning:
         self._noise, self._recordings, self._rules, self._on_step = noise, recordings, rules, on_step
         self._space, self._configured = noise.space, noise.values
         self._kept = np.isin(noise.keys, rules.keep)
+        self._named = np.array([bool(name) for _, name in noise.space.names])  # not the shares of outliers
         self._endless = np.zeros(len(self._kept), dtype=np.bool_)
         for key in rules.keep:
             if key not in noise.keys:
@@ -152,21 +122,17 @@ class _Tuning:
 
     def report(self, broken: Mapping[str, str]) -> TuneReport:
         """Return the result of rounds of association and fit to the first part, judged by the rest."""
-        series, _ = self._associated(self._configured)
-        splits = [self._split_ns(tracks) for tracks in series] if self._rules.train_share < 1.0 else None
+        series, runs = self._associated(self._configured)
+        splits_ns = [self._split_ns(tracks) for tracks in series]
         values, rounds, settled = self._configured, 0, False
         while not settled and rounds < self._rules.max_rounds:
             if rounds:
                 self._on_step(f"association {rounds + 1}")
-                series, _ = self._associated(values)
+                series, runs = self._associated(values)
                 series = [[without_mixed(one, self._space, values) for one in tracks] for tracks in series]
             rounds += 1
-            first = [
-                replace(one, until_ns=math.inf if splits is None else splits[k])
-                for k, tracks in enumerate(series)
-                for one in tracks
-            ]
-            problem = self._problem(first)
+            parts = zip(series, splits_ns, strict=True)
+            problem = self._problem([replace(one, until_ns=end_ns) for tracks, end_ns in parts for one in tracks])
             if rounds == 1:
                 values = self._best_start(problem)
             self._on_step(f"fit {rounds}")
@@ -175,32 +141,32 @@ class _Tuning:
             moved = np.abs(np.log(values[free] / before[free]))
             still = (moved <= _SETTLED * likelihood.spread(np.log(values[free]))).all()
             settled = rounds > 1 and bool(still)  # with the configured noise one cannot tell what is mixed
-        fitted, held_out = self._fitted(problem, values), None
-        if splits is not None:
-            held_out = self._held_out(fitted.values, series, splits)
+        (values, likelihood, parameters), held_out = self._fitted(problem, values), None
+        if self._rules.train_share < 1.0:
+            held_out = self._held_out(values, series, splits_ns)
             self._on_step("fit to everything")
             problem = self._problem(list(chain.from_iterable(series)))
-            fitted = self._fitted(problem, fitted.values)
-        config = self._noise.config_with(fitted.values)
-        sensors = tuple(self._sensor(name, problem, fitted) for name in self._space.sensors)
+            values, likelihood, parameters = self._fitted(problem, values)
+        sensors = tuple(self._sensor(name, problem, values) for name in self._space.sensors)
         count = sum(one.count for one in sensors)
         return TuneReport(
-            config=config,
-            parameters=self._parameters(config, fitted),
+            config=self._noise.config_with(values),
+            parameters=parameters,
             sensors=sensors,
             held_out=held_out,
-            log_likelihood=float(fitted.likelihood.totals(fitted.values[None])[0]) / count,
+            log_likelihood=float(likelihood.totals(values[None])[0]) / count,
             count=count,
             num_tracks=len(problem.series),
             num_mixed=sum(len(one.mixed) for one in problem.series),
             rounds=rounds,
             settled=settled,
             broken=broken,
+            runs=tuple(runs),
         )
 
     def _associated(self, values: FloatArray) -> tuple[list[list[Series]], list[Run]]:
         """Return the series of long tracks and the run of each recording, with the noise of `values`."""
-        config = _for_tuning(self._noise.config_with(values))
+        config = replace(self._noise.config_with(values), estimator="ekf-replay")  # which keeps late data
         all_series, runs = [], []
         for name, messages in self._recordings.items():
             series, run = recorded(messages, config, name, _GATE_STDS)
@@ -210,14 +176,16 @@ class _Tuning:
             runs.append(run)
         return all_series, runs
 
-    def _split_ns(self, tracks: Sequence[Series]) -> int:
-        """Return the stamp at which the held-out part of a recording begins."""
+    def _split_ns(self, tracks: Sequence[Series]) -> float:
+        """Return the stamp at which the held-out part of a recording begins; infinite without one."""
+        if self._rules.train_share == 1.0:
+            return math.inf
         stamps_ns = [one.measurement.stamp_ns for track in tracks for one in track.observations] or [0]
         return min(stamps_ns) + round(self._rules.train_share * (max(stamps_ns) - min(stamps_ns)))
 
     def _problem(self, series: Sequence[Series]) -> Problem:
         problem = Problem(series, self._space, self._configured)
-        if not problem.counts()[: self._space.num_motion].any():
+        if not problem.counts().any():
             raise self._nothing(
                 f"no track has {_MIN_OBSERVATIONS} measurements; look at `fgtrack info` for sensors without a model, "
                 "and at the gate"
@@ -238,7 +206,7 @@ class _Tuning:
     def _free(self, problem: Problem) -> BoolArray:
         """Return which parameters have enough measurements and a maximum."""
         free = np.asarray((problem.counts() >= _MIN_COUNT) & ~self._kept & ~self._endless)
-        if not free[[bool(name) for _, name in self._space.names]].any():
+        if not free[self._named].any():
             raise self._nothing(
                 f"no parameter that may be fitted has {_MIN_COUNT} measurements on tracks that have settled; take a "
                 "longer recording, of objects that move, or look at the gate"
@@ -269,7 +237,7 @@ class _Tuning:
             reached.append((likelihood.cost(np.log(values[free])).objective, values))
         return min(reached, key=lambda one: one[0])[1]
 
-    def _fitted(self, problem: Problem, start: FloatArray) -> _Fitted:
+    def _fitted(self, problem: Problem, start: FloatArray) -> tuple[FloatArray, Likelihood, tuple[TunedParameter, ...]]:
         """Return the maximum; instead of what is not known there, what is configured, or what is nearest to it.
 
         The rest is not fitted again: it would make up for what was put there, and with the yaw's noise too large the
@@ -282,9 +250,8 @@ class _Tuning:
         why[self._endless], why[self._kept] = _ENDLESS, "kept as asked"
         log_std = np.full(count, math.nan)
         log_std[free] = likelihood.log_std(np.log(values[free]))
-        errors = self._noise.shown(values, log_std)[1]
-        rows = [row for row in np.flatnonzero(free).tolist() if self._space.names[row][1]]
-        for row in sorted(rows, key=lambda one: -errors[one]):
+        errors = log_std.copy()
+        for row in sorted(np.flatnonzero(free & self._named).tolist(), key=lambda one: -errors[one]):
             why[row] = ""
             if errors[row] <= _ROUGHLY_KNOWN:
                 known[row] = "yes" if errors[row] <= _KNOWN else "roughly"
@@ -298,7 +265,14 @@ class _Tuning:
             values[row], log_std[row] = limit, math.nan
         if not {"yes", "roughly"} & set(known):
             raise self._nothing("no parameter is identifiable in so few measurements; take a longer recording")
-        return _Fitted(values, log_std, tuple(known), tuple(why), likelihood)
+        tuned_values = ConfigNoise(self._noise.config_with(values)).values
+        rows = zip(self._noise.keys, self._configured, tuned_values, log_std, known, why, strict=True)
+        parameters = [
+            TunedParameter(key, float(was), float(now), None if math.isnan(error) else float(error), how, reason)
+            for key, was, now, error, how, reason in rows
+            if key
+        ]
+        return values, likelihood, tuple(parameters)
 
     def _limit(self, likelihood: Likelihood, values: FloatArray, row: int) -> float:
         """Return the value nearest to the configured one that the data do not reject, the other parameters given."""
@@ -312,12 +286,11 @@ class _Tuning:
         return float(rows[max(int(rejected[0]) - 1, 0), row])
 
     def _held_out(
-        self, trained: FloatArray, series: Sequence[Sequence[Series]], splits: Sequence[int]
+        self, trained: FloatArray, series: Sequence[Sequence[Series]], splits_ns: Sequence[float]
     ) -> HeldOut | None:
         """Return the performance in the rest of noise fitted to the first part; None where nothing counts there."""
-        rest = [replace(one, from_ns=at_ns) for tracks, at_ns in zip(series, splits, strict=True) for one in tracks]
-        configured = np.array([bool(name) for _, name in self._space.names])  # not the shares of outliers
-        before, squares_before = self._judged(rest, np.where(configured, self._configured, trained))
+        rest = [replace(one, from_ns=at_ns) for tracks, at_ns in zip(series, splits_ns, strict=True) for one in tracks]
+        before, squares_before = self._judged(rest, np.where(self._named, self._configured, trained))
         after, squares_after = self._judged(rest, trained)
         if not before:
             return None
@@ -331,10 +304,8 @@ class _Tuning:
             )
             for name, squares in sorted(squares_before.items())
         )
-        self._on_step("held-out time")
-        runs = tuple(self._associated(trained)[1])
         means = float(np.mean(before)), float(np.mean(after))
-        return HeldOut(1.0 - self._rules.train_share, len(before), *means, innovations, runs)
+        return HeldOut(1.0 - self._rules.train_share, len(before), *means, innovations)
 
     def _judged(
         self, series: Sequence[Series], values: FloatArray
@@ -351,19 +322,9 @@ class _Tuning:
                     squares.setdefault((observation.sensor, name), []).append(float(square))
         return terms, squares
 
-    def _parameters(self, config: Config, fitted: _Fitted) -> tuple[TunedParameter, ...]:
-        was, _ = self._noise.shown(self._configured, fitted.log_std)
-        now, errors = self._noise.shown(ConfigNoise(config).values, fitted.log_std)
-        columns = self._noise.keys, was.tolist(), now.tolist(), errors.tolist(), fitted.known, fitted.why
-        return tuple(
-            TunedParameter(key, was, value, None if math.isnan(error) else error, known, why)
-            for key, was, value, error, known, why in zip(*columns, strict=True)
-            if key
-        )
-
-    def _sensor(self, name: str, problem: Problem, fitted: _Fitted) -> SensorNoise:
+    def _sensor(self, name: str, problem: Problem, values: FloatArray) -> SensorNoise:
         row = self._space.names.index((name, ""))
         count = int(problem.counts()[row])
         observations = chain.from_iterable(one.observations for one in problem.series)
         own = sum(one.sensor == name and not one.tuned for one in observations)
-        return SensorNoise(name, count, own, float(outlier_share(fitted.values[row])) if count else None)
+        return SensorNoise(name, count, own, float(outlier_share(values[row])) if count else None)

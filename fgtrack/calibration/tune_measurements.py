@@ -26,6 +26,8 @@ from fgtrack.tracking.objects import Apart
 from fgtrack.tracking.preprocess import Candidate, Candidates, Preprocess
 from fgtrack.tracking.tracker import TrackerParts
 
+_GATE_PROBABILITY = 0.9999
+
 
 def recorded(
     messages: Iterable[Message], config: Config, origin: str = "", gate_stds: float = 0.0
@@ -52,7 +54,7 @@ def recorded(
 
 @dataclass(frozen=True)
 class _OpenedGate:
-    """An `Association` whose gate in metres is opened to so many standard deviations of each detection."""
+    """An `Association` whose gate is opened to so many standard deviations of each detection, and as probable."""
 
     association: GatedEuclidean | GatedMahalanobis
     stds: float
@@ -63,15 +65,15 @@ class _OpenedGate:
         if isinstance(self.association, GatedEuclidean):
             return self.association.within(np.maximum(self.association.gate_m, needed_m), candidates, states, apart)
         limit_m = float(needed_m.max(initial=self.association.max_distance_m))
-        return replace(self.association, max_distance_m=limit_m)(candidates, states, apart)
+        probability = max(self.association.gate_probability, _GATE_PROBABILITY)
+        opened = replace(self.association, max_distance_m=limit_m, gate_probability=probability)
+        return opened(candidates, states, apart)
 
     def _stds_m(self, candidate: Candidate, means: FloatArray) -> FloatArray:
         """Return the largest standard deviation of the position; of a bearing alone, across the line of sight."""
         if candidate.position_covariance is not None:
             return np.full(len(means), math.sqrt(np.linalg.eigvalsh(candidate.position_covariance)[-1]))
         measurement = candidate.measurement
-        if "bearing_rad" not in measurement.model.components:
-            return np.zeros(len(means))
         k = measurement.model.components.index("bearing_rad")
         away_m = np.hypot(means[:, 0] - measurement.pose.x_m, means[:, 1] - measurement.pose.y_m)
         return np.asarray(away_m * math.sqrt(measurement.R[k, k]))

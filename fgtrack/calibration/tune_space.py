@@ -1,8 +1,7 @@
 """Noise of a configuration as a vector of parameters, rules of its fit, and the report of what was fitted."""
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
 import numpy as np
@@ -13,26 +12,24 @@ from fgtrack.io.run import Run
 from fgtrack.models.correlated_errors import with_correlated_errors
 from fgtrack.models.motion import MotionModel
 from fgtrack.pipeline.config import Config, MotionConfig
+from fgtrack.pipeline.load import plain
 
 _FIRST_SHARE = 0.01
 _DIGITS = 4
-_DENSITY = "_density_"  # in the name of a parameter that a variance grows with
 
 
 @dataclass(frozen=True)
 class ConfigNoise:
-    """Tuned parameters of a configuration: process noise, and the standard deviations of every sensor.
-
-    Of a plug-in's motion model those parameters whose name holds `_density_` (a variance grows with it) or `std`.
-    """
+    """Tuned parameters of a configuration: process noise, and the standard deviations of every sensor."""
 
     config: Config
 
     @property
     def keys(self) -> tuple[str, ...]:
         """Keys of the configuration, in the order of the parameters; empty for the shares of outliers."""
-        motion = "motion.parameters" if self.config.motion.is_plug_in else "motion.std_per_s"
-        prefixes = ((f"sensors.{sensor}.std" if sensor else motion, name) for sensor, name in self.space.names)
+        prefixes = (
+            (f"sensors.{sensor}.std" if sensor else "motion.std_per_s", name) for sensor, name in self.space.names
+        )
         return tuple(f"{prefix}.{name}" if name else "" for prefix, name in prefixes)
 
     @property
@@ -46,14 +43,6 @@ class ConfigNoise:
         """The configured parameters, shape (p,)."""
         stds = [sensor.std[name] for sensor in self.config.used_sensors.values() for name in sensor.components]
         return np.array([*self._motion_stds.values(), *stds, *[_FIRST_SHARE] * len(self.config.used_sensors)])
-
-    def shown(self, values: FloatArray, log_std: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return parameters as the configuration has them, and standard errors as shares of these, shape (p,).
-
-        `log_std`, shape (p,), are those of the logarithms.
-        """
-        powers = np.array([2.0 if not sensor and _DENSITY in name else 1.0 for sensor, name in self.space.names])
-        return values**powers, powers * log_std
 
     def config_with(self, values: FloatArray) -> Config:
         """Return the configuration with `values`, shape (p,), to four digits; configured ones stay to the bit."""
@@ -70,23 +59,12 @@ class ConfigNoise:
 
     @property
     def _motion_stds(self) -> dict[str, float]:
-        """Positive noise parameters of the motion model, by name; a density as its root."""
+        """Positive noise parameters of the motion model, by name; none of a plug-in's, which has its own."""
         motion = self.config.motion
-        if not motion.is_plug_in:
-            return {name: value for name, value in motion.std_per_s.items() if value > 0.0}
-        model, values = motion.model(), dict[str, float]()
-        if is_dataclass(model):
-            values = {one.name: getattr(model, one.name) for one in fields(model)}
-        values |= motion.parameters
-        noise = {name: float(value) for name, value in values.items() if _DENSITY in name or "std" in name}
-        return {name: math.sqrt(value) if _DENSITY in name else value for name, value in noise.items() if value > 0.0}
+        return {} if motion.is_plug_in else {name: value for name, value in motion.std_per_s.items() if value > 0.0}
 
     def _motion_with(self, stds: Mapping[str, float]) -> MotionConfig:
-        motion = self.config.motion
-        if not motion.is_plug_in:
-            return replace(motion, std_per_s={**motion.std_per_s, **stds})
-        parameters = {name: std * std if _DENSITY in name else std for name, std in stds.items()}
-        return replace(motion, parameters={**motion.parameters, **parameters})
+        return replace(self.config.motion, std_per_s={**self.config.motion.std_per_s, **stds})
 
     def _motion_model(self, stds: Mapping[str, float]) -> MotionModel:
         return with_correlated_errors(self._motion_with(stds).model(), self.config.used_sensors)
@@ -170,8 +148,6 @@ class HeldOut:
     after: float
     """With the noise fitted to the rest."""
     innovations: tuple[InnovationFit, ...]
-    runs: tuple[Run, ...] = field(repr=False)
-    """Runs with the noise fitted to the rest, of the estimator `ekf-replay`, one for each recording."""
 
 
 @dataclass(frozen=True)
@@ -198,10 +174,10 @@ class TuneReport:
     """True if another association would have changed nothing any more."""
     broken: Mapping[str, str]
     """Why a recording broke off, by its name; what came before was used."""
+    runs: tuple[Run, ...] = field(repr=False)
+    """Runs of the last association, of the estimator `ekf-replay`, one for each recording."""
 
     def as_dict(self) -> dict[str, object]:
         """Return plain values for JSON, without the runs."""
-        names: Sequence[str] = [one.name for one in fields(self) if one.name not in ("config", "held_out")]
-        judged = None if self.held_out is None else asdict(replace(self.held_out, runs=()))
-        rows = {name: [asdict(one) for one in getattr(self, name)] for name in ("parameters", "sensors")}
-        return {**{name: getattr(self, name) for name in names}, **rows, "held_out": judged}
+        names = [one.name for one in fields(self) if one.name not in ("config", "runs")]
+        return {name: plain(getattr(self, name)) for name in names}

@@ -97,11 +97,10 @@ def _sensors(report: TuneReport) -> list[str]:
             lines.append(f"{one.sensor}: {one.count} measurements, {100.0 * one.outlier_share:.1f} % outliers")
         if one.own_covariance:
             lines.append(f"{one.sensor}: {one.own_covariance} measurements have a covariance of their own, which stays")
-    runs = () if report.held_out is None else report.held_out.runs
     lines += [
         f"{one.sensor}: innovations still correlated in time (autocorrelation {one.lag1:.2f}): so are errors, of it or "
         "of the sensor that is trusted more, and white noise is too small for them"
-        for run in runs
+        for run in report.runs
         for one in noise_fits(run)
         if one.lasts
     ]

@@ -53,7 +53,8 @@ class NoiseSpace:
         The rest has shape (..., n, n), the parts have shape (q, ..., n, n).
         """
         model = self.motion_model(np.ones(self.num_motion))
-        if not isinstance(model.base if isinstance(model, CorrelatedErrors) else model, WhiteNoise):
+        base = model.base if isinstance(model, CorrelatedErrors) else model
+        if not (self.num_motion and isinstance(base, WhiteNoise)):
             return None
         rest = self.motion_model(np.zeros(self.num_motion)).process_noise(x, dt_s)
         units = np.eye(self.num_motion)
