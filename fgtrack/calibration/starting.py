@@ -16,9 +16,9 @@ from fgtrack.core.errors import CallError, DataError, FgtrackError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DESCRIBING, MEASURABLE, STATE_NAMES
 from fgtrack.io.adapters import ADAPTERS
-from fgtrack.io.adapters.ego import ODOMETRY
 from fgtrack.io.adapters.fields import fields_of
 from fgtrack.io.adapters.native import NATIVE_ADAPTERS
+from fgtrack.io.adapters.objects import ODOMETRY
 from fgtrack.io.adapters.tables import headers, rows
 from fgtrack.io.config import CsvInput, CsvTable, Field, InputConfig, TopicInput
 from fgtrack.io.guess import Guess, agreeing_with_motion, guesses, time_unit, words_of

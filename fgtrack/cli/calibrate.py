@@ -12,7 +12,7 @@ from fgtrack.calibration.advise import advise as advised
 from fgtrack.calibration.clock_offsets import OffsetReport, estimate_offsets
 from fgtrack.calibration.clocks import clock_text
 from fgtrack.calibration.starting import starting_config
-from fgtrack.calibration.trial import TRIAL_S, Trial, try_out
+from fgtrack.calibration.trial import TRIAL_S, try_out
 from fgtrack.cli.arguments import ConfigFile, Input, Json, Overwrite, PitMap, Reference, Settings, TrackMap
 from fgtrack.cli.show import progress, say, sentences, show, warn
 from fgtrack.core.errors import CallError, DataError, FgtrackError
@@ -61,29 +61,26 @@ def info(
     config = None if config_file is None else read_config(config_file)
     found = describe(recording, None if config is None else config.input)
     topics = _topics(found, NO_VALUE if config is None else "ignored")
-    comes_to = (config or Config()).effective
-    values: dict[str, object] = {
-        "path": str(found.path),
-        "kind": found.kind,
-        "start_ns": found.start_ns,
-        "duration_s": found.duration_s,
-    }
-    values |= {"problem": found.problem, "topics": topics.plain()}
-    show(topics, "json" if as_json else None, {**values, "effective": plain(comes_to)})
-    if not as_json:
+    comes_to, problem = (config or Config()).effective, found.problem
+    if as_json:
+        values = {name: getattr(found, name) for name in ("kind", "start_ns", "duration_s", "problem")}
+        show(
+            topics, "json", {"path": str(found.path), **values, "topics": topics.plain(), "effective": plain(comes_to)}
+        )
+    else:
+        show(topics, None)
         sentences([f"{config_file or 'without a configuration'}: {comes_to}"])
-    trial = None
-    if config is not None and found.problem is None and not as_json:
-        trial = _try_out(recording, config)
-    elif not as_json:
-        with suppress(FgtrackError), progress("detections"):  # whose topics and columns nothing names
-            sentences(assumed(Config(), open_input(recording)).lines())
-    problem = found.problem if trial is None else trial.problem
+        if config is None:
+            with suppress(FgtrackError), progress("detections"):  # whose topics and columns nothing names
+                sentences(assumed(Config(), open_input(recording)).lines())
+        elif problem is None:
+            problem = _try_out(recording, config)
     if problem is not None:
         raise DataError(problem)
 
 
-def _try_out(recording: Path, config: Config) -> Trial:
+def _try_out(recording: Path, config: Config) -> str | None:
+    """Print what the first seconds come to; gives the problem of the recording."""
     with progress("first seconds"):
         source = open_input(recording, config.input)
         open_settings = assumed(config, source)
@@ -100,7 +97,7 @@ def _try_out(recording: Path, config: Config) -> Trial:
         say(f"first {TRIAL_S:g} s: {len(set(trial.run.tables['tracks']['track_id'].tolist()))} tracks")
     for found in trial.suspicions:
         warn(str(found))
-    return trial
+    return trial.problem
 
 
 def _topics(found: InputInfo, unused: str) -> Table:
@@ -156,21 +153,20 @@ def advise(
 
     Sentences in order of importance, and the lateness of each sensor.
     """
-    if out is not None:
-        check_output(out, overwrite)
     config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
     if out is not None:
+        check_output(out, overwrite)
         check_apart(out, [recording, config_file])
     with progress("advise") as tell:
         advice = advised(recording, config, reference=reference, tune=tune, on_step=tell)
+    show(advice.tables, "json" if as_json else None, advice.as_dict())
     if out is not None:
         head = [f"Settings for {recording} (fgtrack advise).", "", *advice.comments(), ""]
         with new_file(out, overwrite) as file:
             file.write(Assumed(advice.config, ()).to_yaml(head).encode())
-    show(advice.tables, "json" if as_json else None, advice.as_dict())
-    if out is not None and not as_json:
         again = shlex.join(["fgtrack", "replay", str(recording), "-c", str(out), "-o", "RUN"])
-        say(f"{out}: written; follow it by `{again}`")
+        if not as_json:
+            say(f"{out}: written; follow it by `{again}`")
     if advice.broken is not None:
         raise DataError(f"{located(advice.broken, str(recording))}; used up to there")
 

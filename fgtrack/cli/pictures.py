@@ -59,7 +59,13 @@ def figure(
     settings(paper)  # raises where one is not usable
     picture = out if one_file else out / f"figure.{form}"  # what else is in the folder stays
     with progress("draw"):
-        first, plans, missing = _of_sweep(runs, stamp) or _of_runs(runs, picture, stamp, paper)
+        sweeps = [folder for folder in runs if is_sweep(folder)]
+        if not sweeps:
+            first, plans, missing = _of_runs(runs, picture, stamp, paper)
+        elif len(runs) == 1 and stamp is None:
+            first, plans, missing = [], planned_sweep(read_sweep(sweeps[0])), None
+        else:
+            raise CallError(f"{sweeps[0]}: is a sweep, name it alone and without --stamp")
         named = chain(first, drawn(plans, every, **paper))
         if one_file:
             with new_file(out, overwrite) as file:
@@ -77,22 +83,10 @@ def figure(
         say(f"{left_out} more with --all")
 
 
-_Figures = tuple[list[tuple[str, Figure]], list[Planned], DataError | None]  # the close-up, the others, why it is none
-
-
-def _of_sweep(folders: Sequence[Path], stamp: float | None) -> _Figures | None:
-    """The figures of a sweep; None where `folders` are none."""
-    sweeps = [folder for folder in folders if is_sweep(folder)]
-    if not sweeps:
-        return None
-    if len(folders) > 1:
-        raise CallError(f"{sweeps[0]}: is a sweep, which is drawn by itself: name it alone")
-    if stamp is not None:
-        raise CallError(f"{sweeps[0]}: is a sweep, --stamp chooses a late detection of a run")
-    return [], planned_sweep(read_sweep(sweeps[0])), None
-
-
-def _of_runs(folders: Sequence[Path], out: Path, stamp: float | None, paper: Paper) -> _Figures:
+def _of_runs(
+    folders: Sequence[Path], out: Path, stamp: float | None, paper: Paper
+) -> tuple[list[tuple[str, Figure]], list[Planned], DataError | None]:
+    """The close-up, the other figures, and why there is no close-up."""
     found = evaluated(folders)
     check_apart(out, run_folders(found))
     stamp_ns = None if stamp is None else start_ns(found) + nanoseconds(stamp)

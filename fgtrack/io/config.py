@@ -128,8 +128,6 @@ class NuscenesInput:
     """Name of the sensor that the boxes are of."""
     classes: tuple[str, ...] = ("car",)
     """Classes that are read, of boxes and of truth; empty for all."""
-    min_score: float = 0.0
-    """Boxes of a lower score are left out."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.time import seconds, wrong_unit
 from fgtrack.core.types import DetectionList, EgoState
 from fgtrack.io.adapters import ADAPTERS
-from fgtrack.io.adapters.ego import ODOMETRY
+from fgtrack.io.adapters.objects import ODOMETRY
 from fgtrack.io.config import InputConfig
 from fgtrack.io.errors import TruncatedInput, UntilBreak
 from fgtrack.io.ros.bag import Bag, BagTopic

@@ -28,7 +28,7 @@ def test_a_sweep_is_drawn_by_its_folder(tmp_path: Path, capsys: pytest.CaptureFi
 
 def test_a_sweep_is_drawn_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sweep, out = str(a_sweep(tmp_path / "sweep")), ["-o", str(tmp_path / "out")]
-    for more, message in (([str(tmp_path)], "name it alone"), (["--stamp", "1"], "--stamp chooses a late")):
+    for more, message in (([str(tmp_path)], "name it alone"), (["--stamp", "1"], "without --stamp")):
         assert command(["figure", sweep, *more, *out]) == 2
         assert message in capsys.readouterr().err
     (tmp_path / "sweep" / "sweep.csv").write_text(HEADER)

@@ -8,8 +8,8 @@ import pytest
 from fgtrack.core.types import Detection
 from fgtrack.io.adapters import ADAPTERS
 from fgtrack.io.adapters.common import object_id, yaw_rad
-from fgtrack.io.adapters.ego import ego_from_odometry
 from fgtrack.io.adapters.fields import FieldError, ego_by_fields, objects_by_fields
+from fgtrack.io.adapters.objects import ego_from_odometry
 from fgtrack.io.config import Field, Filter
 
 

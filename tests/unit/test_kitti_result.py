@@ -38,7 +38,7 @@ def sequence(at: Path, **files: list[str]) -> Path:
     ]
     seen = [line(frame, car, score=" 7.75") for frame in FRAMES for car in (0, 1)]
     folder(at, oxts=ego, pointrcnn_car=seen, **files)
-    views, _ = read_views(at / "oxts/0001.txt", at / "calib/0001.txt")
+    views, _ = read_views(at, "0001")
     labels = []
     for frame in FRAMES:
         for car in (0, 1):

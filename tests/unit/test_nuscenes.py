@@ -106,11 +106,9 @@ def test_classes_scores_and_ids_of_trackers(tmp_path):
     tracked = {"tracking_name": "bus", "tracking_score": 0.3, "tracking_id": "7a", "velocity": [math.nan, 0.0]}
     bus = {key: value for key, value in box(1.0).items() if not key.startswith("detection_")} | tracked
     path = data(tmp_path, {"s0": [box(1.0, "truck"), box(2.0, score=0.1), bus]})
-    (found, _) = (
-        item for item in messages(path, min_score=0.2, classes=("bus", "car")) if isinstance(item, DetectionList)
-    )
-    (item,) = found.objects
-    assert found.left_out == ("input.nuscenes.classes", "input.nuscenes.min_score")
+    (found, _) = (item for item in messages(path, classes=("bus", "car")) if isinstance(item, DetectionList))
+    _, item = found.objects
+    assert found.left_out == ("input.nuscenes.classes",)
     assert (item.class_name, item.score, item.object_id, item.speed_mps) == ("bus", 0.3, object_id("7a"), None)
     (found, _) = (item for item in messages(path, classes=(), sensor="x") if isinstance(item, DetectionList))
     assert (found.sensor, len(found.objects)) == ("x", 3)

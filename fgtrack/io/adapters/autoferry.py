@@ -21,7 +21,8 @@ from decimal import Decimal
 from functools import partial
 from heapq import merge
 from pathlib import Path
-from typing import Any
+
+import numpy as np
 
 from fgtrack.core.checks import LARGEST_NS
 from fgtrack.core.geometry import wrap_angle
@@ -32,9 +33,6 @@ from fgtrack.io.source import FileFormat
 SENSORS = {1: "lidar", 2: "radar", 3: "infrared", 4: "daylight"}
 _CAMERAS = {3, 4}
 _DETECTIONS = "*_detections.json"
-
-# Parsed JSON, checked while it is read.
-Json = Any
 
 
 def read_scenario(folder: Path) -> Iterator[Message]:
@@ -56,42 +54,24 @@ FORMAT = FileFormat(
 
 
 def _sensed(file: Path) -> Iterator[EgoState | DetectionList]:
+    """Points around the own ship, `[[north...], [east...]]` or `[north, east]`; bearings from the north, clockwise."""
     newest_ns = -LARGEST_NS
     for index, record in enumerate(json_values(file, parse_float=Decimal)):
         with reported_as(f"{file}: record {index} is not one of the data set"):
             stamp_ns = exact_ns(record["time"])
             north_m, east_m = map(float, record["ownshipPosition"])
-            sensor = record["sensorID"]
-            name = SENSORS[sensor]
-            objects = (
-                _bearings(record["measurement"])
-                if sensor in _CAMERAS
-                else _points(record["measurement"], north_m, east_m)
-            )
+            is_camera, name = record["sensorID"] in _CAMERAS, SENSORS[record["sensorID"]]
+            values = np.array(record["measurement"], dtype=np.float64)
+            if is_camera:
+                objects = [Detection(bearing_rad=wrap_angle(0.5 * math.pi - each)) for each in values.ravel().tolist()]
+            else:
+                norths_m, easts_m = values.reshape(2, -1).tolist()
+                objects = [Detection(east_m + x, north_m + y) for x, y in zip(easts_m, norths_m, strict=True)]
         receipt_ns = max(stamp_ns, newest_ns)
         if stamp_ns > newest_ns:
             yield EgoState(stamp_ns, receipt_ns, x_m=east_m, y_m=north_m, yaw_rad=0.0, speed_mps=0.0)
-        yield DetectionList(name, stamp_ns, receipt_ns, objects, "ego" if sensor in _CAMERAS else "map")
+        yield DetectionList(name, stamp_ns, receipt_ns, objects, "ego" if is_camera else "map")
         newest_ns = receipt_ns
-
-
-def _points(measurement: Json, north_m: float, east_m: float) -> tuple[Detection, ...]:
-    """Points around the own ship: `[[north...], [east...]]`, `[north, east]` of one point, or `[]`."""
-    if not measurement:
-        return ()
-    norths, easts = measurement
-    if not isinstance(norths, list):
-        norths, easts = [norths], [easts]
-    return tuple(
-        Detection(x_m=east_m + float(east), y_m=north_m + float(north))
-        for north, east in zip(norths, easts, strict=True)
-    )
-
-
-def _bearings(measurement: Json) -> tuple[Detection, ...]:
-    """Bearings from the north, clockwise: a list, or a bare number for one."""
-    bearings = measurement if isinstance(measurement, list) else [measurement]
-    return tuple(Detection(bearing_rad=wrap_angle(0.5 * math.pi - float(item))) for item in bearings)
 
 
 def _truth(file: Path) -> list[TruthState]:

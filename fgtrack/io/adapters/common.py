@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from fgtrack.core.checks import is_stamp
 from fgtrack.core.errors import DataError, FgtrackError
@@ -158,10 +159,7 @@ def covariance(
     index = [row for row, name in enumerate(MEASURABLE) if values.get(name) is not None]
     if pose is None:
         return None
-    full = np.zeros((4, 4))
-    full[:3, :3] = pose
-    full[3, 3] = speed or 0.0
-    chosen = full[np.ix_(index, index)]
+    chosen = block_diag(pose, [speed or 0.0])[np.ix_(index, index)]
     if (np.diag(chosen) <= 0.0).any():  # ROS says "not known" by 0 or -1
         return None
     return tuple(chosen.ravel().tolist())

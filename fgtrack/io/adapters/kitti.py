@@ -39,7 +39,7 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.types import Detection, DetectionList, Frame, Message, TruthState
 from fgtrack.io.adapters.common import reported_as, split
-from fgtrack.io.adapters.kitti_view import View, lines_of, read_views
+from fgtrack.io.adapters.kitti_view import CALIB, OXTS, View, lines_of, read_views
 from fgtrack.io.config import KittiInput
 from fgtrack.io.source import FileFormat
 
@@ -49,7 +49,7 @@ _TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tra
 CLASS_NAMES: Mapping[str, str] = {name.lower(): name for name in _TYPES}
 """Types of the data set by the names that detections get."""
 
-_OXTS, _CALIB, _LABELS = "oxts", "calib", "label_02"
+_LABELS = "label_02"
 _DONT_CARE = "DontCare"
 _CLASSES = {"1": "Pedestrian", "2": "Car", "3": "Cyclist"}  # numbers of AB3DMOT
 _NEIGHBOURS: Mapping[str, str] = {"Car": "Van", "Pedestrian": "Person_sitting"}
@@ -67,14 +67,14 @@ def read_sequence(folder: Path, sequence: str, settings: KittiInput) -> Iterator
     Raises `DataError`, with file and line, where a file is missing, and, after all messages of earlier frames, where a
     line is damaged: the file may have been cut off there.
     """
-    views, error = _views(folder, sequence)
+    views, error = read_views(folder, sequence)
     damages = [] if error is None else [(len(views), error)]
     labels = folder / _LABELS / f"{sequence}.txt"
     truth = _by_frame(labels, views, partial(_truth, settings), damages) if labels.exists() else {}
     sensors = {
         file.parent.name: _by_frame(file, views, partial(_detection, settings, file.parent.name), damages)
         for file in sorted(folder.glob(f"*/{sequence}.txt"))
-        if file.parent.name not in (_OXTS, _CALIB, _LABELS)
+        if file.parent.name not in (OXTS, CALIB, _LABELS)
     }
     in_image = {name: _in_image(folder / name, frames) for name, frames in sensors.items()}
     end, damage = min(damages, key=itemgetter(0), default=(len(views), None))
@@ -109,7 +109,7 @@ def _by_frame(
                 frame = int(fields[0])
                 latest = max(latest, frame)
                 if not 0 <= frame < len(views):
-                    raise ValueError(f"of frame {frame}, but {_OXTS} has {len(views)} frames")
+                    raise ValueError(f"of frame {frame}, but {OXTS} has {len(views)} frames")
                 by_frame[frame].append(parse(views[frame], fields))
     except DataError as error:
         damages.append((latest, error))
@@ -126,34 +126,30 @@ def _in_image(detector: Path, frames: Mapping[int, list[Detection | str]]) -> bo
 
 def view_of_sequence(path: Path) -> list[View]:
     """The ego at every frame of the sequence that `path`, a folder or a file of `oxts/`, means; raises as a reader."""
-    views, error = _views(*_located(path))
+    views, error = read_views(*_located(path))
     if error is not None:
         raise error
     return views
-
-
-def _views(folder: Path, sequence: str) -> tuple[list[View], DataError | None]:
-    return read_views(folder / _OXTS / f"{sequence}.txt", folder / _CALIB / f"{sequence}.txt")
 
 
 def _located(path: Path, named: int | str | None = None) -> tuple[Path, str]:
     """Folder and name of the sequence that `path`, a folder or a file of `oxts/`, and `named` mean."""
     if path.is_file():
         return path.parent.parent, path.stem
-    known = sorted(file.stem for file in (path / _OXTS).glob("*.txt"))
+    known = sorted(file.stem for file in (path / OXTS).glob("*.txt"))
     sequence = f"{named:04d}" if isinstance(named, int) else named or known[0]
     if sequence not in known or (named is None and len(known) > 1):
         raise CallError(
             f"{path}: holds the sequences {', '.join(known)}, name one of them: input.kitti.sequence, or its file "
-            f"{path / _OXTS}/{known[0]}.txt"
+            f"{path / OXTS}/{known[0]}.txt"
         )
     return path, sequence
 
 
 def is_sequence(path: Path) -> bool:
     """True if `path` is a folder of the data set, or a file of its `oxts/`."""
-    folder = path.parent.parent if path.is_file() and path.parent.name == _OXTS else path
-    return any((folder / _OXTS).glob("*.txt")) and (folder / _CALIB).is_dir()
+    folder = path.parent.parent if path.is_file() and path.parent.name == OXTS else path
+    return any((folder / OXTS).glob("*.txt")) and (folder / CALIB).is_dir()
 
 
 FORMAT = FileFormat(

@@ -13,6 +13,7 @@ from fgtrack.core.geometry import rotation, wrap_angle
 from fgtrack.core.types import EgoState, FloatArray
 from fgtrack.io.adapters.common import reported_as
 
+OXTS, CALIB = "oxts", "calib"
 PERIOD_NS = 100_000_000
 IMAGE_PX = (1242.0, 375.0)
 """Width and height of the images; of some sequences a few pixels less."""
@@ -115,13 +116,13 @@ def _calibration(file: Path) -> tuple[FloatArray, FloatArray]:
         return matrices["P2"].reshape(3, 4), rectified_from_camera @ camera_from_velodyne @ velodyne_from_imu
 
 
-def read_views(file: Path, calibration_file: Path) -> tuple[list[View], DataError | None]:
-    """Ego at every frame of the `oxts` file, up to a line that is not one of the data set, and the error of that."""
-    calibration = _calibration(calibration_file)
+def read_views(folder: Path, sequence: str) -> tuple[list[View], DataError | None]:
+    """Ego at every frame of a sequence, up to a line that is not one of the data set, and the error of that."""
+    calibration = _calibration(folder / CALIB / f"{sequence}.txt")
     views: list[View] = []
     scale, origin_m = 1.0, np.zeros(2)
     try:
-        for where, fields in lines_of(file):
+        for where, fields in lines_of(folder / OXTS / f"{sequence}.txt"):
             with reported_as(where):
                 latitude_deg, longitude_deg, roll_rad, pitch_rad, yaw_rad, speed_mps, accel_mps2, yaw_rate_radps = (
                     float(fields[index]) for index in (0, 1, 3, 4, 5, 8, 14, 22)

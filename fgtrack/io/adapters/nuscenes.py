@@ -78,11 +78,8 @@ def _results(file: Path) -> Iterator[tuple[str, Json]]:
 
 
 def _tables(file: Path, settings: NuscenesInput) -> Path:
-    if settings.tables is not None:
-        folder = file.parent / settings.tables
-    else:
-        found = [each.parent for each in sorted(file.parent.glob("v1.0-*/ego_pose.json"))]
-        folder = found[0] if len(found) == 1 else file.parent
+    beside = sorted(each.parent for each in file.parent.glob("v1.0-*/ego_pose.json"))
+    folder = file.parent / (settings.tables or (beside[0] if len(beside) == 1 else ""))
     if not (folder / "ego_pose.json").is_file():
         raise CallError(f"{file}: no folder with ego_pose.json is beside it, name one as input.nuscenes.tables")
     return folder
@@ -133,9 +130,6 @@ def _boxes(boxes: list[Json], settings: NuscenesInput) -> Iterator[Detection | s
         score = float(box.get("detection_score", box.get("tracking_score", math.nan)))
         if settings.classes and name not in settings.classes:
             yield "input.nuscenes.classes"
-            continue
-        if score < settings.min_score:
-            yield "input.nuscenes.min_score"
             continue
         x_m, y_m, z_m = map(float, box["translation"])
         width_m, length_m, height_m = map(float, box["size"])

@@ -1,4 +1,4 @@
-"""Object lists of the message types in use; each adapter gives all that the message measures.
+"""Object lists of the message types in use, and the ego of odometry; each adapter gives all that a message measures.
 
 Which of it a tracker uses is the sensor model's choice. A speed is negative where an object moves backwards.
 No object is left out: what is not a number stays so and is counted by the tracker.
@@ -8,9 +8,10 @@ import math
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from fgtrack.core.geometry import wrap_angle
-from fgtrack.core.types import Detection
+from fgtrack.core.types import Detection, EgoState, FloatArray
 from fgtrack.io.adapters.common import (
     ObjectList,
     RosMessage,
@@ -19,15 +20,19 @@ from fgtrack.io.adapters.common import (
     object_list,
     planar,
     signed_speed_mps,
+    speed_gradient,
     speed_variance,
     stamp_ns,
     yaw_rad,
 )
 
+ODOMETRY = "nav_msgs/msg/Odometry"
+
 _ORIENTATION_AVAILABLE = 2  # in autoware's DetectedObjectKinematics
 _AUTOWARE_CLASSES = ("unknown", "car", "truck", "bus", "trailer", "motorcycle", "bicycle", "pedestrian")
 _ESR_NO_TARGET = 0  # status
 _ID_MASK = (1 << 63) - 1
+_UNKNOWN = 1e3
 
 
 def detection3d_array(message: RosMessage) -> ObjectList:
@@ -172,3 +177,36 @@ def odometry(message: RosMessage) -> ObjectList:
     variance = speed_variance(velocity.x, velocity.y, planar(message.twist.covariance)[:2, :2])
     item = Detection(**values, covariance=covariance(values, planar(message.pose.covariance), variance))
     return object_list(message.header, [item])
+
+
+def ego_from_odometry(message: RosMessage, receipt_ns: int) -> EgoState:
+    """`nav_msgs/Odometry`: pose in the map, twist in the ego's own frame; an unknown yaw is NaN."""
+    pose, twist = message.pose.pose, message.twist.twist
+    yaw = yaw_rad(pose.orientation)
+    return EgoState(
+        stamp_ns(message.header.stamp),
+        receipt_ns,
+        x_m=pose.position.x,
+        y_m=pose.position.y,
+        yaw_rad=math.nan if yaw is None else yaw,
+        speed_mps=signed_speed_mps(twist.linear.x, twist.linear.y, 0.0),
+        yaw_rate_radps=twist.angular.z,
+        covariance=_ego_covariance(message),
+    )
+
+
+def _ego_covariance(message: RosMessage) -> tuple[float, ...] | None:
+    """Covariance of x, y, yaw, speed and yaw rate, row-major; of pose and twist each, zero where it is not known."""
+    velocity = message.twist.twist.linear
+    direction = speed_gradient(velocity.x, velocity.y)
+    J = np.eye(2, 3, k=1)  # of speed and yaw rate by vx, vy and yaw rate
+    J[0, :2] = -direction if signed_speed_mps(velocity.x, velocity.y, 0.0) < 0.0 else direction
+    parts = planar(message.pose.covariance), J @ planar(message.twist.covariance) @ J.T
+    full = block_diag(*(part if _is_known(part) else np.zeros_like(part) for part in parts))
+    return tuple(full.ravel().tolist()) if full.any() else None
+
+
+def _is_known(covariance: FloatArray) -> bool:
+    """True if all is finite and every variance is in use: "unknown" is 0 or -1 in ROS, 1e3 or more in many drivers."""
+    variances = np.diag(covariance)
+    return bool(np.isfinite(covariance).all() and (variances > 0.0).all() and (variances < _UNKNOWN).all())

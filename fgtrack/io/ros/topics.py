@@ -10,7 +10,6 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DESCRIBING, MEASURABLE, Detection, DetectionList, Message, TruthState
 from fgtrack.io.adapters import ADAPTERS, message_types
 from fgtrack.io.adapters.common import ObjectList, RosMessage, object_id, split
-from fgtrack.io.adapters.ego import ODOMETRY, ego_from_odometry
 from fgtrack.io.adapters.fields import (
     EGO_FIELDS,
     OBJECT_FIELDS,
@@ -21,6 +20,7 @@ from fgtrack.io.adapters.fields import (
     value_at,
 )
 from fgtrack.io.adapters.native import DETECTIONS, EGO, NATIVE_ADAPTERS, TRUTH, detections
+from fgtrack.io.adapters.objects import ODOMETRY, ego_from_odometry
 from fgtrack.io.adapters.scans import grouped
 from fgtrack.io.config import InputConfig, TopicInput
 from fgtrack.io.errors import TruncatedInput
