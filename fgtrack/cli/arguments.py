@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
+from typer import Argument, Option
 
 from fgtrack.io.recording import Storage
 
@@ -31,35 +31,20 @@ def estimators(incomplete: str) -> list[str]:
     return [f"{before}{comma}{name}" for name in ESTIMATORS]
 
 
-Input = Annotated[
-    Path,
-    typer.Argument(metavar="INPUT", help="Recording: rosbag2, .mcap, .db3, .bag, stream, CSV or data set."),
-]
+Input = Annotated[Path, Argument(metavar="INPUT", help="Recording: rosbag2, .mcap, .db3, .bag, stream, CSV, data set.")]
 ConfigFile = Annotated[
-    str | None,
-    typer.Option(
-        "-c",
-        "--config",
-        help="Configuration: a file (YAML) or a shipped name; without it the defaults.",
-        autocompletion=configurations,
-    ),
+    str | None, Option("-c", "--config", help="YAML or shipped name.", autocompletion=configurations)
 ]
-TrackMap = Annotated[str | None, typer.Option("--map", help="Map of the track (CSV), or `oval` for the built-in one.")]
-PitMap = Annotated[str | None, typer.Option("--pit-map", help="Map of the pit lane (CSV), or `oval`.")]
-Settings = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Override one key of the configuration; may be repeated."),
-]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what such a command wrote there before.")]
-Reference = Annotated[
-    str | None, typer.Option("--reference", help="Sensor whose clock is right, where two do not agree.")
-]
-Runs = Annotated[
-    list[Path], typer.Argument(metavar="RUN...", help="Run folders, or folders of runs, as that of the demo.")
-]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
-StorageOption = Annotated[Storage, typer.Option("--storage", help="Storage of a rosbag2 folder.")]
+TrackMap = Annotated[str | None, Option("--map", help="Map of the track (CSV), or `oval` for the built-in one.")]
+PitMap = Annotated[str | None, Option("--pit-map", help="Map of the pit lane (CSV), or `oval`.")]
+Settings = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help="Override a key; repeatable.")]
+Overwrite = Annotated[bool, Option("--overwrite", help="Replace what such a command wrote there before.")]
+Seed = Annotated[int, Option(min=0, help="Seed of the random generator.")]
+Reference = Annotated[str | None, Option("--reference", help="Sensor whose clock is right, where two do not agree.")]
+Runs = Annotated[list[Path], Argument(metavar="RUN...", help="Run folders, or folders of runs, as that of the demo.")]
+Json = Annotated[bool, Option("--json", help="Print JSON instead of tables.")]
+StorageOption = Annotated[Storage, Option("--storage", help="Storage of a rosbag2 folder.")]
 
 Form = Literal["md", "csv", "latex", "json"]
-FormOption = Annotated[Form | None, typer.Option("--format", help="Print this instead of tables for a terminal.")]
-All = Annotated[bool, typer.Option("--all", help="Show every table and column, not the main ones alone.")]
+FormOption = Annotated[Form | None, Option("--format", help="Print this instead of tables for a terminal.")]
+All = Annotated[bool, Option("--all", help="Show every table and column, not the main ones alone.")]

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Option
 
 from fgtrack.calibration.advise import advise as advised
 from fgtrack.calibration.clock_offsets import OffsetReport, estimate_offsets
@@ -35,10 +35,7 @@ _DELAYS = ("mean_s", "p50_s", "p90_s", "max_s")
 def info(
     recording: Input,
     config_file: ConfigFile = None,
-    write: Annotated[
-        Path | None,
-        typer.Option("--write", metavar="MY.yaml", help="Write a commented starting configuration for the recording."),
-    ] = None,
+    write: Annotated[Path | None, Option(metavar="MY.yaml", help="Write a configuration to start from.")] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
@@ -138,10 +135,8 @@ def _whole(value: Value) -> str:
 def advise(
     recording: Input,
     config_file: ConfigFile = None,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Configuration to write that follows the advice (YAML).")
-    ] = None,
-    tune: Annotated[bool, typer.Option("--tune", help="Fit noise that does not fit, too.")] = False,
+    out: Annotated[Path | None, Option("-o", "--out", help="Configuration that follows the advice.")] = None,
+    tune: Annotated[bool, Option("--tune", help="Fit noise that does not fit, too.")] = False,
     reference: Reference = None,
     track_map: TrackMap = None,
     pit_map: PitMap = None,

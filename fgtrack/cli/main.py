@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Option
 from typer.core import TyperGroup
 
 import fgtrack
@@ -86,14 +87,9 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
-    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
-    ] = False,
-    max_memory_gb: Annotated[
-        float,
-        typer.Option("--max-memory", min=0.0, metavar="GIB", help="Most memory that the command may use; 0: all."),
-    ] = 4.0,
+    debug: Annotated[bool, Option("--debug", help="Show the traceback of an error.")] = False,
+    version: Annotated[bool, Option("--version", callback=_version, is_eager=True, help="Show the version.")] = False,
+    max_memory_gb: Annotated[float, Option("--max-memory", min=0.0, metavar="GIB", help="Most memory; 0: all.")] = 4.0,
 ) -> None:
     """Options before the command; `main` reads --debug itself."""
     if max_memory_gb and sys.platform == "linux":  # elsewhere the system does not hold to it

@@ -5,8 +5,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Annotated, Literal, cast
 
-import typer
 from matplotlib.figure import Figure
+from typer import Argument, Option
 
 from fgtrack.calibration.study import head_at
 from fgtrack.cli.arguments import Overwrite, Runs
@@ -25,21 +25,14 @@ from fgtrack.viewers.report import write_report
 
 
 def figure(
-    runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN...", help="Run folders, folders of run folders, or one sweep folder.")
-    ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the pictures, or one .pdf.")],
-    form: Annotated[Literal["png", "svg", "pdf"], typer.Option("--format", help="Format of the pictures.")] = "png",
-    stamp: Annotated[
-        float | None, typer.Option(min=0.0, max=1e9, help="Stamp of the close-up: s after the first tick.")
-    ] = None,
-    width: Annotated[
-        str | None,
-        typer.Option(metavar="3.4in", help="Width on paper (in, cm, mm), without title."),
-    ] = None,
-    font: Annotated[str | None, typer.Option(metavar="NAME", help='Font, as "Times New Roman".')] = None,
-    style: Annotated[str | None, typer.Option(metavar="FILE", help="Style of matplotlib (.mplstyle).")] = None,
-    every: Annotated[bool, typer.Option("--all", help="Draw every object, run and metric, not the few.")] = False,
+    runs: Annotated[list[Path], Argument(metavar="RUN...", help="Run folders, folders of runs, or one sweep folder.")],
+    out: Annotated[Path, Option("-o", "--out", help="Folder for the pictures, or one .pdf.")],
+    form: Annotated[Literal["png", "svg", "pdf"], Option("--format", help="Format of the pictures.")] = "png",
+    stamp: Annotated[float | None, Option(min=0.0, max=1e9, help="Close-up so many s after the first tick.")] = None,
+    width: Annotated[str | None, Option(metavar="3.4in", help="Width on paper (in, cm, mm), without title.")] = None,
+    font: Annotated[str | None, Option(metavar="NAME", help='Font, as "Times New Roman".')] = None,
+    style: Annotated[str | None, Option(metavar="FILE", help="Style of matplotlib (.mplstyle).")] = None,
+    every: Annotated[bool, Option("--all", help="Draw every object, run and metric, not the few.")] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Draw runs or a sweep: late detections, map, errors, time.
@@ -99,7 +92,7 @@ def _of_runs(
 
 def report(
     runs: Runs,
-    out: Annotated[Path, typer.Option("-o", "--out", help="HTML file.")],
+    out: Annotated[Path, Option("-o", "--out", help="HTML file.")],
     overwrite: Overwrite = False,
 ) -> None:
     """Write one HTML file: verdict, viewer, figures, tables.

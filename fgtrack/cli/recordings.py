@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Annotated, get_args
 
 import numpy as np
-import typer
 from rich.table import Table as Grid
 from rich.text import Text
+from typer import Argument, Option
 
-from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, Settings, StorageOption, scenarios
+from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, Seed, Settings, StorageOption, scenarios
 from fgtrack.cli.show import console, progress, say
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.diagnostics import excluded_lines
@@ -25,19 +25,10 @@ from fgtrack.sim.simulate import simulate as simulated
 
 
 def simulate(
-    scenario_file: Annotated[
-        str,
-        typer.Argument(
-            metavar="SCENARIO",
-            help="Scenario: a file (YAML) or a shipped name, as `default`.",
-            autocompletion=scenarios,
-        ),
-    ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Stream (.jsonl, .jsonl.gz), else a rosbag2 folder.")],
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random generator.")] = 0,
-    duration_s: Annotated[
-        float | None, typer.Option("--duration", help="Length in seconds, instead of the scenario's.")
-    ] = None,
+    scenario_file: Annotated[str, Argument(metavar="SCENARIO", help="YAML or shipped name.", autocompletion=scenarios)],
+    out: Annotated[Path, Option("-o", "--out", help="Stream (.jsonl, .jsonl.gz), else a rosbag2 folder.")],
+    seed: Seed = 0,
+    duration_s: Annotated[float | None, Option("--duration", help="Length [s], instead of the scenario's.")] = None,
     storage: StorageOption = "mcap",
     overwrite: Overwrite = False,
 ) -> None:
@@ -53,13 +44,10 @@ def simulate(
 
 def convert(
     recording: Input,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Stream (.jsonl, .jsonl.gz), else a rosbag2 folder.")],
+    out: Annotated[Path, Argument(metavar="OUT", help="Stream (.jsonl, .jsonl.gz), else a rosbag2 folder.")],
     config_file: ConfigFile = None,
-    delays_file: Annotated[
-        Path | None,
-        typer.Option("--delays", help="Give detections other delays, losses and clock errors by sensor (YAML)."),
-    ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random generator of --delays.")] = 0,
+    delays_file: Annotated[Path | None, Option("--delays", help="Other delays, losses, clocks by sensor.")] = None,
+    seed: Seed = 0,
     storage: StorageOption = "mcap",
     overwrite: Overwrite = False,
 ) -> None:
@@ -94,9 +82,7 @@ def _with_unread(messages: Iterable[Message], unread: dict[str, Counter[str]]) -
 def config(
     config_file: ConfigFile = None,
     settings: Settings = None,
-    listed: Annotated[
-        bool, typer.Option("--list", help="List the shipped configurations, scenarios and sweeps.")
-    ] = False,
+    listed: Annotated[bool, Option("--list", help="List the shipped configurations, scenarios and sweeps.")] = False,
 ) -> None:
     """Print the resolved configuration, or list the shipped ones."""
     if not listed:

@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Option
 
 from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, PitMap, Settings, TrackMap, estimators
 from fgtrack.cli.show import progress, say, warn
@@ -21,16 +21,10 @@ from fgtrack.pipeline.shipped import read_config
 
 def replay(
     recording: Input,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Run folder; for several estimators one below it each.")],
+    out: Annotated[Path, Option("-o", "--out", help="Run folder; for several estimators one below it each.")],
     config_file: ConfigFile = None,
     estimators: Annotated[
-        str | None,
-        typer.Option(
-            "-e",
-            "--estimator",
-            help="Estimator, or several with commas between them.",
-            autocompletion=estimators,
-        ),
+        str | None, Option("-e", "--estimator", help="Names, with commas between them.", autocompletion=estimators)
     ] = None,
     track_map: TrackMap = None,
     pit_map: PitMap = None,

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Option
 
 from fgtrack.cli.arguments import All, FormOption, Json, Overwrite, Runs
 from fgtrack.cli.show import progress, say, show, warn
@@ -22,9 +22,7 @@ def compare(
     as_json: Json = False,
     form: FormOption = None,
     everything: All = False,
-    streaming: Annotated[
-        bool, typer.Option("--streaming", help="Judge what was published when it was ready, too.")
-    ] = False,
+    streaming: Annotated[bool, Option("--streaming", help="Judge what was published when it was ready, too.")] = False,
 ) -> None:
     """Compare runs in tables, and write metrics.json into each."""
     form = "json" if as_json else form
@@ -46,16 +44,9 @@ def compare(
 
 def export(
     runs: Runs,
-    out: Annotated[
-        Path, typer.Option("-o", "--out", help="MCAP file; --ros2: or a rosbag2 folder; --kitti: a text file.")
-    ],
-    ros2: Annotated[
-        bool, typer.Option("--ros2", help="Write standard ROS 2 messages instead of Foxglove's own.")
-    ] = False,
-    kitti: Annotated[
-        Path | None,
-        typer.Option("--kitti", metavar="OXTS", help="Write a KITTI result; names the sequence's oxts/NNNN.txt."),
-    ] = None,
+    out: Annotated[Path, Option("-o", "--out", help="MCAP file; --ros2: or a rosbag2 folder; --kitti: a text file.")],
+    ros2: Annotated[bool, Option("--ros2", help="Write standard ROS 2 messages instead of Foxglove's own.")] = False,
+    kitti: Annotated[Path | None, Option(metavar="OXTS", help="Write a KITTI result of this oxts/NNNN.txt.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Export runs for Foxglove, Lichtblick, RViz; or a KITTI result."""

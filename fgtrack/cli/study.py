@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import typer
+from typer import Option
 
 from fgtrack.calibration.study import Study, outputs
 from fgtrack.calibration.study import study as studied
-from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, PitMap, Settings, TrackMap
+from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, PitMap, Seed, Settings, TrackMap
 from fgtrack.cli.show import progress, say, sentences, show, warn
 from fgtrack.core.errors import DataError
 from fgtrack.evaluation.diagnostics import diagnostics
@@ -26,7 +26,7 @@ from fgtrack.sim.simulate import simulate
 
 def study(
     recording: Input,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for report, settings, runs and figures.")],
+    out: Annotated[Path, Option("-o", "--out", help="Folder for report, settings, runs and figures.")],
     config_file: ConfigFile = None,
     track_map: TrackMap = None,
     pit_map: PitMap = None,
@@ -68,10 +68,10 @@ _CONFIG = "tuned"
 
 
 def demo(
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for recording, runs, figures and report.")] = Path(
+    out: Annotated[Path, Option("-o", "--out", help="Folder for recording, runs, figures and report.")] = Path(
         "fgtrack-demo"
     ),
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random generator.")] = 1,
+    seed: Seed = 1,
     overwrite: Overwrite = False,
 ) -> None:
     """Simulate a race, record it, and study the recording."""

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import pandas as pd
-import typer
+from typer import Argument, Option
 
 from fgtrack.cli.arguments import All, Form, FormOption, Overwrite, Settings, sweeps
 from fgtrack.cli.show import progress, say, show
@@ -39,24 +39,11 @@ _NAMES = ("name", "estimator")
 
 
 def sweep(
-    sweep_name: Annotated[
-        str,
-        typer.Argument(
-            metavar="SWEEP",
-            help="What is varied: a file (YAML, fgtrack-sweep/1) or a shipped name.",
-            autocompletion=sweeps,
-        ),
-    ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the tables; what is done there is kept.")],
-    jobs: Annotated[
-        int | None, typer.Option("--jobs", min=1, help="Processes on this machine.", show_default="one for each core")
-    ] = None,
-    dask: Annotated[
-        str | None, typer.Option("--dask", metavar="ADDRESS", help="Let the workers of a dask cluster do it.")
-    ] = None,
-    recording: Annotated[
-        Path | None, typer.Option("--input", metavar="INPUT", help="Replay this instead of the sweep's input.")
-    ] = None,
+    sweep_name: Annotated[str, Argument(metavar="SWEEP", help="YAML or shipped name.", autocompletion=sweeps)],
+    out: Annotated[Path, Option("-o", "--out", help="Folder of the tables; what is done there is kept.")],
+    jobs: Annotated[int | None, Option(min=1, help="Processes, by default one for each core.")] = None,
+    dask: Annotated[str | None, Option(metavar="ADDRESS", help="Cluster of dask to run on.")] = None,
+    recording: Annotated[Path | None, Option("--input", metavar="INPUT", help="Instead of the sweep's input.")] = None,
     settings: Settings = None,
     form: FormOption = None,
     everything: All = False,

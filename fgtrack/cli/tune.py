@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from fgtrack.calibration.outcome import noise_fits
 from fgtrack.calibration.tune import tuned
@@ -24,17 +24,13 @@ _KNOWN = {"yes": "yes", "roughly": "roughly", "limit": "a limit", "no": "not ide
 
 
 def tune(
-    recordings: Annotated[
-        list[Path], typer.Argument(metavar="INPUT...", help="Recordings, as for replay; their noise is the same.")
-    ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Tuned configuration to write (YAML).")],
+    recordings: Annotated[list[Path], Argument(metavar="INPUT...", help="Recordings with the same noise.")],
+    out: Annotated[Path, Option("-o", "--out", help="Tuned configuration to write (YAML).")],
     config_file: ConfigFile = None,
     track_map: TrackMap = None,
     pit_map: PitMap = None,
     settings: Settings = None,
-    keep: Annotated[
-        list[str] | None, typer.Option("--keep", metavar="KEY", help="Leave this key as configured; may be repeated.")
-    ] = None,
+    keep: Annotated[list[str] | None, Option(metavar="KEY", help="Leave this key as configured; repeatable.")] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:

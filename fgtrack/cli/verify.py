@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Annotated
 
-import typer
+from typer import Option
 
 from fgtrack.cli.arguments import Json, estimators
 from fgtrack.cli.show import progress, say, show
@@ -23,9 +23,7 @@ _COLUMNS = (
 
 def verify(
     as_json: Json = False,
-    name: Annotated[
-        str | None, typer.Option("-e", "--estimator", help="This one alone.", autocompletion=estimators)
-    ] = None,
+    name: Annotated[str | None, Option("-e", "--estimator", help="This one alone.", autocompletion=estimators)] = None,
 ) -> int:
     """Check the contract of estimators, in any order of arrival.
 
