@@ -3,11 +3,11 @@
 Every message carries two times: `stamp_ns` (the world was sensed) and `receipt_ns` (the tracker got it).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from itertools import takewhile
-from typing import Literal, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -266,7 +266,7 @@ class SmoothedReport:
     """Time from the state to the tick; None of a final one."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class TickReport:
     """All that one tracker tick gives."""
 
@@ -275,3 +275,22 @@ class TickReport:
     tracks: tuple[TrackReport, ...]
     updates: tuple[UpdateRecord, ...]
     smoothed: tuple[SmoothedReport, ...] = ()
+
+    @classmethod
+    def made_later(
+        cls, tick: int, now_ns: int, smoothed: Sequence[SmoothedReport], **makers: Callable[[], Iterable[object]]
+    ) -> Self:
+        """Return a report whose `tracks` and `updates` the `makers` of these names give when they are asked for."""
+        report = object.__new__(cls)
+        report.__dict__.update(tick=tick, now_ns=now_ns, smoothed=tuple(smoothed), makers=makers)
+        return report
+
+    def __getattr__(self, name: str) -> Any:  # Any: of what is not made yet
+        makers = self.__dict__.get("makers", {})
+        if name not in makers:
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        self.__dict__[name] = made = tuple(makers.pop(name)())
+        return made
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {each.name: getattr(self, each.name) for each in fields(self)}

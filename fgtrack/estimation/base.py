@@ -284,7 +284,7 @@ class TrackBank(Protocol):
     def remove(self, track_id: int) -> None:
         """Forget a track."""
 
-    def present(self) -> list[TrackState]:
+    def present(self) -> Sequence[TrackState]:
         """Kinematic states (x, y, yaw, speed, yaw rate[, acceleration]) now, in the order of `track_ids`."""
 
     def smoothed(self) -> list[SmoothedReport]:

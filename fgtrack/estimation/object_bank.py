@@ -1,7 +1,6 @@
 """A bank of independent estimators, and the estimator of one object from a bank."""
 
 from collections.abc import Callable, Sequence
-from itertools import repeat
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -94,13 +93,13 @@ class ObjectBank(Generic[_E]):
         """See `TrackBank.remove`."""
         del self._estimators[track_id]
 
-    def present(self) -> list[TrackState]:
+    def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
         if not self._estimators:
             return []
         states = self._ask(lambda _, one: self._state(one, max(self._now_ns, one.window_ns[0]))).values()
         means, covariances = zip(*((state.mean, state.covariance) for state in states), strict=True)
-        return kinematic_states(self._motion, repeat(self._now_ns), np.array(means), np.array(covariances))
+        return kinematic_states(self._motion, self._now_ns, np.array(means), np.array(covariances))
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`: none."""

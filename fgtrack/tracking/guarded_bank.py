@@ -12,6 +12,7 @@ from fgtrack.core.linalg import kernels
 from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import EstimatorError, Failure, Failures
+from fgtrack.estimation.filters.propagation import States
 
 _T = TypeVar("_T")
 
@@ -108,7 +109,7 @@ class GuardedBank:
             else:
                 self._start_over(error)
 
-    def present(self) -> list[TrackState]:
+    def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; all are sound."""
         while True:
             states = self._ask(lambda bank: bank.present())
@@ -169,8 +170,11 @@ def faults(states: Sequence[TrackState]) -> dict[int, Failure]:
     """
     if not states:
         return {}
-    x = np.array([state.mean for state in states], dtype=np.float64)
-    P = np.array([state.covariance for state in states], dtype=np.float64)
+    if isinstance(states, States):
+        x, P = states.means, states.covariances
+    else:
+        x, P = np.array([state.mean for state in states]), np.array([state.covariance for state in states])
+    x, P = (np.array(each, dtype=np.float64, order="C") for each in (x, P))
     codes = kernels("fgtrack.tracking.kernels").faults(x, P)
     kinds = Failure.NOT_FINITE, Failure.NOT_DEFINITE
     return {row: kinds[codes[row] - 1] for row in codes.nonzero()[0].tolist()} if codes.any() else {}

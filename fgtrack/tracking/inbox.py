@@ -12,6 +12,7 @@ from fgtrack.core.checks import LARGEST
 from fgtrack.core.linalg import is_covariance
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import Detection, DetectionList, Disposition, FloatArray, Frame, UpdateRecord
+from fgtrack.estimation.base import Measurement
 from fgtrack.models.sensors import SensorModel
 
 #: In any unit: no sensor is better than this.
@@ -37,10 +38,15 @@ def record(
     disposition: Disposition,
     track_id: int | None = None,
     nis: float | None = None,
-    innovation: Mapping[str, float] | None = None,
+    measurement: Measurement | None = None,
+    innovation: FloatArray | None = None,
 ) -> UpdateRecord:
-    """Return the record of detection `index` of `message`."""
-    stamp_ns = message.objects[index].stamp_ns
+    """Return the record of detection `index` of `message`; the innovation is that of `measurement`, or one like it."""
+    stamp_ns, named = message.objects[index].stamp_ns, dict[str, float]()
+    if measurement is not None and innovation is not None:
+        named = dict(zip(measurement.model.components, innovation.tolist(), strict=True))
+        for name in measurement.assumed:
+            del named[name]
     return UpdateRecord(
         message.sensor,
         message.stamp_ns if stamp_ns is None else stamp_ns,
@@ -49,7 +55,7 @@ def record(
         disposition,
         track_id,
         nis,
-        innovation or {},
+        named,
     )
 
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import repeat
+from typing import Any
 
 import numpy as np
 
@@ -16,13 +17,15 @@ from fgtrack.core.types import (
     Disposition,
     EgoState,
     FloatArray,
+    ObjectReport,
     SmoothedReport,
     TickReport,
     TrackReport,
     TrackState,
+    TrackStatus,
     UpdateRecord,
 )
-from fgtrack.estimation.base import Measurement, Measurements, Start, StatesAt, TrackBank, UpdateResult, UpdateStatus
+from fgtrack.estimation.base import Measurements, Start, StatesAt, TrackBank, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.ekf import correct_one, propagated
 from fgtrack.estimation.filters.propagation import kinematic_states
@@ -40,6 +43,8 @@ from fgtrack.tracking.lifecycle import Scan
 from fgtrack.tracking.objects import Objects
 from fgtrack.tracking.preprocess import Candidates, Preprocess
 
+_Own = tuple[int, TrackStatus, int, ObjectReport | None]
+"""Id, status, number of measurements and object of a track."""
 _DISPOSITIONS = {status: Disposition(status.value) for status in UpdateStatus}
 
 
@@ -86,7 +91,7 @@ class Tracker:
         self._parts = parts
         self._tick = -1
         self._next_id = 0
-        self._records: list[UpdateRecord] = []
+        self._records: list[UpdateRecord | tuple[Any, ...]] = []  # or what `record` makes one of
         self._num_measured = Counter[int]()  # detections that have changed the state, by track
         self._undirected: dict[int, Start] = {}  # of tracks with one position and an unknown heading, by id
         self._seen: dict[int, set[int]] = {}  # in this tick, by message: tracks that it has matched or started
@@ -123,11 +128,17 @@ class Tracker:
         self._seen = {}
         for batch in batches:
             self._process_if_possible(batch)
-        updates, self._records = tuple(self._records), []
+        noted, self._records = self._records, []
         bank = self._parts.bank
         states = bank.present()  # first: tracks may end by it
-        tracks = tuple(map(self._report, bank.track_ids, states))
-        return TickReport(self._tick, now_ns, tracks, updates, tuple(bank.smoothed()))
+        own = list(map(self._own, bank.track_ids))
+        return TickReport.made_later(
+            self._tick,
+            now_ns,
+            bank.smoothed(),
+            tracks=lambda: map(_report, own, states),
+            updates=lambda: (each if isinstance(each, UpdateRecord) else record(*each) for each in noted),
+        )
 
     def finish(self) -> tuple[SmoothedReport, ...]:
         """End all tracks; gives the final smoothed states that were still inside a window."""
@@ -153,9 +164,9 @@ class Tracker:
         states = states_of(bank, motion, stamp_ns)
         if not states.track_ids:
             return ()
-        present = kinematic_states(motion, repeat(stamp_ns), states.means, states.covariances)
+        present = kinematic_states(motion, stamp_ns, states.means, states.covariances)
         unsound, rows = faults(present), enumerate(zip(states.track_ids, present, strict=True))
-        return tuple(self._report(*track) for row, track in rows if row not in unsound)
+        return tuple(_report(self._own(i), state) for row, (i, state) in rows if row not in unsound)
 
     def _process_if_possible(self, batch: Batch) -> None:
         """Process a batch; after an exception that is not propagated, the rest of it ends as failed."""
@@ -167,7 +178,8 @@ class Tracker:
                 raise
             self.failures.add(Failure.LIST_FAILED)
             self.failures.note(error)
-            ended = {update.index for update in self._records[first:]}
+            noted = self._records[first:]
+            ended = {each.index if isinstance(each, UpdateRecord) else each[1] for each in noted}
             failed = [index for index in batch.indices if index not in ended]
             self._records += [record(batch.message, index, Disposition.FAILED) for index in failed]
 
@@ -263,31 +275,27 @@ class Tracker:
 
     def _estimate(self, batch: Batch, candidates: Candidates, assignment: Assignment, states: StatesAt) -> None:
         """Fuse the matched candidates, group by group; the records are in the order of the candidates."""
-        bank, results = self._parts.bank, dict[int, tuple[Measurement, UpdateResult]]()
+        bank, results = self._parts.bank, dict[int, tuple[Measurements, int, UpdateResult]]()
         chosen, tracks = np.array(assignment.pairs).T
         for group, members, here in candidates.split(chosen):
             of = tracks[here]
             measurements = Measurements(group.seen_at(members, states.means[of]))
-            track_ids = [states.track_ids[track] for track in of.tolist()]
-            updated = bank.update(batch.stamp_ns, track_ids, measurements)
-            results.update(zip(here.tolist(), zip(measurements, updated, strict=True), strict=True))
+            updated = bank.update(batch.stamp_ns, [states.track_ids[track] for track in of.tolist()], measurements)
+            results.update(zip(here.tolist(), zip(repeat(measurements), range(len(of)), updated), strict=True))
         for k, (position, track) in enumerate(assignment.pairs):
-            (measurement, result), track_id, innovation = results[k], states.track_ids[track], dict[str, float]()
+            (measurements, index, result), track_id = results[k], states.track_ids[track]
             nis = result.nis
             if result.innovation is not None:
                 self._num_measured[track_id] += 1
-                is_placed = candidates.placed[position]
-                if is_placed:
+                if candidates.placed[position]:
                     self._parts.lifecycle.fused(track_id)
-                if is_placed and self._undirected.pop(track_id, None) is not None:
-                    # The prior of the estimator, linearised along an unknown direction, spreads along it alone.
-                    seen = measurement.seen_by(self._parts.motion)
-                    with suppress(np.linalg.LinAlgError):
-                        nis = correct_one(states.means[track], states.covariances[track], seen).nis
-                innovation = dict(zip(measurement.model.components, result.innovation.tolist(), strict=True))
-                for name in measurement.assumed:
-                    del innovation[name]
-            self._conclude(batch, candidates, position, _DISPOSITIONS[result.status], track_id, nis, innovation)
+                    if self._undirected.pop(track_id, None) is not None:
+                        # The estimator's prior, linearised along an unknown direction, spreads along it alone.
+                        seen = measurements[index].seen_by(self._parts.motion)
+                        with suppress(np.linalg.LinAlgError):
+                            nis = correct_one(states.means[track], states.covariances[track], seen).nis
+            outcome = _DISPOSITIONS[result.status], track_id, nis, measurements.stack, result.innovation
+            self._conclude(batch, candidates, position, *outcome)
 
     def _give_birth(self, batch: Batch, candidates: Candidates, position: int, scan: Scan) -> None:
         parts, prior, candidate = self._parts, None, candidates[position]
@@ -322,14 +330,13 @@ class Tracker:
         position: int,
         disposition: Disposition,
         track_id: int | None = None,
-        nis: float | None = None,
-        innovation: Mapping[str, float] | None = None,
+        *more: object,
     ) -> None:
-        """Record the outcome of a candidate, and of the detections that were merged into it."""
+        """Note the outcome of a candidate, see `record`, and of the detections that were merged into it."""
         leader = candidates.leaders[position]
-        self._records.append(record(batch.message, leader, disposition, track_id, nis, innovation))
+        self._records.append((batch.message, leader, disposition, track_id, *more))
         for index in candidates.merged.get(leader, ()):
-            self._records.append(record(batch.message, index, Disposition.MERGED, track_id))
+            self._records.append((batch.message, index, Disposition.MERGED, track_id))
 
     def _end(self, track_ids: Sequence[int]) -> None:
         for track_id in track_ids:
@@ -339,6 +346,11 @@ class Tracker:
             del self._num_measured[track_id]
             self._parts.lifecycle.forget(track_id)
 
-    def _report(self, track_id: int, state: TrackState) -> TrackReport:
-        status, report = self._parts.lifecycle.status(track_id), self._parts.objects.report(track_id)
-        return TrackReport(track_id, status, state, self._num_measured[track_id], report)
+    def _own(self, track_id: int) -> _Own:
+        parts = self._parts
+        return track_id, parts.lifecycle.status(track_id), self._num_measured[track_id], parts.objects.report(track_id)
+
+
+def _report(own: _Own, state: TrackState) -> TrackReport:
+    track_id, status, num_measured, described = own
+    return TrackReport(track_id, status, state, num_measured, described)

@@ -1,7 +1,6 @@
 """Published states are sound."""
 
 from collections.abc import Sequence
-from itertools import repeat
 
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ def present(motion: MotionModel, count: int = 3) -> list[TrackState]:
     rng = np.random.default_rng(1)
     means = rng.normal(size=(count, motion.dim)) * 10.0 + 5.0
     roots = rng.normal(size=(count, motion.dim, motion.dim))
-    return kinematic_states(motion, repeat(0), means, roots @ roots.mT + 0.1 * np.eye(motion.dim))
+    return kinematic_states(motion, 0, means, roots @ roots.mT + 0.1 * np.eye(motion.dim))
 
 
 def spoilt(states: Sequence[TrackState], place: int, mean: FloatArray, covariance: FloatArray) -> list[TrackState]:

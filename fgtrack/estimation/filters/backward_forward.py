@@ -8,7 +8,6 @@ is the baseline, and not a replay.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import repeat
 from typing import NamedTuple
 
 import numpy as np
@@ -186,7 +185,7 @@ class BackwardForwardBank:
         del self._objects[track_id]
         self._cached.clear()
 
-    def present(self) -> list[TrackState]:
+    def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; the part of a step beyond the newest grid stamp is predicted."""
         states = self._at_grid(self._grid)
         if not states.track_ids:
@@ -196,7 +195,7 @@ class BackwardForwardBank:
         if rest_s:
             one = np.ones(len(mean), dtype=np.int64)
             mean, covariance = self._propagator.propagate(mean, covariance, one, rest_s)
-        return kinematic_states(self._propagator.motion, repeat(self.present_ns), mean, covariance)
+        return kinematic_states(self._propagator.motion, self.present_ns, mean, covariance)
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`: none."""

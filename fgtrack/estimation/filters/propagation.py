@@ -1,7 +1,8 @@
 """Propagators of many objects through equal time steps, and the kinematic states that a bank gives."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -91,9 +92,24 @@ def wrapped_yaw(mean: FloatArray) -> FloatArray:
     return found
 
 
+class States(Sequence[TrackState]):
+    """States of several objects; each is made when it is asked for."""
+
+    def __init__(self, stamps_ns: Sequence[int], means: FloatArray, covariances: FloatArray) -> None:
+        self.stamps_ns, self.means, self.covariances = stamps_ns, means, covariances
+        """Shapes (m,), (m, n) and (m, n, n)."""
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def __getitem__(self, index: Any) -> Any:  # Any: there are no slices
+        return TrackState(self.stamps_ns[index], self.means[index], self.covariances[index])
+
+
 def kinematic_states(
-    motion: MotionModel, stamps_ns: Iterable[int], means: FloatArray, covariances: FloatArray
-) -> list[TrackState]:
-    """Kinematic states of m states of `motion`, shapes (m, n) and (m, n, n), at these stamps."""
+    motion: MotionModel, stamps_ns: int | Sequence[int], means: FloatArray, covariances: FloatArray
+) -> States:
+    """Kinematic states of m states of `motion`, shapes (m, n) and (m, n, n), at these stamps, or at one."""
     means, covariances = motion.kinematic(means, covariances)
-    return list(map(TrackState, stamps_ns, wrapped_yaw(means), covariances))
+    stamps_ns = [stamps_ns] * len(means) if isinstance(stamps_ns, int) else stamps_ns
+    return States(stamps_ns, wrapped_yaw(means), covariances)

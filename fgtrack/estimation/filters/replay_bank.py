@@ -1,7 +1,6 @@
 """The replaying EKFs of all objects in arrays."""
 
 from collections.abc import Callable, Sequence
-from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -72,10 +71,10 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         inside = [i for i, start_ns in zip(self._estimators, self._starts_ns(), strict=True) if start_ns <= stamp_ns]
         return StatesAt(tuple(inside), *self._ahead(inside, [stamp_ns] * len(inside)))
 
-    def present(self) -> list[TrackState]:
+    def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
         stamps_ns = [max(self._now_ns, start_ns) for start_ns in self._starts_ns()]
-        return kinematic_states(self._motion, repeat(self._now_ns), *self._ahead(list(self._estimators), stamps_ns))
+        return kinematic_states(self._motion, self._now_ns, *self._ahead(list(self._estimators), stamps_ns))
 
     def update(
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]

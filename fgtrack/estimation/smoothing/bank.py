@@ -160,13 +160,13 @@ class SmootherBank:
         self._free.append(track)
         self._changed()
 
-    def present(self) -> list[TrackState]:
+    def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
         if not self._tracks:
             return []
         tracks = np.array([*self._tracks.values()], dtype=np.int64)
         states = self.windows.states_at(tracks, np.maximum(self.present_ns, self._times()[2, tracks]))
-        return kinematic_states(self._motion, repeat(self.present_ns), *states)
+        return kinematic_states(self._motion, self.present_ns, *states)
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`."""
@@ -174,7 +174,7 @@ class SmootherBank:
         for lag_s in self._settings.lagged_s:
             stamp_ns = self.present_ns - nanoseconds(lag_s)
             states = self.states_at(stamp_ns)
-            reports += self._reports(states.track_ids, repeat(stamp_ns), states.means, states.covariances, lag_s)
+            reports += self._reports(states.track_ids, stamp_ns, states.means, states.covariances, lag_s)
         return reports
 
     def converge(self, max_iterations: int = 50) -> None:
@@ -186,7 +186,7 @@ class SmootherBank:
     def _reports(
         self,
         track_ids: Iterable[int],
-        stamps_ns: Iterable[int],
+        stamps_ns: int | Sequence[int],
         means: FloatArray,
         covariances: FloatArray,
         lag_s: float | None = None,
