@@ -7,7 +7,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from fgtrack.core.linalg import congruence, inverse_roots, mahalanobis_squared
+from fgtrack.core.linalg import congruence, inverse_root, mahalanobis_squared
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Measurement
@@ -73,7 +73,7 @@ def whitened(term: MeasurementTerm, x: FloatArray) -> FloatArray:
     Raises `numpy.linalg.LinAlgError` for an R that is not positive definite.
     """
     y, H, R = linearised(term, x)
-    rows = inverse_roots(R) @ np.column_stack([H, y])
+    rows = inverse_root(R) @ np.column_stack([H, y])
     if isinstance(term, Measurement) and term.loss is not None:
         rows *= math.sqrt(weight(term.loss, float(np.linalg.norm(rows[:, -1]))))
     return np.asarray(rows)

@@ -8,7 +8,7 @@ import numpy as np
 from gtsam.noiseModel import mEstimator
 from scipy.linalg.lapack import dtrtri
 
-from fgtrack.core.linalg import identity, inverse_roots, noise_roots
+from fgtrack.core.linalg import identity, inverse_root, noise_root
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.smoothing.bank import SmootherBank
@@ -107,7 +107,7 @@ def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float, Q: Fl
             jacobians[0], jacobians[1] = -F, identity(motion.dim)
         return np.subtract(values.atVector(right), mean)
 
-    return gtsam.CustomFactor(_gaussian(noise_roots(Q)), [left, right], error)
+    return gtsam.CustomFactor(_gaussian(noise_root(Q)), [left, right], error)
 
 
 def measurement_factor(key: int, term: MeasurementTerm, origin: FloatArray) -> gtsam.NonlinearFactor:
@@ -127,7 +127,7 @@ def measurement_factor(key: int, term: MeasurementTerm, origin: FloatArray) -> g
             jacobians[0] = H
         return -y
 
-    noise, loss = _gaussian(inverse_roots(term.R)), term.loss
+    noise, loss = _gaussian(inverse_root(term.R)), term.loss
     if loss is not None:
         noise = gtsam.noiseModel.Robust.Create(_LOSSES[loss.kind](loss.width), noise)
     return gtsam.CustomFactor(noise, [key], error)

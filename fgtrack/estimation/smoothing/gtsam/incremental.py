@@ -6,7 +6,7 @@ from functools import cache
 import gtsam
 import numpy as np
 
-from fgtrack.core.linalg import inverse_roots, psd_solve, symmetrise
+from fgtrack.core.linalg import inverse_root, psd_solve, symmetrise
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.smoothing import node_kernels
 from fgtrack.estimation.smoothing.bank import SmootherBank
@@ -190,7 +190,7 @@ class IncrementalSolver(Solver):
         if graph is None:
             nodes, oldest = self.nodes, int(window[0])
             prior = nodes.predicted[oldest]
-            W = inverse_roots(prior[:, :-1])
+            W = inverse_root(prior[:, :-1])
             graph = self._graphs[track] = _Graph(gtsam.JacobianFactor(oldest, W, W @ prior[:, -1], _unit(len(W))))
             nodes.changed[window] = True
         return graph
