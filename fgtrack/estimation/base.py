@@ -23,8 +23,6 @@ Content = tuple[tuple[str, ...], tuple[float, ...], tuple[str, ...]]
 """Names of what is measured, numbers, names of what is assumed and of the loss; it has an order."""
 Order = tuple[int, Content]
 """Stamp and content."""
-NOTHING: Content = (), (), ()
-"""Before every other content."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,25 +43,21 @@ class CorrelatedErrors(MotionModel):
 
     def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.predict`."""
-        moved = self.base.predict(x[..., : self._n], dt_s)
-        return np.concatenate([moved, x[..., self._n :] * np.exp(self._exponents(dt_s))], axis=-1)
+        moved = self.base.predict(x[..., : self.base.dim], dt_s)
+        return np.concatenate([moved, x[..., self.base.dim :] * np.exp(self._exponents(dt_s))], axis=-1)
 
     def jacobian(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.jacobian`."""
-        return self._beside(self.base.jacobian(x[..., : self._n], dt_s), np.exp(self._exponents(dt_s)))
+        return self._beside(self.base.jacobian(x[..., : self.base.dim], dt_s), np.exp(self._exponents(dt_s)))
 
     def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.process_noise`."""
-        Q = self.base.process_noise(x[..., : self._n], dt_s)
+        Q = self.base.process_noise(x[..., : self.base.dim], dt_s)
         return self._beside(Q, -np.expm1(2.0 * self._exponents(dt_s)))
 
     def start_variance(self, name: str) -> float:
         """See `MotionModel.start_variance`; an error is in its stationary state."""
         return self.base.start_variance(name) if name in self.base.state_names else 1.0
-
-    @cached_property
-    def _n(self) -> int:
-        return self.base.dim
 
     @cached_property
     def _rates_hz(self) -> FloatArray:
@@ -74,8 +70,8 @@ class CorrelatedErrors(MotionModel):
     def _beside(self, block: FloatArray, diagonal: FloatArray) -> FloatArray:
         """Block-diagonal matrix (..., n, n) of `block` and of `diagonal` (..., errors)."""
         matrix = np.zeros((*block.shape[:-2], self.dim, self.dim))
-        matrix[..., : self._n, : self._n] = block
-        indices = np.arange(self._n, self.dim)
+        matrix[..., : self.base.dim, : self.base.dim] = block
+        indices = np.arange(self.base.dim, self.dim)
         matrix[..., indices, indices] = diagonal
         return matrix
 

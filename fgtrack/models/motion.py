@@ -234,14 +234,8 @@ class CTRA(CTRV):
     """
 
     accel_density_m2ps5: float = 3.0**2 / 100.0
-    accel_birth_variance_m2ps4: float = 1.0
-    """Variance of the acceleration where `from_kinematic` is given none."""
 
     state_names: ClassVar[tuple[str, ...]] = STATE_NAMES
-
-    def start_variance(self, name: str) -> float:
-        """See `MotionModel.start_variance`: `accel_birth_variance_m2ps4`."""
-        return self.accel_birth_variance_m2ps4
 
 
 @dataclass(frozen=True)

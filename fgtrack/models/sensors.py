@@ -50,10 +50,8 @@ class Filter:
             return False
         if self.min is None and self.max is None:
             return True
-        if not isinstance(value, Real):
-            return False
         low, high = -math.inf if self.min is None else self.min, math.inf if self.max is None else self.max
-        return low <= float(value) <= high
+        return isinstance(value, Real) and low <= float(value) <= high
 
 
 @settings
@@ -190,8 +188,8 @@ class SensorModel:
     @property
     def is_view_given(self) -> bool:
         """True if its field of view or a range is given."""
-        limits = (self.field_of_view_rad, self.max_range_m, self.view_range_m, self.max_range_behind_m)
-        return any(limit is not None for limit in limits)
+        limits = {self.field_of_view_rad, self.max_range_m, self.view_range_m, self.max_range_behind_m}
+        return limits != {None}
 
     def sees(self, positions_m: FloatArray, ego_poses: FloatArray, origin_m: tuple[float, float]) -> BoolArray:
         """True if an object there is in range and in the field of view, shape (...); nothing hides it.

@@ -162,10 +162,10 @@ def test_arcs_give_their_state_and_adapt_the_acceleration_of_a_birth() -> None:
     x, P = CTRV().from_kinematic(mean, covariance)
     assert_array_equal(x, mean[:5])
     assert_array_equal(P, covariance[:5, :5])
-    x, P = CTRA(accel_birth_variance_m2ps4=7.0).from_kinematic(x, P)
+    x, P = CTRA().from_kinematic(x, P)
     assert_array_equal(x, [0.0, 1.0, 2.0, 3.0, 4.0, 0.0])
     assert_array_equal(P[:5, :5], covariance[:5, :5])
-    assert_array_equal(P[5], [0.0, 0.0, 0.0, 0.0, 0.0, 7.0])
+    assert_array_equal(P[5], [0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
 
 def test_the_kinematic_view_of_constant_velocity_is_its_linear_image() -> None:
