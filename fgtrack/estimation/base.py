@@ -178,11 +178,7 @@ KNOWN_YAW_STD_RAD = 0.1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Start:
-    """State of a new object at its first stamp, with standard deviations.
-
-    Raises `CallError` for a value that is not a number, not finite or beyond 10^36, a negative standard deviation, a
-    wrong shape, and a stamp that is not an integer.
-    """
+    """State of a new object at its first stamp, with standard deviations. Raises `CallError` for an invalid number."""
 
     stamp_ns: int = 0
     position_m: Sequence[float] | FloatArray = (0.0, 0.0)
@@ -248,10 +244,7 @@ class StatesAt:
 
 @runtime_checkable
 class TrackBank(Protocol):
-    """The estimators of all objects; a bank may work on them together.
-
-    The tracker asks for states at a stamp, associates, and gives measurements of one stamp back.
-    """
+    """The estimators of all objects: states at a stamp for association, then the measurements of that stamp."""
 
     @property
     def present_ns(self) -> int:
@@ -286,10 +279,9 @@ class TrackBank(Protocol):
         """Kinematic states (x, y, yaw, speed, yaw rate[, acceleration]) now, in the order of `track_ids`."""
 
     def smoothed(self) -> list[SmoothedReport]:
-        """Kinematic states of the past that later measurements have improved.
+        """Kinematic states of the past, improved by later measurements; of a filter none.
 
-        The lagged ones as they are now, the final ones that left a window, or whose track was removed, since the last
-        call. A filter has none.
+        Lagged ones as they are now, final ones that left a window, or whose track was removed, since the last call.
         """
 
 

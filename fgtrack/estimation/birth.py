@@ -12,9 +12,8 @@ from fgtrack.models.motion import MotionModel
 def initial_state(motion: MotionModel, start: Start) -> tuple[FloatArray, FloatArray]:
     """Mean (n,) and covariance (n, n), in the state of `motion`, of `start`.
 
-    Where the direction of travel is unknown, a Cartesian model starts with an isotropic velocity of mean zero; a
-    model with a yaw starts at yaw 0 with its (wide) standard deviation. Raises `CallError` for a `position_cross` with
-    an entry that the state lacks.
+    Without a direction of travel, a Cartesian velocity is isotropic with mean zero, a yaw 0 with a wide standard
+    deviation. Raises `CallError` for a `position_cross` with an entry that the state lacks.
     """
     position = np.eye(2) * start.position_std_m**2
     if start.position_covariance is not None:

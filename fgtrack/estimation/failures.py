@@ -36,15 +36,7 @@ class Failure(StrEnum):
 
 
 class EstimatorError(Exception):
-    """Estimators of single tracks raised; those of the others did what was asked of them.
-
-    Parameters
-    ----------
-    causes
-        Exceptions by track.
-    answers
-        What the others returned, by track.
-    """
+    """Estimators raised: `causes` by track; `answers` are the results of the other estimators."""
 
     def __init__(self, causes: dict[int, Exception], answers: Mapping[int, Any]) -> None:  # Any: depends on the call
         super().__init__(f"estimators of the tracks {', '.join(map(str, causes))} raised")

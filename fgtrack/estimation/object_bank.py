@@ -28,17 +28,7 @@ _T = TypeVar("_T")
 
 
 class ObjectBank(Generic[_E]):
-    """One `Estimator` per object. What they raise, but `DataError`, becomes an `EstimatorError` that names the tracks.
-
-    Parameters
-    ----------
-    motion
-        The motion model of all estimators.
-    start
-        Makes the estimator of a new object.
-    lag_s
-        Length of the estimators' windows.
-    """
+    """One `Estimator` per object, made by `start`. Exceptions, but `DataError`, become an `EstimatorError`."""
 
     def __init__(self, motion: MotionModel, start: Callable[[Start], _E], lag_s: float) -> None:
         self._motion = motion
@@ -122,14 +112,7 @@ class ObjectBank(Generic[_E]):
 class OneObject:
     """A bank with one object, as an `Estimator`: its clock follows the newest stamp.
 
-    Parameters
-    ----------
-    motion
-        The motion model of the bank.
-    bank
-        An empty bank. One on a time grid, such as `BackwardForwardBank`, gives the state of the nearest grid point.
-    start
-        What is known of the object at its first stamp.
+    `bank` is empty; one on a time grid, such as `BackwardForwardBank`, gives the state of the nearest grid point.
     """
 
     def __init__(self, motion: MotionModel, bank: TrackBank, start: Start) -> None:
@@ -168,10 +151,7 @@ class OneObject:
 
 
 def states_of(bank: TrackBank, motion: MotionModel, stamp_ns: int) -> StatesAt:
-    """States of the tracks of `bank` at any stamp, predicted ahead of the present, in the own form of `motion`.
-
-    Those whose window begins later are left out.
-    """
+    """States of the tracks of `bank` whose window has begun, at any stamp, in the own form of `motion`."""
     states = bank.states_at(min(stamp_ns, bank.present_ns))
     if stamp_ns <= bank.present_ns or not states.track_ids:
         return states
@@ -180,10 +160,7 @@ def states_of(bank: TrackBank, motion: MotionModel, stamp_ns: int) -> StatesAt:
 
 
 def state_of(bank: TrackBank, motion: MotionModel, track_id: int, stamp_ns: int) -> TrackState:
-    """State of a track of `bank` at any stamp, see `states_of`.
-
-    Raises `CallError` for a stamp before the track's window.
-    """
+    """State of a track of `bank` at any stamp; raises `CallError` for one before the track's window."""
     states = states_of(bank, motion, stamp_ns)
     if track_id not in states.track_ids:
         raise CallError(f"track {track_id} has no state at {stamp_ns} ns: before its window, or not finite")

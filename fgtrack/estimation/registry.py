@@ -123,20 +123,15 @@ def estimator(name: str, motion: MotionModel, start: Start, *, lag_s: float = 1.
     Parameters
     ----------
     name
-        A name of `ESTIMATORS`: `smoother`, `ekf-replay`, that of a method of the literature, of a plug-in.
-    motion
-        Motion model.
-    start
-        What is known of the object at its first stamp; nothing older can be fused.
+        One of `list_estimators()`.
+    motion, start
+        Motion model, and the state at the first stamp; nothing older can be fused.
     lag_s
         Length of the window behind the newest stamp or the clock.
     options
-        Keyword parameters of that estimator; and of every estimator `initiation`, see `Initiation`.
+        Keyword parameters of that estimator, and `initiation` of every one, see `Initiation`.
 
-    Raises
-    ------
-    CallError
-        The name is unknown, or the estimator does not take the options.
+    Raises `CallError` for an unknown name, and for options that the estimator does not take.
     """
     for what, value, kind in (("name", name, str), ("motion", motion, MotionModel), ("start", start, Start)):
         if not isinstance(value, kind):
@@ -165,10 +160,7 @@ def start_estimator(
 def estimator_bank(
     name: str, motion: MotionModel, lag_s: float, options: Mapping[str, Any], factory: Factory | None = None
 ) -> TrackBank:
-    """The estimators `name` of all objects; raises as `estimator`. One that is a bank itself takes no `initiation`.
-
-    A `factory` need not be registered; `name` then stands in errors alone.
-    """
+    """The estimators `name` of all objects; raises as `estimator`. A `factory` needs no entry."""
     factory = factory or ESTIMATORS.load(name)
     claims = Claims.of(factory)
     own = {key: options[key] for key in options if claims.initiates or key != "initiation"}

@@ -18,10 +18,9 @@ def rts_step(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return a state, or a stack of them, after the smoothing of the next one, and C = Cov(x, x_next) P_next^-1.
 
-    Of `mean` (..., n) and `covariance` (..., n, n): x + C s and P + C (P_s - P_next) C' with the prediction P_next of
-    the next state, by how much it was moved in the smoothing, s = `shift` (..., n), and its covariance then, P_s =
-    `after` (..., n, n). Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA Journal
-    3(8), 1965. Raises `numpy.linalg.LinAlgError` for a singular P_next.
+    x + C s and P + C (P_s - P_next) C', of `mean` (..., n) and `covariance` (..., n, n), with the prediction P_next of
+    the next state, its `shift` s (..., n) by the smoothing and its covariance P_s = `after` then (..., n, n). Rauch,
+    Tung and Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA Journal 3(8), 1965.
     """
     C = psd_solve(predicted.covariance, predicted.cross).mT
     P = covariance + congruence(C, after - predicted.covariance)

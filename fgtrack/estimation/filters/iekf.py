@@ -20,20 +20,12 @@ _MAX_HALVINGS = 8
 
 
 class IekfReplay(ReplayEkf):
-    """Iterated EKF that rewinds and replays: each update is linearised at its own result (Gauss-Newton).
+    """Iterated EKF with replay: each update is linearised at its own result (Gauss-Newton).
 
     Bell and Cathey, The iterated Kalman filter update as a Gauss-Newton method, IEEE Transactions on Automatic Control
     38(2), 1993: the update minimises half of |x - x_0|^2 in P^-1 and |z - h(x)|^2 in R^-1, or a robust loss instead of
-    the latter. A step that does not lower this sum is halved. A linear measurement is fused as by `ReplayEkf`.
-
-    Parameters
-    ----------
-    motion, prior, lag_s, initiation
-        See `ReplayEkf`.
-    max_iterations
-        Linearisations per update; 1 is the EKF.
-    tolerance
-        A step below this many standard deviations of the prediction ends the iteration.
+    the latter. A step that does not lower this sum is halved, one below `tolerance` standard deviations of the
+    prediction is the last. A linear measurement is fused as by `ReplayEkf`.
     """
 
     def __init__(
@@ -79,10 +71,7 @@ def check_iteration(max_iterations: int, tolerance: float) -> None:
 
 
 def descended(cost: Callable[[FloatArray], float], limit: float, start: FloatArray, end: FloatArray) -> FloatArray:
-    """Farthest point from `start` (n,) to `end` (n,), halving the way, at which `cost` is at most `limit`.
-
-    `start`, where it is that, if there is no such point.
-    """
+    """Farthest point from `start` (n,) to `end` (n,), by halving, with a `cost` of at most `limit`; else `start`."""
     step = end - start
     for _ in range(_MAX_HALVINGS):
         if cost(start + step) <= limit:
@@ -100,10 +89,9 @@ def largest_move(step: FloatArray, covariance: FloatArray) -> float:
 def negative_log_posterior(
     off: FloatArray, P: FloatArray, residual: FloatArray, R: FloatArray, loss: RobustLoss | None
 ) -> float:
-    """Cost that an update minimises, but for a constant: half of off' P^-1 off, and the loss of the whitened residual.
+    """Cost that an update minimises: half of off' P^-1 off, and the loss of the residual (k,) in R (k, k).
 
-    `off` (n,) is the way from the prior, whose covariance is P (n, n); `residual` (k,) that of the measurement there,
-    with R (k, k). Raises `numpy.linalg.LinAlgError` for a singular P or R.
+    `off` (n,) is the step from the prior with covariance P (n, n).
     """
     return 0.5 * float(off.dot(psd_solve(P, off))) + penalty(loss, _length(residual, R))
 
@@ -117,10 +105,10 @@ def reweighted(
     loss: RobustLoss | None,
     off: FloatArray,
 ) -> OneCorrection:
-    """`updated_one` with a measurement that is linearised `off` (n,) from the prior, where it leaves `residual` (k,).
+    """`updated_one` with a measurement that is linearised `off` (n,) from the prior, with the `residual` (k,) there.
 
-    Its innovation for the prior is residual + H off. The weight under a robust loss is that of the residual, which
-    makes the step one that lowers `negative_log_posterior`; at the prior itself it is that of the whole update.
+    Its innovation for the prior is residual + H off. The weight under a robust loss is that of the residual, so the
+    step lowers `negative_log_posterior`; at the prior itself it is that of the whole update.
     """
     y = residual + H.dot(off)
     if loss is None or not off.any():

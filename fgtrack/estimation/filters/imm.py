@@ -25,24 +25,15 @@ _LEAST = 1e-12
 
 
 class ImmReplay(ReplayEkf):
-    """Interacting multiple model filter that rewinds and replays: `motion` and another model, weighed by what they say.
+    """Interacting multiple model filter with replay: `motion` and another model, weighted by their likelihoods.
 
     Blom and Bar-Shalom, The interacting multiple model algorithm for systems with Markovian switching coefficients,
     IEEE Transactions on Automatic Control 33(8), 1988, with a Markov chain in continuous time (see `transition`). Each
     step of the window keeps the states by both models and their probabilities, so the order of arrival does not matter.
     With one model it is `ReplayEkf`. The innovation of a late measurement is predicted from those before it alone.
 
-    Parameters
-    ----------
-    motion, prior, lag_s, initiation
-        See `ReplayEkf`. States are those of `motion`.
-    other
-        The other model, or its name. Where nothing is given: CTRA if `motion` is CTRV, CTRV if it is CTRA, with the
-        same noise, and none beside another `motion`.
-    stay_s, other_stay_s
-        Mean time that an object stays with `motion`, and with the other model.
-    accel_density_m2ps5
-        Noise of the acceleration of CTRA beside CTRV.
+    `other` is a model or its name; by default CTRA with the noise of `motion` beside CTRV, and CTRV beside CTRA.
+    `stay_s` and `other_stay_s` are the mean sojourn times.
     """
 
     spreads = mixes = True
@@ -117,11 +108,7 @@ class ImmReplay(ReplayEkf):
         return replace(step, mixture=posterior), correction
 
     def _mixed(self, before: Step, stamp_ns: int) -> Mixture:
-        """The mixture at `stamp_ns`, from the step before it.
-
-        Each model starts from the mixture of what the object may have followed before, given that it follows that model
-        now; all of these together have the moments of the mixture before.
-        """
+        """The mixture at `stamp_ns`: each model predicts the mixture before, given that the object follows it now."""
         old = before.mixture
         assert old is not None
         if stamp_ns == before.stamp_ns:

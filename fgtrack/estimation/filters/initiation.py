@@ -95,10 +95,9 @@ def straight_lines(fixes: Sequence[Fix], least: int) -> Iterator[Line]:
 
 @dataclass(frozen=True)
 class Search:
-    """Time for which a smoother begins again from a straight line through the first positions of an object.
+    """Time for which a smoother restarts along a straight line through the first positions of an object.
 
-    A state that started with an unknown heading was linearised at a wrong one; from there the solver may not find the
-    right one. A value: `next_line` gives the line and another search.
+    A state of unknown heading was linearised at a wrong one, from which the solver may not converge.
     """
 
     first_ns: int
@@ -114,11 +113,10 @@ class Search:
         return cls(start.stamp_ns, checked) if sought(motion, start, checked) else None
 
     def next_line(self, fixes: Callable[[], Iterable[Fix]], oldest_ns: int) -> "tuple[Line, Search] | None":
-        """The line to begin again from after measurements of which the oldest has the stamp `oldest_ns`.
+        """The line to restart along, and another search, after measurements from the stamp `oldest_ns` on.
 
-        Through so many of `fixes` as the method asks for: the first ones in order of their times, whatever the order in
-        which they came. None where the last line stays, where all fixes are of one time, and where one has no
-        uncertainty.
+        Through as many of the first `fixes` as the method asks for, whatever the order of arrival. None where the last
+        line stays, where all fixes are of one time, and where one has no uncertainty.
         """
         if self.until_ns is not None and oldest_ns > self.until_ns:
             return None

@@ -15,13 +15,7 @@ from fgtrack.models.motion import MotionModel
 
 
 class ExactPropagator:
-    """Predicts m objects at once, all steps in one: exact, because flow and process noise of a motion model compose.
-
-    Parameters
-    ----------
-    motion
-        Names and conversions of the state, and its equations.
-    """
+    """Predicts m objects at once, all steps in one: exact, because flow and process noise of a motion model compose."""
 
     def __init__(self, motion: MotionModel) -> None:
         self.motion = motion
@@ -42,10 +36,7 @@ class ExactPropagator:
 
 
 class EulerCtrv(ExactPropagator):
-    """CTRV in Euler steps (Karle et al. 2023, eq. 10).
-
-    States beyond the yaw rate are carried along unchanged, and so is their noise.
-    """
+    """CTRV in Euler steps (Karle et al. 2023, eq. 10); states beyond the yaw rate and their noise are carried along."""
 
     yaw_limit_rad = math.inf
     """Largest yaw that a step gives."""
@@ -53,8 +44,7 @@ class EulerCtrv(ExactPropagator):
     def __init__(self, motion: MotionModel, density: FloatArray, *, accelerates: bool = False) -> None:
         """`density`: diagonal of Q per second, shape (n,), along and across the heading first.
 
-        `accelerates`: the acceleration is a state that drives the speed but is absent from the transition matrix
-        (defect Q5 of the published implementation).
+        `accelerates`: the acceleration drives the speed but is absent from the transition matrix (defect Q5).
         """
         super().__init__(motion)
         self._density = np.array(density, dtype=np.float64)

@@ -51,7 +51,7 @@ class PublishedStorage(BackwardForwardBank):
     """The published object storage.
 
     With `leads` the tracking time leads the clock by up to one step, and never waits (defect Q14). With `is_stale` an
-    update that is not delayed does not reach the stored present state (defect Q8).
+    update in time does not reach the stored present state (defect Q8).
     """
 
     def __init__(

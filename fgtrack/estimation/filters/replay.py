@@ -56,15 +56,8 @@ _stamp = attrgetter("stamp_ns")
 class ReplayEkf(WindowedFilter):
     """An EKF that keeps the measurements of a window; its estimates do not depend on the order of arrival.
 
-    Rewind and replay, as in robot_localization; see docs/baseline.md. Filters with another prediction or correction
-    override `predict` and `correct`.
-
-    Parameters
-    ----------
-    motion, prior, lag_s
-        See `WindowedFilter`.
-    initiation
-        Method for the direction of travel where `prior` gives none, see `Initiation`.
+    It rolls back and re-filters later measurements, as robot_localization does. Filters with another prediction or
+    correction override `predict` and `correct`. `initiation`: see `Initiation`.
     """
 
     exact = "any lag, any number"
@@ -116,10 +109,9 @@ class ReplayEkf(WindowedFilter):
         return predict_across(mean, covariance, self._motion, dt_s)
 
     def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
-        """State after `measurement`, made at the stamp of `mean` (n,) and `covariance` (n, n).
+        """State after `measurement` at the stamp of `mean` (n,) and `covariance` (n, n), with the innovation before it.
 
-        Innovation, NIS and S are those of the prediction. Raises `numpy.linalg.LinAlgError` for a measurement that
-        cannot be fused.
+        Raises `numpy.linalg.LinAlgError` for a measurement that cannot be fused.
         """
         return correct_one(mean, covariance, measurement)
 
@@ -146,10 +138,7 @@ class ReplayEkf(WindowedFilter):
         return Step(measurement.stamp_ns, measurement, wrapped(self._motion, mean), covariance, predicted, search)
 
     def _retrodicted(self, new: Step, later: Sequence[Step]) -> tuple[FloatArray, FloatArray]:
-        """State (n,), (n, n) at the `new` measurement, given all that was fused before it, also the `later` steps.
-
-        From the newest step back (see `smoothed_back`), each as it was when the new measurement was unknown.
-        """
+        """State (n,), (n, n) at the `new` measurement, given all that was fused before, the `later` steps included."""
         links: list[Link] = [(each.stamp_ns, each.mean, each.covariance, each.predicted) for each in later]
         mean, covariance = later[-1].mean, later[-1].covariance
         for index in range(len(later) - 1, -1, -1):

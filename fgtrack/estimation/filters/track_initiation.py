@@ -37,10 +37,7 @@ LONGEST_S, MOST_MEASUREMENTS = 2.0, 25
 
 @dataclass(frozen=True)
 class TrackInitiation:
-    """Measurements of a new object while its direction of travel is sought, in order of the stamps.
-
-    A value: `with_measurement` gives another one, so a filter may keep one at each step and go back to it.
-    """
+    """Measurements of a new object while its direction of travel is sought, in order of the stamps; immutable."""
 
     motion: MotionModel
     start: Start
@@ -88,12 +85,8 @@ class TrackInitiation:
 
             x' = f(x_n) + F (x - x_n),   P' = F P F' + Q,   F = df/dx at x_n
 
-        Each measurement counts once: the line gives the trajectory and the direction about which nothing was known,
-        with the wide standard deviation of `start`. Speed, yaw rate and process noise are those of `start` and
-        `motion`, so without process noise and with a vague speed the result is the covariance of the fit, turned into
-        yaw and speed to first order.
-
-        Raises `numpy.linalg.LinAlgError` where it is not finite, and where there is no line.
+        Each measurement counts once: the line gives only the trajectory and the direction, with the wide standard
+        deviation of `start`. Raises `numpy.linalg.LinAlgError` where the state is not finite, and without a line.
         """
         _, mean, covariance, _ = self._filtered()[-1]
         if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
@@ -103,8 +96,7 @@ class TrackInitiation:
     def turned(self) -> Start:
         """The start, turned along the line and as fast, but as uncertain as before: the measurements count from there.
 
-        For an estimator that is linearised at its own estimates. What is known of the speed counts a little more than
-        once where the line knows it as well as the start does, and once where either knows it much better. Raises as
+        The speed counts a little more than once where line and start are about equally certain of it. Raises as
         `state`.
         """
         yaw_rad, speed_mps = self._course()
@@ -112,10 +104,7 @@ class TrackInitiation:
         return replace(self.start, yaw_rad=yaw_rad, yaw_std_rad=std_rad, speed_mps=speed_mps)
 
     def retrodicted(self, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The state at `stamp_ns`, between the start and the newest measurement, given all that came after.
-
-        `mean` (n,) and `covariance` (n, n) are those at the newest measurement, given the same. Raises as `state`.
-        """
+        """The state at `stamp_ns` given all measurements, of `mean` (n,) and `covariance` (n, n) at the newest one."""
         links = [link for link in self._filtered(stamp_ns) if link[0] >= stamp_ns]
         return smoothed_back(self.motion, links, mean, covariance)
 
@@ -148,10 +137,7 @@ class TrackInitiation:
         return links
 
     def nominal(self, x: FloatArray) -> FloatArray:
-        """State (n,) on the line at the start; entries that the line does not give are those of x (n,).
-
-        Raises `numpy.linalg.LinAlgError` where there is no line.
-        """
+        """State (n,) on the line at the start, other entries as in x (n,); raises as `state` without a line."""
         yaw_rad, speed_mps = self._course()
         motion = cartesian(np.array([yaw_rad, speed_mps])) if self.motion.cartesian else (yaw_rad, speed_mps)
         nominal = x.copy()
@@ -161,10 +147,7 @@ class TrackInitiation:
         return nominal
 
     def _course(self) -> tuple[float, float]:
-        """Direction of the line, and the speed along it, weighed with what the start knows of the speed.
-
-        A line through fixes close together in time may be far too fast.
-        """
+        """Direction of the line, and the speed along it, weighted with that of the start: a short line may be off."""
         if self.line is None:
             raise np.linalg.LinAlgError("no line leads through the first positions")
         yaw_rad, speed_mps = polar(self.line.velocity_mps).tolist()
@@ -180,17 +163,10 @@ def initiated(motion: MotionModel, start: Start, method: str, make: Callable[[St
 
 
 class Initiated:
-    """An `Estimator` that begins again, in the direction of the first positions, until that is certain.
+    """An `Estimator` that is reinitialised along the first positions until their direction is certain.
 
-    What it has fused so far is given in order of the stamps to a new one, which starts along the line (see
-    `TrackInitiation.turned`). From then on it is the last of these.
-
-    Parameters
-    ----------
-    search
-        Before the first measurement.
-    make
-        Makes the estimator of an object.
+    A new one that starts along the line (see `TrackInitiation.turned`) fuses all measurements so far, in order of
+    stamps.
     """
 
     def __init__(self, search: TrackInitiation, make: Callable[[Start], Estimator]) -> None:

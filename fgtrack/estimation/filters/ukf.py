@@ -43,10 +43,9 @@ def regression(
 ) -> Regression:
     """Statistical linear regression of `g`, (..., n) -> (..., k), over N(mean, covariance), (..., n) and (..., n, n).
 
-    See Arasaratnam, Haykin and Elliott 2007; Garcia-Fernandez et al. 2015, eqs. 9 to 11. With the points m +- c L_i of
-    the root P = L L', c^2 = n, and what g differs there from g(m), d+ and d-: A L_i = (d+ - d-) / 2c, and the noise
-    comes from the bends (d+ + d-) / 2, so that it is zero of a linear g. `difference` may bring angles to their range.
-    Raises `numpy.linalg.LinAlgError` for a covariance that is not positive semidefinite.
+    Garcia-Fernandez et al. 2015, eqs. 9 to 11. With the points m +- c L_i of the root P = L L', c^2 = n, and the
+    differences d+ and d- of g there from g(m): A L_i = (d+ - d-) / 2c, and the noise comes from the bends (d+ + d-) /
+    2, so that it is zero of a linear g. Raises `numpy.linalg.LinAlgError` for a covariance that is not semidefinite.
     """
     n, L = mean.shape[-1], _root(covariance)
     centre, offsets = mean[..., None, :], n**0.5 * L.mT
@@ -89,11 +88,11 @@ def _difference(model: MeasurementModel) -> Callable[[FloatArray, FloatArray], F
 
 
 class UkfReplay(ReplayEkf):
-    """Unscented Kalman filter that rewinds and replays: means over the spread of the state instead of derivatives.
+    """Unscented Kalman filter with replay: means over the spread of the state instead of derivatives.
 
     Julier and Uhlmann, Unscented filtering and nonlinear estimation, Proceedings of the IEEE 92(3), 2004, written as
-    the statistical linear regression that it is (see `regression`). The process noise, that of the mean, is added. What
-    is linear it does as `ReplayEkf`, whose parameters it has.
+    statistical linear regression (see `regression`). The process noise is that of the mean. What is linear it does as
+    `ReplayEkf`.
     """
 
     spreads = True
@@ -116,22 +115,14 @@ class UkfReplay(ReplayEkf):
 
 
 class IplfReplay(UkfReplay):
-    """Iterated posterior linearisation filter that rewinds and replays: averages over the spread of the posterior.
+    """Iterated posterior linearisation filter with replay: averages over the spread of the posterior.
 
     Garcia-Fernandez, Svensson, Morelande and Sarkka, Posterior linearization filter: principles and implementation
     using sigma points, IEEE Transactions on Signal Processing 63(20), 2015. The regression is repeated over each
-    posterior that the prior and the last regression give. With the spread and noise of a regression held, a step of
-    the mean that does not lower prior plus loss is halved (Raitoharju et al., Damped posterior linearization filter,
-    IEEE Signal Processing Letters 25(4), 2018). What is linear it does as `ReplayEkf`.
-
-    Parameters
-    ----------
-    motion, prior, lag_s, initiation
-        See `ReplayEkf`.
-    max_iterations
-        Regressions per update; 1 is the unscented filter.
-    tolerance
-        Where mean and standard deviations change by less than this many standard deviations, the iteration ends.
+    posterior that the prior and the last regression give, until mean and standard deviations change by less than
+    `tolerance`. With the spread and noise of a regression held, a step of the mean that does not lower the cost is
+    halved (Raitoharju et al., Damped posterior linearization filter, IEEE Signal Processing Letters 25(4), 2018). What
+    is linear it does as `ReplayEkf`.
     """
 
     def __init__(

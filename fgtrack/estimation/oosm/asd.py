@@ -27,14 +27,9 @@ class AccumulatedStateDensity(WindowedFilter):
     and out-of-sequence processing, same journal 50(3), 2014. The present goes on as x_{k+1} = F x_k + v, with the
     cross-covariances F Cov(x_k, x_j). A stamp between two others becomes a state of its own, x = Lambda x_l + Psi x_r +
     N(0, Sigma) (see `between`), with the cross-covariances [Lambda Psi] Cov([x_l; x_r], x_j). Every measurement, late
-    or not, is `fuse_across` of the whole stack. There is no history that could be out of date.
+    or not, is `fuse_across` of the whole stack.
 
     Exact for: any lag, any number of late measurements in any order. States in the past are smoothed.
-
-    Parameters
-    ----------
-    motion, prior, lag_s
-        See `WindowedFilter`.
     """
 
     exact = "any lag, any number"

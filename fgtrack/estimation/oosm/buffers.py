@@ -14,21 +14,12 @@ from fgtrack.models.motion import MotionModel
 class DelayedHorizon:
     """Run the filter at now - D, and predict from there to now.
 
-    Now is the clock, or the newest stamp where that is ahead, so D has to cover the longest delay. As in flight
-    controllers (the delayed fusion horizon of the PX4 EKF). Later measurements are held in order of their stamps,
-    earlier ones are too old. Innovation and NIS are predicted from all measurements that have come, held ones included.
+    Now is the clock, or the newest stamp where that is ahead, so D = `horizon_s` has to cover the longest delay. As in
+    flight controllers (the delayed fusion horizon of the PX4 EKF). Later measurements are held in order of their
+    stamps, earlier ones are too old. Innovation and NIS are predicted from all measurements that have come, held ones
+    included.
 
-    Exact for: the state at now - D, linear model, any number of measurements with delays up to D. At now it is the
-    prediction over D, however little was late.
-
-    Parameters
-    ----------
-    motion, prior, lag_s
-        See `WindowedFilter`.
-    horizon_s
-        D, at most `lag_s`. Raises `CallError` otherwise.
-    initiation
-        See `ReplayEkf`.
+    Exact for: the state at now - D, linear model, any number of measurements with delays up to D.
     """
 
     exact = "up to now - D: any lag, any number"
@@ -82,21 +73,11 @@ class DelayedHorizon:
 class ReorderBuffer(DelayedHorizon):
     """Hold every measurement until one has come whose stamp is D later, and fuse in order of stamps.
 
-    The stamps push the front and the clock does not, so D has to cover only how much later than its successors a
-    measurement comes, and not its whole delay. When nothing comes any more, the last D seconds stay held. As the
-    watermark of stream processing (Akidau et al., The dataflow model, Proceedings of the VLDB Endowment, 2015).
+    The stamps push the front and the clock does not, so D = `hold_s` has to cover only how much later than its
+    successors a measurement comes. As the watermark of stream processing (Akidau et al., The dataflow model,
+    Proceedings of the VLDB Endowment, 2015).
 
-    Exact for: the state D before the newest stamp, linear model, any number of measurements that come at most D behind
-    the newest stamp.
-
-    Parameters
-    ----------
-    motion, prior, lag_s
-        See `WindowedFilter`.
-    hold_s
-        D, at most `lag_s`. Raises `CallError` otherwise.
-    initiation
-        See `ReplayEkf`.
+    Exact for: the state D before the newest stamp, linear model, any number of measurements at most D behind it.
     """
 
     exact = "up to D before the newest stamp: any lag, any number"

@@ -43,9 +43,8 @@ def fuse_across(mean: FloatArray, covariance: FloatArray, past: Past, measuremen
 class CrossingEkf(RewindForget):
     """An EKF that corrects the present through its cross-covariance with the past (see `fuse_across`).
 
-    The corrected present enters the history with an equivalent measurement there (see `_absorb`), so a second
-    late measurement finds the state that the first one made. What lies between the first one's stamp and the present
-    keeps the state it had.
+    The corrected present enters the history with an equivalent measurement (see `_absorb`), so a second late
+    measurement starts from it; the steps in between stay as they were.
     """
 
     def _fuse_late(self, measurement: Measurement) -> OneCorrection:
@@ -82,11 +81,11 @@ class A1(CrossingEkf):
         P_vv = Q - Q H' S^-1 H Q,   P_xv = Q - P H' S^-1 H Q
         P_tau = F(tau, k) (P_k + P_vv - P_xv - P_xv') F(tau, k)',   P_k,tau = (P_k - P_xv) F(tau, k)'
 
-    then `fuse_across`. It stores nothing of older steps, so at l lags the same equations are used with the whole noise
-    Q(k, tau) and the last innovation alone, and an earlier late measurement counts as one of the newest stamp.
+    then `fuse_across`. At l lags the same equations are used with the whole noise Q(k, tau) and the last innovation
+    alone.
 
-    Exact for: one lag, the first late measurement since the newest stamp. At several lags it takes away more
-    covariance than there is, the more so the larger Q is; where none would be left the measurement is `failed`.
+    Exact for: one lag, the first late measurement since the newest stamp. At several lags it takes away more covariance
+    than there is, the more so the larger Q is; where none would be left the measurement is `failed`.
     """
 
     exact = "one lag, first late measurement"
@@ -116,9 +115,8 @@ class B1(A1):
     """Algorithm B for one lag: A1 without the noise in the retrodicted state.
 
     Hilton, Martin and Blair, Tracking with time-delayed data in multisensor systems, NSWCDD technical report, 1993;
-    Blackman and Popoli, Design and analysis of modern tracking systems, 1999; called B in Bar-Shalom 2002.
-    x_tau = F(tau, k) x_k and P_vv = Q, the rest as in `A1`, and so are its ways with lags and further late
-    measurements.
+    Blackman and Popoli, Design and analysis of modern tracking systems, 1999; called B in Bar-Shalom 2002. x_tau =
+    F(tau, k) x_k and P_vv = Q, the rest as in `A1`.
 
     Exact for: nothing, but close at one lag. Overconfident at many.
     """
@@ -131,7 +129,7 @@ class C(CrossingEkf):
     """Algorithm C: retrodict as if there were no process noise.
 
     Bar-Shalom 2002 (see `A1`). x_tau = F(tau, k) x_k, P_tau = F(tau, k) P_k F(tau, k)', P_k,tau = P_k F(tau, k)', then
-    `fuse_across`. It needs no history, and a further late measurement finds the present as it is.
+    `fuse_across`. It needs no history.
 
     Exact for: no process noise, any lag and number. Else overconfident, at many lags badly.
     """
@@ -150,10 +148,8 @@ class Al1(A1):
     """Algorithm Al1: A1 with the equivalent measurement of the last l steps.
 
     Bar-Shalom, Chen and Mallick, One-step solution for the multistep out-of-sequence-measurement problem in tracking,
-    IEEE Transactions on Aerospace and Electronic Systems 40(1), 2004. The equations of `A1` with the
-    prediction of step m to the present as x and P: S*^-1 = P^-1 - P^-1 P_k P^-1, S*^-1 y* = P^-1 (x_k - x). It stores
-    mean and covariance of the steps. They are not repaired after a late measurement; that one is part of the
-    equivalent measurement, like all that came since m.
+    IEEE Transactions on Aerospace and Electronic Systems 40(1), 2004. The equations of `A1` with the prediction of step
+    m to the present as x and P: S*^-1 = P^-1 - P^-1 P_k P^-1, S*^-1 y* = P^-1 (x_k - x).
 
     Exact for: one lag, the first late measurement since step m. Numerically the same as `Fpfd` in a linear model.
     """
@@ -164,8 +160,8 @@ class Al1(A1):
 class Bl1(B1):
     """Algorithm Bl1: Al1 without the noise in the retrodicted state.
 
-    Bar-Shalom, Chen and Mallick 2004 (see `Al1`): x_tau = F(tau, k) x_k and P_vv = Q, so that of the steps only the
-    covariances are needed. The Sensor Fusion and Tracking Toolbox of MathWorks names this paper for its `retrodict`.
+    Bar-Shalom, Chen and Mallick 2004 (see `Al1`): x_tau = F(tau, k) x_k and P_vv = Q. The Sensor Fusion and Tracking
+    Toolbox of MathWorks names this paper for its `retrodict`.
 
     Exact for: nothing, but close to `Al1`.
     """
@@ -176,15 +172,14 @@ class Bl1(B1):
 class RtsCrossCovariance(CrossingEkf):
     """Smooth back to the late stamp, with the product of the smoother gains as cross-covariance.
 
-    Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA Journal 3(8), 1965, for the
-    gains; Challa, Evans and Wang, A Bayesian solution and its approximations to out-of-sequence measurement problems,
-    Information Fusion 4(3), 2003, for their use. With C_j = P_{j|j} F_{j+1}' P_{j+1|j}^-1, from j = k - 1 to tau:
+    Rauch, Tung and Striebel (see `rts_step`) for the gains; Challa, Evans and Wang, A Bayesian solution and its
+    approximations to out-of-sequence measurement problems, Information Fusion 4(3), 2003, for their use. With C_j =
+    P_{j|j} F_{j+1}' P_{j+1|j}^-1, from j = k - 1 to tau:
 
         x_j = x_{j|j} + C_j (x_{j+1} - x_{j+1|j}),   P_j = P_{j|j} + C_j (P_{j+1} - P_{j+1|j}) C_j'
         P_k,tau = (C_tau C_{m+1} ... C_{k-1} P_k)'
 
-    where tau lies between the steps m and m + 1 with x_{tau|m}, P_{tau|m}. Then `fuse_across`. The history is not
-    repaired after a late measurement: the next one starts from the corrected present.
+    where tau lies between the steps m and m + 1 with x_{tau|m}, P_{tau|m}. Then `fuse_across`.
 
     Exact for: any lag, the first late measurement since step m.
     """
@@ -210,8 +205,7 @@ class FixedPoint(CrossingEkf):
 
         x_tau += U-' H' S^-1 y,   P_tau -= U-' H' S^-1 H U-,   U = (I - K H) U-,   U- = F_{j+1} U
 
-    and at last P_k,tau = U, then `fuse_across`. No state is smoothed and no measurement applied again. A late
-    measurement stays in the history as an equivalent measurement of the step at which it was fused (see `CrossingEkf`).
+    and at last P_k,tau = U, then `fuse_across`.
 
     Exact for: any lag, the first late measurement since step m.
     """
@@ -239,12 +233,9 @@ class Larsen(CrossingEkf):
 
         x+ = x_k + M K_tau (z - h(x_{tau|m})),   P+ = P_k - M K_tau H P_{tau|m} M'
 
-    that is `fuse_across` with x_{tau|m}, P_{tau|m} and P_k,tau = M P_{tau|m}. The gains since are those that were used,
-    for at tau the measurement was unknown. A late measurement stays in the history as an equivalent
-    measurement of the step at which it was fused (see `CrossingEkf`).
+    that is `fuse_across` with x_{tau|m}, P_{tau|m} and P_k,tau = M P_{tau|m}, with the gains that were used.
 
-    Exact for: nothing. It would be, had the covariance been updated at tau already, and all gains since with it. Else
-    consistent and suboptimal: what was measured since does not sharpen the innovation.
+    Exact for: nothing. Consistent and suboptimal: measurements since tau do not sharpen the innovation.
     """
 
     def _past(self, stamp_ns: int) -> Past:

@@ -50,7 +50,7 @@ class Fpfd(RewindForget):
 
 
 class CovarianceIntersection(Fpfd):
-    """Fuse both estimates without knowing what they share.
+    """Fuse both estimates for any correlation between them.
 
     Julier and Uhlmann, Fusion of time delayed measurements with uncertain time delays, American Control Conference,
     2005:
@@ -59,8 +59,7 @@ class CovarianceIntersection(Fpfd):
 
     with the w in [0, 1] for which the trace of P is smallest, whose entries differ in their units.
 
-    Exact for: nothing; never overconfident. Where one estimate is better than the other in all, it takes that one and
-    loses the other.
+    Exact for: nothing; never overconfident.
     """
 
     exact = ""

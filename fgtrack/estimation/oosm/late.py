@@ -43,13 +43,7 @@ class RewindForget(WindowedFilter):
     to now. Here at the stamp itself; `fgtrack.estimation.filters.backward_forward` has the paper's time grid. The other
     methods override `_fuse_late`; all are linearised at the stored means.
 
-    Exact for: nothing. For what it keeps it is the filter in order of stamps, so it stays consistent, but all
-    measurements between the late stamp and the present are lost.
-
-    Parameters
-    ----------
-    motion, prior, lag_s
-        See `WindowedFilter`.
+    Exact for: nothing; consistent, but all measurements between the late stamp and the present are lost.
     """
 
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
@@ -105,11 +99,10 @@ class RewindForget(WindowedFilter):
         return predict(mean, covariance, self._motion, seconds(to_ns - from_ns))
 
     def _absorb(self, mean: FloatArray, covariance: FloatArray) -> None:
-        """Add `mean` (n,) and `covariance` (n, n) of the present, into which a late measurement turned its state.
+        """Add a step at the present stamp: its state after a late measurement, `mean` (n,) and `covariance` (n, n).
 
-        They become a step at the present stamp, with the one measurement of the present state that has the same
-        effect: H' S^-1 y = P^-1 (x+ - x), H' S^-1 H = P^-1 (P - P+) P^-1 (the equivalent measurement of Bar-Shalom,
-        Chen and Mallick 2004).
+        Its measurement is the equivalent one of Bar-Shalom, Chen and Mallick 2004: H' S^-1 y = P^-1 (x+ - x), H' S^-1 H
+        = P^-1 (P - P+) P^-1.
         """
         now = self._steps[-1]
         gained = psd_solve(now.covariance, now.covariance - covariance)
@@ -131,12 +124,9 @@ class Drop(RewindForget):
 
 
 class AsCurrent(RewindForget):
-    """Take a late measurement as if it had been made at the newest stamp fused.
+    """Take a late measurement as if it had been made at the newest stamp fused, as a filter without stamps does.
 
-    What a filter without stamps does (no source): x+ = x_k + K (z - h(x_k)). The object has moved on by speed times
-    lag since, which the covariance leaves out.
-
-    Exact for: nothing; overconfident.
+    Exact for: nothing; overconfident, for the object has moved on by speed times lag since.
     """
 
     def _fuse_late(self, measurement: Measurement) -> OneCorrection:
