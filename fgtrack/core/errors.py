@@ -28,10 +28,7 @@ def did_you_mean(name: object, known: Iterable[object]) -> str:
 
 
 def one_line(text: str) -> str:
-    """`text` on one line, with escapes for what is not printable; of a long one the beginning and the end.
-
-    Messages contain names of sensors and topics from files: they must neither move the cursor nor fill the screen.
-    """
+    """`text` on one line, escaped (it holds names from files), of a long one the beginning and the end."""
     if len(text) > _LONGEST:
         text = f"{text[: _LONGEST - _TAIL]} ... {text[-_TAIL:]}"
     return printable(" ".join(text.split()) if any(space in text for space in "\n\r\t\v\f") else text)

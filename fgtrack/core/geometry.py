@@ -50,10 +50,7 @@ def rotations(yaws_rad: FloatArray) -> FloatArray:
 
 
 def in_polygon(points: FloatArray, corners: FloatArray) -> BoolArray:
-    """True where each of `points`, shape (n, 2), lies inside a polygon with `corners`, shape (m, 2); shape (n,).
-
-    By the parity of the edges that a ray along +x crosses, so outlines that cross themselves have holes.
-    """
+    """True (n,) where `points` (n, 2) lie inside a polygon with `corners` (m, 2), by the parity of crossed edges."""
     x, y = points[:, :1], points[:, 1:]
     (ax, ay), (bx, by) = corners.T, np.roll(corners, -1, axis=0).T
     spans = (ay > y) != (by > y)
@@ -73,10 +70,7 @@ def polar(vector: FloatArray) -> FloatArray:
 
 
 def polar_gradient(vector: FloatArray, floor: float) -> FloatArray:
-    """Derivative of `polar` by `vector`, shape (..., 2, 2).
-
-    The direction changes by 1 / length; a length below `floor` counts as `floor` there, so all is finite.
-    """
+    """Derivative of `polar` by `vector`, shape (..., 2, 2), of the direction as if the length were at least `floor`."""
     x, y = vector[..., 0], vector[..., 1]
     direction, length = np.arctan2(y, x), np.maximum(np.hypot(x, y), floor)
     c, s = np.cos(direction), np.sin(direction)
@@ -99,10 +93,10 @@ def cartesian_gradient(direction_length: FloatArray) -> FloatArray:
 def body_point(
     x_m: Real, y_m: Real, yaw_rad: Real, speed_mps: Real, yaw_rate_radps: Real, ahead_m: float, left_m: float
 ) -> tuple[Real, Real, Real, Real]:
-    """Position x, y and velocity vx, vy = v + w x r, in the map, of a point that is fixed to a moving body.
+    """Position x, y and velocity vx, vy = v + w x r, in the map, of a point fixed to a body that moves along its yaw.
 
-    The body's reference point is at x, y and moves along the yaw; the point is `ahead_m` and to the `left_m` of it,
-    which is the lever arm r. Floats, or arrays of any one shape.
+    The lever arm r from the body's reference point x, y is `ahead_m` and to the `left_m`. Floats, or arrays of one
+    shape.
     """
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     arm_x_m, arm_y_m = c * ahead_m - s * left_m, s * ahead_m + c * left_m
@@ -111,10 +105,9 @@ def body_point(
 
 
 def body_point_jacobian(yaw_rad: float, arm_m: tuple[float, float], velocity_mps: tuple[float, float]) -> FloatArray:
-    """Derivative, shape (5, 5), of x, y, yaw, vx, vy of a frame fixed to a body by the body's own x, y, yaw, speed and
-    yaw rate.
+    """Derivative (5, 5) of x, y, yaw, vx, vy of `body_point` by the body's x, y, yaw, speed and yaw rate.
 
-    `arm_m` is what `body_point` adds to the position, in the map, and `velocity_mps` the velocity that it gives.
+    `arm_m` is the lever arm in the map, `velocity_mps` that of the point.
     """
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     (arm_x_m, arm_y_m), (vx_mps, vy_mps) = arm_m, velocity_mps

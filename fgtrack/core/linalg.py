@@ -46,10 +46,7 @@ ASYMMETRY = 1e-6
 
 
 def is_covariance(P: FloatArray, least: float) -> bool:
-    """True if `P`, shape (n, n), is finite, symmetric, and the eigenvalues of its correlations exceed `least`.
-
-    A variance of 0 stands for itself.
-    """
+    """True if `P` (n, n) is finite and symmetric, and its correlations, with 1 for a variance of 0, exceed `least`."""
     variances = np.diag(P)
     if not (np.abs(P) <= LARGEST**2).all() or (variances < 0.0).any():
         return False
@@ -85,10 +82,9 @@ def applied(A: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def psd_solve(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
-    """Solve `matrix @ x = rhs` for a symmetric positive definite `matrix`.
+    """Solve `matrix @ x = rhs` for a symmetric positive definite `matrix`, shapes (..., n, n) and (..., n, k).
 
-    Shapes (..., n, n) and (..., n, k); with one matrix, `rhs` may be a vector (n,). Raises
-    `numpy.linalg.LinAlgError` when `matrix` is singular.
+    With one matrix, `rhs` may be a vector (n,). Raises `numpy.linalg.LinAlgError` when `matrix` is singular.
     """
     if matrix.ndim > 2:
         if matrix.shape[:-2] != (1,):
@@ -103,10 +99,7 @@ def psd_solve(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
 def mahalanobis_squared(
     residual: FloatArray, covariance: FloatArray, entries: Sequence[int] | None = None
 ) -> FloatArray:
-    """Squared Mahalanobis distance y' S^-1 y; shapes (..., n) and (..., n, n), result (...).
-
-    With `entries`, that of the marginal distribution of these entries.
-    """
+    """Squared Mahalanobis distance y' S^-1 y, (..., n) and (..., n, n), of the marginal of `entries` if given."""
     if entries is not None:
         k = len(entries)
         if list(entries) == list(range(k)):  # views are faster than copies
@@ -121,10 +114,7 @@ def mahalanobis_squared(
 
 
 def inverse_root(S: FloatArray) -> FloatArray:
-    """W with W S W' = I, of a symmetric positive definite S (n, n): the inverse of its Cholesky factor.
-
-    Raises `numpy.linalg.LinAlgError` where S is not positive definite.
-    """
+    """Inverse Cholesky factor W of S (n, n), W S W' = I; raises `numpy.linalg.LinAlgError` unless positive definite."""
     root, info = dpotrf(S, lower=1)
     if info:
         raise np.linalg.LinAlgError("a covariance is not positive definite")
@@ -140,9 +130,6 @@ def noise_root(Q: FloatArray) -> FloatArray:
 
 
 def regular(Q: FloatArray) -> FloatArray:
-    """Process noise (..., n, n) with a millionth of each entry's standard deviation more, and at least 1e-9.
-
-    Without any noise of the position, that of an object that stands is singular: it cannot move sideways.
-    """
+    """Process noise (..., n, n) with a millionth more of each standard deviation, and at least 1e-9: never singular."""
     variances = np.maximum(np.diagonal(Q, axis1=-2, axis2=-1), 1e-6)
     return Q + 1e-12 * variances[..., None] * identity(Q.shape[-1])

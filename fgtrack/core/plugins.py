@@ -16,10 +16,9 @@ _logger = logging.getLogger(__name__)
 
 
 class Registry:
-    """Parts of one kind by name.
+    """Parts of one kind by name: built-in ones, and entry points of the groups, loaded when their name is used.
 
-    A plug-in is an entry point of one of the groups. It is loaded when its name is used, so a broken one does not
-    disturb the others. One with the name of a built-in part, or of an earlier plug-in, is left out with a warning.
+    One with the name of a built-in part, or of an earlier plug-in, is left out with a warning.
     """
 
     def __init__(
@@ -66,10 +65,7 @@ class Registry:
 
     @contextmanager
     def blamed(self, name: str, what: str) -> Iterator[None]:
-        """Whatever is raised in the block is a `CallError` that names the plug-in `name`, of which it says `what`.
-
-        What is raised on purpose passes, and all of a built-in part: that is a bug.
-        """
+        """Exceptions in the block, unless raised on purpose or by built-in parts, become a `CallError` about `name`."""
         try:
             yield
         except FgtrackError:

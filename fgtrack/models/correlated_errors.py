@@ -1,10 +1,8 @@
 """Errors of a sensor that are correlated in time, estimated with the state of the object.
 
-Where the errors of successive detections resemble each other, as those of a box around a car seen from one side,
-an estimator that takes them for white is overconfident: a smoother, which averages over its window, most of all.
-The remedy: the correlated part of the error is a first-order Gauss-Markov process and a state
-(Bryson and Henrikson, "Estimation using sampled data containing sequentially correlated noise", 1968; Bar-Shalom, Li,
-Kirubarajan 2001, section 8.3). Every estimator does it alike, because motion and measurement models bring the state.
+An estimator that takes them for white is overconfident, a smoother most of all. The correlated part of the error is a
+first-order Gauss-Markov process and a state (Bryson and Henrikson, "Estimation using sampled data containing
+sequentially correlated noise", 1968; Bar-Shalom, Li, Kirubarajan 2001, section 8.3), in every estimator alike.
 """
 
 from collections.abc import Mapping, Sequence
@@ -120,9 +118,8 @@ def split_error(
 ) -> tuple[MeasurementModel, FloatArray]:
     """The measurement model with the correlated part of the error, and the covariance (k, k) of the rest.
 
-    Of the covariance R (k, k) of the components that the sensor measures, the share s = `model.correlation.share`
-    is correlated: z = h(x) + (s R)^1/2 e + N(0, (1 - s) R), so that a detection alone has the covariance R.
-    `state_names` are those of the motion model. Both are returned as they are without correlation.
+    Of the covariance R (k, k) of the components that the sensor measures, the share s = `model.correlation.share` is
+    correlated: z = h(x) + (s R)^1/2 e + N(0, (1 - s) R), so that a detection alone has the covariance R.
     """
     if model.correlation is None:
         return measurement, R
@@ -147,10 +144,7 @@ def whole_error(measurement: MeasurementModel, white: FloatArray) -> FloatArray:
 
 
 def position_cross(measurement: MeasurementModel, z: FloatArray, pose: SensorPose) -> dict[str, tuple[float, float]]:
-    """Covariance of the position that z (k,) gives with the correlated errors, by the names of these in the state.
-
-    An object that is placed at its first detection, x = G (z - gain e - noise), is off by what the error is: -G gain.
-    """
+    """Covariance of the position by z (k,) with the correlated errors, by name: -G gain, x = G (z - gain e)."""
     if not isinstance(measurement, ColouredNoiseMeasurement):
         return {}
     G = position_gradient(measurement.components, z, pose)

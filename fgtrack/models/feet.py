@@ -14,9 +14,9 @@ _ALONG, _QUANTITIES = 9, 10  # see `fgtrack.models.track_map`
 def feet(points_m: FloatArray, segments: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Quantities (m, 10) at the feet of points (m, 2) on the line, and lateral offsets (m,), left positive.
 
-    `segments` (n, 20) are the rows of `TrackMap`. The foot is on the one that begins or ends at the nearest point of
-    the line. It has the point on its normal: Re((q - t e) (B + t dB)) = 0 with q from the start of the segment to the
-    point, e the segment, and B, dB the inverse of the heading and its change, as complex numbers.
+    `segments` (n, 20) are the rows of `TrackMap`. The foot, on a segment at the nearest point of the line, has the
+    point on its normal: Re((q - t e) (B + t dB)) = 0 with q from the start of the segment to the point, e the segment,
+    and B, dB the inverse of the heading and its change, as complex numbers.
     """
     quantities, lateral = np.empty((len(points_m), _QUANTITIES)), np.empty(len(points_m))
     for i in range(len(points_m)):

@@ -48,8 +48,7 @@ _AT_ORIGIN = SensorPose()
 class MeasurementModel:
     """Measurement of a state, z = h(x, pose) + noise; `measurement_model` gives a shared one.
 
-    A state may have more entries than `state_names`; the Jacobian is as wide as the state that it is given.
-    Raises `CallError` when a component is unknown, repeated or out of order, or the state is of another kind.
+    A state may have more entries than `state_names`. Raises `CallError` for components or states that are not known.
     """
 
     components: tuple[str, ...]
@@ -92,11 +91,7 @@ class MeasurementModel:
         return _observed(self.components, x, pose, self._cartesian)[0]
 
     def jacobian(self, x: FloatArray, pose: SensorPose = _AT_ORIGIN) -> FloatArray:
-        """Derivative H of `predict` by `x`, shape (..., k, n); read-only where the model is linear.
-
-        Finite everywhere: the gradient of an angle grows up to `MIN_RANGE_M` and `MIN_SPEED_MPS` and no
-        further.
-        """
+        """Derivative H of `predict` by `x`, (..., k, n), read-only of a linear model; finite, see `MIN_RANGE_M`."""
         n = x.shape[-1]
         shape = (*x.shape[:-1], len(self.components), n)
         if self.linear:
@@ -164,10 +159,7 @@ def _shared_model(components: tuple[str, ...], state_names: tuple[str, ...]) -> 
 def measured_position(
     components: tuple[str, ...], z: FloatArray, R: FloatArray, pose: SensorPose
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Position in the map, shape (2,), and its covariance, (2, 2), from x and y, or range and bearing to first order.
-
-    `z` (k,) and `R` (k, k) are those of `components`, in the order of `MEASURABLE`; None where these hold no position.
-    """
+    """Position in the map (2,), and covariance (2, 2), of x and y, or to first order of range and bearing; or None."""
     if components[:2] == ("x_m", "y_m"):
         return z[:2], R[:2, :2]
     G = position_gradient(components, z, pose)
@@ -199,8 +191,7 @@ def _observed(
 ) -> tuple[FloatArray, FloatArray]:
     """Values (..., k) of the components `names`, and their derivatives (..., k, 5) by the state as far as a yaw rate.
 
-    A moved object turns the line of sight towards its normal; its velocity counts along it. A curvature is the yaw rate
-    over the speed, times v^2 / (v^2 + v0^2) with v0 = `SLOW_MPS`, which falls to 0 at rest.
+    A curvature is the yaw rate over the speed, times v^2 / (v^2 + v0^2) with v0 = `SLOW_MPS`, which falls to 0 at rest.
     """
     shape = *x.shape[:-1], len(names)
     z, G = np.empty(shape), np.zeros((*shape, 5))

@@ -37,11 +37,10 @@ class Transition(NamedTuple):
 
 
 class MotionModel(ABC):
-    """Motion of an object between two stamps, and its uncertainty.
+    """Motion of an object between two stamps, and its uncertainty: a frozen dataclass.
 
-    A model has `state_names`, `predict`, `jacobian` and `process_noise`; everything else follows from them. One that
-    computes these three in one go overrides `transition`, which is what estimators call.
-    It is immutable, equal to one with the same parameters, and hashable: a frozen dataclass.
+    A model has `state_names`, `predict`, `jacobian` and `process_noise`; one that computes these three in one go
+    overrides `transition`, which is what estimators call.
     """
 
     state_names: ClassVar[tuple[str, ...]]
@@ -110,8 +109,8 @@ class MotionModel(ABC):
     def from_kinematic(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """State and covariance P of this model from a kinematic state; a missing entry is 0 with `start_variance`.
 
-        The covariance of a Cartesian velocity is of first order, plus the variance of the product of speed error and
-        yaw error, across the heading: without it, an object born at speed 0 could not move sideways.
+        To the first-order covariance of a Cartesian velocity comes the variance of the product of speed error and yaw
+        error, across the heading: without it, an object born at speed 0 could not move sideways.
         """
         n = self.dim
         if self._leads and n <= mean.shape[-1]:
@@ -146,7 +145,7 @@ class MotionModel(ABC):
 class WhiteNoise(MotionModel):
     """A motion model with a compiled transition, driven by white noise in each entry of the state.
 
-    The noise parameters are spectral densities, in fields `<what>_density_<unit>` in the order of the state.
+    Noise parameters are spectral densities, in fields `<entry>_density_<unit>` in the order of the state.
     """
 
     kind: ClassVar[int] = 0
@@ -157,11 +156,10 @@ class WhiteNoise(MotionModel):
 
     @classmethod
     def from_std_per_step(cls, std: Mapping[str, float], frequency_hz: float) -> Self:
-        """Model as noisy as a filter that adds the variance (std / frequency_hz)^2 in each of its steps.
+        """Model with the noise of a filter that adds (std / frequency_hz)^2 in each step: densities std^2 / frequency_hz.
 
-        Its densities are std^2 / frequency_hz. `std` is per second, as in Karle et al. 2023; its keys are the
-        names of all densities up to `_density_`: `position`, `yaw`, `speed`, ... Raises `ValueError` when a
-        key is missing or unknown.
+        `std` is per second, as in Karle et al. 2023, by the names of all densities up to `_density_`: `position`,
+        `yaw`, ...
         """
         names = {name.partition("_density_")[0]: name for name in cls.density_names()}
         if set(std) != set(names):
@@ -212,9 +210,9 @@ class WhiteNoise(MotionModel):
 class CTRV(WhiteNoise):
     """Constant turn rate and velocity; state x, y, yaw, speed, yaw rate.
 
-    x(t) + i y(t) = x + i y + speed * integral over s in [0, t] of exp(i (yaw + yaw_rate s)). White noise
-    drives each entry; its covariance Q composes (see `MotionModel`). All is exact to rounding, at any yaw rate. The
-    defaults are those of Karle et al. 2023: std per second 0.2, 0.3, 1, 0.5 at 100 Hz.
+    x(t) + i y(t) = x + i y + speed * integral over s in [0, t] of exp(i (yaw + yaw_rate s)), exact at any yaw rate.
+    White noise drives each entry. The defaults are those of Karle et al. 2023: std per second 0.2, 0.3, 1, 0.5 at 100
+    Hz.
     """
 
     position_density_m2ps: float = 0.2**2 / 100.0
@@ -242,8 +240,8 @@ class CTRA(CTRV):
 class CV(WhiteNoise):
     """Constant velocity, linear; state x, y and the velocities vx, vy along the axes of the map.
 
-    White noise acceleration drives vx and vy alike. The default is the speed's density of Karle et al. 2023
-    (see `CTRV`); an object that turns sharply needs more.
+    White noise acceleration drives vx and vy alike, by default with the speed's density of Karle et al. 2023 (see
+    `CTRV`).
     """
 
     velocity_density_m2ps3: float = 1.0**2 / 100.0

@@ -33,8 +33,8 @@ _PIT_HALF_WIDTH_M = 4.5
 def make_oval() -> TrackMap:
     """Banked tri-oval of 2.4 km, 15 m wide, turns of 220 m radius, driven counter-clockwise.
 
-    The curvature is continuous with a continuous derivative: constant values joined by smooth ramps. The lap
-    is symmetric about the line through the start and the middle of the back straight, so it closes exactly.
+    Its curvature has a continuous derivative. The lap is symmetric about the line through the start and the middle of
+    the back straight, so it closes exactly.
     """
     points = _centre_line()
     path = Path.through(points)

@@ -1,9 +1,7 @@
-"""Positions ahead of states: on its arc, or on its arc at first and then along the track.
+"""Positions ahead of states: on their arc, or on their arc at first and then along the track.
 
-The second is the "rail" of the published node of Karle et al. 2023: constant turn rate and speed for a fifth of a
-second; from there on at that speed along the track, at the same share of the way from one bound to the other. Without
-that node's defects: a point is projected on the line with its sign, and a metre is a metre where the track turns,
-while the node counts along the raceline.
+The second is the "rail" of the published node of Karle et al. 2023, without its defects: constant turn rate and speed
+for a fifth of a second, then along the track, at the same share of the way from one bound to the other.
 """
 
 import numpy as np
@@ -17,18 +15,14 @@ ARC_S = 0.2
 
 
 def arc_positions(states: FloatArray, ahead_s: FloatArray) -> FloatArray:
-    """Positions at constant turn rate and speed (`CTRV`) after each of m rising times, shape (n, m, 2) in metres.
-
-    `states` are x, y, yaw, speed and yaw rate of n objects, shape (n, 5), `ahead_s` positive times from theirs, (m,).
-    """
+    """Positions (n, m, 2) of states x, y, yaw, speed, yaw rate (n, 5) after `ahead_s` (m,), on their arcs (`CTRV`)."""
     return np.asarray(CTRV().predict(states[:, None], ahead_s)[..., :2])
 
 
 def rail_positions(track: TrackMap, states: FloatArray, ahead_s: FloatArray) -> FloatArray:
-    """As `arc_positions` for `ARC_S`, then along `track`.
+    """As `arc_positions` for `ARC_S`, then along `track`; the times rise by some 0.1 s.
 
-    An object beyond a bound goes on along that bound, one with a negative speed stays where it is then. The way is
-    measured from time to time along chords, so the times should be some 0.1 s apart.
+    An object beyond a bound goes on along that bound, one with a negative speed stops.
     """
     positions = arc_positions(states, ahead_s)
     s_m, lateral_m = track.frenet(arc_positions(states, np.array([ARC_S]))[:, 0])

@@ -19,8 +19,7 @@ class PublishedMap:
     """Arc look-up at the nearest row, with bounds as points (defect Q4) and a heading that is interpolated as a plain
     number, through its jump at +-pi (defect Q3), unless it is `circular`.
 
-    The raceline's arc length serves as the knots although the projection is on the reference line; the projection
-    is taken without its sign, so a point behind the nearest row is mirrored ahead of it.
+    The knots are the raceline's arc length although the projection, without its sign, is on the reference line.
     """
 
     def __init__(self, track: TrackMap, circular: bool = False) -> None:

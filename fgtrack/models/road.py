@@ -14,10 +14,7 @@ OPEN_SPACE = "none"
 
 @dataclass(frozen=True)
 class Road:
-    """Track and pit lane, by their maps; without a track, open space, where objects may be anywhere.
-
-    A buffer is how far (in metres) an object may lie beyond the bound; a negative one keeps away from the wall.
-    """
+    """Maps of track and pit lane, open space without a track; objects may lie beyond the bounds by the buffers."""
 
     track: TrackMap | PublishedMap | None = None
     pit: TrackMap | PublishedMap | None = None

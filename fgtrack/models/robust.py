@@ -1,8 +1,8 @@
-"""Weight of a measurement under a robust loss: the M-estimators' weights of iteratively reweighted least squares.
+"""Weight of a measurement under a robust loss, as in iteratively reweighted least squares.
 
 The weight at a whitened residual of length d is rho'(d) / d of the loss rho, which begins as d^2 / 2; c is the width.
-Names and forms are those of GTSAM's `noiseModel.mEstimator`. All weights begin at 1 and never grow with d, so each
-reweighting lowers prior plus loss (Huber and Ronchetti, Robust Statistics, 2009, section 7.8).
+Names and forms are those of GTSAM. Weights begin at 1 and never grow with d, so each reweighting lowers prior plus loss
+(Huber and Ronchetti, Robust Statistics, 2009, section 7.8).
 """
 
 import math
@@ -32,10 +32,7 @@ def _loss(loss: RobustLoss, d: float) -> tuple[float, float]:
 
 
 def weight(loss: RobustLoss, distance: float) -> float:
-    """Weight of a measurement under `loss`, 1 at most, at a whitened residual of length `distance`.
-
-    Never less than `LEAST_WEIGHT`, which stands for a distance without bounds, too.
-    """
+    """Weight of a measurement under `loss`, from `LEAST_WEIGHT` to 1, at a whitened residual of length `distance`."""
     if not math.isfinite(distance):
         return LEAST_WEIGHT
     return max(_loss(loss, distance)[1], LEAST_WEIGHT)

@@ -194,8 +194,8 @@ class SensorModel:
     def sees(self, positions_m: FloatArray, ego_poses: FloatArray, origin_m: tuple[float, float]) -> BoolArray:
         """True if an object there is in range and in the field of view, shape (...); nothing hides it.
 
-        `positions_m` (..., 2) are in the map, `ego_poses` (..., 3) are x, y and yaw of the ego there at the same times,
-        `origin_m` is the origin of the detection frame seen from the ego (`ego.detection_origin_*`).
+        `positions_m` (..., 2) and the `ego_poses` x, y, yaw (..., 3) at the same times are in the map, `origin_m` is
+        the origin of the detection frame in that of the ego.
         """
         x_m, y_m, yaw_rad = np.moveaxis(ego_poses, -1, 0)
         still, mount = np.zeros_like(x_m), self.placed
@@ -212,10 +212,7 @@ class SensorModel:
         )
 
     def noise(self, components: tuple[str, ...]) -> FloatArray:
-        """Diagonal covariance R of `components`, shape (k, k), in the sensor's own axes; shared and read-only.
-
-        A yaw that the sensor does not measure, and a curvature, come from the map.
-        """
+        """Diagonal covariance R (k, k) of `components`, also those from the map, in the sensor's axes; read-only."""
         if components not in self._noises:
             from_map = {"yaw_rad": self.yaw_from_map_std_rad, "curvature_radpm": self.curvature_from_map_std_radpm}
             std = {name: value for name, value in {**from_map, **self.std}.items() if value is not None}
@@ -231,10 +228,7 @@ class SensorModel:
         return self.std["x_m"] == self.std["y_m"] and growth.get("x_m", 0.0) == growth.get("y_m", 0.0)
 
     def growth(self, components: tuple[str, ...], range_m: FloatArray) -> FloatArray | None:
-        """Increase of the variances of `components` at `range_m` (m,) over those in `noise`, shape (m, k).
-
-        None where nothing grows; 0 at a range that is not known (NaN).
-        """
+        """Increase (m, k) of the variances in `noise` at `range_m` (m,), 0 at NaN; None where nothing grows."""
         rates = np.array([self.std_growth.get(name, 0.0) for name in components])
         return np.nan_to_num(np.outer(range_m, rates) ** 2) if rates.any() else None
 
@@ -252,10 +246,9 @@ def in_view(
     max_range_m: float = math.inf,
     max_range_behind_m: float | None = None,
 ) -> BoolArray:
-    """Which objects at these ranges and bearings (0 on the sensor's axis), any one shape, a sensor can see.
+    """True for objects at these ranges and bearings (0 on the sensor's axis), any one shape, in view of a sensor.
 
-    `field_of_view_rad` is the full angle, centred on the axis; `max_range_behind_m`, if given, takes the place of
-    `max_range_m` in the half behind the sensor.
+    `field_of_view_rad` is the full angle; `max_range_behind_m` replaces `max_range_m` in the half behind the sensor.
     """
     off_axis_rad = np.abs(wrap_angles(bearing_rad))
     behind_m = max_range_m if max_range_behind_m is None else min(max_range_behind_m, max_range_m)

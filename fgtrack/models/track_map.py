@@ -64,17 +64,13 @@ class RoadView(NamedTuple):
 class TrackMap:
     """A closed reference line with widths to both bounds.
 
-    The line runs straight from row to row. Its normals turn evenly within a segment, from the heading of one
-    row to that of the next, so road coordinates (arc length s, lateral offset) are continuous and one-to-one
-    as far as the centre of curvature. s is measured along the segments from the first row; lateral is
-    positive to the left of the driving direction. Angles are REP-103. Points must be finite.
+    The line runs straight from row to row. Its normals turn evenly within a segment, so road coordinates (arc length s
+    along the segments, lateral offset to the left) are one-to-one as far as the centre of curvature. Angles are
+    REP-103.
     """
 
     def __init__(self, table: FloatArray) -> None:
-        """`table`: rows of `COLUMNS`, shape (n, 17), headings in REP-103.
-
-        Raises `DataError` if it is not a closed line in driving direction.
-        """
+        """`table`: rows of `COLUMNS`, headings in REP-103; raises `DataError` unless it is a closed driven line."""
         table = _closed(np.asarray(table, dtype=np.float64))
         table[:, _HEADINGS] = wrap_angles(table[:, _HEADINGS])
         x, y = np.ascontiguousarray(table[:, :2].T)
@@ -100,8 +96,7 @@ class TrackMap:
     def read(cls, path: str | Path) -> Self:
         """Map of a semicolon-separated file with the 17 `COLUMNS`; `#` starts a comment line.
 
-        The last row may repeat the first. The file's headings (0 along +y) become REP-103 here. Raises `DataError`
-        with the path if the file cannot be read or is not a map.
+        The last row may repeat the first. Raises `DataError` with the path if the file cannot be read or is not a map.
         """
         content = read_whole(Path(path), _LARGEST_MB)
         try:
@@ -148,8 +143,7 @@ class TrackMap:
     def view(self, points_m: FloatArray, inner_buffer_m: float, outer_buffer_m: float) -> RoadView:
         """Heading and curvature of the line beside `points_m`, shape (n, 2), and True for those outside the bounds.
 
-        A positive buffer lets points in that lie up to that far beyond the bound; a negative one shrinks the
-        track. The inner bound is the one that the lap encloses: the left one if driven counter-clockwise.
+        A positive buffer widens the track. The inner bound is the left one if it is driven counter-clockwise.
         """
         foot, lateral = self._locate(points_m)
         left_m, right_m = (
@@ -180,10 +174,7 @@ def _complex(vectors: FloatArray) -> npt.NDArray[np.complex128]:
 
 
 def _closed(table: FloatArray) -> FloatArray:
-    """Copy of `table` that ends with its first point, arc lengths carried on over the closing segment.
-
-    Raises `DataError` with the row if it is not a closed line in driving direction.
-    """
+    """Copy of `table` that ends with its first point; raises `DataError` with the row that is wrong."""
     if table.ndim != 2 or table.shape[1] != len(COLUMNS) or len(table) < 4:
         raise DataError(f"not a map: at least 4 rows of {len(COLUMNS)} columns are needed")
     if not (np.abs(table) <= LARGEST).all():

@@ -20,8 +20,8 @@ def propagate(
 ) -> None:
     """Move means (m, n) and covariances (m, n, n), each by its own number of `steps` (m,): P' = F P F' + Q dt.
 
-    `density`, shape (n,): diagonal of Q, along and across the heading first. What follows the yaw rate stays, but that
-    an acceleration may drive the speed, without a part in F; the yaw goes up to `yaw_limit_rad`.
+    `density`, shape (n,): diagonal of Q, along and across the heading first. An acceleration may drive the speed,
+    without a part in F; the yaw goes up to `yaw_limit_rad`.
     """
     m, n = mean.shape
     F, FP, more = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))

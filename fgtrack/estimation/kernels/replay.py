@@ -162,9 +162,8 @@ def fuse(
 ) -> None:
     """Put a measurement `new` (m, k + 1, k) into the steps of each of `tracks` (m,), and filter the later ones again.
 
-    A track has fewer steps than slots. Writes innovations y (m, k), the NIS of their `rows`, and S (m, k, k), given all
-    that was fused, and the status. Where a measurement fails, or is older than `oldest_ns` or the window of the track,
-    all is as it was.
+    Writes innovations y (m, k), the NIS of their `rows`, and S (m, k, k), given all that was fused, and the status. A
+    failed measurement, and one older than `oldest_ns` or the window of the track, change nothing.
     """
     k, n, stamp_ns = y.shape[1], len(density), new_label[0]
     now, H, K = np.empty((n + 1, n)), np.empty((k, n)), np.empty((k, n))
