@@ -156,7 +156,7 @@ class WhiteNoise(MotionModel):
 
     @classmethod
     def from_std_per_step(cls, std: Mapping[str, float], frequency_hz: float) -> Self:
-        """Model with the noise of a filter that adds (std / frequency_hz)^2 in each step: densities std^2 / frequency_hz.
+        """Model with the noise of a filter that adds (std / frequency_hz)^2 per step: densities std^2 / frequency_hz.
 
         `std` is per second, as in Karle et al. 2023, by the names of all densities up to `_density_`: `position`,
         `yaw`, ...
