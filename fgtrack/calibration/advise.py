@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 from fgtrack.calibration.arrivals import FEWEST, LONGEST_STORAGE_S, Arrivals, arrivals_of, overtaken, window_findings
@@ -37,7 +38,6 @@ TUNED_S = 60.0
 """Noise is fitted to so much of it."""
 _TUNE_RULES = TuneRules(train_share=1.0, max_rounds=3, max_observations=1500)  # the replay judges the result
 _USELESS = 90.0  # what weighs more leaves nothing to be judged
-_FIRST = 45.0  # what weighs more comes before noise
 _OFTEN = 0.05  # share of lists that are overtaken
 _SLOW_EGO_S = 0.2
 
@@ -108,7 +108,6 @@ class Adviser:
 
     def advice(self, broken: str | None = None, tune: bool = False) -> Advice:
         """Return the advice after all steps; `broken` is why the recording breaks off, where it does."""
-        work = 0.35 if tune else 1.0  # share of the work without the tuning
         if self._assumed.assumptions:
             text = f"not configured: {'. '.join(self._assumed.lines())}."
             self._findings.append(Finding("assumed", "sensors", 35.0, text))
@@ -119,28 +118,27 @@ class Adviser:
             raise DataError(f"{self._recording}: there are no detections of a sensor that the configuration has")
         for name in [*sensors, *([EGO] if EGO in self._arrivals else [])]:
             self._take(stamp_findings(self._arrivals[name]))
-        self._take(self._misread())
-        self._on_step("clocks", 0.2 * work)
+        for one in suspicions(list(beginning(self._messages, nanoseconds(TRIAL_S))), self._config):
+            self._take([Finding("input", one.about, 94.0 if one.spoils else 45.0, f"{one.text}.", one.settings)])
+        self._on_step("clocks", 0.1)
         self._take(self._offsets())
         seen = arrivals_of(
             corrected(message, self._config.sensors)
             for message in self._messages
             if isinstance(message, DetectionList) and message.sensor in sensors
         )
-        shares, timed = overtaken(seen, sensors), [one for one in seen.values() if one.has_stamps]
+        shares = overtaken(seen, sensors)
         self._take(self._late(shares))
-        self._take(window_findings(timed, self._config))
+        self._take(window_findings([one for one in seen.values() if one.has_stamps], self._config))
         self._take(self._ego())
-        self._on_step("tracking", 0.6 * work)
-        run = self._run(self._config)
-        if run is not None:
-            self._take(self._diagnostics(run))
+        self._on_step("tracking", 0.3)
+        self._take(self._diagnostics(self._run(self._config)))
         self._withdraw_harm(before)
         run = self._run(self._config)
         if run is not None and not self._is_useless:
-            self._take(noise_findings(run, Outcome.of(run).noise, tune))
+            self._take(noise_findings(run, tune))
         if tune and run is not None:
-            self._take(self._tuned(run, work))
+            self._take(self._tuned(run))
         old, new = (None if found is None else Outcome.of(found) for found in map(self._run, (before, self._config)))
         if new is not None and new.shortfall is not None:
             text = f"{new.shortfall}: look at the sectors and ranges of sensors (`fgtrack info`) and at the gate."
@@ -179,9 +177,8 @@ class Adviser:
 
     def _is_harm(self, old: Config, new: Config) -> str | None:
         """Return what gets worse from one configuration to the other; None where nothing does."""
-        runs = [self._run(old), self._run(new)]
-        before, after = (None if run is None else Outcome.of(run) for run in runs)
-        return None if old == new or before is None or after is None else harm(before, after)
+        before, after = self._run(old), self._run(new)
+        return None if old == new or before is None or after is None else harm(Outcome.of(before), Outcome.of(after))
 
     @property
     def _is_useless(self) -> bool:
@@ -194,24 +191,17 @@ class Adviser:
         unknown = [name for name in self._arrivals if name not in known]
         if not unknown:
             return
-        measured = dict.fromkeys(unknown, "nothing")
-        for message in self._messages:
-            if isinstance(message, DetectionList) and message.sensor in unknown and message.objects:
-                measured[message.sensor] = ", ".join(message.objects[0].measured)
-        has = "; ".join(f"{name}: {components}" for name, components in measured.items())
+        lists = [one for one in self._messages if isinstance(one, DetectionList) and one.objects]
+        first = {one.sensor: ", ".join(one.objects[0].measured) for one in reversed(lists)}
+        has = "; ".join(f"{name}: {first.get(name, 'nothing')}" for name in unknown)
         text = f"no model of {', '.join(unknown)} ({has}): give sensors.NAME.std, or leave them out."
         ignored = sorted({*self._config.ignore_sensors, *unknown})
         yield Finding("model", "sensors", 98.0, text, {"ignore_sensors": ignored})
 
-    def _misread(self) -> Iterator[Finding]:
-        """Yield suspicions in how the first seconds are read."""
-        for one in suspicions(list(beginning(self._messages, nanoseconds(TRIAL_S))), self._config):
-            yield Finding("input", one.about, 94.0 if one.spoils else 45.0, f"{one.text}.", one.settings)
-
-    def _diagnostics(self, run: Run) -> Iterator[Finding]:
+    def _diagnostics(self, run: Run | None) -> Iterator[Finding]:
         """Yield the diagnostics of a run with the settings, except of sensors with a known problem."""
         known = {one.about for one in self._findings if one.weight >= _USELESS}
-        for one in diagnostics(run):
+        for one in [] if run is None else diagnostics(run):
             if one.about not in known:
                 yield Finding("track", one.about, 70.0, f"{one.text}.", one.settings)
 
@@ -265,44 +255,33 @@ class Adviser:
             )
             yield Finding("ego", EGO, 35.0, text)
 
-    def _tuned(self, before: Run, begun: float) -> Iterator[Finding]:
-        """The noise that is fitted to the recording, unless nothing can be, or it does harm."""
-        if not any(one.kind == "noise" for one in self._findings) and not any(
-            one.key.endswith(".std") for one in self._assumed.assumptions
-        ):
+    def _tuned(self, before: Run) -> Iterator[Finding]:
+        """Yield the noise that is fitted to the recording, unless nothing can be, or it does harm."""
+        is_assumed = any(one.key.endswith(".std") for one in self._assumed.assumptions)
+        if not is_assumed and not any(one.kind == "noise" for one in self._findings):
             return
-        steps = iter(range(1, 100))
+        steps = count()
         messages = list(beginning(self._tracked, nanoseconds(TUNED_S)))
         try:
             report = tuned(
                 {self._recording: source_of(lambda: messages)},
                 self._config,
                 _TUNE_RULES,
-                lambda text: self._on_step(f"tune: {text}", begun + 0.55 * (1.0 - 0.8 ** next(steps))),
+                lambda text: self._on_step(f"tune: {text}", 0.9 - 0.55 * 0.8 ** next(steps)),
             )
         except DataError as error:
-            yield Finding("tune", "tune", 76.0, f"no noise is changed: {error}. {self._kept}")
+            yield Finding("tune", "tune", 76.0, f"no noise is changed: {error}.")
             return
         self._on_step("tracking", 0.9)
         after = self._run(report.config)
         why = None if after is None else objection(before, after)
         if why is not None:
-            yield Finding("tune", "tune", 76.0, f"no noise is changed. With what is fitted, {why}. {self._kept}")
+            yield Finding("tune", "tune", 76.0, f"no noise is changed. With what is fitted, {why}.")
             return
         settings = {one.key: one.tuned for one in report.parameters if one.tuned != one.configured}
         stay = ", ".join(one.key for one in report.parameters if one.key not in settings)
         rest = f" As configured stay {stay}." if stay else ""
         yield Finding("tune", "tune", 76.0, f"fitted to the recording by maximum likelihood.{rest}", settings)
-
-    @property
-    def _kept(self) -> str:
-        """Instruction where no noise is fitted: what is wrong besides noise comes first."""
-        first = [one for one in self._findings if one.weight > _FIRST and not one.settings and one.kind != "noise"]
-        if not first:
-            return "Keep the configured noise."
-        return (
-            f"First settle what is said of {max(first, key=lambda one: one.weight).about}; until then keep the noise."
-        )
 
     def _run(self, config: Config) -> Run | None:
         """A run of the first minutes, of the replaying EKF for a smoother; None where nothing can be tracked."""
@@ -328,27 +307,23 @@ class Adviser:
         if ego is not None and not wrong & {("ego", EGO), ("clock", EGO), ("input", EGO)} and ego.period_s:
             longest, delay = milliseconds(float(ego.steps_s.max())), milliseconds(ego.quantile_s(0.5))
             yield f"the ego ({1.0 / ego.period_s:.0f} Hz, longest gap {longest}, delay {delay})"
-        stamps = [name for name, one in seen.items() if len(one.stamps_ns) >= FEWEST and not one.is_receipt]
-        stamps = [name for name in stamps if ("clock", name) not in wrong]
-        if stamps:
-            yield f"stamps of {', '.join(stamps)}"
         offsets = [] if self._clocks is None else self._clocks.others
-        clocks = [one.sensor for one in offsets if one.is_known and not one.is_off]
-        if clocks:
-            yield f"clock of {', '.join(clocks)}"
+        noise = () if outcome is None else outcome.noise
+        stamped = [name for name, one in seen.items() if len(one.stamps_ns) >= FEWEST and not one.is_receipt]
+        named = {
+            "stamps": [name for name in stamped if ("clock", name) not in wrong],
+            "clock": [one.sensor for one in offsets if one.is_known and not one.is_off],
+            "noise": [one.sensor for one in noise if ("noise", one.sensor) not in wrong and one.is_consistent],
+        }
+        yield from (f"{what} of {', '.join(names)}" for what, names in named.items() if names)
         if not kinds & {"input", "model"}:
             yield "frames, angles and fields"
         if "window" not in kinds and any(one.has_stamps for one in seen.values()):
             found = self._config.effective
             yield f"{found.lag_key} ({found.lag_s:g} s) and max_delay_s"
-        if outcome is None:
-            return
-        if "track" not in kinds and outcome.truth is not None:
+        if "track" not in kinds and outcome is not None and outcome.truth is not None:
             tracked = percent(outcome.truth.tracked_share_in_sight)
             yield f"tracks ({outcome.births} beginnings, {tracked} tracked where a sensor could see)"
-        noise = [one.sensor for one in outcome.noise if ("noise", one.sensor) not in wrong and one.is_consistent]
-        if noise:
-            yield f"noise of {', '.join(noise)}"
 
 
 def _with(config: Config, finding: Finding) -> Config:

@@ -6,20 +6,16 @@ the offset d
     r(d) = p(s - d) - T(s - d) z = r(0) + d r'(0) + ...
 
 r' is minus the velocity of the object against the turning ego. d is found by Gauss-Newton, with Huber weights. The path
-is that of the truth, or a smoothing spline through the detections of a reference sensor, so that only the agreement of
-two sensors counts. With truth a constant bias is found as well: along and across the motion of the object, where the
-sensor sees another part of it than the truth means, or of the ego, where the origin of its detections is not the
-configured one, the one that leaves the smaller residuals. Where the velocity hardly changes, bias and offset cannot be
-distinguished, and the offset is not known.
+is that of the truth, or a smoothing spline through the detections of a reference sensor. With truth a constant bias is
+found as well, along and across the motion of the object or of the ego, the one that leaves the smaller residuals. Where
+the velocity hardly changes, bias and offset cannot be distinguished, and the offset is not known.
 
 The standard deviation of d is that of the jackknife over stretches of time, so it includes time-correlated errors
-(Bell, McCaffrey, Survey Methodology 28, 2002). Few stretches determine the two apart, those with a bend or an
-overtaking: it is uncertain, and d over it follows Student's t with one degree of freedom less than stretches count, the
-larger ones more (Carter, Schnepel, Steigerwald, Review of Economics and Statistics 99, 2017).
+(Bell, McCaffrey, Survey Methodology 28, 2002). d over it follows Student's t with one degree of freedom less than
+stretches count, the larger ones more (Carter, Schnepel, Steigerwald, Review of Economics and Statistics 99, 2017).
 """
 
 import math
-from collections import Counter
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Literal, NamedTuple
@@ -27,6 +23,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.special import stdtrit
 
+from fgtrack.calibration.arrivals import arrivals_of
 from fgtrack.calibration.paths import EgoPath, ObjectPath, Sightings, sightings_of, true_paths
 from fgtrack.core.errors import CallError, DataError, did_you_mean
 from fgtrack.core.geometry import rotations
@@ -144,9 +141,9 @@ class OffsetReport:
 class _Fit(NamedTuple):
     """Solution of r + A x = 0, x = (offset, bias ahead and to the left)."""
 
-    x: tuple[float, ...]
-    std: tuple[float, ...]
-    """Standard deviations of x."""
+    x: FloatArray
+    std: FloatArray
+    """Standard deviations of x; infinite where nothing determines them."""
     dof: float
     """Degrees of freedom of that of the offset."""
     cost: float
@@ -186,11 +183,9 @@ def estimate_offsets(
     }
     config = replace(config, estimator="ekf-replay", sensors=unrefused)
     lists = [one for one in heard if isinstance(one, DetectionList) and one.sensor in config.used_sensors]
-    counts, least_s = Counter[str](), dict[str, float]()
-    for one in lists:
-        counts[one.sensor] += len(one.objects)
-        delay_s = seconds(one.receipt_ns - one.stamp_ns)
-        least_s[one.sensor] = min(least_s.get(one.sensor, math.inf), delay_s)
+    arrivals = arrivals_of(lists)
+    counts = {name: int(one.counts.sum()) for name, one in arrivals.items()}
+    least_s = {name: float(one.delays_s.min()) for name, one in arrivals.items()}
     if not counts:
         raise DataError("there are no detections of a sensor that the configuration names (sensors)")
     if reference is not None and reference not in counts:
@@ -207,16 +202,13 @@ def estimate_offsets(
     def against(name: str, paths: Sequence[ObjectPath]) -> OffsetReport:
         rows = []
         for sensor in sensors:
-            pairs = [] if sensor == name else _paired(seen.get(sensor, {}), paths)
             is_swapped = name != TRUTH and counts[sensor] > counts[name]  # the path of the better sensor is smoother
-            if is_swapped:
-                pairs = _paired(seen.get(name, {}), _paths(seen, sensor))
-            row = _row(sensor, pairs, name, len(sensors))
+            fixed, moved = (_paths(seen, sensor), name) if is_swapped else (paths, sensor)
+            row = _row(sensor, _paired(seen.get(moved, {}), fixed), name, len(sensors))
             rows.append(replace(row, offset_s=-row.offset_s) if is_swapped and row.offset_s is not None else row)
         return OffsetReport(name, tuple(rows), least_s)
 
-    paths = true_paths(messages) if reference is None else []
-    if paths:
+    if reference is None and (paths := true_paths(messages)):
         return against(TRUTH, paths)
     if reference is not None:
         return against(reference, _paths(seen, reference))
@@ -282,10 +274,10 @@ def _row(name: str, pairs: Sequence[_Pair], reference: str, num_sensors: int) ->
         return SensorOffset(name, None, None, len(stamps_ns), why)
     biases = [  # 0 where it may be chance or does not matter
         bias_m if abs(bias_m) > max(_BIAS_STDS * std_m, _SMALLEST_BIAS_M) else 0.0
-        for bias_m, std_m in zip(fit.x[1:], fit.std[1:], strict=True)
+        for bias_m, std_m in zip(fit.x[1:].tolist(), fit.std[1:].tolist(), strict=True)
     ]
     bias = Bias(of, *biases) if any(biases) else None
-    return SensorOffset(name, offset_s, fit.std[0], len(stamps_ns), why, fit.dof, bias)
+    return SensorOffset(name, offset_s, float(fit.std[0]), len(stamps_ns), why, fit.dof, bias)
 
 
 _Frames = dict[Literal["ego", "vehicle"], FloatArray]
@@ -312,8 +304,9 @@ def _solved(r: FloatArray, A: FloatArray, stamps_ns: IntArray) -> _Fit:
     known = np.isfinite(r).all(axis=1) & np.isfinite(A).all(axis=(1, 2))
     r, A, stamps_ns = r[known], A[known], stamps_ns[known]
     size = A.shape[2]
+    unknown = np.full(size, math.inf)
     if len(r) < _FEWEST:
-        return _Fit((0.0,) * size, (math.inf,) * size, 0.0, math.inf)
+        return _Fit(np.zeros(size), unknown, 0.0, math.inf)
     x, weights, scale_m = np.zeros(size), np.ones(len(r)), 1.0
     H = np.eye(size)
     for _ in range(5):
@@ -329,14 +322,14 @@ def _solved(r: FloatArray, A: FloatArray, stamps_ns: IntArray) -> _Fit:
     stretch_s = min(_STRETCH_S, max(length_s / _STRETCHES, _SHORTEST_STRETCH_S))
     names, stretches = np.unique(stamps_ns // nanoseconds(stretch_s), return_inverse=True)
     if len(names) < _FEWEST_STRETCHES:
-        return _Fit(tuple(x.tolist()), (math.inf,) * size, 0.0, cost)
+        return _Fit(x, unknown, 0.0, cost)
     parts, scores = np.zeros((len(names), size, size)), np.zeros((len(names), size))
     np.add.at(parts, stretches, np.einsum("n,nij,nik->njk", weights, A, A))
     np.add.at(scores, stretches, np.einsum("n,nij,ni->nj", weights, A, r + A @ x))
     without = psd_solve(H - parts, scores[:, :, None])[:, :, 0]  # how far the solution moves without each
-    std = np.sqrt((1.0 - 1.0 / len(names)) * np.square(without).sum(axis=0)).tolist()
+    std = np.sqrt((1.0 - 1.0 / len(names)) * np.square(without).sum(axis=0))
     column = psd_solve(H, np.eye(size)[0])
     shares = np.einsum("j,njk,k->n", column, parts, column) / column[0]  # of what is known of the offset
     if not shares.any():  # nothing moves
-        return _Fit(tuple(x.tolist()), (math.inf,) * size, 0.0, cost)
-    return _Fit(tuple(x.tolist()), tuple(std), 1.0 / float(shares @ shares) - 1.0, cost)
+        return _Fit(x, unknown, 0.0, cost)
+    return _Fit(x, std, 1.0 / float(shares @ shares) - 1.0, cost)

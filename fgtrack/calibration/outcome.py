@@ -1,7 +1,7 @@
 """Quality of a run in the few numbers that advice is judged by, and the consistency of its noise."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,13 +70,13 @@ def noise_fits(run: Run) -> list[NoiseFit]:
     return fits
 
 
-def noise_findings(run: Run, fits: Sequence[NoiseFit], tune: bool) -> Iterator[Finding]:
+def noise_findings(run: Run, tune: bool) -> Iterator[Finding]:
     """Sensors whose noise does not fit, and those of which a few innovations are far too large.
 
     With `tune` noise is fitted afterwards, which need not be offered.
     """
     off = dict(misfits(run))
-    for one in fits:
+    for one in noise_fits(run):
         sensor = one.sensor
         if sensor not in off:
             if one.count >= FEWEST and not one.is_consistent:

@@ -16,6 +16,7 @@ from fgtrack.core.types import (
     FUSED,
     BoolArray,
     DetectionList,
+    Disposition,
     EgoState,
     FloatArray,
     IntArray,
@@ -26,7 +27,7 @@ from fgtrack.io.run import NO_TRACK, Run
 from fgtrack.models.road import Road
 from fgtrack.pipeline.config import Config
 from fgtrack.tracking.ego import EgoPose, is_finite
-from fgtrack.tracking.inbox import Batch, stamps
+from fgtrack.tracking.inbox import Inbox, record
 from fgtrack.tracking.preprocess import Preprocess
 
 __all__ = ["EgoPath", "ObjectPath", "Sightings", "sightings_of", "true_paths"]
@@ -40,21 +41,11 @@ _POSITION = ("x_m", "y_m", "range_m", "bearing_rad")
 
 
 class EgoPath:
-    """Smoothing splines through positions and unwrapped yaw of the ego.
+    """Smoothing splines through positions and unwrapped yaw of the ego; of states in any order.
 
-    A spline and not the line from state to state: that line moves as fast as its noise, 2 cm at 100 Hz are 3 m/s, and
-    an estimator that asks how a pose changes with time would take this for motion. The spline minimises
-    sum (y - f)^2 + lam integral f''^2, a low-pass that lets half of a sine of 2 Hz through.
-
-    Parameters
-    ----------
-    states
-        In any order; those that are not finite or repeat a stamp are left out.
-
-    Raises
-    ------
-    DataError
-        There are fewer than five states.
+    A line from state to state moves as fast as its noise: 2 cm at 100 Hz are 3 m/s. The spline minimises
+    sum (y - f)^2 + lam integral f''^2, a low-pass that lets half of a sine of 2 Hz through. Raises `DataError` for
+    fewer than five states.
     """
 
     def __init__(self, states: Iterable[EgoState]) -> None:
@@ -79,25 +70,18 @@ class EgoPath:
 
 @dataclass(frozen=True)
 class ObjectPath:
-    """Positions of one object in the map.
-
-    Attributes
-    ----------
-    stamps_ns
-        Times at which it was seen, rising, shape (n,).
-    curve
-        Positions in m over seconds from the first of them.
-    """
+    """Positions of one object in the map."""
 
     stamps_ns: IntArray
+    """Times of its measurements, rising, shape (n,)."""
     curve: BSpline
+    """Positions in m over seconds from the first of them."""
 
     @classmethod
     def through(cls, stamps_ns: IntArray, positions_m: FloatArray) -> "ObjectPath | None":
-        """Return the path through noisy positions (n, 2); None through too few.
+        """Return the smoothing spline through noisy positions (n, 2); None through too few.
 
-        A smoothing spline, its stiffness by generalised cross-validation (Woltring, Advances in Engineering Software
-        8, 1986).
+        Its stiffness is that of generalised cross-validation (Woltring, Advances in Engineering Software 8, 1986).
         """
         known_ns, rows = np.unique(stamps_ns, return_index=True)
         if len(known_ns) < 2 * _FEWEST:
@@ -116,18 +100,12 @@ class ObjectPath:
 
 @dataclass(frozen=True)
 class Sightings:
-    """Positions that one sensor measured of one track.
-
-    Attributes
-    ----------
-    stamps_ns
-        Shape (n,).
-    positions_m
-        In the frame of the ego, or of the map where `in_map`, shape (n, 2).
-    """
+    """Positions that one sensor measured of one track."""
 
     stamps_ns: IntArray
+    """Shape (n,)."""
     positions_m: FloatArray
+    """In the frame of the ego, or of the map where `in_map`, shape (n, 2)."""
     in_map: BoolArray
     ego: EgoPath | None
 
@@ -150,7 +128,7 @@ def true_paths(messages: Iterable[Message]) -> list[ObjectPath]:
     for one in messages:
         if not isinstance(one, TruthState) or one.ignored or one.object_id == EGO_ID:
             continue
-        if max(abs(one.x_m), abs(one.y_m)) <= LARGEST:  # what is compared with: detections
+        if max(abs(one.x_m), abs(one.y_m)) <= LARGEST:  # as detections are
             states[one.object_id][one.stamp_ns] = (one.x_m, one.y_m)
     paths = []
     for each in states.values():
@@ -170,15 +148,10 @@ def sightings_of(
 
     `ego` is None where all detections are in the map frame.
     """
-    columns = (
-        run.tables["updates"][name].tolist() for name in ("sensor", "stamp_ns", "receipt_ns", "index", "track_id")
-    )
-    fused = np.isin(run.tables["updates"]["disposition"], list(FUSED)).tolist()
-    tracks = {
-        (sensor, stamp_ns, receipt_ns, index): track_id
-        for sensor, stamp_ns, receipt_ns, index, track_id, is_fused in zip(*columns, fused, strict=True)
-        if is_fused and track_id != NO_TRACK
-    }
+    updates = run.tables["updates"]
+    fused = updates.where(np.isin(updates["disposition"], list(FUSED)) & (updates["track_id"] != NO_TRACK))
+    keys = zip(*(fused[name].tolist() for name in ("sensor", "stamp_ns", "receipt_ns", "index")), strict=True)
+    tracks = dict(zip(keys, fused["track_id"].tolist(), strict=True))
     preprocess = Preprocess(Road(), config.merge, config.motion.model(), config.ego.detection_origin_m)
     sensors = {
         name: replace(
@@ -190,25 +163,24 @@ def sightings_of(
         )
         for name, sensor in config.sensors.items()
     }
-    found: dict[str, dict[int, list[tuple[int, FloatArray, bool]]]] = defaultdict(lambda: defaultdict(list))
+    inbox = Inbox(sensors)
+    rows: dict[tuple[str, int], list[tuple[int, FloatArray, bool]]] = defaultdict(list)
     for message in lists:
-        own_ns = [message.stamp_ns if one.stamp_ns is None else one.stamp_ns for one in message.objects]
-        at_ns = stamps(message, sensors[message.sensor])
-        for stamp_ns in dict.fromkeys(at_ns):
-            batch = Batch(message, stamp_ns, tuple(k for k, each in enumerate(at_ns) if each == stamp_ns))
-            pose = np.zeros(3) if ego is None else ego(np.array([stamp_ns]))[0]
+        inbox.put(message)
+        for batch in inbox.collect():
+            pose = np.zeros(3) if ego is None else ego(np.array([batch.stamp_ns]))[0]
             if np.isnan(pose[0]):
                 continue
             placed = None if ego is None else EgoPose(pose[0], pose[1], pose[2], 0.0)
             for one in preprocess(batch, sensors[message.sensor], placed)[0]:
-                key = message.sensor, own_ns[one.leader], message.receipt_ns, one.leader
-                if key in tracks and one.position_m is not None:
-                    in_map = ego is None or message.frame == "map"
-                    z_m = one.position_m if in_map else (one.position_m - pose[:2]) @ rotations(pose[2])
-                    found[message.sensor][tracks[key]].append((stamp_ns, z_m, in_map))
-    return {sensor: {name: _gathered(rows, ego) for name, rows in each.items()} for sensor, each in found.items()}
-
-
-def _gathered(rows: Sequence[tuple[int, FloatArray, bool]], ego: EgoPath | None) -> Sightings:
-    stamps_ns, positions_m, in_map = zip(*rows, strict=True)
-    return Sightings(np.array(stamps_ns), np.array(positions_m), np.array(in_map), ego)
+                row = record(message, one.leader, Disposition.BIRTH)
+                track_id = tracks.get((row.sensor, row.stamp_ns, row.receipt_ns, row.index))
+                if track_id is not None and one.position_m is not None:
+                    is_map = ego is None or message.frame == "map"
+                    z_m = one.position_m if is_map else (one.position_m - pose[:2]) @ rotations(pose[2])
+                    rows[message.sensor, track_id].append((batch.stamp_ns, z_m, is_map))
+    found: dict[str, dict[int, Sightings]] = {sensor: {} for sensor, _ in rows}
+    for (sensor, track_id), each in rows.items():
+        stamps_ns, positions_m, in_map = map(np.array, zip(*each, strict=True))
+        found[sensor][track_id] = Sightings(stamps_ns, positions_m, in_map, ego)
+    return found
