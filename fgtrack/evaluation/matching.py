@@ -1,6 +1,6 @@
 """Pairs of tracks and true objects, tick by tick, and the errors of these tracks."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,20 +60,6 @@ class Scenes:
     in_sight: BoolArray
     """True where it is present and some sensor could see it, shape (t, objects)."""
 
-    @property
-    def num_ticks(self) -> int:
-        """Number of ticks t."""
-        return len(self.present)
-
-    def per_tick(self, values: FloatArray | IntArray) -> FloatArray:
-        """Sum of `values`, one of each row, over the rows of every tick, shape (t,)."""
-        return np.bincount(self.tick_index, values, self.num_ticks).astype(np.float64)
-
-    def __iter__(self) -> Iterator[slice]:
-        """The rows of every tick."""
-        edges = np.searchsorted(self.tick_index, np.arange(self.num_ticks + 1)).tolist()
-        return map(slice, edges[:-1], edges[1:])
-
 
 @dataclass(frozen=True)
 class TrackErrors:
@@ -130,19 +116,6 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
     )
 
 
-def ambiguous(inside: BoolArray, tick_index: IntArray, num_ticks: int) -> BoolArray:
-    """Ticks at which there is a choice: a row with several objects, or an object with several rows; shape (ticks,).
-
-    At every other tick the pairs are those of `inside`, shape (rows, objects), whatever the distances are.
-    """
-    rows, columns = np.nonzero(inside)
-    objects = inside.shape[1]
-    rows_of = np.bincount(tick_index[rows] * objects + columns, minlength=num_ticks * objects)
-    several = np.asarray((rows_of.reshape(num_ticks, objects) > 1).any(axis=1))
-    several[tick_index[inside.sum(axis=1) > 1]] = True
-    return several
-
-
 def pair(scores: FloatArray, ids: IntArray, tick_index: IntArray, previous: IntArray) -> IntArray:
     """Object of every row, shape (rows,), so that each tick has the largest sum of scores; `NO_OBJECT` without one.
 
@@ -151,7 +124,11 @@ def pair(scores: FloatArray, ids: IntArray, tick_index: IntArray, previous: IntA
     """
     num_ticks, inside = len(previous), scores > 0.0
     object_index = np.full(len(ids), NO_OBJECT)
-    unclear = ambiguous(inside, tick_index, num_ticks)
+    rows, columns = np.nonzero(inside)
+    ways = tick_index[rows] * scores.shape[1] + columns  # elsewhere a row has one object, and an object one row
+    ways_per_object = np.bincount(ways, minlength=num_ticks * scores.shape[1]).reshape(num_ticks, scores.shape[1])
+    unclear = np.asarray((ways_per_object > 1).any(axis=1))
+    unclear[tick_index[inside.sum(axis=1) > 1]] = True
     clear_rows, columns = np.nonzero(inside & ~unclear[tick_index, None])
     object_index[clear_rows] = columns
     order = np.argsort(tick_index, kind="stable")
@@ -208,13 +185,23 @@ def confirmed(tracks: Table) -> BoolArray:
 
 def published_rows(tracks: Table, ticks: IntArray, track_ids: IntArray) -> IntArray:
     """Row of `tracks` of each of these ticks and tracks, shape (n,); -1 where there is none."""
-    if not tracks.num_rows:
-        return np.full(len(ticks), -1)
-    step = 1 + max(int(tracks["track_id"].max()), int(track_ids.max(initial=0)))
-    keys, wanted = tracks["tick"] * step + tracks["track_id"], ticks * step + track_ids
-    order = np.argsort(keys)
-    rows = order[np.searchsorted(keys[order], wanted).clip(max=len(keys) - 1)]
-    return np.where(keys[rows] == wanted, rows, -1)
+    before, after = neighbours(tracks, "tick", ticks, track_ids)
+    return np.where(before == after, before, -1)
+
+
+def neighbours(tracks: Table, name: str, values: IntArray, track_ids: IntArray) -> tuple[IntArray, IntArray]:
+    """Rows of these tracks whose column `name` is the last up to, and the first from `values` on, shape (n,) each.
+
+    -1 where there is none.
+    """
+    every = np.unique(np.concatenate([tracks[name], values]))
+    places, wanted = (np.searchsorted(every, each) for each in (tracks[name], values))
+    keys, wanted = tracks["track_id"] * len(every) + places, track_ids * len(every) + wanted
+    order = np.argsort(keys, kind="stable")
+    keys, order = np.append(keys[order], -1), np.append(order, -1)
+    at = np.searchsorted(keys[:-1], wanted, side="right") - 1, np.searchsorted(keys[:-1], wanted)
+    before, after = (np.where(keys[k] // max(len(every), 1) == track_ids, order[k], -1) for k in at)
+    return before, after
 
 
 def recorded(run: Run, stamps_ns: IntArray) -> BoolArray:

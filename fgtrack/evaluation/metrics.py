@@ -1,7 +1,7 @@
 """All metrics of a run."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Disposition
 from fgtrack.evaluation.diagnostics import excluded_lines
-from fgtrack.evaluation.matching import ERROR_NAMES, Matching, confirmed, match, scenes, track_errors
+from fgtrack.evaluation.matching import Matching, confirmed, match, scenes, track_errors
 from fgtrack.evaluation.scores.consistency import Consistency, consistency
 from fgtrack.evaluation.scores.continuity import breaks, switches, times_to_confirm, tracked_visits
 from fgtrack.evaluation.scores.innovations import (
@@ -23,7 +23,7 @@ from fgtrack.evaluation.scores.innovations import (
 from fgtrack.evaluation.scores.lagged import LagMetrics, lag_metrics
 from fgtrack.evaluation.scores.multi_object import MultiObjectMetrics, multi_object_metrics
 from fgtrack.evaluation.scores.prediction import PredictionErrors, prediction_errors
-from fgtrack.evaluation.scores.statistics import ChiSquareMean, Distribution, Moments
+from fgtrack.evaluation.scores.statistics import Distribution, Moments
 from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, Table
 
 FALSE_TRACK_SHARE = 0.5
@@ -61,16 +61,6 @@ class ObjectMetrics:
         """Share of the ticks in sight at which the object was tracked."""
         return self.ticks_tracked_in_sight / self.ticks_in_sight if self.ticks_in_sight else math.nan
 
-    @classmethod
-    def total(cls, objects: Iterable["ObjectMetrics"]) -> "ObjectMetrics":
-        """All `objects` together."""
-        every = list(objects)
-        errors = {name: sum((one.errors[name] for one in every), Moments()) for name in ERROR_NAMES}
-        confirm_s = sum((one.time_to_confirm_s for one in every), Moments())
-        counts = [entry.name for entry in fields(cls) if entry.name not in ("errors", "time_to_confirm_s")]
-        sums = {name: sum(getattr(one, name) for one in every) for name in counts}
-        return cls(errors, time_to_confirm_s=confirm_s, **sums)
-
 
 @dataclass(frozen=True)
 class TruthMetrics:
@@ -84,11 +74,8 @@ class TruthMetrics:
     """Judged tracks paired in less than `FALSE_TRACK_SHARE` of their rows."""
     tracked_visits: int
     """Times that an object came into sight and was tracked there: TP of the precision, see `tracked_visits`."""
-
-    @property
-    def overall(self) -> ObjectMetrics:
-        """All objects together."""
-        return ObjectMetrics.total(self.objects.values())
+    overall: ObjectMetrics
+    """All objects together."""
 
 
 @dataclass(frozen=True)
@@ -151,11 +138,6 @@ class Metrics:
     def as_dict(self) -> dict[str, Any]:
         """JSON values by name, derived ones included; None for NaN."""
         values: dict[str, Any] = _plain(self)
-        values["precision"] = _plain(self.precision)
-        for name, sensor in self.sensors.items():
-            values["sensors"][name]["detections"] = sensor.detections
-        if self.truth is not None:
-            values["truth"]["overall"] = _plain(self.truth.overall)
         return values
 
 
@@ -200,30 +182,32 @@ def evaluate_matched(run: Run, matching: Matching | None, options: EvaluationCon
 
 
 def _truth_metrics(run: Run, matching: Matching, options: EvaluationConfig) -> TruthMetrics:
-    errors = track_errors(matching)
-    confirm_s = times_to_confirm(run, matching, options.gate_m)
-    objects = {}
-    for index, object_id in enumerate(matching.object_ids):
-        mine = errors.object_index == index
-        present, in_sight = matching.present[:, index], matching.in_sight[:, index]
-        tracked = matching.track_ids[:, index] != NO_TRACK
-        objects[object_id] = ObjectMetrics(
+    errors, confirm_s = track_errors(matching), times_to_confirm(run, matching, options.gate_m)
+    tracked = matching.track_ids != NO_TRACK
+
+    def together(indices: Sequence[int]) -> ObjectMetrics:
+        mine = np.isin(errors.object_index, indices)
+        present, in_sight = matching.present[:, indices], matching.in_sight[:, indices]
+        sequences = [matching.track_ids[matching.present[:, index], index] for index in indices]
+        return ObjectMetrics(
             errors={name: Moments.of(values[mine]) for name, values in errors.values.items()},
             ticks_present=int(present.sum()),
-            ticks_tracked=int((present & tracked).sum()),
-            breaks=breaks(matching.track_ids[present, index]),
-            id_switches=len(switches(matching.track_ids[present, index])),
-            time_to_confirm_s=Moments.of(confirm_s[index : index + 1]),
+            ticks_tracked=int((present & tracked[:, indices]).sum()),
+            breaks=sum(map(breaks, sequences)),
+            id_switches=sum(len(switches(sequence)) for sequence in sequences),
+            time_to_confirm_s=Moments.of(confirm_s[indices]),
             ticks_in_sight=int((present & in_sight).sum()),
-            ticks_tracked_in_sight=int((present & in_sight & tracked).sum()),
+            ticks_tracked_in_sight=int((present & in_sight & tracked[:, indices]).sum()),
         )
+
     ids, inverse = np.unique(matching.tracks["track_id"], return_inverse=True)
     life, paired_life = (np.bincount(of, minlength=len(ids)) for of in (inverse, inverse[matching.paired]))
     return TruthMetrics(
-        objects=objects,
+        objects={object_id: together([index]) for index, object_id in enumerate(matching.object_ids)},
         judged_tracks=len(ids),
         false_tracks=int((paired_life < FALSE_TRACK_SHARE * life).sum()),
         tracked_visits=tracked_visits(matching),
+        overall=together(range(len(matching.object_ids))),
     )
 
 
@@ -243,19 +227,12 @@ def _sensor_metrics(run: Run) -> dict[str, SensorMetrics]:
 
 
 def _plain(value: Any) -> Any:
-    """`value` as JSON: with derived properties, NaN as None, keys as text."""
-    if isinstance(value, Moments | ChiSquareMean):
-        return {name: _plain(number) for name, number in value.as_dict().items()}
+    """`value` as JSON: fields and properties but flags by name, NaN as None, keys as text."""
     if is_dataclass(value):
-        plain = {entry.name: _plain(getattr(value, entry.name)) for entry in fields(value)}
-        if isinstance(value, ObjectMetrics):
-            plain["tracked_share"] = _plain(value.tracked_share)
-            plain["tracked_share_in_sight"] = _plain(value.tracked_share_in_sight)
-        return plain
+        derived = [name for name, each in vars(type(value)).items() if isinstance(each, property) and name[:3] != "is_"]
+        value = {name: getattr(value, name) for name in (*(entry.name for entry in fields(value)), *derived)}
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, tuple):
         return [_plain(entry) for entry in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -12,9 +12,10 @@ from fgtrack.calibration.clocks import clock_findings, clock_text, stamp_finding
 from fgtrack.calibration.outcome import NoiseFit, Outcome, harm
 from fgtrack.evaluation.intervals import Estimate
 from fgtrack.evaluation.metrics import ObjectMetrics
+from fgtrack.evaluation.scores.statistics import Moments
 
 SECOND_NS = 1_000_000_000
-TRUTH = replace(ObjectMetrics.total(()), ticks_present=6000, ticks_in_sight=6000, ticks_tracked_in_sight=5900)
+TRUTH = ObjectMetrics({"position_m": Moments()}, ticks_present=6000, ticks_in_sight=6000, ticks_tracked_in_sight=5900)
 GOOD = Outcome(births=20, confirmed=3, used={"radar": 0.9}, noise=(), truth=TRUTH, tick_s=0.02)
 
 

@@ -56,7 +56,8 @@ def test_nees_of_the_position_has_its_known_value(tmp_path: Path) -> None:
     tracks = [[WEST.track(k, 1, **errors), WEST.track(k, 2, across_m=60.0)] for k in range(5)]
     run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(5)))
     found = evaluate(replace(run, config_text="evaluation: {gate_m: 6}")).consistency
-    assert found.position_nees == ChiSquareMean(5, pytest.approx(25.0), 2.0)
+    nees = found.position_nees
+    assert (nees.count, nees.mean, nees.dof) == (5, pytest.approx(25.0), 2.0)
 
 
 def test_nis_has_the_degrees_of_freedom_of_what_was_measured(tmp_path: Path) -> None:
@@ -69,14 +70,15 @@ def test_nis_has_the_degrees_of_freedom_of_what_was_measured(tmp_path: Path) -> 
         ],
     }
     found = evaluate(write_run(tmp_path / "run", updates=updates)).consistency
-    assert dict(found.nis) == {"lidar": ChiSquareMean(2, 2.5, 2.5), "radar": ChiSquareMean(1, 2.0, 1.0)}
+    means = {sensor: (of.count, of.mean, of.dof) for sensor, of in found.nis.items()}
+    assert means == {"lidar": (2, 2.5, 2.5), "radar": (1, 2.0, 1.0)}
     assert found.position_nees.count == 0
 
 
 def test_the_band_is_that_of_a_sum_of_independent_squares() -> None:
-    low, high = ChiSquareMean(40, 2.0, 2.5).band
-    assert (low, high) == pytest.approx(tuple(chi2.ppf([0.025, 0.975], 100) / 40))
-    assert all(map(math.isnan, ChiSquareMean().band))
+    found = ChiSquareMean.of(np.full(40, 2.0), np.repeat([2, 3], 20))
+    assert (found.mean, found.dof) == (2.0, 2.5)
+    assert (found.band_low, found.band_high) == pytest.approx(tuple(chi2.ppf([0.025, 0.975], 100) / 40))
 
 
 # --- whiteness

@@ -15,17 +15,6 @@ from fgtrack.evaluation.metrics import Metrics, ObjectMetrics, evaluate
 from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.io.run import Run
 
-samples = hnp.arrays(np.float64, st.integers(0, 20), elements=st.floats(-1e3, 1e3))
-
-
-@settings(deadline=None)
-@given(samples, samples)
-def test_moments_of_two_samples_add_up(a: np.ndarray, b: np.ndarray) -> None:
-    total, together = Moments.of(a) + Moments.of(b), Moments.of(np.concatenate([a, b]))
-    assert total.count == together.count
-    expected = (together.mean, together.std, together.rmse)
-    assert (total.mean, total.std, total.rmse) == pytest.approx(expected, abs=1e-6, nan_ok=True)
-
 
 @settings(deadline=None)
 @given(hnp.arrays(np.float64, st.integers(1, 20), elements=st.floats(-1.0, 1.0)), st.floats(-3.0, 3.0))

@@ -252,7 +252,7 @@ def test_the_tracking_table_has_errors_continuity_and_times(tables: Tables, runs
     metrics = evaluate(runs["smoother"])
     assert metrics.truth is not None
     west = replace(metrics.truth.objects[7], breaks=3, id_switches=2)
-    changed = replace(metrics, truth=replace(metrics.truth, objects={7: west}), num_tracks=5)
+    changed = replace(metrics, truth=replace(metrics.truth, overall=west), num_tracks=5)
     times = Distribution(9, mean=0.004, p50=0.001, p90=0.002, p99=0.003)
     other = compare(evaluated("run", runs["smoother"], replace(changed, time_per_tick_s=times)))
     assert rows_of(other, "tracking")[0].split()[-5:] == ["3/2", "0", "1.00", "5/2", "1.00/3.00"]

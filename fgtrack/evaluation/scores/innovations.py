@@ -9,7 +9,7 @@ import numpy as np
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import MEASURABLE, BoolArray, FloatArray, IntArray
-from fgtrack.evaluation.matching import confirmed
+from fgtrack.evaluation.matching import confirmed, neighbours
 from fgtrack.evaluation.roads import roads
 from fgtrack.evaluation.scores.statistics import NORMAL_95, Moments
 from fgtrack.io.run import NO_TRACK, Run, Table
@@ -123,16 +123,14 @@ def track_states(run: Run, wanted: BoolArray) -> FloatArray:
     for a track that was never published.
     """
     tracks, updates = run.tables["tracks"], run.tables["updates"]
+    before, after = neighbours(tracks, "stamp_ns", updates["stamp_ns"], updates["track_id"])
+    before, after = np.where(before < 0, after, before), np.where(after < 0, before, after)
+    there = wanted & (before >= 0)
     states = np.full((updates.num_rows, len(_TRACK_STATE)), np.nan)
-    order = np.lexsort((tracks["stamp_ns"], tracks["track_id"]))
-    ids = tracks["track_id"][order]
-    for track_id in np.intersect1d(updates["track_id"][wanted], ids).tolist():
-        rows = order[slice(*np.searchsorted(ids, (track_id, track_id + 1)).tolist())]
-        mine = np.flatnonzero(wanted & (updates["track_id"] == track_id))
-        stamps_ns = tracks["stamp_ns"][rows]
-        # differences are exact as floats, epoch stamps are not
-        asked, known = ((ns - stamps_ns[0]).astype(np.float64) for ns in (updates["stamp_ns"][mine], stamps_ns))
-        for column, name in enumerate(_TRACK_STATE):
-            values = tracks[name][rows]
-            states[mine, column] = np.interp(asked, known, np.unwrap(values) if name in ANGULAR else values)
+    a, b = (np.stack([tracks[name][rows[there]] for name in _TRACK_STATE], axis=-1) for rows in (before, after))
+    from_ns, until_ns = tracks["stamp_ns"][before[there]], tracks["stamp_ns"][after[there]]
+    share = (updates["stamp_ns"][there] - from_ns).clip(0) / np.maximum(until_ns - from_ns, 1)
+    change = b - a
+    change[:, 2] = wrap_angles(change[:, 2])
+    states[there] = a + share[:, None] * change
     return states

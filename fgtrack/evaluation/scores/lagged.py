@@ -9,7 +9,7 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, within_run
-from fgtrack.evaluation.matching import Matching, TrackErrors, state_errors
+from fgtrack.evaluation.matching import Matching, TrackErrors, neighbours, state_errors
 from fgtrack.evaluation.scores.consistency import position_squares
 from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.evaluation.truth import true_states
@@ -106,18 +106,11 @@ def _with_truth(run: Run, matching: Matching, states: Table) -> tuple[Table, Flo
 
 def _rows_at(matching: Matching, states: Table) -> IntArray:
     """Row of each state's track that is nearest in stamp, shape (n,); `_NO_ROW` outside of its life."""
-    nearest, tracks = np.full(states.num_rows, _NO_ROW), matching.tracks
-    order = np.lexsort((tracks["stamp_ns"], tracks["track_id"]))
-    ids = tracks["track_id"][order]
-    for track_id in np.intersect1d(states["track_id"], ids).tolist():
-        rows = order[slice(*np.searchsorted(ids, (track_id, track_id + 1)).tolist())]
-        stamps_ns = tracks["stamp_ns"][rows]
-        alive = (states["stamp_ns"] >= stamps_ns[0]) & (states["stamp_ns"] <= stamps_ns[-1])
-        mine = np.flatnonzero((states["track_id"] == track_id) & alive)
-        wanted_ns = states["stamp_ns"][mine]
-        right = np.searchsorted(stamps_ns, wanted_ns)
-        left = (right - 1).clip(min=0)
-        nearest[mine] = rows[np.where(wanted_ns - stamps_ns[left] < stamps_ns[right] - wanted_ns, left, right)]
+    stamps_ns, tracks_ns = states["stamp_ns"], matching.tracks["stamp_ns"]
+    before, after = neighbours(matching.tracks, "stamp_ns", stamps_ns, states["track_id"])
+    alive, nearest = (before != _NO_ROW) & (after != _NO_ROW), np.full(len(before), _NO_ROW)
+    before, after, stamps_ns = before[alive], after[alive], stamps_ns[alive]
+    nearest[alive] = np.where(stamps_ns - tracks_ns[before] < tracks_ns[after] - stamps_ns, before, after)
     return nearest
 
 

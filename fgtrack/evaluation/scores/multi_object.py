@@ -18,10 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 from motrics import compute_hota_from_similarity, compute_identity_from_similarity
-from scipy.optimize import linear_sum_assignment
 
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.matching import NO_OBJECT, Scenes, ambiguous, pair
+from fgtrack.evaluation.matching import NO_OBJECT, Scenes, pair
 from fgtrack.evaluation.scores.continuity import switches
 from fgtrack.io.run import NO_TRACK
 
@@ -71,12 +70,15 @@ def multi_object_metrics(scenes: Scenes, gate_m: float) -> MultiObjectMetrics:
     roots = {"mean_m": _mean(np.sqrt(parts.total_m2)), "rms_m": math.sqrt(total_m2)}
     own = dict(zip(parts._fields, means_m2, strict=True)) | {"in_sight_rms_m": math.sqrt(sight_m2)}
     similarity = np.maximum(0.0, 1.0 - scenes.distances_m / (2.0 * gate_m))
-    ids, rows_of = scenes.track_ids.tolist(), list(zip(scenes, scenes.present, strict=True))
-    objects = [np.flatnonzero(present).tolist() for _, present in rows_of]
-    frames = objects, [ids[k] for k, _ in rows_of], [similarity[k].T[here].tolist() for k, here in rows_of]
+    edges = np.searchsorted(scenes.tick_index, np.arange(1, len(scenes.present)))
+    frames = (
+        [np.flatnonzero(here).tolist() for here in scenes.present],
+        [ids.tolist() for _, ids in zip(scenes.present, np.split(scenes.track_ids, edges), strict=False)],
+        [of.T[here].tolist() for here, of in zip(scenes.present, np.split(similarity, edges), strict=False)],
+    )
     identity, hota = compute_identity_from_similarity(*frames, AT_GATE), compute_hota_from_similarity(*frames)
     return MultiObjectMetrics(
-        {"c_m": gate_m, "ticks": scenes.num_ticks, **roots, **own},
+        {"c_m": gate_m, "ticks": len(scenes.present), **roots, **own},
         clear(scenes, gate_m),
         {name: getattr(identity, name) if identity.num_gt else math.nan for name in ("idf1", "idp", "idr")},
         {name: getattr(hota, name) if hota.num_gt else math.nan for name in ("hota", "deta", "assa")},
@@ -90,8 +92,9 @@ def clear(scenes: Scenes, gate_m: float) -> dict[str, float]:
     """
     similarity = np.maximum(0.0, 1.0 - scenes.distances_m / (2.0 * gate_m))
     scores = np.where(similarity >= AT_GATE - np.finfo(np.float64).eps, similarity, 0.0)
-    used = scenes.present.any(axis=1) & (scenes.per_tick(np.ones(len(scores))) > 0)
-    last = np.maximum.accumulate(np.where(used, np.arange(scenes.num_ticks), 0))
+    num_ticks, num_rows = len(scenes.present), np.bincount(scenes.tick_index, minlength=len(scenes.present))
+    used = scenes.present.any(axis=1) & (num_rows > 0)
+    last = np.maximum.accumulate(np.where(used, np.arange(num_ticks), 0))
     columns = pair(scores, scenes.track_ids, scenes.tick_index, np.concatenate([[-1], last])[:-1])
     paired = np.flatnonzero(columns != NO_OBJECT)
     track_ids = np.full(scenes.present.shape, NO_TRACK)
@@ -114,22 +117,18 @@ def gospa(scenes: Scenes, c_m: float) -> GospaParts:
 
     A pair at c or beyond costs as much as a missed object and a false track, and counts as these.
     """
-    inside = scenes.distances_m < c_m
-    squares = np.where(inside, scenes.distances_m, c_m) ** 2
-    unclear = ambiguous(inside, scenes.tick_index, scenes.num_ticks)
-    chosen = inside & ~unclear[scenes.tick_index, None]
-    rows_of = list(scenes)
-    for tick in np.flatnonzero(unclear).tolist():
-        rows, columns = linear_sum_assignment(squares[rows_of[tick]])
-        chosen[rows_of[tick].start + rows, columns] = inside[rows_of[tick]][rows, columns]
-    paired = np.zeros_like(scenes.present)
-    rows, columns = np.nonzero(chosen)
-    paired[scenes.tick_index[rows], columns] = True
+    gains_m2 = np.maximum(c_m**2 - np.square(scenes.distances_m), 0.0)
+    num_ticks, tick_index = len(scenes.present), scenes.tick_index
+    columns = pair(gains_m2, scenes.track_ids, tick_index, np.full(num_ticks, -1))
+    rows = np.flatnonzero(columns != NO_OBJECT)
+    columns, ticks = columns[rows], tick_index[rows]
+    squares_m2, paired = np.square(scenes.distances_m[rows, columns]), np.zeros_like(scenes.present)
+    paired[ticks, columns] = True
     single_m2, missed = c_m**2 / 2.0, scenes.present & ~paired
     return GospaParts(
-        localisation_m2=scenes.per_tick(np.where(chosen, squares, 0.0).sum(axis=1)),
+        localisation_m2=np.asarray(np.bincount(ticks, squares_m2, num_ticks), dtype=np.float64),
         missed_m2=single_m2 * missed.sum(axis=1),
-        false_m2=single_m2 * (scenes.per_tick(np.ones(len(squares))) - paired.sum(axis=1)),
+        false_m2=single_m2 * (np.bincount(tick_index, minlength=num_ticks) - paired.sum(axis=1)),
         out_of_sight_m2=single_m2 * (missed & ~scenes.in_sight).sum(axis=1),
     )
 

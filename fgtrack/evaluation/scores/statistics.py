@@ -16,56 +16,33 @@ NORMAL_95 = 1.959963984540054
 
 @dataclass(frozen=True)
 class Moments:
-    """Moments of a sample; those of two samples add up to those of both together."""
+    """Moments of a sample; NaN of an empty one."""
 
     count: int = 0
     mean: float = math.nan
-    squares: float = 0.0
-    """Sum of squared deviations from the mean."""
+    std: float = math.nan
+    """Standard deviation of the sample (divided by n)."""
 
     @classmethod
     def of(cls, values: FloatArray) -> Self:
         """Moments of `values`, shape (n,), ignoring NaN."""
         values = values[~np.isnan(values)]
-        if not len(values):
-            return cls()
-        mean = float(values.mean())
-        return cls(len(values), mean, float(np.square(values - mean).sum()))
+        return cls(len(values), float(values.mean()), float(values.std())) if len(values) else cls()
 
     @classmethod
     def of_angles(cls, values_rad: FloatArray) -> Self:
-        """Moments of angles: deviations from the circular mean, wrapped to (-pi, pi].
-
-        Those of the plain values where these do not reach pi.
-        """
+        """Moments of angles: deviations from the circular mean, wrapped to (-pi, pi]."""
         values_rad = values_rad[~np.isnan(values_rad)]
         if not len(values_rad):
             return cls()
         middle_rad = circular_mean(values_rad)
         around = cls.of(wrap_angles(values_rad - middle_rad))
-        return cls(around.count, wrap_angle(middle_rad + around.mean), around.squares)
-
-    def __add__(self, other: "Moments") -> "Moments":
-        if not self.count or not other.count:
-            return self if self.count else other
-        count = self.count + other.count
-        step = other.mean - self.mean
-        squares = self.squares + other.squares + step**2 * self.count * other.count / count
-        return Moments(count, self.mean + step * other.count / count, squares)
-
-    @property
-    def std(self) -> float:
-        """Standard deviation of the sample (divided by n); NaN of an empty one."""
-        return math.sqrt(self.squares / self.count) if self.count else math.nan
+        return cls(around.count, wrap_angle(middle_rad + around.mean), around.std)
 
     @property
     def rmse(self) -> float:
-        """Root of the mean square; NaN of an empty sample."""
-        return math.sqrt(self.mean**2 + self.squares / self.count) if self.count else math.nan
-
-    def as_dict(self) -> dict[str, float]:
-        """Values by name."""
-        return {"count": self.count, "mean": self.mean, "std": self.std, "rmse": self.rmse}
+        """Root of the mean square."""
+        return math.hypot(self.mean, self.std)
 
 
 @dataclass(frozen=True)
@@ -96,6 +73,9 @@ class ChiSquareMean:
     mean: float = math.nan
     dof: float = math.nan
     """Mean of the degrees of freedom: the expected value of `mean`."""
+    band_low: float = math.nan
+    band_high: float = math.nan
+    """Two-sided 95 % interval of `mean`."""
 
     @classmethod
     def of(cls, values: FloatArray, dof: IntArray) -> Self:
@@ -103,20 +83,9 @@ class ChiSquareMean:
         known = ~np.isnan(values)
         if not known.any():
             return cls()
-        return cls(int(known.sum()), float(values[known].mean()), float(dof[known].mean()))
-
-    @property
-    def band(self) -> tuple[float, float]:
-        """Two-sided 95 % interval of `mean`; NaN of an empty sample."""
-        if not self.count:
-            return math.nan, math.nan
-        low, high = chi_square_band(np.array([self.count * self.dof]), np.array([self.count]))
-        return float(low[0]), float(high[0])
-
-    def as_dict(self) -> dict[str, float]:
-        """Values by name."""
-        low, high = self.band
-        return {"count": self.count, "mean": self.mean, "dof": self.dof, "band_low": low, "band_high": high}
+        count = int(known.sum())
+        low, high = chi_square_band(dof[known].sum(keepdims=True), np.array([count]))
+        return cls(count, float(values[known].mean()), float(dof[known].mean()), low.item(), high.item())
 
 
 def chi_square_band(dof: FloatArray, count: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -237,7 +237,7 @@ def _consistency(metrics: Mapping[str, Metrics]) -> Table:
         squares = {"NEES position": of.position_nees} | {f"NIS {sensor}": nis for sensor, nis in of.nis.items()}
         for name, square in squares.items():
             record: dict[str, Any] = {"run": label, "of": name, "num_samples": square.count, "mean": square.mean}
-            record |= {"expected": square.dof, "band_low": square.band[0], "band_high": square.band[1]}
+            record |= {"expected": square.dof, "band_low": square.band_low, "band_high": square.band_high}
             white = of.autocorrelation.get(name.removeprefix("NIS "))
             record |= {} if white is None else {"lag1_correlation": white.lag1, "lag1_band": white.lag1_band}
             records += [record] if square.count else []
