@@ -1,7 +1,7 @@
 """The protocols of estimators and their banks."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from typing import Any, Protocol, runtime_checkable
@@ -138,14 +138,15 @@ class Measurements(Sequence[Measurement]):
         return Measurement(own.stamp_ns, own.model, own.z[index], own.R[index], own.pose, own.loss, own.assumed)
 
 
-def stacks(measurements: Sequence[Measurement]) -> Iterator[tuple[Sequence[int], Measurement]]:
-    """Yield the indices of measurements that differ in their numbers alone, and the stack of these."""
+def stacks(measurements: Sequence[Measurement]) -> list[tuple[Sequence[int], Measurement]]:
+    """Return the measurements that differ in their numbers alone: their indices, and the stack of them."""
     if isinstance(measurements, Measurements):
-        yield range(len(measurements)), measurements.stack
-        return
+        return [(range(len(measurements)), measurements.stack)]
+    parts = list[tuple[Sequence[int], Measurement]]()
     for rows in equal_ones([(id(one.model), one.pose, one.assumed, one.loss) for one in measurements]):
         z, R = (np.array([getattr(measurements[row], name) for row in rows]) for name in ("z", "R"))
-        yield rows, replace(measurements[rows[0]], z=z, R=R)
+        parts.append((rows, replace(measurements[rows[0]], z=z, R=R)))
+    return parts
 
 
 class UpdateStatus(StrEnum):

@@ -1,6 +1,7 @@
 """The map at a position: the heading of the traffic, its curvature, and whether an object can be there."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -22,7 +23,7 @@ class Road:
     outer_buffer_m: float = 0.0
     pit_buffer_m: float = 0.0
 
-    @property
+    @cached_property
     def known(self) -> bool:
         """False in open space, where headings mean nothing."""
         return self.track is not None

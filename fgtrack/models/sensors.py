@@ -221,7 +221,7 @@ class SensorModel:
             self._noises[components] = R
         return self._noises[components]
 
-    @property
+    @cached_property
     def round(self) -> bool:
         """True if its error of the position is the same along and across the line of sight."""
         growth = self.std_growth

@@ -90,8 +90,6 @@ def in_any_direction(states: StatesAt, stamp_ns: int, starts: Mapping[int, Start
     A state with a yaw that is unknown is linearised along that yaw, and its predicted position spreads along it alone.
     Until a second position gives the direction, the position gets the same variance across, (speed_std dt)^2.
     """
-    if not starts:
-        return states
     rows = [row for row, track_id in enumerate(states.track_ids) if track_id in starts]
     covariances = states.covariances.copy()
     for row in rows:

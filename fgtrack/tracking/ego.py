@@ -12,7 +12,7 @@ import numpy as np
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.linalg import ASYMMETRY, congruence, is_covariance, symmetrise
-from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
+from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import EgoState, FloatArray
 
 #: A detection whose stamp is further than this from any ego state cannot be placed, in a gap neither.
@@ -55,7 +55,7 @@ def extrapolated(ego: EgoState, stamp_ns: int, covariance: FloatArray | None = N
     `covariance`, shape (5, 5), is that of `ego`; what the ego does meanwhile besides is not added to it. `straight`:
     the position goes on along the heading, as in the published tracker; at 60 m/s and 0.4 rad/s 12 m off after 1 s.
     """
-    dt_s = seconds(stamp_ns - ego.stamp_ns)
+    dt_s = (stamp_ns - ego.stamp_ns) / NS_PER_S
     half_rad = 0.0 if straight else 0.5 * ego.yaw_rate_radps * dt_s
     bent = abs(half_rad) > _STRAIGHT_RAD
     chord_s = dt_s * math.sin(half_rad) / half_rad if bent else dt_s
@@ -103,7 +103,7 @@ def is_ego_covariance(given: tuple[float, ...]) -> bool:
 
 
 def _consistent(before: EgoState, after: EgoState) -> bool:
-    dt_s = seconds(after.stamp_ns - before.stamp_ns)
+    dt_s = (after.stamp_ns - before.stamp_ns) / NS_PER_S
     if abs(dt_s) > _LONGEST_S:
         return True
     travelled_m = 0.5 * (before.speed_mps + after.speed_mps) * dt_s
@@ -212,7 +212,7 @@ class EgoTrajectory:
             return "repeated stamp"
         if row == len(self._states):
             if self.current is not None:
-                turned_rad = self.current.yaw_rate_radps * seconds(ego.stamp_ns - self.current.stamp_ns)
+                turned_rad = self.current.yaw_rate_radps * ((ego.stamp_ns - self.current.stamp_ns) / NS_PER_S)
                 ego = self._low_passed(ego, self.current.yaw_rad + turned_rad, self.current.yaw_rate_radps)
             self.current = ego
         self._stamps.insert(row, ego.stamp_ns)

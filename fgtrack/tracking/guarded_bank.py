@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import compress
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -13,8 +13,6 @@ from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import EstimatorError, Failure, Failures
 from fgtrack.estimation.filters.propagation import States
-
-_T = TypeVar("_T")
 
 
 class GuardedBank:
@@ -51,11 +49,11 @@ class GuardedBank:
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`."""
         self._now_ns = now_ns
-        self._ask(lambda bank: bank.advance(now_ns))
+        self._ask("advance", now_ns)
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`; states that are not finite are left out."""
-        states = self._ask(lambda bank: bank.states_at(stamp_ns))
+        states: StatesAt = self._ask("states_at", stamp_ns)
         if math.isfinite(states.means.sum() + states.covariances.sum()):
             return states
         finite = np.isfinite(states.means.sum(axis=1) + states.covariances.sum(axis=(1, 2)))
@@ -112,27 +110,27 @@ class GuardedBank:
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; all are sound."""
         while True:
-            states = self._ask(lambda bank: bank.present())
-            unsound = {self.track_ids[row]: fault for row, fault in faults(states).items()}
+            states: Sequence[TrackState] = self._ask("present")
+            unsound = faults(states)
             if not unsound:
                 return states
-            for track_id, fault in unsound.items():
+            for track_id, fault in [(self.track_ids[row], fault) for row, fault in unsound.items()]:
                 self.failures.add(fault)
                 self._end({track_id: f"the state of track {track_id} is {fault.value}"}, fault)
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`; those that are not sound are left out."""
-        reports = self._ask(lambda bank: bank.smoothed())
+        reports: list[SmoothedReport] = self._ask("smoothed")
         unsound = faults([report.state for report in reports])
         for fault in unsound.values():
             self.failures.add(fault)
         return [report for row, report in enumerate(reports) if row not in unsound] if unsound else reports
 
-    def _ask(self, question: Callable[[TrackBank], _T]) -> _T:
+    def _ask(self, method: str, *arguments: int) -> Any:  # Any: what the method returns
         """Return the bank's answer, when the tracks that prevent one have ended."""
         while True:
             try:
-                return question(self._bank)
+                return getattr(self._bank, method)(*arguments)
             except DataError:
                 raise
             except Exception as error:
@@ -174,7 +172,7 @@ def faults(states: Sequence[TrackState]) -> dict[int, Failure]:
         x, P = states.means, states.covariances
     else:
         x, P = np.array([state.mean for state in states]), np.array([state.covariance for state in states])
-    x, P = (np.array(each, dtype=np.float64, order="C") for each in (x, P))
+    x, P = np.array(x, dtype=np.float64, order="C"), np.array(P, dtype=np.float64, order="C")
     codes = kernels("fgtrack.tracking.kernels").faults(x, P)
     kinds = Failure.NOT_FINITE, Failure.NOT_DEFINITE
     return {row: kinds[codes[row] - 1] for row in codes.nonzero()[0].tolist()} if codes.any() else {}

@@ -111,16 +111,17 @@ class Candidates(Sequence[Candidate]):
             None if position is None else position[1],
         )
 
-    def split(self, chosen: IntArray) -> Iterator[tuple[Group, IntArray, IntArray]]:
-        """Yield each group, and of those of the candidates `chosen` (p,) that are in it the indices there and here."""
+    def split(self, chosen: IntArray) -> list[tuple[Group, IntArray, IntArray]]:
+        """Return the groups, and of those of the candidates `chosen` (p,) in each the indices there and here."""
+        if len(self.groups) == 1:
+            return [(self.groups[0], chosen, np.arange(len(chosen)))]
+        parts = []
         for group in self.groups:
-            if len(self.groups) == 1:
-                yield group, chosen, np.arange(len(chosen))
-                return
             members = np.searchsorted(group.rows, chosen)
             here = np.flatnonzero(group.rows.take(members, mode="clip") == chosen)
             if len(here):
-                yield group, members[here], here
+                parts.append((group, members[here], here))
+        return parts
 
     def at(self, indices: Sequence[int]) -> "Candidates":
         """Return the candidates at `indices`."""
@@ -193,14 +194,15 @@ class Preprocess:
 
     def _on_road(self, items: MapDetections, lost: dict[int, str]) -> MapDetections:
         """Return the detections inside the bounds, with yaw and curvature of the map; `lost` gets the rest."""
-        placed = items.placed
-        if not self._road.known or not len(placed):
+        if not self._road.known or not len(items.placed):
             return items
+        placed: IntArray | slice = items.placed if len(items.placed) < len(items.indices) else slice(None)
         view = self._road.view(items.points_m[placed])
         if items.sensor.yaw_from_map_std_rad is not None:
-            lack = np.isnan(items.values[placed, YAW])
-            items.values[placed[lack], YAW] = view.yaw_rad[lack]
-            items.map_yaw[placed[lack]] = True
+            yaw_rad = items.values[placed, YAW]
+            lack = np.isnan(yaw_rad)
+            items.values[placed, YAW] = np.where(lack, view.yaw_rad, yaw_rad)
+            items.map_yaw[placed] |= lack
         if items.sensor.curvature_from_map_std_radpm is not None:
             items.values[placed, CURVATURE] = view.curvature_radpm
         outside = np.zeros(len(items.indices), dtype=bool)
@@ -209,14 +211,16 @@ class Preprocess:
 
     def _candidates(self, items: MapDetections, pose_covariance: FloatArray | None) -> Candidates:
         """Candidates of `items` in their order; those that measure the same components are one group."""
-        kinds = ~np.isnan(items.values)
-        kinds = np.column_stack([kinds, items.map_yaw & kinds[:, YAW]])
+        kinds = np.empty((len(items.values), len(COMPONENTS) + 1), dtype=bool)
+        np.equal(items.values, items.values, out=kinds[:, :-1])  # NaN is not equal to itself
+        np.logical_and(items.map_yaw, kinds[:, YAW], out=kinds[:, -1])
         if (kinds == kinds[:1]).all():
             groups = list(self._groups(items, np.arange(len(kinds)), pose_covariance))
         else:
             alike = map(np.array, equal_ones(list(map(tuple, kinds.tolist()))))
             groups = [group for rows in alike for group in self._groups(items.at(rows), rows, pose_covariance)]
-        pose, lines = items.pose, np.column_stack([items.points_m, np.full(len(kinds), np.nan)])
+        pose, lines = items.pose, np.full((len(kinds), 3), np.nan)
+        lines[:, :2] = items.points_m
         for row in np.isnan(lines[:, 0]).nonzero()[0].tolist():
             lines[row] = pose.x_m, pose.y_m, pose.yaw_rad + items.values[row, BEARING]
         return Candidates(items.indices.tolist(), items.merged, lines, groups)

@@ -244,7 +244,8 @@ class Tracker:
 
     def _offered(self, batch: Batch) -> StatesAt:
         """The tracks that `batch` may be associated with, at its stamp."""
-        return in_any_direction(self._parts.bank.states_at(batch.stamp_ns), batch.stamp_ns, self._undirected)
+        states = self._parts.bank.states_at(batch.stamp_ns)
+        return in_any_direction(states, batch.stamp_ns, self._undirected) if self._undirected else states
 
     def _ranges_m(self, track_ids: Sequence[int], positions_m: FloatArray, ego: EgoPose | None) -> FloatArray:
         """Distances from the ego to tracks at `positions_m` (n, 2), both at the stamp of the batch."""
