@@ -1,6 +1,5 @@
 """A recording in one call: advice, three methods on the same stream, their comparison, figures, and a page."""
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -16,7 +15,7 @@ from fgtrack.calibration.page import Advice
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Message
-from fgtrack.evaluation.diagnostics import USED, diagnostics
+from fgtrack.evaluation.diagnostics import USED, diagnostics, lifetimes_and_breaks
 from fgtrack.evaluation.runs import EvaluatedRun, evaluated
 from fgtrack.evaluation.tables import Tables, short
 from fgtrack.evaluation.tables.compare import compare
@@ -70,46 +69,23 @@ def _tracks(one: EvaluatedRun) -> str:
             f"{_several(of.breaks, 'break')}, {_several(of.id_switches, 'identity switch', 'es')}, "
             f"{_several(truth.false_tracks, 'false track')}."
         )
-    tracks = one.run.tables["tracks"]
-    confirmed = tracks["status"] != "tentative"
-    ids, first = np.unique(tracks["track_id"][confirmed], return_index=True)
-    if not len(ids):
-        return f"{one.label} confirms no track."
-    now_ns = tracks["now_ns"][confirmed]
-    last = np.array([now_ns[tracks["track_id"][confirmed] == track].max() for track in ids])
-    lives_s = (last - now_ns[first]) / NS_PER_S
-    return f"{one.label} confirms {_several(len(ids), 'track')}, half of them for {np.median(lives_s):.1f} s or longer."
+    lives_s, _ = lifetimes_and_breaks(one.run)
+    lives = f", half of them for {np.median(lives_s):.1f} s or longer" if len(lives_s) else ""
+    return f"{one.label} confirms {_several(len(lives_s), 'track')}{lives}."
 
 
 def _to_do(runs: Sequence[EvaluatedRun], tables: Tables, advice: Advice | None) -> str:
-    """Return what comes first: a defect of the recording or its settings, else the choice of a method."""
-    open_findings = [] if advice is None else [one for one in advice.findings if not one.settings]
-    found = [str(one) for one in open_findings if one.weight >= _IMPORTANT] or [
-        str(one) for one in diagnostics(runs[0].run)
-    ]
-    if found:
+    """Return what comes first: a defect of the recording or its settings, else the fastest of the best methods."""
+    findings = () if advice is None else advice.findings
+    found = [str(one) for one in findings if not one.settings and one.weight >= _IMPORTANT]
+    if found := found or [str(one) for one in diagnostics(runs[0].run)]:
         return f"First: {found[0]}"
-    return f"Take {'; '.join(_choices(tables))}."
-
-
-def _choices(tables: Tables) -> Iterator[str]:
-    """The fastest of the best for the present state, and the best where the output may wait."""
-    rows = tables.tables["differences"].records
-    ranked = [row for row in rows if row["quantity"] == "position_rmse_m"]
+    ranked = [row for row in tables.tables["differences"].records if row["quantity"] == "position_rmse_m"]
     best = {row["run"] for row in ranked if row["standing"] != "worse"}
-    of_runs = tables.tables["tracking"].records
-    times = {row["run"]: row["time_per_tick_p50_s"] for row in of_runs}
+    times = {row["run"]: row["time_per_tick_p50_s"] for row in tables.tables["tracking"].records}
     fastest = min(best or times, key=lambda run: (times[run], run))
     because = "as accurate as the best" if best else "errors are unknown without truth"
-    yield f"{fastest} for the present state ({short(_MS * times[fastest])} ms per tick, {because})"
-    lags = tables.tables["lag"].records
-    lagged = [row for row in lags if (row["lag_s"] or 0.0) > 0.0 and math.isfinite(row["position_reduction"])]
-    if lagged:
-        row = lagged[0]
-        share = _PERCENT * row["position_reduction"]
-        yield f"{row['run']} where the output may wait {row['lag']} s ({share:.0f} % less error than now)"
-    elif not best:
-        yield "smoother where the output may wait"
+    return f"Take {fastest} for the present state ({short(_MS * times[fastest])} ms per tick, {because})."
 
 
 def _percent(mask: Any) -> str:  # Any: an array of bool
@@ -133,31 +109,21 @@ OnStep = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Study:
-    """A recording studied; `str` gives the summary, the assumptions and where the files are.
-
-    Attributes
-    ----------
-    path
-        Folder of `report.html`, `settings.yaml`, `runs/` and `figures/`.
-    summary
-        About five sentences: the recording, the tracks, the best method, the noise, what to do.
-    assumptions
-        Settings that neither the configuration nor the advice gives, a line per sensor with the reasons.
-    advice
-        None where it was not asked for, or nothing could be judged.
-    tables
-        Comparison of the runs.
-    broken
-        Why the recording breaks off, where it does.
-    """
+    """A recording studied; `str` gives the summary, the assumptions and where the files are."""
 
     path: Path
+    """Folder of `report.html`, `settings.yaml`, `runs/` and `figures/`."""
     summary: tuple[str, ...]
+    """About five sentences: the recording, the tracks, the best method, the noise, what to do."""
     assumptions: tuple[str, ...] = field(repr=False)
+    """Settings that neither the configuration nor the advice gives, a line per sensor with the reasons."""
     advice: Advice | None = field(repr=False)
+    """None where it was not asked for, or nothing could be judged."""
     runs: tuple[Run, ...] = field(repr=False)
     tables: Tables = field(repr=False)
+    """Comparison of the runs."""
     broken: str | None
+    """Why the recording breaks off, where it does."""
 
     @property
     def report(self) -> Path:
@@ -231,8 +197,18 @@ def study(
         readable = UntilBreak(source.messages())
         messages = list(readable)
         known = assumed(resolved, replace(source, messages=lambda: iter(messages)))
-        advised = _advised(source_path, messages, known, on_step) if advice else None
-        known = known if advised is None else _following(known, advised)
+        advised: Advice | None = None
+        adviser = Adviser(
+            str(source_path),
+            messages,
+            Assumed(known.config),
+            on_step=lambda text, share: on_step(f"advice, {text}", _ADVICE + (_REPLAY - _ADVICE) * share),
+        )
+        with suppress(DataError):  # where nothing can be judged, which the runs report as well
+            advised = adviser.advice() if advice else None
+        if advised is not None:  # what the advice changes is not assumed any more
+            changed = {one.key for one in advised.changes}
+            known = Assumed(advised.config, tuple(one for one in known.assumptions if one.key not in changed))
         with new_file(settings, overwrite) as file:
             head = [f"Settings of {source_path.name} {_MARK}: change them and run again with -c."]
             file.write(known.to_yaml([*head, *([] if advised is None else advised.comments())]).encode())
@@ -252,17 +228,20 @@ def study(
         on_step("compare", _COMPARE)
         every = evaluated([load_run(folder) for folder in folders.values()])
         tables = compare(*every)
-        for one in every:
-            if one.run.path is not None:
-                write_metrics(one.run.path, one.metrics.as_dict())
+        for folder, one in zip(runs, every, strict=True):
+            write_metrics(folder, one.metrics.as_dict())
         lines = summary(every, tables, advised)
         on_step("draw", _DRAW)
-        report_head = ReportHead(
-            sentences=lines,
-            assumptions=known.lines(),
-            advice=() if advised is None else advised.sentences,
-        )
-        _pictured(every, tables, report_head, figures or {}, pictures, page, overwrite)
+        close_up, late = drawn_close_up(every)
+        others = tuple(f"_{one.label}" for one in every[1:])  # figures of single runs are drawn of the first
+        plans = (one for one in planned(every) if not one.name.endswith(others))
+        images = [(name, png(one)) for name, one in chain(close_up, drawn(plans), (figures or {}).items())]
+        with new_files(pictures, overwrite) as into:
+            for name, image in images:
+                (into / f"{name}.png").write_bytes(image)
+        head_advice = () if advised is None else advised.sentences
+        report_head = replace(head_at(late), sentences=lines, assumptions=known.lines(), advice=head_advice)
+        write_report(every, tables, images, page, report_head, overwrite)
         on_step("done", _DONE)
     found = tuple(one.run for one in every)
     return Study(out, lines, tuple(known.lines()), advised, found, tables, found[0].meta["broken_off"])
@@ -270,49 +249,8 @@ def study(
 
 def outputs(out: Path) -> list[Path]:
     """Return what a study in `out` writes: the run of every estimator, figures, settings, report."""
-    return [
-        *(out / "runs" / name for name in ESTIMATORS),
-        *(out / n for n in ("figures", "settings.yaml", "report.html")),
-    ]
-
-
-def _advised(recording: Path, messages: Sequence[Message], known: Assumed, on_step: OnStep) -> Advice | None:
-    """Return the advice on `recording`; None where nothing can be judged, which the runs report as well."""
-    with suppress(DataError):
-        return Adviser(
-            str(recording),
-            messages,
-            Assumed(known.config, ()),
-            on_step=lambda text, share: on_step(f"advice, {text}", _ADVICE + (_REPLAY - _ADVICE) * share),
-        ).advice()
-    return None
-
-
-def _following(known: Assumed, advice: Advice) -> Assumed:
-    """Return `known` with the advice followed; what the advice changes is not assumed any more."""
-    changed = {one.key for one in advice.changes}
-    return Assumed(advice.config, tuple(one for one in known.assumptions if one.key not in changed))
-
-
-def _pictured(
-    runs: list[EvaluatedRun],
-    tables: Tables,
-    head: ReportHead,
-    more: Mapping[str, Figure],
-    figures: Path,
-    page: Path,
-    overwrite: bool,
-) -> None:
-    close_up, late = drawn_close_up(runs)
-    others = tuple(f"_{one.label}" for one in runs[1:])  # figures of single runs are drawn of the first
-    plans = (one for one in planned(runs) if not one.name.endswith(others))
-    pictures = [(name, png(figure)) for name, figure in chain(close_up, drawn(plans), more.items())]
-    with new_files(figures, overwrite) as folder:
-        for name, picture in pictures:
-            (folder / f"{name}.png").write_bytes(picture)
-    at = head_at(late)
-    head = replace(head, moment=at.moment, missing=at.missing)
-    write_report(runs, tables, pictures, page, head, overwrite)
+    names = *(f"runs/{each}" for each in ESTIMATORS), "figures", "settings.yaml", "report.html"
+    return [out / name for name in names]
 
 
 def head_at(late: CloseUp | DataError) -> ReportHead:
