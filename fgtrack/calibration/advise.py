@@ -1,6 +1,7 @@
 """The advice of `fgtrack advise`: findings in order of importance, and a configuration that follows it."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -20,7 +21,6 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.io.errors import UntilBreak
-from fgtrack.io.run import Run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumptions.assumed import assumed, source_of
 from fgtrack.pipeline.assumptions.assumption import Assumed
@@ -103,7 +103,7 @@ class Adviser:
         self._findings: list[Finding] = []
         self._arrivals = arrivals_of(messages)
         self._tracked = list(beginning(messages, nanoseconds(TRACKED_S)))
-        self._runs: list[tuple[Config, Run | None]] = []
+        self._outcomes: list[tuple[Config, Outcome | None]] = []
         self._clocks: OffsetReport | None = None
 
     def advice(self, broken: str | None = None, tune: bool = False) -> Advice:
@@ -132,14 +132,14 @@ class Adviser:
         self._take(window_findings([one for one in seen.values() if one.has_stamps], self._config))
         self._take(self._ego())
         self._on_step("tracking", 0.3)
-        self._take(self._diagnostics(self._run(self._config)))
+        self._take(self._diagnostics(self._outcome(self._config)))
         self._withdraw_harm(before)
-        run = self._run(self._config)
-        if run is not None and not self._is_useless:
-            self._take(noise_findings(run, tune))
-        if tune and run is not None:
-            self._take(self._tuned(run))
-        old, new = (None if found is None else Outcome.of(found) for found in map(self._run, (before, self._config)))
+        new = self._outcome(self._config)
+        if new is not None and not self._is_useless:
+            self._take(noise_findings(new))
+        if tune and new is not None:
+            self._take(self._tuned(new))
+        old, new = self._outcome(before), self._outcome(self._config)
         if new is not None and new.shortfall is not None:
             text = f"{new.shortfall}: look at the sectors and ranges of sensors (`fgtrack info`) and at the gate."
             self._findings.append(Finding("track", "tracks", 32.0, text))
@@ -177,8 +177,8 @@ class Adviser:
 
     def _is_harm(self, old: Config, new: Config) -> str | None:
         """Return what gets worse from one configuration to the other; None where nothing does."""
-        before, after = self._run(old), self._run(new)
-        return None if old == new or before is None or after is None else harm(Outcome.of(before), Outcome.of(after))
+        before, after = self._outcome(old), self._outcome(new)
+        return None if old == new or before is None or after is None else harm(before, after)
 
     @property
     def _is_useless(self) -> bool:
@@ -198,10 +198,10 @@ class Adviser:
         ignored = sorted({*self._config.ignore_sensors, *unknown})
         yield Finding("model", "sensors", 98.0, text, {"ignore_sensors": ignored})
 
-    def _diagnostics(self, run: Run | None) -> Iterator[Finding]:
+    def _diagnostics(self, outcome: Outcome | None) -> Iterator[Finding]:
         """Yield the diagnostics of a run with the settings, except of sensors with a known problem."""
         known = {one.about for one in self._findings if one.weight >= _USELESS}
-        for one in [] if run is None else diagnostics(run):
+        for one in [] if outcome is None else diagnostics(outcome.run):
             if one.about not in known:
                 yield Finding("track", one.about, 70.0, f"{one.text}.", one.settings)
 
@@ -213,7 +213,8 @@ class Adviser:
         unlimited = all(sensor.max_delay_s is None for sensor in self._config.sensors.values())
         is_same = unlimited and self._config.estimator != "ekf-backward-forward"  # nothing is refused for its delay
         try:
-            run = self._run(self._config) if is_same else None
+            outcome = self._outcome(self._config) if is_same else None
+            run = None if outcome is None else outcome.run
             self._clocks = estimate_offsets(self._tracked, self._config, self._reference, doubtful, run)
         except (DataError, CallError) as error:
             if self._reference is not None and isinstance(error, CallError):
@@ -255,7 +256,7 @@ class Adviser:
             )
             yield Finding("ego", EGO, 35.0, text)
 
-    def _tuned(self, before: Run) -> Iterator[Finding]:
+    def _tuned(self, before: Outcome) -> Iterator[Finding]:
         """Yield the noise that is fitted to the recording, unless nothing can be, or it does harm."""
         is_assumed = any(one.key.endswith(".std") for one in self._assumed.assumptions)
         if not is_assumed and not any(one.kind == "noise" for one in self._findings):
@@ -273,7 +274,7 @@ class Adviser:
             yield Finding("tune", "tune", 76.0, f"no noise is changed: {error}.")
             return
         self._on_step("tracking", 0.9)
-        after = self._run(report.config)
+        after = self._outcome(report.config)
         why = None if after is None else objection(before, after)
         if why is not None:
             yield Finding("tune", "tune", 76.0, f"no noise is changed. With what is fitted, {why}.")
@@ -283,20 +284,18 @@ class Adviser:
         rest = f" As configured stay {stay}." if stay else ""
         yield Finding("tune", "tune", 76.0, f"fitted to the recording by maximum likelihood.{rest}", settings)
 
-    def _run(self, config: Config) -> Run | None:
-        """A run of the first minutes, of the replaying EKF for a smoother; None where nothing can be tracked."""
-        for known, run in self._runs:
+    def _outcome(self, config: Config) -> Outcome | None:
+        """Outcome of the first minutes, of the replaying EKF for a smoother; None where nothing can be tracked."""
+        for known, outcome in self._outcomes:
             if known == config:
-                return run
-        storage_s = min(config.effective.reach_s, LONGEST_STORAGE_S)
-        fast = config
+                return outcome
+        fast, found = config, None
         if config.estimator.startswith("smoother"):
+            storage_s = min(config.effective.reach_s, LONGEST_STORAGE_S)
             fast = replace(fast, estimator="ekf-replay", filter=replace(config.filter, storage_s=storage_s))
-        try:
-            found = replay_in_memory(self._tracked, fast)
-        except DataError:
-            found = None
-        self._runs.append((config, found))
+        with suppress(DataError):
+            found = Outcome.of(replay_in_memory(self._tracked, fast))
+        self._outcomes.append((config, found))
         return found
 
     def _fine(self, seen: Mapping[str, Arrivals], outcome: Outcome | None) -> Iterator[str]:

@@ -24,14 +24,11 @@ class Finding:
     """Values of keys of the configuration that correct it; empty where no setting does."""
 
     def __str__(self) -> str:
-        settings = ", ".join(f"{key}: {_written(value)}" for key, value in self.settings.items())
+        settings = ", ".join(
+            f"{key}: {value:g}" if isinstance(value, float) else f"{key}: {value}"
+            for key, value in self.settings.items()
+        ).replace("'", "")
         return f"{self.about}: {self.text}{f' Set {settings}.' if settings else ''}"
-
-
-def _written(value: object) -> str:
-    if isinstance(value, float):
-        return f"{value:g}"
-    return f"[{', '.join(value)}]" if isinstance(value, list) else str(value)
 
 
 def nice_above(value: float) -> float:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -70,34 +70,25 @@ def noise_fits(run: Run) -> list[NoiseFit]:
     return fits
 
 
-def noise_findings(run: Run, tune: bool) -> Iterator[Finding]:
-    """Sensors whose noise does not fit, and those of which a few innovations are far too large.
-
-    With `tune` noise is fitted afterwards, which need not be offered.
-    """
-    off = dict(misfits(run))
-    for one in noise_fits(run):
-        sensor = one.sensor
-        if sensor not in off:
-            if one.count >= FEWEST and not one.is_consistent:
-                text = f"{one}, but its median is as expected: a few innovations are far off. Look at its clutter and "
-                text += f"the gate, or try sensors.{sensor}.loss: {{kind: huber, width: 3.0}}."
-                yield Finding("noise", sensor, 45.0, text)
-            continue
-        factor = math.sqrt(one.ratio.mean)
-        size = "small" if factor > 1.0 else "large"
-        text = f"{one}: the configured noise is too {size}, as if errors were {factor:.2g} times as large. "
-        if one.lasts:
-            text += (
-                f"Innovations are correlated in time (autocorrelation {one.lag1:.2f}): so are its errors, or the "
-                "process noise is too small."
-            )
-            text += "" if tune else " --tune fits white noise, and takes it only if innovations are white then."
-        else:
-            white = "" if one.lag1 is None else f" (autocorrelation {one.lag1:.2f})"
-            text += f"Innovations are white enough{white}"
-            text += " to fit it." if tune else ": --tune fits it."
-        yield Finding("noise", sensor, min(30.0 + 10.0 * abs(math.log(max(one.ratio.mean, _SMALLEST))), 75.0), text)
+def noise_findings(outcome: "Outcome") -> Iterator[Finding]:
+    """Yield sensors whose noise does not fit, and those of which a few innovations are far too large."""
+    off = dict(misfits(outcome.run))
+    for one in outcome.noise:
+        if one.sensor in off:
+            factor = math.sqrt(one.ratio.mean)
+            size = "small" if factor > 1.0 else "large"
+            lag1 = "" if one.lag1 is None else f" (autocorrelation {one.lag1:.2f})"
+            cause = f"Innovations are white enough{lag1} to fit it (--tune)."
+            if one.lasts:
+                cause = f"Innovations are correlated in time{lag1}: so are its errors, or process noise is too small"
+                cause += "; fitted white noise (--tune) is taken only if innovations are white then."
+            text = f"{one}: the configured noise is too {size}, as if errors were {factor:.2g} times as large. {cause}"
+            weight = min(30.0 + 10.0 * abs(math.log(max(one.ratio.mean, _SMALLEST))), 75.0)
+            yield Finding("noise", one.sensor, weight, text)
+        elif one.count >= FEWEST and not one.is_consistent:
+            text = f"{one}, but its median is as expected: a few innovations are far off. Look at its clutter and the "
+            text += f"gate, or try sensors.{one.sensor}.loss: {{kind: huber, width: 3.0}}."
+            yield Finding("noise", one.sensor, 45.0, text)
 
 
 _CHANCE = 2.0  # standard deviations of the difference of two counts
@@ -123,6 +114,7 @@ class Outcome:
     """All true objects together; None for a recording without truth."""
     tick_s: float
     """Time between two ticks."""
+    run: Run = field(repr=False)
 
     @classmethod
     def of(cls, run: Run) -> "Outcome":
@@ -137,6 +129,7 @@ class Outcome:
             noise=tuple(noise_fits(run)),
             truth=None if metrics.truth is None else metrics.truth.overall,
             tick_s=float(np.ptp(ticks_ns)) / NS_PER_S / max(len(ticks_ns) - 1, 1) if len(ticks_ns) else 0.0,
+            run=run,
         )
 
     @property
@@ -200,20 +193,19 @@ def harm(before: Outcome, after: Outcome) -> str | None:
     return None
 
 
-def objection(before: Run, after: Run) -> str | None:
+def objection(before: Outcome, after: Outcome) -> str | None:
     """Return why the fitted noise of the run `after` is not taken, in words; None where nothing speaks against it."""
-    for one in noise_fits(after):
-        if one.lasts:
-            return (
-                f"innovations of {one.sensor} are still correlated in time (autocorrelation {one.lag1:.2f}): so are "
-                "errors, of it or of the sensor that is trusted more, and white noise cannot express that; "
-                "sensors.NAME.correlation can, with std and time_s from truth or a data sheet"
-            )
-    for sensor, nis in misfits(after):
+    for one in filter(lambda one: one.lasts, after.noise):
+        return (
+            f"innovations of {one.sensor} are still correlated in time (autocorrelation {one.lag1:.2f}): so are "
+            "errors, of it or of the sensor that is trusted more, and white noise cannot express that; "
+            "sensors.NAME.correlation can, with std and time_s from truth or a data sheet"
+        )
+    for sensor, nis in misfits(after.run):
         return f"mean NIS of {sensor} is {nis.mean:.3g} then, expected {nis.dof:.3g}"
-    if (worse := harm(Outcome.of(before), Outcome.of(after))) is not None:
+    if (worse := harm(before, after)) is not None:
         return f"{worse}: tracks break at errors that the noise does not expect"
-    runs = [EvaluatedRun("before", before), EvaluatedRun("after", after)]
+    runs = [EvaluatedRun("before", before.run), EvaluatedRun("after", after.run)]
     for name, entries in (each for one in comparisons(runs) for each in one.quantities.items()):
         found = {entry.name: entry for entry in entries}
         was, now = found["before"].value, found["after"].value

@@ -1,8 +1,8 @@
 """The page of `fgtrack advise`: sentences, two tables, and the configuration that follows them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from textwrap import wrap
+from textwrap import TextWrapper
 
 from fgtrack.calibration.arrivals import Arrivals
 from fgtrack.calibration.finding import Finding
@@ -57,41 +57,38 @@ class Advice:
     @property
     def sentences(self) -> tuple[str, ...]:
         """The findings, and a line of what is fine."""
-        lines = [str(one) for one in self.findings]
-        if self.fine:
-            lines.append(f"Fine: {', '.join(self.fine)}.")
-        return tuple(lines)
+        return (*map(str, self.findings), *([f"Fine: {', '.join(self.fine)}."] if self.fine else []))
 
     @property
     def tables(self) -> Tables:
         """`outcome` of the replays, and `lateness` of each sensor."""
-        tables = {"outcome": self._outcome(), "lateness": self._lateness()}
-        return Tables(tables, verdict=self.sentences)
+        return Tables({"outcome": self._outcome(), "lateness": self._lateness()}, verdict=self.sentences)
 
     def __str__(self) -> str:
         return str(self.tables)
 
     def _outcome(self) -> Table:
-        before, after = (dict(() if one is None else one.rows()) for one in (self.before, self.after))
-        columns = [Column("replayed", left=True), Column("before")]
-        columns += [Column("advised")] if self.changes else []
-        records = [
-            {"replayed": name, "before": before.get(name)} | ({"advised": after.get(name)} if self.changes else {})
-            for name in {**before, **after}
-        ]
-        return Table("Replays with the settings before and as advised", records, columns, ("replayed",))
+        columns = {"before": self.before} | ({"advised": self.after} if self.changes else {})
+        rows = {name: dict(() if one is None else one.rows()) for name, one in columns.items()}
+        names = dict.fromkeys(key for values in rows.values() for key in values)
+        records = [{"replayed": name} | {column: values.get(name) for column, values in rows.items()} for name in names]
+        title = "Replays with the settings before and as advised"
+        return Table(title, records, [Column("replayed", left=True), *map(Column, rows)], ("replayed",))
 
     def _lateness(self) -> Table:
-        records = []
-        for one in self.arrivals:
-            record = {"sensor": one.name, "lists": len(one.counts), "period_s": one.period_s}
-            record |= {"delay_p50_s": one.quantile_s(0.5), "delay_p95_s": one.quantile_s(0.95)}
-            record |= {
+        records = [
+            {
+                "sensor": one.name,
+                "lists": len(one.counts),
+                "period_s": one.period_s,
+                "delay_p50_s": one.quantile_s(0.5),
+                "delay_p95_s": one.quantile_s(0.95),
                 "delay_max_s": float(one.delays_s.max()),
                 "overtaken": self.overtaken[one.name],
                 "lost": one.lost,
             }
-            records.append(record)
+            for one in self.arrivals
+        ]
         columns = [
             Column("sensor", left=True),
             Column("lists"),
@@ -115,15 +112,15 @@ class Advice:
 
     def comments(self) -> list[str]:
         """Return the reason of each changed setting, and what no setting corrects."""
-        lines = [line for one in self.changes for line in _wrapped(f"{one.key} = {one.value}: {one.why}")]
-        if not self.changes:
-            lines = ["Nothing is changed."]
-        rest = [line for one in self.findings if not one.settings for line in _wrapped(str(one))]
-        return [*lines, *(["", "Without a setting that corrects it:"] if rest else []), *rest]
+        changes = [f"{one.key} = {one.value}: {one.why}" for one in self.changes]
+        rest = [str(one) for one in self.findings if not one.settings]
+        lines = _wrapped(changes) if changes else ["Nothing is changed."]
+        return [*lines, *(["", "Without a setting that corrects it:"] if rest else []), *_wrapped(rest)]
 
 
-def _wrapped(text: str) -> list[str]:
-    return wrap(text, _COMMENT, initial_indent="- ", subsequent_indent="  ", break_long_words=False)
+def _wrapped(texts: Sequence[str]) -> list[str]:
+    how = TextWrapper(_COMMENT, initial_indent="- ", subsequent_indent="  ", break_long_words=False)
+    return [line for text in texts for line in how.wrap(text)]
 
 
 def _whole(value: Value) -> str:

@@ -16,7 +16,7 @@ from fgtrack.evaluation.scores.statistics import Moments
 
 SECOND_NS = 1_000_000_000
 TRUTH = ObjectMetrics({"position_m": Moments()}, ticks_present=6000, ticks_in_sight=6000, ticks_tracked_in_sight=5900)
-GOOD = Outcome(births=20, confirmed=3, used={"radar": 0.9}, noise=(), truth=TRUTH, tick_s=0.02)
+GOOD = Outcome(births=20, confirmed=3, used={"radar": 0.9}, noise=(), truth=TRUTH, tick_s=0.02, run=None)
 
 
 def test_harm_is_more_breaks_more_tracks_and_less_that_is_tracked_or_used() -> None:
