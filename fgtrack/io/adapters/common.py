@@ -143,26 +143,23 @@ def speed_gradient(vx_mps: float, vy_mps: float) -> FloatArray:
     return np.array([vx_mps, vy_mps]) / speed if speed > 0.0 else np.array([1.0, 0.0])
 
 
-def speed_variance(vx_mps: float, vy_mps: float, covariance: FloatArray) -> float:
-    """Variance of the length of the velocity, from its covariance, shape (2, 2), to first order."""
-    direction = speed_gradient(vx_mps, vy_mps)
-    return float(direction @ covariance @ direction)
-
-
 def covariance(
-    values: Mapping[str, float | None], pose: FloatArray | None, speed: float | None = None
+    values: Mapping[str, float | None], pose: FloatArray | None, twist: FloatArray | None = None, velocity: Any = None
 ) -> tuple[float, ...] | None:
     """Covariance of the measured `values` (position, yaw, speed), row-major; None where it does not cover them all.
 
-    `pose` is the covariance, shape (3, 3), of x, y and yaw, `speed` the variance of the speed; None is "not known".
+    `pose` is the covariance of x, y and yaw, shape (3, 3), `twist` begins with that of `velocity`; None is "not known".
+    The variance of the speed is to first order.
     """
-    index = [row for row, name in enumerate(MEASURABLE) if values.get(name) is not None]
     if pose is None:
         return None
-    chosen = block_diag(pose, [speed or 0.0])[np.ix_(index, index)]
-    if (np.diag(chosen) <= 0.0).any():  # ROS says "not known" by 0 or -1
-        return None
-    return tuple(chosen.ravel().tolist())
+    variance = 0.0
+    if twist is not None:
+        direction = speed_gradient(velocity.x, velocity.y)
+        variance = float(direction @ twist[:2, :2] @ direction)
+    index = [row for row, name in enumerate(MEASURABLE) if values.get(name) is not None]
+    chosen = block_diag(pose, [variance])[np.ix_(index, index)]
+    return None if (np.diag(chosen) <= 0.0).any() else tuple(chosen.ravel().tolist())  # 0 and -1 are "not known" in ROS
 
 
 def planar(covariance36: Sequence[float]) -> FloatArray:

@@ -34,14 +34,7 @@ def mapped(
     fields: Mapping[str, FieldPath], names: Iterable[str], read: Callable[[str], Any]
 ) -> dict[str, Any]:  # Any: a value as recorded, and as `EgoState`, `Detection` and `TruthState` take it
     """Values of those of `names` that `fields` maps, by name; `read` gives the recorded value at a path, or None."""
-    values: dict[str, Any] = {}
-    for name in names:
-        if name in _CONVERSIONS and name in fields:
-            value = read(single_path(fields[name]))
-            values[name] = None if value is None else _CONVERSIONS[name](value)
-        elif name in fields:
-            values[name] = _number(fields[name], name, read)
-    return values
+    return {name: _component(name, fields[name], read) for name in names if name in fields}
 
 
 def paths_of(path: FieldPath) -> list[str]:
@@ -58,11 +51,14 @@ def single_path(path: FieldPath) -> str:
     return paths[0]
 
 
-def _number(path: FieldPath, name: str, read: Callable[[str], Any]) -> float | None:
-    """Number at `path`, converted; an angle in degrees or with an offset is wrapped.
+def _component(name: str, path: FieldPath, read: Callable[[str], Any]) -> Any:
+    """The value, converted; an angle in degrees or with an offset is wrapped.
 
     More than 1.5 turns of radians stay as they are: they may be degrees, which wrapping would hide.
     """
+    if name in _CONVERSIONS:
+        value = read(single_path(path))
+        return None if value is None else _CONVERSIONS[name](value)
     numbers = [_float(read(each), each) for each in paths_of(path)]
     present = [value for value in numbers if value is not None]
     if len(present) < len(numbers):

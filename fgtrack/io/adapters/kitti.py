@@ -51,6 +51,13 @@ CLASS_NAMES: Mapping[str, str] = {name.lower(): name for name in _TYPES}
 
 _LABELS = "label_02"
 _DONT_CARE = "DontCare"
+#: Class, box in the image, score and box in space of a line, by its number of fields.
+_FORMS = {
+    6: (slice(0), slice(1, 5), slice(5, 6), slice(0)),
+    15: (slice(1, 2), slice(2, 6), slice(6, 7), slice(7, 14)),
+    17: (slice(2, 3), slice(6, 10), slice(0), slice(10, 17)),
+    18: (slice(2, 3), slice(6, 10), slice(17, 18), slice(10, 17)),
+}
 _CLASSES = {"1": "Pedestrian", "2": "Car", "3": "Cyclist"}  # numbers of AB3DMOT
 _NEIGHBOURS: Mapping[str, str] = {"Car": "Van", "Pedestrian": "Person_sitting"}
 _BORDER_PX = 2.0
@@ -188,14 +195,10 @@ def _region(view: View, left_px: float, top_px: float, right_px: float, bottom_p
 
 def _detection(settings: KittiInput, sensor: str, view: View, fields: list[str]) -> Detection | str:
     """The object of a line, or the setting that excludes it."""
-    if len(fields) == 15:
-        kind, image, scores, space = _CLASSES.get(fields[1], fields[1]), fields[2:6], fields[6:7], fields[7:14]
-    elif len(fields) in (17, 18):
-        kind, image, scores, space = fields[2], fields[6:10], fields[17:], fields[10:17]
-    elif len(fields) == 6:
-        kind, image, scores, space = "", fields[1:5], fields[5:], []
-    else:
+    if len(fields) not in _FORMS:
         raise ValueError(f"{len(fields)} fields instead of 6 (a box in the image), 15 (AB3DMOT), 17 or 18 (KITTI)")
+    kinds, image, scores, space = (fields[part] for part in _FORMS[len(fields)])
+    kind = _CLASSES.get(kinds[0], kinds[0]) if kinds else ""
     score = float(scores[0]) if scores else None
     if kind and kind not in settings.classes:
         return "input.kitti.classes"

@@ -21,7 +21,6 @@ from fgtrack.io.adapters.common import (
     planar,
     signed_speed_mps,
     speed_gradient,
-    speed_variance,
     stamp_ns,
     yaw_rad,
 )
@@ -93,17 +92,14 @@ def _autoware_object(item: RosMessage) -> Detection:
         "yaw_rad": yaw_rad(pose.orientation) if available else None,
         "speed_mps": signed_speed_mps(velocity.x, velocity.y, 0.0 if available else None) if has_twist else None,
     }
-    variance = None
-    if getattr(kinematics, "has_twist_covariance", True):
-        variance = speed_variance(velocity.x, velocity.y, planar(twist.covariance)[:2, :2])
-    pose_covariance = kinematics.pose_with_covariance.covariance
+    pose_covariance, has_twist_covariance = None, getattr(kinematics, "has_twist_covariance", True)
+    if getattr(kinematics, "has_position_covariance", True):
+        pose_covariance = planar(kinematics.pose_with_covariance.covariance)
     label = max(item.classification, key=lambda each: each.probability).label if len(item.classification) else 0
     return Detection(
         **values,
         covariance=covariance(
-            values,
-            planar(pose_covariance) if getattr(kinematics, "has_position_covariance", True) else None,
-            variance,
+            values, pose_covariance, planar(twist.covariance) if has_twist_covariance else None, velocity
         ),
         object_id=_uuid(item.object_id) if hasattr(item, "object_id") else None,
         **_size(item.shape.dimensions, pose.position.z),
@@ -114,18 +110,15 @@ def _autoware_object(item: RosMessage) -> Detection:
 
 def delphi_esr(message: RosMessage) -> ObjectList:
     """`delphi_esr_msgs/EsrTrack`, one track of a Delphi (Aptiv) ESR, whose angles are in degrees, clockwise."""
-    tracks = []
-    if message.status != _ESR_NO_TARGET:
-        bearing_rad = -math.radians(message.angle)
-        track = Detection(
-            range_m=float(message.range),
-            bearing_rad=wrap_angle(bearing_rad) if math.isfinite(bearing_rad) else math.nan,
-            range_rate_mps=float(message.range_rate),
-            object_id=int(message.id),
-            width_m=float(message.width) if message.width > 0.0 else None,
-        )
-        tracks.append(track)
-    return object_list(message.header, tracks, "sensor")
+    bearing_rad = -math.radians(message.angle)
+    track = Detection(
+        range_m=float(message.range),
+        bearing_rad=wrap_angle(bearing_rad) if math.isfinite(bearing_rad) else math.nan,
+        range_rate_mps=float(message.range_rate),
+        object_id=int(message.id),
+        width_m=float(message.width) if message.width > 0.0 else None,
+    )
+    return object_list(message.header, [track] if message.status != _ESR_NO_TARGET else [], "sensor")
 
 
 def radar_tracks(message: RosMessage) -> ObjectList:
@@ -135,15 +128,16 @@ def radar_tracks(message: RosMessage) -> ObjectList:
 
 def _radar_track(item: RosMessage) -> Detection:
     position, velocity = item.position, item.velocity
-    pose = np.zeros((3, 3))
-    pose[:2, :2] = _planar_triangle(item.position_covariance)
     values = {
         "x_m": position.x,
         "y_m": position.y,
         "speed_mps": signed_speed_mps(velocity.x, velocity.y, None),
     }
-    variance = speed_variance(velocity.x, velocity.y, _planar_triangle(item.velocity_covariance))
-    own = covariance(values, pose, variance)
+    pose, twist = (
+        block_diag(_planar_triangle(item.position_covariance), [0.0]),
+        _planar_triangle(item.velocity_covariance),
+    )
+    own = covariance(values, pose, twist, velocity)
     return Detection(**values, covariance=own, object_id=_uuid(item.uuid), **_size(item.size))
 
 
@@ -153,16 +147,13 @@ def _uuid(identity: RosMessage) -> int | None:
 
 def _planar_triangle(triangle: RosMessage) -> np.ndarray:
     """Covariance of x and y, shape (2, 2), from the upper triangle xx, xy, xz, yy, yz, zz."""
-    xx, xy, _, yy, _, _ = (float(value) for value in triangle)
-    return np.array([[xx, xy], [xy, yy]])
+    return np.asarray(triangle, dtype=np.float64)[[0, 1, 1, 3]].reshape(2, 2)
 
 
 def pose_array(message: RosMessage) -> ObjectList:
     """`geometry_msgs/PoseArray`: position and yaw."""
-    objects = [
-        Detection(x_m=pose.position.x, y_m=pose.position.y, yaw_rad=yaw_rad(pose.orientation)) for pose in message.poses
-    ]
-    return object_list(message.header, objects)
+    values = ((each.position.x, each.position.y, yaw_rad(each.orientation)) for each in message.poses)
+    return object_list(message.header, [Detection(*each) for each in values])
 
 
 def odometry(message: RosMessage) -> ObjectList:
@@ -174,9 +165,8 @@ def odometry(message: RosMessage) -> ObjectList:
         "yaw_rad": yaw_rad(pose.orientation),
         "speed_mps": signed_speed_mps(velocity.x, velocity.y, 0.0),
     }
-    variance = speed_variance(velocity.x, velocity.y, planar(message.twist.covariance)[:2, :2])
-    item = Detection(**values, covariance=covariance(values, planar(message.pose.covariance), variance))
-    return object_list(message.header, [item])
+    own = covariance(values, planar(message.pose.covariance), planar(message.twist.covariance), velocity)
+    return object_list(message.header, [Detection(**values, covariance=own)])
 
 
 def ego_from_odometry(message: RosMessage, receipt_ns: int) -> EgoState:
