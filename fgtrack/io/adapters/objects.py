@@ -133,11 +133,8 @@ def _radar_track(item: RosMessage) -> Detection:
         "y_m": position.y,
         "speed_mps": signed_speed_mps(velocity.x, velocity.y, None),
     }
-    pose, twist = (
-        block_diag(_planar_triangle(item.position_covariance), [0.0]),
-        _planar_triangle(item.velocity_covariance),
-    )
-    own = covariance(values, pose, twist, velocity)
+    pose = block_diag(_planar_triangle(item.position_covariance), [0.0])
+    own = covariance(values, pose, _planar_triangle(item.velocity_covariance), velocity)
     return Detection(**values, covariance=own, object_id=_uuid(item.uuid), **_size(item.size))
 
 
