@@ -46,7 +46,12 @@ class PublishedMap:
 
     def view(self, points_m: FloatArray, inner_buffer_m: float, outer_buffer_m: float) -> RoadView:
         """Heading, curvature and whether a point lies further outside than the buffers allow; points (n, 2)."""
-        arc = self._arcs(points_m)
+        squared = (self._line[:, 0] - points_m[:, 0:1]) ** 2 + (self._line[:, 1] - points_m[:, 1:2]) ** 2
+        nearest = np.argmin(squared, axis=1)
+        along = np.sum(self._segment[nearest] * (points_m - self._line[nearest]), axis=1)
+        share = np.abs(along) / self._segment_squared[nearest]
+        passed_m = share * np.sqrt(self._segment_squared[nearest])
+        arc = np.mod(self._arc[nearest] + passed_m, float(self._arc.max()))
         high = np.clip(np.searchsorted(self._arc, arc, side="left"), 1, len(self._arc) - 1)
         weight = (arc - self._arc[high - 1]) / (self._arc[high] - self._arc[high - 1])
         low_row, high_row = self._table[high - 1], self._table[high]
@@ -57,11 +62,3 @@ class PublishedMap:
         turn = self._heading[high] - self._heading[high - 1]
         yaw = (wrap_angles(turn) if self._circular else turn) * weight + self._heading[high - 1]
         return RoadView(yaw + 0.5 * math.pi, row[:, 5], outside)
-
-    def _arcs(self, points_m: FloatArray) -> FloatArray:
-        squared = (self._line[:, 0] - points_m[:, 0:1]) ** 2 + (self._line[:, 1] - points_m[:, 1:2]) ** 2
-        nearest = np.argmin(squared, axis=1)
-        along = np.sum(self._segment[nearest] * (points_m - self._line[nearest]), axis=1)
-        share = np.abs(along) / self._segment_squared[nearest]
-        passed_m = share * np.sqrt(self._segment_squared[nearest])
-        return np.asarray(np.mod(self._arc[nearest] + passed_m, float(self._arc.max())))

@@ -5,14 +5,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fgtrack.core.checks import not_negative
 from fgtrack.core.linalg import psd_solve
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.filters.ekf import OneCorrection, linearised, updated_one
-from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.filters.replay import ReplayEkf
-from fgtrack.models.motion import MotionModel
 from fgtrack.models.robust import penalty, weight
 from fgtrack.models.sensors import RobustLoss
 
@@ -24,22 +21,11 @@ class IekfReplay(ReplayEkf):
 
     Bell and Cathey, The iterated Kalman filter update as a Gauss-Newton method, IEEE Transactions on Automatic Control
     38(2), 1993: the update minimises half of |x - x_0|^2 in P^-1 and |z - h(x)|^2 in R^-1, or a robust loss instead of
-    the latter. A step that does not lower this sum is halved, one below `tolerance` standard deviations of the
+    the latter. A step that does not lower this sum is halved, one below 1e-6 standard deviations of the
     prediction is the last. A linear measurement is fused as by `ReplayEkf`.
     """
 
-    def __init__(
-        self,
-        motion: MotionModel,
-        prior: Start,
-        lag_s: float,
-        max_iterations: int = 10,
-        tolerance: float = 1e-6,
-        initiation: str = DEFAULT,
-    ) -> None:
-        super().__init__(motion, prior, lag_s, initiation)
-        check_iteration(max_iterations, tolerance)
-        self._max_iterations, self._tolerance = max_iterations, tolerance
+    _max_iterations, _tolerance = 10, 1e-6
 
     def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
         """See `ReplayEkf.correct`."""
@@ -56,18 +42,11 @@ class IekfReplay(ReplayEkf):
             y, H = linearised(measurement.z, x, measurement.model, measurement.pose)
             update = reweighted(mean, covariance, y, H, measurement.R, measurement.loss, x - mean)
             limit = negative_log_posterior(x - mean, covariance, y, measurement.R, measurement.loss)
-            x = update.mean if self._max_iterations == 1 else descended(cost, limit, last, update.mean)
+            x = descended(cost, limit, last, update.mean)
             if largest_move(x - last, covariance) < self._tolerance:
                 break
         first = super().correct(mean, covariance, measurement)
         return first._replace(mean=x, covariance=update.covariance, weight=update.weight)
-
-
-def check_iteration(max_iterations: int, tolerance: float) -> None:
-    """Raise `ValueError` for a number of iterations or a tolerance out of range."""
-    if not 1 <= max_iterations <= 100:
-        raise ValueError(f"max_iterations: must lie between 1 and 100, is {max_iterations}")
-    not_negative(tolerance=tolerance)
 
 
 def descended(cost: Callable[[FloatArray], float], limit: float, start: FloatArray, end: FloatArray) -> FloatArray:

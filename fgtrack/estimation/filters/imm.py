@@ -1,7 +1,7 @@
 """The interacting multiple model filter, in continuous time, so that late measurements can be rewound to."""
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -33,7 +33,7 @@ class ImmReplay(ReplayEkf):
     With one model it is `ReplayEkf`. The innovation of a late measurement is predicted from those before it alone.
 
     `other` is a model or its name; by default CTRA with the noise of `motion` beside CTRV, and CTRV beside CTRA.
-    `stay_s` and `other_stay_s` are the mean sojourn times.
+    `stay_s` is the mean sojourn time in each.
     """
 
     spreads = mixes = True
@@ -46,19 +46,18 @@ class ImmReplay(ReplayEkf):
         lag_s: float,
         other: str | MotionModel = "",
         stay_s: float = 5.0,
-        other_stay_s: float = 5.0,
-        accel_density_m2ps5: float = CTRA.accel_density_m2ps5,
         initiation: str = DEFAULT,
     ) -> None:
         super().__init__(motion, prior, lag_s, initiation)
-        beside = _beside(motion, other, accel_density_m2ps5)
+        if not 0.0 < stay_s < math.inf:
+            raise ValueError(f"stay_s: must be positive and finite, is {stay_s}")
+        beside = _beside(motion, other)
         self._models = (motion,) if beside is None else (motion, beside)
-        stay = np.array([stay_s, other_stay_s][: len(self._models)])
-        if not (np.isfinite(stay).all() and (stay > 0.0).all()):
-            raise ValueError(f"the mean time with a model must be positive and finite, is {stay.tolist()} s")
-        self._share, self._rate_hz = stay / stay.sum(), float((1.0 / stay).sum())
+        self._rate_hz = len(self._models) / stay_s
         means, covariances = zip(*(initial_state(model, prior) for model in self._models), strict=True)
-        self.steps = [replace(self.steps[0], mixture=Mixture(means, covariances, self._share))]
+        self.steps = [
+            replace(self.steps[0], mixture=Mixture(means, covariances, np.full(len(means), 1.0 / len(means))))
+        ]
 
     @property
     def probabilities(self) -> FloatArray:
@@ -70,11 +69,11 @@ class ImmReplay(ReplayEkf):
     def transition(self, dt_s: float) -> FloatArray:
         """Probability of model j (columns) `dt_s` after model i (rows), shape (m, m).
 
-        exp(G dt) = exp(-r dt) I + (1 - exp(-r dt)) 1 s', with the sum r of the rates at which the models are left and
-        their stationary probabilities s. It composes, so time may be split anywhere.
+        exp(G dt) = exp(-r dt) I + (1 - exp(-r dt)) / m, with r = m over the mean sojourn time. It composes, so time may
+        be split anywhere.
         """
-        same = math.exp(-self._rate_hz * dt_s)
-        return np.asarray(same * identity(len(self._share)) + (1.0 - same) * self._share)
+        m, same = len(self._models), math.exp(-self._rate_hz * dt_s)
+        return np.asarray(same * identity(m) + (1.0 - same) / m)
 
     def _ahead(self, before: Step, stamp_ns: int) -> Prediction:
         """See `ReplayEkf._ahead`; the cross-covariance, which is not used, is the covariance."""
@@ -101,7 +100,7 @@ class ImmReplay(ReplayEkf):
         weight = float(posterior.probabilities @ [each.weight for each in corrected])
         correction = correct_one(mean, covariance, measurement)._replace(mean=x, covariance=P, weight=weight)
         step = self._concluded(before, measurement, Prediction(mean, covariance, covariance), correction)
-        if step.along:  # the state comes from all that was measured, along a line, by `motion`
+        if step.search is not None and step.search.line is not None:  # the state comes from the line, by `motion`
             alike = [_converted(self._motion, model, step.mean, step.covariance) for model in self._models]
             means, covariances = zip(*alike, strict=True)
             posterior = posterior._replace(means=means, covariances=covariances)
@@ -147,20 +146,17 @@ def _converted(
     return wanted.from_kinematic(*model.kinematic(mean, covariance))
 
 
-def _beside(motion: MotionModel, other: str | MotionModel, accel_density_m2ps5: float) -> MotionModel | None:
+def _beside(motion: MotionModel, other: str | MotionModel) -> MotionModel | None:
     """The other model. Raises `CallError` where there is none of that name, or `motion` cannot be one of two."""
     if isinstance(motion, CorrelatedErrors):
         raise CallError("takes no sensors with correlated errors")
     if isinstance(other, MotionModel):
         return other
     default = "ctrv" if isinstance(motion, CTRA) else "ctra" if isinstance(motion, CTRV) else ""
-    name = other or default
-    if not name:
+    if not (other or default):
         return None
-    if name == default and isinstance(motion, CTRV):
-        noise = {key: value for key, value in asdict(motion).items() if hasattr(CTRV, key)}
-        return CTRV(**noise) if name == "ctrv" else CTRA(**noise, accel_density_m2ps5=accel_density_m2ps5)
-    return motion_model(name, {})
+    same = {name: getattr(motion, name) for name in CTRV.density_names()} if other in ("", default) else {}
+    return motion_model(other or default, same)
 
 
 def _log_likelihood(found: OneCorrection, measurement: Measurement) -> float:

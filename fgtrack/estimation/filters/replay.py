@@ -44,11 +44,6 @@ class Step:
     mixture: Mixture | None = None
     """States by each model of `imm-replay`; mean and covariance are their moments."""
 
-    @property
-    def along(self) -> bool:
-        """True if the state comes from all that had been measured, along a line, and not from the step before."""
-        return self.search is not None and self.search.line is not None
-
 
 _stamp = attrgetter("stamp_ns")
 

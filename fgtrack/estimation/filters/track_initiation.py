@@ -4,6 +4,7 @@ import bisect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 
@@ -105,11 +106,11 @@ class TrackInitiation:
 
     def retrodicted(self, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The state at `stamp_ns` given all measurements, of `mean` (n,) and `covariance` (n, n) at the newest one."""
-        links = [link for link in self._filtered(stamp_ns) if link[0] >= stamp_ns]
+        links = [link for link in self._filtered((stamp_ns, None)) if link[0] >= stamp_ns]
         return smoothed_back(self.motion, links, mean, covariance)
 
-    def _filtered(self, extra_ns: int | None = None) -> list[Link]:
-        """The start, and the state after each measurement; with one at `extra_ns`, where nothing is measured."""
+    def _filtered(self, *others: tuple[int, None]) -> list[Link]:
+        """The start, and the state after each measurement and at the stamps of `others`."""
         x, P = initial_state(self.motion, self.start)
         nominal = self.nominal(x)
         if not self.motion.cartesian:
@@ -117,18 +118,12 @@ class TrackInitiation:
             x[YAW] = nominal[YAW]
         at_ns = self.start.stamp_ns
         links: list[Link] = [(at_ns, x, P, Prediction(x, P, P))]
-        wanted: list[tuple[int, Measurement | None]] = [(each.stamp_ns, each) for each in self.measurements]
-        if extra_ns is not None:
-            wanted.append((extra_ns, None))
-            wanted.sort(key=lambda each: each[0])
-        for stamp_ns, measurement in wanted:
+        stamped = [*((each.stamp_ns, each) for each in self.measurements), *others]
+        for stamp_ns, measurement in sorted(stamped, key=itemgetter(0)):
             predicted = Prediction(x, P, P)
             if stamp_ns > at_ns:
-                step = self.motion.transition(nominal, seconds(stamp_ns - at_ns))
-                moved = step.mean
-                predicted = Prediction(
-                    moved + step.F @ (x - nominal), propagated(step.F, P, step.Q), product(step.F, P)
-                )
+                moved, F, Q = self.motion.transition(nominal, seconds(stamp_ns - at_ns))
+                predicted = Prediction(moved + F @ (x - nominal), propagated(F, P, Q), product(F, P))
                 nominal, at_ns = moved, stamp_ns
             x, P = predicted.mean, predicted.covariance
             if measurement is not None:

@@ -13,13 +13,11 @@ import numpy as np
 
 from fgtrack.core.linalg import identity, symmetrise
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.filters.ekf import OneCorrection, Prediction, updated_one
-from fgtrack.estimation.filters.iekf import check_iteration, descended, largest_move, negative_log_posterior, reweighted
-from fgtrack.estimation.filters.initiation import DEFAULT
+from fgtrack.estimation.filters.iekf import descended, largest_move, negative_log_posterior, reweighted
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.models.measurement import MeasurementModel
-from fgtrack.models.motion import MotionModel
 
 _JITTER = 1e-12
 
@@ -120,23 +118,12 @@ class IplfReplay(UkfReplay):
     Garcia-Fernandez, Svensson, Morelande and Sarkka, Posterior linearization filter: principles and implementation
     using sigma points, IEEE Transactions on Signal Processing 63(20), 2015. The regression is repeated over each
     posterior that the prior and the last regression give, until mean and standard deviations change by less than
-    `tolerance`. With the spread and noise of a regression held, a step of the mean that does not lower the cost is
+    a hundredth. With the spread and noise of a regression held, a step of the mean that does not lower the cost is
     halved (Raitoharju et al., Damped posterior linearization filter, IEEE Signal Processing Letters 25(4), 2018). What
     is linear it does as `ReplayEkf`.
     """
 
-    def __init__(
-        self,
-        motion: MotionModel,
-        prior: Start,
-        lag_s: float,
-        max_iterations: int = 10,
-        tolerance: float = 1e-2,
-        initiation: str = DEFAULT,
-    ) -> None:
-        super().__init__(motion, prior, lag_s, initiation)
-        check_iteration(max_iterations, tolerance)
-        self._max_iterations, self._tolerance = max_iterations, tolerance
+    _max_iterations, _tolerance = 10, 1e-2
 
     def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
         """See `ReplayEkf.correct`."""
@@ -150,15 +137,14 @@ class IplfReplay(UkfReplay):
             y, R = measurement.model.residual(measurement.z, z), measurement.R + noise
             update = reweighted(mean, covariance, y, A, R, measurement.loss, x - mean)
             x, P = update.mean, update.covariance
-            if self._max_iterations > 1:
 
-                def cost(x: FloatArray, spread: FloatArray = spread, R: FloatArray = R) -> float:
-                    z = measurement_regression(measurement, x, spread).mean
-                    residual = measurement.model.residual(measurement.z, z)
-                    return negative_log_posterior(x - mean, covariance, residual, R, measurement.loss)
+            def cost(x: FloatArray, spread: FloatArray = spread, R: FloatArray = R) -> float:
+                z = measurement_regression(measurement, x, spread).mean
+                residual = measurement.model.residual(measurement.z, z)
+                return negative_log_posterior(x - mean, covariance, residual, R, measurement.loss)
 
-                limit = negative_log_posterior(last - mean, covariance, y, R, measurement.loss)
-                x = descended(cost, limit, last, x)
+            limit = negative_log_posterior(last - mean, covariance, y, R, measurement.loss)
+            x = descended(cost, limit, last, x)
             narrowed = np.abs(1.0 - spread.diagonal() / P.diagonal()).max()
             if max(largest_move(x - last, P), narrowed) < self._tolerance:
                 break
