@@ -21,8 +21,6 @@ _STAMP = f"an integer of at most {LARGEST_NS:.0g}"
 
 Content = tuple[tuple[str, ...], tuple[float, ...], tuple[str, ...]]
 """Names of what is measured, numbers, names of what is assumed and of the loss; it has an order."""
-Order = tuple[int, Content]
-"""Stamp and content."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +101,7 @@ class Measurement:
         return self.model.components, (*numbers, self.loss.width), (*self.assumed, self.loss.kind)
 
     @property
-    def order(self) -> Order:
+    def order(self) -> tuple[int, Content]:
         """Place among measurements: by stamp, and at one stamp by content, so that arrival does not matter."""
         return self.stamp_ns, self.content
 

@@ -35,17 +35,13 @@ class ObjectBank(Generic[_E]):
         self._start = start
         self._lag_ns = nanoseconds(lag_s)
         self._estimators: dict[int, _E] = {}
-        self._now_ns = 0
-
-    @property
-    def present_ns(self) -> int:
+        self.present_ns = 0
         """See `TrackBank.present_ns`."""
-        return self._now_ns
 
     @property
     def window_start_ns(self) -> int:
         """See `TrackBank.window_start_ns`."""
-        return self._now_ns - self._lag_ns
+        return self.present_ns - self._lag_ns
 
     @property
     def track_ids(self) -> tuple[int, ...]:
@@ -54,7 +50,7 @@ class ObjectBank(Generic[_E]):
 
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`."""
-        self._now_ns = now_ns
+        self.present_ns = now_ns
         self._ask(lambda _, estimator: estimator.advance(now_ns))
 
     def states_at(self, stamp_ns: int) -> StatesAt:
@@ -86,9 +82,9 @@ class ObjectBank(Generic[_E]):
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
         if not self._estimators:
             return []
-        states = self._ask(lambda _, one: one.state_at(max(self._now_ns, one.window_ns[0]))).values()
+        states = self._ask(lambda _, one: one.state_at(max(self.present_ns, one.window_ns[0]))).values()
         means, covariances = zip(*((state.mean, state.covariance) for state in states), strict=True)
-        return kinematic_states(self._motion, self._now_ns, np.array(means), np.array(covariances))
+        return kinematic_states(self._motion, self.present_ns, np.array(means), np.array(covariances))
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`: none."""

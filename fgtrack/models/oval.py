@@ -17,17 +17,7 @@ _TURN_RADIUS_M = 220.0
 _BEND_RADIUS_M = 600.0
 _BEND_M = 30.0  # from the start line to where the bend of the front straight begins to end
 _BLEND_M = 130.0  # over which the curvature goes from one value to the next
-_HALF_WIDTH_M = 7.5
-_BANKING_RAD = (math.radians(9.0), math.radians(20.0))  # on the straights and in the turns
 _START_HEADING_RAD = 0.5  # so that no straight lies on the jump of the heading
-_RACE_SPEED_MPS = 70.0
-_SPACING_M = 2.0
-
-_PIT_OFFSET_M = 24.0  # of the pit road from the reference line, to the left
-_APRON_OFFSET_M = 10.0  # of the lane that leads there
-_PIT_ROAD_M = 220.0  # from the start line to where the pit road begins to end
-_PIT_BLEND_M = 160.0
-_PIT_HALF_WIDTH_M = 4.5
 
 
 def make_oval() -> TrackMap:
@@ -39,10 +29,10 @@ def make_oval() -> TrackMap:
     points = _centre_line()
     path = Path.through(points)
     curvature = path.frame(np.linspace(0.0, path.length_m, len(points))).turn
-    low, high = _BANKING_RAD
+    low, high = math.radians(9.0), math.radians(20.0)  # on the straights and in the turns
     banking = low + (high - low) * np.clip(curvature * _TURN_RADIUS_M, 0.0, 1.0)
     # As in the speedways' files, negative banking leans to the left.
-    return _map_along(points, half_width_m=_HALF_WIDTH_M, banking_rad=-banking)
+    return _map_along(points, half_width_m=7.5, banking_rad=-banking)
 
 
 def make_pit_lane() -> TrackMap:
@@ -50,11 +40,10 @@ def make_pit_lane() -> TrackMap:
     oval = make_oval()
     s = np.linspace(0.0, oval.length_m, len(oval.table))
     from_start = np.minimum(s, oval.length_m - s)
-    blend = _smooth_step((from_start - _PIT_ROAD_M) / _PIT_BLEND_M)
-    offset = _PIT_OFFSET_M + (_APRON_OFFSET_M - _PIT_OFFSET_M) * blend
-    points = oval.position(s, offset)
+    blend = _smooth_step((from_start - 220.0) / 160.0)
+    points = oval.position(s, 24.0 - 14.0 * blend)  # the road lies 24 m to the left, the apron 10 m
     points[-1] = points[0]
-    return _map_along(points, half_width_m=_PIT_HALF_WIDTH_M, banking_rad=np.zeros(len(points)))
+    return _map_along(points, half_width_m=4.5, banking_rad=np.zeros(len(points)))
 
 
 def _smooth_step(x: FloatArray) -> FloatArray:
@@ -86,7 +75,7 @@ def _centre_line() -> FloatArray:
 
     # The half lap must end above its start. A longer front straight moves its end forward by the cosine of
     # the bend and shortens the back straight: one linear equation gives the length of the front straight.
-    s = np.linspace(0.0, half_m, round(half_m / _SPACING_M) + 1)
+    s = np.linspace(0.0, half_m, round(half_m / 2.0) + 1)
     end_x = _integrate(s, lambda u: np.cos(heading(u, 0.0)))[-1]
     straight_m = -end_x / (1.0 + math.cos(bend_angle))
     x = _integrate(s, lambda u: np.cos(heading(u, straight_m)))
@@ -121,7 +110,7 @@ def _map_along(points: FloatArray, *, half_width_m: float, banking_rad: FloatArr
         "s_racetraj_m": s,
         "psi_racetraj_rad": frame.heading_rad,
         "kappa_racetraj_radpm": curvature,
-        "vx_racetraj_mps": _RACE_SPEED_MPS,
+        "vx_racetraj_mps": 70.0,
         "ax_racetraj_mps2": 0.0,
         "banking_rad": banking_rad,
         "s_ref_m": s,

@@ -61,7 +61,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
 
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`."""
-        self._now_ns = now_ns
+        self.present_ns = now_ns
         self._start_ns = max(self._start_ns, now_ns - self._lag_ns)
         if len(self._rows) < len(self._estimators):
             self._ask(lambda _, one: one.advance(now_ns), [i for i in self._estimators if i not in self._rows])
@@ -73,8 +73,8 @@ class ReplayBank(ObjectBank[ReplayEkf]):
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
-        stamps_ns = [max(self._now_ns, start_ns) for start_ns in self._starts_ns()]
-        return kinematic_states(self._motion, self._now_ns, *self._ahead(list(self._estimators), stamps_ns))
+        stamps_ns = [max(self.present_ns, start_ns) for start_ns in self._starts_ns()]
+        return kinematic_states(self._motion, self.present_ns, *self._ahead(list(self._estimators), stamps_ns))
 
     def update(
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
