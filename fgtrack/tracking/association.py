@@ -94,7 +94,8 @@ class GatedEuclidean:
             for chosen, chosen_nis, _, _ in innovations(pairs, candidates, states):
                 nis[chosen] = chosen_nis
             pairs = pairs.at(nis <= self.max_nis)
-        return _refusing(suspects, assigned(pairs, len(candidates), len(states.means)))
+        assignment = assigned(pairs, len(candidates), len(states.means))
+        return _refusing(suspects, assignment) if suspects else assignment
 
 
 @settings

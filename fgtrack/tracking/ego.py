@@ -223,10 +223,8 @@ class EgoTrajectory:
         return None
 
     def _extrapolated(self, ego: EgoState, stamp_ns: int) -> EgoPose:
-        return extrapolated(ego, stamp_ns, self._covariance(ego), self._straight)
-
-    def _covariance(self, ego: EgoState) -> FloatArray | None:
-        return None if self._std is None else _completed(ego.covariance, self._std)
+        covariance = None if self._std is None else _completed(ego.covariance, self._std)
+        return extrapolated(ego, stamp_ns, covariance, self._straight)
 
     def _low_passed(self, ego: EgoState, yaw_rad: float, yaw_rate_radps: float) -> EgoState:
         """`ego` with its yaw and yaw rate drawn towards the given ones."""
@@ -243,7 +241,9 @@ class EgoTrajectory:
         same, as those of a localisation within a moment nearly are.
         """
         share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
-        covariance, newer = self._covariance(before), self._covariance(after)
+        covariance = newer = None
+        if self._std is not None:
+            covariance, newer = _completed(before.covariance, self._std), _completed(after.covariance, self._std)
         if covariance is not newer:
             older, newer = (np.zeros((5, 5)) if one is None else one for one in (covariance, newer))
             covariance = (1.0 - share) * older + share * newer

@@ -100,8 +100,10 @@ def is_valid_covariance(detection: Detection, sensor: SensorModel) -> bool:
 
 def stamps(message: DetectionList, sensor: SensorModel) -> list[int]:
     """Stamp of every detection of `message`: the list's, its own, or the mean of those that have one."""
+    if sensor.stamp_from not in ("object", "objects_mean"):
+        return [message.stamp_ns] * len(message.objects)
     own = [each.stamp_ns for each in message.objects if each.stamp_ns is not None]
-    if sensor.stamp_from not in ("object", "objects_mean") or not own:
+    if not own:
         return [message.stamp_ns] * len(message.objects)
     if sensor.stamp_from == "objects_mean":
         return [sum(own) // len(own)] * len(message.objects)

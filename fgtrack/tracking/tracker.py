@@ -262,7 +262,8 @@ class Tracker:
         """
         lifecycle, sensor = self._parts.lifecycle, self._parts.sensors[batch.message.sensor]
         seen = self._seen.setdefault(id(batch.message), set())
-        seen.update(states.track_ids[track] for _, track in assignment.pairs)
+        for _, track in assignment.pairs:
+            seen.add(states.track_ids[track])
         lifecycle.matched(scan, candidates, assignment.pairs, states)
         if self._parts.objects.describes(scan.objects):
             for position, track in assignment.pairs:
