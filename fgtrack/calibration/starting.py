@@ -2,9 +2,10 @@
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import chain, islice
+from functools import partial
+from itertools import chain, count, islice
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from ruamel.yaml import YAML
 
 from fgtrack.calibration.trial import TRIAL_S, beginning, suspicions
-from fgtrack.core.errors import CallError, DataError, FgtrackError
+from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DESCRIBING, MEASURABLE, STATE_NAMES
 from fgtrack.io.adapters import ADAPTERS
@@ -22,18 +23,17 @@ from fgtrack.io.adapters.objects import ODOMETRY
 from fgtrack.io.adapters.tables import headers, rows
 from fgtrack.io.config import CsvInput, CsvTable, Field, InputConfig, TopicInput
 from fgtrack.io.guess import Guess, agreeing_with_motion, guesses, time_unit, words_of
-from fgtrack.io.info import OTHER_CLOCK_S, InputInfo, TopicInfo, describe
+from fgtrack.io.info import OTHER_CLOCK_S, TopicInfo, describe
 from fgtrack.io.ros.bag import Bag
 from fgtrack.io.source import input_kind, open_input
-from fgtrack.models.sensors import Filter
 from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.pipeline.assumptions.assumption import Assumed, departures
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import validate
 
-__all__ = ["Part", "starting_config", "table_parts", "topic_parts"]
+__all__ = ["starting_config"]
 
-_ROWS, _MESSAGES, _FEW = 20_000, 20, 8  # that are looked at: of a table, of a topic; texts that tell rows apart
+_ROWS, _MESSAGES = 20_000, 20  # that are looked at: of a table, of a topic
 _EGO = frozenset(("ego", "own", "ownship", "host", "self"))
 _TRUTH = frozenset(("truth", "gt", "groundtruth", "label", "labels", "reference", "cars", "opponent", "target", "npc"))
 _GENERAL = frozenset(
@@ -62,41 +62,30 @@ class Part:
         return self.item.topic if isinstance(self.item, TopicInput) else self.item.file or "the file"
 
 
-def topic_parts(bag: Bag, topics: Sequence[TopicInfo]) -> tuple[list[Part], list[str]]:
-    """Parts among the topics of a recording, the likeliest ego first, and a line for each other topic."""
-    parts: list[Part] = []
-    left: list[str] = []
-    for topic in topics:
-        words = set(words_of(topic.name))
-        is_truth = bool(words & _TRUTH and not words & _EGO)
-        has_clock = topic.delay is None or abs(topic.delay.p50_s) < OTHER_CLOCK_S
-        item = TopicInput(topic.name, stamp_from="message" if has_clock else "receipt")
-        reasons = {"stamp_from": "its stamps are of another clock than the recorder's, or not set"}
-        problem = next((one.problem for one in bag.topics if (one.name, one.type) == (topic.name, topic.type)), None)
-        if problem is not None or not topic.count:
-            left.append(f"{topic.name} ({topic.type}): {problem or 'no messages'}")
-        elif topic.type == ODOMETRY:
-            parts.append(Part("truth" if is_truth else "ego", item, reasons))
-        elif topic.type in ADAPTERS:
-            parts.append(Part("truth" if is_truth else _sensor_name(topic.name, parts), item, reasons))
-        elif topic.type.startswith(_OTHER_PACKAGES):
-            left.append(f"{topic.name} ({topic.type})")
-        else:
-            part, why = _mapped(bag, item, topic.type, _sensor_name(topic.name, parts))
-            if part is not None:
-                parts.append(replace(part, reasons={**reasons, **part.reasons}))
-            else:
-                left.append(f"{topic.name} ({topic.type}): {why}")
-    parts.sort(key=lambda part: (part.role != "ego", not set(words_of(part.label)) & _EGO))
-    return parts, left
+def _topic_part(bag: Bag, topic: TopicInfo, parts: Sequence[Part]) -> Part:
+    """Return what `topic` is taken as, beside other `parts`; raises `DataError` with the reason where it is not."""
+    words = set(words_of(topic.name))
+    is_truth = bool(words & _TRUTH and not words & _EGO)
+    has_clock = topic.delay is None or abs(topic.delay.p50_s) < OTHER_CLOCK_S
+    item = TopicInput(topic.name, stamp_from="message" if has_clock else "receipt")
+    reasons = {"stamp_from": "its stamps are of another clock than the recorder's, or not set"}
+    problem = next((one.problem for one in bag.topics if (one.name, one.type) == (topic.name, topic.type)), None)
+    if problem is not None or not topic.count:
+        raise DataError(problem or "no messages")
+    if topic.type == ODOMETRY:
+        return Part("truth" if is_truth else "ego", item, reasons)
+    sensor = _sensor_name(topic.name, parts)
+    if topic.type in ADAPTERS:
+        return Part("truth" if is_truth else sensor, item, reasons)
+    if topic.type.startswith(_OTHER_PACKAGES):
+        raise DataError("no objects")
+    part = _mapped(bag, item, topic.type, sensor)
+    return replace(part, reasons={**reasons, **part.reasons})
 
 
-def _mapped(bag: Bag, item: TopicInput, type_name: str, sensor: str) -> tuple[Part | None, str]:
-    """The guess for a topic of an unknown type; without one a line of what is in it."""
-    try:
-        messages = [one for topic, _, one in islice(bag.messages({item.topic}), _MESSAGES) if topic.type == type_name]
-    except DataError as error:
-        return None, str(error)
+def _mapped(bag: Bag, item: TopicInput, type_name: str, sensor: str) -> Part:
+    """Return the guess for a topic of an unknown type; raises `DataError` with a line of what is in it."""
+    messages = [one for topic, _, one in islice(bag.messages({item.topic}), _MESSAGES) if topic.type == type_name]
     found = [fields_of(message) for message in messages]
     lists: dict[str, list[Mapping[str, Any]]] = {}
     for path, items in chain.from_iterable(each.items() for _, each in found):
@@ -110,18 +99,16 @@ def _mapped(bag: Bag, item: TopicInput, type_name: str, sensor: str) -> tuple[Pa
         is_ego = not path and _NEEDED["ego"] <= own.keys() and bool(set(words_of(item.topic)) & _EGO)
         known = STATE_NAMES if is_ego else (*MEASURABLE, *DESCRIBING, "object_id")
         used = {key: one for key, one in own.items() if key in known}
+        if not (path or is_ego or "range_m" in own):
+            mapping = ", ".join(f"{key}: {one.path}" for key, one in used.items())
+            raise DataError(f"one pose per message: the ego, truth or one object; fields: {{{mapping}}}")
         fields = {**({"objects": path} if path else {}), **{key: one.path for key, one in used.items()}}
         reasons = {"objects": "the list in the message", **{key: one.reason for key, one in used.items()}}
-        part = Part("ego" if is_ego else sensor, replace(item, fields=fields), reasons, _unused(values, used))
-        if path or is_ego:
-            return part, ""
-        if "range_m" in own:
-            return replace(
-                part, notes=(*part.notes, "one object per message: set scan_s to put those of a scan together")
-            ), ""
-        mapping = ", ".join(f"{key}: {one.path}" for key, one in used.items())
-        return None, f"one pose per message: the ego, truth or one object; fields: {{{mapping}}}"
-    return None, f"no position among {_spreads(_columns(lists[''])) or 'its fields'}"
+        notes = _unused(values, used)
+        if not (path or is_ego):
+            notes += ("one object per message: set scan_s to put those of a scan together",)
+        return Part("ego" if is_ego else sensor, replace(item, fields=fields), reasons, notes)
+    raise DataError(f"no position among {_spreads(_columns(lists[''])) or 'its fields'}")
 
 
 def _columns(samples: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:
@@ -134,71 +121,40 @@ def _sensor_name(text: str, parts: Sequence[Part]) -> str:
     words = words_of(text)
     name = "_".join([word for word in words if word not in _GENERAL] or words) or "sensor"
     taken = {part.role for part in parts} | {"ego", "truth"}
-    return name if name not in taken else next(f"{name}_{k}" for k in range(2, 200) if f"{name}_{k}" not in taken)
+    return name if name not in taken else next(f"{name}_{k}" for k in count(2) if f"{name}_{k}" not in taken)
 
 
-def table_parts(recording: Path) -> tuple[list[Part], list[str]]:
-    """Parts of a CSV file or of those in a folder, and a line for each other table. Raises `DataError` as `rows`."""
-    parts: list[Part] = []
-    left: list[str] = []
-    for file, columns in headers(recording).items():
-        cells = [cells for _, cells in islice(rows(file), 1, _ROWS)]
-        for value, column, group in _groups(columns, cells):
-            part, why = _table(file, recording, [name for name in columns if name != column], group, value)
-            if part is None:
-                left.append(why)
-                continue
-            if column is not None:
-                part = replace(part, item=replace(part.item, filters={column: Filter(one_of=(value,))}))
-            role = part.role if part.role in ("ego", "truth") else _sensor_name(part.role, parts)
-            parts.append(replace(part, role=role))
-    return parts, left
-
-
-def _groups(
-    columns: Sequence[str], cells: Sequence[Mapping[str, str]]
-) -> Iterator[tuple[str, str | None, list[Mapping[str, str]]]]:
-    """Rows that belong together: all, or by a column of few texts that says of what they are."""
-    for column in columns:
-        texts = {one[column] for one in cells}
-        if 1 < len(texts) <= _FEW and any(set(words_of(text)) & _EGO for text in texts):
-            for text in sorted(texts):
-                yield text, column, [one for one in cells if one[column] == text]
-            return
-    yield "", None, list(cells)
-
-
-def _table(
-    file: Path, recording: Path, columns: Sequence[str], cells: Sequence[Mapping[str, str]], kind: str
-) -> tuple[Part | None, str]:
-    """The guess for the rows of a table, or a line of what is in it."""
+def _table_part(file: Path, columns: Sequence[str], is_folder: bool, parts: Sequence[Part]) -> Part:
+    """Return the guess for a table beside other `parts`; raises `DataError` with a line of what is in it."""
+    cells = [cells for _, cells in islice(rows(file), 1, _ROWS)]
     values = {name: [_number(one[name]) for one in cells] for name in columns if any(one[name] for one in cells)}
     own = guesses({name: [value for value in found if math.isfinite(value)] for name, found in values.items()})
-    words = set(words_of(kind or file.stem))
+    words = set(words_of(file.stem))
     is_truth, is_ego = bool(words & _TRUTH and not words & _EGO), bool(words & _EGO)
-    is_ego |= not (is_truth or kind or "object_id" in own) and _NEEDED["ego"] <= own.keys()
-    role = "ego" if is_ego else "truth" if is_truth else kind or file.stem
+    is_ego |= not (is_truth or "object_id" in own) and _NEEDED["ego"] <= own.keys()
+    role = "ego" if is_ego else "truth" if is_truth else _sensor_name(file.stem, parts)
     if "stamp" not in own:
-        return None, f"{file.name}: no column of times among {_spreads(values)}"
+        raise DataError(f"no column of times among {_spreads(values)}")
     column = str(own["stamp"].path)
     unit, why = time_unit(column, [value for value in values[column] if math.isfinite(value)])
     if is_ego:
         own = agreeing_with_motion(own, {name: np.array(found) for name, found in values.items()}, unit)
     missing = _NEEDED.get(role, set()) - own.keys()
     if missing or not any(wanted <= own.keys() for wanted in _POSITIONS):
-        return None, f"{file.name}: no column for {', '.join(sorted(missing)) or 'a position'} among {_spreads(values)}"
-    known = ("stamp", "receipt", *(STATE_NAMES if role in ("ego", "truth") else (*MEASURABLE, *DESCRIBING)))
+        raise DataError(f"no column for {', '.join(sorted(missing)) or 'a position'} among {_spreads(values)}")
+    is_sensor = not (is_ego or is_truth)
+    known = ("stamp", "receipt", *((*MEASURABLE, *DESCRIBING) if is_sensor else STATE_NAMES))
     used = {key: one for key, one in own.items() if key in known or (key == "object_id" and not is_ego)}
-    named = {str(own[key].path) for key in ("x_m", "y_m") if key in own and role not in ("ego", "truth")}
+    named = [str(own[key].path) for key in ("x_m", "y_m") if key in own and is_sensor]
     in_map = bool(named) and all(set(words_of(name)) & {"east", "easting", "north", "northing"} for name in named)
     table = CsvTable(
         {key: one.path for key, one in used.items()},
-        file.name if recording.is_dir() else None,
+        file.name if is_folder else None,
         unit,  # type: ignore[arg-type]  # a name of NS_PER_UNIT
         frame="map" if in_map else None,
     )
     reasons = {**{key: one.reason for key, one in used.items()}, "time_unit": why, "frame": "east and north"}
-    return Part(role, table, reasons, _unused(values, used)), ""
+    return Part(role, table, reasons, _unused(values, used))
 
 
 def _number(text: str) -> float:
@@ -237,25 +193,22 @@ def starting_config(recording: Path) -> str:
     DataError
         It is not an input, or damaged from the start.
     """
-    found, parts, left = _parts(recording)
-    taken, refused = _readable(recording, parts)
+    parts, refused = _parts(recording)
+    taken = _readable(recording, parts, refused)
     config = Config(input=_input(taken))
+    checks, with_sensors = list[str](), Assumed(config)
     try:
         source = open_input(recording, config.input)
         with_sensors = assumed(config, source)
-        checks = [
-            str(one)
-            for one in suspicions(list(beginning(source.messages(), nanoseconds(TRIAL_S))), with_sensors.config)
-        ]
-    except FgtrackError as error:  # of a recording in which nothing can be taken
-        with_sensors, checks = Assumed(config, ()), [str(error)] if taken else []
+        checks += map(str, suspicions(list(beginning(source.messages(), nanoseconds(TRIAL_S))), with_sensors.config))
+    except FgtrackError as error:
+        checks += [str(error)] if taken else []  # else of a recording in which nothing can be taken
     head = [
         f"Starting configuration for {recording.name} {_MARK}",
         "Guesses from names and values: check units, frames and noise, then",
         f"  fgtrack info {recording} -c THIS.yaml; fgtrack replay {recording} -c THIS.yaml -o RUN",
-        *_contents(found),
-        *(f"Check: {line}" for line in [*checks, *filter(None, [found.problem])]),
-        *(f"Not taken: {line}" for line in [*left, *refused]),
+        *(f"Check: {line}" for line in checks),
+        *(f"Not taken: {line}" for line in refused),
         *(f"{part.label}: {note}" for part in taken for note in part.notes),
     ]
     text = with_sensors.to_yaml(head, [one for part in taken for one in _comments(part)])
@@ -263,35 +216,32 @@ def starting_config(recording: Path) -> str:
     return text
 
 
-def _contents(found: InputInfo) -> Iterator[str]:
-    yield f"{found.kind}, {found.duration_s:.1f} s:"
-    for topic in found.topics:
-        rate = "" if topic.rate_hz is None else f", {topic.rate_hz:.3g} Hz"
-        delay = "" if topic.delay is None else f", median delay {topic.delay.p50_s:.3g} s"
-        yield f"  {topic.name} ({topic.type}): {topic.count} messages{rate}{delay}"
-
-
-def _parts(recording: Path) -> tuple[InputInfo, list[Part], list[str]]:
-    """Return the contents of the recording, its parts with a guess, and a line for each other part."""
-    try:
-        found = describe(recording)
-    except CallError:
-        if not recording.exists() or input_kind(recording) != "csv":
-            raise
-        parts, left = table_parts(recording)
-        taken, _ = _readable(recording, parts)
-        found = describe(recording, _input(taken)) if taken else InputInfo(recording, "csv", None, 0.0, (), None)
-        return found, parts, left
-    if found.kind != "recording" or any(topic.type in NATIVE_ADAPTERS for topic in found.topics):
-        return found, [], []
-    parts, left = topic_parts(Bag(recording), found.topics)
-    return found, parts, left
-
-
-def _readable(recording: Path, parts: Sequence[Part]) -> tuple[list[Part], list[str]]:
-    """The parts of which a first message can be read, each role once, and why not the others."""
-    taken: list[Part] = []
+def _parts(recording: Path) -> tuple[list[Part], list[str]]:
+    """Return the parts of the recording with a guess, the likeliest ego first, and a line for each other part."""
+    parts: list[Part] = []
     refused: list[str] = []
+    makers: dict[str, Callable[[], Part]] = {}
+    if input_kind(recording) == "csv":
+        is_folder = recording.is_dir()
+        for file, columns in headers(recording).items():
+            makers[file.name] = partial(_table_part, file, columns, is_folder, parts)
+    else:
+        found = describe(recording)
+        refused += [] if found.problem is None else [found.problem]
+        if found.kind == "recording" and not any(topic.type in NATIVE_ADAPTERS for topic in found.topics):
+            bag = Bag(recording)
+            makers = {f"{topic.name} ({topic.type})": partial(_topic_part, bag, topic, parts) for topic in found.topics}
+    for label, make in makers.items():
+        try:
+            parts.append(make())
+        except DataError as error:
+            refused.append(f"{label}: {error}")
+    return sorted(parts, key=lambda part: (part.role != "ego", not set(words_of(part.label)) & _EGO)), refused
+
+
+def _readable(recording: Path, parts: Sequence[Part], refused: list[str]) -> list[Part]:
+    """Return the parts of which a first message can be read, each role once; `refused` gets lines on the others."""
+    taken: list[Part] = []
     for part in parts:
         what = f"{part.label} as {part.role}"
         if any(part.role == other.role for other in taken):
@@ -302,7 +252,7 @@ def _readable(recording: Path, parts: Sequence[Part]) -> tuple[list[Part], list[
             taken.append(part)
         except FgtrackError as error:
             refused.append(f"{what}: {error}")
-    return taken, refused
+    return taken
 
 
 def _input(parts: Sequence[Part]) -> InputConfig:

@@ -80,18 +80,6 @@ def test_tables_of_another_program_are_written_read_and_replayed(foreign, tmp_pa
     assert "warning" not in capsys.readouterr().err.replace("map: there is none", "")
 
 
-def test_one_table_of_several_things_is_told_apart_by_a_column(tmp_path):
-    rows = [["ms", "kind", "pos: x", "pos #y", "yaw", "v"]]
-    for k in range(40):
-        rows += [[50 * k, "ego", 0.5 * k, 0.0, 0.0, 10.0], [50 * k, "radar", 30 + k, 1.0, "", ""]]
-    table(tmp_path / "log.csv", *rows)
-    config = loaded(starting_config(tmp_path / "log.csv"), tmp_path)
-    assert config.input.csv.ego.columns["x_m"] == "pos: x"
-    found = list(open_input(tmp_path / "log.csv", config.input).messages())
-    assert sum(isinstance(one, EgoState) for one in found) == sum(isinstance(one, DetectionList) for one in found) == 40
-    assert found[-1].stamp_ns == 39 * 50_000_000
-
-
 def test_a_type_that_nobody_knows_is_mapped_by_its_fields(tmp_path):
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(RADAR, "acme_msgs/msg/Scan"))
@@ -120,7 +108,6 @@ def test_a_type_that_nobody_knows_is_mapped_by_its_fields(tmp_path):
     assert first.objects[1].bearing_rad == pytest.approx(math.radians(-10.0))
     assert "# Not taken: /chatter (std_msgs/msg/String)" in text
     assert "not used: rcs (5 to 5)" in text
-    assert "/sensing/front_radar/scan (acme_msgs/msg/Scan): 20 messages, 20 Hz, median delay 0.01 s" in text
 
 
 def test_topics_of_known_types_are_the_ego_and_sensors(tmp_path):
