@@ -21,6 +21,7 @@ from fgtrack.pipeline.replay import replay_in_memory
 __all__ = ["TRIAL_S", "Trial", "beginning", "suspicions", "try_out"]
 
 TRIAL_S = 5.0
+_SHOWN = (*MEASURABLE, "yaw_rate_radps", *DESCRIBING, "object_id")
 _FAR_M, _NEARER = 250.0, 0.3  # what is so far, and so much nearer in another frame, is in that one
 
 
@@ -41,18 +42,15 @@ class Trial:
 def try_out(messages: Iterable[Message], config: Config) -> Trial:
     """Read and track the first `TRIAL_S` of `messages`, in memory."""
     readable = UntilBreak(messages)
+    found, run = list[Message](), None
     try:
         found = list(beginning(readable, nanoseconds(TRIAL_S)))
-    except DataError as error:  # of the first message
-        return Trial({}, (), None, str(error))
-    problem = None if readable.error is None else str(readable.error)
-    run = None
-    try:
         run = replay_in_memory(found, config)
-        problem = problem or run.meta["broken_off"]
+        problem = run.meta["broken_off"]
     except DataError as error:
-        problem = problem or str(error)
-    return Trial(_samples(found), tuple(suspicions(found, config)), run, problem)
+        problem = str(error)
+    problem = problem if readable.error is None else str(readable.error)
+    return Trial(_samples(found), tuple(suspicions(found, config)) if found else (), run, problem)
 
 
 def beginning(messages: Iterable[Message], duration_ns: int) -> Iterator[Message]:
@@ -119,17 +117,17 @@ def _frames(name: str, lists: Sequence[DetectionList], egos: Sequence[EgoState])
     offsets = [math.hypot(x_m - ego.x_m, y_m - ego.y_m) for (_, x_m, y_m), ego in zip(points, nearest, strict=True)]
     from_ego_m = float(np.median(offsets))
     frame = lists[0].frame
-    if frame == "map" and from_ego_m > _FAR_M and bare_m < _NEARER * from_ego_m:
-        text = (
-            f"is read as in the map, {from_ego_m:.0f} m from the ego, but its numbers are small ({bare_m:.0f} m): "
-            "set `frame: ego` (or sensor)"
-        )
-        yield Diagnostic(name, text, spoils=True)
-    if frame != "map" and bare_m > _FAR_M and from_ego_m < _NEARER * bare_m:
+    own_m, other_m = (from_ego_m, bare_m) if frame == "map" else (bare_m, from_ego_m)
+    if own_m > _FAR_M and other_m < _NEARER * own_m:
         text = (
             f"is read as relative to the {frame}, {bare_m:.0f} m away, but its numbers lie {from_ego_m:.0f} m from "
             "where the ego is in the map: set `frame: map`"
         )
+        if frame == "map":
+            text = (
+                f"is read as in the map, {from_ego_m:.0f} m from the ego, but its numbers are small ({bare_m:.0f} m): "
+                "set `frame: ego` (or sensor)"
+            )
         yield Diagnostic(name, text, spoils=True)
 
 
@@ -145,24 +143,11 @@ def _measured(name: str, objects: Sequence[Detection], sensor: SensorModel) -> I
 def _samples(messages: Sequence[Message]) -> dict[str, str]:
     found: dict[str, str] = {}
     for message in messages:
-        match message:
-            case DetectionList() if message.objects:
-                name, of = f"{message.sensor} (in the frame {message.frame})", message.objects[0]
-                text = _values(of, (*MEASURABLE, *DESCRIBING, "object_id"))
-            case EgoState():
-                name, text = "ego", _values(message, ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps"))
-            case TruthState() if not message.ignored:
-                name, text = "truth", _values(message, ("object_id", "x_m", "y_m", "yaw_rad", "speed_mps"))
-            case _:
-                continue
-        found.setdefault(name, text)
+        name, of = "truth" if isinstance(message, TruthState) else "ego", list[Message | Detection]([message])
+        if isinstance(message, DetectionList):
+            name, of = f"{message.sensor} (in the frame {message.frame})", list(message.objects)
+        if of and name not in found:
+            values = {key: value for key in _SHOWN if (value := getattr(of[0], key, None)) is not None}
+            texts = (f"{key} {one:.6g}" if isinstance(one, float) else f"{key} {one}" for key, one in values.items())
+            found[name] = ", ".join(texts)
     return found
-
-
-def _values(message: Message | Detection, names: Sequence[str]) -> str:
-    values = ((name, getattr(message, name)) for name in names)
-    return ", ".join(
-        f"{name} {value:.6g}" if isinstance(value, float) else f"{name} {value}"
-        for name, value in values
-        if value is not None
-    )
