@@ -56,9 +56,7 @@ def show_study(found: Study, recording: Path) -> None:
     for assumption in found.assumptions:
         say(assumption)
     again = shlex.join(["fgtrack", "study", str(recording), "-c", str(found.settings), "-o", "OTHER"])
-    tables = shlex.join(["fgtrack", "compare", str(found.path / "runs"), "--all"])
     say(f"settings: {found.settings}; change them and run again by `{again}`")
-    say(f"every table and column: {tables}")
     say(f"report: {found.report}, open it in a browser")
     if found.broken is not None:
         raise DataError(f"{located(found.broken, str(recording))}; used up to there")

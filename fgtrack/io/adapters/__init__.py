@@ -1,8 +1,7 @@
 """Converts messages and data sets of others to fgtrack's messages and conventions.
 
-A package adds an adapter by an entry point of the group `fgtrack.adapters`. Its name says what it is: a message type
-`package/msg/Type`, whose entry is a function from a message to an `ObjectList`, or a file format, whose entry is a
-`FileFormat` or a function that gives one.
+An entry point of the group `fgtrack.adapters` adds one: named `package/msg/Type`, a function from a message to an
+`ObjectList`; by another name a `FileFormat`, or a function that gives one.
 """
 
 from fgtrack.core.plugins import Registry

@@ -1,18 +1,13 @@
 """The Autoferry data set: object lists and bearings of a ferry, with the GNSS truth of two vessels.
 
 Helgesen, Vasstein, Brekke, Stahl, "Heterogeneous multi-sensor tracking for an autonomous surface vehicle in a
-littoral environment", 2022; github.com/Autoferry/sensor_fusion_dataset, a folder per scenario.
+littoral environment", 2022; github.com/Autoferry/sensor_fusion_dataset. Choices that the data leave open:
 
-Choices that the data leave open:
-
-- The receipt of a record is the newest stamp up to it in the file. In scenario 6 the records are not in the
-  order of their times, each sensor alone is; that fits a file in the order of arrival. This is an inference:
-  the publishers do not say so, and the true delay is at least the one that this gives.
-- Every scan is aligned to the north, so the ego frame is: its yaw is 0 and it only shifts. Its speed is given
-  as 0 because a speed along yaw 0 would be a motion to the east. An own-ship position older than one already
-  delivered is not delivered again.
-- LiDAR and RADAR points get the own ship's position of their record and are in the map frame. The bearings of
-  the cameras stay relative to the ego.
+- The receipt of a record is the newest stamp up to it in the file: in scenario 6 the records are not in the order of
+  their times, each sensor alone is, as in the order of arrival. The true delay is at least that.
+- Every scan is aligned to the north, so the yaw of the ego frame is 0, and its speed too: along yaw 0 it would be a
+  motion to the east. An own-ship position older than one already delivered is not delivered again.
+- LiDAR and RADAR points get the own ship's position and are in the map frame. Bearings stay relative to the ego.
 """
 
 import math

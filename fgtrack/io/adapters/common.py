@@ -25,7 +25,7 @@ PLANAR = [0, 1, 5]
 
 _DECIMAL = Context(Emax=40)  # no exponent makes a number of a million digits
 _LARGEST_MB = 2000.0
-A_LIST, _BETWEEN = re.compile(r"\s*\[\s*"), re.compile(r"[\s,:]*")
+_A_LIST, _BETWEEN = re.compile(r"\s*\[\s*"), re.compile(r"[\s,:]*")
 _INT64 = range(-(1 << 63), 1 << 63)
 
 # A message is known by its attributes only: its class is made when a recording is read.
@@ -59,7 +59,7 @@ def reported_as(text: str) -> Iterator[None]:
         raise DataError(f"{text} ({type(error).__name__}: {str(error)[:200]})") from error
 
 
-def json_values(file: Path, begin: re.Pattern[str] = A_LIST, **form: Any) -> Iterator[Any]:  # Any: parsed JSON
+def json_values(file: Path, begin: re.Pattern[str] = _A_LIST, **form: Any) -> Iterator[Any]:  # Any: parsed JSON
     """Values of the list that follows `begin` in the JSON `file`, or keys and values of the object.
 
     One after the other: the text of a table may have a gigabyte, and its values take five times as much. `form` is that
@@ -78,9 +78,8 @@ def json_values(file: Path, begin: re.Pattern[str] = A_LIST, **form: Any) -> Ite
 
 def split(items: Iterable[Detection | str]) -> tuple[tuple[Detection, ...], tuple[str, ...]]:
     """The detections among `items`, and for each other object the setting that excludes it."""
-    every = tuple(items)
-    excluded = tuple(item for item in every if isinstance(item, str))
-    return tuple(item for item in every if not isinstance(item, str)), excluded
+    every = list(items)
+    return tuple(i for i in every if not isinstance(i, str)), tuple(i for i in every if isinstance(i, str))
 
 
 def object_id(value: object) -> int | None:

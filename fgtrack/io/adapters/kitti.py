@@ -1,27 +1,16 @@
 """The KITTI tracking data set: detections of road users, the ego's motion, and labelled truth at 10 Hz.
 
-Geiger, Lenz, Urtasun, "Are we ready for autonomous driving? The KITTI vision benchmark suite", CVPR 2012;
-www.cvlibs.net/datasets/kitti, laid out as `oxts/ calib/ label_02/` with a text file per sequence. Every other folder
-beside them with a file of the sequence holds the detections of a sensor of that name, in one of these forms:
+Geiger, Lenz, Urtasun, "Are we ready for autonomous driving? The KITTI vision benchmark suite", CVPR 2012: a text file
+per sequence in `oxts/ calib/ label_02/`. Every other folder with such a file holds the detections of a sensor of that
+name, in a form of docs/recordings.md. Conventions that the data do not specify:
 
-- `frame,class,left,top,right,bottom,score,h,w,l,x,y,z,rotation_y,alpha`, as AB3DMOT publishes them;
-- `frame track type truncated occluded alpha left top right bottom h w l x y z rotation_y score`, as the data set's own
-  results of tracking;
-- `frame,left,top,right,bottom,score`: a box in the image of camera 2.
-
-Boxes in space give position, yaw and size; where there is none, the bearing of the middle of the box in the image.
-
-Conventions that the data do not specify:
-
-- Frame k is at k x 0.1 s and received at once: the data have no receipt times (`fgtrack convert` gives delays).
-- The map frame begins where the ego does; x to the east, y to the north, in the Mercator projection of the data set's
-  own development kit. The ego frame is that of the inertial unit, levelled by its roll and pitch.
-- A bearing is from camera 2 and relative to the ego's heading: `frame` is `sensor`, and the sensor's `mount` is the
-  position of the camera, without a yaw, since the calibration has turned the bearing already.
-- A box that touches the left or right border of the image shows a part of a car, whose middle is elsewhere: left out.
-- Detections and truth of other classes than `input.kitti.classes` are left out. As in the data set's own evaluation a
-  neighbouring class (a van for a car) is ignored, and so is what lies in a `DontCare` region: behind it as seen from
-  camera 2, from the distance on at which a car looks so small that it can be in it.
+- Frame k is at k x 0.1 s and received at once.
+- The map begins where the ego does, in the Mercator projection of the development kit. The ego frame is that of the
+  inertial unit, levelled by its roll and pitch.
+- A bearing is from camera 2 and relative to the ego's heading: the sensor's `mount` has no yaw.
+- A box at the left or right border of the image shows a part of a car, whose middle is elsewhere: left out.
+- As in the data set's own evaluation a neighbouring class (a van for a car) is ignored, and so is what lies in a
+  `DontCare` region: behind it as seen from camera 2, where a car looks so small that it can be in it.
 """
 
 import math
@@ -42,8 +31,6 @@ from fgtrack.io.adapters.common import reported_as, split
 from fgtrack.io.adapters.kitti_view import CALIB, OXTS, View, lines_of, read_views
 from fgtrack.io.config import KittiInput
 from fgtrack.io.source import FileFormat
-
-__all__ = ["CLASS_NAMES", "FORMAT", "is_sequence", "read_sequence", "view_of_sequence"]
 
 _TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
 CLASS_NAMES: Mapping[str, str] = {name.lower(): name for name in _TYPES}
@@ -109,10 +96,7 @@ def _by_frame(
     latest, by_frame = 0, defaultdict(list)
     try:
         for where, fields in lines_of(file):
-            with (
-                reported_as(where),
-                np.errstate(all="ignore"),
-            ):  # of values that are not finite: the tracker counts them
+            with reported_as(where), np.errstate(all="ignore"):  # the tracker counts what is not finite
                 frame = int(fields[0])
                 latest = max(latest, frame)
                 if not 0 <= frame < len(views):
@@ -187,7 +171,8 @@ def _region(view: View, left_px: float, top_px: float, right_px: float, bottom_p
     v_px = 0.5 * (top_px + bottom_px)
     sides = np.array([view.bearing_rad(u_px, v_px) for u_px in (left_px, right_px)])
     rays = np.column_stack([np.cos(sides), np.sin(sides)])
-    corners = view.in_map(view.camera_m[:2] + np.vstack([near_m * rays, far_m * rays[::-1]]))
+    camera_m = view.position_m((-np.linalg.solve(view.projection[:, :3], view.projection[:, 3])).tolist())
+    corners = view.in_map(camera_m[:2] + np.vstack([near_m * rays, far_m * rays[::-1]]))
     x_m, y_m = corners.mean(axis=0).tolist()
     outline_m = tuple(corners.ravel().tolist())
     return TruthState(view.ego.stamp_ns, view.ego.receipt_ns, -2, x_m, y_m, ignored=True, outline_m=outline_m)

@@ -63,11 +63,6 @@ class View(NamedTuple):
         """Point in the ego frame, shape (3,)."""
         return self.levelled_from_imu @ np.linalg.solve(self.rectified_from_imu, [*rectified_m, 1.0])[:3]
 
-    @property
-    def camera_m(self) -> FloatArray:
-        """Camera 2 in the ego frame, shape (3,)."""
-        return self.position_m((-np.linalg.solve(self.projection[:, :3], self.projection[:, 3])).tolist())
-
     def pose(self, x_m: float, y_m: float, z_m: float, rotation_y_rad: float) -> tuple[FloatArray, float]:
         """Position (3,) and yaw in the ego frame of an object given in the rectified camera frame."""
         heading = [math.cos(rotation_y_rad), 0.0, -math.sin(rotation_y_rad)]

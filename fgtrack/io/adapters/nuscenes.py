@@ -1,13 +1,10 @@
 """nuScenes: boxes in the submission form of the data set, ego poses and truth from its tables.
 
-Caesar et al., "nuScenes: a multimodal dataset for autonomous driving", CVPR 2020; www.nuscenes.org. The input is the
-JSON file of the results (`meta` and `results` by sample) of a detector or tracker; the tables (`sample.json`,
-`sample_data.json`, `ego_pose.json`, `scene.json`; for truth `sample_annotation.json`, `instance.json`, `category.json`)
-stand in a folder of the version, `v1.0-...`, beside it. Choices that the data leave open:
+Caesar et al., "nuScenes: a multimodal dataset for autonomous driving", CVPR 2020. The input is the JSON file of results
+(`meta` and `results` by sample); the tables stand in a folder `v1.0-...` beside it. Choices that the data leave open:
 
-- A box is sensed at the stamp of its sample and received at once: the data have no receipt times.
-- Boxes and truth are in the map frame, that of the data set's maps. The ego's speed and yaw rate are those between its
-  poses.
+- A box is sensed at the stamp of its sample and received at once.
+- Boxes and truth are in the map frame. The ego's speed and yaw rate are those between its poses.
 - Truth that no sensor has a point of is ignored, as in the data set's own evaluation.
 """
 
@@ -27,8 +24,6 @@ from fgtrack.core.types import Detection, DetectionList, EgoState, Message, Trut
 from fgtrack.io.adapters.common import json_values, object_id, reported_as, signed_speed_mps, split
 from fgtrack.io.config import NuscenesInput
 from fgtrack.io.source import FileFormat
-
-__all__ = ["FORMAT", "read_scene"]
 
 _RESULTS = re.compile(rb'\s*\{\s*"(meta|results)"\s*:')
 _OF_RESULTS = re.compile(r'.*?"results"\s*:\s*\{\s*', re.DOTALL)

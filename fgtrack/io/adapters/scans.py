@@ -8,8 +8,6 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.io.errors import UntilBreak
 
-__all__ = ["grouped"]
-
 _LONGEST_NS = NS_PER_S  # after the last detection of a scan, in receipts: it is complete then
 
 

@@ -26,8 +26,6 @@ from fgtrack.io.adapters.fusiontracking import LOG_NAME
 from fgtrack.io.config import CsvTable, InputConfig
 from fgtrack.io.source import FileFormat
 
-__all__ = ["FORMAT", "headers", "read_tables", "rows"]
-
 _ENDINGS = (".csv", ".tsv")
 _LONGEST_HEADER = 1_000_000
 _TIMES = ("stamp", "receipt")
@@ -146,17 +144,16 @@ def _values(cells: Cells, table: CsvTable, role: str) -> dict[str, Any]:  # Any:
 
 def _times(cells: Cells, table: CsvTable) -> tuple[int, int]:
     """Stamp and receipt of a row in integer nanoseconds."""
-    times: dict[str, int] = {}
+    times: list[int] = []
     for name in _TIMES:
-        if name in table.columns:
-            column = single_path(table.columns[name])
-            try:
-                times[name] = exact_ns(cells[column], table.time_unit)
-            except (ArithmeticError, ValueError) as error:
-                text = f"{cells[column]!r:.40} is not a time in {table.time_unit}"
-                raise FieldError(f"{column}: {text}, or change `time_unit`") from error
-    receipt_ns = times.get("receipt", times["stamp"])
-    return receipt_ns if table.stamp_from == "receipt" else times["stamp"], receipt_ns
+        column = single_path(table.columns.get(name, table.columns["stamp"]))
+        try:
+            times.append(exact_ns(cells[column], table.time_unit))
+        except (ArithmeticError, ValueError) as error:
+            text = f"{cells[column]!r:.40} is not a time in {table.time_unit}"
+            raise FieldError(f"{column}: {text}, or change `time_unit`") from error
+    stamp_ns, receipt_ns = times
+    return receipt_ns if table.stamp_from == "receipt" else stamp_ns, receipt_ns
 
 
 def _recognises(path: Path) -> bool:
