@@ -150,14 +150,11 @@ def _figure(name: str, picture: bytes) -> str:
 
 def _configuration(runs: Sequence[EvaluatedRun]) -> str:
     """The keys whose values differ between runs, then everything of each run."""
-    flat = {one.label: pd.json_normalize(one.run.config).to_dict("records")[0] for one in runs}
-    settings = {
-        label: {key: value if isinstance(value, str) else json.dumps(value, default=str) for key, value in one.items()}
-        for label, one in flat.items()
-    }
-    keys = dict.fromkeys(key for one in settings.values() for key in one)
-    rows = [{"key": key} | {label: one.get(key, _NONE) for label, one in settings.items()} for key in keys]
-    rows = [row for row in rows if len({row[label] for label in settings}) > 1]
+    settings = pd.DataFrame({one.label: pd.json_normalize(one.run.config).to_dict("records")[0] for one in runs})
+    texts = settings.map(lambda value: value if isinstance(value, str) else json.dumps(value, default=str))
+    settings = texts.replace("NaN", _NONE)
+    differing = settings[settings.nunique(axis=1) > 1]
+    rows = [{"key": str(key)} | row for key, row in differing.to_dict("index").items()]
     text = _grid("Where the runs differ", rows) if rows else ""
     for one in runs:
         config = f"<pre>{escape(one.run.config_text)}</pre>"

@@ -89,11 +89,9 @@ def truth_messages(truth: Table) -> Iterator[Messages]:
     ]
 
     def box(row: int) -> Entity:
-        shape = _box(_point(states[row]), states[row].yaw_rad or 0.0, NOMINAL_SIZE_M, (*_WHITE[:3], 0.35))
-        return Entity(f"object {states[row].object_id}", (shape,))
+        return Entity(f"object {states[row].object_id}", (_box(*_pose(states[row]), (*_WHITE[:3], 0.35)),))
 
-    steps = ((stamp_ns, stamp_ns, [box(row) for row in rows.tolist()]) for stamp_ns, rows in groups(table["stamp_ns"]))
-    yield _scenes("/truth", steps)
+    yield _scenes("/truth", groups(table["stamp_ns"]), box)
     yield _objects("/truth", table["stamp_ns"], table["stamp_ns"], states)
 
 
@@ -105,7 +103,7 @@ def run_messages(run: Run, look: Look) -> Iterator[Messages]:
     final = located(run.tables["smoothed"].where(run.tables["smoothed"]["kind"] == "final"))
     states = _states(final, run.tables["objects"])
     yield _objects(f"{look.prefix}/smoothed", final_ns(run, final), final["stamp_ns"], states)
-    yield from _detection_messages(run, look)
+    yield _detection_messages(run, look)
     yield _outcome_messages(run, look)
 
 
@@ -115,17 +113,12 @@ def _track_messages(run: Run, look: Look) -> Iterator[Messages]:
     states, axes = _states(tracks, run.tables["objects"]), ellipses(tracks, _DEVIATIONS).tolist()
     facts = list(_rows(tracks, "track_id", "status", "speed_mps"))
     rows_at = dict.fromkeys(run.tables["timing"]["now_ns"].tolist(), np.zeros(0, dtype=np.int64))
-    rows_at |= dict(groups(tracks["now_ns"]))
-
-    def steps(entity: Callable[[int], Entity | None]) -> Iterator[tuple[int, int, list[Entity]]]:
-        for now_ns, rows in sorted(rows_at.items(), key=itemgetter(0)):
-            entities = [one for row in rows.tolist() if (one := entity(row)) is not None]
-            yield now_ns, int(tracks["stamp_ns"][rows].max()) if len(rows) else now_ns, entities
+    ticks = sorted((rows_at | dict(groups(tracks["now_ns"]))).items(), key=itemgetter(0))
 
     def box(row: int) -> Entity:
         track_id, status, speed_mps = facts[row]
-        state, at_m, size_m = states[row], _point(states[row]), _size(states[row])
-        yaw_rad, name = state.yaw_rad or 0.0, f"{track_id} {state.class_name or ''}".strip()
+        at_m, yaw_rad, size_m = _pose(states[row])
+        name = f"{track_id} {states[row].class_name or ''}".strip()
         shapes = [
             _box(at_m, yaw_rad, size_m, look.of_track(track_id, _OPACITY.get(status, _CONFIRMED))),
             Shape("text", _WHITE, (0.0, 0.0, _LETTER_M), at_m, size_m[2] + _LABEL_ABOVE_M, text=name),
@@ -136,14 +129,13 @@ def _track_messages(run: Run, look: Look) -> Iterator[Messages]:
         return Entity(f"track {track_id}", tuple(shapes))
 
     def patch(row: int) -> Entity | None:
-        long_m, short_m, yaw_rad = axes[row]
-        size_m, height_m = (2.0 * long_m, 2.0 * short_m, 0.02), _size(states[row])[2] + 0.05
-        colour = look.of_track(facts[row][0], 0.6)
-        shape = Shape("cylinder", colour, size_m, _point(states[row]), height_m, yaw_rad)
-        return Entity(f"track {facts[row][0]}", (shape,)) if math.isfinite(long_m) else None
+        (long_m, short_m, yaw_rad), (at_m, _, (*_, above_m)), track_id = axes[row], _pose(states[row]), facts[row][0]
+        size_m = (2.0 * long_m, 2.0 * short_m, 0.02)
+        shape = Shape("cylinder", look.of_track(track_id, 0.6), size_m, at_m, above_m + 0.05, yaw_rad)
+        return Entity(f"track {track_id}", (shape,)) if math.isfinite(long_m) else None
 
-    yield _scenes(f"{look.prefix}/tracks", steps(box))
-    yield _scenes(f"{look.prefix}/ellipses", steps(patch))
+    yield _scenes(f"{look.prefix}/tracks", ticks, box)
+    yield _scenes(f"{look.prefix}/ellipses", ticks, patch)
     yield _objects(f"{look.prefix}/tracks", tracks["now_ns"], tracks["stamp_ns"], states)
 
 
@@ -153,66 +145,58 @@ def _past_messages(run: Run, look: Look) -> Messages:
     lagged = lagged.where(lagged["lag_s"] > 0.0)
     present = present.where(np.isin(present["now_ns"], lagged["now_ns"]))
     names = ("now_ns", "track_id", "stamp_ns", "x_m", "y_m")
-    states = Table({name: np.concatenate([lagged[name], present[name]]) for name in names})
-    order = np.lexsort((states["stamp_ns"], states["track_id"]))
-    states = Table({name: column[order] for name, column in states.items()})
-    points_m = np.stack([states["x_m"], states["y_m"]], axis=-1)
+    now_ns, ids, stamps_ns, x_m, y_m = (np.concatenate([lagged[name], present[name]]) for name in names)
+    order = np.lexsort((stamps_ns, ids, now_ns))
+    edges = np.flatnonzero(np.diff(now_ns[order]) | np.diff(ids[order])) + 1
+    lines = [rows for rows in np.split(order, edges) if len(rows) > 1]
 
-    def steps() -> Iterator[tuple[int, int, list[Entity]]]:
-        for now_ns, rows in groups(states["now_ns"]):
-            lines = {track_id: rows[mine] for track_id, mine in groups(states["track_id"][rows])}
-            entities = [
-                Entity(f"track {k}", (_line(points_m[mine].tolist(), _TRACK_LINE_M, look.of_track(k)),))
-                for k, mine in lines.items()
-                if len(mine) > 1
-            ]
-            yield now_ns, now_ns, entities
+    def line(k: int) -> Entity:
+        track_id, points_m = int(ids[lines[k][0]]), np.stack([x_m[lines[k]], y_m[lines[k]]], axis=-1)
+        return Entity(f"track {track_id}", (_line(points_m.tolist(), _TRACK_LINE_M, look.of_track(track_id)),))
 
-    return _scenes(f"{look.prefix}/past", steps())
+    return _scenes(f"{look.prefix}/past", groups(now_ns[[rows[0] for rows in lines]]) if lines else (), line)
 
 
-def _detection_messages(run: Run, look: Look) -> Iterator[Messages]:
-    """At every receipt of a list its detections, grey where not used, their poses, and arrows to their tracks now.
+def _detection_messages(run: Run, look: Look) -> Messages:
+    """At every receipt of a list its detections, grey where not used, arrows to their tracks now, and their poses.
 
     An arrow leads from where a detection was sensed to where its track is at the tick that fused it. It is strong where
     the detection came out of sequence, and faint where it did not.
     """
-    table, updates, where, update_of = run.tables["detections"], run.tables["updates"], placed(run), update_rows(run)
-    fates = [updates["disposition"][row] if row >= 0 else "" for row in update_of.tolist()]
-    keys = list(_rows(table, "receipt_ns", "sensor", "stamp_ns"))
-    order = sorted(range(len(keys)), key=keys.__getitem__)
-    lists = [(key, list(rows)) for key, rows in groupby(order, key=keys.__getitem__)]
-    names = np.unique(table["sensor"]).tolist()
-    colours = {name: rgba(SENSORS[k % len(SENSORS)]) for k, name in enumerate(names)}
+    table, where, rows = run.tables["detections"], placed(run), update_rows(run)
+    fates = np.append(run.tables["updates"]["disposition"].astype(np.str_), "")[rows].tolist()  # row -1 is of none
+    colours = {name: rgba(SENSORS[k % len(SENSORS)]) for k, name in enumerate(np.unique(table["sensor"]).tolist())}
+    off_m = track_positions(run, rows) - where.position_m  # NaN without a position or a track
+    lengths_m, yaws_rad = np.hypot(*off_m.T).tolist(), np.arctan2(off_m[:, 1], off_m[:, 0]).tolist()
     positions_m: list[Point] = list(map(tuple, where.position_m.tolist()))
-    ends_m = track_positions(run, update_of).tolist()
-
-    def scenes(topic: str, shape: Callable[[int, Colour], Shape | None], is_sparse: bool) -> Messages:
-        for (receipt_ns, sensor, stamp_ns), rows in lists:
-            shapes = tuple(one for row in rows if (one := shape(row, colours[sensor])) is not None)
-            if shapes or not is_sparse:
-                entity = Entity(sensor, shapes, _SHOWN_S)
-                yield ViewerMessage(receipt_ns, stamp_ns, f"{look.prefix}/{topic}", Scene((entity,)))
-
-    def mark(row: int, colour: Colour) -> Shape | None:
-        return _mark(where, row, colour if fates[row] in _USED else _GREY)
-
-    def arrival(row: int, colour: Colour) -> Shape | None:
-        receipt_ns, _, stamp_ns = keys[row]
-        (x_m, y_m), (end_x_m, end_y_m) = positions_m[row], ends_m[row]
-        length_m = math.hypot(end_x_m - x_m, end_y_m - y_m)  # NaN without a position or a track
-        if fates[row] not in FUSED or receipt_ns <= stamp_ns or not length_m > 0.0:
-            return None
-        colour = (*colour[:3], 1.0 if fates[row] in LATE else 0.3)
-        return _arrow((x_m, y_m), math.atan2(end_y_m - y_m, end_x_m - x_m), length_m, 0.3, colour)
-
-    yield scenes("detections", mark, is_sparse=False)
-    for sensor in names:
-        mine = np.flatnonzero((table["sensor"] == sensor) & np.isfinite(where.position_m).all(axis=1))
-        states = [Detection(*positions_m[row], _known(float(where.yaw_rad[row]))) for row in mine.tolist()]
-        topic = f"{look.prefix}/detections/{token(sensor)}"
-        yield _objects(topic, table["receipt_ns"][mine], table["stamp_ns"][mine], states)
-    yield scenes("arrivals", arrival, is_sparse=True)
+    keys = list(_rows(table, "receipt_ns", "sensor", "stamp_ns"))
+    for key, group in groupby(sorted(range(len(keys)), key=keys.__getitem__), key=keys.__getitem__):
+        (receipt_ns, sensor, stamp_ns), mine = key, list(group)
+        colour, late = colours[sensor], receipt_ns > stamp_ns
+        marks = [_mark(where, row, colour if fates[row] in _USED else _GREY) for row in mine]
+        arrows = [
+            _arrow(
+                positions_m[row],
+                yaws_rad[row],
+                lengths_m[row],
+                0.3,
+                (*colour[:3], 1.0 if fates[row] in LATE else 0.3),
+            )
+            for row in mine
+            if late and fates[row] in FUSED and lengths_m[row] > 0.0
+        ]
+        states = tuple(
+            Detection(*positions_m[row], _known(float(where.yaw_rad[row])))
+            for row in mine
+            if math.isfinite(sum(positions_m[row]))
+        )
+        scene = Scene((Entity(sensor, tuple(filter(None, marks)), _SHOWN_S),))
+        yield ViewerMessage(receipt_ns, stamp_ns, f"{look.prefix}/detections", scene)
+        if arrows:
+            scene = Scene((Entity(sensor, tuple(arrows), _SHOWN_S),))
+            yield ViewerMessage(receipt_ns, stamp_ns, f"{look.prefix}/arrivals", scene)
+        if states:
+            yield ViewerMessage(receipt_ns, stamp_ns, f"{look.prefix}/detections/{token(sensor)}", states)
 
 
 def _mark(where: Placed, row: int, colour: Colour) -> Shape | None:
@@ -238,14 +222,15 @@ def _outcome_messages(run: Run, look: Look) -> Messages:
         yield ViewerMessage(receipt_ns, stamp_ns, f"{look.prefix}/outcomes", values)
 
 
-def _scenes(topic: str, steps: Iterable[tuple[int, int, list[Entity]]]) -> Messages:
-    """Scenes of log time, stamp and entities; those of the step before that are not in this one are removed."""
+def _scenes(topic: str, rows_at: Iterable[tuple[int, IntArray]], entity: Callable[[int], Entity | None]) -> Messages:
+    """A scene of the entities of the rows at each time; those of the time before that are not in it are removed."""
     before: set[str] = set()
-    for log_ns, stamp_ns, entities in steps:
+    for at_ns, rows in rows_at:
+        entities = tuple(one for row in rows.tolist() if (one := entity(row)) is not None)
         names = {one.name for one in entities}
-        gone, before = tuple(sorted(before - names)), names
-        if entities or gone:
-            yield ViewerMessage(log_ns, stamp_ns, topic, Scene(tuple(entities), gone))
+        if entities or before:
+            yield ViewerMessage(at_ns, at_ns, topic, Scene(entities, tuple(sorted(before - names))))
+        before = names
 
 
 def _objects(topic: str, log_ns: IntArray, stamps_ns: IntArray, states: Sequence[Detection]) -> Messages:
@@ -280,14 +265,11 @@ def _known(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _point(state: Detection) -> Point:
-    return state.x_m or 0.0, state.y_m or 0.0
-
-
-def _size(state: Detection) -> tuple[float, float, float]:
-    """Length, width and height of an object; nominal where unknown."""
+def _pose(state: Detection) -> tuple[Point, float, tuple[float, float, float]]:
+    """Position, yaw, and length, width and height of an object; nominal where unknown."""
     length_m, width_m, height_m = NOMINAL_SIZE_M
-    return state.length_m or length_m, state.width_m or width_m, state.height_m or height_m
+    size_m = (state.length_m or length_m, state.width_m or width_m, state.height_m or height_m)
+    return (state.x_m or 0.0, state.y_m or 0.0), state.yaw_rad or 0.0, size_m
 
 
 def _box(centre_m: Point, yaw_rad: float, size_m: tuple[float, float, float], colour: Colour) -> Shape:
