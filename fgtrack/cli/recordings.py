@@ -20,7 +20,7 @@ from fgtrack.io.source import open_input
 from fgtrack.pipeline.load import dump, load
 from fgtrack.pipeline.recorded import recorded_of
 from fgtrack.pipeline.shipped import Kind, read_config, read_scenario, shipped, summary
-from fgtrack.sim.redelay import Redelayed, SensorDelays, redelay
+from fgtrack.sim.redelay import SensorDelays, redelay
 from fgtrack.sim.simulate import simulate as simulated
 
 
@@ -58,13 +58,12 @@ def convert(
     source = open_input(recording, config.input)
     unread: dict[str, Counter[str]] = {}
     with progress("convert"):
-        messages: Iterable[Message] = source.messages()
+        messages, lost = source.messages(), dict[str, int]()
         if delays_file is not None:
             delays = load(dict[str, SensorDelays], delays_file)
-            messages = redelay(source.messages, delays, np.random.default_rng(seed))
+            messages, lost = redelay(messages, delays, np.random.default_rng(seed))
         kept = _with_unread(messages, unread)
         count = write_recording(out, kept, storage, settings=source.settings(), overwrite=overwrite)
-    lost = messages.num_lost if isinstance(messages, Redelayed) else {}
     losses = ", ".join(f"{number} of {sensor}" for sensor, number in lost.items() if number)
     say(f"{out}: {count} messages{losses and f', lost {losses}'}")
     for line in excluded_lines({"left_out": unread}):

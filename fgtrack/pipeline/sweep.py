@@ -232,7 +232,7 @@ def read_messages(recipe: Recipe, config: Config) -> list[Message]:
     source = open_input(recipe.recording, config.input)
     if not recipe.delays:
         return list(source.messages())
-    return list(redelay(source.messages, validate(dict[str, SensorDelays], recipe.delays, "delays"), rng))
+    return list(redelay(source.messages(), validate(dict[str, SensorDelays], recipe.delays, "delays"), rng)[0])
 
 
 def _cell(messages: Sequence[Message], config: Config, score: Score, source_s: float) -> Cell:

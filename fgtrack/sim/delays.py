@@ -57,21 +57,6 @@ class UniformDelay:
 
 
 @settings
-class NormalDelay:
-    """Normal, given that it is not negative; so its mean lies above `mean_s`."""
-
-    mean_s: NonNegativeFloat
-    std_s: PositiveFloat
-    kind: Literal["normal"] = "normal"
-
-    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
-        """Delays, see `AnyDelay`: inverts the distribution function."""
-        # 1 - u is uniform on (ndtr(-mean / std), 1]; the upper tail keeps its digits that way.
-        tail = rng.uniform(0.0, special.ndtr(self.mean_s / self.std_s), len(stamps_s))
-        return np.maximum(self.mean_s - self.std_s * special.ndtri(tail), 0.0)
-
-
-@settings
 class GammaDelay:
     """`min_s` plus a gamma variable, with the mean and the 90 % quantile that were measured.
 
@@ -177,7 +162,7 @@ class MarkovTimeDelay:
 #: Every delay model, chosen by `kind`; `draw` gives the delays in s of the messages stamped `stamps_s` (ascending),
 #: shape (n,), NaN for a lost one.
 AnyDelay = Annotated[
-    NoDelay | ConstantDelay | UniformDelay | NormalDelay | GammaDelay | LossyDelay | MarkovDelay | MarkovTimeDelay,
+    NoDelay | ConstantDelay | UniformDelay | GammaDelay | LossyDelay | MarkovDelay | MarkovTimeDelay,
     Discriminator("kind"),
 ]
 

@@ -3,15 +3,15 @@
 What was sensed stays as it was recorded; so the same drive can be replayed under any delays.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from fgtrack.core.errors import CallError, DataError, did_you_mean
 from fgtrack.core.settings import Probability, settings
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import DetectionList, IntArray, Message
+from fgtrack.core.types import DetectionList, Message
 from fgtrack.sim.clocks import AnyClock, reported_stamps
 from fgtrack.sim.delays import AnyDelay
 
@@ -31,70 +31,28 @@ class SensorDelays:
     """Probability that a list never arrives, each by itself."""
 
 
-@dataclass(frozen=True, eq=False)
-class Redelayed:
-    """The messages under their new delays, in order of receipt; can be iterated any number of times.
-
-    At the same receipt, what keeps its receipt comes first, in its old order; then sensor by sensor, by stamp.
-    Holds no more messages at a time than wait for an earlier one. Raises what the input raises, after everything
-    before it; `DataError` where it is shorter than it was when the delays were drawn.
-    """
-
-    num_lost: Mapping[str, int]
-    """Lists lost, by sensor."""
-    _read: Callable[[], Iterable[Message]]
-    _ranks: IntArray
-    """Rank of each message of the input in the order of receipt, -1 of a lost one."""
-    _receipts_ns: IntArray
-    _stamps_ns: IntArray
-
-    def __iter__(self) -> Iterator[Message]:
-        waiting: dict[int, Message] = {}
-        next_rank = 0
-        rows = zip(self._ranks.tolist(), self._stamps_ns.tolist(), self._receipts_ns.tolist(), strict=True)
-        for message, (rank, stamp_ns, receipt_ns) in zip(self._read(), rows, strict=False):
-            if rank >= 0:
-                if isinstance(message, DetectionList):  # all others keep their stamp
-                    message = restamped(message, stamp_ns)
-                waiting[rank] = replace(message, receipt_ns=receipt_ns)
-            while next_rank in waiting:
-                yield waiting.pop(next_rank)
-                next_rank += 1
-        if next_rank <= self._ranks.max(initial=-1):
-            raise DataError("the input has changed while it was given other delays: record to the end, then convert")
-
-
 def redelay(
-    read: Callable[[], Iterable[Message]], delays: Mapping[str, SensorDelays], rng: np.random.Generator
-) -> Redelayed:
-    """Return the messages of `read()` with the detections of the sensors in `delays` under other delays.
+    messages: Iterable[Message], delays: Mapping[str, SensorDelays], rng: np.random.Generator
+) -> tuple[Iterator[Message], dict[str, int]]:
+    """Return `messages` with the detections of the sensors in `delays` under other delays, and the lists lost by each.
 
-    The receipt becomes the stamp plus a delay, drawn for all lists of a sensor in the order of their stamps. The
-    ego, the truth and sensors that are not named keep theirs. Every sensor, and in it delays, losses and clock
-    errors, draw from a generator of their own. Detections with stamps of their own follow their list's error.
-
-    Parameters
-    ----------
-    read
-        Gives the messages of the input; called here and once for each iteration over the result.
-    delays
-        By sensor; `OTHERS` stands for all that are not named.
-
-    Raises
-    ------
-    CallError
-        A sensor of `delays` is not in the input.
+    `OTHERS` stands for all sensors that are not named. The receipt becomes the stamp plus a delay, drawn for all lists
+    of a sensor in the order of their stamps. The ego, the truth and sensors that are not named keep theirs. Every
+    sensor, and in it delays, losses and clock errors, draw from a generator of their own. Detections with stamps of
+    their own follow their list's error. At the same receipt, what keeps its receipt comes first, in its old order; then
+    sensor by sensor, by stamp. A `DataError` of the input comes after everything before it. Raises `CallError` if a
+    sensor of `delays` is not in the input.
     """
-    times, sensors = list[tuple[int, int]](), list[str]()
+    read, broken = list[Message](), list[DataError]()
     try:
-        for message in read():
-            times.append((message.receipt_ns, message.stamp_ns))
-            sensors.append(message.sensor if isinstance(message, DetectionList) else "")
-    except DataError:
-        pass  # comes again when the messages are read, after everything before it
-    receipts_ns, stamps_ns = np.array(times, dtype=np.int64).reshape(-1, 2).T.copy()
-    reported_ns, priority, lost = stamps_ns.copy(), np.zeros_like(stamps_ns), np.zeros(len(times), dtype=bool)
-    chosen, num_lost, names = _chosen(delays, set(sensors) - {""}), dict[str, int](), np.array(sensors)
+        for message in messages:
+            read.append(message)
+    except DataError as error:
+        broken.append(error)
+    receipts_ns, stamps_ns = np.array([(one.receipt_ns, one.stamp_ns) for one in read], dtype=np.int64).reshape(-1, 2).T
+    names = np.array([one.sensor if isinstance(one, DetectionList) else "" for one in read])
+    reported_ns, priority, lost = stamps_ns.copy(), np.zeros_like(stamps_ns), np.zeros(len(read), dtype=bool)
+    chosen, num_lost = _chosen(delays, set(names.tolist()) - {""}), dict[str, int]()
     for number, (sensor, child) in enumerate(zip(chosen, rng.spawn(len(chosen)), strict=True), 1):
         settings, (delay_rng, loss_rng, clock_rng) = chosen[sensor], child.spawn(3)
         own = np.flatnonzero(names == sensor)
@@ -109,21 +67,29 @@ def redelay(
         num_lost[sensor] = int(lost[own].sum())
     # What keeps its receipt also keeps its order among equals: no stamp in its key.
     order = np.lexsort((np.where(priority > 0, stamps_ns, 0), priority, receipts_ns))
-    kept, ranks = order[~lost[order]], np.full(len(order), -1, dtype=np.int64)
-    ranks[kept] = np.arange(len(kept))
-    return Redelayed(num_lost, read, ranks, receipts_ns, reported_ns)
+
+    def redelayed() -> Iterator[Message]:
+        for k in order[~lost[order]].tolist():
+            message = read[k]
+            if isinstance(message, DetectionList):  # all others keep their stamp
+                message = restamped(message, int(reported_ns[k]))
+            yield replace(message, receipt_ns=int(receipts_ns[k]))
+        for error in broken:
+            raise error
+
+    return redelayed(), num_lost
 
 
 def _chosen(delays: Mapping[str, SensorDelays], known: Iterable[str]) -> dict[str, SensorDelays]:
     """Settings of every sensor that has some: the named ones in their order, then the others by name."""
     names = sorted(known)
-    missing = [sensor for sensor in delays if sensor not in (*names, OTHERS)]
-    if missing:
-        there, hint = ", ".join(names) or "none", did_you_mean(missing[0], names)
-        raise CallError(f"sensor {missing[0]!r} is not in the input, whose sensors are: {there}{hint}")
+    for sensor in delays:
+        if sensor not in (*names, OTHERS):
+            there, hint = ", ".join(names) or "none", did_you_mean(sensor, names)
+            raise CallError(f"sensor {sensor!r} is not in the input, whose sensors are: {there}{hint}")
+    others = dict.fromkeys(names, delays[OTHERS]) if OTHERS in delays else {}
     named = {sensor: settings for sensor, settings in delays.items() if sensor != OTHERS}
-    others = {sensor: delays[OTHERS] for sensor in names if sensor not in delays} if OTHERS in delays else {}
-    return named | others
+    return named | {sensor: settings for sensor, settings in others.items() if sensor not in named}
 
 
 def restamped(message: DetectionList, stamp_ns: int) -> DetectionList:

@@ -73,9 +73,8 @@ class SimulatedSensor:
     def __post_init__(self) -> None:
         std, behind_m = set(self.std), self.max_range_behind_m
         seen = behind_m is None or self.min_range_m < behind_m <= self.max_range_m
-        known = bool(std) and std <= set(MEASURABLE)
-        require(known, "std", f"name components out of {', '.join(MEASURABLE)}", sorted(std))
-        require(("x_m" in std) == ("y_m" in std), "std", "x_m and y_m are measured together", sorted(std))
+        known = bool(std) and std <= set(MEASURABLE) and ("x_m" in std) == ("y_m" in std)
+        require(known, "std", f"x_m with y_m, components out of {', '.join(MEASURABLE)}", sorted(std))
         require("x_m" not in std or std.isdisjoint(POLAR), "std", "positions or range and bearing", sorted(std))
         require(self.jitter_s < 1.0 / self.rate_hz, "jitter_s", "must be below a period", self.jitter_s)
         require(self.max_range_m > self.min_range_m, "max_range_m", "must exceed min_range_m", self.max_range_m)

@@ -33,18 +33,15 @@ from fgtrack.sim.vehicles import AnyVehicle, DrawnVehicle, TrackTrajectory, Traj
 def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
     """Messages of `scenario` in order of receipt; at the same receipt truth, ego, sensors in their order.
 
-    Same scenario and same state of `rng`, same messages. Every vehicle and every sensor, and in it the
-    delays, the clock errors, the clutter and the detections of each object, draw from a generator of their own:
-    another sensor, delay or clock model leaves everything else as it was. A clock changes what is reported as the
-    stamp, never when or what was sensed. A message that its delay model loses is not in the list.
-
-    Raises
-    ------
-    DataError
-        If the map cannot be read.
+    Every vehicle and every sensor, and in it the delays, the clock errors, the clutter and the detections of each
+    object, draw from a generator of their own: another sensor, delay or clock model leaves everything else as it was. A
+    clock changes what is reported as the stamp, never when or what was sensed. A message that its delay model loses is
+    not in the list. Raises `DataError` if the map cannot be read.
     """
     vehicles_rng, ego_rng, sensors_rng = rng.spawn(3)
-    track = _track(scenario)
+    track = None
+    if scenario.map is not None:
+        track = make_oval() if scenario.map == OVAL else TrackMap.read(scenario.map)
     path = None if track is None else Path.through(track.table[:, :2])
     vehicles = (scenario.ego, *scenario.opponents)
     ego, *opponents = (
@@ -58,12 +55,6 @@ def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
     return messages
 
 
-def _track(scenario: Scenario) -> TrackMap | None:
-    if scenario.map is None:
-        return None
-    return make_oval() if scenario.map == OVAL else TrackMap.read(scenario.map)
-
-
 def _trajectory(vehicle: AnyVehicle, path: Path | None, rng: np.random.Generator, duration_s: float) -> Trajectory:
     if isinstance(vehicle, DrawnVehicle):
         return vehicle.trajectory(rng, duration_s)
@@ -72,7 +63,7 @@ def _trajectory(vehicle: AnyVehicle, path: Path | None, rng: np.random.Generator
 
 
 def _truth(scenario: Scenario, vehicles: Sequence[Trajectory]) -> list[Message]:
-    stamps_ns, times_s = _stamps(scenario, _times(scenario, scenario.truth_rate_hz))
+    stamps_ns, times_s = _stamps(scenario, scenario.truth_rate_hz)
     rows = [vehicle.states(times_s).tolist() for vehicle in vehicles]
     return [
         TruthState(stamp_ns, stamp_ns, object_id, *states[index])
@@ -84,7 +75,7 @@ def _truth(scenario: Scenario, vehicles: Sequence[Trajectory]) -> list[Message]:
 def _ego_messages(scenario: Scenario, ego: Trajectory, rng: np.random.Generator) -> list[Message]:
     settings = scenario.ego_messages
     noise_rng, delay_rng = rng.spawn(2)
-    stamps_ns, times_s = _stamps(scenario, _times(scenario, settings.rate_hz))
+    stamps_ns, times_s = _stamps(scenario, settings.rate_hz)
     std = [*[settings.position_std_m] * 2, settings.yaw_std_rad, settings.speed_std_mps]
     std += [settings.yaw_rate_std_radps, settings.accel_std_mps2]
     states = ego.states(times_s)
@@ -122,13 +113,11 @@ def _scans(
     ]
 
 
-def _times(scenario: Scenario, rate_hz: float) -> FloatArray:
-    return np.arange(math.floor(scenario.duration_s * rate_hz + 1e-9) + 1) / rate_hz
-
-
-def _stamps(scenario: Scenario, times_s: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Stamps of times since the start, and the times again, now of whole nanoseconds."""
-    since_start_ns = np.rint(times_s * NS_PER_S).astype(np.int64)
+def _stamps(scenario: Scenario, times: FloatArray | float) -> tuple[IntArray, FloatArray]:
+    """Stamps of times since the start, or at a rate, and the times, of whole nanoseconds."""
+    if isinstance(times, float):
+        times = np.arange(math.floor(scenario.duration_s * times + 1e-9) + 1) / times
+    since_start_ns = np.rint(times * NS_PER_S).astype(np.int64)
     return scenario.start_ns + since_start_ns, since_start_ns / NS_PER_S
 
 

@@ -231,7 +231,7 @@ DELAYS = b"""radar:
 lidar_cluster:
   delay:
     kind: markov_time
-    good: {kind: normal, mean_s: 0.1, std_s: 0.1}
+    good: {kind: uniform, min_s: 0.0, max_s: 0.2}
     bad: {kind: loss, probability: 0.7, base: {kind: uniform, min_s: 0.08, max_s: 0.18}}
     to_bad_per_s: 0.5
     to_good_per_s: 2.0

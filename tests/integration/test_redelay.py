@@ -28,7 +28,7 @@ lidar_cluster:
     bad: {kind: uniform, min_s: 0.2, max_s: 0.35}
     to_bad_per_s: 0.5
     to_good_per_s: 2.0
-radar: {delay: {kind: normal, mean_s: 0.06, std_s: 0.03}}
+radar: {delay: {kind: gamma, min_s: 0.01, mean_s: 0.06, q90_s: 0.1}}
 """
 BACK = """
 lidar_cluster: {delay: {kind: constant, delay_s: 0.15}}

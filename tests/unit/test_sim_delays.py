@@ -11,7 +11,6 @@ from fgtrack.sim.delays import (
     MarkovDelay,
     MarkovTimeDelay,
     NoDelay,
-    NormalDelay,
     UniformDelay,
 )
 
@@ -22,7 +21,6 @@ ALL = (
     NoDelay(),
     ConstantDelay(0.1),
     UniformDelay(0.1, 0.3),
-    NormalDelay(0.02, 0.05),
     LIDAR,
     RADAR,
     LossyDelay(0.1, base=RADAR),
@@ -55,7 +53,6 @@ def test_a_gamma_delay_has_exactly_the_mean_and_quantile_it_was_given(model: Gam
     ("model", "distribution"),
     [
         (UniformDelay(0.1, 0.3), stats.uniform(0.1, 0.2)),
-        (NormalDelay(0.02, 0.05), stats.truncnorm(-0.4, np.inf, loc=0.02, scale=0.05)),
         (LIDAR, stats.gamma(LIDAR.shape, loc=0.09, scale=LIDAR.scale_s)),
         (RADAR, stats.gamma(RADAR.shape, loc=0.03, scale=RADAR.scale_s)),
     ],
@@ -126,7 +123,6 @@ def test_a_chain_in_time_forgets_over_a_gap_and_stays_at_equal_stamps() -> None:
     [
         (lambda: ConstantDelay(delay_s=float("nan")), "delay_s"),
         (lambda: UniformDelay(0.2, 0.1), "max_s"),
-        (lambda: NormalDelay(mean_s=0.1, std_s=0.0), "std_s"),
         (lambda: GammaDelay(0.1, 0.1, 0.2), "mean_s"),
         (lambda: GammaDelay(0.1, 0.2, 0.2), "q90_s: no gamma fits"),
         (lambda: LossyDelay(probability=-0.1), "probability"),
