@@ -169,7 +169,7 @@ def test_scans_come_at_their_rate_phase_and_jitter() -> None:
     ("settings", "message"),
     [
         ({"std": {"colour": 1.0}}, "std: .*colour"),
-        ({"std": {"x_m": 1.0}}, "std: x_m and y_m"),
+        ({"std": {"x_m": 1.0}}, "std: x_m with y_m"),
         ({"std": {**NO_NOISE, "range_m": 1.0}}, "std: positions or range"),
         ({"jitter_s": 0.05}, "jitter_s"),
         ({"max_range_m": math.inf}, "max_range_m"),
