@@ -9,7 +9,7 @@ from fgtrack.core.types import FloatArray, Message
 from fgtrack.evaluation.comparison import comparison
 from fgtrack.evaluation.intervals import Estimate, by_stamp, within_run
 from fgtrack.evaluation.runs import EvaluatedRun
-from fgtrack.evaluation.scores.prediction import displacements
+from fgtrack.evaluation.scores.prediction import STEP_S, displacements
 from fgtrack.sim.delays import ConstantDelay
 from fgtrack.sim.redelay import SensorDelays, redelay
 
@@ -45,7 +45,7 @@ def _ahead(runs: Sequence[EvaluatedRun], horizon_s: float) -> FloatArray:
     squares = [
         dict(zip(zip(one.stamps_ns.tolist(), one.object_index.tolist(), strict=True), column, strict=True))
         for one in found
-        for column in [np.square(one.at(horizon_s)).tolist()]
+        for column in [np.square(one.values["arc"][:, round(horizon_s / STEP_S) - 1]).tolist()]
     ]
     places = sorted(functools.reduce(set.intersection, (set(each) for each in squares)))
     values = np.array([[each[place] for each in squares] for place in places]).reshape(-1, len(runs))

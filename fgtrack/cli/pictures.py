@@ -13,7 +13,7 @@ from fgtrack.cli.arguments import Overwrite, Runs
 from fgtrack.cli.show import progress, say
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
-from fgtrack.evaluation.runs import evaluated, run_folders, start_ns
+from fgtrack.evaluation.runs import evaluated, start_ns
 from fgtrack.evaluation.tables.compare import compare
 from fgtrack.evaluation.tables.seeds import is_sweep, read_sweep
 from fgtrack.io.output import check_apart, check_output, new_file, new_files
@@ -81,7 +81,7 @@ def _of_runs(
 ) -> tuple[list[tuple[str, Figure]], list[Planned], DataError | None]:
     """The close-up, the other figures, and why there is no close-up."""
     found = evaluated(folders)
-    check_apart(out, run_folders(found))
+    check_apart(out, [one.run.path for one in found])
     stamp_ns = None if stamp is None else start_ns(found) + nanoseconds(stamp)
     first, late = drawn_close_up(found, stamp_ns, **paper)
     missing = late if isinstance(late, DataError) else None
@@ -103,7 +103,7 @@ def report(
     """
     check_output(out, overwrite)
     every = evaluated(runs)
-    check_apart(out, run_folders(every))
+    check_apart(out, [one.run.path for one in every])
     with progress("report"):
         close_up, late = drawn_close_up(every)
         pictures = ((name, png(figure)) for name, figure in chain(close_up, drawn(planned(every))))

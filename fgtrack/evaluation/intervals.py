@@ -64,11 +64,9 @@ def paired(values_a: Sequence[float] | FloatArray, values_b: Sequence[float] | F
 
 
 def average(values: Sequence[float] | FloatArray) -> Estimate:
-    """Mean of `values`, one of each seed, and its 95 % interval.
+    """Mean of `values`, one of each seed, and its 95 % interval mean +- t(n - 1) std / sqrt(n); NaN is left out.
 
-    The t interval: mean +- t(n - 1) std / sqrt(n). It needs no random draws and keeps its promise with few seeds, where
-    a bootstrap over seeds is too narrow. A NaN is left out (`count` says how many are left); of one value the interval
-    is unknown.
+    It keeps its promise with few seeds, where a bootstrap over seeds is too narrow; of one value it is unknown.
     """
     known = np.asarray(values, dtype=np.float64)
     known = known[~np.isnan(known)]
@@ -81,15 +79,14 @@ def average(values: Sequence[float] | FloatArray) -> Estimate:
 def within_run(ticks: FloatArray, statistic: Statistic, rng: np.random.Generator) -> Estimate:
     """The `statistic` of the sums of `ticks` over time and its 95 % interval by a circular block bootstrap.
 
-    `ticks` are summed in order of time, shape (n, k); `statistic` takes sums, shape (k, draws), and gives shape
-    (draws,). A root mean square is sqrt(S[0] / S[1]) of the sums S of squared errors and counts; the difference of two
-    is sqrt(S[0] / S[2]) - sqrt(S[1] / S[2]), and ticks of both are drawn together.
+    `ticks`, shape (n, k), are in order of time; `statistic` takes sums, shape (k, draws), and gives shape (draws,). A
+    root mean square is sqrt(S[0] / S[1]) of the sums S of squared errors and counts, the difference of two
+    sqrt(S[0] / S[2]) - sqrt(S[1] / S[2]).
 
     Blocks of ticks are drawn with replacement, the end of the run joined to its beginning (Politis & Romano 1992). The
     interval is theta +- t(m - 1) s sqrt(m / (m - 1)), with s the standard deviation of the drawn statistics and m, the
-    `count` of the result, the number of blocks that fit into the run: m blocks vary around their own mean, and s itself
-    is known from m blocks. Quantiles of the draws would be too narrow. The length of the blocks is `block_length` of
-    the influence of each tick on the statistic. The interval of fewer than eight ticks is unknown.
+    `count` of the result, the number of blocks that fit into the run; quantiles of the draws would be too narrow.
+    Blocks are as long as `block_length` of the influence of each tick. Of fewer than eight ticks it is unknown.
     """
     sums, size = ticks.sum(axis=0), max(1, math.ceil(len(ticks) / _MOST_PIECES))
     pieces = np.add.reduceat(ticks, np.arange(0, len(ticks), size), axis=0) if len(ticks) else ticks
@@ -98,7 +95,10 @@ def within_run(ticks: FloatArray, statistic: Statistic, rng: np.random.Generator
         value = float(statistic(sums))
         if n < _FEWEST_PIECES or not math.isfinite(value):
             return Estimate(value, math.nan, math.nan, n)
-        length = block_length(pieces @ _gradient(statistic, sums))
+        steps = np.diag(_STEP * sums)
+        change = statistic((sums + steps).T) - statistic((sums - steps).T)  # 0 for a sum of 0: nothing adds to it
+        gradient = np.divide(change, 2.0 * _STEP * sums, out=np.zeros_like(sums), where=sums != 0.0)
+        length = block_length(pieces @ gradient)
         drawn = statistic(_drawn_sums(pieces, length, rng).T)
     blocks = n / length
     error = float(np.nanstd(drawn)) * math.sqrt(blocks / (blocks - 1.0))
@@ -130,11 +130,10 @@ def by_stamp(stamps_ns: IntArray, samples: FloatArray) -> FloatArray:
 def block_length(values: FloatArray) -> int:
     """Length of the blocks of a circular bootstrap for the mean of `values`, shape (n,), at most n / 3.
 
-    The rule of Politis & White 2004 (Automatic block-length selection for the dependent bootstrap, Econometric Reviews
-    23) as corrected by Patton, Politis & White 2009: (2 G^2 / D)^(1/3) n^(1/3) with G = sum |k| R(k) and
-    D = 4/3 (sum R(k))^2 over the flat-top window of the autocovariances R, whose width is twice the lag from which on
-    five correlations in a row are insignificant. Where there is none below n / 4 the correlation is too long to be
-    measured, and the blocks are n / 3 long.
+    The rule of Politis & White 2004 (Econometric Reviews 23) as corrected by Patton, Politis & White 2009:
+    (2 G^2 / D)^(1/3) n^(1/3) with G = sum |k| R(k) and D = 4/3 (sum R(k))^2 over the flat-top window of the
+    autocovariances R, whose width is twice the lag from which on five correlations in a row are insignificant; n / 3
+    where there is no such lag below n / 4.
     """
     n = len(values)
     centred = values - values.mean()
@@ -154,13 +153,6 @@ def block_length(values: FloatArray) -> int:
         return 1
     length: float = (1.5 * (float((lags * weighted).sum()) / total) ** 2 * n) ** (1.0 / 3.0)
     return min(max(math.ceil(length), 1), n // _FEWEST_BLOCKS)
-
-
-def _gradient(statistic: Statistic, sums: FloatArray) -> FloatArray:
-    """Derivative of the statistic with respect to each of the `sums`; 0 for one that is 0, as nothing adds to it."""
-    steps = np.diag(_STEP * sums)
-    change = statistic((sums + steps).T) - statistic((sums - steps).T)
-    return np.divide(change, 2.0 * _STEP * sums, out=np.zeros_like(sums), where=sums != 0.0)
 
 
 def _drawn_sums(pieces: FloatArray, length: int, rng: np.random.Generator) -> FloatArray:

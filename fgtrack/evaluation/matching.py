@@ -8,7 +8,7 @@ from scipy.optimize import linear_sum_assignment
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray, TrackStatus
-from fgtrack.evaluation.truth import TRUE_STATE, TruePath, ignored_paths, in_ignored_regions, true_paths, visible
+from fgtrack.evaluation.truth import TRUE_STATE, TruePath, in_ignored_regions, true_paths, visible
 from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, Table
 
 NO_OBJECT = -1
@@ -211,8 +211,13 @@ def recorded(run: Run, stamps_ns: IntArray) -> BoolArray:
 
 
 def _ignored(run: Run, tracks: Table, paths: list[TruePath], gate_m: float) -> BoolArray:
-    """True for the rows of `tracks` without a true object that follow an ignored one or lie in an ignored region."""
-    _, distances_m = _distances(tracks, [*paths, *ignored_paths(run.tables["ignored"])])
+    """True for the rows of `tracks` without a true object that follow an ignored one or lie in an ignored region.
+
+    As in the evaluation of the KITTI data set (Geiger, Lenz, Urtasun 2012): these are neither right nor false.
+    """
+    objects = run.tables["ignored"].where(run.tables["ignored"]["outline_m"] == "")
+    unknown = dict.fromkeys(("yaw_rad", "speed_mps", "yaw_rate_radps"), np.full(objects.num_rows, np.nan))
+    _, distances_m = _distances(tracks, [*paths, *true_paths(Table({**objects, **unknown}))])
     timing, stamps_ns = run.tables["timing"], tracks["stamp_ns"]
     tick_index = np.searchsorted(timing["tick"], tracks["tick"])
     index = nearest_pairs(distances_m, tracks["track_id"], tick_index, timing.num_rows, gate_m)

@@ -46,9 +46,8 @@ def looks(estimators: Sequence[str]) -> list[Look]:
     """Return one look for each of `estimators`, in their order; equal colours get different lines."""
     result: list[Look] = []
     for one in map(look, estimators):
-        lines = (one.line, *_LINES)
-        free = (line for line in lines if all((one.colour, line) != (other.colour, other.line) for other in result))
-        result.append(one._replace(line=next(free, one.line)))
+        taken = [other.line for other in result if other.colour == one.colour]
+        result.append(one._replace(line=next((line for line in (one.line, *_LINES) if line not in taken), one.line)))
     return result
 
 
@@ -59,6 +58,5 @@ def distinct_colours(estimators: Sequence[str]) -> list[str]:
     """
     result: list[str] = []
     for own in (look(name).colour for name in estimators):
-        free = (colour for colour in (own, *PALETTE) if colour not in result)
-        result.append(next(free, own))
+        result.append(next((colour for colour in (own, *PALETTE) if colour not in result), own))
     return result

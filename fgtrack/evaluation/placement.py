@@ -31,17 +31,16 @@ class Placed:
 def placed(run: Run) -> Placed:
     """The detections of `run` in the map, by the path of the ego in ego.csv, linear between its stamps.
 
-    The tracker itself places them by what it knew of the ego when they came, so its own places may differ by what the
-    ego moved unexpectedly.
+    The tracker itself uses what it knew of the ego when they came.
     """
     table = run.tables["detections"]
     frame, stamps_ns = table["frame"], table["stamp_ns"]
     poses = ego_states(run.tables["ego"], stamps_ns)
     mounts = _mounts(run, table["sensor"], frame == "sensor")
-    sensor_m, sensor_rad = _moved(poses[:, :2], poses[:, 2], mounts[:, :2]), poses[:, 2] + mounts[:, 2]
-    in_map = frame == "map"
-    given_m = np.stack([table["x_m"], table["y_m"]], axis=-1)
-    turned_m = _moved(sensor_m, sensor_rad, given_m)
+    turns, sensor_rad = rotations(poses[:, 2]), poses[:, 2] + mounts[:, 2]
+    sensor_m = poses[:, :2] + np.einsum("nij,nj->ni", turns, mounts[:, :2])
+    in_map, given_m = frame == "map", np.stack([table["x_m"], table["y_m"]], axis=-1)
+    turned_m = sensor_m + np.einsum("nij,nj->ni", rotations(sensor_rad), given_m)
     bearing_rad = sensor_rad + table["bearing_rad"]
     polar_m = sensor_m + cartesian(np.stack([bearing_rad, table["range_m"]], axis=-1))
     position_m = np.where(in_map[:, None], given_m, turned_m)
@@ -60,15 +59,10 @@ def update_rows(run: Run) -> IntArray:
     return np.array([waiting[key].popleft() if waiting[key] else -1 for key in keys], dtype=np.int64)
 
 
-def _moved(origins_m: FloatArray, yaws_rad: FloatArray, points_m: FloatArray) -> FloatArray:
-    """`points_m` of frames at `origins_m`, turned by `yaws_rad`, in the map, shape (n, 2)."""
-    return np.asarray(origins_m + np.einsum("nij,nj->ni", rotations(yaws_rad), points_m))
-
-
 def _mounts(run: Run, sensors: Column, mounted: BoolArray) -> FloatArray:
-    """Places (ahead, left) and yaw, shape (n, 3), of the frames of detections on the ego.
+    """Position (ahead, left) and yaw, shape (n, 3), of the frames of detections on the ego.
 
-    `mounted` is True for those given in the frame of their sensor; the others are in the ego's detection frame.
+    `mounted` is True for the frames of the sensors themselves; the others are the ego's detection frame.
     """
     config = run.config
     ego, known = config.get("ego") or {}, config.get("sensors") or {}

@@ -37,7 +37,7 @@ class EvaluatedRun:
 
 
 OneRun = Run | EvaluatedRun | Path | str
-Runs = OneRun | Mapping[str, OneRun] | Iterable[OneRun | Iterable[OneRun] | Mapping[str, OneRun]]
+Runs = OneRun | Mapping[str, OneRun] | Iterable["Runs"]
 
 
 def evaluated(runs: Runs) -> list[EvaluatedRun]:
@@ -46,16 +46,11 @@ def evaluated(runs: Runs) -> list[EvaluatedRun]:
     Runs of a folder come by name; they may be one folder deeper, as in that of `fgtrack demo`. Raises `CallError` if a
     path is neither, or a run is given twice, and `DataError` if a run folder is damaged.
     """
-    every = [one for entry in _several(runs) for one in _several(entry)]
-    if all(isinstance(one, EvaluatedRun) for one in every):
-        return every
-    read: list[Run] = []
-    for one in every:
-        if not isinstance(one, OneRun):
-            raise CallError(f"runs: must be runs or paths of run folders, there is a {type(one).__name__}")
-        plain = one.run if isinstance(one, EvaluatedRun) else one
-        read += [plain] if isinstance(plain, Run) else _read(Path(plain))
-    return [EvaluatedRun(label, run) for label, run in labelled(read).items()]
+    every = _flat(runs)
+    if any(isinstance(one, Run) for one in every):
+        read = [one.run if isinstance(one, EvaluatedRun) else one for one in every]
+        every = [EvaluatedRun(label, run) for label, run in labelled(read).items()]
+    return [one for one in every if isinstance(one, EvaluatedRun)]
 
 
 def one_evaluated(run: OneRun) -> EvaluatedRun:
@@ -64,11 +59,6 @@ def one_evaluated(run: OneRun) -> EvaluatedRun:
     if len(every) > 1:
         raise CallError(f"{run}: holds {len(every)} runs, name one of them")
     return every[0]
-
-
-def run_folders(runs: Iterable[EvaluatedRun]) -> list[Path]:
-    """Return the folders of `runs`, of those that have one."""
-    return [one.run.path for one in runs if one.run.path is not None]
 
 
 def start_ns(runs: Sequence[EvaluatedRun]) -> int:
@@ -83,9 +73,9 @@ def labelled(runs: Sequence[Run]) -> dict[str, Run]:
     The estimator follows where the path does not name it, and alone for a run in memory. Raises `CallError` if a run is
     given twice.
     """
-    for identity, times in Counter(run.path.resolve() if run.path else id(run) for run in runs).items():
-        if times > 1:
-            raise CallError(f"{identity if isinstance(identity, Path) else 'run'}: is given twice, name every run once")
+    identities = Counter(str(run.path.resolve()) if run.path else id(run) for run in runs)
+    for identity in (identity for identity, times in identities.items() if times > 1):
+        raise CallError(f"{identity if isinstance(identity, str) else 'run'}: is given twice, name every run once")
     paths = [run.path.resolve() for run in runs if run.path]
     length = next(n for n in count(1) if len({path.parts[-n:] for path in paths}) == len(paths))
     labels: dict[str, Run] = {}
@@ -110,10 +100,9 @@ def same_recording(one: Run, other: Run) -> bool:
     common = np.intersect1d(one.tables["updates"]["sensor"], other.tables["updates"]["sensor"]).tolist()
     if common:
         return all(_same_detections(one, other, sensor) for sensor in common)
-    if one.tables["truth"].num_rows:
-        return True
-    if one.tables["ego"].num_rows or other.tables["ego"].num_rows:
-        return one.tables["ego"].equals(other.tables["ego"])
+    for name in ("truth", "ego"):
+        if one.tables[name].num_rows or other.tables[name].num_rows:
+            return one.tables[name].equals(other.tables[name])
     return one.recording is not None and one.recording == other.recording
 
 
@@ -121,8 +110,9 @@ def by_recording(runs: Sequence[EvaluatedRun]) -> list[list[EvaluatedRun]]:
     """`runs` in groups, those of the same recording together."""
     groups: list[list[EvaluatedRun]] = []
     for one in runs:
-        group = next((group for group in groups if same_recording(group[0].run, one.run)), [])
-        groups += [] if group else [group]
+        group = next((group for group in groups if same_recording(group[0].run, one.run)), None)
+        if group is None:
+            groups.append(group := [])
         group.append(one)
     return groups
 
@@ -139,19 +129,19 @@ def recordings_warning(runs: Sequence[EvaluatedRun]) -> list[str]:
     return [f"{text}: {'; '.join(texts)}"] if len(groups) > 1 else []
 
 
-def _several(given: Any) -> list[Any]:  # Any: what a user gives
+def _flat(given: Any) -> list[Run | EvaluatedRun]:  # Any: what a user gives
+    if isinstance(given, Run | EvaluatedRun):
+        return [given]
     if isinstance(given, Mapping):
         return [EvaluatedRun(str(label), one_evaluated(run).run) for label, run in given.items()]
-    return [given] if isinstance(given, OneRun) or not isinstance(given, Iterable) else list(given)
-
-
-def _read(path: Path) -> list[Run]:
-    if is_run_folder(path):
-        return [load_run(path)]
-    for pattern in ("*", "*/*") if path.is_dir() else ():
-        below = [load_run(child) for child in sorted(path.glob(pattern)) if is_run_folder(child)]
-        if below:
-            return below
+    if not isinstance(given, Path | str):
+        if not isinstance(given, Iterable):
+            raise CallError(f"runs: must be runs or paths of run folders, there is a {type(given).__name__}")
+        return [one for entry in given for one in _flat(entry)]
+    path = Path(given)
+    for pattern in ("", "*", "*/*") if path.is_dir() else ():
+        if folders := [each for each in (sorted(path.glob(pattern)) if pattern else [path]) if is_run_folder(each)]:
+            return [load_run(folder) for folder in folders]
     raise CallError(f"{path}: no run folder, make one with `fgtrack replay`")
 
 

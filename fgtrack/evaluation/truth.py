@@ -1,14 +1,13 @@
 """True objects as functions of time, their visibility to the sensors, and what of them is not evaluated."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from pydantic import TypeAdapter
 
 from fgtrack.core.checks import LARGEST
-from fgtrack.core.geometry import in_polygon, wrap_angles
+from fgtrack.core.geometry import cartesian, in_polygon, wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import EGO_ID, BoolArray, FloatArray, IntArray
 from fgtrack.io.run import Run, Table
@@ -34,10 +33,8 @@ class TruePath:
     def at(self, stamps_ns: IntArray) -> FloatArray:
         """States at `stamps_ns`, shape (m,); shape (m, 5), NaN where there is no truth.
 
-        The position is a cubic Hermite curve where both neighbours have yaw and speed, else linear. Yaw goes
-        the shorter way round, the rest is linear. There is no truth before the first stamp, after the last one,
-        and in a gap: neighbours more than a second and more than five usual periods apart (the object was
-        away).
+        The position is a cubic Hermite curve where both neighbours have yaw and speed, else linear, as the rest. There
+        is no truth outside of the stamps, and in a gap of more than a second and of more than five usual periods.
         """
         if len(self.stamps_ns) == 1:
             return np.where((stamps_ns == self.stamps_ns[0])[:, None], self.states[0], np.nan)
@@ -47,10 +44,11 @@ class TruePath:
         u = (stamps_ns - self.stamps_ns[left]) / h_ns
         a, b = self.states[left], self.states[left + 1]
         states = a + u[:, None] * (b - a)
-        both = np.isfinite(states[:, 2])
-        turned_rad = u[both] * wrap_angles(b[both, 2] - a[both, 2])
-        states[both, 2] = wrap_angles(a[both, 2] + turned_rad)
-        curve = _hermite(a, b, u, h_ns / NS_PER_S)
+        states[:, 2] = wrap_angles(a[:, 2] + u * wrap_angles(b[:, 2] - a[:, 2]))
+        v, h_s = u[:, None], h_ns[:, None] / NS_PER_S
+        way_a, way_b = (h_s * cartesian(each[:, 2:4]) for each in (a, b))
+        from_a = (1 + 2 * v) * (1 - v) ** 2 * a[:, :2] + v * (1 - v) ** 2 * way_a
+        curve = from_a + v**2 * (3 - 2 * v) * b[:, :2] - v**2 * (1 - v) * way_b
         states[:, :2] = np.where(np.isfinite(curve), curve, states[:, :2])
         away = h_ns > max(_SHORTEST_GAP_NS, _GAP_PERIODS * float(np.median(periods_ns)))
         states[(u < 0.0) | (u > 1.0) | (away & (u > 0.0) & (u < 1.0))] = np.nan
@@ -86,26 +84,13 @@ def true_states(truth: Table, object_index: IntArray, stamps_ns: IntArray) -> Fl
     return states
 
 
-def ignored_paths(ignored: Table) -> list[TruePath]:
-    """Objects of a neighbouring class: a track that follows one of them is neither right nor false.
-
-    As in the evaluation of the KITTI data set (Geiger, Lenz, Urtasun 2012).
-    """
-    rows = ignored.where(ignored["outline_m"] == "")
-    unknown = np.full(rows.num_rows, np.nan)
-    return true_paths(Table({**rows, **dict.fromkeys(("yaw_rad", "speed_mps", "yaw_rate_radps"), unknown)}))
-
-
 def in_ignored_regions(run: Run, stamps_ns: IntArray, points_m: FloatArray) -> BoolArray:
     """True for `points_m`, shape (n, 2), that lie in an unlabelled region at `stamps_ns`, shape (n,).
 
     Between two stamps of the truth the regions of the nearer one count.
     """
-    ignored = run.tables["ignored"]
+    ignored, inside = run.tables["ignored"], np.zeros(len(stamps_ns), dtype=np.bool_)
     regions = ignored.where(ignored["outline_m"] != "")
-    inside = np.zeros(len(stamps_ns), dtype=np.bool_)
-    if not regions.num_rows:
-        return inside
     known_ns = np.union1d(run.tables["truth"]["stamp_ns"], ignored["stamp_ns"])
     nearest_ns = known_ns[np.searchsorted(known_ns[:-1] + np.diff(known_ns) // 2, stamps_ns)]
     for stamp_ns, text in zip(regions["stamp_ns"], regions["outline_m"], strict=True):
@@ -117,20 +102,22 @@ def in_ignored_regions(run: Run, stamps_ns: IntArray, points_m: FloatArray) -> B
 def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> BoolArray:
     """True where an object of `paths` is in range and in the field of view of a sensor at `now_ns`, shape (n, objects).
 
-    The sensors are those that the run had detections of, as its configuration describes them, from the pose of the ego
-    that ego.csv gives (linear between its stamps), without occlusion. Where the ego's path or a sensor is not known,
-    every object counts as visible; an object without truth is not visible.
+    Sensors are those with detections, as configured, from the pose of the ego in ego.csv, without occlusion. Where the
+    ego's path or a sensor is not known every object with truth counts as visible.
     """
     positions_m = np.stack([path.at(now_ns)[:, :2] for path in paths], axis=1)
     present = np.asarray(np.isfinite(positions_m).all(axis=-1))
-    sensors, poses = _sensors(run), ego_states(run.tables["ego"], now_ns)[:, :3]
-    if np.isnan(poses).all() or not sensors:
+    sensors, poses = run.config.get("sensors") or {}, ego_states(run.tables["ego"], now_ns)[:, :3]
+    names = np.unique(run.tables["updates"]["sensor"]).tolist()
+    if np.isnan(poses).all() or not names or not sensors.keys() >= set(names):
         return present
+    models = TypeAdapter(dict[str, SensorModel]).validate_python({name: sensors[name] for name in names})
     ego = run.config.get("ego") or {}
     origin_m = (float(ego.get("detection_origin_x_m", 0.0)), float(ego.get("detection_origin_y_m", 0.0)))
     positions_m[~present] = 0.0
     poses = np.broadcast_to(poses[:, None], (*present.shape, 3))
-    return np.asarray(present & np.any([sensor.sees(positions_m, poses, origin_m) for sensor in sensors], axis=0))
+    seen = [model.sees(positions_m, poses, origin_m) for model in models.values()]
+    return np.asarray(present & np.any(seen, axis=0))
 
 
 def ego_states(ego: Table, stamps_ns: IntArray) -> FloatArray:
@@ -147,21 +134,3 @@ def ego_states(ego: Table, stamps_ns: IntArray) -> FloatArray:
     rows[:, 2] = np.unwrap(rows[:, 2])
     times, wanted = ((ns - at_ns[0]).astype(np.float64) for ns in (at_ns, stamps_ns))
     return np.stack([np.interp(wanted, times, column) for column in rows.T], axis=-1)
-
-
-def _hermite(a: FloatArray, b: FloatArray, u: FloatArray, h_s: FloatArray) -> FloatArray:
-    """Positions, shape (m, 2), at the share `u` of the way from `a` to `b`, `h_s` seconds apart."""
-    u, h_s = u[:, None], h_s[:, None]
-    v_a, v_b = (one[:, 3:4] * np.stack([np.cos(one[:, 2]), np.sin(one[:, 2])], axis=-1) for one in (a, b))
-    from_a = (1 + 2 * u) * (1 - u) ** 2 * a[:, :2] + u * (1 - u) ** 2 * h_s * v_a
-    from_b = u**2 * (3 - 2 * u) * b[:, :2] - u**2 * (1 - u) * h_s * v_b
-    return np.asarray(from_a + from_b)
-
-
-def _sensors(run: Run) -> list[SensorModel]:
-    """Models of the sensors that occur in the run; empty where one has none."""
-    configured: Mapping[str, Any] = run.config.get("sensors") or {}
-    names = np.unique(run.tables["updates"]["sensor"]).tolist()
-    known = {name: configured[name] for name in names if name in configured}
-    models = TypeAdapter(dict[str, SensorModel]).validate_python(known)
-    return list(models.values()) if len(models) == len(names) else []

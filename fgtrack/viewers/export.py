@@ -7,7 +7,7 @@ from pathlib import Path
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation.palette import distinct_colours
 from fgtrack.evaluation.roads import roads
-from fgtrack.evaluation.runs import Runs, evaluated, run_folders, same_recording
+from fgtrack.evaluation.runs import Runs, evaluated, same_recording
 from fgtrack.io.output import check_apart, check_output
 from fgtrack.io.ros.bag_writer import check_bag, token
 from fgtrack.io.run import Run
@@ -43,7 +43,7 @@ def export(runs: Runs, out: Path, *, ros2: bool = False, overwrite: bool = False
             raise CallError(f"{out}: viewers recognise such a file by its name, let it end in .mcap")
     (check_output if out.suffix == ".mcap" else check_bag)(out, overwrite)
     every = evaluated(runs)
-    check_apart(out, run_folders(every))
+    check_apart(out, [one.run.path for one in every])
     messages, notes = viewer_messages({one.label: one.run for one in every})
     return write(out, messages, overwrite), notes
 

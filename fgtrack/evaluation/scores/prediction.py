@@ -1,13 +1,12 @@
 """Displacement errors of predictions from the published states some seconds ahead (ADE, FDE)."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.matching import Matching, confirmed
+from fgtrack.core.types import FloatArray
+from fgtrack.evaluation.matching import Matching, TrackErrors, confirmed
 from fgtrack.evaluation.roads import roads
 from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.evaluation.truth import TRUE_STATE, true_states
@@ -17,7 +16,7 @@ from fgtrack.models.predictor import arc_positions, rail_positions
 #: Times ahead of the predictions, in s.
 HORIZONS_S = (1.0, 2.0, 3.0, 5.0)
 
-_STEP_S = 0.1
+STEP_S = 0.1
 _PERIOD_NS = NS_PER_S // 10  # of the published node's predictions
 
 
@@ -31,27 +30,12 @@ class PredictionErrors:
     """For each prediction the mean over every 0.1 s until then: the mean is the average displacement error, ADE."""
 
 
-@dataclass(frozen=True)
-class Displacements:
-    """Distances of predicted from true positions, ten times a second and for every tenth of a second ahead."""
+def displacements(run: Run, matching: Matching) -> TrackErrors:
+    """Distances of predicted from true positions, ten times a second, shape (n, m) for every `STEP_S` ahead.
 
-    stamps_ns: IntArray
-    object_index: IntArray
-    """Stamp and object of the states that are predicted, shape (n,)."""
-    distances_m: Mapping[str, FloatArray]
-    """By predictor, up to the last of `HORIZONS_S`, shape (n, m); NaN where the truth is not known."""
-
-    def at(self, horizon_s: float, predictor: str = "arc") -> FloatArray:
-        """Distances `horizon_s` ahead, shape (n,)."""
-        return self.distances_m[predictor][:, round(horizon_s / _STEP_S) - 1]
-
-
-def displacements(run: Run, matching: Matching) -> Displacements:
-    """Distances of predictions from the states of `run` from the truth.
-
-    Predictors are `arc` and, where the run has a map, `rail`. Confirmed tracks that are paired with an object are
-    predicted, and compared with that object, wherever it goes. Raises `DataError` where the map that the run names is
-    not a map.
+    Values are by predictor: `arc` and, where the run has a map, `rail`; NaN where the truth is not known. Confirmed
+    tracks that are paired with an object are compared with that object, wherever it goes. Raises `DataError` where the
+    map that the run names is not a map.
     """
     _, first = np.unique(matching.now_ns // _PERIOD_NS, return_index=True)
     tracks = matching.tracks
@@ -59,7 +43,7 @@ def displacements(run: Run, matching: Matching) -> Displacements:
     states[:, 4] = np.nan_to_num(states[:, 4])  # models without a yaw rate
     chosen = matching.paired & np.isin(matching.tick_index, first) & confirmed(tracks) & np.isfinite(states).all(axis=1)
     stamps_ns, objects = tracks["stamp_ns"][chosen], matching.object_index[chosen]
-    ahead_s: FloatArray = _STEP_S * np.arange(1, round(HORIZONS_S[-1] / _STEP_S) + 1, dtype=np.float64)
+    ahead_s: FloatArray = STEP_S * np.arange(1, round(HORIZONS_S[-1] / STEP_S) + 1, dtype=np.float64)
     at_ns = stamps_ns[:, None] + np.round(ahead_s * NS_PER_S).astype(np.int64)
     every = true_states(run.tables["truth"], np.repeat(objects, len(ahead_s)), at_ns.reshape(-1))
     truth = every[:, :2].reshape(*at_ns.shape, 2)
@@ -68,16 +52,16 @@ def displacements(run: Run, matching: Matching) -> Displacements:
     if road is not None:
         positions_m["rail"] = rail_positions(road, states[chosen], ahead_s)
     distances_m = {name: np.asarray(np.linalg.norm(each - truth, axis=-1)) for name, each in positions_m.items()}
-    return Displacements(stamps_ns, objects, distances_m)
+    return TrackErrors(stamps_ns, objects, tracks["track_id"][chosen], distances_m)
 
 
 def prediction_errors(run: Run, matching: Matching | None) -> dict[str, dict[str, PredictionErrors]]:
     """Return means of `displacements` by predictor and horizon, `1s` to `5s`; empty without truth."""
     errors: dict[str, dict[str, PredictionErrors]] = {}
-    for name, distances_m in displacements(run, matching).distances_m.items() if matching is not None else ():
+    for name, distances_m in displacements(run, matching).values.items() if matching is not None else ():
         errors[name] = {}
         for horizon_s in HORIZONS_S:
-            until = distances_m[:, : round(horizon_s / _STEP_S)]
+            until = distances_m[:, : round(horizon_s / STEP_S)]
             until = until[np.isfinite(until).all(axis=1)]
             final_m, average_m = Moments.of(until[:, -1]), Moments.of(until.mean(axis=1))
             errors[name][f"{horizon_s:g}s"] = PredictionErrors(final_m, average_m)
