@@ -86,11 +86,12 @@ def _topic_part(bag: Bag, topic: TopicInfo, parts: Sequence[Part]) -> Part:
 def _mapped(bag: Bag, item: TopicInput, type_name: str, sensor: str) -> Part:
     """Return the guess for a topic of an unknown type; raises `DataError` with a line of what is in it."""
     messages = [one for topic, _, one in islice(bag.messages({item.topic}), _MESSAGES) if topic.type == type_name]
-    found = [fields_of(message) for message in messages]
+    found: list[Mapping[str, Any]] = [fields_of(message) for message in messages]
     lists: dict[str, list[Mapping[str, Any]]] = {}
-    for path, items in chain.from_iterable(each.items() for _, each in found):
-        lists.setdefault(path, []).extend(fields_of(one)[0] for one in items)
-    lists[""] = [values for values, _ in found]  # the message itself, the last choice
+    for path, items in chain.from_iterable(each.items() for each in found):
+        if isinstance(items, list):
+            lists.setdefault(path, []).extend(map(fields_of, items))
+    lists[""] = found  # the message itself, the last choice
     for path, samples in lists.items():
         values = _columns(samples)
         own = guesses(values)
@@ -113,7 +114,7 @@ def _mapped(bag: Bag, item: TopicInput, type_name: str, sensor: str) -> Part:
 
 def _columns(samples: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:
     """Numbers by name; none of a text."""
-    names = dict.fromkeys(name for one in samples for name in one)
+    names = dict.fromkeys(name for one in samples for name, value in one.items() if not isinstance(value, list))
     return {name: [float(one[name]) for one in samples if not isinstance(one.get(name), str | None)] for name in names}
 
 

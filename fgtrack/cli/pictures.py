@@ -71,9 +71,8 @@ def figure(
         say(f"no close-up: {missing}")
     for path in files:
         say(path)
-    left_out = 0 if every else sum(one.is_extra for one in plans)
-    if left_out:
-        say(f"{left_out} more with --all")
+    if not every and any(one.is_extra for one in plans):
+        say(f"{sum(one.is_extra for one in plans)} more with --all")
 
 
 def _of_runs(

@@ -96,10 +96,9 @@ def _summarise(table: SweepTable, out: Path, form: Form | None, everything: bool
     write_file(out / SUMMARY_TABLE, summary.to_csv())
     if form is None and any(map(differences.is_main, differences.records)):
         show(differences, form)
-        say(f"all metrics: {out / PAIRED_TABLE}")
     show(summary.in_full() if everything else summary, form)
     if form is None and not everything:
-        say(f"\nevery metric: --all, or {out / SUMMARY_TABLE}")
+        say(f"\nevery metric: --all, {out / SUMMARY_TABLE}, {out / PAIRED_TABLE}")
 
 
 def score(run: Run) -> tuple[dict[str, Scalar], dict[str, Scalar]]:

@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState
-from fgtrack.io.adapters import ADAPTERS, message_types
+from fgtrack.io.adapters import ADAPTERS
 from fgtrack.io.config import InputConfig, TopicInput
 from fgtrack.io.source import open_input
 from fgtrack.io.stream import write_stream
@@ -75,7 +75,7 @@ def test_a_format_that_fails_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("plugin")
 def test_a_message_type_of_a_plug_in_is_read_like_a_built_in_one(tmp_path: Path) -> None:
-    assert POINT in message_types()
+    assert POINT in ADAPTERS
     store = get_typestore(Stores.ROS2_HUMBLE)
     header = store.types["std_msgs/msg/Header"](store.types["builtin_interfaces/msg/Time"](1, 2), "map")
     point = store.types[POINT](header, store.types["geometry_msgs/msg/Point"](3.0, 4.0, 0.0))

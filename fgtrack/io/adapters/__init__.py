@@ -30,8 +30,3 @@ ADAPTERS = Registry(
         }
     },
 )
-
-
-def message_types() -> list[str]:
-    """Message types whose objects can be read without naming fields."""
-    return sorted(name for name in ADAPTERS if "/" in name)

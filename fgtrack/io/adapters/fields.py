@@ -135,28 +135,20 @@ def _time(message: RosMessage, path: FieldPath) -> int:
     return round(value * NS_PER_S) if isinstance(value, float) else int(value)
 
 
-def fields_of(message: RosMessage) -> tuple[dict[str, Any], dict[str, list[RosMessage]]]:
-    """Values of the fields of `message` by path, and its lists of objects by path.
-
-    Numbers and texts as they are, a quaternion as its yaw, a time in seconds; arrays of numbers and headers are left
-    out.
-    """
+def fields_of(message: RosMessage) -> dict[str, Any]:
+    """Values of the fields of `message` by path: numbers, texts, yaws of quaternions, times in s, lists of objects."""
     values: dict[str, Any] = {}
-    lists: dict[str, list[RosMessage]] = {}
     for name in getattr(message, "__dataclass_fields__", ()):
         value = getattr(message, name)
         if name.startswith("__") or name == "header":
             continue
-        if isinstance(value, bool | int | float | str | np.number):
-            values[name] = value
-        elif hasattr(value, "nanosec"):
-            values[name] = stamp_ns(value) / NS_PER_S
+        if hasattr(value, "nanosec"):
+            value = stamp_ns(value) / NS_PER_S
         elif hasattr(value, "w") and hasattr(value, "z"):
-            values[name] = yaw_rad(value)
-        elif isinstance(value, list | tuple) and all(hasattr(item, "__dataclass_fields__") for item in value):
-            lists[name] = list(value)
+            value = yaw_rad(value)
+        is_list = isinstance(value, list) and all(hasattr(item, "__dataclass_fields__") for item in value)
+        if is_list or isinstance(value, bool | int | float | str | np.number | None):
+            values[name] = value
         else:
-            inner_values, inner_lists = fields_of(value)
-            values |= {f"{name}.{path}": inner for path, inner in inner_values.items()}
-            lists |= {f"{name}.{path}": inner for path, inner in inner_lists.items()}
-    return values, lists
+            values |= {f"{name}.{path}": inner for path, inner in fields_of(value).items()}
+    return values

@@ -20,7 +20,7 @@ from dataclasses import replace
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -51,8 +51,6 @@ _BORDER_PX = 2.0
 _NOWHERE_M = -999.0  # a box without a position is at -1000
 _CAR_HEIGHT_M, _INSIDE = 1.5, 0.5  # as high and as far inside a region that it counts as in it
 _FAR_M = 150.0
-
-Item = TypeVar("Item")
 
 
 def read_sequence(folder: Path, sequence: str, settings: KittiInput) -> Iterator[Message]:
@@ -87,8 +85,8 @@ def read_sequence(folder: Path, sequence: str, settings: KittiInput) -> Iterator
 
 
 def _by_frame(
-    file: Path, views: list[View], parse: Callable[[View, list[str]], Item], damages: list[tuple[int, DataError]]
-) -> Mapping[int, list[Item]]:
+    file: Path, views: list[View], parse: Callable[[View, list[str]], Any], damages: list[tuple[int, DataError]]
+) -> Mapping[int, list[Any]]:
     """Results of `parse` for the lines of `file`, by frame; a damaged line is added to `damages` with its frame.
 
     Lines are in the order of their frames, so a damaged frame number is not before that of the line above.

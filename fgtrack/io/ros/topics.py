@@ -8,7 +8,7 @@ from pathlib import Path
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DESCRIBING, MEASURABLE, Detection, DetectionList, Message, TruthState
-from fgtrack.io.adapters import ADAPTERS, message_types
+from fgtrack.io.adapters import ADAPTERS
 from fgtrack.io.adapters.common import ObjectList, RosMessage, object_id, split
 from fgtrack.io.adapters.fields import (
     EGO_FIELDS,
@@ -180,7 +180,7 @@ def _object_list(topic: BagTopic, item: TopicInput) -> Callable[[RosMessage], Ob
     if topic.type == DETECTIONS:
         return partial(detections, receipt_ns=0)  # a list of fgtrack's own has what an object list has
     if topic.type not in ADAPTERS:
-        known = ", ".join(message_types())
+        known = ", ".join(sorted(name for name in ADAPTERS if "/" in name))
         raise CallError(f"topic {topic.name}: objects of type {topic.type} need fields, known are {known}")
     read: Callable[[RosMessage], ObjectList] = ADAPTERS.load(topic.type)
     return read
