@@ -20,7 +20,7 @@ from fgtrack.evaluation.runs import EvaluatedRun, evaluated
 from fgtrack.evaluation.tables import Tables, short
 from fgtrack.evaluation.tables.compare import compare
 from fgtrack.io.errors import UntilBreak
-from fgtrack.io.output import check_apart, check_output, claimed, new_file, new_files
+from fgtrack.io.output import check_apart, check_output, claimed, new_files, write_file
 from fgtrack.io.run import Run, check_run, load_run, write_metrics
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumptions.assumed import assumed
@@ -209,9 +209,9 @@ def study(
         if advised is not None:  # what the advice changes is not assumed any more
             changed = {one.key for one in advised.changes}
             known = Assumed(advised.config, tuple(one for one in known.assumptions if one.key not in changed))
-        with new_file(settings, overwrite) as file:
-            head = [f"Settings of {source_path.name} {_MARK}: change them and run again with -c."]
-            file.write(known.to_yaml([*head, *([] if advised is None else advised.comments())]).encode())
+        head = [f"Settings of {source_path.name} {_MARK}: change them and run again with -c."]
+        comments = [] if advised is None else advised.comments()
+        write_file(settings, known.to_yaml([*head, *comments]), overwrite)
 
         taken = count()
 

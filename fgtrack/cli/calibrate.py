@@ -20,7 +20,7 @@ from fgtrack.evaluation.diagnostics import excluded_lines
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Value
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.info import OTHER_CLOCK_S, InputInfo, describe
-from fgtrack.io.output import check_apart, check_output, new_file
+from fgtrack.io.output import check_apart, check_output, write_file
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.pipeline.assumptions.assumption import Assumed
@@ -50,8 +50,7 @@ def info(
         check_output(write, overwrite)
         check_apart(write, [recording])
         text = starting_config(recording)
-        with new_file(write, overwrite) as file:
-            file.write(text.encode())
+        write_file(write, text, overwrite)
         if not as_json:
             say(f"{write}: written; check its guesses, they are applied below")
         config_file = str(write)
@@ -157,8 +156,7 @@ def advise(
     show(advice.tables, "json" if as_json else None, advice.as_dict())
     if out is not None:
         head = [f"Settings for {recording} (fgtrack advise).", "", *advice.comments(), ""]
-        with new_file(out, overwrite) as file:
-            file.write(Assumed(advice.config, ()).to_yaml(head).encode())
+        write_file(out, Assumed(advice.config, ()).to_yaml(head), overwrite)
         again = shlex.join(["fgtrack", "replay", str(recording), "-c", str(out), "-o", "RUN"])
         if not as_json:
             say(f"{out}: written; follow it by `{again}`")

@@ -15,7 +15,7 @@ from fgtrack.cli.arguments import ConfigFile, Json, Overwrite, PitMap, Settings,
 from fgtrack.cli.show import progress, say, show
 from fgtrack.core.errors import DataError
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
-from fgtrack.io.output import check_apart, check_output, new_file
+from fgtrack.io.output import check_apart, check_output, write_file
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumptions.assumption import Assumed
 from fgtrack.pipeline.shipped import read_config
@@ -51,8 +51,7 @@ def tune(
     of_recordings = replace(report.config, map=read_config(config_file).map)  # the maps belong to these
     title = f"The noise of {config_file or 'the defaults'}, fitted to {', '.join(sources)} (fgtrack tune)."
     head = [title, "", *str(tables).splitlines(), "", *found, ""]
-    with new_file(out, overwrite) as file:
-        file.write(Assumed(of_recordings, ()).to_yaml(head).encode())
+    write_file(out, Assumed(of_recordings, ()).to_yaml(head), overwrite)
     show(tables, "json" if as_json else None, report.as_dict())
     if not as_json:
         say("\n".join(["", *found, f"{out}: written"]))

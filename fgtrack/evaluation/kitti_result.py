@@ -19,7 +19,7 @@ from fgtrack.evaluation.matching import confirmed
 from fgtrack.evaluation.placement import update_rows
 from fgtrack.io.adapters.kitti import CLASS_NAMES, is_sequence, view_of_sequence
 from fgtrack.io.adapters.kitti_view import PERIOD_NS, Box, View
-from fgtrack.io.output import check_apart, new_file
+from fgtrack.io.output import check_apart, write_file
 from fgtrack.io.run import NO_TRACK, Run
 
 _MEANS = ["height_m", "width_m", "length_m", "score"]
@@ -57,8 +57,7 @@ def write_kitti_result(run: Run, sequence: Path, out: Path, *, overwrite: bool =
             f"{run.path}: no detection of its tracks has a size (detections.csv), which a box needs: replay detections "
             "with length_m, width_m, height_m and z_m"
         )
-    with new_file(out, overwrite) as file:
-        file.write("".join(lines).encode())
+    write_file(out, "".join(lines), overwrite)
     return len(lines), len(tracks), len(without - tracks)
 
 

@@ -1,8 +1,8 @@
 """Safe outputs: what exists stays without `overwrite`, and no output is half-written.
 
-A file, or a folder that is written once, is made beside its destination under a random name that ends in `.part`, and
-renamed when it is complete; a killed command leaves the `.part`. A folder that must be readable at any time is claimed
-instead: created, and locked until the command ends.
+A file, or a folder that is written once, is made in a folder beside its destination under a random name that ends in
+`.part`, and renamed when it is complete; a killed command leaves the `.part`. A folder that must be readable at any
+time is claimed instead: created, and locked until the command ends.
 """
 
 import errno
@@ -37,10 +37,10 @@ def check_output(
             if not parent.is_dir() or not os.access(parent, os.W_OK):
                 raise PermissionError(errno.EACCES, f"{parent} is not a folder to write into")
             return
-        is_folder = path.is_dir() and not path.is_symlink()
-        if is_folder and all(name.endswith(".part") for name in os.listdir(path)):
+        is_link = path.is_symlink()
+        if path.is_dir() and not is_link and all(name.endswith(".part") for name in os.listdir(path)):
             return
-        if path.is_symlink() or not replaceable(path):
+        if is_link or not replaceable(path):
             raise CallError(f"{path}: exists and is not {what}, choose another name")
     except OSError as error:
         raise write_error(path, error) from error
@@ -51,14 +51,11 @@ def check_output(
 def check_apart(out: Path, inputs: Iterable[str | Path | None]) -> None:
     """Raise `CallError` where the output `out` is one of `inputs`, holds one, or lies in one."""
     target = out.resolve()
-    for source in inputs:
-        place = None if source is None else Path(source).resolve()
-        if place is None or not place.exists():  # the name of a shipped configuration
-            continue
-        if target == place or target in place.parents:
-            raise CallError(f"{out}: is the input or holds it ({source}), choose another name")
-        if place in target.parents:
-            raise CallError(f"{out}: lies in the input {source}, choose another place")
+    for source in (each for each in inputs if each is not None):
+        place = Path(source).resolve()
+        overlaps = target == place or target in place.parents or place in target.parents
+        if overlaps and place.exists():  # else the name of a shipped configuration
+            raise CallError(f"{out}: must not overlap the input {source}, choose another name")
 
 
 def write_error(path: Path, error: OSError) -> FgtrackError:
@@ -68,30 +65,42 @@ def write_error(path: Path, error: OSError) -> FgtrackError:
     return CallError(f"{path}: cannot be written ({error.strerror or error}), choose another place")
 
 
-def write_file(path: Path, text: str) -> None:
-    """Write the text file `path` completely or not at all, replacing a former version."""
-    with new_file(path, overwrite=True) as file:
-        file.write(text.encode())
+def write_file(path: Path, text: str, overwrite: bool = True) -> None:
+    """Write the text file `path` completely or not at all."""
+    with new_path(path, overwrite) as new:
+        new.write_bytes(text.encode())
 
 
 @contextmanager
 def new_file(path: Path, overwrite: bool) -> Iterator[BinaryIO]:
-    """A file that is renamed to `path` when the block ends; raises as `check_output` and `write_error`."""
-    check_output(path, overwrite)
+    """A file that is renamed to `path` when the block ends; raises as `new_path`."""
+    with new_path(path, overwrite) as new, new.open("xb") as file:
+        yield file
+
+
+@contextmanager
+def new_path(
+    path: Path, overwrite: bool, replaceable: Callable[[Path], bool] = os.path.isfile, what: str = "a file"
+) -> Iterator[Path]:
+    """Path of a file or folder to make that is renamed to `path` when the block ends.
+
+    Raises as `check_output` and `write_error`.
+    """
+    check_output(path, overwrite, replaceable, what)
     with _part_of(path) as part:
-        part.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("xb") as file:
-            yield file
-        check_output(path, overwrite)  # another command may have made it
-        os.replace(part, path)
+        new = part / Path(os.path.abspath(path)).name
+        yield new
+        check_output(path, overwrite, replaceable, what)  # another command may have made it
+        if path.is_dir() and new.is_dir():
+            os.rename(path, part / _REPLACED)
+        os.replace(new, path)
 
 
 @contextmanager
 def new_files(folder: Path, overwrite: bool) -> Iterator[Path]:
-    """A folder whose files are moved into `folder` when the block ends; raises as `new_file` where one would change."""
+    """A folder whose files are moved into `folder` when the block ends; raises as `new_path` where one would change."""
     check_output(folder, True, os.path.isdir, "a folder")
     with _part_of(folder) as part:
-        part.mkdir(parents=True)
         yield part
         files = sorted(part.iterdir())
         for file in files:
@@ -101,35 +110,20 @@ def new_files(folder: Path, overwrite: bool) -> Iterator[Path]:
         folder.mkdir(exist_ok=True)
         for file in files:
             os.replace(file, folder / file.name)
-        part.rmdir()
-
-
-@contextmanager
-def new_folder(path: Path, overwrite: bool, replaceable: Callable[[Path], bool], what: str) -> Iterator[Path]:
-    """Path at which to make a folder that is renamed to `path` when the block ends; raises as `new_file`."""
-    check_output(path, overwrite, replaceable, what)
-    with _part_of(path) as part:
-        part.mkdir(parents=True)
-        new = part / Path(os.path.abspath(path)).name
-        yield new
-        check_output(path, overwrite, replaceable, what)
-        if path.exists():
-            os.rename(path, part / _REPLACED)
-        os.rename(new, path)
-        shutil.rmtree(part)
 
 
 @contextmanager
 def _part_of(path: Path) -> Iterator[Path]:
-    """The path `<path>.*.part`, removed after an error; an interrupt keeps it, as a kill does."""
+    """The folder `<path>.*.part`, which is removed at the end of the block; an interrupt keeps it, as a kill does."""
     absolute = Path(os.path.abspath(path))
     part = absolute.with_name(f"{absolute.name}.{secrets.token_hex(6)}.part")
     try:
+        part.mkdir(parents=True)
         yield part
+        shutil.rmtree(part)
     except Exception as error:
         if not (part / _REPLACED).exists():  # it could not be put back
             shutil.rmtree(part, ignore_errors=True)
-            part.unlink(missing_ok=True)
         if isinstance(error, OSError):
             raise write_error(path, error) from error
         raise

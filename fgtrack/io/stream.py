@@ -94,7 +94,7 @@ def write_stream(
     """Write `messages`, which must be in receipt order, to `path`; gives their number.
 
     A name that ends in `.gz` is gzipped; the same messages give the same bytes. The file gets its name when it is
-    complete; what a killed writer leaves beside it (`<path>.*.part`) is readable. `header` are entries of the header
+    complete; what a killed writer leaves in `<path>.*.part` is readable. `header` are entries of the header
     record besides `type` and `format`. Raises `TruncatedInput` where `messages` broke off, after writing what came
     before, and as `new_file`.
     """

@@ -1,7 +1,5 @@
 """Writes what shows a run as a rosbag2 recording of standard messages, for RViz and whatever reads ROS."""
 
-import shutil
-import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -14,7 +12,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import DetectionList, EgoState
 from fgtrack.io.adapters.common import RosMessage
-from fgtrack.io.output import new_file, new_folder
+from fgtrack.io.output import new_path
 from fgtrack.io.ros.bag_writer import RECORDING, BagTopics, as_write_error, is_recording
 from fgtrack.io.ros.messages import MARKER_ARRAY, TRANSFORMS, MessageFactory
 from fgtrack.viewers.shapes import Entity, Scene, Shape, ViewerMessage
@@ -33,15 +31,11 @@ def write_ros2(path: Path, messages: Iterable[ViewerMessage], overwrite: bool = 
     """
     with as_write_error(path):
         if path.suffix != ".mcap":
-            with new_folder(path, overwrite, is_recording, RECORDING) as folder:
+            with new_path(path, overwrite, is_recording, RECORDING) as folder:
                 return _write(folder, messages)
-        with (
-            new_file(path, overwrite) as file,
-            tempfile.TemporaryDirectory(".part", f"{path.name}.", path.parent) as part,
-        ):
-            counts = _write(Path(part) / path.stem, messages)
-            with (Path(part) / path.stem / f"{path.stem}.mcap").open("rb") as written:
-                shutil.copyfileobj(written, file)
+        with new_path(path, overwrite) as file:
+            counts = _write(file.with_name(path.stem), messages)
+            (file.with_name(path.stem) / path.name).rename(file)
             return counts
 
 

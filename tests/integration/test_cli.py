@@ -176,7 +176,7 @@ def foreign_folder(path: Path) -> None:
             "duration_s: Input should be greater than 0, not 0.0",
         ),
         (("simulate", "default", "-o", "x.jsonl", "--seed", "-1"), "--seed"),
-        (("replay", "drive.jsonl", "-o", "drive.jsonl"), "drive.jsonl: is the input or holds it"),
+        (("replay", "drive.jsonl", "-o", "drive.jsonl"), "drive.jsonl: must not overlap the input drive.jsonl"),
         (("replay", "drive.jsonl", "-o", "foreign"), "foreign: exists and is not a run folder"),
         (("replay", "drive.jsonl", "-o", "run", "-e", "magic"), "estimator 'magic' is unknown"),
         (

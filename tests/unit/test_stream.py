@@ -164,5 +164,5 @@ def test_a_killed_writer_leaves_a_readable_part_and_no_short_stream(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         write_stream(tmp_path / "a.jsonl", breaking())
     assert not (tmp_path / "a.jsonl").exists()
-    (part,) = tmp_path.glob("a.jsonl.*.part")
+    (part,) = tmp_path.glob("a.jsonl.*.part/a.jsonl")
     assert list(read_stream(part)) == drive()

@@ -16,7 +16,7 @@ from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.io.adapters.common import RosMessage
 from fgtrack.io.errors import UntilBreak, one_line
-from fgtrack.io.output import check_output, new_folder
+from fgtrack.io.output import check_output, new_path
 from fgtrack.io.ros.bag_files import METADATA, SETTINGS, files_of
 from fgtrack.io.ros.messages import MessageFactory
 
@@ -38,16 +38,16 @@ def write_bag(
     `/fgtrack/ego`, `/fgtrack/detections/SENSOR` and `/fgtrack/truth` hold every field to the bit and carry their
     definitions; the log time is the receipt, the header stamp the stamp. The twins for other tools are `/ego/odometry`
     (nav_msgs/Odometry) and `/detections/SENSOR` (vision_msgs/Detection3DArray, of objects with a position, without
-    speeds). Every thousand messages reach the disk: a killed writer leaves a readable recording (`<path>.*.part`).
+    speeds). Every thousand messages reach the disk: a killed writer leaves a readable recording (in `<path>.*.part`).
     `settings`, what the recording carries of a configuration, are in the custom data of metadata.yaml.
 
-    Raises `TruncatedInput` where `messages` broke off, after writing what came before; as `new_folder`; and `DataError`
+    Raises `TruncatedInput` where `messages` broke off, after writing what came before; as `new_path`; and `DataError`
     for a time outside what ROS messages hold.
     """
     path, count = Path(path), 0
     with (
         as_write_error(path),
-        new_folder(path, overwrite, is_recording, RECORDING) as folder,
+        new_path(path, overwrite, is_recording, RECORDING) as folder,
         Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=_PLUGINS[storage]) as bag,
     ):
         if settings:
