@@ -66,7 +66,7 @@ def _topic_part(bag: Bag, topic: TopicInfo, parts: Sequence[Part]) -> Part:
     """Return what `topic` is taken as, beside other `parts`; raises `DataError` with the reason where it is not."""
     words = set(words_of(topic.name))
     is_truth = bool(words & _TRUTH and not words & _EGO)
-    has_clock = topic.delay is None or abs(topic.delay.p50_s) < OTHER_CLOCK_S
+    has_clock = topic.delay is None or abs(topic.delay["p50_s"]) < OTHER_CLOCK_S
     item = TopicInput(topic.name, stamp_from="message" if has_clock else "receipt")
     reasons = {"stamp_from": "its stamps are of another clock than the recorder's, or not set"}
     problem = next((one.problem for one in bag.topics if (one.name, one.type) == (topic.name, topic.type)), None)

@@ -100,7 +100,7 @@ def _topics(found: InputInfo, unused: str) -> Table:
     records = []
     for one in found.topics:
         record: dict[str, object] = {"topic": one.name, "messages": one.count, "rate_hz": one.rate_hz}
-        record |= {f"delay_{name}": None if one.delay is None else getattr(one.delay, name) for name in _DELAYS}
+        record |= {f"delay_{name}": None if one.delay is None else one.delay[name] for name in _DELAYS}
         records.append(record | {"taken_as": one.used_as or unused, "type": one.type})
     columns = [
         Column("topic", left=True),

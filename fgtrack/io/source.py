@@ -76,11 +76,9 @@ def input_kind(path: Path) -> str:
         if path.is_file() and path.stat().st_size == 0:
             raise DataError(f"{path}: is empty")
         for name, form in formats.items():
-            if _recognises(name, form, path):
-                return name
-        for name, form in formats.items():
-            if not path.is_dir() and _recognises(name, form, path.parent):
-                raise DataError(f"{path}: is no input by itself, name its folder {path.parent} ({form.description})")
+            with ADAPTERS.blamed(name, f"cannot look at {path}"):
+                if form.recognises(path):
+                    return name
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     known = ", ".join(form.description for form in reversed(formats.values()))
@@ -95,8 +93,3 @@ def file_format(name: str) -> FileFormat:
     if not isinstance(found, FileFormat):
         raise CallError(f"adapter {name!r}: is a {type(found).__name__}, not a FileFormat")
     return found
-
-
-def _recognises(name: str, form: FileFormat, path: Path) -> bool:
-    with ADAPTERS.blamed(name, f"cannot look at {path}"):
-        return bool(form.recognises(path))

@@ -44,7 +44,7 @@ def read_stream(path: Path | str) -> Iterator[Message]:
     path = Path(path)
     unknown: Counter[str] = Counter()
     with closing(_records(path)) as records:
-        _check_header(path, next(records, None))
+        next(records)
         for line, record in records:
             try:
                 yield _message(record, unknown)
@@ -63,26 +63,19 @@ def _recognises(path: Path) -> bool:
     return start.startswith(GZIP_MAGIC) or start.lstrip().startswith(b"{")
 
 
-def _settings(path: Path) -> Mapping[str, object]:
-    """Settings in the header."""
-    found = read_header(path).get(SETTINGS)
-    return found if isinstance(found, dict) else {}
-
-
 FORMAT = FileFormat(
     "an fgtrack stream (.jsonl, .jsonl.gz)",
     _recognises,
     lambda path, config: partial(read_stream, path),
-    _settings,
+    lambda path: read_header(path).get(SETTINGS, {}),
     validates=True,
 )
 
 
 def read_header(path: Path | str) -> Mapping[str, Any]:
     """Header record of the stream `path`; JSON values. Raises `DataError` when there is none."""
-    path = Path(path)
-    with closing(_records(path)) as records:
-        return _check_header(path, next(records, None))
+    with closing(_records(Path(path))) as records:
+        return next(records)[1]
 
 
 def write_stream(
@@ -132,7 +125,7 @@ def _given(value: EgoState | TruthState | Detection) -> Record:
 
 
 def _records(path: Path) -> Generator[tuple[int, Record], None, None]:
-    """Line number and JSON object of every line that is not blank."""
+    """Line number and JSON object of every line that is not blank, the first one the header."""
     line, num_records = 0, 0
     try:
         with open_file(path) as raw:
@@ -152,23 +145,16 @@ def _records(path: Path) -> Generator[tuple[int, Record], None, None]:
                     raise DataError(f"{path}:{line}: is not JSON ({error})") from error
                 if not isinstance(record, dict):
                     raise DataError(f"{path}:{line}: is not a JSON object")
+                if not num_records and (record.get("type"), record.get("format")) != ("header", STREAM_FORMAT):
+                    break
                 num_records += 1
                 yield line, record
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise TruncatedInput(f"{path}:{line + 1}: breaks off after record {num_records} ({error})") from error
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
-
-
-def _check_header(path: Path, first: tuple[int, Record] | None) -> Record:
-    if first is None:
-        raise DataError(f"{path}: is empty, a stream starts with a header record")
-    line, record = first
-    if record.get("type") != "header":
-        raise DataError(f"{path}:{line}: a stream starts with a header record of format {STREAM_FORMAT!r}")
-    if record.get("format") != STREAM_FORMAT:
-        raise DataError(f"{path}:{line}: format {record.get('format')!r} is not {STREAM_FORMAT!r}")
-    return record
+    if not num_records:
+        raise DataError(f"{path}: a stream starts with a header record of format {STREAM_FORMAT!r}")
 
 
 def _message(record: Record, unknown: Counter[str]) -> Message:

@@ -87,15 +87,6 @@ def test_a_message_type_of_a_plug_in_is_read_like_a_built_in_one(tmp_path: Path)
     assert list(open_input(tmp_path / "bag", config).messages()) == [cone]
 
 
-@pytest.mark.parametrize("name", ["bag/metadata.yaml", "log/data_logs.csv"])
-def test_a_part_of_a_folder_names_the_folder(tmp_path: Path, name: str) -> None:
-    file = tmp_path / name
-    file.parent.mkdir()
-    file.write_text("x")
-    with pytest.raises(DataError, match=f"{file.name}: is no input by itself, name its folder .*{file.parent.name} "):
-        open_input(file)
-
-
 @pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/null")], ids=["pipe", "device"])
 def test_a_pipe_or_device_is_refused_at_once(tmp_path: Path, make: Callable[[Path], None]) -> None:
     make(tmp_path / "x.jsonl")

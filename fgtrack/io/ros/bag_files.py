@@ -63,15 +63,14 @@ def files_of(path: Path) -> list[Path]:
     return files
 
 
-def settings_of(path: Path) -> Mapping[str, object]:
+def settings_of(path: Path) -> Any:  # Any: JSON values, validated by `fgtrack.pipeline.recorded`
     """Settings that the recording at `path` carries: none without a metadata.yaml that has them."""
     if not (path / METADATA).is_file():
         return {}
     try:
-        found = json.loads(_metadata(path)["custom_data"][SETTINGS])
+        return json.loads(_metadata(path)["custom_data"][SETTINGS])
     except (KeyError, TypeError, ValueError, RecursionError, YAMLError):
         return {}
-    return found if isinstance(found, dict) else {}
 
 
 def bags_in(path: Path) -> list[Path]:
