@@ -14,7 +14,7 @@ import numpy as np
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.geometry import cartesian, cartesian_gradient, polar, polar_gradient, wrap_angles
-from fgtrack.core.types import MEASURABLE, YAW_RATE, FloatArray, IntArray
+from fgtrack.core.types import MEASURABLE, STATE_NAMES, YAW_RATE, FloatArray, IntArray
 from fgtrack.models.motion import CARTESIAN, MIN_SPEED_MPS, POLAR, MotionModel
 
 #: The gradient of a bearing by the position grows as 1 / range; below this range it stays as it is there.
@@ -62,12 +62,12 @@ class MeasurementModel:
                 f"measurement of {', '.join(self.components) or 'nothing'}: give one or more of "
                 f"{', '.join(COMPONENTS)}, each once and in this order"
             )
-        if self.state_names[:4] not in (POLAR, CARTESIAN):
+        begins = (STATE_NAMES[:5],) if "curvature_radpm" in self.components else (POLAR, CARTESIAN)
+        if not any(self.state_names[: len(each)] == each for each in begins):
             raise CallError(
-                f"state of {', '.join(self.state_names)}: must begin with {', '.join(POLAR)} or {', '.join(CARTESIAN)}"
+                f"measurement of {', '.join(self.components)}: state of {', '.join(self.state_names)}: must begin with "
+                f"{' or '.join(', '.join(each) for each in begins)}"
             )
-        if "curvature_radpm" in self.components and self.state_names[YAW_RATE : YAW_RATE + 1] != ("yaw_rate_radps",):
-            raise CallError("measurement of curvature_radpm: needs a state with a yaw rate, as that of CTRV or CTRA")
 
     @cached_property
     def angular(self) -> tuple[int, ...]:

@@ -171,5 +171,5 @@ def test_a_curvature_is_the_yaw_rate_over_the_speed_and_says_nothing_at_rest(
 
 def test_a_curvature_needs_a_yaw_rate() -> None:
     assert (*MEASURABLE, "curvature_radpm") == COMPONENTS
-    with pytest.raises(CallError, match="needs a state with a yaw rate"):
+    with pytest.raises(CallError, match=r"must begin with x_m, y_m, yaw_rad, speed_mps, yaw_rate_radps$"):
         measurement_model(("x_m", "y_m", "curvature_radpm"), CV())

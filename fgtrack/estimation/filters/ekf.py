@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -21,6 +21,8 @@ from fgtrack.models.measurement import MeasurementModel, SensorPose
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.robust import weight
 from fgtrack.models.sensors import RobustLoss
+
+T = TypeVar("T", float, FloatArray)
 
 _KALMAN = "fgtrack.estimation.kernels.kalman"
 _MAX_REWEIGHTINGS = 50
@@ -83,27 +85,8 @@ def robust_weight(loss: RobustLoss | None, y: FloatArray, spread: FloatArray, R:
     return w
 
 
-class Correction(NamedTuple):
-    """Result of `correct` for m independent states."""
-
-    mean: FloatArray
-    """Posterior means, shape (m, n); angles are not wrapped."""
-    covariance: FloatArray
-    """Posterior covariances, shape (m, n, n)."""
-    innovation: FloatArray
-    """Shape (m, k)."""
-    nis: FloatArray
-    """Normalised innovation squared, shape (m,)."""
-    weight: FloatArray
-    """Weight of each measurement under its loss, shape (m,); 1 at most."""
-    S: FloatArray
-    """Covariances of the innovations, shape (m, k, k), before any loss."""
-    fused: BoolArray
-    """True where S was positive definite and the posterior is finite, shape (m,)."""
-
-
-class OneCorrection(NamedTuple):
-    """Result of `correct_one`."""
+class Correction(NamedTuple, Generic[T]):
+    """Result of fusing a measurement into one state, or into each of m states; shapes then begin with m."""
 
     mean: FloatArray
     """Posterior mean, shape (n,); angles are not wrapped."""
@@ -111,12 +94,17 @@ class OneCorrection(NamedTuple):
     """Posterior covariance, shape (n, n)."""
     innovation: FloatArray
     """Shape (k,)."""
-    nis: float
+    nis: T
     """Normalised innovation squared."""
-    weight: float
+    weight: T
     """Weight of the measurement under its loss; 1 at most."""
     S: FloatArray
     """Covariance of the innovation, shape (k, k), before any loss."""
+    fused: BoolArray = np.ones(1, dtype=bool)
+    """True where S was positive definite and the posterior is finite, shape (m,)."""
+
+
+OneCorrection = Correction[float]
 
 
 class Prediction(NamedTuple):
@@ -159,7 +147,7 @@ def correct(
     R: FloatArray,
     measured: Sequence[int] | None = None,
     loss: RobustLoss | None = None,
-) -> Correction:
+) -> Correction[FloatArray]:
     """Fuse innovations y (m, k) of measurements with Jacobians H (m, k, n) or (k, n) and covariances R (m, k, k).
 
     Karle et al. 2023, eqs. 5 to 9, on m states. `measured` is `Measurement.measured`, for the NIS, `loss` the
@@ -196,7 +184,7 @@ def updated_one(
     x, P, y, nis, w, S, fused = correct(mean[None], covariance[None], y[None], H, R[None], measured, loss)
     if not fused[0]:
         raise np.linalg.LinAlgError("innovation covariance not positive definite, or posterior not finite")
-    return OneCorrection(x[0], P[0], y[0], float(nis[0]), float(w[0]), S[0])
+    return Correction(x[0], P[0], y[0], float(nis[0]), float(w[0]), S[0])
 
 
 def correct_one(mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:

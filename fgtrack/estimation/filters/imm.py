@@ -59,13 +59,6 @@ class ImmReplay(ReplayEkf):
             replace(self.steps[0], mixture=Mixture(means, covariances, np.full(len(means), 1.0 / len(means))))
         ]
 
-    @property
-    def probabilities(self) -> FloatArray:
-        """Probabilities of `motion` and the other model after the newest measurement, shape (m,)."""
-        mixture = self.steps[-1].mixture
-        assert mixture is not None  # every step of this filter has one
-        return mixture.probabilities
-
     def transition(self, dt_s: float) -> FloatArray:
         """Probability of model j (columns) `dt_s` after model i (rows), shape (m, m).
 
@@ -109,7 +102,7 @@ class ImmReplay(ReplayEkf):
     def _mixed(self, before: Step, stamp_ns: int) -> Mixture:
         """The mixture at `stamp_ns`: each model predicts the mixture before, given that the object follows it now."""
         old = before.mixture
-        assert old is not None
+        assert old is not None  # every step of this filter has one
         if stamp_ns == before.stamp_ns:
             return old
         dt_s = seconds(stamp_ns - before.stamp_ns)

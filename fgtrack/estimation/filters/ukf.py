@@ -7,7 +7,6 @@ columns of the covariance's root. They give no weight to the mean, so every cova
 
 from collections.abc import Callable
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,15 +21,9 @@ from fgtrack.models.measurement import MeasurementModel
 _JITTER = 1e-12
 
 
-class Regression(NamedTuple):
-    """g(x) = mean + A (x - m) + e for x ~ N(m, P), with the least mean square of e, which is uncorrelated with x."""
-
-    mean: FloatArray
-    """E[g(x)], shape (..., k)."""
-    A: FloatArray
-    """Shape (..., k, n)."""
-    noise: FloatArray
-    """Covariance of e, shape (..., k, k)."""
+Regression = tuple[FloatArray, FloatArray, FloatArray]
+"""z = E[g(x)] (..., k), A (..., k, n), and the covariance (..., k, k) of e, which is uncorrelated with x, in
+g(x) = z + A (x - m) + e for x ~ N(m, P)."""
 
 
 def regression(
@@ -53,7 +46,7 @@ def regression(
     bends, slopes = 0.5 * (ahead + behind), (ahead - behind) / (2.0 * n**0.5)
     shift = bends.sum(axis=-2) / n
     noise = bends.mT @ bends / n - shift[..., :, None] * shift[..., None, :]
-    return Regression(values[..., 0, :] + shift, np.linalg.solve(L.mT, slopes).mT, symmetrise(noise))
+    return values[..., 0, :] + shift, np.linalg.solve(L.mT, slopes).mT, symmetrise(noise)
 
 
 def _root(covariance: FloatArray) -> FloatArray:
@@ -139,7 +132,7 @@ class IplfReplay(UkfReplay):
             x, P = update.mean, update.covariance
 
             def cost(x: FloatArray, spread: FloatArray = spread, R: FloatArray = R) -> float:
-                z = measurement_regression(measurement, x, spread).mean
+                z, _, _ = measurement_regression(measurement, x, spread)
                 residual = measurement.model.residual(measurement.z, z)
                 return negative_log_posterior(x - mean, covariance, residual, R, measurement.loss)
 

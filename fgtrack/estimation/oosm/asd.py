@@ -67,7 +67,13 @@ class AccumulatedStateDensity(WindowedFilter):
         index = max(bisect.bisect_right(stamps_ns, stamp_ns) - 1, 0)
         if stamps_ns[index] == stamp_ns:
             return self._stack, slice(index * n, index * n + n)
-        own, A, noise = self._given_neighbours(index, stamp_ns)
+        left, until_s = mean[index * n : index * n + n], seconds(stamp_ns - stamps_ns[index])
+        if index + 1 == len(stamps_ns):
+            own, A, noise = self._motion.transition(left, until_s)
+        else:
+            right, after_s = mean[index * n + n : index * n + 2 * n], seconds(stamps_ns[index + 1] - stamp_ns)
+            own, Lambda, Psi, noise = between(self._motion, left, right, until_s, after_s)
+            A = np.hstack((Lambda, Psi))
         neighbours, at = slice(index * n, index * n + A.shape[1]), index * n + n
         cross = A @ covariance[neighbours]
         grown = np.empty((len(mean) + n, len(mean) + n))
@@ -78,16 +84,3 @@ class AccumulatedStateDensity(WindowedFilter):
         grown[at : at + n, at : at + n] = propagated(A, covariance[neighbours, neighbours], noise)
         stamps_ns = (*stamps_ns[: index + 1], stamp_ns, *stamps_ns[index + 1 :])
         return (stamps_ns, np.insert(mean, at, own), grown), slice(at, at + n)
-
-    def _given_neighbours(self, index: int, stamp_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Mean (n,), A and noise (n, n) of x = A [neighbours] + noise after the state at `index`.
-
-        A is (n, n) after the newest state, and (n, 2 n) between two.
-        """
-        n, (stamps_ns, mean, _) = self._motion.dim, self._stack
-        left, until_s = mean[index * n : index * n + n], seconds(stamp_ns - stamps_ns[index])
-        if index + 1 == len(stamps_ns):
-            return self._motion.transition(left, until_s)
-        right, after_s = mean[index * n + n : index * n + 2 * n], seconds(stamps_ns[index + 1] - stamp_ns)
-        own, Lambda, Psi, Sigma = between(self._motion, left, right, until_s, after_s)
-        return own, np.hstack((Lambda, Psi)), Sigma

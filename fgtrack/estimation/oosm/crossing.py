@@ -8,7 +8,7 @@ from fgtrack.core.linalg import congruence, identity, psd_solve, symmetrise
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.filters.ekf import OneCorrection, Prediction, linearised, propagated, robust_weight
+from fgtrack.estimation.filters.ekf import Correction, OneCorrection, Prediction, linearised, propagated, robust_weight
 from fgtrack.estimation.oosm.late import FilterStep, RewindForget
 from fgtrack.estimation.rts import rts_step
 
@@ -34,7 +34,7 @@ def fuse_across(mean: FloatArray, covariance: FloatArray, past: Past, measuremen
         S = propagated(H, P_tau, measurement.R / w)
     across = cross @ H.T
     gain = psd_solve(S, across.T).T
-    result = OneCorrection(mean + gain @ y, symmetrise(covariance - gain @ across.T), y, nis, w, expected)
+    result = Correction(mean + gain @ y, symmetrise(covariance - gain @ across.T), y, nis, w, expected)
     if not (np.isfinite(result.mean).all() and np.isfinite(result.covariance).all()):
         raise np.linalg.LinAlgError("the measurement gives a state that is not finite")
     return result

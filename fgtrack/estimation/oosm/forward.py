@@ -6,7 +6,7 @@ from scipy.optimize import minimize_scalar
 from fgtrack.core.linalg import identity, psd_solve, symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.filters.ekf import OneCorrection, correct_one
+from fgtrack.estimation.filters.ekf import Correction, OneCorrection, correct_one
 from fgtrack.estimation.oosm.late import RewindForget
 
 _Estimate = tuple[FloatArray, FloatArray]
@@ -39,7 +39,7 @@ class Fpfd(RewindForget):
         x, P = self._fused((now.mean, now.covariance), late, common)
         np.linalg.cholesky(P)
         self._absorb(x, P)
-        return OneCorrection(x, P, at_tau.innovation, at_tau.nis, at_tau.weight, at_tau.S)
+        return Correction(x, P, at_tau.innovation, at_tau.nis, at_tau.weight, at_tau.S)
 
     def _fused(self, now: _Estimate, late: _Estimate, common: _Estimate) -> _Estimate:
         """One estimate from `now` and `late`, which share the information of `common`."""
