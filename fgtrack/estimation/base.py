@@ -12,11 +12,10 @@ from fgtrack.core.checks import LARGEST, LARGEST_NS, is_number, is_stamp
 from fgtrack.core.errors import CallError
 from fgtrack.core.linalg import equal_ones, mahalanobis_squared
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
-from fgtrack.models.measurement import COMPONENTS, MeasurementModel, SensorPose, measurement_model
+from fgtrack.models.measurement import AT_ORIGIN, COMPONENTS, MeasurementModel, SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.models.sensors import RobustLoss
 
-_AT_ORIGIN = SensorPose()
 _STAMP = f"an integer of at most {LARGEST_NS:.0g}"
 
 Content = tuple[tuple[str, ...], tuple[float, ...], tuple[str, ...]]
@@ -33,7 +32,7 @@ class Measurement:
     """Measured components, shape (k,); (m, k) of a stack."""
     R: FloatArray
     """Covariance, shape (k, k); (m, k, k) of a stack."""
-    pose: SensorPose = _AT_ORIGIN
+    pose: SensorPose = AT_ORIGIN
     loss: RobustLoss | None = None
     """Robust loss; None is the Gaussian."""
     assumed: tuple[str, ...] = ()
@@ -46,7 +45,7 @@ class Measurement:
         *,
         std: Mapping[str, float] | float | None = None,
         covariance: FloatArray | None = None,
-        pose: SensorPose = _AT_ORIGIN,
+        pose: SensorPose = AT_ORIGIN,
         loss: RobustLoss | None = None,
         assumed: tuple[str, ...] = (),
         **values: float,

@@ -193,10 +193,9 @@ def _made(registry: Registry, kind: type, name: str, factory: Factory, *argument
 
 
 def _check_options(name: str, factory: Factory, num_arguments: int, options: Mapping[str, Any]) -> None:
-    try:
-        signature = inspect.signature(factory)
-    except (TypeError, ValueError) as error:  # not callable; of C, without a signature
-        raise CallError(f"{name}: {factory!r} is no class or function of Python: {error}") from error
+    if not callable(factory):
+        raise CallError(f"{name}: {factory!r} is no class or function of Python")
+    signature = inspect.signature(factory)
     try:
         signature.bind(*[None] * num_arguments, **options)
     except TypeError as error:

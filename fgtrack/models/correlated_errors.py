@@ -13,11 +13,10 @@ import numpy as np
 
 from fgtrack.core.linalg import symmetrise
 from fgtrack.core.types import FloatArray
-from fgtrack.models.measurement import MeasurementModel, SensorPose, position_gradient
+from fgtrack.models.measurement import AT_ORIGIN, MeasurementModel, SensorPose, position_gradient
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.sensors import SensorModel
 
-_AT_ORIGIN = SensorPose()
 _MOST = 30.0  # exponent of an error that is moved back in time, in which it would grow beyond all numbers
 
 
@@ -83,11 +82,11 @@ class ColouredNoiseMeasurement(MeasurementModel):
     gain: FloatArray
     """Shape (k, number of errors)."""
 
-    def predict(self, x: FloatArray, pose: SensorPose = _AT_ORIGIN) -> FloatArray:
+    def predict(self, x: FloatArray, pose: SensorPose = AT_ORIGIN) -> FloatArray:
         """See `MeasurementModel.predict`."""
         return np.asarray(super().predict(x, pose) + x.take(self.columns, axis=-1) @ self.gain.T)
 
-    def jacobian(self, x: FloatArray, pose: SensorPose = _AT_ORIGIN) -> FloatArray:
+    def jacobian(self, x: FloatArray, pose: SensorPose = AT_ORIGIN) -> FloatArray:
         """See `MeasurementModel.jacobian`."""
         H = super().jacobian(x, pose)  # that of a linear model is `selection`
         if not self.linear:

@@ -41,7 +41,7 @@ class SensorPose(NamedTuple):
     vy_mps: float = 0.0
 
 
-_AT_ORIGIN = SensorPose()
+AT_ORIGIN = SensorPose()
 
 
 @dataclass(frozen=True)
@@ -84,13 +84,13 @@ class MeasurementModel:
         """True if the measurement selects entries of the state, whatever the sensor pose."""
         return set(self.components) <= set(self.state_names)
 
-    def predict(self, x: FloatArray, pose: SensorPose = _AT_ORIGIN) -> FloatArray:
+    def predict(self, x: FloatArray, pose: SensorPose = AT_ORIGIN) -> FloatArray:
         """Measurement expected of the states `x`, shape (..., n) -> (..., k). Angles are not wrapped."""
         if self.linear:
             return x.take(self.selected, axis=-1)
         return _observed(self.components, x, pose, self._cartesian)[0]
 
-    def jacobian(self, x: FloatArray, pose: SensorPose = _AT_ORIGIN) -> FloatArray:
+    def jacobian(self, x: FloatArray, pose: SensorPose = AT_ORIGIN) -> FloatArray:
         """Derivative H of `predict` by `x`, (..., k, n), read-only of a linear model; finite, see `MIN_RANGE_M`."""
         n = x.shape[-1]
         shape = (*x.shape[:-1], len(self.components), n)

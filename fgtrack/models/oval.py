@@ -12,9 +12,7 @@ from fgtrack.models.track_map import COLUMNS, TrackMap
 #: The name that stands for this map wherever a map file may be named.
 OVAL = "oval"
 
-_LENGTH_M = 2400.0
 _TURN_RADIUS_M = 220.0
-_BEND_RADIUS_M = 600.0
 _BEND_M = 30.0  # from the start line to where the bend of the front straight begins to end
 _BLEND_M = 130.0  # over which the curvature goes from one value to the next
 _START_HEADING_RAD = 0.5  # so that no straight lies on the jump of the heading
@@ -60,10 +58,10 @@ def _smooth_step_integral(x: FloatArray) -> FloatArray:
 
 def _centre_line() -> FloatArray:
     """Points of the lap, evenly spaced from the start line, shape (n + 1, 2); the last repeats the first."""
-    bend, turn = 1.0 / _BEND_RADIUS_M, 1.0 / _TURN_RADIUS_M
+    bend, turn = 1.0 / 600.0, 1.0 / _TURN_RADIUS_M
     bend_angle = bend * (_BEND_M + _BLEND_M / 2.0)
     turn_m = (math.pi - bend_angle) / turn  # from the middle of one ramp to the middle of the other
-    half_m = _LENGTH_M / 2.0
+    half_m = 1200.0
     straight_start = _BEND_M + _BLEND_M
 
     def heading(s: FloatArray, straight_m: float) -> FloatArray:

@@ -12,8 +12,6 @@ from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.models.track_map import COLUMNS, RoadView, TrackMap
 
-_CLOSING = 0.999  # the closing point lies this share of the way from the last row to the first
-
 
 class PublishedMap:
     """Arc look-up at the nearest row, with bounds as points (defect Q4) and a heading that is interpolated as a plain
@@ -28,9 +26,9 @@ class PublishedMap:
         column["psi_ref_rad"] = wrap_angles(column["psi_ref_rad"] - 0.5 * math.pi)
 
         def closed(name: str) -> FloatArray:
-            """A column whose last row is the closing point."""
+            """A column whose last row is the closing point, 0.999 of the way from the last row to the first."""
             values = column[name][:-1]
-            return np.append(values, _CLOSING * (values[0] - values[-1]) + values[-1])
+            return np.append(values, 0.999 * (values[0] - values[-1]) + values[-1])
 
         self._line = np.stack([closed("x_ref_m"), closed("y_ref_m")], axis=-1)
         self._arc = column["s_racetraj_m"]

@@ -41,7 +41,6 @@ _ARCS = [_COLUMN["s_racetraj_m"], _COLUMN["s_ref_m"]]
 _FILE_HEADING_OFFSET_RAD = math.pi / 2  # a file's heading is 0 along +y, REP-103 is 0 along +x
 _SAME_POINT_M = 1e-3
 _LARGEST_MB = 20.0  # some 100,000 rows
-_MAX_GAP = 10.0  # closing segment, in lengths of the longest other segment
 _MAX_HEADING_ERROR_RAD = 1.0  # coarse maps turn much in a row; a wrong convention is off by pi / 2
 
 # A segment row holds these quantities where the segment starts, and then the changes to its end. A point is complex,
@@ -109,13 +108,6 @@ class TrackMap:
         except (ValueError, DataError) as error:
             text = str(error).removeprefix("not a map: ")
             raise DataError(f"{path}: not a map of {len(COLUMNS)} columns separated by ';': {text}") from error
-
-    def write(self, path: str | Path) -> None:
-        """Write the layout that `read` reads, with nine decimals."""
-        table = self.table.copy()
-        table[:, _HEADINGS] = wrap_angles(table[:, _HEADINGS] - _FILE_HEADING_OFFSET_RAD)
-        table = np.round(table, 9) + 0.0  # no negative zeros
-        np.savetxt(path, table, fmt="%.9f", delimiter="; ", header="; ".join(COLUMNS), encoding="utf-8")
 
     def frenet(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Arc length s in [0, length) and lateral offset (left positive) of `points_m`, shape (n, 2)."""
@@ -190,7 +182,7 @@ def _closed(table: FloatArray) -> FloatArray:
         np.hypot(*steps.T),
         closed[:-1, [_COLUMN["width_left_m"], _COLUMN["width_right_m"]]].sum(axis=1),
     )
-    far_m = np.append(np.full(len(steps) - 1, math.inf), _MAX_GAP * lengths_m[:-1].max())
+    far_m = np.append(np.full(len(steps) - 1, math.inf), 10.0 * lengths_m[:-1].max())
     off_rad = np.abs(wrap_angles(np.arctan2(steps[:, 1], steps[:, 0]) - closed[:-1, _COLUMN["psi_ref_rad"]]))
     for wrong, text in (
         (lengths_m < _SAME_POINT_M, "the next row holds the same point"),

@@ -2,6 +2,7 @@
 
 import ast
 import pydoc
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -22,9 +23,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("drive")
     bag = fgtrack.simulate("single_opponent", seed=1, duration_s=3.0, out=folder / "bag")
     next(bag.glob("*.mcap")).rename(folder / "drive.mcap")
-    from fgtrack.models.oval import make_oval
-
-    make_oval().write(folder / "track.csv")
+    shutil.copy(Path(__file__).parents[2] / "configs/maps/oval_track.csv", folder / "track.csv")
     fgtrack.replay(folder / "drive.mcap", "smoother", map=folder / "track.csv", out=folder / "runs/x")
     return folder
 

@@ -23,7 +23,6 @@ from support.ticks import listed_ticks
 
 from fgtrack.core.types import EgoState
 from fgtrack.io.stream import read_stream
-from fgtrack.models.oval import make_oval, make_pit_lane
 from fgtrack.pipeline.build import build_propagator, build_tracker
 from fgtrack.pipeline.clock import Delivered
 from fgtrack.pipeline.config import Config
@@ -47,13 +46,10 @@ class Snapshot:
 
 
 @pytest.fixture(scope="module")
-def maps(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Maps]:
+def maps() -> dict[str, Maps]:
     """Track and pit lane of every map there is."""
-    folder = tmp_path_factory.mktemp("maps")
-    oval = (folder / "oval_track.csv", folder / "oval_pitlane.csv")
-    make_oval().write(oval[0])
-    make_pit_lane().write(oval[1])
-    found = {"oval": oval}
+    folder = Path(__file__).parents[2] / "configs/maps"
+    found = {"oval": (folder / "oval_track.csv", folder / "oval_pitlane.csv")}
     for name in SHARED_MAPS:
         track, pit = (SHARED / f"data/maps/{name}_{lane}.csv" for lane in ("track", "pitlane"))
         if track.exists() and pit.exists():

@@ -16,7 +16,7 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Disposition
 from fgtrack.evaluation.runs import evaluated
 from fgtrack.io.run import Run
-from fgtrack.models.track_map import COLUMNS, TrackMap
+from fgtrack.models.track_map import COLUMNS
 from fgtrack.plotting import plot
 from fgtrack.plotting.style import FORMATS, WRONG, broken_line
 
@@ -200,9 +200,9 @@ def circle_map(path: Path) -> Path:
     table = np.zeros((101, len(COLUMNS)))
     table[:, 0], table[:, 1] = 300 * np.cos(angle), 300 * np.sin(angle)
     table[:, 2:4] = 7.5
-    table[:, COLUMNS.index("psi_ref_rad")] = angle + np.pi / 2
+    table[:, COLUMNS.index("psi_ref_rad")] = angle  # a file counts it from +y
     table[-1, :2] = table[0, :2]
-    TrackMap(table).write(path)
+    np.savetxt(path, table, delimiter=";")
     return path
 
 

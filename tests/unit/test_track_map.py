@@ -151,11 +151,6 @@ def lines_of(table: FloatArray) -> list[str]:
     return ["# a comment", "", *(";".join(f"{value:.9g}" for value in row) for row in table)]
 
 
-def test_what_is_written_is_read_again(tmp_path: Path) -> None:
-    OVAL.write(tmp_path / "map.csv")
-    np.testing.assert_allclose(TrackMap.read(tmp_path / "map.csv").table, OVAL.table, atol=1e-9)
-
-
 def test_a_heading_in_the_file_counts_from_the_y_axis(tmp_path: Path) -> None:
     (tmp_path / "map.csv").write_text("\n".join(lines_of(circle_table())))
     track = TrackMap.read(tmp_path / "map.csv")
