@@ -126,39 +126,30 @@ def window_findings(arrivals: Sequence[Arrivals], config: Config) -> Iterator[Fi
         elif limit_s is not None:
             most_s = min(most_s, limit_s)
         needed_s = max(needed_s, most_s)
-    yield from _window(arrivals, config, needed_s)
-    yield from _life(arrivals, config)
+    yield from _too_short(arrivals, config, needed_s)
 
 
-def _window(arrivals: Sequence[Arrivals], config: Config, needed_s: float) -> Iterator[Finding]:
-    reach = config.effective
-    shorter = f"{reach.lag_key} {reach.lag_s:g} s is shorter than"
+def _too_short(arrivals: Sequence[Arrivals], config: Config, needed_s: float) -> Iterator[Finding]:
+    """Yield a window shorter than the delays, or than the time between two lists, and a track that lives less long."""
     slowest = max(arrivals, key=lambda one: one.period_s, default=None)
     if slowest is None:
         return
-    if needed_s > reach.reach_s:
-        worst = max(arrivals, key=lambda one: one.beyond(reach.reach_s))
-        lost = worst.beyond(reach.reach_s)
-        text = f"{shorter} the delays: {percent(lost)} of the detections of {worst.name} fall beyond it."
+    reach, between = config.effective, "the time between two lists of {0.name}, {0.period_s:.3g} s".format
+    worst = max(arrivals, key=lambda one: one.beyond(reach.reach_s))
+    lost = worst.beyond(reach.reach_s)
+    if needed_s > reach.reach_s or reach.lag_s < slowest.period_s:
+        text = f"{between(slowest)}: too short."
+        if needed_s > reach.reach_s:
+            text = f"the delays: {percent(lost)} of the detections of {worst.name} fall beyond it."
         value = min(nice_above(_SPARE * max(needed_s, _LISTS * slowest.period_s)), LONGEST_STORAGE_S)
-        yield Finding("window", "window", 50.0 + 40.0 * lost, text, {reach.lag_key: value})
-    elif reach.lag_s < slowest.period_s:
-        text = f"{shorter} the time between two lists of {slowest.name}, {slowest.period_s:.3g} s: too short."
-        yield Finding("window", "window", 55.0, text, {reach.lag_key: nice_above(_LISTS * slowest.period_s)})
-
-
-def _life(arrivals: Sequence[Arrivals], config: Config) -> Iterator[Finding]:
-    """Yield a time after which a track ends that is shorter than the time between two lists."""
+        text = f"{reach.lag_key} {reach.lag_s:g} s is shorter than {text}"
+        yield Finding("window", "window", 55.0 + 35.0 * lost, text, {reach.lag_key: value})
     key, limit_s = "lifecycle.forget_s", getattr(config.lifecycle, "forget_s", 0.0)
     placing = [one for one in arrivals if config.sensors[one.name].gives_position]
     if isinstance(config.lifecycle, ExistenceRules):
         key, limit_s = "lifecycle.out_of_view_s", config.lifecycle.out_of_view_s
-        if len(placing) == 1:
-            return  # only a list that could not show a track ends it
+        placing = placing if len(placing) > 1 else []  # only a list that could not show a track ends it
     slowest = max(placing, key=lambda one: one.period_s, default=None)
     if slowest is not None and slowest.period_s > limit_s:
-        text = (
-            f"{key} {limit_s:g} s is shorter than the time between two lists of {slowest.name}, {slowest.period_s:.3g} "
-            "s: a track that it alone sees ends in between."
-        )
+        text = f"{key} {limit_s:g} s is shorter than {between(slowest)}: a track that it alone sees ends in between."
         yield Finding("track", slowest.name, 55.0, text, {key: nice_above(_LISTS * slowest.period_s)})

@@ -55,21 +55,11 @@ def tune(
 ) -> TuneReport:
     """Fit process and measurement noise to recordings; `report.config` is the tuned configuration.
 
-    Parameters
-    ----------
-    recordings
-        Path of anything that fgtrack reads, or several of them.
-    config, map, pit_map, set
-        As for `fgtrack.replay`.
-    keep
-        Keys that stay as configured: `["motion.std_per_s.speed"]`.
+    `recordings` is the path of anything that fgtrack reads, or several; `config`, `map`, `pit_map` and `set` are as for
+    `fgtrack.replay`. Keys in `keep` stay as configured: `["motion.std_per_s.speed"]`.
 
-    Raises
-    ------
-    CallError
-        The configuration does not fit.
-    DataError
-        A recording cannot be read, a sensor of it has no model, or nothing can be fitted to it.
+    Raises `CallError` where the configuration does not fit, and `DataError` where a recording cannot be read, a sensor
+    of it has no model, or nothing can be fitted to it.
     """
     resolved = read_config(config, set, track_map=map, pit_map=pit_map)
     paths: Sequence[str | Path] = [recordings]  # type: ignore[list-item]  # open_input names what is not a path
@@ -132,7 +122,8 @@ class _Tuning:
                 series = [[without_mixed(one, self._space, values) for one in tracks] for tracks in series]
             rounds += 1
             parts = zip(series, splits_ns, strict=True)
-            problem = self._problem([replace(one, until_ns=end_ns) for tracks, end_ns in parts for one in tracks])
+            first = [replace(one, until_ns=end_ns) for tracks, end_ns in parts for one in tracks]
+            problem = Problem(first, self._space, self._configured)
             if rounds == 1:
                 values = self._best_start(problem)
             self._on_step(f"fit {rounds}")
@@ -145,7 +136,7 @@ class _Tuning:
         if self._rules.train_share < 1.0:
             held_out = self._held_out(values, series, splits_ns)
             self._on_step("fit to everything")
-            problem = self._problem(list(chain.from_iterable(series)))
+            problem = replace(problem, series=list(chain.from_iterable(series)))
             values, likelihood, parameters = self._fitted(problem, values)
         sensors = tuple(self._sensor(name, problem, values) for name in self._space.sensors)
         count = sum(one.count for one in sensors)
@@ -183,15 +174,6 @@ class _Tuning:
         stamps_ns = [one.measurement.stamp_ns for track in tracks for one in track.observations] or [0]
         return min(stamps_ns) + round(self._rules.train_share * (max(stamps_ns) - min(stamps_ns)))
 
-    def _problem(self, series: Sequence[Series]) -> Problem:
-        problem = Problem(series, self._space, self._configured)
-        if not problem.counts().any():
-            raise self._nothing(
-                f"no track has {_MIN_OBSERVATIONS} measurements; look at `fgtrack info` for sensors without a model, "
-                "and at the gate"
-            )
-        return problem
-
     def _maximum(self, problem: Problem, start: FloatArray) -> tuple[FloatArray, Likelihood, BoolArray]:
         """Return parameters at the maximum, the likelihood, and which are free; others are as configured."""
         while True:
@@ -208,8 +190,8 @@ class _Tuning:
         free = np.asarray((problem.counts() >= _MIN_COUNT) & ~self._kept & ~self._endless)
         if not free[self._named].any():
             raise self._nothing(
-                f"no parameter that may be fitted has {_MIN_COUNT} measurements on tracks that have settled; take a "
-                "longer recording, of objects that move, or look at the gate"
+                f"no parameter that may be fitted has {_MIN_COUNT} measurements on tracks of objects that move; take a "
+                "longer recording, or look at the gate, and for sensors without a model at `fgtrack info`"
             )
         return free
 
@@ -240,8 +222,7 @@ class _Tuning:
     def _fitted(self, problem: Problem, start: FloatArray) -> tuple[FloatArray, Likelihood, tuple[TunedParameter, ...]]:
         """Return the maximum; instead of what is not known there, what is configured, or what is nearest to it.
 
-        The rest is not fitted again: it would make up for what was put there, and with the yaw's noise too large the
-        yaw rate's comes out too small. Nor would its standard errors hold, which are those of all parameters together.
+        The rest is not fitted again: it would make up for what was put there.
         """
         count = len(start)
         known: list[Known] = ["no"] * count

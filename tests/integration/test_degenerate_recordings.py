@@ -61,7 +61,7 @@ def boundless_truth() -> list[Message]:
 
 
 NOISELESS = "was it simulated without noise?"
-FEW = "no track has 20 measurements"
+FEW = "no parameter that may be fitted has 30 measurements"
 #: What `tune` says of each; None where it fits something.
 KINDS = {
     "constant yaw": (lambda: drive(yaw_rad=0.0), None),
@@ -69,7 +69,7 @@ KINDS = {
     "truth of positions only": (lambda: drive(speed_is_truth=False), None),
     "truth beyond all bounds": (boundless_truth, None),
     "noiseless": (lambda: drive(std_m=0.0), NOISELESS),
-    "all alike, of unknown yaw": (lambda: drive(alike=True), "of objects that move"),
+    "all alike, of unknown yaw": (lambda: drive(alike=True), FEW),
     "one detection": (one_detection, FEW),
     "one stamp": (lambda: drive(stamps=1), FEW),
 }
