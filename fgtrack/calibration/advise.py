@@ -140,9 +140,6 @@ class Adviser:
         if tune and new is not None:
             self._take(self._tuned(new))
         old, new = self._outcome(before), self._outcome(self._config)
-        if new is not None and new.shortfall is not None:
-            text = f"{new.shortfall}: look at the sectors and ranges of sensors (`fgtrack info`) and at the gate."
-            self._findings.append(Finding("track", "tracks", 32.0, text))
         return Advice(
             recording=self._recording,
             findings=tuple(sorted(self._findings, key=lambda one: -one.weight)),

@@ -239,7 +239,7 @@ def _paired(tracks: Mapping[int, Sightings], paths: Sequence[ObjectPath]) -> lis
             if np.isfinite(gaps_m).sum() > len(gaps_m) / 2 and float(np.nanmedian(gaps_m)) < best_m:
                 best, best_m = path, float(np.nanmedian(gaps_m))
         if best is not None:
-            pairs.append((one, best))
+            pairs.append((one.chosen(np.isfinite(best(one.stamps_ns)[:, 0])), best))
     return pairs
 
 
@@ -248,7 +248,6 @@ def _row(name: str, pairs: Sequence[_Pair], reference: str, num_sensors: int) ->
         return SensorOffset(name, None, None, 0, "the only modality: nothing to compare it with")
     if name == reference:
         return SensorOffset(name, 0.0, 0.0, 0, "the reference: its clock is taken for that of the ego")
-    pairs = [(one.chosen(np.isfinite(path(one.stamps_ns)[:, 0])), path) for one, path in pairs]
     count = sum(len(one.stamps_ns) for one, _ in pairs)
     if count < _FEWEST:
         why = f"fewer than {_FEWEST} detections of objects whose path is known from {reference}"

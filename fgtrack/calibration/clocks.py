@@ -17,6 +17,7 @@ _AHEAD_S, _AHEAD_SHARE = 1e-3, 0.005  # rounding of stamps
 _PARTS, _SHORTEST_PART_S = 10, 1.0  # of a recording, whose median delays are compared
 _CHANGE_S, _JUMP_STDS = 0.015, 7.0  # of the mean delay before and after the best of seven splits
 _DRIFT_STDS, _DRIFT_CORRELATION = 4.0, 0.9  # a steady drift is 5 apart, but correlates with time as chance does not
+_WHERE = "{:.2f} m ahead and {:.2f} m left".format  # negative behind, and to the right
 _SAME_BIAS_M = 0.5  # of sensors of one frame: what two calibrations, or two parts of a car, may differ by
 
 
@@ -58,18 +59,16 @@ def _change(one: Arrivals) -> Iterator[Finding]:
     k = int(np.argmin(within))
     before_s, after_s = (float(half.mean()) for half in halves[k])
     std_s = math.sqrt(within[k] / (_PARTS - 2) * (1.0 / splits[k] + 1.0 / (_PARTS - splits[k])))
-    change_s = abs(after_s - before_s)
+    change_s, at_s = abs(after_s - before_s), times_s[splits[k] * len(times_s) // _PARTS]
     if change_s < max(_CHANGE_S, _DRIFT_STDS * std_s):
         return
     correlation = np.corrcoef(medians_s, np.arange(_PARTS))[0, 1]
-    if change_s < _JUMP_STDS * std_s and abs(correlation) < _DRIFT_CORRELATION:
-        return
-    at_s = times_s[splits[k] * len(times_s) // _PARTS]
-    text = (
-        f"its delay is {milliseconds(before_s)} until about {at_s:.0f} s and {milliseconds(after_s)} after that: its "
-        "clock was set, or drifts, or a queue fills. No setting corrects that: synchronise the clock, or replay parts."
-    )
-    yield Finding("clock", one.name, 80.0, text)
+    if change_s >= _JUMP_STDS * std_s or abs(correlation) >= _DRIFT_CORRELATION:
+        text = (
+            f"its delay is {milliseconds(before_s)} until about {at_s:.0f} s and {milliseconds(after_s)} after that: "
+            "its clock was set, or drifts, or a queue fills. No setting corrects that: synchronise the clock."
+        )
+        yield Finding("clock", one.name, 80.0, text)
 
 
 def clock_text(one: SensorOffset, report: OffsetReport) -> str:
@@ -122,18 +121,12 @@ def bias_findings(report: OffsetReport, ego: EgoConfig) -> Iterator[Finding]:
     num_placed = sum(one.offset_s is not None for one in report.sensors)
     if len(biases_m) == num_placed > 0 and (np.ptp(biases_m, axis=0) < _SAME_BIAS_M).all():
         off_m = biases_m.mean(axis=0).tolist()
-        text = f"detections of all sensors lie {_where(*off_m)} of the truth, in the frame of the ego: set its origin."
+        text = f"detections of all sensors lie {_WHERE(*off_m)} of the truth, in the frame of the ego: set its origin."
         keys = "ego.detection_origin_x_m", "ego.detection_origin_y_m"
         origins = zip(keys, ego.detection_origin_m, off_m, strict=True)
         yield Finding("bias", EGO, 88.0, text, {key: round(now - off, 2) for key, now, off in origins if off})
         return
     for name, bias in biased.items():
         cure = "mount" if bias.of == "ego" else "near_side_m: it sees another part of a vehicle than the truth means"
-        text = f"its detections lie {_where(bias.ahead_m, bias.left_m)} of the truth, in the frame of the {bias.of}"
+        text = f"its detections lie {_WHERE(*bias[1:])} of the truth, in the frame of the {bias.of}"
         yield Finding("bias", name, 50.0, f"{text}: look at sensors.{name}.{cure}.")
-
-
-def _where(ahead_m: float, left_m: float) -> str:
-    parts = [f"{abs(ahead_m):.2f} m {'ahead' if ahead_m > 0.0 else 'behind'}"] if ahead_m else []
-    parts += [f"{abs(left_m):.2f} m to the {'left' if left_m > 0.0 else 'right'}"] if left_m else []
-    return " and ".join(parts)

@@ -13,7 +13,6 @@ from fgtrack.evaluation.diagnostics import (
     CORRELATED,
     FAR_OFF,
     FEWEST,
-    MOST_BREAKS_PER_MINUTE,
     USED,
     misfits,
 )
@@ -94,7 +93,6 @@ def noise_findings(outcome: "Outcome") -> Iterator[Finding]:
 _CHANCE = 2.0  # standard deviations of the difference of two counts
 _MORE_USED = 0.05  # share of the detections of a sensor
 _LESS = 0.02  # share of states that fewer are tracked by where it counts
-_FEWEST_TRACKED = 0.95
 _POSITION_DOF = 2.0
 
 
@@ -137,19 +135,6 @@ class Outcome:
         """Breaks of tracking per true object and minute; NaN without truth."""
         minutes = 0.0 if self.truth is None else self.truth.ticks_present * self.tick_s / 60.0
         return math.nan if self.truth is None or not minutes else self.truth.breaks / minutes
-
-    @property
-    def shortfall(self) -> str | None:
-        """A clause that says how objects are lost; None where they are not, or where there is no truth to say so."""
-        if self.truth is None or not self.truth.ticks_in_sight:
-            return None
-        tracked = self.truth.tracked_share_in_sight
-        if tracked >= _FEWEST_TRACKED and self.breaks_per_minute <= MOST_BREAKS_PER_MINUTE:
-            return None
-        return (
-            f"true objects are tracked {percent(tracked)} of the time in which a sensor could see them, with "
-            f"{self.breaks_per_minute:.2g} breaks per object and minute ({self.births} beginnings of tracks)"
-        )
 
     def rows(self) -> Iterator[tuple[str, float]]:
         """Yield what a page shows, with units."""

@@ -126,14 +126,13 @@ class _RecordingBank(GuardedBank):
     def __init__(self, make: Callable[[], TrackBank], failures: Failures, preprocess: _WatchedPreprocess) -> None:
         super().__init__(make, failures)
         self._preprocess = preprocess
-        self._starts: dict[int, Start] = {}
-        self._fused: dict[int, list[Observation]] = {}
+        self._tracks: dict[int, tuple[Start, list[Observation]]] = {}
 
     def series(self) -> list[Series]:
         """Return the fused measurements of each track, by rising stamp, in order of birth."""
         return [
-            Series(start, sorted(self._fused[track_id], key=lambda one: one.measurement.stamp_ns))
-            for track_id, start in self._starts.items()
+            Series(start, sorted(fused, key=lambda one: one.measurement.stamp_ns))
+            for start, fused in self._tracks.values()
         ]
 
     def update(
@@ -143,11 +142,10 @@ class _RecordingBank(GuardedBank):
         results = super().update(stamp_ns, track_ids, measurements)
         for track_id, measurement, result in zip(track_ids, measurements, results, strict=True):
             if result.innovation is not None:
-                self._fused[track_id].append(self._preprocess.observation(measurement))
+                self._tracks[track_id][1].append(self._preprocess.observation(measurement))
         return results
 
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`."""
         super().birth(track_id, prior)
-        self._starts[track_id] = prior
-        self._fused[track_id] = []
+        self._tracks[track_id] = prior, []

@@ -309,7 +309,7 @@ def test_an_origin_that_is_wrong_is_found_by_the_truth(call: Call) -> None:
     advice = fgtrack.advise("drive.jsonl", "c.yaml")
     (bias,) = [one for one in advice.findings if one.kind == "bias"]
     assert bias.text.startswith("detections of all sensors lie 1.")
-    assert "m ahead of the truth, in the frame of the ego" in bias.text
+    assert "m left of the truth, in the frame of the ego: set its origin" in bias.text
     assert advice.config.ego.detection_origin_x_m == pytest.approx(-1.5, abs=0.1)
     assert advice.before is not None
     assert advice.after is not None

@@ -33,14 +33,6 @@ def test_harm_is_more_breaks_more_tracks_and_less_that_is_tracked_or_used() -> N
     assert harm(GOOD, replace(GOOD, used={"radar": 1.0}, confirmed=60)) is None, "of other detections"
 
 
-def test_objects_that_are_lost_or_break_up_are_a_shortfall_and_without_truth_nothing_is() -> None:
-    assert GOOD.shortfall is None
-    assert replace(GOOD, truth=None).shortfall is None
-    text = replace(GOOD, truth=replace(TRUTH, breaks=10)).shortfall
-    assert text is not None
-    assert "tracked 98 % of the time in which a sensor could see them, with 5 breaks per object and minute" in text
-
-
 @pytest.mark.parametrize(("at_s", "is_jump"), [(2.0, False), (30.0, True), (58.0, False)])
 def test_a_change_in_the_last_seconds_is_no_jump_of_the_clock(at_s: float, is_jump: bool) -> None:
     stamps_ns = np.arange(0, 60 * SECOND_NS, SECOND_NS // 20)
