@@ -62,12 +62,12 @@ def sweep(
     left = len(work.todo)
     tell(f"jobs: {len(work.plan.jobs)}, each of {len(work.plan.estimators)} estimators; to do: {left}")
     with progress("sweep", left) as moved:
-        result = work.run(score, jobs=jobs or -1, dask=dask, on_job=lambda cells: moved())
-    tell(f"{out / SWEEP_TABLE}: {result.num_good} of {result.num_cells} cells")
+        result = work.run(score, jobs=jobs or -1, dask=dask, on_job=moved)
+    tell(f"{out / SWEEP_TABLE}: {result.num_good} of {len(plan.jobs) * len(plan.estimators)} cells")
     if result.num_good:
         _summarise(read_sweep(out), out, form, everything)
-    if result.num_bad:
-        raise DataError(f"{out / ERROR_TABLE}: {result.num_bad} bad cells, the first: {result.first_error}")
+    if result.errors:
+        raise DataError(f"{out / ERROR_TABLE}: {len(result.errors)} bad cells, the first: {result.errors[0]}")
     if result.unknown_metrics and recording is None:  # the metrics were not chosen for another input
         names = ", ".join(result.unknown_metrics)
         raise DataError(f"{sweep_file}: metrics: no column fits {names}; without `metrics` {SWEEP_TABLE} has all")

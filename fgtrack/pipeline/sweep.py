@@ -1,5 +1,6 @@
 """Sweeps: the jobs of a plan on all cores or a cluster, every finished one kept at once, and tables of the results."""
 
+import fnmatch
 import importlib
 import json
 import logging
@@ -11,7 +12,6 @@ import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from fnmatch import fnmatchcase
 from multiprocessing import resource_tracker
 from pathlib import Path
 
@@ -35,12 +35,10 @@ from fgtrack.sim.redelay import SensorDelays, redelay
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.simulate import simulate
 
-PART_FORMAT = "fgtrack-sweep-part/1"
 SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE = "sweep.csv", "timing.csv", "errors.csv"
 PAIRED_TABLE, SUMMARY_TABLE = "paired.csv", "summary.csv"
 _PARTS = "parts"
 _TABLES = (SWEEP_TABLE, TIMING_TABLE, ERROR_TABLE, PAIRED_TABLE, SUMMARY_TABLE)
-#: All that a sweep writes into its folder.
 PRODUCTS = (*_TABLES, _PARTS)
 _SCHEDULER_TIMEOUT_S = 10
 _WATCH_S = 1.0  # how often a process checks that its sweep still runs
@@ -74,13 +72,12 @@ _CELLS = TypeAdapter(tuple[Cell, ...], config=ConfigDict(strict=True, extra="for
 
 @dataclass(frozen=True)
 class SweepResult:
-    """Counts of the tables of a sweep."""
+    """Summary of the tables of a sweep."""
 
-    num_cells: int
-    """Cells of the plan: finished, bad and left ones."""
     num_good: int
-    num_bad: int
-    first_error: str | None
+    """Cells with metrics."""
+    errors: tuple[str, ...]
+    """Reasons of the bad cells."""
     unknown_metrics: tuple[str, ...]
     """The plan's metrics that match no column."""
 
@@ -101,16 +98,10 @@ class Sweep:
         Raises `CallError` where `folder` has a link, or, without `overwrite`, tables but no parts of a sweep.
         """
         parts = {path.stem: path for path in (folder / _PARTS).glob("*.json")}
-        known = parts.keys() & {job.key for job in plan.jobs}
-        resumes = bool(known) or any(map(_read_part, parts.values()))
         for name in _TABLES:
-            check_output(folder / name, overwrite or resumes)
-        names, done = sorted(plan.estimators), dict[str, Sequence[Cell]]()
-        for key in known:
-            cells = _read_part(parts[key])
-            if sorted(cell.estimator for cell in cells) == names:
-                done[key] = cells
-        return cls(plan, folder, done)
+            check_output(folder / name, overwrite or bool(parts))
+        cells = {key: _read_part(parts[key]) for key in parts.keys() & {job.key for job in plan.jobs}}
+        return cls(plan, folder, {key: found for key, found in cells.items() if found})
 
     @property
     def todo(self) -> list[Job]:
@@ -120,8 +111,8 @@ class Sweep:
         """
         good = {key for key, cells in self.done.items() if all(cell.error is None for cell in cells)}
         left = {job.key: job for job in self.plan.jobs if job.recipe is not None and job.key not in good}
-        seeds = {seed: rank for rank, seed in enumerate(dict.fromkeys(job.seed for job in self.plan.jobs))}
-        return sorted(left.values(), key=lambda job: seeds[job.seed])
+        seeds = [job.seed for job in self.plan.jobs]
+        return sorted(left.values(), key=lambda job: seeds.index(job.seed))
 
     def run(
         self,
@@ -129,7 +120,7 @@ class Sweep:
         *,
         jobs: int = -1,
         dask: str | None = None,
-        on_job: Callable[[Sequence[Cell]], None] = lambda cells: None,
+        on_job: Callable[[], None] = lambda: None,
     ) -> SweepResult:
         """Do the jobs that are left, keep each at once, and write the tables; also when interrupted.
 
@@ -142,7 +133,7 @@ class Sweep:
         dask
             Address of a dask scheduler, whose workers do the jobs instead.
         on_job
-            Called with the cells of each finished job.
+            Called after each job.
 
         Raises
         ------
@@ -156,29 +147,25 @@ class Sweep:
             (self.folder / _PARTS).mkdir(exist_ok=True)
             try:
                 for key, cells in _local(tasks, score, jobs) if dask is None else _on_cluster(tasks, score, dask):
-                    content = {"format": PART_FORMAT, "cells": [asdict(cell) for cell in cells]}
-                    write_file(self.folder / _PARTS / f"{key}.json", json.dumps(content))
+                    write_file(self.folder / _PARTS / f"{key}.json", json.dumps([asdict(cell) for cell in cells]))
                     self.done[key] = cells
-                    on_job(cells)
+                    on_job()
             finally:
                 result = write_tables(self.folder, self.plan, self.done)
         return result
 
 
 def _read_part(path: Path) -> tuple[Cell, ...]:
-    """Return the cells of a job; none of a file that no sweep wrote, with a warning."""
+    """Return the cells of a job; none of a damaged file, with a warning."""
     try:
-        content = json.loads(path.read_bytes())
-        if content["format"] == PART_FORMAT:
-            return _CELLS.validate_json(json.dumps(content["cells"]))
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        pass
-    _logger.warning("%s: no sweep wrote it, its job is done again", path)
-    return ()
+        return _CELLS.validate_json(path.read_bytes())
+    except (OSError, ValueError):
+        _logger.warning("%s: is damaged, its job is repeated", path)
+        return ()
 
 
 def write_tables(folder: Path, plan: Plan, done: Mapping[str, Sequence[Cell]]) -> SweepResult:
-    """Write sweep.csv, timing.csv and errors.csv from the cells of the finished jobs, by key, in grid order."""
+    """Write sweep.csv, timing.csv and errors.csv from the cells of the finished jobs, by key."""
     rows: list[tuple[tuple[Value, ...], Cell]] = []
     for job in plan.jobs:
         cells = done.get(job.key, ()) if job.recipe else [Cell(name, {}, {}, job.problem) for name in plan.estimators]
@@ -186,7 +173,7 @@ def write_tables(folder: Path, plan: Plan, done: Mapping[str, Sequence[Cell]]) -
     good = [(keys, cell) for keys, cell in rows if cell.error is None]
     bad = [(keys, {"error": cell.error}) for keys, cell in rows if cell.error is not None]
     columns = list(dict.fromkeys(name for _, cell in good for name in cell.values))
-    matching = {pattern: [c for c in columns if fnmatchcase(c, pattern)] for pattern in plan.metrics or ("*",)}
+    matching = {pattern: fnmatch.filter(columns, pattern) for pattern in plan.metrics or ("*",)}
     chosen = list(dict.fromkeys(column for found in matching.values() for column in found))
     times = list(dict.fromkeys(name for _, cell in good for name in cell.times))
     for name, wanted, values in (
@@ -198,8 +185,7 @@ def write_tables(folder: Path, plan: Plan, done: Mapping[str, Sequence[Cell]]) -
         table = pd.DataFrame(texts, columns=[*plan.columns, *KEY_COLUMNS, *wanted], dtype=str)
         write_file(folder / name, table.to_csv(index=False, lineterminator="\n"))
     unknown = tuple(pattern for pattern, found in matching.items() if good and not found)
-    first_error = bad[0][1]["error"] if bad else None
-    return SweepResult(len(plan.jobs) * len(plan.estimators), len(good), len(bad), first_error, unknown)
+    return SweepResult(len(good), tuple(str(cell.error) for _, cell in rows if cell.error is not None), unknown)
 
 
 def _text(value: Value) -> str:
@@ -211,42 +197,29 @@ def _text(value: Value) -> str:
 
 def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:
     """Return the cells of a job, with its key. Whatever goes wrong becomes the error of a cell."""
-    started = time.perf_counter()
     try:
-        config = validate(Config, recipe.config, "configuration")
-        messages = read_messages(recipe, config)
-        if recipe.recording is not None:
-            source = open_input(recipe.recording, config.input)
+        config, rng = validate(Config, recipe["config"], "config"), np.random.default_rng(recipe["seed"])
+        if recipe["recording"] is None:
+            messages = simulate(validate(Scenario, recipe["scenario"], "scenario"), rng)
+        else:
+            source = open_input(recipe["recording"], config.input)
+            delays = validate(dict[str, SensorDelays], recipe["delays"], "delays")
+            messages = list(redelay(source.messages(), delays, rng)[0] if delays else source.messages())
             config = assumed(config, replace(source, messages=lambda: iter(messages))).config
     except (Exception, SystemExit) as error:  # whatever is wrong with one job out of hundreds
-        return key, [Cell(name, {}, {}, _reason(error)) for name in recipe.estimators]
-    source_s = time.perf_counter() - started
-    return key, [_cell(messages, replace(config, estimator=name), score, source_s) for name in recipe.estimators]
+        return key, [Cell(name, {}, {}, _reason(error)) for name in recipe["estimators"]]
+    return key, [_cell(messages, replace(config, estimator=name), score) for name in recipe["estimators"]]
 
 
-def read_messages(recipe: Recipe, config: Config) -> list[Message]:
-    """Return the stream of a job, simulated or recorded, perhaps under other delays. All estimators get the same."""
-    rng = np.random.default_rng(recipe.seed)
-    if recipe.recording is None:
-        return simulate(validate(Scenario, recipe.scenario or {}, "scenario"), rng)
-    source = open_input(recipe.recording, config.input)
-    if not recipe.delays:
-        return list(source.messages())
-    return list(redelay(source.messages(), validate(dict[str, SensorDelays], recipe.delays, "delays"), rng)[0])
-
-
-def _cell(messages: Sequence[Message], config: Config, score: Score, source_s: float) -> Cell:
-    started = time.perf_counter()
+def _cell(messages: Sequence[Message], config: Config, score: Score) -> Cell:
     try:
         run = replay_in_memory(messages, config)
         if run.meta["broken_off"] is not None:
             raise DataError(str(run.meta["broken_off"]))
-        replayed = time.perf_counter()
-        values, score_times = score(run)
+        values, times = score(run)
     except (Exception, SystemExit) as error:  # as in `run_job`
         return Cell(config.estimator, {}, {}, _reason(error))
-    times = {"source_s": source_s, "replay_s": replayed - started, "score_s": time.perf_counter() - replayed}
-    return Cell(config.estimator, values, {**times, **score_times})
+    return Cell(config.estimator, values, {"replay_s": run.meta["wall_s"], **times})
 
 
 def _reason(error: BaseException) -> str:

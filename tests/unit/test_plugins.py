@@ -20,6 +20,8 @@ from fgtrack.estimation.registry import (
 )
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
+from fgtrack.pipeline.load import plain
+from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.pipeline.sweep import run_job
 
 GROUP = "fgtrack.tests"
@@ -164,7 +166,7 @@ def test_what_a_job_raises_is_the_error_of_a_cell(monkeypatch: pytest.MonkeyPatc
     def leaves(*_: object) -> None:
         raise SystemExit(0)
 
-    monkeypatch.setattr("fgtrack.pipeline.sweep.read_messages", lambda *_: [])
-    recipe = SimpleNamespace(config={}, recording=None, estimators=("ekf-replay",))
+    scenario = {**plain(read_scenario("single_opponent")), "duration_s": 0.1}
+    recipe = {"config": {}, "recording": None, "scenario": scenario, "seed": 0, "estimators": ("ekf-replay",)}
     monkeypatch.setattr("fgtrack.pipeline.sweep.replay_in_memory", leaves)
     assert [cell.error for cell in run_job("key", recipe, leaves)[1]] == ["SystemExit: 0"]
