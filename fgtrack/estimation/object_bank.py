@@ -55,7 +55,7 @@ class ObjectBank(Generic[_E]):
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`."""
-        states = self._ask(lambda _, one: one.state_at(stamp_ns) if one.window_ns[0] <= stamp_ns else None)
+        states = self._ask(lambda _, one: self._state(one, stamp_ns) if one.window_ns[0] <= stamp_ns else None)
         known = {track_id: state for track_id, state in states.items() if state is not None}
         if not known:
             return no_states(self._motion.dim)
@@ -67,7 +67,7 @@ class ObjectBank(Generic[_E]):
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
         seen = dict(zip(track_ids, measurements, strict=True))
-        found = self._ask(lambda track_id, estimator: estimator.update(seen[track_id]), track_ids)
+        found = self._ask(lambda track_id, estimator: _checked(estimator.update(seen[track_id])), track_ids)
         return [found[track_id] for track_id in track_ids]
 
     def birth(self, track_id: int, prior: Start) -> None:
@@ -82,7 +82,7 @@ class ObjectBank(Generic[_E]):
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
         if not self._estimators:
             return []
-        states = self._ask(lambda _, one: one.state_at(max(self.present_ns, one.window_ns[0]))).values()
+        states = self._ask(lambda _, one: self._state(one, max(self.present_ns, one.window_ns[0]))).values()
         means, covariances = zip(*((state.mean, state.covariance) for state in states), strict=True)
         return kinematic_states(self._motion, self.present_ns, np.array(means), np.array(covariances))
 
@@ -103,6 +103,18 @@ class ObjectBank(Generic[_E]):
         if causes:
             raise EstimatorError(causes, answers)
         return answers
+
+    def _state(self, estimator: _E, stamp_ns: int) -> TrackState:
+        state, n = estimator.state_at(stamp_ns), self._motion.dim
+        if state.mean.shape != (n,) or state.covariance.shape != (n, n):
+            raise ValueError(f"a state has the shapes {state.mean.shape} and {state.covariance.shape}")
+        return state
+
+
+def _checked(result: UpdateResult) -> UpdateResult:
+    if not isinstance(result, UpdateResult):
+        raise TypeError(f"update must return an UpdateResult, returned a {type(result).__name__}")
+    return result
 
 
 class OneObject:
