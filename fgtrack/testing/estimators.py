@@ -39,11 +39,14 @@ _CONVERGED, _ORDER = 1e-5, 1e-9
 _NEAR_SIGMA, _NEAR_COVARIANCE = 1.0, 0.15
 
 
-def _close(found: TrackState, expected: TrackState, tolerance: float, stream: Stream, what: str) -> None:
+def _close(
+    found: TrackState, expected: TrackState, tolerance: float, stream: Stream, what: str, of_covariance: float = 0.0
+) -> None:
+    """Require that two states are as near in mean and covariance; `of_covariance` may be another tolerance."""
     mean_sigma, covariance = difference(found, expected, stream.motion)
     at_s = (found.stamp_ns - stream.start.stamp_ns) / 1e9
     require(
-        mean_sigma < tolerance and covariance < tolerance,
+        mean_sigma < tolerance and covariance < (of_covariance or tolerance),
         f"the state at {at_s:.9f} s differs from {what} by {mean_sigma:.1e} standard deviations in the mean and "
         f"{covariance:.1e} in the covariance (tolerance {tolerance:.1e})",
     )
@@ -208,33 +211,36 @@ def _changes_no_input_and_no_output_later(subject: Subject, stream: Stream) -> N
     require(all((now == then).all() for now, then in given), "a state or innovation that was given changes later")
 
 
+def _unchanged(
+    estimator: Estimator, newest_ns: int, measurement: Measurement, allowed: tuple[UpdateStatus, ...], what: str
+) -> None:
+    """Require that an update has one of the `allowed` statuses and changes neither states nor the window."""
+    probes = [newest_ns, newest_ns + 200 * MS]
+    before, window_ns = _bits(estimator, probes), estimator.window_ns
+    result = estimator.update(measurement)
+    require(result.status in allowed, f"{what} is {result.status}")
+    require(result.nis is None and result.innovation is None, f"{what} has an innovation")
+    require(_bits(estimator, probes) == before, f"{what} changes the state")
+    require(estimator.window_ns == window_ns, f"{what} moves the window")
+
+
 def _reports_what_is_too_old_and_stays_as_it_was(subject: Subject, stream: Stream) -> None:
     estimator, _ = subject.fed(stream)
     estimator.advance(stream.newest_ns + round(0.5e9 * LAG_S))
     rng = np.random.default_rng(0)
     for offset_ns in (-1, estimator.window_ns[0] - 1 - stream.start.stamp_ns):
-        probes = [stream.newest_ns, stream.newest_ns + 100 * MS]
-        before, window_ns = _bits(estimator, probes), estimator.window_ns
-        result = estimator.update(measured(rng, stream.motion, offset_ns))
-        require(result.status is UpdateStatus.TOO_OLD, f"a stamp before {window_ns[0]} is {result.status}")
-        require(result.nis is None and result.innovation is None, "what is too old has an innovation")
-        require(_bits(estimator, probes) == before, "what is too old changes the state")
-        require(estimator.window_ns == window_ns, "what is too old moves the window")
+        old, what = measured(rng, stream.motion, offset_ns), f"a stamp before {estimator.window_ns[0]}"
+        _unchanged(estimator, stream.newest_ns, old, (UpdateStatus.TOO_OLD,), what)
 
 
 def _stays_as_it_was_after_a_failure_and_fuses_the_next(subject: Subject, stream: Stream) -> None:
     estimator, _ = subject.fed(stream)
     rng, newest_ns = np.random.default_rng(1), stream.newest_ns
     for offset_ns in (-20 * MS, 0, 30 * MS):
-        probes = [newest_ns, newest_ns + 200 * MS]
-        before, window_ns = _bits(estimator, probes), estimator.window_ns
         good = measured(rng, stream.motion, newest_ns - stream.start.stamp_ns + offset_ns)
+        allowed = (UpdateStatus.FAILED, UpdateStatus.TOO_OLD) if offset_ns < 0 else (UpdateStatus.FAILED,)
         for broken in (replace(good, z=good.z * np.nan), replace(good, R=good.R * np.nan)):
-            status = estimator.update(broken).status
-            allowed = (UpdateStatus.FAILED, UpdateStatus.TOO_OLD) if offset_ns < 0 else (UpdateStatus.FAILED,)
-            require(status in allowed, f"a measurement that is not a number is {status}")
-            require(_bits(estimator, probes) == before, "a measurement that is not a number changes the state")
-            require(estimator.window_ns == window_ns, "a measurement that is not a number moves the window")
+            _unchanged(estimator, newest_ns, broken, allowed, "a measurement that is not a number")
     status = estimator.update(good).status
     require(status is UpdateStatus.IN_SEQUENCE, f"after the failure a good measurement is {status}")
 
@@ -275,12 +281,8 @@ def _comes_near_the_posterior_of_a_nonlinear_model(subject: Subject, stream: Str
     _converged(subject, estimator)
     newest_ns = max(stream.newest_ns - nanoseconds(claims.held_s), stream.start.stamp_ns)
     for at_ns in (newest_ns,) if claims.held_s else (newest_ns, newest_ns + 100 * MS):
-        off, covariance = difference(estimator.state_at(at_ns), _joint(subject, stream, at_ns), stream.motion)
-        require(
-            off < _NEAR_SIGMA and covariance < _NEAR_COVARIANCE,
-            f"the state at {at_ns} differs from that of a plain calculation by {off:.1e} standard deviations in "
-            f"the mean and {covariance:.1e} in the covariance ({_NEAR_SIGMA}, {_NEAR_COVARIANCE} allowed)",
-        )
+        expected, what = _joint(subject, stream, at_ns), "that of a plain calculation"
+        _close(estimator.state_at(at_ns), expected, _NEAR_SIGMA, stream, what, of_covariance=_NEAR_COVARIANCE)
 
 
 def _converged(subject: Subject, *estimators: Any) -> bool:  # Any: the claim promises `converge`
@@ -342,20 +344,10 @@ def check_estimator(
 ) -> None:
     """Raise `BrokenPromiseError` unless an estimator keeps the contract, with the measurements that show it.
 
-    Parameters
-    ----------
-    factory
-        Class or function `(motion, start, lag_s, **options) -> Estimator` or, where its attribute `bank` is true,
-        `(motion, lag_s, **options) -> TrackBank`; or the name of a registered one.
-    exact
-        True holds it to the dense joint posterior of a linear model in any order of arrival, False does not; text as
-        in `Claims.exact`. None takes the claims of the factory.
-    seed
-        Seed of the random streams.
-    num_streams
-        Number of random streams for each promise that speaks of any order.
-    options
-        Options of the estimator.
+    `factory` is a class or function `(motion, start, lag_s, **options) -> Estimator` or, where its attribute `bank` is
+    true, `(motion, lag_s, **options) -> TrackBank`; or the name of a registered one. `exact=True` holds it to the dense
+    joint posterior of a linear model in any order of arrival, False does not, text is as in `Claims.exact`; None takes
+    the claims of the factory. `num_streams` random streams are drawn for each promise that speaks of any order.
     """
     checks = estimator_checks(factory, exact=exact, seed=seed, num_streams=num_streams, **options)
     run_all(_name(factory), checks)

@@ -7,17 +7,16 @@ from functools import partial
 import numpy as np
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.geometry import wrap_angles
-from fgtrack.core.types import ACCEL, STATE_NAMES, YAW, FloatArray
+from fgtrack.core.types import ACCEL, STATE_NAMES, FloatArray
 from fgtrack.models.motion import CARTESIAN, POLAR, MotionModel
 from fgtrack.testing.promise import BrokenPromiseError, WrongError, fault, require, run_all, sound
+from fgtrack.testing.references import slope
 
 ModelCheck = Callable[[MotionModel, FloatArray, float], None]
 """Raises `WrongError` for the fault of a model at a state (n,) and a duration."""
 
 #: Of the covariance from which a covariance of first order is distinguished from one with higher terms.
 _SMALL = 1e-6
-_STEP = 1e-6
 _NUM_STATES = 20
 #: Of every other state a short duration as between two measurements, of the rest up to a long gap.
 _LONGEST_S = 0.5, 4.0
@@ -68,12 +67,7 @@ def _flows_on_where_it_stopped(model: MotionModel, x: FloatArray, dt_s: float) -
 
 
 def _has_the_jacobian_of_its_prediction(model: MotionModel, x: FloatArray, dt_s: float) -> None:
-    h = 1e-6 * (1.0 + np.abs(x))
-    columns = [
-        (model.predict(x + h * unit, dt_s) - model.predict(x - h * unit, dt_s)) / (2.0 * h[k])
-        for k, unit in enumerate(np.eye(model.dim))
-    ]
-    _equal(model.jacobian(x, dt_s), np.column_stack(columns), 1e-6, "jacobian")
+    _equal(model.jacobian(x, dt_s), slope(lambda state: model.predict(state, dt_s), x), 1e-6, "jacobian")
     if model.linear:
         _equal(model.jacobian(x, dt_s), model.jacobian(0.0 * x, dt_s), 1e-12, "jacobian of a linear model")
 
@@ -149,14 +143,7 @@ def _covariance(n: int) -> FloatArray:
 
 def _publishes_the_entries_of_its_state(model: MotionModel, x: FloatArray, dt_s: float) -> None:
     """The mean by name, the covariance by difference quotients of that."""
-    P = _covariance(model.dim)
-    steps = _STEP * (1.0 + np.abs(x)) * np.eye(model.dim)
-    columns = []
-    for step in steps:
-        off = _shown(model, x + step) - _shown(model, x - step)
-        off[YAW] = wrap_angles(off[YAW : YAW + 1])[0]
-        columns.append(off / (2.0 * step.sum()))
-    J = np.column_stack(columns)
+    P, J = _covariance(model.dim), slope(lambda state: _shown(model, state), x)
     mean, covariance = model.kinematic(x, P)
     many, covariances = model.kinematic(np.stack([x, 1.1 * x]), np.stack([P, 2.0 * P]))
     _equal(mean, _shown(model, x), 1e-9, "the mean of kinematic")

@@ -1,11 +1,11 @@
 """Answers that estimators are held to: plain calculations that share no recursion, graph or factor with any of them.
 
 All take the measurements in the order of the stamps or all at once, so there is no order of arrival in them. They share
-the motion and measurement models, which have checks of their own (`check_motion_model`).
+motion models (see `check_motion_model`), measurement models and losses.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,10 +17,10 @@ from fgtrack.estimation.base import Measurement, Start, UpdateResult
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.propagation import wrapped
 from fgtrack.models.motion import MotionModel
+from fgtrack.models.robust import weight
 
 _WEIGHT_STEPS, _NEWTON_STEPS = 50, 50
 _STEP_TOLERANCE, _QUOTIENT_STEP = 1e-6, 1e-6
-_LEAST_ROOT = 1e-6  # of the weight of a measurement that a loss ignores
 
 
 def dense_joint(
@@ -105,22 +105,18 @@ def _residual(one: Measurement, x: FloatArray) -> FloatArray:
 
 
 def _slope(one: Measurement, x: FloatArray) -> FloatArray:
-    """Jacobian of the measurement at `x` (n,) by difference quotients, shape (k, n)."""
+    return slope(lambda state: -_residual(one, state), x)
+
+
+def slope(function: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:
+    """Jacobian of `function` at `x` (n,) by difference quotients, shape (k, n)."""
     steps = _QUOTIENT_STEP * (1.0 + np.abs(x)) * np.eye(len(x))
-    columns = [(_residual(one, x - step) - _residual(one, x + step)) / (2.0 * step.sum()) for step in steps]
-    return np.column_stack(columns)
+    return np.column_stack([(function(x + step) - function(x - step)) / (2.0 * step.sum()) for step in steps])
 
 
 def _weight(one: Measurement, y: FloatArray) -> float:
     """Weight of a measurement under its robust loss at the residual `y` (k,)."""
-    if one.loss is None:
-        return 1.0
-    far = float(np.sqrt(y @ np.linalg.solve(one.R, y))) / one.loss.width
-    if one.loss.kind == "cauchy":
-        return 1.0 / (1.0 + far**2)
-    if one.loss.kind == "tukey":
-        return max(1.0 - far**2, _LEAST_ROOT) ** 2
-    return 1.0 / max(far, 1.0)
+    return 1.0 if one.loss is None else weight(one.loss, math.sqrt(y @ np.linalg.solve(one.R, y)))
 
 
 class Difference(NamedTuple):
