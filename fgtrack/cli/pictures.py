@@ -37,8 +37,8 @@ def figure(
 ) -> None:
     """Draw runs or a sweep: late detections, map, errors, time.
 
-    Of runs: a late detection in close-up, the map, residuals, NEES and NIS, arrivals, delays, errors over time and
-    against lag, time per tick. Of many objects or runs the worst few. Of a sweep: its metrics over the grid, mean and
+    Of runs: a late detection in close-up, the map, residuals, NEES and NIS, arrivals, errors over time and against
+    lag, time per tick. Of many objects or runs the worst few. Of a sweep: its metrics over the grid, mean and
     95 % interval over the seeds.
 
     The close-up replays the recording up to a late detection that is typical of those that lower the error of the first

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.evaluation.palette import SENSORS
 from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_ns
 from fgtrack.evaluation.scores.consistency import position_nees
 from fgtrack.evaluation.scores.innovations import num_measured
@@ -20,7 +21,6 @@ from fgtrack.plotting.style import (
     legend_above,
     log_axis,
     run_looks,
-    sensor_colour,
     usual_step_ns,
 )
 
@@ -55,7 +55,7 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
             text = _summary("position", values, dof, (mean >= band[0]) & (mean <= band[1]), "ticks")
         else:
             sensor = name.removeprefix("NIS of ")
-            colour = sensor_colour(sensors.index(sensor))
+            colour = SENSORS[sensors.index(sensor) % len(SENSORS)]
             low, high = chi_square_band(dof.astype(np.float64), np.ones(len(dof), dtype=np.int64))
             length = min(max(_SHORTEST, min(_LONGEST, len(values) // _WINDOWS)), len(values))
             text = _summary(sensor, values, dof, (values >= low) & (values <= high), "detections")

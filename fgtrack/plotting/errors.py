@@ -68,8 +68,7 @@ def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> 
                 label=f"{label}: {text}" if axes is rows[0] else text,
                 zorder=2.0 if look.line == "-" else 2.5,  # a dashed line shows what it lies on
             )
-        axes.set_ylabel(f"{what} error [{unit}]")
-        axes.set_ylim(0.0, None)
+        axes.set(ylabel=f"{what} error [{unit}]", ylim=(0.0, None))
         legend_above(axes)
     rows[-1].set_xlabel("time [s]")
     whose = "all objects" if wanted is None else f"object {wanted}"

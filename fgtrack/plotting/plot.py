@@ -24,13 +24,12 @@ from fgtrack.plotting.paper import Paper
 from fgtrack.plotting.residuals import residuals
 from fgtrack.plotting.style import save
 from fgtrack.plotting.sweep import error_against_delay, sweep, sweep_metrics
-from fgtrack.plotting.times import delays, timing
+from fgtrack.plotting.times import timing
 
 __all__ = [
     "arrivals",
     "close_up",
     "consistency",
-    "delays",
     "error_against_delay",
     "errors",
     "lag",
@@ -73,15 +72,13 @@ def planned(runs: Sequence[EvaluatedRun]) -> list[Planned]:
     ):
         mine = [one for one in runs if has_data(one)]
         plans += [Planned(f"{name}_{one.label}", partial(draw, one), one.label in extra) for one in mine]
-    streams: dict[bytes, EvaluatedRun] = {}  # estimators of one stream share these figures
+    streams: dict[bytes, EvaluatedRun] = {}  # estimators of one stream share this figure
     for one in runs:
         if (receipts_ns := one.run.tables["updates"]["receipt_ns"]).size:
             streams.setdefault(np.sort(receipts_ns).tobytes(), one)
     for k, one in enumerate(streams.values()):
         ending, is_extra = f"_{one.label}" if len(streams) > 1 else "", len(streams) > _MOST_RUNS and k >= _FEW
         plans.append(Planned(f"arrivals{ending}", partial(arrivals, one), is_extra))
-        if any(each.delay_s.max for each in one.metrics.sensors.values()):
-            plans.append(Planned(f"delays{ending}", partial(delays, one), is_extra))
     ids = sorted({k for one in runs if one.matching for k in one.matching.object_ids})
     worst = sorted(ids, key=lambda object_id: max(_rmse_m(one, object_id) for one in runs))[-_FEW:]
     if len(ids) > _FEW:

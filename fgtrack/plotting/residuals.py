@@ -1,5 +1,6 @@
 """The figure of the innovations."""
 
+from itertools import cycle
 from typing import Unpack
 
 import numpy as np
@@ -7,11 +8,12 @@ from matplotlib.figure import Figure
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
+from fgtrack.evaluation.palette import SENSORS
 from fgtrack.evaluation.runs import OneRun, one_evaluated, start_ns
 from fgtrack.evaluation.scores import innovations
 from fgtrack.evaluation.scores.innovations import RESIDUAL_NAMES
 from fgtrack.plotting.paper import Paper, Sheet, styled
-from fgtrack.plotting.style import bulk, legend_above, sensor_colour
+from fgtrack.plotting.style import bulk, legend_above
 
 _RESIDUALS = {
     "along_m": "along track [m]",
@@ -49,7 +51,7 @@ def residuals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         known = {sensor: np.isfinite(values[name]) & (updates["sensor"] == sensor) for sensor in sensors}
         low, high = bulk([values[name][mine] for mine in known.values()])
         bins = np.linspace(low, high, 41)
-        for k, (sensor, mine) in enumerate(known.items()):
+        for (sensor, mine), colour in zip(known.items(), cycle(SENSORS), strict=False):
             sample = values[name][mine]
             if not len(sample):
                 continue
@@ -58,9 +60,9 @@ def residuals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
             mean = round(moments.mean, 3) + 0.0  # no negative zero
             label = f"{sensor}: mean {mean:.3f}, std {moments.std:.3f}, n {moments.count}"
             label += f" ({outside} outside)" if outside else ""
-            over_time.plot(time_s[mine], sample, ".", ms=3.0, alpha=0.6, mew=0, color=sensor_colour(k), label=label)
+            over_time.plot(time_s[mine], sample, ".", ms=3.0, alpha=0.6, mew=0, color=colour, label=label)
             density = np.histogram(sample, bins)[0] / (len(sample) * np.diff(bins))
-            histogram.stairs(density, bins, orientation="horizontal", color=sensor_colour(k), lw=1.4)
+            histogram.stairs(density, bins, orientation="horizontal", color=colour, lw=1.4)
         over_time.set(ylim=(low, high), ylabel=_RESIDUALS[name], xlabel="time [s]" if name == names[-1] else "")
         histogram.set(ylim=(low, high), xlabel=f"density [{_DENSITIES[name.rpartition('_')[2]]}]")
         histogram.tick_params(labelleft=False)

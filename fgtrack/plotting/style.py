@@ -21,7 +21,7 @@ from PIL import Image
 
 from fgtrack.core.errors import CallError, printable_lines
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.palette import SENSORS, Look, looks
+from fgtrack.evaluation.palette import Look, looks
 from fgtrack.evaluation.runs import EvaluatedRun
 
 _RC: Any = mpl.rcParams  # Any: its keys are a Literal of all names
@@ -70,11 +70,6 @@ class StyledFigure(Figure):
 
     def _repr_html_(self) -> str:
         return f'<img src="data:image/png;base64,{base64.b64encode(png(self)).decode()}">'
-
-
-def sensor_colour(index: int) -> str:
-    """Colour of the sensor number `index` by name."""
-    return SENSORS[index % len(SENSORS)]
 
 
 def run_looks(runs: Sequence[EvaluatedRun]) -> dict[str, Look]:

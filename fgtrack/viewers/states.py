@@ -47,16 +47,10 @@ def track_positions(run: Run, update_rows: IntArray) -> FloatArray:
 
 
 def final_ns(run: Run, final: Table) -> IntArray:
-    """Time at which each row of `final` left the window of the smoother, or its track ended, shape (n,)."""
+    """Time at which each row of `final` left the window of the smoother, or the run ended, shape (n,)."""
     lag_s = (run.config.get("smoother") or {}).get("lag_s", _DEFAULT_LAG_S)
-    ends = {
-        track_id: int(run.tables["tracks"]["now_ns"][rows].max())
-        for track_id, rows in groups(run.tables["tracks"]["track_id"])
-    }
-    known_ns = final["stamp_ns"] + nanoseconds(float(lag_s))
-    for track_id, rows in groups(final["track_id"]):
-        known_ns[rows] = np.minimum(known_ns[rows], ends.get(track_id, known_ns[rows].max()))
-    return np.asarray(np.maximum(known_ns, final["stamp_ns"]))
+    end_ns = run.tables["timing"]["now_ns"].max(initial=0)
+    return np.asarray(np.maximum(np.minimum(final["stamp_ns"] + nanoseconds(float(lag_s)), end_ns), final["stamp_ns"]))
 
 
 def start_ns(run: Run) -> int:

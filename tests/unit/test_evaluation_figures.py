@@ -47,14 +47,6 @@ EXPECTED: dict[str, tuple[bool, set[str], list[str]]] = {
         ["position: mean 0.073, expected 2; 77 % of the ticks in their band", "95 % band", "expected"],
     ),
     "arrivals": (False, {"time [s]", "time of receipt [s]", "delay [ms]"}, ["fused in sequence: 120 of 120"]),
-    "delays": (
-        False,
-        {"delay from stamp to receipt [ms]", "share of the messages received"},
-        [
-            f"{name}: mean {ms} ms, 90 % within {ms} ms, all within {ms} ms"
-            for name, ms in (("lidar", 150), ("radar", 60))
-        ],
-    ),
     "errors": (
         True,
         {*("position error [m]", "speed error [m/s]", "yaw error [deg]", "time [s]")},
@@ -140,30 +132,25 @@ def test_there_is_a_figure_of_what_runs_have_data_for(
     assert names(runs) == [
         *("map_smoother", "map_ekf-replay", "residuals_smoother", "residuals_ekf-replay"),
         *("consistency_smoother", "consistency_ekf-replay"),
-        *("arrivals", "delays"),
+        "arrivals",
         *("errors_object_7", "errors_object_8", "error_against_lag", "timing"),
     ]
     assert names(runs[1:]) == [name for name in names(runs) if "smoother" not in name and "lag" not in name]
     plain = runs[0].with_tables(
         truth=runs[0].tables["truth"].where(np.zeros(len(runs[0].tables["truth"]["stamp_ns"]), dtype=bool))
     )
-    assert names([plain]) == [
-        *("map_smoother", "residuals_smoother", "consistency_smoother", "arrivals", "delays", "timing")
-    ]
+    assert names([plain]) == [*("map_smoother", "residuals_smoother", "consistency_smoother", "arrivals", "timing")]
     other = write_run(tmp_path / "other", updates={0: [update(delay_ns=1_000_000)]})
-    assert [name for name in names([*runs, other]) if "delays" in name] == [
-        "delays_smoother",
-        "delays_other (smoother)",
+    assert [name for name in names([*runs, other]) if "arrivals" in name] == [
+        "arrivals_smoother",
+        "arrivals_other (smoother)",
     ]
     assert names([write_run(tmp_path / "empty", [[]])]) == []
     lidar, radar = update("lidar", tick=0, delay_ns=7), update("radar", tick=1, delay_ns=9)
     gated = replace(radar, disposition=Disposition.GATED)
     order = {"as received": [lidar, radar], "the other way": [radar, lidar], "gated": [lidar, gated]}  # one figure
     alike = [write_run(tmp_path / name, updates={0: rows}) for name, rows in order.items()]
-    found = [name for name in names(alike) if name.startswith(("arrivals", "delays"))]
-    assert found == ["arrivals", "delays"]
-    at_once = write_run(tmp_path / "at once", updates={0: [update(delay_ns=0)]})
-    assert [name for name in names([at_once]) if "delays" in name] == []
+    assert [name for name in names(alike) if name.startswith("arrivals")] == ["arrivals"]
 
 
 def test_arrivals_show_the_part_with_the_most_late_detections(tmp_path: Path) -> None:

@@ -17,9 +17,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[EvaluatedRun]:
     return evaluated([a_run(folder / name) for name in ("smoother", "ekf-replay", "ekf-backward-forward")])
 
 
-@pytest.mark.parametrize("name", ["errors", "lag", "timing", "delays"])
+@pytest.mark.parametrize("name", ["errors", "lag", "timing"])
 def test_a_figure_in_a_column_is_readable(name: str, runs: list[EvaluatedRun]) -> None:
-    figure = getattr(plot, name)(runs if name != "delays" else runs[0], width="3.4in")
+    figure = getattr(plot, name)(runs, width="3.4in")
     assert figure.get_figwidth() == pytest.approx(3.4)
     assert figure.get_suptitle() == ""  # a paper has captions
     assert faults(figure) == []
