@@ -138,7 +138,7 @@ class Measurements(Sequence[Measurement]):
 def stacks(measurements: Sequence[Measurement]) -> list[tuple[Sequence[int], Measurement]]:
     """Return the measurements that differ in their numbers alone: their indices, and the stack of them."""
     if isinstance(measurements, Measurements):
-        return [(range(len(measurements)), measurements.stack)]
+        return [(range(len(measurements.stack.z)), measurements.stack)]
     parts = list[tuple[Sequence[int], Measurement]]()
     for rows in equal_ones([(id(one.model), one.pose, one.assumed, one.loss) for one in measurements]):
         z, R = (np.array([getattr(measurements[row], name) for row in rows]) for name in ("z", "R"))

@@ -1,6 +1,6 @@
 """Gates, and association of candidates with tracks (Karle et al. 2023, section III-D)."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cache
 from typing import Literal, NamedTuple, Protocol
 
@@ -188,20 +188,22 @@ def near(
 
 def innovations(
     pairs: Pairs, candidates: Candidates, states: StatesAt
-) -> Iterator[tuple[IntArray, FloatArray, FloatArray, int]]:
-    """Yield the innovations of `pairs` of `candidates` and tracks with these states.
+) -> list[tuple[IntArray, FloatArray, FloatArray, int]]:
+    """Return the innovations of `pairs` of `candidates` and tracks with these states.
 
     Indices of pairs that measure the same, assumed components included, with NIS and log det S, shapes (p,), and the
     number k of components. NaN where S has no root.
     """
-    P = np.array(states.covariances, dtype=np.float64, order="C")
+    P, parts = np.array(states.covariances, dtype=np.float64, order="C"), []
     for group, members, chosen in candidates.split(pairs.rows):
         columns = pairs.columns[chosen]
         x = states.means[columns]
         own = group.seen_at(members, x)
         y, H = linearised(own.z, x, own.model, own.pose)
         H = np.array(H, ndmin=3, order="C")
-        yield chosen, *kernels("fgtrack.tracking.kernels").innovations(y, H, P, columns, own.R), y.shape[-1]
+        nis, logdet = kernels("fgtrack.tracking.kernels").innovations(y, H, P, columns, own.R)
+        parts.append((chosen, nis, logdet, y.shape[-1]))
+    return parts
 
 
 def reaches_m(groups: Sequence[Group], states: StatesAt, probability: float, limit_m: float) -> FloatArray:

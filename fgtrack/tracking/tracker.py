@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import repeat
 from typing import Any
 
@@ -122,7 +123,9 @@ class Tracker:
         """Process everything received up to `now_ns`."""
         self._tick += 1
         batches = self._parts.inbox.collect()
-        self._end(self._parts.lifecycle.expired(now_ns))
+        expired = self._parts.lifecycle.expired(now_ns)
+        if expired:
+            self._end(expired)
         self._parts.bank.advance(now_ns)
         self._parts.ego.start_tick()
         self._seen = {}
@@ -136,8 +139,8 @@ class Tracker:
             self._tick,
             now_ns,
             bank.smoothed(),
-            tracks=lambda: map(_report, own, states),
-            updates=lambda: (each if isinstance(each, UpdateRecord) else record(*each) for each in noted),
+            tracks=partial(map, _report, own, states),
+            updates=partial(map, _made, noted),
         )
 
     def finish(self) -> tuple[SmoothedReport, ...]:
@@ -178,8 +181,7 @@ class Tracker:
                 raise
             self.failures.add(Failure.LIST_FAILED)
             self.failures.note(error)
-            noted = self._records[first:]
-            ended = {each.index if isinstance(each, UpdateRecord) else each[1] for each in noted}
+            ended = {_made(each).index for each in self._records[first:]}
             failed = [index for index in batch.indices if index not in ended]
             self._records += [record(batch.message, index, Disposition.FAILED) for index in failed]
 
@@ -351,6 +353,10 @@ class Tracker:
     def _own(self, track_id: int) -> _Own:
         parts = self._parts
         return track_id, parts.lifecycle.status(track_id), self._num_measured[track_id], parts.objects.report(track_id)
+
+
+def _made(noted: UpdateRecord | tuple[Any, ...]) -> UpdateRecord:
+    return noted if isinstance(noted, UpdateRecord) else record(*noted)
 
 
 def _report(own: _Own, state: TrackState) -> TrackReport:
