@@ -92,7 +92,7 @@ def _summarise(table: SweepTable, out: Path, form: Form | None, everything: bool
     contests = seed_comparisons(table)
     differences = difference_table(contests, table.axes)
     write_file(out / PAIRED_TABLE, differences.to_csv())
-    summary = summary_table(table, contests)
+    summary = summary_table(table)
     write_file(out / SUMMARY_TABLE, summary.to_csv())
     if form is None and any(map(differences.is_main, differences.records)):
         show(differences, form)

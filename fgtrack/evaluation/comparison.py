@@ -11,9 +11,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, within_run
-from fgtrack.evaluation.matching import recorded, scenes, track_errors
+from fgtrack.evaluation.matching import TrackErrors, recorded, scenes, track_errors
 from fgtrack.evaluation.runs import EvaluatedRun, by_recording
 from fgtrack.evaluation.scores.consistency import position_nees
 from fgtrack.evaluation.scores.multi_object import gospa
@@ -113,38 +113,35 @@ def entry_columns(heading: str, name: str = "value") -> list[Column]:
 
 def comparison(group: Sequence[EvaluatedRun]) -> Comparison:
     """Return the comparison of `group`, runs of one recording, at the same objects and stamps."""
-    matchings = [one.matching for one in group if one.matching is not None]
-    errors, squares = [track_errors(one) for one in matchings], [position_nees(one) for one in matchings]
-    codes, at_ns, rows = common_samples([one.object_index for one in errors], [one.stamps_ns for one in errors])
-    sums: dict[str, FloatArray] = {}
-    if len(at_ns):
-        for name, error in _ERRORS.items():
-            values = [np.square(one.values[error][row]) for one, row in zip(errors, rows, strict=True)]
-            sums[name] = by_stamp(at_ns, np.stack(values, axis=-1))
-        values = [one[row] for one, row in zip(squares, rows, strict=True)]
-        sums[POSITION_NEES] = by_stamp(at_ns, np.stack(values, axis=-1))
+    errors = []
+    for matching in (one.matching for one in group if one.matching is not None):
+        own = track_errors(matching)
+        squares = {name: np.square(own.values[error]) for name, error in _ERRORS.items()}
+        errors.append(replace(own, values={**squares, POSITION_NEES: position_nees(matching)}))
+    most, common, sums = common_sums(errors)
     if all(one.run.evaluation.multi_object for one in group):
         sums["gospa_in_sight_rms_m"] = _gospa_sums(group)
     labels = tuple(one.label for one in group)
     quantities = {name: compared(name, labels, ticks) for name, ticks in sums.items() if ticks[:, -1].any()}
-    return Comparison(labels, len(at_ns), max(codes), quantities, sums)
+    return Comparison(labels, common, most, quantities, sums)
 
 
-def common_samples(
-    objects: Sequence[IntArray], stamps_ns: Sequence[IntArray]
-) -> tuple[list[int], IntArray, list[IntArray]]:
-    """Return the samples of several runs at the same object and stamp.
+def common_sums(every: Sequence[TrackErrors]) -> tuple[int, int, dict[str, FloatArray]]:
+    """Return the sums by stamp of the values of several runs at the objects and stamps that all have.
 
-    Distinct samples of each run, the stamps of the common ones, shape (n,), and of each run their rows, shape (n,).
+    The most samples of a run, the common ones, and by name the sums of each run and, last, the counts, shape
+    (n, runs + 1); empty without a common sample.
     """
-    every_ns = np.unique(np.concatenate(stamps_ns))
-    samples = [
-        np.unique(index * len(every_ns) + np.searchsorted(every_ns, ns), return_index=True)
-        for index, ns in zip(objects, stamps_ns, strict=True)
-    ]
-    common = functools.reduce(np.intersect1d, [codes for codes, _ in samples])
-    rows = [first[np.searchsorted(codes, common)] for codes, first in samples]
-    return [len(codes) for codes, _ in samples], every_ns[common % max(len(every_ns), 1)], rows
+    every_ns = np.unique(np.concatenate([one.stamps_ns for one in every]))
+    codes = [one.object_index * len(every_ns) + np.searchsorted(every_ns, one.stamps_ns) for one in every]
+    samples = [np.unique(of, return_index=True) for of in codes]
+    common = functools.reduce(np.intersect1d, [distinct for distinct, _ in samples])
+    rows = [first[np.searchsorted(distinct, common)] for distinct, first in samples]
+    sums = {}
+    for name in every[0].values if len(common) else ():
+        values = np.stack([one.values[name][row] for one, row in zip(every, rows, strict=True)], axis=-1)
+        sums[name] = by_stamp(every_ns[common % len(every_ns)], values)
+    return max(len(distinct) for distinct, _ in samples), len(common), sums
 
 
 def compared(name: str, labels: Sequence[str], ticks: FloatArray) -> tuple[Entry, ...]:

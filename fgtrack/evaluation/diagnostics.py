@@ -13,7 +13,7 @@ from fgtrack.core.geometry import cartesian
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.matching import confirmed
-from fgtrack.evaluation.scores.innovations import autocorrelation, num_measured
+from fgtrack.evaluation.scores.innovations import by_sensor, num_measured
 from fgtrack.evaluation.scores.statistics import ChiSquareMean
 from fgtrack.io.run import Run, Table
 from fgtrack.models.measurement import ANGULAR
@@ -63,7 +63,7 @@ def diagnostics(run: Run) -> list[Diagnostic]:
 
 def noise_diagnostics(run: Run) -> list[Diagnostic]:
     """Sensors whose innovations are inconsistent with the noise; see also the verdict of `compare`."""
-    updates, result = run.tables["updates"], []
+    result = []
     for sensor, nis in misfits(run):
         size = "small" if nis.mean > nis.dof else "large"
         factor = math.sqrt(max(nis.mean, 0.0) / nis.dof)  # below 0 by rounding, where one std is 1e9 of another
@@ -71,9 +71,6 @@ def noise_diagnostics(run: Run) -> list[Diagnostic]:
             f"mean NIS {nis.mean:.3g}, expected {nis.dof:.3g}: the configured noise is too {size}, as if "
             f"errors were {factor:.2g} times what is configured"
         )
-        white = autocorrelation(updates.where(updates["sensor"] == sensor))
-        if white is not None and white.lag1 > CORRELATED:
-            text += f", and errors are correlated in time ({white.lag1:.2f}), which fitted white noise cannot express"
         fit = _advise(run, " --tune -o advised.yaml")
         result.append(Diagnostic(sensor, f"{text}; `{fit}` fits it, or reports what has to be done first"))
     return result
@@ -84,7 +81,7 @@ def misfits(run: Run) -> Iterator[tuple[str, ChiSquareMean]]:
 
     The mean alone may be that of a few outliers, or of the first innovations of new tracks.
     """
-    for sensor, mine in _by_sensor(run.tables["updates"]):
+    for sensor, mine in by_sensor(run.tables["updates"]):
         nis = ChiSquareMean.of(mine["nis"], num_measured(mine))
         if nis.count >= FEWEST and is_far_off(nis):
             ratio = float(np.nanmedian(mine["nis"])) / float(chdtri(nis.dof, 0.5))
@@ -133,7 +130,7 @@ def _advise(run: Run, options: str = "") -> str:
 
 def _angles(run: Run) -> Iterator[Diagnostic]:
     """Angles that were recorded in degrees and read as radians."""
-    for about, table in [(EGO, run.tables["ego"]), *_by_sensor(run.tables["detections"])]:
+    for about, table in [(EGO, run.tables["ego"]), *by_sensor(run.tables["detections"])]:
         for name in ANGULAR:
             finite = [value for value in table.get(name, np.empty(0)).tolist() if math.isfinite(value)]
             if wrong := in_degrees(about, name, min(finite, default=0.0), max(finite, default=0.0)):
@@ -169,7 +166,7 @@ def _map(run: Run) -> Iterator[Diagnostic]:
     if not _ego_speeds_births(run) or _section(run, "map").get("track") not in (None, OPEN_SPACE):
         return
     detections = run.tables["detections"]
-    blind = [name for name, mine in _by_sensor(detections) if not np.isfinite(mine["yaw_rad"]).any()]
+    blind = [name for name, mine in by_sensor(detections) if not np.isfinite(mine["yaw_rad"]).any()]
     if blind:
         text = (
             f"there is none, and no heading from {', '.join(blind)}: new objects may drive in any direction; name the "
@@ -185,7 +182,7 @@ def _ego_speeds_births(run: Run) -> bool:
 
 def _mostly(run: Run) -> Iterator[tuple[str, Table, str, int]]:
     """Sensors and their updates, of which more than half were not used for one reason: it, and their number."""
-    for sensor, mine in _by_sensor(run.tables["updates"]):
+    for sensor, mine in by_sensor(run.tables["updates"]):
         name, count = Counter(mine["disposition"].tolist()).most_common(1)[0]
         if name not in USED and 2 * count > mine.num_rows:
             yield sensor, mine, name, count
@@ -193,7 +190,7 @@ def _mostly(run: Run) -> Iterator[tuple[str, Table, str, int]]:
 
 def _sensors(run: Run) -> Iterator[Diagnostic]:
     """Stamps that no driver sets, and the disposition of most detections, where no other diagnostic explains it."""
-    unset = [name for name, mine in _by_sensor(run.tables["updates"]) if not mine["stamp_ns"].any()]
+    unset = [name for name, mine in by_sensor(run.tables["updates"]) if not mine["stamp_ns"].any()]
     for sensor in unset:
         text = (
             "all stamps are 0: its driver does not set them, so its delay is unknown; "
@@ -279,8 +276,3 @@ def lifetimes_and_breaks(run: Run) -> tuple[FloatArray, int]:
 
 def _section(run: Run, name: str) -> Mapping[str, Any]:
     return run.config.get(name) or {}
-
-
-def _by_sensor(table: Table) -> Iterator[tuple[str, Table]]:
-    for sensor in np.unique(table["sensor"]).tolist():
-        yield sensor, table.where(table["sensor"] == sensor)

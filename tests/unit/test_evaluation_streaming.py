@@ -1,6 +1,6 @@
 """Runs judged when they were ready, by timings made by hand."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,10 +27,10 @@ def made(path: Path, times_ms: Sequence[int], config: str = AT_50_HZ, **errors: 
     return write_run(path, tracks, truth=truth, config_text=config, process_ns=took_ns)
 
 
-def errors_of(run: Run) -> dict[str, FloatArray]:
+def errors_of(run: Run) -> Mapping[str, FloatArray]:
     matching = match(run)
     assert matching is not None
-    return streaming_errors(run, matching)
+    return streaming_errors(run, matching).values
 
 
 def rmse(tables: Tables, judged: str) -> dict[str, float]:

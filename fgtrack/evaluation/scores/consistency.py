@@ -8,7 +8,7 @@ import numpy as np
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, mean_square
 from fgtrack.evaluation.matching import Matching
-from fgtrack.evaluation.scores.innovations import Autocorrelation, autocorrelation, num_measured
+from fgtrack.evaluation.scores.innovations import Autocorrelation, autocorrelation, by_sensor, num_measured
 from fgtrack.evaluation.scores.statistics import ChiSquareMean
 from fgtrack.io.run import Run, Table
 
@@ -35,11 +35,9 @@ class Consistency:
 
 def consistency(run: Run, matching: Matching | None) -> Consistency:
     """NEES of the evaluated rows of `run`, NIS and whiteness of its innovations."""
-    updates = run.tables["updates"]
-    measured = num_measured(updates)
-    sensors = {name: updates["sensor"] == name for name in np.unique(updates["sensor"]).tolist()}
-    nis = {name: ChiSquareMean.of(updates["nis"][mine], measured[mine]) for name, mine in sensors.items()}
-    white = {name: autocorrelation(updates.where(mine)) for name, mine in sensors.items()}
+    sensors = dict(by_sensor(run.tables["updates"]))
+    nis = {name: ChiSquareMean.of(mine["nis"], num_measured(mine)) for name, mine in sensors.items()}
+    white = {name: autocorrelation(mine) for name, mine in sensors.items()}
     if matching is None or not matching.paired.any():
         return Consistency(ChiSquareMean(), nis, white)
     squares = position_nees(matching)

@@ -1,7 +1,7 @@
 """Innovations and delays by sensor: along and across the direction of the track, their context and their whiteness."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,6 +71,12 @@ def residuals(run: Run) -> Mapping[str, FloatArray]:
     along_m = c * values["x_m"] + s * values["y_m"]
     across_m = c * values["y_m"] - s * values["x_m"]
     return {"along_m": along_m, "across_m": across_m, **values}
+
+
+def by_sensor(table: Table) -> Iterator[tuple[str, Table]]:
+    """Yield the sensors of `table` by name, each with its rows."""
+    for sensor in np.unique(table["sensor"]).tolist():
+        yield sensor, table.where(table["sensor"] == sensor)
 
 
 def num_measured(updates: Table) -> IntArray:

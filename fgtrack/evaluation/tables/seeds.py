@@ -1,7 +1,7 @@
 """The table of a sweep over its seeds: means at every point of the grid, and paired differences of the estimators."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -15,7 +15,7 @@ from fgtrack.core.files import open_text
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.comparison import Entry, entry_columns, entry_record, ranked
 from fgtrack.evaluation.intervals import paired
-from fgtrack.evaluation.tables import PERCENT, Column, DataFrame, Record, Table
+from fgtrack.evaluation.tables import PERCENT, Column, DataFrame, Table
 
 SWEEP_FILE = "sweep.csv"
 
@@ -165,11 +165,8 @@ def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) ->
     return Table(first, records, columns, keys, notes, is_main=lambda row: row["metric"] == first and row["seeds"] > 1)
 
 
-def summary_table(sweep: SweepTable, compared: Sequence[SeedComparison]) -> Table:
-    """Return mean and standard error over the seeds of every metric, a row for each point and estimator.
-
-    The best value at a point is bold where `compared`, those of the sweep, have no tie.
-    """
+def summary_table(sweep: SweepTable) -> Table:
+    """Return mean and standard error over the seeds of every metric, a row for each point and estimator."""
     metrics = [name for name in sweep.metrics if sweep.rows[name].notna().any()]
     main = [name for name in _MAIN if name in metrics] or metrics[: len(_MAIN)]
     metrics = list(dict.fromkeys((*main, *metrics)))
@@ -177,21 +174,12 @@ def summary_table(sweep: SweepTable, compared: Sequence[SeedComparison]) -> Tabl
     errors, seeds = groups.sem().add_suffix(".standard_error"), groups.count().max(axis=1).rename("seeds")
     names = [name for metric in metrics for name in (metric, f"{metric}.standard_error")]
     records = pd.concat([groups.mean(), errors], axis=1)[names].join(seeds).reset_index().to_dict("records")
-    best = {
-        (one.point, entry.name, one.metric) for one in compared for entry in one.entries if entry.standing == "best"
-    }
-
-    def is_best(metric: str) -> Callable[[Record], bool]:
-        return lambda record: (tuple(record[axis] for axis in sweep.axes), record["estimator"], metric) in best
-
     columns = [_point_column(sweep.rows[list(sweep.axes)]), Column("estimator", left=True)]
     for name in metrics:
         heading = _MAIN.get(name) or re.sub(r"\.(?!\d)", "\n", name)
         both, scale = (name, f"{name}.standard_error"), PERCENT if name in _SHARES else 1.0
-        columns.append(Column(heading, both, "{} ± {}", scale, bold=is_best(name), is_extra=name not in main))
+        columns.append(Column(heading, both, "{} ± {}", scale, is_extra=name not in main))
     notes = ["± standard error of the mean over the seeds"]
-    if any(metric in main for *_, metric in best):
-        notes.append("bold: the best estimator of its point in this, with 95 % confidence")
     return Table("Summary", records, [*columns, Column("seeds")], (*sweep.axes, "estimator"), notes)
 
 

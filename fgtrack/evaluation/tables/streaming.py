@@ -7,23 +7,22 @@ published. Times come from timing.csv, so nothing here depends on the machine th
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from fgtrack.core.geometry import cartesian
 from fgtrack.core.time import NS_PER_S, period_ns
-from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.core.types import IntArray
 from fgtrack.evaluation.comparison import (
     STANDING_NOTE,
-    Entry,
-    common_samples,
+    common_sums,
     comparable,
     compared,
     entry_columns,
     entry_record,
 )
-from fgtrack.evaluation.intervals import by_stamp
-from fgtrack.evaluation.matching import Matching
+from fgtrack.evaluation.matching import Matching, TrackErrors
 from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.scores.statistics import Distribution
 from fgtrack.evaluation.tables import MS, PERCENT, RUN, Column, Table
@@ -38,11 +37,11 @@ ASKED, READY, PREDICTED = "asked", "ready", "predicted"
 _TITLES = {ASKED: "at its stamp", READY: "when ready", PREDICTED: "predicted to then"}
 
 
-def streaming_errors(run: Run, matching: Matching) -> dict[str, FloatArray]:
-    """Return distances to the truth of the paired rows, by when they are evaluated, shape (p,) each.
+def streaming_errors(run: Run, matching: Matching) -> TrackErrors:
+    """Return distances to the truth of the paired rows by when they are evaluated, where there is truth when ready.
 
     Predictions move the published position along the published yaw at the published speed; a state without yaw or
-    speed stays. NaN where there is no truth then.
+    speed stays.
     """
     rows = np.flatnonzero(matching.paired)
     tracks, object_index = matching.tracks.where(matching.paired), matching.object_index[rows]
@@ -51,11 +50,14 @@ def streaming_errors(run: Run, matching: Matching) -> dict[str, FloatArray]:
     published = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
     way_m = tracks["speed_mps"] * (ready_ns - tracks["stamp_ns"]) / NS_PER_S
     moved = published + np.nan_to_num(cartesian(np.stack([tracks["yaw_rad"], way_m], axis=-1)))
-    return {
-        ASKED: matching.distances_m[rows, object_index],
-        READY: np.linalg.norm(published - truth, axis=-1),
-        PREDICTED: np.linalg.norm(moved - truth, axis=-1),
+    known = np.isfinite(truth[:, 0])
+    values = {
+        ASKED: matching.distances_m[rows, object_index][known],
+        READY: np.linalg.norm(published - truth, axis=-1)[known],
+        PREDICTED: np.linalg.norm(moved - truth, axis=-1)[known],
     }
+    now_ns = matching.now_ns[matching.tick_index[rows[known]]]
+    return TrackErrors(now_ns, object_index[known], tracks["track_id"][known], values)
 
 
 def streaming_tables(runs: Sequence[EvaluatedRun]) -> tuple[dict[str, Table], list[str]]:
@@ -67,7 +69,10 @@ def streaming_tables(runs: Sequence[EvaluatedRun]) -> tuple[dict[str, Table], li
     load, records, sentences = _load(runs), [], []
     late = {record["run"]: record["load"] for record in load.records if record["load"] > 1.0}
     for group in comparable([one for one in runs if one.label not in late]):
-        entries = _compared(group)
+        errors = [streaming_errors(one.run, one.matching) for one in group if one.matching is not None]
+        squares = [replace(one, values={when: np.square(m) for when, m in one.values.items()}) for one in errors]
+        labels = [one.label for one in group]
+        entries = {when: compared(when, labels, sums) for when, sums in common_sums(squares)[2].items()}
         if len(group) > 1 and entries:
             sentences += [
                 who_is_best(entries[READY], "where each is evaluated when it is ready"),
@@ -88,23 +93,6 @@ def streaming_tables(runs: Sequence[EvaluatedRun]) -> tuple[dict[str, Table], li
     columns = [evaluated, RUN, *entry_columns("pos. [m]", "position_rmse_m")]
     title = "Streaming accuracy (position RMSE, each run paying for its time)"
     return {"streaming": Table(title, records, columns, ("run", "judged"), notes), "load": load}, sentences
-
-
-def _compared(group: Sequence[EvaluatedRun]) -> dict[str, tuple[Entry, ...]]:
-    """Runs of one recording by when they are evaluated, at the objects and ticks that all have, with truth then."""
-    pairs = [(one.run, one.matching) for one in group if one.matching is not None]
-    errors_m = [streaming_errors(run, matching) for run, matching in pairs]
-    objects = [matching.object_index[matching.paired] for _, matching in pairs]
-    ticks_ns = [matching.now_ns[matching.tick_index[matching.paired]] for _, matching in pairs]
-    _, at_ns, rows = common_samples(objects, ticks_ns)
-    every_m = {
-        when: np.stack([one[when][row] for one, row in zip(errors_m, rows, strict=True)], axis=-1) for when in _TITLES
-    }
-    known = np.isfinite(every_m[READY]).all(axis=1)
-    if not known.any():
-        return {}
-    labels = [one.label for one in group]
-    return {when: compared(when, labels, by_stamp(at_ns[known], np.square(m[known]))) for when, m in every_m.items()}
 
 
 def _ready(run: Run) -> tuple[IntArray, Node]:
