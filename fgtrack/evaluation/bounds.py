@@ -53,24 +53,21 @@ def bounds(
     truth: Callable[[IntArray], FloatArray],
     now_ns: Sequence[int],
 ) -> Bounds:
-    """Bounds at the times `now_ns`.
+    """Return the bounds at the ascending times `now_ns`.
 
     With F, Q and H at the true states, and E the mean over trajectories, the information of the newest state is
     J' = D22 - D12' (J + D11)^-1 D12 with D11 = E[F' Q^-1 F], D12 = -E[F' Q^-1], D22 = E[Q^-1], plus E[H' R^-1 H] of
-    each measurement there. A measurement counts from its receipt on, at its own stamp.
+    each measurement there. A measurement counts from its receipt on, at its own stamp. Where F varies much between
+    trajectories the bound is far from what can be reached: see `bounds_along`.
 
     Parameters
     ----------
     motion
         Motion model; its process noise must be positive definite.
     start_ns, prior_covariance
-        Stamp and covariance (n, n) of the first state.
-    measurements
-        In any order; none before `start_ns`.
+        Stamp and covariance (n, n) of the first state; no measurement or time lies before it.
     truth
         True states at stamps (s,), of one or more drawn trajectories, shape (trajectories, s, n).
-    now_ns
-        Ascending.
 
     Raises
     ------
@@ -78,56 +75,11 @@ def bounds(
         A measurement or a time lies before the start.
     numpy.linalg.LinAlgError
         The process noise is singular.
-
-    Notes
-    -----
-    Where F varies much from one trajectory to the next, as with headings in every direction, its mean loses what ties
-    position, heading and speed together, and the bound is far from what can be reached: see `bounds_along`.
     """
-    return _bounds(motion, *_chain(start_ns, measurements, truth, now_ns), prior_covariance, measurements, now_ns)
-
-
-def bounds_along(
-    motion: MotionModel,
-    start_ns: int,
-    prior_covariance: FloatArray,
-    measurements: Sequence[ScheduledMeasurement],
-    truth: Callable[[IntArray], FloatArray],
-    now_ns: Sequence[int],
-) -> Bounds:
-    """Mean over trajectories of the bounds along each of them; parameters and errors are those of `bounds`.
-
-    In a linear model they are the same. In a nonlinear one each is the covariance of a filter that is linearised at
-    the true states: closer to what can be reached, but no bound in the strict sense, since no theorem forbids an
-    estimator to do better.
-    """
-    stamps_ns, states = _chain(start_ns, measurements, truth, now_ns)
-    each = [_bounds(motion, stamps_ns, one[None], prior_covariance, measurements, now_ns) for one in states]
-    return Bounds(*(np.mean(covariances, axis=0) for covariances in zip(*each, strict=True)))
-
-
-def _chain(
-    start_ns: int,
-    measurements: Sequence[ScheduledMeasurement],
-    truth: Callable[[IntArray], FloatArray],
-    now_ns: Sequence[int],
-) -> tuple[IntArray, FloatArray]:
-    """All stamps that matter, ascending, and the true states there. Raises `ValueError` if one precedes the start."""
     stamps_ns = np.unique([start_ns, *(item.stamp_ns for item in measurements), *now_ns])
     if stamps_ns[0] < start_ns:
         raise ValueError(f"start_ns: {start_ns} is after a measurement or a time at {stamps_ns[0]}")
-    return stamps_ns, truth(stamps_ns)
-
-
-def _bounds(
-    motion: MotionModel,
-    stamps_ns: IntArray,
-    states: FloatArray,
-    prior_covariance: FloatArray,
-    measurements: Sequence[ScheduledMeasurement],
-    now_ns: Sequence[int],
-) -> Bounds:
-    """`bounds` from the true `states` (trajectories, s, n) at `stamps_ns` (s,)."""
+    states = truth(stamps_ns)
     ordered = sorted(measurements, key=lambda item: item.stamp_ns)
     receipts_ns = np.array([item.receipt_ns for item in ordered], dtype=np.int64)
     own_ns = np.array([item.stamp_ns for item in ordered], dtype=np.int64)
@@ -139,10 +91,7 @@ def _bounds(
     start = psd_solve(prior_covariance, np.eye(motion.dim))
 
     def covariances(from_ns: IntArray) -> FloatArray:
-        """Bounds where measurement i counts from `from_ns[i]` on, shape (m, n, n).
-
-        What lies before the oldest measurement that is still to come does not change any more and is kept.
-        """
+        """Bounds where measurement i counts from `from_ns[i]` on, shape (m, n, n); what is final is kept."""
         result, settled, J = [], 0, start
         for time_ns in now_ns:
             here, counts = int(np.searchsorted(stamps_ns, time_ns)), from_ns <= time_ns
@@ -165,6 +114,26 @@ def _bounds(
         return sum((gained[i] for i in range(first, last) if counts[i]), start=J)
 
     return Bounds(covariances(own_ns), covariances(receipts_ns), covariances(np.where(kept, receipts_ns, _NEVER_NS)))
+
+
+def bounds_along(
+    motion: MotionModel,
+    start_ns: int,
+    prior_covariance: FloatArray,
+    measurements: Sequence[ScheduledMeasurement],
+    truth: Callable[[IntArray], FloatArray],
+    now_ns: Sequence[int],
+) -> Bounds:
+    """Mean over trajectories of the bounds along each of them; parameters and errors are those of `bounds`.
+
+    Each is the covariance of a filter that is linearised at the true states: in a nonlinear model closer to what can
+    be reached, but no bound in the strict sense.
+    """
+    states = truth(np.unique([start_ns, *(item.stamp_ns for item in measurements), *now_ns]))
+    each = [
+        bounds(motion, start_ns, prior_covariance, measurements, lambda _, one=one: one[None], now_ns) for one in states
+    ]
+    return Bounds(*(np.mean(covariances, axis=0) for covariances in zip(*each, strict=True)))
 
 
 def _step(motion: MotionModel, states: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:

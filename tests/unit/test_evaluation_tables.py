@@ -174,7 +174,7 @@ def test_few_tables_columns_and_rows_are_shown_unless_all_are_asked_for(tables: 
     assert "across" in tables.in_full().to_markdown()
     assert "across" in tables.to_csv() == tables.in_full().to_csv(), "files with all digits have everything"
     assert tables.to_dict() == tables.in_full().to_dict()
-    assert list(tables[["lag", "consistency"]]) == ["lag", "consistency"]
+    assert list(tables[["lag", "consistency"]].tables) == ["lag", "consistency"]
     assert "Consistency (" in str(tables[["consistency"]])
     assert str(tables.tables["lag"]) in few
 

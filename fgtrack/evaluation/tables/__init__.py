@@ -152,14 +152,10 @@ class Table:
 
     def rows(self, text: Callable[[str], str] = str, bold: str = "{}") -> list[list[str]]:
         """Return a row of cells for each record shown, `bold` ones in that format; a repeated first cell is empty."""
-        rows = [
-            [
-                bold.format(text(column.cell(record))) if column.bold(record) else text(column.cell(record))
-                for column in self.shown
-            ]
-            for record in self.records
-            if self.is_main(record)
-        ]
+        rows, shown = [], self.shown
+        for record in filter(self.is_main, self.records):
+            cells = [(text(column.cell(record)), column.bold(record)) for column in shown]
+            rows.append([bold.format(cell) if is_bold else cell for cell, is_bold in cells])
         for row, before in zip(rows[:0:-1], rows[-2::-1], strict=True):
             if row[0] == before[0]:
                 row[0] = ""
@@ -228,10 +224,10 @@ class Table:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Tables(Mapping[str, DataFrame]):
+class Tables:
     """Tables by name: `tables["tracking"]` is a pandas DataFrame, `tables[["tracking", "lag"]]` are two of the tables.
 
-    `str` gives the verdict and the main tables as text, in full all that have rows.
+    `str` gives the verdict and the main tables.
     """
 
     tables: Mapping[str, Table]
@@ -248,12 +244,6 @@ class Tables(Mapping[str, DataFrame]):
         if isinstance(name, list):
             return Tables({each: self.tables[each].in_full() for each in name})
         return self.tables[name].data
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.tables)
-
-    def __len__(self) -> int:
-        return len(self.tables)
 
     __str__ = _text
 
