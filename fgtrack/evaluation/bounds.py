@@ -130,9 +130,11 @@ def bounds_along(
     be reached, but no bound in the strict sense.
     """
     states = truth(np.unique([start_ns, *(item.stamp_ns for item in measurements), *now_ns]))
-    each = [
-        bounds(motion, start_ns, prior_covariance, measurements, lambda _, one=one: one[None], now_ns) for one in states
-    ]
+
+    def along(one: FloatArray) -> Bounds:
+        return bounds(motion, start_ns, prior_covariance, measurements, lambda _: one[None], now_ns)
+
+    each = map(along, states)
     return Bounds(*(np.mean(covariances, axis=0) for covariances in zip(*each, strict=True)))
 
 

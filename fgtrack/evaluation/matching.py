@@ -1,6 +1,6 @@
 """Pairs of tracks and true objects, tick by tick, and the errors of these tracks."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -94,7 +94,7 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
     tracks = tracks.where(kept & confirmed(tracks) if options.confirmed_only else kept)
     if run.tables["ignored"].num_rows:
         tracks = tracks.where(~_ignored(run, tracks, paths, options.gate_m))
-    candidates, distances_m = _distances(tracks, paths)
+    candidates, distances_m = distances(tracks, paths)
     tick_index = np.searchsorted(timing["tick"], tracks["tick"])
     object_index = nearest_pairs(distances_m, tracks["track_id"], tick_index, timing.num_rows, options.gate_m)
     paired = np.flatnonzero(object_index != NO_OBJECT)
@@ -217,7 +217,7 @@ def _ignored(run: Run, tracks: Table, paths: list[TruePath], gate_m: float) -> B
     """
     objects = run.tables["ignored"].where(run.tables["ignored"]["outline_m"] == "")
     unknown = dict.fromkeys(("yaw_rad", "speed_mps", "yaw_rate_radps"), np.full(objects.num_rows, np.nan))
-    _, distances_m = _distances(tracks, [*paths, *true_paths(Table({**objects, **unknown}))])
+    _, distances_m = distances(tracks, [*paths, *true_paths(Table({**objects, **unknown}))])
     timing, stamps_ns = run.tables["timing"], tracks["stamp_ns"]
     tick_index = np.searchsorted(timing["tick"], tracks["tick"])
     index = nearest_pairs(distances_m, tracks["track_id"], tick_index, timing.num_rows, gate_m)
@@ -225,7 +225,7 @@ def _ignored(run: Run, tracks: Table, paths: list[TruePath], gate_m: float) -> B
     return np.asarray((index >= len(paths)) | ((index == NO_OBJECT) & in_regions))
 
 
-def _distances(tracks: Table, paths: list[TruePath]) -> tuple[FloatArray, FloatArray]:
+def distances(tracks: Table, paths: Sequence[TruePath]) -> tuple[FloatArray, FloatArray]:
     """True states at the stamps of `tracks`, shape (rows, objects, 5), and distances from them, shape (rows, objects).
 
     NaN where there is no truth or no finite state.

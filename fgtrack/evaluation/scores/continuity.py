@@ -4,7 +4,7 @@ import numpy as np
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FUSED, FloatArray, IntArray
-from fgtrack.evaluation.matching import Matching, confirmed, published_rows
+from fgtrack.evaluation.matching import Matching, confirmed, distances, published_rows
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run import NO_TRACK, Run
 
@@ -31,24 +31,20 @@ def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
     object within `gate_m`), and ends with the tick at which the object is first paired with a row that is `confirmed`.
     NaN where there is no such row.
     """
+    import pandas as pd
+
     tracks, updates = run.tables["tracks"], run.tables["updates"]
-    fused = np.isin(updates["disposition"], [name.value for name in FUSED])
-    updates = updates.where(fused & (updates["track_id"] != NO_TRACK))
+    updates = updates.where(np.isin(updates["disposition"], list(FUSED)) & (updates["track_id"] != NO_TRACK))
     rows = published_rows(tracks, updates["tick"], updates["track_id"])
-    stamps_ns, rows = updates["stamp_ns"][rows >= 0], rows[rows >= 0]
-    xy = np.stack([tracks["x_m"][rows], tracks["y_m"][rows]], axis=-1)
-    paths = true_paths(run.tables["truth"])
-    truth = np.stack([path.at(tracks["stamp_ns"][rows])[:, :2] for path in paths], axis=1)
-    distances_m = np.linalg.norm(truth - xy[:, None], axis=-1)
-    distances_m[~(distances_m <= gate_m)] = np.inf
-    near = np.isfinite(distances_m).any(axis=1)
-    never = np.iinfo(np.int64).max
-    detected_ns, confirmed_ns = np.full((2, len(paths)), never)
-    np.minimum.at(detected_ns, distances_m[near].argmin(axis=1), stamps_ns[near])
+    _, distances_m = distances(tracks.where(rows[rows >= 0]), true_paths(run.tables["truth"]))
+    distances_m = np.where(distances_m <= gate_m, distances_m, np.inf)
+    near, first_ns = np.isfinite(distances_m).any(axis=1), run.tables["truth"]["stamp_ns"].min()
     paired = matching.paired & confirmed(matching.tracks)
-    np.minimum.at(confirmed_ns, matching.object_index[paired], matching.now_ns[matching.tick_index[paired]])
-    known = (detected_ns != never) & (confirmed_ns != never)
-    return np.where(known, np.where(known, confirmed_ns - detected_ns, 0) / NS_PER_S, np.nan)
+    detected_ns = pd.Series(updates["stamp_ns"][rows >= 0][near] - first_ns)
+    confirmed_ns = pd.Series(matching.now_ns[matching.tick_index[paired]] - first_ns)
+    begin_ns = detected_ns.groupby(distances_m[near].argmin(axis=1)).min()
+    times_s = (confirmed_ns.groupby(matching.object_index[paired]).min() - begin_ns) / NS_PER_S
+    return np.asarray(times_s.reindex(range(len(matching.object_ids))), dtype=np.float64)
 
 
 def tracked_visits(matching: Matching) -> int:

@@ -101,24 +101,21 @@ def autocorrelation(updates: Table) -> Autocorrelation | None:
 
         rho = sum_k nu(k)' nu(k + 1) / sum_k nu(k)' nu(k).
 
-    Without correlation the products of the numerator have mean 0 and do not depend on each other, so its variance is
-    the sum of their squares: the band is 1.96 sqrt(sum_k (nu(k)' nu(k + 1))^2) / sum_k nu(k)' nu(k), whatever
-    becomes of the covariance of the innovations along the track. Where that is constant and nu a number, this is the
-    1.96 / sqrt(n) of Bar-Shalom, Li, Kirubarajan 2001, section 5.4.
+    Without correlation the products are independent with mean 0, so the band is
+    1.96 sqrt(sum_k (nu(k)' nu(k + 1))^2) / sum_k nu(k)' nu(k): for a constant variance the 1.96 / sqrt(n) of
+    Bar-Shalom, Li, Kirubarajan 2001, section 5.4.
     """
     for names in (("x_m", "y_m"), *((name,) for name in MEASURABLE if name not in ("x_m", "y_m"))):
         innovations = np.stack([updates[f"res_{name}"] for name in names], axis=-1)
         known = np.isfinite(innovations).all(axis=1) & (updates["track_id"] != NO_TRACK)
         ids, counts = np.unique(updates["track_id"][known], return_counts=True)
-        energy = product = square = 0.0
-        for track_id in ids[counts >= FEWEST].tolist():
-            nu = innovations[known & (updates["track_id"] == track_id)]
-            products = np.einsum("ni,ni->n", nu[:-1], nu[1:])
-            energy += float(np.square(nu).sum())
-            product += float(products.sum())
-            square += float(np.square(products).sum())
+        known &= np.isin(updates["track_id"], ids[counts >= FEWEST])
+        order = np.flatnonzero(known)[np.argsort(updates["track_id"][known], kind="stable")]
+        nu, ids = innovations[order], updates["track_id"][order]
+        products, energy = np.einsum("ni,ni->n", nu[:-1], nu[1:])[ids[:-1] == ids[1:]], float(np.square(nu).sum())
         if energy > 0.0:
-            return Autocorrelation(product / energy, NORMAL_95 * math.sqrt(square) / energy)
+            band = NORMAL_95 * math.sqrt(float(np.square(products).sum())) / energy
+            return Autocorrelation(float(products.sum()) / energy, band)
     return None
 
 

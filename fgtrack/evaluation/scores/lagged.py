@@ -71,7 +71,7 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
     result = [LagMetrics(0.0, errors, Moments.of(position_squares(present, truth)), errors)]
     for lag_s, every in parts.items():
         states, truth, rows = _with_truth(run, matching, every)
-        present = Table({name: column[rows] for name, column in matching.tracks.items()})
+        present = matching.tracks.where(rows)
         of_states, of_present = state_errors(states, truth), state_errors(present, matching.true_states[rows])
         squares = np.square(np.stack([of_states["position_m"], of_present["position_m"]], axis=-1))
         reduction = within_run(

@@ -18,7 +18,7 @@ from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import DataError
 from fgtrack.core.files import open_file, read_whole
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import BoolArray
+from fgtrack.core.types import BoolArray, IntArray
 from fgtrack.io.run.rows import text_header
 from fgtrack.io.run.schema import COLUMNS, NO_TRACK, OPTIONAL_TABLES, RUN_FORMAT, Column, column, column_type
 from fgtrack.io.run.writer import LARGEST_META_MB, RunWriter, path_from_run
@@ -51,9 +51,9 @@ class Table(dict[str, Column]):
             np.array_equal(self[name], other[name], equal_nan=column_type(name) is float) for name in self
         )
 
-    def where(self, mask: BoolArray) -> "Table":
-        """The rows where `mask`, shape (rows,), is true."""
-        return Table({name: values[mask] for name, values in self.items()})
+    def where(self, rows: BoolArray | IntArray) -> "Table":
+        """The rows where a mask, shape (rows,), is true, or those with these indices."""
+        return Table({name: values[rows] for name, values in self.items()})
 
 
 @dataclass(frozen=True)
