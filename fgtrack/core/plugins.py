@@ -89,10 +89,8 @@ class Registry:
         }
         for group in self._built_in:
             for entry in sorted(entry_points(group=group), key=lambda entry: (entry.name, _package(entry))):
-                holder = entries.get(self._aliases.get(entry.name, entry.name))
-                if holder is None:
-                    entries[entry.name] = entry
-                elif (holder.value, _package(holder)) != (entry.value, _package(entry)):
+                holder = entries.setdefault(self._aliases.get(entry.name, entry.name), entry)
+                if (holder.value, _package(holder)) != (entry.value, _package(entry)):
                     _logger.warning(
                         "%s %r of %s is left out: the name belongs to %s; rename the entry point",
                         self._noun,

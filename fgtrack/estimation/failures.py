@@ -9,8 +9,6 @@ from typing import Any
 
 __all__ = ["EstimatorError", "Failure", "Failures"]
 
-_MOST_ENDED = 100
-
 
 class Failure(StrEnum):
     """A kind of failure, or of what was done about one."""
@@ -62,7 +60,7 @@ class Failures:
     def end(self, track_id: int, now_ns: int, failure: Failure) -> None:
         """Count a track that ends."""
         self.add(Failure.TRACK_ENDED)
-        if len(self.ended) < _MOST_ENDED:
+        if len(self.ended) < 100:
             self.ended.append({"track_id": track_id, "now_ns": now_ns, "failure": failure.value})
 
     def note(self, what: str | Exception) -> None:

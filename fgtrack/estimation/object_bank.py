@@ -1,13 +1,13 @@
 """A bank of independent estimators, and the estimator of one object from a bank."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Generic, TypeVar
 
 import numpy as np
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds, seconds
-from fgtrack.core.types import SmoothedReport, TrackState
+from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import (
     Estimator,
     Measurement,
@@ -16,7 +16,6 @@ from fgtrack.estimation.base import (
     TrackBank,
     UpdateResult,
     UpdateStatus,
-    no_states,
 )
 from fgtrack.estimation.failures import EstimatorError
 from fgtrack.estimation.filters.ekf import predict
@@ -57,10 +56,7 @@ class ObjectBank(Generic[_E]):
         """See `TrackBank.states_at`."""
         states = self._ask(lambda _, one: self._state(one, stamp_ns) if one.window_ns[0] <= stamp_ns else None)
         known = {track_id: state for track_id, state in states.items() if state is not None}
-        if not known:
-            return no_states(self._motion.dim)
-        means = np.array([state.mean for state in known.values()])
-        return StatesAt(tuple(known), means, np.array([state.covariance for state in known.values()]))
+        return StatesAt(tuple(known), *_stacked(known.values(), self._motion.dim))
 
     def update(
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
@@ -80,11 +76,8 @@ class ObjectBank(Generic[_E]):
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
-        if not self._estimators:
-            return []
-        states = self._ask(lambda _, one: self._state(one, max(self.present_ns, one.window_ns[0]))).values()
-        means, covariances = zip(*((state.mean, state.covariance) for state in states), strict=True)
-        return kinematic_states(self._motion, self.present_ns, np.array(means), np.array(covariances))
+        states = self._ask(lambda _, one: self._state(one, max(self.present_ns, one.window_ns[0])))
+        return kinematic_states(self._motion, self.present_ns, *_stacked(states.values(), self._motion.dim))
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`: none."""
@@ -115,6 +108,11 @@ def _checked(result: UpdateResult) -> UpdateResult:
     if not isinstance(result, UpdateResult):
         raise TypeError(f"update must return an UpdateResult, returned a {type(result).__name__}")
     return result
+
+
+def _stacked(states: Iterable[TrackState], n: int) -> tuple[FloatArray, FloatArray]:
+    means, covariances = [state.mean for state in states], [state.covariance for state in states]
+    return np.array(means).reshape(-1, n), np.array(covariances).reshape(-1, n, n)
 
 
 class OneObject:

@@ -74,7 +74,7 @@ class Claims:
 
     exact: str = ""
     """For which late measurements a linear model gives the dense joint posterior of all accepted ones; empty for none.
-    One that says `any lag, any number` is held to it by `fgtrack verify` and `check_estimator`."""
+    `any lag, any number` is verified by `fgtrack verify` and `check_estimator`."""
     nonlinear: Literal["at once", "at convergence", "never"] = "at once"
     """When, in a nonlinear model, estimates do not depend on the order of arrival: by themselves, after the method
     `converge()` of the estimator or bank, or never, where an estimate keeps its linearisation."""
@@ -85,18 +85,15 @@ class Claims:
     rounding: float = 0.0
     """Where stamps nearly coincide, the tolerance grows to this many times `rounding_bound` of the suite."""
     retrodicts: bool = False
-    """True if a filter predicts the innovation of a late measurement from everything that has been fused, also what was
-    sensed after it. One that smooths does so anyway."""
+    """True if a filter predicts the innovation of a late measurement from everything fused, as smoothers do."""
     spreads: bool = False
     """True if predictions of a nonlinear model are averages over the spread of the state, not values at its mean."""
     mixes: bool = False
-    """True if it weighs other motion models beside the one that it is given: what it predicts, and what it estimates in
-    sequence, is then not what that model alone would give."""
+    """True if it weighs other motion models beside the one that it is given."""
     held_s: float = 0.0
     """Time that a measurement waits before it counts."""
     initiates: bool = False
-    """True if it finds an unknown direction of travel by itself, and takes `initiation` as an option. Another one is
-    made again, along its first positions, until their direction is certain (see `Initiated`)."""
+    """True if it estimates an unknown direction of travel, with the option `initiation`; others become `Initiated`."""
     bank: bool = False
     """True if the entry makes the estimators of all objects together."""
 
