@@ -68,8 +68,8 @@ def test_a_certain_direction_is_not_sought_again(monkeypatch: pytest.MonkeyPatch
         Windows, "restart", lambda self, track, line: (restarts.append(line), restart(self, track, line))
     )
     fused(1.0, 20)
-    assert restarts[-1].certainty > 3.0
-    assert not any(line.certainty > 3.0 for line in restarts[:-1])
+    assert over(restarts[-1], "regression", 3.0)
+    assert not any(over(line, "regression", 3.0) for line in restarts[:-1])
     assert 1 < len(restarts) < 20
     restarts.clear()
     standing = OneObject(CTRV(), SmootherBank(CTRV(), 0.1), start())
@@ -83,7 +83,7 @@ def test_a_certain_direction_is_not_sought_again(monkeypatch: pytest.MonkeyPatch
 
 
 def test_certainty_counts_standard_deviations_of_the_velocity() -> None:
-    assert Line(np.zeros(2), np.array([0.0, 5.8]), np.diag([1.0, 4.0])).certainty == pytest.approx(2.9)
+    assert not over(Line(np.zeros(2), np.array([0.0, 5.8]), np.diag([1.0, 4.0])), "regression", 2.9)
     line = Line(np.zeros(2), np.array([0.0, 6.2]), np.diag([1.0, 4.0]))
     assert over(line, "regression", 3.0)
     assert not over(line, "regression", 3.2)

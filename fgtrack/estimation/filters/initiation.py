@@ -17,13 +17,12 @@ from fgtrack.models.measurement import measured_position
 from fgtrack.models.motion import MotionModel
 
 Initiation = Literal["one-point", "two-point", "regression"]
-"""Methods to find the direction of travel of a new object where neither map nor sensor gives one.
+"""Methods to estimate the direction of travel of a new object where neither map nor sensor gives one.
 
-- `one-point`: it is not sought: the state starts at yaw 0 with a wide standard deviation.
+- `one-point`: none; the state starts at yaw 0 with a wide standard deviation.
 - `two-point`: from the first two positions (Bar-Shalom, Li and Kirubarajan 2001, section 5.5.3).
-- `regression`: from a straight line through the first positions, by weighted least squares (the same, section 3.5),
-  until the velocity is so many standard deviations from zero that its direction is certain: three for a smoother,
-  which goes on relinearising, ten for a filter, which does not (0.1 rad, as well as a direction that is known).
+- `regression`: from a weighted least-squares line through the first positions (the same, section 3.5), until the
+  velocity is three standard deviations from zero for a smoother, which relinearises, and ten (0.1 rad) for a filter.
 """
 DEFAULT: Initiation = "regression"
 
@@ -56,11 +55,6 @@ class Line(NamedTuple):
     velocity_mps: FloatArray
     covariance: FloatArray
     """Covariance of the velocity, shape (2, 2)."""
-
-    @property
-    def certainty(self) -> float:
-        """Distance of the velocity from zero, in standard deviations."""
-        return math.sqrt(self.velocity_mps @ psd_solve(self.covariance, self.velocity_mps))
 
 
 def fix_of(measurement: Measurement, time_s: float) -> Fix | None:
@@ -148,5 +142,6 @@ def sought(motion: MotionModel, start: Start, method: Initiation) -> bool:
 
 
 def over(line: Line, method: Initiation, certain: float) -> bool:
-    """True if `line`, through two fixes or more, is the last one that `method` asks for."""
-    return method == "two-point" or line.certainty > certain
+    """True if `line` is the last one for `method`: its velocity is `certain` standard deviations from zero."""
+    sigmas = math.sqrt(line.velocity_mps @ psd_solve(line.covariance, line.velocity_mps))
+    return method == "two-point" or sigmas > certain
