@@ -109,7 +109,7 @@ def _stamps(messages: Iterator[Message]) -> Iterator[tuple[BagTopic, int, int | 
     """Sensor or kind, receipt and stamp of `messages`, as of a recording with a topic for each."""
     for message in messages:
         kind = "ego" if isinstance(message, EgoState) else "truth"
-        topic = BagTopic(kind, kind, 0, None)
+        topic = BagTopic(kind, kind, None)
         if isinstance(message, DetectionList):
-            topic = BagTopic(message.sensor, "detections", 0, None)
+            topic = BagTopic(message.sensor, "detections", None)
         yield topic, message.receipt_ns, message.stamp_ns

@@ -6,7 +6,7 @@ from rosbags.typesys import Stores, get_typestore
 from support.mcap import poses
 
 from fgtrack.core.errors import DataError
-from fgtrack.io.ros.typestore import MessageTypes, check_definition, typestore_of
+from fgtrack.io.ros.typestore import MessageTypes, checked, typestore_of
 
 NUMBER = (Nodetype.BASE, ("float64", 0))
 NAME = "a_msgs/msg/B"
@@ -14,8 +14,8 @@ NAME = "a_msgs/msg/B"
 
 @pytest.mark.parametrize("store", Stores)
 def test_every_definition_of_ros_passes(store: Stores) -> None:
-    for name, definition in get_typestore(store).fielddefs.items():
-        check_definition(name, definition)
+    types = dict(get_typestore(store).fielddefs)
+    assert checked(types) is types
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,7 @@ def test_every_definition_of_ros_passes(store: Stores) -> None:
 )
 def test_what_is_no_name_and_no_number_is_refused(name: str, definition, problem: str) -> None:
     with pytest.raises(ValueError, match=problem):
-        check_definition(name, definition)
+        checked({name: definition})
 
 
 def test_a_definition_that_is_refused_is_a_problem_of_its_type_alone(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,6 @@ import json
 import math
 import os
 from contextlib import suppress
-from io import FileIO
 
 import numpy as np
 import pytest
@@ -183,20 +182,6 @@ def test_a_killed_run_is_readable_up_to_its_last_whole_row(tmp_path):
     assert run.tables["tracks"].num_rows == 5
     assert run.tables["timing"].num_rows == 3
     writer.close()
-
-
-def test_a_disk_that_takes_only_a_part_at_a_time_gets_all(tmp_path, monkeypatch):
-    """As one that is nearly full does: what it did not take must not be lost without a word."""
-
-    class Grudging(FileIO):
-        def write(self, data):
-            return super().write(bytes(data)[:7])
-
-    write(tmp_path / "right", report())
-    monkeypatch.setattr("fgtrack.io.run.writer.FileIO", Grudging)
-    write(tmp_path / "run", report())
-    for name in ("tracks.csv", "updates.csv", "timing.csv"):
-        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "right" / name).read_bytes()
 
 
 def test_ticks_that_do_not_increase_are_refused(tmp_path):

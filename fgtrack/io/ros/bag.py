@@ -27,7 +27,6 @@ class BagTopic:
 
     name: str
     type: str
-    count: int
     problem: str | None
     """Why its messages cannot be decoded; None when they can."""
 
@@ -54,9 +53,8 @@ class Bag:
         self._types = MessageTypes(map(_key, connections), self._ros1, message_definitions)
         self._topics: dict[tuple[str, str], BagTopic] = {}
         for name, group in groupby(connections, _topic_and_type):
-            same = list(group)
-            problems = [self._types.problems[_key(item)] for item in same if _key(item) in self._types.problems]
-            self._topics[name] = BagTopic(*name, sum(item.msgcount for item in same), next(iter(problems), None))
+            problems = [self._types.problems.get(_key(item)) for item in group]
+            self._topics[name] = BagTopic(*name, next(filter(None, problems), None))
         self.topics = tuple(self._topics.values())
         """Topics by name; a topic with two types is listed twice."""
 

@@ -1,6 +1,5 @@
 """MCAP files of ROS 2 messages, including truncated ones (format: https://mcap.dev/spec)."""
 
-from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from operator import attrgetter
 from pathlib import Path
@@ -21,7 +20,6 @@ _FORMATS = {
     "omgidl": MessageDefinitionFormat.IDL,
 }
 _NO_SCHEMA = Schema(data=b"", encoding="", id=0, name="")
-_Contents = tuple[dict[int, Schema], dict[int, Channel], dict[int, int]]  # and the number of messages by channel
 
 
 class McapFile:
@@ -37,18 +35,15 @@ class McapFile:
     def open(self) -> None:
         """Open the file and read which connections it holds."""
         self._file = self.path.open("rb")
-        contents = self._indexed()
-        self._is_indexed = contents is not None
-        schemas, channels, counts = contents or self._scanned()
+        indexed = self._indexed()
+        self._is_indexed = indexed is not None
+        schemas, channels = indexed or self._scanned()
         for channel in channels.values():
             schema = schemas.get(channel.schema_id, _NO_SCHEMA)
             form = _FORMATS.get(schema.encoding, MessageDefinitionFormat.NONE)
             definition = MessageDefinition(form, schema.data.decode() if form != MessageDefinitionFormat.NONE else "")
             ext = ConnectionExtRosbag2(channel.message_encoding, [])
-            count = counts.get(channel.id, 0)
-            self.connections.append(
-                Connection(channel.id, channel.topic, schema.name, definition, "", count, ext, self)
-            )
+            self.connections.append(Connection(channel.id, channel.topic, schema.name, definition, "", 0, ext, self))
 
     def close(self) -> None:
         """Close the file."""
@@ -72,8 +67,8 @@ class McapFile:
         assert self._file
         return SeekingReader(self._file, validate_crcs=True, record_size_limit=_LARGEST_BYTES)
 
-    def _indexed(self) -> _Contents | None:
-        """Contents by the end of the file; None unless all messages are in chunks of its index."""
+    def _indexed(self) -> tuple[dict[int, Schema], dict[int, Channel]] | None:
+        """Schemas and channels by the end of the file; None unless all messages are in chunks of its index."""
         try:
             summary = self._reader().get_summary()
         except Exception:  # whatever the end of a truncated file raises
@@ -83,20 +78,17 @@ class McapFile:
             return None
         if known.channel_count > len(summary.channels):
             return None
-        return summary.schemas, summary.channels, known.channel_message_counts
+        return summary.schemas, summary.channels
 
-    def _scanned(self) -> _Contents:
-        """Contents of the file up to its end, or to where it breaks off."""
-        schemas, channels, counts = dict[int, Schema](), dict[int, Channel](), Counter[int]()
+    def _scanned(self) -> tuple[dict[int, Schema], dict[int, Channel]]:
+        """Schemas and channels of the file up to its end, or to where it breaks off."""
+        schemas, channels = dict[int, Schema](), dict[int, Channel]()
         for record in self._records():
-            match record:
-                case Schema():
-                    schemas[record.id] = record
-                case Channel():
-                    channels.setdefault(record.id, record)
-                case Message():
-                    counts[record.channel_id] += 1
-        return schemas, channels, counts
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels.setdefault(record.id, record)
+        return schemas, channels
 
     def _records(self) -> Iterator[McapRecord]:
         """Records from the beginning of the file to its end, or to where it breaks off."""

@@ -38,7 +38,6 @@ class Rosbag1File(Reader):
         except Exception:  # the end of the file, or whatever a cut chunk makes its decompressor raise
             self.break_off = f"breaks off at byte {position}"
         self.indexes = {item.id: sorted(indexes[item.id]) for item in self.connections}
-        self.connections = [item._replace(msgcount=len(self.indexes[item.id])) for item in self.connections]
 
     def _index_chunk(self, position: int, indexes: dict[int, list[IndexData]]) -> None:
         """Index the connections and messages of the chunk at `position`."""

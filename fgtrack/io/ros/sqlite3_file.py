@@ -58,7 +58,7 @@ class Sqlite3File:
                 yield by_id[topic_id], log_ns, data
 
     def _read_topics(self, base: apsw.Connection) -> None:
-        counts = dict(base.execute("SELECT topic_id, count(*) FROM messages GROUP BY 1"))
+        base.execute("SELECT topic_id, count(*) FROM messages GROUP BY 1").fetchall()  # raises for a truncated file
         definitions: dict[str, MessageDefinition] = {}
         if any(base.execute("PRAGMA table_info(message_definitions)")):  # an old schema has none
             for name, kind, text in base.execute(f"SELECT {_TABLES['message_definitions']} FROM message_definitions"):
@@ -66,7 +66,7 @@ class Sqlite3File:
                     definitions.setdefault(name, MessageDefinition(_FORMATS[kind], text))
         self.connections = [
             Connection(
-                *(number, topic, kind, definitions.get(kind, _NO_DEFINITION), "", counts.get(number, 0)),
+                *(number, topic, kind, definitions.get(kind, _NO_DEFINITION), "", 0),
                 ConnectionExtRosbag2(serialization, []),
                 self,
             )

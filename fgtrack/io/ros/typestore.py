@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat, Nodetype
-from rosbags.interfaces.typing import Constdefs, Fielddefs, FieldDesc, Typesdict
+from rosbags.interfaces.typing import FieldDesc, Typesdict
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
@@ -22,7 +22,7 @@ from fgtrack.core.files import read_whole
 from fgtrack.io.errors import one_line
 from fgtrack.io.ros.definitions import DEFINITIONS
 
-__all__ = ["Key", "MessageTypes", "check_definition", "type_name", "typestore_of"]
+__all__ = ["Key", "MessageTypes", "checked", "type_name", "typestore_of"]
 
 Key = tuple[str, MessageDefinition | None]
 """A message type and its definition in the recording: two topics may define one name differently."""
@@ -169,7 +169,7 @@ def _user_types(path: Path) -> Typesdict:
     for file in sorted(path.rglob("*.msg")) if path.is_dir() else [path]:
         package = file.parent.parent.name if file.parent.name == "msg" else file.parent.name
         try:
-            types |= _checked(get_types_from_msg(read_whole(file, 1.0).decode(), f"{package}/msg/{file.stem}"))
+            types |= checked(get_types_from_msg(read_whole(file, 1.0).decode(), f"{package}/msg/{file.stem}"))
         except Exception as error:  # whatever an invalid definition makes the parser raise
             raise CallError(f"{file}: is not a message definition ({one_line(error)})") from error
     return types
@@ -187,11 +187,11 @@ def _embedded(name: str, definition: MessageDefinition | None) -> Typesdict:
         raise ValueError(f"it has more than {_LONGEST_TEXT} characters")
     _check_type_name(name)
     if form == MessageDefinitionFormat.MSG:
-        return _checked(get_types_from_msg(_EMPTY_LINE.sub("", f"{text}\n"), name))
+        return checked(get_types_from_msg(_EMPTY_LINE.sub("", f"{text}\n"), name))
     types: Typesdict = {}
     first, *others = text.split(_SEPARATOR)
     for part in [part.partition("\n")[2] for part in others] if others and not first.strip() else [text]:
-        types |= _checked(get_types_from_idl(_plain_idl(part)))
+        types |= checked(get_types_from_idl(_plain_idl(part)))
     return types
 
 
@@ -206,32 +206,27 @@ def _plain_idl(text: str) -> str:
     return plain.replace(">", "> ")  # rosbags takes the end of `sequence<string<9>>` for a shift
 
 
-def _checked(types: Typesdict) -> Typesdict:
-    for name, definition in types.items():
-        check_definition(name, definition)
+def checked(types: Typesdict) -> Typesdict:
+    """Return `types`; raise `ValueError` unless all their names are names, and their constants plain values."""
+    for name, (constants, members) in types.items():
+        _check_type_name(name)
+        names = [*(constant[0] for constant in constants), *(member[0] for member in members)]
+        for member in names:
+            if not _MEMBER_NAME.fullmatch(member):
+                raise ValueError(f"{member!a:.200} is not a name of a member")
+        if len(set(map(normalize_fieldname, names))) < len(names):
+            raise ValueError(f"{name} has two members of one name")
+        for member, kind, value in constants:
+            is_number = value in _INTEGERS if type(value) is int else type(value) is float and math.isfinite(value)
+            if not (is_number or type(value) in (bool, str)) or not _BASE_NAME.fullmatch(kind):
+                raise ValueError(f"the constant {member} is not a plain value")
+        for member, description in members:
+            node, inner = _innermost(description)
+            if node == Nodetype.NAME:
+                _check_type_name(cast("str", inner))
+            elif not _BASE_NAME.fullmatch(cast("tuple[str, int]", inner)[0]):
+                raise ValueError(f"{member} is of an unknown type")
     return types
-
-
-def check_definition(name: str, definition: tuple[Constdefs, Fielddefs]) -> None:
-    """Raise `ValueError` unless all names of a definition are names, and its constants plain values."""
-    constants, members = definition
-    _check_type_name(name)
-    names = [*(constant[0] for constant in constants), *(member[0] for member in members)]
-    for member in names:
-        if not _MEMBER_NAME.fullmatch(member):
-            raise ValueError(f"{member!a:.200} is not a name of a member")
-    if len(set(map(normalize_fieldname, names))) < len(names):
-        raise ValueError(f"{name} has two members of one name")
-    for member, kind, value in constants:
-        is_number = value in _INTEGERS if type(value) is int else type(value) is float and math.isfinite(value)
-        if not (is_number or type(value) in (bool, str)) or not _BASE_NAME.fullmatch(kind):
-            raise ValueError(f"the constant {member} is not a plain value")
-    for member, description in members:
-        node, inner = _innermost(description)
-        if node == Nodetype.NAME:
-            _check_type_name(cast("str", inner))
-        elif not _BASE_NAME.fullmatch(cast("tuple[str, int]", inner)[0]):
-            raise ValueError(f"{member} is of an unknown type")
 
 
 def _check_type_name(name: str) -> None:

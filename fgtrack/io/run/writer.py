@@ -6,7 +6,7 @@ import os
 import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
-from io import FileIO
+from io import BufferedWriter
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -57,7 +57,7 @@ class RunWriter(RunSink):
         super().__init__(config_text, meta, smoothed_lag_s)
         self.path = Path(path)
         self._folder: Path | None = None  # where the files are, once there are any
-        self._files: dict[str, FileIO] = {}
+        self._files: dict[str, BufferedWriter] = {}
         with ExitStack() as claim:
             claim.enter_context(claimed(self.path))
             check_run(self.path, overwrite)
@@ -76,7 +76,8 @@ class RunWriter(RunSink):
     def close(self) -> None:
         """Close the tables and unlock the folder; without `finish` before, the run stays marked as incomplete."""
         while self._files:
-            self._files.popitem()[1].close()
+            with suppress(OSError):  # of a full disk, reported when it was written
+                self._files.popitem()[1].close()
         self._claim.close()
 
     def finish(self, meta: Mapping[str, object]) -> dict[str, object]:
@@ -109,9 +110,10 @@ class RunWriter(RunSink):
         path = self._begin() / f"{table}.csv"
         try:
             if table not in self._files:
-                self._files[table] = FileIO(path, "w")
-                _write_all(self._files[table], text_header(table))
-            _write_all(self._files[table], lines.encode())
+                self._files[table] = path.open("wb")
+                self._files[table].write(text_header(table))
+            self._files[table].write(lines.encode())
+            self._files[table].flush()
         except OSError as error:
             raise write_error(path, error) from error
 
@@ -173,9 +175,3 @@ def is_run_folder(path: Path) -> bool:
             if json.loads(read_whole(file, LARGEST_META_MB))["format"] == RUN_FORMAT:
                 return True
     return False
-
-
-def _write_all(file: FileIO, data: bytes) -> None:
-    """Write `data`; a disk that is about to be full takes only the first part of it at a time."""
-    while data:
-        data = data[file.write(data) :]
