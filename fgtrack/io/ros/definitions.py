@@ -6,55 +6,43 @@ Definitions embedded in a recording and those of the user take precedence.
 from fgtrack.core.types import MEASURABLE
 
 # Versions of the layouts below: vision_msgs 4, radar_msgs 0.2, tier4's autoware_auto_msgs, autoware_msgs 1.
-_AUTOWARE_CLASSIFICATION = "uint8 label\nfloat32 probability\n"
-_AUTOWARE_SHAPE = "uint8 type\ngeometry_msgs/Polygon footprint\ngeometry_msgs/Vector3 dimensions\n"
-_AUTOWARE_KINEMATICS = """\
-uint8 UNAVAILABLE=0
-uint8 SIGN_UNKNOWN=1
-uint8 AVAILABLE=2
-geometry_msgs/PoseWithCovariance pose_with_covariance
-bool has_position_covariance
-uint8 orientation_availability
-geometry_msgs/TwistWithCovariance twist_with_covariance
-bool has_twist
-bool has_twist_covariance
-"""
-_AUTOWARE_OBJECT = """\
-float32 existence_probability
-ObjectClassification[] classification
-DetectedObjectKinematics kinematics
-Shape shape
-"""
-_AUTOWARE_TRACKED_KINEMATICS = """\
-uint8 UNAVAILABLE=0
-uint8 SIGN_UNKNOWN=1
-uint8 AVAILABLE=2
-geometry_msgs/PoseWithCovariance pose_with_covariance
-uint8 orientation_availability
-geometry_msgs/TwistWithCovariance twist_with_covariance
-geometry_msgs/AccelWithCovariance acceleration_with_covariance
-bool is_stationary
-"""
-_AUTOWARE_TRACKED_OBJECT = """\
-unique_identifier_msgs/UUID object_id
-float32 existence_probability
-ObjectClassification[] classification
-TrackedObjectKinematics kinematics
-Shape shape
-"""
+_AVAILABILITY = "uint8 UNAVAILABLE=0, uint8 SIGN_UNKNOWN=1, uint8 AVAILABLE=2"
+_POSE = "geometry_msgs/PoseWithCovariance pose_with_covariance"
+_TWIST = "geometry_msgs/TwistWithCovariance twist_with_covariance"
 _AUTOWARE = {
-    "ObjectClassification": _AUTOWARE_CLASSIFICATION,
-    "Shape": _AUTOWARE_SHAPE,
-    "DetectedObjectKinematics": _AUTOWARE_KINEMATICS,
-    "DetectedObject": _AUTOWARE_OBJECT,
-    "DetectedObjects": "std_msgs/Header header\nDetectedObject[] objects\n",
-    "TrackedObjectKinematics": _AUTOWARE_TRACKED_KINEMATICS,
-    "TrackedObject": _AUTOWARE_TRACKED_OBJECT,
-    "TrackedObjects": "std_msgs/Header header\nTrackedObject[] objects\n",
+    "ObjectClassification": "uint8 label, float32 probability",
+    "Shape": "uint8 type, geometry_msgs/Polygon footprint, geometry_msgs/Vector3 dimensions",
+    "DetectedObjectKinematics": f"{_AVAILABILITY}, {_POSE}, bool has_position_covariance, "
+    f"uint8 orientation_availability, {_TWIST}, bool has_twist, bool has_twist_covariance",
+    "DetectedObject": "float32 existence_probability, ObjectClassification[] classification, "
+    "DetectedObjectKinematics kinematics, Shape shape",
+    "DetectedObjects": "std_msgs/Header header, DetectedObject[] objects",
+    "TrackedObjectKinematics": f"{_AVAILABILITY}, {_POSE}, uint8 orientation_availability, {_TWIST}, "
+    "geometry_msgs/AccelWithCovariance acceleration_with_covariance, bool is_stationary",
+    "TrackedObject": "unique_identifier_msgs/UUID object_id, float32 existence_probability, "
+    "ObjectClassification[] classification, TrackedObjectKinematics kinematics, Shape shape",
+    "TrackedObjects": "std_msgs/Header header, TrackedObject[] objects",
 }
-
+_FOREIGN = {
+    **{f"autoware_perception_msgs/msg/{name}": text for name, text in _AUTOWARE.items()},
+    **{f"autoware_auto_perception_msgs/msg/{name}": text for name, text in _AUTOWARE.items()},
+    "vision_msgs/msg/ObjectHypothesis": "string class_id, float64 score",
+    "vision_msgs/msg/ObjectHypothesisWithPose": "ObjectHypothesis hypothesis, geometry_msgs/PoseWithCovariance pose",
+    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center, geometry_msgs/Vector3 size",
+    "vision_msgs/msg/Detection3D": "std_msgs/Header header, ObjectHypothesisWithPose[] results, BoundingBox3D bbox, "
+    "string id",
+    "vision_msgs/msg/Detection3DArray": "std_msgs/Header header, Detection3D[] detections",
+    "radar_msgs/msg/RadarTrack": "unique_identifier_msgs/UUID uuid, geometry_msgs/Point position, "
+    "geometry_msgs/Vector3 velocity, geometry_msgs/Vector3 acceleration, geometry_msgs/Vector3 size, "
+    "uint16 classification, float32[6] position_covariance, float32[6] velocity_covariance, "
+    "float32[6] acceleration_covariance, float32[6] size_covariance",
+    "radar_msgs/msg/RadarTracks": "std_msgs/Header header, RadarTrack[] tracks",
+    "delphi_esr_msgs/msg/EsrTrack": "std_msgs/Header header, string canmsg, uint8 id, float32 lat_rate, "
+    "bool grouping_changed, bool oncoming, uint8 status, float32 angle, float32 range, bool bridge_object, "
+    "bool rolling_count, float32 width, float32 range_accel, uint8 med_range_mode, float32 range_rate",
+}
 _COMPONENTS = "\n".join(f"float64 {name}" for name in MEASURABLE)
-FGTRACK_DEFINITIONS = {
+_OWN = {
     "fgtrack_msgs/msg/Ego": """\
 std_msgs/Header header
 float64 x_m
@@ -106,51 +94,4 @@ float64[] outline_m
 }
 
 #: Text of every definition by type name.
-DEFINITIONS: dict[str, str] = {
-    **FGTRACK_DEFINITIONS,
-    **{f"autoware_perception_msgs/msg/{name}": text for name, text in _AUTOWARE.items()},
-    **{f"autoware_auto_perception_msgs/msg/{name}": text for name, text in _AUTOWARE.items()},
-    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",
-    "vision_msgs/msg/ObjectHypothesisWithPose": """\
-ObjectHypothesis hypothesis
-geometry_msgs/PoseWithCovariance pose
-""",
-    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
-    "vision_msgs/msg/Detection3D": """\
-std_msgs/Header header
-ObjectHypothesisWithPose[] results
-BoundingBox3D bbox
-string id
-""",
-    "vision_msgs/msg/Detection3DArray": "std_msgs/Header header\nDetection3D[] detections\n",
-    "radar_msgs/msg/RadarTrack": """\
-unique_identifier_msgs/UUID uuid
-geometry_msgs/Point position
-geometry_msgs/Vector3 velocity
-geometry_msgs/Vector3 acceleration
-geometry_msgs/Vector3 size
-uint16 classification
-float32[6] position_covariance
-float32[6] velocity_covariance
-float32[6] acceleration_covariance
-float32[6] size_covariance
-""",
-    "radar_msgs/msg/RadarTracks": "std_msgs/Header header\nRadarTrack[] tracks\n",
-    "delphi_esr_msgs/msg/EsrTrack": """\
-std_msgs/Header header
-string canmsg
-uint8 id
-float32 lat_rate
-bool grouping_changed
-bool oncoming
-uint8 status
-float32 angle
-float32 range
-bool bridge_object
-bool rolling_count
-float32 width
-float32 range_accel
-uint8 med_range_mode
-float32 range_rate
-""",
-}
+DEFINITIONS: dict[str, str] = _OWN | {name: text.replace(", ", "\n") for name, text in _FOREIGN.items()}
