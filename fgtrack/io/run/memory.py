@@ -1,7 +1,8 @@
 """Keeps a run in memory: what `load_run` would give of the folder that `RunWriter` writes, without the files."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from functools import cached_property
 
 from fgtrack.io.run.reader import Run, parsed
 from fgtrack.io.run.rows import Row, text, text_header
@@ -10,22 +11,17 @@ from fgtrack.io.run.sink import RunSink
 
 
 class MemoryRun(RunSink):
-    """Takes what `RunWriter` takes; `run` is the run so far. Parameters as of `RunSink`."""
-
-    def __init__(
-        self,
-        config_text: str = "",
-        meta: Mapping[str, object] | None = None,
-        smoothed_lag_s: float | None = None,
-    ) -> None:
-        super().__init__(config_text, meta, smoothed_lag_s)
-        self._files = {table: bytearray(text_header(table)) for table in COLUMNS}
+    """Takes what `RunWriter` takes; `run` is the run so far."""
 
     @property
     def run(self) -> Run:
         """The run; it has no path."""
         tables = {table: parsed(table, content) for table, content in self._files.items()}
         return Run(None, dict(self._meta), self._config_text, tables)
+
+    @cached_property
+    def _files(self) -> dict[str, bytearray]:
+        return {table: bytearray(text_header(table)) for table in COLUMNS}
 
     def _append(self, table: str, rows: Sequence[Row]) -> None:
         self._files[table] += text(table, rows).encode()

@@ -88,24 +88,16 @@ def _frame(table: str, doc: str) -> "cached_property[DataFrame]":
 
 @dataclass(frozen=True, repr=False)
 class Run:
-    """A run as evaluation sees it.
-
-    Attributes
-    ----------
-    path
-        Folder of the run; None for a run in memory.
-    meta
-        Content of meta.json; JSON values.
-    config_text
-        Text of config.yaml.
-    tables
-        The tables by name as NumPy columns; those left out have no rows.
-    """
+    """A run as evaluation sees it."""
 
     path: Path | None
+    """Folder of the run; None for a run in memory."""
     meta: Mapping[str, Any]
+    """Content of meta.json; JSON values."""
     config_text: str
+    """Text of config.yaml."""
     tables: Mapping[str, Table]
+    """The tables by name as NumPy columns; those left out have no rows."""
 
     def __post_init__(self) -> None:
         empty = {name: Table({key: column(key, ()) for key in COLUMNS[name]}) for name in COLUMNS}
@@ -202,14 +194,9 @@ _parsed = lru_cache(maxsize=64)(safe_yaml)
 
 
 def load_run(path: Path | str) -> Run:
-    """Read the run folder `path`.
+    """Read the run folder `path`. Raises `DataError` where a file is missing or damaged.
 
     Of a run that did not finish (`meta["complete"]` is false) a half-written last row is left out.
-
-    Raises
-    ------
-    DataError
-        A file is missing or damaged; the message names it.
     """
     path = Path(path)
     file, config = path / "meta.json", path / "config.yaml"

@@ -21,17 +21,16 @@ from fgtrack.io.run.schema import RUN_FORMAT
 class RunSink(ABC):
     """Takes a run tick by tick; where the rows go, its subclasses decide.
 
-    Parameters
-    ----------
-    config_text
-        Text of `config.yaml`, the resolved configuration.
-    meta
-        What `meta.json` says from the start on.
-    smoothed_lag_s
-        The lag whose states go to `smoothed` with the final ones; `lagged` gets those of every lag.
+    `meta` are the entries of `meta.json` from the start on. The states of the lag `smoothed_lag_s` go to `smoothed`
+    with the final ones; `lagged` gets those of every lag.
     """
 
-    def __init__(self, config_text: str, meta: Mapping[str, object] | None, smoothed_lag_s: float | None) -> None:
+    def __init__(
+        self,
+        config_text: str = "",
+        meta: Mapping[str, object] | None = None,
+        smoothed_lag_s: float | None = None,
+    ) -> None:
         self._config_text = config_text
         self._meta: dict[str, object] = {"format": RUN_FORMAT, **(meta or {}), "complete": False}
         self._smoothed_lag_s = smoothed_lag_s
@@ -58,7 +57,7 @@ class RunSink(ABC):
         self._append("smoothed", smoothed_rows(reports))
 
     def write_truth(self, truth: TruthState) -> None:
-        """Take a row of `truth`, or of `ignored`; the next tick puts it behind the others, as all that is received."""
+        """Take a row of `truth` or `ignored`; it is appended with the next tick, as all that is received."""
         if truth.ignored:
             self._received["ignored"].append(ignored_row(truth))
         else:
@@ -75,11 +74,7 @@ class RunSink(ABC):
             self._left_out.setdefault(message.sensor, Counter()).update(message.left_out)
 
     def finish(self, meta: Mapping[str, object]) -> dict[str, object]:
-        """Complete the run with `meta`, the counts and the digest; gives the content of `meta.json`.
-
-        `counts` holds, per sensor, the number of detections of every disposition, `out_of_bounds` of those with this
-        disposition how many by which setting, and `left_out` the same of what the reader did not give.
-        """
+        """Complete the run with `meta`, the counts per sensor and the digest; return the content of `meta.json`."""
         self._append_received()
         self._append_objects(set())
         counts = {

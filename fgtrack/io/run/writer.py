@@ -25,25 +25,11 @@ _FILES = (*(f"{table}.csv" for table in COLUMNS), "metrics.json", "config.yaml",
 
 
 class RunWriter(RunSink):
-    """Writes a run folder as the run goes; a context manager.
+    """Writes the run folder `path`, which is locked until the writer is closed; a context manager.
 
-    The folder is locked until the writer is closed. Every tick reaches the files before `write_tick` returns: a killed
-    run leaves readable files and a `meta.json` with `"complete": false`. An older run stays until `finish`: the new one
-    grows in `new.part` beside it. Other files in the folder stay.
-
-    Parameters
-    ----------
-    path
-        Folder of the run; made if need be.
-    config_text, meta, smoothed_lag_s
-        As of `RunSink`.
-    overwrite
-        Replace a run at `path`.
-
-    Raises
-    ------
-    CallError
-        Something is at `path`, or another writer holds it.
+    Every tick reaches the files before `write_tick` returns: a killed run leaves readable files and a `meta.json` with
+    `"complete": false`. An older run stays until `finish`: the new one grows in `new.part` beside it. Other files in
+    the folder stay. Raises `CallError` where something is at `path`, or another writer holds it.
     """
 
     def __init__(
@@ -61,7 +47,7 @@ class RunWriter(RunSink):
         with ExitStack() as claim:
             claim.enter_context(claimed(self.path))
             check_run(self.path, overwrite)
-            self._claim = claim.pop_all()
+            self._open = claim.pop_all()
 
     def __enter__(self) -> Self:
         return self
@@ -75,10 +61,8 @@ class RunWriter(RunSink):
 
     def close(self) -> None:
         """Close the tables and unlock the folder; without `finish` before, the run stays marked as incomplete."""
-        while self._files:
-            with suppress(OSError):  # of a full disk, reported when it was written
-                self._files.popitem()[1].close()
-        self._claim.close()
+        with suppress(OSError):  # of a full disk, reported when it was written
+            self._open.close()
 
     def finish(self, meta: Mapping[str, object]) -> dict[str, object]:
         """Complete the run, see `RunSink`, and replace an older one."""
@@ -110,7 +94,7 @@ class RunWriter(RunSink):
         path = self._begin() / f"{table}.csv"
         try:
             if table not in self._files:
-                self._files[table] = path.open("wb")
+                self._files[table] = self._open.enter_context(path.open("wb"))
                 self._files[table].write(text_header(table))
             self._files[table].write(lines.encode())
             self._files[table].flush()
