@@ -55,27 +55,12 @@ def advise(
 ) -> Advice:
     """Return what is late, wrong or inconsistent, and the settings that correct it; `advice.config` has them.
 
-    The recording is replayed before and after, and settings that make the tracks worse are not given.
+    The recording is replayed before and after, and settings that make the tracks worse are not given. `config`, `map`,
+    `pit_map` and `set` are as for `fgtrack.replay`; `reference` is the sensor whose clock is right, where two do not
+    agree and the recording has no truth; with `tune`, noise that does not fit is fitted. `on_step` is called before
+    each step with its name and the share that is done.
 
-    Parameters
-    ----------
-    recording
-        Path of anything that fgtrack reads.
-    config, map, pit_map, set
-        As for `fgtrack.replay`.
-    reference
-        The sensor whose clock is right, where two do not agree and the recording has no truth.
-    tune
-        Whether noise that does not fit is fitted to the recording.
-    on_step
-        Called before each step with its name and the share that is done.
-
-    Raises
-    ------
-    CallError
-        The configuration does not fit.
-    DataError
-        The recording cannot be read, or holds nothing to track.
+    Raises `CallError` where the configuration does not fit, and `DataError` where nothing can be read or tracked.
     """
     resolved = read_config(config, set, track_map=map, pit_map=pit_map)
     on_step("reading", 0.0)
@@ -159,7 +144,7 @@ class Adviser:
             self._config = _with(self._config, one)
 
     def _withdraw_harm(self, before: Config) -> None:
-        """Take back settings that make the replay worse than without them; facts of the recording stay said."""
+        """Take back settings that make the replay worse than without them; their findings stay."""
         if self._is_harm(before, self._config) is None:
             return
         self._config = before
@@ -183,7 +168,7 @@ class Adviser:
         return any(one.weight >= _USELESS and not one.settings for one in self._findings)
 
     def _unknown_sensors(self) -> Iterator[Finding]:
-        """Sensors of the recording that the configuration does not know."""
+        """Yield the sensors of the recording that the configuration lacks."""
         known = {*self._config.sensors, *self._config.ignore_sensors, EGO}
         unknown = [name for name in self._arrivals if name not in known]
         if not unknown:
@@ -203,7 +188,7 @@ class Adviser:
                 yield Finding("track", one.about, 70.0, f"{one.text}.", one.settings)
 
     def _offsets(self) -> Iterator[Finding]:
-        """Clocks that do not agree, and positions that are off, where that can be known."""
+        """Yield clocks that do not agree, and biases of positions, where these can be estimated."""
         if self._is_useless:
             return
         doubtful = {one.about for one in self._findings if one.kind == "clock"}
@@ -234,7 +219,7 @@ class Adviser:
             yield Finding("late", "estimator", 60.0, text, {"estimator": "ekf-replay"})
 
     def _ego(self) -> Iterator[Finding]:
-        """Gaps and lateness of the ego."""
+        """Yield gaps and low rates of the ego."""
         one = self._arrivals.get(EGO)
         if one is None or len(one.stamps_ns) < FEWEST or not one.has_stamps:
             return

@@ -114,8 +114,7 @@ class OffsetReport:
     """Name of that sensor, or `truth`."""
     sensors: tuple[SensorOffset, ...]
     least_delays_s: Mapping[str, float]
-    """Shortest delay of each sensor: its stamps are not earlier than the truth by more than that, for nothing is
-    received before it was sensed."""
+    """Shortest delay of each sensor: its stamps are not earlier than the truth by more than that."""
 
     @property
     def others(self) -> list[SensorOffset]:
@@ -161,15 +160,10 @@ def estimate_offsets(
 
     Without truth, or where `reference` is named, offsets are differences of two clocks. The reference is then the
     sensor with most detections, but for those that are `doubtful` and those whose clock must be wrong: nothing is
-    received before it was sensed. Sensors are not refused for their delays here: a wrong stamp looks like one. `run` is
-    one of `messages` in which nothing was refused; without it they are replayed.
+    received before it was sensed. Nothing is refused for its delay: a wrong stamp looks like one. `run` is one of
+    `messages` in which nothing was refused; without it they are replayed.
 
-    Raises
-    ------
-    CallError
-        The reference is not in the input, or the configuration cannot be built.
-    DataError
-        There are no detections, fewer than five ego states, or a sensor has no model.
+    Raises `CallError` for an unknown reference, and `DataError` without detections or with fewer than five ego states.
     """
     heard = [corrected(one, config.sensors) if isinstance(one, DetectionList) else one for one in messages]
     unrefused = {  # corrected stamps are taken as they are, and none is too late

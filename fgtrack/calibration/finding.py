@@ -14,7 +14,7 @@ class Finding:
     """A sentence or two with numbers, and settings; `str` tells all of it."""
 
     kind: str
-    """Subject: `input`, `model`, `clock`, `late`, `loss`, `window`, `ego`, `noise`, `tune`, `track`."""
+    """Subject: `input`, `model`, `clock`, `late`, `window`, `ego`, `noise`, `tune`, `track`."""
     about: str
     """Sensor, `ego`, or what else."""
     weight: float

@@ -187,12 +187,7 @@ _MARK = "(fgtrack info --write)"
 def starting_config(recording: Path) -> str:
     """YAML text of a configuration for `recording`: what can be taken as settings, all else as comments.
 
-    Raises
-    ------
-    CallError
-        Nothing is there.
-    DataError
-        It is not an input, or damaged from the start.
+    Raises `CallError` where nothing is there, and `DataError` where it is not an input, or damaged from the start.
     """
     parts, refused = _parts(recording)
     taken = _readable(recording, parts, refused)

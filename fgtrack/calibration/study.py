@@ -155,29 +155,12 @@ def study(
 ) -> Study:
     """Return a recording studied: advised, replayed by three estimators, compared, drawn and reported into a folder.
 
-    Parameters
-    ----------
-    recording
-        Path of anything that fgtrack reads.
-    out
-        Folder to write to.
-    config, map, pit_map, set
-        As for `fgtrack.replay`.
-    advice
-        True to follow the settings of `fgtrack.advise`.
-    figures
-        Further figures for folder and report, by name.
-    overwrite
-        True to replace a study in `out`.
-    on_step
-        Called with the name of each step, and the share of the work that is done.
+    `config`, `map`, `pit_map` and `set` are as for `fgtrack.replay`. With `advice` the settings of `fgtrack.advise` are
+    followed; `figures` are further ones by name; `overwrite` replaces a study in `out`. `on_step` is called with the
+    name of each step, and the share of the work that is done.
 
-    Raises
-    ------
-    CallError
-        The configuration or `out` is invalid.
-    DataError
-        The recording cannot be read, or holds nothing to track.
+    Raises `CallError` where the configuration or `out` is invalid, and `DataError` where the recording cannot be read,
+    or holds nothing to track.
     """
     out, source_path = Path(out), Path(recording)
     resolved = read_config(config, set, track_map=map, pit_map=pit_map)

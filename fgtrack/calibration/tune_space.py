@@ -77,12 +77,11 @@ class TuneRules:
     keep: tuple[str, ...] = ()
     """Keys of the configuration that stay as they are."""
     train_share: float = 0.7
-    """Part of the time of each recording, from its start, that the noise which is judged is fitted to; 1: no part is
-    left to judge it by."""
+    """Leading part of each recording that the noise which is judged is fitted to; 1: none is judged."""
     max_rounds: int = 4
     """Largest number of associations."""
     max_observations: int | None = None
-    """Longer tracks are cut to so many measurements; None: none is."""
+    """Longer tracks are cut to so many measurements."""
 
 
 Known = Literal["yes", "roughly", "limit", "no"]
@@ -100,8 +99,8 @@ class TunedParameter:
     std_error: float | None
     """Standard error as a share of the value; None where there is none."""
     known: Known
-    """`yes`: `std_error` is at most 5 %; `roughly`: at most 50 %, and adopted too; `limit`: only a limit is known, and
-    the configured value lies beyond it, so that the limit is adopted; `no`: the configured value stays."""
+    """`yes`: `std_error` is at most 5 %; `roughly`: at most 50 %; `limit`: only a limit is known, which the configured
+    value exceeds, and is adopted; `no`: the configured value stays."""
     why: str
     """Why it is not known; empty where it is."""
 
@@ -114,8 +113,7 @@ class SensorNoise:
     count: int
     """Innovations that counted."""
     own_covariance: int
-    """Innovations to which the standard deviations do not apply: of detections with a covariance of their own, or of a
-    sensor with time-correlated errors."""
+    """Innovations with a covariance of their own, or time-correlated errors: the standard deviations do not apply."""
     outlier_share: float | None
     """Share of measurements with larger errors; None where nothing counted."""
 
@@ -167,11 +165,11 @@ class TuneReport:
     num_tracks: int
     """Tracks they belong to."""
     num_mixed: int
-    """Measurements that were left out, because most of those around them are outliers; see `without_mixed`."""
+    """Measurements left out, as most of those around them are outliers; see `without_mixed`."""
     rounds: int
     """Number of associations."""
     settled: bool
-    """True if another association would have changed nothing any more."""
+    """True if another association would change nothing."""
     broken: Mapping[str, str]
     """Why a recording broke off, by its name; what came before was used."""
     runs: tuple[Run, ...] = field(repr=False)

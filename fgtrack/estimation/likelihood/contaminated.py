@@ -36,12 +36,11 @@ def update(P: FloatArray, H: FloatArray, y: FloatArray, R: FloatArray, foreign: 
     """Fuse innovations y (..., k) of measurements with Jacobians H (..., k, n).
 
     The error has the covariance c^2 R + `foreign`, shape (..., k, k), with c = 1 or, with the probability
-    `outlier_share(odds)`, another one of `SCALES`. With p(y) the mixture of the normal densities of covariances
-    S_i = H P H' + c_i^2 R + foreign, w_i the probability of class i given y and s_i = P H' S_i^-1 y the step of the
-    Kalman filter for class i, the posterior has the mean x + s, s = sum w_i s_i, and the covariance
-    P - sum w_i P H' S_i^-1 H P + sum w_i (s_i - s) (s_i - s)': the moments of a mixture of the posteriors of the
-    classes, which are exact (Alspach and Sorenson 1972, "Nonlinear Bayesian estimation using Gaussian sum
-    approximations", IEEE Transactions on Automatic Control 17(4)). At odds 0 this is the Kalman filter.
+    `outlier_share(odds)`, another one of `SCALES`. With S_i = H P H' + c_i^2 R + foreign, w_i the probability of class
+    i given y and s_i = P H' S_i^-1 y, the posterior has the mean x + s, s = sum w_i s_i, and the covariance
+    P - sum w_i P H' S_i^-1 H P + sum w_i (s_i - s) (s_i - s)': the exact moments of the mixture (Alspach and Sorenson
+    1972, "Nonlinear Bayesian estimation using Gaussian sum approximations", IEEE Transactions on Automatic Control
+    17(4)). At odds 0 this is the Kalman filter.
     """
     HP = H @ P
     scales = np.square(SCALES).reshape(-1, *[1] * R.ndim)

@@ -40,6 +40,8 @@ class Cost(NamedTuple):
     Of normal innovations, sum of tr(S^-1 dS S^-1 dS) / 2 + dy' S^-1 dy; of the shares of outliers, which change
     neither y nor S, the squared scores.
     """
+    scores: FloatArray
+    """Derivatives of the log-likelihoods of the N innovations, shape (f, N)."""
 
 
 class Likelihood:
@@ -72,8 +74,8 @@ class Likelihood:
 
     def stop_where_flat(self, logs: FloatArray) -> None:
         """Raise `StopIteration` where the next step would gain next to nothing."""
-        _, g, information = self.cost(logs)
-        if float(g @ psd_solve(information, g)) < 2.0 * _FLAT:
+        cost = self.cost(logs)
+        if float(cost.gradient @ psd_solve(cost.information, cost.gradient)) < 2.0 * _FLAT:
             raise StopIteration
 
     def spread(self, logs: FloatArray) -> FloatArray:
@@ -81,10 +83,11 @@ class Likelihood:
         return np.sqrt(np.diag(psd_solve(self.cost(logs).information, np.eye(len(logs)))))
 
     def _cost_at(self, logs: FloatArray) -> Cost:
-        evaluation, scores = self._differentiated(logs)
-        middle = evaluation.log_likelihoods[0]
+        rows = np.concatenate([logs[None], logs + _DIFFERENCE * np.eye(len(logs))])
+        evaluation = self._innovations.evaluate(self.values(rows))
+        middle, scores = evaluation.log_likelihoods[0], _difference(evaluation.log_likelihoods)
         if not np.isfinite(middle).all():
-            return Cost(math.inf, np.zeros_like(logs), np.eye(len(logs)))
+            return Cost(math.inf, np.zeros_like(logs), np.eye(len(logs)), scores)
         moved = logs - self._prior_log
         off = moved / self._prior_log_std
         beyond = np.sign(moved) * np.maximum(np.abs(moved) - _MOST_LOG, 0.0)
@@ -93,29 +96,22 @@ class Likelihood:
         gradient = off / self._prior_log_std + wall * beyond - scores.sum(axis=1)
         information = _expected(evaluation) + np.diag(self._prior_log_std**-2 + wall * (beyond != 0.0))
         information[self._shares, self._shares] += np.square(scores[self._shares]).sum(axis=1)
-        return Cost(objective, gradient, information)
-
-    def _differentiated(self, logs: FloatArray) -> tuple[Evaluation, FloatArray]:
-        """Return innovations at `logs`, then a little further in every direction; the scores (f, N) by differences."""
-        rows = np.concatenate([logs[None], logs + _DIFFERENCE * np.eye(len(logs))])
-        evaluation = self._innovations.evaluate(self.values(rows))
-        return evaluation, _difference(evaluation.log_likelihoods)
+        return Cost(objective, gradient, information, scores)
 
     def log_std(self, logs: FloatArray) -> FloatArray:
         """Return standard errors of the free logarithms, shape (f,); infinite where there is no information.
 
-        The larger one of two: that of the curvature, right where the model is, and the sandwich of curvature and
-        scores, these summed over blocks of time, which holds for correlated innovations too (White 1982, "Maximum
-        likelihood estimation of misspecified models", Econometrica 50(1)).
+        The larger one of that of the curvature and the sandwich of curvature and scores summed over blocks of time,
+        which holds for correlated innovations too (White 1982, "Maximum likelihood estimation of misspecified models",
+        Econometrica 50(1)).
         """
-        _, scores = self._differentiated(logs)
         counted = self._innovations.counted
         blocks = (self._innovations.since_start_s / _BLOCK_S).astype(np.int64)
         series = np.broadcast_to(np.arange(blocks.shape[1]), blocks.shape)
         keys = np.stack([blocks[counted], series[counted]], axis=-1)
         groups = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
         clusters = np.zeros((groups.max() + 1, len(logs)))
-        np.add.at(clusters, groups, scores.T)
+        np.add.at(clusters, groups, self.cost(logs).scores.T)
         meat = clusters.T @ clusters * len(clusters) / max(len(clusters) - 1, 1)
         values, vectors = np.linalg.eigh(self._curvature(logs))
         inverse = vectors @ np.diag(1.0 / np.maximum(values, _FLOOR)) @ vectors.T

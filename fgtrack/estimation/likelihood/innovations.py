@@ -1,9 +1,8 @@
 """The log-likelihood of innovations at many vectors of parameters at once, linearised about one trajectory.
 
-Along a given trajectory motion and measurements are linear, so all that depends on the parameters is the noise. The
-trajectory is that of the filter itself (`filtered`), so each linearisation depends on earlier measurements only; the
-score then has mean zero at the true parameters where the model is right, as that of the filter has (Schweppe 1965,
-"Evaluation of likelihood functions for Gaussian signals", IEEE Transactions on Information Theory 11(1)).
+Along a trajectory all that depends on the parameters is the noise. It is that of the filter itself (`filtered`), so
+each linearisation depends on earlier measurements only, and the score has mean zero at the true parameters (Schweppe
+1965, "Evaluation of likelihood functions for Gaussian signals", IEEE Transactions on Information Theory 11(1)).
 """
 
 import math
@@ -124,10 +123,7 @@ class Innovations:
         return Evaluation(*(array.swapaxes(0, 1)[:, self.counted] for array in (log_likelihoods, ys, Ss)))
 
     def _transitions(self, values: FloatArray, block: slice) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return F, the change of the prediction against that of the reference, and Q of a block of steps, by row.
-
-        White noise changes Q alone: then the first two have one row for all.
-        """
+        """Return F, the change of the prediction against that of the reference, and Q of a block of steps, by row."""
         if self._parts is not None:
             rest, parts = self._parts
             weights = np.square(values[:, : len(parts)])

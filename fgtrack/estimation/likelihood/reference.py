@@ -84,9 +84,8 @@ def filtered(series: Series, space: NoiseSpace, values: Sequence[float] | FloatA
 def without_mixed(series: Series, space: NoiseSpace, values: FloatArray) -> Series:
     """Return `series` where only observations of one object count, as judged at `values`, shape (p,).
 
-    Outliers are rare and independent of each other. Where most of 20 successive innovations are outliers, the track
-    has gone from one object to another, or mixes two that pass; the mixture of `contaminated` does not describe that,
-    and a few seconds of it inflate small standard deviations by many of their standard errors.
+    Where most of 20 successive innovations are outliers, the track has gone from one object to another, or mixes two
+    that pass, which the mixture of `contaminated` does not describe.
     """
     outlier = np.array([step.update.outlier for step in filtered(series, space, values)])
     stamps_ns = np.array([one.measurement.stamp_ns for one in series.observations])

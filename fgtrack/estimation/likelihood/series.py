@@ -19,10 +19,7 @@ from fgtrack.models.motion import MotionModel, WhiteNoise
 
 @dataclass(frozen=True)
 class NoiseSpace:
-    """The parameters in one vector: noise of the motion, then of each sensor, then the share of its outliers.
-
-    All are positive.
-    """
+    """The positive parameters in one vector: noise of the motion, then of each sensor, then shares of outliers."""
 
     motion_names: tuple[str, ...]
     motion: Callable[[Mapping[str, float]], MotionModel]
@@ -65,8 +62,8 @@ class NoiseSpace:
 class Observation:
     """One measurement of a sensor; the covariance of its error is T diag(std^2) T' + `own` + `foreign`.
 
-    The first d components are measured. Those that follow are assumed, as a heading from a map: they move the state as
-    in the tracker, but they are no measurements, have no part in the likelihood and keep their noise.
+    The first d components are measured. Those that follow are assumed, as a heading from a map: they move the state,
+    but have no part in the likelihood and keep their noise.
     """
 
     sensor: str
@@ -137,8 +134,7 @@ class Series:
     def initiated(self, motion: MotionModel, method: Initiation) -> "Series":
         """Return it with a nominal trajectory along the first positions, where `start` has no direction of travel.
 
-        As in the tracker (see `TrackInitiation`): an EKF that starts in a wrong direction takes many seconds to turn,
-        in which its innovations say nothing of the noise. Unchanged where no line leads through the positions.
+        As in the tracker (see `TrackInitiation`); unchanged where no line leads through the positions.
         """
         search, count = TrackInitiation.of(motion, self.start, method), 0
         if search is None:

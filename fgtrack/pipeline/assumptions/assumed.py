@@ -62,14 +62,9 @@ Rule = Callable[[Config, Coverages], Iterator[Assumption]]
 def assumed(config: Config, source: InputSource) -> Assumed:
     """`config` with nothing left open, and what of it was assumed; a key that is set stays as it is.
 
-    Three sources, the first that gives a key decides:
-
-    - What `source` carries: origin of detections, track, and of each sensor mount, field of view and ranges.
-    - What its detections show (`coverages`): the sensors, where `config` has none, with what they measure; field of
-      view and range of those of which neither the configuration nor the recording gives any of both. A position counts
-      once: a detection of x and y is not taken as range and bearing as well.
-    - Usual values: standard deviations, and a sensor that looks all around from the origin. Sensors that give bearings
-      alone are left out where others give positions, unless the recording carries their mount.
+    The first that gives a key decides: what `source` carries (origin of detections, track, mounts and views of
+    sensors); what its detections show (`coverages`): the sensors, where `config` has none, and where those of unknown
+    view detect; usual values: standard deviations, and a sensor that looks all around from the origin.
     """
     carried = recorded(source)
     found = Assumed(config).assuming(*_recorded(config, carried))
@@ -137,10 +132,9 @@ def _recorded(config: Config, carried: Recorded) -> Iterator[Assumption]:
 def _slow_revisits(config: Config, covered: Coverages) -> Iterator[Assumption]:
     """Yield motion and clock of objects that every sensor measures too seldom for the defaults.
 
-    The default motion model is linearised along the heading, whose standard deviation after a time t without a
-    measurement is sqrt(q t^3 / 3), q the density of the yaw rate. Where it exceeds 1 rad the heading is unknown, and a
-    straight line with the noise of `_MANOEUVRES`, which is linear, predicts better. Windows then hold two
-    measurements of an object, and ticks are as many times rarer. Sections that are not the default stay as they are.
+    The standard deviation of a heading after a time t without a measurement is sqrt(q t^3 / 3), q the density of the
+    yaw rate. Where it exceeds 1 rad a straight line with the noise of `_MANOEUVRES`, which is linear, predicts better.
+    Windows then hold two measurements of an object. Sections that are not the default stay as they are.
     """
     intervals_s = [one.revisit_s for one in covered.values() if one.num_lists]
     limit_s = math.cbrt(3.0 / (MotionConfig().std_per_s["yaw_rate"] ** 2 / NOISE_HZ))
@@ -258,9 +252,8 @@ def _views(config: Config, covered: Coverages) -> Iterator[Assumption]:
 def _out_of_view(config: Config, covered: Coverages) -> Iterator[Assumption]:
     """Yield how long a track lives that no sensor can see.
 
-    Where one sensor alone gives positions nothing else sees what has left its view: the first list that could not show
-    it ends it. Else it may come into the view of another one, and outlives two lists of the slowest sensor, and the
-    longest silence of the one that saw it, while others go on.
+    Where one sensor alone gives positions, the first list that could not show it ends it. Else it outlives two lists of
+    the slowest sensor, and the longest silence of the one that saw it.
     """
     periods_s = {name: 1.0 / one.rate_hz for name, one in covered.items() if one.rate_hz}
     placing = [name for name, one in config.used_sensors.items() if one.gives_position]

@@ -84,8 +84,7 @@ class Assumed:
     def to_yaml(self, head: Iterable[str] = (), comments: Iterable[tuple[Sequence[str], str]] = ()) -> str:
         """Return YAML of all settings that differ from the defaults; a comment gives the reason of an assumed one.
 
-        As `-c` it gives the run of this configuration without assuming anything. The lines of `head` are comments, and
-        `comments` are those of further keys, by path.
+        The lines of `head` are comments, and `comments` are those of further keys, by path.
         """
         tree = _commented(departures(self.config))
         for path, reason in [*((one.path, f"assumed: {one.reason}") for one in self.assumptions), *comments]:

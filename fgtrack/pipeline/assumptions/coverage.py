@@ -79,17 +79,13 @@ class Coverage:
 def coverages(messages: Iterable[Message], mounts: Mapping[str, Mount] | None = None) -> dict[str, Coverage]:
     """Coverage of each sensor in `messages`, by name; `mounts` are the known ones.
 
-    The estimate is that of what happens, not of a data sheet: where nothing is ever detected there may be nothing. For
-    the tracks of the same recording both are the same, for there none is missed.
-
-    - Only a detection that comes back counts: another list of the sensor has one close by and soon. Clutter that is
-      spread over space and time seldom does, an object does at nearly every list.
+    - Only a detection that comes back counts: another list of the sensor has one close by and soon, as of an object and
+      seldom of clutter. With fewer than 100 of them nothing is estimated.
     - The sector is the rest of the circle beside the widest arc with at most 1 % of these detections. It is taken up
       to 160 degrees: one car that overtakes has a sensor which looks all around detect in nearly half a circle.
     - Cars pass its edges within a few lists. So it goes on as far as the detections in that arc follow one another
       within 12 degrees and a third of what they would if they were spread evenly over it, as clutter is.
     - The range is the quantile of 99 %, and a tenth more.
-    - With fewer than 100 such detections, of which 1 % is not one, nothing is estimated.
 
     Detections in the map are seen from the ego, interpolated; without an ego they give no sector and no range.
     """

@@ -48,12 +48,10 @@ class Lists(NamedTuple):
 class Persistence:
     """Detection probability, clutter and scores of a sensor, from triples of detections in three successive lists.
 
-    Three detections on a line at constant speed are of one object. How often the fourth list continues the line is the
-    detection probability; detections in no triple, beyond those that misses explain, are clutter.
-
-    What a detector takes for a car now it takes for one in the next list, too. So where scores tell clutter, its
-    density is also that around clutter, where it competes with a track that began there (Song, Musicki: Adaptive
-    clutter measurement density estimation for improved target tracking, IEEE T-AES 2011).
+    Three detections on a line at constant speed are of one object. How often the next lists continue the line is the
+    detection probability; detections in no triple, beyond those that misses explain, are clutter. Where scores tell
+    clutter, its density is also that around clutter, where it competes with a track that began there (Song, Musicki:
+    Adaptive clutter measurement density estimation for improved target tracking, IEEE T-AES 2011).
     """
 
     detection_probability: float
@@ -74,10 +72,9 @@ class Persistence:
 def disagreement_m(one: Persistence, other: Lists) -> float | None:
     """Standard deviation, per axis, of where another sensor, with the lists `other`, sees the objects of `one`.
 
-    None if unknown. A sensor alone does not show time-correlated errors, as on an object that is larger than what it
-    sees of it. Two detections are of one object if each is the nearest to the other: its neighbour is nearest where it
-    is missed. Both sensors see the same objects only if detections are nearer to where these are than to places beside
-    them.
+    None if unknown. Two detections are of one object if each is the nearest to the other: its neighbour is nearest
+    where it is missed. Both sensors see the same objects only if detections are nearer to where these are than to
+    points beside them.
     """
     distances_m, beside_m = [], []
     for stamp_s, *state in one.lines.tolist():
@@ -181,10 +178,7 @@ def _best(
 
 
 def _scale(misfits: FloatArray, start: float = 0.5) -> float:
-    """Scale of the Rayleigh distribution of the small misfits: their median, without the outliers.
-
-    `start` is a quantile that is not one of the outliers.
-    """
+    """Scale of the Rayleigh distribution of the misfits without outliers; `start` is a quantile below these."""
     if not len(misfits):
         return 0.0
     scale = float(np.quantile(misfits, start)) / math.sqrt(-2.0 * math.log(1.0 - start))
