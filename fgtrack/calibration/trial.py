@@ -1,56 +1,22 @@
-"""A configuration on trial: what it makes of the first seconds of an input, before a whole replay is worth it."""
+"""The first seconds of an input as a configuration reads them: what is suspicious, and the first of each message."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import takewhile
 
 import numpy as np
 
 from fgtrack.core.diagnostic import EGO, Diagnostic, in_degrees
-from fgtrack.core.errors import DataError
-from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DESCRIBING, MEASURABLE, Detection, DetectionList, EgoState, Message, TruthState
-from fgtrack.io.errors import UntilBreak
-from fgtrack.io.run import Run
 from fgtrack.models.measurement import ANGULAR
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.replay import replay_in_memory
 
-__all__ = ["TRIAL_S", "Trial", "beginning", "suspicions", "try_out"]
+__all__ = ["TRIAL_S", "beginning", "samples", "suspicions"]
 
 TRIAL_S = 5.0
 _SHOWN = (*MEASURABLE, "yaw_rate_radps", *DESCRIBING, "object_id")
 _FAR_M, _NEARER = 250.0, 0.3  # what is so far, and so much nearer in another frame, is in that one
-
-
-@dataclass(frozen=True)
-class Trial:
-    """Result of a trial."""
-
-    samples: Mapping[str, str]
-    """Contents of the first message of everything as read, by `ego`, `truth` and the names of sensors."""
-    suspicions: tuple[Diagnostic, ...]
-    """Probable errors of the configuration, each with its cure."""
-    run: Run | None
-    """The dry run; None where nothing could be tracked."""
-    problem: str | None
-    """Why reading or tracking ended early."""
-
-
-def try_out(messages: Iterable[Message], config: Config) -> Trial:
-    """Read and track the first `TRIAL_S` of `messages`, in memory."""
-    readable = UntilBreak(messages)
-    found, run = list[Message](), None
-    try:
-        found = list(beginning(readable, nanoseconds(TRIAL_S)))
-        run = replay_in_memory(found, config)
-        problem = run.meta["broken_off"]
-    except DataError as error:
-        problem = str(error)
-    problem = problem if readable.error is None else str(readable.error)
-    return Trial(_samples(found), tuple(suspicions(found, config)) if found else (), run, problem)
 
 
 def beginning(messages: Iterable[Message], duration_ns: int) -> Iterator[Message]:
@@ -140,7 +106,8 @@ def _measured(name: str, objects: Sequence[Detection], sensor: SensorModel) -> I
         yield Diagnostic(name, f"never measures {what}: change sensors.{name}.std or the fields")
 
 
-def _samples(messages: Sequence[Message]) -> dict[str, str]:
+def samples(messages: Sequence[Message]) -> dict[str, str]:
+    """Return the contents of the first message of everything, by `ego`, `truth` and the names of sensors."""
     found: dict[str, str] = {}
     for message in messages:
         name, of = "truth" if isinstance(message, TruthState) else "ego", list[Message | Detection]([message])

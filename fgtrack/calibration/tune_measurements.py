@@ -84,7 +84,7 @@ class _WatchedPreprocess(Preprocess):
 
     def __init__(self, watched: Preprocess) -> None:
         self._watched = watched
-        self._sensor: tuple[str, SensorModel] | None = None
+        self._sensor: tuple[str, SensorModel]
         self._own: dict[bytes, bool] = {}  # by what is measured
 
     def __call__(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> tuple[Candidates, list[UpdateRecord]]:
@@ -100,9 +100,7 @@ class _WatchedPreprocess(Preprocess):
 
     def observation(self, measurement: Measurement) -> Observation:
         """Return a measurement of the newest batch with its noise in parts."""
-        assert self._sensor is not None  # a batch is preprocessed before anything of it is fused
-        name, sensor = self._sensor
-        return observation(name, sensor, measurement, self._own[measurement.z.tobytes()])
+        return observation(*self._sensor, measurement, self._own[measurement.z.tobytes()])
 
 
 def observation(name: str, sensor: SensorModel, measurement: Measurement, own: bool) -> Observation:

@@ -12,10 +12,12 @@ from fgtrack.calibration.advise import advise as advised
 from fgtrack.calibration.clock_offsets import OffsetReport, estimate_offsets
 from fgtrack.calibration.clocks import clock_text
 from fgtrack.calibration.starting import starting_config
-from fgtrack.calibration.trial import TRIAL_S, try_out
+from fgtrack.calibration.trial import TRIAL_S, beginning, samples, suspicions
 from fgtrack.cli.arguments import ConfigFile, Input, Json, Overwrite, PitMap, Reference, Settings, TrackMap
 from fgtrack.cli.show import progress, say, sentences, show, warn
 from fgtrack.core.errors import CallError, DataError, FgtrackError
+from fgtrack.core.time import nanoseconds
+from fgtrack.core.types import Message
 from fgtrack.evaluation.diagnostics import excluded_lines
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Value
 from fgtrack.io.errors import UntilBreak
@@ -26,7 +28,7 @@ from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.pipeline.assumptions.assumption import Assumed
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import plain
-from fgtrack.pipeline.replay import located
+from fgtrack.pipeline.replay import located, replay_in_memory
 from fgtrack.pipeline.shipped import read_config
 
 _DELAYS = ("mean_s", "p50_s", "p90_s", "max_s")
@@ -77,23 +79,30 @@ def info(
 
 def _try_out(recording: Path, config: Config) -> str | None:
     """Print what the first seconds come to; gives the problem of the recording."""
+    messages, run, problem = list[Message](), None, None
     with progress("first seconds"):
         source = open_input(recording, config.input)
-        open_settings = assumed(config, source)
-        trial = try_out(source.messages(), open_settings.config)
-    sentences(open_settings.lines())
-    for name, text in trial.samples.items():
+        found = assumed(config, source)
+        readable = UntilBreak(source.messages())
+        try:
+            messages = list(beginning(readable, nanoseconds(TRIAL_S)))
+            run = replay_in_memory(messages, found.config)
+        except DataError as error:
+            problem = str(error)
+    sentences(found.lines())
+    for name, text in samples(messages).items():
         say(f"first of {name}: {text}")
-    if trial.run is not None:
-        for sensor, counts in trial.run.meta["counts"].items():
+    if run is not None:
+        for sensor, counts in run.meta["counts"].items():
             became = ", ".join(f"{count} {fate.replace('_', ' ')}" for fate, count in counts.items() if count)
             say(f"first {TRIAL_S:g} s of {sensor}: {became or 'no detection'}")
-        for line in excluded_lines(trial.run.meta):
+        for line in excluded_lines(run.meta):
             say(f"first {TRIAL_S:g} s of {line}")
-        say(f"first {TRIAL_S:g} s: {len(set(trial.run.tables['tracks']['track_id'].tolist()))} tracks")
-    for found in trial.suspicions:
-        warn(str(found))
-    return trial.problem
+        say(f"first {TRIAL_S:g} s: {len(set(run.tables['tracks']['track_id'].tolist()))} tracks")
+        problem = run.meta["broken_off"]
+    for one in suspicions(messages, found.config) if messages else ():
+        warn(str(one))
+    return problem if readable.error is None else str(readable.error)
 
 
 def _topics(found: InputInfo, unused: str) -> Table:
