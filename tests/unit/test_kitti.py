@@ -19,6 +19,7 @@ from support.messages import shared
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
+from fgtrack.io.adapters.kitti_view import Box
 from fgtrack.io.config import InputConfig, KittiInput
 from fgtrack.io.source import open_input
 
@@ -155,13 +156,20 @@ def test_results_in_the_form_of_the_data_set_are_detections(tmp_path, score, val
     assert (car.length_m, car.score, car.class_name) == (4.0, value, "car")
 
 
-def test_results_without_a_place_in_space_are_bearings(tmp_path):
-    line = f"{KITTI} -1000 -1000 -1000 -10 0.8"
+@pytest.mark.parametrize(
+    ("line", "score"),
+    [
+        (f"{KITTI} -1000 -1000 -1000 -10 0.8", 0.8),
+        (f"{KITTI} -1000 -1000 -1000 -10", None),
+        ("0,2,400,170,460,190,0.7,1.5,1.6,4.0,-1000,-1000,-1000,-10,0.1", 0.7),
+    ],
+)
+def test_results_without_a_place_in_space_are_bearings(tmp_path, line, score):
     (found,) = lists(folder(tmp_path, camera=[line]))
     bearing_rad = pytest.approx(math.atan2(170.0, FOCAL_PX))
     assert (found.frame, found.objects) == (
         "sensor",
-        (Detection(bearing_rad=bearing_rad, score=0.8, class_name="car"),),
+        (Detection(bearing_rad=bearing_rad, score=score, class_name="car"),),
     )
     with pytest.raises(DataError, match=r"camera: some boxes have a position, others are in the image alone"):
         lists(folder(tmp_path, camera=[pose(0, 10.0, 0.0, 0.0), line]))
@@ -190,6 +198,25 @@ def test_other_classes_low_scores_and_boxes_cut_off_are_left_out(tmp_path):
     assert len(camera.objects) == 1
     camera, laser = lists(drive, image_width_px=1300.0)
     assert (len(camera.objects), len(laser.objects)) == (3, 2)
+
+
+@pytest.mark.parametrize(
+    ("turned_rad", "expected"),
+    [
+        (0.0, (600 + 700 / 20.8, 180, 600 + 700 * 5 / 19.2, 180 + 700 * 1.5 / 19.2)),
+        (0.5 * math.pi, (600 + 700 * 2.2 / 22, 180, 600 + 700 * 3.8 / 18, 180 + 700 * 1.5 / 18)),
+        (math.pi, (600 + 700 / 20.8, 180, 600 + 700 * 5 / 19.2, 180 + 700 * 1.5 / 19.2)),
+    ],
+)
+def test_a_box_in_the_image_is_the_hull_of_its_corners(turned_rad, expected):
+    """1.5 m high, 1.6 m wide and 4 m long, 3 m to the right, 20 m ahead, with its roof at the height of the camera."""
+    projection = np.array([[700.0, 0.0, 600.0, 0.0], [0.0, 700.0, 180.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
+    found = Box(1.5, 1.6, 4.0, 3.0, 1.5, 20.0, turned_rad)
+    assert found.image_px(projection) == pytest.approx(expected)
+    cut = found._replace(x_m=17.0).image_px(projection)
+    assert cut == pytest.approx((cut[0], 180.0, 1241.0, expected[3]))
+    assert found._replace(x_m=40.0).image_px(projection) is None
+    assert found._replace(z_m=-20.0).image_px(projection) is None
 
 
 def test_the_other_spellings_of_a_calibration_say_the_same(tmp_path):
@@ -231,25 +258,25 @@ def test_a_damaged_file_is_one_line_that_names_it(tmp_path, files, where):
 
 
 @pytest.mark.parametrize(
-    ("file", "broken", "where"),
+    ("file", "line", "broken", "end"),
     [
-        ("laser", pose(2, 11.0, 0.0, 0.0)[:20], r"laser/0001\.txt:3: "),
-        ("laser", "", r"laser/0001\.txt:3: "),
-        ("label_02", "2 5 Car 0", r"label_02/0001\.txt:3: "),
-        ("oxts", oxts()[:40], r"oxts/0001\.txt:3: "),
+        ("laser", 3, pose(2, 11.0, 0.0, 0.0)[:20], 2),
+        ("laser", 3, "", 1),  # a line without a frame may belong to that of the line above
+        ("laser", 1, "", 0),
+        ("label_02", 3, "2 5 Car 0", 2),
+        ("oxts", 3, oxts()[:40], 2),
     ],
 )
-def test_a_sequence_is_read_up_to_the_frame_of_a_damaged_line(tmp_path, file, broken, where):
+def test_a_sequence_is_read_up_to_the_frame_of_a_damaged_line(tmp_path, file, line, broken, end):
     files = {
         "oxts": [oxts()] * 4,
         "label_02": [label(frame, 5, "Car", 10.0, 0.0, 0.0) for frame in range(4)],
         "laser": [pose(frame, 10.0, 0.0, 0.0) for frame in range(4)],
     }
     intact = messages(folder(tmp_path / "intact", **files))
-    end = 1 if not broken else 2  # a line without a frame may belong to that of the line above
-    files[file][2] = broken
+    files[file][line - 1] = broken
     received = []
-    with pytest.raises(DataError, match=where):
+    with pytest.raises(DataError, match=rf"{file}/0001\.txt:{line}: "):
         received.extend(open_input(folder(tmp_path / "damaged", **files)).messages())
     assert received == [item for item in intact if item.stamp_ns < end * 100_000_000]
 

@@ -222,50 +222,32 @@ def test_an_angle_of_many_turns_is_not_wrapped_as_it_may_be_in_degrees(tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("tables", "complaint"),
+    ("role", "columns", "complaint"),
     [
-        ({}, r"name its columns in input\.csv: radar\.csv has t, seen, x, y"),
-        (
-            {"ego": CsvTable({"stamp": "t"}, "radar.csv")},
-            r"input\.csv\.ego\.columns: must name speed_mps, stamp, x_m, y_m, yaw_rad",
-        ),
-        (
-            {"detections": {"radar": CsvTable({"x_m": "x"}, "radar.csv")}},
-            r"input\.csv\.detections\.radar.*must name stamp",
-        ),
-        (
-            {"detections": {"radar": CsvTable({"stamp": "t", "speed": "v"}, "radar.csv")}},
-            "unknown column 'speed', known",
-        ),
-        (
-            {"detections": {"radar": CsvTable({"stamp": "t", "score": "x"}, "radar.csv")}},
-            "stamp and what is measured",
-        ),
-        ({"detections": {"radar": CsvTable({"stamp": "t", "x_m": "x"})}}, "is a folder, so .* must name its file"),
+        ("ego", {"stamp": "t"}, r"input\.csv\.ego\.columns: must name speed_mps, stamp, x_m, y_m, yaw_rad$"),
+        ("truth", {"stamp": "t"}, r"input\.csv\.truth\.columns: must name stamp, x_m, y_m$"),
+        ("radar", {"x_m": "x"}, r"input\.csv\.detections\.radar\.columns: must name stamp"),
+        ("radar", {"stamp": "t", "speed": "v"}, "unknown column 'speed', known"),
+        ("radar", {"stamp": "t", "score": "x"}, "stamp and what is measured, one of x_m"),
     ],
 )
-def test_a_mapping_that_does_not_fit_is_one_line(tmp_path, tables, complaint):
+def test_a_mapping_that_does_not_fit_is_one_line(tmp_path, role, columns, complaint):
     write(tmp_path, radar=RADAR_TEXT)
+
+    def tables(table):
+        return {"detections": {"radar": table}} if role == "radar" else {role: table}
+
     with pytest.raises(CallError, match=complaint):
-        messages(tmp_path, **tables)
+        messages(tmp_path, **tables(CsvTable(columns, "radar.csv")))
+    with pytest.raises(CallError, match=r"is a folder, so .* must name its file"):
+        messages(tmp_path, detections={"radar": CsvTable({"stamp": "t", "x_m": "x"})})
+    with pytest.raises(CallError, match=r"name its columns in input\.csv: radar\.csv has t, seen, x, y"):
+        messages(tmp_path)
 
 
 def test_the_mapping_is_written_in_the_configuration(tmp_path):
     write(tmp_path, radar=RADAR_TEXT)
-    raw = {
-        "input": {
-            "csv": {
-                "detections": {
-                    "radar": {
-                        "file": "radar.csv",
-                        "columns": {"stamp": "t", "x_m": "x", "y_m": {"path": "y", "scale": -1}},
-                    }
-                }
-            }
-        }
-    }
+    columns = {"stamp": "t", "x_m": "x", "y_m": {"path": "y", "scale": -1}}
+    raw = {"input": {"csv": {"detections": {"radar": {"file": "radar.csv", "columns": columns}}}}}
     (first, _) = open_input(tmp_path, validate(Config, raw, "test").input).messages()
     assert [item.y_m for item in first.objects] == [-2.0, 2.0]
-    raw["input"]["csv"]["detections"]["radar"]["columns"]["y_m"] = {"path": "y", "scal": -1}
-    with pytest.raises(CallError, match=r"input\.csv\.detections\.radar\.columns\.y_m\.scal: unknown key"):
-        validate(Config, raw, "test")
