@@ -2,8 +2,10 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from fgtrack.core.types import DESCRIBING, MEASURABLE, Detection, DetectionList, EgoState, Message, TruthState
 
@@ -84,3 +86,9 @@ def drive(num_ticks: int = 50) -> list[Message]:
             messages.append(DetectionList("lidar", stamp_ns, now_ns, lidar))
             messages.append(DetectionList("radar", stamp_ns - 7, now_ns, radar))
     return messages
+
+
+def tilted(yaw_rad: float, pitch_rad: float = 0.3, roll_rad: float = 0.2) -> np.ndarray:
+    """Quaternion w, x, y, z of a yaw after a pitch after a roll, which leave the yaw as it is."""
+    x, y, z, w = Rotation.from_euler("ZYX", [yaw_rad, pitch_rad, roll_rad]).as_quat()
+    return np.array([w, x, y, z])

@@ -4,6 +4,7 @@ from types import SimpleNamespace as Message
 
 import numpy as np
 import pytest
+from support.messages import tilted
 
 from fgtrack.core.types import Detection
 from fgtrack.io.adapters import ADAPTERS
@@ -18,9 +19,8 @@ def xyz(x=0.0, y=0.0, z=0.0):
 
 
 def quaternion(yaw=None, norm=1.0):
-    if yaw is None:
-        return Message(x=0.0, y=0.0, z=0.0, w=0.0)
-    return Message(x=0.0, y=0.0, z=norm * math.sin(yaw / 2), w=norm * math.cos(yaw / 2))
+    w, x, y, z = (0.0,) * 4 if yaw is None else norm * tilted(yaw)
+    return Message(x=x, y=y, z=z, w=w)
 
 
 def pose(x, y, yaw=None):
@@ -48,14 +48,14 @@ def read(name, message):
     return ADAPTERS.load(name)(message)
 
 
-def autoware(availability=2, has_twist=True, has_covariance=True, velocity=(-3.0, 0.0)):
+def autoware():
     kinematics = Message(
         pose_with_covariance=Message(pose=pose(1.0, 2.0, 0.5), covariance=POSE_COVARIANCE),
-        has_position_covariance=has_covariance,
-        orientation_availability=availability,
-        twist_with_covariance=Message(twist=Message(linear=xyz(*velocity)), covariance=square(6, c00=0.25)),
-        has_twist=has_twist,
-        has_twist_covariance=has_covariance,
+        has_position_covariance=True,
+        orientation_availability=2,
+        twist_with_covariance=Message(twist=Message(linear=xyz(-3.0)), covariance=square(6, c00=0.25)),
+        has_twist=True,
+        has_twist_covariance=True,
     )
     shape = Message(dimensions=xyz(4.5, 1.9, 1.6))
     labels = [Message(label=2, probability=0.2), Message(label=1, probability=0.7)]
@@ -96,26 +96,21 @@ def test_a_delphi_esr_counts_degrees_clockwise():
     assert read("delphi_esr_msgs/msg/EsrTrack", track).objects == ()
 
 
-@pytest.mark.parametrize("availability", [0, 1])
-def test_an_orientation_that_is_not_available_is_no_yaw(availability):
-    (item,) = read("autoware_perception_msgs/msg/DetectedObjects", autoware(availability)).objects
-    assert item.yaw_rad is None
-    assert item.speed_mps == 3.0
-
-
-def test_what_autoware_marks_as_absent_is_absent():
-    message = autoware(has_twist=False, has_covariance=False)
-    (item,) = read("autoware_perception_msgs/msg/DetectedObjects", message).objects
-    assert item.speed_mps is None
-    assert item.covariance is None
-
-
-def test_a_covariance_that_does_not_cover_the_speed_is_not_given():
+@pytest.mark.parametrize(
+    ("changes", "values"),
+    [
+        ({"orientation_availability": 0}, (None, 3.0, 9)),
+        ({"orientation_availability": 1}, (None, 3.0, 9)),
+        ({"has_twist": False}, (0.5, None, 9)),
+        ({"has_position_covariance": False}, (0.5, -3.0, 0)),
+        ({"has_twist_covariance": False}, (0.5, -3.0, 0)),  # it would not cover the speed
+    ],
+)
+def test_what_autoware_marks_as_absent_is_absent(changes, values):
     message = autoware()
-    message.objects[0].kinematics.has_twist_covariance = False
+    vars(message.objects[0].kinematics).update(changes)
     (item,) = read("autoware_perception_msgs/msg/DetectedObjects", message).objects
-    assert item.speed_mps is not None
-    assert item.covariance is None
+    assert (item.yaw_rad, item.speed_mps, len(item.covariance or ())) == pytest.approx(values)
 
 
 def vision(size=1.0, results=True, **identity):
@@ -175,11 +170,6 @@ def test_the_yaw_of_a_quaternion_does_not_depend_on_its_norm():
     assert math.isnan(yaw_rad(Message(x=math.nan, y=0.0, z=0.0, w=1.0)))
 
 
-def odometry(yaw):
-    twist = Message(twist=Message(linear=xyz(3.0, 4.0), angular=xyz(0.0, 0.0, 0.7)), covariance=square(6))
-    return Message(header=header(), pose=Message(pose=pose(1.0, 2.0, yaw), covariance=square(6)), twist=twist)
-
-
 def test_paths_read_vectors_quaternions_and_the_stamps_of_objects():
     item = Message(p=pose(1.0, 2.0, 0.5), v=[3.0, 4.0], vel=xyz(3.0, 4.0), t=2.5, number=4)
     message = Message(header=header(frame_id="odom"), tracks=[item])
@@ -227,15 +217,27 @@ def uncertain_odometry(vx=3.0, vy=0.0, pose_covariance=(0.0,) * 36, twist_covari
     )
 
 
-def covariance_of(message):
-    return np.reshape(ego_from_odometry(message, 7).covariance, (5, 5))
+def covariance_of(*values):
+    return np.reshape(ego_from_odometry(uncertain_odometry(*values), 7).covariance, (5, 5))
 
 
 TWIST_COVARIANCE = square(6, c00=0.25, c11=0.16, c55=0.01, c05=0.02)
 
 
+def test_odometry_is_an_ego_or_an_object_with_a_speed_along_its_heading():
+    message = uncertain_odometry(-3.0, 0.0, POSE_COVARIANCE, TWIST_COVARIANCE)
+    ego = ego_from_odometry(message, 7)
+    values = (1.0, 2.0, pytest.approx(0.5), -3.0)
+    assert (ego.stamp_ns, ego.receipt_ns, ego.yaw_rate_radps) == (1_500_000_002, 7, 0.2)
+    found = read("nav_msgs/msg/Odometry", message)
+    (item,) = found.objects
+    assert (found.stamp_ns, found.frame) == (1_500_000_002, "ego")
+    assert [(each.x_m, each.y_m, each.yaw_rad, each.speed_mps) for each in (ego, item)] == [values] * 2
+    assert item.covariance == (*XY_YAW[:3], 0.0, *XY_YAW[3:6], 0.0, *XY_YAW[6:], 0.0, 0.0, 0.0, 0.0, 0.25)
+
+
 def test_odometry_gives_the_covariance_of_pose_speed_and_yaw_rate():
-    found = covariance_of(uncertain_odometry(0.0, 0.0, POSE_COVARIANCE, TWIST_COVARIANCE))
+    found = covariance_of(0.0, 0.0, POSE_COVARIANCE, TWIST_COVARIANCE)
     expected = np.zeros((5, 5))
     expected[:3, :3] = [[1.0, 0.1, 0.2], [0.1, 2.0, 0.3], [0.2, 0.3, 3.0]]
     expected[3:, 3:] = [[0.25, 0.02], [0.02, 0.01]]
@@ -244,9 +246,7 @@ def test_odometry_gives_the_covariance_of_pose_speed_and_yaw_rate():
 
 @pytest.mark.parametrize(("vx", "vy"), [(3.0, 4.0), (-3.0, 4.0)])
 def test_the_variance_of_the_speed_is_that_along_the_velocity(vx, vy):
-    found = np.reshape(
-        ego_from_odometry(uncertain_odometry(vx, vy, POSE_COVARIANCE, TWIST_COVARIANCE), 7).covariance, (5, 5)
-    )
+    found = covariance_of(vx, vy, POSE_COVARIANCE, TWIST_COVARIANCE)
     assert found[3, 3] == pytest.approx(0.36 * 0.25 + 0.64 * 0.16)
     assert found[3, 4] == pytest.approx(0.6 * 0.02)  # backwards, both the speed and vx are negative
 
@@ -257,9 +257,7 @@ def test_the_variance_of_the_speed_is_that_along_the_velocity(vx, vy):
 def test_a_part_that_is_not_known_is_zero_and_nothing_at_all_is_none(unknown):
     both = ego_from_odometry(uncertain_odometry(pose_covariance=unknown, twist_covariance=unknown), 7)
     assert both.covariance is None
-    pose_alone = np.reshape(
-        ego_from_odometry(uncertain_odometry(3.0, 0.0, POSE_COVARIANCE, unknown), 7).covariance, (5, 5)
-    )
+    pose_alone = covariance_of(3.0, 0.0, POSE_COVARIANCE, unknown)
     assert pose_alone[0, 0] == 1.0
     assert not pose_alone[3:].any()
 

@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 
 import pytest
+from support.messages import tilted
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
@@ -17,7 +18,7 @@ T0_US = 1_532_402_927_647_951
 
 
 def turned(yaw_rad: float) -> list[float]:
-    return [math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2)]
+    return tilted(yaw_rad).tolist()
 
 
 def box(x_m: float, name: str = "car", score: float = 0.8, **more: object) -> dict[str, object]:
