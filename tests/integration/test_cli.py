@@ -211,7 +211,7 @@ def test_no_command_shows_the_help_and_is_a_bad_call(fgtrack: Command) -> None:
         (b"", "is empty"),
         (b"hello\n", "is none of the inputs"),
         (b'{"type": "ego"}\n', "starts with a header"),
-        (b'{"type": "header", "format": "fgtrack-stream/2"}\n', "fgtrack-stream/2"),
+        (b'{"type": "header", "format": "fgtrack-stream/2"}\n', "of format 'fgtrack-stream/1'"),
     ],
 )
 def test_a_file_that_is_no_input_is_one_line_and_exit_code_1(
