@@ -3,6 +3,7 @@
 Calls of NumPy, BLAS and assignments of slices in compiled code take seconds to compile: loops do not.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -101,3 +102,12 @@ def solve(S: FloatArray, columns: FloatArray) -> bool:
                 columns[i, c] -= S[k, i] * columns[k, c]
             columns[i, c] /= S[i, i]
     return True
+
+
+@inlined
+def wrapped(angle_rad: float) -> float:
+    """Return the angle in (-pi, pi], unchanged where it lies there."""
+    if -math.pi < angle_rad <= math.pi:
+        return angle_rad
+    turned = math.pi - np.mod(math.pi - angle_rad, 2.0 * math.pi)
+    return math.pi if turned <= -math.pi else turned

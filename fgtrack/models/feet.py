@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import njit
-from fgtrack.core.types import FloatArray
+from fgtrack.core.compiled import njit, wrapped
+from fgtrack.core.types import BoolArray, FloatArray
 
-_ALONG, _QUANTITIES = 9, 10  # see `fgtrack.models.track_map`
+_HEADING, _CURVATURE, _LEFT, _RIGHT, _ALONG, _QUANTITIES = 4, 5, 6, 7, 9, 10  # see `fgtrack.models.track_map`
 
 
 @njit("(float64[:, ::1], Array(float64, 2, 'C', readonly=True))")
@@ -39,3 +39,17 @@ def feet(points_m: FloatArray, segments: FloatArray) -> tuple[FloatArray, FloatA
         right, up = right - part * at[10], up - part * at[11]
         lateral[i] = (right * quantities[i, 3] + up * quantities[i, 2]) / math.hypot(quantities[i, 2], quantities[i, 3])
     return quantities, lateral
+
+
+@njit("(float64[:, ::1], Array(float64, 2, 'C', readonly=True), float64, float64)")
+def view(
+    points_m: FloatArray, segments: FloatArray, left_m: float, right_m: float
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Heading in (-pi, pi], curvature, and True beyond the bounds and so much more, of points (m, 2), shapes (m,)."""
+    quantities, lateral = feet(points_m, segments)
+    m = len(points_m)
+    heading, curvature, outside = np.empty(m), np.empty(m), np.empty(m, np.bool_)
+    for i in range(m):
+        heading[i], curvature[i] = wrapped(quantities[i, _HEADING]), quantities[i, _CURVATURE]
+        outside[i] = lateral[i] > quantities[i, _LEFT] + left_m or -lateral[i] > quantities[i, _RIGHT] + right_m
+    return heading, curvature, outside

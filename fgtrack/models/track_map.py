@@ -137,12 +137,11 @@ class TrackMap:
 
         A positive buffer widens the track. The inner bound is the left one if it is driven counter-clockwise.
         """
-        foot, lateral = self._locate(points_m)
-        left_m, right_m = (
-            (inner_buffer_m, outer_buffer_m) if self.counter_clockwise else (outer_buffer_m, inner_buffer_m)
-        )
-        outside = (lateral > foot[:, _LEFT] + left_m) | (-lateral > foot[:, _RIGHT] + right_m)
-        return RoadView(wrap_angles(foot[:, _HEADING]), foot[:, _CURVATURE], outside)
+        left_m, right_m = inner_buffer_m, outer_buffer_m
+        if not self.counter_clockwise:
+            left_m, right_m = right_m, left_m
+        points_m = np.array(points_m, order="C")
+        return RoadView(*kernels("fgtrack.models.feet").view(points_m, self._segments, left_m, right_m))
 
     def _at(self, s_m: FloatArray) -> FloatArray:
         """Quantities at arc length `s_m`, shape (n, 10)."""

@@ -1,13 +1,14 @@
 """The replaying EKFs of all objects in arrays."""
 
 from collections.abc import Callable, Sequence
+from itertools import compress
 from typing import Any
 
 import numpy as np
 
 from fgtrack.core.checks import LARGEST_NS
 from fgtrack.core.linalg import kernels
-from fgtrack.core.types import FloatArray, TrackState
+from fgtrack.core.types import FloatArray, IntArray, TrackState
 from fgtrack.estimation.base import Measurement, Measurements, Start, StatesAt, UpdateResult, UpdateStatus, stacks
 from fgtrack.estimation.filters.ekf import Prediction
 from fgtrack.estimation.filters.propagation import kinematic_states
@@ -40,6 +41,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         self._kind, self._density = motion.kind, motion.density
         self._start_ns = -int(LARGEST_NS)  # of all windows, by the clock
         self._rows: dict[int, int] = {}  # of tracks in the arrays
+        self._order: IntArray | None = None  # of all tracks by birth, until one comes, goes or moves
         self._free: list[int] = []
         self._arrays = list[Any]()
         self._allocate(8, 64, 4)
@@ -68,13 +70,16 @@ class ReplayBank(ObjectBank[ReplayEkf]):
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`."""
-        inside = [i for i, start_ns in zip(self._estimators, self._starts_ns(), strict=True) if start_ns <= stamp_ns]
-        return StatesAt(tuple(inside), *self._ahead(inside, [stamp_ns] * len(inside)))
+        rows, starts_ns = self._windows()
+        inside = starts_ns <= stamp_ns
+        track_ids = tuple(compress(self._estimators, inside.tolist()))
+        return StatesAt(track_ids, *self._ahead(track_ids, rows[inside], np.full(len(track_ids), stamp_ns)))
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
-        stamps_ns = [max(self.present_ns, start_ns) for start_ns in self._starts_ns()]
-        return kinematic_states(self._motion, self.present_ns, *self._ahead(list(self._estimators), stamps_ns))
+        rows, starts_ns = self._windows()
+        states = self._ahead(tuple(self._estimators), rows, np.maximum(starts_ns, self.present_ns))
+        return kinematic_states(self._motion, self.present_ns, *states)
 
     def update(
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
@@ -98,6 +103,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`."""
         super().birth(track_id, prior)
+        self._order = None
         self._put_in(track_id)
 
     def remove(self, track_id: int) -> None:
@@ -105,13 +111,17 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         if track_id in self._rows:
             self._free.append(self._rows.pop(track_id))
         super().remove(track_id)
+        self._order = None
 
-    def _starts_ns(self) -> list[int]:
-        """Starts of the windows of all tracks, in order of birth."""
-        starts_ns = np.maximum(self._arrays[3][:, 1], self._start_ns).tolist()
-        return [
-            one.window_ns[0] if i not in self._rows else starts_ns[self._rows[i]] for i, one in self._estimators.items()
-        ]
+    def _windows(self) -> tuple[IntArray, IntArray]:
+        """Rows of all tracks in the arrays, -1 of filters of their own, and starts of their windows, shapes (m,)."""
+        if self._order is None:
+            self._order = np.array([self._rows.get(i, -1) for i in self._estimators], dtype=np.int64)
+        starts_ns = np.maximum(self._arrays[3][self._order, 1], self._start_ns)
+        if len(self._rows) < len(self._estimators):
+            for k, (i, one) in enumerate(self._estimators.items()):
+                starts_ns[k] = starts_ns[k] if i in self._rows else one.window_ns[0]
+        return self._order, starts_ns
 
     def _fused(self, stamp_ns: int, rows: Sequence[int], one: Measurement) -> list[UpdateResult]:
         """Outcomes of a stack of measurements of entries of the state."""
@@ -142,19 +152,17 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         if k > largest or is_full:
             self._allocate(num_rows, slots * (1 + is_full), max(k, largest))
 
-    def _ahead(self, track_ids: Sequence[int], stamps_ns: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+    def _ahead(self, track_ids: Sequence[int], rows: IntArray, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray]:
         """Means (m, n) and covariances (m, n, n) of tracks, each at its stamp, with the yaw in (-pi, pi]."""
-        n, rows = self._motion.dim, [self._rows.get(track_id, -1) for track_id in track_ids]
-        tracks, stamps = np.array(rows, dtype=np.int64), np.array(stamps_ns, dtype=np.int64)
-        inside = tracks >= 0
-        means, covariances = np.empty((len(rows), n)), np.empty((len(rows), n, n))
-        predicted = np.empty((np.count_nonzero(inside), 2 * n + 1, n))
-        self._kernels.ahead(self._kind, self._density, *self._arrays[:4], tracks[inside], stamps[inside], predicted)
-        means[inside], covariances[inside] = predicted[:, 0], predicted[:, 1 : n + 1]
+        n, inside = self._motion.dim, rows >= 0
+        states = np.empty((len(rows), 2 * n + 1, n))
+        predicted = states if inside.all() else states[inside]
+        self._kernels.ahead(self._kind, self._density, *self._arrays[:4], rows[inside], stamps_ns[inside], predicted)
+        states[inside] = predicted
         for i in (~inside).nonzero()[0].tolist():
-            state = self._estimators[track_ids[i]].state_at(stamps_ns[i])
-            means[i], covariances[i] = state.mean, state.covariance
-        return means, covariances
+            state = self._estimators[track_ids[i]].state_at(int(stamps_ns[i]))
+            states[i, 0], states[i, 1 : n + 1] = state.mean, state.covariance
+        return states[:, 0], states[:, 1 : n + 1]
 
     def _put_in(self, track_id: int) -> None:
         """Move the steps of a filter into the arrays, where these can hold them."""
@@ -166,6 +174,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         if not self._free or len(one.steps) >= slots or k > largest:
             self._allocate(rows * (1 + (not self._free)), max(slots, 2 * len(one.steps)), max(k, largest))
         row = self._rows[track_id] = self._free.pop()
+        self._order = None
         order, labels, steps, windows, measured = (array[row] for array in self._arrays)
         windows[:] = len(one.steps), *one.window_ns
         for slot, each in zip(order, one.steps, strict=False):
@@ -178,7 +187,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
 
     def _take_out(self, track_id: int) -> None:
         """Move the steps of a filter out of the arrays, if they are there."""
-        row, n = self._rows.pop(track_id, None), self._motion.dim
+        row, n, self._order = self._rows.pop(track_id, None), self._motion.dim, None
         if row is None:
             return
         self._free.append(row)

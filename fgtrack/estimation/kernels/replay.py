@@ -7,11 +7,19 @@ it, and the cross-covariance of that with the step before. One of `measured` has
 is a prior, is 0. A row of `windows` has the number of the track's steps, and its oldest and newest stamp.
 """
 
-import math
-
 import numpy as np
 
-from fgtrack.core.compiled import add_congruence, add_product_transposed, copy, inlined, merged, njit, product, solve
+from fgtrack.core.compiled import (
+    add_congruence,
+    add_product_transposed,
+    copy,
+    inlined,
+    merged,
+    njit,
+    product,
+    solve,
+    wrapped,
+)
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.kernels.kalman import correct_one, innovate
@@ -19,15 +27,6 @@ from fgtrack.models.transitions import ARC, transition
 
 FAILED, TOO_OLD, IN_SEQUENCE, OUT_OF_SEQUENCE = range(4)
 _YAW = 2
-
-
-@inlined
-def _wrapped(angle_rad: float) -> float:
-    """Return the angle in (-pi, pi], unchanged where it lies there."""
-    if -math.pi < angle_rad <= math.pi:
-        return angle_rad
-    wrapped = math.pi - np.mod(math.pi - angle_rad, 2.0 * math.pi)
-    return math.pi if wrapped <= -math.pi else wrapped
 
 
 @inlined
@@ -46,7 +45,7 @@ def _innovation(x: FloatArray, z: FloatArray, label: IntArray, wraps: bool, y: F
         entry = label[2 + a]
         y[a] = z[a] - x[entry]
         if wraps and entry == _YAW:
-            y[a] = _wrapped(y[a])
+            y[a] = wrapped(y[a])
         for b in range(len(x)):
             H[a, b] = 1.0 if b == entry else 0.0
 
@@ -82,7 +81,7 @@ def _retrodict(
                 C[a, b] = gain[b, a]
                 root[a, b] = now[1 + a, b] - ahead[1 + a, b]
         if motion == ARC:
-            shift[_YAW] = _wrapped(shift[_YAW])
+            shift[_YAW] = wrapped(shift[_YAW])
         product(C, root, CD)
         for a in range(n):
             root[0, a] = state[0, a]
@@ -114,7 +113,7 @@ def _step(
     if np.isnan(nis) or not correct_one(after[0], after[1 : n + 1], y, H, measured[1:], K):
         return False
     if motion == ARC:
-        after[0, _YAW] = _wrapped(after[0, _YAW])
+        after[0, _YAW] = wrapped(after[0, _YAW])
     return True
 
 
@@ -230,4 +229,4 @@ def ahead(
         s = order[t, j]
         _ahead(motion, density, steps[t, s, : n + 1], stamps_ns[i] - labels[t, s, 0], predicted[i])
         if motion == ARC:
-            predicted[i, 0, _YAW] = _wrapped(predicted[i, 0, _YAW])
+            predicted[i, 0, _YAW] = wrapped(predicted[i, 0, _YAW])
