@@ -29,26 +29,19 @@ CORRELATED = 0.3
 """Autocorrelation of innovations at lag 1 above which their errors are correlated in time."""
 MOST_BREAKS_PER_MINUTE = 2.0
 """More breaks per object and minute than these are bad tracking."""
-_FEWEST_BREAKS, _BREAKS_SHARE = 3, 0.25
-"""Breaks, and their share of all confirmed tracks, that are not those of occlusions or of chance."""
-_DEAD_SHARE = 0.5
-"""Share of the detections used that begin a track which is never confirmed; of clutter it is below."""
-#: A track continues another one that ended at most so long before, or after, it began.
-_GAP_S, _OVERLAP_S = 5.0, 2.0
-#: It begins within this distance of the prediction of the other one: noise, and a turn of 0.3 rad or 30 % of its speed.
-_NEAR_M, _DEPARTURE = 3.0, 0.3
+_FEWEST_BREAKS, _BREAKS_SHARE = 3, 0.25  # of all confirmed tracks; fewer are those of occlusions or of chance
+_DEAD_SHARE = 0.5  # of the detections used, beginning a track that is never confirmed; of clutter it is below
+_GAP_S, _OVERLAP_S = 5.0, 2.0  # a track continues one that ended at most so long before, or after, it began
+_NEAR_M, _DEPARTURE = 3.0, 0.3  # from its prediction: noise, and a turn of 0.3 rad or 30 % of its speed
 _NO_FAILURE = "step damped"  # not a failure: with bearings damped steps are usual
-
 #: Cause and cure of dispositions that most detections of a sensor may have.
 _CURES = {
-    "gated": "no track was near enough and none was started: check the gate of `association`, the clock, and "
-    "ego.detection_origin_x_m",
-    "out_of_bounds": "{reasons}: are these settings meant, and is it the right map (--map), and the frame of the "
-    "detections?",
+    "gated": "no track was near, none was started: check the gate of `association`, clock, ego.detection_origin_x_m",
+    "out_of_bounds": "{reasons}: are these settings meant, is it the right map (--map), and frame of the detections?",
     "duplicate": "the same list again and again: look at the recording, a sensor or a bridge repeats itself",
     "superseded": "another list of the sensor came in the same tick, and the inbox keeps one: raise clock.node_hz",
-    "invalid": "no position, a value that is not finite, an invalid covariance, or a stamp ahead of its receipt: "
-    "compare the keys of sensors.{sensor}.std with what `fgtrack info` shows",
+    "invalid": "no position, not finite, an invalid covariance, or stamped ahead of its receipt: compare the keys of "
+    "sensors.{sensor}.std with what `fgtrack info` shows",
     "failed": "no ego state near the stamp, or a numerical failure: check the clock of the ego",
 }
 _STANDING = {"birth.ego_speed_factor": 0.0}
@@ -63,16 +56,17 @@ def diagnostics(run: Run) -> list[Diagnostic]:
 
 def noise_diagnostics(run: Run) -> list[Diagnostic]:
     """Sensors whose innovations are inconsistent with the noise; see also the verdict of `compare`."""
-    result = []
+    result, source = [], (run.meta.get("input") or {}).get("path")
+    of_run = f" {source} -c {run.path / 'config.yaml'}" if run.path is not None and source else ""
     for sensor, nis in misfits(run):
         size = "small" if nis.mean > nis.dof else "large"
         factor = math.sqrt(max(nis.mean, 0.0) / nis.dof)  # below 0 by rounding, where one std is 1e9 of another
         text = (
-            f"mean NIS {nis.mean:.3g}, expected {nis.dof:.3g}: the configured noise is too {size}, as if "
-            f"errors were {factor:.2g} times what is configured"
+            f"mean NIS {nis.mean:.3g}, expected {nis.dof:.3g}: the configured noise is too {size}, as if errors were "
+            f"{factor:.2g} times what is configured; `fgtrack advise{of_run} --tune -o advised.yaml` fits it, or "
+            "reports what has to be done first"
         )
-        fit = _advise(run, " --tune -o advised.yaml")
-        result.append(Diagnostic(sensor, f"{text}; `{fit}` fits it, or reports what has to be done first"))
+        result.append(Diagnostic(sensor, text))
     return result
 
 
@@ -121,13 +115,6 @@ def excluded_lines(meta: Mapping[str, Any]) -> Iterator[str]:
         yield f"{sensor}: {'; '.join(parts)}"
 
 
-def _advise(run: Run, options: str = "") -> str:
-    """The command that examines the settings of `run`."""
-    source = str((run.meta.get("input") or {}).get("path") or "")
-    named = f" {source} -c {run.path / 'config.yaml'}" if run.path is not None and source else ""
-    return f"fgtrack advise{named}{options}"
-
-
 def _angles(run: Run) -> Iterator[Diagnostic]:
     """Angles that were recorded in degrees and read as radians."""
     for about, table in [(EGO, run.tables["ego"]), *by_sensor(run.tables["detections"])]:
@@ -143,18 +130,11 @@ def _ego(run: Run) -> Iterator[Diagnostic]:
     if not num_states and any(name == "failed" for _, _, name, _ in _mostly(run)):
         yield Diagnostic(EGO, f"no state was received, so nothing in its frame can be placed: {_NAME_EGO}")
     elif not num_states and _ego_speeds_births(run):
-        text = (
-            "no state was received, so new objects are assumed to stand still, and what the sensors could see is not "
-            f"known: {_NAME_EGO}, or set birth.ego_speed_factor to 0"
-        )
-        yield Diagnostic(EGO, text, _STANDING)
+        text = f"no state was received, so new objects are assumed to stand still: {_NAME_EGO}"
+        yield Diagnostic(EGO, f"{text}, or set birth.ego_speed_factor to 0", _STANDING)
     if jumps := run.meta.get("ego_jumps"):
         times = "once" if jumps == 1 else f"{jumps} times"
-        text = (
-            f"its position jumps {times}, as where a clock is set or a localisation is reinitialised: detections are "
-            "misplaced there, cut the recording in parts"
-        )
-        yield Diagnostic(EGO, text)
+        yield Diagnostic(EGO, f"its position jumps {times}: detections are misplaced there, cut the recording in parts")
     for reason, count in dict(run.meta.get("ego_refused") or {}).items():
         if 0 < num_states < 2 * count:
             text = f"{count} of {num_states} states not used, {reason}: look at the clock of its driver"
@@ -168,11 +148,9 @@ def _map(run: Run) -> Iterator[Diagnostic]:
     detections = run.tables["detections"]
     blind = [name for name, mine in by_sensor(detections) if not np.isfinite(mine["yaw_rad"]).any()]
     if blind:
-        text = (
-            f"there is none, and no heading from {', '.join(blind)}: new objects may drive in any direction; name the "
-            "map with --map (`oval` for the simulated races), or set birth.ego_speed_factor to 0 for open space"
-        )
-        yield Diagnostic("map", text, _STANDING)
+        text = f"there is none, and no heading from {', '.join(blind)}: new objects may drive in any direction"
+        cure = "name it with --map (`oval` for the simulated races), or set birth.ego_speed_factor to 0 for open space"
+        yield Diagnostic("map", f"{text}; {cure}", _STANDING)
 
 
 def _ego_speeds_births(run: Run) -> bool:
@@ -192,10 +170,7 @@ def _sensors(run: Run) -> Iterator[Diagnostic]:
     """Stamps that no driver sets, and the disposition of most detections, where no other diagnostic explains it."""
     unset = [name for name, mine in by_sensor(run.tables["updates"]) if not mine["stamp_ns"].any()]
     for sensor in unset:
-        text = (
-            "all stamps are 0: its driver does not set them, so its delay is unknown; "
-            f"`stamp_from: receipt` on its topic, or sensors.{sensor}.stamp_from, takes the receipt for the stamp"
-        )
+        text = "all stamps are 0: its driver does not set them; `stamp_from: receipt` takes the receipt for the stamp"
         yield Diagnostic(sensor, text, {f"sensors.{sensor}.stamp_from": "receipt"})
     for sensor, mine, name, count in _mostly(run):
         if (name == "too_old" and sensor in unset) or (name == "failed" and not run.tables["ego"].num_rows):
@@ -234,7 +209,7 @@ def _fragmentation(run: Run) -> Iterator[Diagnostic]:
             f"{num_breaks} of {total} confirmed tracks begin where another one has just ended: "
             f"{num_breaks / minutes:.2g} breaks per object and minute, median life {np.median(lifetimes_s):.2g} of "
             f"{float(np.ptp(now_ns)) / NS_PER_S:.3g} s; likely causes: a field of view or range larger than what a "
-            f"sensor covers, detection_probability, lifecycle.lifetime_s, noise; `{_advise(run)}` looks for them"
+            "sensor covers, detection_probability, lifecycle.lifetime_s, noise; `fgtrack advise` looks for them"
         )
         yield Diagnostic("tracks", text)
     dispositions = run.tables["updates"]["disposition"]
@@ -243,7 +218,7 @@ def _fragmentation(run: Run) -> Iterator[Diagnostic]:
     if used >= FEWEST and dead > _DEAD_SHARE * used:
         text = (
             f"{dead} of {used} detections used began a track that was never confirmed; likely causes: clutter, errors "
-            f"or motion larger than configured, a wrong ego or clock; `{_advise(run)}` looks for them"
+            "or motion larger than configured, a wrong ego or clock; `fgtrack advise` looks for them"
         )
         yield Diagnostic("tracks", text)
 

@@ -1,16 +1,20 @@
-"""Positions of the detections of a run in the map, and the outcome of each."""
+"""Detections of a run in the map, the outcome of each, and the roads of the map."""
 
 from collections import defaultdict, deque
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from fgtrack.core.geometry import cartesian, rotations, wrap_angles
-from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.truth import ego_states
 from fgtrack.io.run import Run
-from fgtrack.io.run.schema import Column
+from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
+from fgtrack.models.road import OPEN_SPACE
+from fgtrack.models.track_map import TrackMap
 
+_BOUND_STEP_M = 2.0
 _KEY = ("sensor", "stamp_ns", "receipt_ns", "index")
 
 
@@ -36,7 +40,13 @@ def placed(run: Run) -> Placed:
     table = run.tables["detections"]
     frame, stamps_ns = table["frame"], table["stamp_ns"]
     poses = ego_states(run.tables["ego"], stamps_ns)
-    mounts = _mounts(run, table["sensor"], frame == "sensor")
+    ego, sensors = run.config.get("ego") or {}, run.config.get("sensors") or {}
+    origin = [float(ego.get("detection_origin_x_m", 0.0)), float(ego.get("detection_origin_y_m", 0.0)), 0.0]
+    mounts = np.tile(origin, (len(frame), 1))  # ahead, left, yaw
+    for name in np.unique(table["sensor"]).tolist():
+        mount = (sensors.get(name) or {}).get("mount") or {}
+        mine = (frame == "sensor") & (table["sensor"] == name)
+        mounts[mine] += [float(mount.get(key, 0.0)) for key in ("x_m", "y_m", "yaw_rad")]
     turns, sensor_rad = rotations(poses[:, 2]), poses[:, 2] + mounts[:, 2]
     sensor_m = poses[:, :2] + np.einsum("nij,nj->ni", turns, mounts[:, :2])
     in_map, given_m = frame == "map", np.stack([table["x_m"], table["y_m"]], axis=-1)
@@ -59,16 +69,26 @@ def update_rows(run: Run) -> IntArray:
     return np.array([waiting[key].popleft() if waiting[key] else -1 for key in keys], dtype=np.int64)
 
 
-def _mounts(run: Run, sensors: Column, mounted: BoolArray) -> FloatArray:
-    """Position (ahead, left) and yaw, shape (n, 3), of the frames of detections on the ego.
+def roads(run: Run) -> tuple[dict[str, TrackMap], list[str]]:
+    """Return the maps that the configuration names, by `track` and `pit`, and a line for each file that is gone.
 
-    `mounted` is True for the frames of the sensors themselves; the others are the ego's detection frame.
+    Raises `DataError` if a file is not a map.
     """
-    config = run.config
-    ego, known = config.get("ego") or {}, config.get("sensors") or {}
-    origin = np.array([float(ego.get("detection_origin_x_m", 0.0)), float(ego.get("detection_origin_y_m", 0.0)), 0.0])
-    result = np.tile(origin, (len(sensors), 1))
-    for name in np.unique(sensors).tolist():
-        mount = (known.get(name) or {}).get("mount") or {}
-        result[mounted & (sensors == name)] += [float(mount.get(key, 0.0)) for key in ("x_m", "y_m", "yaw_rad")]
-    return result
+    result, notes = {}, []
+    config = run.config.get("map") or {}
+    for key, built_in in (("track", make_oval), ("pit", make_pit_lane)):
+        name = config.get(key)
+        if name == OVAL:
+            result[key] = built_in()
+        elif name and Path(str(name)).is_file():
+            result[key] = TrackMap.read(Path(str(name)))
+        elif name and name != OPEN_SPACE:
+            notes.append(f"map.{key}: {name} is not there any more, so it is not shown")
+    return result, notes
+
+
+def road_lines(road: TrackMap) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the left bound, the right bound and the reference line of `road`, each of shape (n, 2)."""
+    s_m = np.linspace(0.0, road.length_m, max(2, round(road.length_m / _BOUND_STEP_M)) + 1)
+    left_m, right_m = road.bounds(s_m)
+    return road.position(s_m, left_m), road.position(s_m, -right_m), road.position(s_m, np.zeros_like(s_m))

@@ -10,8 +10,7 @@ from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.evaluation.matching import confirmed
 from fgtrack.evaluation.palette import PALETTE
-from fgtrack.evaluation.placement import placed
-from fgtrack.evaluation.roads import road_lines, roads
+from fgtrack.evaluation.placement import placed, road_lines, roads
 from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_ns
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run import Run, Table

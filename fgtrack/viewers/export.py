@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation.palette import distinct_colours
-from fgtrack.evaluation.roads import roads
+from fgtrack.evaluation.placement import roads
 from fgtrack.evaluation.runs import Runs, evaluated, same_recording
 from fgtrack.io.output import check_apart, check_output
 from fgtrack.io.ros.bag_writer import check_bag, token

@@ -12,8 +12,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import EGO_ID, LATE, FloatArray, IntArray
 from fgtrack.evaluation.diagnostics import USED
 from fgtrack.evaluation.palette import SENSORS, distinct_colours
-from fgtrack.evaluation.placement import placed, update_rows
-from fgtrack.evaluation.roads import road_lines, roads
+from fgtrack.evaluation.placement import placed, road_lines, roads, update_rows
 from fgtrack.evaluation.runs import EvaluatedRun, by_recording
 from fgtrack.io.run import Run, Table
 from fgtrack.viewers.states import AROUND_95, NOMINAL_SIZE_M, ellipses, final_ns, located, start_ns, track_positions

@@ -12,8 +12,7 @@ import numpy as np
 from fgtrack.core.time import seconds
 from fgtrack.core.types import EGO_ID, FUSED, LATE, STATE_NAMES, Detection, Disposition, EgoState, IntArray
 from fgtrack.evaluation.palette import PALETTE, SENSORS
-from fgtrack.evaluation.placement import Placed, placed, update_rows
-from fgtrack.evaluation.roads import road_lines
+from fgtrack.evaluation.placement import Placed, placed, road_lines, update_rows
 from fgtrack.io.ros.bag_writer import token
 from fgtrack.io.run import NO_TRACK, Run, Table
 from fgtrack.models.track_map import TrackMap

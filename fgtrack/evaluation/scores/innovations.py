@@ -10,7 +10,7 @@ from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import MEASURABLE, BoolArray, FloatArray, IntArray
 from fgtrack.evaluation.matching import confirmed, neighbours
-from fgtrack.evaluation.roads import roads
+from fgtrack.evaluation.placement import roads
 from fgtrack.evaluation.scores.statistics import NORMAL_95, Moments
 from fgtrack.io.run import NO_TRACK, Run, Table
 from fgtrack.models.measurement import ANGULAR

@@ -18,7 +18,6 @@ from fgtrack.io.run import Run, Table
 WINDOW: Literal["window"] = "window"
 """The lag of a final state: the window's length, or less where the track ended before."""
 
-_NO_ROW = -1
 _SEED = 1  # of the bootstrap: the same run gives the same interval
 
 
@@ -54,18 +53,17 @@ class LagMetrics:
 def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
     """Metrics of the present states, of every lag of lagged.csv by rising lag, and of the final states.
 
-    A lagged state belongs to the object that its track was paired with at the tick of the same stamp; where no tick
-    has this stamp, at the one nearest to it. States without such a pair are not evaluated. Empty for a run without
-    truth.
+    A lagged state belongs to the object that its track was paired with at the tick nearest to its stamp; without one
+    it is not evaluated. Empty for a run without truth.
     """
     if matching is None:
         return ()
-    lagged, final = run.tables["lagged"], _final(run)
+    lagged, smoothed = run.tables["lagged"], run.tables["smoothed"]
     parts: dict[float | Literal["window"], Table] = {
         lag_s: lagged.where(lagged["lag_s"] == lag_s) for lag_s in np.unique(lagged["lag_s"]).tolist() if lag_s > 0.0
     }
-    if final.num_rows:
-        parts[WINDOW] = final
+    if (smoothed["kind"] == "final").any():
+        parts[WINDOW] = smoothed.where(smoothed["kind"] == "final")
     present, truth = matching.tracks.where(matching.paired), matching.true_states[matching.paired]
     errors = _moments(state_errors(present, truth))
     result = [LagMetrics(0.0, errors, Moments.of(position_squares(present, truth)), errors)]
@@ -84,34 +82,22 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
 
 def final_errors(run: Run, matching: Matching) -> TrackErrors:
     """Errors of the final states, each against the object that its track was paired with at that stamp."""
-    states, truth, rows = _with_truth(run, matching, _final(run))
-    index = matching.object_index[rows]
-    return TrackErrors(states["stamp_ns"], index, states["track_id"], state_errors(states, truth))
-
-
-def _final(run: Run) -> Table:
     smoothed = run.tables["smoothed"]
-    return smoothed.where(smoothed["kind"] == "final")
+    states, truth, rows = _with_truth(run, matching, smoothed.where(smoothed["kind"] == "final"))
+    errors = state_errors(states, truth)
+    return TrackErrors(states["stamp_ns"], matching.object_index[rows], states["track_id"], errors)
 
 
 def _with_truth(run: Run, matching: Matching, states: Table) -> tuple[Table, FloatArray, IntArray]:
     """Return those of `states` that belong to an object, its true states there, shape (n, 5), and their track rows."""
-    rows = _rows_at(matching, states)
-    alive = rows != _NO_ROW
-    states, rows = states.where(alive), rows[alive]
-    truth = true_states(run.tables["truth"], matching.object_index[rows], states["stamp_ns"])
+    before, after = neighbours(matching.tracks, "stamp_ns", states["stamp_ns"], states["track_id"])
+    alive = (before >= 0) & (after >= 0)
+    states, before, after = states.where(alive), before[alive], after[alive]
+    tracks_ns, stamps_ns = matching.tracks["stamp_ns"], states["stamp_ns"]
+    rows = np.where(stamps_ns - tracks_ns[before] < tracks_ns[after] - stamps_ns, before, after)
+    truth = true_states(run.tables["truth"], matching.object_index[rows], stamps_ns)
     known = np.isfinite(truth[:, 0]) & np.isfinite(states["x_m"])
     return states.where(known), truth[known], rows[known]
-
-
-def _rows_at(matching: Matching, states: Table) -> IntArray:
-    """Row of each state's track that is nearest in stamp, shape (n,); `_NO_ROW` outside of its life."""
-    stamps_ns, tracks_ns = states["stamp_ns"], matching.tracks["stamp_ns"]
-    before, after = neighbours(matching.tracks, "stamp_ns", stamps_ns, states["track_id"])
-    alive, nearest = (before != _NO_ROW) & (after != _NO_ROW), np.full(len(before), _NO_ROW)
-    before, after, stamps_ns = before[alive], after[alive], stamps_ns[alive]
-    nearest[alive] = np.where(stamps_ns - tracks_ns[before] < tracks_ns[after] - stamps_ns, before, after)
-    return nearest
 
 
 def _moments(errors: Mapping[str, FloatArray]) -> dict[str, Moments]:

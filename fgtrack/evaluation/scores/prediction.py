@@ -7,7 +7,7 @@ import numpy as np
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.matching import Matching, TrackErrors, confirmed
-from fgtrack.evaluation.roads import roads
+from fgtrack.evaluation.placement import roads
 from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.evaluation.truth import TRUE_STATE, true_states
 from fgtrack.io.run import Run
