@@ -66,6 +66,5 @@ def replay(
         warn(line)
     if (broken := runs[0].meta["broken_off"]) is not None:  # the others break off at the same message
         raise DataError(f"{pipeline.located(broken, str(recording))}; replayed up to there")
-    reason = unused(runs[0])
-    if reason is not None:
+    if (reason := unused(runs[0])) is not None:
         raise DataError(f"{recording}: {reason}")

@@ -62,9 +62,6 @@ def show_study(found: Study, recording: Path) -> None:
         raise DataError(f"{located(found.broken, str(recording))}; used up to there")
 
 
-_CONFIG = "tuned"
-
-
 def demo(
     out: Annotated[Path, Option("-o", "--out", help="Folder for recording, runs, figures and report.")] = Path(
         "fgtrack-demo"
@@ -80,10 +77,10 @@ def demo(
         with progress("simulate"):
             messages = simulate(scenario, np.random.default_rng(seed))
             write_recording(bag, messages, overwrite=overwrite, settings=recorded_of(scenario))
-        config = read_config(_CONFIG, track_map=OVAL, pit_map=OVAL)
+        config = read_config("tuned", track_map=OVAL, pit_map=OVAL)
     with progress("study") as tell:
         sweep = {"error_against_delay": error_against_delay()}
         found = studied(bag, out, config, advice=False, figures=sweep, overwrite=overwrite, on_step=tell)
-    say(f"{scenario.duration_s:g} s of a simulated race ({bag}), noise fitted to other races (-c {_CONFIG}):")
+    say(f"{scenario.duration_s:g} s of a simulated race ({bag}), noise fitted to other races (-c tuned):")
     show_study(found, bag)
     say(f"error against delay, of a sweep over ten races: {out / 'figures/error_against_delay.png'}")

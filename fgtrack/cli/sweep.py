@@ -59,9 +59,8 @@ def sweep(
     for name in PRODUCTS:  # what else is in the folder stays
         check_apart(out / name, plan.inputs)
     work = Sweep.open(plan, out, overwrite)
-    left = len(work.todo)
-    tell(f"jobs: {len(work.plan.jobs)}, each of {len(work.plan.estimators)} estimators; to do: {left}")
-    with progress("sweep", left) as moved:
+    tell(f"jobs: {len(work.plan.jobs)}, each of {len(work.plan.estimators)} estimators; to do: {len(work.todo)}")
+    with progress("sweep", len(work.todo)) as moved:
         result = work.run(score, jobs=jobs or -1, dask=dask, on_job=moved)
     tell(f"{out / SWEEP_TABLE}: {result.num_good} of {len(plan.jobs) * len(plan.estimators)} cells")
     if result.num_good:
@@ -69,8 +68,7 @@ def sweep(
     if result.errors:
         raise DataError(f"{out / ERROR_TABLE}: {len(result.errors)} bad cells, the first: {result.errors[0]}")
     if result.unknown_metrics and recording is None:  # the metrics were not chosen for another input
-        names = ", ".join(result.unknown_metrics)
-        raise DataError(f"{sweep_file}: metrics: no column fits {names}; without `metrics` {SWEEP_TABLE} has all")
+        raise DataError(f"{sweep_file}: metrics: no column of {SWEEP_TABLE} fits {', '.join(result.unknown_metrics)}")
 
 
 def swept(sweep_file: Path, out: Path, num_seeds: int | None = None) -> list[dict[str, str]]:

@@ -58,8 +58,9 @@ def test_points_get_the_own_ship_and_become_east_and_north(tmp_path, measurement
     ],
 )
 def test_bearings_from_the_north_become_bearings_from_the_east(tmp_path, measurement, bearings):
-    (message,) = lists(scenario(tmp_path, record(3, "1.0", measurement)))
-    assert (message.sensor, message.frame) == ("infrared", "ego")
+    message, other = lists(scenario(tmp_path, record(3, "1.0", measurement), record(4, "1.0", measurement)))
+    assert (message.sensor, message.frame, message.objects) == ("infrared", "ego", other.objects)
+    assert (other.sensor, other.frame) == ("daylight", "ego")
     assert [item.bearing_rad for item in message.objects] == [pytest.approx(value) for value in bearings]
     assert message.objects == tuple(Detection(bearing_rad=item.bearing_rad) for item in message.objects)
 
@@ -101,12 +102,6 @@ def test_a_damaged_scenario_is_one_line_that_names_the_file(tmp_path, text):
     with pytest.raises(DataError, match=r"scenario9_detections\.json: ") as caught:
         list(open_input(tmp_path).messages())
     assert "\n" not in str(caught.value)
-
-
-def test_a_file_of_a_scenario_points_to_its_folder(tmp_path):
-    scenario(tmp_path)
-    with pytest.raises(DataError, match="name its folder"):
-        open_input(tmp_path / "scenario9_detections.json")
 
 
 @pytest.mark.slow

@@ -156,6 +156,8 @@ def test_without_tables_the_setting_is_named(tmp_path):
         messages(path, tables="elsewhere")
     (tmp_path / "v1.0-mini").rename(tmp_path / "meta")
     assert len(messages(path, tables="meta")) == 6
+    (tmp_path / "meta/sample_annotation.json").unlink()
+    assert [type(item) for item in messages(path, tables="meta")] == [EgoState, DetectionList] * 2
 
 
 @pytest.mark.parametrize(

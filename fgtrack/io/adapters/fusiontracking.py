@@ -77,8 +77,7 @@ def _ego(ego: Json, receipt_ns: int) -> EgoState:
 def _lists(detections: Json, receipt_ns: int, frames: Mapping[str, Frame]) -> Iterator[DetectionList]:
     for sensor, (objects, stamp_ns) in sorted(detections.items(), key=lambda item: item[1][1]):
         frame = frames.get(sensor, "ego")
-        found = tuple(_object(item, frame) for item in objects)
-        yield DetectionList(sensor, int(stamp_ns), receipt_ns, found, frame)
+        yield DetectionList(sensor, int(stamp_ns), receipt_ns, [_object(item, frame) for item in objects], frame)
 
 
 def _object(item: Json, frame: Frame) -> Detection:

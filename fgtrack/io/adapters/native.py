@@ -33,9 +33,8 @@ def presence(value: Detection | TruthState, names: tuple[str, ...]) -> int:
 
 def _given(message: RosMessage) -> dict[str, RosMessage]:
     """Fields behind `present` that were given."""
-    kind: RosMessage = type(message)
-    optional, present = _optional(kind), message.present
-    given = {name: getattr(message, name) for bit, name in enumerate(optional) if present >> bit & 1}
+    names = _optional(message.__class__)
+    given = {name: getattr(message, name) for bit, name in enumerate(names) if message.present >> bit & 1}
     return {name: tuple(value.tolist()) if name in LISTS else value for name, value in given.items()}
 
 

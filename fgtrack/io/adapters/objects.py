@@ -195,5 +195,5 @@ def _ego_covariance(message: RosMessage) -> tuple[float, ...] | None:
 
 def _is_known(covariance: FloatArray) -> bool:
     """True if all is finite and every variance is in use: "unknown" is 0 or -1 in ROS, 1e3 or more in many drivers."""
-    variances = np.diag(covariance)
-    return bool(np.isfinite(covariance).all() and (variances > 0.0).all() and (variances < _UNKNOWN).all())
+    in_use = (np.diag(covariance) > 0.0) & (np.diag(covariance) < _UNKNOWN)
+    return bool(np.isfinite(covariance).all() and in_use.all())

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from itertools import chain
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import DetectionList, Message
@@ -53,5 +52,5 @@ def _joined(group: list[Message]) -> Message:
         for each in lists
         for item in each.objects
     ]
-    left_out = tuple(chain.from_iterable(each.left_out for each in lists))
-    return replace(lists[-1], stamp_ns=mean_ns, objects=objects, left_out=left_out)
+    left_out = [name for each in lists for name in each.left_out]
+    return replace(lists[-1], stamp_ns=mean_ns, objects=objects, left_out=tuple(left_out))
