@@ -1,7 +1,6 @@
 """Errors of the stamps that a sensor reports: error = reported stamp - the time at which it sensed.
 
-A sensor has a list of clock models; each reads what the one before it reported. A model reads all messages of one
-sensor at once, in the order in which it sensed, and is an immutable value.
+A sensor has a list of clock models; each reads what the one before it reported.
 """
 
 from collections.abc import Sequence
@@ -25,10 +24,6 @@ class OffsetClock:
     """Positive: stamps are later than the world was sensed."""
     kind: Literal["offset"] = "offset"
 
-    def read(self, rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray) -> IntArray:
-        """Reported stamps, see `AnyClock`."""
-        return stamps_ns + nanoseconds(self.offset_s)
-
 
 @settings
 class DriftClock:
@@ -38,11 +33,6 @@ class DriftClock:
     """Microseconds gained per second; a quartz has some tens."""
     kind: Literal["drift"] = "drift"
 
-    def read(self, rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray) -> IntArray:
-        """Reported stamps, see `AnyClock`."""
-        elapsed_ns = (stamps_ns - stamps_ns[:1]).astype(np.float64)
-        return stamps_ns + np.rint(elapsed_ns * (self.drift_ppm * 1e-6)).astype(np.int64)
-
 
 @settings
 class JitterClock:
@@ -50,11 +40,6 @@ class JitterClock:
 
     std_s: Annotated[float, Field(ge=0.0, le=_LARGEST_ERROR_S)]
     kind: Literal["jitter"] = "jitter"
-
-    def read(self, rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray) -> IntArray:
-        """Reported stamps, see `AnyClock`."""
-        errors_ns = rng.standard_normal(len(stamps_ns)) * (self.std_s * NS_PER_S)
-        return stamps_ns + np.rint(errors_ns).astype(np.int64)
 
 
 @settings
@@ -64,10 +49,6 @@ class QuantisedClock:
     step_s: Annotated[float, Field(ge=1e-9, le=_LARGEST_ERROR_S)]
     kind: Literal["quantised"] = "quantised"
 
-    def read(self, rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray) -> IntArray:
-        """Reported stamps, see `AnyClock`."""
-        return stamps_ns - stamps_ns % nanoseconds(self.step_s)
-
 
 @settings
 class ArrivalClock:
@@ -75,13 +56,8 @@ class ArrivalClock:
 
     kind: Literal["arrival"] = "arrival"
 
-    def read(self, rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray) -> IntArray:
-        """Reported stamps, see `AnyClock`."""
-        return receipts_ns.copy()
 
-
-#: Every clock model, chosen by `kind`; `read` gives the stamps reported for `stamps_ns` of messages received at
-#: `receipts_ns`, shape (n,) each.
+#: Every clock model, chosen by `kind`.
 AnyClock = Annotated[
     OffsetClock | DriftClock | JitterClock | QuantisedClock | ArrivalClock,
     Discriminator("kind"),
@@ -91,10 +67,22 @@ AnyClock = Annotated[
 def reported_stamps(
     clocks: Sequence[AnyClock], rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray
 ) -> IntArray:
-    """Stamps that a sensor with `clocks` reports; all shapes (n,).
+    """Stamps that a sensor with `clocks` reports of messages in the order in which it sensed, shape (n,) as all others.
 
     Each place in the list has a generator of its own: other clocks before or after one leave what it draws.
     """
     for clock, child in zip(clocks, rng.spawn(len(clocks)), strict=True):
-        stamps_ns = clock.read(child, stamps_ns, receipts_ns)
+        match clock:
+            case OffsetClock():
+                stamps_ns = stamps_ns + nanoseconds(clock.offset_s)
+            case DriftClock():
+                elapsed_ns = (stamps_ns - stamps_ns[:1]).astype(np.float64)
+                stamps_ns = stamps_ns + np.rint(elapsed_ns * (clock.drift_ppm * 1e-6)).astype(np.int64)
+            case JitterClock():
+                errors_ns = child.standard_normal(len(stamps_ns)) * (clock.std_s * NS_PER_S)
+                stamps_ns = stamps_ns + np.rint(errors_ns).astype(np.int64)
+            case QuantisedClock():
+                stamps_ns = stamps_ns - stamps_ns % nanoseconds(clock.step_s)
+            case ArrivalClock():
+                stamps_ns = receipts_ns.copy()
     return stamps_ns

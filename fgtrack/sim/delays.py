@@ -1,8 +1,4 @@
-"""Delays of the messages of a sensor: delay = receipt - stamp.
-
-A model draws the delays of all messages of one sensor at once, given their stamps in order, so that a model
-may have a memory (bursts) and still be an immutable value.
-"""
+"""Delays of the messages of a sensor: delay = receipt - stamp. All are drawn at once, for bursts have a memory."""
 
 import math
 from dataclasses import field
@@ -23,10 +19,6 @@ class NoDelay:
 
     kind: Literal["none"] = "none"
 
-    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
-        """Delays, see `AnyDelay`."""
-        return np.zeros(len(stamps_s))
-
 
 @settings
 class ConstantDelay:
@@ -34,10 +26,6 @@ class ConstantDelay:
 
     delay_s: NonNegativeFloat
     kind: Literal["constant"] = "constant"
-
-    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
-        """Delays, see `AnyDelay`."""
-        return np.full(len(stamps_s), self.delay_s)
 
 
 @settings
@@ -50,10 +38,6 @@ class UniformDelay:
 
     def __post_init__(self) -> None:
         require(self.max_s >= self.min_s, "max_s", "must not be below min_s", self.max_s)
-
-    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
-        """Delays, see `AnyDelay`."""
-        return rng.uniform(self.min_s, self.max_s, len(stamps_s))
 
 
 @settings
@@ -94,10 +78,6 @@ class GammaDelay:
         """Scale of the gamma part."""
         return (self.mean_s - self.min_s) / self.shape
 
-    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
-        """Delays, see `AnyDelay`."""
-        return self.min_s + rng.gamma(self.shape, self.scale_s, len(stamps_s))
-
 
 @settings
 class LossyDelay:
@@ -106,12 +86,6 @@ class LossyDelay:
     probability: Probability
     base: "AnyDelay" = field(default_factory=NoDelay)
     kind: Literal["loss"] = "loss"
-
-    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
-        """Delays, see `AnyDelay`."""
-        delays = self.base.draw(rng, stamps_s)
-        delays[rng.random(len(stamps_s)) < self.probability] = math.nan
-        return delays
 
 
 @settings
@@ -130,12 +104,6 @@ class MarkovDelay:
     to_good: Annotated[float, Field(gt=0.0, le=1.0)]
     kind: Literal["markov"] = "markov"
 
-    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
-        """Delays, see `AnyDelay`."""
-        moves = np.ones(len(stamps_s))
-        share = self.to_bad / (self.to_bad + self.to_good)
-        return _two_states(self, rng, stamps_s, share, self.to_bad * moves, self.to_good * moves)
-
 
 @settings
 class MarkovTimeDelay:
@@ -151,16 +119,8 @@ class MarkovTimeDelay:
     to_good_per_s: PositiveFloat
     kind: Literal["markov_time"] = "markov_time"
 
-    def draw(self, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
-        """Delays, see `AnyDelay`."""
-        rate_per_s = self.to_bad_per_s + self.to_good_per_s
-        share = self.to_bad_per_s / rate_per_s
-        forgotten = -np.expm1(-rate_per_s * np.diff(stamps_s, prepend=stamps_s[:1]))
-        return _two_states(self, rng, stamps_s, share, share * forgotten, (1.0 - share) * forgotten)
 
-
-#: Every delay model, chosen by `kind`; `draw` gives the delays in s of the messages stamped `stamps_s` (ascending),
-#: shape (n,), NaN for a lost one.
+#: Every delay model, chosen by `kind`.
 AnyDelay = Annotated[
     NoDelay | ConstantDelay | UniformDelay | GammaDelay | LossyDelay | MarkovDelay | MarkovTimeDelay,
     Discriminator("kind"),
@@ -175,25 +135,36 @@ def _relative_q90(log_shape: float) -> float:
     return float(special.gammaincinv(shape, 0.9)) / shape
 
 
-def _two_states(
-    model: MarkovDelay | MarkovTimeDelay,
-    rng: np.random.Generator,
-    stamps_s: FloatArray,
-    share: float,
-    to_bad: FloatArray,
-    to_good: FloatArray,
-) -> FloatArray:
-    """Delays of `model`, whose chain is bad at the first message with probability `share`.
-
-    Entry k of `to_bad` and `to_good`, shape (n,), is the probability to move from message k - 1 to k; the first
-    is not used.
-    """
-    draws, bad = rng.random(len(stamps_s)), np.zeros(len(stamps_s), dtype=bool)
+def draw_delays(model: AnyDelay, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
+    """Delays in s of the messages of one sensor stamped `stamps_s` (ascending), shape (n,), NaN for a lost one."""
+    n = len(stamps_s)
+    match model:
+        case NoDelay():
+            return np.zeros(n)
+        case ConstantDelay():
+            return np.full(n, model.delay_s)
+        case UniformDelay():
+            return rng.uniform(model.min_s, model.max_s, n)
+        case GammaDelay():
+            return model.min_s + rng.gamma(model.shape, model.scale_s, n)
+        case LossyDelay():
+            delays_s = draw_delays(model.base, rng, stamps_s)
+            delays_s[rng.random(n) < model.probability] = math.nan
+            return delays_s
+        case MarkovDelay():
+            share = model.to_bad / (model.to_bad + model.to_good)
+            to_bad, to_good = np.full(n, model.to_bad), np.full(n, model.to_good)
+        case MarkovTimeDelay():
+            rate_per_s = model.to_bad_per_s + model.to_good_per_s
+            share = model.to_bad_per_s / rate_per_s
+            forgotten = -np.expm1(-rate_per_s * np.diff(stamps_s, prepend=stamps_s[:1]))
+            to_bad, to_good = share * forgotten, (1.0 - share) * forgotten
+    draws, bad = rng.random(n), np.zeros(n, dtype=bool)
     bad[:1] = draws[:1] < share
-    for k in range(1, len(bad)):
+    for k in range(1, n):  # from message k - 1 to k
         bad[k] = draws[k] >= to_good[k] if bad[k - 1] else draws[k] < to_bad[k]
-    good_s = model.good.draw(rng, stamps_s)  # both are drawn for all messages
-    return np.where(bad, model.bad.draw(rng, stamps_s), good_s)
+    good_s = draw_delays(model.good, rng, stamps_s)  # both are drawn for all messages
+    return np.where(bad, draw_delays(model.bad, rng, stamps_s), good_s)
 
 
 #: Delays of Karle et al. 2023, section IV-B: mean and 90 % quantile.

@@ -13,7 +13,7 @@ from fgtrack.core.settings import Probability, settings
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.sim.clocks import AnyClock, reported_stamps
-from fgtrack.sim.delays import AnyDelay
+from fgtrack.sim.delays import AnyDelay, draw_delays
 
 #: Stands for all sensors that are not named.
 OTHERS = "*"
@@ -59,7 +59,7 @@ def redelay(
         own = own[np.argsort(stamps_ns[own], kind="stable")]
         lost[own] = loss_rng.random(len(own)) < settings.loss_probability
         if settings.delay is not None:
-            delays_s = settings.delay.draw(delay_rng, (stamps_ns[own] - stamps_ns[own[:1]]) / NS_PER_S)
+            delays_s = draw_delays(settings.delay, delay_rng, (stamps_ns[own] - stamps_ns[own[:1]]) / NS_PER_S)
             lost[own] |= np.isnan(delays_s)
             receipts_ns[own] = stamps_ns[own] + np.rint(np.nan_to_num(delays_s) * NS_PER_S).astype(np.int64)
             priority[own] = number

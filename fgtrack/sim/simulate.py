@@ -1,7 +1,8 @@
 """From a scenario to the messages that a tracker would have received."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -23,11 +24,14 @@ from fgtrack.models.oval import OVAL, make_oval
 from fgtrack.models.path import Path
 from fgtrack.models.track_map import TrackMap
 from fgtrack.sim.clocks import reported_stamps
-from fgtrack.sim.delays import AnyDelay
+from fgtrack.sim.delays import AnyDelay, draw_delays
 from fgtrack.sim.scanner import Scanner
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.sensor import SimulatedSensor
-from fgtrack.sim.vehicles import AnyVehicle, DrawnVehicle, TrackTrajectory, Trajectory
+from fgtrack.sim.vehicles import AnyVehicle, DrawnVehicle
+
+States = Callable[[FloatArray], FloatArray]
+"""True states of a vehicle, shape (n, 6), at times since the start, shape (n,)."""
 
 
 def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
@@ -45,7 +49,7 @@ def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
     path = None if track is None else Path.through(track.table[:, :2])
     vehicles = (scenario.ego, *scenario.opponents)
     ego, *opponents = (
-        _trajectory(vehicle, path, child, scenario.duration_s)
+        _states_of(vehicle, path, child, scenario.duration_s)
         for vehicle, child in zip(vehicles, vehicles_rng.spawn(len(vehicles)), strict=True)
     )
     messages: list[Message] = [*_truth(scenario, [ego, *opponents]), *_ego_messages(scenario, ego, ego_rng)]
@@ -55,16 +59,16 @@ def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
     return messages
 
 
-def _trajectory(vehicle: AnyVehicle, path: Path | None, rng: np.random.Generator, duration_s: float) -> Trajectory:
+def _states_of(vehicle: AnyVehicle, path: Path | None, rng: np.random.Generator, duration_s: float) -> States:
     if isinstance(vehicle, DrawnVehicle):
-        return vehicle.trajectory(rng, duration_s)
+        return vehicle.trajectory(rng, duration_s).states
     assert path is not None, "a scenario without a map has no vehicle on a track"
-    return TrackTrajectory(vehicle, path)
+    return partial(vehicle.states, path)
 
 
-def _truth(scenario: Scenario, vehicles: Sequence[Trajectory]) -> list[Message]:
+def _truth(scenario: Scenario, vehicles: Sequence[States]) -> list[Message]:
     stamps_ns, times_s = _stamps(scenario, scenario.truth_rate_hz)
-    rows = [vehicle.states(times_s).tolist() for vehicle in vehicles]
+    rows = [vehicle(times_s).tolist() for vehicle in vehicles]
     return [
         TruthState(stamp_ns, stamp_ns, object_id, *states[index])
         for index, stamp_ns in enumerate(stamps_ns.tolist())
@@ -72,13 +76,13 @@ def _truth(scenario: Scenario, vehicles: Sequence[Trajectory]) -> list[Message]:
     ]
 
 
-def _ego_messages(scenario: Scenario, ego: Trajectory, rng: np.random.Generator) -> list[Message]:
+def _ego_messages(scenario: Scenario, ego: States, rng: np.random.Generator) -> list[Message]:
     settings = scenario.ego_messages
     noise_rng, delay_rng = rng.spawn(2)
     stamps_ns, times_s = _stamps(scenario, settings.rate_hz)
     std = [*[settings.position_std_m] * 2, settings.yaw_std_rad, settings.speed_std_mps]
     std += [settings.yaw_rate_std_radps, settings.accel_std_mps2]
-    states = ego.states(times_s)
+    states = ego(times_s)
     states += np.array(std) * noise_rng.standard_normal(states.shape)
     states[:, YAW] = wrap_angles(states[:, YAW])
     receipts_ns, lost = _receipts(settings.delay, delay_rng, stamps_ns, times_s)
@@ -94,15 +98,15 @@ def _ego_messages(scenario: Scenario, ego: Trajectory, rng: np.random.Generator)
 def _scans(
     scenario: Scenario,
     sensor: SimulatedSensor,
-    ego: Trajectory,
-    opponents: Sequence[Trajectory],
+    ego: States,
+    opponents: Sequence[States],
     track: TrackMap | None,
     rng: np.random.Generator,
 ) -> list[Message]:
     times_rng, delay_rng, scanner_rng, clock_rng = rng.spawn(4)
     stamps_ns, times_s = _stamps(scenario, sensor.scan_times(times_rng, scenario.duration_s))
-    scanner = Scanner(sensor, ego.states(times_s), scenario.detection_origin_x_m)
-    scans = scanner.scans(scanner_rng, [opponent.states(times_s) for opponent in opponents], track)
+    scanner = Scanner(sensor, ego(times_s), scenario.detection_origin_x_m)
+    scans = scanner.scans(scanner_rng, [opponent(times_s) for opponent in opponents], track)
     receipts_ns, lost = _receipts(sensor.delay, delay_rng, stamps_ns, times_s)
     reported_ns = reported_stamps(sensor.clock, clock_rng, stamps_ns, receipts_ns)
     columns = zip(reported_ns.tolist(), receipts_ns.tolist(), scans, lost | sensor.silent(times_s), strict=True)
@@ -125,5 +129,5 @@ def _receipts(
     delay: AnyDelay, rng: np.random.Generator, stamps_ns: IntArray, times_s: FloatArray
 ) -> tuple[IntArray, BoolArray]:
     """Receipt of each stamp, and True where the message is lost."""
-    delays_s = delay.draw(rng, times_s)
+    delays_s = draw_delays(delay, rng, times_s)
     return stamps_ns + np.rint(np.nan_to_num(delays_s) * NS_PER_S).astype(np.int64), np.isnan(delays_s)

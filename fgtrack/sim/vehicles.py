@@ -48,28 +48,17 @@ class TrackVehicle:
             end_s = before.start_s + before.duration_s
             require(change.start_s >= end_s, "lane_changes", "one must end before the next", change.start_s)
 
-
-@dataclass(frozen=True, eq=False)
-class TrackTrajectory:
-    """Motion along a path with a lateral offset; yaw is the direction of travel.
-
-    The path parameter u and the lateral offset d are functions of time with derivatives u1, u2 and d1, d2. With
-    the direction psi of the tangent and the scale g (metres of path per unit of u), a prime for the derivative
-    by u: the velocity is w = u1 (g - d psi') along the tangent and d1 across it, and yaw = psi + atan2(d1, w).
-    Yaw rate and acceleration are the exact derivatives of yaw and speed.
-    """
-
-    vehicle: TrackVehicle
-    path: Path
-
-    def states(self, times_s: FloatArray) -> FloatArray:
+    def states(self, path: Path, times_s: FloatArray) -> FloatArray:
         """States at `times_s`, shape (n,), from the start of the scenario: shape (n, 6), `STATE_NAMES`.
 
-        The acceleration is that along the heading.
+        The path parameter u and the lateral offset d are functions of time with derivatives u1, u2 and d1, d2. With the
+        direction psi of the tangent and the scale g (metres of path per unit of u), a prime for the derivative by u:
+        the velocity is w = u1 (g - d psi') along the tangent and d1 across it, and yaw = psi + atan2(d1, w). Yaw rate
+        and acceleration, along the heading, are the exact derivatives of yaw and speed.
         """
         u, u1, u2 = self._along(times_s)
         d, d1, d2 = self._across(times_s)
-        frame = self.path.frame(u)
+        frame = path.frame(u)
         stretch = frame.scale - d * frame.turn
         w = u1 * stretch
         w1 = u2 * stretch + u1 * (u1 * (frame.scale_rate - d * frame.turn_rate) - d1 * frame.turn)
@@ -88,7 +77,7 @@ class TrackTrajectory:
 
     def _along(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Path parameter and its first two derivatives by time."""
-        knots = np.array(self.vehicle.speed, dtype=np.float64)
+        knots = np.array(self.speed, dtype=np.float64)
         if len(knots) == 1:
             knots = np.vstack([knots, knots + np.array([1.0, 0.0])])
         # Level at every knot, so that the acceleration has no jump where the speed becomes constant.
@@ -96,15 +85,15 @@ class TrackTrajectory:
         times = np.append(times_s, 0.0)
         inside = np.clip(times, knots[0, 0], knots[-1, 0])
         distance = speed.antiderivative()(inside) + speed(inside) * (times - inside)
-        u = self.vehicle.arc_m + distance[:-1] - distance[-1]
+        u = self.arc_m + distance[:-1] - distance[-1]
         return u, speed(inside[:-1]), speed(inside[:-1], 1)
 
     def _across(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Lateral offset and its first two derivatives by time."""
-        d = np.full(len(times_s), self.vehicle.lateral_m)
+        d = np.full(len(times_s), self.lateral_m)
         d1, d2 = np.zeros((2, len(times_s)))
-        lateral_m = self.vehicle.lateral_m
-        for change in self.vehicle.lane_changes:
+        lateral_m = self.lateral_m
+        for change in self.lane_changes:
             x = np.clip((times_s - change.start_s) / change.duration_s, 0.0, 1.0)
             step = change.lateral_m - lateral_m
             d += step * x**3 * (10.0 + x * (6.0 * x - 15.0))
@@ -161,7 +150,7 @@ class DrawnTrajectory:
     """Independent noise of the same covariance, shape (m, 5)."""
 
     def states(self, times_s: FloatArray) -> FloatArray:
-        """As `TrackTrajectory.states`; the acceleration is 0, as the model has none."""
+        """As `TrackVehicle.states`; the acceleration is 0, as the model has none."""
         step_s, motion = self.vehicle.step_s, self.vehicle.motion
         k = np.clip((times_s / step_s).astype(np.int64), 0, len(self.noise) - 1)
         within_s = times_s - k * step_s
@@ -175,8 +164,6 @@ class DrawnTrajectory:
 
 #: Every kind of vehicle, chosen by `kind`.
 AnyVehicle = Annotated[TrackVehicle | DrawnVehicle, Discriminator("kind")]
-#: The true motion of one vehicle.
-Trajectory = TrackTrajectory | DrawnTrajectory
 
 
 def drawn(motion: MotionModel, x: FloatArray, dt_s: float, rng: np.random.Generator) -> FloatArray:

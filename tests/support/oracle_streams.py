@@ -16,7 +16,7 @@ from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import Mount, RobustLoss, SensorModel
-from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY
+from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY, draw_delays
 from fgtrack.tracking.detections import NoMerge
 from fgtrack.tracking.ego import EgoTrajectory
 from fgtrack.tracking.inbox import Batch
@@ -245,7 +245,9 @@ def drawn(
         measurement, sighting = sense(rng, x, _START_NS + nanoseconds(stamp_s), sensor)
         measurements.append(measurement)
         sightings.append(sighting)
-    delays_s = np.where(sensors == "radar", RADAR_DELAY.draw(rng, stamps_s), LIDAR_DELAY.draw(rng, stamps_s))
+    delays_s = np.where(
+        sensors == "radar", draw_delays(RADAR_DELAY, rng, stamps_s), draw_delays(LIDAR_DELAY, rng, stamps_s)
+    )
     random_s = rng.uniform(0.0, reach_s, len(stamps_s))
     orders = {
         "arrival": np.argsort(stamps_s + delays_s, kind="stable").tolist(),

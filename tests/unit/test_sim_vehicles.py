@@ -9,7 +9,7 @@ from fgtrack.core.types import ACCEL, SPEED, YAW, YAW_RATE
 from fgtrack.models.motion import CTRV
 from fgtrack.models.oval import make_oval
 from fgtrack.models.path import Path
-from fgtrack.sim.vehicles import DrawnVehicle, LaneChange, TrackTrajectory, TrackVehicle, drawn
+from fgtrack.sim.vehicles import DrawnVehicle, LaneChange, TrackVehicle, drawn
 
 OVAL = make_oval()
 PATH = Path.through(OVAL.table[:, :2])
@@ -25,9 +25,8 @@ STILL = CTRV(0.0, 0.0, 0.0, 0.0)
 @given(st.lists(st.floats(0.01, 60.0), min_size=1, max_size=50))
 @example([34.89984906191907])
 def test_yaw_is_the_direction_of_travel_and_the_rates_are_derivatives(times: list[float]) -> None:
-    trajectory = TrackTrajectory(BUSY, PATH)
     t, h = np.array(times), 1e-4
-    now, ahead, behind = (trajectory.states(t + shift) for shift in (0.0, h, -h))
+    now, ahead, behind = (BUSY.states(PATH, t + shift) for shift in (0.0, h, -h))
     velocity = (ahead[:, :2] - behind[:, :2]) / (2.0 * h)
     np.testing.assert_allclose(np.hypot(*velocity.T), now[:, SPEED], rtol=1e-6)
     assert np.abs(wrap_angles(np.arctan2(velocity[:, 1], velocity[:, 0]) - now[:, YAW])).max() < 1e-6
