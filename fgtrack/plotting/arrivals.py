@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import BoolArray, IntArray
 from fgtrack.evaluation.runs import OneRun, one_evaluated, start_ns
 from fgtrack.io.run import Table
 from fgtrack.io.run.schema import Column
@@ -57,17 +56,16 @@ def arrivals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     first_ns = start_ns([one])
     fates = np.array([_FATES.get(name, "not used") for name in updates["disposition"].tolist()])
     _draw_flow(flow, updates, fates, first_ns)
-    for name, color in _COLOURS.items():
-        count = int((fates == name).sum())
-        if count:
-            flow.plot([], [], "o", ms=4.0, color=color, label=f"{name}: {count} of {len(fates)}")
     delay_ms = (updates["receipt_ns"] - updates["stamp_ns"]) / (NS_PER_S / 1e3)
     received_s = (updates["receipt_ns"] - first_ns) / NS_PER_S
-    for axes, sensor in zip(rows, sensors, strict=True):
-        for name, color in _COLOURS.items():
+    low_ms, high_ms = min(0.0, float(delay_ms.min())), max(1.0, float(delay_ms.max()))
+    for name, color in _COLOURS.items():
+        if count := int((fates == name).sum()):
+            flow.plot([], [], "o", ms=4.0, color=color, label=f"{name}: {count} of {len(fates)}")
+        for axes, sensor in zip(rows, sensors, strict=True):
             mine = (fates == name) & (updates["sensor"] == sensor)
             axes.plot(received_s[mine], delay_ms[mine], ".", ms=4.0, mew=0, color=color)
-        low_ms, high_ms = min(0.0, float(delay_ms.min())), max(1.0, float(delay_ms.max()))
+    for axes, sensor in zip(rows, sensors, strict=True):
         axes.set_ylim(low_ms, high_ms + 0.05 * (high_ms - low_ms))
         axes.set_title(sensor.replace("_", " "), loc="left", y=0.98, pad=1.0)
         axes.sharex(rows[0])
@@ -84,7 +82,10 @@ def _draw_flow(axes: Axes, updates: Table, fates: Column, first_ns: int) -> None
     own = (updates["stamp_ns"][updates["sensor"] == name] for name in np.unique(updates["sensor"]).tolist())
     shortest_ns = min(map(usual_step_ns, own))
     length_ns = round(_SHOWN_LISTS * shortest_ns) if np.isfinite(shortest_ns) else NS_PER_S
-    start_ns = _busiest_ns(updates["receipt_ns"], fates == "fused out of sequence", length_ns)
+    late = fates == "fused out of sequence"
+    receipts_ns = np.sort(updates["receipt_ns"][late] if late.any() else updates["receipt_ns"])
+    counts = np.searchsorted(receipts_ns, receipts_ns + length_ns, side="right") - np.arange(len(receipts_ns))
+    start_ns = int(receipts_ns[counts.argmax()])  # where the most of the late ones were received
     inside = (updates["receipt_ns"] >= start_ns) & (updates["stamp_ns"] <= start_ns + length_ns)
     sensors = np.unique(updates["sensor"][inside]).tolist()
     for name, color in _COLOURS.items():
@@ -102,10 +103,3 @@ def _draw_flow(axes: Axes, updates: Table, fates: Column, first_ns: int) -> None
     axes.set_yticklabels([text for sensor in sensors for text in ("received", f"{sensor.replace('_', ' ')}: stamp")])
     from_s = (start_ns - first_ns) / NS_PER_S
     axes.set(xlim=(from_s, from_s + length_ns / NS_PER_S), ylim=(0.0, len(sensors)), xlabel="time [s]")
-
-
-def _busiest_ns(receipts_ns: IntArray, late: BoolArray, length_ns: int) -> int:
-    """When the part begins in which the most of the `late` were received, or of all where there are none."""
-    receipts_ns = np.sort(receipts_ns[late] if late.any() else receipts_ns)
-    counts = np.searchsorted(receipts_ns, receipts_ns + length_ns, side="right") - np.arange(len(receipts_ns))
-    return int(receipts_ns[counts.argmax()])

@@ -3,12 +3,11 @@
 from typing import Unpack
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.palette import SENSORS
 from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_ns
 from fgtrack.evaluation.scores.consistency import position_nees
@@ -49,27 +48,36 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         since_ns = stamps_ns - first_ns
         if name == _NEES:
             at_ns, index, count = np.unique(since_ns, return_inverse=True, return_counts=True)
-            mean, mean_dof = (np.bincount(index, each) / count for each in (values, dof))
-            band = chi_square_band(mean_dof * count, count)
-            colour = run_looks([one])[one.label].colour
-            text = _summary("position", values, dof, (mean >= band[0]) & (mean <= band[1]), "ticks")
+            mean, expected = (np.bincount(index, each) / count for each in (values, dof))
+            band = chi_square_band(expected * count, count)
+            colour, inside = run_looks([one])[one.label].colour, (mean >= band[0]) & (mean <= band[1])
+            text = "position: mean {:.3g}, expected {:.3g}; {:.0f} % of the ticks in their band"
         else:
             sensor = name.removeprefix("NIS of ")
             colour = SENSORS[sensors.index(sensor) % len(SENSORS)]
             low, high = chi_square_band(dof.astype(np.float64), np.ones(len(dof), dtype=np.int64))
+            inside = (values >= low) & (values <= high)
             length = min(max(_SHORTEST, min(_LONGEST, len(values) // _WINDOWS)), len(values))
-            text = _summary(sensor, values, dof, (values >= low) & (values <= high), "detections")
+            text = sensor + ": mean {:.3g}, expected {:.3g}; {:.0f} % of the detections in their band"
             text += f"; line: mean of {length}"
-            order = np.argsort(since_ns, kind="stable")
-            middle_ns, mean, mean_dof = (_means(each[order], length) for each in (since_ns, values, dof))
-            at_ns, band = middle_ns.astype(np.int64), chi_square_band(mean_dof * length, np.full(len(mean), length))
+            order, share = np.argsort(since_ns, kind="stable"), np.full(length, 1.0 / length)
+            at_ns, mean, expected = (np.convolve(each[order], share, "valid") for each in (since_ns, values, dof))
+            at_ns, band = at_ns.astype(np.int64), chi_square_band(expected * length, np.full(len(mean), length))
             axes.plot(since_ns / NS_PER_S, values, ".", ms=3.0, mew=0, color=colour, alpha=0.5, rasterized=True)
-        _draw(axes, at_ns, mean, band, mean_dof, colour, text)
-        shown = values[values > 0.0]  # the axis is logarithmic
-        if name != _NEES and len(shown):
-            bottom, top = axes.get_ylim()
-            axes.set_ylim(min(bottom, np.quantile(shown, 0.05)), max(top, np.quantile(shown, 0.99)))
-        axes.set_ylabel(name.replace(" of ", " of\n").replace("_", " "))
+        step_ns, time_s = usual_step_ns(at_ns), at_ns / NS_PER_S
+        x_s, y = broken_line(at_ns, time_s, mean, step_ns)
+        low, high, middle = (broken_line(at_ns, time_s, each, step_ns)[1] for each in (*band, expected))
+        axes.fill_between(x_s, low, high, color=GREY, alpha=0.25, lw=0)
+        label = text.format(values.mean(), dof.mean(), 100.0 * inside.mean())
+        axes.plot(x_s, y, color=colour, lw=1.1, label=label)
+        axes.plot(x_s, middle, color="black", lw=0.9, ls="--")
+        positive, shown = values[values > 0.0], np.concatenate([mean[mean > 0.0], *band])  # the axis is logarithmic
+        limits = [max(_LOWEST * float(np.median(expected)), 0.8 * float(shown.min())), 1.25 * float(shown.max())]
+        if name != _NEES and len(positive):
+            ends = np.quantile(positive, (0.05, 0.99))
+            limits = [min(limits[0], ends[0]), max(limits[1], ends[1])]
+        axes.set(yscale="log", ylim=limits, ylabel=name.replace(" of ", " of\n").replace("_", " "))
+        log_axis(axes.yaxis)
         if axes is rows[0]:
             axes.fill_between([], [], color=GREY, alpha=0.25, lw=0, label="95 % band")
             axes.plot([], color="black", lw=0.9, ls="--", label="expected")
@@ -103,36 +111,3 @@ def _panels(one: EvaluatedRun) -> dict[str, _Squares]:
 def has_squares(one: EvaluatedRun) -> bool:
     """True if `consistency` has anything to show."""
     return bool(_panels(one))
-
-
-def _draw(
-    axes: Axes,
-    since_ns: IntArray,
-    mean: FloatArray,
-    band: tuple[FloatArray, FloatArray],
-    expected: FloatArray,
-    colour: str,
-    text: str,
-) -> None:
-    step_ns, time_s = usual_step_ns(since_ns), since_ns / NS_PER_S
-    x_s, y = broken_line(since_ns, time_s, mean, step_ns)
-    low, high, middle = (broken_line(since_ns, time_s, each, step_ns)[1] for each in (*band, expected))
-    axes.fill_between(x_s, low, high, color=GREY, alpha=0.25, lw=0)
-    axes.plot(x_s, y, color=colour, lw=1.1, label=text)
-    axes.plot(x_s, middle, color="black", lw=0.9, ls="--")
-    axes.set_yscale("log")
-    shown = np.concatenate([mean[mean > 0.0], *band])
-    lowest = max(_LOWEST * float(np.median(expected)), 0.8 * float(shown.min()))
-    axes.set_ylim(lowest, 1.25 * float(shown.max()))
-    log_axis(axes.yaxis)
-
-
-def _means(values: FloatArray | IntArray, length: int) -> FloatArray:
-    """Means of `length` values in a row, shape (n - length + 1,)."""
-    total = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
-    return np.asarray((total[length:] - total[:-length]) / length)
-
-
-def _summary(name: str, values: FloatArray, dof: IntArray, inside: BoolArray, of: str) -> str:
-    share = 100.0 * float(inside.mean())
-    return f"{name}: mean {values.mean():.3g}, expected {dof.mean():.3g}; {share:.0f} % of the {of} in their band"

@@ -3,6 +3,7 @@
 import logging
 import math
 import re
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, wraps
 from pathlib import Path
@@ -16,7 +17,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from fgtrack.core.errors import CallError
-from fgtrack.plotting.style import StyledFigure, title
+from fgtrack.plotting.style import LETTER, StyledFigure, grow, size_in
 
 _logger = logging.getLogger(__name__)
 
@@ -180,9 +181,12 @@ class Sheet:
         return result
 
     def title(self, text: str) -> None:
-        """Write `text` above the figure, where it has a title."""
+        """Write `text` above the figure, where it has a title, broken into lines that are no wider than it."""
         if self._has_title:
-            title(self.figure, text)
+            width = max(10, int(self.figure.get_figwidth() / (LETTER * size_in("figure.titlesize"))))
+            lines = [line for part in text.split("\n") for line in textwrap.wrap(part, width)]
+            self.figure.suptitle("\n".join(lines))
+            grow(self.figure, "figure.titlesize", len(lines) - 1)
 
     def caption(self, text: str) -> None:
         """Write `text` below the figure, where it has a title."""

@@ -30,7 +30,7 @@ GREY = "#777777"
 
 _PAUSE_STEPS = 3  # a line is not drawn across a pause that is longer than as many usual steps
 
-_LETTER, _LINE = 0.58, 1.5  # width of a letter and height of a line over the size of the font
+LETTER, _LINE = 0.58, 1.5  # width of a letter and height of a line over the size of the font
 _MOST_ENTRIES = 12  # of a legend
 _HANDLE = 8  # characters that the line before an entry and the space around it take
 _BESIDE_IN = 0.6  # what the labels of an axis take of the width
@@ -78,14 +78,6 @@ def run_looks(runs: Sequence[EvaluatedRun]) -> dict[str, Look]:
     return {one.label: each for one, each in zip(runs, result, strict=True)}
 
 
-def title(figure: Figure, text: str) -> None:
-    """Write `text` above `figure`, broken into lines that are no wider than it."""
-    width = max(10, int(figure.get_figwidth() / (_LETTER * _size_in("figure.titlesize"))))
-    lines = [line for part in text.split("\n") for line in textwrap.wrap(part, width)]
-    figure.suptitle("\n".join(lines))
-    _grow(figure, "figure.titlesize", len(lines) - 1)
-
-
 def legend_above(axes: Axes, share: float = 1.0, markerscale: float = 1.0) -> None:
     """Legend above a plot, where it hides nothing; of many entries the first.
 
@@ -99,7 +91,7 @@ def legend_above(axes: Axes, share: float = 1.0, markerscale: float = 1.0) -> No
     if more > 1:
         handles, labels = handles[:_MOST_ENTRIES], labels[:_MOST_ENTRIES]
         labels[-1] += f" ... and {more} more"
-    letters = (share * figure.get_figwidth() - _BESIDE_IN) / (_LETTER * _size_in("legend.fontsize"))
+    letters = (share * figure.get_figwidth() - _BESIDE_IN) / (LETTER * size_in("legend.fontsize"))
     width = max(_HANDLE + 10, int(letters))
     broken = [textwrap.wrap(label, width - _HANDLE) for label in labels]
     columns = max(1, width // (_HANDLE + max(len(line) for lines in broken for line in lines)))
@@ -116,17 +108,17 @@ def legend_above(axes: Axes, share: float = 1.0, markerscale: float = 1.0) -> No
         handlelength=1.8,
     )
     if isinstance(figure, StyledFigure):
-        _grow(figure, "legend.fontsize", math.ceil(sum(map(len, broken)) / columns) - _FREE_LINES)
+        grow(figure, "legend.fontsize", math.ceil(sum(map(len, broken)) / columns) - _FREE_LINES)
 
 
-def _size_in(name: str) -> float:
+def size_in(name: str) -> float:
     """Return the size in inches of the texts of this setting."""
     return float(FontProperties(size=_RC[name]).get_size_in_points()) / 72.0
 
 
-def _grow(figure: Figure, name: str, lines: int) -> None:
+def grow(figure: Figure, name: str, lines: int) -> None:
     """Make room for `lines` of the texts of this setting above the plots."""
-    figure.set_figheight(figure.get_figheight() + max(0, lines) * _LINE * _size_in(name))
+    figure.set_figheight(figure.get_figheight() + max(0, lines) * _LINE * size_in(name))
 
 
 def log_axis(axis: Axis) -> None:
