@@ -8,15 +8,7 @@ import numpy as np
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
-from fgtrack.estimation.base import (
-    Estimator,
-    Measurement,
-    Start,
-    StatesAt,
-    TrackBank,
-    UpdateResult,
-    UpdateStatus,
-)
+from fgtrack.estimation.base import Estimator, Measurement, Start, StatesAt, TrackBank, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import EstimatorError
 from fgtrack.estimation.filters.ekf import predict
 from fgtrack.estimation.filters.propagation import kinematic_states, track_state

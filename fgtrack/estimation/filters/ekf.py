@@ -6,15 +6,7 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from fgtrack.core.linalg import (
-    congruence,
-    identity,
-    kernels,
-    product,
-    psd_solve,
-    symmetrise,
-    times_transposed,
-)
+from fgtrack.core.linalg import congruence, identity, kernels, product, psd_solve, symmetrise, times_transposed
 from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.models.measurement import MeasurementModel, SensorPose
