@@ -33,7 +33,7 @@ from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
 from fgtrack.estimation.oosm.buffers import DelayedHorizon, ReorderBuffer
 from fgtrack.estimation.oosm.crossing import A1
-from fgtrack.estimation.oosm.forward import CovarianceIntersection
+from fgtrack.estimation.oosm.late import CovarianceIntersection
 from fgtrack.estimation.registry import estimator
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV

@@ -10,8 +10,8 @@ from support.models import MODELS, MOTIONS
 
 from fgtrack.core.time import seconds
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
-from fgtrack.estimation.interpolation import between
 from fgtrack.estimation.object_bank import OneObject
+from fgtrack.estimation.rts import between
 from fgtrack.estimation.smoothing.bank import SmootherBank
 from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalBank
 from fgtrack.models.measurement import measurement_model

@@ -11,8 +11,8 @@ from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import OneCorrection, propagated
 from fgtrack.estimation.filters.propagation import track_state
 from fgtrack.estimation.filters.windowed import WindowedFilter
-from fgtrack.estimation.interpolation import between
 from fgtrack.estimation.oosm.crossing import fuse_across
+from fgtrack.estimation.rts import between
 from fgtrack.models.motion import MotionModel
 
 _Stack = tuple[tuple[int, ...], FloatArray, FloatArray]

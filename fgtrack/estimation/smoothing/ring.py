@@ -12,7 +12,7 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.filters.ekf import joseph, kalman_gain, propagated
-from fgtrack.estimation.interpolation import between
+from fgtrack.estimation.rts import between
 from fgtrack.estimation.smoothing.nodes import Nodes
 from fgtrack.estimation.smoothing.terms import EquivalentMeasurement, NearMeasurement, whitened
 from fgtrack.models.motion import MotionModel
