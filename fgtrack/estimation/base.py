@@ -112,11 +112,7 @@ class Measurement:
         return [place for place, name in enumerate(self.model.components) if name not in self.assumed]
 
     def nis(self, innovation: FloatArray, S: FloatArray) -> float:
-        """Normalised innovation squared y' S^-1 y of what was measured: components that are `assumed` are left out.
-
-        `innovation`, shape (k,), and its covariance `S`, shape (k, k), are those of all components. Raises
-        `numpy.linalg.LinAlgError` for a singular `S`.
-        """
+        """Normalised innovation squared y' S^-1 y of y (k,) and S (k, k), without components that are `assumed`."""
         return float(mahalanobis_squared(innovation, S, self.measured))
 
 

@@ -64,7 +64,7 @@ class Failures:
             self.ended.append({"track_id": track_id, "now_ns": now_ns, "failure": failure.value})
 
     def note(self, what: str | Exception) -> None:
-        """Remember what a failure said, or the exception that it was."""
+        """Remember the message of a failure, or its exception."""
         if isinstance(what, Exception):
             line, self.last = f"{type(what).__name__}: {what}", "".join(format_exception(what))
         else:

@@ -1,8 +1,7 @@
-"""All estimators and all motion models by name, plug-ins included.
+"""All estimators and motion models by name, plug-ins included.
 
-An estimator's entry is a class or function `(motion, start, lag_s, **options) -> Estimator`; one whose attribute `bank`
-is true is `(motion, lag_s, **options) -> TrackBank`, for all objects together. A motion model's entry is a class or
-function `(**parameters) -> MotionModel`.
+An estimator is made by a class or function `(motion, start, lag_s, **options) -> Estimator`, or with a true attribute
+`bank` by `(motion, lag_s, **options) -> TrackBank`; a motion model by `(**parameters) -> MotionModel`.
 """
 
 import inspect

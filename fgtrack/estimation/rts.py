@@ -44,11 +44,9 @@ def between(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return mean, Lambda, Psi and Sigma of the state `until_s` after one and `after_s` before another one.
 
-    x = mean + Lambda (x_l - l) + Psi (x_r - r) + N(0, Sigma), given the neighbours near their means l = `left` and r =
-    `right`, shape (..., n). See Koch and Govaers 2014 (accumulated state densities), or Gaussian-process interpolation
-    in Barfoot et al. 2014. With F1, Q1 until the stamp and F2, Q2 after it, the right one is a measurement F2 x +
-    N(0, Q2) of a state with covariance Q1, and Psi its gain; Lambda = F1 - Psi F2 F1, Sigma = Q1 - Psi F2 Q1. The
-    motion is linearised at `left`.
+    x = mean + Lambda (x_l - l) + Psi (x_r - r) + N(0, Sigma), near l = `left` and r = `right`, (..., n) (Koch and
+    Govaers 2014). With F1, Q1 until the stamp and F2, Q2 after it, the right one is a measurement F2 x + N(0, Q2) of a
+    state with covariance Q1, and Psi its gain; Lambda = F1 - Psi F2 F1, Sigma = Q1 - Psi F2 Q1, linearised at `left`.
     """
     first, F1, Q1 = motion.transition(left, until_s)
     second, F2, Q2 = motion.transition(first, after_s)

@@ -70,8 +70,8 @@ class MotionModel(ABC):
     def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """Covariance Q of the noise accumulated over `dt_s`, shape (..., n, n).
 
-        Composes: Q(x, a + b) = F(x_a, b) Q(x, a) F(x_a, b)' + Q(x_a, b) with x_a = predict(x, a), so a late
-        detection may split a segment. Raises `CallError` where `dt_s` is negative (let `forward` check it).
+        Composes: Q(x, a + b) = F(x_a, b) Q(x, a) F(x_a, b)' + Q(x_a, b) with x_a = predict(x, a). Raises `CallError`
+        where `dt_s` is negative (let `forward` check it).
         """
 
     @staticmethod
@@ -91,10 +91,10 @@ class MotionModel(ABC):
         return 1.0
 
     def kinematic(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean, shape (..., m), and first-order covariance, (..., m, m), of the leading m entries of `STATE_NAMES`.
+        """Mean (..., m) and first-order covariance (..., m, m) of the leading m entries of `STATE_NAMES`.
 
-        m is 6 of a model with an acceleration, else 5; an entry that the state lacks is 0 with variance 0. The yaw of
-        a Cartesian state at speed 0 is 0, with a large but finite variance, see `MIN_SPEED_MPS`.
+        m is 6 of a model with an acceleration, else 5; an entry that the state lacks is 0 with variance 0. The variance
+        of a Cartesian state's yaw at speed 0 is large but finite, see `MIN_SPEED_MPS`.
         """
         if self._leads:
             return x, P
@@ -227,8 +227,8 @@ class CTRV(WhiteNoise):
 class CTRA(CTRV):
     """Constant turn rate and acceleration: CTRV with the acceleration along the heading as sixth entry.
 
-    x(t) + i y(t) = x + i y + integral over s in [0, t] of (speed + accel s) exp(i (yaw + yaw_rate s)). The
-    defaults are those of Karle et al. 2023 (see `CTRV`), for the acceleration std 3 per second at 100 Hz.
+    x(t) + i y(t) = x + i y + integral over s in [0, t] of (speed + accel s) exp(i (yaw + yaw_rate s)); by default with
+    the noise of Karle et al. 2023 (see `CTRV`), for the acceleration std 3 per second at 100 Hz.
     """
 
     accel_density_m2ps5: float = 3.0**2 / 100.0

@@ -27,10 +27,7 @@ def propagated(F: FloatArray, P: FloatArray, Q: FloatArray) -> FloatArray:
 
 
 def kalman_gain(P: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Gain K = P H' S^-1, shape (..., n, k), and covariance S = H P H' + R of the innovation, (..., k, k).
-
-    Raises `numpy.linalg.LinAlgError` for a singular S.
-    """
+    """Gain K = P H' S^-1 (..., n, k), and innovation covariance S = H P H' + R (..., k, k), which must be regular."""
     HP = product(H, P)
     S = times_transposed(HP, H) + R
     return psd_solve(S, HP).mT, S
@@ -49,21 +46,17 @@ def linearised(
     pose: SensorPose,
     residual: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Innovation y (..., k) of z (..., k) at the states x (..., n), and its Jacobian H (k, n) or (..., k, n).
-
-    `residual` may take the place of the model's own.
-    """
+    """Innovation y (..., k) of z (..., k) at x (..., n), by another `residual` if given, and Jacobian H (..., k, n)."""
     y = (residual or model.residual)(z, model.predict(x, pose))
     return y, model.selection(x.shape[-1]) if model.linear else model.jacobian(x, pose)
 
 
 def robust_weight(loss: RobustLoss | None, y: FloatArray, spread: FloatArray, R: FloatArray) -> float:
-    """Weight w of an innovation y (k,) with covariance `spread` + R, both (k, k), under a robust loss.
+    """Weight w of an innovation y (k,) with covariance `spread` + R, both (k, k), under a robust loss; 1 without.
 
-    At w the correction with R / w minimises prior plus loss of the residual r that is left of y: r = R / w S^-1 y with
-    S = `spread` + R / w, and w is the loss's weight at sqrt(r' R^-1 r). Reweighting from w = 1 on never lets w grow, so
-    it ends at the largest such weight: the minimum that is reached from the estimate without a loss. 1 without a
-    `loss`. Raises `numpy.linalg.LinAlgError` for a singular S.
+    At w the correction with R / w minimises prior plus loss of the post-fit residual r = R / w S^-1 y, S = `spread` + R
+    / w, and w is the loss's weight at sqrt(r' R^-1 r). Reweighting from w = 1 never lets w grow, so it ends at the
+    largest such weight.
     """
     w = 1.0
     if loss is None:
@@ -113,10 +106,7 @@ class Prediction(NamedTuple):
 def predict(
     mean: FloatArray, covariance: FloatArray, motion: MotionModel, dt_s: FloatArray | float
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance after `dt_s`: x' = f(x), P' = F P F' + Q (Karle et al. 2023, eqs. 3 and 4).
-
-    Shapes (..., n) and (..., n, n); `dt_s` a number or of shape (...).
-    """
+    """Mean (..., n) and covariance (..., n, n) after `dt_s` (...): f(x), F P F' + Q (Karle et al. 2023, eqs. 3, 4)."""
     return predict_across(mean, covariance, motion, dt_s)[:2]
 
 
@@ -140,10 +130,9 @@ def correct(
     measured: Sequence[int] | None = None,
     loss: RobustLoss | None = None,
 ) -> Correction[FloatArray]:
-    """Fuse innovations y (m, k) of measurements with Jacobians H (m, k, n) or (k, n) and covariances R (m, k, k).
+    """Fuse innovations y (m, k) with Jacobians H (m, k, n) or (k, n) and R (m, k, k) (Karle et al. 2023, eqs. 5 to 9).
 
-    Karle et al. 2023, eqs. 5 to 9, on m states. `measured` is `Measurement.measured`, for the NIS, `loss` the
-    robust loss of all (see `robust_weight`). The posterior covariance is in Joseph form.
+    `measured` is `Measurement.measured`, for the NIS, `loss` the robust loss of all (see `robust_weight`).
     """
     rows = np.arange(y.shape[-1]) if measured is None else np.array(measured, dtype=np.int64)
     x, P, y, R = (np.array(each, dtype=np.float64, order="C") for each in (mean, covariance, y, R))
@@ -169,7 +158,7 @@ def updated_one(
     loss: RobustLoss | None = None,
     measured: Sequence[int] | None = None,
 ) -> OneCorrection:
-    """One state, (n,) and (n, n), after the innovation y (k,) of a measurement with Jacobian H (k, n), noise R (k, k).
+    """One state, (n,) and (n, n), after the innovation y (k,) of a measurement with H (k, n) and R (k, k).
 
     Raises `numpy.linalg.LinAlgError` for one that cannot be fused.
     """

@@ -70,10 +70,9 @@ def fixes_of(mean: FloatArray, covariance: FloatArray, later: Iterable[tuple[flo
 
 
 def straight_lines(fixes: Sequence[Fix], least: int) -> Iterator[Line]:
-    """Weighted least squares lines at constant velocity through the first `least` fixes, and through each one more.
+    """Least-squares lines at constant velocity through the first `least` fixes, and through each one more.
 
-    With two fixes this is two-point initiation: the velocity is their difference over their time. Raises
-    `numpy.linalg.LinAlgError` where all are of one time, or one has no uncertainty.
+    Raises `numpy.linalg.LinAlgError` where all are of one time, or one has no uncertainty.
     """
     information, vector = np.zeros((4, 4)), np.zeros(4)  # of the position at time 0 and the velocity
     for count, fix in enumerate(fixes, start=1):

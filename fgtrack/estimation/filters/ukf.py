@@ -1,8 +1,8 @@
 """The unscented Kalman filter and the iterated posterior linearisation filter, by statistical linear regression.
 
-The sigma points are those of the cubature rule of third degree (Arasaratnam and Haykin, Cubature Kalman filters, IEEE
-Transactions on Automatic Control 54(6), 2009): 2 n of equal weight, sqrt(n) standard deviations to both sides along the
-columns of the covariance's root. They give no weight to the mean, so every covariance stays positive semidefinite.
+The 2 n sigma points are those of the cubature rule of third degree (Arasaratnam and Haykin, Cubature Kalman filters,
+IEEE Transactions on Automatic Control 54(6), 2009), at sqrt(n) standard deviations along the columns of the
+covariance's root. They give no weight to the mean, so every covariance stays positive semidefinite.
 """
 
 from collections.abc import Callable
