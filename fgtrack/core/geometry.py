@@ -105,7 +105,7 @@ def body_point(
 
 
 def body_point_jacobian(yaw_rad: float, arm_m: tuple[float, float], velocity_mps: tuple[float, float]) -> FloatArray:
-    """Derivative (5, 5) of x, y, yaw, vx, vy of `body_point`, at this arm and velocity, by x, y, yaw, speed, yaw rate."""
+    """Derivative (5, 5) of x, y, yaw, vx, vy of `body_point`, with this arm and velocity, by those of the body."""
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     (arm_x_m, arm_y_m), (vx_mps, vy_mps) = arm_m, velocity_mps
     return np.array(
