@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.error import YAMLError
 
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import CallError, did_you_mean
@@ -26,14 +26,16 @@ SMALLEST = 1e-12
 _UNKNOWN = "unexpected_keyword_argument"
 
 
-def load(kind: type[T], path: Path | None, settings: Sequence[str] = ()) -> T:
-    """Return an instance of the dataclass `kind` from the YAML file `path`, with `settings` of the form a.b=value.
+def load(kind: type[T], path: Path | T | None, settings: Sequence[str] | Mapping[str, Any] = ()) -> T:
+    """Return an instance of the dataclass `kind` from the YAML file `path`, another instance, or the defaults.
 
-    Without a file, from the defaults. Raises `CallError` for a missing file, wrong YAML, an unknown or repeated key,
-    and a value of the wrong type or range.
+    `settings` are values by dotted key, or texts of the form a.b=value. Raises `CallError` with file and key.
     """
-    raw, origin = ({}, "defaults") if path is None else (read_yaml(path), str(path))
-    return with_settings(kind, raw, dict(map(key_and_value, settings)), origin)
+    raw, origin = ({}, "defaults") if path is None else (plain(path), "the given configuration")
+    if isinstance(path, Path):
+        raw, origin = read_yaml(path), str(path)
+    changes = settings if isinstance(settings, Mapping) else dict(map(key_and_value, settings))
+    return with_settings(kind, raw, changes, origin)
 
 
 def with_settings(kind: type[T], raw: dict[str, Any], settings: Mapping[str, Any], origin: str) -> T:
@@ -69,10 +71,8 @@ def _parse(text: str, origin: str) -> Any:
     try:
         return safe_yaml(text)
     except YAMLError as error:
-        mark, problem = None, str(error)
-        if isinstance(error, MarkedYAMLError):
-            mark, problem = error.problem_mark, str(error.problem or error.context).split("To suppress")[0]
-        line = "" if mark is None else f":{mark.line + 1}"
+        mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None) or str(error)
+        problem, line = problem.split("To suppress")[0], "" if mark is None else f":{mark.line + 1}"
         raise CallError(f"{origin}{line}: invalid YAML, {' '.join(problem.split())}") from error
 
 
@@ -169,26 +169,22 @@ def _first_problem(error: ValidationError, kind: type[Any], text: str) -> str:
     """Return a line on the first complaint of pydantic, on an unknown key where there is one."""
     details = error.errors(include_url=False)
     first = next((one for one in details if one["type"] == _UNKNOWN), details[0])
-    raw = json.loads(text)
-    names, inside, siblings = list[str](), raw, raw
+    names, inside = list[str](), json.loads(text)
     part: Any
     for part in first["loc"]:  # tags of unions are not written in the file
         if isinstance(inside, list) or (isinstance(inside, Mapping) and part in inside):
-            names, inside, siblings = [*names, str(part)], inside[part], inside
-    if first["type"] == "missing":
-        names, siblings = [*names, str(first["loc"][-1])], siblings if len(first["loc"]) > 1 else {}
-    message, given = first["msg"].removeprefix("Value error, "), f", not {_short(first.get('input'))}"
+            names, inside = [*names, str(part)], inside[part]
+    message, given = first["msg"].removeprefix("Value error, "), f", not {_short(first['input'])}"
     if first["type"] == _UNKNOWN:
         known = _known_keys(kind, text, names[:-1])
         hint = did_you_mean(names[-1], known).removesuffix("?")
         message, given = f"unknown key{hint}" + (f", known here: {', '.join(known)}" if known else ""), ""
+    elif first["type"] == "missing":
+        names, given = [*names, str(first["loc"][-1])], ""
     elif first["type"] == "union_tag_not_found":
         message = "needs the key `kind`, which says which of its forms is meant"
     elif first["type"] == "union_tag_invalid":
         given += did_you_mean(first["ctx"]["tag"], first["ctx"]["expected_tags"].replace("'", "").split(", "))
-    elif first["type"] == "missing":  # of `sensors.radr` the misspelt part may not be meant to be a new one
-        others = [key for key in siblings if key != names[-2]] if isinstance(siblings, Mapping) and names[1:] else []
-        given = did_you_mean(names[-2], others) if others else ""
     elif first["type"] == "value_error":
         given = ""
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
@@ -196,17 +192,14 @@ def _first_problem(error: ValidationError, kind: type[Any], text: str) -> str:
 
 
 def _known_keys(kind: type[Any], text: str, names: Sequence[str]) -> list[str]:
-    """Return the keys of the dataclass at the path `names`; none where the rest is wrong as well."""
+    """Return the keys at the path `names`; none where the rest is wrong as well."""
     try:
-        value = _adapter(kind).validate_json(text, strict=True, extra="ignore")  # type: ignore[arg-type]  # as above
+        inside = plain(_adapter(kind).validate_json(text, strict=True, extra="ignore"))  # type: ignore[arg-type]  # as above
     except ValidationError:
         return []
     for name in names:
-        if is_dataclass(value):
-            value = getattr(value, name)
-        else:
-            value = value[name] if isinstance(value, Mapping) else value[int(name)]
-    return [field.name for field in fields(value)]
+        inside = inside[int(name)] if isinstance(inside, list) else inside[name]
+    return list(inside)
 
 
 def _short(value: object) -> str:

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from fgtrack.core.errors import DataError
 from fgtrack.io.source import InputSource
 from fgtrack.models.oval import OVAL
 from fgtrack.models.sensors import Mount
+from fgtrack.pipeline.config import EgoConfig, MapConfig
 from fgtrack.pipeline.load import plain
 from fgtrack.sim.scenario import Scenario
 
@@ -31,21 +32,11 @@ class RecordedSensor:
 
 
 @dataclass(frozen=True)
-class _Ego:
-    detection_origin_x_m: float | None = None
-
-
-@dataclass(frozen=True)
-class _Map:
-    track: str | None = None
-
-
-@dataclass(frozen=True)
 class Recorded:
-    """The keys of a configuration that a recording may carry; None of what it does not."""
+    """The keys of a configuration that a recording may carry; None of those that it does not."""
 
-    ego: _Ego = field(default_factory=_Ego)
-    map: _Map = field(default_factory=_Map)
+    ego: EgoConfig = field(default_factory=EgoConfig)
+    map: MapConfig = field(default_factory=MapConfig)
     sensors: Mapping[str, RecordedSensor] = field(default_factory=dict)
 
 
@@ -53,23 +44,20 @@ _RECORDED = TypeAdapter(Recorded | None, config=ConfigDict(allow_inf_nan=False))
 
 
 def recorded(source: InputSource) -> Recorded:
-    """Return the settings that `source` carries; a warning is logged where that is not valid.
-
-    A track whose file is not there is left out, with a warning as well.
-    """
+    """Return the settings that `source` carries; invalid ones, and a track without its file, are a warning."""
     try:
-        found = _RECORDED.validate_python(source.settings()) or Recorded()
-    except DataError:  # reading the messages says it
+        found = _RECORDED.validate_python(source.settings(), extra="ignore") or Recorded()
+    except DataError:  # reading the messages reports it
         return Recorded()
     except ValidationError as error:
         (first, *_) = error.errors(include_url=False)
         where = ".".join(str(part) for part in first["loc"])
         _logger.warning("%s: the recorded settings are not used, %s: %s", source.path, where, first["msg"])
         return Recorded()
-    track = found.map.track
+    track = found.map.track_file
     if track is not None and track != OVAL and not Path(track).is_file():
         _logger.warning("%s: the recorded map %s is not there, name it by --map", source.path, track)
-        return Recorded(found.ego, _Map(), found.sensors)
+        return replace(found, map=MapConfig())
     return found
 
 
@@ -81,5 +69,5 @@ def recorded_of(scenario: Scenario) -> dict[str, Any]:  # Any: plain values, as 
         )
         for one in scenario.sensors
     }
-    found: dict[str, Any] = plain(Recorded(_Ego(scenario.detection_origin_x_m), _Map(scenario.map), sensors))
-    return found
+    ego, track = {"detection_origin_x_m": scenario.detection_origin_x_m}, {"track": scenario.map}
+    return {"ego": ego, "map": track, "sensors": plain(sensors)}

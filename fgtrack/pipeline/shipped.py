@@ -8,14 +8,13 @@ from typing import Literal
 from fgtrack.core.checks import check_paths
 from fgtrack.core.errors import CallError, did_you_mean
 from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import key_and_value, plain, read_yaml, validate, with_settings
+from fgtrack.pipeline.load import load, plain, read_yaml, validate
 from fgtrack.sim.scenario import Scenario
 
 Kind = Literal["configuration", "scenario", "sweep"]
 
 _FOLDERS = {"configuration": ".", "scenario": "scenarios", "sweep": "sweeps"}
 _PACKAGE = Path(__file__).parents[1]
-_WANTED = {"estimator": "a name", "set": "a mapping of keys to values"}
 
 
 def shipped_folder() -> Path:
@@ -69,17 +68,10 @@ def read_config(
     Raises `CallError` for what does not fit.
     """
     check_paths(map=track_map, pit_map=pit_map)
-    if not isinstance(estimator, str | None) or not isinstance(settings, Mapping | list | tuple | None):
-        what, given = ("set", settings) if isinstance(estimator, str | None) else ("estimator", estimator)
-        raise CallError(f"{what}: must be {_WANTED[what]}, is a {type(given).__name__}")
-    changes = settings if isinstance(settings, Mapping) else dict(map(key_and_value, settings or ()))
-    if isinstance(name, Config):
-        config = with_settings(Config, plain(name), changes, "the given configuration") if changes else name
-    else:
+    if not isinstance(name, Config | None):
         check_paths(config=name)
-        path = None if name is None else find_file("configuration", name, folder)
-        raw, origin = ({}, "defaults") if path is None else (read_yaml(path), str(path))
-        config = with_settings(Config, raw, changes, origin)
+        name = find_file("configuration", name, folder)
+    config = name if isinstance(name, Config) and not settings else load(Config, name, settings or ())
     track, pit = track_map or config.map.track, pit_map or config.map.pit
     road = replace(config.map, track=track and str(track), pit=pit and str(pit))
     return replace(config, map=road, estimator=estimator or config.estimator)
