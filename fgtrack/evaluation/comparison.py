@@ -145,10 +145,9 @@ def common_sums(every: Sequence[TrackErrors]) -> tuple[int, int, dict[str, Float
 
 
 def compared(name: str, labels: Sequence[str], ticks: FloatArray) -> tuple[Entry, ...]:
-    """The runs by rising cost, and how much worse than the best they are.
+    """The runs by rising cost, and how much worse than the best they are, from the sums of `common_sums`.
 
-    `ticks` has a column of sums for each run and one of counts, shape (n, runs + 1). The cost is the root of the mean,
-    of a NEES its distance from 2.
+    The cost is the root of the mean, of a NEES its distance from 2.
     """
     is_nees = name == POSITION_NEES
 
@@ -165,10 +164,7 @@ def compared(name: str, labels: Sequence[str], ticks: FloatArray) -> tuple[Entry
 
 
 def _gospa_sums(group: Sequence[EvaluatedRun]) -> FloatArray:
-    """Squared GOSPA of the visible objects of every run, and 1, at the ticks that all have.
-
-    Objects that a sensor of any run could see are visible, so that all runs are measured alike.
-    """
+    """Squared GOSPA, and 1, at the ticks that all runs have, of the objects that a sensor of any run could see."""
     matchings = [one.matching for one in group if one.matching is not None]
     ticks_ns = [one.now_ns[recorded(each.run, one.now_ns)] for each, one in zip(group, matchings, strict=True)]
     common_ns = functools.reduce(np.intersect1d, ticks_ns)

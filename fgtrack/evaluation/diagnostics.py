@@ -71,10 +71,7 @@ def noise_diagnostics(run: Run) -> list[Diagnostic]:
 
 
 def misfits(run: Run) -> Iterator[tuple[str, ChiSquareMean]]:
-    """The sensors whose mean and median NIS are both far off, on the same side, and their NIS.
-
-    The mean alone may be that of a few outliers, or of the first innovations of new tracks.
-    """
+    """The sensors whose mean and median NIS (not a few outliers) are far off on the same side, and their NIS."""
     for sensor, mine in by_sensor(run.tables["updates"]):
         nis = ChiSquareMean.of(mine["nis"], num_measured(mine))
         if nis.count >= FEWEST and is_far_off(nis):
@@ -224,10 +221,7 @@ def _fragmentation(run: Run) -> Iterator[Diagnostic]:
 
 
 def lifetimes_and_breaks(run: Run) -> tuple[FloatArray, int]:
-    """Return the lifetimes [s] of the confirmed tracks, shape (tracks,), and how many of them continue another one.
-
-    Such a track begins where and when another one ends, within the distance that the object can have travelled.
-    """
+    """Lifetimes [s] of the confirmed tracks, shape (tracks,), and how many begin where and when another one ends."""
     tracks = run.tables["tracks"]
     tracks = tracks.where(np.isin(tracks["track_id"], tracks["track_id"][confirmed(tracks)]))
     births = np.unique(tracks["track_id"], return_index=True)[1]

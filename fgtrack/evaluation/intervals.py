@@ -55,10 +55,7 @@ UNKNOWN = Estimate(math.nan, math.nan, math.nan, 0)
 
 
 def paired(values_a: Sequence[float] | FloatArray, values_b: Sequence[float] | FloatArray) -> Estimate:
-    """Mean of `values_a` minus `values_b` and its 95 % interval; entry k of both is of the same seed.
-
-    `average` of the differences. A relative difference comes from logarithms: `exp(paired(log(a), log(b)).mean) - 1`.
-    """
+    """Mean of `values_a` minus `values_b` and its 95 % interval, see `average`; entry k of both is of the same seed."""
     a, b = np.asarray(values_a, dtype=np.float64), np.asarray(values_b, dtype=np.float64)
     return average((a - b)[np.isfinite(a) & np.isfinite(b)])
 
@@ -106,10 +103,7 @@ def within_run(ticks: FloatArray, statistic: Statistic, rng: np.random.Generator
 
 
 def mean_square(ticks: FloatArray, rng: np.random.Generator) -> Estimate:
-    """S[0] / S[1] of the sums S of `ticks`, as a mean NEES or NIS; see `within_run`.
-
-    The interval is that of the logarithm, so it is positive however few blocks it comes from.
-    """
+    """S[0] / S[1] of the sums S of `ticks`, see `within_run`; the interval is that of the logarithm, so positive."""
     log = within_run(ticks, lambda S: np.log(S[0] / S[1]), rng)
     with np.errstate(over="ignore"):
         mean, low, high = np.exp([log.mean, log.low, log.high]).tolist()
@@ -117,10 +111,7 @@ def mean_square(ticks: FloatArray, rng: np.random.Generator) -> Estimate:
 
 
 def by_stamp(stamps_ns: IntArray, samples: FloatArray) -> FloatArray:
-    """Sums of `samples`, shape (n, k), over those of each stamp in rising order, and their number: the last column.
-
-    Rows with a NaN are left out.
-    """
+    """Sums of `samples` (n, k) without NaN over each stamp in rising order, and their number: the last column."""
     known = np.isfinite(samples).all(axis=1)
     distinct, index = np.unique(stamps_ns, return_inverse=True)
     columns = [*samples[known].T, np.ones(int(known.sum()))]

@@ -80,9 +80,9 @@ ERROR_NAMES = ("position_m", "along_m", "across_m", "yaw_rad", "speed_mps")
 def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
     """Pair the tracks of `run` to its true objects at every tick; None for a run without truth.
 
-    `options` are by default those of its configuration. As CLEAR does (Bernardin and Stiefelhagen 2008): a pair of the
-    tick before stays while it lies inside the gate, the rest is assigned by the Hungarian method, first as many pairs
-    as possible, then the least sum of distances. Tracks of ignored objects and in ignored regions are left out.
+    As CLEAR does (Bernardin and Stiefelhagen 2008): a pair of the tick before stays while it lies inside the gate, the
+    rest is assigned by the Hungarian method, first as many pairs as possible, then the least sum of distances. Tracks
+    of ignored objects and in ignored regions are left out.
     """
     options = options or run.evaluation
     paths = true_paths(run.tables["truth"])
@@ -119,8 +119,8 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
 def pair(scores: FloatArray, ids: IntArray, tick_index: IntArray, previous: IntArray) -> IntArray:
     """Object of every row, shape (rows,), so that each tick has the largest sum of scores; `NO_OBJECT` without one.
 
-    `scores` of the pairs that are allowed are positive, shape (rows, objects), the others 0; `ids` and `tick_index` are
-    of the rows. A pair of track and object that the tick `previous` had stays, shape (ticks,), below 0 without one.
+    `scores`, shape (rows, objects), are 0 for pairs that are not allowed. A pair that the tick `previous` had stays,
+    shape (ticks,), below 0 without one.
     """
     num_ticks, inside = len(previous), scores > 0.0
     object_index = np.full(len(ids), NO_OBJECT)
@@ -165,10 +165,7 @@ def state_errors(states: Table, truth: FloatArray) -> dict[str, FloatArray]:
 
 
 def scenes(run: Run, matching: Matching) -> Scenes:
-    """The ticks of `run` between the first and the last stamp of its truth, with the evaluated rows there.
-
-    An object is present where its truth is known at the tick. A row is as far from it as at the row's own stamp.
-    """
+    """The ticks of `run` while truth was recorded, with the evaluated rows; distances are at the stamps of the rows."""
     scored = recorded(run, matching.now_ns)
     rows = np.flatnonzero(scored[matching.tick_index])
     rows = rows[np.argsort(matching.tick_index[rows], kind="stable")]
@@ -190,10 +187,7 @@ def published_rows(tracks: Table, ticks: IntArray, track_ids: IntArray) -> IntAr
 
 
 def neighbours(tracks: Table, name: str, values: IntArray, track_ids: IntArray) -> tuple[IntArray, IntArray]:
-    """Rows of these tracks whose column `name` is the last up to, and the first from `values` on, shape (n,) each.
-
-    -1 where there is none.
-    """
+    """Rows of these tracks whose column `name` is the last up to, and the first from `values` on; -1 without one."""
     every = np.unique(np.concatenate([tracks[name], values]))
     places, wanted = (np.searchsorted(every, each) for each in (tracks[name], values))
     keys, wanted = tracks["track_id"] * len(every) + places, track_ids * len(every) + wanted
@@ -211,10 +205,7 @@ def recorded(run: Run, stamps_ns: IntArray) -> BoolArray:
 
 
 def _ignored(run: Run, tracks: Table, paths: list[TruePath], gate_m: float) -> BoolArray:
-    """True for the rows of `tracks` without a true object that follow an ignored one or lie in an ignored region.
-
-    As in the evaluation of the KITTI data set (Geiger, Lenz, Urtasun 2012): these are neither right nor false.
-    """
+    """True for the rows of no true object that follow an ignored one or lie in an ignored region, as in KITTI."""
     objects = run.tables["ignored"].where(run.tables["ignored"]["outline_m"] == "")
     unknown = dict.fromkeys(("yaw_rad", "speed_mps", "yaw_rate_radps"), np.full(objects.num_rows, np.nan))
     _, distances_m = distances(tracks, [*paths, *true_paths(Table({**objects, **unknown}))])
@@ -226,10 +217,7 @@ def _ignored(run: Run, tracks: Table, paths: list[TruePath], gate_m: float) -> B
 
 
 def distances(tracks: Table, paths: Sequence[TruePath]) -> tuple[FloatArray, FloatArray]:
-    """True states at the stamps of `tracks`, shape (rows, objects, 5), and distances from them, shape (rows, objects).
-
-    NaN where there is no truth or no finite state.
-    """
+    """True states at the stamps of `tracks`, shape (rows, objects, 5), and distances, shape (rows, objects), or NaN."""
     candidates = np.stack([path.at(tracks["stamp_ns"]) for path in paths], axis=1)
     xy = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
     return candidates, np.linalg.norm(candidates[..., :2] - xy[:, None], axis=-1)

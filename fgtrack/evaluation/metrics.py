@@ -144,8 +144,8 @@ class Metrics:
 def evaluate(run: Run, truth: Mapping[str, Any] | None = None, options: EvaluationConfig | None = None) -> Metrics:
     """Return the metrics of `run`; without truth, those that need none.
 
-    `truth` are columns of truth.csv by name, such as a pandas DataFrame: `stamp_ns`, `object_id`, `x_m`, `y_m`, and
-    what else is known; by default that of the recording. `options` are by default those of the run's configuration.
+    `truth` are columns of truth.csv, such as a pandas DataFrame, by default those of the recording; `options` are by
+    default those of the run's configuration.
     """
     if truth is not None:
         num_rows = len(truth["stamp_ns"])

@@ -52,10 +52,7 @@ def looks(estimators: Sequence[str]) -> list[Look]:
 
 
 def distinct_colours(estimators: Sequence[str]) -> list[str]:
-    """Return one colour for each of `estimators`, in their order, where there are no line styles.
-
-    The first of a name has the name's colour, a further one takes a free colour of the palette while there is one.
-    """
+    """Return one colour for each of `estimators`: its own, or if that is taken a free one of the palette."""
     result: list[str] = []
     for own in (look(name).colour for name in estimators):
         result.append(next((colour for colour in (own, *PALETTE) if colour not in result), own))

@@ -33,10 +33,7 @@ class Placed:
 
 
 def placed(run: Run) -> Placed:
-    """The detections of `run` in the map, by the path of the ego in ego.csv, linear between its stamps.
-
-    The tracker itself uses what it knew of the ego when they came.
-    """
+    """The detections of `run` in the map, by the path of the ego in ego.csv, linear between its stamps."""
     table = run.tables["detections"]
     frame, stamps_ns = table["frame"], table["stamp_ns"]
     poses = ego_states(run.tables["ego"], stamps_ns)
@@ -70,10 +67,7 @@ def update_rows(run: Run) -> IntArray:
 
 
 def roads(run: Run) -> tuple[dict[str, TrackMap], list[str]]:
-    """Return the maps that the configuration names, by `track` and `pit`, and a line for each file that is gone.
-
-    Raises `DataError` if a file is not a map.
-    """
+    """The maps that the configuration names, `track` and `pit`, and a line for each that is gone; or `DataError`."""
     result, notes = {}, []
     config = run.config.get("map") or {}
     for key, built_in in (("track", make_oval), ("pit", make_pit_lane)):

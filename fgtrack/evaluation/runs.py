@@ -43,8 +43,8 @@ Runs = OneRun | Mapping[str, OneRun] | Iterable["Runs"]
 def evaluated(runs: Runs) -> list[EvaluatedRun]:
     """Return runs under labels of their own; a path is a run folder, or a folder of them; a mapping gives labels.
 
-    Runs of a folder come by name; they may be one folder deeper, as in that of `fgtrack demo`. Raises `CallError` if a
-    path is neither, or a run is given twice, and `DataError` if a run folder is damaged.
+    Runs of a folder come by name, and may be one folder deeper. Raises `CallError` if a path is neither, or a run is
+    given twice, and `DataError` if a run folder is damaged.
     """
     every = _flat(runs)
     if any(isinstance(one, Run) for one in every):
@@ -68,10 +68,9 @@ def start_ns(runs: Sequence[EvaluatedRun]) -> int:
 
 
 def labelled(runs: Sequence[Run]) -> dict[str, Run]:
-    """Runs by a label of their own: the end of their path, as long as it must be to be unique.
+    """Runs by the end of their path, as long as it must be to be unique, and by the estimator where that is not in it.
 
-    The estimator follows where the path does not name it, and alone for a run in memory. Raises `CallError` if a run is
-    given twice.
+    Raises `CallError` if a run is given twice.
     """
     identities = Counter(str(run.path.resolve()) if run.path else id(run) for run in runs)
     for identity in (identity for identity, times in identities.items() if times > 1):
@@ -91,9 +90,8 @@ def labelled(runs: Sequence[Run]) -> dict[str, Run]:
 def same_recording(one: Run, other: Run) -> bool:
     """True if two runs are of the same scene, detected by the same sensors.
 
-    The truth is the same, and of every sensor that both have the detections are as many and have the same values, at
-    the same stamps (a recording with other delays) or the same receipts (a configuration with other stamps). Without a
-    common sensor and without truth the ego decides, without that the path of the recording.
+    Truth and detections of common sensors are the same, but for other delays or stamps. Without a common sensor and
+    without truth the ego decides, without that the path of the recording.
     """
     if not one.tables["truth"].equals(other.tables["truth"]):
         return False

@@ -59,11 +59,7 @@ class TruePath:
 
 
 def true_paths(truth: Table) -> list[TruePath]:
-    """Every true object but the ego, by rising id.
-
-    Of several rows with one stamp the last counts. A value beyond `LARGEST` is unknown, as that of a detection; rows
-    without a position are ignored.
-    """
+    """Every true object but the ego, by rising id; of rows with one stamp the last counts, without a position none."""
     rows = np.stack([truth[name] for name in TRUE_STATE], axis=-1)
     rows[~(np.abs(rows) <= LARGEST)] = np.nan
     usable = np.isfinite(rows[:, :2]).all(axis=1) & (truth["object_id"] != EGO_ID)
@@ -85,10 +81,7 @@ def true_states(truth: Table, object_index: IntArray, stamps_ns: IntArray) -> Fl
 
 
 def in_ignored_regions(run: Run, stamps_ns: IntArray, points_m: FloatArray) -> BoolArray:
-    """True for `points_m`, shape (n, 2), that lie in an unlabelled region at `stamps_ns`, shape (n,).
-
-    Between two stamps of the truth the regions of the nearer one count.
-    """
+    """True for `points_m`, shape (n, 2), in an unlabelled region of the truth stamp that is nearest to `stamps_ns`."""
     ignored, inside = run.tables["ignored"], np.zeros(len(stamps_ns), dtype=np.bool_)
     regions = ignored.where(ignored["outline_m"] != "")
     known_ns = np.union1d(run.tables["truth"]["stamp_ns"], ignored["stamp_ns"])
@@ -100,7 +93,7 @@ def in_ignored_regions(run: Run, stamps_ns: IntArray, points_m: FloatArray) -> B
 
 
 def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> BoolArray:
-    """True where an object of `paths` is in range and in the field of view of a sensor at `now_ns`, shape (n, objects).
+    """True where an object of `paths` is in the field of view of a sensor at `now_ns`, shape (n, objects).
 
     Sensors are those with detections, as configured, from the pose of the ego in ego.csv, without occlusion. Where the
     ego's path or a sensor is not known every object with truth counts as visible.
@@ -121,10 +114,7 @@ def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> BoolArray:
 
 
 def ego_states(ego: Table, stamps_ns: IntArray) -> FloatArray:
-    """x, y, yaw (not wrapped) and speed of the ego at `stamps_ns`, shape (n, 4), constant beyond the ends.
-
-    NaN where no state of it is known.
-    """
+    """x, y, yaw (not wrapped) and speed of the ego, shape (n, 4), constant beyond the ends; NaN if never known."""
     rows = np.stack([ego[name] for name in ("x_m", "y_m", "yaw_rad", "speed_mps")], axis=-1)
     known = np.flatnonzero(np.isfinite(rows[:, :3]).all(axis=1))
     if not len(known):

@@ -19,8 +19,7 @@ _SEED = 1  # of the bootstrap: the same run gives the same interval
 class Consistency:
     """Normalised squared errors and innovations of one run, and the whiteness of the innovations.
 
-    The bands are those of independent samples. Innovations of a consistent estimator are independent, errors along a
-    run are not: a single run may leave the band of its NEES, see `position_nees_interval`.
+    Bands are those of independent samples; errors along a run are not, see `position_nees_interval`.
     """
 
     position_nees: ChiSquareMean
@@ -52,9 +51,9 @@ def position_nees(matching: Matching) -> FloatArray:
 
 
 def position_squares(states: Table, truth: FloatArray) -> FloatArray:
-    """Return the normalised error squared e' P^-1 e of x and y, shape (n,), against `truth`, shape (n, 2 or more).
+    """Return the normalised error squared e' P^-1 e of x and y, shape (n,), 2 on average if consistent.
 
-    A consistent estimator has a mean of 2. NaN where the covariance is not positive definite or an error is NaN.
+    NaN where the covariance is not positive definite or an error is NaN.
     """
     x, y = states["x_m"] - truth[:, 0], states["y_m"] - truth[:, 1]
     P_x, P_xy, P_y = (states[name] for name in ("p_x_x", "p_x_y", "p_y_y"))

@@ -43,9 +43,8 @@ def moments_of(name: str, values: FloatArray) -> Moments:
 def local_innovations(run: Run) -> tuple[IntArray, dict[str, FloatArray], FloatArray]:
     """Innovations of the tracks that were `confirmed`: rows of updates.csv, values by name, and states of the track.
 
-    Values are of shape (n,), NaN where not measured: along and across the direction of the track, its yaw and speed.
-    Without a measured yaw, on a map, that of the map less the track's, as in the paper. States are x, y, yaw and speed
-    at the stamps of the detections, shape (n, 4). Raises `DataError` where the map that the run names is not a map.
+    Values are those of `LOCAL_NAMES`, shape (n,), NaN where not measured; without a measured yaw that of the map less
+    the track's. States are x, y, yaw and speed at the detections, shape (n, 4). Raises `DataError` without a valid map.
     """
     tracks, updates, every = run.tables["tracks"], run.tables["updates"], residuals(run)
     known = np.isin(updates["track_id"], tracks["track_id"][confirmed(tracks)])
@@ -62,8 +61,7 @@ def local_innovations(run: Run) -> tuple[IntArray, dict[str, FloatArray], FloatA
 def residuals(run: Run) -> Mapping[str, FloatArray]:
     """Innovations by name of `RESIDUAL_NAMES`, each of shape (rows of updates.csv,), NaN where not measured.
 
-    `along_m` and `across_m` (left positive) turn the position residual into the direction of the track, the
-    published yaw at the detection's stamp: they are x_loc and y_loc of Karle et al. 2023.
+    `along_m` and `across_m` (left positive) are in the direction of the track: x_loc and y_loc of Karle et al. 2023.
     """
     values: dict[str, FloatArray] = {name: run.tables["updates"][f"res_{name}"] for name in MEASURABLE}
     yaw_rad = track_states(run, np.isfinite(values["x_m"]))[:, 2]
@@ -85,10 +83,7 @@ def num_measured(updates: Table) -> IntArray:
 
 
 def message_delays(updates: Table) -> tuple[IntArray, FloatArray]:
-    """Receipt in ns and delay in s of every message behind `updates` of one sensor, in order of receipt.
-
-    A message counts once, however many detections it holds; one without any does not appear in updates.csv.
-    """
+    """Receipt in ns and delay in s of the messages with a detection in `updates` of one sensor, by receipt."""
     messages = np.unique(np.stack([updates["receipt_ns"], updates["stamp_ns"]], axis=-1), axis=0)
     return messages[:, 0], (messages[:, 0] - messages[:, 1]) / NS_PER_S
 
@@ -122,8 +117,7 @@ def autocorrelation(updates: Table) -> Autocorrelation | None:
 def track_states(run: Run, wanted: BoolArray) -> FloatArray:
     """x, y, yaw (not wrapped) and speed of the updated track at the stamps of the `wanted` updates, shape (rows, 4).
 
-    Linear between the published rows of the track, constant before the first and after the last one; NaN elsewhere, and
-    for a track that was never published.
+    Linear between published rows, constant outside; NaN elsewhere.
     """
     tracks, updates = run.tables["tracks"], run.tables["updates"]
     before, after = neighbours(tracks, "stamp_ns", updates["stamp_ns"], updates["track_id"])

@@ -23,10 +23,7 @@ _SEED = 1  # of the bootstrap: the same run gives the same interval
 
 @dataclass(frozen=True)
 class LagMetrics:
-    """The states of one lag, and the present states of the same tracks at the same stamps.
-
-    Both are compared with the same truth, so their difference is the gain of waiting.
-    """
+    """States of one lag, and the present states of the same tracks at the same stamps, against the same truth."""
 
     lag_s: float | Literal["window"]
     """0 for the present states, `WINDOW` for the final ones."""
@@ -53,8 +50,7 @@ class LagMetrics:
 def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
     """Metrics of the present states, of every lag of lagged.csv by rising lag, and of the final states.
 
-    A lagged state belongs to the object that its track was paired with at the tick nearest to its stamp; without one
-    it is not evaluated. Empty for a run without truth.
+    A lagged state belongs to the object that its track was paired with at the nearest tick. Empty without truth.
     """
     if matching is None:
         return ()

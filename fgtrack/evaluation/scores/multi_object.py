@@ -45,10 +45,7 @@ class GospaParts(NamedTuple):
 
 @dataclass(frozen=True)
 class MultiObjectMetrics:
-    """Scores over the ticks at which truth is recorded; NaN where there is nothing to score.
-
-    Identity gives every object one track for the whole run, so that most of the pairs are right.
-    """
+    """Scores over the ticks at which truth is recorded; NaN where there is nothing to score."""
 
     gospa: Mapping[str, float]
     """Cut-off distance `c_m`, `ticks`, `mean_m` and root mean square `rms_m` over them, mean squared parts
@@ -86,10 +83,7 @@ def multi_object_metrics(scenes: Scenes, gate_m: float) -> MultiObjectMetrics:
 
 
 def clear(scenes: Scenes, gate_m: float) -> dict[str, float]:
-    """CLEAR of `scenes`; a pair is not farther apart than `gate_m`.
-
-    Pairs of the last tick with objects and tracks stay, the others have the largest sum of similarities.
-    """
+    """CLEAR of `scenes`: pairs of the last tick stay, the rest has the largest sum of similarities within `gate_m`."""
     similarity = np.maximum(0.0, 1.0 - scenes.distances_m / (2.0 * gate_m))
     scores = np.where(similarity >= AT_GATE - np.finfo(np.float64).eps, similarity, 0.0)
     num_ticks, num_rows = len(scenes.present), np.bincount(scenes.tick_index, minlength=len(scenes.present))
@@ -113,10 +107,7 @@ def clear(scenes: Scenes, gate_m: float) -> dict[str, float]:
 
 
 def gospa(scenes: Scenes, c_m: float) -> GospaParts:
-    """GOSPA with the cut-off distance `c_m`, as its parts at every tick.
-
-    A pair at c or beyond costs as much as a missed object and a false track, and counts as these.
-    """
+    """GOSPA with the cut-off distance `c_m`, as its parts at every tick; a pair at c or beyond is none."""
     gains_m2 = np.maximum(c_m**2 - np.square(scenes.distances_m), 0.0)
     num_ticks, tick_index = len(scenes.present), scenes.tick_index
     columns = pair(gains_m2, scenes.track_ids, tick_index, np.full(num_ticks, -1))

@@ -33,9 +33,8 @@ class PredictionErrors:
 def displacements(run: Run, matching: Matching) -> TrackErrors:
     """Distances of predicted from true positions, ten times a second, shape (n, m) for every `STEP_S` ahead.
 
-    Values are by predictor: `arc` and, where the run has a map, `rail`; NaN where the truth is not known. Confirmed
-    tracks that are paired with an object are compared with that object, wherever it goes. Raises `DataError` where the
-    map that the run names is not a map.
+    Values are by predictor: `arc` and, with a map, `rail`; NaN where the truth is not known. Predicted are confirmed
+    tracks that are paired with an object. Raises `DataError` where the map that the run names is not a map.
     """
     _, first = np.unique(matching.now_ns // _PERIOD_NS, return_index=True)
     tracks = matching.tracks

@@ -225,10 +225,7 @@ class Table:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tables:
-    """Tables by name: `tables["tracking"]` is a pandas DataFrame, `tables[["tracking", "lag"]]` are two of the tables.
-
-    `str` gives the verdict and the main tables.
-    """
+    """Tables by name: `tables["tracking"]` is a DataFrame, `tables[["tracking", "lag"]]` are two of the tables."""
 
     tables: Mapping[str, Table]
     details: Mapping[str, Any] = field(default_factory=dict)  # Any: JSON values

@@ -49,15 +49,8 @@ def compare(*runs: OneRun | Iterable[OneRun] | Mapping[str, OneRun], streaming: 
     `lag`, `consistency`, `dispositions`, and `residuals_SENSOR` of every sensor.
 
     Runs of the same recording are compared sample by sample. A path is a run folder, or a folder that holds run
-    folders; a mapping gives runs labels. With `streaming` a table of that name evaluates what was published when it was
-    ready, and the verdict names the best run then.
-
-    Raises
-    ------
-    CallError
-        No run is given, one is given twice, or a path is not a run folder.
-    DataError
-        A run folder is damaged.
+    folders; a mapping gives runs labels. `streaming` also evaluates what was published when it was ready. Raises
+    `CallError` if no run is given, one is given twice, or a path is not a run folder, `DataError` if one is damaged.
     """
     every = evaluated(runs)
     if not every:

@@ -66,10 +66,9 @@ class SweepTable:
         return distinguishing(self.rows[varying])
 
     def means(self, metric: str) -> DataFrame:
-        """Return the mean over the seeds at every point and of every estimator, in the order of the table.
+        """Return the mean over the seeds at every point and of every estimator; `CallError` if there is no such metric.
 
         Columns are `shown_axes`, `estimator`, `mean`, `standard_error` (NaN of one seed) and `seeds` with a value.
-        Raises `CallError` if there is no such metric.
         """
         if metric not in self.metrics:
             hint = did_you_mean(metric, self.metrics) or f", there are {', '.join(self.metrics[:5])} ..."
@@ -92,10 +91,7 @@ class SeedComparison:
 
 
 def read_sweep(folder: Path | str) -> SweepTable:
-    """Return the table of the sweep in `folder`.
-
-    Raises `CallError` if there is no table, and `DataError` if it is not that of a sweep, or has no rows.
-    """
+    """The table of the sweep in `folder`; `CallError` without one, `DataError` if it is not that of a sweep."""
     path = Path(folder) / SWEEP_FILE
     try:
         with open_text(path) as file:

@@ -40,8 +40,7 @@ _TITLES = {ASKED: "at its stamp", READY: "when ready", PREDICTED: "predicted to 
 def streaming_errors(run: Run, matching: Matching) -> TrackErrors:
     """Return distances to the truth of the paired rows by when they are evaluated, where there is truth when ready.
 
-    Predictions move the published position along the published yaw at the published speed; a state without yaw or
-    speed stays.
+    Predictions move the published position along the published yaw at the published speed, if there are both.
     """
     rows = np.flatnonzero(matching.paired)
     tracks, object_index = matching.tracks.where(matching.paired), matching.object_index[rows]
@@ -63,8 +62,7 @@ def streaming_errors(run: Run, matching: Matching) -> TrackErrors:
 def streaming_tables(runs: Sequence[EvaluatedRun]) -> tuple[dict[str, Table], list[str]]:
     """Return tables `streaming` and `load` of `runs`, and sentences on the best run when each pays for its time.
 
-    A run with a load above 1 is not ranked: its loss has no bound, and the few samples before the truth ends would
-    decide.
+    A run with a load above 1 is not ranked: its loss has no bound.
     """
     load, records, sentences = _load(runs), [], []
     late = {record["run"]: record["load"] for record in load.records if record["load"] > 1.0}
