@@ -24,6 +24,7 @@ from fgtrack.evaluation.tables import MS, PERCENT, RUN, Column, Table, Tables, n
 from fgtrack.evaluation.tables.streaming import streaming_tables
 from fgtrack.evaluation.tables.verdict import verdict
 
+_GOSPA = "gospa_in_sight_rms_m"
 _ERRORS = {
     "position_m": "pos.\n[m]",
     "along_m": "along\n[m]",
@@ -36,10 +37,9 @@ _QUANTITIES = {
     "speed_rmse_mps": "speed [m/s]",
     "yaw_rmse_rad": "yaw [rad]",
     POSITION_NEES: "NEES pos.",
-    "gospa_in_sight_rms_m": "GOSPA [m]",
+    _GOSPA: "GOSPA [m]",
 }
-_MAIN_QUANTITIES = ("position_rmse_m", "gospa_in_sight_rms_m")
-_GOSPA = "gospa_in_sight_rms_m"
+_CONTINUITY = ("tracked_share", "tracked_share_in_sight", "breaks", "id_switches")
 _UNITS = {"m": "m", "rad": "rad", "mps": "m/s"}
 _COMMON_SHARE = 0.9  # of the samples that all runs have in common; below it a note counts them
 
@@ -88,14 +88,9 @@ def _differences(compared: Sequence[Comparison]) -> Table:
         for one in compared
         if one.samples < _COMMON_SHARE * one.most_samples
     ]
-    return Table(
-        "Differences of runs of the same recording",
-        records,
-        [quantity, RUN, *entry_columns("value")],
-        ("run", "quantity"),
-        notes,
-        is_main=lambda record: record["quantity"] in _MAIN_QUANTITIES,
-    )
+    title, columns = "Differences of runs of the same recording", [quantity, RUN, *entry_columns("value")]
+    main = ("position_rmse_m", _GOSPA)
+    return Table(title, records, columns, ("run", "quantity"), notes, is_main=lambda row: row["quantity"] in main)
 
 
 def _tracking(metrics: Mapping[str, Metrics]) -> Table:
@@ -106,15 +101,9 @@ def _tracking(metrics: Mapping[str, Metrics]) -> Table:
         if one.truth is not None:
             overall = one.truth.overall
             record |= {named(name, "rmse"): overall.errors[name].rmse for name in _ERRORS}
-            record |= {
-                "position_nees": one.consistency.position_nees.mean,
-                "tracked_share": overall.tracked_share,
-                "tracked_share_in_sight": overall.tracked_share_in_sight,
-                "breaks": overall.breaks,
-                "id_switches": overall.id_switches,
-                "false_tracks": one.truth.false_tracks,
-                "precision": one.precision,
-            }
+            record |= {"position_nees": one.consistency.position_nees.mean}
+            record |= {name: getattr(overall, name) for name in _CONTINUITY}
+            record |= {"false_tracks": one.truth.false_tracks, "precision": one.precision}
         time_s = one.time_per_tick_s
         record |= {"num_tracks": one.num_tracks, "num_confirmed": one.num_confirmed}
         records.append(record | {"time_per_tick_p50_s": time_s.p50, "time_per_tick_p99_s": time_s.p99})
@@ -130,8 +119,7 @@ def _tracking(metrics: Mapping[str, Metrics]) -> Table:
         Column("ms/tick\np50/p99", "time_per_tick_p50_s time_per_tick_p99_s", "{}/{}", MS),
     ]
     notes = [
-        "errors: RMSE against truth; NEES: mean of the position's; 2 if consistent",
-        "tracked: share of the ticks in sight of a sensor",
+        "errors: RMSE against truth; NEES: mean of the position's; 2 if consistent; tracked: of the ticks in sight",
         "breaks: resumed after a loss or with another track; switches: the latter",
         f"false: paired with a true object in less than {FALSE_TRACK_SHARE:.0%} of its life",
     ]
@@ -143,23 +131,14 @@ def _multi_object(metrics: Mapping[str, Metrics]) -> Table:
     records = []
     for label, one in metrics.items():
         if one.multi_object is not None and one.truth is not None:
-            m2, overall = one.multi_object.gospa, one.truth.overall
-            record = {
-                "run": label,
-                _GOSPA: m2["in_sight_rms_m"],
-                "gospa_localisation_m": math.sqrt(m2["localisation_m2"]),
-                "gospa_missed_in_sight_m": math.sqrt(max(m2["missed_m2"] - m2["out_of_sight_m2"], 0.0)),
-                "gospa_false_m": math.sqrt(m2["false_m2"]),
-                "gospa_out_of_sight_m": math.sqrt(m2["out_of_sight_m2"]),
-                "gospa_rms_m": m2["rms_m"],
-                "gospa_missed_m": math.sqrt(m2["missed_m2"]),
-                "mota": one.multi_object.clear["mota"],
-                "idf1": one.multi_object.identity["idf1"],
-                **one.multi_object.hota,
-                "id_switches": overall.id_switches,
-                "time_to_confirm_s": overall.time_to_confirm_s.mean,
-            }
-            records.append(record)
+            of, m2, overall = one.multi_object, one.multi_object.gospa, one.truth.overall
+            parts = {part: m2[f"{part}_m2"] for part in ("localisation", "false", "out_of_sight", "missed")}
+            parts["missed_in_sight"] = max(parts["missed"] - parts["out_of_sight"], 0.0)
+            record = {"run": label, _GOSPA: m2["in_sight_rms_m"], "gospa_rms_m": m2["rms_m"]}
+            record |= {f"gospa_{part}_m": math.sqrt(square) for part, square in parts.items()}
+            record |= {"mota": of.clear["mota"], "idf1": of.identity["idf1"], **of.hota}
+            switches, confirm_s = overall.id_switches, overall.time_to_confirm_s.mean
+            records.append(record | {"id_switches": switches, "time_to_confirm_s": confirm_s})
     columns = [
         RUN,
         Column("GOSPA\n[m]", _GOSPA),
@@ -173,9 +152,8 @@ def _multi_object(metrics: Mapping[str, Metrics]) -> Table:
         Column("confirm\n[s]", "time_to_confirm_s"),
     ]
     notes = [
-        "GOSPA: root mean square over ticks; the squares of its parts add up to its own",
+        "GOSPA: root mean square over ticks; the squares of its parts add up to its own; scores: 100 is perfect",
         "unseen: missed where no sensor could see; the scores in % count it too",
-        "scores: 100 is perfect; defined in docs/metrics.md",
         "confirm: from an object's first detection to its first confirmed track",
     ]
     return Table("Multi-object metrics", records, columns, notes=notes, is_detail=True)
@@ -186,18 +164,12 @@ def _lag(metrics: Mapping[str, Metrics]) -> Table:
     records = []
     for label, one in metrics.items() if any(len(one.lagged) > 1 for one in metrics.values()) else ():
         for lag in one.lagged:
-            at = (
-                {"lag": lag.lag_s, "lag_s": None}
-                if lag.lag_s == WINDOW
-                else {"lag": f"{lag.lag_s:g}", "lag_s": lag.lag_s}
-            )
-            record: dict[str, Any] = {"run": label, **at, "num_states": lag.errors["position_m"].count}
+            at_s = lag.lag_s if isinstance(lag.lag_s, float) else None
+            record: dict[str, Any] = {"run": label, "lag": WINDOW if at_s is None else f"{at_s:g}", "lag_s": at_s}
+            record |= {"num_states": lag.errors["position_m"].count}
             for name in ("position_m", "speed_mps", "yaw_rad"):
-                reduction = f"{name.rpartition('_')[0]}_reduction"
-                record |= {
-                    named(name, "rmse"): lag.errors[name].rmse,
-                    reduction: lag.gain(name) if lag.lag_s else math.nan,
-                }
+                gain = lag.gain(name) if lag.lag_s else math.nan
+                record |= {named(name, "rmse"): lag.errors[name].rmse, f"{name.rpartition('_')[0]}_reduction": gain}
             of = lag.position_reduction
             record |= {"position_reduction_low": of.low, "position_reduction_high": of.high}
             records.append(record | {"position_nees": lag.position_nees.mean})
@@ -215,9 +187,8 @@ def _lag(metrics: Mapping[str, Metrics]) -> Table:
         Column("NEES\npos.", "position_nees"),
     ]
     notes = [
-        "lag 0: states as published; window: final states, as they leave the window",
+        "lag 0: states as published; window: final states, as they leave the window; NEES: 2 if consistent",
         "below: reduction against the present states of the same tracks and stamps",
-        "NEES: of the position; 2 if consistent",
     ]
     return Table("Error against lag (RMSE against truth)", records, columns, ("run", "lag"), notes)
 
@@ -235,17 +206,12 @@ def _consistency(metrics: Mapping[str, Metrics]) -> Table:
             record |= {} if white is None else {"lag1_correlation": white.lag1, "lag1_band": white.lag1_band}
             records += [record] if square.count else []
     columns = [
-        RUN,
-        Column("of", left=True),
-        Column("samples", "num_samples"),
-        Column("mean"),
-        Column("expected"),
+        *(RUN, Column("of", left=True), Column("samples", "num_samples"), Column("mean"), Column("expected")),
         Column("95 % band", "band_low band_high", "{} to {}"),
         Column("correlation\nat lag 1", "lag1_correlation lag1_band", "{} ± {}"),
     ]
     notes = [
-        "band: of the mean of independent samples; errors along one run are correlated,",
-        "so the NEES of a single run may leave it (average over several runs)",
+        "band: of the mean of independent samples; errors along a run are not, so a single NEES may leave it",
         f"correlation: of innovations, tracks with {FEWEST}+ of them; ± 95 % band if white",
     ]
     title = "Consistency (mean NEES and NIS, and their expected values)"
