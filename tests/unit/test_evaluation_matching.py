@@ -168,18 +168,11 @@ def test_pairs_inside_the_gate_stay_and_the_rest_is_assigned(seed: int, density:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            "evaluation: {gate_m: -1}",
-            r"run.config\.yaml: evaluation: Value error, gate_m: must be positive and at most 1e\+09, is -1",
-        ),
-        (
-            "evaluation: {confirmed_only: [1]}",
-            r"run.config\.yaml: evaluation.confirmed_only: Input should be",
-        ),
-        ("evaluation: {", r"run.config\.yaml: is not YAML"),
+        ("evaluation: {gate_m: -1}", "evaluation: Value error, gate_m: must be positive and at most 1e.09, is -1"),
+        ("evaluation: {", "is not YAML"),
     ],
 )
 def test_a_configuration_that_cannot_be_used_is_one_clear_error(tmp_path: Path, text: str, message: str) -> None:
     run = write_run(tmp_path / "run", config_text=text)
-    with pytest.raises(DataError, match=message):
+    with pytest.raises(DataError, match=rf"run.config\.yaml: {message}"):
         _ = run.evaluation

@@ -151,3 +151,6 @@ def test_metrics_are_strict_json(story: Run) -> None:
     assert again["truth"]["objects"]["7"]["errors"]["position_m"]["rmse"] == pytest.approx(2.5)
     assert again["truth"]["overall"]["tracked_share"] == pytest.approx(16 / 19)
     assert again["precision"] == 0.5
+    assert list(again["truth"]["overall"]["errors"]["position_m"]) == ["count", "mean", "std", "rmse"]
+    assert list(again["consistency"]["position_nees"]) == ["count", "mean", "dof", "band_low", "band_high"]
+    assert list(again["consistency"]["position_nees_interval"]) == ["mean", "low", "high", "count"]
