@@ -8,20 +8,12 @@ from fgtrack.calibration.arrivals import Arrivals
 from fgtrack.calibration.finding import Finding
 from fgtrack.calibration.outcome import Outcome
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
+from fgtrack.pipeline.assumptions.assumption import Assumption
 from fgtrack.pipeline.config import Config
 
-__all__ = ["Advice", "Change"]
+__all__ = ["Advice"]
 
 _COMMENT = 110  # characters in a line of a file
-
-
-@dataclass(frozen=True)
-class Change:
-    """A setting that the advice changes."""
-
-    key: str
-    value: object
-    why: str
 
 
 @dataclass(frozen=True)
@@ -47,11 +39,12 @@ class Advice:
     """Why the recording breaks off, where it does; what came before was used."""
 
     @property
-    def changes(self) -> tuple[Change, ...]:
-        """The settings that the findings change, the most important first."""
-        found: dict[str, Change] = {}
+    def changes(self) -> tuple[Assumption, ...]:
+        """The settings that the findings change with their reasons, the most important first."""
+        found: dict[str, Assumption] = {}
         for one in self.findings:
-            found |= {key: Change(key, value, f"{one.about}: {one.text}") for key, value in one.settings.items()}
+            for key, value in one.settings.items():
+                found[key] = Assumption(tuple(key.split(".")), value, f"{one.about}: {one.text}")
         return tuple(found.values())
 
     @property
@@ -105,14 +98,14 @@ class Advice:
             "recording": self.recording,
             "findings": [asdict(one) for one in self.findings],
             "fine": list(self.fine),
-            "changes": [asdict(one) for one in self.changes],
+            "changes": [{"key": one.key, "value": one.value, "why": one.reason} for one in self.changes],
             "broken": self.broken,
             **self.tables.to_dict(),
         }
 
     def comments(self) -> list[str]:
         """Return the reason of each changed setting, and what no setting corrects."""
-        changes = [f"{one.key} = {one.value}: {one.why}" for one in self.changes]
+        changes = [f"{one.key} = {one.value}: {one.reason}" for one in self.changes]
         rest = [str(one) for one in self.findings if not one.settings]
         lines = _wrapped(changes) if changes else ["Nothing is changed."]
         return [*lines, *(["", "Without a setting that corrects it:"] if rest else []), *_wrapped(rest)]

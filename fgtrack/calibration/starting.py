@@ -181,9 +181,6 @@ def _spreads(values: Mapping[str, Sequence[float]]) -> str:
     return ", ".join(found)
 
 
-_MARK = "(fgtrack info --write)"
-
-
 def starting_config(recording: Path) -> str:
     """YAML text of a configuration for `recording`: what can be taken as settings, all else as comments.
 
@@ -200,7 +197,7 @@ def starting_config(recording: Path) -> str:
     except FgtrackError as error:
         checks += [str(error)] if taken else []  # else of a recording in which nothing can be taken
     head = [
-        f"Starting configuration for {recording.name} {_MARK}",
+        f"Starting configuration for {recording.name} (fgtrack info --write)",
         "Guesses from names and values: check units, frames and noise, then",
         f"  fgtrack info {recording} -c THIS.yaml; fgtrack replay {recording} -c THIS.yaml -o RUN",
         *(f"Check: {line}" for line in checks),

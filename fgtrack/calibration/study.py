@@ -1,6 +1,6 @@
 """A recording in one call: advice, three methods on the same stream, their comparison, figures, and a page."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
@@ -40,11 +40,6 @@ _PERCENT, _MS = 100.0, 1e3
 _IMPORTANT = 60.0  # weight of a finding without a setting that has to be dealt with first
 
 
-def summary(runs: Sequence[EvaluatedRun], tables: Tables, advice: Advice | None) -> tuple[str, ...]:
-    """Return sentences: the recording, its tracks, the verdict of the comparison, and what to do."""
-    return (_recording(runs[0]), _tracks(runs[0]), *tables.verdict, _to_do(runs, tables, advice))
-
-
 def _recording(one: EvaluatedRun) -> str:
     updates, now_ns = one.run.tables["updates"], one.run.tables["timing"]["now_ns"]
     length_s = (int(now_ns[-1]) - int(now_ns[0])) / NS_PER_S if len(now_ns) else 0.0
@@ -54,10 +49,9 @@ def _recording(one: EvaluatedRun) -> str:
         delays_s = (updates["receipt_ns"][mine] - updates["stamp_ns"][mine]) / NS_PER_S
         middle_ms, most_ms = _MS * float(np.median(delays_s)), _MS * float(delays_s.max())
         sensors.append(f"{sensor} ({len(delays_s)} detections, {middle_ms:.0f} ms late, at most {most_ms:.0f})")
-    fates = updates["disposition"]
-    late, used = _percent(fates == "out_of_sequence"), _percent(np.isin(fates, USED))
-    many = f"; {late} arrived after newer ones had been fused, {used} were used" if len(fates) else ""
-    return f"In {length_s:.0f} s detections came from {' and '.join(sensors) or 'no sensor'}{many}."
+    late, used = (_percent(np.isin(updates["disposition"], fates)) for fates in (("out_of_sequence",), USED))
+    many = f"{late} arrived after newer ones had been fused, {used} were used"
+    return f"In {length_s:.0f} s detections came from {' and '.join(sensors) or 'no sensor'}; {many}."
 
 
 def _tracks(one: EvaluatedRun) -> str:
@@ -74,11 +68,11 @@ def _tracks(one: EvaluatedRun) -> str:
     return f"{one.label} confirms {_several(len(lives_s), 'track')}{lives}."
 
 
-def _to_do(runs: Sequence[EvaluatedRun], tables: Tables, advice: Advice | None) -> str:
+def _to_do(first: EvaluatedRun, tables: Tables, advice: Advice | None) -> str:
     """Return what comes first: a defect of the recording or its settings, else the fastest of the best methods."""
     findings = () if advice is None else advice.findings
     found = [str(one) for one in findings if not one.settings and one.weight >= _IMPORTANT]
-    if found := found or [str(one) for one in diagnostics(runs[0].run)]:
+    if found := found or [str(one) for one in diagnostics(first.run)]:
         return f"First: {found[0]}"
     ranked = [row for row in tables.tables["differences"].records if row["quantity"] == "position_rmse_m"]
     best = {row["run"] for row in ranked if row["standing"] != "worse"}
@@ -98,7 +92,6 @@ def _several(count: int, what: str, ending: str = "s") -> str:
 
 ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
 """Estimators of a study."""
-_MARK = "(fgtrack study)"
 #: Share of the work that is done when a step begins.
 _ADVICE, _REPLAY, _COMPARE, _DRAW, _DONE = 0.02, 0.3, 0.85, 0.9, 1.0
 
@@ -192,7 +185,7 @@ def study(
         if advised is not None:  # what the advice changes is not assumed any more
             changed = {one.key for one in advised.changes}
             known = Assumed(advised.config, tuple(one for one in known.assumptions if one.key not in changed))
-        head = [f"Settings of {source_path.name} {_MARK}: change them and run again with -c."]
+        head = [f"Settings of {source_path.name} (fgtrack study): change them and run again with -c."]
         comments = [] if advised is None else advised.comments()
         write_file(settings, known.to_yaml([*head, *comments]), overwrite)
 
@@ -213,7 +206,7 @@ def study(
         tables = compare(*every)
         for folder, one in zip(runs, every, strict=True):
             write_metrics(folder, one.metrics.as_dict())
-        lines = summary(every, tables, advised)
+        lines = _recording(every[0]), _tracks(every[0]), *tables.verdict, _to_do(every[0], tables, advised)
         on_step("draw", _DRAW)
         close_up, late = drawn_close_up(every)
         others = tuple(f"_{one.label}" for one in every[1:])  # figures of single runs are drawn of the first
