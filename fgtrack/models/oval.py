@@ -15,7 +15,6 @@ OVAL = "oval"
 _TURN_RADIUS_M = 220.0
 _BEND_M = 30.0  # from the start line to where the bend of the front straight begins to end
 _BLEND_M = 130.0  # over which the curvature goes from one value to the next
-_START_HEADING_RAD = 0.5  # so that no straight lies on the jump of the heading
 
 
 def make_oval() -> TrackMap:
@@ -79,7 +78,7 @@ def _centre_line() -> FloatArray:
     x = _integrate(s, lambda u: np.cos(heading(u, straight_m)))
     y = _integrate(s, lambda u: np.sin(heading(u, straight_m)))
     x, y = np.concatenate([x, -x[-2::-1]]), np.concatenate([y, y[-2::-1]])
-    c, sn = math.cos(_START_HEADING_RAD), math.sin(_START_HEADING_RAD)
+    c, sn = math.cos(0.5), math.sin(0.5)  # so that no straight lies on the jump of the heading
     return np.stack([c * x - sn * y, sn * x + c * y], axis=1)
 
 

@@ -40,7 +40,6 @@ _ARCS = [_COLUMN["s_racetraj_m"], _COLUMN["s_ref_m"]]
 
 _FILE_HEADING_OFFSET_RAD = math.pi / 2  # a file's heading is 0 along +y, REP-103 is 0 along +x
 _SAME_POINT_M = 1e-3
-_LARGEST_MB = 20.0  # some 100,000 rows
 _MAX_HEADING_ERROR_RAD = 1.0  # coarse maps turn much in a row; a wrong convention is off by pi / 2
 
 # A segment row holds these quantities where the segment starts, and then the changes to its end. A point is complex,
@@ -97,7 +96,7 @@ class TrackMap:
 
         The last row may repeat the first. Raises `DataError` with the path if the file cannot be read or is not a map.
         """
-        content = read_whole(Path(path), _LARGEST_MB)
+        content = read_whole(Path(path), 20.0)  # some 100,000 rows
         try:
             lines = [
                 line for line in content.decode().splitlines() if line.strip() and not line.lstrip().startswith("#")
@@ -121,11 +120,6 @@ class TrackMap:
         back = _complex(foot[:, _BACK])
         points = _complex(foot[:, _POINT]) + 1j * lateral_m * np.abs(back) / back
         return points.view(np.float64).reshape(-1, 2)
-
-    def heading(self, points_m: FloatArray) -> FloatArray:
-        """Driving direction of the line beside `points_m`, shape (n,), interpolated along the circle."""
-        foot, _ = self._locate(points_m)
-        return wrap_angles(foot[:, _HEADING])
 
     def bounds(self, s_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Widths (left, right) from the line to the bounds at arc length `s_m`, shapes (n,)."""

@@ -82,7 +82,7 @@ class Scanner:
             s = track.frenet(self.ego[scan, :2])[0] + rng.uniform(-1.0, 1.0, m) * sensor.max_range_m
             left_m, right_m = track.bounds(s)
             ghosts[:, :2] = track.position(s, rng.uniform(-right_m, left_m))
-            ghosts[:, YAW] = track.heading(ghosts[:, :2])
+            ghosts[:, YAW] = track.view(ghosts[:, :2], 0.0, 0.0).yaw_rad
         else:
             # Uniform over the area of a ring: the square of the range is uniform.
             distance = np.sqrt(rng.uniform(sensor.min_range_m**2, sensor.max_range_m**2, m))

@@ -46,7 +46,7 @@ def on_the_oval(tmp_path: Path) -> Run:
     """An object on the line of the oval, headed 0.1 rad left of it; the ego is 30 m behind and 4 m right."""
     road = make_oval()
     x_m, y_m = road.position(np.array([100.0]), np.array([0.0]))[0]
-    heading = float(road.heading(np.array([[x_m, y_m]]))[0])
+    heading = float(road.view(np.array([[x_m, y_m]]), 0.0, 0.0).yaw_rad[0])
     car = Car(1, x_m, y_m, heading + 0.1, 50.0)
     c, s = math.cos(heading), math.sin(heading)
     ego = (x_m - 30.0 * c + 4.0 * s, y_m - 30.0 * s - 4.0 * c, heading, 60.0, 0.0, 0.0)

@@ -44,3 +44,10 @@ def test_a_polygon_holds_what_its_outline_surrounds() -> None:
     points = np.array([(0.5, 0.5), (3.5, 3.0), (1.0, 2.0), (-0.1, 0.5), (4.1, 0.5), (3.5, 4.5)])
     for corners in (bent, bent[::-1], np.roll(bent, 2, axis=0)):
         assert in_polygon(points, corners).tolist() == [True, True, False, False, False, False]
+    slanted = np.array([(1.0, 1.0), (5.0, 1.0), (1.0, 3.0)])
+    assert in_polygon(np.array([(2.9, 2.0), (3.1, 2.0), (4.5, 1.2), (0.9, 2.0)]), slanted).tolist() == [
+        True,
+        False,
+        True,
+        False,
+    ]

@@ -17,7 +17,7 @@ def on_the_track(s_m: np.ndarray, lateral_m: float, speed_mps: float = 60.0) -> 
     xy = TRACK.position(s_m, np.full(len(s_m), lateral_m))
     curvature = TRACK.view(xy, 0.0, 0.0).curvature_radpm
     yaw_rate = speed_mps * curvature / (1.0 - curvature * lateral_m)
-    return np.column_stack([xy, TRACK.heading(xy), np.full(len(s_m), speed_mps), yaw_rate])
+    return np.column_stack([xy, TRACK.view(xy, 0.0, 0.0).yaw_rad, np.full(len(s_m), speed_mps), yaw_rate])
 
 
 def test_an_arc_is_a_circle() -> None:

@@ -54,7 +54,7 @@ def local_innovations(run: Run) -> tuple[IntArray, dict[str, FloatArray], FloatA
     road = roads(run)[0].get("track")
     missing = np.flatnonzero(np.isnan(values["yaw_rad"]) & np.isfinite(states).all(axis=1))
     if road is not None and len(missing):
-        values["yaw_rad"][missing] = wrap_angles(road.heading(states[missing, :2]) - states[missing, 2])
+        values["yaw_rad"][missing] = wrap_angles(road.view(states[missing, :2], 0.0, 0.0).yaw_rad - states[missing, 2])
     return rows, values, states
 
 
