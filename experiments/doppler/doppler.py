@@ -23,7 +23,6 @@ from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.linalg import congruence, identity, mahalanobis_squared, psd_solve, symmetrise
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.estimation.filters.ekf import linearised
 from fgtrack.estimation.filters.propagation import wrapped
 from fgtrack.evaluation.intervals import Estimate, paired
 from fgtrack.models.measurement import SensorPose, measured_position, measurement_model
@@ -77,7 +76,7 @@ class Hypotheses:
         fused: list[tuple[float, Estimator]] = []
         for log_weight, each in self.weighted:
             state = each.state_at(measurement.stamp_ns)
-            y, H = linearised(measurement.z, state.mean, measurement.model, measurement.pose)
+            y, H = measurement.model.linearised(measurement.z, state.mean, measurement.pose)
             S = congruence(H, state.covariance) + measurement.R
             result = each.update(measurement)
             if result.innovation is not None:

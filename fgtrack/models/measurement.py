@@ -5,7 +5,7 @@ x_m, y_m and yaw_rad are in the map frame and speed_mps is over ground along the
 turn positive, is that of the way of the object: its yaw rate over its speed. No sensor measures it, a map tells it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import NamedTuple
@@ -99,6 +99,20 @@ class MeasurementModel:
         H = np.zeros(shape)
         H[..., :5] = _observed(self.components, x, pose, self._cartesian)[1][..., :n]
         return H
+
+    def linearised(
+        self,
+        z: FloatArray,
+        x: FloatArray,
+        pose: SensorPose = AT_ORIGIN,
+        residual: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Innovation y (..., k) of z (..., k) at the states x (..., n), and its Jacobian H (k, n) or (..., k, n).
+
+        `residual` may take the place of the model's own.
+        """
+        y = (residual or self.residual)(z, self.predict(x, pose))
+        return y, self.selection(x.shape[-1]) if self.linear else self.jacobian(x, pose)
 
     def pose_jacobian(self, x: FloatArray, pose: SensorPose) -> FloatArray:
         """Derivative of `predict` by the entries of `pose`, shape (..., k, 5); finite as `jacobian` is."""

@@ -14,7 +14,6 @@ from fgtrack.core.linalg import kernels, symmetrise
 from fgtrack.core.settings import OpenProbability, settings
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import StatesAt
-from fgtrack.estimation.filters.ekf import linearised
 from fgtrack.tracking.objects import Apart
 from fgtrack.tracking.preprocess import Candidates, Group
 
@@ -199,7 +198,7 @@ def innovations(
         columns = pairs.columns[chosen]
         x = states.means[columns]
         own = group.seen_at(members, x)
-        y, H = linearised(own.z, x, own.model, own.pose)
+        y, H = own.model.linearised(own.z, x, own.pose)
         H = np.array(H, ndmin=3, order="C")
         nis, logdet = kernels("fgtrack.tracking.kernels").innovations(y, H, P, columns, own.R)
         parts.append((chosen, nis, logdet, y.shape[-1]))

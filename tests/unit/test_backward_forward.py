@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
 from fgtrack.estimation.filters.backward_forward import BackwardForwardBank
-from fgtrack.estimation.filters.ekf import correct, linearised
+from fgtrack.estimation.filters.ekf import correct
 from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator
 from fgtrack.estimation.filters.published import PublishedStorage
 from fgtrack.models.measurement import SensorPose, measurement_model
@@ -203,7 +203,7 @@ class NaiveBank:
             track, place = self.tracks[track_id], places[track_id]
             mean = track.means[place][None]
             done = correct(
-                mean, track.covariances[place][None], *linearised(m.z[None], mean, m.model, m.pose), m.R[None]
+                mean, track.covariances[place][None], *m.model.linearised(m.z[None], mean, m.pose), m.R[None]
             )
             steps = len(track.means) - 1 - place
             del track.stamps_ns[place + 1 :], track.means[place:], track.covariances[place:]

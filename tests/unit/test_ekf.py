@@ -6,7 +6,7 @@ from support.models import MODELS
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.filters.ekf import correct, correct_one, linearised, predict
+from fgtrack.estimation.filters.ekf import correct, correct_one, predict
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
@@ -27,7 +27,7 @@ def test_the_correction_is_the_textbook_formula(seed: int, components: tuple[str
     k = len(components)
     x, P = rng.normal(size=(4, 5)), positive_definite(rng, 4, 5)
     z, R = x[:, :k] + rng.normal(scale=0.3, size=(4, k)), positive_definite(rng, 4, k)
-    done = correct(x, P, *linearised(z, x, model, SensorPose()), R)
+    done = correct(x, P, *model.linearised(z, x, SensorPose()), R)
     for i in range(4):
         H = np.eye(5)[:k]
         y = z[i] - H @ x[i]
@@ -84,7 +84,7 @@ def test_a_filter_over_linear_motion_is_the_batch_solution_of_the_whole_chain() 
         add(blocks[step] - F @ blocks[step - 1], np.zeros(n), Q)
         add(H @ blocks[step], z, R)
         mean, covariance = predict(mean, covariance, motion, dt_s)
-        mean, covariance = correct(mean, covariance, *linearised(z[None], mean, model, SensorPose()), R[None])[:2]
+        mean, covariance = correct(mean, covariance, *model.linearised(z[None], mean, SensorPose()), R[None])[:2]
     np.testing.assert_allclose(mean[0], np.linalg.solve(information, vector)[-n:], atol=1e-9)
     np.testing.assert_allclose(covariance[0], np.linalg.inv(information)[-n:, -n:], atol=1e-9)
 
@@ -97,7 +97,7 @@ def test_the_posterior_stays_symmetric_and_positive_however_good_the_measurement
     model = measurement_model(("x_m", "y_m", "yaw_rad"), CTRV())
     R = positive_definite(rng, 3, 3) * scale
     x, z = rng.normal(size=(3, 5)), rng.normal(size=(3, 3))
-    done = correct(x, P, *linearised(z, x, model, SensorPose()), R)
+    done = correct(x, P, *model.linearised(z, x, SensorPose()), R)
     assert np.array_equal(done.covariance, np.swapaxes(done.covariance, -1, -2))
     assert np.linalg.eigvalsh(done.covariance).min() > -1e-10 * 1e4
     assert np.all(np.diagonal(done.covariance, axis1=-2, axis2=-1) <= np.diagonal(P, axis1=-2, axis2=-1))
@@ -142,7 +142,7 @@ def test_the_correction_of_one_state_is_that_of_a_stack(
     inputs = [array.copy() for array in (x, P, z, R)]
     pose = SensorPose(20.0, -3.0, 0.4, 5.0, 1.0)
     one = correct_one(x, P, Measurement(0, model, z, R, pose))
-    stack = correct(x[None], P[None], *linearised(z[None], x[None], model, pose), R[None])
+    stack = correct(x[None], P[None], *model.linearised(z[None], x[None], pose), R[None])
     for found, expected in zip(one[:-1], stack[:-1], strict=True):
         np.testing.assert_allclose(found, expected[0], rtol=1e-12, atol=1e-12 * np.abs(stack.mean).max())
     np.testing.assert_array_equal(one.covariance, one.covariance.T)

@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement
-from fgtrack.estimation.filters.ekf import correct, correct_one, linearised
+from fgtrack.estimation.filters.ekf import correct, correct_one
 from fgtrack.estimation.registry import ESTIMATORS, Claims, estimator
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
@@ -91,7 +91,7 @@ def test_a_stack_of_states_is_weighted_one_by_one() -> None:
     stacked = correct(
         means,
         np.array([P] * 2),
-        *linearised(np.array([item.z for item in items]), means, POSITION, items[0].pose),
+        *POSITION.linearised(np.array([item.z for item in items]), means, items[0].pose),
         np.array([item.R for item in items]),
         loss=items[0].loss,
     )

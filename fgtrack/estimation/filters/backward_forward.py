@@ -16,7 +16,7 @@ from fgtrack.core.time import nanoseconds, period_ns, seconds
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states, stacks
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.filters.ekf import correct, linearised
+from fgtrack.estimation.filters.ekf import correct
 from fgtrack.estimation.filters.propagation import ExactPropagator, kinematic_states
 from fgtrack.models.motion import MotionModel
 
@@ -150,7 +150,7 @@ class BackwardForwardBank:
         for indices, alike in stacks(measurements):
             chosen = [rows[track_ids[i]] for i in indices]
             x, P = states.means.take(chosen, axis=0), states.covariances.take(chosen, axis=0)
-            y, H = linearised(alike.z, x, alike.model, alike.pose, partial(self._propagator.residual, alike.model))
+            y, H = alike.model.linearised(alike.z, x, alike.pose, partial(self._propagator.residual, alike.model))
             corrected = correct(x, P, y, H, alike.R, alike.measured, alike.loss)
             wrapped, nis = self._propagator.wrap(corrected.mean), corrected.nis.tolist()
             for k in corrected.fused.nonzero()[0].tolist():

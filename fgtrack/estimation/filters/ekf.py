@@ -1,7 +1,7 @@
 """The extended Kalman filter's two steps, on stacks of independent states."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -9,7 +9,6 @@ import numpy as np
 from fgtrack.core.linalg import congruence, identity, kernels, product, psd_solve, symmetrise, times_transposed
 from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.models.measurement import MeasurementModel, SensorPose
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.robust import weight
 from fgtrack.models.sensors import RobustLoss
@@ -37,18 +36,6 @@ def joseph(P: FloatArray, K: FloatArray, H: FloatArray, R: FloatArray) -> FloatA
     """Covariance (I - K H) P (I - K H)' + K R K' after a measurement H x + N(0, R) with any gain K, (..., n, n)."""
     A = identity(P.shape[-1]) - product(K, H)
     return symmetrise(congruence(A, P) + congruence(K, R))
-
-
-def linearised(
-    z: FloatArray,
-    x: FloatArray,
-    model: MeasurementModel,
-    pose: SensorPose,
-    residual: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
-) -> tuple[FloatArray, FloatArray]:
-    """Innovation y (..., k) of z (..., k) at x (..., n), by another `residual` if given, and Jacobian H (..., k, n)."""
-    y = (residual or model.residual)(z, model.predict(x, pose))
-    return y, model.selection(x.shape[-1]) if model.linear else model.jacobian(x, pose)
 
 
 def robust_weight(loss: RobustLoss | None, y: FloatArray, spread: FloatArray, R: FloatArray) -> float:
@@ -170,5 +157,5 @@ def updated_one(
 
 def correct_one(mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
     """`correct` of one state, shapes (n,) and (n, n). Raises as `updated_one`."""
-    y, H = linearised(measurement.z, mean, measurement.model, measurement.pose)
+    y, H = measurement.model.linearised(measurement.z, mean, measurement.pose)
     return updated_one(mean, covariance, y, H, measurement.R, measurement.loss, measurement.measured)

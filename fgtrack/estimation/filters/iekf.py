@@ -8,7 +8,7 @@ import numpy as np
 from fgtrack.core.linalg import psd_solve
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.filters.ekf import OneCorrection, linearised, updated_one
+from fgtrack.estimation.filters.ekf import OneCorrection, updated_one
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.models.robust import penalty, weight
 from fgtrack.models.sensors import RobustLoss
@@ -39,7 +39,7 @@ class IekfReplay(ReplayEkf):
         x = mean
         for _ in range(self._max_iterations):
             last = x
-            y, H = linearised(measurement.z, x, measurement.model, measurement.pose)
+            y, H = measurement.model.linearised(measurement.z, x, measurement.pose)
             update = reweighted(mean, covariance, y, H, measurement.R, measurement.loss, x - mean)
             limit = negative_log_posterior(x - mean, covariance, y, measurement.R, measurement.loss)
             x = descended(cost, limit, last, update.mean)

@@ -10,7 +10,7 @@ from fgtrack.core.linalg import congruence
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.filters.ekf import joseph, kalman_gain, linearised, propagated
+from fgtrack.estimation.filters.ekf import joseph, kalman_gain, propagated
 from fgtrack.estimation.likelihood.contaminated import Update, update
 from fgtrack.estimation.likelihood.series import NoiseSpace, Observation, Series
 
@@ -64,7 +64,7 @@ def filtered(series: Series, space: NoiseSpace, values: Sequence[float] | FloatA
             stds = np.array([by_name[name] for name in observation.parameters])
             R = congruence(observation.axes, np.diag(np.square(stds)))
         seen_from = series.nominal[k + 1] if initial else predicted
-        y, H = linearised(measurement.z, seen_from, measurement.model, measurement.pose)
+        y, H = measurement.model.linearised(measurement.z, seen_from, measurement.pose)
         y = y - H @ (predicted - seen_from)
         result = update(P, H[here], y[here], R, observation.foreign, np.array(by_name[sensor, ""]))
         after, P = predicted + result.step, result.covariance

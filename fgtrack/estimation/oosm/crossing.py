@@ -8,7 +8,7 @@ from fgtrack.core.linalg import congruence, identity, psd_solve, symmetrise
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.filters.ekf import Correction, OneCorrection, Prediction, linearised, propagated, robust_weight
+from fgtrack.estimation.filters.ekf import Correction, OneCorrection, Prediction, propagated, robust_weight
 from fgtrack.estimation.oosm.late import FilterStep, RewindForget
 from fgtrack.estimation.rts import rts_step
 
@@ -25,7 +25,7 @@ def fuse_across(mean: FloatArray, covariance: FloatArray, past: Past, measuremen
     `numpy.linalg.LinAlgError` where S is not positive definite or the result is not finite.
     """
     x_tau, P_tau, cross = past
-    y, H = linearised(measurement.z, x_tau, measurement.model, measurement.pose)
+    y, H = measurement.model.linearised(measurement.z, x_tau, measurement.pose)
     S = propagated(H, P_tau, measurement.R)
     np.linalg.cholesky(S)  # raises where S is not positive definite
     expected, nis = S, measurement.nis(y, S)

@@ -11,7 +11,7 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.filters.ekf import Correction, OneCorrection, correct_one, linearised, predict, propagated
+from fgtrack.estimation.filters.ekf import Correction, OneCorrection, correct_one, predict, propagated
 from fgtrack.estimation.filters.propagation import track_state, wrapped
 from fgtrack.estimation.filters.windowed import WindowedFilter
 from fgtrack.models.motion import MotionModel
@@ -74,7 +74,7 @@ class RewindForget(WindowedFilter):
         index = self._left(measurement.stamp_ns)
         mean, covariance = self._predicted(index, measurement.stamp_ns)
         result = correct_one(mean, covariance, measurement)
-        y, H = linearised(measurement.z, mean, measurement.model, measurement.pose)
+        y, H = measurement.model.linearised(measurement.z, mean, measurement.pose)
         weighted = psd_solve(propagated(H, covariance, measurement.R / result.weight), np.column_stack((y, H)))
         information = H.T @ weighted[:, 0], symmetrise(H.T @ weighted[:, 1:])
         step = FilterStep(measurement.stamp_ns, result.mean, result.covariance, mean, covariance, *information)

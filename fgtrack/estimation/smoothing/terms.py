@@ -11,7 +11,6 @@ from fgtrack.core.linalg import congruence, inverse_root, mahalanobis_squared
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.filters import ekf
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.robust import penalty, weight
 
@@ -62,9 +61,9 @@ def linearised(term: MeasurementTerm, x: FloatArray) -> tuple[FloatArray, FloatA
         return term.y - term.H @ (x - term.origin), term.H, term.R
     if isinstance(term, NearMeasurement):
         ahead, F = term.motion.predict(x, term.ahead_s), term.motion.jacobian(x, term.ahead_s)
-        y, H = ekf.linearised(term.z, ahead, term.model, term.pose)
+        y, H = term.model.linearised(term.z, ahead, term.pose)
         return y, H @ F, term.R
-    return *ekf.linearised(term.z, x, term.model, term.pose), term.R
+    return *term.model.linearised(term.z, x, term.pose), term.R
 
 
 def whitened(term: MeasurementTerm, x: FloatArray) -> FloatArray:
@@ -124,7 +123,7 @@ class Innovations(NamedTuple):
     @classmethod
     def of(cls, stack: Measurement, means: FloatArray, covariances: FloatArray) -> "Innovations":
         """Return those of a stack of measurements at the states (m, n), (m, n, n)."""
-        y, H = ekf.linearised(stack.z, means, stack.model, stack.pose)
+        y, H = stack.model.linearised(stack.z, means, stack.pose)
         S = congruence(H, covariances) + stack.R
         H = np.broadcast_to(H, (*y.shape, means.shape[1])).copy()
         return cls(y, H, stack.R, S, _nis(y, S, stack.measured))
