@@ -33,11 +33,8 @@ class UniformDelay:
     """Uniform between two delays."""
 
     min_s: NonNegativeFloat
-    max_s: float
+    max_s: NonNegativeFloat
     kind: Literal["uniform"] = "uniform"
-
-    def __post_init__(self) -> None:
-        require(self.max_s >= self.min_s, "max_s", "must not be below min_s", self.max_s)
 
 
 @settings

@@ -1,6 +1,6 @@
 """Promises of every estimator, in any order of arrival."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -10,7 +10,7 @@ import numpy as np
 
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray, TrackState
-from fgtrack.estimation.base import Estimator, Measurement, UpdateResult, UpdateStatus
+from fgtrack.estimation.base import Estimator, Measurement, UpdateStatus
 from fgtrack.estimation.registry import ESTIMATORS, EXACT, Claims, Factory
 from fgtrack.estimation.smoothing.terms import NEAR_NS
 from fgtrack.models.motion import MotionModel
@@ -60,6 +60,20 @@ def _joint(subject: Subject, stream: Stream, at_ns: int) -> TrackState:
     return dense_joint(stream.motion, stream.start, known, [at_ns])[at_ns]
 
 
+def _close_to_joint(
+    subject: Subject,
+    stream: Stream,
+    estimator: Estimator,
+    stamps_ns: Iterable[int],
+    what: str,
+    tolerance: float,
+    of_covariance: float = 0.0,
+) -> None:
+    for at_ns in stamps_ns:
+        expected = _joint(subject, stream, at_ns)
+        _close(estimator.state_at(at_ns), expected, tolerance, stream, what, of_covariance)
+
+
 def _tolerance(subject: Subject, stream: Stream) -> float:
     return max(subject.claims.tolerance, subject.claims.rounding * rounding_bound(stream.motion, stream.stamps_ns))
 
@@ -84,17 +98,15 @@ def _is_the_kalman_filter_in_sequence(subject: Subject, stream: Stream) -> None:
     statuses = [result.status.value for result in results]
     require(statuses == ["in_sequence"] * len(results), f"statuses are {statuses}")
     at_ns = stream.newest_ns - round(subject.claims.held_s * 1e9)
-    expected = _joint(subject, stream, at_ns)
-    _close(estimator.state_at(at_ns), expected, max(1e-9, subject.claims.tolerance), stream, "the Kalman filter's")
+    _close_to_joint(subject, stream, estimator, [at_ns], "the Kalman filter's", max(1e-9, subject.claims.tolerance))
 
 
 def _gives_the_dense_joint_posterior_in_any_order(subject: Subject, stream: Stream) -> None:
     estimator, results = subject.fed(stream)
     refused = [k for k, result in enumerate(results) if result.status not in FUSED]
     require(not refused, f"of the measurements inside the window the one at place {refused[:1]} is not fused")
-    for at_ns in _probes_ns(stream):
-        expected = _joint(subject, stream, at_ns)
-        _close(estimator.state_at(at_ns), expected, _tolerance(subject, stream), stream, "the dense joint posterior")
+    tolerance = _tolerance(subject, stream)
+    _close_to_joint(subject, stream, estimator, _probes_ns(stream), "the dense joint posterior", tolerance)
 
 
 def _keeps_all_that_it_accepts_and_nothing_else(subject: Subject, stream: Stream) -> None:
@@ -110,10 +122,8 @@ def _keeps_all_that_it_accepts_and_nothing_else(subject: Subject, stream: Stream
             newest_ns = max(newest_ns, measurement.stamp_ns)
         estimator.advance(newest_ns + round(0.3e9 * LAG_S))
     known, oldest_ns = replace(stream, measurements=tuple(accepted)), estimator.window_ns[0]
-    for at_ns in (oldest_ns, *_probes_ns(known)) if subject.claims.smooths else (newest_ns, newest_ns + 100 * MS):
-        if at_ns >= oldest_ns:
-            expected = _joint(subject, known, at_ns)
-            _close(estimator.state_at(at_ns), expected, _tolerance(subject, stream), stream, "that of these")
+    probes = [oldest_ns, *_probes_ns(known, oldest_ns)] if subject.claims.smooths else [newest_ns, newest_ns + 100 * MS]
+    _close_to_joint(subject, known, estimator, probes, "that of these", _tolerance(subject, stream))
 
 
 def _gives_the_estimate_of_the_time_order_in_any_order(subject: Subject, stream: Stream) -> None:
@@ -126,8 +136,7 @@ def _gives_the_estimate_of_the_time_order_in_any_order(subject: Subject, stream:
 def _fuses_a_late_measurement_exactly(subject: Subject, stream: Stream) -> None:
     estimator, results = subject.fed(stream)
     require(results[-1].status in FUSED, f"the last measurement is {results[-1].status}")
-    at_ns = stream.newest_ns
-    _close(estimator.state_at(at_ns), _joint(subject, stream, at_ns), 1e-9, stream, "the dense joint posterior")
+    _close_to_joint(subject, stream, estimator, [stream.newest_ns], "the dense joint posterior", 1e-9)
 
 
 def _reports_the_innovation_against_all_that_it_has_fused(subject: Subject, stream: Stream) -> None:
@@ -153,32 +162,28 @@ def _reports_the_innovation_against_all_that_it_has_fused(subject: Subject, stre
 
 
 def _counts_each_measurement_as_what_it_is(subject: Subject, stream: Stream) -> None:
+    """The innovation and NIS are finite; an innovation covariance, where given, is that of the NIS."""
     estimator = subject.start(stream)
     newest_ns = stream.start.stamp_ns
     for place, measurement in enumerate(stream.measurements):
-        result = estimator.update(measurement)
+        result, what = estimator.update(measurement), f"place {place}"
         late = measurement.stamp_ns < newest_ns
         allowed = (*_LATE, UpdateStatus.TOO_OLD, UpdateStatus.FAILED) if late else (UpdateStatus.IN_SEQUENCE,)
-        require(result.status in allowed, f"place {place}: {'late' if late else 'in sequence'}, is {result.status}")
-        complete = (result.status in FUSED) == (result.innovation is not None) == (result.nis is not None)
-        require(complete, f"place {place}: {result.status}, innovation {result.innovation}, NIS {result.nis}")
-        if result.innovation is not None:
-            _check_innovation(result, measurement, place)
+        require(result.status in allowed, f"{what}: {'late' if late else 'in sequence'}, is {result.status}")
+        y, S, nis = result.innovation, result.innovation_covariance, result.nis
+        complete = (result.status in FUSED) == (y is not None) == (nis is not None)
+        require(complete, f"{what}: {result.status}, innovation {y}, NIS {nis}")
+        if y is not None and nis is not None:
+            right = y.shape == measurement.z.shape and np.isfinite(y).all() and 0.0 <= nis < np.inf
+            require(right, f"{what}: the innovation is {y}, the NIS {nis}")
+            if S is not None:
+                sound(y, (S + S.T) / 2.0, f"the innovation at {what}")
+                own = measurement.nis(y, S)
+                right = np.allclose(S, S.T, 1e-9) and abs(own - nis) <= 1e-6 * (1.0 + own)
+                require(right, f"{what}: the NIS is {nis}, not {own} by the covariance\n{S}")
         newest_ns = max(newest_ns, measurement.stamp_ns)
     end_ns = estimator.window_ns[1]
     require(0 <= newest_ns - end_ns <= NEAR_NS, f"window_ns ends at {end_ns}, newest is {newest_ns}")
-
-
-def _check_innovation(result: UpdateResult, measurement: Measurement, place: int) -> None:
-    """Require a finite innovation and NIS; its covariance, where given, is that by which the NIS is normalised."""
-    y, S, nis = np.asarray(result.innovation), result.innovation_covariance, float(result.nis or 0.0)
-    require(y.shape == measurement.z.shape and np.isfinite(y).all(), f"place {place}: the innovation is {y}")
-    require(0.0 <= nis < np.inf, f"place {place}: NIS is {nis}")
-    if S is not None:
-        sound(y, (S + S.T) / 2.0, f"the innovation at place {place}")
-        require(np.allclose(S, S.T, 1e-9), f"place {place}: the innovation covariance is not symmetric")
-        own = measurement.nis(y, S)
-        require(abs(own - nis) <= 1e-6 * (1.0 + own), f"place {place}: the NIS is {nis}, not {own}")
 
 
 def _gives_symmetric_positive_definite_covariances(subject: Subject, stream: Stream) -> None:
@@ -280,9 +285,9 @@ def _comes_near_the_posterior_of_a_nonlinear_model(subject: Subject, stream: Str
     estimator, claims = subject.fed(stream)[0], subject.claims
     _converged(subject, estimator)
     newest_ns = max(stream.newest_ns - nanoseconds(claims.held_s), stream.start.stamp_ns)
-    for at_ns in (newest_ns,) if claims.held_s else (newest_ns, newest_ns + 100 * MS):
-        expected, what = _joint(subject, stream, at_ns), "that of a plain calculation"
-        _close(estimator.state_at(at_ns), expected, _NEAR_SIGMA, stream, what, of_covariance=_NEAR_COVARIANCE)
+    probes = [newest_ns] if claims.held_s else [newest_ns, newest_ns + 100 * MS]
+    what = "that of a plain calculation"
+    _close_to_joint(subject, stream, estimator, probes, what, _NEAR_SIGMA, _NEAR_COVARIANCE)
 
 
 def _converged(subject: Subject, *estimators: Any) -> bool:  # Any: the claim promises `converge`

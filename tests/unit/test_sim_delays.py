@@ -125,7 +125,7 @@ def test_a_chain_in_time_forgets_over_a_gap_and_stays_at_equal_stamps() -> None:
     ("make", "message"),
     [
         (lambda: ConstantDelay(delay_s=float("nan")), "delay_s"),
-        (lambda: UniformDelay(0.2, 0.1), "max_s"),
+        (lambda: UniformDelay(min_s=0.2, max_s=-0.1), "max_s"),
         (lambda: GammaDelay(0.1, 0.1, 0.2), "mean_s"),
         (lambda: GammaDelay(0.1, 0.2, 0.2), "q90_s: no gamma fits"),
         (lambda: LossyDelay(probability=-0.1), "probability"),

@@ -176,9 +176,7 @@ def test_scans_come_at_their_rate_phase_and_jitter() -> None:
         ({"max_range_behind_m": 100.1}, "max_range_behind_m"),
         ({"max_range_behind_m": 0.0}, "max_range_behind_m"),
         ({"detection_probability": 1.1}, "detection_probability"),
-        ({"split_distance_m": (3.0, 2.0)}, "split_distance_m"),
         ({"drop_outs": ((2.0, 1.0),)}, "drop_outs"),
-        ({"clutter": {"speed_mps": (2.0, 1.0)}}, "speed_mps"),
     ],
 )
 def test_a_setting_that_makes_no_sense_is_named(settings: dict[str, object], message: str) -> None:
