@@ -35,11 +35,11 @@ def figure(
     every: Annotated[bool, Option("--all", help="Draw every object, run and metric, not the few.")] = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Draw runs or a sweep: late detections, map, errors, time.
+    """Draw runs or a sweep: late detections, map, errors.
 
     Of runs: a late detection in close-up, the map, residuals, NEES and NIS, arrivals, errors over time and against
-    lag, time per tick. Of many objects or runs the worst few. Of a sweep: its metrics over the grid, mean and
-    95 % interval over the seeds.
+    lag. Of many objects or runs the worst few. Of a sweep: its metrics over the grid, mean and 95 % interval over the
+    seeds.
 
     The close-up replays the recording up to a late detection that is typical of those that lower the error of the first
     run's present; where the recording is not there any more it is left out.

@@ -24,7 +24,6 @@ from fgtrack.plotting.paper import Paper
 from fgtrack.plotting.residuals import residuals
 from fgtrack.plotting.style import save
 from fgtrack.plotting.sweep import error_against_delay, sweep, sweep_metrics
-from fgtrack.plotting.times import timing
 
 __all__ = [
     "arrivals",
@@ -36,7 +35,6 @@ __all__ = [
     "map",
     "residuals",
     "sweep",
-    "timing",
 ]
 
 
@@ -86,8 +84,6 @@ def planned(runs: Sequence[EvaluatedRun]) -> list[Planned]:
     plans += [Planned(f"errors_object_{k}", partial(errors, runs, k), k not in worst) for k in ids]
     if any(entry.is_lagged for one in runs for entry in one.metrics.lagged):
         plans.append(Planned("error_against_lag", partial(lag, runs)))
-    if any((one.run.tables["timing"]["num_detections"] > 0).any() for one in runs):
-        plans.append(Planned("timing", partial(timing, runs)))
     return plans
 
 

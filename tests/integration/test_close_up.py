@@ -107,7 +107,7 @@ def test_the_command_refuses_times_that_are_not_and_goes_on_without_a_recording(
         assert command(["figure", runs[0], "-o", str(tmp_path / "rest")]) == 0
         assert "no close-up:" in capsys.readouterr().out
         assert not (tmp_path / "rest/close_up.png").exists()
-        assert (tmp_path / "rest/timing.png").exists()
+        assert (tmp_path / "rest/arrivals.png").exists()
         assert command(["figure", runs[0], "-o", str(tmp_path / "none"), "--stamp", "4"]) == 1
         assert "recording of the run is not there" in capsys.readouterr().err
     finally:

@@ -74,5 +74,5 @@ def test_the_demo_goes_from_scenario_to_report(demo: Path) -> None:
         assert sorted(ESTIMATORS, key=lambda name: text.index(f" {name} ")) == list(ESTIMATORS)
     assert set(found["smoother"].tables["lagged"]["lag_s"].tolist()) == {0.3}
     assert "final" in found["smoother"].tables["smoothed"]["kind"]
-    assert {path.name for path in (demo / "figures").iterdir()} >= {"error_against_lag.png", "timing.png"}
+    assert {path.name for path in (demo / "figures").iterdir()} >= {"error_against_lag.png", "arrivals.png"}
     assert "report.html" in shown

@@ -57,11 +57,6 @@ EXPECTED: dict[str, tuple[bool, set[str], list[str]]] = {
         {"position RMSE [m]", "lag of the output [s]"},
         ["smoother", "ekf-replay (no lag)", "present, at the same stamps"],
     ),
-    "timing": (
-        True,
-        {"time per tick with detections [ms]", "share of the ticks"},
-        ["smoother: median 1 ms, 99 % within 1 ms", "ekf-replay: median 1 ms, 99 % within 1 ms"],
-    ),
 }
 
 
@@ -133,13 +128,13 @@ def test_there_is_a_figure_of_what_runs_have_data_for(
         *("map_smoother", "map_ekf-replay", "residuals_smoother", "residuals_ekf-replay"),
         *("consistency_smoother", "consistency_ekf-replay"),
         "arrivals",
-        *("errors_object_7", "errors_object_8", "error_against_lag", "timing"),
+        *("errors_object_7", "errors_object_8", "error_against_lag"),
     ]
     assert names(runs[1:]) == [name for name in names(runs) if "smoother" not in name and "lag" not in name]
     plain = runs[0].with_tables(
         truth=runs[0].tables["truth"].where(np.zeros(len(runs[0].tables["truth"]["stamp_ns"]), dtype=bool))
     )
-    assert names([plain]) == [*("map_smoother", "residuals_smoother", "consistency_smoother", "arrivals", "timing")]
+    assert names([plain]) == [*("map_smoother", "residuals_smoother", "consistency_smoother", "arrivals")]
     other = write_run(tmp_path / "other", updates={0: [update(delay_ns=1_000_000)]})
     assert [name for name in names([*runs, other]) if "arrivals" in name] == [
         "arrivals_smoother",
@@ -214,7 +209,7 @@ def test_a_line_is_not_drawn_across_a_pause() -> None:
 
 @pytest.fixture
 def short_run(tmp_path: Path) -> Run:
-    return write_run(tmp_path / "a run", process_ns=[1_000_000], num_detections=[1])
+    return write_run(tmp_path / "a run", updates={0: [update(delay_ns=1_000_000)]})
 
 
 @pytest.mark.parametrize(
@@ -225,7 +220,7 @@ def test_files_hold_no_date_and_no_version(
     form: str, start: bytes, varying: bytes, short_run: Run, tmp_path: Path
 ) -> None:
     (file,) = plot.save_named(plot.drawn(plot.planned(evaluated(short_run))), tmp_path, form)
-    assert file.name == f"timing.{form}"
+    assert file.name == f"arrivals.{form}"
     content = file.read_bytes()
     assert content.startswith(start)
     assert varying not in content
@@ -237,25 +232,25 @@ def test_a_figure_has_its_style_whenever_it_is_drawn_and_saved(short_run: Run) -
         figure.savefig(file, dpi=30)
         return file.getvalue()
 
-    expected, drawn_before = picture(plot.timing(short_run)), plot.timing(short_run)
+    expected, drawn_before = picture(plot.arrivals(short_run)), plot.arrivals(short_run)
     with mpl.rc_context({"lines.linewidth": 9.0, "axes.facecolor": "red", "xtick.labelsize": 30}):
         before = dict(mpl.rcParams)
         assert picture(drawn_before) == expected  # it keeps the settings with which it was made
-        mine = plot.timing(short_run)
+        mine = plot.arrivals(short_run)
         assert mine.axes[0].get_facecolor() == (1.0, 0.0, 0.0, 1.0)  # those of the user win
         assert dict(mpl.rcParams) == before
     assert picture(mine) != expected
-    assert picture(plot.timing(short_run)) == expected
+    assert picture(plot.arrivals(short_run)) == expected
 
 
 def test_what_cannot_be_written_is_one_clear_error_and_a_notebook_shows_the_figure(
     short_run: Run, tmp_path: Path
 ) -> None:
-    figure = plot.timing(short_run)
+    figure = plot.arrivals(short_run)
     figure.set_dpi(30)
     with pytest.raises(CallError, match="cannot be written"):
-        plot.save(figure, tmp_path / "nowhere" / "timing.png")
-    for name in ("timing.gif", "timing"):
+        plot.save(figure, tmp_path / "nowhere" / "arrivals.png")
+    for name in ("arrivals.gif", "arrivals"):
         with pytest.raises(CallError, match=rf"no format of a figure.*{', .'.join(FORMATS)}"):
             plot.save(figure, tmp_path / name)
     assert str(figure._repr_html_()).startswith('<img src="data:image/png;base64,')

@@ -17,7 +17,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[EvaluatedRun]:
     return evaluated([a_run(folder / name) for name in ("smoother", "ekf-replay", "ekf-backward-forward")])
 
 
-@pytest.mark.parametrize("name", ["errors", "lag", "timing"])
+@pytest.mark.parametrize("name", ["errors", "lag"])
 def test_a_figure_in_a_column_is_readable(name: str, runs: list[EvaluatedRun]) -> None:
     figure = getattr(plot, name)(runs, width="3.4in")
     assert figure.get_figwidth() == pytest.approx(3.4)
@@ -29,8 +29,8 @@ def test_a_figure_in_a_column_is_readable(name: str, runs: list[EvaluatedRun]) -
 
 def test_a_style_is_a_file_or_a_name(runs: list[EvaluatedRun], tmp_path: Path) -> None:
     (tmp_path / "mine.mplstyle").write_text("axes.facecolor: black\n")
-    assert plot.timing(runs, style=tmp_path / "mine.mplstyle").axes[0].get_facecolor() == (0.0, 0.0, 0.0, 1.0)
-    assert plot.timing(runs, style="dark_background").axes[0].get_facecolor() == (0.0, 0.0, 0.0, 1.0)
+    assert plot.arrivals(runs[0], style=tmp_path / "mine.mplstyle").axes[0].get_facecolor() == (0.0, 0.0, 0.0, 1.0)
+    assert plot.arrivals(runs[0], style="dark_background").axes[0].get_facecolor() == (0.0, 0.0, 0.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -45,4 +45,4 @@ def test_a_style_is_a_file_or_a_name(runs: list[EvaluatedRun], tmp_path: Path) -
 )
 def test_what_is_not_usable_is_one_clear_error(paper: dict[str, str], message: str, runs: list[EvaluatedRun]) -> None:
     with pytest.raises(CallError, match=message):
-        plot.timing(runs, **paper)
+        plot.arrivals(runs[0], **paper)
