@@ -42,8 +42,6 @@ class TopicInput:
 
     topic: str
     """Name of the topic."""
-    type: str | None = None
-    """Message type, where the topic has several or must have this one."""
     frame: Frame | None = None
     """Frame of the positions; by default `map` where the header names a fixed frame, else `ego`."""
     fields: Mapping[str, FieldPath] | None = None

@@ -69,7 +69,7 @@ def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
         bag = Bag(path, given.message_definitions)
         times |= {topic: [] for topic in bag.topics}
         try:
-            used = {use.topic: use.role for use in topic_uses(bag, given)}
+            used = {topic: role for topic, role, _ in topic_uses(bag, given)}
         except DataError as error:
             problem = str(error) if config else None
         readable = UntilBreak(bag.stamps())

@@ -34,5 +34,4 @@ def safe_yaml(text: str) -> Any:  # Any: the type is known after validation only
         except RecursionError as error:
             raise YAMLError("is nested too deeply, or has an alias that contains itself") from error
         except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-            what = "a key is a list or a mapping" if "unhashable" in str(error) else f"a value cannot be read ({error})"
-            raise YAMLError(what) from error
+            raise YAMLError(f"cannot be read ({error})") from error

@@ -244,7 +244,7 @@ def _sweep_problems(folder: Path, out: str, undisturbed: Path, older: Path | Non
 def _values(part: Path) -> list[tuple[str, Mapping[str, object]]] | None:
     if not part.exists():
         return None
-    return [(cell["estimator"], cell["values"]) for cell in json.loads(part.read_text())["cells"]]
+    return [(cell["estimator"], cell["values"]) for cell in json.loads(part.read_text())]
 
 
 _JUDGES = {"run": _run_problems, "recording": _recording_problems, "sweep": _sweep_problems}

@@ -342,9 +342,9 @@ def test_a_topic_that_the_recording_lacks_is_named_with_what_there_is(tmp_path):
     write_bag(tmp_path / "bag", drive())
     config = InputConfig(
         ego=TopicInput("/ego/odometry"),
-        detections={"lidar": TopicInput("/lidar", type="vision_msgs/Detection3DArray")},
+        detections={"lidar": TopicInput("/lidar")},
     )
-    with pytest.raises(DataError, match=r"no topic /lidar of type .*; .* /detections/lidar \(vision_msgs"):
+    with pytest.raises(DataError, match=r"no topic /lidar; .* /detections/lidar \(vision_msgs"):
         open_input(tmp_path / "bag", config)
 
 
@@ -356,11 +356,6 @@ def test_a_foreign_recording_without_a_configuration_is_one_line():
 @pytest.mark.parametrize(
     ("item", "error", "complaint"),
     [
-        (
-            TopicInput("/ego/odometry", type="nav_msgs/Path"),
-            DataError,
-            "no topic /ego/odometry of type nav_msgs/msg/Path",
-        ),
         (TopicInput("/detections/lidar"), CallError, "needs fields"),
         (TopicInput("/ego/odometry", fields={"x": "a"}), CallError, "unknown field 'x'"),
         (TopicInput("/ego/odometry", fields={"x_m": "a"}), CallError, "must name y_m"),

@@ -26,11 +26,6 @@ TRUTH_OPTIONAL = (*STATE_NAMES[2:], "outline_m")
 LISTS, TEXTS = frozenset({"covariance", "outline_m"}), frozenset({"class_name"})
 
 
-def presence(value: Detection | TruthState, names: tuple[str, ...]) -> int:
-    """Bits of those of the fields `names` that `value` has."""
-    return sum(1 << bit for bit, name in enumerate(names) if getattr(value, name) is not None)
-
-
 def _given(message: RosMessage) -> dict[str, RosMessage]:
     """Fields behind `present` that were given."""
     names = _optional(message.__class__)

@@ -18,7 +18,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.io.errors import TruncatedInput, one_line
 from fgtrack.io.ros.bag_files import ZSTD_MAGIC, BagFile, bags_in, decompressed, files_of, storage_of
 from fgtrack.io.ros.rosbag1_file import Rosbag1File
-from fgtrack.io.ros.typestore import Key, MessageTypes, type_name
+from fgtrack.io.ros.typestore import Key, MessageTypes
 
 
 @dataclass(frozen=True)
@@ -149,6 +149,3 @@ def _as_data_error(path: Path) -> Iterator[None]:
         raise
     except Exception as error:  # rosbags raises its own, assertions, struct, SQLite, YAML, Unicode errors
         raise DataError(f"{path}: cannot be read as a recording ({one_line(error)})") from error
-
-
-__all__ = ["Bag", "BagTopic", "is_bag", "type_name"]

@@ -16,7 +16,6 @@ from fgtrack.io.adapters.native import (
     TEXTS,
     TRUTH,
     TRUTH_OPTIONAL,
-    presence,
 )
 from fgtrack.io.ros.typestore import typestore_of
 
@@ -71,13 +70,13 @@ class MessageFactory:
             x_m=state.x_m,
             y_m=state.y_m,
             ignored=state.ignored,
-            present=presence(state, TRUTH_OPTIONAL),
-            **{name: _or_nothing(name, getattr(state, name)) for name in TRUTH_OPTIONAL},
+            **_optional(state, TRUTH_OPTIONAL),
         )
 
     def odometry(self, state: EgoState) -> RosMessage:
         """`nav_msgs/Odometry` in the frame `map`."""
-        pose, twist = _odometry_covariances(state)
+        given, pose, twist = np.reshape(state.covariance or (0.0,) * 25, (5, 5)), np.zeros((6, 6)), np.zeros((6, 6))
+        pose[np.ix_(PLANAR, PLANAR)], twist[np.ix_([0, 5], [0, 5])] = given[:3, :3], given[3:, 3:]
         linear, angular = self._vector(state.speed_mps), self._vector(z=state.yaw_rate_radps)
         return self._make(
             ODOMETRY,
@@ -108,8 +107,7 @@ class MessageFactory:
         return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
 
     def _detection(self, item: Detection) -> RosMessage:
-        given = {name: _or_nothing(name, getattr(item, name)) for name in DETECTION_OPTIONAL}
-        return self._make("fgtrack_msgs/msg/Detection", present=presence(item, DETECTION_OPTIONAL), **given)
+        return self._make("fgtrack_msgs/msg/Detection", **_optional(item, DETECTION_OPTIONAL))
 
     def _detection3d(self, item: Detection) -> RosMessage:
         pose = self._pose(item.x_m, item.y_m, item.yaw_rad)
@@ -148,18 +146,13 @@ class MessageFactory:
         return self._make(f"geometry_msgs/msg/{kind}WithCovariance", **fields)
 
 
-def _or_nothing(name: str, value: RosMessage) -> RosMessage:
-    """Return the field `name` of `value`, which may be None."""
-    if name in LISTS:
-        return np.array(value or (), dtype=np.float64)
-    return value if value is not None else "" if name in TEXTS else 0
-
-
-def _odometry_covariances(state: EgoState) -> tuple[FloatArray, FloatArray]:
-    """Covariances, shape (6, 6), of pose and twist; zero where the state has none."""
-    given, pose, twist = np.reshape(state.covariance or (0.0,) * 25, (5, 5)), np.zeros((6, 6)), np.zeros((6, 6))
-    pose[np.ix_(PLANAR, PLANAR)], twist[np.ix_([0, 5], [0, 5])] = given[:3, :3], given[3:, 3:]
-    return pose, twist
+def _optional(value: Detection | TruthState, names: tuple[str, ...]) -> dict[str, RosMessage]:
+    """Return the fields `names` of `value`, 0 or empty for None, and in `present` a bit for each that is given."""
+    given = {name: getattr(value, name) for name in names}
+    present = sum(1 << bit for bit, name in enumerate(names) if given[name] is not None)
+    given |= {name: "" if name in TEXTS else 0 for name in names if given[name] is None}
+    lists = {name: np.array(given[name] or (), dtype=np.float64) for name in LISTS & given.keys()}
+    return given | lists | {"present": present}
 
 
 def _full_covariance(item: Detection) -> FloatArray | None:

@@ -1,7 +1,7 @@
 """Converts the topics of a recording to fgtrack's messages, as configured."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from fgtrack.io.adapters.objects import ODOMETRY, ego_from_odometry
 from fgtrack.io.adapters.scans import grouped
 from fgtrack.io.config import InputConfig, TopicInput
 from fgtrack.io.errors import TruncatedInput
-from fgtrack.io.ros.bag import Bag, BagTopic, is_bag, type_name
+from fgtrack.io.ros.bag import Bag, BagTopic, is_bag
 from fgtrack.io.ros.bag_files import settings_of
 from fgtrack.io.source import FileFormat
 
@@ -40,20 +40,13 @@ _KEYS = {
 }
 
 Convert = Callable[[RosMessage, int], Iterable[Message]]
+"""Messages of a ROS message and its receipt."""
+TopicUse = tuple[BagTopic, str, Convert]
+"""A topic, its role in a replay (`ego`, `detections SENSOR`, `truth`, or `messages` for those of fgtrack's own types),
+and its conversion."""
 
 
-@dataclass(frozen=True)
-class TopicUse:
-    """Use of one topic in a replay."""
-
-    topic: BagTopic
-    role: str
-    """`ego`, `detections SENSOR`, `truth`, or `messages` for what fgtrack itself has written."""
-    convert: Convert
-    """Gives the messages of a ROS message and its receipt."""
-
-
-def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
+def topic_uses(bag: Bag, config: InputConfig) -> list[TopicUse]:
     """Return the uses of the topics of `bag`, as `config` names them.
 
     A recording that fgtrack wrote is recognised by its message types; `config` takes precedence where it names a topic
@@ -67,7 +60,7 @@ def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
         *((f"detections {name}", item, partial(_detections, sensor=name)) for name, item in config.detections.items()),
         *(("truth", item, partial(_truths, number=number, topics=len(truth))) for number, item in enumerate(truth)),
     ]
-    native = tuple(TopicUse(topic, "messages", _native(topic)) for topic in bag.topics if topic.type in NATIVE_ADAPTERS)
+    native = [(topic, "messages", _native(topic)) for topic in bag.topics if topic.type in NATIVE_ADAPTERS]
     if native and names.isdisjoint(item.topic for _, item, _ in roles):
         return native
     if not roles:
@@ -75,7 +68,7 @@ def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
             raise TruncatedInput(f"{bag.break_off}, and holds no topic that fgtrack has written")
         raise DataError(
             f"{bag.path}: not written by fgtrack, so the configuration must name its topics "
-            f"(input.ego, input.detections); it has {_listed(bag.topics)}"
+            f"(input.ego, input.detections); it has {_listed(bag)}"
         )
     uses = []
     for role, item, converter in roles:
@@ -84,8 +77,8 @@ def topic_uses(bag: Bag, config: InputConfig) -> tuple[TopicUse, ...]:
                 raise CallError(f"topic {item.topic}: {key} applies to {' and '.join(of)} only, leave it out")
         topic = _find(bag, item)
         convert = converter(topic, item)
-        uses.append(TopicUse(topic, role, convert if item.stamp_from == "message" else _at_receipt(convert)))
-    return tuple(uses)
+        uses.append((topic, role, convert if item.stamp_from == "message" else _at_receipt(convert)))
+    return uses
 
 
 def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
@@ -98,34 +91,31 @@ def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
 FORMAT = FileFormat("a rosbag2 folder, an .mcap, .db3 or ROS 1 .bag file", is_bag, _open, settings_of)
 
 
-def bag_messages(bag: Bag, uses: tuple[TopicUse, ...]) -> Iterator[Message]:
+def bag_messages(bag: Bag, uses: list[TopicUse]) -> Iterator[Message]:
     """Messages of `bag` in receipt order, which is the order of the recorder's log times.
 
     Raises `TruncatedInput` after everything before a break, and `DataError` for a message that does not fit its use.
     """
-    for topic, log_ns, data in bag.messages({use.topic.name for use in uses}):
-        for use in [use for use in uses if use.topic is topic]:
+    for topic, log_ns, data in bag.messages({used.name for used, _, _ in uses}):
+        for convert in [convert for used, _, convert in uses if used is topic]:
             try:
-                yield from use.convert(data, log_ns)
+                yield from convert(data, log_ns)
             except (FieldError, AttributeError, TypeError, ValueError, OverflowError) as error:
                 raise DataError(f"{bag.path}: topic {topic.name} ({topic.type}) at {log_ns} ns: {error}") from error
 
 
 def _find(bag: Bag, item: TopicInput) -> BagTopic:
-    wanted = type_name(item.type) if item.type else None
-    found = [topic for topic in bag.topics if topic.name == item.topic and wanted in (None, topic.type)]
+    found = [topic for topic in bag.topics if topic.name == item.topic]
     if len(found) == 1:
         return found[0]
     if not found and bag.break_off:
         raise TruncatedInput(f"{bag.break_off}, before topic {item.topic}")
-    if found:
-        raise DataError(f"{bag.path}: topic {item.topic} has several types ({_listed(found)}), name one as its type")
-    kind = f" of type {wanted}" if wanted else ""
-    raise DataError(f"{bag.path}: has no topic {item.topic}{kind}; it has {_listed(bag.topics)}")
+    count = "several types of" if found else "no"
+    raise DataError(f"{bag.path}: has {count} topic {item.topic}; it has {_listed(bag)}")
 
 
-def _listed(topics: tuple[BagTopic, ...] | list[BagTopic]) -> str:
-    return ", ".join(f"{topic.name} ({topic.type})" for topic in topics) or "no topic"
+def _listed(bag: Bag) -> str:
+    return ", ".join(f"{topic.name} ({topic.type})" for topic in bag.topics) or "no topic"
 
 
 def _check_fields(item: TopicInput, known: frozenset[str], needed: tuple[str, ...] = ()) -> None:

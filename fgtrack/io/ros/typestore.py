@@ -22,8 +22,6 @@ from fgtrack.core.files import read_whole
 from fgtrack.io.errors import one_line
 from fgtrack.io.ros.definitions import DEFINITIONS
 
-__all__ = ["Key", "MessageTypes", "checked", "type_name", "typestore_of"]
-
 Key = tuple[str, MessageDefinition | None]
 """A message type and its definition in the recording: two topics may define one name differently."""
 
@@ -42,12 +40,6 @@ _EMPTY_LINE = re.compile(r"^[ \t]*(?:#[^\n]*)?\n", re.MULTILINE)
 _IDL_TEXT = re.compile(r'"(?:\\.|[^"\\])*"')
 _IDL_REMARK = re.compile(r"/\*.*?\*/|//[^\n]*|^#[^\n]*|@\s*[\w:]*(?:\s*\([^()]*\))?", re.DOTALL | re.MULTILINE)
 _IDL_COSTLY = re.compile(r"=[^;]*[()*/%|^&~<]|(?:sequence\s*<\s*){4}")
-
-
-def type_name(name: str) -> str:
-    """Full name of a message type: `pkg/Type` becomes `pkg/msg/Type`."""
-    package, _, base = name.partition("/")
-    return name if "/" in base else f"{package}/msg/{base}"
 
 
 class MessageTypes:
