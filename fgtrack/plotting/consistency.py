@@ -51,15 +51,14 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
             mean, expected = (np.bincount(index, each) / count for each in (values, dof))
             band = chi_square_band(expected * count, count)
             colour, inside = run_looks([one])[one.label].colour, (mean >= band[0]) & (mean <= band[1])
-            text = "position: mean {:.3g}, expected {:.3g}; {:.0f} % of the ticks in their band"
+            subject, unit, line = "position", "ticks", ""
         else:
             sensor = name.removeprefix("NIS of ")
             colour = SENSORS[sensors.index(sensor) % len(SENSORS)]
             low, high = chi_square_band(dof.astype(np.float64), np.ones(len(dof), dtype=np.int64))
             inside = (values >= low) & (values <= high)
             length = min(max(_SHORTEST, min(_LONGEST, len(values) // _WINDOWS)), len(values))
-            text = sensor + ": mean {:.3g}, expected {:.3g}; {:.0f} % of the detections in their band"
-            text += f"; line: mean of {length}"
+            subject, unit, line = sensor, "detections", f"; line: mean of {length}"
             order, share = np.argsort(since_ns, kind="stable"), np.full(length, 1.0 / length)
             at_ns, mean, expected = (np.convolve(each[order], share, "valid") for each in (since_ns, values, dof))
             at_ns, band = at_ns.astype(np.int64), chi_square_band(expected * length, np.full(len(mean), length))
@@ -68,7 +67,8 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
         x_s, y = broken_line(at_ns, time_s, mean, step_ns)
         low, high, middle = (broken_line(at_ns, time_s, each, step_ns)[1] for each in (*band, expected))
         axes.fill_between(x_s, low, high, color=GREY, alpha=0.25, lw=0)
-        label = text.format(values.mean(), dof.mean(), 100.0 * inside.mean())
+        share_inside = f"{100.0 * inside.mean():.0f} % of the {unit} in their band"
+        label = f"{subject}: mean {values.mean():.3g}, expected {dof.mean():.3g}; {share_inside}{line}"
         axes.plot(x_s, y, color=colour, lw=1.1, label=label)
         axes.plot(x_s, middle, color="black", lw=0.9, ls="--")
         positive, shown = values[values > 0.0], np.concatenate([mean[mean > 0.0], *band])  # the axis is logarithmic
