@@ -135,8 +135,6 @@ def test_an_argument_of_another_type_is_named(wrong: object) -> None:
         "config": lambda: fgtrack.replay("x.jsonl", wrong),
         "map": lambda: fgtrack.replay("x.jsonl", map=wrong),
         "pit_map": lambda: fgtrack.advise("x.jsonl", pit_map=wrong),
-        "estimator": lambda: fgtrack.replay("x.jsonl", estimator=wrong),
-        "set": lambda: fgtrack.replay("x.jsonl", set=wrong),
         "out": lambda: fgtrack.replay("x.jsonl", out=wrong),
         "scenario": lambda: fgtrack.simulate(wrong),
         "seed": lambda: fgtrack.simulate(seed=wrong if wrong != 5 else -5),
