@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.errors import CallError
 from fgtrack.core.time import period_ns, seconds
 from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.failures import Failures
@@ -27,22 +27,14 @@ from fgtrack.tracking.guarded_bank import GuardedBank
 from fgtrack.tracking.inbox import Inbox
 from fgtrack.tracking.lifecycle import CountingLifecycle
 from fgtrack.tracking.preprocess import Preprocess
-from fgtrack.tracking.published import (
-    PublishedEgo,
-    PublishedLifecycle,
-    PublishedTracker,
-    SlotInbox,
-)
+from fgtrack.tracking.published import PublishedEgo, PublishedLifecycle, PublishedTracker, SlotInbox
 from fgtrack.tracking.tracker import Tracker, TrackerParts
 
 _EGO_STORAGE_TICKS = 350  # of the published implementation
 
 
 def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerParts] | None = None) -> Tracker:
-    """The tracker that `config` describes. Raises `CallError` for an estimator that does not exist.
-
-    `observed` may put its own parts, which watch the others, in their place.
-    """
+    """Return the tracker that `config` describes, of the parts that `observed` returns for the usual ones."""
     road = build_road(config.map, config.defects)
     motion, failures = config.motion_model(), Failures()
     published_order = config.lifecycle.kind == "published"
@@ -50,9 +42,7 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
         sensors=config.sensors,
         ego=_build_ego(config),
         inbox=(SlotInbox if "one_slot" in config.defects else Inbox)(config.sensors),
-        preprocess=Preprocess(
-            road, config.merge, motion, config.ego.detection_origin_m, assumes_map_yaw=not published_order
-        ),
+        preprocess=Preprocess(road, config.merge, motion, config.ego.detection_origin_m, not published_order),
         association=config.association,
         bank=GuardedBank(lambda: build_bank(config, failures), failures),
         failures=failures,
@@ -66,7 +56,7 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
 
 
 def build_lifecycle(config: Config) -> Lifecycle:
-    """Rules that confirm and end tracks."""
+    """Return the rules that confirm and end tracks."""
     rules = config.lifecycle
     if isinstance(rules, ExistenceRules):
         return ExistenceLifecycle(rules, config.sensors, config.ego.detection_origin_m)
@@ -74,23 +64,18 @@ def build_lifecycle(config: Config) -> Lifecycle:
 
 
 def build_road(config: MapConfig, defects: Collection[Defect] = ()) -> Road:
-    """The map that `config` names. Raises `CallError` for a pit lane without a track, which it belongs to."""
+    """Return the map that `config` names. Raises `CallError` for a missing file and a pit lane without a track."""
     if config.track_file is None:
-        if config.pit is not None:
-            raise CallError(
-                f"{config.pit}: a pit lane (map.pit) needs the map of its track (map.track), give --map too"
-            )
-        return Road()
+        if config.pit is None:
+            return Road()
+        raise CallError(f"{config.pit}: a pit lane (map.pit) needs the map of its track (map.track), give --map too")
     track = _read_map(config.track_file, make_oval)
     pit = None if config.pit is None else _read_map(config.pit, make_pit_lane)
     buffers = (config.inner_buffer_m, config.outer_buffer_m, config.pit_buffer_m)
     if not {"heading_jump", "circular_heading"} & set(defects):
         return Road(track, pit, *buffers)
     circular = "heading_jump" not in defects
-    try:
-        return Road(PublishedMap(track, circular), None if pit is None else PublishedMap(pit, circular), *buffers)
-    except DataError as error:
-        raise DataError(f"{config.track}: {error}") from error
+    return Road(PublishedMap(track, circular), None if pit is None else PublishedMap(pit, circular), *buffers)
 
 
 def _read_map(name: str, built_in: Callable[[], TrackMap]) -> TrackMap:
@@ -123,10 +108,7 @@ def _build_backward_forward(config: Config) -> TrackBank:
 
 
 def build_bank(config: Config, failures: Failures | None = None) -> TrackBank:
-    """The estimators of all objects, which add to `failures`.
-
-    Raises `CallError` for options that the estimator does not take.
-    """
+    """Return the estimators of all objects, which add to `failures`. Raises `CallError` for invalid options."""
     name, given = config.estimator, config.options.get(config.estimator, {})
     is_filter = name == "ekf-backward-forward"
     if given and (is_filter or name in SMOOTHERS):
@@ -141,7 +123,7 @@ def build_bank(config: Config, failures: Failures | None = None) -> TrackBank:
 
 
 def build_propagator(config: Config, step_s: float) -> ExactPropagator:
-    """The motion model in steps of `step_s`."""
+    """Return the motion model in steps of `step_s`."""
     motion, noise = config.motion_model(), config.motion
     if noise.kind != "ctrv_euler":
         return ExactPropagator(motion)

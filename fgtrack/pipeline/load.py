@@ -27,9 +27,9 @@ _UNKNOWN = "unexpected_keyword_argument"
 
 
 def load(kind: type[T], path: Path | T | None, settings: Sequence[str] | Mapping[str, Any] = ()) -> T:
-    """Return an instance of the dataclass `kind` from the YAML file `path`, another instance, or the defaults.
+    """Return an instance of `kind` from a YAML file, another instance, or the defaults.
 
-    `settings` are values by dotted key, or texts of the form a.b=value. Raises `CallError` with file and key.
+    `settings` are values by dotted key, or texts a.b=value. Raises `CallError` with file and key.
     """
     raw, origin = ({}, "defaults") if path is None else (plain(path), "the given configuration")
     if isinstance(path, Path):

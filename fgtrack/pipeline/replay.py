@@ -27,10 +27,7 @@ _PACKAGES = ("fgtrack", "gtsam", "numpy", "scipy", "rosbags")
 
 
 class _Feed:
-    """Messages with corrected stamps, without those of ignored sensors, up to the break of the input.
-
-    A list of a sensor without a model and a receipt that goes back are a break, too.
-    """
+    """Messages with corrected stamps, without ignored sensors, up to the break of the input or an invalid message."""
 
     def __init__(self, messages: Iterable[Message], config: Config) -> None:
         self._messages, self._config = messages, config
@@ -80,21 +77,8 @@ def replay(
 ) -> list[dict[str, object]]:
     """Run each estimator of `folders` over the messages into its run folder; return the contents of their meta.json.
 
-    Parameters
-    ----------
-    messages
-        Gives them in receipt order. Where they end in a `DataError`, the run ends there: `broken_off` says why.
-    origin, kind
-        Path and format of the input.
-    overwrite
-        Replace runs, each once its first tick is done.
-
-    Raises
-    ------
-    CallError
-        The configuration cannot be built, or a folder exists or cannot be written to.
-    DataError
-        A sensor of the input has no model, or the input gives the tracker nothing.
+    `messages` come in receipt order; where they end in a `DataError`, `broken_off` of the meta data says why. `origin`
+    and `kind` are path and format of the input. Raises `DataError` for an input without messages for the tracker.
     """
     config = assumed(config, source_of(messages)).config
     with ExitStack() as claims:
@@ -146,10 +130,7 @@ def _drive(
     origin: str,
     on_tick: Callable[[TickReport], None] = lambda report: None,
 ) -> dict[str, object]:
-    """Run `tracker` over `messages` into `writer`; return the contents of meta.json.
-
-    Only here the wall clock is read: the ticks are those of the recording, however long they take.
-    """
+    """Run `tracker` over `messages` into `writer`; return the contents of meta.json."""
     started_ns = perf_counter_ns()
     feed = _Feed(messages, config)
     detections_received = 0

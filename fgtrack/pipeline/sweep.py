@@ -10,7 +10,6 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -18,7 +17,6 @@ from pathlib import Path
 import joblib  # type: ignore[import-untyped]  # has no stubs
 import numpy as np
 import pandas as pd
-from joblib.externals.loky.process_executor import TerminatedWorkerError  # type: ignore[import-untyped]
 from pydantic import ConfigDict, TypeAdapter
 
 from fgtrack.core.errors import CallError, DataError, FgtrackError
@@ -49,8 +47,7 @@ _logger = logging.getLogger(__name__)
 Scalar = str | bool | int | float | None
 
 
-#: Returns metrics of a run, the same wherever and whenever it is made, and wall times, both by column. A function of a
-#: module, so that other processes find it.
+#: Returns reproducible metrics of a run and its wall times, by column; a function that other processes can import.
 Score = Callable[[Run], tuple[Mapping[str, Scalar], Mapping[str, Scalar]]]
 
 
@@ -93,10 +90,7 @@ class Sweep:
 
     @classmethod
     def open(cls, plan: Plan, folder: Path, overwrite: bool = False) -> "Sweep":
-        """Return the sweep `plan` in `folder` with the jobs that were finished there before.
-
-        Raises `CallError` where `folder` has a link, or, without `overwrite`, tables but no parts of a sweep.
-        """
+        """Return the sweep `plan` in `folder`. Raises `CallError` for tables without parts, unless `overwrite`."""
         parts = {path.stem: path for path in (folder / _PARTS).glob("*.json")}
         for name in _TABLES:
             check_output(folder / name, overwrite or bool(parts))
@@ -105,10 +99,7 @@ class Sweep:
 
     @property
     def todo(self) -> list[Job]:
-        """Jobs without a result, and those with a bad cell, which are tried again.
-
-        All points of the grid with the first seed come first: an interrupted sweep covers the grid.
-        """
+        """Jobs without a result or with a bad cell; an interrupted sweep covers the grid, as the first seed leads."""
         good = {key for key, cells in self.done.items() if all(cell.error is None for cell in cells)}
         left = {job.key: job for job in self.plan.jobs if job.recipe is not None and job.key not in good}
         seeds = [job.seed for job in self.plan.jobs]
@@ -124,23 +115,8 @@ class Sweep:
     ) -> SweepResult:
         """Do the jobs that are left, keep each at once, and write the tables; also when interrupted.
 
-        Parameters
-        ----------
-        score
-            Judges a run.
-        jobs
-            Number of processes; -1 is one for each core, 1 is this one.
-        dask
-            Address of a dask scheduler, whose workers do the jobs instead.
-        on_job
-            Called after each job.
-
-        Raises
-        ------
-        CallError
-            There is no dask, no scheduler at the address, or another sweep is at work in the folder.
-        DataError
-            The cluster failed, or the folder cannot be written to.
+        `jobs` is the number of processes, -1 is one for each core; `dask` is the address of a scheduler whose workers
+        do the jobs instead. Raises `CallError` without dask or scheduler, `DataError` where a process dies.
         """
         tasks = {job.key: job.recipe for job in self.todo if job.recipe is not None}
         with claimed(self.folder):
@@ -223,7 +199,7 @@ def _cell(messages: Sequence[Message], config: Config, score: Score) -> Cell:
 
 
 def _reason(error: BaseException) -> str:
-    """Return the message of an error in a line; of a bug with its type."""
+    """Return the message of an error in a line, of a bug with its type."""
     text = " ".join(str(error).split())
     return text if isinstance(error, FgtrackError) else f"{type(error).__name__}: {text}"
 
@@ -236,13 +212,7 @@ def _local(tasks: Mapping[str, Recipe], score: Score, jobs: int) -> Iterator[_Re
     # With several jobs at once, threads of BLAS would only wait for each other.
     settings = {"inner_max_num_threads": 1, "initializer": _end_with_parent, "initargs": (os.getpid(),)}
     with joblib.parallel_config("loky", n_jobs=joblib.effective_n_jobs(jobs), **settings):
-        try:
-            yield from _results(tasks, score)
-        except TerminatedWorkerError as error:
-            raise DataError(
-                "a process died, out of memory or by a crash in a library: start the sweep again to go on, perhaps "
-                "with fewer --jobs"
-            ) from error
+        yield from _results(tasks, score)
 
 
 def _end_with_parent(parent: int) -> None:
@@ -269,32 +239,24 @@ def _on_cluster(tasks: Mapping[str, Recipe], score: Score, address: str) -> Iter
     except (OSError, ValueError) as error:
         raise CallError(f"--dask {address}: no scheduler answers there, start one with `dask scheduler`") from error
     with client, joblib.parallel_config("dask", wait_for_workers_timeout=_SCHEDULER_TIMEOUT_S):
-        try:
-            yield from _results(tasks, score)
-        except Exception as error:  # whatever a scheduler or a network may do; the jobs report their own errors
-            reason = _reason(error)
-            raise DataError(f"{address}: the cluster failed ({reason}), start the sweep again to go on") from error
+        yield from _results(tasks, score)
 
 
 def _results(tasks: Mapping[str, Recipe], score: Score) -> Iterator[_Result]:
     """Yield results of the tasks in the backend of joblib that is set, as they come."""
     parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch=f"{_HANDED_OUT}*n_jobs")
-    with _interrupts_blocked():
+    resource_tracker.ensure_running()  # started below, it would let interrupts through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # Ctrl-C is for this process, not for workers
+    try:
         results: Generator[_Result] = parallel(joblib.delayed(run_job)(*task, score) for task in tasks.items())
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     try:
         yield from results
+    except Exception as error:  # of a process, a scheduler or a network; the jobs report their own errors
+        what = f"the workers failed, perhaps out of memory ({_reason(error):.120})"
+        raise DataError(f"{what}: start the sweep again to go on, or with fewer --jobs") from error
     finally:
         with warnings.catch_warnings():  # an interrupt is reported once, in one line
             warnings.filterwarnings("ignore", "[0-9]+ tasks (have|which)", UserWarning)
             results.close()
-
-
-@contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Keep Ctrl-C, which is for this process, from those that are started in the block; here it waits for its end."""
-    resource_tracker.ensure_running()  # started in the block, it would let interrupts through again
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

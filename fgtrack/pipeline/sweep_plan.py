@@ -173,13 +173,8 @@ class Plan:
 def load_plan(path: Path, recording: Path | None = None, settings: Sequence[str] = ()) -> Plan:
     """Return the plan of the sweep file `path`, with `settings` a.b=value for all its runs.
 
-    `recording` replaces what the file names, with the first seed alone. A grid point with settings that do not fit is a
-    job with a problem.
-
-    Raises
-    ------
-    CallError
-        The file is wrong, something that it names is missing, or no grid point can be run.
+    `recording` replaces the input of the file, with the first seed alone. Raises `CallError` for an invalid file, and
+    where no grid point can be run; a single point that cannot be run is a job with a problem.
     """
     sweep, folder = load(SweepConfig, path), path.parent
     changes: dict[str, Value] = {"set": {**sweep.set, **dict(map(key_and_value, settings))}}

@@ -276,7 +276,7 @@ vary: {evaluation.gate_m: [5.0, 3.0, 4.0]}
 """,
     )
     plan, out = load_plan(sweep), tmp_path / "out"
-    with pytest.raises(DataError, match="a process died, out of memory"):
+    with pytest.raises(DataError, match="the workers failed, perhaps out of memory"):
         Sweep.open(plan, out).run(deadly, jobs=2)
     assert len(rows(out / "sweep.csv")) == 2 * len(Sweep.open(plan, out).done)
 
