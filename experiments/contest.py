@@ -18,7 +18,7 @@ import typer
 import fgtrack
 from fgtrack.evaluation.intervals import average
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.scores.consistency import Consistency
+from fgtrack.evaluation.scores.innovations import Consistency
 from fgtrack.pipeline.load import validate
 from fgtrack.sim.scenario import Scenario
 

@@ -26,8 +26,7 @@ from joblib import Parallel, delayed
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import EgoState, Message
 from fgtrack.evaluation.intervals import average, paired
-from fgtrack.evaluation.matching import match
-from fgtrack.evaluation.scores.consistency import position_nees
+from fgtrack.evaluation.matching import match, position_nees
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.config import EgoConfig, MotionConfig
 from fgtrack.pipeline.public import replay

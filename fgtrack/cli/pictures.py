@@ -15,7 +15,7 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.evaluation.runs import evaluated, start_ns
 from fgtrack.evaluation.tables.compare import compare
-from fgtrack.evaluation.tables.seeds import is_sweep, read_sweep
+from fgtrack.evaluation.tables.seeds import SWEEP_FILE, read_sweep
 from fgtrack.io.output import check_apart, check_output, new_file, new_files
 from fgtrack.plotting.late_detection import drawn_close_up
 from fgtrack.plotting.paper import Paper, settings
@@ -52,7 +52,7 @@ def figure(
     settings(paper)  # raises where one is not usable
     picture = out if one_file else out / f"figure.{form}"  # what else is in the folder stays
     with progress("draw"):
-        sweeps = [folder for folder in runs if is_sweep(folder)]
+        sweeps = [folder for folder in runs if (folder / SWEEP_FILE).is_file()]
         if not sweeps:
             first, plans, missing = _of_runs(runs, picture, stamp, paper)
         elif len(runs) == 1 and stamp is None:

@@ -13,9 +13,8 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, within_run
-from fgtrack.evaluation.matching import TrackErrors, recorded, scenes, track_errors
+from fgtrack.evaluation.matching import TrackErrors, position_nees, recorded, scenes, track_errors
 from fgtrack.evaluation.runs import EvaluatedRun, by_recording
-from fgtrack.evaluation.scores.consistency import position_nees
 from fgtrack.evaluation.scores.multi_object import gospa
 from fgtrack.evaluation.tables import Column, Value, short, two_digits
 from fgtrack.io.run import EvaluationConfig
@@ -175,6 +174,6 @@ def _gospa_sums(group: Sequence[EvaluatedRun]) -> FloatArray:
     for one, scene, mine in zip(group, there, rows, strict=True):
         in_sight = scene.in_sight.copy()
         in_sight[mine] = seen
-        parts = gospa(replace(scene, in_sight=in_sight), one.run.evaluation.gate_m)
-        columns.append((parts.total_m2 - parts.out_of_sight_m2)[mine])
+        squares_m2 = gospa(replace(scene, in_sight=in_sight), one.run.evaluation.gate_m)
+        columns.append(squares_m2["in_sight_m2"][mine])
     return np.stack([*columns, np.ones(len(common_ns))], axis=-1)

@@ -96,7 +96,11 @@ def within_run(ticks: FloatArray, statistic: Statistic, rng: np.random.Generator
         change = statistic((sums + steps).T) - statistic((sums - steps).T)  # 0 for a sum of 0: nothing adds to it
         gradient = np.divide(change, 2.0 * _STEP * sums, out=np.zeros_like(sums), where=sums != 0.0)
         length = block_length(pieces @ gradient)
-        drawn = statistic(_drawn_sums(pieces, length, rng).T)
+        below = np.concatenate([np.zeros((1, len(sums))), np.cumsum(np.concatenate([pieces, pieces]), axis=0)])
+        starts = rng.integers(0, n, (_DRAWS, math.ceil(n / length)))  # as many pieces in all as there are
+        rest = n - (starts.shape[1] - 1) * length
+        whole_sums, rest_sums = (below[of : of + n] - below[:n] for of in (length, rest))
+        drawn = statistic((whole_sums[starts[:, :-1]].sum(axis=1) + rest_sums[starts[:, -1]]).T)
     blocks = n / length
     error = float(np.nanstd(drawn)) * math.sqrt(blocks / (blocks - 1.0))
     return _t_interval(value, error, blocks)
@@ -144,16 +148,6 @@ def block_length(values: FloatArray) -> int:
         return 1
     length: float = (1.5 * (float((lags * weighted).sum()) / total) ** 2 * n) ** (1.0 / 3.0)
     return min(max(math.ceil(length), 1), n // _FEWEST_BLOCKS)
-
-
-def _drawn_sums(pieces: FloatArray, length: int, rng: np.random.Generator) -> FloatArray:
-    """Sums over drawn blocks, as many pieces in all as there are, shape (draws, k)."""
-    n = len(pieces)
-    blocks = math.ceil(n / length)
-    below = np.concatenate([np.zeros((1, pieces.shape[1])), np.cumsum(np.concatenate([pieces, pieces]), axis=0)])
-    starts = rng.integers(0, n, (_DRAWS, blocks))
-    whole, rest = (below[size : size + n] - below[:n] for size in (length, n - (blocks - 1) * length))
-    return np.asarray(whole[starts[:, :-1]].sum(axis=1) + rest[starts[:, -1]])
 
 
 def _t_interval(mean: float, error: float, count: float) -> Estimate:

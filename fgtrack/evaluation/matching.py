@@ -164,6 +164,25 @@ def state_errors(states: Table, truth: FloatArray) -> dict[str, FloatArray]:
     return dict(zip(ERROR_NAMES, errors, strict=True))
 
 
+def position_nees(matching: Matching) -> FloatArray:
+    """Return the NEES of the position of every paired row, shape (p,); NaN where there is none."""
+    return position_squares(matching.tracks.where(matching.paired), matching.true_states[matching.paired])
+
+
+def position_squares(states: Table, truth: FloatArray) -> FloatArray:
+    """Return the normalised error squared e' P^-1 e of x and y, shape (n,), 2 on average if consistent.
+
+    NaN where the covariance is not positive definite or an error is NaN.
+    """
+    x, y = states["x_m"] - truth[:, 0], states["y_m"] - truth[:, 1]
+    P_x, P_xy, P_y = (states[name] for name in ("p_x_x", "p_x_y", "p_y_y"))
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # of indefinite covariances
+        gain = P_xy / P_x
+        rest = P_y - gain * P_xy  # variance of y given x
+        squares = x**2 / P_x + (y - gain * x) ** 2 / rest
+    return np.where((P_x > 0.0) & (rest > 0.0) & np.isfinite(squares), squares, np.nan)
+
+
 def scenes(run: Run, matching: Matching) -> Scenes:
     """The ticks of `run` while truth was recorded, with the evaluated rows; distances are at the stamps of the rows."""
     scored = recorded(run, matching.now_ns)

@@ -11,10 +11,11 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Disposition
 from fgtrack.evaluation.diagnostics import excluded_lines
 from fgtrack.evaluation.matching import Matching, confirmed, match, scenes, track_errors
-from fgtrack.evaluation.scores.consistency import Consistency, consistency
 from fgtrack.evaluation.scores.continuity import breaks, switches, times_to_confirm, tracked_visits
 from fgtrack.evaluation.scores.innovations import (
     RESIDUAL_NAMES,
+    Consistency,
+    consistency,
     local_innovations,
     message_delays,
     moments_of,

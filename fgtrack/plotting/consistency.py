@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.evaluation.matching import position_nees
 from fgtrack.evaluation.palette import SENSORS
 from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_ns
-from fgtrack.evaluation.scores.consistency import position_nees
 from fgtrack.evaluation.scores.innovations import num_measured
 from fgtrack.evaluation.scores.statistics import chi_square_band
 from fgtrack.plotting.paper import Paper, Sheet, styled

@@ -10,8 +10,8 @@ from evaluation_runs import WEST, update, write_run
 from scipy.stats import chi2
 
 from fgtrack.core.types import Disposition, UpdateRecord
+from fgtrack.evaluation.matching import position_squares
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.scores.consistency import position_squares
 from fgtrack.evaluation.scores.innovations import FEWEST, Autocorrelation
 from fgtrack.evaluation.scores.statistics import ChiSquareMean
 from fgtrack.io.run import COVARIANCE_COLUMNS, Run, Table

@@ -44,14 +44,14 @@ def test_gospa_and_its_parts_are_those_of_stone_soup(seed: int, side_m: float) -
     found = gospa(there, C_M)
     for tick in range(len(there.present)):
         if not len(objects.ids[tick]) + len(tracks.ids[tick]):
-            assert found.total_m2[tick] == 0.0
+            assert found["total_m2"][tick] == 0.0
             continue
         stamp = start + timedelta(seconds=tick)
         states = [[State(xy[:, None], timestamp=stamp) for xy in one.xy[tick]] for one in (tracks, objects)]
         expected = generator.compute_gospa_metric(*states)[0].value
-        assert math.sqrt(found.total_m2[tick]) == pytest.approx(expected["distance"], abs=1e-9)
+        assert math.sqrt(found["total_m2"][tick]) == pytest.approx(expected["distance"], abs=1e-9)
         for name in ("localisation", "missed", "false"):
-            assert getattr(found, f"{name}_m2")[tick] == pytest.approx(expected[name], abs=1e-9)
+            assert found[f"{name}_m2"][tick] == pytest.approx(expected[name], abs=1e-9)
 
 
 @pytest.fixture
@@ -81,8 +81,9 @@ def test_gospa_of_a_run_is_what_can_be_counted(story: Run) -> None:
 def test_a_pair_at_the_cut_off_is_a_miss_and_a_false_track() -> None:
     there = Scenes(np.array([0]), np.array([1]), np.array([[2.0]]), np.array([[True]]), np.array([[True]]))
     at, inside = gospa(there, 2.0), gospa(there, 2.0 + 1e-9)
-    assert (at.localisation_m2[0], at.missed_m2[0], at.false_m2[0]) == (0.0, 2.0, 2.0)
-    assert (inside.localisation_m2[0], inside.missed_m2[0], inside.false_m2[0]) == (4.0, 0.0, 0.0)
+    names = ("localisation_m2", "missed_m2", "false_m2", "total_m2", "in_sight_m2")
+    assert [at[name][0] for name in names] == [0.0, 2.0, 2.0, 4.0, 4.0]
+    assert [inside[name][0] for name in names] == [4.0, 0.0, 0.0, 4.0, 4.0]
 
 
 # --- CLEAR, IDF1, HOTA

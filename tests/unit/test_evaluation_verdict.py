@@ -10,7 +10,7 @@ from evaluation_runs import WEST, write_run
 from fgtrack.evaluation.comparison import Comparison, Entry
 from fgtrack.evaluation.intervals import Estimate
 from fgtrack.evaluation.metrics import Metrics, evaluate
-from fgtrack.evaluation.scores.consistency import Consistency
+from fgtrack.evaluation.scores.innovations import Consistency
 from fgtrack.evaluation.scores.statistics import ChiSquareMean, Moments
 from fgtrack.evaluation.tables.verdict import verdict
 

@@ -9,7 +9,7 @@ import pytest
 from support.pictures import faults
 
 from fgtrack.core.errors import CallError, DataError
-from fgtrack.evaluation.tables.seeds import SWEEP_FILE, is_sweep, read_sweep
+from fgtrack.evaluation.tables.seeds import SWEEP_FILE, read_sweep
 from fgtrack.pipeline.sweep import SWEEP_TABLE
 from fgtrack.plotting import plot
 from fgtrack.plotting.sweep import metric_words
@@ -74,8 +74,6 @@ def test_what_is_no_sweep_is_one_clear_error(tmp_path: Path) -> None:
     (tmp_path / SWEEP_FILE).write_text("a,b\n1,2\n")
     with pytest.raises(DataError, match="holds no rows of a sweep"):
         read_sweep(tmp_path)
-    assert is_sweep(tmp_path / "sweep")
-    assert not is_sweep(tmp_path / "nowhere")
     assert SWEEP_FILE == SWEEP_TABLE
 
 

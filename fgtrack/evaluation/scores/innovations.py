@@ -1,4 +1,4 @@
-"""Innovations and delays by sensor: along and across the direction of the track, their context and their whiteness."""
+"""Innovations and delays by sensor, and the consistency of covariances: NEES, NIS, whiteness."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -9,9 +9,10 @@ import numpy as np
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import MEASURABLE, BoolArray, FloatArray, IntArray
-from fgtrack.evaluation.matching import confirmed, neighbours
+from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, mean_square
+from fgtrack.evaluation.matching import Matching, confirmed, neighbours, position_nees
 from fgtrack.evaluation.placement import roads
-from fgtrack.evaluation.scores.statistics import NORMAL_95, Moments
+from fgtrack.evaluation.scores.statistics import NORMAL_95, ChiSquareMean, Moments
 from fgtrack.io.run import NO_TRACK, Run, Table
 from fgtrack.models.measurement import ANGULAR
 
@@ -22,6 +23,7 @@ LOCAL_NAMES = ("along_m", "across_m", "yaw_rad", "speed_mps")
 FEWEST = 20
 """A track with fewer innovations of the sensor is left out: the band is that of a large sample."""
 
+_SEED = 1  # of the bootstrap: the same run gives the same interval
 _TRACK_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps")
 
 
@@ -131,3 +133,33 @@ def track_states(run: Run, wanted: BoolArray) -> FloatArray:
     change[:, 2] = wrap_angles(change[:, 2])
     states[there] = a + share[:, None] * change
     return states
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Normalised squared errors and innovations of one run, and the whiteness of the innovations.
+
+    Bands are those of independent samples; errors along a run are not, see `position_nees_interval`.
+    """
+
+    position_nees: ChiSquareMean
+    """NEES of the present position; empty without truth."""
+    nis: Mapping[str, ChiSquareMean]
+    """By sensor."""
+    autocorrelation: Mapping[str, Autocorrelation | None]
+    """By sensor."""
+    position_nees_interval: Estimate = UNKNOWN
+    """Mean of `position_nees` with the interval of correlated errors, see `mean_square`."""
+
+
+def consistency(run: Run, matching: Matching | None) -> Consistency:
+    """NEES of the evaluated rows of `run`, NIS and whiteness of its innovations."""
+    sensors = dict(by_sensor(run.tables["updates"]))
+    nis = {name: ChiSquareMean.of(mine["nis"], num_measured(mine)) for name, mine in sensors.items()}
+    white = {name: autocorrelation(mine) for name, mine in sensors.items()}
+    if matching is None or not matching.paired.any():
+        return Consistency(ChiSquareMean(), nis, white)
+    squares = position_nees(matching)
+    ticks = by_stamp(matching.tracks["stamp_ns"][matching.paired], squares[:, None])
+    interval = mean_square(ticks, np.random.default_rng(_SEED))
+    return Consistency(ChiSquareMean.of(squares, np.full(len(squares), 2)), nis, white, interval)

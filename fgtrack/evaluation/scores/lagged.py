@@ -9,8 +9,7 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, within_run
-from fgtrack.evaluation.matching import Matching, TrackErrors, neighbours, state_errors
-from fgtrack.evaluation.scores.consistency import position_squares
+from fgtrack.evaluation.matching import Matching, TrackErrors, neighbours, position_squares, state_errors
 from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.evaluation.truth import true_states
 from fgtrack.io.run import Run, Table

@@ -14,7 +14,6 @@ similarity of positions 1 - d / zero distance of TrackEval and a zero distance o
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from motrics import compute_hota_from_similarity, compute_identity_from_similarity
@@ -26,21 +25,6 @@ from fgtrack.io.run import NO_TRACK
 
 AT_GATE = 0.5
 """Similarity of a pair that is as far apart as the gate, from which on it counts."""
-
-
-class GospaParts(NamedTuple):
-    """Squared parts at every tick, shape (t,) each; they add up to the square of GOSPA."""
-
-    localisation_m2: FloatArray
-    missed_m2: FloatArray
-    false_m2: FloatArray
-    out_of_sight_m2: FloatArray
-    """The part of `missed_m2` that no sensor could see."""
-
-    @property
-    def total_m2(self) -> FloatArray:
-        """Squared GOSPA at every tick, shape (t,)."""
-        return self.localisation_m2 + self.missed_m2 + self.false_m2
 
 
 @dataclass(frozen=True)
@@ -61,11 +45,10 @@ class MultiObjectMetrics:
 
 def multi_object_metrics(scenes: Scenes, gate_m: float) -> MultiObjectMetrics:
     """Scores of `scenes`; a pair is not farther apart than `gate_m`."""
-    parts = gospa(scenes, gate_m)
-    in_sight_m2 = parts.total_m2 - parts.out_of_sight_m2
-    total_m2, sight_m2, *means_m2 = (_mean(values) for values in (parts.total_m2, in_sight_m2, *parts))
-    roots = {"mean_m": _mean(np.sqrt(parts.total_m2)), "rms_m": math.sqrt(total_m2)}
-    own = dict(zip(parts._fields, means_m2, strict=True)) | {"in_sight_rms_m": math.sqrt(sight_m2)}
+    squares_m2 = gospa(scenes, gate_m)
+    means_m2 = {name: _mean(values) for name, values in squares_m2.items()}
+    roots = {"mean_m": _mean(np.sqrt(squares_m2["total_m2"])), "rms_m": math.sqrt(means_m2.pop("total_m2"))}
+    roots["in_sight_rms_m"] = math.sqrt(means_m2.pop("in_sight_m2"))
     similarity = np.maximum(0.0, 1.0 - scenes.distances_m / (2.0 * gate_m))
     edges = np.searchsorted(scenes.tick_index, np.arange(1, len(scenes.present)))
     frames = (
@@ -75,7 +58,7 @@ def multi_object_metrics(scenes: Scenes, gate_m: float) -> MultiObjectMetrics:
     )
     identity, hota = compute_identity_from_similarity(*frames, AT_GATE), compute_hota_from_similarity(*frames)
     return MultiObjectMetrics(
-        {"c_m": gate_m, "ticks": len(scenes.present), **roots, **own},
+        {"c_m": gate_m, "ticks": len(scenes.present), **roots, **means_m2},
         clear(scenes, gate_m),
         {name: getattr(identity, name) if identity.num_gt else math.nan for name in ("idf1", "idp", "idr")},
         {name: getattr(hota, name) if hota.num_gt else math.nan for name in ("hota", "deta", "assa")},
@@ -106,8 +89,11 @@ def clear(scenes: Scenes, gate_m: float) -> dict[str, float]:
     }
 
 
-def gospa(scenes: Scenes, c_m: float) -> GospaParts:
-    """GOSPA with the cut-off distance `c_m`, as its parts at every tick; a pair at c or beyond is none."""
+def gospa(scenes: Scenes, c_m: float) -> dict[str, FloatArray]:
+    """Squares of GOSPA with the cut-off distance `c_m` at every tick: its parts, the total, and that in sight.
+
+    A pair at c or beyond is none; `out_of_sight_m2` is the part of `missed_m2` that no sensor could see.
+    """
     gains_m2 = np.maximum(c_m**2 - np.square(scenes.distances_m), 0.0)
     num_ticks, tick_index = len(scenes.present), scenes.tick_index
     columns = pair(gains_m2, scenes.track_ids, tick_index, np.full(num_ticks, -1))
@@ -116,12 +102,12 @@ def gospa(scenes: Scenes, c_m: float) -> GospaParts:
     squares_m2, paired = np.square(scenes.distances_m[rows, columns]), np.zeros_like(scenes.present)
     paired[ticks, columns] = True
     single_m2, missed = c_m**2 / 2.0, scenes.present & ~paired
-    return GospaParts(
-        localisation_m2=np.asarray(np.bincount(ticks, squares_m2, num_ticks), dtype=np.float64),
-        missed_m2=single_m2 * missed.sum(axis=1),
-        false_m2=single_m2 * (np.bincount(tick_index, minlength=num_ticks) - paired.sum(axis=1)),
-        out_of_sight_m2=single_m2 * (missed & ~scenes.in_sight).sum(axis=1),
-    )
+    localisation_m2 = np.asarray(np.bincount(ticks, squares_m2, num_ticks), dtype=np.float64)
+    missed_m2 = single_m2 * missed.sum(axis=1)
+    false_m2 = single_m2 * (np.bincount(tick_index, minlength=num_ticks) - paired.sum(axis=1))
+    unseen_m2, total_m2 = single_m2 * (missed & ~scenes.in_sight).sum(axis=1), localisation_m2 + missed_m2 + false_m2
+    parts = {"localisation_m2": localisation_m2, "missed_m2": missed_m2, "false_m2": false_m2}
+    return parts | {"out_of_sight_m2": unseen_m2, "total_m2": total_m2, "in_sight_m2": total_m2 - unseen_m2}
 
 
 def _mean(values: FloatArray) -> float:

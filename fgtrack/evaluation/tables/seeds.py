@@ -108,11 +108,6 @@ def read_sweep(folder: Path | str) -> SweepTable:
     return SweepTable(tuple(rows.columns[:seed]), tuple(numbers), pd.concat([cells, numbers], axis=1))
 
 
-def is_sweep(folder: Path) -> bool:
-    """True if `folder` holds the table of a sweep."""
-    return (folder / SWEEP_FILE).is_file()
-
-
 def distinguishing(points: DataFrame) -> list[str]:
     """Columns that distinguish `points`, without those of whole mappings where labels do it."""
     distinct = points.drop_duplicates()

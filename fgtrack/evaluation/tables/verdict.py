@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from fgtrack.evaluation.comparison import Comparison, Entry
 from fgtrack.evaluation.diagnostics import FEWEST, is_far_off
-from fgtrack.evaluation.intervals import UNKNOWN, Estimate
+from fgtrack.evaluation.intervals import UNKNOWN
 from fgtrack.evaluation.metrics import Metrics
 from fgtrack.evaluation.scores.lagged import WINDOW
 from fgtrack.evaluation.tables import PERCENT, short, two_digits
@@ -33,7 +33,11 @@ def verdict(metrics: Mapping[str, Metrics], compared: Sequence[Comparison]) -> t
         sentences += _noise(label, metrics[label])
     for label, one in metrics.items():
         lags = [lag for lag in one.lagged if lag.is_lagged and lag.lag_s != WINDOW and lag.position_reduction.is_known]
-        parts = [f"{lag.lag_s:g} s by {_percent(lag.position_reduction)}" for lag in (*lags[:1], *lags[1:][-1:])]
+        shares = {lag.lag_s: lag.position_reduction for lag in (*lags[:1], *lags[1:][-1:])}
+        parts = [
+            f"{lag_s:g} s by {PERCENT * of.mean:.0f} % ({PERCENT * of.low:.0f} to {PERCENT * of.high:.0f})"
+            for lag_s, of in shares.items()
+        ]
         if parts:
             sentences.append(f"Waiting lowers the position RMSE of {label}: {', '.join(parts)}.")
     return tuple(sentences)
@@ -90,10 +94,6 @@ def _noise(label: str, one: Metrics) -> Iterator[str]:
         yield f"Too short a run to tell if the noise fits (judged by {label}): {names}."
     elif squares:
         yield f"The noise fits (judged by {label}): {', '.join(texts.values())}."
-
-
-def _percent(share: Estimate) -> str:
-    return f"{PERCENT * share.mean:.0f} % ({PERCENT * share.low:.0f} to {PERCENT * share.high:.0f})"
 
 
 def _listed(names: Sequence[str]) -> str:
