@@ -70,6 +70,7 @@ def test_one_detection_is_as_uncertain_as_its_covariance_says(name: str) -> None
     numeric = np.stack([(model.predict(x + d, pose) - model.predict(x - d, pose)) / 2e-6 for d in 1e-6 * np.eye(9)]).T
     np.testing.assert_allclose(H, numeric, atol=1e-7)
     assert model.linear == (name == "lidar")
+    assert H.flags.writeable == (name == "camera")  # that of a linear model is shared
 
 
 def nees(name: str, modelled: bool, lag_s: float, num_runs: int = 40) -> float:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fgtrack.core.geometry import body_point, in_polygon
+from fgtrack.core.geometry import body_point, in_polygon, may_be_radians
 
 metres = st.floats(-10.0, 10.0)
 
@@ -51,3 +51,11 @@ def test_a_polygon_holds_what_its_outline_surrounds() -> None:
         True,
         False,
     ]
+
+
+@pytest.mark.parametrize(
+    ("least", "most", "is_plausible"),
+    [(-math.pi, math.pi, True), (0.0, math.tau, True), (100.0, 101.0, False), (-6.0, 6.0, False), (0.0, 6.3, False)],
+)
+def test_angles_in_radians_lie_within_a_turn(least: float, most: float, is_plausible: bool) -> None:
+    assert may_be_radians(least, most) == is_plausible

@@ -1,5 +1,6 @@
 """The out-of-sequence methods: which are exact when, and what the others forget or assume."""
 
+import inspect
 import itertools
 import pickle
 
@@ -157,6 +158,11 @@ def test_the_reorder_buffer_is_pushed_by_stamps_and_not_by_the_clock() -> None:
     newer = measured(rng, 2.02)
     estimator.update(newer)
     assert_same(estimator.state_at(stamp(4.0)), replayed([*steps[:17], in_time]).state_at(stamp(4.0)))
+
+
+@pytest.mark.parametrize(("kind", "option"), [(DelayedHorizon, "horizon_s"), (ReorderBuffer, "hold_s")])
+def test_the_time_that_is_claimed_is_the_default(kind, option: str) -> None:
+    assert inspect.signature(kind).parameters[option].default == kind.held_s
 
 
 @pytest.mark.parametrize("hold_s", [-0.1, 1.1, float("nan")])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fgtrack.core.linalg import inverse_root, noise_root
+from fgtrack.core.linalg import inverse_root, noise_root, regular
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.registry import estimator
@@ -44,5 +44,6 @@ def test_smoothers_agree_without_noise_of_some_component(without: tuple[str, ...
 def test_noise_that_is_regular_is_taken_as_it_is() -> None:
     Q = CTRV().process_noise(np.array([0.0, 0.0, 0.3, 5.0, 0.1]), 0.1)
     np.testing.assert_array_equal(noise_root(Q), inverse_root(Q))
+    np.testing.assert_allclose(regular(np.diag([4.0, 0.0])), np.diag([4.0 + 4e-12, 1e-18]), rtol=1e-15)
     with pytest.raises(np.linalg.LinAlgError):
         noise_root(np.array([[1.0, 2.0], [2.0, 1.0]]))

@@ -18,6 +18,11 @@ def test_the_values_and_their_standard_deviations_become_the_state() -> None:
     assert np.sqrt(np.diag(P)).tolist() == pytest.approx([0.5, 0.5, 0.2, 10.0, 0.3, 1.0])
 
 
+def test_every_value_is_named() -> None:
+    with pytest.raises(TypeError):
+        Start(0)  # type: ignore[misc]
+
+
 def test_a_position_covariance_takes_the_place_of_the_standard_deviation() -> None:
     R = np.array([[2.0, 0.5], [0.5, 1.0]])
     for motion in (CTRV(), CV()):
