@@ -190,10 +190,3 @@ def test_a_file_that_is_not_a_map_is_refused_with_its_row(tmp_path: Path, lines:
     (tmp_path / "map.csv").write_text("\n".join(lines), encoding="latin-1")
     with pytest.raises(DataError, match=rf"map\.csv: not a map .*{message}"):
         TrackMap.read(tmp_path / "map.csv")
-
-
-def test_headings_that_count_from_the_x_axis_are_noticed() -> None:
-    table = circle_table()
-    table[:, HEADING] -= np.pi / 2.0
-    with pytest.raises(DataError, match="row 1: psi_ref_rad is off"):
-        TrackMap(table)
