@@ -129,3 +129,26 @@ def test_an_object_that_keeps_its_place_does_not_make_the_area_small() -> None:
     area_m2 = coverages(messages)["radar"].area_m2
     assert area_m2 is not None
     assert 0.5 * 0.35 * 30.0**2 < area_m2 < 200.0
+
+
+def of_sizes(*sizes: int) -> Coverage:
+    found = []
+    for number, size in enumerate(sizes):
+        objects = [Detection(x_m=10.0 * number, y_m=float(k + number % 2)) for k in range(size)]
+        found.append(DetectionList("any", number, number, objects))
+    return coverages(found)["any"]
+
+
+@pytest.mark.parametrize(
+    ("sizes", "scans"),
+    [([1] * 20, False), ([1] * 18 + [2] * 2, False), ([1] * 19 + [0], True), ([1, 2] * 10, True), ([1] * 9, True)],
+)
+def test_lists_of_one_object_are_no_scans_unless_one_is_empty(sizes: list[int], scans: bool) -> None:
+    assert of_sizes(*sizes).scans == scans
+
+
+def test_clutter_is_at_most_as_dense_as_all_detections() -> None:
+    assert of_sizes(*[1] * 11).density_per_m2 == pytest.approx(1.0 / 100.0)
+    assert of_sizes(*[1] * 9).density_per_m2 == math.inf
+    line = [DetectionList("any", k, k, [Detection(range_m=float(k), bearing_rad=0.0)]) for k in range(20)]
+    assert coverages(line)["any"].density_per_m2 == math.inf

@@ -4,6 +4,7 @@ import csv
 import gzip
 import math
 from collections import defaultdict
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -69,6 +70,34 @@ def test_a_replay_says_what_it_assumes_of_slow_reporters_and_what_is_set_stays()
     assert (kept.motion, kept.clock) == (mine.motion, mine.clock)
     again = read_config(None, [])
     assert assumed(again, source_of(lambda: turning(1.0))).config.motion == again.motion
+
+
+def reporting() -> list[DetectionList]:
+    """Six aircraft that report position and velocity every 10 s, each in a list of its own, for two minutes."""
+    found = []
+    for k in range(72):
+        number, at_s = k % 6, k * 10.0 / 6.0
+        south_mps = 100.0 * (number % 2)
+        x_m, y_m = 1e3 + 30e3 * number + 200.0 * at_s, 20e3 * (number % 3) - south_mps * at_s
+        velocity = {"yaw_rad": -math.atan2(south_mps, 200.0), "speed_mps": math.hypot(south_mps, 200.0)}
+        stamp_ns = SECOND_NS * 1000 + round(at_s * SECOND_NS)
+        found.append(DetectionList("adsb", stamp_ns, stamp_ns, [Detection(x_m=x_m, y_m=y_m, **velocity)], frame="map"))
+    return found
+
+
+def test_objects_that_report_one_by_one_are_tracked_each_under_one_id() -> None:
+    run = fgtrack.replay(reporting(), set={"clock.node_hz": 1.0})
+    assert run.config["sensors"]["adsb"]["scan"] is False
+    assert sum(run.updates["disposition"] == "birth") == 6
+    last = run.tracks["tick"] == run.tracks["tick"].max()
+    assert list(run.tracks["status"][last]) == ["confirmed"] * 6
+
+
+def test_a_scan_misses_what_it_lacks_whatever_the_recording_looks_like() -> None:
+    empty = replace(reporting()[-1], stamp_ns=SECOND_NS * 1130, receipt_ns=SECOND_NS * 1130, objects=[])
+    run = fgtrack.replay([*reporting(), empty], set={"clock.node_hz": 1.0})
+    assert run.config["sensors"]["adsb"]["scan"] is True
+    assert sum(run.updates["disposition"] == "birth") > 6
 
 
 def _reports(duration_s: float) -> tuple[list[DetectionList], list[str]]:
