@@ -27,6 +27,11 @@ def box(x_m: float, name: str = "car", score: float = 0.8, **more: object) -> di
     return {**common, "velocity": [-math.cos(0.5), -math.sin(0.5)], **kind, **more}
 
 
+def annotation(sample: str, instance: str, x_m: float, **points: int) -> dict[str, object]:
+    place = {"translation": [x_m, 2.0, 1.0], "rotation": turned(0.5)}
+    return {"sample_token": sample, "instance_token": instance, **place, **points}
+
+
 def data(at: Path, boxes: dict[str, object] | None = None) -> Path:
     """Two samples half a second apart of one scene, one of another; the ego drives to the north and turns left."""
     tables = {
@@ -49,23 +54,9 @@ def data(at: Path, boxes: dict[str, object] | None = None) -> Path:
         "category": [{"token": "c", "name": "vehicle.car"}, {"token": "d", "name": "animal"}],
         "instance": [{"token": "i", "category_token": "c"}, {"token": "j", "category_token": "d"}],
         "sample_annotation": [
-            {
-                "sample_token": "s0",
-                "instance_token": "i",
-                "translation": [110.0, 2.0, 1.0],
-                "rotation": turned(0.5),
-                "num_lidar_pts": 5,
-                "num_radar_pts": 0,
-            },
-            {
-                "sample_token": "s1",
-                "instance_token": "i",
-                "translation": [111.0, 2.0, 1.0],
-                "rotation": turned(0.5),
-                "num_lidar_pts": 0,
-                "num_radar_pts": 0,
-            },
-            {"sample_token": "s0", "instance_token": "j", "translation": [1.0, 2.0, 1.0], "rotation": turned(0.5)},
+            annotation("s0", "i", 110.0, num_lidar_pts=5, num_radar_pts=0),
+            annotation("s1", "i", 111.0, num_lidar_pts=0),
+            annotation("s0", "j", 1.0),
         ],
     }
     (at / "v1.0-mini").mkdir(parents=True)
