@@ -1,6 +1,5 @@
-"""Arguments that several commands share, and the names that the shell offers for them."""
+"""Arguments that several commands share."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -8,33 +7,8 @@ from typer import Argument, Option
 
 from fgtrack.io.recording import Storage
 
-Completion = Callable[[], list[str]]
-
-
-def _shipped(kind: str) -> Completion:
-    def names() -> list[str]:
-        from fgtrack.pipeline.shipped import shipped  # loads much, and is only needed here
-
-        return list(shipped(kind))  # type: ignore[arg-type]  # a kind of `shipped`
-
-    return names
-
-
-configurations, scenarios, sweeps = map(_shipped, ("configuration", "scenario", "sweep"))
-
-
-def estimators(incomplete: str) -> list[str]:
-    """Names of estimators, of several with commas between them the last."""
-    from fgtrack.estimation.registry import ESTIMATORS
-
-    before, comma, _ = incomplete.rpartition(",")
-    return [f"{before}{comma}{name}" for name in ESTIMATORS]
-
-
 Input = Annotated[Path, Argument(metavar="INPUT", help="Recording: rosbag2, .mcap, .db3, .bag, stream, CSV, data set.")]
-ConfigFile = Annotated[
-    str | None, Option("-c", "--config", help="YAML or shipped name.", autocompletion=configurations)
-]
+ConfigFile = Annotated[str | None, Option("-c", "--config", help="Configuration: a file (YAML) or a shipped name.")]
 TrackMap = Annotated[str | None, Option("--map", help="Map of the track (CSV), or `oval` for the built-in one.")]
 PitMap = Annotated[str | None, Option("--pit-map", help="Map of the pit lane (CSV), or `oval`.")]
 Settings = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help="Override a key; repeatable.")]

@@ -10,7 +10,7 @@ from rich.table import Table as Grid
 from rich.text import Text
 from typer import Argument, Option
 
-from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, Seed, Settings, StorageOption, scenarios
+from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, Seed, Settings, StorageOption
 from fgtrack.cli.show import console, progress, say
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.diagnostics import excluded_lines
@@ -25,7 +25,7 @@ from fgtrack.sim.simulate import simulate as simulated
 
 
 def simulate(
-    scenario_file: Annotated[str, Argument(metavar="SCENARIO", help="YAML or shipped name.", autocompletion=scenarios)],
+    scenario_file: Annotated[str, Argument(metavar="SCENARIO", help="Scenario: a file (YAML) or a shipped name.")],
     out: Annotated[Path, Option("-o", "--out", help="Stream (.jsonl, .jsonl.gz), else a rosbag2 folder.")],
     seed: Seed = 0,
     duration_s: Annotated[float | None, Option("--duration", help="Length [s], instead of the scenario's.")] = None,

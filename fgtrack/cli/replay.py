@@ -6,7 +6,7 @@ from typing import Annotated
 
 from typer import Option
 
-from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, PitMap, Settings, TrackMap, estimators
+from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, PitMap, Settings, TrackMap
 from fgtrack.cli.show import progress, say, warn
 from fgtrack.core.errors import DataError
 from fgtrack.estimation.registry import ESTIMATORS
@@ -23,9 +23,7 @@ def replay(
     recording: Input,
     out: Annotated[Path, Option("-o", "--out", help="Run folder; for several estimators one below it each.")],
     config_file: ConfigFile = None,
-    estimators: Annotated[
-        str | None, Option("-e", "--estimator", help="Names, with commas between them.", autocompletion=estimators)
-    ] = None,
+    estimators: Annotated[str | None, Option("-e", "--estimator", help="Names, with commas between them.")] = None,
     track_map: TrackMap = None,
     pit_map: PitMap = None,
     settings: Settings = None,

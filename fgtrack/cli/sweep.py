@@ -8,7 +8,7 @@ from typing import Annotated
 import pandas as pd
 from typer import Argument, Option
 
-from fgtrack.cli.arguments import All, Form, FormOption, Overwrite, Settings, sweeps
+from fgtrack.cli.arguments import All, Form, FormOption, Overwrite, Settings
 from fgtrack.cli.show import progress, say, show
 from fgtrack.core.errors import DataError
 from fgtrack.evaluation.metrics import evaluate
@@ -39,7 +39,7 @@ _NAMES = ("name", "estimator")
 
 
 def sweep(
-    sweep_name: Annotated[str, Argument(metavar="SWEEP", help="YAML or shipped name.", autocompletion=sweeps)],
+    sweep_name: Annotated[str, Argument(metavar="SWEEP", help="Sweep: a file (YAML) or a shipped name.")],
     out: Annotated[Path, Option("-o", "--out", help="Folder of the tables; what is done there is kept.")],
     jobs: Annotated[int | None, Option(min=1, help="Processes, by default one for each core.")] = None,
     dask: Annotated[str | None, Option(metavar="ADDRESS", help="Cluster of dask to run on.")] = None,

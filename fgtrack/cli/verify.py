@@ -4,7 +4,7 @@ from typing import Annotated
 
 from typer import Option
 
-from fgtrack.cli.arguments import Json, estimators
+from fgtrack.cli.arguments import Json
 from fgtrack.cli.show import progress, say, show
 from fgtrack.core.errors import DataError
 from fgtrack.estimation.registry import ESTIMATORS, MOTION_MODELS, Claims
@@ -22,7 +22,7 @@ _COLUMNS = (
 
 def verify(
     as_json: Json = False,
-    name: Annotated[str | None, Option("-e", "--estimator", help="This one alone.", autocompletion=estimators)] = None,
+    name: Annotated[str | None, Option("-e", "--estimator", help="This one alone.")] = None,
 ) -> None:
     """Check the contract of estimators, in any order of arrival.
 

@@ -39,12 +39,9 @@ def test_python_m_runs_the_command_line() -> None:
 
 @pytest.mark.parametrize(
     ("words", "offered"),
-    [
-        ("replay drive.jsonl -e ekf-replay,smoother-b", {"ekf-replay,smoother-batch", "ekf-replay,smoother-banded"}),
-        ("replay drive.jsonl -c karle", {"karle2023", "karle2023_reference"}),
-    ],
+    [("rep", {"replay", "report"}), ("replay drive.jsonl --pit", {"--pit-map"})],
 )
-def test_the_shell_completes_commands_options_and_names(words: str, offered: set[str]) -> None:
+def test_the_shell_completes_commands_and_options(words: str, offered: set[str]) -> None:
     asked = {
         "_FGTRACK_COMPLETE": "complete_bash",
         "COMP_WORDS": f"fgtrack {words}",

@@ -107,7 +107,8 @@ def test_times_keep_all_their_digits(tmp_path):
     assert (found.stamp_ns, found.receipt_ns) == (1_700_000_000_123_456_789, 1_700_000_000_200_000_000)
     late = CsvTable(RADAR.columns, "radar.csv", stamp_from="receipt")
     (found,) = messages(tmp_path, detections={"radar": late})
-    assert found.stamp_ns == found.receipt_ns
+    assert found.stamp_ns == found.receipt_ns == 1_700_000_000_200_000_000
+    assert messages(tmp_path, truth=late) == [TruthState(found.stamp_ns, found.stamp_ns, 0, 1.0, 2.0)]
 
 
 def test_a_drive_survives_csv_to_the_bit(tmp_path):
