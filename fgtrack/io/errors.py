@@ -1,7 +1,6 @@
 """The error of an input that breaks off in the middle, and how to work with what comes before the break."""
 
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 from typing import Generic, TypeVar
 
 from fgtrack.core.errors import DataError
@@ -46,10 +45,3 @@ class UntilBreak(Generic[_T]):
         """Raise the error of the break, if there was one."""
         if self.error:
             raise self.error
-
-    def raise_before_replacing(self, path: Path) -> None:
-        """Raise the error of the break if something at `path` would be replaced by what comes before the break."""
-        if self.error and path.exists():
-            raise DataError(
-                f"{self.error}; {path} is kept, convert to another name for what comes before"
-            ) from self.error

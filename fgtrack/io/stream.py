@@ -102,7 +102,8 @@ def write_stream(
         for message in readable:
             lines.write(_line(_record(message)))
             count += 1
-        readable.raise_before_replacing(path)
+        if path.exists():  # it is kept
+            readable.raise_error()
     readable.raise_error()
     return count
 

@@ -74,7 +74,8 @@ def write_bag(
                         opened.bio.flush()
                     case Sqlite3Writer() as opened:
                         opened.conn.commit()
-        readable.raise_before_replacing(path)
+        if path.exists():  # it is kept
+            readable.raise_error()
     readable.raise_error()
     return count
 
@@ -127,5 +128,4 @@ def is_recording(path: Path) -> bool:
         listed = [file.name for file in files_of(path)] if (path / METADATA).is_file() else []
     except Exception:  # whatever a damaged metadata.yaml raises
         return False
-    journals = [f"{name}{suffix}" for name in listed for suffix in ("-wal", "-shm", "-journal")]  # of SQLite
-    return bool(listed) and {file.name for file in path.iterdir()} <= {METADATA, *listed, *journals}
+    return bool(listed) and {file.name for file in path.iterdir()} <= {METADATA, *listed}

@@ -37,7 +37,12 @@ class McapFile:
         self._file = self.path.open("rb")
         indexed = self._indexed()
         self._is_indexed = indexed is not None
-        schemas, channels = indexed or self._scanned()
+        schemas, channels = indexed or ({}, {})
+        for record in () if self._is_indexed else self._records():
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels.setdefault(record.id, record)
         for channel in channels.values():
             schema = schemas.get(channel.schema_id, _NO_SCHEMA)
             form = _FORMATS.get(schema.encoding, MessageDefinitionFormat.NONE)
@@ -79,16 +84,6 @@ class McapFile:
         if known.channel_count > len(summary.channels):
             return None
         return summary.schemas, summary.channels
-
-    def _scanned(self) -> tuple[dict[int, Schema], dict[int, Channel]]:
-        """Schemas and channels of the file up to its end, or to where it breaks off."""
-        schemas, channels = dict[int, Schema](), dict[int, Channel]()
-        for record in self._records():
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels.setdefault(record.id, record)
-        return schemas, channels
 
     def _records(self) -> Iterator[McapRecord]:
         """Records from the beginning of the file to its end, or to where it breaks off."""

@@ -78,7 +78,12 @@ class Sqlite3File:
 
     def _recover(self) -> None:
         """Copy the rows in the order of writing, up to where the file is cut."""
-        source = apsw.Connection(str(self._whole_pages()))
+        copy = self._copy()
+        with copy.open("r+b") as file:  # without the page that was cut: SQLite would read zeros for the rest of it
+            page_size = int.from_bytes(file.read(_PAGE_SIZE.stop)[_PAGE_SIZE], "big")
+            page_size = 65536 if page_size == 1 else max(page_size, 512)
+            file.truncate(copy.stat().st_size // page_size * page_size)
+        source = apsw.Connection(str(copy))
         source.execute("PRAGMA writable_schema=ON").fetchall()  # else a file shorter than its header states is refused
         self._base.execute("BEGIN")
         for name, columns in _TABLES.items():
@@ -95,12 +100,3 @@ class Sqlite3File:
         for file in (self.path, *journals):
             shutil.copyfile(file, Path(self._copies.name) / file.name)
         return Path(self._copies.name) / self.path.name
-
-    def _whole_pages(self) -> Path:
-        """Path of a copy without the page that was cut: SQLite would read zeros for the rest of it."""
-        copy = self._copy()
-        with copy.open("r+b") as file:
-            page_size = int.from_bytes(file.read(_PAGE_SIZE.stop)[_PAGE_SIZE], "big")
-            page_size = 65536 if page_size == 1 else max(page_size, 512)
-            file.truncate(copy.stat().st_size // page_size * page_size)
-        return copy

@@ -19,6 +19,7 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.files import open_file, read_whole
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, IntArray
+from fgtrack.io.errors import one_line
 from fgtrack.io.run.rows import text_header
 from fgtrack.io.run.schema import COLUMNS, NO_TRACK, OPTIONAL_TABLES, RUN_FORMAT, Column, column, column_type
 from fgtrack.io.run.writer import LARGEST_META_MB, RunWriter, path_from_run
@@ -223,10 +224,8 @@ def _read_table(path: Path, table: str, complete: bool) -> Table:
         if complete and not content.endswith(b"\n"):
             raise DataError(f"{path}: breaks off in its last row, repeat the run")
         return parsed(table, content[: content.rfind(b"\n") + 1] or text_header(table))
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}), is this a run folder?") from error
-    except (ValueError, OverflowError) as error:
-        raise DataError(f"{path}: cannot be read ({' '.join(str(error).split())}), repeat the run") from error
+    except (OSError, ValueError, OverflowError) as error:
+        raise DataError(f"{path}: cannot be read ({one_line(error)}), repeat the run") from error
 
 
 def parsed(table: str, content: bytes | bytearray) -> Table:

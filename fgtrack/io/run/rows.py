@@ -63,12 +63,6 @@ def smoothed_rows(reports: Iterable[SmoothedReport]) -> list[Row]:
     ]
 
 
-def ignored_row(truth: TruthState) -> Row:
-    """A row of `ignored`; corners as `x y x y ...`."""
-    outline = None if truth.outline_m is None else " ".join(map(repr, map(float, truth.outline_m)))
-    return (truth.stamp_ns, truth.object_id, float(truth.x_m), float(truth.y_m), outline)
-
-
 def detection_rows(message: DetectionList) -> list[Row]:
     """Rows of `detections`: what `message` says of every object, in its own frame."""
     found: list[Row] = []

@@ -14,7 +14,7 @@ from fgtrack.core.types import (
     TickReport,
     TruthState,
 )
-from fgtrack.io.run.rows import Row, detection_rows, ignored_row, rows, smoothed_rows, state_cells
+from fgtrack.io.run.rows import Row, detection_rows, rows, smoothed_rows, state_cells
 from fgtrack.io.run.schema import RUN_FORMAT
 
 
@@ -59,7 +59,10 @@ class RunSink(ABC):
     def write_truth(self, truth: TruthState) -> None:
         """Take a row of `truth` or `ignored`; it is appended with the next tick, as all that is received."""
         if truth.ignored:
-            self._received["ignored"].append(ignored_row(truth))
+            outline = None if truth.outline_m is None else " ".join(map(repr, map(float, truth.outline_m)))
+            self._received["ignored"].append(
+                (truth.stamp_ns, truth.object_id, float(truth.x_m), float(truth.y_m), outline)
+            )
         else:
             self._received["truth"].append((truth.stamp_ns, truth.object_id, *state_cells(truth)))
 
