@@ -38,7 +38,7 @@ def report(tick: int = 0, size: int = 5) -> TickReport:
         (track(1, size), track(2, size)),
         (
             UpdateRecord("lidar", 900, 950, 0, Disposition.IN_SEQUENCE, 1, 0.1, {"x_m": 0.3, "y_m": -0.1}),
-            UpdateRecord("a,b", 901, 951, 1, Disposition.INVALID),
+            UpdateRecord('a",b', 901, 951, 1, Disposition.INVALID),
         ),
     )
 
@@ -87,13 +87,13 @@ def test_what_the_sensors_said_comes_back_and_is_not_in_the_digest(tmp_path):
     path = tmp_path / "run"
     box = Detection(x_m=np.float32(0.1), y_m=-2, covariance=(1.0, 0.0, 0.0, 1.0), object_id=7)
     with RunWriter(path) as writer:
-        writer.write_detections(DetectionList("a,b", 5, 9, [box, Detection(bearing_rad=0.3, stamp_ns=6)], "sensor"))
+        writer.write_detections(DetectionList('a",b', 5, 9, [box, Detection(bearing_rad=0.3, stamp_ns=6)], "sensor"))
         writer.write_tick(report(), 5, 2)
         writer.write_detections(DetectionList("radar", 7, 10, [Detection(x_m=math.nan, y_m=1.0)], "map"))
         writer.write_detections(DetectionList("radar", 8, 11, []))
         finished = writer.finish({})
     found = load_run(path).tables["detections"]
-    assert found["sensor"].tolist() == ["a,b", "a,b", "radar"]
+    assert found["sensor"].tolist() == ['a",b', 'a",b', "radar"]
     assert found["frame"].tolist() == ["sensor", "sensor", "map"]
     assert found["stamp_ns"].tolist() == [5, 6, 7]
     assert found["receipt_ns"].tolist() == [9, 9, 10]
@@ -113,7 +113,7 @@ def test_updates_truth_smoothed_and_timing_come_back(tmp_path):
         writer.finish({})
     run = load_run(tmp_path / "run")
     assert run.config_text == "seed: 1\n"
-    assert run.tables["updates"]["sensor"].tolist() == ["lidar", "a,b"]
+    assert run.tables["updates"]["sensor"].tolist() == ["lidar", 'a",b']
     assert run.tables["updates"]["track_id"].tolist() == [1, NO_TRACK]
     assert run.tables["updates"]["disposition"].tolist() == ["in_sequence", "invalid"]
     assert run.tables["updates"]["nis"][0] == 0.1
@@ -155,7 +155,7 @@ def test_the_meta_file_counts_every_disposition_and_carries_the_digest(tmp_path)
     assert meta["complete"] is True
     assert meta["estimator"] == "test"
     assert meta["counts"]["lidar"]["in_sequence"] == 2
-    assert set(meta["counts"]["a,b"]) == set(Disposition)
+    assert set(meta["counts"]['a",b']) == set(Disposition)
     assert sum(map(sum, (counts.values() for counts in meta["counts"].values()))) == 4
     tables = (path / "tracks.csv").read_bytes() + (path / "updates.csv").read_bytes()
     assert meta["digest"] == hashlib.sha256(tables).hexdigest()

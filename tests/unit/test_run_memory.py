@@ -7,20 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluation_runs import START_NS, WEST, update
 
-from fgtrack.core.types import (
-    EgoState,
-    Message,
-    SmoothedReport,
-    TickReport,
-    TrackReport,
-    TrackState,
-    TrackStatus,
-    TruthState,
-)
+from fgtrack.core.types import EgoState, Message
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.io.run import COLUMNS, MemoryRun, Run, RunWriter, load_run
+from fgtrack.io.run import COLUMNS, Run, load_run
 from fgtrack.pipeline.config import Config, MapConfig, MotionConfig
 from fgtrack.pipeline.replay import replay, replay_in_memory
 from fgtrack.pipeline.shipped import read_scenario
@@ -53,7 +43,7 @@ def messages() -> list[Message]:
     return simulate(replace(read_scenario("default"), duration_s=3.0), np.random.default_rng(4))
 
 
-@pytest.mark.parametrize("estimator", ["smoother", "ekf-replay", "ekf-backward-forward"])
+@pytest.mark.parametrize("estimator", ["smoother", "ekf-replay"])
 def test_replays_are_the_same_in_memory_and_written(estimator: str, messages: list[Message], tmp_path: Path) -> None:
     config = Config(estimator=estimator, map=MapConfig(track="oval"))
     config = replace(config, smoother=replace(config.smoother, lagged_s=(0.3, 0.1)))
@@ -87,43 +77,3 @@ def test_a_break_in_the_input_is_told(messages: list[Message]) -> None:
     memory = replay_in_memory([*messages, first], Config())
     assert "receipt time goes back" in memory.meta["broken_off"]
     assert memory.meta["complete"] is True
-
-
-@pytest.mark.parametrize("size", [4, 5, 6])
-def test_every_kind_of_row_is_the_same(size: int, tmp_path: Path) -> None:
-    """Also what a tracker gives rarely: no tick, no pose of the truth, no NIS, text that a CSV has to quote."""
-    rng = np.random.default_rng(size)
-
-    def state() -> TrackState:
-        return TrackState(START_NS, rng.normal(size=size), rng.normal(size=(size, size)))
-
-    tracks = tuple(TrackReport(k, TrackStatus.COASTING, state(), 9) for k in range(3))
-    smoothed = tuple(SmoothedReport(k, state(), lag) for k in (1, 7) for lag in (None, 0.3, 0.0, 0.1))
-    records = (update('a "b", c', track_id=None), update(nis=0.0, x_m=-0.0, yaw_rad=1e-300))
-    reports = [TickReport(0, START_NS, (), ()), TickReport(1, START_NS + 1, tracks, records, smoothed)]
-    truth = [*WEST.truth(range(3)), *WEST.truth([4], pose=False), TruthState(5, 5, -1, 0.0, 1.0)]
-    with RunWriter(tmp_path / "run", "a: 1\n", {"seed": None}, 0.3) as writer:
-        memory = MemoryRun("a: 1\n", {"seed": None}, 0.3)
-        for sink in (writer, memory):
-            for row in truth:
-                sink.write_truth(row)
-            for report in reports:
-                sink.write_ego(EgoState(report.now_ns, report.now_ns + 3, 0.1, 1e300, -0.0, 4.0))
-                sink.write_tick(report, 17, 2)
-            sink.write_ego(EgoState(9, 9, 0.0, 0.0, 0.0, 0.0, 0.1, 0.2))
-            sink.write_smoothed([SmoothedReport(7, reports[1].tracks[0].state)])
-            sink.finish({"broken_off": None})
-    assert_same(memory.run, load_run(tmp_path / "run"))
-    assert memory.run.tables["smoothed"].num_rows == 4
-    assert memory.run.tables["ego"].num_rows == 3
-
-
-def test_states_are_kept_as_they_were_when_they_came() -> None:
-    mean, covariance = np.zeros(5), np.eye(5)
-    memory = MemoryRun()
-    track = TrackReport(1, TrackStatus.CONFIRMED, TrackState(START_NS, mean, covariance), 3)
-    memory.write_tick(TickReport(0, START_NS, (track,), ()), 0, 0)
-    mean += 1.0
-    covariance += 1.0
-    assert memory.run.tables["tracks"]["x_m"].tolist() == [0.0]
-    assert memory.run.tables["tracks"]["p_x_y"].tolist() == [0.0]
