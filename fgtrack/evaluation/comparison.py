@@ -1,8 +1,4 @@
-"""Runs of one recording compared: paired differences of their errors, at the same objects and stamps.
-
-The sums behind a value are kept for every stamp, so that the difference of two runs has the interval of a block
-bootstrap over time (`fgtrack.evaluation.intervals`).
-"""
+"""Runs of one recording compared: paired differences of their errors, at the same objects and stamps."""
 
 import functools
 from collections.abc import Callable, Mapping, Sequence

@@ -1,8 +1,6 @@
 """Confidence intervals of 95 %: of differences paired over seeds (t interval), and within one run (block bootstrap).
 
-Two estimators on the same recording make nearly the same errors, so their difference is known far better than either
-value. Over seeds the differences are independent. Along one run they are not: neighbouring ticks share their errors,
-so blocks of time are drawn instead of ticks.
+Over seeds differences are independent. Neighbouring ticks of a run share their errors, so blocks of time are drawn.
 """
 
 import math

@@ -1,14 +1,11 @@
 """All tracks against all true objects: GOSPA, CLEAR, IDF1 and HOTA.
 
-With the best assignment of tracks to objects nearer than c (Rahmathullah, Garcia-Fernandez, Svensson: Generalized
-optimal sub-pattern assignment metric, Fusion 2017, with p = 2 and alpha = 2),
+With the best assignment of tracks to objects nearer than c (Rahmathullah, Garcia-Fernandez, Svensson, Fusion 2017),
 
     GOSPA^2 = sum of squared distances of the pairs + c^2 / 2 (number of missed objects + number of false tracks).
 
-CLEAR (Bernardin and Stiefelhagen 2008) counts as TrackEval does. That of motrics 0.3 differs: it charges 1e18 for a
-pair outside the gate, in whose rounding the similarities of the other pairs are lost, and it keeps to the last track
-that an object ever had. IDF1 (Ristani et al. 2016) and HOTA (Luiten et al. 2021) are computed by motrics, with the
-similarity of positions 1 - d / zero distance of TrackEval and a zero distance of twice the gate.
+CLEAR (Bernardin and Stiefelhagen 2008) counts as TrackEval does; motrics 0.3 differs outside the gate and in switches.
+IDF1 (Ristani et al. 2016) and HOTA (Luiten et al. 2021) are those of motrics with the similarity 1 - d / (2 gate).
 """
 
 import math

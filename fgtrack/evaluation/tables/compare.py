@@ -65,12 +65,9 @@ def compare(*runs: OneRun | Iterable[OneRun] | Mapping[str, OneRun], streaming: 
         **{f"residuals_{name}": _residuals(name, metrics) for one in metrics.values() for name in one.sensors},
         "dispositions": _dispositions(metrics),
     }
-    sentences = verdict(metrics, compared)
-    if streaming:
-        more, added = streaming_tables(every)
-        tables, sentences = tables | more, (*sentences, *added)
+    more, sentences = streaming_tables(every) if streaming else ({}, [])
     details = {"runs": {label: one.as_dict() for label, one in metrics.items()}}
-    return Tables(tables, details, sentences)
+    return Tables(tables | more, details, (*verdict(metrics, compared), *sentences))
 
 
 def _differences(compared: Sequence[Comparison]) -> Table:

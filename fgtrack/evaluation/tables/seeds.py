@@ -45,8 +45,6 @@ _MAIN: Mapping[str, str] = {
     "multi_object.gospa.in_sight_rms_m": "GOSPA\n[m]",
     "truth.overall.tracked_share_in_sight": "tracked\n[%]",
 }
-_SHARES = ("truth.overall.tracked_share_in_sight",)
-_INTERVALS = "t intervals of paired differences over seeds; tie with the best: 0 is inside"
 
 
 @dataclass(frozen=True)
@@ -62,8 +60,7 @@ class SweepTable:
     @property
     def shown_axes(self) -> list[str]:
         """Axes that vary and distinguish the points, without those of whole mappings where labels do it."""
-        varying = [axis for axis in self.axes if self.rows[axis].nunique() > 1]
-        return distinguishing(self.rows[varying])
+        return distinguishing(self.rows[[axis for axis in self.axes if self.rows[axis].nunique() > 1]])
 
     def means(self, metric: str) -> DataFrame:
         """Return the mean over the seeds at every point and of every estimator; `CallError` if there is no such metric.
@@ -150,9 +147,8 @@ def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) ->
     ]
     first, keys = compared[0].metric if compared else "", (*axes, "metric", "estimator")
     points = pd.DataFrame([one.point for one in compared], columns=list(axes))
-    columns = [_point_column(points), Column("estimator", left=True)]
-    columns += [*entry_columns("mean", "mean"), Column("seeds")]
-    notes = [_INTERVALS, "+: best; =: ties with the best"]
+    columns = [_point_column(points), Column("estimator", left=True), *entry_columns("mean", "mean"), Column("seeds")]
+    notes = ["t intervals of paired differences over seeds; +: best; =: ties with the best, 0 is inside"]
     return Table(first, records, columns, keys, notes, is_main=lambda row: row["metric"] == first and row["seeds"] > 1)
 
 
@@ -168,7 +164,7 @@ def summary_table(sweep: SweepTable) -> Table:
     columns = [_point_column(sweep.rows[list(sweep.axes)]), Column("estimator", left=True)]
     for name in metrics:
         heading = _MAIN.get(name) or re.sub(r"\.(?!\d)", "\n", name)
-        both, scale = (name, f"{name}.standard_error"), PERCENT if name in _SHARES else 1.0
+        both, scale = (name, f"{name}.standard_error"), PERCENT if name.endswith("share_in_sight") else 1.0
         columns.append(Column(heading, both, "{} ± {}", scale, is_extra=name not in main))
     notes = ["± standard error of the mean over the seeds"]
     return Table("Summary", records, [*columns, Column("seeds")], (*sweep.axes, "estimator"), notes)

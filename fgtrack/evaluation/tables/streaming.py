@@ -1,9 +1,7 @@
 """Accuracy when each run pays for its time: published states against the truth at the moment when they were ready.
 
-The streaming accuracy of Li, Wang, Ramanan: Towards streaming perception, ECCV 2020, for object detection; Wang et al.:
-Are we ready for vision-centric driving streaming perception? The ASAP benchmark, CVPR 2023, for tracking. Ticks are
-done one after the other by one thread, and an output that took 30 ms is compared with the truth 30 ms later, as it was
-published. Times come from timing.csv, so nothing here depends on the machine that compares.
+Li, Wang, Ramanan: Towards streaming perception, ECCV 2020; Wang et al.: The ASAP benchmark, CVPR 2023. Ticks are done
+one after the other; their times are those of timing.csv, so nothing depends on the machine that compares.
 """
 
 from collections.abc import Sequence
