@@ -54,9 +54,9 @@ def diagnostics(run: Run) -> list[Diagnostic]:
     return [diagnostic for kind in kinds for diagnostic in kind(run)]
 
 
-def noise_diagnostics(run: Run) -> list[Diagnostic]:
+def noise_diagnostics(run: Run) -> Iterator[Diagnostic]:
     """Sensors whose innovations are inconsistent with the noise; see also the verdict of `compare`."""
-    result, source = [], (run.meta.get("input") or {}).get("path")
+    source = (run.meta.get("input") or {}).get("path")
     of_run = f" {source} -c {run.path / 'config.yaml'}" if run.path is not None and source else ""
     for sensor, nis in misfits(run):
         size = "small" if nis.mean > nis.dof else "large"
@@ -66,8 +66,7 @@ def noise_diagnostics(run: Run) -> list[Diagnostic]:
             f"{factor:.2g} times what is configured; `fgtrack advise{of_run} --tune -o advised.yaml` fits it, or "
             "reports what has to be done first"
         )
-        result.append(Diagnostic(sensor, text))
-    return result
+        yield Diagnostic(sensor, text)
 
 
 def misfits(run: Run) -> Iterator[tuple[str, ChiSquareMean]]:
@@ -100,16 +99,12 @@ def reasons(counts: Mapping[str, int]) -> str:
 
 
 def excluded_lines(meta: Mapping[str, Any]) -> Iterator[str]:
-    """A line for each sensor of a run with this meta.json whose detections settings excluded."""
-    bounds, unread = (dict(meta.get(key) or {}) for key in ("out_of_bounds", "left_out"))
-    for sensor in sorted({*bounds, *unread}):
-        parts = []
-        if sensor in bounds:
-            count, total = sum(bounds[sensor].values()), sum(meta["counts"][sensor].values())
-            parts.append(f"{count} of {total} detections out of bounds ({reasons(bounds[sensor])})")
-        if sensor in unread:
-            parts.append(f"{sum(unread[sensor].values())} left out when read ({reasons(unread[sensor])})")
-        yield f"{sensor}: {'; '.join(parts)}"
+    """Lines on the detections of each sensor that settings excluded in a run with this meta.json."""
+    for sensor, counts in sorted(dict(meta.get("out_of_bounds") or {}).items()):
+        total = sum(meta["counts"][sensor].values())
+        yield f"{sensor}: {sum(counts.values())} of {total} detections out of bounds ({reasons(counts)})"
+    for sensor, counts in sorted(dict(meta.get("left_out") or {}).items()):
+        yield f"{sensor}: {sum(counts.values())} left out when read ({reasons(counts)})"
 
 
 def _angles(run: Run) -> Iterator[Diagnostic]:

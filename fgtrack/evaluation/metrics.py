@@ -1,6 +1,7 @@
 """All metrics of a run."""
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
@@ -218,9 +219,9 @@ def _sensor_metrics(run: Run) -> dict[str, SensorMetrics]:
     for sensor in np.unique(updates["sensor"]).tolist():
         mine = updates["sensor"] == sensor
         moments = {name: moments_of(name, values[name][mine]) for name in RESIDUAL_NAMES}
-        dispositions = updates["disposition"][mine].tolist()
+        counts = Counter(updates["disposition"][mine].tolist())
         sensors[sensor] = SensorMetrics(
-            dispositions={name.value: dispositions.count(name.value) for name in Disposition},
+            dispositions={name.value: counts[name.value] for name in Disposition},
             delay_s=Distribution.of(message_delays(updates.where(mine))[1]),
             residuals={name: value for name, value in moments.items() if value.count},
         )

@@ -118,11 +118,10 @@ def by_recording(runs: Sequence[EvaluatedRun]) -> list[list[EvaluatedRun]]:
 def recordings_warning(runs: Sequence[EvaluatedRun]) -> list[str]:
     """Return a line where `runs` are of different recordings, with their names; empty otherwise."""
     groups = by_recording(runs)
-    inputs = [group[0].run.meta.get("input") or {} for group in groups]
-    texts = [
-        f"{', '.join(one.label for one in group)} ({source.get('path') or 'messages in memory'})"
-        for group, source in zip(groups, inputs, strict=True)
-    ]
+    texts = []
+    for group in groups:
+        source = (group[0].run.meta.get("input") or {}).get("path") or "messages in memory"
+        texts.append(f"{', '.join(one.label for one in group)} ({source})")
     text = f"the runs are of {len(groups)} recordings, so their numbers cannot be compared across them"
     return [f"{text}: {'; '.join(texts)}"] if len(groups) > 1 else []
 

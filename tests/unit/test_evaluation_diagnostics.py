@@ -37,7 +37,7 @@ def test_a_healthy_run_has_none(tmp_path: Path) -> None:
     fine = [update(tick=k, delay_ns=150_000_000, nis=float(rng.chisquare(2)), x_m=0.1, y_m=0.1) for k in range(100)]
     refused = [update(tick=k, disposition=Disposition.GATED) for k in range(100, 150)]
     run = run_of(tmp_path / "run", fine + refused)
-    assert (diagnostics(run), noise_diagnostics(run), unused(run)) == ([], [], None)
+    assert (diagnostics(run), list(noise_diagnostics(run)), unused(run)) == ([], [], None)
 
 
 @pytest.mark.parametrize(
@@ -88,9 +88,9 @@ def test_noise_that_does_not_fit_is_told(nis: float, size: str, tmp_path: Path) 
     assert str(found).startswith(f"lidar: mean NIS {nis:.3g}, expected 2: the configured noise is too {size}")
     burst = [26.0 if k % 10 == 0 else 1.4 for k in range(40)]
     born = run_of(tmp_path / "born", [update(tick=k, nis=each, x_m=0.1, y_m=0.1) for k, each in enumerate(burst)])
-    assert noise_diagnostics(born) == []
+    assert list(noise_diagnostics(born)) == []
     few = run_of(tmp_path / "few", [update(tick=k, nis=nis, x_m=0.1, y_m=0.1) for k in range(20)])
-    assert noise_diagnostics(few) == []
+    assert list(noise_diagnostics(few)) == []
 
 
 def test_a_run_that_used_nothing_says_what_became_of_all(tmp_path: Path) -> None:
