@@ -38,11 +38,6 @@ __all__ = [
 ]
 
 
-def __dir__() -> list[str]:
-    """Return the names of the figures: what `fgtrack.plot.` completes to."""
-    return sorted(__all__)
-
-
 _FEW = 3  # of objects, and of runs where they are many: the worst are drawn
 _MOST_RUNS = 6  # that have figures of their own
 
@@ -108,6 +103,6 @@ def drawn(plans: Iterable[Planned], every: bool = False, **paper: Unpack[Paper])
 
 
 def save_named(named: Iterable[tuple[str, Figure]], folder: Path, form: str) -> list[Path]:
-    """Write figures into `folder`, each into a file of its name; raises `CallError` as `save`."""
+    """Write figures into `folder`, each into a file of its name."""
     slug = re.compile(r"[^A-Za-z0-9.-]+")
     return [save(figure, folder / f"{slug.sub('_', name).strip('_')}.{form}") for name, figure in named]

@@ -19,7 +19,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import LogLocator, NullFormatter
 from PIL import Image
 
-from fgtrack.core.errors import CallError, printable_lines
+from fgtrack.core.errors import printable_lines
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.palette import Look, looks
 from fgtrack.evaluation.runs import EvaluatedRun
@@ -176,17 +176,7 @@ def png(figure: Figure, dpi: float = 150.0) -> bytes:
     return small.getvalue()
 
 
-def save(figure: Figure, path: Path | str) -> Path:
-    """Write `figure` as PNG, SVG or PDF, by the suffix, without date and version: equal figures, equal files.
-
-    Raises `CallError` if the suffix is none of these, or the file cannot be written.
-    """
-    path = Path(path)
-    form = path.suffix.lower().removeprefix(".")
-    if form not in FORMATS:
-        raise CallError(f"{path}: no format of a figure, end the name with .{', .'.join(FORMATS)}")
-    try:
-        figure.savefig(path, format=form, metadata=dict(FORMATS[form]))
-    except OSError as error:
-        raise CallError(f"{path}: cannot be written ({error.strerror}), choose another folder") from error
+def save(figure: Figure, path: Path) -> Path:
+    """Write `figure` as PNG, SVG or PDF, by the suffix, without date and version: equal figures, equal files."""
+    figure.savefig(path, metadata=dict(FORMATS[path.suffix.removeprefix(".")]))
     return path

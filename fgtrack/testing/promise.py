@@ -1,7 +1,7 @@
 """One promise of the contract of estimators, and how it is checked."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -110,7 +110,8 @@ class Promise:
                 wrong = fault(self.check, subject, stream)
                 place = 0
                 while wrong and place < len(stream.measurements) > 1:
-                    smaller = stream.without(place)
+                    fewer = stream.measurements[:place] + stream.measurements[place + 1 :]
+                    smaller = replace(stream, measurements=fewer)
                     if still := fault(self.check, subject, smaller):
                         stream, wrong = smaller, still
                     else:

@@ -6,7 +6,6 @@ motion models (see `check_motion_model`), measurement models and losses.
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -119,38 +118,32 @@ def _weight(one: Measurement, y: FloatArray) -> float:
     return 1.0 if one.loss is None else weight(one.loss, math.sqrt(y @ np.linalg.solve(one.R, y)))
 
 
-class Difference(NamedTuple):
-    """Distance of one Gaussian from another."""
+def difference(found: TrackState, expected: TrackState, motion: MotionModel | None = None) -> tuple[float, float]:
+    """Distance of `found` from `expected`: the largest difference of means and covariances, in standard deviations.
 
-    mean_sigma: float
-    """Largest difference of the means, in standard deviations."""
-    covariance: float
-    """Largest difference of the covariances, relative to the two standard deviations that belong to the entry."""
-
-
-def difference(found: TrackState, expected: TrackState, motion: MotionModel | None = None) -> Difference:
-    """Distance of `found` from `expected`; a NaN stays one. The yaw of a state of `motion` goes the short way round."""
+    A covariance is relative to the two standard deviations of its entry; a NaN stays one. The yaw of a state of
+    `motion` goes the short way round.
+    """
     sigma, off = np.sqrt(np.diag(expected.covariance)), found.mean - expected.mean
     off = off if motion is None else wrapped(motion, off)
-    mean = np.abs(off) / sigma
     covariance = np.abs(found.covariance - expected.covariance) / np.outer(sigma, sigma)
-    return Difference(float(mean.max()), float(covariance.max()))
+    return float((np.abs(off) / sigma).max()), float(covariance.max())
 
 
-def innovation_difference(result: UpdateResult, measurement: Measurement, before: TrackState) -> Difference:
+def innovation_difference(result: UpdateResult, measurement: Measurement, before: TrackState) -> tuple[float, float]:
     """Distance of the innovation of `result` from that of the state `before` the measurement; of the NIS over 1 + NIS.
 
     Infinite where there is none.
     """
     if result.innovation is None or result.nis is None:
-        return Difference(math.inf, math.inf)
+        return math.inf, math.inf
     model, mean = measurement.model, before.mean
     H = model.jacobian(mean, measurement.pose)
     S = H @ before.covariance @ H.T + measurement.R
     y = model.residual(measurement.z, model.predict(mean, measurement.pose))
     nis = float(y @ np.linalg.solve(S, y))
     apart = np.abs(result.innovation - y) / np.sqrt(np.diag(S))
-    return Difference(float(apart.max()), abs(result.nis - nis) / (1.0 + nis))
+    return float(apart.max()), abs(result.nis - nis) / (1.0 + nis)
 
 
 def rounding_bound(motion: MotionModel, stamps_ns: Iterable[int], sigma_m: float = 0.5) -> float:

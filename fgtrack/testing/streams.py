@@ -53,10 +53,6 @@ class Stream:
         order = sorted(range(len(self.measurements)), key=lambda k: (self.measurements[k].stamp_ns, -k))
         return replace(self, measurements=tuple(self.measurements[k] for k in order))
 
-    def without(self, place: int) -> "Stream":
-        """All but one measurement."""
-        return replace(self, measurements=self.measurements[:place] + self.measurements[place + 1 :])
-
     def __str__(self) -> str:
         lines = [f"{type(self.motion).__name__}, measurements in the order of arrival (stamp after the start):"]
         for m in self.measurements:

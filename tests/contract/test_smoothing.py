@@ -19,7 +19,7 @@ from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalBank
 from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import RobustLoss
-from fgtrack.testing.references import Difference, dense_joint, difference
+from fgtrack.testing.references import dense_joint, difference
 from fgtrack.testing.streams import COMPONENTS, MS, START, measured, shuffled
 
 START_NS = START.stamp_ns
@@ -262,7 +262,7 @@ def test_final_states_of_a_nonlinear_model_are_near_the_optimum_of_what_had_arri
 # --- many tracks
 
 
-def known_apart(found: TrackState, expected: TrackState) -> Difference:
+def known_apart(found: TrackState, expected: TrackState) -> tuple[float, float]:
     """`difference` of what is known of a kinematic state."""
     known = np.diag(expected.covariance) > 0.0
     parts = (TrackState(s.stamp_ns, s.mean[known], s.covariance[known][:, known]) for s in (found, expected))

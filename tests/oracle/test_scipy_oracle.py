@@ -15,7 +15,7 @@ from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Estimator
 from fgtrack.estimation.registry import ESTIMATORS, start_estimator
 from fgtrack.models.sensors import SensorModel
-from fgtrack.testing.references import Difference, dense_joint, difference
+from fgtrack.testing.references import dense_joint, difference
 
 Draw = Callable[[np.random.Generator], Stream]
 SMOOTHERS = ("smoother", "smoother-banded", "smoother-batch")
@@ -67,7 +67,7 @@ def probes_ns(name: str, stream: Stream) -> list[int]:
     return [*past, stream.newest_ns, stream.newest_ns + AHEAD_NS]
 
 
-def largest(differences: list[Difference]) -> float:
+def largest(differences: list[tuple[float, float]]) -> float:
     """A NaN wins."""
     return float(np.max(differences))
 
