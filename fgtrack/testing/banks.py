@@ -24,7 +24,10 @@ List = dict[int, Measurement]
 def gives_each_of_several_objects_what_it_gives_one_alone(subject: Subject, stream: Stream) -> None:
     """Each list has a measurement of most objects; half way one is removed and another one begins."""
     objects = [_shifted(stream, number) for number in range(_NUM_OBJECTS)]
-    lists = _lists_of([one.measurements for one in objects])
+    lists = [  # of what was sensed together; each object is missing in every fourth list
+        {k: one.measurements[place] for k, one in enumerate(objects) if (place + k) % 4}
+        for place in range(len(stream.measurements))
+    ]
     half, new = (len(lists) + 1) // 2, len(objects)
     later = [{new if number == _GONE else number: m for number, m in one.items()} for one in lists[half:]]
     bank = subject.start_bank(stream)
@@ -119,11 +122,3 @@ def _fed(bank: TrackBank, lists: Sequence[List]) -> list[dict[int, UpdateResult]
         bank.states_at(stamp_ns)
         reported.append(dict(zip(one, bank.update(stamp_ns, list(one), list(one.values())), strict=True)))
     return reported
-
-
-def _lists_of(objects: Sequence[Sequence[Measurement]]) -> list[List]:
-    """Measurements of objects that were sensed together; each object is missing in every fourth list."""
-    return [
-        {k: one[place] for k, one in enumerate(objects) if (place + k) % 4}
-        for place in range(min(len(one) for one in objects))
-    ]

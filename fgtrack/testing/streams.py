@@ -47,12 +47,6 @@ class Stream:
         """The newest stamp."""
         return self.stamps_ns[-1]
 
-    @property
-    def in_order(self) -> "Stream":
-        """By stamp; those of one stamp the other way round, because their order must not matter either."""
-        order = sorted(range(len(self.measurements)), key=lambda k: (self.measurements[k].stamp_ns, -k))
-        return replace(self, measurements=tuple(self.measurements[k] for k in order))
-
     def __str__(self) -> str:
         lines = [f"{type(self.motion).__name__}, measurements in the order of arrival (stamp after the start):"]
         for m in self.measurements:

@@ -22,15 +22,9 @@ def export(runs: Runs, out: Path, *, ros2: bool = False, overwrite: bool = False
 
     Log times are those at which something was known (receipt, tick), publish times and header stamps those that it is
     about. Several runs stand side by side, the topics of each below its name. Returns the number of messages by topic,
-    and a line for whatever could not be shown.
-
-    Raises
-    ------
-    CallError
-        The runs are not of the same recording, the package `foxglove-sdk` is missing, `out` does not end in `.mcap`,
-        lies in a run, or something is there.
-    DataError
-        A run or its map is damaged, or a time does not fit into the file.
+    and a line for whatever could not be shown. Raises `CallError` if the runs are not of the same recording, the
+    package `foxglove-sdk` is missing, or `out` is no name for the file, exists or lies in a run, and `DataError` if a
+    run or its map is damaged, or a time does not fit into the file.
     """
     write = write_ros2
     if not ros2:

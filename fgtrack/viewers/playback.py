@@ -31,22 +31,17 @@ _LONGEST_S = 1e7  # times farther from the start are of another clock, and left 
 def playback(runs: Sequence[EvaluatedRun], moment: Moment | None = None) -> tuple[Json, list[str]]:
     """Return what the viewer shows of `runs`, first `moment`, and a line for whatever it does not show.
 
-    Times are seconds from the start of a recording, positions relative to its origin, and missing values null.
-
-    Raises
-    ------
-    DataError
-        A run or its map is damaged.
+    Times are seconds from the start of a recording, and missing values null. Raises `DataError` if a run or its map is
+    damaged.
     """
-    recordings, notes = [_Recording.of(group) for group in by_recording(runs)], dict[str, None]()
-    first = recordings[0]
-    x0_m, y0_m = first.origin_m.tolist()
+    recordings = [_Recording(group, min(start_ns(one.run) for one in group)) for group in by_recording(runs)]
+    notes = dict[str, None]()
     return {
         "colours": distinct_colours([str(one.run.meta.get("estimator", "")) for one in runs]),
         "sensor_colours": SENSORS,
         "moment": None
         if moment is None
-        else {"t": (moment[0] - first.start_ns) / NS_PER_S, "x": moment[1] - x0_m, "y": moment[2] - y0_m},
+        else {"t": (moment[0] - recordings[0].start_ns) / NS_PER_S, "x": moment[1], "y": moment[2]},
         "size_m": NOMINAL_SIZE_M[:2],
         "recordings": [one.values(notes, MOST_ROWS // len(recordings)) for one in recordings],
         "runs": [
@@ -60,22 +55,10 @@ def playback(runs: Sequence[EvaluatedRun], moment: Moment | None = None) -> tupl
 
 @dataclass(frozen=True)
 class _Recording:
-    """Runs of one recording, and the time and place that theirs are relative to."""
+    """Runs of one recording, and the time that theirs are relative to."""
 
     runs: Sequence[EvaluatedRun]
     start_ns: int
-    origin_m: FloatArray
-
-    @classmethod
-    def of(cls, runs: Sequence[EvaluatedRun]) -> "_Recording":
-        """Return the recording of `runs`; its origin is near the middle of all that is drawn, in whole metres."""
-        origin_m = np.zeros(2)
-        first = runs[0].run.tables
-        for table in (first["ego"], first["truth"], *(one.run.tables["tracks"] for one in runs)):
-            if (drawn := located(table)).num_rows:
-                origin_m = np.rint([0.5 * (drawn[name].min() + drawn[name].max()) for name in ("x_m", "y_m")])
-                break
-        return cls(runs, min(start_ns(one.run) for one in runs), origin_m)
 
     def seconds(self, times_ns: IntArray) -> FloatArray:
         times_s = (times_ns - self.start_ns) / NS_PER_S
@@ -83,7 +66,7 @@ class _Recording:
 
     def place(self, position_m: FloatArray, prefix: str = "") -> Json:
         """Columns of positions, shape (n, 2)."""
-        return {f"{prefix}{name}": _column(position_m[:, k] - self.origin_m[k]) for k, name in enumerate("xy")}
+        return {f"{prefix}{name}": _column(position_m[:, k]) for k, name in enumerate("xy")}
 
     def rows(self, states: Table, time: str, *order: str) -> Table:
         """Rows of `states` with a position and a time, in the order of `time` and `order`."""
@@ -114,7 +97,6 @@ class _Recording:
         (truth,) = _thinned([self.rows(truth, "stamp_ns", "object_id")], "stamp_ns", most, "truth", notes)
         return {
             "start_ns": str(self.start_ns),  # of more digits than a number of JavaScript holds
-            "origin_m": self.origin_m.tolist(),
             "map": [{"kind": kind, **self.place(line)} for kind, line in lines],
             "ego": self.columns(ego, "stamp_ns"),
             "truth": {"object": _column(truth["object_id"]), **self.columns(truth, "stamp_ns")},
