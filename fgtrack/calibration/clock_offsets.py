@@ -17,7 +17,7 @@ stretches count, the larger ones more (Carter, Schnepel, Steigerwald, Review of 
 
 import math
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -120,10 +120,6 @@ class OffsetReport:
     def others(self) -> list[SensorOffset]:
         """The sensors but the reference."""
         return [one for one in self.sensors if one.sensor != self.reference]
-
-    def as_dict(self) -> dict[str, object]:
-        """Return plain values for JSON."""
-        return asdict(self)
 
     def surely_late_s(self, one: SensorOffset) -> float | None:
         """Return by how much the later one of two clocks is late at least; negative where it is that of the reference.

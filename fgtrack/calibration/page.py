@@ -8,10 +8,11 @@ from fgtrack.calibration.arrivals import Arrivals
 from fgtrack.calibration.finding import Finding
 from fgtrack.calibration.outcome import Outcome
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
+from fgtrack.io.info import OTHER_CLOCK_S
 from fgtrack.pipeline.assumptions.assumption import Assumption
 from fgtrack.pipeline.config import Config
 
-__all__ = ["Advice"]
+__all__ = ["Advice", "whole"]
 
 _COMMENT = 110  # characters in a line of a file
 
@@ -86,7 +87,7 @@ class Advice:
             Column("sensor", left=True),
             Column("lists"),
             Column("period\n[ms]", "period_s", scale=1e3),
-            Column("delay [ms]\np50/p95/max", "delay_p50_s delay_p95_s delay_max_s", "{}/{}/{}", 1e3, text=_whole),
+            Column("delay [ms]\np50/p95/max", "delay_p50_s delay_p95_s delay_max_s", "{}/{}/{}", 1e3, text=whole),
             Column("overtaken\n[%]", "overtaken", scale=100.0),
             Column("lost\n[%]", "lost", scale=100.0),
         ]
@@ -116,5 +117,6 @@ def _wrapped(texts: Sequence[str]) -> list[str]:
     return [line for text in texts for line in how.wrap(text)]
 
 
-def _whole(value: Value) -> str:
-    return f"{value:.0f}" if abs(float(value)) < 3.6e6 else NO_VALUE
+def whole(value: Value) -> str:
+    """Whole milliseconds; of a recorder with another clock than the sensor nothing."""
+    return f"{value:.0f}" if abs(float(value)) < 1e3 * OTHER_CLOCK_S else NO_VALUE

@@ -2,6 +2,7 @@
 
 import shlex
 from contextlib import suppress
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +12,7 @@ from typer import Option
 from fgtrack.calibration.advise import advise as advised
 from fgtrack.calibration.clock_offsets import OffsetReport, estimate_offsets
 from fgtrack.calibration.clocks import clock_text
+from fgtrack.calibration.page import whole
 from fgtrack.calibration.starting import starting_config
 from fgtrack.calibration.trial import TRIAL_S, beginning, samples, suspicions
 from fgtrack.cli.arguments import ConfigFile, Input, Json, Overwrite, PitMap, Reference, Settings, TrackMap
@@ -19,9 +21,9 @@ from fgtrack.core.errors import CallError, DataError, FgtrackError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Message
 from fgtrack.evaluation.diagnostics import excluded_lines
-from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Value
+from fgtrack.evaluation.tables import NO_VALUE, Column, Table
 from fgtrack.io.errors import UntilBreak
-from fgtrack.io.info import OTHER_CLOCK_S, InputInfo, describe
+from fgtrack.io.info import InputInfo, describe
 from fgtrack.io.output import check_apart, check_output, write_file
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumptions.assumed import assumed
@@ -120,7 +122,7 @@ def _topics(found: InputInfo, unused: str) -> Table:
             " ".join(f"delay_{name}" for name in _DELAYS),
             "{}/{}/{}/{}",
             1e3,
-            text=_whole,
+            text=whole,
         ),
         Column("taken as", "taken_as", left=True),
         Column("type", left=True),
@@ -133,11 +135,6 @@ def _topics(found: InputInfo, unused: str) -> Table:
         start = datetime.fromtimestamp(found.start_ns // 1_000_000_000, UTC)
         extent = f"{found.duration_s:.3f} s from {start:%Y-%m-%d %H:%M:%S} UTC ({found.start_ns} ns)"
     return Table(f"{found.path}: {found.kind}, {extent}", records, columns, ("topic",), notes)
-
-
-def _whole(value: Value) -> str:
-    """Whole milliseconds; of a recorder with another clock than the sensor nothing."""
-    return f"{value:.0f}" if abs(float(value)) < 1e3 * OTHER_CLOCK_S else NO_VALUE
 
 
 def advise(
@@ -195,7 +192,7 @@ def offsets(
     for line in found.lines() if not as_json else ():
         say(line)
     verdicts = {one.sensor: clock_text(one, report) for one in report.others}
-    show(_offsets(report), "json" if as_json else None, report.as_dict() | {"verdicts": verdicts})
+    show(_offsets(report), "json" if as_json else None, asdict(report) | {"verdicts": verdicts})
     if not as_json:
         sentences(f"{name}: {text}" for name, text in verdicts.items())
     if readable.error is not None:

@@ -127,6 +127,11 @@ def test_a_track_outlives_the_silence_of_the_slowest_sensor() -> None:
     config = read_config(None, [f"sensors={{{sensors}}}", "lifecycle.out_of_view_s=0.5", "filter.storage_s=10.0"])
     (found,) = window_findings(arrivals, config)
     assert (found.about, found.settings) == ("lidar", {"lifecycle.out_of_view_s": 10.0})
+    short = replace(config, filter=replace(config.filter, storage_s=1.0))
+    assert next(window_findings(arrivals, short)).settings == {"filter.storage_s": 12.0}
+    every_30_s = START_NS + 10 * (arrivals[1].stamps_ns - START_NS)
+    seldom = replace(arrivals[1], stamps_ns=every_30_s, receipts_ns=every_30_s)
+    assert next(window_findings([seldom], short)).settings == {"filter.storage_s": 60.0}
     alone = replace(config, sensors={"lidar": config.sensors["lidar"]})
     assert not list(window_findings(arrivals[1:2], alone))
     settings = ["lifecycle.kind=counting", "lifecycle.forget_s=0.5"]

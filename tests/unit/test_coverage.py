@@ -49,7 +49,8 @@ def test_the_sector_of_a_sensor_is_found_wherever_it_looks(axis_rad, field_of_vi
     found = coverage(lists(seen(axis_rad, field_of_view_rad, clutter=clutter)))
     assert found.field_of_view_rad == pytest.approx(field_of_view_rad, abs=0.25)
     assert math.cos(found.axis_rad - axis_rad) > math.cos(0.1)
-    assert found.rate_hz == pytest.approx(20.0)
+    assert (found.rate_hz, found.silence_s, found.revisit_s) == pytest.approx((20.0, 0.05, 0.05))
+    assert (found.scans, found.measured, found.num_lists) == (True, {"x_m", "y_m"}, 1200)
 
 
 def test_the_range_is_that_of_nearly_all_detections_and_some_more() -> None:

@@ -238,10 +238,11 @@ def _views(config: Config, covered: Coverages) -> Iterator[Assumption]:
     for name, sensor in config.sensors.items():
         if sensor.scan and not sensor.is_view_given and name in covered:
             one = covered[name]
+            rate = "" if one.rate_hz is None else f" at {one.rate_hz:.3g} Hz"
             usable_m = None if sensor.score is not None or one.persistence is None else one.persistence.max_range_m
             yield from _sensor(
                 name,
-                f"where it detects, of {one}",
+                f"where it detects, of {one.num_detections} detections in {one.num_lists} lists{rate}",
                 mount=plain(Mount(yaw_rad=one.axis_rad)) if one.axis_rad else None,
                 field_of_view_rad=one.field_of_view_rad,
                 view_range_m=one.range_m,

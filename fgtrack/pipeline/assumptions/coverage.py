@@ -71,10 +71,6 @@ class Coverage:
     range_m: float | None = None
     """Up to where it detects; None where it measures no range, or too seldom."""
 
-    def __str__(self) -> str:
-        rate = "" if self.rate_hz is None else f" at {self.rate_hz:.3g} Hz"
-        return f"{self.num_detections} detections in {self.num_lists} lists{rate}"
-
 
 def coverages(messages: Iterable[Message], mounts: Mapping[str, Mount] | None = None) -> dict[str, Coverage]:
     """Coverage of each sensor in `messages`, by name; `mounts` are the known ones.
