@@ -25,14 +25,7 @@ from fgtrack.tracking.existence import ExistenceRules
 from fgtrack.tracking.lifecycle import LifecycleRules
 from fgtrack.tracking.published import NeighbourhoodMerge, UngatedEuclidean
 
-__all__ = [
-    "ClockConfig",
-    "EgoConfig",
-    "FilterConfig",
-    "InitiationConfig",
-    "MapConfig",
-    "MotionConfig",
-]
+__all__ = ["ClockConfig", "EgoConfig", "FilterConfig", "InitiationConfig", "MapConfig", "MotionConfig"]
 
 MergeConfig = Annotated[ConnectedMerge | NoMerge | NeighbourhoodMerge, Discriminator("kind")]
 AssociationConfig = Annotated[GatedEuclidean | GatedMahalanobis | UngatedEuclidean, Discriminator("kind")]
@@ -165,7 +158,7 @@ class MotionConfig:
 
     kind: str = "ctrv"
     """`ctrv`, `ctra`, `cv`, `ctrv_euler` (the paper's steps), or the name of a plug-in."""
-    std_per_s: Mapping[str, float] = field(default_factory=_STD_PER_S.copy)
+    std_per_s: Mapping[str, NonNegativeFloat] = field(default_factory=_STD_PER_S.copy)
     """Process noise as the paper gives it: each step of 1 / `NOISE_HZ` adds (std_per_s / NOISE_HZ)^2, hence the density
     std_per_s^2 / NOISE_HZ. `ctra` takes `accel` as well, `cv` takes `velocity` alone; of `ctrv_euler` `accel` is an
     acceleration that drives the speed but is never estimated (Q5)."""
@@ -173,12 +166,9 @@ class MotionConfig:
     """Keyword parameters of a plug-in, which has no `std_per_s`."""
 
     def __post_init__(self) -> None:
-        for name, std_per_s in self.std_per_s.items():
-            if std_per_s < 0.0:
-                raise ValueError(f"std_per_s.{name}: must not be negative, is {std_per_s}")
-        if self.kind in _BUILT_IN_MOTION and self.parameters:
+        if self.parameters and not self.is_plug_in:
             raise ValueError(f"parameters: are a plug-in's, kind {self.kind} takes std_per_s")
-        if self.kind not in _BUILT_IN_MOTION and dict(self.std_per_s) != _STD_PER_S:
+        if self.is_plug_in and dict(self.std_per_s) != _STD_PER_S:
             raise ValueError(f"std_per_s: is that of the built-in models, give parameters for kind {self.kind}")
         self.model()
 
@@ -265,17 +255,12 @@ class Config:
                 raise ValueError(f"input.{key}: {sorted(unknown)[0]!r} has no model under sensors")
         if self.motion.kind != "ctrv_euler" and {"noise_per_step", "saturated_yaw"} & set(self.defects):
             raise ValueError("defects: noise_per_step and saturated_yaw are of motion.kind ctrv_euler")
-        coloured = [name for name, sensor in self.sensors.items() if sensor.correlation is not None]
-        if coloured and self.motion.kind == "ctrv_euler":
-            raise ValueError(f"sensors.{coloured[0]}.correlation: needs motion.kind ctrv, ctra or cv")
-        with_curvature = [
-            name for name, sensor in self.sensors.items() if sensor.curvature_from_map_std_radpm is not None
-        ]
-        if with_curvature and "yaw_rate_radps" not in self.motion.model().state_names:
-            key = f"sensors.{with_curvature[0]}.curvature_from_map_std_radpm"
-            raise ValueError(
-                f"{key}: needs a motion model with a yaw rate, as ctrv or ctra, and not {self.motion.kind}"
-            )
+        for name, sensor in self.sensors.items():
+            if sensor.correlation is not None and self.motion.kind == "ctrv_euler":
+                raise ValueError(f"sensors.{name}.correlation: needs motion.kind ctrv, ctra or cv")
+            curvature = sensor.curvature_from_map_std_radpm
+            if curvature is not None and "yaw_rate_radps" not in self.motion.model().state_names:
+                raise ValueError(f"sensors.{name}.curvature_from_map_std_radpm: needs motion.kind ctrv or ctra")
 
     @classmethod
     def from_yaml(cls, name: str | Path) -> Self:
@@ -289,9 +274,9 @@ class Config:
         Path(path).write_text(dump(self), encoding="utf-8")
 
     def replace(self, settings: Mapping[str, object] | None = None, /, **sections: object) -> Self:
-        """Return a copy with other values of dotted keys or of whole sections, validated as a file is.
+        """Return a copy with other values of dotted keys or of whole sections. Raises `CallError` with the key.
 
-        `config.replace({"smoother.lag_s": 3.0}, estimator="smoother")`. Raises `CallError` with the key.
+        `config.replace({"smoother.lag_s": 3.0}, estimator="smoother")`
         """
         changes = {key: plain(value) for key, value in {**(settings or {}), **sections}.items()}
         return with_settings(type(self), plain(self), changes, "the configuration")

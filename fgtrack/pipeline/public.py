@@ -33,10 +33,9 @@ def replay(
     out: str | Path | None = None,
     overwrite: bool = False,
 ) -> Run:
-    """Replay a recording through the tracker.
+    """Return the run that the command `fgtrack replay` writes.
 
-    Gives the same numbers and the same digest as the command `fgtrack replay`. A recording that breaks off is replayed
-    up to the break, with a `UserWarning`; the run's `meta["broken_off"]` says why.
+    A recording that breaks off is replayed up to the break, with a `UserWarning`, and `meta["broken_off"]` says why.
 
     Parameters
     ----------
@@ -45,22 +44,15 @@ def replay(
     config
         Name of a shipped configuration, path of a YAML file, or a `Config`; None for the defaults.
     map, pit_map
-        CSV files of the track and of the pit lane, or `oval`; instead of those of the configuration.
+        CSV files of the track and of the pit lane, or `oval`.
     estimator
-        Name of the estimator, instead of that of the configuration.
+        Name of the estimator.
     set
-        Values of single settings: `{"smoother.lag_s": 3.0}`.
+        Values of single settings: `{"smoother.lag_s": 3.0}`. All four replace those of the configuration.
     out
         Folder to write the run to; None keeps it in memory.
     overwrite
-        Whether a run in `out` may be replaced.
-
-    Raises
-    ------
-    CallError
-        The configuration or `out` does not fit.
-    DataError
-        The recording cannot be read, or a sensor of it has no model.
+        True to replace a run in `out`.
     """
     resolved = read_config(config, set, track_map=map, pit_map=pit_map, estimator=estimator)
     check_paths(out=out)
@@ -85,7 +77,7 @@ def replay(
 
 
 def _messages(recording: Iterable[Message]) -> Iterator[Message]:
-    """The messages of `recording`. Raises `CallError` for what holds none."""
+    """Yield the messages of `recording`. Raises `CallError` for other objects."""
     if not isinstance(recording, Iterable):
         raise CallError(f"recording: must be a path or messages, is a {type(recording).__name__}")
     for message in recording:
@@ -121,7 +113,7 @@ def simulate(
     storage: Storage = "mcap",
     overwrite: bool = False,
 ) -> Iterator[Message] | Path:
-    """Simulate a scenario: messages in the order of their receipt, or the path of the recording written.
+    """Return the messages of a simulated scenario in the order of their receipt, or the path of the recording written.
 
     Parameters
     ----------
@@ -136,12 +128,7 @@ def simulate(
     storage
         Storage of a rosbag2 folder.
     overwrite
-        Whether a recording at `out` may be replaced.
-
-    Raises
-    ------
-    CallError
-        The scenario or `out` does not fit.
+        True to replace a recording at `out`.
     """
     check_paths(out=out)
     if not isinstance(seed, (int, np.integer)) or seed < 0:

@@ -29,23 +29,15 @@ def shipped(kind: Kind) -> dict[str, Path]:
 
 
 def find_file(kind: Kind, name: str | Path, folder: Path | None = None) -> Path:
-    """The file `name`, relative to `folder`, or the shipped one of that name where there is no such file.
-
-    Raises
-    ------
-    CallError
-        There is neither.
-    """
+    """Return the file `name` in `folder`, else the shipped one of that name. Raises `CallError` where both miss."""
     path = Path(name) if folder is None else folder / name
     if path.is_file():
         return path
     known = shipped(kind)
     if str(name) in known:
         return known[str(name)]
-    if path.exists() or path.suffix or len(Path(name).parts) != 1:
-        raise CallError(f"{path}: there is no such {kind} file")
     hint = did_you_mean(name, known) or f"; shipped are {', '.join(known)}"
-    raise CallError(f"{path}: there is no such file, and no shipped {kind} of that name{hint}")
+    raise CallError(f"{path}: there is no such {kind} file{hint}")
 
 
 def summary(path: Path) -> str:
@@ -64,8 +56,7 @@ def read_config(
 ) -> Config:
     """Return the configuration of a file (in `folder`) or of that shipped name, else the defaults.
 
-    `settings` are values by dotted key, or texts of the form a.b=value; maps and estimator replace those of the file.
-    Raises `CallError` for what does not fit.
+    `settings` as of `load`; maps and estimator replace those of the file. Raises `CallError` with the key.
     """
     check_paths(map=track_map, pit_map=pit_map)
     if not isinstance(name, Config | None):

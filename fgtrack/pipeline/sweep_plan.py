@@ -134,7 +134,7 @@ def _one_at_a_time(given: Mapping[str, Value]) -> list[Point]:
 
 
 def compact(value: Value) -> str:
-    """`value` as JSON without spaces."""
+    """Return `value` as JSON without spaces."""
     return json.dumps(value, separators=(",", ":"))
 
 

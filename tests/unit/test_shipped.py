@@ -34,7 +34,7 @@ def test_maps_and_settings_go_before_what_the_file_says() -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("smothr", "no shipped configuration of that name, did you mean 'smoother'?"),
+        ("smothr", "smothr: there is no such configuration file, did you mean 'smoother'?"),
         (
             "zzz",
             "shipped are autoferry, karle2023, karle2023_reference, kitti, open_space, racecar",
