@@ -10,21 +10,23 @@ from fgtrack.core.types import BoolArray, FloatArray
 _HEADING, _CURVATURE, _LEFT, _RIGHT, _ALONG, _QUANTITIES = 4, 5, 6, 7, 9, 10  # see `fgtrack.models.track_map`
 
 
-@njit("(float64[:, ::1], Array(float64, 2, 'C', readonly=True))")
-def feet(points_m: FloatArray, segments: FloatArray) -> tuple[FloatArray, FloatArray]:
+@njit("(float64[:, ::1], Array(float64, 2, 'C', readonly=True), float64)")
+def feet(points_m: FloatArray, segments: FloatArray, longest_m: float) -> tuple[FloatArray, FloatArray]:
     """Quantities (m, 10) at the feet of points (m, 2) on the line, and lateral offsets (m,), left positive.
 
-    `segments` (n, 20) are the rows of `TrackMap`. The foot, on a segment at the nearest point of the line, has the
-    point on its normal: Re((q - t e) (B + t dB)) = 0 with q from the start of the segment to the point, e the segment,
-    and B, dB the inverse of the heading and its change, as complex numbers.
+    `segments` (n, 20), at most `longest_m` long, are the rows of `TrackMap`. The foot, on a segment at the nearest
+    point of the line, has the point on its normal: Re((q - t e) (B + t dB)) = 0 with q from the start of the segment to
+    the point, e the segment, and B, dB the inverse of the heading and its change, as complex numbers.
     """
     quantities, lateral = np.empty((len(points_m), _QUANTITIES)), np.empty(len(points_m))
     for i in range(len(points_m)):
-        x, y, first, least = points_m[i, 0], points_m[i, 1], 0, np.inf
-        for j in range(len(segments)):
+        x, y, first, least, j = points_m[i, 0], points_m[i, 1], 0, np.inf, 0
+        while j < len(segments):
             squared_m2 = (segments[j, 0] - x) ** 2 + (segments[j, 1] - y) ** 2
             if squared_m2 < least:
                 least, first = squared_m2, j
+            # The rows up to there are too near to this one to be nearer to the point than the nearest so far.
+            j += 1 + int(max((math.sqrt(squared_m2) - math.sqrt(least)) / longest_m - 1e-6, 0.0))
         at = segments[first]
         if (x - at[0]) * at[2] - (y - at[1]) * at[3] < 0.0:
             at = segments[(first - 1) % len(segments)]
@@ -41,12 +43,12 @@ def feet(points_m: FloatArray, segments: FloatArray) -> tuple[FloatArray, FloatA
     return quantities, lateral
 
 
-@njit("(float64[:, ::1], Array(float64, 2, 'C', readonly=True), float64, float64)")
+@njit("(float64[:, ::1], Array(float64, 2, 'C', readonly=True), float64, float64, float64)")
 def view(
-    points_m: FloatArray, segments: FloatArray, left_m: float, right_m: float
+    points_m: FloatArray, segments: FloatArray, longest_m: float, left_m: float, right_m: float
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Heading in (-pi, pi], curvature, and True beyond the bounds and so much more, of points (m, 2), shapes (m,)."""
-    quantities, lateral = feet(points_m, segments)
+    quantities, lateral = feet(points_m, segments, longest_m)
     m = len(points_m)
     heading, curvature, outside = np.empty(m), np.empty(m), np.empty(m, np.bool_)
     for i in range(m):

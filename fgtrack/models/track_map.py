@@ -88,7 +88,7 @@ class TrackMap:
         """Length of one lap."""
         self.counter_clockwise = bool(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1]) > 0.0)
         """True if the line is driven counter-clockwise, so that the inner bound is the left one."""
-        self._arc, self._segments = arc, segments
+        self._arc, self._segments, self._longest_m = arc, segments, float(np.diff(arc).max())
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
@@ -134,8 +134,8 @@ class TrackMap:
         left_m, right_m = inner_buffer_m, outer_buffer_m
         if not self.counter_clockwise:
             left_m, right_m = right_m, left_m
-        points_m = np.array(points_m, order="C")
-        return RoadView(*kernels("fgtrack.models.feet").view(points_m, self._segments, left_m, right_m))
+        line = np.array(points_m, order="C"), self._segments, self._longest_m
+        return RoadView(*kernels("fgtrack.models.feet").view(*line, left_m, right_m))
 
     def _at(self, s_m: FloatArray) -> FloatArray:
         """Quantities at arc length `s_m`, shape (n, 10)."""
@@ -148,7 +148,7 @@ class TrackMap:
     def _locate(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Quantities at the feet of `points_m` on the line, shape (n, 10), and lateral offsets, shape (n,)."""
         feet: tuple[FloatArray, FloatArray] = kernels("fgtrack.models.feet").feet(
-            np.array(points_m, order="C"), self._segments
+            np.array(points_m, order="C"), self._segments, self._longest_m
         )
         return feet
 

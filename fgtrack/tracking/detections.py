@@ -14,8 +14,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from fgtrack.core.geometry import Real, circular_mean, rotations, wrap_angles
-from fgtrack.core.linalg import congruence, symmetrise
-from fgtrack.core.types import MEASURABLE, BoolArray, Detection, FloatArray, IntArray
+from fgtrack.core.linalg import congruence, kernels, symmetrise
+from fgtrack.core.types import BoolArray, Detection, FloatArray, IntArray
 from fgtrack.models.measurement import ANGULAR, COMPONENTS, MIN_RANGE_M, MeasurementModel, SensorPose
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.inbox import Batch, own_covariance
@@ -23,7 +23,6 @@ from fgtrack.tracking.inbox import Batch, own_covariance
 X, Y, YAW, RANGE, BEARING, CURVATURE = (
     COMPONENTS.index(name) for name in ("x_m", "y_m", "yaw_rad", "range_m", "bearing_rad", "curvature_radpm")
 )
-_VALUES = attrgetter(*MEASURABLE)
 
 
 class MapDetections(NamedTuple):
@@ -69,11 +68,11 @@ class MapDetections(NamedTuple):
 
 def in_map_frame(batch: Batch, sensor: SensorModel, pose: SensorPose) -> MapDetections:
     """The detections of `batch`, what `sensor` measures of them, seen from `pose`."""
-    values = np.empty((len(batch.indices), len(COMPONENTS)))
-    values[:, len(MEASURABLE) :] = np.nan
+    values = np.full((len(batch.indices), len(COMPONENTS)), np.nan)
+    measured = tuple(sensor.std)
     if batch.indices:
-        values[:, : len(MEASURABLE)] = list(map(_VALUES, map(batch.message.objects.__getitem__, batch.indices)))
-    values[:, _unmeasured(tuple(sensor.std))] = np.nan
+        read = map(attrgetter(*measured), map(batch.message.objects.__getitem__, batch.indices))
+        values[:, _columns(measured)] = np.array(list(read), dtype=np.float64).reshape(len(values), -1)
     if batch.message.frame != "map":
         if "yaw_rad" in sensor.std:
             values[:, YAW] = wrap_angles(values[:, YAW] + pose.yaw_rad)
@@ -107,11 +106,13 @@ def merged(items: MapDetections, merge: "Merge") -> MapDetections:
     """
     placed = items.placed.tolist()
     groups = merge.groups(items.points_m if len(placed) == len(items.indices) else items.points_m[placed])
+    if groups is None:
+        if len(placed) == len(items.indices):
+            return items
+        groups = dict(enumerate(zip(range(len(placed)))))
     rows = list(map(placed.__getitem__, groups))
     if len(placed) < len(items.indices):
         rows += np.isnan(items.points_m[:, 0]).nonzero()[0].tolist()
-    if rows == list(range(len(items.indices))) and max(map(len, groups.values()), default=1) == 1:
-        return items
     result, claimed = items.at(np.array(rows, dtype=np.int64)), set(groups)
     others, averaged = dict[int, tuple[int, ...]](), dict[int, MapDetections]()
     for row, members in enumerate(groups.values()):
@@ -166,9 +167,8 @@ def covariances(items: MapDetections, names: tuple[str, ...]) -> FloatArray:
 
 
 @cache
-def _unmeasured(names: tuple[str, ...]) -> list[int]:
-    """Columns of what is not among `names`."""
-    return [column for column, name in enumerate(MEASURABLE) if name not in names]
+def _columns(names: tuple[str, ...]) -> list[int]:
+    return [COMPONENTS.index(name) for name in names]
 
 
 def _in_map(x_m: Real, y_m: Real, pose: SensorPose) -> tuple[Real, Real]:
@@ -229,9 +229,9 @@ def placement(components: tuple[str, ...], offsets_m: FloatArray, assumed: tuple
 class Merge:
     """Finds detections of one list that are the same object, and averages them."""
 
-    def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
-        """Members of all groups of `points_m` (n, 2), by the point that leads it; here each is a group of its own."""
-        return dict(enumerate(zip(range(len(points_m)))))
+    def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]] | None:
+        """Members of all groups of `points_m` (n, 2), by the point that leads it; None if each stands for itself."""
+        return None
 
     def mean(self, name: str, values: FloatArray) -> float:
         """Average of component `name`; of angles on the circle."""
@@ -253,14 +253,15 @@ class ConnectedMerge(Merge):
     """Detections at most this far apart are linked."""
     kind: Literal["connected"] = "connected"
 
-    def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
+    def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]] | None:
         """See `Merge.groups`; in the order of their first members, which lead."""
-        num = len(points_m)
-        links = np.empty((0, 2), dtype=np.int64)
+        num, far = len(points_m), True
         if num > 1:
-            links = cKDTree(points_m).query_pairs(self.distance_m, output_type="ndarray")
-        if not len(links):
-            return super().groups(points_m)
+            by_x = points_m[np.argsort(points_m[:, 0])]
+            far = kernels("fgtrack.tracking.kernels").are_apart(by_x, self.distance_m * (1.0 + 1e-9))
+        if far:
+            return None
+        links = cKDTree(points_m).query_pairs(self.distance_m, output_type="ndarray")
         graph = coo_array((np.ones(len(links), dtype=np.int8), links.T), shape=(num, num))
         labels = connected_components(graph, directed=False)[1]
         members: dict[int, list[int]] = {}

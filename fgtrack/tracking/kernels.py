@@ -48,6 +48,19 @@ def near(
     return rows[:count], columns[:count], distances[:count]
 
 
+@njit("(float64[:, ::1], float64)")
+def are_apart(points: FloatArray, distance: float) -> bool:
+    """True if no two of `points` (n, 2), which ascend in x, are at most `distance` apart."""
+    for i in range(len(points)):
+        j = i + 1
+        while j < len(points) and points[j, 0] - points[i, 0] <= distance:
+            dx, dy = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
+            if dx * dx + dy * dy <= distance * distance:
+                return False
+            j += 1
+    return True
+
+
 @njit("(float64[:, ::1], float64[:, :, ::1], float64[:, :, ::1], int64[:], float64[:, :, ::1])")
 def innovations(
     y: FloatArray, H: FloatArray, P: FloatArray, tracks: IntArray, R: FloatArray
