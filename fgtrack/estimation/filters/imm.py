@@ -82,11 +82,11 @@ class ImmReplay(ReplayEkf):
         ]
         logs = np.log(np.maximum(prior.probabilities, _LEAST))
         logs += [_log_likelihood(each, measurement) for each in corrected]
-        found = np.maximum(np.exp(logs - logs.max()), _LEAST)
+        likelihoods = np.maximum(np.exp(logs - logs.max()), _LEAST)
         posterior = Mixture(
             tuple(wrapped(model, each.mean) for model, each in zip(self._models, corrected, strict=True)),
             tuple(each.covariance for each in corrected),
-            found / found.sum(),
+            likelihoods / likelihoods.sum(),
         )
         x, P = self._moments(posterior, posterior.probabilities, self._motion)
         weight = float(posterior.probabilities @ [each.weight for each in corrected])
@@ -151,7 +151,7 @@ def _beside(motion: MotionModel, other: str | MotionModel) -> MotionModel | None
     return motion_model(other or default, same)
 
 
-def _log_likelihood(found: OneCorrection, measurement: Measurement) -> float:
+def _log_likelihood(corrected: OneCorrection, measurement: Measurement) -> float:
     """Log-likelihood of the innovation by one model, under the loss of the measurement, without common terms."""
-    distance = math.sqrt(max(float(mahalanobis_squared(found.innovation, found.S)), 0.0))
-    return -penalty(measurement.loss, distance) - 0.5 * float(np.linalg.slogdet(found.S)[1])
+    distance = math.sqrt(max(float(mahalanobis_squared(corrected.innovation, corrected.S)), 0.0))
+    return -penalty(measurement.loss, distance) - 0.5 * float(np.linalg.slogdet(corrected.S)[1])

@@ -1,4 +1,4 @@
-"""Where a new object heads and how fast, from its first positions: one component for smoothers and filters."""
+"""Direction and speed of a new object from its first positions, for smoothers and filters."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -59,14 +59,14 @@ class Line(NamedTuple):
 
 def fix_of(measurement: Measurement, time_s: float) -> Fix | None:
     """The position that `measurement` gives; None where it gives none: a bearing alone, a range alone."""
-    found = measured_position(measurement.model.components, measurement.z, measurement.R, measurement.pose)
-    return None if found is None else Fix(time_s, *found)
+    position = measured_position(measurement.model.components, measurement.z, measurement.R, measurement.pose)
+    return None if position is None else Fix(time_s, *position)
 
 
 def fixes_of(mean: FloatArray, covariance: FloatArray, later: Iterable[tuple[float, Measurement]]) -> list[Fix]:
     """The position of a first state, (n,) and (n, n), at time 0, and those of the measurements `later` with times."""
-    found = [fix_of(measurement, time_s) for time_s, measurement in later]
-    return [Fix(0.0, mean[:2], covariance[:2, :2]), *(fix for fix in found if fix is not None)]
+    fixes = [fix_of(measurement, time_s) for time_s, measurement in later]
+    return [Fix(0.0, mean[:2], covariance[:2, :2]), *(fix for fix in fixes if fix is not None)]
 
 
 def straight_lines(fixes: Sequence[Fix], least: int) -> Iterator[Line]:
@@ -131,8 +131,8 @@ def along(line: Line, time_s: float, state_names: Sequence[str]) -> FloatArray:
     yaw_rad, speed_mps = polar(line.velocity_mps).tolist()
     vx_mps, vy_mps = line.velocity_mps.tolist()
     x_m, y_m = (line.position_m + time_s * line.velocity_mps).tolist()
-    known = {"x_m": x_m, "y_m": y_m, "yaw_rad": yaw_rad, "speed_mps": speed_mps, "vx_mps": vx_mps, "vy_mps": vy_mps}
-    return np.array([known.get(name, 0.0) for name in state_names])
+    values = {"x_m": x_m, "y_m": y_m, "yaw_rad": yaw_rad, "speed_mps": speed_mps, "vx_mps": vx_mps, "vy_mps": vy_mps}
+    return np.array([values.get(name, 0.0) for name in state_names])
 
 
 def sought(motion: MotionModel, start: Start, method: Initiation) -> bool:

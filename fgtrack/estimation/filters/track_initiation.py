@@ -147,8 +147,8 @@ class TrackInitiation:
             raise np.linalg.LinAlgError("no line leads through the first positions")
         yaw_rad, speed_mps = polar(self.line.velocity_mps).tolist()
         along = np.array([math.cos(yaw_rad), math.sin(yaw_rad)])
-        known, found = self.start.speed_std_mps**2, float(along @ self.line.covariance @ along)
-        return yaw_rad, self.start.speed_mps + known / (known + found) * (speed_mps - self.start.speed_mps)
+        P, R = self.start.speed_std_mps**2, float(along @ self.line.covariance @ along)
+        return yaw_rad, self.start.speed_mps + P / (P + R) * (speed_mps - self.start.speed_mps)
 
 
 def initiated(motion: MotionModel, start: Start, method: str, make: Callable[[Start], Estimator]) -> Estimator:

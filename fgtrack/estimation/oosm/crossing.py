@@ -102,10 +102,10 @@ class A1(CrossingEkf):
             mean, covariance = first.predicted_mean, first.predicted_covariance
         Q = motion.process_noise(motion.predict(now.mean, -back_s), back_s)
         weighted = psd_solve(covariance, Q)  # P^-1 Q
-        seen = (covariance - now.covariance) @ weighted  # P H' S^-1 H Q
-        P_vv, P_xv, end = Q, Q - seen, now.mean
+        gained = (covariance - now.covariance) @ weighted  # P H' S^-1 H Q
+        P_vv, P_xv, end = Q, Q - gained, now.mean
         if self.noise_in_state:
-            P_vv, end = Q - weighted.T @ seen, now.mean - weighted.T @ (now.mean - mean)
+            P_vv, end = Q - weighted.T @ gained, now.mean - weighted.T @ (now.mean - mean)
         start, back = motion.predict(end, -back_s), motion.jacobian(end, -back_s)
         spread = back @ (now.covariance + P_vv - P_xv - P_xv.T) @ back.T
         return start, symmetrise(spread), (now.covariance - P_xv) @ back.T

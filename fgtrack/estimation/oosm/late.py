@@ -22,7 +22,7 @@ _Estimate = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class FilterStep:
-    """A state before and after a measurement, and what the measurement said; yaws are not wrapped."""
+    """A state before and after a measurement, and its information; yaws are not wrapped."""
 
     stamp_ns: int
     mean: FloatArray
