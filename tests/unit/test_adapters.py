@@ -92,6 +92,8 @@ def test_a_delphi_esr_counts_degrees_clockwise():
     (found,) = read("delphi_esr_msgs/msg/EsrTrack", track).objects
     bearing_rad = pytest.approx(-0.5 * math.pi)
     assert found == Detection(range_m=50.0, bearing_rad=bearing_rad, range_rate_mps=-2.0, object_id=7)
+    track.width = 0.8
+    assert read("delphi_esr_msgs/msg/EsrTrack", track).objects[0].width_m == 0.8
     track.status = 0
     assert read("delphi_esr_msgs/msg/EsrTrack", track).objects == ()
 

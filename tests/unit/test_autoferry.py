@@ -3,12 +3,11 @@ import math
 from collections import Counter
 from itertools import pairwise
 
-import numpy as np
 import pytest
 from support.messages import shared
 
 from fgtrack.core.errors import DataError
-from fgtrack.core.types import Detection, DetectionList, EgoState, TruthState
+from fgtrack.core.types import Detection, DetectionList, TruthState
 from fgtrack.io.source import open_input
 
 SCENARIOS = range(2, 7)
@@ -118,32 +117,3 @@ def test_every_record_of_the_data_set_is_read_in_receipt_order(number):
     fixes = json.loads((folder / f"scenario{number}_groundTruth.json").read_text())
     distinct = {(fix["targetID"], fix["time"]) for item in fixes for fix in item}
     assert sum(isinstance(m, TruthState) for m in messages) == len(distinct)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", SCENARIOS)
-def test_lidar_points_and_bearings_lie_at_the_true_vessels(number):
-    messages = list(open_input(shared(f"data/autoferry/scenario{number}")).messages())
-
-    def track(states):
-        return np.array([(state.stamp_ns * 1e-9, state.x_m, state.y_m) for state in states]).T
-
-    vessels = [track(m for m in messages if isinstance(m, TruthState) and m.object_id == i) for i in (1, 2)]
-    ego = track(m for m in messages if isinstance(m, EgoState))
-    misses_m, misses_rad = [], []
-    for message in messages:
-        if not isinstance(message, DetectionList):
-            continue
-        now_s = message.stamp_ns * 1e-9
-        (ego_x, *true_x), (ego_y, *true_y) = (
-            [np.interp(now_s, item[0], item[axis]) for item in (ego, *vessels)] for axis in (1, 2)
-        )
-        bearings = np.arctan2(np.array(true_y) - ego_y, np.array(true_x) - ego_x)
-        for item in message.objects:
-            if message.sensor == "lidar":
-                misses_m.append(np.hypot(np.array(true_x) - item.x_m, np.array(true_y) - item.y_m).min())
-            elif message.sensor == "daylight":
-                off = np.angle(np.exp(1j * (bearings - item.bearing_rad)))
-                misses_rad.append(np.abs(off).min())
-    assert np.quantile(misses_m, 0.3) < 10.0  # points of a wrong frame miss by hundreds of metres
-    assert np.quantile(misses_rad, 0.3) < 0.06  # bias and scatter that the data set states
