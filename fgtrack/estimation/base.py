@@ -92,6 +92,11 @@ class Measurement:
         return replace(self, model=measurement_model(self.model.components, motion))
 
     @property
+    def is_nonlinear(self) -> bool:
+        """True if it has to be linearised, or weighted, at a state."""
+        return self.loss is not None or not self.model.linear
+
+    @property
     def content(self) -> Content:
         """All but the stamp: only what is the same in every respect is equal."""
         numbers = [*self.z.tolist(), *self.R.ravel().tolist(), *self.pose]

@@ -122,7 +122,7 @@ class Fuse:
 
     def __init__(self, one: SmootherBank, when: Literal["before", "after"]) -> None:
         self.blown = False
-        solver = one.windows.solver
+        solver = one.solver
         solve = solver.solve
 
         def gives_up(tracks: Any, *arguments: Any) -> None:
@@ -158,7 +158,7 @@ def test_a_solver_that_gives_up_once_fails_one_measurement_and_the_rest_is_as_if
         assert hit.update(measured(rng, motion, ms * MS)).status is UpdateStatus.FAILED
         spared.advance(START_NS + ms * MS)
         assert fuse.blown
-        assert bank.windows.failures.counts == {Failure.GRAPH_REBUILT: 1}
+        assert bank.failures.counts == {Failure.GRAPH_REBUILT: 1}
         assert hit.window_ns == spared.window_ns
         assert apart(hit, spared) < tolerance
 
@@ -166,7 +166,7 @@ def test_a_solver_that_gives_up_once_fails_one_measurement_and_the_rest_is_as_if
             measurement = measured(rng, motion, late_ms * MS)
             assert hit.update(measurement).status is spared.update(measurement).status
             assert apart(hit, spared) < tolerance
-        assert bank.windows.failures.counts == {Failure.GRAPH_REBUILT: 1}
+        assert bank.failures.counts == {Failure.GRAPH_REBUILT: 1}
         for each in (bank, spared_bank):
             each.remove(0)
         for found, expected in zip(final(bank), final(spared_bank), strict=True):
@@ -195,7 +195,7 @@ def test_of_several_tracks_the_one_that_cannot_be_updated_fails_alone(make: type
         expected = [result.status for result in spared.update(stamp_ns, [1, 2], measurements[1:])]
         broken = {"R": {"R": -9.0 * np.eye(2)}, "z": {"z": np.full(2, np.nan)}, "solver": {}}[what]
         given = [replace(measurements[0], **broken), *measurements[1:]]
-        solve, solver = hit.windows.solver.solve, hit.windows.solver
+        solve, solver = hit.solver.solve, hit.solver
         calls: list[int] = []
 
         def gives_up(tracks: Any, *arguments: Any, solve: Any = solve, calls: list[int] = calls) -> None:

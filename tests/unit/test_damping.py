@@ -50,9 +50,9 @@ def test_bearings_alone_lead_where_levenberg_marquardt_does() -> None:
     found = [heard(np.random.default_rng(seed)) for seed in (2,)]
     streams = [stream for stream, _ in found]
     slow, *banks = (tracked(streams, each) for each in (BatchBank, SmootherBank, IncrementalBank))
-    assert not slow.windows.failures.counts
+    assert not slow.failures.counts
     for bank in banks:
-        assert bank.windows.failures.counts[Failure.STEP_DAMPED] > 0
+        assert bank.failures.counts[Failure.STEP_DAMPED] > 0
         for track_id, (measurements, truth) in enumerate(found):
             state, expected = (state_of(each, MOTION, track_id, measurements[-1].stamp_ns) for each in (bank, slow))
             std = np.sqrt(np.diag(expected.covariance))
@@ -64,4 +64,4 @@ def test_bearings_alone_lead_where_levenberg_marquardt_does() -> None:
 def test_positions_need_none() -> None:
     model = measurement_model(("x_m", "y_m"), MOTION)
     fixes = [Measurement(k * NS_PER_S, model, np.array([5.0 * k, 1.0]), np.eye(2)) for k in range(5)]
-    assert not tracked([fixes], SmootherBank).windows.failures.counts
+    assert not tracked([fixes], SmootherBank).failures.counts

@@ -14,7 +14,6 @@ from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.registry import estimator
 from fgtrack.estimation.smoothing.gtsam.batch import measurement_factor, motion_factor
-from fgtrack.estimation.smoothing.terms import EquivalentMeasurement
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.models.robust import penalty, weight
@@ -132,7 +131,7 @@ def test_a_measurement_factor_is_the_whitened_weighted_residual(kind: str, what:
     for off in (0.4, 2.0, 5.0):
         item, x = measurement(kind, what, None if loss is None else RobustLoss(loss, 1.5), off)
         root_weight = 1.0 if loss is None else math.sqrt(loss_and_weight(loss, 1.5, off)[1])
-        A, b = linear_parts(measurement_factor(LEFT, item, x), values(left=x))
+        A, b = linear_parts(measurement_factor(LEFT, (item, 0.0), x, MOTIONS[kind]), values(left=x))
         expected = numeric_jacobian(lambda at, item=item: whitened(item, at), x)
         np.testing.assert_allclose(A, root_weight * expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
         np.testing.assert_allclose(b, -root_weight * whitened(item, x), rtol=1e-9, atol=1e-9)
@@ -142,7 +141,7 @@ def test_a_measurement_factor_is_the_whitened_weighted_residual(kind: str, what:
 @pytest.mark.parametrize("kind", LOSSES)
 def test_a_robust_loss_is_its_formula(kind: str, width: float, off: float) -> None:
     item, x = measurement("ctrv", "position", RobustLoss(kind, width), off)
-    factor = measurement_factor(LEFT, item, x)
+    factor = measurement_factor(LEFT, (item, 0.0), x, CTRV())
     loss, expected_weight = loss_and_weight(kind, width, off)
     assert factor.error(values(left=x)) == pytest.approx(loss, rel=1e-9)
     assert penalty(RobustLoss(kind, width), off) == pytest.approx(loss, rel=1e-12)
@@ -150,18 +149,6 @@ def test_a_robust_loss_is_its_formula(kind: str, width: float, off: float) -> No
     step = 1e-6
     slope = (loss_and_weight(kind, width, off + step)[0] - loss_and_weight(kind, width, off - step)[0]) / (2 * step)
     assert slope == pytest.approx(expected_weight * off, rel=1e-5, abs=1e-6)
-
-
-def test_an_equivalent_detection_is_the_linear_measurement_that_it_says() -> None:
-    rng = np.random.default_rng(6)
-    H, origin, y = rng.standard_normal((2, 5)), rng.standard_normal(5), rng.standard_normal(2)
-    item = EquivalentMeasurement(origin, H, y, np.array([[0.5, 0.1], [0.1, 0.3]]))
-    L = np.linalg.cholesky(item.R)
-    for x in (origin, origin + rng.standard_normal(5)):
-        for mean in (origin, x, np.zeros(5)):
-            A, b = linear_parts(measurement_factor(LEFT, item, mean), values(left=x))
-            np.testing.assert_allclose(A, np.linalg.solve(L, H), atol=1e-12)
-            np.testing.assert_allclose(b, np.linalg.solve(L, y - H @ (x - origin)), atol=1e-12)
 
 
 # --- angles
@@ -173,7 +160,7 @@ def test_a_yaw_is_taken_on_the_branch_next_to_the_state(loss: RobustLoss | None,
     model = measurement_model(("yaw_rad",), CTRV())
     item = Measurement(0, model, np.array([-math.pi + 0.1]), np.array([[0.01]]), loss=loss)
     x = np.array([0.0, 0.0, math.pi - 0.05 + 2.0 * math.pi * turns, 10.0, 0.0])
-    _, b = linear_parts(measurement_factor(LEFT, item, x), values(left=x))
+    _, b = linear_parts(measurement_factor(LEFT, (item, 0.0), x, CTRV()), values(left=x))
     assert b == pytest.approx([1.5])
 
 

@@ -8,7 +8,7 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.filters.initiation import Fix, Line, Search, fixes_of, over
 from fgtrack.estimation.object_bank import OneObject
 from fgtrack.estimation.smoothing.bank import SmootherBank
-from fgtrack.estimation.smoothing.windows import Windows
+from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.models.motion import CTRV
 from fgtrack.models.sensors import RobustLoss
 
@@ -63,9 +63,9 @@ def test_while_the_direction_is_uncertain_every_measurement_is_solved_to_converg
 def test_a_certain_direction_is_not_sought_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """A line is a poor guess of a bend, so it serves as long as it must and no longer."""
     restarts: list[Line] = []
-    restart = Windows.restart
+    restart = Solver.restart
     monkeypatch.setattr(
-        Windows, "restart", lambda self, track, line: (restarts.append(line), restart(self, track, line))
+        Solver, "restart", lambda self, track, line: (restarts.append(line), restart(self, track, line))
     )
     fused(1.0, 20)
     assert over(restarts[-1], "regression", 3.0)

@@ -189,7 +189,7 @@ def find_far(
     rows: IntArray,
     indices: IntArray,
 ) -> int:
-    """Write the nodes with a `step` longer than `thresholds` as rows of `tracks` and indices; return their number.
+    """Write the nodes with a `step` longer than `thresholds` (m, n) as rows and indices; return their number.
 
     A `LEAVING_SHARE` of the thresholds holds for nodes before `anchors`, a `SOLVED_SHARE` from `starts` on and after
     the first node that is too far.
@@ -203,7 +203,7 @@ def find_far(
             if is_solved or index >= starts[t]:
                 share = SOLVED_SHARE
             for i in range(step.shape[1]):
-                too_long |= abs(step[at, i]) > share * thresholds[tracks[t], i]
+                too_long |= abs(step[at, i]) > share * thresholds[t, i]
             if too_long:
                 is_solved = True
                 rows[num], indices[num] = t, index

@@ -14,13 +14,7 @@ from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.smoothing.bank import SmootherBank
 from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
 from fgtrack.estimation.smoothing.settings import SmootherSettings
-from fgtrack.estimation.smoothing.terms import (
-    EquivalentMeasurement,
-    MeasurementTerm,
-    is_nonlinear,
-    linearised,
-    whitened,
-)
+from fgtrack.estimation.smoothing.terms import Term, linearised, whitened
 from fgtrack.models.motion import MotionModel
 
 _Loss = mEstimator.Huber | mEstimator.Cauchy | mEstimator.Tukey | mEstimator.GemanMcClure | mEstimator.DCS
@@ -67,8 +61,15 @@ class BatchSolver(IncrementalSolver):
             for number in numbers:
                 nodes.step[number] = values.atVector(number) - nodes.origin[number]
 
+    def forget(self, track: int) -> None:
+        """See `Solver.forget`."""
+        super().forget(track)
+        self._solved.pop(track, None)
+
     def _covariance(self, track: int, *numbers: int) -> FloatArray:
         """See `IncrementalSolver._covariance`; from one dense QR of the whole linearised window."""
+        if track not in self._solved:
+            return super()._covariance(track, *numbers)
         graph, values = self._solved[track]
         ordering, n = gtsam.Ordering(), self.motion.dim
         for number in (*sorted(set(values.keys()).difference(numbers)), *numbers):
@@ -77,9 +78,6 @@ class BatchSolver(IncrementalSolver):
         R, size = np.asarray(np.linalg.qr(A, mode="r")), n * len(numbers)
         root = dtrtri(R[-size:, -size:])[0]
         return np.asarray(root @ root.T)
-
-    def _forget(self, track: int) -> None:
-        self._solved.pop(track, None)
 
     def _factors(self, track: int) -> gtsam.NonlinearFactorGraph:
         """Return the factors of a window as functions of the states."""
@@ -94,7 +92,7 @@ class BatchSolver(IncrementalSolver):
             graph.add(motion_factor(self.motion, left, right, seconds(dt_ns), nodes.segment[left, :, n : 2 * n]))
         for number in numbers:
             for term in nodes.terms[number]:
-                graph.add(measurement_factor(number, term, nodes.origin[number]))
+                graph.add(measurement_factor(number, term, nodes.origin[number], self.motion))
         return graph
 
 
@@ -110,24 +108,25 @@ def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float, Q: Fl
     return gtsam.CustomFactor(_gaussian(noise_root(Q)), [left, right], error)
 
 
-def measurement_factor(key: int, term: MeasurementTerm, origin: FloatArray) -> gtsam.NonlinearFactor:
+def measurement_factor(key: int, term: Term, origin: FloatArray, motion: MotionModel) -> gtsam.NonlinearFactor:
     """Return the factor of `term` on the state at `key`; a linear one takes angles on the branch next to `origin`.
 
     Raises `numpy.linalg.LinAlgError` for a covariance that is not positive definite.
     """
-    if isinstance(term, EquivalentMeasurement) or not is_nonlinear(term):
-        rows, at = whitened(term, origin), gtsam.Values()
+    measurement = term[0]
+    if not measurement.is_nonlinear:
+        rows, at = whitened(term, origin, motion), gtsam.Values()
         at.insert(key, origin)
         linear = gtsam.JacobianFactor(key, rows[:, :-1], rows[:, -1], gtsam.noiseModel.Unit.Create(len(rows)))
         return gtsam.LinearContainerFactor(linear, at)
 
     def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
-        y, H, _ = linearised(term, values.atVector(key))
+        y, H = linearised(term, values.atVector(key), motion)
         if jacobians is not None:
             jacobians[0] = H
         return -y
 
-    noise, loss = _gaussian(inverse_root(term.R)), term.loss
+    noise, loss = _gaussian(inverse_root(measurement.R)), measurement.loss
     if loss is not None:
         noise = gtsam.noiseModel.Robust.Create(_LOSSES[loss.kind](loss.width), noise)
     return gtsam.CustomFactor(noise, [key], error)

@@ -10,7 +10,6 @@ from fgtrack.core.linalg import inverse_root, psd_solve, symmetrise
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.smoothing import node_kernels
 from fgtrack.estimation.smoothing.bank import SmootherBank
-from fgtrack.estimation.smoothing.nodes import grown
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.models.motion import MotionModel
@@ -83,45 +82,34 @@ class IncrementalSolver(Solver):
     def __init__(self, motion: MotionModel, settings: SmootherSettings) -> None:
         super().__init__(motion, settings)
         self._graphs: dict[int, _Graph] = {}
-        self._reference = np.zeros((0, motion.dim))
-        """States that the variables are relative to, by number: their first linearisation points."""
-        self._known: dict[int, dict[tuple[int | None, int], FloatArray]] = {}
-        """Covariances by track and node, with the node before that it was read with, if any, since the last solution.
+        self._known: dict[int, dict[tuple[int, ...], FloatArray]] = {}
+        """Covariances by track and nodes: what is read for a stamp does not depend on what was read for others."""
 
-        So what is read for a stamp does not depend on what was read for others.
-        """
+    def forget(self, track: int) -> None:
+        """See `Solver.forget`: the next solution makes a new graph."""
+        self._graphs.pop(track, None)
+        self._known[track] = {}
 
-    def begin(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
-        """See `Solver.begin`."""
-        super().begin(track, stamp_ns, mean, covariance)
-        self._forget(track)
-        self._known[track] = {(None, int(self.nodes.numbers[track, 0])): covariance}
-
-    def prepare_leaving(self, tracks: IntArray, anchors: IntArray) -> None:
-        """See `Solver.prepare_leaving`: eliminated by themselves."""
-        self.eliminate(tracks, self.nodes.first[tracks], anchors + 1)
-        self.look_up(tracks, anchors, np.zeros(len(tracks), dtype=bool))
-        self.nodes.known[tracks] = anchors
-
-    def look_up(self, tracks: IntArray, indices: IntArray, with_previous: BoolArray) -> None:
-        """See `Solver.look_up`."""
+    def smoothed(
+        self, tracks: IntArray, indices: IntArray, with_previous: BoolArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """See `Solver.smoothed`; inside the windows from the graphs."""
         nodes, n = self.nodes, self.motion.dim
-        rows = zip(tracks.tolist(), indices.tolist(), nodes.first[tracks].tolist(), with_previous.tolist(), strict=True)
+        joint = np.zeros(len(tracks), dtype=bool) if with_previous is None else with_previous
+        rows = zip(tracks.tolist(), indices.tolist(), nodes.first[tracks].tolist(), joint.tolist(), strict=True)
         for track, index, first, has_previous in rows:
-            number, known = int(nodes.numbers[track, max(index, first)]), self._known[track]
-            left = int(nodes.numbers[track, index - 1]) if has_previous and index > first else None
-            if (left, number) in known:
-                pass
-            elif left is None:
-                known[left, number] = self._covariance(track, number)
-            else:
-                joint = self._covariance(track, left, number)
-                cross, P = joint[:n, n:], joint[n:, n:]
-                A = psd_solve(P, cross.T).T  # the state on the left, given this one
-                nodes.back[left, :, :n], nodes.back[left, :, n] = A, nodes.step[left] - A.dot(nodes.step[number])
-                nodes.C[left] = symmetrise(joint[:n, :n] - A.dot(cross.T))
-                known[left, number] = P
-            nodes.P[number] = known[left, number]
+            last = max(index, first)
+            key = tuple(nodes.numbers[track, last - (has_previous and index > first) : last + 1].tolist())
+            known = self._known[track]
+            if key not in known:
+                known[key] = P = self._covariance(track, *key)
+                if len(key) > 1:
+                    left, number = key
+                    A = psd_solve(P[n:, n:], P[n:, :n]).T  # the state on the left, given this one
+                    nodes.back[left, :, :n], nodes.back[left, :, n] = A, nodes.step[left] - A.dot(nodes.step[number])
+                    nodes.C[left] = symmetrise(P[:n, :n] - A.dot(P[n:, :n]))
+            nodes.P[key[-1]] = known[key][-n:, -n:]
+        return super().smoothed(tracks, indices)
 
     def solve(self, tracks: IntArray, starts: IntArray, anchors: IntArray) -> None:
         """See `Solver.solve`."""
@@ -139,18 +127,10 @@ class IncrementalSolver(Solver):
             self._known[track] = {}
         nodes.known[tracks] = anchors
 
-    def rebuild(self, tracks: IntArray) -> None:
-        """See `Solver.rebuild`; in graphs of their own."""
-        for track in tracks.tolist():
-            self._forget(track)
-        super().rebuild(tracks)
-
-    def _forget(self, track: int) -> None:
-        """Forget the graph of a track."""
-        self._graphs.pop(track, None)
-
     def _covariance(self, track: int, *numbers: int) -> FloatArray:
         """Return the joint covariance of one node, shape (n, n), or of two neighbours, (2 n, 2 n)."""
+        if track not in self._graphs:  # nothing was fused: there is one node
+            return np.array(self.nodes.P[numbers[0]])
         isam = self._graphs[track].isam
         if len(numbers) == 1:
             return isam.marginalCovariance(numbers[0])
@@ -163,8 +143,6 @@ class IncrementalSolver(Solver):
         only a new graph helps.
         """
         nodes, zero = self.nodes, np.zeros(self.motion.dim)
-        if nodes.numbers.size > len(self._reference):
-            self._reference = grown(self._reference, nodes.numbers.size)
         leaving = (nodes.first[tracks] - starts).tolist()
         windows, graphs, values = [], [], []
         for track, start in zip(tracks.tolist(), starts.tolist(), strict=True):
@@ -175,13 +153,13 @@ class IncrementalSolver(Solver):
                 if number not in graph.slots:
                     graph.slots[number] = None
                     values[-1].insert(number, zero)
-                    self._reference[number] = nodes.origin[number]
+                    nodes.reference[number] = nodes.origin[number]
             windows.append(window)
             graphs.append(graph)
         changed = self._changed_factors(tracks, starts, sum(map(len, windows)))
         for graph, window, num_leaving, new, factors in zip(graphs, windows, leaving, values, changed, strict=True):
             delta = graph.solve(window.tolist(), num_leaving, new, *factors)
-            if not node_kernels.write_steps(window[num_leaving:], delta, self._reference, nodes.origin, nodes.step):
+            if not node_kernels.write_steps(window[num_leaving:], delta, nodes.reference, nodes.origin, nodes.step):
                 raise ValueError("a state is not finite")
 
     def _graph(self, track: int, window: IntArray) -> _Graph:
@@ -199,7 +177,7 @@ class IncrementalSolver(Solver):
         """Return the factors that have changed, at most so many, of each track, and the first index from `starts`."""
         nodes, n = self.nodes, self.motion.dim
         owners, factors = np.empty((most, 5), dtype=np.int64), np.empty((most, 2 * n + 1, n + nodes.rows.shape[1]))
-        given = nodes.origin, self._reference, nodes.segment, nodes.rows, nodes.num_rows, nodes.changed
+        given = nodes.origin, nodes.reference, nodes.segment, nodes.rows, nodes.num_rows, nodes.changed
         num = node_kernels.changed_factors(tracks, starts, nodes.count, nodes.numbers, *given, owners, factors)
         if num < 0:
             raise ValueError("process noise is not positive definite")
