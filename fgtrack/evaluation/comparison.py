@@ -110,9 +110,9 @@ def comparison(group: Sequence[EvaluatedRun]) -> Comparison:
     """Return the comparison of `group`, runs of one recording, at the same objects and stamps."""
     errors = []
     for matching in (one.matching for one in group if one.matching is not None):
-        own = track_errors(matching)
-        squares = {name: np.square(own.values[error]) for name, error in _ERRORS.items()}
-        errors.append(replace(own, values={**squares, POSITION_NEES: position_nees(matching)}))
+        errors_of = track_errors(matching)
+        squares = {name: np.square(errors_of.values[error]) for name, error in _ERRORS.items()}
+        errors.append(replace(errors_of, values={**squares, POSITION_NEES: position_nees(matching)}))
     most, common, sums = common_sums(errors)
     if all(one.run.evaluation.multi_object for one in group):
         sums["gospa_in_sight_rms_m"] = _gospa_sums(group)

@@ -97,8 +97,8 @@ def within_run(ticks: FloatArray, statistic: Statistic, rng: np.random.Generator
         below = np.concatenate([np.zeros((1, len(sums))), np.cumsum(np.concatenate([pieces, pieces]), axis=0)])
         starts = rng.integers(0, n, (_DRAWS, math.ceil(n / length)))  # as many pieces in all as there are
         rest = n - (starts.shape[1] - 1) * length
-        whole_sums, rest_sums = (below[of : of + n] - below[:n] for of in (length, rest))
-        drawn = statistic((whole_sums[starts[:, :-1]].sum(axis=1) + rest_sums[starts[:, -1]]).T)
+        block_sums, rest_sums = (below[of : of + n] - below[:n] for of in (length, rest))
+        drawn = statistic((block_sums[starts[:, :-1]].sum(axis=1) + rest_sums[starts[:, -1]]).T)
     blocks = n / length
     error = float(np.nanstd(drawn)) * math.sqrt(blocks / (blocks - 1.0))
     return _t_interval(value, error, blocks)

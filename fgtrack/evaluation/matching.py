@@ -208,8 +208,8 @@ def published_rows(tracks: Table, ticks: IntArray, track_ids: IntArray) -> IntAr
 def neighbours(tracks: Table, name: str, values: IntArray, track_ids: IntArray) -> tuple[IntArray, IntArray]:
     """Rows of these tracks whose column `name` is the last up to, and the first from `values` on; -1 without one."""
     every = np.unique(np.concatenate([tracks[name], values]))
-    places, wanted = (np.searchsorted(every, each) for each in (tracks[name], values))
-    keys, wanted = tracks["track_id"] * len(every) + places, track_ids * len(every) + wanted
+    ranks, wanted = (np.searchsorted(every, each) for each in (tracks[name], values))
+    keys, wanted = tracks["track_id"] * len(every) + ranks, track_ids * len(every) + wanted
     order = np.argsort(keys, kind="stable")
     keys, order = np.append(keys[order], -1), np.append(order, -1)
     at = np.searchsorted(keys[:-1], wanted, side="right") - 1, np.searchsorted(keys[:-1], wanted)

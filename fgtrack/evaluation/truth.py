@@ -109,8 +109,8 @@ def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> BoolArray:
     origin_m = (float(ego.get("detection_origin_x_m", 0.0)), float(ego.get("detection_origin_y_m", 0.0)))
     positions_m[~present] = 0.0
     poses = np.broadcast_to(poses[:, None], (*present.shape, 3))
-    seen = [model.sees(positions_m, poses, origin_m) for model in models.values()]
-    return np.asarray(present & np.any(seen, axis=0))
+    covered = [model.sees(positions_m, poses, origin_m) for model in models.values()]
+    return np.asarray(present & np.any(covered, axis=0))
 
 
 def ego_states(ego: Table, stamps_ns: IntArray) -> FloatArray:

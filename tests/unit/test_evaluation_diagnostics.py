@@ -99,24 +99,22 @@ def test_a_run_that_used_nothing_says_what_became_of_all(tmp_path: Path) -> None
     assert unused(run_of(tmp_path / "empty", [])) is None
 
 
-@pytest.mark.parametrize(("refused", "told"), [(2, False), (3, True)])
-def test_states_of_the_ego_that_were_refused_are_told_where_they_are_most(
-    refused: int, told: bool, tmp_path: Path
+@pytest.mark.parametrize(
+    ("meta", "text"),
+    [
+        ({"ego_refused": {"stamp ahead of its receipt": 2}, "ego_jumps": 0}, None),
+        ({"ego_refused": {"stamp ahead of its receipt": 3}}, "3 of 4 states not used, stamp ahead of its receipt"),
+        ({"ego_jumps": 1}, "its position jumps once"),
+        ({"ego_jumps": 3}, "its position jumps 3 times"),
+    ],
+)
+def test_most_states_refused_and_jumps_of_the_ego_are_told(
+    meta: dict[str, object], text: str | None, tmp_path: Path
 ) -> None:
     run = run_of(tmp_path / "run", lists(Disposition.IN_SEQUENCE))
     ego = Table({name: column(name, [0, 1, 2, 3]) for name in run.tables["ego"]})
-    meta = {**run.meta, "ego_refused": {"stamp ahead of its receipt": refused}}
-    found = diagnostics(replace(run.with_tables(ego=ego), meta=meta))
-    assert len(found) == told
-    assert not told or str(found[0]).startswith(f"ego: {refused} of 4 states not used, stamp ahead of its receipt")
-
-
-@pytest.mark.parametrize(("jumps", "told"), [(0, None), (1, "jumps once"), (3, "jumps 3 times")])
-def test_jumps_of_the_ego_are_told(jumps: int, told: str | None, tmp_path: Path) -> None:
-    run = run_of(tmp_path / "run", lists(Disposition.IN_SEQUENCE))
-    ego = Table({name: column(name, [0, 1]) for name in run.tables["ego"]})
-    found = list(map(str, diagnostics(replace(run.with_tables(ego=ego), meta={**run.meta, "ego_jumps": jumps}))))
-    assert [f"ego: its position {told}" in each for each in found] == ([] if told is None else [True])
+    found = list(map(str, diagnostics(replace(run.with_tables(ego=ego), meta={**run.meta, **meta}))))
+    assert [f"ego: {text}" in each for each in found] == ([] if text is None else [True])
 
 
 def test_angles_in_degrees_are_told(tmp_path: Path) -> None:
