@@ -72,11 +72,9 @@ def _topic_part(bag: Bag, topic: TopicInfo, parts: Sequence[Part]) -> Part:
     problem = next((one.problem for one in bag.topics if (one.name, one.type) == (topic.name, topic.type)), None)
     if problem is not None or not topic.count:
         raise DataError(problem or "no messages")
-    if topic.type == ODOMETRY:
-        return Part("truth" if is_truth else "ego", item, reasons)
     sensor = _sensor_name(topic.name, parts)
-    if topic.type in ADAPTERS:
-        return Part("truth" if is_truth else sensor, item, reasons)
+    if topic.type == ODOMETRY or topic.type in ADAPTERS:
+        return Part("truth" if is_truth else "ego" if topic.type == ODOMETRY else sensor, item, reasons)
     if topic.type.startswith(_OTHER_PACKAGES):
         raise DataError("no objects")
     part = _mapped(bag, item, topic.type, sensor)
