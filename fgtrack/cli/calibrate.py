@@ -159,13 +159,13 @@ def advise(
         check_apart(out, [recording, config_file])
     with progress("advise") as tell:
         advice = advised(recording, config, reference=reference, tune=tune, on_step=tell)
-    show(advice.tables, "json" if as_json else None, advice.as_dict())
     if out is not None:
         head = [f"Settings for {recording} (fgtrack advise).", "", *advice.comments(), ""]
         write_file(out, Assumed(advice.config, ()).to_yaml(head), overwrite)
-        again = shlex.join(["fgtrack", "replay", str(recording), "-c", str(out), "-o", "RUN"])
-        if not as_json:
-            say(f"{out}: written; follow it by `{again}`")
+    show(advice.tables, "json" if as_json else None, advice.as_dict())
+    if out is not None and not as_json:
+        again = ["fgtrack", "replay", str(recording), "-c", str(out), "-o", "RUN"]
+        say(f"{out}: written; follow it by `{shlex.join(again)}`")
     if advice.broken is not None:
         raise DataError(f"{located(advice.broken, str(recording))}; used up to there")
 
