@@ -79,10 +79,7 @@ def read_header(path: Path | str) -> Mapping[str, Any]:
 
 
 def write_stream(
-    path: Path | str,
-    messages: Iterable[Message],
-    header: Mapping[str, object] | None = None,
-    overwrite: bool = False,
+    path: Path | str, messages: Iterable[Message], header: Mapping[str, object] | None = None, overwrite: bool = False
 ) -> int:
     """Write `messages`, which must be in receipt order, to `path`; gives their number.
 

@@ -340,10 +340,7 @@ def test_a_needed_type_without_definition_is_one_line_and_a_given_one_is_read(tm
 
 def test_a_topic_that_the_recording_lacks_is_named_with_what_there_is(tmp_path):
     write_bag(tmp_path / "bag", drive())
-    config = InputConfig(
-        ego=TopicInput("/ego/odometry"),
-        detections={"lidar": TopicInput("/lidar")},
-    )
+    config = InputConfig(ego=TopicInput("/ego/odometry"), detections={"lidar": TopicInput("/lidar")})
     with pytest.raises(DataError, match=r"no topic /lidar; .* /detections/lidar \(vision_msgs"):
         open_input(tmp_path / "bag", config)
 

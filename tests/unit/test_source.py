@@ -52,9 +52,7 @@ def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("plugin")
-def test_a_format_of_a_plug_in_is_recognised_before_the_built_in_ones(
-    tmp_path: Path,
-) -> None:
+def test_a_format_of_a_plug_in_is_recognised_before_the_built_in_ones(tmp_path: Path) -> None:
     (tmp_path / "x").write_text("{numbers} 1 5")
     source = open_input(tmp_path / "x")
     assert source.kind == "numbers"

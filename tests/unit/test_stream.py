@@ -17,14 +17,7 @@ from fgtrack.io.stream import read_header, read_stream, write_stream
 
 HEADER = {"type": "header", "format": "fgtrack-stream/1"}
 EGO = {"type": "ego", "stamp_ns": 1, "receipt_ns": 2, "x_m": 0, "y_m": 0, "yaw_rad": 0.0, "speed_mps": 1.5}
-LIST = {
-    "type": "detections",
-    "sensor": "lidar",
-    "stamp_ns": 1,
-    "receipt_ns": 2,
-    "frame": "ego",
-    "objects": [],
-}
+LIST = {"type": "detections", "sensor": "lidar", "stamp_ns": 1, "receipt_ns": 2, "frame": "ego", "objects": []}
 
 
 def write_records(path: Path, *records: object) -> Path:
@@ -117,14 +110,7 @@ def test_a_bad_record_is_one_line_with_file_and_line(tmp_path, record, complaint
 
 @pytest.mark.parametrize(
     "text",
-    [
-        "",
-        "{",
-        "nonsense\n",
-        json.dumps(EGO) + "\n",
-        '{"type": "header", "format": "fgtrack-stream/2"}\n',
-        "[" * 10**5,
-    ],
+    ["", "{", "nonsense\n", json.dumps(EGO) + "\n", '{"type": "header", "format": "fgtrack-stream/2"}\n', "[" * 10**5],
 )
 def test_what_does_not_start_with_the_header_is_no_stream(tmp_path, text):
     (tmp_path / "a.jsonl").write_text(text)

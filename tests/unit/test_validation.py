@@ -34,10 +34,7 @@ def of(**fields: object) -> DetectionList:
         (replace(EGO, receipt_ns=1.0), "receipt_ns: a 64 bit integer expected, not 1.0"),
         (replace(LIST, stamp_ns=1 << 63), "stamp_ns: a 64 bit integer expected, not 9223372036854775808"),
         (replace(LIST, receipt_ns=-(1 << 63) - 1), "receipt_ns: a 64 bit integer"),
-        (
-            replace(LIST, receipt_ns=-(1 << 63)),
-            "receipt_ns: at most 4e.18 ns from 0 expected, not -922",
-        ),
+        (replace(LIST, receipt_ns=-(1 << 63)), "receipt_ns: at most 4e.18 ns from 0 expected, not -922"),
         (replace(EGO, receipt_ns=4 * 10**18 + 1), "receipt_ns: at most 4e.18 ns from 0 expected"),
         (replace(TRUTH, object_id="car"), "object_id: a 64 bit integer expected, not 'car'"),
         (replace(EGO, x_m="1.0"), "x_m: a number expected, not '1.0'"),

@@ -8,15 +8,7 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import STATE_NAMES, Detection, DetectionList, EgoState, FloatArray, Frame, TruthState
 from fgtrack.io.adapters.common import PLANAR, RosMessage
-from fgtrack.io.adapters.native import (
-    DETECTION_OPTIONAL,
-    DETECTIONS,
-    EGO,
-    LISTS,
-    TEXTS,
-    TRUTH,
-    TRUTH_OPTIONAL,
-)
+from fgtrack.io.adapters.native import DETECTION_OPTIONAL, DETECTIONS, EGO, LISTS, TEXTS, TRUTH, TRUTH_OPTIONAL
 from fgtrack.io.ros.typestore import typestore_of
 
 ODOMETRY = "nav_msgs/msg/Odometry"

@@ -6,7 +6,8 @@ and numbers there.
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections import ChainMap
+from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, cast
@@ -68,7 +69,7 @@ class MessageTypes:
                 self.problems[key] = f"its embedded definition cannot be read ({one_line(error)})"
         for key, types in embedded.items():
             try:
-                self.types[key] = _closure(key[0], (types, *embedded.values(), known))
+                self.types[key] = _closure(key[0], ChainMap(types, *embedded.values(), known))
             except (ValueError, RecursionError) as error:
                 self.problems[key] = str(error)
 
@@ -97,7 +98,7 @@ def typestore_of(names: tuple[str, ...]) -> Typestore:
     """One store of shipped ROS 2 types and all their parts."""
     needed: Typesdict = {}
     for name in names:
-        needed |= _closure(name, [_shipped_types(False)])
+        needed |= _closure(name, _shipped_types(False))
     return _registered(needed)
 
 
@@ -107,8 +108,8 @@ def _registered(types: Typesdict) -> Typestore:
     return store
 
 
-def _closure(name: str, sources: Sequence[Typesdict]) -> Typesdict:
-    """The type `name` with all its parts, each from the first of `sources` that has it.
+def _closure(name: str, known: Mapping[str, Any]) -> Typesdict:
+    """Return the type `name` with all its parts.
 
     Raises `ValueError` for an undefined part, a type that contains itself, and one of more than `_MOST_VALUES` values.
     """
@@ -130,15 +131,14 @@ def _closure(name: str, sources: Sequence[Typesdict]) -> Typesdict:
 
     def size_of_type(current: str) -> int:
         if current not in sizes:
-            definition = next((types[current] for types in sources if current in types), None)
-            if definition is None:
+            if current not in known:
                 raise ValueError(
                     f"the definition of {current or 'a type without a name'} is not in the recording, "
                     "name its .msg file in message_definitions"
                 )
-            needed[current] = definition
+            needed[current] = known[current]
             sizes[current] = _MOST_VALUES + 1  # until it is computed: a type that contains itself is too large
-            sizes[current] = sum(size_of(description) for _, description in definition[1])
+            sizes[current] = sum(size_of(description) for _, description in known[current][1])
         if sizes[current] > _MOST_VALUES:
             raise ValueError(f"{name} has more than {_MOST_VALUES} values, or contains itself")
         return sizes[current]

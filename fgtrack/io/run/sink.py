@@ -1,7 +1,7 @@
 """Sinks of a run: rows of the tables, counts of the dispositions, the meta data."""
 
 from abc import ABC, abstractmethod
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import astuple
 
@@ -26,17 +26,14 @@ class RunSink(ABC):
     """
 
     def __init__(
-        self,
-        config_text: str = "",
-        meta: Mapping[str, object] | None = None,
-        smoothed_lag_s: float | None = None,
+        self, config_text: str = "", meta: Mapping[str, object] | None = None, smoothed_lag_s: float | None = None
     ) -> None:
         self._config_text = config_text
         self._meta: dict[str, object] = {"format": RUN_FORMAT, **(meta or {}), "complete": False}
         self._smoothed_lag_s = smoothed_lag_s
-        self._counts: dict[str, Counter[Disposition]] = {}
-        self._out_of_bounds: dict[str, Counter[str]] = {}  # by setting
-        self._left_out: dict[str, Counter[str]] = {}  # by the reader and its settings
+        self._counts: dict[str, Counter[Disposition]] = defaultdict(Counter)
+        self._out_of_bounds: dict[str, Counter[str]] = defaultdict(Counter)  # by setting
+        self._left_out: dict[str, Counter[str]] = defaultdict(Counter)  # by the reader and its settings
         self._objects: dict[int, ObjectReport] = {}  # the last word on tracks that have not ended
         self._received: dict[str, list[Row]] = {name: [] for name in ("truth", "ignored", "ego", "detections")}
 
@@ -44,9 +41,9 @@ class RunSink(ABC):
         """Take all rows of one tick, see `rows`, and what was received before it."""
         self._append_received()
         for record in report.updates:
-            self._counts.setdefault(record.sensor, Counter())[record.disposition] += 1
+            self._counts[record.sensor][record.disposition] += 1
             if record.reason is not None:
-                self._out_of_bounds.setdefault(record.sensor, Counter())[record.reason] += 1
+                self._out_of_bounds[record.sensor][record.reason] += 1
         self._append_objects({track.track_id for track in report.tracks})
         self._objects |= {track.track_id: track.object for track in report.tracks if track.object is not None}
         for table, cells in rows(report, process_ns, num_detections, self._smoothed_lag_s):
@@ -74,7 +71,7 @@ class RunSink(ABC):
         """Take the rows of `detections`."""
         self._received["detections"] += detection_rows(message)
         if message.left_out:
-            self._left_out.setdefault(message.sensor, Counter()).update(message.left_out)
+            self._left_out[message.sensor].update(message.left_out)
 
     def finish(self, meta: Mapping[str, object]) -> dict[str, object]:
         """Complete the run with `meta`, the counts per sensor and the digest; return the content of `meta.json`."""
