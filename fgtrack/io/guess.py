@@ -78,16 +78,16 @@ def guesses(values: Mapping[str, Sequence[float]]) -> dict[str, Guess]:
 
     Components are those of a table or of `fields`. Of several names for one component the first is taken.
     """
-    found: dict[str, Guess] = {}
+    guessed: dict[str, Guess] = {}
     for name, samples in values.items():
         component, unit = _component(name)
-        if component is not None and component not in found:
-            found[component] = _converted(component, unit, name, samples)
-    vx, vy = found.pop("velocity x", None), found.pop("velocity y", None)
-    if vx and vy and "speed_mps" not in found:
+        if component is not None and component not in guessed:
+            guessed[component] = _converted(component, unit, name, samples)
+    vx, vy = guessed.pop("velocity x", None), guessed.pop("velocity y", None)
+    if vx and vy and "speed_mps" not in guessed:
         names, scale = [_name(vx), _name(vy)], vx.path.scale if isinstance(vx.path, Field) else 1.0
-        found["speed_mps"] = Guess(names if scale == 1.0 else Field(names, scale), "length of the velocity")
-    return found
+        guessed["speed_mps"] = Guess(names if scale == 1.0 else Field(names, scale), "length of the velocity")
+    return guessed
 
 
 def time_unit(name: str, samples: Sequence[float]) -> tuple[str, str]:
@@ -105,31 +105,31 @@ def time_unit(name: str, samples: Sequence[float]) -> tuple[str, str]:
     return "s", "uncertain: check it"
 
 
-def agreeing_with_motion(found: Mapping[str, Guess], values: Mapping[str, FloatArray], unit: str) -> dict[str, Guess]:
-    """Guesses `found` of one object, with the heading and speed in the convention that its positions confirm.
+def agreeing_with_motion(guessed: Mapping[str, Guess], values: Mapping[str, FloatArray], unit: str) -> dict[str, Guess]:
+    """Guesses `guessed` of one object, with the heading and speed in the convention that its positions confirm.
 
     `values` are the columns by name, shape (rows,); `unit` is that of the stamp.
     """
-    if not {"stamp", "x_m", "y_m"} <= found.keys():
-        return dict(found)
-    t_s, x_m, y_m = (values[_name(found[name])] for name in ("stamp", "x_m", "y_m"))
+    if not {"stamp", "x_m", "y_m"} <= guessed.keys():
+        return dict(guessed)
+    t_s, x_m, y_m = (values[_name(guessed[name])] for name in ("stamp", "x_m", "y_m"))
     gap_s, dx_m, dy_m = np.diff(t_s) * NS_PER_UNIT[unit] / NS_PER_S, np.diff(x_m), np.diff(y_m)
     step_m = np.hypot(dx_m, dy_m)
     moved = (step_m > _MOVED_M) & (gap_s > 0.0)
     if moved.sum() < _FEWEST_STEPS:
-        return dict(found)
-    changed = dict(found)
-    if "yaw_rad" in found:
-        raw = values[_name(found["yaw_rad"])][:-1][moved]
-        changed["yaw_rad"] = _heading(found["yaw_rad"], raw, np.arctan2(dy_m, dx_m)[moved])
-    if "speed_mps" in found and isinstance(found["speed_mps"].path, str):
+        return dict(guessed)
+    changed = dict(guessed)
+    if "yaw_rad" in guessed:
+        raw = values[_name(guessed["yaw_rad"])][:-1][moved]
+        changed["yaw_rad"] = _heading(guessed["yaw_rad"], raw, np.arctan2(dy_m, dx_m)[moved])
+    if "speed_mps" in guessed and isinstance(guessed["speed_mps"].path, str):
         ratio = float(
-            np.median(values[_name(found["speed_mps"])][:-1][moved]) / np.median(step_m[moved] / gap_s[moved])
+            np.median(values[_name(guessed["speed_mps"])][:-1][moved]) / np.median(step_m[moved] / gap_s[moved])
         )
         for name, scale in _SPEED_SCALES.items():
             if abs(ratio * scale - 1.0) < _SPEED_TOLERANCE and scale != 1.0:
                 reason = f"{ratio:.3g} times the distance travelled per second: {name}"
-                changed["speed_mps"] = Guess(Field(_name(found["speed_mps"]), scale), reason)
+                changed["speed_mps"] = Guess(Field(_name(guessed["speed_mps"]), scale), reason)
     return changed
 
 
@@ -138,7 +138,7 @@ def _heading(guess: Guess, raw: FloatArray, course_rad: FloatArray) -> Guess:
     degrees = isinstance(guess.path, Field) and guess.path.degrees
     quarter = 90.0 if degrees else 0.5 * math.pi
     options = [Field(_name(guess), degrees=degrees), Field(_name(guess), scale=-1.0, offset=quarter, degrees=degrees)]
-    agreement = [float(np.mean(np.cos(course_rad - [one.value(each) for each in raw]))) for one in options]
+    agreement = [float(np.mean(np.cos(course_rad - [option.value(each) for each in raw]))) for option in options]
     best = int(agreement[1] > agreement[0])
     if agreement[best] < _AGREEMENT:
         return Guess(guess.path, f"{guess.reason}; does not agree with the direction of travel: check it")

@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -81,7 +82,7 @@ def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
         problem = str(readable.error)
     if kind != "recording":
         used = {topic: topic.type.replace("detections", f"detections {topic.name}") for topic in times}
-    topics = tuple(_topic(topic, times[topic], used.get(topic)) for topic in sorted(times, key=lambda one: one.name))
+    topics = tuple(_topic(topic, times[topic], used.get(topic)) for topic in sorted(times, key=attrgetter("name")))
     receipts_ns = [receipt_ns for every in times.values() for receipt_ns, _ in every]
     if not receipts_ns:
         return InputInfo(path, kind, None, 0.0, topics, problem)
@@ -109,7 +110,5 @@ def _stamps(messages: Iterator[Message]) -> Iterator[tuple[BagTopic, int, int | 
     """Sensor or kind, receipt and stamp of `messages`, as of a recording with a topic for each."""
     for message in messages:
         kind = "ego" if isinstance(message, EgoState) else "truth"
-        topic = BagTopic(kind, kind, None)
-        if isinstance(message, DetectionList):
-            topic = BagTopic(message.sensor, "detections", None)
-        yield topic, message.receipt_ns, message.stamp_ns
+        name, kind = (message.sensor, "detections") if isinstance(message, DetectionList) else (kind, kind)
+        yield BagTopic(name, kind, None), message.receipt_ns, message.stamp_ns

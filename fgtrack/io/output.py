@@ -52,9 +52,9 @@ def check_apart(out: Path, inputs: Iterable[str | Path | None]) -> None:
     """Raise `CallError` where the output `out` is one of `inputs`, holds one, or lies in one."""
     target = out.resolve()
     for source in (each for each in inputs if each is not None):
-        place = Path(source).resolve()
-        overlaps = target == place or target in place.parents or place in target.parents
-        if overlaps and place.exists():  # else the name of a shipped configuration
+        source_path = Path(source).resolve()
+        overlaps = target == source_path or target in source_path.parents or source_path in target.parents
+        if overlaps and source_path.exists():  # else the name of a shipped configuration
             raise CallError(f"{out}: must not overlap the input {source}, choose another name")
 
 

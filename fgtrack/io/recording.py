@@ -37,10 +37,10 @@ def write_recording(
 
 def check_recording(out: Path, overwrite: bool) -> None:
     """Raise `CallError` where `write_recording` would for what is there, before the messages are made."""
-    if not _is_stream(out) and _FILE_ENDING.search(out.name) and not out.is_dir():
-        raise CallError(f"{out}: is written as .jsonl, as .jsonl.gz, or as a rosbag2 folder without such an ending")
     if _is_stream(out):
         check_output(out, overwrite)
+    elif _FILE_ENDING.search(out.name) and not out.is_dir():
+        raise CallError(f"{out}: is written as .jsonl, as .jsonl.gz, or as a rosbag2 folder without such an ending")
     else:
         check_bag(out, overwrite)
 

@@ -81,15 +81,15 @@ def input_kind(path: Path) -> str:
                     return name
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
-    known = ", ".join(form.description for form in reversed(formats.values()))
-    raise DataError(f"{path}: is none of the inputs that fgtrack reads: {known}")
+    formats_read = ", ".join(form.description for form in reversed(formats.values()))
+    raise DataError(f"{path}: is none of the inputs that fgtrack reads: {formats_read}")
 
 
 def file_format(name: str) -> FileFormat:
     """The format `name`. Raises `CallError` where a plug-in fails or is not one."""
     with ADAPTERS.blamed(name, "cannot be made"):
-        found = ADAPTERS.load(name)
-        found = found if isinstance(found, FileFormat) else found()
-    if not isinstance(found, FileFormat):
-        raise CallError(f"adapter {name!r}: is a {type(found).__name__}, not a FileFormat")
-    return found
+        form = ADAPTERS.load(name)
+        form = form if isinstance(form, FileFormat) else form()
+    if not isinstance(form, FileFormat):
+        raise CallError(f"adapter {name!r}: is a {type(form).__name__}, not a FileFormat")
+    return form

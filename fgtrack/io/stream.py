@@ -172,11 +172,11 @@ def _made(name: str, kind: type[_Made], record: object, unknown: Counter[str]) -
     """An instance of `kind` from a JSON object; null is not given. Unknown keys are counted."""
     if not isinstance(record, dict):
         raise InvalidMessageError(f"{name}: a JSON object expected, not {record!r}")
-    known = _FIELDS[kind]
-    if not record.keys() <= known.keys():
-        unknown.update(f"{name}.{key}" for key in record.keys() - known.keys())
-    given = {key: _value(key, value) for key, value in record.items() if value is not None and key in known}
-    for key, is_needed in known.items():
+    required = _FIELDS[kind]
+    if not record.keys() <= required.keys():
+        unknown.update(f"{name}.{key}" for key in record.keys() - required.keys())
+    given = {key: _value(key, value) for key, value in record.items() if value is not None and key in required}
+    for key, is_needed in required.items():
         if is_needed and key not in given:
             raise InvalidMessageError(f"{key}: is missing")
     return kind(**given)

@@ -57,9 +57,9 @@ def files_of(path: Path) -> list[Path]:
         files = [path / PurePath(name).name for name in _metadata(path)["relative_file_paths"]]
     elif path.is_dir():
         files = bags_in(path)
-    for one, other in combinations(files, 2):
-        if one.stat().st_size and filecmp.cmp(one, other, shallow=False):
-            raise DataError(f"{path}: {one.name} and {other.name} are copies of one recording: remove or name one")
+    for first, other in combinations(files, 2):
+        if first.stat().st_size and filecmp.cmp(first, other, shallow=False):
+            raise DataError(f"{path}: {first.name} and {other.name} are copies of one recording: remove or name one")
     return files
 
 

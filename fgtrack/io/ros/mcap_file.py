@@ -60,11 +60,13 @@ class McapFile:
         by_id = {connection.id: connection for connection in connections}
         if self._is_indexed:
             topics = {connection.topic for connection in connections}
-            found: Iterable[Message] = (message for _, _, message in self._reader().iter_messages(topics))
+            messages: Iterable[Message] = (message for _, _, message in self._reader().iter_messages(topics))
         else:
-            wanted = (one for one in self._records() if isinstance(one, Message) and one.channel_id in by_id)
-            found = sorted(wanted, key=attrgetter("log_time"))
-        for message in found:
+            wanted = (
+                record for record in self._records() if isinstance(record, Message) and record.channel_id in by_id
+            )
+            messages = sorted(wanted, key=attrgetter("log_time"))
+        for message in messages:
             if message.channel_id in by_id:
                 yield by_id[message.channel_id], message.log_time, message.data
 
@@ -78,10 +80,10 @@ class McapFile:
             summary = self._reader().get_summary()
         except Exception:  # whatever the end of a truncated file raises
             return None
-        known = None if summary is None else summary.statistics
-        if summary is None or known is None or not 0 < known.chunk_count == len(summary.chunk_indexes):
+        statistics = None if summary is None else summary.statistics
+        if summary is None or statistics is None or not 0 < statistics.chunk_count == len(summary.chunk_indexes):
             return None
-        if known.channel_count > len(summary.channels):
+        if statistics.channel_count > len(summary.channels):
             return None
         return summary.schemas, summary.channels
 

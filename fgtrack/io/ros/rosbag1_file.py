@@ -48,7 +48,7 @@ class Rosbag1File(Reader):
         file.seek(chunk.datapos)
         data = chunk.decompressor(read_bytes(file, chunk.datasize))
         self.chunks[position] = chunk
-        known = {item.id for item in self.connections}
+        ids = {item.id for item in self.connections}
         self.bio = inside = BytesIO(data)  # where `read_connection` reads
         try:
             while (offset := inside.tell()) < len(data):
@@ -56,8 +56,8 @@ class Rosbag1File(Reader):
                 if header.get_uint8("op") == RecordType.CONNECTION:
                     inside.seek(offset)
                     connection = self.read_connection()
-                    if connection.id not in known:
-                        known.add(connection.id)
+                    if connection.id not in ids:
+                        ids.add(connection.id)
                         self.connections.append(connection)
                 else:
                     indexes[header.get_uint32("conn")].append(IndexData(header.get_time("time"), position, offset))

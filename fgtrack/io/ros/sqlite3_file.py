@@ -30,14 +30,14 @@ class Sqlite3File:
 
     def open(self) -> None:
         """Open the file and read which connections it holds."""
-        journals = [self.path.with_name(self.path.name + suffix) for suffix in ("-wal", "-journal")]
-        left = [journal for journal in journals if journal.exists() and journal.stat().st_size]
+        files = [self.path.with_name(self.path.name + suffix) for suffix in ("-wal", "-journal")]
+        journals = [file for file in files if file.exists() and file.stat().st_size]
         base = apsw.Connection(
             f"{self.path.absolute().as_uri()}?immutable=1", apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
         )
-        if left:
-            self.break_off = f"was not closed by its writer ({left[0].name} is left)"
-            base = apsw.Connection(str(self._copy(*left)))  # SQLite applies the journals
+        if journals:
+            self.break_off = f"was not closed by its writer ({journals[0].name} remains)"
+            base = apsw.Connection(str(self._copy(*journals)))  # SQLite applies the journals
         try:
             self._read_topics(base)
         except apsw.Error:

@@ -105,12 +105,12 @@ def bag_messages(bag: Bag, uses: list[TopicUse]) -> Iterator[Message]:
 
 
 def _find(bag: Bag, item: TopicInput) -> BagTopic:
-    found = [topic for topic in bag.topics if topic.name == item.topic]
-    if len(found) == 1:
-        return found[0]
-    if not found and bag.break_off:
+    topics = [topic for topic in bag.topics if topic.name == item.topic]
+    if len(topics) == 1:
+        return topics[0]
+    if not topics and bag.break_off:
         raise TruncatedInput(f"{bag.break_off}, before topic {item.topic}")
-    count = "several types of" if found else "no"
+    count = "several types of" if topics else "no"
     raise DataError(f"{bag.path}: has {count} topic {item.topic}; it has {_listed(bag)}")
 
 
@@ -118,10 +118,10 @@ def _listed(bag: Bag) -> str:
     return ", ".join(f"{topic.name} ({topic.type})" for topic in bag.topics) or "no topic"
 
 
-def _check_fields(item: TopicInput, known: frozenset[str], needed: tuple[str, ...] = ()) -> None:
+def _check_fields(item: TopicInput, names: frozenset[str], needed: tuple[str, ...] = ()) -> None:
     fields = item.fields or {}
-    for name in sorted(set(fields) - known):
-        raise CallError(f"topic {item.topic}: unknown field {name!r}, known are {', '.join(sorted(known))}")
+    for name in sorted(set(fields) - names):
+        raise CallError(f"topic {item.topic}: unknown field {name!r}, known are {', '.join(sorted(names))}")
     for name in needed:
         if name not in fields:
             raise CallError(f"topic {item.topic}: fields must name {name}")
@@ -148,10 +148,10 @@ def _detections(topic: BagTopic, item: TopicInput, sensor: str) -> Convert:
     read = _object_list(topic, item)
 
     def convert(message: RosMessage, receipt_ns: int) -> Iterable[Message]:
-        found = read(message)
-        stamp_ns = receipt_ns if found.stamp_ns is None else found.stamp_ns
-        frame = item.frame or found.frame or "ego"
-        objects, left_out = split(found.objects)
+        listed = read(message)
+        stamp_ns = receipt_ns if listed.stamp_ns is None else listed.stamp_ns
+        frame = item.frame or listed.frame or "ego"
+        objects, left_out = split(listed.objects)
         if item.filters:
             own = objects if item.fields is None else items_by_fields(message, item.fields)
             objects, left_out = split(_judged(item, *pair) for pair in zip(objects, own, strict=True))
@@ -165,8 +165,8 @@ def _object_list(topic: BagTopic, item: TopicInput) -> Callable[[RosMessage], Ob
         _check_fields(item, OBJECT_FIELDS)
         return partial(objects_by_fields, fields=item.fields)
     if unknown := item.filters.keys() - DETECTION_FIELDS:
-        known = ", ".join(sorted(DETECTION_FIELDS))
-        raise CallError(f"topic {item.topic}: without fields, filters go by {known}, not by {min(unknown)!r}")
+        names = ", ".join(sorted(DETECTION_FIELDS))
+        raise CallError(f"topic {item.topic}: without fields, filters go by {names}, not by {min(unknown)!r}")
     if topic.type == DETECTIONS:
         return partial(detections, receipt_ns=0)  # a list of fgtrack's own has what an object list has
     if topic.type not in ADAPTERS:

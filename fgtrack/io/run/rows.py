@@ -65,20 +65,20 @@ def smoothed_rows(reports: Iterable[SmoothedReport]) -> list[Row]:
 
 def detection_rows(message: DetectionList) -> list[Row]:
     """Rows of `detections`: what `message` says of every object, in its own frame."""
-    found: list[Row] = []
-    for index, one in enumerate(message.objects):
-        stamp_ns = message.stamp_ns if one.stamp_ns is None else one.stamp_ns
-        values = (value if value is None or isinstance(value, str) else float(value) for value in _values(one))
-        found.append((message.sensor, stamp_ns, message.receipt_ns, index, message.frame, *values))
-    return found
+    cells: list[Row] = []
+    for index, item in enumerate(message.objects):
+        stamp_ns = message.stamp_ns if item.stamp_ns is None else item.stamp_ns
+        values = (value if value is None or isinstance(value, str) else float(value) for value in _values(item))
+        cells.append((message.sensor, stamp_ns, message.receipt_ns, index, message.frame, *values))
+    return cells
 
 
-def text(table: str, found: Sequence[Row]) -> str:
+def text(table: str, cells: Sequence[Row]) -> str:
     """Rows as lines of the CSV file of `table`, floats with 17 significant digits."""
     for name in _NAMES & set(COLUMNS[table]):
-        place = COLUMNS[table].index(name)
-        found = [(*row[:place], _quoted(row[place]), *row[place + 1 :]) for row in found]
-    return "".join([_line(tuple(map(type, row))) % row for row in found])
+        index = COLUMNS[table].index(name)
+        cells = [(*row[:index], _quoted(row[index]), *row[index + 1 :]) for row in cells]
+    return "".join([_line(tuple(map(type, row))) % row for row in cells])
 
 
 def text_header(table: str) -> bytes:
@@ -117,8 +117,8 @@ def _state_cells(state: TrackState) -> Row:
 def _upper_triangle(size: int) -> Callable[[list[Cell]], Row]:
     """Return a function that picks the cells of the covariance of `size` states, row by row, and a final None."""
     kept = range(len(COVARIANCE_STATES))
-    places = [i * size + j if j < size else -1 for i in kept for j in kept[i:]]
-    picked: Callable[[list[Cell]], Any] = itemgetter(*places)  # Any: a tuple, as there are several places
+    indices = [i * size + j if j < size else -1 for i in kept for j in kept[i:]]
+    picked: Callable[[list[Cell]], Any] = itemgetter(*indices)  # Any: a tuple, as there are several indices
     return picked
 
 
