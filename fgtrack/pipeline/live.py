@@ -140,7 +140,7 @@ class Tracker:
 
     @property
     def refused(self) -> Mapping[str, int]:
-        """Messages, ticks and output stamps that were not used, by reason."""
+        """Messages and ticks that were not used, by reason."""
         with self._turn:
             self._take_arrivals()
             return self._refused + self._tracker.refused_ego

@@ -22,18 +22,12 @@ from fgtrack.pipeline.shipped import read_config, read_scenario
 from fgtrack.sim.redelay import SensorDelays
 from fgtrack.sim.scenario import Scenario
 
-#: What a key may be set to: JSON, which is checked by the dataclass that has the key.
+#: Value of a key: JSON, which is validated by the dataclass that has the key.
 Value = Any
-
-#: Columns that every table of a sweep has behind those of its axes.
+#: Columns of every table of a sweep behind those of its axes.
 KEY_COLUMNS = ("seed", "estimator")
-
 #: Key of a group of keys that names its values, in a column of the group's own name.
 LABEL = "label"
-
-#: Columns of `one_at_a_time`: which setting is changed, and to what; in the row without a change, this and nothing.
-CHANGED, TO, BASE = "changed", "to", "base"
-
 #: Roots of keys; those of the configuration have none.
 CONFIG, SCENARIO, DELAYS = "config", "scenario", "delays"
 _KINDS: Mapping[str, Any] = {CONFIG: Config, SCENARIO: Scenario, DELAYS: dict[str, SensorDelays]}
@@ -107,13 +101,11 @@ class SweepConfig:
 
 
 def _axis(where: str, name: str, given: Value) -> list[Point]:
-    """Return the points of the axis at the path `where`; raises `ValueError` with that path."""
+    """Return the points of the axis at the path `where`."""
     lists = given if isinstance(given, Mapping) else {name: given}
-    lengths = {key: len(values) if isinstance(values, (list, tuple)) else 0 for key, values in lists.items()}
-    if not set(lists) - {LABEL} or not all(lengths.values()):
-        raise ValueError(f"{where}: a list of values is needed, or a mapping of keys to such lists")
-    if len(set(lengths.values())) > 1:
-        raise ValueError(f"{where}: its keys change together and need equally many values, not {compact(lengths)}")
+    lengths = {len(values) if isinstance(values, (list, tuple)) else 0 for values in lists.values()}
+    if not set(lists) - {LABEL} or len(lengths) > 1 or 0 in lengths:
+        raise ValueError(f"{where}: a list of values is needed, or a mapping of keys to equally long lists")
     points = []
     for values in zip(*lists.values(), strict=True):
         changes = dict(zip(lists, values, strict=True))
@@ -124,12 +116,12 @@ def _axis(where: str, name: str, given: Value) -> list[Point]:
 
 def _one_at_a_time(given: Mapping[str, Value]) -> list[Point]:
     """Return the points of the base and of every value alone."""
-    points = [Point({CHANGED: BASE, TO: None}, {})]
+    points = [Point({"changed": "base", "to": None}, {})]
     for name, values in given.items():
         for point in _axis(f"one_at_a_time.{name}", name, values):
             cells = list(point.cells.values())
             alone = len(cells) == 1 or name in point.cells  # one key, or a label
-            points.append(Point({CHANGED: name, TO: cells[0] if alone else cells}, point.changes))
+            points.append(Point({"changed": name, "to": cells[0] if alone else cells}, point.changes))
     return points
 
 

@@ -96,6 +96,7 @@ def test_the_committed_smoke_sweep_has_a_row_for_every_cell(done: Path) -> None:
     ]
     assert cells == expected
     assert rows(done / "errors.csv") == []
+    assert all(float(row["replay_s"]) > 0.0 for row in rows(done / "timing.csv"))
     assert all(0.0 < float(row["truth.overall.errors.position_m.rmse"]) < 3.0 for row in table)
 
 

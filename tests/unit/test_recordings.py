@@ -93,3 +93,6 @@ def test_the_recording_of_a_run_is_found_from_elsewhere_and_after_a_move(
     meta = load_run("copy").meta
     assert (meta["messages_received"], meta["first_receipt_ns"]) == (40, START_NS)
     assert meta["last_receipt_ns"] == START_NS + 380 * MS
+    assert (meta["detections_received"], meta["detections_ignored"], meta["ego_jumps"]) == (20, 0, 0)
+    ignoring = run_of(drive(), "ignore_sensors=[lidar]").meta
+    assert (ignoring["detections_received"], ignoring["detections_ignored"]) == (0, 20)

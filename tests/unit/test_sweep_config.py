@@ -118,10 +118,7 @@ one_at_a_time:
         ("seeds: [-1]", "seeds.0: Input should be greater than or equal to 0"),
         ("vary: {association.gate_m: 5.0}", "vary.association.gate_m: a list of values is needed"),
         ("vary: {a: {label: [1]}}", "vary.a: a list of values is needed, or a mapping"),
-        (
-            "vary: {a: {clock.node_hz: [5.0, 9.0], association.gate_m: [3.0]}}",
-            "vary.a: its keys change together and need equally many values",
-        ),
+        ("vary: {a: {clock.node_hz: [5.0, 9.0], association.gate_m: [3.0]}}", "mapping of keys to equally long lists"),
         ("set: {estimator: smoother}", "set.estimator: is not a key of the runs of this sweep"),
         ("vary: {delays.radar.delay: [null]}", "vary.delays.radar.delay: is not a key of the runs of this sweep"),
         ("delays: d.yaml", "delays: a scenario has its own"),
