@@ -86,9 +86,8 @@ def ranked(
 
 def entry_record(entry: Entry, name: str = "value") -> dict[str, Any]:
     """Numbers of an entry, its value as `name`, which `entry_columns` show."""
-    worse = entry.worse_by or UNKNOWN
-    numbers = {"worse_by": worse.mean, "low": worse.low, "high": worse.high}
-    return {"run": entry.name, name: entry.value, "standing": entry.standing, **numbers}
+    worse, values = entry.worse_by or UNKNOWN, {"run": entry.name, name: entry.value, "standing": entry.standing}
+    return values | {"worse_by": worse.mean, "low": worse.low, "high": worse.high}
 
 
 def entry_columns(heading: str, name: str = "value") -> list[Column]:

@@ -1,6 +1,5 @@
 """Detections of a run in the map, the outcome of each, and the roads of the map."""
 
-from collections import defaultdict, deque
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from fgtrack.models.road import OPEN_SPACE
 from fgtrack.models.track_map import TrackMap
 
 _BOUND_STEP_M = 2.0
-_KEY = ("sensor", "stamp_ns", "receipt_ns", "index")
+_KEY = ["sensor", "stamp_ns", "receipt_ns", "index"]
 
 
 @dataclass(frozen=True)
@@ -59,11 +58,11 @@ def placed(run: Run) -> Placed:
 
 def update_rows(run: Run) -> IntArray:
     """Row of `Run.updates` with the outcome of each of `Run.detections`, shape (n,); -1 without one."""
-    waiting: defaultdict[tuple[object, ...], deque[int]] = defaultdict(deque)
-    for row, key in enumerate(zip(*(run.tables["updates"][name].tolist() for name in _KEY), strict=True)):
-        waiting[key].append(row)
-    keys = zip(*(run.tables["detections"][name].tolist() for name in _KEY), strict=True)
-    return np.array([waiting[key].popleft() if waiting[key] else -1 for key in keys], dtype=np.int64)
+    import pandas as pd
+
+    frames = run.updates[_KEY], run.detections[_KEY]
+    keys = [pd.MultiIndex.from_frame(frame.assign(nth=frame.groupby(_KEY).cumcount())) for frame in frames]
+    return np.asarray(keys[0].get_indexer(keys[1]), dtype=np.int64)
 
 
 def roads(run: Run) -> tuple[dict[str, TrackMap], list[str]]:
