@@ -114,7 +114,9 @@ def close_up(runs: Runs, close_ups: Sequence[CloseUp], **paper: Unpack[Paper]) -
     rows[1, 0].set_ylabel(quantity)
     sensor = first.arrival.sensor.replace("_", " ")
     sheet.title(f"A {sensor} detection arrives {late_ms:.0f} ms late: nearer to the centre is better")
-    sheet.caption("\n".join(textwrap.wrap(first.rule, int(17 * sheet.figure.get_figwidth()))))
+    if sheet.has_title:
+        rule = "\n".join(textwrap.wrap(first.rule, int(17 * sheet.figure.get_figwidth())))
+        sheet.figure.supxlabel(rule, fontsize="small", ha="left", x=0.01)
     return sheet.figure
 
 

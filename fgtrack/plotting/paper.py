@@ -147,7 +147,7 @@ class Sheet:
     def __init__(self, width_in: float, height_in: float, paper: Paper) -> None:
         """Make a figure of this usual size, in the width that `paper` wants."""
         self._ax = paper.get("ax")
-        self._has_title = self._ax is None and "width" not in paper
+        self.has_title = self._ax is None and "width" not in paper
         if self._ax is None:
             wanted_in = inches(paper.get("width", width_in))
             figure: Any = StyledFigure(figsize=(wanted_in, height_in * (wanted_in / width_in) ** _FLATTEN))
@@ -182,13 +182,8 @@ class Sheet:
 
     def title(self, text: str) -> None:
         """Write `text` above the figure, where it has a title, broken into lines that are no wider than it."""
-        if self._has_title:
+        if self.has_title:
             width = max(10, int(self.figure.get_figwidth() / (LETTER * size_in("figure.titlesize"))))
             lines = [line for part in text.split("\n") for line in textwrap.wrap(part, width)]
             self.figure.suptitle("\n".join(lines))
             grow(self.figure, "figure.titlesize", len(lines) - 1)
-
-    def caption(self, text: str) -> None:
-        """Write `text` below the figure, where it has a title."""
-        if self._has_title:
-            self.figure.supxlabel(text, fontsize="small", ha="left", x=0.01)

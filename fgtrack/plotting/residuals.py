@@ -58,8 +58,8 @@ def residuals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
             moments = innovations.moments_of(name, sample)
             outside = int(((sample < low) | (sample > high)).sum())
             mean = round(moments.mean, 3) + 0.0  # no negative zero
-            label = f"{sensor}: mean {mean:.3f}, std {moments.std:.3f}, n {moments.count}"
-            label += f" ({outside} outside)" if outside else ""
+            ending = f" ({outside} outside)" if outside else ""
+            label = f"{sensor}: mean {mean:.3f}, std {moments.std:.3f}, n {moments.count}{ending}"
             over_time.plot(time_s[mine], sample, ".", ms=3.0, alpha=0.6, mew=0, color=colour, label=label)
             density = np.histogram(sample, bins)[0] / (len(sample) * np.diff(bins))
             histogram.stairs(density, bins, orientation="horizontal", color=colour, lw=1.4)

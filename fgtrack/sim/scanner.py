@@ -58,8 +58,7 @@ class Scanner:
 
     def _see(self, rng: np.random.Generator, states: FloatArray) -> _Detected:
         """Sightings of one object: none, one or two (a split) in every scan."""
-        sensor, n = self.sensor, len(states)
-        everything = np.arange(n)
+        sensor, n, everything = self.sensor, len(states), np.arange(len(states))
         seen = self._visible(everything, states) & (rng.random(n) < sensor.detection_probability)
         split = rng.random(n) < sensor.split_probability
         shift_m = np.where(split, rng.uniform(*sensor.split_distance_m, n) / 2.0, 0.0)

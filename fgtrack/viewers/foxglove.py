@@ -17,6 +17,7 @@ from fgtrack.io.output import new_file
 from fgtrack.viewers.shapes import Entity, Point, Scene, Shape, ViewerMessage
 
 _LONGEST_HEAD_M = 1.5
+_SOLIDS = {"cube": sdk.CubePrimitive, "cylinder": sdk.CylinderPrimitive, "sphere": sdk.SpherePrimitive}
 #: The rows of `updates.csv` have no message of Foxglove's own.
 _OUTCOME = {
     "title": "fgtrack.Outcome",
@@ -62,25 +63,26 @@ def write_foxglove(path: Path, messages: Iterable[ViewerMessage], overwrite: boo
 
 def values(message: ViewerMessage) -> Iterator[tuple[str, Any]]:  # Any: messages of Foxglove, which share no type
     """Topics, and what is written to them of `message`."""
-    content, topic = message.content, message.topic
+    topic = message.topic
     sec, nsec = divmod(message.stamp_ns, NS_PER_S)
     time = sdk.Timestamp(sec, nsec)
-    if isinstance(content, Scene):
-        entities = [_entity(one, time, message.log_ns - message.stamp_ns) for one in content.entities]
-        removed = [sdk.SceneEntityDeletion(timestamp=time, id=name) for name in content.removed]
-        yield topic, sdk.SceneUpdate(deletions=removed, entities=entities)
-    elif isinstance(content, EgoState):
-        position, turn = _vector(content.x_m, content.y_m), _turn(content.yaw_rad)
-        frames = {"parent_frame_id": "map", "child_frame_id": "ego"}
-        yield "/tf", sdk.FrameTransform(timestamp=time, translation=position, rotation=turn, **frames)
-        pose = sdk.Pose(position=position, orientation=turn)
-        yield f"{topic}/pose", sdk.PoseInFrame(timestamp=time, frame_id="map", pose=pose)
-    elif isinstance(content, tuple):
-        poses = [_pose((one.x_m or 0.0, one.y_m or 0.0), 0.0, one.yaw_rad or 0.0) for one in content]
-        yield f"{topic}/poses", sdk.PosesInFrame(timestamp=time, frame_id="map", poses=poses)
-    else:
-        known = {name: value for name, value in content.items() if value is not None}
-        yield topic, {"header": {"stamp": {"sec": sec, "nsec": nsec}}, **known}
+    match message.content:
+        case Scene(entities, removed):
+            shown = [_entity(one, time, message.log_ns - message.stamp_ns) for one in entities]
+            deletions = [sdk.SceneEntityDeletion(timestamp=time, id=name) for name in removed]
+            yield topic, sdk.SceneUpdate(deletions=deletions, entities=shown)
+        case EgoState() as ego:
+            position, turn = _vector(ego.x_m, ego.y_m), _turn(ego.yaw_rad)
+            frames = {"parent_frame_id": "map", "child_frame_id": "ego"}
+            yield "/tf", sdk.FrameTransform(timestamp=time, translation=position, rotation=turn, **frames)
+            pose = sdk.Pose(position=position, orientation=turn)
+            yield f"{topic}/pose", sdk.PoseInFrame(timestamp=time, frame_id="map", pose=pose)
+        case tuple() as states:
+            poses = [_pose((one.x_m or 0.0, one.y_m or 0.0), 0.0, one.yaw_rad or 0.0) for one in states]
+            yield f"{topic}/poses", sdk.PosesInFrame(timestamp=time, frame_id="map", poses=poses)
+        case outcome:
+            known = {name: value for name, value in outcome.items() if value is not None}
+            yield topic, {"header": {"stamp": {"sec": sec, "nsec": nsec}}, **known}
 
 
 def _entity(entity: Entity, time: sdk.Timestamp, late_ns: int) -> sdk.SceneEntity:
@@ -116,9 +118,8 @@ def _primitive(shape: Shape) -> Any:  # Any: primitives share no type
         case "text":
             return sdk.TextPrimitive(text=shape.text, font_size=letter_m, billboard=True, **common)
         case "cylinder":
-            return sdk.CylinderPrimitive(size=_vector(*shape.size_m), bottom_scale=1.0, top_scale=1.0, **common)
-    kind = sdk.CubePrimitive if shape.kind == "cube" else sdk.SpherePrimitive
-    return kind(size=_vector(*shape.size_m), **common)
+            common |= {"bottom_scale": 1.0, "top_scale": 1.0}
+    return _SOLIDS[shape.kind](size=_vector(*shape.size_m), **common)
 
 
 def _pose(at_m: Point, z_m: float, yaw_rad: float) -> sdk.Pose:

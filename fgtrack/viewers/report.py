@@ -70,12 +70,12 @@ def _page(runs: Sequence[EvaluatedRun], tables: Tables, pictures: Iterable[tuple
     figures = {name: _figure(name, picture) for name, picture in pictures}
     first = [next((name for name in figures if name.startswith(kind)), "") for kind in _FIRST]
     first = list(dict.fromkeys(name for name in (*first, *figures) if name))[:_MOST_OPEN]
-    verdict = _list(head.sentences or tables.verdict)
-    more = _list(warnings[_MOST_WARNINGS:])
+    few, more = _list(warnings[:_MOST_WARNINGS], "warnings"), _list(warnings[_MOST_WARNINGS:])
+    nothing = "<p>Nothing to evaluate: no errors and no innovations.</p>"
     shown = [table for table in tables.in_full().tables.values() if table.records]
     open_parts = {
-        "Verdict": verdict or "<p>Nothing to evaluate: no errors and no innovations.</p>",
-        "Warnings": _list(warnings[:_MOST_WARNINGS], "warnings") + _folded("More warnings", more),
+        "Verdict": _list(head.sentences or tables.verdict) or nothing,
+        "Warnings": few + _folded("More warnings", more),
         "Viewer": _template("viewer.html"),
         "Figures": _figures(text for name, text in figures.items() if name in first),
     }

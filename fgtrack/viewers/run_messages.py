@@ -56,27 +56,25 @@ def rgba(text: str, opacity: float = 1.0) -> Colour:
 
 def map_messages(maps: dict[str, TrackMap], at_ns: int) -> Messages:
     """Bounds and reference line of each road, once."""
-    opacities = {name: zip(road_lines(road), (0.9, 0.9, 0.3), strict=True) for name, road in maps.items()}
-    entities = [
-        Entity(name, tuple(_line(points.tolist(), _MAP_LINE_M, (*_GREY[:3], alpha)) for points, alpha in lines))
-        for name, lines in opacities.items()
-    ]
-    shown = tuple(one for one in entities if one.shapes)
-    if shown:
-        yield ViewerMessage(at_ns, at_ns, "/map", Scene(shown, latched=True))
+    entities = list[Entity]()
+    for name, road in maps.items():
+        lines = zip(road_lines(road), (0.9, 0.9, 0.3), strict=True)
+        shapes = tuple(_line(points.tolist(), _MAP_LINE_M, (*_GREY[:3], alpha)) for points, alpha in lines)
+        entities.append(Entity(name, shapes))
+    if entities:
+        yield ViewerMessage(at_ns, at_ns, "/map", Scene(tuple(entities), latched=True))
 
 
 def ego_messages(ego: Table, at_ns: int) -> Messages:
     """The box of the ego in its own frame, once, and its state at every receipt."""
     rows = np.flatnonzero(np.isfinite(np.stack([ego[name] for name in STATE_NAMES[:3]])).all(axis=0))
-    rows = rows[np.argsort(ego["receipt_ns"][rows], kind="stable")]
     if len(rows):
         box = Entity("ego", (_box((0.0, 0.0), 0.0, NOMINAL_SIZE_M, _WHITE),), frame="ego")
         yield ViewerMessage(at_ns, at_ns, "/ego", Scene((box,), latched=True))
-    states = np.nan_to_num(np.stack([ego[name][rows] for name in STATE_NAMES], axis=-1)).tolist()
-    times = zip(ego["stamp_ns"][rows].tolist(), ego["receipt_ns"][rows].tolist(), strict=True)
-    for (stamp_ns, receipt_ns), state in zip(times, states, strict=True):
-        yield ViewerMessage(receipt_ns, stamp_ns, "/ego", EgoState(stamp_ns, receipt_ns, *state))
+    states = np.nan_to_num(np.stack([ego[name] for name in STATE_NAMES], axis=-1))
+    for row in rows[np.argsort(ego["receipt_ns"][rows], kind="stable")].tolist():
+        stamp_ns, receipt_ns = int(ego["stamp_ns"][row]), int(ego["receipt_ns"][row])
+        yield ViewerMessage(receipt_ns, stamp_ns, "/ego", EgoState(stamp_ns, receipt_ns, *states[row].tolist()))
 
 
 def truth_messages(truth: Table) -> Iterator[Messages]:
