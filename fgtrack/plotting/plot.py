@@ -55,8 +55,7 @@ class Planned:
 
 def planned(runs: Sequence[EvaluatedRun]) -> list[Planned]:
     """Return every figure that `runs` have data for; of many objects and runs but the worst few are extras."""
-    best = sorted(runs, key=_rmse_m)[:-_FEW] if len(runs) > _MOST_RUNS else []
-    extra = {one.label for one in best}
+    extra = {one.label for one in sorted(runs, key=_rmse_m)[:-_FEW]} if len(runs) > _MOST_RUNS else set()
     plans = []
     for name, draw, has_data in (
         ("map", map, lambda one: one.run.tables["tracks"].num_rows),

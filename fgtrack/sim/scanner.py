@@ -85,9 +85,8 @@ class Scanner:
         else:
             # Uniform over the area of a ring: the square of the range is uniform.
             distance = np.sqrt(rng.uniform(sensor.min_range_m**2, sensor.max_range_m**2, m))
-            half = sensor.field_of_view_rad / 2.0
             origin, _, yaw = self._carried(scan, sensor.mount)
-            direction = yaw + rng.uniform(-half, half, m)
+            direction = yaw + rng.uniform(-sensor.field_of_view_rad / 2.0, sensor.field_of_view_rad / 2.0, m)
             ghosts[:, X] = origin[:, X] + distance * np.cos(direction)
             ghosts[:, Y] = origin[:, Y] + distance * np.sin(direction)
             ghosts[:, YAW] = rng.uniform(-math.pi, math.pi, m)

@@ -8,10 +8,11 @@ import numpy as np
 from fgtrack.core.types import STATE_NAMES, YAW_RATE, TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start, TrackBank, UpdateResult
 from fgtrack.estimation.object_bank import state_of
+from fgtrack.estimation.registry import estimator_bank
 from fgtrack.models.motion import MotionModel
 from fgtrack.testing.promise import Subject, require, sound
 from fgtrack.testing.references import difference
-from fgtrack.testing.streams import MS, Stream
+from fgtrack.testing.streams import LAG_S, MS, Stream
 
 _TOGETHER = 1e-6
 _NUM_OBJECTS = 8  # more than are fused one by one
@@ -30,7 +31,7 @@ def gives_each_of_several_objects_what_it_gives_one_alone(subject: Subject, stre
     ]
     half, new = (len(lists) + 1) // 2, len(objects)
     later = [{new if number == _GONE else number: m for number, m in one.items()} for one in lists[half:]]
-    bank = subject.start_bank(stream)
+    bank = estimator_bank(subject.name, stream.motion, LAG_S, subject.options, factory=subject.factory)
     for number, one in enumerate(objects):
         bank.advance(max(bank.present_ns, one.start.stamp_ns))
         bank.birth(number, one.start)

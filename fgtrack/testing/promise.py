@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Estimator, TrackBank, UpdateResult
-from fgtrack.estimation.registry import Claims, Factory, estimator_bank, start_estimator
+from fgtrack.estimation.base import Estimator, UpdateResult
+from fgtrack.estimation.registry import Claims, Factory, start_estimator
 from fgtrack.testing.streams import LAG_S, Stream
 
 
@@ -76,10 +76,6 @@ class Subject:
     def start(self, stream: Stream) -> Estimator:
         """A new one for the object of `stream`."""
         return start_estimator(self.name, self.factory, stream.motion, stream.start, LAG_S, self.options)
-
-    def start_bank(self, stream: Stream) -> TrackBank:
-        """A new bank without any object, as the tracker has it."""
-        return estimator_bank(self.name, stream.motion, LAG_S, self.options, factory=self.factory)
 
     def fed(self, stream: Stream) -> tuple[Estimator, list[UpdateResult]]:
         """A new one that has taken all of `stream`, and the results."""

@@ -12,7 +12,7 @@ import numpy as np
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
-from fgtrack.estimation.base import Measurement, Start, UpdateResult
+from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.propagation import wrapped
 from fgtrack.models.motion import MotionModel
@@ -128,22 +128,6 @@ def difference(found: TrackState, expected: TrackState, motion: MotionModel | No
     off = off if motion is None else wrapped(motion, off)
     covariance = np.abs(found.covariance - expected.covariance) / np.outer(sigma, sigma)
     return float((np.abs(off) / sigma).max()), float(covariance.max())
-
-
-def innovation_difference(result: UpdateResult, measurement: Measurement, before: TrackState) -> tuple[float, float]:
-    """Distance of the innovation of `result` from that of the state `before` the measurement; of the NIS over 1 + NIS.
-
-    Infinite where there is none.
-    """
-    if result.innovation is None or result.nis is None:
-        return math.inf, math.inf
-    model, mean = measurement.model, before.mean
-    H = model.jacobian(mean, measurement.pose)
-    S = H @ before.covariance @ H.T + measurement.R
-    y = model.residual(measurement.z, model.predict(mean, measurement.pose))
-    nis = float(y @ np.linalg.solve(S, y))
-    apart = np.abs(result.innovation - y) / np.sqrt(np.diag(S))
-    return float(apart.max()), abs(result.nis - nis) / (1.0 + nis)
 
 
 def rounding_bound(motion: MotionModel, stamps_ns: Iterable[int], sigma_m: float = 0.5) -> float:
