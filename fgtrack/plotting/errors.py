@@ -140,8 +140,7 @@ def lag(runs: Runs, **paper: Unpack[Paper]) -> Figure:
             axes.axhline(rmse_m[0], label=f"{one.label} (no lag)", **given)
     if len(axes.lines) > len(every):
         axes.plot([], [], color="black", ls=":", lw=0.8, label="present, at the same stamps")
-    axes.set(xlabel="lag of the output [s]", ylabel="position RMSE [m]")
-    axes.set_ylim(0.0, 1.08 * axes.dataLim.y1 or 1.0)
+    axes.set(xlabel="lag of the output [s]", ylabel="position RMSE [m]", ylim=(0.0, 1.08 * axes.dataLim.y1 or 1.0))
     legend_above(axes)
     sheet.title("Error against lag: what it gains to wait")
     return sheet.figure

@@ -83,7 +83,6 @@ class Subject:
         return estimator, [estimator.update(measurement) for measurement in stream.measurements]
 
 
-Check = Callable[[Subject, Stream], None]
 Draw = Callable[[np.random.Generator], Stream]
 
 
@@ -91,7 +90,7 @@ Draw = Callable[[np.random.Generator], Stream]
 class Promise:
     """Promise of an estimator on streams of one kind."""
 
-    check: Check
+    check: Callable[[Subject, Stream], None]
     draws: tuple[Draw, ...]
     applies: Callable[[Claims], bool] = lambda claims: True
     """True if an estimator with these claims promises it."""

@@ -64,10 +64,6 @@ class _Recording:
         times_s = (times_ns - self.start_ns) / NS_PER_S
         return np.where(np.abs(times_s) < _LONGEST_S, times_s, math.nan)
 
-    def place(self, position_m: FloatArray, prefix: str = "") -> Json:
-        """Columns of positions, shape (n, 2)."""
-        return {f"{prefix}{name}": _column(position_m[:, k]) for k, name in enumerate("xy")}
-
     def rows(self, states: Table, time: str, *order: str) -> Table:
         """Rows of `states` with a position and a time, in the order of `time` and `order`."""
         states = located(states)
@@ -77,8 +73,8 @@ class _Recording:
 
     def columns(self, states: Table, time: str) -> Json:
         """Times and poses of rows, and where they have covariances the half axes of their 95 % ellipses."""
-        position_m = np.stack([states["x_m"], states["y_m"]], axis=-1)
-        columns = {"t": _column(self.seconds(states[time]), _TIME_DIGITS), **self.place(position_m)}
+        columns = {"t": _column(self.seconds(states[time]), _TIME_DIGITS)}
+        columns |= {name: _column(states[f"{name}_m"]) for name in "xy"}
         if "yaw_rad" in states:
             columns["yaw"] = _column(states["yaw_rad"])
         if "p_x_x" in states:
@@ -97,7 +93,7 @@ class _Recording:
         (truth,) = _thinned([self.rows(truth, "stamp_ns", "object_id")], "stamp_ns", most, "truth", notes)
         return {
             "start_ns": str(self.start_ns),  # of more digits than a number of JavaScript holds
-            "map": [{"kind": kind, **self.place(line)} for kind, line in lines],
+            "map": [{"kind": kind, **_place(line)} for kind, line in lines],
             "ego": self.columns(ego, "stamp_ns"),
             "truth": {"object": _column(truth["object_id"]), **self.columns(truth, "stamp_ns")},
         }
@@ -133,7 +129,6 @@ class _Recording:
         sensors, sensor = np.unique(table["sensor"], return_inverse=True)
         outcome = np.append(updates["disposition"].astype(np.str_), "")[rows]  # row -1 is of none
         fate = np.isin(outcome, USED).astype(np.int64) + np.isin(outcome, LATE)
-        track_m = track_positions(run, rows)
         order = np.argsort(table["receipt_ns"], kind="stable")
         order = order[np.isfinite(self.seconds(table["receipt_ns"][order]))]
         return {
@@ -143,15 +138,20 @@ class _Recording:
                 "receipt": _column(self.seconds(table["receipt_ns"][order]), _TIME_DIGITS),
                 "sensor": _column(sensor[order]),
                 "fate": _column(fate[order]),
-                **self.place(where.position_m[order]),
-                **self.place(track_m[order], "track_"),
-                **self.place(where.sensor_m[order], "from_"),
+                **_place(where.position_m[order]),
+                **_place(track_positions(run, rows)[order], "track_"),
+                **_place(where.sensor_m[order], "from_"),
                 "bearing": _column(where.bearing_rad[order]),
             },
         }
 
 
 _LINES = ("bound", "bound", "centre")  # of a road
+
+
+def _place(position_m: FloatArray, prefix: str = "") -> Json:
+    """Columns of positions, shape (n, 2)."""
+    return {f"{prefix}{name}": _column(position_m[:, k]) for k, name in enumerate("xy")}
 
 
 def _thinned(tables: Sequence[Table], time: str, most: int, label: str, notes: dict[str, None]) -> list[Table]:

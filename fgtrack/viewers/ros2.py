@@ -89,18 +89,15 @@ class _MarkerFactory(MessageFactory):
             markers += [one for name in content.removed for one in self._markers(topic, stamp_ns, Entity(name, ()))]
             yield f"{topic}/markers", self._make(MARKER_ARRAY, markers=markers)
         elif isinstance(content, EgoState):
-            yield "/tf", self._transforms(content)
+            turn = self._pose(content.x_m, content.y_m, content.yaw_rad).orientation
+            way = self._vector(content.x_m, content.y_m)
+            transform = self._make("geometry_msgs/msg/Transform", translation=way, rotation=turn)
+            frames = {"header": self._header(stamp_ns, "map"), "child_frame_id": _FRAME_IDS["ego"]}
+            stamped = self._make("geometry_msgs/msg/TransformStamped", **frames, transform=transform)
+            yield "/tf", self._make(TRANSFORMS, transforms=[stamped])
             yield f"{topic}/odometry", self.odometry(content)
         elif isinstance(content, tuple):
             yield topic, self.detection3d_array(DetectionList("", stamp_ns, message.log_ns, content, "map"))
-
-    def _transforms(self, ego: EgoState) -> RosMessage:
-        """`tf2_msgs/TFMessage` with the pose of the ego in the map."""
-        turn, way = self._pose(ego.x_m, ego.y_m, ego.yaw_rad).orientation, self._vector(ego.x_m, ego.y_m)
-        transform = self._make("geometry_msgs/msg/Transform", translation=way, rotation=turn)
-        frames = {"header": self._header(ego.stamp_ns, "map"), "child_frame_id": _FRAME_IDS["ego"]}
-        stamped = self._make("geometry_msgs/msg/TransformStamped", **frames, transform=transform)
-        return self._make(TRANSFORMS, transforms=[stamped])
 
     def _markers(self, topic: str, stamp_ns: int, entity: Entity) -> list[RosMessage]:
         """A namespace with a marker for each shape; markers that it had before beyond these are removed."""
