@@ -141,7 +141,7 @@ class Adviser:
         """Keep findings, and follow them."""
         for one in findings:
             self._findings.append(one)
-            self._config = _with(self._config, one)
+            self._config = read_config(self._config, one.settings)
 
     def _withdraw_harm(self, before: Config) -> None:
         """Take back settings that make the replay worse than without them; their findings stay."""
@@ -149,7 +149,7 @@ class Adviser:
             return
         self._config = before
         for one in sorted(filter(lambda one: one.settings, self._findings), key=lambda one: -one.weight):
-            config = _with(self._config, one)
+            config = read_config(self._config, one.settings)
             worse = self._is_harm(self._config, config)
             if worse is None:
                 self._config = config
@@ -196,8 +196,9 @@ class Adviser:
         is_same = unlimited and self._config.estimator != "ekf-backward-forward"  # nothing is refused for its delay
         try:
             outcome = self._outcome(self._config) if is_same else None
-            run = None if outcome is None else outcome.run
-            self._clocks = estimate_offsets(self._tracked, self._config, self._reference, doubtful, run)
+            self._clocks = estimate_offsets(
+                self._tracked, self._config, self._reference, doubtful, None if outcome is None else outcome.run
+            )
         except (DataError, CallError) as error:
             if self._reference is not None and isinstance(error, CallError):
                 raise
@@ -243,8 +244,7 @@ class Adviser:
         is_assumed = any(one.key.endswith(".std") for one in self._assumed.assumptions)
         if not is_assumed and not any(one.kind == "noise" for one in self._findings):
             return
-        steps = count()
-        messages = list(beginning(self._tracked, nanoseconds(TUNED_S)))
+        steps, messages = count(), list(beginning(self._tracked, nanoseconds(TUNED_S)))
         try:
             report = tuned(
                 {self._recording: source_of(lambda: messages)},
@@ -305,8 +305,3 @@ class Adviser:
         if "track" not in kinds and outcome is not None and outcome.truth is not None:
             tracked = percent(outcome.truth.tracked_share_in_sight)
             yield f"tracks ({outcome.births} beginnings, {tracked} tracked where a sensor could see)"
-
-
-def _with(config: Config, finding: Finding) -> Config:
-    """`config` with the settings of a finding."""
-    return read_config(config, finding.settings) if finding.settings else config

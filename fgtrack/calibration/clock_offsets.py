@@ -296,8 +296,7 @@ def _solved(r: FloatArray, A: FloatArray, stamps_ns: IntArray) -> _Fit:
     unknown = np.full(size, math.inf)
     if len(r) < _FEWEST:
         return _Fit(np.zeros(size), unknown, 0.0, math.inf)
-    x, weights, scale_m = np.zeros(size), np.ones(len(r)), 1.0
-    H = np.eye(size)
+    x, H, weights, scale_m = np.zeros(size), np.eye(size), np.ones(len(r)), 1.0
     for _ in range(5):
         H = np.einsum("n,nij,nik->jk", weights, A, A) + 1e-9 * np.eye(size)
         x = -psd_solve(H, np.einsum("n,nij,ni->j", weights, A, r))

@@ -122,9 +122,9 @@ def bias_findings(report: OffsetReport, ego: EgoConfig) -> Iterator[Finding]:
     if len(biases_m) == num_placed > 0 and (np.ptp(biases_m, axis=0) < _SAME_BIAS_M).all():
         off_m = biases_m.mean(axis=0).tolist()
         text = f"detections of all sensors lie {_WHERE(*off_m)} of the truth, in the frame of the ego: set its origin."
-        keys = "ego.detection_origin_x_m", "ego.detection_origin_y_m"
-        origins = zip(keys, ego.detection_origin_m, off_m, strict=True)
-        yield Finding("bias", EGO, 88.0, text, {key: round(now - off, 2) for key, now, off in origins if off})
+        origins = zip("xy", ego.detection_origin_m, off_m, strict=True)
+        settings = {f"ego.detection_origin_{axis}_m": round(now - off, 2) for axis, now, off in origins if off}
+        yield Finding("bias", EGO, 88.0, text, settings)
         return
     for name, bias in biased.items():
         cure = "mount" if bias.of == "ego" else "near_side_m: it sees another part of a vehicle than the truth means"

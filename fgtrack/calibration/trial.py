@@ -31,7 +31,6 @@ def beginning(messages: Iterable[Message], duration_ns: int) -> Iterator[Message
 def suspicions(messages: Sequence[Message], config: Config) -> Iterator[Diagnostic]:
     """Yield probable errors in how `messages` are read, with the cure."""
     egos = [message for message in messages if isinstance(message, EgoState)]
-    truth = [message for message in messages if isinstance(message, TruthState)]
     lists: dict[str, list[DetectionList]] = {}
     for message in messages:
         if isinstance(message, DetectionList) and message.sensor not in config.ignore_sensors:
@@ -43,7 +42,7 @@ def suspicions(messages: Sequence[Message], config: Config) -> Iterator[Diagnost
     if egos and not any(ego.stamp_ns for ego in egos):
         yield Diagnostic(EGO, "all stamps are 0: set `stamp_from: receipt` on its topic", spoils=True)
     yield from _degrees(EGO, egos)
-    yield from _degrees("truth", truth)
+    yield from _degrees("truth", [message for message in messages if isinstance(message, TruthState)])
     for name in sorted(set(config.sensors) - set(lists)):
         if name in (config.input.detections or config.input.csv.detections):
             yield Diagnostic(name, "sends nothing in the first seconds")

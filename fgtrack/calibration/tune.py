@@ -285,15 +285,15 @@ class _Tuning:
             )
             for name, squares in sorted(squares_before.items())
         )
-        means = float(np.mean(before)), float(np.mean(after))
-        return HeldOut(1.0 - self._rules.train_share, len(before), *means, innovations)
+        return HeldOut(
+            1.0 - self._rules.train_share, len(before), float(np.mean(before)), float(np.mean(after)), innovations
+        )
 
     def _judged(
         self, series: Sequence[Series], values: FloatArray
     ) -> tuple[list[float], dict[tuple[str, str], list[float]]]:
         """Return log-likelihoods of the innovations that count, and squares over variances by sensor and component."""
-        terms: list[float] = []
-        squares: dict[tuple[str, str], list[float]] = {}
+        terms, squares = list[float](), dict[tuple[str, str], list[float]]()
         for one in series:
             for step in compress(filtered(one, self._space, values), one.counted):
                 terms.append(float(step.update.log_likelihood))

@@ -60,8 +60,8 @@ class _OpenedGate:
     stds: float
 
     def __call__(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Assignment:
-        needed_m = self.stds * np.array([self._stds_m(candidate, states.means) for candidate in candidates])
-        needed_m = needed_m.reshape(len(candidates), len(states.means))
+        stds_m = np.array([self._stds_m(candidate, states.means) for candidate in candidates])
+        needed_m = self.stds * stds_m.reshape(len(candidates), len(states.means))
         if isinstance(self.association, GatedEuclidean):
             return self.association.within(np.maximum(self.association.gate_m, needed_m), candidates, states, apart)
         limit_m = float(needed_m.max(initial=self.association.max_distance_m))
