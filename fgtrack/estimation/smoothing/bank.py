@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import compress, repeat
+from operator import itemgetter
 from typing import Any, ClassVar
 
 import numpy as np
@@ -108,17 +109,17 @@ class SmootherBank:
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
-        tracks = np.array([self._tracks[track_id] for track_id in track_ids], dtype=np.int64)
+        tracks = np.array([*map(self._tracks.__getitem__, track_ids)], dtype=np.int64)
         newest_ns, start_ns, reach_ns = self._times(tracks)
         states, results = self.states_at(stamp_ns), [_TOO_OLD] * len(tracks)
-        positions = dict(zip(states.track_ids, range(len(states.track_ids)), strict=True))
+        row_of = dict(zip(states.track_ids, range(len(states.track_ids)), strict=True))
         for indices, stack in stacks(measurements):
             inside = (reach_ns[np.array(indices)] <= stamp_ns).nonzero()[0]
             if not len(inside):
                 continue
             group, alike = np.array(indices)[inside], stack.seen_by(self._motion)
             alike = replace(alike, z=alike.z[inside], R=alike.R[inside])
-            at = [positions[track_ids[row]] for row in group.tolist()]
+            at = [row_of[track_ids[row]] for row in group.tolist()]
             y, H = alike.model.linearised(alike.z, states.means[at], alike.pose)
             H = np.broadcast_to(H, (*y.shape, H.shape[-1])).copy()
             prior = correct(states.means[at], states.covariances[at], y, H, alike.R, alike.measured)
@@ -193,14 +194,14 @@ class SmootherBank:
         self._known.clear()
         of, chosen = tracks[rows], replace(stack, z=stack.z[rows], R=stack.R[rows])
         try:
-            left = self.solver.fuse(of, chosen, *(each[rows] for each in given))
+            left = self.solver.fuse(of, chosen, *map(itemgetter(rows), given))
         except np.linalg.LinAlgError:
             if len(rows) > 1:
                 return np.concatenate([self._fuse(row[None], tracks, stack, *given) for row in rows])
             self.failures.add(Failure.GRAPH_REBUILT)
             return rows[:0]
         if left is not None:
-            self._final += self._reports([self._ids[track] for track in left[0].tolist()], *left[1:])
+            self._final += self._reports(map(self._ids.__getitem__, left[0].tolist()), *left[1:])
         for track in self._searches.keys() & set(of.tolist()):
             self._initiate(track, stack.stamp_ns)
         if damped := self.solver.damp(of):

@@ -13,7 +13,6 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.smoothing.bank import SmootherBank
 from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
-from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.terms import Term, linearised, whitened
 from fgtrack.models.motion import MotionModel
 
@@ -36,10 +35,6 @@ class BatchSolver(IncrementalSolver):
 
     is_damped: ClassVar[bool] = True
 
-    def __init__(self, motion: MotionModel, settings: SmootherSettings) -> None:
-        super().__init__(motion, settings)
-        self._solved: dict[int, tuple[gtsam.NonlinearFactorGraph, gtsam.Values]] = {}
-
     def optimise(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
         """Return the values near `values` with the least error."""
         params = gtsam.LevenbergMarquardtParams()
@@ -49,28 +44,28 @@ class BatchSolver(IncrementalSolver):
         return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
 
     def _update(self, tracks: IntArray, starts: IntArray) -> None:
-        nodes = self.nodes
+        nodes, n = self.nodes, self.motion.dim
         for track in tracks.tolist():
-            graph, values = self._factors(track), gtsam.Values()
-            _, last = self._solved.get(track, (None, values))
-            numbers = nodes.window(track).tolist()
+            graph, values, numbers = gtsam.NonlinearFactorGraph(), gtsam.Values(), nodes.window(track).tolist()
+            _, last = self._graphs.get(track, (None, values))
+            prior = nodes.predicted[numbers[0]]
+            noise = gtsam.noiseModel.Gaussian.Covariance(prior[:, :n])
+            graph.add(gtsam.PriorFactorVector(numbers[0], nodes.origin[numbers[0]] + prior[:, n], noise))
+            spans_ns = np.diff(nodes.window_stamps_ns(track)).tolist()
+            for left, right, dt_ns in zip(numbers, numbers[1:], spans_ns, strict=False):
+                graph.add(motion_factor(self.motion, left, right, seconds(dt_ns), nodes.segment[left, :, n : 2 * n]))
             for number in numbers:
                 values.insert(number, last.atVector(number) if last.exists(number) else nodes.origin[number])
+                for term in nodes.terms[number]:
+                    graph.add(measurement_factor(number, term, nodes.origin[number], self.motion))
             values = self.optimise(graph, values)
-            self._solved[track] = graph, values
+            self._graphs[track] = graph, values
             for number in numbers:
                 nodes.step[number] = values.atVector(number) - nodes.origin[number]
 
-    def forget(self, track: int) -> None:
-        """See `Solver.forget`."""
-        super().forget(track)
-        self._solved.pop(track, None)
-
     def _covariance(self, track: int, *numbers: int) -> FloatArray:
         """See `IncrementalSolver._covariance`; from one dense QR of the whole linearised window."""
-        if track not in self._solved:
-            return super()._covariance(track, *numbers)
-        graph, values = self._solved[track]
+        graph, values = self._graphs[track]
         ordering, n = gtsam.Ordering(), self.motion.dim
         for number in (*sorted(set(values.keys()).difference(numbers)), *numbers):
             ordering.push_back(number)
@@ -78,22 +73,6 @@ class BatchSolver(IncrementalSolver):
         R, size = np.asarray(np.linalg.qr(A, mode="r")), n * len(numbers)
         root = dtrtri(R[-size:, -size:])[0]
         return np.asarray(root @ root.T)
-
-    def _factors(self, track: int) -> gtsam.NonlinearFactorGraph:
-        """Return the factors of a window as functions of the states."""
-        nodes, n = self.nodes, self.motion.dim
-        graph, numbers = gtsam.NonlinearFactorGraph(), nodes.window(track).tolist()
-        prior = nodes.predicted[numbers[0]]
-        noise = gtsam.noiseModel.Gaussian.Covariance(prior[:, :n])
-        graph.add(gtsam.PriorFactorVector(numbers[0], nodes.origin[numbers[0]] + prior[:, n], noise))
-        for left, right, dt_ns in zip(
-            numbers, numbers[1:], np.diff(nodes.window_stamps_ns(track)).tolist(), strict=False
-        ):
-            graph.add(motion_factor(self.motion, left, right, seconds(dt_ns), nodes.segment[left, :, n : 2 * n]))
-        for number in numbers:
-            for term in nodes.terms[number]:
-                graph.add(measurement_factor(number, term, nodes.origin[number], self.motion))
-        return graph
 
 
 def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float, Q: FloatArray) -> gtsam.NonlinearFactor:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import cache
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -81,7 +82,7 @@ class IncrementalSolver(Solver):
 
     def __init__(self, motion: MotionModel, settings: SmootherSettings) -> None:
         super().__init__(motion, settings)
-        self._graphs: dict[int, _Graph] = {}
+        self._graphs: dict[int, Any] = {}  # Any: a subclass has its own
         self._known: dict[int, dict[tuple[int, ...], FloatArray]] = {}
         """Covariances by track and nodes: what is read for a stamp does not depend on what was read for others."""
 
@@ -102,7 +103,8 @@ class IncrementalSolver(Solver):
             key = tuple(nodes.numbers[track, last - (has_previous and index > first) : last + 1].tolist())
             known = self._known[track]
             if key not in known:
-                known[key] = P = self._covariance(track, *key)
+                has_graph = track in self._graphs  # else nothing was fused: there is one node
+                known[key] = P = self._covariance(track, *key) if has_graph else nodes.P[key[0]].copy()
                 if len(key) > 1:
                     left, number = key
                     A = psd_solve(P[n:, n:], P[n:, :n]).T  # the state on the left, given this one
@@ -129,9 +131,7 @@ class IncrementalSolver(Solver):
 
     def _covariance(self, track: int, *numbers: int) -> FloatArray:
         """Return the joint covariance of one node, shape (n, n), or of two neighbours, (2 n, 2 n)."""
-        if track not in self._graphs:  # nothing was fused: there is one node
-            return np.array(self.nodes.P[numbers[0]])
-        isam = self._graphs[track].isam
+        isam: gtsam.ISAM2 = self._graphs[track].isam
         if len(numbers) == 1:
             return isam.marginalCovariance(numbers[0])
         return isam.jointMarginalCovariance(list(numbers)).fullMatrix()
@@ -147,7 +147,13 @@ class IncrementalSolver(Solver):
         windows, graphs, values = [], [], []
         for track, start in zip(tracks.tolist(), starts.tolist(), strict=True):
             window = nodes.numbers[track, start : nodes.count[track]].copy()
-            graph = self._graph(track, window)
+            graph = self._graphs.get(track)
+            if graph is None:  # of the prior of the oldest node only
+                prior = nodes.predicted[window[0]]
+                W = inverse_root(prior[:, :-1])
+                factor = gtsam.JacobianFactor(int(window[0]), W, W @ prior[:, -1], _unit(len(W)))
+                graph = self._graphs[track] = _Graph(factor)
+                nodes.changed[window] = True
             values.append(gtsam.Values())
             for number in window.tolist():
                 if number not in graph.slots:
@@ -161,17 +167,6 @@ class IncrementalSolver(Solver):
             delta = graph.solve(window.tolist(), num_leaving, new, *factors)
             if not node_kernels.write_steps(window[num_leaving:], delta, nodes.reference, nodes.origin, nodes.step):
                 raise ValueError("a state is not finite")
-
-    def _graph(self, track: int, window: IntArray) -> _Graph:
-        """Return the graph of a track; a new one has the prior of the oldest node only."""
-        graph = self._graphs.get(track)
-        if graph is None:
-            nodes, oldest = self.nodes, int(window[0])
-            prior = nodes.predicted[oldest]
-            W = inverse_root(prior[:, :-1])
-            graph = self._graphs[track] = _Graph(gtsam.JacobianFactor(oldest, W, W @ prior[:, -1], _unit(len(W))))
-            nodes.changed[window] = True
-        return graph
 
     def _changed_factors(self, tracks: IntArray, starts: IntArray, most: int) -> list[tuple[int, _Changed]]:
         """Return the factors that have changed, at most so many, of each track, and the first index from `starts`."""
