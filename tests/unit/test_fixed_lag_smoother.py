@@ -115,12 +115,18 @@ def test_the_window_is_as_long_as_it_says() -> None:
     assert smoother.update(at(1000, 10.0)).status is UpdateStatus.IN_SEQUENCE
 
 
-def test_what_lies_behind_the_ring_is_forgotten() -> None:
-    smoother = one_of(CV(), Start(), lag_s=0.3, ring_s=0.2)
+@pytest.mark.parametrize("make", [SmootherBank, IncrementalBank])
+def test_what_lies_behind_the_ring_is_forgotten(make: type[SmootherBank]) -> None:
+    """And what does not is kept, in arrays that do not grow with the drive."""
+    smoother = one_of(CV(), Start(), make, lag_s=0.3, ring_s=0.2)
     for k in range(1, 31):
         smoother.update(at(100 * k, 1.0 * k))
     assert smoother.window_ns == (2500 * MS, 3000 * MS)
-    assert smoother.update(at(2500, 25.0)).status is UpdateStatus.BEYOND_WINDOW
+    assert smoother.bank.solver.nodes.stamps_ns.shape[1] == 32
+    before = smoother.state_at(3000 * MS)
+    assert smoother.update(at(2500, 25.4)).status is UpdateStatus.BEYOND_WINDOW
+    assert 0.0 < smoother.state_at(3000 * MS).mean[0] - before.mean[0] < 0.1
+    assert smoother.state_at(3000 * MS).covariance[0, 0] < before.covariance[0, 0]
     assert smoother.update(at(2499, 25.0)).status is UpdateStatus.TOO_OLD
 
 
