@@ -46,6 +46,7 @@ def of(**fields: object) -> DetectionList:
         (replace(LIST, sensor=""), "sensor: a name expected, not ''"),
         (replace(LIST, sensor="\ud800"), r"sensor: a name .* not '\\ud800'"),
         (replace(LIST, sensor=b"radar"), "sensor: a name"),
+        (replace(EGO, in_pit=1), "in_pit: true or false expected, not 1"),
         (replace(LIST, frame="world"), "frame: one of ego, map, sensor expected, not 'world'"),
         (replace(LIST, objects=({"x_m": 1.0},)), r"radar: objects\[0\]: a dict is not a detection"),
         (of(speed_mps="fast"), r"radar: objects\[1\]: speed_mps: a number expected, not 'fast'"),
