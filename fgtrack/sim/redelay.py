@@ -52,7 +52,13 @@ def redelay(
     receipts_ns, stamps_ns = np.array([(one.receipt_ns, one.stamp_ns) for one in read], dtype=np.int64).reshape(-1, 2).T
     names = np.array([one.sensor if isinstance(one, DetectionList) else "" for one in read])
     reported_ns, priority, lost = stamps_ns.copy(), np.zeros_like(stamps_ns), np.zeros(len(read), dtype=bool)
-    chosen, num_lost = _chosen(delays, set(names.tolist()) - {""}), dict[str, int]()
+    known, num_lost = sorted(set(names.tolist()) - {""}), dict[str, int]()
+    for sensor in delays:
+        if sensor not in (*known, OTHERS):
+            there, hint = ", ".join(known) or "none", did_you_mean(sensor, known)
+            raise CallError(f"sensor {sensor!r} is not in the input, whose sensors are: {there}{hint}")
+    others = {sensor: delays[OTHERS] for sensor in known if sensor not in delays} if OTHERS in delays else {}
+    chosen = {sensor: settings for sensor, settings in delays.items() if sensor != OTHERS} | others
     for number, (sensor, child) in enumerate(zip(chosen, rng.spawn(len(chosen)), strict=True), 1):
         settings, (delay_rng, loss_rng, clock_rng) = chosen[sensor], child.spawn(3)
         own = np.flatnonzero(names == sensor)
@@ -78,18 +84,6 @@ def redelay(
             raise error
 
     return redelayed(), num_lost
-
-
-def _chosen(delays: Mapping[str, SensorDelays], known: Iterable[str]) -> dict[str, SensorDelays]:
-    """Settings of every sensor that has some: the named ones in their order, then the others by name."""
-    names = sorted(known)
-    for sensor in delays:
-        if sensor not in (*names, OTHERS):
-            there, hint = ", ".join(names) or "none", did_you_mean(sensor, names)
-            raise CallError(f"sensor {sensor!r} is not in the input, whose sensors are: {there}{hint}")
-    others = dict.fromkeys(names, delays[OTHERS]) if OTHERS in delays else {}
-    named = {sensor: settings for sensor, settings in delays.items() if sensor != OTHERS}
-    return named | {sensor: settings for sensor, settings in others.items() if sensor not in named}
 
 
 def restamped(message: DetectionList, stamp_ns: int) -> DetectionList:

@@ -21,8 +21,6 @@ from fgtrack.viewers.states import NOMINAL_SIZE_M, ellipses, final_ns, groups, l
 
 Messages = Iterator[ViewerMessage]
 
-_OBJECT = ("track_id", "length_m", "width_m", "height_m", "class_name")
-
 _WHITE, _GREY = (1.0, 1.0, 1.0, 1.0), (0.55, 0.55, 0.55, 0.9)
 _OPACITY = {"tentative": 0.15, "coasting": 0.3}
 _CONFIRMED = 0.5  # so that ellipses and arrows in the box are seen
@@ -211,9 +209,8 @@ def _mark(where: Placed, row: int, colour: Colour) -> Shape | None:
 def _outcome_messages(run: Run, look: Look) -> Messages:
     """Rows of `updates.csv` at their receipts."""
     names = ("receipt_ns", "stamp_ns", "sensor", "index", "disposition", "track_id", "nis")
-    for receipt_ns, stamp_ns, sensor, index, disposition, track_id, nis in sorted(
-        _rows(run.tables["updates"], *names), key=itemgetter(0)
-    ):
+    rows = sorted(_rows(run.tables["updates"], *names), key=itemgetter(0))
+    for receipt_ns, stamp_ns, sensor, index, disposition, track_id, nis in rows:
         values = {"sensor": sensor, "index": index, "disposition": disposition, "nis": _known(nis)}
         values |= {"track_id": None if track_id == NO_TRACK else track_id, "delay_s": seconds(receipt_ns - stamp_ns)}
         yield ViewerMessage(receipt_ns, stamp_ns, f"{look.prefix}/outcomes", values)
@@ -243,7 +240,9 @@ def _states(states: Table, objects: Table) -> list[Detection]:
         track_id: Detection(
             length_m=_known(length_m), width_m=_known(width_m), height_m=_known(height_m), class_name=name
         )
-        for track_id, length_m, width_m, height_m, name in _rows(objects, *_OBJECT)
+        for track_id, length_m, width_m, height_m, name in _rows(
+            objects, "track_id", "length_m", "width_m", "height_m", "class_name"
+        )
     }
     names = ("p_x_x", "p_x_y", "p_x_yaw", "p_x_y", "p_y_y", "p_y_yaw", "p_x_yaw", "p_y_yaw", "p_yaw_yaw")
     result = []
