@@ -3,9 +3,6 @@
 import numpy as np
 import pytest
 
-from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.object_bank import OneObject
-from fgtrack.estimation.smoothing.bank import SmootherBank
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.models.motion import CTRV, CV
 
@@ -38,19 +35,3 @@ def test_where_all_is_linear_nothing_is_relinearised() -> None:
     settings = SmootherSettings(relinearise={"x_m": 0.3})
     assert (settings.thresholds(CV(), nonlinear=False) > 1e6).all()
     np.testing.assert_array_equal(settings.thresholds(CV(), nonlinear=True), [0.3, 0.05, 0.2, 0.2])
-
-
-def test_more_iterations_bring_a_state_nearer_to_that_at_which_nothing_moves() -> None:
-    """Positions that turn the heading by 1 rad."""
-    off = []
-    for max_iterations in (1, 2, 6):
-        exact = dict.fromkeys(CTRV.state_names, 1e-6)
-        bank = SmootherBank(CTRV(), 1.0, max_iterations=max_iterations, relinearise=exact)
-        smoother = OneObject(CTRV(), bank, Start(yaw_rad=0.0, yaw_std_rad=0.5, speed_mps=20.0))
-        for k in (1, 2):
-            at = {"x_m": 20.0 * k * np.cos(1.0), "y_m": 20.0 * k * np.sin(1.0)}
-            smoother.update(Measurement.of(k * 10**9, **at, std=dict.fromkeys(at, 0.3)))
-        found = smoother.state_at(2 * 10**9).mean
-        bank.converge()
-        off.append(float(np.linalg.norm(found - smoother.state_at(2 * 10**9).mean)))
-    assert off[2] < 0.01 * off[1] < 1e-3 * off[0]
