@@ -54,7 +54,7 @@ class GuardedBank:
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`; states that are not finite are left out."""
         states: StatesAt = self._ask("states_at", stamp_ns)
-        if math.isfinite(states.means.sum() + states.covariances.sum()):
+        if math.isfinite(np.add.reduce(states.means, axis=None) + np.add.reduce(states.covariances, axis=None)):
             return states
         finite = np.isfinite(states.means.sum(axis=1) + states.covariances.sum(axis=(1, 2)))
         return StatesAt(tuple(compress(states.track_ids, finite)), states.means[finite], states.covariances[finite])

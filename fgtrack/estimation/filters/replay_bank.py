@@ -154,14 +154,13 @@ class ReplayBank(ObjectBank[ReplayEkf]):
 
     def _ahead(self, track_ids: Sequence[int], rows: IntArray, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray]:
         """Means (m, n) and covariances (m, n, n) of tracks, each at its stamp, with the yaw in (-pi, pi]."""
-        n, inside = self._motion.dim, rows >= 0
+        n = self._motion.dim
         states = np.empty((len(rows), 2 * n + 1, n))
-        predicted = states if inside.all() else states[inside]
-        self._kernels.ahead(self._kind, self._density, *self._arrays[:4], rows[inside], stamps_ns[inside], predicted)
-        states[inside] = predicted
-        for i in (~inside).nonzero()[0].tolist():
-            state = self._estimators[track_ids[i]].state_at(int(stamps_ns[i]))
-            states[i, 0], states[i, 1 : n + 1] = state.mean, state.covariance
+        self._kernels.ahead(self._kind, self._density, *self._arrays[:4], rows, stamps_ns, states)
+        if len(self._rows) < len(self._estimators):
+            for i in (rows < 0).nonzero()[0].tolist():
+                state = self._estimators[track_ids[i]].state_at(int(stamps_ns[i]))
+                states[i, 0], states[i, 1 : n + 1] = state.mean, state.covariance
         return states[:, 0], states[:, 1 : n + 1]
 
     def _put_in(self, track_id: int) -> None:

@@ -219,10 +219,12 @@ def ahead(
     stamps_ns: IntArray,
     predicted: FloatArray,
 ) -> None:
-    """Write the `_ahead` (m, 2 n + 1, n) of `tracks` at their stamps: from their last step up to there."""
+    """Write the `_ahead` (m, 2 n + 1, n) of `tracks`, but those below 0, at their stamps: from the last step before."""
     n = len(density)
     for i in range(len(tracks)):
         t = tracks[i]
+        if t < 0:
+            continue
         j = windows[t, 0] - 1
         while j > 0 and labels[t, order[t, j], 0] > stamps_ns[i]:
             j -= 1
