@@ -75,8 +75,7 @@ class SimulatedSensor:
         require(self.jitter_s < 1.0 / self.rate_hz, "jitter_s", "must be below a period", self.jitter_s)
         require(self.max_range_m > self.min_range_m, "max_range_m", "must exceed min_range_m", self.max_range_m)
         require(seen, "max_range_behind_m", "must lie in (min_range_m, max_range_m]", behind_m)
-        known = all(start_s <= end_s for start_s, end_s in self.drop_outs)
-        require(known, "drop_outs", "must be (start, end)", self.drop_outs)
+        require(all(a <= b for a, b in self.drop_outs), "drop_outs", "must be (start, end)", self.drop_outs)
 
     @property
     def components(self) -> tuple[str, ...]:

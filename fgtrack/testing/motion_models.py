@@ -157,8 +157,7 @@ def _is_as_it_was_after_a_kinematic_state(model: MotionModel, x: FloatArray, dt_
     P = _covariance(model.dim)
     shown, published = model.kinematic(x, P)
     back, covariance = model.from_kinematic(shown, published)
-    shapes = back.shape, covariance.shape
-    require(shapes == (x.shape, P.shape), f"from_kinematic gives shapes {shapes[0]} and {shapes[1]}")
+    require(back.shape == x.shape and covariance.shape == P.shape, "from_kinematic gives other shapes")
     known = [k for k, name in enumerate(model.state_names) if k < 4 or name in STATE_NAMES[: len(shown)]]
     both = np.ix_(known, known)
     _equal(back[known], x[known], 1e-9, "from_kinematic of kinematic")
@@ -170,8 +169,7 @@ def _begins_with_a_sound_covariance(model: MotionModel, x: FloatArray, dt_s: flo
     """An entry of which nothing is known begins at 0 with its own variance."""
     for name in model.state_names:
         variance = model.start_variance(name)
-        sensible = 0.0 < variance < math.inf
-        require(sensible, f"start_variance({name!r}) is {variance}; it must be positive and finite")
+        require(0.0 < variance < math.inf, f"start_variance({name!r}) is {variance}; it must be positive and finite")
     mean, P = _shown(model, x), np.eye(ACCEL)
     begun, covariance = model.from_kinematic(mean[:ACCEL], P)
     for k, name in enumerate(model.state_names[4:], start=4):
