@@ -7,7 +7,6 @@ import pytest
 from fgtrack.estimation.registry import ESTIMATORS, Claims
 from fgtrack.testing import check_estimator
 
-SMOOTHERS = ("smoother", "smoother-batch")
 #: Estimators whose options change what they promise nothing of.
 VARIANTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("smoother", {"late": "drop"}),

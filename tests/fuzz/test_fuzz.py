@@ -121,26 +121,3 @@ def test_a_minute_of_corrupted_inputs(server: Server, name: str, request: pytest
         case += 1
     assert case > 0
     assert not findings, f"{len(findings)} of {case} cases"
-
-
-@pytest.mark.parametrize(
-    ("code", "said", "expected"),
-    [
-        (1, "fgtrack: error: internal error: Boom", "internal error"),
-        (1, "", "said ''"),
-        (2, f"fgtrack: error: {'x' * 10_000}", "prints"),
-        (0, "\x1b[31m", "prints"),
-        (7, "what", "exit code 7"),
-        (0, "fine", None),
-    ],
-)
-def test_what_is_looked_for_is_found(code: int, said: str, expected: str | None) -> None:
-    problem = _problem(Outcome(code, 0.1, said, None))
-    assert (problem is None) if expected is None else (expected in str(problem))
-
-
-def test_an_input_that_is_right_must_be_taken(server: Server, tmp_path: Path) -> None:
-    """Else nothing but its refusal is fuzzed."""
-    wrong = {**healthy("delays")[0], "x.yaml": b"radar: {delay: {kind: gamma}}\n"}
-    assert problem_of(server, TARGETS["delays"], wrong, tmp_path / "a") is None
-    assert "for an input that is right" in str(problem_of(server, TARGETS["delays"], wrong, tmp_path / "b", right=True))

@@ -73,12 +73,9 @@ class ObjectResult:
 class TickResult:
     """All that a tick gives."""
 
-    now_ns: int
     track_ns: int
     objects: dict[int, ObjectResult]
-    births: list[int]
     deaths: list[int]
-    ego: tuple[int, Array] | None
 
 
 class PublishedTracker:
@@ -91,14 +88,13 @@ class PublishedTracker:
         self.started, self.track_ns = False, 0
         self.objects: dict[int, Object] = {}
         self.next_id = 0
-        self.births: list[int] = []
         self.deaths: list[int] = []
 
     # Sections 5 and 6
 
     def tick(self, now_ns: int) -> TickResult:
         """One cycle of the node."""
-        self.births, self.deaths = [], []
+        self.deaths = []
         num_steps = self._advance(now_ns)
         batches = self.input.collect()
         for thing in self.objects.values():
@@ -111,7 +107,7 @@ class PublishedTracker:
             self.input.store_ego()
             for stamp_ns, name, entries in batches:
                 self._process(stamp_ns, name, entries)
-        return self._result(now_ns)
+        return self._result()
 
     def _advance(self, now_ns: int) -> int:
         if not self.started:
@@ -126,14 +122,13 @@ class PublishedTracker:
         assert self.input.ego is not None, "batches are processed once there is an ego"
         return self.input.ego
 
-    def _result(self, now_ns: int) -> TickResult:
+    def _result(self) -> TickResult:
         to_rep103 = np.array([0.0, 0.0, math.pi / 2, 0.0, 0.0, 0.0])
         objects = {
             name: ObjectResult(thing.x + to_rep103, thing.P, thing.counter, thing.num_measured, thing.last_seen_ns)
             for name, thing in self.objects.items()
         }
-        ego = None if self.input.ego is None else (self.input.ego[0], np.array(self.input.ego[1]) + to_rep103)
-        return TickResult(now_ns, self.track_ns, objects, self.births, self.deaths, ego)
+        return TickResult(self.track_ns, objects, self.deaths)
 
     # Sections 9 to 14
 
@@ -253,7 +248,6 @@ class PublishedTracker:
             thing.x, thing.P = predict(thing.x, thing.P)
             thing.store(self.track_ns - step * STEP_NS)
         self.objects[number] = thing
-        self.births.append(number)
 
 
 def merge(detections: list[Array]) -> list[Array]:

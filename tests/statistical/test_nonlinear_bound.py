@@ -28,8 +28,6 @@ PRIOR = Start(
     yaw_rate_radps=0.05,
     yaw_rate_std_radps=0.02,
 )
-PAPER = CTRV()
-LOOSE_TIES = CTRV(position_density_m2ps=0.05)  # headings matter less, so their spread does not spoil the bound
 NUM_STEPS = 50
 NUM_RUNS = 40
 NOWS_NS = [START_NS + k * STEP_NS + STEP_NS // 2 for k in (30, 40, 50)]
@@ -103,12 +101,7 @@ def wrapped(errors: FloatArray) -> FloatArray:
 
 @pytest.fixture(scope="module")
 def paper() -> Trial:
-    return tried(PAPER)
-
-
-@pytest.fixture(scope="module")
-def loose_ties() -> Trial:
-    return tried(LOOSE_TIES)
+    return tried(CTRV())
 
 
 def position_ratio(trial: Trial, name: str, covariances: FloatArray) -> tuple[float, float]:
@@ -126,19 +119,11 @@ def test_the_mean_of_the_bounds_along_the_trajectories_is_reached(paper: Trial, 
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("trial", ["paper", "loose_ties"])
-def test_nobody_is_better_than_the_posterior_bound(request: pytest.FixtureRequest, trial: str, name: str) -> None:
+def test_no_estimator_is_better_than_the_posterior_bound(paper: Trial, name: str) -> None:
     """The trace of B^-1 E[e e'] is at least n, with the bound B and the errors e of all n entries."""
-    found: Trial = request.getfixturevalue(trial)
-    for covariance, errors in zip(found.posterior.arrived, np.moveaxis(found.errors[name], 1, 0), strict=True):
+    for covariance, errors in zip(paper.posterior.arrived, np.moveaxis(paper.errors[name], 1, 0), strict=True):
         weighed = np.vecdot(errors, np.linalg.solve(covariance, errors.T).T)
         assert weighed.mean() > 5.0 - 3.0 * weighed.std(ddof=1) / np.sqrt(NUM_RUNS)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_the_posterior_bound_is_close_where_the_spread_of_headings_matters_little(loose_ties: Trial, name: str) -> None:
-    ratio, error = position_ratio(loose_ties, name, loose_ties.posterior.arrived)
-    assert 1.0 - 3.0 * error < ratio < 1.25 + 3.0 * error
 
 
 def test_the_posterior_bound_is_far_off_where_it_matters_much(paper: Trial) -> None:

@@ -165,8 +165,8 @@ class Sighting:
     z: FloatArray
     R: FloatArray
     eye: Eye = _AT_ORIGIN
-    loss: tuple[str, float] | None = None
-    """Robust loss on the length of the whitened residual, huber, cauchy or tukey, and its width; None: a Gaussian."""
+    loss: float | None = None
+    """Width of a Huber loss on the length of the whitened residual; None: a Gaussian."""
 
     def residual(self, x: FloatArray, state_names: tuple[str, ...]) -> FloatArray:
         """z - h(x), whitened, shape (k,); angles go the short way round."""
@@ -184,13 +184,7 @@ class Sighting:
         """What the sighting counts at the whitened residual `y`."""
         if self.loss is None:
             return 1.0
-        kind, width = self.loss
-        far = float(np.linalg.norm(y)) / width
-        if kind == "cauchy":
-            return 1.0 / (1.0 + far**2)
-        if kind == "tukey":
-            return max(1.0 - far**2, 0.0) ** 2 if far < 1.0 else 0.0
-        return 1.0 / max(far, 1.0)
+        return 1.0 / max(float(np.linalg.norm(y)) / self.loss, 1.0)
 
 
 def seen(names: tuple[str, ...], x: FloatArray, state_names: tuple[str, ...], eye: Eye) -> FloatArray:

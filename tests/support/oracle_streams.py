@@ -65,8 +65,6 @@ class Stream:
     """The same as `measurements`, for the oracle."""
     orders: Mapping[str, Sequence[int]]
     lag_s: float
-    late: bool = False
-    """Whether some arrive when they are older than the window."""
 
     @property
     def newest_ns(self) -> int:
@@ -74,9 +72,9 @@ class Stream:
         return self.measurements[-1].stamp_ns
 
     def probes_ns(self) -> list[int]:
-        """Stamps of the past to look at: nodes and in between, inside the window and, where asked for, behind it."""
-        reach_s = 3.0 * self.lag_s if self.late else 0.9 * self.lag_s
-        past = [at for at in (m.stamp_ns for m in self.measurements) if at >= self.newest_ns - nanoseconds(reach_s)]
+        """Stamps of nodes inside the window and one between them."""
+        oldest_ns = self.newest_ns - nanoseconds(0.9 * self.lag_s)
+        past = [m.stamp_ns for m in self.measurements if m.stamp_ns >= oldest_ns]
         return sorted({*past[:: max(len(past) // 5, 1)], (past[0] + self.newest_ns) // 2})
 
     @cached_property
@@ -108,11 +106,6 @@ Plan = tuple[FloatArray, npt.NDArray[np.str_]]
 def linear(rng: np.random.Generator) -> Stream:
     """Positions of the paper's LiDAR and RADAR in a linear model, with the paper's delays."""
     return drawn(rng, CV(), paper_stamps(1.2), lag_s=1.0, reach_s=0.95)
-
-
-def late(rng: np.random.Generator) -> Stream:
-    """A window shorter than the delays: most of it arrives when it is older than the window."""
-    return drawn(rng, CV(), paper_stamps(1.0), lag_s=0.05, reach_s=0.5, late=True)
 
 
 def whole(rng: np.random.Generator) -> Stream:
@@ -168,7 +161,7 @@ def _with_outliers(rng: np.random.Generator, x: FloatArray, stamp_ns: int, senso
     outlier = np.sqrt(np.diag(sighting.R)) * rng.normal(0.0, 8.0, len(sighting.z))
     z = sighting.z + outlier * (rng.random() < 0.2)
     measurement = replace(measurement, z=z, loss=RobustLoss("huber", _LOSS_WIDTH))
-    return measurement, replace(sighting, z=z, loss=("huber", _LOSS_WIDTH))
+    return measurement, replace(sighting, z=z, loss=_LOSS_WIDTH)
 
 
 class _Onboard:
@@ -228,13 +221,12 @@ def drawn(
     plan: Plan,
     lag_s: float,
     reach_s: float,
-    late: bool = False,
     start: Start = FAST,
     sense: Sense = paper,
 ) -> Stream:
     """Truth with the motion model's own noise, measured as `plan` says; in the random order up to `reach_s` late."""
     stamps_s, sensors = plan
-    empty = Stream(motion, start, (), (), {}, lag_s, late)
+    empty = Stream(motion, start, (), (), {}, lag_s)
     dynamics, x = empty.problem.dynamics, empty.problem.start.mean
     measurements, sightings, last_s = list[Measurement](), list[Sighting](), 0.0
     for stamp_s, sensor in zip(stamps_s.tolist(), sensors.tolist(), strict=True):
@@ -253,4 +245,4 @@ def drawn(
         "arrival": np.argsort(stamps_s + delays_s, kind="stable").tolist(),
         "random": np.argsort(stamps_s + random_s, kind="stable").tolist(),
     }
-    return Stream(motion, start, tuple(measurements), tuple(sightings), orders, lag_s, late)
+    return Stream(motion, start, tuple(measurements), tuple(sightings), orders, lag_s)

@@ -47,13 +47,6 @@ def test_equal_values_of_one_stamp_count_the_same_whichever_came_first(name: str
     assert len({bits(state) for state in states}) == 1
 
 
-@pytest.mark.parametrize("what", ["pose", "loss"])
-@pytest.mark.parametrize("name", ["smoother", "smoother-banded"])
-def test_a_smoother_that_has_converged_counts_them_the_same_too(name: str, what: str) -> None:
-    first, *others = (fed(name, order) for order in permutations((*ALIKE[what], POSITION)))
-    assert max(max(difference(other, first, CTRV())) for other in others) < 1e-5
-
-
 def test_of_two_fixes_in_one_place_at_one_time_the_line_takes_the_same_first() -> None:
     start = Start(position_m=(0.0, 0.0), position_std_m=0.1)
     search = Search.of(CTRV(), start, "regression")

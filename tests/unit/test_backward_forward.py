@@ -8,12 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.base import Measurement, Start, UpdateStatus
+from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.filters.backward_forward import BackwardForwardBank
 from fgtrack.estimation.filters.ekf import correct
 from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator
-from fgtrack.estimation.filters.published import PublishedStorage
-from fgtrack.models.measurement import SensorPose, measurement_model
+from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV
 
 STEP_NS = 10_000_000
@@ -56,30 +55,10 @@ def same(a: FloatArray, b: FloatArray) -> None:
     np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
 
 
-def ms(value: float) -> int:
-    return round(value * 1e6)
-
-
 # --- the nearest stored state
 
 
 # --- an update in the past
-
-
-def test_what_was_fused_after_a_late_stamp_is_forgotten() -> None:
-    """The definition of the method: after the late update, the newer one has left no trace."""
-    with_newer, without_newer = bank(), bank()
-    for made in (with_newer, without_newer):
-        made.birth(0, prior(START_NS))
-        made.advance(START_NS + 20 * STEP_NS)
-    newer_ns, late_ns = START_NS + 15 * STEP_NS, START_NS + 10 * STEP_NS
-    [newer] = with_newer.update(newer_ns, [0], [position(newer_ns, 9.0, 9.0)])
-    assert newer.status is UpdateStatus.IN_SEQUENCE
-    [late] = with_newer.update(late_ns, [0], [position(late_ns, 4.0)])
-    [only] = without_newer.update(late_ns, [0], [position(late_ns, 4.0)])
-    assert (late.status, only.status) == (UpdateStatus.OUT_OF_SEQUENCE, UpdateStatus.IN_SEQUENCE)
-    same(with_newer.present()[0].mean, without_newer.present()[0].mean)
-    same(with_newer.present()[0].covariance, without_newer.present()[0].covariance)
 
 
 # --- births
@@ -91,41 +70,16 @@ def test_what_was_fused_after_a_late_stamp_is_forgotten() -> None:
 def test_the_present_lies_between_grid_stamps_and_its_yaw_is_wrapped() -> None:
     made = bank()
     made.birth(0, prior(START_NS, yaw_rad=math.pi - 1e-4))
-    made.advance(START_NS + ms(14))
+    made.advance(START_NS + 14_000_000)
     [state] = made.present()
-    assert state.stamp_ns == made.present_ns == START_NS + ms(14)
-    grid = made.states_at(START_NS + ms(10))
+    assert state.stamp_ns == made.present_ns == START_NS + 14_000_000
+    grid = made.states_at(START_NS + 10_000_000)
     means, _ = euler().propagate(grid.means, grid.covariances, np.array([1]), 0.004)
     same(state.mean[:2], means[0, :2])
     assert state.mean[2] == pytest.approx(-math.pi - 1e-4 + 0.0014)
 
 
 # --- several measurements
-
-
-def test_measurements_of_several_kinds_and_poses_in_one_call_are_fused_each_for_itself() -> None:
-    together, alone = bank(), bank()
-    for made in (together, alone):
-        for track_id in range(4):
-            made.birth(track_id, prior(START_NS, x_m=10.0 * track_id, y_m=1.0))
-        made.advance(START_NS + 10 * STEP_NS)
-    stamp_ns = START_NS + ms(60)
-    R = np.array([[1e-3]])
-    measurements = [
-        position(stamp_ns, 3.0, 1.5),
-        Measurement(stamp_ns, POSE, np.array([12.0, 1.0, 0.3]), 0.1 * np.eye(3)),
-        Measurement(stamp_ns, BEARING, np.array([0.1]), R, SensorPose(0.0, 0.0, 0.0)),
-        Measurement(stamp_ns, BEARING, np.array([0.1]), R, SensorPose(5.0, -3.0, 0.5)),
-    ]
-    ids = [2, 0, 3, 1]
-    results = together.update(stamp_ns, ids, measurements)
-    for track_id, measurement, result in zip(ids, measurements, results, strict=True):
-        [one] = alone.update(stamp_ns, [track_id], [measurement])
-        assert (one.status, one.nis) == (result.status, pytest.approx(result.nis))
-        same(one.innovation, result.innovation)
-    for a, b in zip(together.present(), alone.present(), strict=True):
-        same(a.mean, b.mean)
-        same(a.covariance, b.covariance)
 
 
 def test_a_measurement_that_cannot_be_fused_fails_alone_and_changes_nothing() -> None:
@@ -259,24 +213,3 @@ def test_any_history_of_operations_is_that_of_a_bank_of_lists(seed: int, length:
 
 
 # --- the published storage
-
-
-def test_a_leading_clock_reaches_now_or_leads_by_less_than_a_step_and_never_waits() -> None:
-    made = PublishedStorage(euler(), STEP_NS, 20, leads=True, is_stale=False)
-    for now_ms, lead_ms in [(0, 0), (20, 20), (33, 40), (34, 50), (50, 60), (60, 70), (200, 200)]:
-        made.advance(START_NS + ms(now_ms))
-        assert made.present_ns == START_NS + ms(lead_ms)
-
-
-def test_a_stale_storage_keeps_the_prior_of_an_update_without_delay() -> None:
-    made = PublishedStorage(euler(), STEP_NS, 20, leads=False, is_stale=True)
-    made.advance(START_NS)
-    made.birth(0, prior(START_NS))
-    made.update(START_NS, [0], [position(START_NS, 1.0)])
-    present = made.states_at(START_NS).means[0, 0]
-    assert present > 0.3
-    made.advance(START_NS + STEP_NS)
-    stored = made.states_at(START_NS)
-    assert stored.means[0, 0] == 0.0
-    made.update(START_NS, [0], [position(START_NS, 1.0)])  # delayed now: reaches the storage
-    assert made.states_at(START_NS).means[0, 0] == pytest.approx(present)

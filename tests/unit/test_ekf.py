@@ -150,42 +150,6 @@ def test_the_correction_of_one_state_is_that_of_a_stack(
         np.testing.assert_array_equal(array, before)
 
 
-def test_the_replaying_filter_keeps_the_yaw_in_its_range_through_full_turns() -> None:
-    motion = CTRV()
-    start = np.array([0.0, 0.0, 3.0, 10.0, 1.0])
-    prior = Start(
-        stamp_ns=0,
-        position_m=start[:2],
-        yaw_rad=3.0,
-        yaw_std_rad=0.1,
-        speed_mps=10.0,
-        speed_std_mps=1.0,
-        yaw_rate_radps=1.0,
-        yaw_rate_std_radps=0.1,
-    )
-    estimator = ReplayEkf(motion, prior, 1.0)
-    model = measurement_model(("x_m", "y_m", "yaw_rad"), motion)
-    for step in range(1, 100):
-        truth = motion.predict(start, 0.1 * step)
-        stamp_ns = step * 100_000_000
-        assert estimator.update(Measurement(stamp_ns, model, truth[:3], 0.01 * np.eye(3))).status == "in_sequence"
-        found = estimator.state_at(stamp_ns).mean[2]
-        assert -np.pi < found <= np.pi
-        assert np.cos(found - truth[2]) > 0.99
-
-
-def test_the_replaying_filter_takes_measurements_of_one_stamp_in_an_order_of_their_own() -> None:
-    pose, std = SensorPose(0.0, -20.0), {"range_m": 0.5, "bearing_rad": 0.1}
-    seen = [Measurement.of(10**8, range_m=20.0 + k, bearing_rad=1.5 + 0.1 * k, std=std, pose=pose) for k in range(3)]
-    found = []
-    for order in ((0, 1, 2), (2, 1, 0), (1, 0, 2)):
-        estimator = ReplayEkf(CTRV(), Start(yaw_rad=0.3, speed_mps=10.0), 1.0)
-        for k in order:
-            estimator.update(seen[k])
-        found.append(estimator.state_at(10**8).mean.tolist())
-    assert found[0] == found[1] == found[2]
-
-
 def test_the_replaying_filter_remembers_no_more_than_its_window() -> None:
     estimator = ReplayEkf(CV(), Start(), 1.0)
     for k in range(100):

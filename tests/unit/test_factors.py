@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 from support.models import MOTIONS
 
-from fgtrack.core.geometry import wrap_angle
-from fgtrack.core.types import YAW, FloatArray
-from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.registry import estimator
+from fgtrack.core.types import FloatArray
+from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.smoothing.gtsam.batch import measurement_factor, motion_factor
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, MotionModel
@@ -162,30 +160,3 @@ def test_a_yaw_is_taken_on_the_branch_next_to_the_state(loss: RobustLoss | None,
     x = np.array([0.0, 0.0, math.pi - 0.05 + 2.0 * math.pi * turns, 10.0, 0.0])
     _, b = linear_parts(measurement_factor(LEFT, (item, 0.0), x, CTRV()), values(left=x))
     assert b == pytest.approx([1.5])
-
-
-@pytest.mark.parametrize("name", ["smoother", "smoother-batch", "smoother-banded"])
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_a_smoother_turns_through_pi_with_its_measurements(name: str, sign: float) -> None:
-    """The object turns from 3.0 rad on at 0.5 rad/s; sensors report yaws wrapped, and some late."""
-    motion = CTRV()
-    prior = Start(
-        stamp_ns=0,
-        yaw_rad=3.0 * sign,
-        yaw_std_rad=0.2,
-        speed_mps=20.0,
-        speed_std_mps=1.0,
-        yaw_rate_radps=0.5 * sign,
-        yaw_rate_std_radps=0.2,
-    )
-    smoother = estimator(name, motion, prior, lag_s=2.0)
-    start = np.array([0.0, 0.0, 3.0 * sign, 20.0, 0.5 * sign])
-    model = measurement_model(("x_m", "y_m", "yaw_rad"), motion)
-    for k in (2, 4, 6, 8, 3, 5, 7, 9, 10, 1):
-        truth = motion.predict(start, 0.1 * k)
-        z = truth[:3] - np.array([0.0, 0.0, 2.0 * math.pi * round(truth[2] / (2.0 * math.pi))])
-        smoother.update(Measurement(k * 100_000_000, model, z, np.diag([0.01, 0.01, 1e-4])))
-    for k in range(11):
-        off = smoother.state_at(k * 100_000_000).mean - motion.predict(start, 0.1 * k)
-        off[YAW] = wrap_angle(off[YAW])
-        np.testing.assert_allclose(off, 0.0, atol=0.02)

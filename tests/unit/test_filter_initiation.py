@@ -1,7 +1,6 @@
 """How a replaying filter finds the direction of an object that starts with an unknown one."""
 
 from collections.abc import Sequence
-from itertools import permutations
 
 import numpy as np
 import pytest
@@ -75,16 +74,6 @@ def test_no_direction_of_travel_is_preferred(method: str, yaw_rad: float) -> Non
         assert abs(wrap_angle(turned[YAW] - ahead[YAW] - yaw_rad)) < 1e-9
         np.testing.assert_allclose(np.delete(turned, YAW), np.delete(ahead, YAW), atol=1e-8)
     assert abs(turned[3] - 30.0) < 4.0
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_the_order_of_arrival_does_not_matter(method: str) -> None:
-    """A late fix that is older than the others changes the line, so all that came of it is computed again."""
-    measurements = positions(2.0, 4, 2.0)
-    measurements.insert(2, Measurement.of(2 * PERIOD_NS, bearing_rad=1.5, std={"bearing_rad": 0.2}))
-    expected = states(fed(method, measurements), 4)
-    for order in list(permutations(measurements))[::11]:
-        np.testing.assert_array_equal(states(fed(method, order), 4), expected)
 
 
 def test_what_is_no_position_does_not_count() -> None:
@@ -166,22 +155,6 @@ def test_the_state_is_consistent_where_the_direction_is_found(method: str, slowe
     # with one fix more than the start the direction may be any: no Gaussian, and not asked for here
     low, high = chi2.ppf([0.001, 0.999], 5 * num) / num
     assert ((low < nees[:, 2:].mean(axis=0)) & (nees[:, 2:].mean(axis=0) < high)).all(), nees.mean(axis=0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("late", [1, 2, 3])
-def test_a_late_one_of_the_first_positions_is_judged_by_all_the_others(method: str, late: int) -> None:
-    num, nis = 200, np.zeros(200)
-    for run in range(num):
-        fixes = positions(2.0, 8, speed_mps=40.0, seed=run)
-        estimator = fed(method, fixes[: late - 1] + fixes[late:])
-        found = estimator.update(fixes[late - 1]).nis
-        assert found is not None
-        nis[run] = found
-    # no motion noise in these positions, so the prediction is a little better than it says
-    low, high = chi2.ppf([0.001, 0.999], 2 * num) / num
-    assert 0.9 * low < nis.mean() < high, nis.mean()
 
 
 def test_what_is_known_of_the_speed_is_used_once() -> None:

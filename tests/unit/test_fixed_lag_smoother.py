@@ -130,29 +130,20 @@ def test_what_lies_behind_the_ring_is_forgotten(make: type[SmootherBank]) -> Non
     assert smoother.update(at(2499, 25.0)).status is UpdateStatus.TOO_OLD
 
 
-def test_final_states_come_once_and_the_rest_when_the_track_ends() -> None:
-    for final, left, rest in ((True, [0, 1, 2], [3, 4, 5, 6]), (False, [], [])):
-        bank = SmootherBank(CV(), 0.25, final=final)
-        smoother = OneObject(CV(), bank, Start())
-        for k in range(1, 7):
-            smoother.update(at(100 * k, 1.0 * k))
-        assert [report.state.stamp_ns for report in bank.smoothed()] == [k * 100 * MS for k in left]
-        assert bank.smoothed() == []
-        bank.remove(0)
-        assert [report.state.stamp_ns for report in bank.smoothed()] == [k * 100 * MS for k in rest]
-
-
-def test_a_bank_reports_lagged_and_final_states() -> None:
-    bank = SmootherBank(CV(), 0.3, ring_s=0.5, lagged_s=(0.2,), final=True)
+@pytest.mark.parametrize(("final", "left", "rest"), [(True, [1], [2, 3, 4, 5]), (False, [], [])])
+def test_a_bank_reports_lagged_states_and_final_ones_once(final: bool, left: list[int], rest: list[int]) -> None:
+    bank = SmootherBank(CV(), 0.25, ring_s=0.5, lagged_s=(0.2,), final=final)
     bank.advance(100 * MS)
     bank.birth(7, Start(stamp_ns=100 * MS))
     assert bank.smoothed() == []  # 0.2 s ago there was no track
     for k in range(2, 6):
         bank.advance(100 * k * MS)
         bank.update(100 * k * MS, [7], [at(100 * k, 1.0 * k)])
-    assert bank.window_start_ns == -300 * MS
-    [lagged] = [report for report in bank.smoothed() if report.lag_s is not None]
+    assert bank.window_start_ns == -250 * MS
+    reports = bank.smoothed()
+    [lagged] = [report for report in reports if report.lag_s is not None]
     assert (lagged.track_id, lagged.state.stamp_ns, lagged.lag_s) == (7, 300 * MS, 0.2)
+    assert [report.state.stamp_ns for report in reports if report.lag_s is None] == [100 * k * MS for k in left]
     bank.remove(7)
-    assert [report.state.stamp_ns for report in bank.smoothed()] == [100 * k * MS for k in (2, 3, 4, 5)]
+    assert [report.state.stamp_ns for report in bank.smoothed()] == [100 * k * MS for k in rest]
     assert bank.smoothed() == []

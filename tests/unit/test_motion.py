@@ -1,5 +1,4 @@
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -193,32 +192,13 @@ def test_a_birth_at_rest_is_as_uncertain_across_its_heading_as_the_product_of_ya
     assert_allclose(P[2:, 2:], np.diag([2.0**2, 0.05**2 * 2.0**2 + 0.06**2]), rtol=1e-14)
 
 
-@dataclass(frozen=True)
-class Accelerating(MotionModel):
-    """Constant acceleration, driven by white noise jerk."""
+class Accelerating(CV):
+    """Constant acceleration."""
 
     state_names = ("x_m", "y_m", "vx_mps", "vy_mps", "ax_mps2", "ay_mps2")
-    linear = True
-    jerk_density_m2ps5: float = 1.0
-
-    def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
-        return (self.jacobian(x, dt_s) @ x[..., None])[..., 0]
-
-    def jacobian(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
-        t = np.asarray(dt_s)[..., None, None]
-        F = np.eye(6) + t * np.eye(6, k=2) + t**2 / 2.0 * np.eye(6, k=4)
-        return np.broadcast_to(F, (*np.broadcast_shapes(x.shape[:-1], np.shape(dt_s)), 6, 6))
-
-    def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
-        t = self.forward(dt_s)[..., None, None]
-        axis = [[t**5 / 20, t**4 / 8, t**3 / 6], [t**4 / 8, t**3 / 3, t**2 / 2], [t**3 / 6, t**2 / 2, t]]
-        Q = self.jerk_density_m2ps5 * sum(
-            np.kron(np.eye(3)[:, [i]] * np.eye(3)[j], np.eye(2)) * axis[i][j] for i in range(3) for j in range(3)
-        )
-        return np.broadcast_to(Q, (*np.broadcast_shapes(x.shape[:-1], np.shape(dt_s)), 6, 6))
 
 
-class Walking(Accelerating):
+class Walking(CV):
     """Yaw and speed instead of the velocity, and no yaw rate."""
 
     state_names = ("x_m", "y_m", "yaw_rad", "speed_mps", "stride_m", "height_m")
@@ -229,7 +209,6 @@ class Walking(Accelerating):
 
 
 MODEL, WALK = Accelerating(), Walking()
-X = np.array([1.0, 2.0, 3.0, 4.0, 0.5, -0.5])
 
 
 def test_what_a_kinematic_state_lacks_starts_at_zero_with_the_model_s_variance() -> None:

@@ -54,14 +54,6 @@ def test_an_exact_method_gives_the_answer_of_the_time_order_after_one_late_measu
     assert_same(last(estimator), last(replayed(measurements)))
 
 
-@pytest.mark.parametrize("name", sorted(set(FUSING) - set(ANY_LAG)))
-def test_the_other_methods_do_not_at_ten_lags(name: str) -> None:
-    rng = np.random.default_rng(10)
-    measurements = [*in_sequence(rng), late(rng, 10)]
-    with pytest.raises(AssertionError):
-        assert_same(last(fed(started(name), measurements)), last(replayed(measurements)))
-
-
 @pytest.mark.parametrize("name", ANY_LAG)
 def test_an_exact_method_stays_exact_when_the_next_late_measurement_is_newer_than_the_step_that_fused_the_last(
     name: str,

@@ -305,13 +305,3 @@ def test_noise_of_range_and_bearing_grows_too_and_a_covariance_of_its_own_does_n
     np.testing.assert_allclose(kept.measurement.R, 0.04 * np.eye(2), atol=1e-12)
     [bearing] = candidates(Detection(bearing_rad=0.1), sensor=replace(polar, std_growth={"bearing_rad": 0.1}))
     np.testing.assert_allclose(bearing.measurement.R, [[0.02**2]])  # how far it is, is not known
-
-
-@pytest.mark.parametrize("frame", ["sensor", "ego"])
-def test_a_sensor_of_a_turning_ego_moves_with_its_lever_arm(frame: Frame) -> None:
-    """v + w x r, with the arm from the ego reference point to the origin of the frame."""
-    turning = EGO._replace(yaw_rate_radps=0.5)
-    [found] = candidates(Detection(range_m=10.0, bearing_rad=0.1), sensor=POLAR, frame=frame, ego=turning)
-    pose = found.measurement.pose
-    arm_m = np.array([pose.x_m, pose.y_m]) - [EGO.x_m, EGO.y_m]
-    assert (pose.vx_mps, pose.vy_mps) == pytest.approx((-0.5 * arm_m[1], 20.0 + 0.5 * arm_m[0]))

@@ -9,7 +9,6 @@ from support.models import MODELS
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator
 from fgtrack.estimation.filters.published import YAW_LIMIT_RAD, SaturatedEulerCtrv, published_yaw
-from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRA, CTRV, MotionModel
 
 ISOTROPIC = np.array([4e-4, 4e-4, 9e-4, 1e-2, 2.5e-3])
@@ -124,19 +123,3 @@ def test_the_published_yaw_range_ends_where_the_published_yaw_is_pi() -> None:
     wanted = [0.0, math.pi, 3 * math.pi / 2, -math.pi / 2 + 1e-9, 3 * math.pi / 2]
     assert published_yaw(yaws) == pytest.approx(wanted)
     assert 3 * math.pi / 2 == YAW_LIMIT_RAD
-
-
-def test_a_published_residual_wraps_by_one_turn_alone() -> None:
-    model = measurement_model(("x_m", "yaw_rad", "bearing_rad"), CTRV())
-    z, predicted = np.array([3.0, -2.0, -3.0]), np.array([1.0, -2.0 - 2.0 * math.pi, 3.0])
-    found = SaturatedEulerCtrv(CTRV(), ISOTROPIC).residual(model, z, predicted)
-    assert found == pytest.approx([2.0, 2.0 * math.pi, 2.0 * math.pi - 6.0])
-
-
-def test_a_saturated_yaw_sticks_at_its_limit_and_may_fall_below_the_range() -> None:
-    x = np.array([[0.0, 0.0, YAW_LIMIT_RAD - 0.05, 0.0, 1.0], [0.0, 0.0, -math.pi / 2 + 0.05, 0.0, -1.0]])
-    means, _ = SaturatedEulerCtrv(CTRV(), ISOTROPIC).propagate(
-        x, np.eye(5)[None].repeat(2, 0), np.array([20, 20]), 0.01
-    )
-    assert means[0, 2] == YAW_LIMIT_RAD
-    assert means[1, 2] == pytest.approx(-math.pi / 2 - 0.15)

@@ -108,7 +108,11 @@ def test_any_history_is_that_of_one_estimator_for_each_object(seed: int, motion:
         if rng.random() < 0.05:
             offset_ns -= 2000 * MS
         measurements = [drawn(rng, motion, offset_ns) for _ in alive]
-        banks.update(START.stamp_ns + offset_ns, alive, measurements)
+        broken = [rng.random() < 0.05 for _ in alive]
+        measurements = [replace(m, z=m.z * np.nan) if bad else m for m, bad in zip(measurements, broken, strict=True)]
+        statuses = banks.update(START.stamp_ns + offset_ns, alive, measurements)
+        refused = (UpdateStatus.FAILED, UpdateStatus.TOO_OLD)
+        assert all(status in refused for status, bad in zip(statuses, broken, strict=True) if bad)
         banks.agree(START.stamp_ns + now_ms * MS - int(rng.integers(0, nanoseconds(LAG_S))))
 
 
@@ -125,22 +129,6 @@ def test_a_stream_of_a_window_many_times_as_long_stays_the_same_and_small() -> N
             chosen = [i for i in range(5) if rng.random() < 0.9]
             banks.update(START.stamp_ns + offset_ns, chosen, [drawn(rng, motion, offset_ns) for _ in chosen])
     assert banks.found._arrays[0].shape == (8, 64)
-
-
-def test_what_cannot_be_fused_fails_alone_and_changes_nothing() -> None:
-    rng, motion = np.random.default_rng(0), CTRV()
-    banks = Banks(motion)
-    for track_id in range(3):
-        banks.birth(track_id, START)
-    for offset_ms in (100, 200, 150):
-        measurements = [drawn(rng, motion, offset_ms * MS) for _ in range(3)]
-        measurements = [
-            replace(one, z=one.z * np.array([np.nan] + [1.0] * (len(one.z) - 1))) if k == 1 else one
-            for k, one in enumerate(measurements)
-        ]
-        statuses = banks.update(START.stamp_ns + offset_ms * MS, [0, 1, 2], measurements)
-        assert statuses[1] is UpdateStatus.FAILED
-        assert UpdateStatus.FAILED not in (statuses[0], statuses[2])
 
 
 def test_the_tracker_gets_the_bank_and_other_filters_are_one_for_each_object() -> None:
