@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -15,6 +16,7 @@ from fgtrack.models.sensors import RobustLoss
 
 T = TypeVar("T", float, FloatArray)
 
+_copied = partial(np.array, dtype=np.float64, order="C")
 _KALMAN = "fgtrack.estimation.kernels.kalman"
 _MAX_REWEIGHTINGS = 50
 _REWEIGHTING_TOLERANCE = 1e-9
@@ -122,13 +124,13 @@ def correct(
     `measured` is `Measurement.measured`, for the NIS, `loss` the robust loss of all (see `robust_weight`).
     """
     rows = np.arange(y.shape[-1]) if measured is None else np.array(measured, dtype=np.int64)
-    x, P, y, R = (np.array(each, dtype=np.float64, order="C") for each in (mean, covariance, y, R))
+    x, P, y, R = map(_copied, (mean, covariance, y, R))
     H = np.array(H, dtype=np.float64, order="C", ndmin=3)
     S, nis, w, fused = np.empty(R.shape), np.empty(len(x)), np.ones(len(x)), np.empty(len(x), dtype=bool)
     fuse = kernels(_KALMAN).correct
     fuse(x, P, y, H, R, rows, S, nis, fused)
     if loss is not None:
-        x, P = (np.array(each, dtype=np.float64, order="C") for each in (mean, covariance))
+        x, P = _copied(mean), _copied(covariance)
         spread = congruence(H, P)
         for row in range(len(x)):
             w[row] = robust_weight(loss, y[row], spread[row], R[row]) if fused[row] else 1.0

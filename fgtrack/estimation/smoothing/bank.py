@@ -59,6 +59,7 @@ class SmootherBank:
         self._motion = motion
         self._settings = settings = SmootherSettings.of_options(lag_s, options)
         self._lag_ns, self._behind_ns = nanoseconds(settings.lag_s), nanoseconds(settings.behind_s)
+        self._lagged = [(lag_s, nanoseconds(lag_s)) for lag_s in settings.lagged_s]
         self.solver = self.make_solver(motion, settings)
         self.failures = failures or Failures()
         self._tracks: dict[int, int] = {}
@@ -164,8 +165,8 @@ class SmootherBank:
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`."""
         reports, self._final = self._final, []
-        for lag_s in self._settings.lagged_s:
-            stamp_ns = self.present_ns - nanoseconds(lag_s)
+        for lag_s, lag_ns in self._lagged:
+            stamp_ns = self.present_ns - lag_ns
             states = self.states_at(stamp_ns)
             reports += self._reports(states.track_ids, stamp_ns, states.means, states.covariances, lag_s)
         return reports
