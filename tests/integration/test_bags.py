@@ -350,20 +350,6 @@ def test_a_foreign_recording_without_a_configuration_is_one_line():
         open_input(shared("data/bags/nav2_turtlebot.mcap"))
 
 
-@pytest.mark.parametrize(
-    ("item", "error", "complaint"),
-    [
-        (TopicInput("/detections/lidar"), CallError, "needs fields"),
-        (TopicInput("/ego/odometry", fields={"x": "a"}), CallError, "unknown field 'x'"),
-        (TopicInput("/ego/odometry", fields={"x_m": "a"}), CallError, "must name y_m"),
-    ],
-)
-def test_an_ego_that_does_not_fit_is_one_line(tmp_path, item, error, complaint):
-    write_bag(tmp_path / "bag", drive())
-    with pytest.raises(error, match=complaint):
-        open_input(tmp_path / "bag", InputConfig(ego=item))
-
-
 def test_a_topic_that_fgtrack_wrote_follows_the_keys_that_name_it(tmp_path):
     near, far = Detection(x_m=5.0, y_m=0.0, score=0.9), Detection(x_m=9.0, y_m=0.0, score=0.2)
     truth = TruthState(1, 2, 7, 1.0, 2.0)
@@ -378,12 +364,15 @@ def test_a_topic_that_fgtrack_wrote_follows_the_keys_that_name_it(tmp_path):
 @pytest.mark.parametrize(
     ("config", "complaint"),
     [
+        (InputConfig(ego=TopicInput("/detections/lidar")), "needs fields"),
+        (InputConfig(ego=TopicInput("/ego/odometry", fields={"x": "a"})), "unknown field 'x'"),
+        (InputConfig(ego=TopicInput("/ego/odometry", fields={"x_m": "a"})), "must name y_m"),
         (InputConfig(ego=TopicInput("/ego/odometry", scan_s=0.1)), "scan_s applies to detections only"),
         (InputConfig(ego=TopicInput("/ego/odometry", frame="ego")), "frame applies to detections only"),
         (InputConfig(detections={"lidar": TopicInput("/detections/lidar", object_id=1)}), "object_id applies to truth"),
     ],
 )
-def test_a_key_that_a_topic_does_not_read_is_refused(tmp_path, config, complaint):
+def test_a_topic_that_does_not_fit_and_a_key_that_it_does_not_read_are_refused(tmp_path, config, complaint):
     write_bag(tmp_path / "bag", drive())
     with pytest.raises(CallError, match=complaint):
         open_input(tmp_path / "bag", config)

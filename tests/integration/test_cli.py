@@ -158,25 +158,14 @@ def test_the_printed_configuration_is_one(fgtrack: Command, stream: Path) -> Non
         (("replay", "missing", "-o", "run"), "missing: there is no such file"),
         (("compare", "missing"), "missing: no run folder"),
         (("simulate", "missing.yaml", "-o", "x.jsonl"), "missing.yaml: there is no such scenario file"),
-        (
-            ("simulate", "default", "-o", "x.jsonl", "--duration", "0"),
-            "duration_s: Input should be greater than 0, not 0.0",
-        ),
+        (("simulate", "default", "-o", "x.jsonl", "--duration", "0"), "duration_s: Input should be greater than 0"),
         (("simulate", "default", "-o", "x.jsonl", "--seed", "-1"), "--seed"),
         (("replay", "drive.jsonl", "-o", "foreign"), "foreign: exists and is not a run folder"),
         (("replay", "drive.jsonl", "-o", "run", "-e", "magic"), "estimator 'magic' is unknown"),
-        (
-            ("replay", "drive.jsonl", "-o", "run", "-c", "missing.yaml"),
-            "missing.yaml: there is no such configuration file",
-        ),
         (("replay", "drive.jsonl", "-o", "run", "--map", "missing.csv"), "missing.csv: there is no such map"),
-        (("replay", "drive.jsonl", "-o", "run", "--set", "nonsense"), "--set nonsense: write key=value"),
-        (("config", "-c", "broken.yaml"), "broken.yaml:2: invalid YAML"),
         (("convert", "drive.jsonl", "drive.html"), "drive.html: is written as .jsonl, as .jsonl.gz, or as a rosbag2"),
         (("replay", "drive.jsonl", "b", "-o", "run"), "usage: fgtrack replay [OPTIONS] {INPUT})"),
         (("replya", "drive.jsonl"), "Did you mean 'replay'?"),
-        (("replay", "drive.jsonl", "-o", "run", "-e", "smother"), "did you mean 'smoother'"),
-        (("replay", "drive.jsonl", "-o", "run", "--set", "smoother.lag=3"), "did you mean 'lag_s'"),
     ],
     ids=" ".join,
 )
@@ -185,7 +174,6 @@ def test_a_bad_call_is_one_line_and_exit_code_2(
 ) -> None:
     (tmp_path / "foreign").mkdir()
     (tmp_path / "foreign/thesis.tex").write_text("years of work")
-    (tmp_path / "broken.yaml").write_text("filter: [1\n")
     called = fgtrack(*arguments)
     assert message in called.error
     assert called.code == 2

@@ -11,7 +11,6 @@ from support.server import Server
 
 import fgtrack
 from fgtrack.core.types import Detection, DetectionList, EgoState
-from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.ros.mcap_file import MCAP_MAGIC
 from fgtrack.io.stream import write_stream
 
@@ -61,24 +60,6 @@ def crowd(*lists: tuple[int, np.ndarray]) -> Make:
 def large_meta(folder: Path) -> None:
     fgtrack.replay(iter(drive()), "smoother", out=folder / "run")
     (folder / "run/meta.json").write_bytes(b'{"format":"fgtrack-run/1","x":[0' + b",{}" * 20_000_000 + b"]}")
-
-
-def metadata(change: Callable[[str], str]) -> Make:
-    """A bag whose metadata.yaml is changed."""
-
-    def make(folder: Path) -> None:
-        write_bag(folder / "bag", drive())
-        file = folder / "bag/metadata.yaml"
-        before = file.read_text()
-        file.write_text(change(before))
-        assert file.read_text() != before
-
-    return make
-
-
-def replay(topic: str = "") -> tuple[str, ...]:
-    sensor = ("--set", "sensors={s: {std: {x_m: 1.0, y_m: 1.0}}}", "-o", "run")
-    return ("replay", "x.mcap", "--set", f"input={{detections: {{s: {{topic: /x{topic}}}}}}}", *sensor)
 
 
 RACE = """ego: {kind: track, arc_m: 0.0, speed: [[0, 50]]}

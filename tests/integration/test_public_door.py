@@ -94,15 +94,6 @@ def test_settings_estimator_and_messages_can_be_given(drive: Path) -> None:
         fgtrack.replay(messages, "smoother", set={"filter.storage": 2.0})
 
 
-def test_what_is_there_is_not_replaced_without_overwrite(drive: Path) -> None:
-    before = fgtrack.load_run(drive / "runs/x").meta["digest"]
-    with pytest.raises(fgtrack.CallError, match="exists"):
-        fgtrack.replay(drive / "drive.mcap", "karle2023", out=drive / "runs/x")
-    assert fgtrack.load_run(drive / "runs/x").meta["digest"] == before
-    with pytest.raises(fgtrack.CallError, match=r"drive\.mcap"):
-        fgtrack.simulate("default", out=drive / "drive.mcap", duration_s=1.0)
-
-
 def test_an_input_that_breaks_off_is_a_warning(drive: Path, tmp_path: Path) -> None:
     path = fgtrack.simulate("single_opponent", duration_s=1.0, out=tmp_path / "drive.jsonl")
     path.write_bytes(path.read_bytes()[:-40])

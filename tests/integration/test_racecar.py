@@ -137,7 +137,6 @@ def test_topics_of_truth_are_an_object_each(recording):
         ({"filters": {"rcs": Filter(min=0.0)}}, CallError, "without fields, filters go by .*score.*, not by 'rcs'"),
         ({"fields": {"range_m": "rangee"}}, DataError, "there is no 'rangee', but header, canmsg, id"),
         ({"fields": {"range_m": "range"}, "filters": {"snr": Filter(min=0.0)}}, DataError, "there is no 'snr'"),
-        ({"fields": {"stamp": ["a", "b"]}}, DataError, "the name of one field is needed"),
     ],
 )
 def test_what_does_not_fit_is_one_line_with_what_there_is(recording, item, error, complaint):

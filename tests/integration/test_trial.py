@@ -10,7 +10,6 @@ from typer.testing import CliRunner
 from fgtrack.calibration.trial import samples, suspicions
 from fgtrack.cli.main import app
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
-from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import dump, validate
@@ -118,18 +117,3 @@ def test_the_command_shows_what_is_read_and_what_becomes_of_it(tmp_path):
     assert "first 5 s of radar: " in text
     assert "in sequence" in text
     assert "tracks" in text
-
-
-def test_a_typo_in_a_field_path_is_one_line_with_the_names_there(tmp_path):
-    write_bag(tmp_path / "bag", drive())
-    config = tmp_path / "c.yaml"
-    config.write_text(
-        "input:\n  ego: {topic: /ego/odometry}\n  detections:\n"
-        "    radar: {topic: /detections/radar, fields: {objects: detections, x_m: bbox.pose.x}}\n"
-        "sensors:\n  radar: {std: {x_m: 1.0, y_m: 1.0}}\n"
-    )
-    code, text = info(tmp_path / "bag", config)
-    assert code == 1
-    assert "bbox.pose.x: there is no 'pose', but center" in text
-    assert "/detections/lidar" in text
-    assert "ignored" in text

@@ -313,12 +313,6 @@ def test_what_describes_an_object_is_read_by_paths_and_places_in_lists():
         objects_by_fields(item, {"class_name": "results.1.name"})
 
 
-def test_a_wrong_path_names_what_there_is():
-    item = Detection(x_m=1.0)
-    with pytest.raises(FieldError, match=r"x: there is no 'x', but x_m, y_m, yaw_rad, "):
-        objects_by_fields(item, {"x_m": "x"})
-
-
 @pytest.mark.parametrize(
     ("given", "expected"),
     [(7, 7), ("7", 7), (" -7 ", -7), ("", None), ("9223372036854775807", (1 << 63) - 1)],

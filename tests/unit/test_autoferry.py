@@ -1,16 +1,11 @@
 import json
 import math
-from collections import Counter
-from itertools import pairwise
 
 import pytest
-from support.messages import shared
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import Detection, DetectionList, TruthState
 from fgtrack.io.source import open_input
-
-SCENARIOS = range(2, 7)
 
 
 def record(sensor: int, time_text: str, measurement: object) -> str:
@@ -101,19 +96,3 @@ def test_a_damaged_scenario_is_one_line_that_names_the_file(tmp_path, text):
     with pytest.raises(DataError, match=r"scenario9_detections\.json: ") as caught:
         list(open_input(tmp_path).messages())
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", SCENARIOS)
-def test_every_record_of_the_data_set_is_read_in_receipt_order(number):
-    folder = shared(f"data/autoferry/scenario{number}")
-    messages = list(open_input(folder).messages())
-    assert all(a.receipt_ns <= b.receipt_ns for a, b in pairwise(messages))
-    assert all(message.receipt_ns >= message.stamp_ns for message in messages)
-    records = json.loads((folder / f"scenario{number}_detections.json").read_text())
-    names = {1: "lidar", 2: "radar", 3: "infrared", 4: "daylight"}
-    found = [message for message in messages if isinstance(message, DetectionList)]
-    assert Counter(m.sensor for m in found) == Counter(names[r["sensorID"]] for r in records)
-    fixes = json.loads((folder / f"scenario{number}_groundTruth.json").read_text())
-    distinct = {(fix["targetID"], fix["time"]) for item in fixes for fix in item}
-    assert sum(isinstance(m, TruthState) for m in messages) == len(distinct)

@@ -1,5 +1,4 @@
 import math
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +14,12 @@ from support.kitti import (
     oxts,
     pose,
 )
-from support.messages import shared
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.io.adapters.kitti_view import Box
 from fgtrack.io.config import InputConfig, KittiInput
 from fgtrack.io.source import open_input
-
-SEQUENCES = ("0004", "0006", "0008", "0010", "0018")
 
 
 def messages(path: Path, **settings: object) -> list[Message]:
@@ -287,18 +283,3 @@ def test_what_is_not_finite_in_a_detection_is_left_to_the_tracker_without_a_warn
     lines = [",".join([*cells[:10], bad, *cells[11:]]) for bad in ("inf", "nan")] + [whole]
     (found,) = lists(folder(tmp_path, laser=lines))
     assert [math.isfinite(item.x_m + item.y_m) for item in found.objects] == [False, False, True]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sequence", SEQUENCES)
-def test_every_line_of_the_data_set_is_read(sequence):
-    root = shared("data/kitti")
-    found = messages(root, sequence=sequence, min_score={"pointrcnn_car": 3.0})
-    assert all(a.receipt_ns <= b.receipt_ns for a, b in pairwise(found))
-    count = {name: len((root / name / f"{sequence}.txt").read_text().split("\n")) - 1 for name in ("oxts", "rrc_car")}
-    assert sum(isinstance(item, EgoState) for item in found) == count["oxts"]
-    labels = (root / "label_02" / f"{sequence}.txt").read_text().splitlines()
-    cars = sum(isinstance(item, TruthState) and not item.ignored for item in found)
-    assert cars == sum(line.split()[2] == "Car" for line in labels)
-    boxes = [len(item.objects) + len(item.left_out) for item in found if getattr(item, "sensor", "") == "rrc_car"]
-    assert sum(boxes) == count["rrc_car"]

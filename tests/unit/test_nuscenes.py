@@ -133,12 +133,6 @@ def test_damaged_tables_are_one_line(tmp_path, table, text, complaint):
     assert "\n" not in str(caught.value)
 
 
-def test_boxes_that_are_none_are_one_line(tmp_path):
-    path = data(tmp_path, {"s0": [{"translation": [1.0, 2.0]}]})
-    with pytest.raises(DataError, match="not those of nuScenes"):
-        messages(path, classes=())
-
-
 def test_without_tables_the_setting_is_named(tmp_path):
     path = data(tmp_path)
     with pytest.raises(

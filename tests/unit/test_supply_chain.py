@@ -18,22 +18,6 @@ EXTRAS = PROJECT["optional-dependencies"]
 REQUIRED = [Requirement(line) for line in PROJECT["dependencies"]]
 LOCKED_EXTRAS = ("test", "dev", "docs")
 
-# Bound above because fgtrack builds on more than their documented interface, or they promise none yet.
-BOUND_ABOVE = {
-    "mcap",
-    "gtsam",
-    "numpy",
-    "scipy",
-    "rosbags",
-    "ruamel.yaml",
-    "pydantic",
-    "typer",
-    "joblib",
-    "motrics",
-    "matplotlib",
-    "pandas",
-}
-
 
 def _name(text: str) -> str:
     return re.sub(r"[-_.]+", "-", text).lower()
@@ -81,11 +65,6 @@ def _imported(node: ast.AST) -> list[str]:
     if isinstance(node, ast.Import):
         return [alias.name for alias in node.names]
     return [node.module] if isinstance(node, ast.ImportFrom) and node.module and not node.level else []
-
-
-def test_what_may_change_without_notice_is_bound_above() -> None:
-    bound = {one.name for one in REQUIRED if any(part.operator == "<" for part in one.specifier)}
-    assert bound == BOUND_ABOVE
 
 
 @pytest.mark.parametrize("lock", LOCKS[1:])
