@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -117,33 +117,26 @@ def test_so_they_do_with_what_is_older_than_the_window(late: str) -> None:
 # --- failures
 
 
-class Fuse:
-    """Lets the next solution of track 0 raise, once, before it is applied or after it."""
+def break_solver(bank: SmootherBank, failing: tuple[int, ...], when: str = "after") -> list[int]:
+    """Let solutions of track 0 raise before or after they are applied; return the numbers of those that were tried."""
+    solve, tried = bank.solver.solve, list[int]()
 
-    def __init__(self, one: SmootherBank, when: Literal["before", "after"]) -> None:
-        self.blown = False
-        solver = one.solver
-        solve = solver.solve
-
-        def gives_up(tracks: Any, *arguments: Any) -> None:
-            hit = 0 in tracks and not self.blown
-            if hit and when == "before":
-                self.blow()
+    def solve_or_raise(tracks: Any, *arguments: Any) -> None:
+        tried.extend([len(tried) + 1] if 0 in tracks else [])
+        raises = 0 in tracks and tried[-1] in failing
+        if not raises or when == "after":
             solve(tracks, *arguments)
-            if hit:
-                self.blow()
+        if raises:
+            raise np.linalg.LinAlgError("the solver gave up")
 
-        solver.solve = gives_up  # type: ignore[method-assign]
-
-    def blow(self) -> None:
-        self.blown = True
-        raise np.linalg.LinAlgError("the solver gave up")
+    bank.solver.solve = solve_or_raise  # type: ignore[method-assign]
+    return tried
 
 
 @pytest.mark.parametrize("when", ["before", "after"])
 @pytest.mark.parametrize("make", TOLERANCES)
 def test_a_solver_that_gives_up_once_fails_one_measurement_and_the_rest_is_as_if_nothing_had_happened(
-    make: type[SmootherBank], when: Literal["before", "after"]
+    make: type[SmootherBank], when: str
 ) -> None:
     """The measurement comes ahead, on the newest node, into a segment, beyond the window, or moves the window on."""
     motion, tolerance = CV(), TOLERANCES[make]
@@ -154,10 +147,10 @@ def test_a_solver_that_gives_up_once_fails_one_measurement_and_the_rest_is_as_if
         left = [state.stamp_ns for state in final(spared_bank)]
         assert [state.stamp_ns for state in final(bank)] == left
 
-        fuse = Fuse(bank, when)
+        tried = break_solver(bank, (1,), when)
         assert hit.update(measured(rng, motion, ms * MS)).status is UpdateStatus.FAILED
         spared.advance(START_NS + ms * MS)
-        assert fuse.blown
+        assert tried
         assert bank.failures.counts == {Failure.GRAPH_REBUILT: 1}
         assert hit.window_ns == spared.window_ns
         assert apart(hit, spared) < tolerance
@@ -195,20 +188,10 @@ def test_of_several_tracks_the_one_that_cannot_be_updated_fails_alone(make: type
         expected = [result.status for result in spared.update(stamp_ns, [1, 2], measurements[1:])]
         broken = {"R": {"R": -9.0 * np.eye(2)}, "z": {"z": np.full(2, np.nan)}, "solver": {}}[what]
         given = [replace(measurements[0], **broken), *measurements[1:]]
-        solve, solver = hit.solver.solve, hit.solver
-        calls: list[int] = []
-
-        def gives_up(tracks: Any, *arguments: Any, solve: Any = solve, calls: list[int] = calls) -> None:
-            """At the update of all, and at that of track 0 alone; not where windows are built again after that."""
-            solve(tracks, *arguments)
-            if what == "solver" and 0 in tracks:
-                calls.append(len(tracks))
-                if len(calls) in (1, 3):
-                    raise np.linalg.LinAlgError("gave up")
-
-        solver.solve = gives_up  # type: ignore[method-assign]
+        solve = hit.solver.solve
+        break_solver(hit, (1, 3) if what == "solver" else ())  # the update of all, and that of track 0 alone
         found = [result.status for result in hit.update(stamp_ns, [0, 1, 2], given)]
-        solver.solve = solve  # type: ignore[method-assign]
+        hit.solver.solve = solve  # type: ignore[method-assign]
         assert found == [UpdateStatus.FAILED, *expected]
         for before, after in zip(spared.present(), hit.present(), strict=True):
             assert max(known_apart(after, before)) < 1e-6

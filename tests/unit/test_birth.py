@@ -2,7 +2,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.models import MODELS
 from support.tracking import START_NS, StraightRoad, bearing, ms
 
 from fgtrack.core.geometry import rotation
@@ -54,20 +53,15 @@ def test_a_position_of_unknown_heading_is_as_uncertain_across_as_along() -> None
     assert found.covariances[1, :2, :2] == pytest.approx(POSITION_COVARIANCE + 25.0**2 * np.eye(2))
 
 
-@pytest.mark.parametrize("birth", [Birth(kind="fixed"), Birth()])
-def test_what_is_measured_stays(birth) -> None:
-    prior = birth.prior(seen(yaw_rad=1.0, speed_mps=20.0), ROAD, EGO, ego_in_pit=False)
-    assert (prior.yaw_rad, prior.speed_mps) == (1.0, 20.0)
-    assert prior.yaw_rate_radps == pytest.approx(20.0 * 0.01)
-
-
 def test_a_measured_component_starts_with_its_own_deviation_or_a_fixed_one() -> None:
     candidate = seen(yaw_rad=1.0, speed_mps=20.0)
     measured = Birth().prior(candidate, ROAD, EGO, ego_in_pit=False)
     assert (measured.yaw_std_rad, measured.speed_std_mps) == pytest.approx((0.7, 0.7))
     assert measured.position_covariance == pytest.approx(POSITION_COVARIANCE)
+    assert measured.yaw_rate_radps == pytest.approx(20.0 * 0.01)
     fixed = Birth(kind="fixed", along_std_m=2.0, across_std_m=0.5).prior(candidate, ROAD, EGO, ego_in_pit=False)
     assert (fixed.yaw_std_rad, fixed.speed_std_mps) == (0.5, 100.0)
+    assert (fixed.yaw_rad, fixed.speed_mps) == (measured.yaw_rad, measured.speed_mps) == (1.0, 20.0)
     turn = rotation(1.0)
     assert fixed.position_covariance == pytest.approx(turn @ np.diag([4.0, 0.25]) @ turn.T)
 
@@ -103,15 +97,3 @@ def test_a_bearing_alone_starts_nothing() -> None:
 def test_a_deviation_that_makes_no_sense_is_named(name: str) -> None:
     with pytest.raises(ValueError, match=name):
         Birth(kind="fixed", **{name: 0.0})
-
-
-@pytest.mark.parametrize("motion", MODELS, ids=lambda motion: type(motion).__name__)
-def test_the_first_state_of_every_motion_model_is_the_prior(motion) -> None:
-    prior = Birth().prior(seen(yaw_rad=1.0, speed_mps=20.0), ROAD, EGO, ego_in_pit=False)
-    mean, P = initial_state(motion, prior)
-    assert mean.shape == (motion.dim,)
-    assert np.array_equal(P, P.T)
-    assert np.linalg.eigvalsh(P).min() > 0.0
-    kinematic, _ = motion.kinematic(mean, P)
-    assert kinematic[:4] == pytest.approx([3.0, 4.0, 1.0, 20.0])
-    assert P[:2, :2] == pytest.approx(POSITION_COVARIANCE)

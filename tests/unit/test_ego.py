@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from support.tracking import START_NS, ms
 
 from fgtrack.core.types import EgoState
-from fgtrack.tracking.ego import EgoPose, EgoStd, EgoTrajectory, extrapolated
+from fgtrack.tracking.ego import EgoStd, EgoTrajectory, extrapolated
 from fgtrack.tracking.published import PublishedEgo
 
 
@@ -92,6 +92,7 @@ def test_beyond_its_ends_the_trajectory_goes_on_for_a_limited_time(stamp_ms: flo
         assert found is None
     else:
         assert found.x_m == pytest.approx(x_m)
+        assert found.y_m == pytest.approx(20.0 * (1.0 - math.cos(0.5)) if stamp_ms > 0 else 0.0)
         assert found.yaw_rad == pytest.approx(0.5 if stamp_ms > 0 else 0.0)
         assert found.yaw_rate_radps == (0.5 if stamp_ms > 0 else 0.0)
 
@@ -249,22 +250,3 @@ def test_a_covariance_that_is_none_is_refused_where_it_is_asked_for(given: tuple
     assert uncertain().receive(ego(0.0, covariance=given)) == "not a covariance"
     assert trajectory().receive(ego(0.0, covariance=given)) is None
     assert uncertain().receive(ego(0.0, covariance=flat(np.ones((5, 5))))) is None  # singular
-
-
-def test_a_trajectory_goes_on_along_the_circle_and_the_published_ego_along_its_heading() -> None:
-    state = EgoState(START_NS, START_NS, 3.0, -2.0, 0.7, 60.0, 0.4)
-    there = pose_of(EgoTrajectory(1.0, 1.0), state, 1000.0)
-    radius_m = 60.0 / 0.4
-    assert there.x_m == pytest.approx(3.0 + radius_m * (math.sin(1.1) - math.sin(0.7)))
-    assert there.y_m == pytest.approx(-2.0 - radius_m * (math.cos(1.1) - math.cos(0.7)))
-    assert there.yaw_rad == pytest.approx(1.1)
-    published = pose_of(PublishedEgo(1.0, 1.0, ms(10), 350), state, 1000.0)
-    assert (published.x_m, published.y_m) == pytest.approx((3.0 + 60.0 * math.cos(0.7), -2.0 + 60.0 * math.sin(0.7)))
-
-
-def pose_of(source: EgoTrajectory, state: EgoState, after_ms: float) -> EgoPose:
-    source.receive(state)
-    source.start_tick()
-    found = source.pose_at(state.stamp_ns + ms(after_ms), state.stamp_ns)
-    assert found is not None
-    return found

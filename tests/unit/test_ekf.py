@@ -40,56 +40,6 @@ def test_the_correction_is_the_textbook_formula(seed: int, components: tuple[str
 
 
 @settings(deadline=None, max_examples=30)
-@given(seed=seeds)
-def test_corrections_one_by_one_give_the_batch_least_squares_posterior(seed: int) -> None:
-    """Any number of linear measurements in any order: the posterior is that of the normal equations."""
-    rng = np.random.default_rng(seed)
-    n, count = 5, 6
-    x0, P0 = rng.normal(size=n), positive_definite(rng, 1, n)[0]
-    information, vector = np.linalg.inv(P0), np.linalg.solve(P0, x0)
-    mean, covariance = x0[None], P0[None]
-    for _ in range(count):
-        k = int(rng.integers(1, 4))
-        H, R, z = rng.normal(size=(k, n)), positive_definite(rng, 1, k)[0], rng.normal(size=k)
-        information = information + H.T @ np.linalg.solve(R, H)
-        vector = vector + H.T @ np.linalg.solve(R, z)
-        done = correct(mean, covariance, (z - H @ mean[0])[None], H, R[None])
-        mean, covariance = done.mean, done.covariance
-    np.testing.assert_allclose(covariance[0], np.linalg.inv(information), atol=1e-9)
-    np.testing.assert_allclose(mean[0], np.linalg.solve(information, vector), atol=1e-9)
-
-
-def test_a_filter_over_linear_motion_is_the_batch_solution_of_the_whole_chain() -> None:
-    """The last state of a Kalman filter equals that of one least-squares problem over all states."""
-    rng = np.random.default_rng(3)
-    motion, steps, dt_s = CV(velocity_density_m2ps3=0.7), 6, 0.3
-    n = motion.dim
-    F, Q = motion.jacobian(np.zeros(n), dt_s), motion.process_noise(np.zeros(n), dt_s)
-    H, R = np.eye(n)[:2], np.diag([0.2, 0.4])
-    x0, P0 = rng.normal(size=n), positive_definite(rng, 1, n)[0]
-    measurements = rng.normal(size=(steps, 2))
-    information = np.zeros((n * (steps + 1), n * (steps + 1)))
-    vector = np.zeros(n * (steps + 1))
-
-    def add(J: FloatArray, target: FloatArray, noise: FloatArray) -> None:
-        nonlocal information, vector
-        information = information + J.T @ np.linalg.solve(noise, J)
-        vector = vector + J.T @ np.linalg.solve(noise, target)
-
-    blocks = np.eye(n * (steps + 1)).reshape(steps + 1, n, -1)
-    add(blocks[0], x0, P0)
-    mean, covariance = x0[None], P0[None]
-    model = measurement_model(("x_m", "y_m"), motion)
-    for step, z in enumerate(measurements, start=1):
-        add(blocks[step] - F @ blocks[step - 1], np.zeros(n), Q)
-        add(H @ blocks[step], z, R)
-        mean, covariance = predict(mean, covariance, motion, dt_s)
-        mean, covariance = correct(mean, covariance, *model.linearised(z[None], mean, SensorPose()), R[None])[:2]
-    np.testing.assert_allclose(mean[0], np.linalg.solve(information, vector)[-n:], atol=1e-9)
-    np.testing.assert_allclose(covariance[0], np.linalg.inv(information)[-n:, -n:], atol=1e-9)
-
-
-@settings(deadline=None, max_examples=30)
 @given(seed=seeds, scale=st.sampled_from([1e-12, 1e-6, 1.0, 1e6]))
 def test_the_posterior_stays_symmetric_and_positive_however_good_the_measurement(seed: int, scale: float) -> None:
     rng = np.random.default_rng(seed)
