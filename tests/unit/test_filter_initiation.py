@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from support.directions import PERIOD_NS, START, STD_M, position, positions
 
 import fgtrack
 from fgtrack.core.geometry import polar, polar_gradient, rotation, wrap_angle
@@ -15,23 +16,7 @@ from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import CTRV
 from fgtrack.sim.vehicles import drawn
 
-STD_M, PERIOD_NS = 0.3, 50_000_000
-STD = {"x_m": STD_M, "y_m": STD_M}
-START = Start(position_std_m=STD_M, speed_std_mps=40.0)
 METHODS = ("two-point", "regression")
-
-
-def position(k: int, x_m: float, y_m: float) -> Measurement:
-    return Measurement.of(k * PERIOD_NS, x_m=x_m, y_m=y_m, std=STD)
-
-
-def positions(yaw_rad: float, num: int, speed_mps: float = 30.0, seed: int = 0) -> list[Measurement]:
-    """Of an object that drives straight on; the same but for the direction."""
-    rng, found = np.random.default_rng(seed), []
-    for k in range(1, num + 1):
-        offset = np.array([speed_mps * k * PERIOD_NS / 1e9, 0.0]) + STD_M * rng.standard_normal(2)
-        found.append(position(k, *(rotation(yaw_rad) @ offset).tolist()))
-    return found
 
 
 def fed(initiation: str, measurements: Sequence[Measurement], start: Start = START) -> Estimator:

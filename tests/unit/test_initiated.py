@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.directions import PERIOD_NS, START, positions
 from support.examples import slow
 
 import fgtrack
-from fgtrack.core.geometry import rotation, wrap_angle
+from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.types import YAW
 from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.filters.backward_forward import BackwardForwardBank
@@ -18,22 +19,10 @@ from fgtrack.pipeline.build import build_bank
 from fgtrack.pipeline.config import Config, InitiationConfig, MapConfig, MotionConfig
 from fgtrack.testing import estimator_checks
 
-PERIOD_NS, STD = 50_000_000, {"x_m": 0.3, "y_m": 0.3}
-START = Start(position_std_m=0.3, speed_std_mps=40.0)
-#: One measurement in ten is late by two steps.
-CTRV_FILTERS = [name for name in ESTIMATORS if name not in ("smoother-batch", "as-current", "drop")]
+NAMES = [name for name in ESTIMATORS if name not in ("smoother-batch", "as-current", "drop")]
 
 
-def positions(yaw_rad: float, num: int, speed_mps: float = 30.0) -> list[Measurement]:
-    rng, found = np.random.default_rng(3), []
-    for k in range(1, num + 1):
-        offset = np.array([speed_mps * k * PERIOD_NS / 1e9, 0.0]) + 0.3 * rng.standard_normal(2)
-        x_m, y_m = (rotation(yaw_rad) @ offset).tolist()
-        found.append(Measurement.of(k * PERIOD_NS, x_m=x_m, y_m=y_m, std=STD))
-    return found
-
-
-@pytest.mark.parametrize("name", CTRV_FILTERS)
+@pytest.mark.parametrize("name", NAMES)
 def test_every_estimator_finds_the_direction(name: str) -> None:
     """Against yaw 0, where one-point initiation leaves a filter linearised."""
     order = [0, 2, 1, *range(3, 12)]
@@ -82,10 +71,7 @@ def test_a_window_that_moves_on_ends_it() -> None:
     assert np.isfinite(state.mean).all()
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["ekf-replay", *slow("smoother", "reorder-buffer", "al1")],
-)
+@pytest.mark.parametrize("name", ["ekf-replay", *slow("smoother", "reorder-buffer", "al1")])
 def test_the_contract_holds_with_an_unknown_direction(name: str) -> None:
     made = ESTIMATORS.load(name)
 
@@ -102,12 +88,10 @@ def test_the_contract_holds_with_an_unknown_direction(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["ekf-replay", "smoother", "rts", "ekf-backward-forward"])
-@pytest.mark.parametrize("method", ["two-point"])
-def test_the_configuration_says_it_for_all_tracks(name: str, method: str) -> None:
-    motion = MotionConfig(kind="ctrv")
-    config = Config(estimator=name, motion=motion, initiation=InitiationConfig(method=method))  # type: ignore[arg-type]
+def test_the_configuration_says_it_for_all_tracks(name: str) -> None:
+    config = Config(name, motion=MotionConfig(kind="ctrv"), initiation=InitiationConfig(method="two-point"))
     bank = build_bank(config)
-    one = fgtrack.estimator(name, config.motion.model(), START, lag_s=3.5, initiation=method)
+    one = fgtrack.estimator(name, config.motion.model(), START, lag_s=3.5, initiation="two-point")
     bank.birth(1, START)
     for measurement in positions(2.0, 4):
         bank.advance(measurement.stamp_ns)
