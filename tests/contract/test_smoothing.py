@@ -60,9 +60,6 @@ def arriving(
     return [drawn[index] for index in order.tolist()]
 
 
-# --- gtsam's factor graph and the compiled loops solve the same windows
-
-
 def largest_difference(
     motion: MotionModel,
     measurements: Sequence[Measurement],
@@ -112,9 +109,6 @@ def test_so_they_do_with_what_is_older_than_the_window(late: str) -> None:
     for motion in (CV(), CTRV()):
         measurements = arriving(motion, 3, LINEAR[:1], delay_s=0.9)
         assert largest_difference(motion, measurements, lag_s=0.3, late=late, ring_s=0.4) < 1e-9
-
-
-# --- failures
 
 
 def break_solver(bank: SmootherBank, failing: tuple[int, ...], when: str = "after") -> list[int]:
@@ -200,9 +194,6 @@ def test_of_several_tracks_the_one_that_cannot_be_updated_fails_alone(make: type
             assert max(difference(after, before)) < 1e-6
 
 
-# --- outputs
-
-
 @pytest.mark.parametrize("make", TOLERANCES)
 def test_final_states_are_the_dense_joint_of_what_had_arrived_when_the_node_left(make: type[SmootherBank]) -> None:
     """Without the measurements that come 1 us after another, which cost digits."""
@@ -240,9 +231,6 @@ def test_final_states_of_a_nonlinear_model_are_near_the_optimum_of_what_had_arri
             differences += [max(difference(state, whole.state_at(state.stamp_ns))) for state in final(bank)]
             whole.update(measurement)
     assert np.median(differences) < 0.008
-
-
-# --- many tracks
 
 
 def known_apart(found: TrackState, expected: TrackState) -> tuple[float, float]:

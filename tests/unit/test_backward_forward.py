@@ -55,15 +55,6 @@ def same(a: FloatArray, b: FloatArray) -> None:
     np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
 
 
-# --- the nearest stored state
-
-
-# --- an update in the past
-
-
-# --- births
-
-
 # --- storage
 
 
@@ -79,9 +70,6 @@ def test_the_present_lies_between_grid_stamps_and_its_yaw_is_wrapped() -> None:
     assert state.mean[2] == pytest.approx(-math.pi - 1e-4 + 0.0014)
 
 
-# --- several measurements
-
-
 def test_a_measurement_that_cannot_be_fused_fails_alone_and_changes_nothing() -> None:
     made = bank()
     for track_id in range(3):
@@ -95,9 +83,6 @@ def test_a_measurement_that_cannot_be_fused_fails_alone_and_changes_nothing() ->
     assert np.array_equal(before[1].mean, after[1].mean)
     assert not np.array_equal(before[0].mean, after[0].mean)
     assert not np.array_equal(before[2].mean, after[2].mean)
-
-
-# --- against the simplest bank there is
 
 
 @dataclass

@@ -39,9 +39,6 @@ def peak_bytes(call: Callable[[], object]) -> int:
         tracemalloc.stop()
 
 
-# --- assignment
-
-
 def pairs_of(cost: FloatArray) -> Pairs:
     rows, columns = np.nonzero(np.isfinite(cost))
     return Pairs(rows, columns, cost[rows, columns])
@@ -69,9 +66,6 @@ def test_an_assignment_of_pairs_is_that_of_the_matrix(equal: bool, seed: int) ->
     assert outcome(cost, result.pairs) == pytest.approx(outcome(cost, dense.pairs), abs=1e-5)
     assert equal or result == dense
     assert len({i for i, _ in result.pairs}) == len({j for _, j in result.pairs}) == len(result.pairs)
-
-
-# --- gates
 
 
 def mixed(rng: np.random.Generator, count: int, side_m: float) -> list[Candidate]:

@@ -24,9 +24,6 @@ def pose(source: EgoTrajectory, stamp_ms: float):
     return source.pose_at(START_NS + ms(stamp_ms), START_NS)
 
 
-# --- stamps that cannot be right
-
-
 @pytest.mark.parametrize("source", [trajectory(), PublishedEgo(0.9, 0.4, ms(10), 350)])
 def test_a_stray_stamp_is_refused_and_the_next_ones_are_taken(source: EgoTrajectory) -> None:
     assert source.receive(ego(0.0)) is None
@@ -61,9 +58,6 @@ def test_a_gap_is_filled_from_its_ends_as_far_as_they_are_extrapolated() -> None
     assert pose(source, 4100.0).x_m == pytest.approx(991.0)
     assert pose(source, 1100.0) is None
     assert pose(source, 3900.0) is None
-
-
-# --- the clean trajectory
 
 
 def test_between_two_states_the_pose_is_interpolated_the_short_way_round() -> None:
@@ -165,9 +159,6 @@ def test_the_pit_lane_is_remembered_until_the_source_says_otherwise(source: EgoT
         source.receive(ego(10.0 * k, in_pit=in_pit))
         said.append(source.in_pit)
     assert said == [False, True, True, False, False]
-
-
-# --- the published storage
 
 
 # --- its covariance

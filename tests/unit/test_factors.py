@@ -58,9 +58,6 @@ def numeric_jacobian(function: Callable[[FloatArray], FloatArray], x: FloatArray
     return np.stack(columns, axis=-1)
 
 
-# --- motion
-
-
 @pytest.mark.parametrize("dt_s", [1e-3, 0.05, 0.9, 3.0])
 @pytest.mark.parametrize("kind", MOTIONS)
 def test_a_motion_factor_is_the_whitened_gap_and_its_derivative_under_the_noise_of_the_linearisation_point(
@@ -83,9 +80,6 @@ def test_a_motion_factor_is_the_whitened_gap_and_its_derivative_under_the_noise_
     expected = numeric_jacobian(residual, both)
     np.testing.assert_allclose(A, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
     np.testing.assert_allclose(b, -residual(both), rtol=1e-9, atol=1e-9 * np.abs(b).max())
-
-
-# --- measurements
 
 
 def measurement(kind: str, what: str, loss: RobustLoss | None, off: float = 1.0) -> tuple[Measurement, FloatArray]:
@@ -147,9 +141,6 @@ def test_a_robust_loss_is_its_formula(kind: str, width: float, off: float) -> No
     step = 1e-6
     slope = (loss_and_weight(kind, width, off + step)[0] - loss_and_weight(kind, width, off - step)[0]) / (2 * step)
     assert slope == pytest.approx(expected_weight * off, rel=1e-5, abs=1e-6)
-
-
-# --- angles
 
 
 @pytest.mark.parametrize("loss", [None, RobustLoss("huber", 2.0)], ids=["gaussian", "huber"])

@@ -33,9 +33,6 @@ def largest_step_to_convergence(smoother: OneObject, ms: int) -> float:
     return float((np.abs(found.mean - smoother.state_at(ms * MS).mean) / np.sqrt(np.diag(found.covariance))).max())
 
 
-# --- relinearisation
-
-
 @pytest.mark.parametrize("make", [SmootherBank, IncrementalBank, BatchBank])
 def test_the_process_noise_follows_the_states_that_move(make: type[SmootherBank]) -> None:
     """The speed starts far off, and with it the noise across the direction of travel."""
@@ -97,9 +94,6 @@ def test_an_object_that_is_never_seen_again_has_no_graph() -> None:
     for state, seen in zip(states, [smoother.state_at(state.stamp_ns) for state in states], strict=True):
         np.testing.assert_allclose(state.mean, seen.mean, atol=1e-9)
         np.testing.assert_allclose(state.covariance, seen.covariance, rtol=1e-6, atol=1e-9)
-
-
-# --- window
 
 
 def test_the_window_is_as_long_as_it_says() -> None:

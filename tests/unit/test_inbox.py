@@ -34,9 +34,6 @@ def said(records: list[UpdateRecord]) -> list[tuple[int, str]]:
     return [(record.index, record.disposition.value) for record in records]
 
 
-# --- the clean queue
-
-
 def test_all_messages_of_a_tick_are_kept_and_come_out_oldest_first() -> None:
     inbox = queue()
     for stamp_ms in (40.0, 0.0, 20.0):
@@ -192,9 +189,6 @@ def test_a_covariance_is_judged_by_the_components_in_use() -> None:
     item = Detection(x_m=1.0, y_m=2.0, speed_mps=3.0, covariance=(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0))
     assert is_usable(item, SensorModel(std=STD))
     assert not is_usable(item, SensorModel(std={**STD, "speed_mps": 1.0}))
-
-
-# --- the published slot
 
 
 def test_a_second_message_within_a_tick_supersedes_the_first() -> None:

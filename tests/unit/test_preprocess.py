@@ -38,9 +38,6 @@ def candidates(
     return found
 
 
-# --- frames
-
-
 @pytest.mark.parametrize(
     ("frame", "x_m", "y_m", "yaw_rad"),
     [
@@ -109,9 +106,6 @@ def test_a_polar_and_a_cartesian_detection_of_one_place_agree(
     assert model.residual(a.measurement.z, predicted) == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
-# --- covariance
-
-
 def test_a_sensors_deviations_lie_along_and_across_the_line_of_sight() -> None:
     radar = SensorModel(std={"x_m": 2.0, "y_m": 0.5})
     [found] = candidates(Detection(x_m=10.0, y_m=10.0), sensor=radar)
@@ -155,9 +149,6 @@ def test_a_bearing_alone_has_no_place() -> None:
     assert (placed.leader, bearing.leader) == (1, 0)  # placed ones first
     assert (bearing.position_m, bearing.position_covariance) == (None, None)
     assert bearing.measurement.model.components == ("bearing_rad",)
-
-
-# --- the map
 
 
 def test_a_yaw_that_was_not_measured_comes_from_the_map_with_its_own_deviation() -> None:
@@ -252,9 +243,6 @@ def test_detections_that_say_in_different_ways_where_they_are_merge_into_the_fir
     assert found.values == {"range_m": 20.0, "bearing_rad": 0.0}
 
 
-# --- what is assumed
-
-
 def test_a_yaw_that_the_map_gave_is_assumed_and_one_that_was_measured_is_not() -> None:
     point, known = Detection(x_m=10.0, y_m=3.0), Detection(x_m=10.0, y_m=3.0, yaw_rad=0.1)
     both = replace(LIDAR, yaw_from_map_std_rad=0.35)
@@ -280,9 +268,6 @@ def test_a_curvature_from_the_map_is_assumed_and_turns_the_state() -> None:
     seen = SensorModel(std={"bearing_rad": 0.02}, curvature_from_map_std_radpm=0.002)
     [bearing] = candidates(Detection(bearing_rad=0.1), sensor=seen, road=StraightRoad(), frame="sensor")
     assert bearing.measurement.model.components == ("bearing_rad",)
-
-
-# --- noise that grows with the range
 
 
 @pytest.mark.parametrize("frame", ["sensor", "ego", "map"])

@@ -39,9 +39,6 @@ def assert_round_trip(track: TrackMap, s: FloatArray, lateral: FloatArray) -> No
     np.testing.assert_allclose(lateral_again, lateral, atol=1e-8)
 
 
-# Road coordinates
-
-
 @given(
     st.lists(st.tuples(st.floats(-5000.0, 5000.0), st.floats(-20.0, 20.0)), min_size=1, max_size=20),
     st.sampled_from([OVAL, TrackMap(circle_table()), TrackMap(circle_table(direction=-1.0))]),
@@ -87,9 +84,6 @@ def test_points_beyond_the_centre_of_curvature_and_far_away_give_finite_answers(
     assert np.isfinite(heading(track, points)).all()
 
 
-# Heading and curvature
-
-
 def heading(track: TrackMap, points_m: FloatArray) -> FloatArray:
     return track.view(points_m, 0.0, 0.0).yaw_rad
 
@@ -113,9 +107,6 @@ def test_heading_and_curvature_at_a_row_are_the_row() -> None:
     rows = OVAL.table[:-1]
     np.testing.assert_allclose(heading(OVAL, rows[:, :2]), rows[:, HEADING], atol=1e-9)
     np.testing.assert_allclose(OVAL.view(rows[:, :2], 0.0, 0.0).curvature_radpm, rows[:, CURVATURE], atol=1e-12)
-
-
-# Bounds
 
 
 def test_the_widths_are_those_of_the_rows_and_linear_between_them() -> None:
@@ -145,9 +136,6 @@ def test_the_inner_bound_is_the_one_that_the_lap_encloses() -> None:
         assert track.counter_clockwise == (direction > 0.0)
         assert track.view(points, inner_buffer_m=-1.0, outer_buffer_m=0.0).outside.tolist() == [True, False]
         assert track.view(points, inner_buffer_m=0.0, outer_buffer_m=-1.0).outside.tolist() == [False, True]
-
-
-# Files
 
 
 def lines_of(table: FloatArray) -> list[str]:

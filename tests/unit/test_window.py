@@ -44,9 +44,6 @@ def smoother(make: type[SmootherBank], *measurements: Measurement) -> OneObject:
     return one
 
 
-# --- behind the window
-
-
 @pytest.mark.parametrize("make", [SmootherBank, IncrementalBank])
 @pytest.mark.parametrize("gap_ns", [1 * US, 50 * MS])
 def test_detections_close_together_behind_the_window_are_exact_in_any_order(
@@ -87,9 +84,6 @@ def test_a_stamp_up_to_a_microsecond_from_a_node_shares_it(offset_ns: int, make:
         one = smoother(make, position(300 * MS, 8.4, 0.4), near, last)
         one.bank.remove(0)
         assert len(one.bank.smoothed()) == num
-
-
-# --- the state between two nodes
 
 
 @settings(deadline=None, max_examples=30)
