@@ -38,6 +38,11 @@ __all__ = [
 ]
 
 
+def __dir__() -> list[str]:
+    """Return the names of the figures: those that `fgtrack.plot.` completes to."""
+    return sorted(__all__)
+
+
 _FEW = 3  # of objects, and of runs where they are many: the worst are drawn
 _MOST_RUNS = 6  # that have figures of their own
 

@@ -65,6 +65,7 @@ def test_a_star_import_and_the_help_show_the_public_names_alone() -> None:
     assert [name for name in fgtrack.__all__ if name not in page] == []
     assert "_HOMES" not in page
     assert "import_module" not in page
+    assert dir(fgtrack.plot) == sorted(fgtrack.plot.__all__)
 
 
 def test_a_run_in_memory_a_run_folder_and_the_command_give_the_same_run(drive: Path, tmp_path: Path) -> None:
@@ -149,3 +150,5 @@ def test_a_run_and_a_comparison_show_themselves_in_a_few_lines(drive: Path, tmp_
         assert 3 <= len(lines) <= 12
         assert max(map(len, lines)) < 300
     assert "estimator: smoother" in repr(run)
+    assert run._repr_html_().startswith("<pre>Run\n")
+    assert "<table>" in tables._repr_html_()

@@ -215,6 +215,9 @@ def test_refused_ego_messages_are_counted_by_reason() -> None:
     for message in (good, good, replace(good, stamp_ns=START_NS + 1, x_m=float("nan")), good):
         one.receive(message)
     assert dict(one.refused_ego) == {"repeated stamp": 2, "not finite": 1}
+    for k in (1, 2, 3):
+        one.receive(replace(good, stamp_ns=START_NS + ms(10.0 * k), x_m=100.0 * (k > 1)))
+    assert one.ego_jumps == 1
 
 
 def test_an_unknown_sensor_is_an_error_that_says_what_to_do() -> None:

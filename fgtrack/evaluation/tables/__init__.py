@@ -251,6 +251,12 @@ class Tables:
         yield from bulleted(self.verdict, options.max_width)
         yield from self._filled()
 
+    def _repr_html_(self) -> str:
+        tables = (
+            f"<table><caption>{escape(table.title)}</caption>{table.to_html()}</table>" for table in self._filled()
+        )
+        return f"<pre>{escape(printable_lines(repr(self)))}</pre>{''.join(tables)}"
+
     def to_markdown(self) -> str:
         """Return verdict and tables, as far as they are shown."""
         verdict = "".join(f"- {_markdown(line)}\n" for line in self.verdict)
