@@ -89,7 +89,7 @@ class View(NamedTuple):
 
 
 def lines_of(file: Path) -> Iterator[tuple[str, list[str]]]:
-    """What an error in a line of `file` says, and the fields of the line, which blanks or commas separate."""
+    """Start of the message about a line of `file`, and the fields of the line, which blanks or commas separate."""
     text = read_whole(file, _LARGEST_MB).decode(errors="replace").rstrip()
     for number, line in enumerate(text.splitlines(), 1):
         fields = line.strip().split(",") if "," in line else line.split()
