@@ -1,4 +1,3 @@
-import math
 import sqlite3
 from pathlib import Path
 
@@ -376,23 +375,3 @@ def test_a_topic_that_does_not_fit_and_a_key_that_it_does_not_read_are_refused(t
     write_bag(tmp_path / "bag", drive())
     with pytest.raises(CallError, match=complaint):
         open_input(tmp_path / "bag", config)
-
-
-def test_any_type_is_read_by_its_paths(tmp_path):
-    write_bag(tmp_path / "bag", drive())
-    pose = "bbox.center"
-    fields = {
-        "objects": "detections",
-        "stamp": "header.stamp",
-        "x_m": f"{pose}.position.x",
-        "y_m": f"{pose}.position.y",
-        "yaw_rad": f"{pose}.orientation",
-        "speed_mps": ["bbox.center.position.x", "bbox.center.position.y"],
-    }
-    item = TopicInput("/detections/radar", frame="sensor", fields=fields)
-    found = [m for m in read(tmp_path / "bag", InputConfig(detections={"front": item})) if m.objects]
-    assert (found[0].sensor, found[0].frame) == ("front", "sensor")
-    assert found[0].stamp_ns == found[0].receipt_ns - 60_000_007
-    item = found[0].objects[0]
-    assert item.speed_mps == math.hypot(item.x_m, item.y_m)
-    assert found[0].objects[0].yaw_rad != found[0].objects[0].yaw_rad  # the twin's yaw is not known

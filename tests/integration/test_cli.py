@@ -7,18 +7,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
+from support.messages import START_NS, standing
 
 from fgtrack.cli.main import run
 from fgtrack.core.errors import DataError
-from fgtrack.core.types import Detection, DetectionList, EgoState, Message
+from fgtrack.core.types import Detection, DetectionList
 from fgtrack.io.ros.bag_writer import write_bag
 from fgtrack.io.run import load_run
 from fgtrack.io.stream import read_stream, write_stream
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
-
-MS = 1_000_000
-START_NS = 1_600_000_000_000_000_000
 
 
 @dataclass(frozen=True)
@@ -57,21 +55,10 @@ def fgtrack(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pyt
     return call
 
 
-def drive(count: int = 60) -> list[Message]:
-    """An ego at rest and one car ahead of it, seen by a lidar."""
-    messages: list[Message] = []
-    for k in range(count):
-        now_ns = START_NS + k * 20 * MS
-        messages.append(EgoState(now_ns, now_ns, 0.0, 0.0, 0.0, 0.0))
-        car = Detection(x_m=20.0 + 0.1 * k, y_m=1.0, yaw_rad=0.0)
-        messages.append(DetectionList("lidar", now_ns - 50 * MS, now_ns, (car,)))
-    return messages
-
-
 @pytest.fixture
 def stream(tmp_path: Path) -> Path:
     path = tmp_path / "drive.jsonl"
-    write_stream(path, drive())
+    write_stream(path, standing(60))
     return path
 
 
@@ -178,7 +165,7 @@ def test_a_bad_call_is_one_line_and_exit_code_2(
     assert message in called.error
     assert called.code == 2
     assert (tmp_path / "foreign/thesis.tex").exists()
-    assert list(read_stream(stream)) == drive()
+    assert list(read_stream(stream)) == standing(60)
 
 
 def test_no_command_shows_the_help_and_is_a_bad_call(fgtrack: Command) -> None:
@@ -247,7 +234,7 @@ def test_a_recording_with_broken_time_is_replayed_up_to_there(
     fgtrack: Command, tmp_path: Path, receipt_ns: int, message: str
 ) -> None:
     recording = tmp_path / "loop.jsonl"  # a bag is read in order of receipt
-    messages = drive()
+    messages = standing(60)
     messages[60] = replace(messages[60], receipt_ns=receipt_ns)
     write_stream(recording, messages)
     called = fgtrack("replay", recording, "-o", "run")
@@ -309,7 +296,7 @@ def test_a_warning_of_a_plug_in_is_a_line(fgtrack: Command, stream: Path, monkey
 def test_whatever_a_recording_says_every_command_prints_lines_for_a_terminal(fgtrack: Command, tmp_path: Path) -> None:
     """As the name of a sensor, and of a key that is not known."""
     odd = "\u202e[bold]\u96f7\u9054[/bold][/]\x1b[31m $\\frac{"
-    named = [replace(one, sensor=odd) if isinstance(one, DetectionList) else one for one in drive(100)]
+    named = [replace(one, sensor=odd) if isinstance(one, DetectionList) else one for one in standing(100)]
     write_stream(tmp_path / "odd.jsonl", named)
     lines = (tmp_path / "odd.jsonl").read_text(encoding="utf-8").splitlines()
     lines[1] = json.dumps({**json.loads(lines[1]), odd: 1})

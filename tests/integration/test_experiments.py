@@ -68,15 +68,6 @@ def test_the_same_start_makes_the_filter_as_good_as_the_smoother() -> None:
     assert rmse[2] > 3.0 * rmse[1]
 
 
-def test_every_contestant_gets_the_same_measurements() -> None:
-    script = load("attribution")
-    world = next(iter(script.WORLDS.values()))
-    one, other = (script.scene(world, np.random.default_rng(3)) for _ in range(2))
-    assert [m.z.tolist() for _, m in one.received] == [m.z.tolist() for _, m in other.received]
-    twice = script.Contestant("ekf-replay", options={"initiation": "one-point"})
-    assert script.score(twice, one) == script.score(script.CONTESTANTS["EKF"], one)
-
-
 # --- recordings of other people
 
 

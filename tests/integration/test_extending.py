@@ -12,6 +12,9 @@ import pytest
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from fgtrack.core.types import EgoState
+from fgtrack.io.ros.messages import ODOMETRY, MessageFactory
+
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -116,27 +119,15 @@ def test_a_recording_with_the_message_type_is_replayed(folder: Path) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     text = "int64 stamp_ns\nfloat64[] ranges_m\nfloat64[] bearings_rad\n"
     store.register(get_types_from_msg(text, BLIPS))
-    types = store.types
-    odometry = "nav_msgs/msg/Odometry"
+    make = MessageFactory()
     with Writer(folder / "bag", version=9) as bag:
-        ego = bag.add_connection("/ego", odometry, typestore=store)
+        ego = bag.add_connection("/ego", ODOMETRY, typestore=make.typestore)
         blips = bag.add_connection("/blips", BLIPS, typestore=store)
         for k in range(60):
             now_ns = 10**9 + k * 50_000_000
-            at = types["builtin_interfaces/msg/Time"](*divmod(now_ns, 10**9))
-            header = types["std_msgs/msg/Header"](at, "map")
-            zero = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
-            pose = types["geometry_msgs/msg/Pose"](
-                types["geometry_msgs/msg/Point"](0.0, 0.0, 0.0),
-                types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
-            )
-            with_pose = types["geometry_msgs/msg/PoseWithCovariance"](pose, np.zeros(36))
-            twist = types["geometry_msgs/msg/TwistWithCovariance"](
-                types["geometry_msgs/msg/Twist"](zero, zero), np.zeros(36)
-            )
-            message = types[odometry](header, "base", with_pose, twist)
-            bag.write(ego, now_ns, store.serialize_cdr(message, odometry))
-            blip = types[BLIPS](now_ns - 20_000_000, np.array([20.0 + 0.5 * k]), np.array([0.1]))
+            message = make.odometry(EgoState(now_ns, now_ns, 0.0, 0.0, 0.0, 0.0))
+            bag.write(ego, now_ns, make.serialize(message))
+            blip = store.types[BLIPS](now_ns - 20_000_000, np.array([20.0 + 0.5 * k]), np.array([0.1]))
             bag.write(blips, now_ns + 1, store.serialize_cdr(blip, BLIPS))
     (folder / "bag.yaml").write_text(CONFIG)
     lines = ["fgtrack info bag -c bag.yaml", "fgtrack replay bag -c bag.yaml -o blips"]

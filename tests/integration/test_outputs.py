@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support import kitti
+from support.messages import START_NS, standing
 from support.paper import paper
 
 from fgtrack.cli import study
@@ -23,22 +24,11 @@ from fgtrack.pipeline.replay import replay
 from fgtrack.pipeline.shipped import shipped_folder
 
 MS = 1_000_000
-START_NS = 1_600_000_000_000_000_000
 SWEEP = "format: fgtrack-sweep/1\nscenario: default\nestimators: [ekf-replay]\nseeds: 1\n"
 
 SCENARIOS = shipped_folder() / "scenarios"
 
 Call = Callable[..., tuple[int, str]]
-
-
-def drive(count: int = 30) -> list[Message]:
-    """An ego at rest and one car ahead of it, seen by a lidar."""
-    messages: list[Message] = []
-    for k in range(count):
-        now_ns = START_NS + k * 20 * MS
-        messages.append(EgoState(now_ns, now_ns, 0.0, 0.0, 0.0, 0.0))
-        messages.append(DetectionList("lidar", now_ns - 50 * MS, now_ns, (Detection(x_m=20.0, y_m=1.0, yaw_rad=0.0),)))
-    return messages
 
 
 def noisy(count: int = 120) -> list[Message]:
@@ -63,11 +53,11 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("made")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setattr(study, "simulate", lambda scenario, rng: drive())
-        write_stream("drive.jsonl", drive())
+        patch.setattr(study, "simulate", lambda scenario, rng: standing(30))
+        write_stream("drive.jsonl", standing(30))
         write_stream("noisy.jsonl", noisy())
-        write_stream("other.jsonl", drive(10))
-        write_bag("bag", drive(10))
+        write_stream("other.jsonl", standing(10))
+        write_bag("bag", standing(10))
         seen = [kitti.pose(frame, 20.0, 3.0, 0.0) for frame in range(30)]
         kitti.folder(folder / "kitti", oxts=[kitti.oxts(speed_mps=10.0)] * 30, pointrcnn_car=seen)
         Path("sweep.yaml").write_text(SWEEP)
@@ -86,7 +76,7 @@ def here(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The current folder, a copy of that one; figures are copied, not drawn."""
     folder = shutil.copytree(made, tmp_path / "here")
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(study, "simulate", lambda scenario, rng: drive())
+    monkeypatch.setattr(study, "simulate", lambda scenario, rng: standing(30))
 
     def redraw(named: object, folder: Path, form: str) -> list[Path]:
         return [Path(shutil.copy(picture, folder)) for picture in sorted((made / "figures").iterdir())]
@@ -221,11 +211,11 @@ def test_a_replay_that_is_under_way_holds_all_its_folders(here: Path) -> None:
     folders = {name: Path("runs") / name for name in ("ekf-replay", "smoother")}
 
     def messages() -> Iterator[Message]:
-        yield from drive(5)
+        yield from standing(5)
         for folder in folders.values():
             with pytest.raises(CallError, match="another command is writing there"):
                 RunWriter(folder, overwrite=True)
-        yield from drive(10)[10:]
+        yield from standing(10)[10:]
 
     assert len(replay(messages, paper(), folders)) == 2
 
@@ -275,7 +265,7 @@ def test_links_are_not_followed(here: Path, call: Call) -> None:
 
 def test_what_appears_while_a_recording_is_written_is_not_replaced(here: Path) -> None:
     def messages(file: Path) -> Iterator[Message]:
-        yield from drive(5)
+        yield from standing(5)
         file.parent.mkdir(exist_ok=True)
         file.write_text("mine")
 
@@ -335,7 +325,7 @@ def test_what_fails_while_it_is_written_keeps_the_old_recording(
     here: Path, write: Callable[..., int], out: str
 ) -> None:
     def failing(error: Exception, count: int) -> Iterator[Message]:
-        yield from drive(count)
+        yield from standing(count)
         raise error
 
     before = content(here)
@@ -346,4 +336,4 @@ def test_what_fails_while_it_is_written_keeps_the_old_recording(
     new = f"new-{out}"  # what comes before the break of an input is written where nothing is lost
     with pytest.raises(DataError, match=r"broken$"):
         write(new, failing(DataError("broken"), 5))
-    assert list(open_input(here / new).messages()) == drive(5)
+    assert list(open_input(here / new).messages()) == standing(5)

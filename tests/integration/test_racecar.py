@@ -8,7 +8,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from fgtrack.core.errors import CallError, DataError
-from fgtrack.core.types import DetectionList, TruthState
+from fgtrack.core.types import DetectionList, EgoState, TruthState
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.io.config import Filter, InputConfig, TopicInput
 from fgtrack.io.ros.messages import ODOMETRY, MessageFactory
@@ -43,13 +43,7 @@ def recording(tmp_path_factory) -> Path:
 
     def odometry(car: int, stamp_ns: int, t_s: float):
         x_m, y_m, speed_mps = position(car, t_s)
-        types = {name: store.types[f"geometry_msgs/msg/{name}"] for name in ("Pose", "Twist")}
-        pose = types["Pose"](make._pose(x_m, y_m, 0.0).position, make._pose(x_m, y_m, 0.0).orientation)
-        twist = types["Twist"](make._vector(speed_mps, 0.0), make._vector(0.0, 0.0))
-        known = np.zeros(36)
-        with_covariance = store.types["geometry_msgs/msg/PoseWithCovariance"](pose, known)
-        twist_with = store.types["geometry_msgs/msg/TwistWithCovariance"](twist, known)
-        return store.types[ODOMETRY](header(stamp_ns, "map"), "base_link", with_covariance, twist_with)
+        return make.odometry(EgoState(stamp_ns, stamp_ns, x_m, y_m, 0.0, speed_mps))
 
     def track(slot: int, car: int, stamp_ns: int, t_s: float):
         x_m, y_m, speed_mps = position(car, t_s)

@@ -1,14 +1,9 @@
 """Commands in a terminal: a pseudo-terminal of some width, and what a person sees in it."""
 
-import fcntl
 import os
-import pty
 import re
-import struct
 import subprocess
 import sys
-import termios
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -27,37 +22,24 @@ raise SystemExit(main.main())
 """
 
 
-def lines_in_terminal(width: int, *arguments: object, program: Sequence[str] = ("-m", "fgtrack")) -> list[str]:
-    """What the command shows on a terminal of `width` columns, as the lines that it writes."""
-    leader, follower = pty.openpty()
-    fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 50, width, 0, 0))
-    environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES", "NO_COLOR")}
-    command = [sys.executable, *program, *map(str, arguments)]
-    with subprocess.Popen(
-        command, stdout=follower, stderr=subprocess.PIPE, env={**environment, "TERM": "xterm"}
-    ) as ran:
-        os.close(follower)
-        shown = b""
-        while True:
-            try:
-                block = os.read(leader, 1 << 16)
-            except OSError:  # the terminal is closed
-                break
-            if not block:
-                break
-            shown += block
-        os.close(leader)
-        error = ran.stderr.read().decode() if ran.stderr else ""
-    assert ran.returncode == 0, error
-    return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.decode()).replace("\r\n", "\n").splitlines()
+#: A program in a pseudo-terminal whose output goes to a pipe.
+IN_TERMINAL = (sys.executable, "-c", "import pty, sys; sys.exit(pty.spawn(sys.argv[1:]) >> 8)")
 
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a short demo, made in a terminal of 80 columns; `shown.txt` holds what it showed."""
     folder = tmp_path_factory.mktemp("demo")
-    lines = lines_in_terminal(80, "demo", "-o", folder, program=("-c", SHORT_DEMO))
-    (folder / "shown.txt").write_text("\n".join(lines), encoding="utf-8")
+    done = subprocess.run(
+        [*IN_TERMINAL, sys.executable, "-c", SHORT_DEMO, "demo", "-o", str(folder)],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "TERM": "xterm", "COLUMNS": "80"},
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", done.stdout)
+    (folder / "shown.txt").write_text(shown, encoding="utf-8")
     return folder
 
 

@@ -88,6 +88,19 @@ def drive(num_ticks: int = 50) -> list[Message]:
     return messages
 
 
+def standing(
+    count: int, *, sensor: str = "lidar", x_m: float = 20.0, delay_ms: int = 50, ego_x_m: float = 0.0
+) -> list[Message]:
+    """An ego at rest and one car that drives off ahead of it, seen by a sensor every 20 ms."""
+    messages: list[Message] = []
+    for k in range(count):
+        now_ns = START_NS + k * 20_000_000
+        messages.append(EgoState(now_ns, now_ns, ego_x_m, 0.0, 0.0, 0.0))
+        car = Detection(x_m=x_m + 0.1 * k, y_m=1.0, yaw_rad=0.0)
+        messages.append(DetectionList(sensor, now_ns - delay_ms * 1_000_000, now_ns, (car,)))
+    return messages
+
+
 def tilted(yaw_rad: float, pitch_rad: float = 0.3, roll_rad: float = 0.2) -> np.ndarray:
     """Quaternion w, x, y, z of a yaw after a pitch after a roll, which leave the yaw as it is."""
     x, y, z, w = Rotation.from_euler("ZYX", [yaw_rad, pitch_rad, roll_rad]).as_quat()

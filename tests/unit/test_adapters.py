@@ -191,8 +191,10 @@ def test_paths_read_vectors_quaternions_and_the_stamps_of_objects():
 
 
 def test_a_message_without_a_list_is_one_object_and_without_a_header_has_no_stamp():
-    found = objects_by_fields(Message(a=1, b=2.0), {"x_m": "a", "y_m": "b"})
+    message = Message(a=1, b=2.0, at=Message(sec=1, nanosec=2))
+    found = objects_by_fields(message, {"x_m": "a", "y_m": "b"})
     assert (found.stamp_ns, found.frame, found.objects) == (None, None, (Detection(x_m=1.0, y_m=2.0),))
+    assert objects_by_fields(message, {"x_m": "a", "stamp": "at"}).stamp_ns == 1_000_000_002
 
 
 @pytest.mark.parametrize(

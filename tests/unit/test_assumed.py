@@ -288,14 +288,6 @@ def test_a_rear_sensor_gets_a_mount_that_looks_back() -> None:
     assert "axis 180 degrees, sees 57 degrees, up to 33 m (where it detects, of 360 detections" in found.lines()[0]
 
 
-def test_the_run_of_a_list_of_messages_and_of_an_iterator_are_the_same_and_hold_what_was_assumed() -> None:
-    named = replace(Config(), sensors={"radar": SensorModel(std={"x_m": 2.0, "y_m": 2.0})})
-    runs = [replay(list(forward()), named), replay(forward(), named)]
-    assert runs[0].meta["digest"] == runs[1].meta["digest"]
-    assert runs[0].config["sensors"]["radar"]["field_of_view_rad"] == pytest.approx(1.0, abs=0.03)
-    assert runs[0].config["ego"]["detection_origin_x_m"] == 0.0
-
-
 @pytest.mark.parametrize("name", ["stream.jsonl", "stream.jsonl.gz", "mcap", "sqlite3"])
 def test_what_a_recording_carries_survives_writing_and_converting(tmp_path, name) -> None:
     settings = recorded_of(read_scenario("default", duration_s=1.0))

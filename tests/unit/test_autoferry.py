@@ -89,7 +89,9 @@ def test_a_repeated_fix_is_one_truth_state_in_time_order(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{}", "[1]", "[{}]", "[[]]", f"[{record(7, '1.0', [])}]", f"[{record(1, '1.0', [[1.0], []])}]"]
+    "text",
+    ["", "{}", "[1]", "[{}]", "[[]]"]
+    + [f"[{record(*values)}]" for values in ((7, "1.0", []), (1, "1.0", [[1.0], []]), (1, "1e30", []))],
 )
 def test_a_damaged_scenario_is_one_line_that_names_the_file(tmp_path, text):
     (tmp_path / "scenario9_detections.json").write_text(text)

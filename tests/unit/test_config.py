@@ -11,7 +11,6 @@ from fgtrack.pipeline.load import dump, load, read_yaml
 from fgtrack.pipeline.sweep_plan import SweepConfig
 from fgtrack.sim.scenario import Scenario
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
-from fgtrack.tracking.birth import Birth
 from fgtrack.tracking.published import PublishedTracker
 from fgtrack.tracking.tracker import Tracker
 
@@ -64,19 +63,6 @@ def test_what_is_easily_overlooked_is_a_line() -> None:
     assert str(smoother).endswith("lag 1 s, late detections up to 3 s")
     drops = paper("estimator=smoother-banded", "motion.kind=ctrv", "smoother.late=drop").effective
     assert (drops.lag_s, drops.reach_s) == (1.0, 1.0)
-
-
-@pytest.mark.parametrize("name", ["karle2023", "karle2023_reference"])
-def test_the_papers_configurations_name_every_value_of_the_paper(name: str) -> None:
-    """None of what the paper gives may follow from a default, which is that of open space."""
-    given = read_yaml(CONFIGS / f"{name}.yaml")
-    assert given["ego"].keys() >= {"yaw_weight", "yaw_rate_weight", "detection_origin_x_m"}
-    assert given["map"].keys() >= {"inner_buffer_m", "outer_buffer_m", "pit_buffer_m"}
-    assert given["birth"].keys() >= {entry.name for entry in fields(Birth)} - {"accel_std_mps2"}
-    assert given["lifecycle"].keys() >= {"kind", "counter_cap", "forget_s", "short_range_m", "confirm_count"}
-    assert given["motion"].keys() >= {"kind", "std_per_s"}
-    assert (given["merge"]["distance_m"], given["association"]["gate_m"], given["clock"]["node_hz"]) == (5.1, 5.0, 50.0)
-    assert (given["filter"]["frequency_hz"], given["filter"]["storage_s"]) == (100.0, 3.5)
 
 
 def test_a_dump_writes_every_key_out() -> None:
@@ -161,6 +147,7 @@ def test_a_setting_below_a_key_of_the_file_adds_nothing_to_it(tmp_path: Path) ->
         ("association: {kind: mahalanobis, gate_probability: 1.5}\n", "gate_probability: Input should be less than 1"),
         ("motion: {kind: cv}\n", "std of CV: give velocity"),
         ("defects: [saturated_yaw]\n", "defects: noise_per_step and saturated_yaw are of motion.kind ctrv_euler"),
+        ("lifecycle: {counter_cap: 0}\n", "counter_cap"),
         ("evaluation: {gate_m: 0.0}\n", "gate_m: must be positive"),
         ("filter: {storage_s: 1.0}\nfilter: {storage_s: 2.0}\n", "config.yaml:2: invalid YAML, found duplicate key"),
         ("filter: {storage_s: &a [*a]}\n", "Circular reference"),

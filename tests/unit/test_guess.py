@@ -13,7 +13,6 @@ from fgtrack.io.guess import agreeing_with_motion, guesses, time_unit
     ("name", "samples", "component", "path"),
     [
         ("t", [0.0], "stamp", "t"),
-        ("timestamp_ns", [0.0], "stamp", "timestamp_ns"),
         ("ms", [0.0], "stamp", "ms"),
         ("recv_time", [0.0], "receipt", "recv_time"),
         ("pose.position.x", [1.0, 2.0], "x_m", "pose.position.x"),
@@ -32,7 +31,6 @@ from fgtrack.io.guess import agreeing_with_motion, guesses, time_unit
         ("track_id", [4.0], "object_id", "track_id"),
         ("x_std", [4.0], None, None),
         ("acceleration.x", [4.0], None, None),
-        ("status.n", [4.0], None, None),
         ("temperature", [4.0], None, None),
     ],
 )

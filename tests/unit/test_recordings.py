@@ -6,9 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from support.messages import START_NS, standing
 from unit.evaluation_runs import ROUND, WEST, update, write_run
 
-from fgtrack.core.types import Detection, DetectionList, EgoState, Message
+from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.runs import by_recording, evaluated, recordings_warning, same_recording
 from fgtrack.io.run import Run, load_run
 from fgtrack.io.stream import write_stream
@@ -17,18 +18,6 @@ from fgtrack.pipeline.replay import replay, replay_in_memory
 from fgtrack.pipeline.shipped import read_config
 
 MS = 1_000_000
-START_NS = 1_600_000_000_000_000_000
-
-
-def drive(offset_m: float = 0.0, delay_ms: int = 50, ego_x_m: float = 0.0, sensor: str = "lidar") -> list[Message]:
-    """An ego at rest, and one car ahead of it."""
-    messages: list[Message] = []
-    for k in range(20):
-        now_ns = START_NS + k * 20 * MS
-        messages.append(EgoState(now_ns, now_ns, ego_x_m, 0.0, 0.0, 0.0))
-        car = Detection(x_m=20.0 + 0.1 * k + offset_m, y_m=1.0, yaw_rad=0.0)
-        messages.append(DetectionList(sensor, now_ns - delay_ms * MS, now_ns, (car,)))
-    return messages
 
 
 def run_of(messages: list[Message], *settings: str) -> Run:
@@ -36,25 +25,25 @@ def run_of(messages: list[Message], *settings: str) -> Run:
 
 
 def test_a_recording_is_the_same_whatever_the_configuration_and_the_estimator() -> None:
-    one = run_of(drive())
-    assert same_recording(one, run_of(drive(), "estimator=ekf-replay", "clock.node_hz=20.0"))
-    later = [replace(m, receipt_ns=m.receipt_ns + 5 * MS) for m in drive()]
+    one = run_of(standing(20))
+    assert same_recording(one, run_of(standing(20), "estimator=ekf-replay", "clock.node_hz=20.0"))
+    later = [replace(m, receipt_ns=m.receipt_ns + 5 * MS) for m in standing(20)]
     assert same_recording(one, run_of(later)), "the same with other delays"
-    restamped = [replace(m, stamp_ns=m.stamp_ns - 5 * MS) if isinstance(m, DetectionList) else m for m in drive()]
+    restamped = [replace(m, stamp_ns=m.stamp_ns - 5 * MS) if isinstance(m, DetectionList) else m for m in standing(20)]
     assert same_recording(one, run_of(restamped)), "the same with other stamps"
 
 
 def test_other_detections_are_another_recording_even_at_the_same_times() -> None:
-    one = run_of(drive())
-    assert not same_recording(one, run_of(drive(offset_m=1e-9)))
-    assert not same_recording(one, run_of(drive()[:-2]))
-    assert not same_recording(one, run_of(drive(delay_ms=51)[:-2] + drive(delay_ms=51)[-2:-1]))
+    one = run_of(standing(20))
+    assert not same_recording(one, run_of(standing(20, x_m=20.0 + 1e-9)))
+    assert not same_recording(one, run_of(standing(20)[:-2]))
+    assert not same_recording(one, run_of(standing(20, delay_ms=51)[:-2] + standing(20, delay_ms=51)[-2:-1]))
 
 
 def test_without_a_common_sensor_the_ego_decides() -> None:
-    lidar, radar = run_of(drive()), run_of(drive(sensor="radar"))
+    lidar, radar = run_of(standing(20)), run_of(standing(20, sensor="radar"))
     assert same_recording(lidar, radar)
-    assert not same_recording(lidar, run_of(drive(sensor="radar", ego_x_m=1.0)))
+    assert not same_recording(lidar, run_of(standing(20, sensor="radar", ego_x_m=1.0)))
 
 
 def test_runs_of_different_recordings_are_told_by_name(tmp_path: Path) -> None:
@@ -77,8 +66,8 @@ def test_the_recording_of_a_run_is_found_from_elsewhere_and_after_a_move(
 ) -> None:
     (tmp_path / "work").mkdir()
     monkeypatch.chdir(tmp_path / "work")
-    write_stream(Path("drive.jsonl"), drive())
-    replay(drive, Config(), {"ekf-replay": Path("out/run")}, origin="drive.jsonl", kind="stream")
+    write_stream(Path("drive.jsonl"), standing(20))
+    replay(lambda: standing(20), Config(), {"ekf-replay": Path("out/run")}, origin="drive.jsonl", kind="stream")
     monkeypatch.chdir(tmp_path)
     place = load_run("work/out/run").recording
     assert place is not None
@@ -89,10 +78,10 @@ def test_the_recording_of_a_run_is_found_from_elsewhere_and_after_a_move(
     assert moved.samefile("moved/drive.jsonl")
     shutil.copytree("moved/out/run", "copy")
     assert load_run("copy").recording is None
-    assert run_of(drive()).recording is None
+    assert run_of(standing(20)).recording is None
     meta = load_run("copy").meta
     assert (meta["messages_received"], meta["first_receipt_ns"]) == (40, START_NS)
     assert meta["last_receipt_ns"] == START_NS + 380 * MS
     assert (meta["detections_received"], meta["detections_ignored"], meta["ego_jumps"]) == (20, 0, 0)
-    ignoring = run_of(drive(), "ignore_sensors=[lidar]").meta
+    ignoring = run_of(standing(20), "ignore_sensors=[lidar]").meta
     assert (ignoring["detections_received"], ignoring["detections_ignored"]) == (0, 20)

@@ -192,13 +192,6 @@ def test_ticks_that_do_not_increase_are_refused(tmp_path):
         load_run(tmp_path / "run")
 
 
-def test_an_exception_leaves_the_run_marked_as_incomplete(tmp_path):
-    with suppress(ZeroDivisionError), RunWriter(tmp_path / "run") as writer:
-        writer.write_tick(report(), 5, 2)
-        raise ZeroDivisionError
-    assert load_run(tmp_path / "run").meta["complete"] is False
-
-
 def test_the_configuration_of_a_run_is_a_mapping(tmp_path):
     write(tmp_path / "run", report())
     run = load_run(tmp_path / "run")

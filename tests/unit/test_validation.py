@@ -105,20 +105,12 @@ def log(folder: Path, *, bad_byte: bool = False, time: object = 300) -> Path:
     return folder
 
 
-def autoferry(folder: Path) -> Path:
-    folder.mkdir()
-    record = {"sensorID": 1, "ownshipPosition": [0.0, 0.0], "measurement": [[1.0], [2.0]]}
-    (folder / "s_detections.json").write_text(json.dumps([record | {"time": time} for time in (1.0, 2.0, 1e30)]))
-    return folder
-
-
 @pytest.mark.parametrize(
     ("make", "complaint", "least"),
     [
         (lambda path: log(path, bad_byte=True), r"data_logs\.csv:4: .*UnicodeDecodeError", 4),
         (lambda path: log(path, time="noon"), r"message 5: receipt_ns: .* not 'noon'", 4),
         (lambda path: log(path, time=float("inf")), "message 5: receipt_ns: .* not inf", 4),
-        (autoferry, "record 2 is not one of the data set", 4),
     ],
 )
 def test_a_damaged_input_is_replayed_converted_and_described_up_to_there(tmp_path, make, complaint, least) -> None:
