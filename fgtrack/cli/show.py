@@ -60,10 +60,7 @@ def show(tables: Tables | Table, form: Form | None, values: Mapping[str, Any] | 
 
 @contextmanager
 def progress(what: str, total: int | None = None) -> Iterator[Callable[..., None]]:
-    """A bar on a terminal that moves while the block runs, with the time that the rest will take.
-
-    The function given sets the text beside it, after each of `total` steps, or with the share that is done.
-    """
+    """A bar on a terminal while the block runs; the function given sets its text after each step or with the share."""
     stderr = Console(stderr=True)
     with Progress(
         console=stderr, transient=True, speed_estimate_period=_SPEED_PERIOD_S, disable=not stderr.is_terminal

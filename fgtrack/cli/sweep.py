@@ -73,9 +73,7 @@ def sweep(
 
 def swept(sweep_file: Path, out: Path, num_seeds: int | None = None) -> list[dict[str, str]]:
     """Rows of the table in `out`, by column; for scripts that draw a sweep.
-
-    Where there is no table the sweep is run first, with the seeds below `num_seeds` alone if that is given. Raises
-    `CallError` for a sweep that cannot be run.
+    Where there is no table the sweep is run first, with the seeds below `num_seeds` alone if that is given.
     """
     if not (out / SWEEP_TABLE).exists():
         plan = load_plan(sweep_file)

@@ -65,16 +65,9 @@ def bounds(
     motion
         Motion model; its process noise must be positive definite.
     start_ns, prior_covariance
-        Stamp and covariance (n, n) of the first state; no measurement or time lies before it.
+        Stamp and covariance (n, n) of the first state; `ValueError` for a measurement or time before it.
     truth
         True states at stamps (s,), of one or more drawn trajectories, shape (trajectories, s, n).
-
-    Raises
-    ------
-    ValueError
-        A measurement or a time lies before the start.
-    numpy.linalg.LinAlgError
-        The process noise is singular.
     """
     stamps_ns = np.unique([start_ns, *(item.stamp_ns for item in measurements), *now_ns])
     if stamps_ns[0] < start_ns:
@@ -125,9 +118,7 @@ def bounds_along(
     now_ns: Sequence[int],
 ) -> Bounds:
     """Mean over trajectories of the bounds along each of them; parameters and errors are those of `bounds`.
-
-    Each is the covariance of a filter that is linearised at the true states: in a nonlinear model closer to what can
-    be reached, but no bound in the strict sense.
+    Each is the covariance of a filter linearised at the true states: closer to what can be reached, but no bound.
     """
     states = truth(np.unique([start_ns, *(item.stamp_ns for item in measurements), *now_ns]))
 

@@ -122,9 +122,7 @@ def comparison(group: Sequence[EvaluatedRun]) -> Comparison:
 
 def common_sums(every: Sequence[TrackErrors]) -> tuple[int, int, dict[str, FloatArray]]:
     """Return the sums by stamp of the values of several runs at the objects and stamps that all have.
-
-    The most samples of a run, the common ones, and by name the sums of each run and, last, the counts, shape
-    (n, runs + 1); empty without a common sample.
+    The most samples of a run, the common ones, and by name the sums of each run and, last, the counts: (n, runs + 1).
     """
     every_ns = np.unique(np.concatenate([one.stamps_ns for one in every]))
     codes = [one.object_index * len(every_ns) + np.searchsorted(every_ns, one.stamps_ns) for one in every]
@@ -140,7 +138,6 @@ def common_sums(every: Sequence[TrackErrors]) -> tuple[int, int, dict[str, Float
 
 def compared(name: str, labels: Sequence[str], ticks: FloatArray) -> tuple[Entry, ...]:
     """The runs by rising cost, and how much worse than the best they are, from the sums of `common_sums`.
-
     The cost is the root of the mean, of a NEES its distance from 2.
     """
     is_nees = name == POSITION_NEES

@@ -1,7 +1,4 @@
-"""Confidence intervals of 95 %: of differences paired over seeds (t interval), and within one run (block bootstrap).
-
-Over seeds differences are independent. Neighbouring ticks of a run share their errors, so blocks of time are drawn.
-"""
+"""Confidence intervals of 95 %: of differences paired over seeds (t interval), and within one run (block bootstrap)."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -59,10 +56,7 @@ def paired(values_a: Sequence[float] | FloatArray, values_b: Sequence[float] | F
 
 
 def average(values: Sequence[float] | FloatArray) -> Estimate:
-    """Mean of `values`, one of each seed, and its 95 % interval mean +- t(n - 1) std / sqrt(n); NaN is left out.
-
-    It keeps its promise with few seeds, where a bootstrap over seeds is too narrow; of one value it is unknown.
-    """
+    """Mean of `values`, one of each seed, and its 95 % interval mean +- t(n - 1) std / sqrt(n); NaN is left out."""
     known = np.asarray(values, dtype=np.float64)
     known = known[~np.isnan(known)]
     if not len(known):
@@ -73,15 +67,12 @@ def average(values: Sequence[float] | FloatArray) -> Estimate:
 
 def within_run(ticks: FloatArray, statistic: Statistic, rng: np.random.Generator) -> Estimate:
     """The `statistic` of the sums of `ticks` over time and its 95 % interval by a circular block bootstrap.
+    `ticks`, shape (n, k), are in order of time; `statistic` takes sums, shape (k, draws), and gives shape (draws,).
 
-    `ticks`, shape (n, k), are in order of time; `statistic` takes sums, shape (k, draws), and gives shape (draws,). A
-    root mean square is sqrt(S[0] / S[1]) of the sums S of squared errors and counts, the difference of two
-    sqrt(S[0] / S[2]) - sqrt(S[1] / S[2]).
-
-    Blocks of ticks are drawn with replacement, the end of the run joined to its beginning (Politis & Romano 1992). The
-    interval is theta +- t(m - 1) s sqrt(m / (m - 1)), with s the standard deviation of the drawn statistics and m, the
-    `count` of the result, the number of blocks that fit into the run; quantiles of the draws would be too narrow.
-    Blocks are as long as `block_length` of the influence of each tick. Of fewer than eight ticks it is unknown.
+    Blocks of ticks, whose errors are correlated, are drawn with replacement, the end of the run joined to its beginning
+    (Politis & Romano 1992). The interval is theta +- t(m - 1) s sqrt(m / (m - 1)), with s the standard deviation of the
+    drawn statistics and m, the `count` of the result, the number of blocks (of `block_length` of the influence of each
+    tick) that fit into the run; quantiles of the draws would be too narrow. Of fewer than eight ticks it is unknown.
     """
     sums, size = ticks.sum(axis=0), max(1, math.ceil(len(ticks) / _MOST_PIECES))
     pieces = np.add.reduceat(ticks, np.arange(0, len(ticks), size), axis=0) if len(ticks) else ticks
@@ -122,7 +113,6 @@ def by_stamp(stamps_ns: IntArray, samples: FloatArray) -> FloatArray:
 
 def block_length(values: FloatArray) -> int:
     """Length of the blocks of a circular bootstrap for the mean of `values`, shape (n,), at most n / 3.
-
     The rule of Politis & White 2004 (Econometric Reviews 23) as corrected by Patton, Politis & White 2009:
     (2 G^2 / D)^(1/3) n^(1/3) with G = sum |k| R(k) and D = 4/3 (sum R(k))^2 over the flat-top window of the
     autocovariances R, whose width is twice the lag from which on five correlations in a row are insignificant; n / 3

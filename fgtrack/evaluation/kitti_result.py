@@ -29,11 +29,9 @@ DataFrame = Any  # of pandas, which is untyped
 
 
 def write_kitti_result(run: Run, sequence: Path, out: Path, *, overwrite: bool = False) -> tuple[int, int, int]:
-    """Write the tracks of `run` at the frames of `sequence` to the text file `out`.
-
-    Returns the numbers of boxes, of tracks with a box, and of tracks of which no detection has a size. `sequence` is
-    its file in `oxts/`, or a folder with one. Raises `CallError` if it is not one, or `out` exists or lies in an input,
-    and `DataError` if a file is damaged or no detection of the run has a size.
+    """Write the tracks of `run` at the frames of `sequence`, its file in `oxts/` or a folder with one, to `out`.
+    Returns the numbers of boxes, of tracks with a box, and of tracks of which no detection has a size. `CallError` if
+    `sequence` is another file, or `out` exists or lies in an input; `DataError` if no detection has a size.
     """
     if not is_sequence(sequence):
         raise CallError(f"{sequence}: is not a sequence of the KITTI data set, name its oxts/NNNN.txt")

@@ -79,7 +79,6 @@ ERROR_NAMES = ("position_m", "along_m", "across_m", "yaw_rad", "speed_mps")
 
 def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
     """Pair the tracks of `run` to its true objects at every tick; None for a run without truth.
-
     As CLEAR does (Bernardin and Stiefelhagen 2008): a pair of the tick before stays while it lies inside the gate, the
     rest is assigned by the Hungarian method, first as many pairs as possible, then the least sum of distances. Tracks
     of ignored objects and in ignored regions are left out.
@@ -118,9 +117,7 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
 
 def pair(scores: FloatArray, ids: IntArray, tick_index: IntArray, previous: IntArray) -> IntArray:
     """Object of every row, shape (rows,), so that each tick has the largest sum of scores; `NO_OBJECT` without one.
-
-    `scores`, shape (rows, objects), are 0 for pairs that are not allowed. A pair that the tick `previous` had stays,
-    shape (ticks,), below 0 without one.
+    `scores`, shape (rows, objects), are 0 for pairs that are not allowed; pairs of the tick `previous`, (ticks,), stay.
     """
     num_ticks, inside = len(previous), scores > 0.0
     object_index = np.full(len(ids), NO_OBJECT)
@@ -170,10 +167,7 @@ def position_nees(matching: Matching) -> FloatArray:
 
 
 def position_squares(states: Table, truth: FloatArray) -> FloatArray:
-    """Return the normalised error squared e' P^-1 e of x and y, shape (n,), 2 on average if consistent.
-
-    NaN where the covariance is not positive definite or an error is NaN.
-    """
+    """Return the normalised error squared e' P^-1 e of x and y, shape (n,); NaN where P is not positive definite."""
     x, y = states["x_m"] - truth[:, 0], states["y_m"] - truth[:, 1]
     P_x, P_xy, P_y = (states[name] for name in ("p_x_x", "p_x_y", "p_y_y"))
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # of indefinite covariances

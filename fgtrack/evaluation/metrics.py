@@ -146,8 +146,7 @@ class Metrics:
 def evaluate(run: Run, truth: Mapping[str, Any] | None = None, options: EvaluationConfig | None = None) -> Metrics:
     """Return the metrics of `run`; without truth, those that need none.
 
-    `truth` are columns of truth.csv, such as a pandas DataFrame, by default those of the recording; `options` are by
-    default those of the run's configuration.
+    `truth` are columns of truth.csv, by default those of the recording; `options` by default those of the run.
     """
     if truth is not None:
         num_rows = len(truth["stamp_ns"])

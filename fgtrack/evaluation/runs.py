@@ -42,7 +42,6 @@ Runs = OneRun | Mapping[str, OneRun] | Iterable["Runs"]
 
 def evaluated(runs: Runs) -> list[EvaluatedRun]:
     """Return runs under labels of their own; a path is a run folder, or a folder of them; a mapping gives labels.
-
     Runs of a folder come by name, and may be one folder deeper. Raises `CallError` if a path is neither, or a run is
     given twice, and `DataError` if a run folder is damaged.
     """
@@ -68,10 +67,7 @@ def start_ns(runs: Sequence[EvaluatedRun]) -> int:
 
 
 def labelled(runs: Sequence[Run]) -> dict[str, Run]:
-    """Runs by the end of their path, as long as it must be to be unique, and by the estimator where that is not in it.
-
-    Raises `CallError` if a run is given twice.
-    """
+    """Runs by the shortest unique end of their path, and by the estimator; `CallError` if a run is given twice."""
     identities = Counter(str(run.path.resolve()) if run.path else id(run) for run in runs)
     for identity in (identity for identity, times in identities.items() if times > 1):
         raise CallError(f"{identity if isinstance(identity, str) else 'run'}: is given twice, name every run once")
@@ -88,10 +84,8 @@ def labelled(runs: Sequence[Run]) -> dict[str, Run]:
 
 
 def same_recording(one: Run, other: Run) -> bool:
-    """True if two runs are of the same scene, detected by the same sensors.
-
-    Truth and detections of common sensors are the same, but for other delays or stamps. Without a common sensor and
-    without truth the ego decides, without that the path of the recording.
+    """True if truth and detections of common sensors are the same, but for other delays or stamps.
+    Without a common sensor and without truth the ego decides, without that the path of the recording.
     """
     if not one.tables["truth"].equals(other.tables["truth"]):
         return False

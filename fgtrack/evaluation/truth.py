@@ -32,9 +32,8 @@ class TruePath:
 
     def at(self, stamps_ns: IntArray) -> FloatArray:
         """States at `stamps_ns`, shape (m,); shape (m, 5), NaN where there is no truth.
-
-        The position is a cubic Hermite curve where both neighbours have yaw and speed, else linear, as the rest. There
-        is no truth outside of the stamps, and in a gap of more than a second and of more than five usual periods.
+        The position is a cubic Hermite curve where both neighbours have yaw and speed, else linear, as the rest.
+        There is no truth outside of the stamps, and in a gap of more than a second and of more than five usual periods.
         """
         if len(self.stamps_ns) == 1:
             return np.where((stamps_ns == self.stamps_ns[0])[:, None], self.states[0], np.nan)
@@ -94,7 +93,6 @@ def in_ignored_regions(run: Run, stamps_ns: IntArray, points_m: FloatArray) -> B
 
 def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> BoolArray:
     """True where an object of `paths` is in the field of view of a sensor at `now_ns`, shape (n, objects).
-
     Sensors are those with detections, as configured, from the pose of the ego in ego.csv, without occlusion. Where the
     ego's path or a sensor is not known every object with truth counts as visible.
     """

@@ -14,17 +14,11 @@ def one_line(error: BaseException) -> str:
 
 
 class TruncatedInput(DataError):  # noqa: N818 - it names what the input is; the readers have given all before it
-    """An input broke off; everything before the break has been yielded.
-
-    A replay finishes the run with what there is, reports the break and exits with 1.
-    """
+    """An input broke off; everything before has been yielded. A replay finishes the run with it and exits with 1."""
 
 
 class UntilBreak(Generic[_T]):
-    """Iterates over messages, or other items, up to the end or the break, and keeps the error of the break for later.
-
-    A `DataError` behind a message is a break as well; one before the first is raised.
-    """
+    """Iterates over messages up to the end or a break (a `DataError` not before the first), whose error it keeps."""
 
     def __init__(self, messages: Iterable[_T]) -> None:
         self._messages = messages

@@ -74,10 +74,7 @@ def words_of(name: str) -> list[str]:
 
 
 def guesses(values: Mapping[str, Sequence[float]]) -> dict[str, Guess]:
-    """Guess by component of the fields `values`: samples by name, none where a field is text.
-
-    Components are those of a table or of `fields`. Of several names for one component the first is taken.
-    """
+    """Guess by component (of a table or of `fields`) of the fields `values`: samples by name, none if one is text."""
     guessed: dict[str, Guess] = {}
     for name, samples in values.items():
         component, unit = _component(name)
@@ -107,7 +104,6 @@ def time_unit(name: str, samples: Sequence[float]) -> tuple[str, str]:
 
 def agreeing_with_motion(guessed: Mapping[str, Guess], values: Mapping[str, FloatArray], unit: str) -> dict[str, Guess]:
     """Guesses `guessed` of one object, with the heading and speed in the convention that its positions confirm.
-
     `values` are the columns by name, shape (rows,); `unit` is that of the stamp.
     """
     if not {"stamp", "x_m", "y_m"} <= guessed.keys():

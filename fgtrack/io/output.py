@@ -1,8 +1,7 @@
 """Safe outputs: what exists stays without `overwrite`, and no output is half-written.
 
-A file, or a folder that is written once, is made in a folder beside its destination under a random name that ends in
-`.part`, and renamed when it is complete; a killed command leaves the `.part`. A folder that must be readable at any
-time is claimed instead: created, and locked until the command ends.
+Made beside its destination under a name that ends in `.part`, which a killed command leaves, and renamed when complete.
+A folder that must be readable at any time is claimed instead: created, and locked until the command ends.
 """
 
 import errno
@@ -27,10 +26,7 @@ _REPLACED = ".replaced"
 def check_output(
     path: Path, overwrite: bool, replaceable: Callable[[Path], bool] = os.path.isfile, what: str = "a file"
 ) -> None:
-    """Raise `CallError` unless `path` can be made, is an empty folder or, with `overwrite`, may be replaced.
-
-    What killed commands leave in a folder, whose names end in `.part`, counts as nothing.
-    """
+    """Raise `CallError` unless `path` can be made, is empty (but for `.part`) or, with `overwrite`, may be replaced."""
     try:
         if not os.path.lexists(path):
             parent = next(above for above in Path(os.path.abspath(path)).parents if above.exists())
@@ -82,10 +78,7 @@ def new_file(path: Path, overwrite: bool) -> Iterator[BinaryIO]:
 def new_path(
     path: Path, overwrite: bool, replaceable: Callable[[Path], bool] = os.path.isfile, what: str = "a file"
 ) -> Iterator[Path]:
-    """Path of a file or folder to make that is renamed to `path` when the block ends.
-
-    Raises as `check_output` and `write_error`.
-    """
+    """Path of a file or folder that becomes `path` when the block ends; raises as `check_output` and `write_error`."""
     check_output(path, overwrite, replaceable, what)
     with _part_of(path) as part:
         new = part / Path(os.path.abspath(path)).name
@@ -131,10 +124,7 @@ def _part_of(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """Create `folder` and lock it during the block; folders created that are still empty at its end are removed.
-
-    Raises `CallError` where it cannot be created, or another command has locked it.
-    """
+    """Create and lock `folder` during the block, and remove it if still empty; `CallError` where that cannot be."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)

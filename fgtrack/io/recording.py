@@ -26,9 +26,7 @@ def write_recording(
     overwrite: bool = False,
 ) -> int:
     """Write a stream where `out` ends in .jsonl or .jsonl.gz, else a rosbag2 folder; gives the message count.
-
     `settings` are what it carries of a configuration, plain values by the names of its keys.
-    Raises `CallError` where something is at `out` that must not be replaced.
     """
     if _is_stream(out):
         return write_stream(out, messages, {SETTINGS: settings} if settings else None, overwrite)

@@ -49,11 +49,7 @@ class FileFormat:
 
 
 def open_input(path: Path | str, config: InputConfig | None = None) -> InputSource:
-    """Open the input at `path`.
-
-    Raises `CallError` where nothing is there or the configuration does not fit, and `DataError` where it is not an
-    input, or damaged.
-    """
+    """Open the input at `path`; raises `CallError` where nothing is there or `config` does not fit, and `DataError`."""
     check_paths(recording=path)
     path = Path(path)
     name = input_kind(path)

@@ -36,10 +36,8 @@ Record = dict[str, Any]
 
 
 def read_stream(path: Path | str) -> Iterator[Message]:
-    """Messages of the stream `path` in the order of the file, which is receipt order.
-
-    Gzip is recognised by its magic number. Unknown keys are ignored; one warning has their names and counts. Raises
-    `TruncatedInput` after every message before a break, and `DataError` with file and line.
+    """Messages of the stream `path` (gzipped or not) in the order of the file, which is receipt order.
+    Unknown keys are ignored with one warning. Raises `TruncatedInput` after what came before a break, and `DataError`.
     """
     path = Path(path)
     unknown: Counter[str] = Counter()
@@ -81,12 +79,10 @@ def read_header(path: Path | str) -> Mapping[str, Any]:
 def write_stream(
     path: Path | str, messages: Iterable[Message], header: Mapping[str, object] | None = None, overwrite: bool = False
 ) -> int:
-    """Write `messages`, which must be in receipt order, to `path`; gives their number.
-
-    A name that ends in `.gz` is gzipped; the same messages give the same bytes. The file gets its name when it is
-    complete; what a killed writer leaves in `<path>.*.part` is readable. `header` are entries of the header
-    record besides `type` and `format`. Raises `TruncatedInput` where `messages` broke off, after writing what came
-    before, and as `new_file`.
+    """Write `messages`, which must be in receipt order, to `path`, gzipped if it ends in `.gz`; gives their number.
+    The same messages give the same bytes. The file gets its name when it is complete; what a killed writer leaves in
+    `<path>.*.part` is readable. `header` are further entries of the header record. Raises `TruncatedInput` where
+    `messages` broke off, after writing what came before.
     """
     path = Path(path)
     count = 0

@@ -1,8 +1,7 @@
-"""Validation behind every reader: all that comes out of an input has the types and ranges that the rest relies on.
+"""Validation behind every reader: all that comes out of an input has the types and ranges that the rest requires.
 
-What is wrong with an input is a `DataError` with its position, whatever the reader raised; everything before has been
-given, so a run is complete up to there. Measured numbers that are not finite pass: the tracker counts them. Describing
-ones (size, score) become None. Detections of a running system pass the same check, see `validated_detection`.
+A wrong input is a `DataError` with its position, after everything before it. Measured numbers that are not finite pass:
+the tracker counts them. Describing ones (size, score) become None.
 """
 
 from collections.abc import Callable, Iterator
@@ -38,10 +37,7 @@ class InvalidMessageError(Exception):
 
 
 def validated(path: Path, messages: Callable[[], Iterator[Message]], done: bool = False) -> Iterator[Message]:
-    """Messages of the input at `path`; those of a reader that has validated them are `done`.
-
-    Raises `DataError` where the reader failed, or gave an invalid message, after everything before that.
-    """
+    """Messages of the input at `path` (those of a validating reader are `done`), then `DataError` where it failed."""
     count = 0
     try:
         for message in messages():
@@ -82,10 +78,7 @@ def validated_message(message: Message) -> Message:
 
 
 def validated_detection(item: Detection) -> Detection:
-    """Return `item` with None for describing numbers that are not finite.
-
-    Raises `InvalidMessageError` for a value of a wrong type.
-    """
+    """`item`, describing numbers that are not finite replaced by None; `InvalidMessageError` for a wrong type."""
     if not isinstance(item, Detection):
         raise InvalidMessageError(f"a {type(item).__name__} is not a detection")
     _check_fields(item)

@@ -15,14 +15,7 @@ _ALIAS = re.compile(r"(?:^|[\s\[{,:-])\*[\w-]", re.MULTILINE)
 
 
 def safe_yaml(text: str) -> Any:  # Any: the type is known after validation only
-    """Value of the YAML 1.2 document `text`.
-
-    Raises
-    ------
-    YAMLError
-        Invalid YAML, longer than `_LONGEST` characters, nested too deeply, or with so many aliases that they could
-        repeat each other without end.
-    """
+    """Value of the YAML 1.2 document `text`; `YAMLError` if invalid, too long, too deeply nested or full of aliases."""
     if len(text) > _LONGEST:
         raise YAMLError(f"is longer than {_LONGEST} characters")
     if len(_ALIAS.findall(text)) > _MOST_ALIASES:

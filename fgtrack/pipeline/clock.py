@@ -22,7 +22,6 @@ class Tick(NamedTuple):
 
 def clock_ticks(messages: Iterable[Delivered], node_hz: float | None) -> Iterator[Tick]:
     """Yield ticks on multiples of the node period, from the first at or after the first receipt until all is delivered.
-
     Messages received at or before a tick are delivered with it. Without `node_hz` every receipt is a tick.
     """
     step_ns = 1 if node_hz is None else period_ns(node_hz)

@@ -231,7 +231,6 @@ class Tracker:
 
     def tick(self, now_ns: int) -> TickReport:
         """Process everything received, and bring all tracks to `now_ns`. Raises `CallError` for an invalid time.
-
         A tick before the last one is refused: it gives the tracks of that one, and messages wait for the next.
         """
         now_ns = _stamp("now_ns", now_ns)

@@ -28,7 +28,6 @@ _UNKNOWN = "unexpected_keyword_argument"
 
 def load(kind: type[T], path: Path | T | None, settings: Sequence[str] | Mapping[str, Any] = ()) -> T:
     """Return an instance of `kind` from a YAML file, another instance, or the defaults.
-
     `settings` are values by dotted key, or texts a.b=value. Raises `CallError` with file and key.
     """
     raw, origin = ({}, "defaults") if path is None else (plain(path), "the given configuration")
@@ -40,7 +39,6 @@ def load(kind: type[T], path: Path | T | None, settings: Sequence[str] | Mapping
 
 def with_settings(kind: type[T], raw: dict[str, Any], settings: Mapping[str, Any], origin: str) -> T:
     """Return `raw` as an instance of `kind`, with values of the dotted keys of `settings`.
-
     A setting below a key that `raw` leaves out changes that key's default: one sensor of all, the same `kind`.
     """
     if not settings:
@@ -77,10 +75,7 @@ def _parse(text: str, origin: str) -> Any:
 
 
 def names_of(key: str) -> list[str]:
-    """Return the names of the path `key`; one that contains a dot is in double quotes: `sensors."cam.top".std.x_m`.
-
-    Empty where `key` is not a path.
-    """
+    """Names of the path `key`, else none; one with a dot is in double quotes: `sensors."cam.top".std.x_m`."""
     quoted = r'(?:"[^"]+"|[^".]+)'
     if not re.fullmatch(rf"{quoted}(?:\.{quoted})*", key):
         return []
@@ -99,10 +94,8 @@ def key_and_value(setting: str) -> tuple[str, Any]:
 
 
 def with_value(inside: Any, names: Sequence[str], value: Any, default: object = None) -> Any:
-    """Return a copy of `inside` with `value` at the path `names`.
-
-    An entry of a list is addressed by its index or by its `name`. Of a mapping that is left out, the other names of
-    `default` stay, or its `kind`. Raises `LookupError` for a path that leads into a number or text.
+    """Return a copy of `inside` with `value` at the path `names`, of list entries their index or `name`.
+    Of a mapping left out the `default` stays, or its `kind`. Raises `LookupError` for a path into a number or text.
     """
     if not names:
         return value

@@ -76,7 +76,6 @@ def replay(
     overwrite: bool = False,
 ) -> list[dict[str, object]]:
     """Run each estimator of `folders` over the messages into its run folder; return the contents of their meta.json.
-
     `messages` come in receipt order; where they end in a `DataError`, `broken_off` of the meta data says why. `origin`
     and `kind` are path and format of the input. Raises `DataError` for an input without messages for the tracker.
     """

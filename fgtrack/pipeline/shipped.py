@@ -55,7 +55,6 @@ def read_config(
     folder: Path | None = None,
 ) -> Config:
     """Return the configuration of a file (in `folder`) or of that shipped name, else the defaults.
-
     `settings` as of `load`; maps and estimator replace those of the file. Raises `CallError` with the key.
     """
     check_paths(map=track_map, pit_map=pit_map)

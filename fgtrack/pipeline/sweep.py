@@ -114,9 +114,8 @@ class Sweep:
         on_job: Callable[[], None] = lambda: None,
     ) -> SweepResult:
         """Do the jobs that are left, keep each at once, and write the tables; also when interrupted.
-
-        `jobs` is the number of processes, -1 is one for each core; `dask` is the address of a scheduler whose workers
-        do the jobs instead. Raises `CallError` without dask or scheduler, `DataError` where a process dies.
+        `jobs` is the number of processes, -1 is one for each core; `dask` is the address of a scheduler to use
+        instead. Raises `CallError` without dask or scheduler, `DataError` where a process dies.
         """
         tasks = {job.key: job.recipe for job in self.todo if job.recipe is not None}
         with claimed(self.folder):

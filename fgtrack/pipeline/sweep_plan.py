@@ -164,7 +164,6 @@ class Plan:
 
 def load_plan(path: Path, recording: Path | None = None, settings: Sequence[str] = ()) -> Plan:
     """Return the plan of the sweep file `path`, with `settings` a.b=value for all its runs.
-
     `recording` replaces the input of the file, with the first seed alone. Raises `CallError` for an invalid file, and
     where no grid point can be run; a single point that cannot be run is a job with a problem.
     """

@@ -26,7 +26,6 @@ def switches(track_ids: IntArray) -> IntArray:
 
 def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
     """Time from the first detection of every object to its first confirmed track in s, shape (objects,).
-
     From the stamp of the first detection that was fused into a track which then lies on the object (the nearest within
     `gate_m`) to the tick at which the object is first paired with a row that is `confirmed`; NaN without one.
     """
@@ -48,7 +47,6 @@ def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
 
 def tracked_visits(matching: Matching) -> int:
     """Times that an object came into sight and was tracked there by a confirmed track, over all objects.
-
     "A TP object gets a unique identifier while it's inside the detectable area" (Karle et al. 2023, section IV-A):
     after a second out of sight it counts again.
     """

@@ -44,7 +44,6 @@ def moments_of(name: str, values: FloatArray) -> Moments:
 
 def local_innovations(run: Run) -> tuple[IntArray, dict[str, FloatArray], FloatArray]:
     """Innovations of the tracks that were `confirmed`: rows of updates.csv, values by name, and states of the track.
-
     Values are those of `LOCAL_NAMES`, shape (n,), NaN where not measured; without a measured yaw that of the map less
     the track's. States are x, y, yaw and speed at the detections, shape (n, 4). Raises `DataError` without a valid map.
     """
@@ -62,7 +61,6 @@ def local_innovations(run: Run) -> tuple[IntArray, dict[str, FloatArray], FloatA
 
 def residuals(run: Run) -> Mapping[str, FloatArray]:
     """Innovations by name of `RESIDUAL_NAMES`, each of shape (rows of updates.csv,), NaN where not measured.
-
     `along_m` and `across_m` (left positive) are in the direction of the track: x_loc and y_loc of Karle et al. 2023.
     """
     values: dict[str, FloatArray] = {name: run.tables["updates"][f"res_{name}"] for name in MEASURABLE}
@@ -92,12 +90,9 @@ def message_delays(updates: Table) -> tuple[IntArray, FloatArray]:
 
 def autocorrelation(updates: Table) -> Autocorrelation | None:
     """Return the autocorrelation of the innovations in `updates` of one sensor; None where no track has enough of them.
-
     It is that of the positions, of a sensor without them that of the first component. Along a track, in the order of
     processing, the innovations nu of n updates have at lag 1 the normalised autocorrelation
-
         rho = sum_k nu(k)' nu(k + 1) / sum_k nu(k)' nu(k).
-
     Without correlation the products are independent with mean 0, so the band is
     1.96 sqrt(sum_k (nu(k)' nu(k + 1))^2) / sum_k nu(k)' nu(k): for a constant variance the 1.96 / sqrt(n) of
     Bar-Shalom, Li, Kirubarajan 2001, section 5.4.
@@ -118,7 +113,6 @@ def autocorrelation(updates: Table) -> Autocorrelation | None:
 
 def track_states(run: Run, wanted: BoolArray) -> FloatArray:
     """x, y, yaw (not wrapped) and speed of the updated track at the stamps of the `wanted` updates, shape (rows, 4).
-
     Linear between published rows, constant outside; NaN elsewhere.
     """
     tracks, updates = run.tables["tracks"], run.tables["updates"]

@@ -48,7 +48,6 @@ class LagMetrics:
 
 def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
     """Metrics of the present states, of every lag of lagged.csv by rising lag, and of the final states.
-
     A lagged state belongs to the object that its track was paired with at the nearest tick. Empty without truth.
     """
     if matching is None:

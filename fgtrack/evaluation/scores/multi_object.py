@@ -1,9 +1,7 @@
 """All tracks against all true objects: GOSPA, CLEAR, IDF1 and HOTA.
 
 With the best assignment of tracks to objects nearer than c (Rahmathullah, Garcia-Fernandez, Svensson, Fusion 2017),
-
     GOSPA^2 = sum of squared distances of the pairs + c^2 / 2 (number of missed objects + number of false tracks).
-
 CLEAR (Bernardin and Stiefelhagen 2008) counts as TrackEval does; motrics 0.3 differs outside the gate and in switches.
 IDF1 (Ristani et al. 2016) and HOTA (Luiten et al. 2021) are those of motrics with the similarity 1 - d / (2 gate).
 """
@@ -88,7 +86,6 @@ def clear(scenes: Scenes, gate_m: float) -> dict[str, float]:
 
 def gospa(scenes: Scenes, c_m: float) -> dict[str, FloatArray]:
     """Squares of GOSPA with the cut-off distance `c_m` at every tick: its parts, the total, and that in sight.
-
     A pair at c or beyond is none; `out_of_sight_m2` is the part of `missed_m2` that no sensor could see.
     """
     gains_m2 = np.maximum(c_m**2 - np.square(scenes.distances_m), 0.0)

@@ -32,7 +32,6 @@ class PredictionErrors:
 
 def displacements(run: Run, matching: Matching) -> TrackErrors:
     """Distances of predicted from true positions, ten times a second, shape (n, m) for every `STEP_S` ahead.
-
     Values are by predictor: `arc` and, with a map, `rail`; NaN where the truth is not known. Predicted are confirmed
     tracks that are paired with an object. Raises `DataError` where the map that the run names is not a map.
     """

@@ -64,7 +64,6 @@ class SweepTable:
 
     def means(self, metric: str) -> DataFrame:
         """Return the mean over the seeds at every point and of every estimator; `CallError` if there is no such metric.
-
         Columns are `shown_axes`, `estimator`, `mean`, `standard_error` (NaN of one seed) and `seeds` with a value.
         """
         if metric not in self.metrics:

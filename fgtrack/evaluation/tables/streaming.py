@@ -1,7 +1,6 @@
 """Accuracy when each run pays for its time: published states against the truth at the moment when they were ready.
 
-Li, Wang, Ramanan: Towards streaming perception, ECCV 2020; Wang et al.: The ASAP benchmark, CVPR 2023. Ticks are done
-one after the other; their times are those of timing.csv, so nothing depends on the machine that compares.
+Li, Wang, Ramanan: Towards streaming perception, ECCV 2020; Wang et al.: The ASAP benchmark, CVPR 2023.
 """
 
 from collections.abc import Sequence
@@ -37,7 +36,6 @@ _TITLES = {ASKED: "at its stamp", READY: "when ready", PREDICTED: "predicted to 
 
 def streaming_errors(run: Run, matching: Matching) -> TrackErrors:
     """Return distances to the truth of the paired rows by when they are evaluated, where there is truth when ready.
-
     Predictions move the published position along the published yaw at the published speed, if there are both.
     """
     rows = np.flatnonzero(matching.paired)
@@ -58,10 +56,7 @@ def streaming_errors(run: Run, matching: Matching) -> TrackErrors:
 
 
 def streaming_tables(runs: Sequence[EvaluatedRun]) -> tuple[dict[str, Table], list[str]]:
-    """Return tables `streaming` and `load` of `runs`, and sentences on the best run when each pays for its time.
-
-    A run with a load above 1 is not ranked: its loss has no bound.
-    """
+    """Return tables `streaming` and `load`, and sentences on the best of the `runs` with a load of at most 1."""
     load, records, sentences = _load(runs), [], []
     late = {record["run"]: record["load"] for record in load.records if record["load"] > 1.0}
     for group in comparable([one for one in runs if one.label not in late]):

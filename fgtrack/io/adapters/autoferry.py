@@ -2,11 +2,8 @@
 
 Helgesen, Vasstein, Brekke, Stahl, "Heterogeneous multi-sensor tracking for an autonomous surface vehicle in a
 littoral environment", 2022; github.com/Autoferry/sensor_fusion_dataset. Choices that the data leave open:
-
-- The receipt of a record is the newest stamp up to it in the file: in scenario 6 the records are not in the order of
-  their times, each sensor alone is, as in the order of arrival. The true delay is at least that.
-- Every scan is aligned to the north, so the yaw of the ego frame is 0, and its speed too: along yaw 0 it would be a
-  motion to the east. An own-ship position older than one already delivered is not delivered again.
+- Receipt is the newest stamp up to the record in the file, a lower bound: each sensor alone is in order of its times.
+- Scans are aligned to the north: the yaw of the ego frame is 0, and its speed, which would be along that yaw, too.
 - LiDAR and RADAR points get the own ship's position and are in the map frame. Bearings stay relative to the ego.
 """
 
@@ -31,10 +28,7 @@ _DETECTIONS = "*_detections.json"
 
 
 def read_scenario(folder: Path) -> Iterator[Message]:
-    """Messages of the scenario in `folder` in receipt order; truth only where the folder has it.
-
-    At equal receipts the truth comes first and the ego before the detections. Raises `DataError`, with file and record.
-    """
+    """Messages of the scenario in `folder` in receipt order; at equal receipts truth, then ego, then detections."""
     file = min(folder.glob(_DETECTIONS))
     truth = file.with_name(file.name.replace("_detections", "_groundTruth"))
     states = _truth(truth) if truth.exists() else []

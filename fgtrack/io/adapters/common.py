@@ -60,10 +60,8 @@ def reported_as(text: str) -> Iterator[None]:
 
 
 def json_values(file: Path, begin: re.Pattern[str] = _A_LIST, **form: Any) -> Iterator[Any]:  # Any: parsed JSON
-    """Values of the list that follows `begin` in the JSON `file`, or keys and values of the object.
-
-    One after the other: the text of a table may have a gigabyte, and its values take five times as much. `form` is that
-    of a `JSONDecoder`. Raises `DataError` where it is not such a file.
+    """Yield values of the list that follows `begin` in the JSON `file`, or keys and values of the object.
+    The text of a table may have a gigabyte. `form` is that of a `JSONDecoder`. Raises `DataError` in other files.
     """
     with reported_as(f"{file}: is not JSON of the expected form, fetch it again"):
         text = read_whole(file, _LARGEST_MB).decode()
@@ -83,10 +81,7 @@ def split(items: Iterable[Detection | str]) -> tuple[tuple[Detection, ...], tupl
 
 
 def object_id(value: object) -> int | None:
-    """`value` as an id: an integer, or its text, as it is; of other text a reproducible number; None of an empty text.
-
-    Numbers are below 2^53, so that a table of floats holds them; a thousand names clash once in 5e8 data sets.
-    """
+    """An integer (or its text) `value` as it is, of other text a reproducible number < 2^53, of an empty one None."""
     text = str(value).strip()
     if text.removeprefix("-").isdecimal() and text.isascii() and len(text) < 20 and int(text) in _INT64:
         return int(text)
@@ -94,10 +89,7 @@ def object_id(value: object) -> int | None:
 
 
 def exact_ns(time: Decimal | int | str, unit: str = "s") -> int:
-    """Integer nanoseconds of a decimal text; a float would lose the last hundred of them.
-
-    Raises `ArithmeticError` or `ValueError` where it is not a time.
-    """
+    """Integer nanoseconds of a decimal text, to the last one; `ArithmeticError` or `ValueError` if it is not a time."""
     time_ns = round(_DECIMAL.create_decimal(time) * NS_PER_UNIT[unit])
     if not is_stamp(time_ns):
         raise ValueError("beyond the year 2096")
@@ -146,7 +138,6 @@ def covariance(
     values: Mapping[str, float | None], pose: FloatArray | None, twist: FloatArray | None = None, velocity: Any = None
 ) -> tuple[float, ...] | None:
     """Covariance of the measured `values` (position, yaw, speed), row-major; None where it does not cover them all.
-
     `pose` is the covariance of x, y and yaw, shape (3, 3), `twist` begins with that of `velocity`; None is "not known".
     The variance of the speed is to first order.
     """

@@ -52,10 +52,7 @@ def single_path(path: FieldPath) -> str:
 
 
 def _component(name: str, path: FieldPath, read: Callable[[str], Any]) -> Any:
-    """The value, converted; an angle in degrees or with an offset is wrapped.
-
-    More than 1.5 turns of radians stay as they are: they may be degrees, which wrapping would hide.
-    """
+    """The value, converted; an angle is wrapped, but not above 1.5 turns of radians, which may be degrees."""
     if name in _CONVERSIONS:
         value = read(single_path(path))
         return None if value is None else _CONVERSIONS[name](value)

@@ -1,7 +1,6 @@
 """The logs of the published tracker, TUMFTM/FusionTracking: what its node received, tick by tick.
 
 `data_logs.csv` holds a row per tick with a JSON value in every cell. Choices that the logs leave open:
-
 - A row is written at the end of its tick: `time_ns` is the receipt of what is in it, an upper bound.
 - Objects are in the ego frame where the configuration names no other.
 - The published yaw is 0 along +y: the ego's, and that of objects in the map frame, get pi/2 added.
@@ -31,9 +30,7 @@ Json = Any
 
 def read_log(folder: Path, frames: Mapping[str, Frame]) -> Iterator[Message]:
     """Messages of the log in `folder` in receipt order, the ego before the detections of its tick.
-
-    `frames` are those of sensors whose objects are not in the ego frame. Raises `DataError`, with the line, behind the
-    rows before a break, and where it is not such a log.
+    `frames` are those of sensors whose objects are not in the ego frame. `DataError` follows the rows before a break.
     """
     file = folder / LOG_NAME
     with open_file(file) as lines:

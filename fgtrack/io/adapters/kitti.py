@@ -3,14 +3,13 @@
 Geiger, Lenz, Urtasun, "Are we ready for autonomous driving? The KITTI vision benchmark suite", CVPR 2012: a text file
 per sequence in `oxts/ calib/ label_02/`. Every other folder with such a file holds the detections of a sensor of that
 name, in a form of docs/recordings.md. Conventions that the data do not specify:
-
 - Frame k is at k x 0.1 s and received at once.
 - The map begins where the ego does, in the Mercator projection of the development kit. The ego frame is that of the
   inertial unit, levelled by its roll and pitch.
 - A bearing is from camera 2 and relative to the ego's heading: the sensor's `mount` has no yaw.
 - A box at the left or right border of the image shows a part of a car, whose middle is elsewhere: left out.
-- As in the data set's own evaluation a neighbouring class (a van for a car) is ignored, and so is what lies in a
-  `DontCare` region: behind it as seen from camera 2, where a car looks so small that it can be in it.
+- As in the data set's own evaluation neighbouring classes (a van for a car) and `DontCare` regions, with all behind
+  them as seen from camera 2, are ignored.
 """
 
 import math
@@ -55,9 +54,7 @@ _FAR_M = 150.0
 
 def read_sequence(folder: Path, sequence: str, settings: KittiInput) -> Iterator[Message]:
     """Messages of `sequence` in receipt order; at a frame the truth comes first, then the ego, then the detections.
-
-    Raises `DataError`, with file and line, where a file is missing, and, after all messages of earlier frames, where a
-    line is damaged: the file may have been cut off there.
+    Raises `DataError` where a file is missing, and after all messages of earlier frames where a line is damaged.
     """
     views, error = read_views(folder, sequence)
     damages = [] if error is None else [(len(views), error)]
@@ -87,10 +84,7 @@ def read_sequence(folder: Path, sequence: str, settings: KittiInput) -> Iterator
 def _by_frame(
     file: Path, views: list[View], parse: Callable[[View, list[str]], Any], damages: list[tuple[int, DataError]]
 ) -> Mapping[int, list[Any]]:
-    """Results of `parse` for the lines of `file`, by frame; a damaged line is added to `damages` with its frame.
-
-    Lines are in the order of their frames, so a damaged frame number is not before that of the line above.
-    """
+    """Results of `parse` for the lines of `file`, by frame; a damaged line is added to `damages` with its frame."""
     latest, by_frame = 0, defaultdict(list)
     try:
         for where, fields in lines_of(file):

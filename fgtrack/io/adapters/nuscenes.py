@@ -1,11 +1,9 @@
 """nuScenes: boxes in the submission form of the data set, ego poses and truth from its tables.
 
 Caesar et al., "nuScenes: a multimodal dataset for autonomous driving", CVPR 2020. The input is the JSON file of results
-(`meta` and `results` by sample); the tables stand in a folder `v1.0-...` beside it. Choices that the data leave open:
-
-- A box is sensed at the stamp of its sample and received at once.
-- Boxes and truth are in the map frame. The ego's speed and yaw rate are those between its poses.
-- Truth that no sensor has a point of is ignored, as in the data set's own evaluation.
+(`meta` and `results` by sample); the tables stand in a folder `v1.0-...` beside it. Boxes and truth are in the map
+frame, received at the stamp of their sample; the ego's speed and yaw rate are those between its poses. Truth that no
+sensor has a point of is ignored, as in the data set's own evaluation.
 """
 
 import math
@@ -47,7 +45,6 @@ Json = Any
 
 def read_scene(file: Path, settings: NuscenesInput) -> Iterator[Message]:
     """Messages of a scene in the order of receipt; at one stamp the truth first, then the ego, then the boxes.
-
     Raises `CallError` where one of several scenes has to be named or there are no tables, and `DataError`.
     """
     tables = _tables(file, settings)

@@ -1,7 +1,6 @@
 """Object lists of the message types in use, and the ego of odometry; each adapter gives all that a message measures.
 
-Which of it a tracker uses is the sensor model's choice. A speed is negative where an object moves backwards.
-No object is left out: what is not a number stays so and is counted by the tracker.
+A speed is negative where an object moves backwards. What is not a number stays so and is counted by the tracker.
 """
 
 import math
@@ -36,9 +35,7 @@ _UNKNOWN = 1e3
 
 def detection3d_array(message: RosMessage) -> ObjectList:
     """`vision_msgs/Detection3DArray`, versions 2 to 4: position and yaw.
-
-    The pose is that of the box, or where the box has no size that of the first hypothesis; the covariance is
-    that of the first hypothesis.
+    The pose is that of the box, or of the first hypothesis where the box has no size; the covariance is the latter's.
     """
     return object_list(message.header, map(_detection3d, message.detections))
 
@@ -71,9 +68,7 @@ def _size(size: RosMessage, z_m: float | None = None) -> dict[str, Any]:
 
 def autoware_objects(message: RosMessage) -> ObjectList:
     """`DetectedObjects` and `TrackedObjects` of autoware_perception_msgs and of autoware_auto_perception_msgs.
-
-    Position, yaw where the orientation is available without a doubt about its sign, speed where there is a
-    twist, which is in the object's own frame.
+    Position, yaw where its sign is not in doubt, speed where there is a twist, which is in the object's own frame.
     """
     return object_list(message.header, map(_autoware_object, message.objects))
 

@@ -12,9 +12,7 @@ _LONGEST_NS = NS_PER_S  # after the last detection of a scan, in receipts: it is
 
 def grouped(messages: Iterable[Message], windows_ns: Mapping[str, int]) -> Iterator[Message]:
     """`messages`, in the order of receipt, with the lists of the sensors in `windows_ns` joined to scans.
-
-    Lists whose stamps are at most the window from the first one's are one scan; it is received with its last list.
-    Whatever ends `messages` in a `DataError`, the scans that are open then come before it.
+    Lists with stamps at most the window from the first are a scan, received with the last; a break follows open scans.
     """
     waiting: dict[int, list[Message]] = {}  # a message, or the lists of a scan, by the index of the last
     newest: dict[str, int] = {}  # index of the scan of every sensor to which lists are added

@@ -1,8 +1,7 @@
 """CSV files whose columns the configuration names: the ego, detections and truth in one file or several.
 
-A row is a state of the ego, a detection or a true object. Rows of one stamp and one receipt are one list of detections;
-a row in which nothing is measured is an empty scan. Columns are converted as in `fields.mapped`; an empty cell is a
-missing value. Rows are sorted by receipt.
+Rows of one stamp and receipt are one list of detections; a row in which nothing is measured is an empty scan, an empty
+cell a missing value. Columns are converted as in `fields.mapped`. Rows are sorted by receipt.
 """
 
 import csv
@@ -37,10 +36,8 @@ Cells = Mapping[str, str]
 
 
 def read_tables(tables: Sequence[tuple[Path, CsvTable, str]]) -> Iterator[Message]:
-    """Messages of the tables, each given with its file and its role: `ego`, `truth` or `detections.SENSOR`.
-
-    They come in the order of receipt; at equal receipts in the order of `tables`. Raises `DataError` where a row does
-    not match the mapping, after all messages up to the last receipt before that row.
+    """Messages in order of receipt of `tables`, with file and role: `ego`, `truth` or `detections.SENSOR`.
+    Raises `DataError` for a row that does not match the mapping, after all messages up to the receipt before it.
     """
     keyed: list[tuple[tuple[int, int, int], Message]] = []
     breaks: list[tuple[float, DataError]] = []
@@ -101,9 +98,8 @@ def _read(file: Path, table: CsvTable, role: str) -> tuple[list[Message], DataEr
 
 
 def rows(file: Path, delimiter: str | None = None) -> Iterator[tuple[str, Cells]]:
-    """File and line, and cells by column, of the rows of `file`, the header first.
-
-    Without a delimiter the most frequent of `,`, `;` and tab in the header. Raises `DataError` where it is not a table.
+    """File and line, and cells by column, of the rows of `file`, the header first; `DataError` if it is not a table.
+    Without a delimiter the most frequent of `,`, `;` and tab in the header.
     """
     where = f"{file}:1"
     try:

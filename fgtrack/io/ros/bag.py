@@ -35,8 +35,7 @@ class Bag:
     """A recording, which can be read any number of times.
 
     `path` is a rosbag2 folder (with or without metadata.yaml), an `.mcap`, `.db3` or ROS 1 `.bag` file. The package of
-    a `.msg` file of `message_definitions` is the name of its folder (or of the one above a folder `msg`). Raises
-    `DataError` where it cannot be read at all.
+    a `.msg` file of `message_definitions` is the name of its folder (or of the one above a folder `msg`).
     """
 
     def __init__(self, path: Path | str, message_definitions: Collection[str] = ()) -> None:
@@ -59,10 +58,8 @@ class Bag:
         """Topics by name; a topic with two types is listed twice."""
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[BagTopic, int, Any]]:
-        """Topic, log time and decoded message of every message on `topics`, in log-time order.
-
-        A message has the attributes of its type. Equal times keep the order of the recording. Raises `TruncatedInput`
-        after every message before a break, and `DataError` for what cannot be decoded.
+        """Yield topic, log time and decoded message of every message on `topics`, in log-time order.
+        Raises `TruncatedInput` after every message before a break, and `DataError` for what cannot be decoded.
         """
         for topic in self.topics:
             if topic.name in topics and topic.problem:
@@ -72,10 +69,7 @@ class Bag:
             yield self._topics[_topic_and_type(connection)], log_ns, self._types.decode(_key(connection), data, what)
 
     def stamps(self) -> Iterator[tuple[BagTopic, int, int | None]]:
-        """Topic, log time and header stamp of every message, without decoding it.
-
-        The stamp is None where the type does not start with a header or is not known.
-        """
+        """Topic, log time and header stamp (None of an unknown type or one without a header) of every message."""
         offset = 4  # behind the CDR header, or in ROS 1 behind the sequence number
         for connection, log_ns, data in self._records({topic.name for topic in self.topics}):
             stamp_ns = None

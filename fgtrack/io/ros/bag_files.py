@@ -48,10 +48,7 @@ def decompressed(file: Path) -> Iterator[Path]:
 
 
 def files_of(path: Path) -> list[Path]:
-    """Files of the recording at `path`: itself, those that metadata.yaml names, or those of the folder.
-
-    Raises `DataError` for copies of one file, and whatever a damaged metadata.yaml makes of itself.
-    """
+    """Files of the recording at `path`: itself, those that metadata.yaml names, or those of the folder."""
     files = [path]
     if (path / METADATA).is_file():
         files = [path / PurePath(name).name for name in _metadata(path)["relative_file_paths"]]

@@ -39,10 +39,8 @@ def write_bag(
     definitions; the log time is the receipt, the header stamp the stamp. The twins for other tools are `/ego/odometry`
     (nav_msgs/Odometry) and `/detections/SENSOR` (vision_msgs/Detection3DArray, of objects with a position, without
     speeds). Every thousand messages reach the disk: a killed writer leaves a readable recording (in `<path>.*.part`).
-    `settings`, what the recording carries of a configuration, are in the custom data of metadata.yaml.
-
-    Raises `TruncatedInput` where `messages` broke off, after writing what came before; as `new_path`; and `DataError`
-    for a time outside what ROS messages hold.
+    `settings`, what the recording carries of a configuration, are in the custom data of metadata.yaml. Raises
+    `TruncatedInput` after writing what came before it, and `DataError` for a time that ROS messages cannot hold.
     """
     path, count = Path(path), 0
     with (

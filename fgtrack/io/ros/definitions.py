@@ -1,7 +1,4 @@
-"""Message definitions of the types that rosbags does not ship: fields in the order in which CDR stores them.
-
-Definitions embedded in a recording and those of the user take precedence.
-"""
+"""Types that rosbags does not ship, fields in CDR order; definitions of a recording or of the user take precedence."""
 
 from fgtrack.core.types import MEASURABLE
 

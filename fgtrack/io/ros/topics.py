@@ -47,11 +47,8 @@ and its conversion."""
 
 
 def topic_uses(bag: Bag, config: InputConfig) -> list[TopicUse]:
-    """Return the uses of the topics of `bag`, as `config` names them.
-
-    A recording that fgtrack wrote is recognised by its message types; `config` takes precedence where it names a topic
-    of the recording. Raises `DataError` for a topic that is not there or not named, and `CallError` for a configuration
-    that does not fit its type.
+    """Return the uses of the topics of `bag`, as `config` names them or, below that, as fgtrack's types are recognised.
+    Raises `DataError` for a topic that is not there or not named, and `CallError` where `config` does not fit its type.
     """
     names = {topic.name for topic in bag.topics}
     truth = config.truth if isinstance(config.truth, tuple) else (config.truth,) if config.truth else ()
@@ -93,7 +90,6 @@ FORMAT = FileFormat("a rosbag2 folder, an .mcap, .db3 or ROS 1 .bag file", is_ba
 
 def bag_messages(bag: Bag, uses: list[TopicUse]) -> Iterator[Message]:
     """Messages of `bag` in receipt order, which is the order of the recorder's log times.
-
     Raises `TruncatedInput` after everything before a break, and `DataError` for a message that does not fit its use.
     """
     for topic, log_ns, data in bag.messages({used.name for used, _, _ in uses}):

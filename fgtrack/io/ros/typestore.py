@@ -1,7 +1,6 @@
 """The message types of a recording: rosbags', fgtrack's, the user's and those embedded in the recording.
 
-rosbags generates Python code from a definition and runs it: what a recording brings must not become anything but names
-and numbers there.
+rosbags generates Python code from a definition and runs it: only names and numbers of a recording may get there.
 """
 
 import math
@@ -45,10 +44,7 @@ _IDL_COSTLY = re.compile(r"=[^;]*[()*/%|^&~<]|(?:sequence\s*<\s*){4}")
 
 class MessageTypes:
     """Decodes messages of the given types, each by the definition that came with it.
-
     Precedence: the definition embedded for the type, those embedded for others, the user's, fgtrack's, rosbags'.
-
-    Raises `CallError` where one of the user's `message_definitions`, files or folders, cannot be read.
     """
 
     def __init__(self, keys: Iterable[Key], ros1: bool, message_definitions: Iterable[str] = ()) -> None:
@@ -109,10 +105,7 @@ def _registered(types: Typesdict) -> Typestore:
 
 
 def _closure(name: str, known: Mapping[str, Any]) -> Typesdict:
-    """Return the type `name` with all its parts.
-
-    Raises `ValueError` for an undefined part, a type that contains itself, and one of more than `_MOST_VALUES` values.
-    """
+    """The type `name` with all its parts; `ValueError` for one that is undefined, recursive or too large."""
     needed: Typesdict = {}
     sizes: dict[str, int] = {}
 
@@ -168,10 +161,7 @@ def _user_types(path: Path) -> Typesdict:
 
 
 def _embedded(name: str, definition: MessageDefinition | None) -> Typesdict:
-    """Types that the text of `definition`, of the type `name`, defines; empty without a text.
-
-    Raises whatever rosbags makes of an invalid one.
-    """
+    """Types that the text of `definition`, of the type `name`, defines; empty without a text."""
     form, text = (None, "") if definition is None else (definition.format, definition.data)
     if form not in (MessageDefinitionFormat.MSG, MessageDefinitionFormat.IDL) or not text.strip():
         return {}
@@ -188,10 +178,7 @@ def _embedded(name: str, definition: MessageDefinition | None) -> Typesdict:
 
 
 def _plain_idl(text: str) -> str:
-    """Text without string contents, annotations, comments and preprocessor lines, which define no member.
-
-    Raises `ValueError` for what rosbags would parse or evaluate for minutes: computed constants, nested sequences.
-    """
+    """Text of members alone; `ValueError` for constants or nested sequences that rosbags would parse for minutes."""
     plain = _IDL_REMARK.sub(" ", _IDL_TEXT.sub('""', text))
     if _IDL_COSTLY.search(plain):
         raise ValueError("it computes a constant or nests sequences, which no definition of ROS does")

@@ -31,10 +31,8 @@ if TYPE_CHECKING:  # takes half a second to import
 
 
 class Table(dict[str, Column]):
-    """Columns by name as NumPy arrays, each of shape (rows,) and read-only.
-
+    """Columns by name as NumPy arrays, each of shape (rows,) and read-only; `len` is the number of columns.
     An empty cell, and a number beyond 1e60, is NaN in a float column; an empty one is `NO_TRACK` in an integer one.
-    `len` is the number of columns.
     """
 
     def __init__(self, columns: Mapping[str, Column]) -> None:
@@ -168,10 +166,7 @@ class Run:
 
     @property
     def recording(self) -> Path | None:
-        """Path of the recording that the run was made of; None where it has gone, or never was a file.
-
-        Relative to the run folder, so that both may be moved together; else as it was given to the command.
-        """
+        """Path, relative to the run folder or as given, of the run's recording; None where there is no such file."""
         source = self.meta.get("input") or {}
         given = [source["path"]] if source.get("path") else []
         if self.path is not None and source.get("path_from_run"):
@@ -200,7 +195,6 @@ _parsed = lru_cache(maxsize=64)(safe_yaml)
 
 def load_run(path: Path | str) -> Run:
     """Read the run folder `path`. Raises `DataError` where a file is missing or damaged.
-
     Of a run that did not finish (`meta["complete"]` is false) a half-written last row is left out.
     """
     path = Path(path)

@@ -30,7 +30,6 @@ def rows(
     report: TickReport, process_ns: int, num_detections: int, smoothed_lag_s: float | None
 ) -> Iterator[tuple[str, list[Row]]]:
     """The rows of one tick by table; lagged states only of the tracks that the tick reports.
-
     `process_ns` is the wall time of the tick, `num_detections` the number of detections that it received. The states of
     `smoothed_lag_s` are in `smoothed` with the final ones; those of every lag are in `lagged`.
     """

@@ -19,10 +19,8 @@ from fgtrack.io.run.schema import RUN_FORMAT
 
 
 class RunSink(ABC):
-    """Takes a run tick by tick; where the rows go, its subclasses decide.
-
-    `meta` are the entries of `meta.json` from the start on. The states of the lag `smoothed_lag_s` go to `smoothed`
-    with the final ones; `lagged` gets those of every lag.
+    """Takes a run tick by tick; where the rows go, its subclasses decide. `meta` is that of `meta.json` at the start.
+    The states of the lag `smoothed_lag_s` go to `smoothed` with the final ones; `lagged` gets those of every lag.
     """
 
     def __init__(

@@ -13,10 +13,9 @@ _END_NS = int(np.iinfo(np.int64).max)
 @dataclass
 class Node:
     """Does ticks one after the other; counts those that miss their deadline, the moment at which the next one is due.
-
     A tick begins when it is due, or when the one before it is done, if that is later: `done = max(due, free) + time`.
-    So after a long tick the next ones may miss theirs, too. The deadline is that of Liu & Layland (Scheduling
-    algorithms for multiprogramming in a hard-real-time environment, Journal of the ACM 20, 1973).
+    The deadline is that of Liu & Layland (Scheduling algorithms for multiprogramming in a hard-real-time environment,
+    Journal of the ACM 20, 1973).
     """
 
     period_ns: int | None

@@ -26,10 +26,8 @@ _FILES = (*(f"{table}.csv" for table in COLUMNS), "metrics.json", "config.yaml",
 
 class RunWriter(RunSink):
     """Writes the run folder `path`, which is locked until the writer is closed; a context manager.
-
     Every tick reaches the files before `write_tick` returns: a killed run leaves readable files and a `meta.json` with
-    `"complete": false`. An older run stays until `finish`: the new one grows in `new.part` beside it. Other files in
-    the folder stay. Raises `CallError` where something is at `path`, or another writer holds it.
+    `"complete": false`. An older run stays until `finish`: the new one grows in `new.part` beside it. Other files stay.
     """
 
     def __init__(

@@ -61,7 +61,6 @@ Rule = Callable[[Config, Coverages], Iterator[Assumption]]
 
 def assumed(config: Config, source: InputSource) -> Assumed:
     """`config` with nothing left open, and what of it was assumed; a key that is set stays as it is.
-
     The first that gives a key decides: what `source` carries (origin of detections, track, mounts and views of
     sensors); what its detections show (`coverages`): the sensors, where `config` has none, and where those of unknown
     view detect; usual values: standard deviations, and a sensor that looks all around from the origin.
@@ -131,10 +130,8 @@ def _recorded(config: Config, carried: Recorded) -> Iterator[Assumption]:
 
 def _slow_revisits(config: Config, covered: Coverages) -> Iterator[Assumption]:
     """Yield motion and clock of objects that every sensor measures too seldom for the defaults.
-
-    The standard deviation of a heading after a time t without a measurement is sqrt(q t^3 / 3), q the density of the
-    yaw rate. Where it exceeds 1 rad a straight line with the noise of `_MANOEUVRES`, which is linear, predicts better.
-    Windows then hold two measurements of an object. Sections that are not the default stay as they are.
+    The standard deviation of a heading after t without a measurement is sqrt(q t^3 / 3), q the density of the yaw rate;
+    above 1 rad a straight line with the noise of `_MANOEUVRES` predicts better. Windows hold two measurements then.
     """
     intervals_s = [one.revisit_s for one in covered.values() if one.num_lists]
     limit_s = math.cbrt(3.0 / (MotionConfig().std_per_s["yaw_rate"] ** 2 / NOISE_HZ))
@@ -200,7 +197,6 @@ def _claim(config: Config, covered: Coverages) -> Iterator[Assumption]:
 
 def _offsets(config: Config, covered: Coverages) -> Iterator[Assumption]:
     """Yield time-correlated errors of sensors that disagree by more than errors that differ from list to list.
-
     Of two sensors each has half of the variance, beside its own errors e: s^2 = e^2 + max(d^2 / 2 - e^2, 0).
     """
     for name, one in covered.items():
@@ -251,10 +247,8 @@ def _views(config: Config, covered: Coverages) -> Iterator[Assumption]:
 
 
 def _out_of_view(config: Config, covered: Coverages) -> Iterator[Assumption]:
-    """Yield how long a track lives that no sensor can see.
-
-    Where one sensor alone gives positions, the first list that could not show it ends it. Else it outlives two lists of
-    the slowest sensor, and the longest silence of the one that saw it.
+    """Yield the life of a track out of view: with one sensor of positions until its first list without the track,
+    else two lists of the slowest sensor, and the longest silence of the one that saw it.
     """
     periods_s = {name: 1.0 / one.rate_hz for name, one in covered.items() if one.rate_hz}
     placing = [name for name, one in config.used_sensors.items() if one.gives_position]

@@ -82,10 +82,7 @@ class Assumed:
         return Assumed(validate(Config, raw, "assumed"), (*kept, *new)) if new else self
 
     def to_yaml(self, head: Iterable[str] = (), comments: Iterable[tuple[Sequence[str], str]] = ()) -> str:
-        """Return YAML of all settings that differ from the defaults; a comment gives the reason of an assumed one.
-
-        The lines of `head` are comments, and `comments` are those of further keys, by path.
-        """
+        """YAML, with comments and `head`, of all settings that differ from defaults, assumed ones with a reason."""
         tree = _commented(departures(self.config))
         for path, reason in [*((one.path, f"assumed: {one.reason}") for one in self.assumptions), *comments]:
             inner = tree

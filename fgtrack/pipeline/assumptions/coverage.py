@@ -74,16 +74,13 @@ class Coverage:
 
 def coverages(messages: Iterable[Message], mounts: Mapping[str, Mount] | None = None) -> dict[str, Coverage]:
     """Coverage of each sensor in `messages`, by name; `mounts` are the known ones.
-
     - Only a detection that comes back counts: another list of the sensor has one close by and soon, as of an object and
       seldom of clutter. With fewer than 100 of them nothing is estimated.
-    - The sector is the rest of the circle beside the widest arc with at most 1 % of these detections. It is taken up
-      to 160 degrees: one car that overtakes has a sensor which looks all around detect in nearly half a circle.
+    - The sector is the rest of the circle beside the widest arc with at most 1 % of these, up to 160 degrees:
+      one car that overtakes has a sensor which looks all around detect in nearly half a circle.
     - Cars pass its edges within a few lists. So it goes on as far as the detections in that arc follow one another
       within 12 degrees and a third of what they would if they were spread evenly over it, as clutter is.
-    - The range is the quantile of 99 %, and a tenth more.
-
-    Detections in the map are seen from the ego, interpolated; without an ego they give no sector and no range.
+    - The range is the quantile of 99 %, and a tenth more. Detections in the map give neither without an ego.
     """
     ego, received = array("d"), defaultdict[str, _Detections](_Detections)
     first_ns: int | None = None
@@ -228,10 +225,7 @@ def _turned(vectors_m: FloatArray, angles_rad: FloatArray) -> FloatArray:
 
 
 def _comes_back(points: FloatArray, numbers: IntArray) -> BoolArray:
-    """True for `points`, shape (n, 3), that share a unit cell with one of another list, of `numbers` (n,); shape (n,).
-
-    Two grids, half a cell apart: what crosses a border of one is inside a cell of the other.
-    """
+    """True for `points`, shape (n, 3), in a cell of one of two shifted grids with one of another list of `numbers`."""
     found = np.zeros(len(points), dtype=bool)
     for shift in (0.0, 0.5):
         cells = np.unique(np.floor(points + shift), axis=0, return_inverse=True)[1].ravel()

@@ -47,7 +47,6 @@ class Lists(NamedTuple):
 @dataclass(frozen=True)
 class Persistence:
     """Detection probability, clutter and scores of a sensor, from triples of detections in three successive lists.
-
     Three detections on a line at constant speed are of one object. How often the next lists continue the line is the
     detection probability; detections in no triple, beyond those that misses explain, are clutter. Where scores tell
     clutter, its density is also that around clutter, where it competes with a track that began there (Song, Musicki:
@@ -71,10 +70,8 @@ class Persistence:
 
 def disagreement_m(one: Persistence, other: Lists) -> float | None:
     """Standard deviation, per axis, of where another sensor, with the lists `other`, sees the objects of `one`.
-
-    None if unknown. Two detections are of one object if each is the nearest to the other: its neighbour is nearest
-    where it is missed. Both sensors see the same objects only if detections are nearer to where these are than to
-    points beside them.
+    None unless detections are nearer to where these are than to points beside them. Two detections are of one object if
+    each is the nearest to the other.
     """
     distances_m, beside_m = [], []
     for stamp_s, *state in one.lines.tolist():
@@ -161,10 +158,7 @@ def _near_clutter_per_m2(trees: Sequence[cKDTree], scores: Sequence[FloatArray],
 def _best(
     centre_m: FloatArray, before: cKDTree, after: cKDTree, before_s: float, after_s: float
 ) -> tuple[float, FloatArray, FloatArray]:
-    """Misfit of the straightest triple about a detection, infinite without one; position and velocity at its end.
-
-    The misfit has the standard deviation of a detection, per axis.
-    """
+    """Misfit (infinite without one) of the straightest triple about a detection; position and velocity at its end."""
     near = before.query_ball_point(centre_m, _FASTEST_MPS * before_s + _LARGEST_ERROR_M)
     if not near or not after.n:
         return math.inf, centre_m, centre_m
