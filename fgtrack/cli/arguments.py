@@ -18,7 +18,6 @@ Reference = Annotated[str | None, Option("--reference", help="Sensor whose clock
 Runs = Annotated[list[Path], Argument(metavar="RUN...", help="Run folders, or folders of runs, as that of the demo.")]
 Json = Annotated[bool, Option("--json", help="Print JSON instead of tables.")]
 StorageOption = Annotated[Storage, Option("--storage", help="Storage of a rosbag2 folder.")]
-
 Form = Literal["md", "csv", "latex", "json"]
 FormOption = Annotated[Form | None, Option("--format", help="Print this instead of tables for a terminal.")]
 All = Annotated[bool, Option("--all", help="Show every table and column, not the main ones alone.")]

@@ -23,7 +23,6 @@ from fgtrack.core.errors import CallError, FgtrackError, one_line
 from fgtrack.io.output import FULL
 
 DONE, BAD_DATA, BAD_CALL = 0, 1, 2
-
 #: Commands in the order of the help, functions of that name, and the modules that hold them.
 COMMANDS = {
     "demo": "study",

@@ -90,9 +90,7 @@ def _of_runs(
 
 
 def report(
-    runs: Runs,
-    out: Annotated[Path, Option("-o", "--out", help="HTML file.")],
-    overwrite: Overwrite = False,
+    runs: Runs, out: Annotated[Path, Option("-o", "--out", help="HTML file.")], overwrite: Overwrite = False
 ) -> None:
     """Write one HTML file: verdict, viewer, figures, tables.
 

@@ -12,30 +12,15 @@ from fgtrack.cli.arguments import All, Form, FormOption, Overwrite, Settings
 from fgtrack.cli.show import progress, say, show
 from fgtrack.core.errors import DataError
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.tables.seeds import (
-    SweepTable,
-    difference_table,
-    read_sweep,
-    seed_comparisons,
-    summary_table,
-)
+from fgtrack.evaluation.tables.seeds import SweepTable, difference_table, read_sweep, seed_comparisons, summary_table
 from fgtrack.io.output import check_apart, write_file
 from fgtrack.io.run import Run
 from fgtrack.pipeline.shipped import find_file
-from fgtrack.pipeline.sweep import (
-    ERROR_TABLE,
-    PAIRED_TABLE,
-    PRODUCTS,
-    SUMMARY_TABLE,
-    SWEEP_TABLE,
-    Scalar,
-    Sweep,
-)
+from fgtrack.pipeline.sweep import ERROR_TABLE, PAIRED_TABLE, PRODUCTS, SUMMARY_TABLE, SWEEP_TABLE, Scalar, Sweep
 from fgtrack.pipeline.sweep_plan import load_plan
 
 #: Wall times among the metrics, and what follows from them; they have a table of their own.
 _TIMES = "time_per_"
-_NAMES = ("name", "estimator")
 
 
 def sweep(
@@ -72,9 +57,7 @@ def sweep(
 
 
 def swept(sweep_file: Path, out: Path, num_seeds: int | None = None) -> list[dict[str, str]]:
-    """Rows of the table in `out`, by column; for scripts that draw a sweep.
-    Where there is no table the sweep is run first, with the seeds below `num_seeds` alone if that is given.
-    """
+    """Rows of the table in `out`, for scripts; the sweep is run first (of `num_seeds` seeds) where there is none."""
     if not (out / SWEEP_TABLE).exists():
         plan = load_plan(sweep_file)
         jobs = tuple(job for job in plan.jobs if num_seeds is None or job.seed < num_seeds)
@@ -99,7 +82,9 @@ def _summarise(table: SweepTable, out: Path, form: Form | None, everything: bool
 
 def score(run: Run) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
     """Return all scalars of the metrics of `run` by path, and its wall times."""
-    scalars = {name: value for name, value in _scalars(evaluate(run).as_dict(), "") if name not in _NAMES}
+    scalars = {
+        name: value for name, value in _scalars(evaluate(run).as_dict(), "") if name not in ("name", "estimator")
+    }
     times = {name: value for name, value in scalars.items() if name.startswith(_TIMES)}
     return {name: value for name, value in scalars.items() if name not in times}, times
 

@@ -11,7 +11,6 @@ from fgtrack.estimation.registry import ESTIMATORS, MOTION_MODELS, Claims
 from fgtrack.evaluation.tables import Column, Table
 from fgtrack.testing import BrokenPromiseError, estimator_checks, motion_model_checks
 
-_NUM_STREAMS = 2
 _COLUMNS = (
     Column("name", left=True),
     Column("exact for late measurements", "exact", left=True),
@@ -21,8 +20,7 @@ _COLUMNS = (
 
 
 def verify(
-    as_json: Json = False,
-    name: Annotated[str | None, Option("-e", "--estimator", help="This one alone.")] = None,
+    as_json: Json = False, name: Annotated[str | None, Option("-e", "--estimator", help="This one alone.")] = None
 ) -> None:
     """Check the contract of estimators, in any order of arrival.
 
@@ -33,8 +31,7 @@ def verify(
     broken: dict[str, dict[str, str]] = {}
     with progress("verify"):
         suites = {
-            each: (Claims.of(ESTIMATORS.load(each)).exact, estimator_checks(each, num_streams=_NUM_STREAMS))
-            for each in names
+            each: (Claims.of(ESTIMATORS.load(each)).exact, estimator_checks(each, num_streams=2)) for each in names
         }
         if name is None:
             models = MOTION_MODELS.loaded().items()

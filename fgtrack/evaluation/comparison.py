@@ -137,9 +137,7 @@ def common_sums(every: Sequence[TrackErrors]) -> tuple[int, int, dict[str, Float
 
 
 def compared(name: str, labels: Sequence[str], ticks: FloatArray) -> tuple[Entry, ...]:
-    """The runs by rising cost, and how much worse than the best they are, from the sums of `common_sums`.
-    The cost is the root of the mean, of a NEES its distance from 2.
-    """
+    """The runs by rising cost (root of the mean; of a NEES its distance from 2), and the excess over the best."""
     is_nees = name == POSITION_NEES
 
     def cost(mean: FloatArray) -> FloatArray:

@@ -16,7 +16,6 @@ _FEWEST_PIECES = 8
 _FEWEST_BLOCKS = 3
 _IN_A_ROW = 5  # insignificant correlations that end the search for significant ones
 _STEP = 1e-5  # relative, of the numerical gradient
-
 #: A number from sums over time: takes shape (k, ...), gives shape (...).
 Statistic = Callable[[FloatArray], FloatArray]
 

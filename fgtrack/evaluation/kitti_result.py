@@ -24,7 +24,6 @@ from fgtrack.io.run import NO_TRACK, Run
 
 _MEANS = ["height_m", "width_m", "length_m", "score"]
 _BOX = [*_MEANS[:3], "z_m"]
-
 DataFrame = Any  # of pandas, which is untyped
 
 

@@ -42,8 +42,7 @@ Runs = OneRun | Mapping[str, OneRun] | Iterable["Runs"]
 
 def evaluated(runs: Runs) -> list[EvaluatedRun]:
     """Return runs under labels of their own; a path is a run folder, or a folder of them; a mapping gives labels.
-    Runs of a folder come by name, and may be one folder deeper. Raises `CallError` if a path is neither, or a run is
-    given twice, and `DataError` if a run folder is damaged.
+    Runs of a folder come by name, and may be one folder deeper. Raises `CallError` and, for a damaged run, `DataError`.
     """
     every = _flat(runs)
     if any(isinstance(one, Run) for one in every):

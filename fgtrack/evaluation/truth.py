@@ -15,7 +15,6 @@ from fgtrack.models.sensors import SensorModel
 
 #: What is interpolated, in the order of the columns of `TruePath.at`.
 TRUE_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
-
 _SHORTEST_GAP_NS = NS_PER_S
 _GAP_PERIODS = 5
 
@@ -92,9 +91,8 @@ def in_ignored_regions(run: Run, stamps_ns: IntArray, points_m: FloatArray) -> B
 
 
 def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> BoolArray:
-    """True where an object of `paths` is in the field of view of a sensor at `now_ns`, shape (n, objects).
-    Sensors are those with detections, as configured, from the pose of the ego in ego.csv, without occlusion. Where the
-    ego's path or a sensor is not known every object with truth counts as visible.
+    """True where an object of `paths` is in the field of view of a sensor with detections, shape (n, objects).
+    Without the ego's path (ego.csv) or a configured sensor every object with truth counts; occlusion is not modelled.
     """
     positions_m = np.stack([path.at(now_ns)[:, :2] for path in paths], axis=1)
     present = np.asarray(np.isfinite(positions_m).all(axis=-1))

@@ -103,9 +103,7 @@ def time_unit(name: str, samples: Sequence[float]) -> tuple[str, str]:
 
 
 def agreeing_with_motion(guessed: Mapping[str, Guess], values: Mapping[str, FloatArray], unit: str) -> dict[str, Guess]:
-    """Guesses `guessed` of one object, with the heading and speed in the convention that its positions confirm.
-    `values` are the columns by name, shape (rows,); `unit` is that of the stamp.
-    """
+    """`guessed` with heading and speed in the convention that the positions in `values`, (rows,) each, confirm."""
     if not {"stamp", "x_m", "y_m"} <= guessed.keys():
         return dict(guessed)
     t_s, x_m, y_m = (values[_name(guessed[name])] for name in ("stamp", "x_m", "y_m"))

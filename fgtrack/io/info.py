@@ -57,9 +57,7 @@ _Times = tuple[int, int | None]  # receipt and stamp
 
 
 def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
-    """Return the contents of the input at `path`, and their use in a replay with `config`.
-    Raises `CallError` where nothing is there, and `DataError` where it is not an input, or damaged from the start.
-    """
+    """Return the contents of the input at `path`, and their use in a replay with `config`; raises as `open_input`."""
     path, given = Path(path), config or InputConfig()
     kind = input_kind(path)
     used: dict[BagTopic, str] = {}

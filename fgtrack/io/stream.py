@@ -25,12 +25,9 @@ STREAM_FORMAT = "fgtrack-stream/1"
 SETTINGS = "settings"
 """Entry of the header record with what the recording carries of a configuration."""
 GZIP_MAGIC = b"\x1f\x8b"
-
 _logger = logging.getLogger(__name__)
 _KINDS: dict[str, type[Message]] = {"ego": EgoState, "detections": DetectionList, "truth": TruthState}
-
 _Made = TypeVar("_Made")
-
 # A parsed JSON object: its values are checked one by one below.
 Record = dict[str, Any]
 

@@ -20,7 +20,6 @@ from fgtrack.core.files import open_text
 from fgtrack.io.yaml_text import safe_yaml
 
 T = TypeVar("T")
-
 SMALLEST = 1e-12
 """No configured number but 0 has a smaller magnitude, in any unit: squares and products stay finite."""
 _UNKNOWN = "unexpected_keyword_argument"

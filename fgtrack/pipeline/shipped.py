@@ -12,7 +12,6 @@ from fgtrack.pipeline.load import load, plain, read_yaml, validate
 from fgtrack.sim.scenario import Scenario
 
 Kind = Literal["configuration", "scenario", "sweep"]
-
 _FOLDERS = {"configuration": ".", "scenario": "scenarios", "sweep": "sweeps"}
 _PACKAGE = Path(__file__).parents[1]
 

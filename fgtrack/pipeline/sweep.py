@@ -41,12 +41,9 @@ PRODUCTS = (*_TABLES, _PARTS)
 _SCHEDULER_TIMEOUT_S = 10
 _WATCH_S = 1.0  # how often a process checks that its sweep still runs
 _HANDED_OUT = 2  # jobs per process that are handed out at a time
-
 _logger = logging.getLogger(__name__)
 
 Scalar = str | bool | int | float | None
-
-
 #: Returns reproducible metrics of a run and its wall times, by column; a function that other processes can import.
 Score = Callable[[Run], tuple[Mapping[str, Scalar], Mapping[str, Scalar]]]
 
@@ -106,12 +103,7 @@ class Sweep:
         return sorted(left.values(), key=lambda job: seeds.index(job.seed))
 
     def run(
-        self,
-        score: Score,
-        *,
-        jobs: int = -1,
-        dask: str | None = None,
-        on_job: Callable[[], None] = lambda: None,
+        self, score: Score, *, jobs: int = -1, dask: str | None = None, on_job: Callable[[], None] = lambda: None
     ) -> SweepResult:
         """Do the jobs that are left, keep each at once, and write the tables; also when interrupted.
         `jobs` is the number of processes, -1 is one for each core; `dask` is the address of a scheduler to use

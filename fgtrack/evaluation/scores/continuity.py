@@ -46,9 +46,8 @@ def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
 
 
 def tracked_visits(matching: Matching) -> int:
-    """Times that an object came into sight and was tracked there by a confirmed track, over all objects.
-    "A TP object gets a unique identifier while it's inside the detectable area" (Karle et al. 2023, section IV-A):
-    after a second out of sight it counts again.
+    """Times that an object came into sight (again after 1 s) and was tracked by a confirmed track, over all objects.
+    "A TP object gets a unique identifier while it's inside the detectable area" (Karle et al. 2023, section IV-A).
     """
     paired = matching.paired & confirmed(matching.tracks)
     tracked = np.zeros_like(matching.in_sight)

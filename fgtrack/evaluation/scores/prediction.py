@@ -15,7 +15,6 @@ from fgtrack.models.predictor import arc_positions, rail_positions
 
 #: Times ahead of the predictions, in s.
 HORIZONS_S = (1.0, 2.0, 3.0, 5.0)
-
 STEP_S = 0.1
 _PERIOD_NS = NS_PER_S // 10  # of the published node's predictions
 
@@ -32,8 +31,7 @@ class PredictionErrors:
 
 def displacements(run: Run, matching: Matching) -> TrackErrors:
     """Distances of predicted from true positions, ten times a second, shape (n, m) for every `STEP_S` ahead.
-    Values are by predictor: `arc` and, with a map, `rail`; NaN where the truth is not known. Predicted are confirmed
-    tracks that are paired with an object. Raises `DataError` where the map that the run names is not a map.
+    By predictor: `arc` and, with a map, `rail`; NaN without truth. Only confirmed tracks paired with an object count.
     """
     _, first = np.unique(matching.now_ns // _PERIOD_NS, return_index=True)
     tracks = matching.tracks

@@ -19,11 +19,9 @@ from fgtrack.core.errors import printable, printable_lines
 Value = str | int | float
 Record = Mapping[str, Any]  # Any: text, integers, floats, None
 DataFrame = Any  # pandas, which is untyped and imported where it is used
-
 NO_VALUE = "-"
 PERCENT = 100.0
 MS = 1e3
-
 _WIDTH = 120  # of a table as text
 _ANY = 10_000  # wider than any cell
 _LONG = 40  # characters of an HTML cell that may be broken

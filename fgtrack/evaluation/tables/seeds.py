@@ -18,7 +18,6 @@ from fgtrack.evaluation.intervals import paired
 from fgtrack.evaluation.tables import PERCENT, Column, DataFrame, Table
 
 SWEEP_FILE = "sweep.csv"
-
 #: Metrics that have a better and a worse, in order of preference; the first is shown.
 _BETTER: Mapping[str, Literal["less", "more", "nearer"]] = {
     "truth.overall.errors.*.rmse": "less",

@@ -11,14 +11,7 @@ import numpy as np
 from fgtrack.core.geometry import cartesian
 from fgtrack.core.time import NS_PER_S, period_ns
 from fgtrack.core.types import IntArray
-from fgtrack.evaluation.comparison import (
-    STANDING_NOTE,
-    common_sums,
-    comparable,
-    compared,
-    entry_columns,
-    entry_record,
-)
+from fgtrack.evaluation.comparison import STANDING_NOTE, common_sums, comparable, compared, entry_columns, entry_record
 from fgtrack.evaluation.matching import Matching, TrackErrors
 from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.scores.statistics import Distribution
@@ -30,7 +23,6 @@ from fgtrack.io.run import Node, Run, ready_times
 #: A state is evaluated at its own stamp, as everywhere else; as published, at the moment when it was ready; the same
 #: after its user has moved it to that moment.
 ASKED, READY, PREDICTED = "asked", "ready", "predicted"
-
 _TITLES = {ASKED: "at its stamp", READY: "when ready", PREDICTED: "predicted to then"}
 
 

@@ -27,10 +27,8 @@ _DECIMAL = Context(Emax=40)  # no exponent makes a number of a million digits
 _LARGEST_MB = 2000.0
 _A_LIST, _BETWEEN = re.compile(r"\s*\[\s*"), re.compile(r"[\s,:]*")
 _INT64 = range(-(1 << 63), 1 << 63)
-
 # A message is known by its attributes only: its class is made when a recording is read.
 RosMessage = Any
-
 MAP_FRAMES = frozenset({"map", "world", "odom"})
 """Header frames that are taken as the map frame where the configuration names none."""
 

@@ -20,10 +20,8 @@ from fgtrack.io.adapters.common import reported_as
 from fgtrack.io.source import FileFormat
 
 LOG_NAME = "data_logs.csv"
-
 _COLUMNS = ("time_ns", "detection_input", "ego_state")
 _NAMES = {"x": "x_m", "y": "y_m", "yaw": "yaw_rad", "v": "speed_mps"}
-
 # Parsed JSON, checked while it is read.
 Json = Any
 

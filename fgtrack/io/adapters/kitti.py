@@ -36,7 +36,6 @@ CLASS_NAMES: Mapping[str, str] = {name.lower(): name for name in _TYPES}
 """Types of the data set by the names that detections get."""
 
 _LABELS = "label_02"
-_DONT_CARE = "DontCare"
 #: Class, box in the image, score and box in space of a line, by its number of fields.
 _FORMS = {
     6: (slice(0), slice(1, 5), slice(5, 6), slice(0)),
@@ -145,7 +144,7 @@ FORMAT = FileFormat(
 def _truth(settings: KittiInput, view: View, fields: list[str]) -> TruthState | None:
     """The object or region of a label; None for other classes."""
     kind, ego = fields[2], view.ego
-    if kind == _DONT_CARE:
+    if kind == "DontCare":
         return _region(view, *map(float, fields[6:10]))
     ignored = kind in {_NEIGHBOURS.get(name) for name in settings.classes}
     if not ignored and kind not in settings.classes:

@@ -17,11 +17,9 @@ from fgtrack.core.types import (
 from fgtrack.io.adapters.common import RosMessage, stamp_ns
 
 EGO, DETECTIONS, TRUTH = (f"fgtrack_msgs/msg/{name}" for name in ("Ego", "DetectionList", "Truth"))
-
 #: Optional fields in the order of the bits of `present`.
 DETECTION_OPTIONAL = (*MEASURABLE, "covariance", "stamp_ns", "object_id", *DESCRIBING)
 TRUTH_OPTIONAL = (*STATE_NAMES[2:], "outline_m")
-
 #: Fields that hold numbers in a list, and those that hold a text.
 LISTS, TEXTS = frozenset({"covariance", "outline_m"}), frozenset({"class_name"})
 
@@ -73,8 +71,4 @@ def truth(message: RosMessage, receipt_ns: int) -> TruthState:
 
 
 #: What reads fgtrack's own message types, by type name.
-NATIVE_ADAPTERS: dict[str, Callable[[RosMessage, int], Message]] = {
-    EGO: ego,
-    DETECTIONS: detections,
-    TRUTH: truth,
-}
+NATIVE_ADAPTERS: dict[str, Callable[[RosMessage, int], Message]] = {EGO: ego, DETECTIONS: detections, TRUTH: truth}

@@ -38,15 +38,12 @@ _CATEGORIES = {
     "vehicle.truck": "truck",
     "human.pedestrian": "pedestrian",
 }
-
 # Parsed JSON, checked while it is read.
 Json = Any
 
 
 def read_scene(file: Path, settings: NuscenesInput) -> Iterator[Message]:
-    """Messages of a scene in the order of receipt; at one stamp the truth first, then the ego, then the boxes.
-    Raises `CallError` where one of several scenes has to be named or there are no tables, and `DataError`.
-    """
+    """Messages of a scene in the order of receipt; at one stamp the truth first, then the ego, then the boxes."""
     tables = _tables(file, settings)
     with reported_as(f"{file}: it or its tables in {tables} are not those of nuScenes"):
         samples = _samples(tables, file, settings)

@@ -25,7 +25,6 @@ from fgtrack.io.adapters.common import (
 )
 
 ODOMETRY = "nav_msgs/msg/Odometry"
-
 _ORIENTATION_AVAILABLE = 2  # in autoware's DetectedObjectKinematics
 _AUTOWARE_CLASSES = ("unknown", "car", "truck", "bus", "trailer", "motorcycle", "bicycle", "pedestrian")
 _ESR_NO_TARGET = 0  # status
@@ -123,11 +122,7 @@ def radar_tracks(message: RosMessage) -> ObjectList:
 
 def _radar_track(item: RosMessage) -> Detection:
     position, velocity = item.position, item.velocity
-    values = {
-        "x_m": position.x,
-        "y_m": position.y,
-        "speed_mps": signed_speed_mps(velocity.x, velocity.y, None),
-    }
+    values = {"x_m": position.x, "y_m": position.y, "speed_mps": signed_speed_mps(velocity.x, velocity.y, None)}
     pose = block_diag(_planar_triangle(item.position_covariance), [0.0])
     own = covariance(values, pose, _planar_triangle(item.velocity_covariance), velocity)
     return Detection(**values, covariance=own, object_id=_uuid(item.uuid), **_size(item.size))

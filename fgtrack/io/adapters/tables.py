@@ -31,7 +31,6 @@ _TIMES = ("stamp", "receipt")
 #: Components of the rows of the ego and of truth, and those that must be there; all others are of detections.
 _NAMES = {"ego": STATE_NAMES, "truth": ("object_id", *STATE_NAMES)}
 _NEEDS = {"ego": STATE_NAMES[:4], "truth": STATE_NAMES[:2]}
-
 Cells = Mapping[str, str]
 
 

@@ -21,8 +21,6 @@ from fgtrack.io.ros.bag_files import METADATA, SETTINGS, files_of
 from fgtrack.io.ros.messages import MessageFactory
 
 _CHECKPOINT = 1000  # messages; a killed writer loses no more than that
-_PLUGINS = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
-_INT64_LIMIT = 1 << 63
 RECORDING = "a rosbag2 folder with nothing else in it"
 
 
@@ -46,7 +44,7 @@ def write_bag(
     with (
         as_write_error(path),
         new_path(path, overwrite, is_recording, RECORDING) as folder,
-        Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=_PLUGINS[storage]) as bag,
+        Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin[storage.upper()]) as bag,
     ):
         if settings:
             bag.set_custom_data(SETTINGS, json.dumps(settings))
@@ -88,7 +86,7 @@ class BagTopics:
 
     def put(self, topic: str, message: RosMessage, log_ns: int, qos: Sequence[Qos] = ()) -> None:
         """Write `message`, and the `qos` profiles that are offered with a new topic."""
-        if not 0 <= log_ns < _INT64_LIMIT:
+        if not 0 <= log_ns < 1 << 63:
             raise DataError(f"the time {log_ns} ns lies outside what a recording holds")
         if topic not in self._connections:
             self._connections[topic] = self._bag.add_connection(

@@ -89,6 +89,5 @@ float64 accel_mps2
 float64[] outline_m
 """,
 }
-
 #: Text of every definition by type name.
 DEFINITIONS: dict[str, str] = _OWN | {name: text.replace(", ", "\n") for name, text in _FOREIGN.items()}

@@ -15,19 +15,15 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 DETECTION3D_ARRAY = "vision_msgs/msg/Detection3DArray"
 MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
-
 _FRAME_IDS: dict[Frame, str] = {"map": "map", "ego": "base_link"}
 _SECONDS_LIMIT = 1 << 31  # builtin_interfaces/Time holds 32 bits
-
-
-_TYPES = (EGO, DETECTIONS, TRUTH, ODOMETRY, DETECTION3D_ARRAY, MARKER_ARRAY, TRANSFORMS)
 
 
 class MessageFactory:
     """Makes and serializes messages of the types that fgtrack writes."""
 
     def __init__(self) -> None:
-        self.typestore = typestore_of(_TYPES)
+        self.typestore = typestore_of((EGO, DETECTIONS, TRUTH, ODOMETRY, DETECTION3D_ARRAY, MARKER_ARRAY, TRANSFORMS))
 
     def serialize(self, message: RosMessage) -> memoryview:
         """CDR bytes of `message`."""

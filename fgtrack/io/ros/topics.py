@@ -38,7 +38,6 @@ _KEYS = {
     "scan_s": ("detections",),
     "object_id": ("truth",),
 }
-
 Convert = Callable[[RosMessage, int], Iterable[Message]]
 """Messages of a ROS message and its receipt."""
 TopicUse = tuple[BagTopic, str, Convert]
@@ -89,9 +88,7 @@ FORMAT = FileFormat("a rosbag2 folder, an .mcap, .db3 or ROS 1 .bag file", is_ba
 
 
 def bag_messages(bag: Bag, uses: list[TopicUse]) -> Iterator[Message]:
-    """Messages of `bag` in receipt order, which is the order of the recorder's log times.
-    Raises `TruncatedInput` after everything before a break, and `DataError` for a message that does not fit its use.
-    """
+    """Messages of `bag` in receipt order, the recorder's; `DataError` for a message that does not fit its use."""
     for topic, log_ns, data in bag.messages({used.name for used, _, _ in uses}):
         for convert in [convert for used, _, convert in uses if used is topic]:
             try:

@@ -194,9 +194,7 @@ _parsed = lru_cache(maxsize=64)(safe_yaml)
 
 
 def load_run(path: Path | str) -> Run:
-    """Read the run folder `path`. Raises `DataError` where a file is missing or damaged.
-    Of a run that did not finish (`meta["complete"]` is false) a half-written last row is left out.
-    """
+    """Read the run folder `path`, without a half-written last row; `DataError` if a file is missing or damaged."""
     path = Path(path)
     file, config = path / "meta.json", path / "config.yaml"
     try:

@@ -9,13 +9,10 @@ import numpy.typing as npt
 from fgtrack.core.types import DESCRIBING, MEASURABLE, STATE_NAMES
 
 RUN_FORMAT = "fgtrack-run/1"
-
 #: States whose covariance is written.
 COVARIANCE_STATES = ("x", "y", "yaw", "speed", "yaw_rate")
-
 #: Upper triangle of the covariance, row by row.
 COVARIANCE_COLUMNS = tuple(f"p_{a}_{b}" for i, a in enumerate(COVARIANCE_STATES) for b in COVARIANCE_STATES[i:])
-
 #: Columns of every table of a run folder, in their order.
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "tracks": (
@@ -37,16 +34,13 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     "objects": ("track_id", "class_name", "class_share", "length_m", "width_m", "height_m"),
     "detections": ("sensor", "stamp_ns", "receipt_ns", "index", "frame", *MEASURABLE, *DESCRIBING),
 }
-
 #: Tables that are written only when there is something to write.
 OPTIONAL_TABLES = ("smoothed", "lagged", "truth", "ignored", "ego", "objects", "detections")
-
 NO_TRACK = -1
 """Track id of an update that belongs to no track."""
 
 # A column holds floats, integers or text, as its name says; the reader of it knows which.
 Column = npt.NDArray[Any]
-
 _TEXT = frozenset({"status", "sensor", "disposition", "kind", "frame", "class_name", "outline_m"})
 _INTEGERS = frozenset(
     {

@@ -32,7 +32,6 @@ ASSUMED_STD = {
     "bearing_rad": 0.02,
     "range_rate_mps": 0.5,
 }
-
 _BOX_STD_M = 0.3
 """Standard deviation of the middle of a box: the translation error of LiDAR detectors is 0.25 to 0.5 m (nuScenes)."""
 _LISTS_OUT_OF_VIEW, _SILENCES = 2.5, 1.5
@@ -48,7 +47,6 @@ _LONGEST_S = 60.0
 #: filter performance for manned maneuvering targets, IEEE T-AES 1970) has 2 sigma^2 tau: an aircraft that banks by at
 #: most 25 degrees accelerates by 4.6 m/s^2, evenly distributed sigma = 2.6 m/s^2, for some 17 s. Ships do less.
 _MANOEUVRES = {"velocity": 150.0}
-
 RECORDED, USUAL = "recorded", "usual of a detector of cars by LiDAR or RADAR"
 USUAL_BOX = "usual of boxes that a detector fits to cars"
 _UNPLACED = "gives no position, and bearings from an unknown mount err by more than the tracks"
@@ -62,8 +60,7 @@ Rule = Callable[[Config, Coverages], Iterator[Assumption]]
 def assumed(config: Config, source: InputSource) -> Assumed:
     """`config` with nothing left open, and what of it was assumed; a key that is set stays as it is.
     The first that gives a key decides: what `source` carries (origin of detections, track, mounts and views of
-    sensors); what its detections show (`coverages`): the sensors, where `config` has none, and where those of unknown
-    view detect; usual values: standard deviations, and a sensor that looks all around from the origin.
+    sensors); what its detections show (`coverages`); usual values: standard deviations, a sensor that looks all around.
     """
     carried = recorded(source)
     found = Assumed(config).assuming(*_recorded(config, carried))

@@ -70,8 +70,7 @@ class Persistence:
 
 def disagreement_m(one: Persistence, other: Lists) -> float | None:
     """Standard deviation, per axis, of where another sensor, with the lists `other`, sees the objects of `one`.
-    None unless detections are nearer to where these are than to points beside them. Two detections are of one object if
-    each is the nearest to the other.
+    None unless pairs of mutual nearest neighbours are nearer than points beside them.
     """
     distances_m, beside_m = [], []
     for stamp_s, *state in one.lines.tolist():
