@@ -1,3 +1,4 @@
+import math
 import sqlite3
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from fgtrack.io.config import Filter, InputConfig, TopicInput
 from fgtrack.io.errors import TruncatedInput, UntilBreak
 from fgtrack.io.ros.bag import Bag
 from fgtrack.io.ros.bag_writer import write_bag
+from fgtrack.io.ros.messages import MessageFactory
 from fgtrack.io.source import open_input
 
 STORAGES = ("mcap", "sqlite3")
@@ -158,21 +160,11 @@ def humble():
 
 
 def make_odometry(store, stamp_ns, ros1=False):
-    types = store.types
-    vector = types["geometry_msgs/msg/Vector3"]
-    stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-    sequence = {"seq": 4} if ros1 else {}
-    pose = types["geometry_msgs/msg/Pose"](
-        position=types["geometry_msgs/msg/Point"](x=1.0, y=2.0, z=0.0),
-        orientation=types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=1.0, w=1.0),
-    )
-    twist = types["geometry_msgs/msg/Twist"](linear=vector(x=-3.0, y=0.0, z=0.0), angular=vector(0.0, 0.0, 0.5))
-    return types["nav_msgs/msg/Odometry"](
-        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="odom", **sequence),
-        child_frame_id="base_link",
-        pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
-        twist=types["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
-    )
+    message = MessageFactory().odometry(EgoState(stamp_ns, 9, 1.0, 2.0, 0.5 * math.pi, -3.0, 0.5))
+    if ros1:
+        header = message.header
+        message.header = store.types["std_msgs/msg/Header"](seq=4, stamp=header.stamp, frame_id=header.frame_id)
+    return message
 
 
 ODOMETRY_STATE = EgoState(5, 9, 1.0, 2.0, pytest.approx(1.5707963267948966), -3.0, 0.5)

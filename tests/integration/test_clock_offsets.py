@@ -47,15 +47,15 @@ def traffic(wrong: str, offset_s: float, seconds_of: float) -> list[Message]:
     return simulate(changed, np.random.default_rng(5))
 
 
-def parked(frame: Frame, speed_mps: float = 0.0, num: int = 30) -> list[Message]:
-    """An object at rest, or driving off, seen by two sensors of an ego that stands."""
+def parked(frame: Frame, num: int = 30) -> list[Message]:
+    """An object at rest, seen by two sensors of an ego that stands."""
     rng = np.random.default_rng(0)
     found: list[Message] = []
     for k in range(num):
         for sensor, after_s in (("lidar", 0.0), ("radar", 0.04)):
             stamp_ns = START_NS + nanoseconds(0.1 * k + after_s)
             found.append(EgoState(stamp_ns, stamp_ns, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-            x_m, y_m = np.array([20.0 + speed_mps * (0.1 * k + after_s), 5.0]) + 0.1 * rng.standard_normal(2)
+            x_m, y_m = np.array([20.0, 5.0]) + 0.1 * rng.standard_normal(2)
             found.append(DetectionList(sensor, stamp_ns, stamp_ns, (Detection(x_m=x_m, y_m=y_m),), frame))
     return found
 

@@ -28,15 +28,7 @@ def call(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest
     return called
 
 
-def drive(
-    count: int = 100,
-    *,
-    ego: bool = True,
-    frame: str = "ego",
-    yaw: bool = True,
-    std_m: float = 0.3,
-    seed: int = 1,
-) -> list[Message]:
+def drive(count: int = 100, *, ego: bool = True, frame: str = "ego", seed: int = 1) -> list[Message]:
     """An ego at rest and a car ahead of it, seen by a lidar with the noise of the default configuration."""
     rng = np.random.default_rng(seed)
     messages: list[Message] = []
@@ -44,8 +36,8 @@ def drive(
         now_ns = START_NS + k * 20 * MS
         if ego:
             messages.append(EgoState(now_ns, now_ns, 0.0, 0.0, 0.0, 0.0))
-        x_m, y_m, yaw_rad = rng.normal((20.0 + 0.02 * k, 1.0, 0.0), (std_m, std_m, 0.4)).tolist()
-        car = Detection(x_m=x_m, y_m=y_m, yaw_rad=yaw_rad if yaw else None)
+        x_m, y_m, yaw_rad = rng.normal((20.0 + 0.02 * k, 1.0, 0.0), (0.3, 0.3, 0.4)).tolist()
+        car = Detection(x_m=x_m, y_m=y_m, yaw_rad=yaw_rad)
         messages.append(DetectionList("lidar", now_ns - 50 * MS, now_ns, (car,), frame))
     return messages
 

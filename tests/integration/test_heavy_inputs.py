@@ -1,7 +1,7 @@
 """Inputs made to fill memory or time, each read by a command in a process of its own: below --max-memory and 40 s."""
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +18,6 @@ pytestmark = pytest.mark.slow
 
 MOST_MB, LONGEST_S = 4096.0, 40.0
 Make = Callable[[Path], object]
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
-    made = Server()
-    yield made
-    made.close()
 
 
 def sparse(name: str, start: bytes, end: bytes = b"\0") -> Make:

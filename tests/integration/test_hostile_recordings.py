@@ -1,7 +1,7 @@
 """Small recordings made to fill memory or time: each command stays below --max-memory and 20 s of processor."""
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,13 +17,6 @@ pytestmark = pytest.mark.slow
 
 MOST_MB, LONGEST_S = 4096.0, 20.0
 _SENSOR = ("--set", "sensors={s: {std: {x_m: 1.0, y_m: 1.0}}}", "-o", "run")
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
-    made = Server()
-    yield made
-    made.close()
 
 
 def replay(name: str, topic: str) -> tuple[str, ...]:

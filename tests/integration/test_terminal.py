@@ -22,8 +22,11 @@ raise SystemExit(main.main())
 """
 
 
-#: A program in a pseudo-terminal whose output goes to a pipe.
-IN_TERMINAL = (sys.executable, "-c", "import pty, sys; sys.exit(pty.spawn(sys.argv[1:]) >> 8)")
+#: A program in a pseudo-terminal of 80 columns whose output goes to a pipe.
+IN_TERMINAL = (
+    *(sys.executable, "-c", "import pty, sys; sys.exit(pty.spawn(sys.argv[1:]) >> 8)"),
+    *("sh", "-c", 'unset COLUMNS LINES NO_COLOR; stty cols 80 rows 50 && exec "$0" "$@"'),
+)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +38,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
-        env={**os.environ, "TERM": "xterm", "COLUMNS": "80"},
+        env={**os.environ, "TERM": "xterm"},
     )
     assert done.returncode == 0, done.stdout + done.stderr
     shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", done.stdout)

@@ -1,7 +1,6 @@
 """Two cars that meet in the open, without a map: as many tracks with every estimator."""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -17,45 +16,29 @@ DURATION_S, MIDDLE_S, SPEED_MPS = 6.0, 3.0, 60.0
 EGO_M = np.array([-40.0, 10.0])
 TICK_NS = 20_000_000
 
-#: Where both cars are, relative to a point that moves on as the first does on average, so long before or after the
-#: middle: the shape is (2, 2).
-Meeting = Callable[[float], FloatArray]
+#: Velocities of both cars in m/s, shape (2, 2), and how far to the left the second one is where they meet, in m.
+Meeting = tuple[FloatArray, float]
 
 
 def crossing(angle_deg: float) -> Meeting:
     """Both in one place at one time, at an angle to one another."""
     half_rad = math.radians(angle_deg / 2.0)
-    ahead, aside = SPEED_MPS * math.cos(half_rad), SPEED_MPS * math.sin(half_rad)
-    return lambda s: np.array([[ahead * s, aside * s], [ahead * s, -aside * s]])
-
-
-def overtaking(s: float) -> FloatArray:
-    """One through the other, 10 m/s faster."""
-    return np.array([[SPEED_MPS * s, 0.0], [(SPEED_MPS + 10.0) * s, 0.0]])
-
-
-def opposite(s: float) -> FloatArray:
-    """Head-on, 3 m apart."""
-    return np.array([[SPEED_MPS * s, 0.0], [-SPEED_MPS * s, 3.0]])
-
-
-def beside(s: float) -> FloatArray:
-    """One beside the other, 6 m apart."""
-    return np.array([[SPEED_MPS * s, 0.0], [SPEED_MPS * s, 6.0]])
+    return SPEED_MPS * np.array([[math.cos(half_rad), sign * math.sin(half_rad)] for sign in (1.0, -1.0)]), 0.0
 
 
 MEETINGS: dict[str, Meeting] = {
     "through one another, 10 degrees": crossing(10.0),
     "through one another, 30 degrees": crossing(30.0),
     "through one another, 90 degrees": crossing(90.0),
-    "overtaking": overtaking,
-    "opposite": opposite,
-    "beside": beside,
+    "overtaking": (np.array([[SPEED_MPS, 0.0], [SPEED_MPS + 10.0, 0.0]]), 0.0),
+    "opposite": (np.array([[SPEED_MPS, 0.0], [-SPEED_MPS, 0.0]]), 3.0),
+    "beside": (np.array([[SPEED_MPS, 0.0], [SPEED_MPS, 0.0]]), 6.0),
 }
 
 
 def messages(meeting: Meeting, towards_deg: float, seed: int) -> list[EgoState | DetectionList]:
     """What LiDAR and RADAR send with the paper's delays; the ego drives beside, all head for `towards_deg`."""
+    velocity_mps, apart_m = meeting
     rng, turn = np.random.default_rng(seed), rotation(math.radians(towards_deg))
 
     def ego_m(time_s: float) -> FloatArray:
@@ -68,8 +51,8 @@ def messages(meeting: Meeting, towards_deg: float, seed: int) -> list[EgoState |
         sent.append(EgoState(stamp_ns, stamp_ns, x_m, y_m, math.radians(towards_deg), SPEED_MPS))
     for sensor, phase_s, delay_s, std_m in (("lidar_cluster", 0.0, 0.15, 0.3), ("radar", 0.023, 0.06, 0.9)):
         for time_s in (phase_s + np.arange(0.05, DURATION_S - 0.05, 0.05)).tolist():
-            relative_m = meeting(time_s - MIDDLE_S) - ego_m(time_s) + std_m * rng.standard_normal((2, 2))
-            velocity_mps = (meeting(time_s - MIDDLE_S + 0.01) - meeting(time_s - MIDDLE_S)) / 0.01
+            cars_m = velocity_mps * (time_s - MIDDLE_S) + [[0.0, 0.0], [0.0, apart_m]]
+            relative_m = cars_m - ego_m(time_s) + std_m * rng.standard_normal((2, 2))
             speeds_mps = np.hypot(*velocity_mps.T) + 0.2 * rng.standard_normal(2)
             objects = [
                 Detection(x_m=x_m, y_m=y_m, speed_mps=speed_mps if sensor == "radar" else None)

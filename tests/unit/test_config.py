@@ -215,7 +215,6 @@ def test_an_empty_file_is_the_default_and_a_missing_one_an_error(tmp_path: Path)
     [
         ("smoother.lag_s=1e308", "smoother.lag_s: a magnitude of 1e-12 to 1e+09, or 0 is needed, not 1e+308"),
         ("sensors.radar.std.speed_mps=1e-300", "sensors.radar.std.speed_mps: a magnitude of"),
-        ("motion.std_per_s.yaw=1e100", "is needed, not 1e+100"),
         ("motion.std_per_s.yaw=-0.3", "motion.std_per_s.yaw: Input should be greater than or equal to 0, not -0.3"),
         ("sensors=" + "[" * 1_000, "nested too deeply"),
     ],
