@@ -66,7 +66,8 @@ def average(values: Sequence[float] | FloatArray) -> Estimate:
 
 def within_run(ticks: FloatArray, statistic: Statistic, rng: np.random.Generator) -> Estimate:
     """The `statistic` of the sums of `ticks` over time and its 95 % interval by a circular block bootstrap.
-    `ticks`, shape (n, k), are in order of time; `statistic` takes sums, shape (k, draws), and gives shape (draws,).
+    `ticks`, shape (n, k), are in order of time; `statistic` takes sums, shape (k, draws), and gives shape (draws,). A
+    root mean square is sqrt(S[0] / S[1]) of the sums S of squared errors and counts.
 
     Blocks of ticks, whose errors are correlated, are drawn with replacement, the end of the run joined to its beginning
     (Politis & Romano 1992). The interval is theta +- t(m - 1) s sqrt(m / (m - 1)), with s the standard deviation of the

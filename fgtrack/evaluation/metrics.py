@@ -146,7 +146,7 @@ class Metrics:
 def evaluate(run: Run, truth: Mapping[str, Any] | None = None, options: EvaluationConfig | None = None) -> Metrics:
     """Return the metrics of `run`; without truth, those that need none.
 
-    `truth` are columns of truth.csv, by default those of the recording; `options` by default those of the run.
+    `truth` are columns of truth.csv, as of a DataFrame, by default the recording's; `options` by default the run's.
     """
     if truth is not None:
         num_rows = len(truth["stamp_ns"])

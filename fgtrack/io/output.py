@@ -124,7 +124,7 @@ def _part_of(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """Create and lock `folder` during the block, and remove it if still empty; `CallError` where that cannot be."""
+    """Create and lock `folder` during the block, remove it if still empty; `CallError` if locked or not possible."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -93,7 +93,7 @@ def key_and_value(setting: str) -> tuple[str, Any]:
 
 
 def with_value(inside: Any, names: Sequence[str], value: Any, default: object = None) -> Any:
-    """Return a copy of `inside` with `value` at the path `names`, of list entries their index or `name`.
+    """Return a copy of `inside` with `value` at the path `names`, where a list entry has its index or `name`.
     Of a mapping left out the `default` stays, or its `kind`. Raises `LookupError` for a path into a number or text.
     """
     if not names:

@@ -1,6 +1,7 @@
 """Accuracy when each run pays for its time: published states against the truth at the moment when they were ready.
 
-Li, Wang, Ramanan: Towards streaming perception, ECCV 2020; Wang et al.: The ASAP benchmark, CVPR 2023.
+Li, Wang, Ramanan: Towards streaming perception, ECCV 2020; Wang et al.: The ASAP benchmark, CVPR 2023. Times of ticks
+are those of timing.csv, so nothing depends on the machine that compares.
 """
 
 from collections.abc import Sequence

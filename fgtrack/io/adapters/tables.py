@@ -35,7 +35,7 @@ Cells = Mapping[str, str]
 
 
 def read_tables(tables: Sequence[tuple[Path, CsvTable, str]]) -> Iterator[Message]:
-    """Messages in order of receipt of `tables`, with file and role: `ego`, `truth` or `detections.SENSOR`.
+    """Messages of `tables`, given with file and role (`ego`, `truth` or `detections.SENSOR`), in order of receipt.
     Raises `DataError` for a row that does not match the mapping, after all messages up to the receipt before it.
     """
     keyed: list[tuple[tuple[int, int, int], Message]] = []

@@ -46,7 +46,7 @@ and its conversion."""
 
 
 def topic_uses(bag: Bag, config: InputConfig) -> list[TopicUse]:
-    """Return the uses of the topics of `bag`, as `config` names them or, below that, as fgtrack's types are recognised.
+    """Return the uses of the topics of `bag`, as `config` names them, else by their types where fgtrack wrote them.
     Raises `DataError` for a topic that is not there or not named, and `CallError` where `config` does not fit its type.
     """
     names = {topic.name for topic in bag.topics}
