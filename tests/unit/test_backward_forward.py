@@ -55,9 +55,6 @@ def same(a: FloatArray, b: FloatArray) -> None:
     np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
 
 
-# --- storage
-
-
 def test_the_present_lies_between_grid_stamps_and_its_yaw_is_wrapped() -> None:
     made = bank()
     made.birth(0, prior(START_NS, yaw_rad=math.pi - 1e-4))
@@ -195,6 +192,3 @@ def test_any_history_of_operations_is_that_of_a_bank_of_lists(seed: int, length:
                 track = naive.tracks[track_id]
                 np.testing.assert_allclose(states.means[row], track.means[place], rtol=1e-9, atol=1e-7)
                 np.testing.assert_allclose(states.covariances[row], track.covariances[place], rtol=1e-7, atol=1e-8)
-
-
-# --- the published storage
