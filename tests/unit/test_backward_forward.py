@@ -12,14 +12,13 @@ from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.filters.backward_forward import BackwardForwardBank
 from fgtrack.estimation.filters.ekf import correct
 from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator
-from fgtrack.models.measurement import measurement_model
+from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV
 
 STEP_NS = 10_000_000
 START_NS = 1_600_000_000_000_000_000
 DENSITY = np.array([4e-4, 4e-4, 9e-4, 1e-2, 2.5e-3])
 POSITION = measurement_model(("x_m", "y_m"), CTRV())
-POSE = measurement_model(("x_m", "y_m", "yaw_rad"), CTRV())
 BEARING = measurement_model(("bearing_rad",), CTRV())
 
 
@@ -80,6 +79,14 @@ def test_a_measurement_that_cannot_be_fused_fails_alone_and_changes_nothing() ->
     assert np.array_equal(before[1].mean, after[1].mean)
     assert not np.array_equal(before[0].mean, after[0].mean)
     assert not np.array_equal(before[2].mean, after[2].mean)
+
+
+def measured(rng: np.random.Generator, stamp_ns: int, x: FloatArray) -> Measurement:
+    """A position, or a bearing from anywhere."""
+    if rng.random() < 0.6:
+        return position(stamp_ns, *(x[:2] + rng.normal(scale=0.3, size=2)))
+    pose = SensorPose(*rng.normal(scale=100.0, size=2).tolist(), rng.uniform(-3.0, 3.0))
+    return Measurement(stamp_ns, BEARING, BEARING.predict(x, pose) + 0.01 * rng.normal(size=1), 1e-3 * np.eye(1), pose)
 
 
 @dataclass
@@ -175,8 +182,7 @@ def test_any_history_of_operations_is_that_of_a_bank_of_lists(seed: int, length:
                 places = naive.nearest(stamp_ns)
                 ids = [i for i in places if rng.random() < 0.7]
                 rng.shuffle(ids)
-                seen = [naive.tracks[i].means[places[i]][:2] + rng.normal(scale=0.3, size=2) for i in ids]
-                measurements = [position(stamp_ns, *xy) for xy in seen]
+                measurements = [measured(rng, stamp_ns, naive.tracks[i].means[places[i]]) for i in ids]
                 made.update(stamp_ns, ids, measurements)
                 naive.update(stamp_ns, ids, measurements)
             case "remove" if naive.tracks:

@@ -241,3 +241,21 @@ def test_a_covariance_that_is_none_is_refused_where_it_is_asked_for(given: tuple
     assert uncertain().receive(ego(0.0, covariance=given)) == "not a covariance"
     assert trajectory().receive(ego(0.0, covariance=given)) is None
     assert uncertain().receive(ego(0.0, covariance=flat(np.ones((5, 5))))) is None  # singular
+
+
+def test_the_published_storage_has_a_length_in_ticks() -> None:
+    source = PublishedEgo(1.0, 1.0, ms(10), 3)
+    for k in range(6):
+        source.receive(ego(20.0 * k, x_m=float(k), speed_mps=0.0))
+        source.start_tick()
+    assert source.pose_at(START_NS, START_NS + ms(100)).x_m == 3.0
+
+
+def test_the_published_pose_without_delay_is_from_the_newest_message_even_before_it_is_stored() -> None:
+    source = PublishedEgo(1.0, 1.0, ms(10), 350)
+    source.receive(ego(0.0, x_m=1.0))
+    source.start_tick()
+    source.receive(ego(20.0, x_m=9.0, speed_mps=0.0))
+    half_step_ns = START_NS + ms(15)
+    assert source.pose_at(half_step_ns, START_NS + ms(20)).x_m == 9.0
+    assert source.pose_at(half_step_ns - 1, START_NS + ms(20)).x_m == pytest.approx(1.15)

@@ -9,6 +9,7 @@ from support.models import MODELS
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator
 from fgtrack.estimation.filters.published import YAW_LIMIT_RAD, SaturatedEulerCtrv, published_yaw
+from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRA, CTRV, MotionModel
 
 ISOTROPIC = np.array([4e-4, 4e-4, 9e-4, 1e-2, 2.5e-3])
@@ -123,3 +124,10 @@ def test_the_published_yaw_range_ends_where_the_published_yaw_is_pi() -> None:
     wanted = [0.0, math.pi, 3 * math.pi / 2, -math.pi / 2 + 1e-9, 3 * math.pi / 2]
     assert published_yaw(yaws) == pytest.approx(wanted)
     assert 3 * math.pi / 2 == YAW_LIMIT_RAD
+
+
+def test_a_published_residual_wraps_by_one_turn_alone() -> None:
+    model = measurement_model(("x_m", "yaw_rad", "bearing_rad"), CTRV())
+    z, predicted = np.array([3.0, -2.0, -3.0]), np.array([1.0, -2.0 - 2.0 * math.pi, 3.0])
+    found = SaturatedEulerCtrv(CTRV(), ISOTROPIC).residual(model, z, predicted)
+    assert found == pytest.approx([2.0, 2.0 * math.pi, 2.0 * math.pi - 6.0])
