@@ -44,12 +44,6 @@ def test_every_field_survives_the_bag_to_the_bit_and_in_order(tmp_path_factory, 
         assert exact(read(path)) == exact(messages)
 
 
-def test_a_folder_without_metadata_is_read(tmp_path):
-    write_bag(tmp_path / "bag", drive())
-    (tmp_path / "bag/metadata.yaml").unlink()
-    assert read(tmp_path / "bag") == drive()
-
-
 def test_two_copies_of_one_file_in_a_folder_are_refused(tmp_path):
     write_bag(tmp_path / "bag", drive())
     content = storage_file(tmp_path / "bag").read_bytes()
@@ -287,18 +281,6 @@ def test_an_unordered_mcap_file_is_read_in_log_time_order_with_and_without_its_e
 
 
 # --- the recordings of other people
-
-
-def test_the_same_recording_in_both_storages_gives_the_same_messages():
-    folder = shared("data/bags/rosbag2_py_resources")
-    for name in ("wbag", "reindex_test_bags/multiple_files"):
-        read_both = []
-        for storage in STORAGES:
-            bag = Bag(folder / storage / name)
-            names = {topic.name for topic in bag.topics}
-            read_both.append([(topic.name, log_ns, m.data) for topic, log_ns, m in bag.messages(names)])
-        assert sorted(read_both[0]) == sorted(read_both[1])
-        assert [m[1] for m in read_both[0]] == [m[1] for m in read_both[1]]
 
 
 def test_a_wrong_serialization_is_refused_in_one_line():

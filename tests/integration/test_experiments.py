@@ -5,7 +5,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from support.messages import shared
 from support.scripts import EXPERIMENTS, load
@@ -54,18 +53,6 @@ def test_a_short_run_writes_its_table_and_prints_it(
     assert capsys.readouterr().out.strip()
     for picture in tmp_path.glob("*.png"):
         assert picture.read_bytes().startswith(b"\x89PNG")
-
-
-def test_the_same_start_makes_the_filter_as_good_as_the_smoother() -> None:
-    """Ten objects show it already: 0.2 s after birth the start counts, and smoothing does not."""
-    script = load("births")
-    labels = ("smoother, regression", "ekf-replay, regression", "ekf-replay, one-point")
-    rmse = [
-        np.sqrt(np.mean([script.errors(label, np.random.default_rng([3, i]))[3, 1] ** 2 for i in range(10)]))
-        for label in labels
-    ]
-    assert rmse[1] == pytest.approx(rmse[0], rel=0.1)
-    assert rmse[2] > 3.0 * rmse[1]
 
 
 # --- recordings of other people

@@ -53,7 +53,7 @@ def test_the_demo_goes_from_scenario_to_report(demo: Path) -> None:
     assert [one.meta["estimator"] for one in found.values()] == list(ESTIMATORS)
     assert {one.config["sensors"]["radar"]["std"]["speed_mps"] for one in found.values()} == {1.006}  # fitted
     shown = (demo / "shown.txt").read_text(encoding="utf-8")
-    summary, tables = shown.split("Tracking (errors")
+    summary, tables = shown.split("\nTracking\n")
     assert "at the newest stamp" in " ".join(summary.split())
     for text in tables.split("Error against lag"):
         assert sorted(ESTIMATORS, key=lambda name: text.index(f" {name} ")) == list(ESTIMATORS)

@@ -70,10 +70,3 @@ def test_replays_are_the_same_in_memory_and_written(estimator: str, messages: li
     assert {name: kept[name] for name in kept if not name.startswith(NAMES_AND_TIMES)} == {
         name: read[name] for name in read if not name.startswith(NAMES_AND_TIMES)
     }
-
-
-def test_a_break_in_the_input_is_told(messages: list[Message]) -> None:
-    first = next(message for message in messages if isinstance(message, EgoState))
-    memory = replay_in_memory([*messages, first], Config())
-    assert "receipt time goes back" in memory.meta["broken_off"]
-    assert memory.meta["complete"] is True

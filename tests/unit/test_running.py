@@ -5,17 +5,11 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import ClassVar
 
 import numpy as np
 import pytest
 
-from fgtrack.core.types import Detection, DetectionList, EgoState, TrackReport, TrackState, TruthState
-from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult
-from fgtrack.estimation.failures import Failures
-from fgtrack.estimation.filters.replay import ReplayEkf
-from fgtrack.estimation.object_bank import ObjectBank
-from fgtrack.pipeline.config import Config
+from fgtrack.core.types import Detection, DetectionList, EgoState, TrackReport, TruthState
 from fgtrack.pipeline.live import EGO, TickTiming, Tracker
 from fgtrack.pipeline.shipped import read_config
 
@@ -92,75 +86,6 @@ def test_what_is_no_message_and_what_cannot_be_read_is_counted() -> None:
 
 
 # Failures
-
-
-class FailingBank(ObjectBank):
-    """Raises when asked to."""
-
-    fails: ClassVar[set[str]] = set()
-
-    def _check(self, method: str) -> None:
-        if method in self.fails:
-            self.fails.remove(method)
-            raise np.linalg.LinAlgError(f"{method} is singular")
-
-    def update(
-        self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
-    ) -> list[UpdateResult]:
-        self._check("update")
-        return super().update(stamp_ns, track_ids, measurements)
-
-    def advance(self, now_ns: int) -> None:
-        self._check("advance")
-        super().advance(now_ns)
-
-    def states_at(self, stamp_ns: int) -> StatesAt:
-        self._check("states_at")
-        return super().states_at(stamp_ns)
-
-    def present(self) -> list[TrackState]:
-        self._check("present")
-        return super().present()
-
-    def birth(self, track_id: int, prior: Start) -> None:
-        self._check("birth")
-        super().birth(track_id, prior)
-
-
-@pytest.fixture
-def failing(monkeypatch: pytest.MonkeyPatch) -> Iterator[Tracker]:
-    def build(config: Config, failures: Failures) -> TrackBank:
-        motion = config.motion_model()
-        return FailingBank(motion, lambda start: ReplayEkf(motion, start, 1.0), 1.0)
-
-    monkeypatch.setattr("fgtrack.pipeline.build.build_bank", build)
-    FailingBank.fails = set()
-    yield tracker_of()
-    assert FailingBank.fails == set()
-
-
-@pytest.mark.parametrize(
-    ("method", "failures", "dispositions"),
-    [
-        ("update", {"update failed": 2, "track ended": 2}, {"birth": 4, "in_sequence": 74, "failed": 2}),
-        ("advance", {"estimator raised": 1, "track ended": 2}, {"birth": 4, "in_sequence": 76}),
-        ("present", {"estimator raised": 1, "track ended": 2}, {"birth": 4, "in_sequence": 76}),
-    ],
-)
-def test_what_an_estimator_raises_ends_its_tracks_which_are_born_again(
-    failing: Tracker, method: str, failures: dict[str, int], dispositions: dict[str, int]
-) -> None:
-    for number, message in enumerate(messages(40)):
-        failing.receive(message)
-        if number == 41:
-            FailingBank.fails = {method}
-        tracks = failing.tick(message.receipt_ns).tracks
-    assert [track.track_id for track in tracks] == [2, 3]
-    undisturbed = run(tracker_of(), 40)
-    assert [track.x_m for track in tracks] == pytest.approx([track.x_m for track in undisturbed], abs=0.3)
-    assert failing.failures == failures
-    assert f"{method} is singular" in str(failing.last_failure)
-    assert failing.counts == {"lidar_cluster": dispositions}
 
 
 def test_a_list_whose_processing_raises_ends_as_failed(monkeypatch: pytest.MonkeyPatch) -> None:
