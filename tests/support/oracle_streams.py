@@ -16,7 +16,6 @@ from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import Mount, RobustLoss, SensorModel
-from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY, draw_delays
 from fgtrack.tracking.detections import NoMerge
 from fgtrack.tracking.ego import EgoTrajectory
 from fgtrack.tracking.inbox import Batch
@@ -56,14 +55,15 @@ _ONBOARD: Mapping[str, SensorModel] = {
 
 @dataclass(frozen=True)
 class Stream:
-    """Measurements in the order of their stamps, and the orders in which they arrive."""
+    """Measurements in the order of their stamps, and their order of arrival."""
 
     motion: MotionModel
     prior: Start
     measurements: tuple[Measurement, ...]
     sightings: tuple[Sighting, ...]
     """The same as `measurements`, for the oracle."""
-    orders: Mapping[str, Sequence[int]]
+    order: Sequence[int]
+    """Order of arrival."""
     lag_s: float
 
     @property
@@ -104,7 +104,7 @@ Plan = tuple[FloatArray, npt.NDArray[np.str_]]
 
 
 def linear(rng: np.random.Generator) -> Stream:
-    """Positions of the paper's LiDAR and RADAR in a linear model, with the paper's delays."""
+    """Positions of the paper's LiDAR and RADAR in a linear model."""
     return drawn(rng, CV(), paper_stamps(1.2), lag_s=1.0, reach_s=0.95)
 
 
@@ -224,9 +224,9 @@ def drawn(
     start: Start = FAST,
     sense: Sense = paper,
 ) -> Stream:
-    """Truth with the motion model's own noise, measured as `plan` says; in the random order up to `reach_s` late."""
+    """Truth with the motion model's own noise, measured as `plan` says; each arrives up to `reach_s` late."""
     stamps_s, sensors = plan
-    empty = Stream(motion, start, (), (), {}, lag_s)
+    empty = Stream(motion, start, (), (), (), lag_s)
     dynamics, x = empty.problem.dynamics, empty.problem.start.mean
     measurements, sightings, last_s = list[Measurement](), list[Sighting](), 0.0
     for stamp_s, sensor in zip(stamps_s.tolist(), sensors.tolist(), strict=True):
@@ -237,12 +237,5 @@ def drawn(
         measurement, sighting = sense(rng, x, _START_NS + nanoseconds(stamp_s), sensor)
         measurements.append(measurement)
         sightings.append(sighting)
-    delays_s = np.where(
-        sensors == "radar", draw_delays(RADAR_DELAY, rng, stamps_s), draw_delays(LIDAR_DELAY, rng, stamps_s)
-    )
-    random_s = rng.uniform(0.0, reach_s, len(stamps_s))
-    orders = {
-        "arrival": np.argsort(stamps_s + delays_s, kind="stable").tolist(),
-        "random": np.argsort(stamps_s + random_s, kind="stable").tolist(),
-    }
-    return Stream(motion, start, tuple(measurements), tuple(sightings), orders, lag_s)
+    order = np.argsort(stamps_s + rng.uniform(0.0, reach_s, len(stamps_s)), kind="stable").tolist()
+    return Stream(motion, start, tuple(measurements), tuple(sightings), order, lag_s)
