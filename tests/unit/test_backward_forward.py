@@ -140,8 +140,11 @@ class NaiveBank:
                 places[track_id] = len(gaps) - 1 - gaps[::-1].index(min(gaps))
         return places
 
-    def update(self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]) -> None:
-        places = self.nearest(stamp_ns)
+    def update(
+        self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+    ) -> list[tuple[FloatArray, float]]:
+        """Fuse and return innovations and NIS."""
+        places, results = self.nearest(stamp_ns), []
         for track_id, m in zip(track_ids, measurements, strict=True):
             track, place = self.tracks[track_id], places[track_id]
             mean = track.means[place][None]
@@ -154,6 +157,8 @@ class NaiveBank:
             track.covariances.append(done.covariance[0])
             for _ in range(steps):
                 self.grow(track)
+            results.append((done.innovation[0], float(done.nis[0])))
+        return results
 
 
 @settings(deadline=None, max_examples=15)
@@ -183,8 +188,10 @@ def test_any_history_of_operations_is_that_of_a_bank_of_lists(seed: int, length:
                 ids = [i for i in places if rng.random() < 0.7]
                 rng.shuffle(ids)
                 measurements = [measured(rng, stamp_ns, naive.tracks[i].means[places[i]]) for i in ids]
-                made.update(stamp_ns, ids, measurements)
-                naive.update(stamp_ns, ids, measurements)
+                results = made.update(stamp_ns, ids, measurements)
+                for result, (y, nis) in zip(results, naive.update(stamp_ns, ids, measurements), strict=True):
+                    np.testing.assert_allclose(result.innovation, y, rtol=1e-7, atol=1e-7)
+                    assert result.nis == pytest.approx(nis, rel=1e-6)
             case "remove" if naive.tracks:
                 gone = int(rng.choice(list(naive.tracks)))
                 made.remove(gone)
