@@ -78,11 +78,7 @@ def lever_arm(seeds: int, duration_s: float) -> str:
     lines = ["| RADAR | position RMSE [m] | NEES (2) | NIS (3) |", "| --- | --- | --- | --- |"]
     for name, mount in _ARMS_M.items():
         sensor = {"std": _DOPPLER_STD, "mount": {"x_m": mount[0], "y_m": mount[1], "yaw_rad": 0.8}}
-        settings = {
-            "sensors": {"radar": sensor},
-            "birth.speed_std_mps": 20.0,
-            "smoother.lagged_s": [],
-        }
+        settings = {"sensors": {"radar": sensor}, "birth.speed_std_mps": 20.0, "smoother.lagged_s": []}
         found = []
         for seed in range(seeds):
             messages = fgtrack.simulate(turning_ego(mount, duration_s), seed=seed)

@@ -310,13 +310,7 @@ def _draw_estimators(axes: Axes, entries: Sequence[Entry], shown_m: tuple[float,
         if not own:
             continue  # not asked for
         delays_s = np.array([e.delay_s for e in own]) + (index - len(DRAWN) // 2) * DODGE_S
-        its = {
-            "color": look(name).colour,
-            "marker": MARKERS[index],
-            "markersize": 4.5,
-            "linestyle": "",
-            "capsize": 2.0,
-        }
+        its = {"color": look(name).colour, "marker": MARKERS[index], "markersize": 4.5, "linestyle": "", "capsize": 2.0}
         bars_m = [2.0 * e.rmse_error_m for e in own]
         axes.errorbar(1e3 * delays_s, [e.rmse_m for e in own], bars_m, label=name, **its)
     axes.set_ylim(*shown_m)

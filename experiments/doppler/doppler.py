@@ -200,11 +200,7 @@ SCENES = {"doppler": doppler, "ranging": ranging}
 NAMES = ("ekf-replay", "iekf-replay", "ukf-replay", "iplf-replay", "smoother")
 #: By scene: how the object may start.
 STARTS: dict[str, dict[str, dict[str, str]]] = {
-    "doppler": {
-        "one-point": {"initiation": "one-point"},
-        "regression": {"initiation": "regression"},
-        "8 headings": {},
-    },
+    "doppler": {"one-point": {"initiation": "one-point"}, "regression": {"initiation": "regression"}, "8 headings": {}},
     "ranging": {"one start": {}, "two intersections": {}},
 }
 

@@ -114,11 +114,7 @@ SCENES: Mapping[str, Scene] = {
 #: On real cars; there is no map.
 GROWTH = {"sensors.pointrcnn_car.std": {"x_m": 0.15, "y_m": 0.08, "yaw_rad": 0.06}}
 GROWTH |= {"sensors.pointrcnn_car.std_growth": {"x_m": 0.007, "y_m": 0.003}}
-KITTI = {
-    **MODELS,
-    "EKF, growth": Contestant(EKF, GROWTH),
-    "smoother, growth": Contestant(SMOOTHER, GROWTH, "smoother"),
-}
+KITTI = {**MODELS, "EKF, growth": Contestant(EKF, GROWTH), "smoother, growth": Contestant(SMOOTHER, GROWTH, "smoother")}
 SEQUENCES = ("0004", "0006", "0008", "0010", "0018")
 
 

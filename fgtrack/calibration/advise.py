@@ -68,8 +68,8 @@ def advise(
     readable = UntilBreak(source.messages())
     messages = list(readable)
     broken = None if readable.error is None else str(readable.error)
-    found = assumed(resolved, replace(source, messages=lambda: iter(messages)))
-    return Adviser(str(recording), messages, found, reference, on_step).advice(broken, tune)
+    result = assumed(resolved, replace(source, messages=lambda: iter(messages)))
+    return Adviser(str(recording), messages, result, reference, on_step).advice(broken, tune)
 
 
 class Adviser:
@@ -139,9 +139,9 @@ class Adviser:
 
     def _take(self, findings: Iterable[Finding]) -> None:
         """Keep findings, and follow them."""
-        for one in findings:
-            self._findings.append(one)
-            self._config = read_config(self._config, one.settings)
+        for item in findings:
+            self._findings.append(item)
+            self._config = read_config(self._config, item.settings)
 
     def _withdraw_harm(self, before: Config) -> None:
         """Take back settings that make the replay worse than without them; their findings stay."""
@@ -165,7 +165,7 @@ class Adviser:
     @property
     def _is_useless(self) -> bool:
         """True if something is wrong that no setting corrects: nothing else can be judged then."""
-        return any(one.weight >= _USELESS and not one.settings for one in self._findings)
+        return any(item.weight >= _USELESS and not item.settings for item in self._findings)
 
     def _unknown_sensors(self) -> Iterator[Finding]:
         """Yield the sensors of the recording that the configuration lacks."""
@@ -173,8 +173,8 @@ class Adviser:
         unknown = [name for name in self._arrivals if name not in known]
         if not unknown:
             return
-        lists = [one for one in self._messages if isinstance(one, DetectionList) and one.objects]
-        first = {one.sensor: ", ".join(one.objects[0].measured) for one in reversed(lists)}
+        lists = [item for item in self._messages if isinstance(item, DetectionList) and item.objects]
+        first = {item.sensor: ", ".join(item.objects[0].measured) for item in reversed(lists)}
         has = "; ".join(f"{name}: {first.get(name, 'nothing')}" for name in unknown)
         text = f"no model of {', '.join(unknown)} ({has}): give sensors.NAME.std, or leave them out."
         ignored = sorted({*self._config.ignore_sensors, *unknown})
@@ -191,7 +191,7 @@ class Adviser:
         """Yield clocks that do not agree, and biases of positions, where these can be estimated."""
         if self._is_useless:
             return
-        doubtful = {one.about for one in self._findings if one.kind == "clock"}
+        doubtful = {item.about for item in self._findings if item.kind == "clock"}
         unlimited = all(sensor.max_delay_s is None for sensor in self._config.sensors.values())
         is_same = unlimited and self._config.estimator != "ekf-backward-forward"  # nothing is refused for its delay
         try:
@@ -241,8 +241,8 @@ class Adviser:
 
     def _tuned(self, before: Outcome) -> Iterator[Finding]:
         """Yield the noise that is fitted to the recording, unless nothing can be, or it does harm."""
-        is_assumed = any(one.key.endswith(".std") for one in self._assumed.assumptions)
-        if not is_assumed and not any(one.kind == "noise" for one in self._findings):
+        is_assumed = any(item.key.endswith(".std") for item in self._assumed.assumptions)
+        if not is_assumed and not any(item.kind == "noise" for item in self._findings):
             return
         steps, messages = count(), list(beginning(self._tracked, nanoseconds(TUNED_S)))
         try:
@@ -261,8 +261,8 @@ class Adviser:
         if why is not None:
             yield Finding("tune", "tune", 76.0, f"no noise is changed. With what is fitted, {why}.")
             return
-        settings = {one.key: one.tuned for one in report.parameters if one.tuned != one.configured}
-        stay = ", ".join(one.key for one in report.parameters if one.key not in settings)
+        settings = {item.key: item.tuned for item in report.parameters if item.tuned != item.configured}
+        stay = ", ".join(item.key for item in report.parameters if item.key not in settings)
         rest = f" As configured stay {stay}." if stay else ""
         yield Finding("tune", "tune", 76.0, f"fitted to the recording by maximum likelihood.{rest}", settings)
 
@@ -271,18 +271,18 @@ class Adviser:
         for known, outcome in self._outcomes:
             if known == config:
                 return outcome
-        fast, found = config, None
+        fast, result = config, None
         if config.estimator.startswith("smoother"):
             storage_s = min(config.effective.reach_s, LONGEST_STORAGE_S)
             fast = replace(fast, estimator="ekf-replay", filter=replace(config.filter, storage_s=storage_s))
         with suppress(DataError):
-            found = Outcome.of(replay_in_memory(self._tracked, fast))
-        self._outcomes.append((config, found))
-        return found
+            result = Outcome.of(replay_in_memory(self._tracked, fast))
+        self._outcomes.append((config, result))
+        return result
 
     def _fine(self, seen: Mapping[str, Arrivals], outcome: Outcome | None) -> Iterator[str]:
         """Yield the checks that found nothing."""
-        wrong = {(one.kind, one.about) for one in self._findings}
+        wrong = {(item.kind, item.about) for item in self._findings}
         kinds = {kind for kind, _ in wrong}
         ego = self._arrivals.get(EGO)
         if ego is not None and not wrong & {("ego", EGO), ("clock", EGO), ("input", EGO)} and ego.period_s:
@@ -290,16 +290,16 @@ class Adviser:
             yield f"the ego ({1.0 / ego.period_s:.0f} Hz, longest gap {longest}, delay {delay})"
         offsets = [] if self._clocks is None else self._clocks.others
         noise = () if outcome is None else outcome.noise
-        stamped = [name for name, one in seen.items() if len(one.stamps_ns) >= FEWEST and not one.is_receipt]
+        stamped = [name for name, item in seen.items() if len(item.stamps_ns) >= FEWEST and not item.is_receipt]
         named = {
             "stamps": [name for name in stamped if ("clock", name) not in wrong],
-            "clock": [one.sensor for one in offsets if one.is_known and not one.is_off],
-            "noise": [one.sensor for one in noise if ("noise", one.sensor) not in wrong and one.is_consistent],
+            "clock": [item.sensor for item in offsets if item.is_known and not item.is_off],
+            "noise": [item.sensor for item in noise if ("noise", item.sensor) not in wrong and item.is_consistent],
         }
         yield from (f"{what} of {', '.join(names)}" for what, names in named.items() if names)
         if not kinds & {"input", "model"}:
             yield "frames, angles and fields"
-        if "window" not in kinds and any(one.has_stamps for one in seen.values()):
+        if "window" not in kinds and any(item.has_stamps for item in seen.values()):
             found = self._config.effective
             yield f"{found.lag_key} ({found.lag_s:g} s) and max_delay_s"
         if "track" not in kinds and outcome is not None and outcome.truth is not None:

@@ -98,7 +98,7 @@ def arrivals_of(messages: Iterable[Message]) -> dict[str, Arrivals]:
         elif isinstance(message, DetectionList):
             row = message.stamp_ns, message.receipt_ns, len(message.objects)
             rows.setdefault(message.sensor, []).append(row)
-    return {name: Arrivals(name, *np.array(found, dtype=np.int64).T) for name, found in sorted(rows.items())}
+    return {name: Arrivals(name, *np.array(result, dtype=np.int64).T) for name, result in sorted(rows.items())}
 
 
 def overtaken(arrivals: Mapping[str, Arrivals], sensors: Sequence[str]) -> dict[str, float]:
@@ -131,11 +131,11 @@ def window_findings(arrivals: Sequence[Arrivals], config: Config) -> Iterator[Fi
 
 def _too_short(arrivals: Sequence[Arrivals], config: Config, needed_s: float) -> Iterator[Finding]:
     """Yield a window shorter than the delays, or than the time between two lists, and a track that lives less long."""
-    slowest = max(arrivals, key=lambda one: one.period_s, default=None)
+    slowest = max(arrivals, key=lambda item: item.period_s, default=None)
     if slowest is None:
         return
     reach, between = config.effective, "the time between two lists of {0.name}, {0.period_s:.3g} s".format
-    worst = max(arrivals, key=lambda one: one.beyond(reach.reach_s))
+    worst = max(arrivals, key=lambda item: item.beyond(reach.reach_s))
     lost = worst.beyond(reach.reach_s)
     if needed_s > reach.reach_s or reach.lag_s < slowest.period_s:
         text = f"{between(slowest)}: too short."
@@ -145,11 +145,11 @@ def _too_short(arrivals: Sequence[Arrivals], config: Config, needed_s: float) ->
         text = f"{reach.lag_key} {reach.lag_s:g} s is shorter than {text}"
         yield Finding("window", "window", 55.0 + 35.0 * lost, text, {reach.lag_key: value})
     key, limit_s = "lifecycle.forget_s", getattr(config.lifecycle, "forget_s", 0.0)
-    placing = [one for one in arrivals if config.sensors[one.name].gives_position]
+    placing = [item for item in arrivals if config.sensors[item.name].gives_position]
     if isinstance(config.lifecycle, ExistenceRules):
         key, limit_s = "lifecycle.out_of_view_s", config.lifecycle.out_of_view_s
         placing = placing if len(placing) > 1 else []  # only a list that could not show a track ends it
-    slowest = max(placing, key=lambda one: one.period_s, default=None)
+    slowest = max(placing, key=lambda item: item.period_s, default=None)
     if slowest is not None and slowest.period_s > limit_s:
         text = f"{key} {limit_s:g} s is shorter than {between(slowest)}: a track that it alone sees ends in between."
         yield Finding("track", slowest.name, 55.0, text, {key: nice_above(_LISTS * slowest.period_s)})

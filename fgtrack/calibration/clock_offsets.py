@@ -119,11 +119,10 @@ class OffsetReport:
     @property
     def others(self) -> list[SensorOffset]:
         """The sensors but the reference."""
-        return [one for one in self.sensors if one.sensor != self.reference]
+        return [item for item in self.sensors if item.sensor != self.reference]
 
     def surely_late_s(self, one: SensorOffset) -> float | None:
         """Return by how much the later one of two clocks is late at least; negative where it is that of the reference.
-
         None where either clock may be wrong.
         """
         if not one.is_off or one.offset_s is None or one.half_s is None:
@@ -161,21 +160,21 @@ def estimate_offsets(
 
     Raises `CallError` for an unknown reference, and `DataError` without detections or with fewer than five ego states.
     """
-    heard = [corrected(one, config.sensors) if isinstance(one, DetectionList) else one for one in messages]
+    heard = [corrected(item, config.sensors) if isinstance(item, DetectionList) else item for item in messages]
     unrefused = {  # corrected stamps are taken as they are, and none is too late
         name: replace(
-            one,
+            item,
             max_delay_s=None,
             clock_offset_s=0.0,
-            stamp_from="message" if one.stamp_from == "receipt" else one.stamp_from,
+            stamp_from="message" if item.stamp_from == "receipt" else item.stamp_from,
         )
-        for name, one in config.sensors.items()
+        for name, item in config.sensors.items()
     }
     config = replace(config, estimator="ekf-replay", sensors=unrefused)
-    lists = [one for one in heard if isinstance(one, DetectionList) and one.sensor in config.used_sensors]
+    lists = [item for item in heard if isinstance(item, DetectionList) and item.sensor in config.used_sensors]
     arrivals = arrivals_of(lists)
-    counts = {name: int(one.counts.sum()) for name, one in arrivals.items()}
-    least_s = {name: float(one.delays_s.min()) for name, one in arrivals.items()}
+    counts = {name: int(item.counts.sum()) for name, item in arrivals.items()}
+    least_s = {name: float(item.delays_s.min()) for name, item in arrivals.items()}
     if not counts:
         raise DataError("there are no detections of a sensor that the configuration names (sensors)")
     if reference is not None and reference not in counts:
@@ -183,9 +182,9 @@ def estimate_offsets(
         raise CallError(
             f"reference {reference!r} is no sensor of the input, which has {', '.join(sorted(counts))}{hint}"
         )
-    needs_ego = any(one.frame != "map" for one in lists)
+    needs_ego = any(item.frame != "map" for item in lists)
     run = replay_in_memory(heard, config) if run is None else run
-    ego = EgoPath(one for one in heard if isinstance(one, EgoState)) if needs_ego else None
+    ego = EgoPath(item for item in heard if isinstance(item, EgoState)) if needs_ego else None
     seen = sightings_of(run, lists, config, ego)
     sensors = [name for name in config.sensors if name in counts]
 
@@ -206,30 +205,30 @@ def estimate_offsets(
     trusted = [name for name in placing if name not in doubtful] or placing or sensors
     reference = max(sorted(trusted), key=counts.__getitem__)
     report = against(reference, _paths(seen, reference))
-    late = [one for one in report.sensors if (report.surely_late_s(one) or 0.0) < 0.0]
+    late = [item for item in report.sensors if (report.surely_late_s(item) or 0.0) < 0.0]
     if not late or len(trusted) < len(placing):
         return report
-    reference = max(late, key=lambda one: one.num_detections).sensor
+    reference = max(late, key=lambda item: item.num_detections).sensor
     return against(reference, _paths(seen, reference))
 
 
 def _paths(seen: Mapping[str, Mapping[int, Sightings]], reference: str) -> list[ObjectPath]:
-    paths = [ObjectPath.through(one.stamps_ns, one.at(one.stamps_ns)) for one in seen.get(reference, {}).values()]
-    return [one for one in paths if one is not None]
+    paths = [ObjectPath.through(item.stamps_ns, item.at(item.stamps_ns)) for item in seen.get(reference, {}).values()]
+    return [item for item in paths if item is not None]
 
 
 def _paired(tracks: Mapping[int, Sightings], paths: Sequence[ObjectPath]) -> list[_Pair]:
     """Return each track that is near a path with the one that it is nearest to."""
     pairs = []
-    for one in tracks.values():
-        positions_m = one.at(one.stamps_ns)
+    for item in tracks.values():
+        positions_m = item.at(item.stamps_ns)
         best, best_m = None, _NEAR_M
         for path in paths:
-            gaps_m = np.hypot(*(path(one.stamps_ns) - positions_m).T)
+            gaps_m = np.hypot(*(path(item.stamps_ns) - positions_m).T)
             if np.isfinite(gaps_m).sum() > len(gaps_m) / 2 and float(np.nanmedian(gaps_m)) < best_m:
                 best, best_m = path, float(np.nanmedian(gaps_m))
         if best is not None:
-            pairs.append((one.chosen(np.isfinite(best(one.stamps_ns)[:, 0])), best))
+            pairs.append((item.chosen(np.isfinite(best(item.stamps_ns)[:, 0])), best))
     return pairs
 
 
@@ -238,20 +237,20 @@ def _row(name: str, pairs: Sequence[_Pair], reference: str, num_sensors: int) ->
         return SensorOffset(name, None, None, 0, "the only modality: nothing to compare it with")
     if name == reference:
         return SensorOffset(name, 0.0, 0.0, 0, "the reference: its clock is taken for that of the ego")
-    count = sum(len(one.stamps_ns) for one, _ in pairs)
+    count = sum(len(item.stamps_ns) for item, _ in pairs)
     if count < _FEWEST:
         why = f"fewer than {_FEWEST} detections of objects whose path is known from {reference}"
         return SensorOffset(name, None, None, count, why)
     step = math.ceil(count / _MOST)
-    pairs = [(one.chosen(slice(None, None, step)), path) for one, path in pairs]
-    stamps_ns = np.concatenate([one.stamps_ns for one, _ in pairs])
+    pairs = [(item.chosen(slice(None, None, step)), path) for item, path in pairs]
+    stamps_ns = np.concatenate([item.stamps_ns for item, _ in pairs])
     offset_s, move_s = 0.0, math.inf
     for _ in range(_ROUNDS):
         r, g, frames = _residuals(pairs, offset_s)
         if reference != TRUTH:
             frames = {"vehicle": np.empty((len(r), 2, 0))}
         fits = {of: _solved(r, np.concatenate([g[:, :, None], axes], axis=2), stamps_ns) for of, axes in frames.items()}
-        of, fit = min(fits.items(), key=lambda one: round(one[1].cost, 6))
+        of, fit = min(fits.items(), key=lambda item: round(item[1].cost, 6))
         move_s = float(np.clip(fit.x[0], -_LARGEST_STEP_S, _LARGEST_STEP_S))
         offset_s += move_s
         if abs(move_s) < 1e-4:
@@ -275,13 +274,13 @@ _Frames = dict[Literal["ego", "vehicle"], FloatArray]
 def _residuals(pairs: Sequence[_Pair], offset_s: float) -> tuple[FloatArray, FloatArray, _Frames]:
     """Return residuals at `offset_s`, their derivatives by it, (n, 2), and (n, 2, 2) axes in which a bias may stay."""
     step_ns, rows = nanoseconds(_STEP_S), []
-    for one, path in pairs:
-        times_ns = one.stamps_ns - nanoseconds(offset_s)
+    for item, path in pairs:
+        times_ns = item.stamps_ns - nanoseconds(offset_s)
         true_m = [path(times_ns + shift_ns) for shift_ns in (-step_ns, 0, step_ns)]
-        sides_m = [true - one.at(times_ns + k * step_ns) for k, true in zip((-1, 0, 1), true_m, strict=True)]
+        sides_m = [true - item.at(times_ns + k * step_ns) for k, true in zip((-1, 0, 1), true_m, strict=True)]
         moves_m = true_m[2] - true_m[0]
         yaws_rad = np.arctan2(moves_m[:, 1], moves_m[:, 0])
-        ego_rad = np.full(len(yaws_rad), np.nan) if one.ego is None else one.ego(one.stamps_ns)[:, 2]
+        ego_rad = np.full(len(yaws_rad), np.nan) if item.ego is None else item.ego(item.stamps_ns)[:, 2]
         rows.append((sides_m[1], (sides_m[0] - sides_m[2]) / (2.0 * _STEP_S), yaws_rad, ego_rad))
     r, g, vehicle_rad, ego_rad = (np.concatenate(column) for column in zip(*rows, strict=True))
     frames: _Frames = {"ego": rotations(ego_rad)} if np.isfinite(ego_rad).any() else {}  # taken where both agree

@@ -116,9 +116,9 @@ def clock_findings(report: OffsetReport, configured_s: Mapping[str, float]) -> I
 
 def bias_findings(report: OffsetReport, ego: EgoConfig) -> Iterator[Finding]:
     """Yield constant errors of position against the truth: of the ego frame, which a setting corrects, or others."""
-    biased = {one.sensor: one.bias for one in report.sensors if one.bias is not None}
+    biased = {item.sensor: item.bias for item in report.sensors if item.bias is not None}
     biases_m = np.array([(bias.ahead_m, bias.left_m) for bias in biased.values() if bias.of == "ego"])
-    num_placed = sum(one.offset_s is not None for one in report.sensors)
+    num_placed = sum(item.offset_s is not None for item in report.sensors)
     if len(biases_m) == num_placed > 0 and (np.ptp(biases_m, axis=0) < _SAME_BIAS_M).all():
         off_m = biases_m.mean(axis=0).tolist()
         text = f"detections of all sensors lie {_WHERE(*off_m)} of the truth, in the frame of the ego: set its origin."

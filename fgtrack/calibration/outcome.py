@@ -9,13 +9,7 @@ import numpy as np
 from fgtrack.calibration.finding import Finding, percent
 from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation.comparison import POSITION_NEES, comparisons
-from fgtrack.evaluation.diagnostics import (
-    CORRELATED,
-    FAR_OFF,
-    FEWEST,
-    USED,
-    misfits,
-)
+from fgtrack.evaluation.diagnostics import CORRELATED, FAR_OFF, FEWEST, USED, misfits
 from fgtrack.evaluation.intervals import Estimate, by_stamp, mean_square
 from fgtrack.evaluation.metrics import ObjectMetrics, evaluate
 from fgtrack.evaluation.runs import EvaluatedRun
@@ -118,7 +112,9 @@ class Outcome:
     def of(cls, run: Run) -> "Outcome":
         """Return the numbers of `run`."""
         counts = dict(run.meta["counts"])
-        used = {name: sum(one.get(fate, 0) for fate in USED) / (sum(one.values()) or 1) for name, one in counts.items()}
+        used = {
+            name: sum(item.get(fate, 0) for fate in USED) / (sum(item.values()) or 1) for name, item in counts.items()
+        }
         metrics, ticks_ns = evaluate(run), run.tables["timing"]["now_ns"]
         return cls(
             births=int(np.count_nonzero(run.tables["updates"]["disposition"] == "birth")),
@@ -153,7 +149,6 @@ class Outcome:
 
 def harm(before: Outcome, after: Outcome) -> str | None:
     """Return what gets worse from one run to another, with its numbers; None where nothing does.
-
     Counts get worse where they rise by more than two standard deviations of their difference (Poisson). Where clearly
     more detections of a sensor are used, the two runs are not of the same data, and nothing is harm.
     """
@@ -192,9 +187,9 @@ def objection(before: Outcome, after: Outcome) -> str | None:
         return f"{worse}: tracks break at errors that the noise does not expect"
     runs = [EvaluatedRun("before", before.run), EvaluatedRun("after", after.run)]
     for name, entries in (each for one in comparisons(runs) for each in one.quantities.items()):
-        found = {entry.name: entry for entry in entries}
-        was, now = found["before"].value, found["after"].value
+        result = {entry.name: entry for entry in entries}
+        was, now = result["before"].value, result["after"].value
         fits = name == POSITION_NEES and 1.0 / FAR_OFF <= now / _POSITION_DOF <= FAR_OFF
-        if found["after"].standing == "worse" and not fits:
+        if result["after"].standing == "worse" and not fits:
             return f"{name} against the truth of the recording goes from {was:.3g} to {now:.3g}"
     return None

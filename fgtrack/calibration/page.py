@@ -42,11 +42,11 @@ class Advice:
     @property
     def changes(self) -> tuple[Assumption, ...]:
         """The settings that the findings change with their reasons, the most important first."""
-        found: dict[str, Assumption] = {}
+        result: dict[str, Assumption] = {}
         for one in self.findings:
             for key, value in one.settings.items():
-                found[key] = Assumption(tuple(key.split(".")), value, f"{one.about}: {one.text}")
-        return tuple(found.values())
+                result[key] = Assumption(tuple(key.split(".")), value, f"{one.about}: {one.text}")
+        return tuple(result.values())
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -63,7 +63,7 @@ class Advice:
 
     def _outcome(self) -> Table:
         columns = {"before": self.before} | ({"advised": self.after} if self.changes else {})
-        rows = {name: dict(() if one is None else one.rows()) for name, one in columns.items()}
+        rows = {name: dict(() if item is None else item.rows()) for name, item in columns.items()}
         names = dict.fromkeys(key for values in rows.values() for key in values)
         records = [{"replayed": name} | {column: values.get(name) for column, values in rows.items()} for name in names]
         title = "Replays with the settings before and as advised"
@@ -72,16 +72,16 @@ class Advice:
     def _lateness(self) -> Table:
         records = [
             {
-                "sensor": one.name,
-                "lists": len(one.counts),
-                "period_s": one.period_s,
-                "delay_p50_s": one.quantile_s(0.5),
-                "delay_p95_s": one.quantile_s(0.95),
-                "delay_max_s": float(one.delays_s.max()),
-                "overtaken": self.overtaken[one.name],
-                "lost": one.lost,
+                "sensor": item.name,
+                "lists": len(item.counts),
+                "period_s": item.period_s,
+                "delay_p50_s": item.quantile_s(0.5),
+                "delay_p95_s": item.quantile_s(0.95),
+                "delay_max_s": float(item.delays_s.max()),
+                "overtaken": self.overtaken[item.name],
+                "lost": item.lost,
             }
-            for one in self.arrivals
+            for item in self.arrivals
         ]
         columns = [
             Column("sensor", left=True),
@@ -97,9 +97,9 @@ class Advice:
         """Plain values for JSON."""
         return {
             "recording": self.recording,
-            "findings": [asdict(one) for one in self.findings],
+            "findings": [asdict(item) for item in self.findings],
             "fine": list(self.fine),
-            "changes": [{"key": one.key, "value": one.value, "why": one.reason} for one in self.changes],
+            "changes": [{"key": item.key, "value": item.value, "why": item.reason} for item in self.changes],
             "broken": self.broken,
             **self.tables.to_dict(),
         }

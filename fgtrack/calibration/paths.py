@@ -42,7 +42,6 @@ _POSITION = ("x_m", "y_m", "range_m", "bearing_rad")
 
 class EgoPath:
     """Smoothing splines through positions and unwrapped yaw of the ego; of states in any order.
-
     A line from state to state moves as fast as its noise: 2 cm at 100 Hz are 3 m/s. The spline minimises
     sum (y - f)^2 + lam integral f''^2, a low-pass that lets half of a sine of 2 Hz through. Raises `DataError` for
     fewer than five states.
@@ -55,7 +54,7 @@ class EgoPath:
         stamps_ns = sorted(by_stamp)
         self._start_ns, self._end_ns = stamps_ns[0], stamps_ns[-1]
         times_s = np.array([seconds(stamp_ns - self._start_ns) for stamp_ns in stamps_ns])
-        values = np.array([[one.x_m, one.y_m, one.yaw_rad] for one in map(by_stamp.__getitem__, stamps_ns)])
+        values = np.array([[item.x_m, item.y_m, item.yaw_rad] for item in map(by_stamp.__getitem__, stamps_ns)])
         values[:, 2] = np.unwrap(values[:, 2])
         density_s = float(times_s[-1]) / (len(times_s) - 1)
         lam = 1.0 / (density_s * (2.0 * np.pi * _EGO_CUTOFF_HZ) ** 4)
@@ -80,7 +79,6 @@ class ObjectPath:
     @classmethod
     def through(cls, stamps_ns: IntArray, positions_m: FloatArray) -> "ObjectPath | None":
         """Return the smoothing spline through noisy positions (n, 2); None through too few.
-
         Its stiffness is that of generalised cross-validation (Woltring, Advances in Engineering Software 8, 1986).
         """
         known_ns, rows = np.unique(stamps_ns, return_index=True)
@@ -93,9 +91,9 @@ class ObjectPath:
         index = np.clip(np.searchsorted(self.stamps_ns, times_ns), 1, len(self.stamps_ns) - 1)
         unknown = (times_ns < self.stamps_ns[0]) | (times_ns > self.stamps_ns[-1])
         unknown |= self.stamps_ns[index] - self.stamps_ns[index - 1] > nanoseconds(_GAP_S)
-        found = np.asarray(self.curve((times_ns - self.stamps_ns[0]) / NS_PER_S))
-        found[unknown] = np.nan
-        return found
+        result = np.asarray(self.curve((times_ns - self.stamps_ns[0]) / NS_PER_S))
+        result[unknown] = np.nan
+        return result
 
 
 @dataclass(frozen=True)
@@ -125,11 +123,11 @@ class Sightings:
 def true_paths(messages: Iterable[Message]) -> list[ObjectPath]:
     """Return the paths of all true objects of which more than one state is known."""
     states: dict[int, dict[int, tuple[float, float]]] = defaultdict(dict)
-    for one in messages:
-        if not isinstance(one, TruthState) or one.ignored or one.object_id == EGO_ID:
+    for item in messages:
+        if not isinstance(item, TruthState) or item.ignored or item.object_id == EGO_ID:
             continue
-        if max(abs(one.x_m), abs(one.y_m)) <= LARGEST:  # as detections are
-            states[one.object_id][one.stamp_ns] = (one.x_m, one.y_m)
+        if max(abs(item.x_m), abs(item.y_m)) <= LARGEST:  # as detections are
+            states[item.object_id][item.stamp_ns] = (item.x_m, item.y_m)
     paths = []
     for each in states.values():
         if len(each) > 1:
@@ -145,7 +143,6 @@ def sightings_of(
     run: Run, lists: Sequence[DetectionList], config: Config, ego: EgoPath | None
 ) -> dict[str, dict[int, Sightings]]:
     """Return what `run` of `lists` fused, transformed and merged as the tracker does, by sensor and track.
-
     `ego` is None where all detections are in the map frame.
     """
     updates = run.tables["updates"]
@@ -172,15 +169,15 @@ def sightings_of(
             if np.isnan(pose[0]):
                 continue
             placed = None if ego is None else EgoPose(pose[0], pose[1], pose[2], 0.0)
-            for one in preprocess(batch, sensors[message.sensor], placed)[0]:
-                row = record(message, one.leader, Disposition.BIRTH)
+            for item in preprocess(batch, sensors[message.sensor], placed)[0]:
+                row = record(message, item.leader, Disposition.BIRTH)
                 track_id = tracks.get((row.sensor, row.stamp_ns, row.receipt_ns, row.index))
-                if track_id is not None and one.position_m is not None:
+                if track_id is not None and item.position_m is not None:
                     is_map = ego is None or message.frame == "map"
-                    z_m = one.position_m if is_map else (one.position_m - pose[:2]) @ rotations(pose[2])
+                    z_m = item.position_m if is_map else (item.position_m - pose[:2]) @ rotations(pose[2])
                     rows[message.sensor, track_id].append((batch.stamp_ns, z_m, is_map))
-    found: dict[str, dict[int, Sightings]] = {sensor: {} for sensor, _ in rows}
+    result: dict[str, dict[int, Sightings]] = {sensor: {} for sensor, _ in rows}
     for (sensor, track_id), each in rows.items():
         stamps_ns, positions_m, in_map = map(np.array, zip(*each, strict=True))
-        found[sensor][track_id] = Sightings(stamps_ns, positions_m, in_map, ego)
-    return found
+        result[sensor][track_id] = Sightings(stamps_ns, positions_m, in_map, ego)
+    return result

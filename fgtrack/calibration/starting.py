@@ -69,7 +69,9 @@ def _topic_part(bag: Bag, topic: TopicInfo, parts: Sequence[Part]) -> Part:
     has_clock = topic.delay is None or abs(topic.delay["p50_s"]) < OTHER_CLOCK_S
     item = TopicInput(topic.name, stamp_from="message" if has_clock else "receipt")
     reasons = {"stamp_from": "its stamps are of another clock than the recorder's, or not set"}
-    problem = next((one.problem for one in bag.topics if (one.name, one.type) == (topic.name, topic.type)), None)
+    problem = next(
+        (entry.problem for entry in bag.topics if (entry.name, entry.type) == (topic.name, topic.type)), None
+    )
     if problem is not None or not topic.count:
         raise DataError(problem or "no messages")
     sensor = _sensor_name(topic.name, parts)
@@ -84,12 +86,12 @@ def _topic_part(bag: Bag, topic: TopicInfo, parts: Sequence[Part]) -> Part:
 def _mapped(bag: Bag, item: TopicInput, type_name: str, sensor: str) -> Part:
     """Return the guess for a topic of an unknown type; raises `DataError` with a line of what is in it."""
     messages = [one for topic, _, one in islice(bag.messages({item.topic}), _MESSAGES) if topic.type == type_name]
-    found: list[Mapping[str, Any]] = [fields_of(message) for message in messages]
+    result: list[Mapping[str, Any]] = [fields_of(message) for message in messages]
     lists: dict[str, list[Mapping[str, Any]]] = {}
-    for path, items in chain.from_iterable(each.items() for each in found):
+    for path, items in chain.from_iterable(each.items() for each in result):
         if isinstance(items, list):
             lists.setdefault(path, []).extend(map(fields_of, items))
-    lists[""] = found  # the message itself, the last choice
+    lists[""] = result  # the message itself, the last choice
     for path, samples in lists.items():
         values = _columns(samples)
         own = guesses(values)
@@ -112,8 +114,10 @@ def _mapped(bag: Bag, item: TopicInput, type_name: str, sensor: str) -> Part:
 
 def _columns(samples: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:
     """Numbers by name; none of a text."""
-    names = dict.fromkeys(name for one in samples for name, value in one.items() if not isinstance(value, list))
-    return {name: [float(one[name]) for one in samples if not isinstance(one.get(name), str | None)] for name in names}
+    names = dict.fromkeys(name for item in samples for name, value in item.items() if not isinstance(value, list))
+    return {
+        name: [float(item[name]) for item in samples if not isinstance(item.get(name), str | None)] for name in names
+    }
 
 
 def _sensor_name(text: str, parts: Sequence[Part]) -> str:
@@ -126,8 +130,8 @@ def _sensor_name(text: str, parts: Sequence[Part]) -> str:
 def _table_part(file: Path, columns: Sequence[str], is_folder: bool, parts: Sequence[Part]) -> Part:
     """Return the guess for a table beside other `parts`; raises `DataError` with a line of what is in it."""
     cells = [cells for _, cells in islice(rows(file), 1, _ROWS)]
-    values = {name: [_number(one[name]) for one in cells] for name in columns if any(one[name] for one in cells)}
-    own = guesses({name: [value for value in found if math.isfinite(value)] for name, found in values.items()})
+    values = {name: [_number(item[name]) for item in cells] for name in columns if any(item[name] for item in cells)}
+    own = guesses({name: [value for value in result if math.isfinite(value)] for name, result in values.items()})
     words = set(words_of(file.stem))
     is_truth, is_ego = bool(words & _TRUTH and not words & _EGO), bool(words & _EGO)
     is_ego |= not (is_truth or "object_id" in own) and _NEEDED["ego"] <= own.keys()
@@ -137,22 +141,22 @@ def _table_part(file: Path, columns: Sequence[str], is_folder: bool, parts: Sequ
     column = str(own["stamp"].path)
     unit, why = time_unit(column, [value for value in values[column] if math.isfinite(value)])
     if is_ego:
-        own = agreeing_with_motion(own, {name: np.array(found) for name, found in values.items()}, unit)
+        own = agreeing_with_motion(own, {name: np.array(result) for name, result in values.items()}, unit)
     missing = _NEEDED.get(role, set()) - own.keys()
     if missing or not any(wanted <= own.keys() for wanted in _POSITIONS):
         raise DataError(f"no column for {', '.join(sorted(missing)) or 'a position'} among {_spreads(values)}")
     is_sensor = not (is_ego or is_truth)
     known = ("stamp", "receipt", *((*MEASURABLE, *DESCRIBING) if is_sensor else STATE_NAMES))
-    used = {key: one for key, one in own.items() if key in known or (key == "object_id" and not is_ego)}
+    used = {key: item for key, item in own.items() if key in known or (key == "object_id" and not is_ego)}
     named = [str(own[key].path) for key in ("x_m", "y_m") if key in own and is_sensor]
     in_map = bool(named) and all(set(words_of(name)) & {"east", "easting", "north", "northing"} for name in named)
     table = CsvTable(
-        {key: one.path for key, one in used.items()},
+        {key: item.path for key, item in used.items()},
         file.name if is_folder else None,
         unit,  # type: ignore[arg-type]  # a name of NS_PER_UNIT
         frame="map" if in_map else None,
     )
-    reasons = {**{key: one.reason for key, one in used.items()}, "time_unit": why, "frame": "east and north"}
+    reasons = {**{key: item.reason for key, item in used.items()}, "time_unit": why, "frame": "east and north"}
     return Part(role, table, reasons, _unused(values, used))
 
 
@@ -165,23 +169,22 @@ def _number(text: str) -> float:
 
 def _unused(values: Mapping[str, Sequence[float]], used: Mapping[str, Guess]) -> tuple[str, ...]:
     """Return a note on the fields or columns that are not `used`; none without any."""
-    paths = [one.path.path if isinstance(one.path, Field) else one.path for one in used.values()]
+    paths = [item.path.path if isinstance(item.path, Field) else item.path for item in used.values()]
     names = {name for path in paths for name in ([path] if isinstance(path, str) else path)}
-    rest = {name: found for name, found in values.items() if name not in names}
+    rest = {name: result for name, result in values.items() if name not in names}
     return (f"not used: {_spreads(rest)}",) if rest else ()
 
 
 def _spreads(values: Mapping[str, Sequence[float]]) -> str:
-    found = []
+    result = []
     for name, samples in values.items():
         finite = [value for value in samples if math.isfinite(value)]
-        found.append(f"{name} ({min(finite):.4g} to {max(finite):.4g})" if finite else name)
-    return ", ".join(found)
+        result.append(f"{name} ({min(finite):.4g} to {max(finite):.4g})" if finite else name)
+    return ", ".join(result)
 
 
 def starting_config(recording: Path) -> str:
     """YAML text of a configuration for `recording`: what can be taken as settings, all else as comments.
-
     Raises `CallError` where nothing is there, and `DataError` where it is not an input, or damaged from the start.
     """
     parts, refused = _parts(recording)
@@ -202,7 +205,7 @@ def starting_config(recording: Path) -> str:
         *(f"Not taken: {line}" for line in refused),
         *(f"{part.label}: {note}" for part in taken for note in part.notes),
     ]
-    text = with_sensors.to_yaml(head, [one for part in taken for one in _comments(part)])
+    text = with_sensors.to_yaml(head, [item for part in taken for item in _comments(part)])
     validate(Config, YAML(typ="safe", pure=True).load(text) or {}, "the starting configuration")
     return text
 
@@ -217,11 +220,13 @@ def _parts(recording: Path) -> tuple[list[Part], list[str]]:
         for file, columns in headers(recording).items():
             makers[file.name] = partial(_table_part, file, columns, is_folder, parts)
     else:
-        found = describe(recording)
-        refused += [] if found.problem is None else [found.problem]
-        if found.kind == "recording" and not any(topic.type in NATIVE_ADAPTERS for topic in found.topics):
+        result = describe(recording)
+        refused += [] if result.problem is None else [result.problem]
+        if result.kind == "recording" and not any(topic.type in NATIVE_ADAPTERS for topic in result.topics):
             bag = Bag(recording)
-            makers = {f"{topic.name} ({topic.type})": partial(_topic_part, bag, topic, parts) for topic in found.topics}
+            makers = {
+                f"{topic.name} ({topic.type})": partial(_topic_part, bag, topic, parts) for topic in result.topics
+            }
     for label, make in makers.items():
         try:
             parts.append(make())
@@ -262,6 +267,6 @@ def _comments(part: Part) -> Iterator[tuple[Sequence[str], str]]:
     """Yield paths of keys, and the reasons of their guesses."""
     is_table = isinstance(part.item, CsvTable)
     of = [*(["csv"] if is_table else []), *(["detections"] if part.role not in ("ego", "truth") else []), part.role]
-    own = {one.name for one in fields(part.item)}
+    own = {item.name for item in fields(part.item)}
     for name, reason in part.reasons.items():
         yield ["input", *of, *([] if name in own else ["columns" if is_table else "fields"]), name], reason

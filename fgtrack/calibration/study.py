@@ -71,8 +71,8 @@ def _tracks(one: EvaluatedRun) -> str:
 def _to_do(first: EvaluatedRun, tables: Tables, advice: Advice | None) -> str:
     """Return what comes first: a defect of the recording or its settings, else the fastest of the best methods."""
     findings = () if advice is None else advice.findings
-    found = [str(one) for one in findings if not one.settings and one.weight >= _IMPORTANT]
-    if found := found or [str(one) for one in diagnostics(first.run)]:
+    found = [str(item) for item in findings if not item.settings and item.weight >= _IMPORTANT]
+    if found := found or [str(item) for item in diagnostics(first.run)]:
         return f"First: {found[0]}"
     ranked = [row for row in tables.tables["differences"].records if row["quantity"] == "position_rmse_m"]
     best = {row["run"] for row in ranked if row["standing"] != "worse"}
@@ -94,9 +94,7 @@ ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
 """Estimators of a study."""
 #: Share of the work that is done when a step begins.
 _ADVICE, _REPLAY, _COMPARE, _DRAW, _DONE = 0.02, 0.3, 0.85, 0.9, 1.0
-
 _MESSAGES = 1000  # between two signs of progress
-
 OnStep = Callable[[str, float], None]
 
 
@@ -219,8 +217,8 @@ def study(
         report_head = replace(head_at(late), sentences=lines, assumptions=known.lines(), advice=head_advice)
         write_report(every, tables, images, page, report_head, overwrite)
         on_step("done", _DONE)
-    found = tuple(one.run for one in every)
-    return Study(out, lines, tuple(known.lines()), advised, found, tables, found[0].meta["broken_off"])
+    result = tuple(one.run for one in every)
+    return Study(out, lines, tuple(known.lines()), advised, result, tables, result[0].meta["broken_off"])
 
 
 def outputs(out: Path) -> list[Path]:

@@ -35,7 +35,7 @@ def suspicions(messages: Sequence[Message], config: Config) -> Iterator[Diagnost
     for message in messages:
         if isinstance(message, DetectionList) and message.sensor not in config.ignore_sensors:
             lists.setdefault(message.sensor, []).append(message)
-    relative = sorted(name for name, found in lists.items() if any(each.frame != "map" for each in found))
+    relative = sorted(name for name, result in lists.items() if any(each.frame != "map" for each in result))
     if relative and not egos:
         text = f"no state is read, but {relative[0]} is relative to it: name its topic (input.ego)"
         yield Diagnostic(EGO, text, spoils=True)
@@ -46,14 +46,14 @@ def suspicions(messages: Sequence[Message], config: Config) -> Iterator[Diagnost
     for name in sorted(set(config.sensors) - set(lists)):
         if name in (config.input.detections or config.input.csv.detections):
             yield Diagnostic(name, "sends nothing in the first seconds")
-    for name, found in sorted(lists.items()):
-        sensor, objects = config.sensors.get(name), [item for each in found for item in each.objects]
-        if not any(each.stamp_ns for each in found) and (sensor is None or sensor.stamp_from != "receipt"):
+    for name, result in sorted(lists.items()):
+        sensor, objects = config.sensors.get(name), [item for each in result for item in each.objects]
+        if not any(each.stamp_ns for each in result) and (sensor is None or sensor.stamp_from != "receipt"):
             key = f"sensors.{name}.stamp_from"
             text = f"all stamps are 0: set `stamp_from: receipt` on its topic, or {key}; nothing is known of its delay"
             yield Diagnostic(name, text, {key: "receipt"}, spoils=True)
         yield from _degrees(name, objects)
-        yield from _frames(name, found, egos)
+        yield from _frames(name, result, egos)
         if sensor is not None and objects:
             yield from _measured(name, objects, sensor)
 
@@ -62,8 +62,8 @@ def _degrees(name: str, states: Sequence[EgoState | TruthState | Detection]) -> 
     for angle in ANGULAR:
         values = [value for state in states if (value := getattr(state, angle, None)) is not None]
         finite = [value for value in values if math.isfinite(value)]
-        if (found := in_degrees(name, angle, min(finite, default=0.0), max(finite, default=0.0))) is not None:
-            yield found
+        if (result := in_degrees(name, angle, min(finite, default=0.0), max(finite, default=0.0))) is not None:
+            yield result
 
 
 def _frames(name: str, lists: Sequence[DetectionList], egos: Sequence[EgoState]) -> Iterator[Diagnostic]:
@@ -107,13 +107,13 @@ def _measured(name: str, objects: Sequence[Detection], sensor: SensorModel) -> I
 
 def samples(messages: Sequence[Message]) -> dict[str, str]:
     """Return the contents of the first message of everything, by `ego`, `truth` and the names of sensors."""
-    found: dict[str, str] = {}
+    result: dict[str, str] = {}
     for message in messages:
         name, of = "truth" if isinstance(message, TruthState) else "ego", list[Message | Detection]([message])
         if isinstance(message, DetectionList):
             name, of = f"{message.sensor} (in the frame {message.frame})", list(message.objects)
-        if of and name not in found:
+        if of and name not in result:
             values = {key: value for key in _SHOWN if (value := getattr(of[0], key, None)) is not None}
             texts = (f"{key} {one:.6g}" if isinstance(one, float) else f"{key} {one}" for key, one in values.items())
-            found[name] = ", ".join(texts)
-    return found
+            result[name] = ", ".join(texts)
+    return result

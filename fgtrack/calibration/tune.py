@@ -119,10 +119,10 @@ class _Tuning:
             if rounds:
                 self._on_step(f"association {rounds + 1}")
                 series, runs = self._associated(values)
-                series = [[without_mixed(one, self._space, values) for one in tracks] for tracks in series]
+                series = [[without_mixed(item, self._space, values) for item in tracks] for tracks in series]
             rounds += 1
             parts = zip(series, splits_ns, strict=True)
-            first = [replace(one, until_ns=end_ns) for tracks, end_ns in parts for one in tracks]
+            first = [replace(item, until_ns=end_ns) for tracks, end_ns in parts for item in tracks]
             problem = Problem(first, self._space, self._configured)
             if rounds == 1:
                 values = self._best_start(problem)
@@ -139,7 +139,7 @@ class _Tuning:
             problem = replace(problem, series=list(chain.from_iterable(series)))
             values, likelihood, parameters = self._fitted(problem, values)
         sensors = tuple(self._sensor(name, problem, values) for name in self._space.sensors)
-        count = sum(one.count for one in sensors)
+        count = sum(item.count for item in sensors)
         return TuneReport(
             config=self._noise.config_with(values),
             parameters=parameters,
@@ -148,7 +148,7 @@ class _Tuning:
             log_likelihood=float(likelihood.totals(values[None])[0]) / count,
             count=count,
             num_tracks=len(problem.series),
-            num_mixed=sum(len(one.mixed) for one in problem.series),
+            num_mixed=sum(len(item.mixed) for item in problem.series),
             rounds=rounds,
             settled=settled,
             broken=broken,
@@ -162,8 +162,8 @@ class _Tuning:
         for name, messages in self._recordings.items():
             series, run = recorded(messages, config, name, _GATE_STDS)
             most = self._rules.max_observations
-            long = [one for one in series if len(one.observations) >= _MIN_OBSERVATIONS]
-            all_series.append([replace(one, observations=one.observations[:most]) for one in long])
+            long = [item for item in series if len(item.observations) >= _MIN_OBSERVATIONS]
+            all_series.append([replace(item, observations=item.observations[:most]) for item in long])
             runs.append(run)
         return all_series, runs
 
@@ -171,7 +171,7 @@ class _Tuning:
         """Return the stamp at which the held-out part of a recording begins; infinite without one."""
         if self._rules.train_share == 1.0:
             return math.inf
-        stamps_ns = [one.measurement.stamp_ns for track in tracks for one in track.observations] or [0]
+        stamps_ns = [item.measurement.stamp_ns for track in tracks for item in track.observations] or [0]
         return min(stamps_ns) + round(self._rules.train_share * (max(stamps_ns) - min(stamps_ns)))
 
     def _maximum(self, problem: Problem, start: FloatArray) -> tuple[FloatArray, Likelihood, BoolArray]:
@@ -204,8 +204,8 @@ class _Tuning:
     def _best_start(self, problem: Problem) -> FloatArray:
         """Return the best of three starts, by the maximum that it reaches on a part of the data."""
         self._on_step("starts")
-        longest = sorted(problem.series, key=lambda one: -len(one.observations))[:_START_TRACKS]
-        some = [replace(one, observations=one.observations[:_START_OBSERVATIONS]) for one in longest]
+        longest = sorted(problem.series, key=lambda item: -len(item.observations))[:_START_TRACKS]
+        some = [replace(item, observations=item.observations[:_START_OBSERVATIONS]) for item in longest]
         part = replace(problem, series=some)
         free = self._free(problem) & (part.counts() >= _MIN_COUNT)
         if not free.any():  # too little in the part to choose a start by
@@ -217,11 +217,10 @@ class _Tuning:
             start[moving] *= factor
             values, likelihood = part.maximum(start, free)
             reached.append((likelihood.cost(np.log(values[free])).objective, values))
-        return min(reached, key=lambda one: one[0])[1]
+        return min(reached, key=lambda item: item[0])[1]
 
     def _fitted(self, problem: Problem, start: FloatArray) -> tuple[FloatArray, Likelihood, tuple[TunedParameter, ...]]:
         """Return the maximum; instead of what is not known there, what is configured, or what is nearest to it.
-
         The rest is not fitted again: it would make up for what was put there.
         """
         count = len(start)
@@ -232,7 +231,7 @@ class _Tuning:
         log_std = np.full(count, math.nan)
         log_std[free] = likelihood.log_std(np.log(values[free]))
         errors = log_std.copy()
-        for row in sorted(np.flatnonzero(free & self._named).tolist(), key=lambda one: -errors[one]):
+        for row in sorted(np.flatnonzero(free & self._named).tolist(), key=lambda item: -errors[item]):
             why[row] = ""
             if errors[row] <= _ROUGHLY_KNOWN:
                 known[row] = "yes" if errors[row] <= _KNOWN else "roughly"
@@ -270,7 +269,9 @@ class _Tuning:
         self, trained: FloatArray, series: Sequence[Sequence[Series]], splits_ns: Sequence[float]
     ) -> HeldOut | None:
         """Return the performance in the rest of noise fitted to the first part; None where nothing counts there."""
-        rest = [replace(one, from_ns=at_ns) for tracks, at_ns in zip(series, splits_ns, strict=True) for one in tracks]
+        rest = [
+            replace(item, from_ns=at_ns) for tracks, at_ns in zip(series, splits_ns, strict=True) for item in tracks
+        ]
         before, squares_before = self._judged(rest, np.where(self._named, self._configured, trained))
         after, squares_after = self._judged(rest, trained)
         if not before:
@@ -294,8 +295,8 @@ class _Tuning:
     ) -> tuple[list[float], dict[tuple[str, str], list[float]]]:
         """Return log-likelihoods of the innovations that count, and squares over variances by sensor and component."""
         terms, squares = list[float](), dict[tuple[str, str], list[float]]()
-        for one in series:
-            for step in compress(filtered(one, self._space, values), one.counted):
+        for item in series:
+            for step in compress(filtered(item, self._space, values), item.counted):
                 terms.append(float(step.update.log_likelihood))
                 observation = step.observation
                 names = [observation.measurement.model.components[i] for i in observation.measured]
@@ -306,6 +307,6 @@ class _Tuning:
     def _sensor(self, name: str, problem: Problem, values: FloatArray) -> SensorNoise:
         row = self._space.names.index((name, ""))
         count = int(problem.counts()[row])
-        observations = chain.from_iterable(one.observations for one in problem.series)
-        own = sum(one.sensor == name and not one.tuned for one in observations)
+        observations = chain.from_iterable(item.observations for item in problem.series)
+        own = sum(item.sensor == name and not item.tuned for item in observations)
         return SensorNoise(name, count, own, float(outlier_share(values[row])) if count else None)

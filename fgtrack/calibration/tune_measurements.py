@@ -33,7 +33,6 @@ def recorded(
     messages: Iterable[Message], config: Config, origin: str = "", gate_stds: float = 0.0
 ) -> tuple[list[Series], Run]:
     """Return the series of all tracks, and the run.
-
     A gate in metres is opened to `gate_stds` standard deviations of the position of each detection.
     """
     banks: list[_RecordingBank] = []
@@ -92,9 +91,9 @@ class _WatchedPreprocess(Preprocess):
         objects = batch.message.objects
         self._sensor = batch.message.sensor, sensor
         self._own = {
-            one.measurement.z.tobytes(): sensor.message_covariance
-            and any(objects[index].covariance is not None for index in (one.leader, *one.merged))
-            for one in candidates
+            item.measurement.z.tobytes(): sensor.message_covariance
+            and any(objects[index].covariance is not None for index in (item.leader, *item.merged))
+            for item in candidates
         }
         return candidates, records
 
@@ -129,7 +128,7 @@ class _RecordingBank(GuardedBank):
     def series(self) -> list[Series]:
         """Return the fused measurements of each track, by rising stamp, in order of birth."""
         return [
-            Series(start, sorted(fused, key=lambda one: one.measurement.stamp_ns))
+            Series(start, sorted(fused, key=lambda item: item.measurement.stamp_ns))
             for start, fused in self._tracks.values()
         ]
 

@@ -177,5 +177,5 @@ class TuneReport:
 
     def as_dict(self) -> dict[str, object]:
         """Return plain values for JSON, without the runs."""
-        names = [one.name for one in fields(self) if one.name not in ("config", "runs")]
+        names = [item.name for item in fields(self) if item.name not in ("config", "runs")]
         return {name: plain(getattr(self, name)) for name in names}

@@ -59,13 +59,13 @@ def info(
             say(f"{write}: written; check its guesses, they are applied below")
         config_file = str(write)
     config = None if config_file is None else read_config(config_file)
-    found = describe(recording, None if config is None else config.input)
-    topics = _topics(found, NO_VALUE if config is None else "ignored")
-    comes_to, problem = (config or Config()).effective, found.problem
+    result = describe(recording, None if config is None else config.input)
+    topics = _topics(result, NO_VALUE if config is None else "ignored")
+    comes_to, problem = (config or Config()).effective, result.problem
     if as_json:
-        values = {name: getattr(found, name) for name in ("kind", "start_ns", "duration_s", "problem")}
+        values = {name: getattr(result, name) for name in ("kind", "start_ns", "duration_s", "problem")}
         show(
-            topics, "json", {"path": str(found.path), **values, "topics": topics.plain(), "effective": plain(comes_to)}
+            topics, "json", {"path": str(result.path), **values, "topics": topics.plain(), "effective": plain(comes_to)}
         )
     else:
         show(topics, None)
@@ -84,14 +84,14 @@ def _try_out(recording: Path, config: Config) -> str | None:
     messages, run, problem = list[Message](), None, None
     with progress("first seconds"):
         source = open_input(recording, config.input)
-        found = assumed(config, source)
+        result = assumed(config, source)
         readable = UntilBreak(source.messages())
         try:
             messages = list(beginning(readable, nanoseconds(TRIAL_S)))
-            run = replay_in_memory(messages, found.config)
+            run = replay_in_memory(messages, result.config)
         except DataError as error:
             problem = str(error)
-    sentences(found.lines())
+    sentences(result.lines())
     for name, text in samples(messages).items():
         say(f"first of {name}: {text}")
     if run is not None:
@@ -102,17 +102,17 @@ def _try_out(recording: Path, config: Config) -> str | None:
             say(f"first {TRIAL_S:g} s of {line}")
         say(f"first {TRIAL_S:g} s: {len(set(run.tables['tracks']['track_id'].tolist()))} tracks")
         problem = run.meta["broken_off"]
-    for one in suspicions(messages, found.config) if messages else ():
-        warn(str(one))
+    for item in suspicions(messages, result.config) if messages else ():
+        warn(str(item))
     return problem if readable.error is None else str(readable.error)
 
 
 def _topics(found: InputInfo, unused: str) -> Table:
     records = []
-    for one in found.topics:
-        record: dict[str, object] = {"topic": one.name, "messages": one.count, "rate_hz": one.rate_hz}
-        record |= {f"delay_{name}": None if one.delay is None else one.delay[name] for name in _DELAYS}
-        records.append(record | {"taken_as": one.used_as or unused, "type": one.type})
+    for item in found.topics:
+        record: dict[str, object] = {"topic": item.name, "messages": item.count, "rate_hz": item.rate_hz}
+        record |= {f"delay_{name}": None if item.delay is None else item.delay[name] for name in _DELAYS}
+        records.append(record | {"taken_as": item.used_as or unused, "type": item.type})
     columns = [
         Column("topic", left=True),
         Column("messages"),
@@ -186,12 +186,12 @@ def offsets(
     config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
     source = open_input(recording, config.input)
     with progress("offsets"):
-        found = assumed(config, source)
+        result = assumed(config, source)
         readable = UntilBreak(source.messages())
-        report = estimate_offsets(list(readable), found.config, reference)
-    for line in found.lines() if not as_json else ():
+        report = estimate_offsets(list(readable), result.config, reference)
+    for line in result.lines() if not as_json else ():
         say(line)
-    verdicts = {one.sensor: clock_text(one, report) for one in report.others}
+    verdicts = {item.sensor: clock_text(item, report) for item in report.others}
     show(_offsets(report), "json" if as_json else None, asdict(report) | {"verdicts": verdicts})
     if not as_json:
         sentences(f"{name}: {text}" for name, text in verdicts.items())

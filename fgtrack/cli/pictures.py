@@ -79,14 +79,14 @@ def _of_runs(
     folders: Sequence[Path], out: Path, stamp: float | None, paper: Paper
 ) -> tuple[list[tuple[str, Figure]], list[Planned], DataError | None]:
     """The close-up, the other figures, and why there is no close-up."""
-    found = evaluated(folders)
-    check_apart(out, [one.run.path for one in found])
-    stamp_ns = None if stamp is None else start_ns(found) + nanoseconds(stamp)
-    first, late = drawn_close_up(found, stamp_ns, **paper)
+    result = evaluated(folders)
+    check_apart(out, [item.run.path for item in result])
+    stamp_ns = None if stamp is None else start_ns(result) + nanoseconds(stamp)
+    first, late = drawn_close_up(result, stamp_ns, **paper)
     missing = late if isinstance(late, DataError) else None
     if missing is not None and stamp is not None:
         raise missing
-    return first, planned(found), missing
+    return first, planned(result), missing
 
 
 def report(
@@ -100,7 +100,7 @@ def report(
     """
     check_output(out, overwrite)
     every = evaluated(runs)
-    check_apart(out, [one.run.path for one in every])
+    check_apart(out, [item.run.path for item in every])
     with progress("report"):
         close_up, late = drawn_close_up(every)
         pictures = ((name, png(figure)) for name, figure in chain(close_up, drawn(planned(every))))

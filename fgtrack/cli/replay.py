@@ -38,20 +38,20 @@ def replay(
         check_apart(folder, [recording, config_file])
     source = open_input(recording, config.input)
     with progress("replay") as tell:
-        found = assumed(config, source)
+        result = assumed(config, source)
         pipeline.replay(
             source.messages,
-            found.config,
+            result.config,
             folders,
             origin=str(recording),
             kind=source.kind,
             on_tick=lambda report: tell(f"tick {report.tick}, {len(report.tracks)} tracks"),
             overwrite=overwrite,
         )
-    for line in dict.fromkeys(str(replace(found.config, estimator=name).effective) for name in names):
+    for line in dict.fromkeys(str(replace(result.config, estimator=name).effective) for name in names):
         say(line)
     runs = [load_run(folder) for folder in folders.values()]
-    for line in found.lines():
+    for line in result.lines():
         say(line)
     for run in runs:
         what = "{estimator}, {detections_received} detections, {wall_s:.1f} s, digest {digest:.12}"
@@ -59,7 +59,7 @@ def replay(
     for line in excluded_lines(runs[0].meta):  # the same of all
         say(line)
     for line in dict.fromkeys(
-        map(str, [*(one for run in runs for one in diagnostics(run)), *noise_diagnostics(runs[0])])
+        map(str, [*(item for run in runs for item in diagnostics(run)), *noise_diagnostics(runs[0])])
     ):
         warn(line)
     if (broken := runs[0].meta["broken_off"]) is not None:  # the others break off at the same message

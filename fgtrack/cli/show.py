@@ -51,8 +51,8 @@ def show(tables: Tables | Table, form: Form | None, values: Mapping[str, Any] | 
     if form is None:
         console().print(tables)
     elif form == "json":
-        found = values if values is not None else tables.to_dict() if isinstance(tables, Tables) else tables.plain()
-        say(json.dumps(found, indent=2, allow_nan=False))
+        result = values if values is not None else tables.to_dict() if isinstance(tables, Tables) else tables.plain()
+        say(json.dumps(result, indent=2, allow_nan=False))
     else:
         text = {"md": tables.to_markdown, "csv": tables.to_csv, "latex": tables.to_latex}[form]()
         say(text.removesuffix("\n"))

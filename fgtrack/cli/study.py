@@ -42,10 +42,10 @@ def study(
     for path in outputs(out):
         check_apart(path, [recording, config_file])
     with progress("study") as tell:
-        found = studied(recording, out, config, overwrite=overwrite, on_step=tell)
-    for line in dict.fromkeys(str(one) for run in found.runs for one in diagnostics(run)):
+        result = studied(recording, out, config, overwrite=overwrite, on_step=tell)
+    for line in dict.fromkeys(str(item) for run in result.runs for item in diagnostics(run)):
         warn(line)
-    show_study(found, recording)
+    show_study(result, recording)
 
 
 def show_study(found: Study, recording: Path) -> None:
@@ -80,7 +80,7 @@ def demo(
         config = read_config("tuned", track_map=OVAL, pit_map=OVAL)
     with progress("study") as tell:
         sweep = {"error_against_delay": error_against_delay()}
-        found = studied(bag, out, config, advice=False, figures=sweep, overwrite=overwrite, on_step=tell)
+        result = studied(bag, out, config, advice=False, figures=sweep, overwrite=overwrite, on_step=tell)
     say(f"{scenario.duration_s:g} s of a simulated race ({bag}), noise fitted to other races (-c tuned):")
-    show_study(found, bag)
+    show_study(result, bag)
     say(f"error against delay, of a sweep over ten races: {out / 'figures/error_against_delay.png'}")

@@ -47,14 +47,14 @@ def tune(
     shown = {"parameters": _parameters(report.parameters)}
     if report.held_out is not None:
         shown["held_out"] = _judged(report.held_out)
-    tables, found = Tables(shown), _sensors(report)
+    tables, result = Tables(shown), _sensors(report)
     of_recordings = replace(report.config, map=read_config(config_file).map)  # the maps belong to these
     title = f"The noise of {config_file or 'the defaults'}, fitted to {', '.join(sources)} (fgtrack tune)."
-    head = [title, "", *str(tables).splitlines(), "", *found, ""]
+    head = [title, "", *str(tables).splitlines(), "", *result, ""]
     write_file(out, Assumed(of_recordings, ()).to_yaml(head), overwrite)
     show(tables, "json" if as_json else None, report.as_dict())
     if not as_json:
-        say("\n".join(["", *found, f"{out}: written"]))
+        say("\n".join(["", *result, f"{out}: written"]))
     if report.broken:
         raise DataError(f"{next(iter(report.broken.values()))}; used up to there")
 

@@ -51,8 +51,8 @@ def verify(
     values = {"met": not broken, "promises": promises, "checked": list(suites), "broken": broken}
     show(table, "json" if as_json else None, values)
     if not as_json:
-        for each, found in broken.items():
-            for promise, what in found.items():
+        for each, result in broken.items():
+            for promise, what in result.items():
                 say(f"{each}: broken promise: it {promise}\n{what}\n")
     if broken:
         raise DataError(f"{sum(map(len, broken.values()))} of {promises} promises broken")

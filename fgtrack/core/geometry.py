@@ -8,7 +8,6 @@ import numpy as np
 from fgtrack.core.types import BoolArray, FloatArray
 
 TWO_PI = 2.0 * math.pi
-
 Real = TypeVar("Real", float, FloatArray)
 
 
@@ -94,7 +93,6 @@ def body_point(
     x_m: Real, y_m: Real, yaw_rad: Real, speed_mps: Real, yaw_rate_radps: Real, ahead_m: float, left_m: float
 ) -> tuple[Real, Real, Real, Real]:
     """Position x, y and velocity vx, vy = v + w x r, in the map, of a point fixed to a body that moves along its yaw.
-
     The lever arm r from the body's reference point x, y is `ahead_m` and to the `left_m`. Floats, or arrays of one
     shape.
     """

@@ -85,7 +85,6 @@ def applied(A: FloatArray, x: FloatArray) -> FloatArray:
 
 def psd_solve(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
     """Solve `matrix @ x = rhs` for a symmetric positive definite `matrix`, shapes (..., n, n) and (..., n, k).
-
     With one matrix, `rhs` may be a vector (n,). Raises `numpy.linalg.LinAlgError` when `matrix` is singular.
     """
     if matrix.ndim > 2:

@@ -17,7 +17,6 @@ _logger = logging.getLogger(__name__)
 
 class Registry:
     """Parts of one kind by name: built-in ones, and entry points of the groups, loaded when their name is used.
-
     One with the name of a built-in part, or of an earlier plug-in, is left out with a warning.
     """
 

@@ -7,7 +7,6 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 T = TypeVar("T")
-
 Rate = Annotated[float, Field(gt=0.0, le=10_000.0)]
 """In Hz."""
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]

@@ -2,7 +2,6 @@
 
 NS_PER_S = 1_000_000_000
 NS_PER_UNIT = {"s": NS_PER_S, "ms": 1_000_000, "us": 1000, "ns": 1}
-
 _EPOCH_S = (1e9, 4e9)  # the years 2001 to 2096, in seconds since 1970
 _MOST_HZ = 1e5, 1e4  # of one source, and where the magnitude is that of another unit too; an inertial unit has 1e4
 _LONGEST_S = 10 * 365.25 * 86400.0

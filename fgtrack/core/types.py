@@ -15,14 +15,11 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
-
 Frame = Literal["map", "ego", "sensor"]
 FRAMES: tuple[Frame, ...] = get_args(Frame)
-
 #: State columns of tracks.csv; a motion model's state is a leading part of them.
 STATE_NAMES = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2")
 X, Y, YAW, SPEED, YAW_RATE, ACCEL = range(6)
-
 #: What the covariance of an `EgoState` is of: x, y, yaw, speed and yaw rate.
 EGO_COVARIANCE_STATES = STATE_NAMES[:5]
 
@@ -84,7 +81,6 @@ class Detection:
 #: What a detection may measure, in the order of its covariance and of the residual columns: the fields of
 #: `Detection` before its covariance.
 MEASURABLE = tuple(takewhile(lambda name: name != "covariance", (each.name for each in fields(Detection))))
-
 #: What a detection says of its object besides: never measurements of the state, and all may be None.
 DESCRIBING = ("z_m", "length_m", "width_m", "height_m", "score", "class_name")
 

@@ -17,7 +17,6 @@ from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.models.sensors import RobustLoss
 
 _STAMP = f"an integer of at most {LARGEST_NS:.0g}"
-
 Content = tuple[tuple[str, ...], tuple[float, ...], tuple[str, ...]]
 """Names of what is measured, numbers, names of what is assumed and of the loss; it has an order."""
 
@@ -51,7 +50,6 @@ class Measurement:
         **values: float,
     ) -> "Measurement":
         """The measurement of `values`, by name of `COMPONENTS`, with a standard deviation each or a covariance.
-
         `std` is a mapping by the same names, or one number for values of one unit (x and y).
         `covariance`, shape (k, k), is in the order of `COMPONENTS`. Raises `CallError` for an unknown or missing name
         and a value or covariance that makes no sense.
@@ -114,7 +112,7 @@ class Measurement:
         """Places of the components that were measured; None where all of them were."""
         if not self.assumed:
             return None
-        return [place for place, name in enumerate(self.model.components) if name not in self.assumed]
+        return [index for index, name in enumerate(self.model.components) if name not in self.assumed]
 
     def nis(self, innovation: FloatArray, S: FloatArray) -> float:
         """Normalised innovation squared y' S^-1 y of y (k,) and S (k, k), without components that are `assumed`."""
@@ -141,7 +139,7 @@ def stacks(measurements: Sequence[Measurement]) -> list[tuple[Sequence[int], Mea
     if isinstance(measurements, Measurements):
         return [(range(len(measurements.stack.z)), measurements.stack)]
     parts = list[tuple[Sequence[int], Measurement]]()
-    for rows in equal_ones([(id(one.model), one.pose, one.assumed, one.loss) for one in measurements]):
+    for rows in equal_ones([(id(item.model), item.pose, item.assumed, item.loss) for item in measurements]):
         z, R = (np.array([getattr(measurements[row], name) for row in rows]) for name in ("z", "R"))
         parts.append((rows, replace(measurements[rows[0]], z=z, R=R)))
     return parts
@@ -279,7 +277,6 @@ class TrackBank(Protocol):
 
     def smoothed(self) -> list[SmoothedReport]:
         """Kinematic states of the past, improved by later measurements; of a filter none.
-
         Lagged ones as they are now, final ones that left a window, or whose track was removed, since the last call.
         """
 

@@ -46,7 +46,7 @@ class ObjectBank(Generic[_E]):
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`."""
-        states = self._ask(lambda _, one: self._state(one, stamp_ns) if one.window_ns[0] <= stamp_ns else None)
+        states = self._ask(lambda _, item: self._state(item, stamp_ns) if item.window_ns[0] <= stamp_ns else None)
         known = {track_id: state for track_id, state in states.items() if state is not None}
         return StatesAt(tuple(known), *_stacked(known.values(), self._motion.dim))
 
@@ -55,8 +55,8 @@ class ObjectBank(Generic[_E]):
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
         seen = dict(zip(track_ids, measurements, strict=True))
-        found = self._ask(lambda track_id, estimator: _checked(estimator.update(seen[track_id])), track_ids)
-        return [found[track_id] for track_id in track_ids]
+        result = self._ask(lambda track_id, estimator: _checked(estimator.update(seen[track_id])), track_ids)
+        return [result[track_id] for track_id in track_ids]
 
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`."""
@@ -68,7 +68,7 @@ class ObjectBank(Generic[_E]):
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
-        states = self._ask(lambda _, one: self._state(one, max(self.present_ns, one.window_ns[0])))
+        states = self._ask(lambda _, item: self._state(item, max(self.present_ns, item.window_ns[0])))
         return kinematic_states(self._motion, self.present_ns, *_stacked(states.values(), self._motion.dim))
 
     def smoothed(self) -> list[SmoothedReport]:
@@ -109,7 +109,6 @@ def _stacked(states: Iterable[TrackState], n: int) -> tuple[FloatArray, FloatArr
 
 class OneObject:
     """A bank with one object, as an `Estimator`: its clock follows the newest stamp.
-
     `bank` is empty; one on a time grid, such as `BackwardForwardBank`, gives the state of the nearest grid point.
     """
 

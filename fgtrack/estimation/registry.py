@@ -22,7 +22,6 @@ from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel, WhiteNoise
 
 OOSM_GROUP = "fgtrack.oosm"
 EXACT = "any lag, any number"
-
 _OOSM = "fgtrack.estimation.oosm"
 ESTIMATORS = Registry(
     "estimator",
@@ -63,7 +62,6 @@ MOTION_MODELS = Registry(
     "motion model",
     {"fgtrack.motion_models": {name: f"fgtrack.models.motion:{name.upper()}" for name in ("ctrv", "ctra", "cv")}},
 )
-
 Factory = Callable[..., Any]  # Any: an estimator or a bank, see the module
 
 
@@ -147,8 +145,8 @@ def start_estimator(
     def made(start: Start) -> Estimator:
         if claims.bank:
             return OneObject(motion, _made(ESTIMATORS, TrackBank, name, factory, motion, lag_s, **own), start)
-        one: Estimator = _made(ESTIMATORS, Estimator, name, factory, motion, start, lag_s, **own)
-        return one
+        item: Estimator = _made(ESTIMATORS, Estimator, name, factory, motion, start, lag_s, **own)
+        return item
 
     return initiated(motion, start, method, made)
 

@@ -19,7 +19,6 @@ def rts_step(
     mean: FloatArray, covariance: FloatArray, predicted: Prediction, shift: FloatArray, after: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return a state, or a stack of them, after the smoothing of the next one, and C = Cov(x, x_next) P_next^-1.
-
     x + C s and P + C (P_s - P_next) C', of `mean` (..., n) and `covariance` (..., n, n), with the prediction P_next of
     the next state, its `shift` s (..., n) by the smoothing and its covariance P_s = `after` then (..., n, n). Rauch,
     Tung and Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA Journal 3(8), 1965.
@@ -43,7 +42,6 @@ def between(
     motion: MotionModel, left: FloatArray, right: FloatArray, until_s: float | FloatArray, after_s: float | FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return mean, Lambda, Psi and Sigma of the state `until_s` after one and `after_s` before another one.
-
     x = mean + Lambda (x_l - l) + Psi (x_r - r) + N(0, Sigma), near l = `left` and r = `right`, (..., n) (Koch and
     Govaers 2014). With F1, Q1 until the stamp and F2, Q2 after it, the right one is a measurement F2 x + N(0, Q2) of a
     state with covariance Q1, and Psi its gain; Lambda = F1 - Psi F2 F1, Sigma = Q1 - Psi F2 Q1, linearised at `left`.

@@ -62,9 +62,9 @@ def comparisons(runs: Sequence[EvaluatedRun]) -> list[Comparison]:
 def comparable(runs: Sequence[EvaluatedRun]) -> list[list[EvaluatedRun]]:
     """The runs with truth, those of the same recording and evaluated by the same settings together."""
     groups: dict[tuple[int, EvaluationConfig], list[EvaluatedRun]] = {}
-    for number, group in enumerate(by_recording([one for one in runs if one.matching is not None])):
-        for one in group:
-            groups.setdefault((number, one.run.evaluation), []).append(one)
+    for number, group in enumerate(by_recording([item for item in runs if item.matching is not None])):
+        for item in group:
+            groups.setdefault((number, item.run.evaluation), []).append(item)
     return list(groups.values())
 
 
@@ -108,14 +108,14 @@ def entry_columns(heading: str, name: str = "value") -> list[Column]:
 def comparison(group: Sequence[EvaluatedRun]) -> Comparison:
     """Return the comparison of `group`, runs of one recording, at the same objects and stamps."""
     errors = []
-    for matching in (one.matching for one in group if one.matching is not None):
+    for matching in (item.matching for item in group if item.matching is not None):
         errors_of = track_errors(matching)
         squares = {name: np.square(errors_of.values[error]) for name, error in _ERRORS.items()}
         errors.append(replace(errors_of, values={**squares, POSITION_NEES: position_nees(matching)}))
     most, common, sums = common_sums(errors)
-    if all(one.run.evaluation.multi_object for one in group):
+    if all(item.run.evaluation.multi_object for item in group):
         sums["gospa_in_sight_rms_m"] = _gospa_sums(group)
-    labels = tuple(one.label for one in group)
+    labels = tuple(item.label for item in group)
     quantities = {name: compared(name, labels, ticks) for name, ticks in sums.items() if ticks[:, -1].any()}
     return Comparison(labels, common, most, quantities, sums)
 
@@ -124,14 +124,14 @@ def common_sums(every: Sequence[TrackErrors]) -> tuple[int, int, dict[str, Float
     """Return the sums by stamp of the values of several runs at the objects and stamps that all have.
     The most samples of a run, the common ones, and by name the sums of each run and, last, the counts: (n, runs + 1).
     """
-    every_ns = np.unique(np.concatenate([one.stamps_ns for one in every]))
-    codes = [one.object_index * len(every_ns) + np.searchsorted(every_ns, one.stamps_ns) for one in every]
+    every_ns = np.unique(np.concatenate([item.stamps_ns for item in every]))
+    codes = [item.object_index * len(every_ns) + np.searchsorted(every_ns, item.stamps_ns) for item in every]
     samples = [np.unique(of, return_index=True) for of in codes]
     common = functools.reduce(np.intersect1d, [distinct for distinct, _ in samples])
     rows = [first[np.searchsorted(distinct, common)] for distinct, first in samples]
     sums = {}
     for name in every[0].values if len(common) else ():
-        values = np.stack([one.values[name][row] for one, row in zip(every, rows, strict=True)], axis=-1)
+        values = np.stack([item.values[name][row] for item, row in zip(every, rows, strict=True)], axis=-1)
         sums[name] = by_stamp(every_ns[common % len(every_ns)], values)
     return max(len(distinct) for distinct, _ in samples), len(common), sums
 
@@ -154,16 +154,16 @@ def compared(name: str, labels: Sequence[str], ticks: FloatArray) -> tuple[Entry
 
 def _gospa_sums(group: Sequence[EvaluatedRun]) -> FloatArray:
     """Squared GOSPA, and 1, at the ticks that all runs have, of the objects that a sensor of any run could see."""
-    matchings = [one.matching for one in group if one.matching is not None]
-    ticks_ns = [one.now_ns[recorded(each.run, one.now_ns)] for each, one in zip(group, matchings, strict=True)]
+    matchings = [item.matching for item in group if item.matching is not None]
+    ticks_ns = [item.now_ns[recorded(each.run, item.now_ns)] for each, item in zip(group, matchings, strict=True)]
     common_ns = functools.reduce(np.intersect1d, ticks_ns)
-    rows = [np.searchsorted(one, common_ns) for one in ticks_ns]
-    there = [scenes(one.run, matching) for one, matching in zip(group, matchings, strict=True)]
+    rows = [np.searchsorted(item, common_ns) for item in ticks_ns]
+    there = [scenes(item.run, matching) for item, matching in zip(group, matchings, strict=True)]
     seen = np.any([scene.in_sight[mine] for scene, mine in zip(there, rows, strict=True)], axis=0)
     columns = []
-    for one, scene, mine in zip(group, there, rows, strict=True):
+    for item, scene, mine in zip(group, there, rows, strict=True):
         in_sight = scene.in_sight.copy()
         in_sight[mine] = seen
-        squares_m2 = gospa(replace(scene, in_sight=in_sight), one.run.evaluation.gate_m)
+        squares_m2 = gospa(replace(scene, in_sight=in_sight), item.run.evaluation.gate_m)
         columns.append(squares_m2["in_sight_m2"][mine])
     return np.stack([*columns, np.ones(len(common_ns))], axis=-1)

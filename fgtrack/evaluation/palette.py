@@ -45,9 +45,9 @@ def look(estimator: str) -> Look:
 def looks(estimators: Sequence[str]) -> list[Look]:
     """Return one look for each of `estimators`, in their order; equal colours get different lines."""
     result: list[Look] = []
-    for one in map(look, estimators):
-        taken = [other.line for other in result if other.colour == one.colour]
-        result.append(one._replace(line=next((line for line in (one.line, *_LINES) if line not in taken), one.line)))
+    for item in map(look, estimators):
+        taken = [other.line for other in result if other.colour == item.colour]
+        result.append(item._replace(line=next((line for line in (item.line, *_LINES) if line not in taken), item.line)))
     return result
 
 

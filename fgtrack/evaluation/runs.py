@@ -45,10 +45,10 @@ def evaluated(runs: Runs) -> list[EvaluatedRun]:
     Runs of a folder come by name, and may be one folder deeper. Raises `CallError` and, for a damaged run, `DataError`.
     """
     every = _flat(runs)
-    if any(isinstance(one, Run) for one in every):
-        read = [one.run if isinstance(one, EvaluatedRun) else one for one in every]
+    if any(isinstance(item, Run) for item in every):
+        read = [item.run if isinstance(item, EvaluatedRun) else item for item in every]
         every = [EvaluatedRun(label, run) for label, run in labelled(read).items()]
-    return [one for one in every if isinstance(one, EvaluatedRun)]
+    return [item for item in every if isinstance(item, EvaluatedRun)]
 
 
 def one_evaluated(run: OneRun) -> EvaluatedRun:
@@ -61,7 +61,7 @@ def one_evaluated(run: OneRun) -> EvaluatedRun:
 
 def start_ns(runs: Sequence[EvaluatedRun]) -> int:
     """Return the time of the first tick of `runs`; 0 without one."""
-    ticks_ns = [one.run.tables["timing"]["now_ns"] for one in runs]
+    ticks_ns = [item.run.tables["timing"]["now_ns"] for item in runs]
     return min((int(ns[0]) for ns in ticks_ns if len(ns)), default=0)
 
 
@@ -100,11 +100,11 @@ def same_recording(one: Run, other: Run) -> bool:
 def by_recording(runs: Sequence[EvaluatedRun]) -> list[list[EvaluatedRun]]:
     """`runs` in groups, those of the same recording together."""
     groups: list[list[EvaluatedRun]] = []
-    for one in runs:
-        group = next((group for group in groups if same_recording(group[0].run, one.run)), None)
+    for item in runs:
+        group = next((group for group in groups if same_recording(group[0].run, item.run)), None)
         if group is None:
             groups.append(group := [])
-        group.append(one)
+        group.append(item)
     return groups
 
 
@@ -127,7 +127,7 @@ def _flat(given: Any) -> list[Run | EvaluatedRun]:  # Any: what a user gives
     if not isinstance(given, Path | str):
         if not isinstance(given, Iterable):
             raise CallError(f"runs: must be runs or paths of run folders, there is a {type(given).__name__}")
-        return [one for entry in given for one in _flat(entry)]
+        return [item for entry in given for item in _flat(entry)]
     path = Path(given)
     for pattern in ("", "*", "*/*") if path.is_dir() else ():
         if folders := [each for each in (sorted(path.glob(pattern)) if pattern else [path]) if is_run_folder(each)]:

@@ -158,7 +158,7 @@ def _component(name: str) -> tuple[str | None, str]:
     text = "_".join(base)
     if len(base[-1]) == 1 and len(base) > 1:
         return None, unit
-    return next((one for one, names in _NAMES.items() if re.fullmatch(f"(?:.*_)?(?:{names})", text)), None), unit
+    return next((item for item, names in _NAMES.items() if re.fullmatch(f"(?:.*_)?(?:{names})", text)), None), unit
 
 
 def _converted(component: str, unit: str, name: str, samples: Sequence[float]) -> Guess:

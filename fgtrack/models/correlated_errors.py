@@ -23,7 +23,6 @@ _MOST = 30.0  # exponent of an error that is moved back in time, in which it wou
 @dataclass(frozen=True)
 class CorrelatedErrors(MotionModel):
     """A motion model whose state also has the time-correlated errors of sensors about one object.
-
     Each is a stationary first-order Gauss-Markov process of mean 0 and variance 1,
     e(t + dt) = exp(-dt / T) e(t) + N(0, 1 - exp(-2 dt / T)), in standard deviations of the correlated part.
     """
@@ -116,7 +115,6 @@ def split_error(
     sensor: str, model: SensorModel, measurement: MeasurementModel, R: FloatArray, state_names: Sequence[str]
 ) -> tuple[MeasurementModel, FloatArray]:
     """The measurement model with the correlated part of the error, and the covariance (k, k) of the rest.
-
     Of the covariance R (k, k) of the components that the sensor measures, the share s = `model.correlation.share` is
     correlated: z = h(x) + (s R)^1/2 e + N(0, (1 - s) R), so that a detection alone has the covariance R.
     """

@@ -13,7 +13,6 @@ _HEADING, _CURVATURE, _LEFT, _RIGHT, _ALONG, _QUANTITIES = 4, 5, 6, 7, 9, 10  # 
 @njit("(float64[:, ::1], Array(float64, 2, 'C', readonly=True), float64)")
 def feet(points_m: FloatArray, segments: FloatArray, longest_m: float) -> tuple[FloatArray, FloatArray]:
     """Quantities (m, 10) at the feet of points (m, 2) on the line, and lateral offsets (m,), left positive.
-
     `segments` (n, 20), at most `longest_m` long, are the rows of `TrackMap`. The foot, on a segment at the nearest
     point of the line, has the point on its normal: Re((q - t e) (B + t dB)) = 0 with q from the start of the segment to
     the point, e the segment, and B, dB the inverse of the heading and its change, as complex numbers.

@@ -19,10 +19,8 @@ from fgtrack.models.motion import CARTESIAN, MIN_SPEED_MPS, POLAR, MotionModel
 
 #: The gradient of a bearing by the position grows as 1 / range; below this range it stays as it is there.
 MIN_RANGE_M = 1e-6
-
 #: Far below this speed a curvature says nothing of the yaw rate: an object at rest has no way that could turn.
 SLOW_MPS = 1.0
-
 #: What a measurement may be of: what a detection measures, and what the map says of a moving object.
 COMPONENTS = (*MEASURABLE, "curvature_radpm")
 #: Components that are angles.
@@ -108,7 +106,6 @@ class MeasurementModel:
         residual: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
     ) -> tuple[FloatArray, FloatArray]:
         """Innovation y (..., k) of z (..., k) at the states x (..., n), and its Jacobian H (k, n) or (..., k, n).
-
         `residual` may take the place of the model's own.
         """
         y = (residual or self.residual)(z, self.predict(x, pose))
@@ -204,7 +201,6 @@ def _observed(
     names: Sequence[str], x: FloatArray, pose: SensorPose, cartesian_state: bool
 ) -> tuple[FloatArray, FloatArray]:
     """Values (..., k) of the components `names`, and their derivatives (..., k, 5) by the state as far as a yaw rate.
-
     A curvature is the yaw rate over the speed, times v^2 / (v^2 + v0^2) with v0 = `SLOW_MPS`, which falls to 0 at rest.
     """
     shape = *x.shape[:-1], len(names)

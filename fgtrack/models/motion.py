@@ -20,7 +20,6 @@ from fgtrack.core.types import ACCEL, SPEED, STATE_NAMES, YAW, YAW_RATE, FloatAr
 
 #: The first entries of every model's state are either of these.
 POLAR, CARTESIAN = STATE_NAMES[:4], ("x_m", "y_m", "vx_mps", "vy_mps")
-
 #: The gradient of a heading by the velocity grows as 1 / speed; below this speed it stays as it is there.
 MIN_SPEED_MPS = 1e-3
 
@@ -69,7 +68,6 @@ class MotionModel(ABC):
     @abstractmethod
     def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """Covariance Q of the noise accumulated over `dt_s`, shape (..., n, n).
-
         Composes: Q(x, a + b) = F(x_a, b) Q(x, a) F(x_a, b)' + Q(x_a, b) with x_a = predict(x, a). Raises `CallError`
         where `dt_s` is negative (let `forward` check it).
         """
@@ -92,7 +90,6 @@ class MotionModel(ABC):
 
     def kinematic(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean (..., m) and first-order covariance (..., m, m) of the leading m entries of `STATE_NAMES`.
-
         m is 6 of a model with an acceleration, else 5; an entry that the state lacks is 0 with variance 0. The variance
         of a Cartesian state's yaw at speed 0 is large but finite, see `MIN_SPEED_MPS`.
         """
@@ -108,7 +105,6 @@ class MotionModel(ABC):
 
     def from_kinematic(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """State and covariance P of this model from a kinematic state; a missing entry is 0 with `start_variance`.
-
         To the first-order covariance of a Cartesian velocity comes the variance of the product of speed error and yaw
         error, across the heading: without it, an object born at speed 0 could not move sideways.
         """
@@ -144,7 +140,6 @@ class MotionModel(ABC):
 @dataclass(frozen=True)
 class WhiteNoise(MotionModel):
     """A motion model with a compiled transition, driven by white noise in each entry of the state.
-
     Noise parameters are spectral densities, in fields `<entry>_density_<unit>` in the order of the state.
     """
 
@@ -157,7 +152,6 @@ class WhiteNoise(MotionModel):
     @classmethod
     def from_std_per_step(cls, std: Mapping[str, float], frequency_hz: float) -> Self:
         """Model with the noise of a filter that adds (std / frequency_hz)^2 per step: densities std^2 / frequency_hz.
-
         `std` is per second, as in Karle et al. 2023, by the names of all densities up to `_density_`: `position`,
         `yaw`, ...
         """

@@ -11,7 +11,6 @@ from fgtrack.models.track_map import COLUMNS, TrackMap
 
 #: The name that stands for this map wherever a map file may be named.
 OVAL = "oval"
-
 _TURN_RADIUS_M = 220.0
 _BEND_M = 30.0  # from the start line to where the bend of the front straight begins to end
 _BLEND_M = 130.0  # over which the curvature goes from one value to the next
@@ -19,7 +18,6 @@ _BLEND_M = 130.0  # over which the curvature goes from one value to the next
 
 def make_oval() -> TrackMap:
     """Banked tri-oval of 2.4 km, 15 m wide, turns of 220 m radius, driven counter-clockwise.
-
     Its curvature has a continuous derivative. The lap is symmetric about the line through the start and the middle of
     the back straight, so it closes exactly.
     """

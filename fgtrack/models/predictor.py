@@ -21,7 +21,6 @@ def arc_positions(states: FloatArray, ahead_s: FloatArray) -> FloatArray:
 
 def rail_positions(track: TrackMap, states: FloatArray, ahead_s: FloatArray) -> FloatArray:
     """As `arc_positions` for `ARC_S`, then along `track`; the times rise by some 0.1 s.
-
     An object beyond a bound goes on along that bound, one with a negative speed stops.
     """
     positions = arc_positions(states, ahead_s)

@@ -77,7 +77,6 @@ class Correlation:
 @settings
 class Score:
     """Likelihood ratio of a detection's score: log p(score | object) / p(score | clutter) = (score - even) / scale.
-
     Its logarithm is at most 10 to either side.
     """
 
@@ -173,7 +172,7 @@ class SensorModel:
 
     def refusing(self, detection: Detection) -> str | None:
         """Name of the first of the filters that `detection` does not pass; None where it passes all."""
-        return next((name for name, one in self.filters.items() if not one.passes(getattr(detection, name))), None)
+        return next((name for name, item in self.filters.items() if not item.passes(getattr(detection, name))), None)
 
     @property
     def gives_position(self) -> bool:
@@ -193,7 +192,6 @@ class SensorModel:
 
     def sees(self, positions_m: FloatArray, ego_poses: FloatArray, origin_m: tuple[float, float]) -> BoolArray:
         """True if an object there is in range and in the field of view, shape (...); nothing hides it.
-
         `positions_m` (..., 2) and the `ego_poses` x, y, yaw (..., 3) at the same times are in the map, `origin_m` is
         the origin of the detection frame in that of the ego.
         """
@@ -247,7 +245,6 @@ def in_view(
     max_range_behind_m: float | None = None,
 ) -> BoolArray:
     """True for objects at these ranges and bearings (0 on the sensor's axis), any one shape, in view of a sensor.
-
     `field_of_view_rad` is the full angle; `max_range_behind_m` replaces `max_range_m` in the half behind the sensor.
     """
     off_axis_rad = np.abs(wrap_angles(bearing_rad))

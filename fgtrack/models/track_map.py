@@ -37,11 +37,9 @@ COLUMNS = (
 _COLUMN = {name: index for index, name in enumerate(COLUMNS)}
 _HEADINGS = (_COLUMN["psi_racetraj_rad"], _COLUMN["psi_ref_rad"])
 _ARCS = [_COLUMN["s_racetraj_m"], _COLUMN["s_ref_m"]]
-
 _FILE_HEADING_OFFSET_RAD = math.pi / 2  # a file's heading is 0 along +y, REP-103 is 0 along +x
 _SAME_POINT_M = 1e-3
 _MAX_HEADING_ERROR_RAD = 1.0  # coarse maps turn much in a row; a wrong convention is off by pi / 2
-
 # A segment row holds these quantities where the segment starts, and then the changes to its end. A point is complex,
 # x + i y; times `_BACK`, exp(-i heading), a vector is along + i left. `_ALONG` is the segment's own part along.
 _POINT, _BACK, (_HEADING, _CURVATURE, _LEFT, _RIGHT, _ARC, _ALONG) = slice(0, 2), slice(2, 4), range(4, 10)
@@ -61,7 +59,6 @@ class RoadView(NamedTuple):
 
 class TrackMap:
     """A closed reference line with widths to both bounds.
-
     The line runs straight from row to row. Its normals turn evenly within a segment, so road coordinates (arc length s
     along the segments, lateral offset to the left) are one-to-one as far as the centre of curvature. Angles are
     REP-103.
@@ -93,7 +90,6 @@ class TrackMap:
     @classmethod
     def read(cls, path: str | Path) -> Self:
         """Map of a semicolon-separated file with the 17 `COLUMNS`; `#` starts a comment line.
-
         The last row may repeat the first. Raises `DataError` with the path if the file cannot be read or is not a map.
         """
         content = read_whole(Path(path), 20.0)  # some 100,000 rows
@@ -128,7 +124,6 @@ class TrackMap:
 
     def view(self, points_m: FloatArray, inner_buffer_m: float, outer_buffer_m: float) -> RoadView:
         """Heading and curvature of the line beside `points_m`, shape (n, 2), and True for those outside the bounds.
-
         A positive buffer widens the track. The inner bound is the left one if it is driven counter-clockwise.
         """
         left_m, right_m = inner_buffer_m, outer_buffer_m

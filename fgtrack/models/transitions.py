@@ -17,7 +17,6 @@ ARC, LINE = 0, 1
 MAX_TURN_RAD = 0.5
 #: An arc of more parts has no finite result: a yaw rate that no object has.
 MAX_PARTS = 10_000
-
 _LEGENDRE_NODES, _LEGENDRE_WEIGHTS = np.polynomial.legendre.leggauss(7)
 _NODES, _WEIGHTS = 0.5 * (1.0 + _LEGENDRE_NODES), 0.5 * _LEGENDRE_WEIGHTS
 # (iw)^k / (k! (k + j + 1)) add up to the integral over [0, 1] of s^j exp(iws): the factors of w^k by j, k % 2, k // 2.
@@ -32,7 +31,6 @@ _SERIES = np.array(
 @merged
 def _position_gradient(R: float, yaw_rate: float, speed: float, accel: float, gradient: FloatArray) -> None:
     """Write the derivatives (4, 2) of the position by yaw, speed, yaw rate and acceleration a time R before.
-
     In the frame of the heading at the end: along and left; `speed` is that at the end. With the moments K_j of the
     heading, integrals of s^j exp(i w s) from the end back, these are as complex numbers i (v K_0 - a K_1), K_0,
     i (v (R K_0 - K_1) - a (R K_1 - K_2)), R K_0 - K_1.

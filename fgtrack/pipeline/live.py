@@ -167,11 +167,11 @@ class Tracker:
         """Delays of messages by sensor, and under `ego` for the ego, as of the last tick."""
         with self._turn:
             self._take_arrivals()
-            found = {}
+            result = {}
             for name, newest_ns in self._delays_ns.items():
                 silent_s = seconds(self._last.now_ns - self._receipts_ns.get(name, self._first_tick_ns))
-                found[name] = Lateness(self._messages[name], *_spread_s(newest_ns), max(silent_s, 0.0))
-            return found
+                result[name] = Lateness(self._messages[name], *_spread_s(newest_ns), max(silent_s, 0.0))
+            return result
 
     @property
     def timing(self) -> TickTiming:

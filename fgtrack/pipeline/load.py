@@ -103,7 +103,7 @@ def with_value(inside: Any, names: Sequence[str], value: Any, default: object = 
         inside = plain(default) if isinstance(default, Mapping) else {}
         inside |= {"kind": default.kind} if hasattr(default, "kind") else {}
     if isinstance(inside, list):
-        known = [str(one.get("name", k)) if isinstance(one, Mapping) else str(k) for k, one in enumerate(inside)]
+        known = [str(item.get("name", k)) if isinstance(item, Mapping) else str(k) for k, item in enumerate(inside)]
         known = known if first in known else [str(k) for k in range(len(inside))]
         if first not in known:
             raise LookupError(f"there is no {first!r} among {len(inside)} entries")
@@ -160,7 +160,7 @@ def _number(value: object) -> object:
 def _first_problem(error: ValidationError, kind: type[Any], text: str) -> str:
     """Return a line on the first complaint of pydantic, on an unknown key where there is one."""
     details = error.errors(include_url=False)
-    first = next((one for one in details if one["type"] == _UNKNOWN), details[0])
+    first = next((item for item in details if item["type"] == _UNKNOWN), details[0])
     names, inside = list[str](), json.loads(text)
     part: Any
     for part in first["loc"]:  # tags of unions are not written in the file

@@ -46,7 +46,7 @@ _RECORDED = TypeAdapter(Recorded | None, config=ConfigDict(allow_inf_nan=False))
 def recorded(source: InputSource) -> Recorded:
     """Return the settings that `source` carries; invalid ones, and a track without its file, are a warning."""
     try:
-        found = _RECORDED.validate_python(source.settings(), extra="ignore") or Recorded()
+        result = _RECORDED.validate_python(source.settings(), extra="ignore") or Recorded()
     except DataError:  # reading the messages reports it
         return Recorded()
     except ValidationError as error:
@@ -54,20 +54,23 @@ def recorded(source: InputSource) -> Recorded:
         where = ".".join(str(part) for part in first["loc"])
         _logger.warning("%s: the recorded settings are not used, %s: %s", source.path, where, first["msg"])
         return Recorded()
-    track = found.map.track_file
+    track = result.map.track_file
     if track is not None and track != OVAL and not Path(track).is_file():
         _logger.warning("%s: the recorded map %s is not there, name it by --map", source.path, track)
-        return replace(found, map=MapConfig())
-    return found
+        return replace(result, map=MapConfig())
+    return result
 
 
 def recorded_of(scenario: Scenario) -> dict[str, Any]:  # Any: plain values, as the header of a stream has them
     """Return the settings that a recording of `scenario` carries."""
     sensors = {
-        one.name: RecordedSensor(
-            None if one.mount == Mount() else one.mount, one.field_of_view_rad, one.max_range_m, one.max_range_behind_m
+        item.name: RecordedSensor(
+            None if item.mount == Mount() else item.mount,
+            item.field_of_view_rad,
+            item.max_range_m,
+            item.max_range_behind_m,
         )
-        for one in scenario.sensors
+        for item in scenario.sensors
     }
     ego, track = {"detection_origin_x_m": scenario.detection_origin_x_m}, {"track": scenario.map}
     return {"ego": ego, "map": track, "sensors": plain(sensors)}

@@ -151,7 +151,7 @@ def _drive(
             tracker.receive(message)
         report = tracker.tick(tick.now_ns)
         process_ns = perf_counter_ns() - before_ns
-        num_detections = sum(len(one.objects) for one in tick.messages if isinstance(one, DetectionList))
+        num_detections = sum(len(item.objects) for item in tick.messages if isinstance(item, DetectionList))
         detections_received += num_detections
         writer.write_tick(report, process_ns, num_detections)
         on_tick(report)

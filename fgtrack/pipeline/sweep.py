@@ -92,7 +92,7 @@ class Sweep:
         for name in _TABLES:
             check_output(folder / name, overwrite or bool(parts))
         cells = {key: _read_part(parts[key]) for key in parts.keys() & {job.key for job in plan.jobs}}
-        return cls(plan, folder, {key: found for key, found in cells.items() if found})
+        return cls(plan, folder, {key: result for key, result in cells.items() if result})
 
     @property
     def todo(self) -> list[Job]:
@@ -141,7 +141,7 @@ def write_tables(folder: Path, plan: Plan, done: Mapping[str, Sequence[Cell]]) -
     bad = [(keys, {"error": cell.error}) for keys, cell in rows if cell.error is not None]
     columns = list(dict.fromkeys(name for _, cell in good for name in cell.values))
     matching = {pattern: fnmatch.filter(columns, pattern) for pattern in plan.metrics or ("*",)}
-    chosen = list(dict.fromkeys(column for found in matching.values() for column in found))
+    chosen = list(dict.fromkeys(column for result in matching.values() for column in result))
     times = list(dict.fromkeys(name for _, cell in good for name in cell.times))
     for name, wanted, values in (
         (SWEEP_TABLE, chosen, [(keys, cell.values) for keys, cell in good]),
@@ -151,7 +151,7 @@ def write_tables(folder: Path, plan: Plan, done: Mapping[str, Sequence[Cell]]) -
         texts = [[_text(value) for value in (*keys, *map(row.get, wanted))] for keys, row in values]
         table = pd.DataFrame(texts, columns=[*plan.columns, *KEY_COLUMNS, *wanted], dtype=str)
         write_file(folder / name, table.to_csv(index=False, lineterminator="\n"))
-    unknown = tuple(pattern for pattern, found in matching.items() if good and not found)
+    unknown = tuple(pattern for pattern, result in matching.items() if good and not result)
     return SweepResult(len(good), tuple(str(cell.error) for _, cell in rows if cell.error is not None), unknown)
 
 

@@ -216,12 +216,12 @@ def _jobs(base: Mapping[str, Value], recipe: Recipe, point: Point, seeds: Sequen
 
 def _hash(source: InputSource) -> str:
     """Return the hash of all settings and messages of an input, up to its break."""
-    found = hashlib.sha256()
+    result = hashlib.sha256()
     with suppress(FgtrackError):
-        found.update(repr(source.settings()).encode())
+        result.update(repr(source.settings()).encode())
         for message in source.messages():
-            found.update(repr(message).encode())
-    return found.hexdigest()
+            result.update(repr(message).encode())
+    return result.hexdigest()
 
 
 def _sha256(data: bytes) -> str:

@@ -75,13 +75,13 @@ def close_up(runs: Runs, close_ups: Sequence[CloseUp], **paper: Unpack[Paper]) -
     `CallError` if they are not as many, or of different detections.
     """
     every = evaluated(runs)
-    if len(every) != len(close_ups) or len({one.arrival for one in close_ups}) != 1:
+    if len(every) != len(close_ups) or len({item.arrival for item in close_ups}) != 1:
         raise CallError(f"{len(every)} runs need as many close-ups of one detection")
     first = close_ups[0]
     now_ns, at_m = np.array([first.now_ns]), first.after.means[-1, :2]
     paths = [path for path in true_paths(every[0].run.tables["truth"]) if np.isfinite(path.at(now_ns)[0, 0])]
     truth = min(paths, key=lambda path: float(np.hypot(*(path.at(now_ns)[0, :2] - at_m))), default=None)
-    both = [[_offsets(one, each, first, truth) for each in (one.before, one.after)] for one in close_ups]
+    both = [[_offsets(item, each, first, truth) for each in (item.before, item.after)] for item in close_ups]
     ends_m = [[off_m[-1] for _, off_m in pair] for pair in both]
     texts = ["{:.2f} m before, {:.2f} m after".format(*np.linalg.norm(pair, axis=-1)) for pair in ends_m]
     highest_m = max(float(np.hypot(*off_m.T).max()) for pair in both for _, off_m in pair)

@@ -14,14 +14,7 @@ from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_n
 from fgtrack.evaluation.scores.innovations import num_measured
 from fgtrack.evaluation.scores.statistics import chi_square_band
 from fgtrack.plotting.paper import Paper, Sheet, styled
-from fgtrack.plotting.style import (
-    GREY,
-    broken_line,
-    legend_above,
-    log_axis,
-    run_looks,
-    usual_step_ns,
-)
+from fgtrack.plotting.style import GREY, broken_line, legend_above, log_axis, run_looks, usual_step_ns
 
 _WINDOWS = 40  # of a run, so many values does each mean of NIS hold
 _SHORTEST, _LONGEST = 5, 100

@@ -40,7 +40,7 @@ def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> 
     Raises `DataError` if no run has truth, or none of this object.
     """
     read = evaluated(runs)
-    every = {one: one.matching for one in read if one.matching is not None}
+    every = {item: item.matching for item in read if item.matching is not None}
     known = sorted({k for matching in every.values() for k in matching.object_ids})
     if not known:
         raise DataError("no run has truth, so there are no errors to draw")
@@ -48,7 +48,7 @@ def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> 
         raise DataError(f"object {object_id}: no run has truth of it, there are {', '.join(map(str, known))}")
     wanted = known[0] if len(known) == 1 else object_id
     curves = _curves(every, wanted)
-    names = [name for name in _QUANTITIES if any(np.isfinite(one[name]).any() for *_, one in curves)]
+    names = [name for name in _QUANTITIES if any(np.isfinite(item[name]).any() for *_, item in curves)]
     names = names or ["position_m"]
     longest_s = max((float(np.ptp(times_ns)) / NS_PER_S for *_, times_ns, _ in curves if len(times_ns)), default=0.0)
     window_s = max(longest_s / _WINDOWS, _SHORTEST_S)
@@ -83,24 +83,24 @@ _Curve = tuple[str, Look, float, IntArray, Mapping[str, FloatArray]]
 def _curves(runs: Mapping[EvaluatedRun, Matching], object_id: int | None) -> list[_Curve]:
     """Errors of the present states of every run, then of the final ones of those that have them."""
     looks = run_looks(list(runs))
-    first_ns = {one: start_ns(group) for group in by_recording(list(runs)) for one in group}
-    both = [(one, its, "", track_errors(its)) for one, its in runs.items()]
-    both += [(one, its, ", final state", final_errors(one.run, its)) for one, its in runs.items()]
+    first_ns = {item: start_ns(group) for group in by_recording(list(runs)) for item in group}
+    both = [(item, its, "", track_errors(its)) for item, its in runs.items()]
+    both += [(item, its, ", final state", final_errors(item.run, its)) for item, its in runs.items()]
     curves = list[_Curve]()
-    for one, its, more, found in both:
+    for item, its, more, result in both:
         if object_id is None:
-            wanted = np.ones(len(found.stamps_ns), dtype=bool)
+            wanted = np.ones(len(result.stamps_ns), dtype=bool)
         elif object_id in its.object_ids:
-            wanted = found.object_index == its.object_ids.index(object_id)
+            wanted = result.object_index == its.object_ids.index(object_id)
         else:
             continue
         rows = np.flatnonzero(wanted)
-        rows = rows[np.argsort(found.stamps_ns[rows], kind="stable")]
-        look = looks[one.label]._replace(line=":") if more else looks[one.label]
+        rows = rows[np.argsort(result.stamps_ns[rows], kind="stable")]
+        look = looks[item.label]._replace(line=":") if more else looks[item.label]
         if len(rows) or not more:
-            values = {name: each[rows] for name, each in found.values.items()}
-            times_ns, step_ns = found.stamps_ns[rows] - first_ns[one], usual_step_ns(its.tracks["now_ns"])
-            curves.append((one.label + more, look, step_ns, times_ns, values))
+            values = {name: each[rows] for name, each in result.values.items()}
+            times_ns, step_ns = result.stamps_ns[rows] - first_ns[item], usual_step_ns(its.tracks["now_ns"])
+            curves.append((item.label + more, look, step_ns, times_ns, values))
     return curves
 
 

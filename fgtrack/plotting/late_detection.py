@@ -53,7 +53,7 @@ def drawn_close_up(
     """
     same = by_recording(runs)[0]
     try:
-        late = close_ups([one.run for one in same], stamp_ns)
+        late = close_ups([item.run for item in same], stamp_ns)
     except DataError as error:
         return [], error
     return [("close_up", figure_of(same, late, **paper))], late[0]
@@ -88,14 +88,14 @@ def close_up_of(run: Run, arrival: Arrival, rule: str = "") -> CloseUp:
         for message in batch[:row]:
             tracker.receive(message)
         report = tracker.tick(now_ns)
-        fused_ns += [(one.track_id, one.stamp_ns) for one in report.updates if one.disposition in FUSED[1:]]
+        fused_ns += [(item.track_id, item.stamp_ns) for item in report.updates if item.disposition in FUSED[1:]]
         if row is None:
             continue
         stamps_ns = sorted({*range(now_ns, start_ns - 1, -nanoseconds(STEP_S)), arrival.stamp_ns}, reverse=True)
-        before = {one.track_id: _estimates(tracker, one.track_id, stamps_ns) for one in report.tracks}
+        before = {item.track_id: _estimates(tracker, item.track_id, stamps_ns) for item in report.tracks}
         tracker.receive(batch[row])
         updates = tracker.tick(now_ns).updates
-        taken = next((one for one in updates if (one.sensor, one.receipt_ns, one.index) == key), None)
+        taken = next((item for item in updates if (item.sensor, item.receipt_ns, item.index) == key), None)
         if taken is None or taken.disposition not in FUSED or taken.track_id not in before:
             raise DataError(f"{name}: no track has fused it ({taken.disposition if taken else 'no such detection'})")
         track_id, after = taken.track_id, _estimates(tracker, taken.track_id, stamps_ns)
@@ -134,7 +134,7 @@ def chosen(runs: Sequence[Run], stamp_ns: int | None = None) -> tuple[Arrival, s
         )
     arrivals = [Arrival(*key) for key in late.index.tolist()]
     if stamp_ns is not None:
-        return min(arrivals, key=lambda one: abs(one.stamp_ns - stamp_ns)), "Chosen by its stamp."
+        return min(arrivals, key=lambda item: abs(item.stamp_ns - stamp_ns)), "Chosen by its stamp."
     errors_m = np.column_stack(
         [late["before_m"], late["after_m"], *(other.loc[late.index, "after_m"] for other in others)]
     )
@@ -148,7 +148,7 @@ def chosen(runs: Sequence[Run], stamp_ns: int | None = None) -> tuple[Arrival, s
     with np.errstate(divide="ignore"):
         apart = np.abs(np.log(errors_m / rms_m)).max(axis=1)
     candidates = lowered & np.isfinite(apart)
-    receipts_ns = np.array([one.receipt_ns for one in arrivals])
+    receipts_ns = np.array([item.receipt_ns for item in arrivals])
     early = candidates & (receipts_ns - receipts_ns.min() <= nanoseconds(_EARLY_S))
     row = int(np.where(early if early.any() else candidates, apart, np.inf).argmin())
     return arrivals[row], (
@@ -160,7 +160,6 @@ def chosen(runs: Sequence[Run], stamp_ns: int | None = None) -> tuple[Arrival, s
 
 def _late_detections(run: Run) -> Any:  # Any: a DataFrame, whose columns have no types
     """Late detections that a settled track fused by themselves, by `_DETECTION`.
-
     Columns are the shift of the present from its prediction and its error before and after, NaN without truth, in m.
     """
     both = ["tick", "track_id"]
@@ -177,10 +176,10 @@ def _late_detections(run: Run) -> Any:  # Any: a DataFrame, whose columns have n
     true_m = np.stack([path.at(now_ns)[:, :2] for path in paths] or [np.full_like(at_m, np.nan)])
     apart_m = np.linalg.norm(true_m - at_m, axis=-1)
     nearest_m = true_m[np.where(np.isnan(apart_m), np.inf, apart_m).argmin(axis=0), np.arange(len(late))]
-    for name, one, other in (
+    for name, item, other in (
         ("moved_m", at_m, predicted_m),
         ("before_m", predicted_m, nearest_m),
         ("after_m", at_m, nearest_m),
     ):
-        late[name] = np.linalg.norm(one - other, axis=-1)
+        late[name] = np.linalg.norm(item - other, axis=-1)
     return late.set_index(_DETECTION)

@@ -18,8 +18,6 @@ from fgtrack.plotting.paper import Paper, Sheet, styled
 from fgtrack.plotting.style import GREY, WRONG, broken_line, bulk, legend_above, usual_step_ns
 
 _NAMED_OBJECTS = 8  # more objects than these share two entries of the legend
-
-
 _AROUND_S = 0.4  # of the life of a track before and after the moment of the close-up
 _LEAST_M = 4.0  # half a side of the close-up
 _DETECTIONS = "#8C7A1F"

@@ -20,10 +20,8 @@ from fgtrack.core.errors import CallError
 from fgtrack.plotting.style import LETTER, StyledFigure, grow, size_in
 
 _logger = logging.getLogger(__name__)
-
 P = ParamSpec("P")
 T = TypeVar("T")
-
 #: Where matplotlib's own value is unchanged: how figures look. Sizes of texts follow `font.size`.
 _STYLE: Mapping[str, Any] = {  # Any: values of rcParams
     "font.size": 9.5,

@@ -25,17 +25,7 @@ from fgtrack.plotting.residuals import residuals
 from fgtrack.plotting.style import save
 from fgtrack.plotting.sweep import error_against_delay, sweep, sweep_metrics
 
-__all__ = [
-    "arrivals",
-    "close_up",
-    "consistency",
-    "error_against_delay",
-    "errors",
-    "lag",
-    "map",
-    "residuals",
-    "sweep",
-]
+__all__ = ["arrivals", "close_up", "consistency", "error_against_delay", "errors", "lag", "map", "residuals", "sweep"]
 
 
 def __dir__() -> list[str]:
@@ -103,7 +93,7 @@ def planned_sweep(table: SweepTable) -> list[Planned]:
 
 def drawn(plans: Iterable[Planned], every: bool = False, **paper: Unpack[Paper]) -> Iterator[tuple[str, Figure]]:
     """Return the figures of `plans`, with their names; extras only where `every` is set."""
-    return ((one.name, one.draw(**paper)) for one in plans if every or not one.is_extra)
+    return ((item.name, item.draw(**paper)) for item in plans if every or not item.is_extra)
 
 
 def save_named(named: Iterable[tuple[str, Figure]], folder: Path, form: str) -> list[Path]:

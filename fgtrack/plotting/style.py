@@ -27,18 +27,14 @@ from fgtrack.evaluation.runs import EvaluatedRun
 _RC: Any = mpl.rcParams  # Any: its keys are a Literal of all names
 WRONG = "#000000"
 GREY = "#777777"
-
 _PAUSE_STEPS = 3  # a line is not drawn across a pause that is longer than as many usual steps
-
 LETTER, _LINE = 0.58, 1.5  # width of a letter and height of a line over the size of the font
 _MOST_ENTRIES = 12  # of a legend
 _HANDLE = 8  # characters that the line before an entry and the space around it take
 _BESIDE_IN = 0.6  # what the labels of an axis take of the width
 _FREE_LINES = 2  # of a legend for which figures have room
-
 _BEYOND = 3.0  # interquartile ranges beyond the quartiles that still belong to the bulk
 _MARGIN = 0.05
-
 _MARK = "fgtrack figure"
 #: Formats of files, with who made them and without what would differ from one writing to the next.
 FORMATS: Mapping[str, Mapping[str, str | None]] = {
@@ -74,8 +70,8 @@ class StyledFigure(Figure):
 
 def run_looks(runs: Sequence[EvaluatedRun]) -> dict[str, Look]:
     """Return how the curves of each run look, by label: colours are those of the estimators."""
-    result = looks([str(one.run.meta.get("estimator") or one.label) for one in runs])
-    return {one.label: each for one, each in zip(runs, result, strict=True)}
+    result = looks([str(item.run.meta.get("estimator") or item.label) for item in runs])
+    return {item.label: each for item, each in zip(runs, result, strict=True)}
 
 
 def legend_above(axes: Axes, share: float = 1.0, markerscale: float = 1.0) -> None:

@@ -58,17 +58,13 @@ class ArrivalClock:
 
 
 #: Every clock model, chosen by `kind`.
-AnyClock = Annotated[
-    OffsetClock | DriftClock | JitterClock | QuantisedClock | ArrivalClock,
-    Discriminator("kind"),
-]
+AnyClock = Annotated[OffsetClock | DriftClock | JitterClock | QuantisedClock | ArrivalClock, Discriminator("kind")]
 
 
 def reported_stamps(
     clocks: Sequence[AnyClock], rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray
 ) -> IntArray:
     """Stamps that a sensor with `clocks` reports of messages in the order in which it sensed, shape (n,) as all others.
-
     Each place in the list has a generator of its own: other clocks before or after one leave what it draws.
     """
     for clock, child in zip(clocks, rng.spawn(len(clocks)), strict=True):

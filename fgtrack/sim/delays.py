@@ -40,7 +40,6 @@ class UniformDelay:
 @settings
 class GammaDelay:
     """`min_s` plus a gamma variable, with the mean and the 90 % quantile that were measured.
-
     Shape k solves quantile(k, 0.9) / k = (q90_s - min_s) / (mean_s - min_s). The left side falls from 2.71 at
     k = 1/2 to 1; a shape below 1/2 is not offered.
     """
@@ -105,7 +104,6 @@ class MarkovDelay:
 @settings
 class MarkovTimeDelay:
     """`MarkovDelay` in continuous time: the link itself is good or bad, whoever sends how often.
-
     In the good state it turns bad at the rate `to_bad_per_s` (a), and back at `to_good_per_s` (b): it is bad for
     a share a / (a + b) of the time, for 1 / b on average. Over dt, P(bad | good) = a / (a + b) (1 - exp(-(a + b) dt)).
     """
@@ -122,7 +120,6 @@ AnyDelay = Annotated[
     NoDelay | ConstantDelay | UniformDelay | GammaDelay | LossyDelay | MarkovDelay | MarkovTimeDelay,
     Discriminator("kind"),
 ]
-
 _MIN_SHAPE, _MAX_SHAPE = 0.5, 1e6
 
 

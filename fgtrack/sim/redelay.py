@@ -49,8 +49,10 @@ def redelay(
             read.append(message)
     except DataError as error:
         broken.append(error)
-    receipts_ns, stamps_ns = np.array([(one.receipt_ns, one.stamp_ns) for one in read], dtype=np.int64).reshape(-1, 2).T
-    names = np.array([one.sensor if isinstance(one, DetectionList) else "" for one in read])
+    receipts_ns, stamps_ns = (
+        np.array([(item.receipt_ns, item.stamp_ns) for item in read], dtype=np.int64).reshape(-1, 2).T
+    )
+    names = np.array([item.sensor if isinstance(item, DetectionList) else "" for item in read])
     reported_ns, priority, lost = stamps_ns.copy(), np.zeros_like(stamps_ns), np.zeros(len(read), dtype=bool)
     known, num_lost = sorted(set(names.tolist()) - {""}), dict[str, int]()
     for sensor in delays:

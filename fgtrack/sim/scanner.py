@@ -43,7 +43,6 @@ class Scanner:
         self, rng: np.random.Generator, objects: Sequence[FloatArray], track: TrackMap | None
     ) -> list[tuple[Detection, ...]]:
         """Detections of the n scans; `objects` holds the states of each object at the scans, shape (n, 6).
-
         Every object and the clutter have a generator of their own.
         """
         clutter_rng, objects_rng = rng.spawn(2)
@@ -135,10 +134,7 @@ class Scanner:
         """Range, bearing and range rate of `states` from the sensor, shape (m, 3), with its own motion."""
         origin, velocity, yaw = self._carried(scan, self.sensor.mount)
         relative = np.concatenate(
-            [
-                _rotated(states[:, :2] - origin, -yaw),
-                _rotated(cartesian(states[:, [YAW, SPEED]]) - velocity, -yaw),
-            ],
+            [_rotated(states[:, :2] - origin, -yaw), _rotated(cartesian(states[:, [YAW, SPEED]]) - velocity, -yaw)],
             axis=1,
         )
         return measurement_model(POLAR, CV()).predict(relative)

@@ -33,7 +33,6 @@ class Clutter:
 @settings
 class SimulatedSensor:
     """One sensor on the ego vehicle.
-
     It measures positions and yaw in the ego's detection frame, or range, bearing and range rate in its own.
     Speed is over ground.
     """

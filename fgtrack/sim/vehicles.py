@@ -136,7 +136,6 @@ class DrawnVehicle:
 @dataclass(frozen=True, eq=False)
 class DrawnTrajectory:
     """A drawn motion: x(t) = prediction from the step before + f noise + sqrt(f (1 - f)) bridge.
-
     f is the part of the step that has passed. So the noise up to t and the noise after it are independent and
     each as large as its share of the step.
     """
@@ -168,7 +167,6 @@ AnyVehicle = Annotated[TrackVehicle | DrawnVehicle, Discriminator("kind")]
 
 def drawn(motion: MotionModel, x: FloatArray, dt_s: float, rng: np.random.Generator) -> FloatArray:
     """A draw of the states `dt_s` after `x`, both shape (..., n): the prediction plus N(0, Q(x, dt_s)).
-
     Raises `numpy.linalg.LinAlgError` where Q is singular, as with a density of zero.
     """
     roots = np.linalg.cholesky(motion.process_noise(x, dt_s))

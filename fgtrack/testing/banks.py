@@ -17,7 +17,6 @@ from fgtrack.testing.streams import LAG_S, MS, Stream
 _TOGETHER = 1e-6
 _NUM_OBJECTS = 8  # more than are fused one by one
 _GONE = 2
-
 List = dict[int, Measurement]
 """Measurements of one stamp, by object."""
 
@@ -26,15 +25,15 @@ def gives_each_of_several_objects_what_it_gives_one_alone(subject: Subject, stre
     """Each list has a measurement of most objects; half way one is removed and another one begins."""
     objects = [_shifted(stream, number) for number in range(_NUM_OBJECTS)]
     lists = [  # of what was sensed together; each object is missing in every fourth list
-        {k: one.measurements[place] for k, one in enumerate(objects) if (place + k) % 4}
-        for place in range(len(stream.measurements))
+        {k: item.measurements[index] for k, item in enumerate(objects) if (index + k) % 4}
+        for index in range(len(stream.measurements))
     ]
     half, new = (len(lists) + 1) // 2, len(objects)
-    later = [{new if number == _GONE else number: m for number, m in one.items()} for one in lists[half:]]
+    later = [{new if number == _GONE else number: m for number, m in item.items()} for item in lists[half:]]
     bank = estimator_bank(subject.name, stream.motion, LAG_S, subject.options, factory=subject.factory)
-    for number, one in enumerate(objects):
-        bank.advance(max(bank.present_ns, one.start.stamp_ns))
-        bank.birth(number, one.start)
+    for number, item in enumerate(objects):
+        bank.advance(max(bank.present_ns, item.start.stamp_ns))
+        bank.birth(number, item.start)
     reported = _fed(bank, lists[:half])
     bank.remove(_GONE)
     bank.birth(new, objects[_GONE].start)
@@ -45,7 +44,7 @@ def gives_each_of_several_objects_what_it_gives_one_alone(subject: Subject, stre
         own = objects[_GONE if number == new else number]
         begun = half if number == new else 0
         estimator, results = _alone(subject, own, number, [*lists[:half], *later], begun)
-        _same_results(number, [one[number] for one in reported if number in one], results)
+        _same_results(number, [item[number] for item in reported if number in item], results)
         for at_ns in (bank.present_ns - 120 * MS, bank.present_ns):
             state = state_of(bank, stream.motion, number, at_ns)
             off, covariance = difference(state, estimator.state_at(at_ns), stream.motion)
@@ -64,7 +63,7 @@ def _shifted(stream: Stream, number: int) -> Stream:
     """The stream of another object, a little aside."""
     shift = np.array([0.3, -0.2]) * number
     start: Start = replace(stream.start, position_m=tuple(np.add(stream.start.position_m, shift).tolist()))
-    moved = (replace(one, z=one.z + np.pad(shift, (0, len(one.z) - 2))) for one in stream.measurements)
+    moved = (replace(item, z=item.z + np.pad(shift, (0, len(item.z) - 2))) for item in stream.measurements)
     return replace(stream, measurements=tuple(moved), start=start)
 
 
@@ -74,13 +73,13 @@ def _alone(
     """An estimator that is given what `lists` hold of the object `number`, which began with the list `begun`."""
     estimator, results = subject.start(own), list[UpdateResult]()
     now_ns = own.start.stamp_ns
-    for place, one in enumerate(lists):
-        now_ns = max(now_ns, *(measurement.stamp_ns for measurement in one.values()))
-        if place + 1 == begun:
+    for index, item in enumerate(lists):
+        now_ns = max(now_ns, *(measurement.stamp_ns for measurement in item.values()))
+        if index + 1 == begun:
             estimator.advance(now_ns)
-        if place >= begun:
+        if index >= begun:
             estimator.advance(now_ns)
-            given: Measurement | None = one.get(number)
+            given: Measurement | None = item.get(number)
             if given is not None:
                 results.append(estimator.update(given))
     return estimator, results
@@ -108,18 +107,18 @@ def _publishes_the_present(bank: TrackBank, motion: MotionModel) -> None:
     for number, state in zip(bank.track_ids, shown, strict=True):
         own = state_of(bank, motion, number, bank.present_ns)
         expected = _known(TrackState(own.stamp_ns, *motion.kinematic(own.mean, own.covariance)), motion)
-        found, what = _known(state, motion), f"the present state of object {number}"
-        sound(found.mean, found.covariance, what)
-        same = state.stamp_ns == bank.present_ns and max(difference(found, expected)) < _TOGETHER
+        result, what = _known(state, motion), f"the present state of object {number}"
+        sound(result.mean, result.covariance, what)
+        same = state.stamp_ns == bank.present_ns and max(difference(result, expected)) < _TOGETHER
         require(same, f"{what} is {state}, not {expected}")
 
 
 def _fed(bank: TrackBank, lists: Sequence[List]) -> list[dict[int, UpdateResult]]:
     """Give `lists` to a bank as the tracker does, and return its results by object."""
     reported = []
-    for one in lists:
-        stamp_ns = next(iter(one.values())).stamp_ns
+    for item in lists:
+        stamp_ns = next(iter(item.values())).stamp_ns
         bank.advance(max(bank.present_ns, stamp_ns))
         bank.states_at(stamp_ns)
-        reported.append(dict(zip(one, bank.update(stamp_ns, list(one), list(one.values())), strict=True)))
+        reported.append(dict(zip(item, bank.update(stamp_ns, list(item), list(item.values())), strict=True)))
     return reported

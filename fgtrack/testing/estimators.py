@@ -128,11 +128,11 @@ def _keeps_all_that_it_accepts_and_nothing_else(subject: Subject, stream: Stream
 
 def _gives_the_estimate_of_the_time_order_in_any_order(subject: Subject, stream: Stream) -> None:
     # Those of one stamp the other way round, because their order must not matter either.
-    ordered = tuple(sorted(stream.measurements, key=lambda one: -one.stamp_ns)[::-1])
-    found, expected = (subject.fed(each)[0] for each in (stream, replace(stream, measurements=ordered)))
-    tolerance = _CONVERGED if _converged(subject, found, expected) else _ORDER
+    ordered = tuple(sorted(stream.measurements, key=lambda item: -item.stamp_ns)[::-1])
+    result, expected = (subject.fed(each)[0] for each in (stream, replace(stream, measurements=ordered)))
+    tolerance = _CONVERGED if _converged(subject, result, expected) else _ORDER
     for at_ns in (stream.start.stamp_ns, stream.newest_ns, stream.newest_ns + 100 * MS):
-        _close(found.state_at(at_ns), expected.state_at(at_ns), tolerance, stream, "that of the time order")
+        _close(result.state_at(at_ns), expected.state_at(at_ns), tolerance, stream, "that of the time order")
 
 
 def _fuses_a_late_measurement_exactly(subject: Subject, stream: Stream) -> None:
@@ -288,7 +288,6 @@ def _predicts_ahead_by_the_motion_model(subject: Subject, stream: Stream) -> Non
 
 def _comes_near_the_posterior_of_a_nonlinear_model(subject: Subject, stream: Stream) -> None:
     """In the order of the stamps: the extended Kalman filter, or least squares over all states.
-
     Noise, Jacobians, the pose and motion of sensors, angles and losses all count there.
     """
     estimator, claims = subject.fed(stream)[0], subject.claims

@@ -104,9 +104,9 @@ def _has_the_transition_of_its_functions(model: MotionModel, x: FloatArray, dt_s
     cases: list[tuple[FloatArray, float | FloatArray]] = [(x, dt_s)]
     cases += [(x + 0.05 * np.linspace(0.0, 1.0, m)[:, None], np.linspace(0.1, 1.0, m) * dt_s) for m in counts]
     for states, durations_s in cases:
-        found = model.transition(states, durations_s)
+        result = model.transition(states, durations_s)
         functions = model.predict, model.jacobian, model.process_noise
-        for name, part, function in zip(found._fields, found, functions, strict=True):
+        for name, part, function in zip(result._fields, result, functions, strict=True):
             _equal(part, function(states, durations_s), 1e-9, f"{name} of the transition of {states.shape}")
 
 

@@ -103,14 +103,14 @@ class Promise:
             for number in range(num_streams if self.repeats else 1):
                 stream = draw(np.random.default_rng([seed, kind, number]))
                 wrong = fault(self.check, subject, stream)
-                place = 0
-                while wrong and place < len(stream.measurements) > 1:
-                    fewer = stream.measurements[:place] + stream.measurements[place + 1 :]
+                index = 0
+                while wrong and index < len(stream.measurements) > 1:
+                    fewer = stream.measurements[:index] + stream.measurements[index + 1 :]
                     smaller = replace(stream, measurements=fewer)
                     if still := fault(self.check, subject, smaller):
                         stream, wrong = smaller, still
                     else:
-                        place += 1
+                        index += 1
                 if wrong:
                     raise BrokenPromiseError(subject.name, {self.name: f"{wrong}\n{stream}"})
 

@@ -37,10 +37,10 @@ def dense_joint(
     are small; noise and robust weights are those at the last states. Raises `CallError` for a stamp before the prior's.
     """
     wanted = sorted(set(stamps_ns))
-    stamps = sorted({prior.stamp_ns, *wanted, *(one.stamp_ns for one in measurements)})
+    stamps = sorted({prior.stamp_ns, *wanted, *(item.stamp_ns for item in measurements)})
     if stamps[0] < prior.stamp_ns:
         raise CallError(f"dense_joint: stamp {stamps[0]} ns lies before the prior's, {prior.stamp_ns} ns")
-    linear = motion.linear and all(one.model.linear and one.loss is None for one in measurements)
+    linear = motion.linear and all(item.model.linear and item.loss is None for item in measurements)
     n, size, nodes = motion.dim, motion.dim * len(stamps), {stamp_ns: k for k, stamp_ns in enumerate(stamps)}
     start, P0 = initial_state(motion, prior)
     known = [] if linear else measurements
@@ -54,11 +54,11 @@ def dense_joint(
             d[k], M[k] = F @ d[k - 1] + motion.predict(x, dt_s) - means[k], F @ M[k - 1]
             M[k, :, k * n : (k + 1) * n] = np.linalg.cholesky(motion.process_noise(x, dt_s))
         rows = [np.eye(size, size + 1)]
-        for one in measurements:
-            k = nodes[one.stamp_ns]
-            y = _residual(one, means[k])
-            H = one.model.selection(n) if one.model.linear else _slope(one, means[k])
-            root = np.linalg.cholesky(one.R / _weight(one, y))
+        for item in measurements:
+            k = nodes[item.stamp_ns]
+            y = _residual(item, means[k])
+            H = item.model.selection(n) if item.model.linear else _slope(item, means[k])
+            root = np.linalg.cholesky(item.R / _weight(item, y))
             rows.append(np.linalg.solve(root, np.column_stack([H @ M[k], y - H @ d[k]])))
         R = np.asarray(np.linalg.qr(np.vstack(rows), mode="r"))[:size]
         step = d + M @ np.linalg.solve(R[:, :size], R[:, size])
@@ -72,22 +72,21 @@ def dense_joint(
 
 def kalman_filter(motion: MotionModel, prior: Start, measurements: Sequence[Measurement], stamp_ns: int) -> TrackState:
     """State at `stamp_ns` of the extended Kalman filter given `measurements` up to it, in the order of their stamps.
-
     Measurement Jacobians are difference quotients; a robust loss weighs a measurement by what is left of its innovation
     after the update.
     """
     (x, P), now_ns = initial_state(motion, prior), prior.stamp_ns
-    for one in sorted(measurements, key=lambda m: m.stamp_ns):
-        if one.stamp_ns > stamp_ns:
+    for item in sorted(measurements, key=lambda m: m.stamp_ns):
+        if item.stamp_ns > stamp_ns:
             break
-        x, P = _moved(motion, x, P, one.stamp_ns - now_ns)
-        y, H = _residual(one, x), _slope(one, x)
+        x, P = _moved(motion, x, P, item.stamp_ns - now_ns)
+        y, H = _residual(item, x), _slope(item, x)
         step, weight = np.zeros(len(x)), 1.0
-        for _ in range(_WEIGHT_STEPS if one.loss else 1):
-            S = H @ P @ H.T + one.R / weight
+        for _ in range(_WEIGHT_STEPS if item.loss else 1):
+            S = H @ P @ H.T + item.R / weight
             step = P @ H.T @ np.linalg.solve(S, y)
-            weight = _weight(one, y - H @ step)
-        x, P, now_ns = x + step, P - P @ H.T @ np.linalg.solve(S, H @ P), one.stamp_ns
+            weight = _weight(item, y - H @ step)
+        x, P, now_ns = x + step, P - P @ H.T @ np.linalg.solve(S, H @ P), item.stamp_ns
     x, P = _moved(motion, x, P, stamp_ns - now_ns)
     return TrackState(stamp_ns, x, P)
 
@@ -120,7 +119,6 @@ def _weight(one: Measurement, y: FloatArray) -> float:
 
 def difference(found: TrackState, expected: TrackState, motion: MotionModel | None = None) -> tuple[float, float]:
     """Distance of `found` from `expected`: the largest difference of means and covariances, in standard deviations.
-
     A covariance is relative to the two standard deviations of its entry; a NaN stays one. The yaw of a state of
     `motion` goes the short way round.
     """

@@ -91,7 +91,6 @@ def one_late(steps: int, rng: np.random.Generator) -> Stream:
 
 def mild(rng: np.random.Generator) -> Stream:
     """A car that is well known from the start and passes a yaw of pi, seen by LiDAR and RADAR of a turning observer.
-
     The LiDAR measures position and yaw, the RADAR range, bearing and Doppler from a pose with an arm and a velocity.
     """
     start = replace(
@@ -124,10 +123,10 @@ def mild_robust(rng: np.random.Generator) -> Stream:
     """The same with positions of which every other one is an outlier, under a Huber loss."""
     stream = mild(rng)
     measurements = []
-    for one in stream.measurements[1::2]:
-        off = np.sqrt(np.diag(one.R)) * rng.normal(0.0, 8.0, len(one.z)) * (rng.random() < 0.5)
+    for item in stream.measurements[1::2]:
+        off = np.sqrt(np.diag(item.R)) * rng.normal(0.0, 8.0, len(item.z)) * (rng.random() < 0.5)
         off[2:] = 0.0
-        measurements.append(replace(one, z=one.z + off, loss=RobustLoss("huber", 1.5)))
+        measurements.append(replace(item, z=item.z + off, loss=RobustLoss("huber", 1.5)))
     return replace(stream, measurements=tuple(measurements))
 
 

@@ -61,7 +61,6 @@ class Association(Protocol):
 @settings
 class GatedEuclidean:
     """Hungarian assignment on distances; pairs further apart than the gate are out before the assignment.
-
     `max_nis` is for what the distance does not show, as a ghost that crosses a track at another speed: a pair whose
     innovation is larger is out as well, and the candidate starts no track, which would compete for the next detections.
     Without it, as in the paper, every pair inside the gate is accepted.
@@ -100,7 +99,6 @@ class GatedEuclidean:
 @settings
 class GatedMahalanobis:
     """Hungarian assignment on squared Mahalanobis distances of the innovation, gated by the chi-square quantile.
-
     The gate widens with the time since the last detection and the speed that is possible, so that it serves sensors of
     any rate; the log-determinant in the cost keeps a track of wide covariance from taking what fits another.
     """
@@ -175,7 +173,6 @@ def near(
     candidates: Candidates, means: FloatArray, reach_m: float | FloatArray, excluded: Apart | None = None
 ) -> Pairs:
     """Return the pairs, with distances, at most `reach_m` (a number or one for each track) apart and not `excluded`.
-
     Of a candidate with more than `MOST_NEAR` tracks so near, the nearest of them. Distances are in the map; that of a
     bearing is from the track to the line of sight.
     """
@@ -189,7 +186,6 @@ def innovations(
     pairs: Pairs, candidates: Candidates, states: StatesAt
 ) -> list[tuple[IntArray, FloatArray, FloatArray, int]]:
     """Return the innovations of `pairs` of `candidates` and tracks with these states.
-
     Indices of pairs that measure the same, assumed components included, with NIS and log det S, shapes (p,), and the
     number k of components. NaN where S has no root.
     """
@@ -207,7 +203,6 @@ def innovations(
 
 def reaches_m(groups: Sequence[Group], states: StatesAt, probability: float, limit_m: float) -> FloatArray:
     """Largest distance from each track of a candidate with a NIS up to the quantile of `probability`, shape (tracks,).
-
     The NIS is at least that of the position alone, which is at least the squared distance over the largest variance of
     S = P + R in any direction. At most `limit_m`, and just that where it is not the position that is measured.
     """

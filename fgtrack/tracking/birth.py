@@ -45,7 +45,6 @@ class Birth:
 
     def prior(self, candidate: Candidate, road: Road, ego: EgoState | None, ego_in_pit: bool) -> Start | None:
         """First state at the candidate's stamp; None where it has no position to start from.
-
         Measured components come first, then map heading, road curvature and a share of the ego speed.
         """
         if candidate.position_m is None:
@@ -86,7 +85,6 @@ class Birth:
 
 def in_any_direction(states: StatesAt, stamp_ns: int, starts: Mapping[int, Start]) -> StatesAt:
     """Return `states` at `stamp_ns` with the positions of the tracks of `starts` as uncertain in any direction.
-
     A state with a yaw that is unknown is linearised along that yaw, and its predicted position spreads along it alone.
     Until a second position gives the direction, the position gets the same variance across, (speed_std dt)^2.
     """

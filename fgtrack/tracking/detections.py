@@ -101,7 +101,6 @@ def move_back(items: MapDetections, by_m: float) -> None:
 
 def merged(items: MapDetections, merge: "Merge") -> MapDetections:
     """Return `items` with those of one object averaged, in the order of the merge; bearings alone are last.
-
     Averaged are the components that all have; where none of these gives a position, the leading one stands for all.
     """
     placed = items.placed.tolist()
@@ -135,7 +134,6 @@ def merged(items: MapDetections, merge: "Merge") -> MapDetections:
 
 def covariances(items: MapDetections, names: tuple[str, ...]) -> FloatArray:
     """Covariances of `names` in the map, shape (m, k, k): a detection's own where it has one, else the sensor's R.
-
     What the map gave has the sensor's standard deviation for it and is not correlated with the rest. The covariance of
     an average is the mean of those of its detections.
     """
@@ -187,7 +185,6 @@ def _turned(R: FloatArray, yaws_rad: FloatArray) -> FloatArray:
 
 class PoseError(NamedTuple):
     """The error e of a sensor pose in the innovation z - h(x, pose) = ... + G e of a detection.
-
     e is the estimated pose minus the true one, of x, y, yaw, vx and vy of the sensor, the same for all detections of a
     batch. It enters z where the detection was placed in the map by the pose, and h where it is relative to the sensor.
     """
@@ -211,7 +208,6 @@ class PoseError(NamedTuple):
 
 def placement(components: tuple[str, ...], offsets_m: FloatArray, assumed: tuple[str, ...] = ()) -> FloatArray:
     """Derivative, shape (..., k, 5), of detections that a pose placed in the map, by its x, y, yaw, vx and vy.
-
     `offsets_m` (..., 2) is where they lie in the map, seen from the pose. What is `assumed`, as a heading from the map,
     was not turned by the pose; a speed is over ground, whatever the ego does.
     """

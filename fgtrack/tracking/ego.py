@@ -22,11 +22,9 @@ LARGEST_STEP_BACK_S = 1.0
 _LARGEST_STEP_BACK_NS = nanoseconds(LARGEST_STEP_BACK_S)
 _MAX_EXTRAPOLATION_NS = nanoseconds(MAX_EXTRAPOLATION_S)
 _MAX_FUTURE_NS = NS_PER_S  # a state stamped further ahead of its receipt has a wrong stamp
-
 CONTRADICTS = "contradicts its neighbours"
 _LONGEST_S, _SLACK_M, _SHARE, _SIGMAS = 1.0, 2.0, 0.5, 3.0  # see `EgoTrajectory`
 _STRAIGHT_RAD = 1e-6  # half of a turn below which chord and arc are the same
-
 _FIELDS = [field.name for field in fields(EgoState)]
 _VALUES = attrgetter(*_FIELDS)
 _YAW, _YAW_RATE = _FIELDS.index("yaw_rad"), _FIELDS.index("yaw_rate_radps")
@@ -51,7 +49,6 @@ def is_finite(ego: EgoState) -> bool:
 
 def extrapolated(ego: EgoState, stamp_ns: int, covariance: FloatArray | None = None, straight: bool = False) -> EgoPose:
     """Pose of `ego` moved to `stamp_ns` on the circle that it drives, with the yaw extrapolated (not wrapped).
-
     `covariance`, shape (5, 5), is that of `ego`; what the ego does meanwhile besides is not added to it. `straight`:
     the position goes on along the heading, as in the published tracker; at 60 m/s and 0.4 rad/s 12 m off after 1 s.
     """
@@ -173,7 +170,6 @@ class EgoTrajectory:
 
     def pose_at(self, stamp_ns: int, present_ns: int) -> EgoPose | None:
         """Pose at `stamp_ns`, or None where it is unknown; `present_ns` is the tracking time.
-
         Beyond its ends, and into a gap, the trajectory is extrapolated for a limited time. A gap is longer than all
         that two extrapolations, one from either side, could cover.
         """
@@ -236,7 +232,6 @@ class EgoTrajectory:
 
     def _interpolated(self, before: EgoState, after: EgoState, stamp_ns: int) -> EgoPose:
         """Pose between two states, the short way round, with the mean of their covariances (None counts as zero).
-
         The error of (1 - share) a + share b has at most this covariance, and just this where the two errors are the
         same, as those of a localisation within a moment nearly are.
         """
@@ -245,7 +240,7 @@ class EgoTrajectory:
         if self._std is not None:
             covariance, newer = _completed(before.covariance, self._std), _completed(after.covariance, self._std)
         if covariance is not newer:
-            older, newer = (np.zeros((5, 5)) if one is None else one for one in (covariance, newer))
+            older, newer = (np.zeros((5, 5)) if item is None else item for item in (covariance, newer))
             covariance = (1.0 - share) * older + share * newer
         return EgoPose(
             before.x_m + share * (after.x_m - before.x_m),

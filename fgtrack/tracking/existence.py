@@ -123,7 +123,6 @@ class Existence:
 
 class ExistenceLifecycle:
     """Tracks live by the probability that their objects exist; see the module.
-
     A list says nothing of objects out of its sensor's range and field of view. Without an ego all are in view.
     """
 

@@ -17,7 +17,6 @@ from fgtrack.estimation.filters.propagation import States
 
 class GuardedBank:
     """Guards a bank: what it raises, and states that cannot be published (see `faults`), end the track concerned.
-
     Where it cannot be told which track failed, all tracks of that call end. A `DataError` is an answer, not a failure,
     and propagates; so does a `CallError` until a first track could be started: the estimator cannot be made as it is
     configured. `make` gives an empty bank.
@@ -162,7 +161,6 @@ class GuardedBank:
 
 def faults(states: Sequence[TrackState]) -> dict[int, Failure]:
     """Return the faults of kinematic states by their index; nothing where all can be published.
-
     A state is sound where it is finite, its entries sum up to at most 10^9, and its covariance is symmetric and
     positive definite: up to rounding, as an entry that the motion model does not have is 0 with variance 0.
     """

@@ -128,7 +128,6 @@ class Inbox:
 
     def put(self, message: DetectionList) -> list[UpdateRecord]:
         """Receive a message; the records of detections that end here.
-
         A message is repeated if an earlier one of the sensor had its stamp and contents.
         """
         sensor = self._sensors[message.sensor]
@@ -153,7 +152,6 @@ class Inbox:
 
     def _is_copy(self, message: DetectionList, usable: Sequence[bool]) -> bool:
         """True if `message` repeats one that is remembered; it is remembered from now on.
-
         Compared are its usable detections, in any order, by their bits: NaN equals nothing, and hash(-1) hash(-2).
         """
         if message.objects and not any(usable):

@@ -19,7 +19,6 @@ def near(
     points: FloatArray, means: FloatArray, reach_m: FloatArray, most: int
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Return rows, columns and distances of the pairs of `points` and tracks that are at most `reach_m` (n,) apart.
-
     Of a point in (m, 3) the third entry is NaN, of a line of sight from there its direction. At most so many tracks of
     each point, the nearest ones.
     """
@@ -66,7 +65,6 @@ def innovations(
     y: FloatArray, H: FloatArray, P: FloatArray, tracks: IntArray, R: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """NIS y' S^-1 y and log det S with S = H P H' + R of pairs, shapes (m,); NaN where S has no root.
-
     Innovations y (m, k), Jacobians H (m, k, n) or (1, k, n), covariances P (tracks, n, n), R (m, k, k).
     """
     m, k = y.shape
@@ -84,7 +82,7 @@ def innovations(
 def faults(means: FloatArray, covariances: FloatArray) -> IntArray:
     """Fault of each state (m, n) and (m, n, n), shape (m,): not finite or beyond any vehicle, invalid covariance."""
     m, n = means.shape
-    found, C = np.full(m, SOUND), np.empty((n, n))
+    result, C = np.full(m, SOUND), np.empty((n, n))
     for i in range(m):
         P, size, total, sound = covariances[i], 0.0, 0.0, True
         for a in range(n):
@@ -96,7 +94,7 @@ def faults(means: FloatArray, covariances: FloatArray) -> IntArray:
                 sound = sound and abs(P[a, b] - P[b, a]) / root <= _ROUNDING
             sound = sound and P[a, a] >= 0.0
         if not (size <= LARGEST and total < np.inf):
-            found[i] = NOT_FINITE
+            result[i] = NOT_FINITE
         elif not (sound and cholesky(C, n, C)):
-            found[i] = NOT_DEFINITE
-    return found
+            result[i] = NOT_DEFINITE
+    return result

@@ -60,7 +60,6 @@ class LifecycleRules:
 
 class CountingLifecycle:
     """Counts matches and misses: status of tracks, and which of them end.
-
     A track is aged by every sensor at the range it is responsible for, and by time alone as well. Only sensors that
     give positions count: a bearing fits whatever is behind or before its object as well, so it neither starts nor
     confirms nor keeps a track.

@@ -11,7 +11,6 @@ from fgtrack.core.types import BoolArray, Detection, IntArray, ObjectReport
 
 #: Says which pairs of candidates and tracks, as positions in their lists, both (m,), are not one object, shape (m,).
 Apart = Callable[[IntArray, IntArray], BoolArray]
-
 #: Classes that a detector may confuse; any other class is like none.
 _ALIKE = (
     ("car", "van", "truck", "bus", "trailer", "vehicle"),
@@ -39,7 +38,6 @@ class _Seen:
 
 class Objects:
     """Class and size of each track, and the pairs that they exclude.
-
     A detection with a class may only belong to a track of its class, which is that of most of its detections, or of
     one like it; one without a class to any.
     """

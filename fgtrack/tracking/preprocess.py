@@ -13,13 +13,7 @@ from fgtrack.core.linalg import congruence, equal_ones
 from fgtrack.core.types import BoolArray, Disposition, FloatArray, IntArray, UpdateRecord
 from fgtrack.estimation.base import Measurement, Measurements
 from fgtrack.models.correlated_errors import split_error
-from fgtrack.models.measurement import (
-    COMPONENTS,
-    RELATIVE,
-    SensorPose,
-    measured_position,
-    measurement_model,
-)
+from fgtrack.models.measurement import COMPONENTS, RELATIVE, SensorPose, measured_position, measurement_model
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
@@ -144,7 +138,6 @@ class Preprocess:
         assumes_map_yaw: bool = True,
     ) -> None:
         """`detection_origin_m`: origin of the ego frame of detections, seen from the ego reference point.
-
         `assumes_map_yaw`: a yaw that the map gave is prior knowledge; as published it counts as measured, in the
         innovations and their NIS.
         """
@@ -156,7 +149,6 @@ class Preprocess:
 
     def __call__(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> tuple[Candidates, list[UpdateRecord]]:
         """Candidates in the order of the merge, and the records of detections that are out of bounds.
-
         `ego` is the pose at the batch's stamp; it may be None for detections in the map frame.
         """
         pose = self._sensor_pose(batch, sensor, ego)
@@ -179,7 +171,6 @@ class Preprocess:
 
     def _sensor_pose(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> SensorPose:
         """Pose of the frame that the detections are given in, and the velocity of its origin.
-
         Of detections in the map the pose that they are seen from: that of the ego, without one the map's origin.
         """
         if ego is None:
@@ -241,7 +232,7 @@ class Preprocess:
         )
         models, white = [model], R
         if sensor.correlation is not None:
-            split = [split_error(batch.message.sensor, sensor, model, one, self._motion.state_names) for one in R]
+            split = [split_error(batch.message.sensor, sensor, model, item, self._motion.state_names) for item in R]
             models, white = [each for each, _ in split], np.array([noise for _, noise in split])
         total, error = white, None
         if pose_covariance is not None:
@@ -260,8 +251,8 @@ class Preprocess:
             yield whole
             return
         for k, each in enumerate(models):
-            one, m = Measurement(batch.stamp_ns, each, z[k : k + 1], total[k : k + 1], pose, sensor.loss, assumed), [k]
-            yield Group(rows[m], one, R[m], error and error.at(m))
+            item, m = Measurement(batch.stamp_ns, each, z[k : k + 1], total[k : k + 1], pose, sensor.loss, assumed), [k]
+            yield Group(rows[m], item, R[m], error and error.at(m))
 
 
 def _without(items: MapDetections, outside: BoolArray, reason: str, lost: dict[int, str]) -> MapDetections:

@@ -30,12 +30,7 @@ class PublishedEgo(EgoTrajectory):
     _straight = True
 
     def __init__(
-        self,
-        yaw_weight: float,
-        yaw_rate_weight: float,
-        step_ns: int,
-        storage_ticks: int,
-        std: EgoStd | None = None,
+        self, yaw_weight: float, yaw_rate_weight: float, step_ns: int, storage_ticks: int, std: EgoStd | None = None
     ) -> None:
         super().__init__(yaw_weight, yaw_rate_weight, std)
         self._half_step_ns = step_ns / 2
@@ -218,7 +213,6 @@ class PublishedLifecycle(CountingLifecycle):
 
 class PublishedTracker(Tracker):
     """The published implementation's order of things, where it differs (defects Q9 and Q22).
-
     A list older than the storage still starts tracks, and an empty list ages every track. The range that ages a
     track is measured from the present ego to where the track was after the batch before, or at the end of the tick
     before.

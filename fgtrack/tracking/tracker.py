@@ -150,7 +150,6 @@ class Tracker:
 
     def state_at(self, track_id: int, stamp_ns: int) -> TrackReport:
         """A track at any stamp in or after its window: smoothed or filtered in the past, predicted ahead of now.
-
         Raises `CallError` for a track that does not exist, a stamp before its window, and a state that is not sound.
         """
         track_ids = self._parts.bank.track_ids
@@ -220,7 +219,6 @@ class Tracker:
 
     def _unclaimed(self, batch: Batch, candidates: Candidates, new: Sequence[int], states: StatesAt) -> list[int]:
         """Return those of `new` that belong to no track which began after the batch's stamp.
-
         The detection that started it has overtaken them. They are too old for it, and not another object. Compared are
         the present states of these tracks, moved back to the stamp.
         """
@@ -259,7 +257,6 @@ class Tracker:
         self, batch: Batch, candidates: Candidates, assignment: Assignment, states: StatesAt, scan: Scan
     ) -> None:
         """Lives of matched and missed tracks, where it is positions that are seen; tracks that run out end here.
-
         A track is missed by a message as a whole, so only its last batch counts.
         """
         lifecycle, sensor = self._parts.lifecycle, self._parts.sensors[batch.message.sensor]

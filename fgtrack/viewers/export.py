@@ -37,8 +37,8 @@ def export(runs: Runs, out: Path, *, ros2: bool = False, overwrite: bool = False
             raise CallError(f"{out}: viewers recognise such a file by its name, let it end in .mcap")
     (check_output if out.suffix == ".mcap" else check_bag)(out, overwrite)
     every = evaluated(runs)
-    check_apart(out, [one.run.path for one in every])
-    messages, notes = viewer_messages({one.label: one.run for one in every})
+    check_apart(out, [item.run.path for item in every])
+    messages, notes = viewer_messages({item.label: item.run for item in every})
     return write(out, messages, overwrite), notes
 
 

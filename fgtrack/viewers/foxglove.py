@@ -33,7 +33,6 @@ _OUTCOME = {
 
 def write_foxglove(path: Path, messages: Iterable[ViewerMessage], overwrite: bool = False) -> dict[str, int]:
     """Write `messages`, in the order of their log times, to the MCAP file `path`; return their number by topic.
-
     The file appears when it is complete. The same messages give the same bytes. Raises `CallError` if something is at
     `path`, and `DataError` if the disk is full or a time lies before 1970.
     """
@@ -68,7 +67,7 @@ def values(message: ViewerMessage) -> Iterator[tuple[str, Any]]:  # Any: message
     time = sdk.Timestamp(sec, nsec)
     match message.content:
         case Scene(entities, removed):
-            shown = [_entity(one, time, message.log_ns - message.stamp_ns) for one in entities]
+            shown = [_entity(item, time, message.log_ns - message.stamp_ns) for item in entities]
             deletions = [sdk.SceneEntityDeletion(timestamp=time, id=name) for name in removed]
             yield topic, sdk.SceneUpdate(deletions=deletions, entities=shown)
         case EgoState() as ego:
@@ -78,7 +77,7 @@ def values(message: ViewerMessage) -> Iterator[tuple[str, Any]]:  # Any: message
             pose = sdk.Pose(position=position, orientation=turn)
             yield f"{topic}/pose", sdk.PoseInFrame(timestamp=time, frame_id="map", pose=pose)
         case tuple() as states:
-            poses = [_pose((one.x_m or 0.0, one.y_m or 0.0), 0.0, one.yaw_rad or 0.0) for one in states]
+            poses = [_pose((item.x_m or 0.0, item.y_m or 0.0), 0.0, item.yaw_rad or 0.0) for item in states]
             yield f"{topic}/poses", sdk.PosesInFrame(timestamp=time, frame_id="map", poses=poses)
         case outcome:
             known = {name: value for name, value in outcome.items() if value is not None}

@@ -30,25 +30,24 @@ _LONGEST_S = 1e7  # times farther from the start are of another clock, and left 
 
 def playback(runs: Sequence[EvaluatedRun], moment: Moment | None = None) -> tuple[Json, list[str]]:
     """Return what the viewer shows of `runs`, first `moment`, and a line for whatever it does not show.
-
     Times are seconds from the start of a recording, and missing values null. Raises `DataError` if a run or its map is
     damaged.
     """
-    recordings = [_Recording(group, min(start_ns(one.run) for one in group)) for group in by_recording(runs)]
+    recordings = [_Recording(group, min(start_ns(item.run) for item in group)) for group in by_recording(runs)]
     notes = dict[str, None]()
     return {
-        "colours": distinct_colours([str(one.run.meta.get("estimator", "")) for one in runs]),
+        "colours": distinct_colours([str(item.run.meta.get("estimator", "")) for item in runs]),
         "sensor_colours": SENSORS,
         "moment": None
         if moment is None
         else {"t": (moment[0] - recordings[0].start_ns) / NS_PER_S, "x": moment[1], "y": moment[2]},
         "size_m": NOMINAL_SIZE_M[:2],
-        "recordings": [one.values(notes, MOST_ROWS // len(recordings)) for one in recordings],
+        "recordings": [item.values(notes, MOST_ROWS // len(recordings)) for item in recordings],
         "runs": [
-            {"label": one.label, "recording": index, **recording.run(one, notes, MOST_ROWS // len(runs))}
-            for one in runs
+            {"label": item.label, "recording": index, **recording.run(item, notes, MOST_ROWS // len(runs))}
+            for item in runs
             for index, recording in enumerate(recordings)
-            if one in recording.runs
+            if item in recording.runs
         ],
     }, list(notes)
 
@@ -156,12 +155,12 @@ def _place(position_m: FloatArray, prefix: str = "") -> Json:
 
 def _thinned(tables: Sequence[Table], time: str, most: int, label: str, notes: dict[str, None]) -> list[Table]:
     """Return `tables` where they have more than `most` rows at every second time of the first one, every third ..."""
-    num_rows = max(one.num_rows for one in tables)
+    num_rows = max(item.num_rows for item in tables)
     step = max(1, math.ceil(num_rows / most))
     if step > 1:
         notes[f"{label}: the viewer shows one of {step} times, as there are {num_rows} rows"] = None
     kept_ns = np.unique(tables[0][time])[::step]
-    return [one.where(np.isin(one[time], kept_ns)) if step > 1 else one for one in tables]
+    return [item.where(np.isin(item[time], kept_ns)) if step > 1 else item for item in tables]
 
 
 def _column(values: npt.ArrayLike, digits: int = _DIGITS) -> list[float | int | None]:

@@ -50,7 +50,6 @@ def write_report(
     overwrite: bool,
 ) -> int:
     """Write the report of `runs` into the HTML file `out`, and return its size in bytes.
-
     Verdict, warnings, viewer and three figures are open, the rest is folded. The same runs and `pictures` (PNG by
     name, in the order in which they are shown) give the same bytes. Raises `CallError` if the file exists, and
     `DataError` if a run or its map is damaged.

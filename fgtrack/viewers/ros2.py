@@ -25,7 +25,6 @@ _FOREVER = QosTime(0, 0)
 
 def write_ros2(path: Path, messages: Iterable[ViewerMessage], overwrite: bool = False) -> dict[str, int]:
     """Write `messages`, in the order of their log times, as a rosbag2 recording; return their number by topic.
-
     `path` becomes a rosbag2 folder, or its MCAP file alone where the name ends in `.mcap`. It appears when it is
     complete. Outcomes have no standard message and are left out. Raises as `write_bag`.
     """
@@ -85,8 +84,8 @@ class _MarkerFactory(MessageFactory):
         """Topics, and the messages on them that show `message`."""
         content, topic, stamp_ns = message.content, message.topic, message.stamp_ns
         if isinstance(content, Scene):
-            markers = [one for entity in content.entities for one in self._markers(topic, stamp_ns, entity)]
-            markers += [one for name in content.removed for one in self._markers(topic, stamp_ns, Entity(name, ()))]
+            markers = [item for entity in content.entities for item in self._markers(topic, stamp_ns, entity)]
+            markers += [item for name in content.removed for item in self._markers(topic, stamp_ns, Entity(name, ()))]
             yield f"{topic}/markers", self._make(MARKER_ARRAY, markers=markers)
         elif isinstance(content, EgoState):
             turn = self._pose(content.x_m, content.y_m, content.yaw_rad).orientation

@@ -20,7 +20,6 @@ from fgtrack.viewers.shapes import Colour, Entity, Point, Scene, Shape, ViewerMe
 from fgtrack.viewers.states import NOMINAL_SIZE_M, ellipses, final_ns, groups, located, track_positions
 
 Messages = Iterator[ViewerMessage]
-
 _WHITE, _GREY = (1.0, 1.0, 1.0, 1.0), (0.55, 0.55, 0.55, 0.9)
 _OPACITY = {"tentative": 0.15, "coasting": 0.3}
 _CONFIRMED = 0.5  # so that ellipses and arrows in the box are seen
@@ -154,7 +153,6 @@ def _past_messages(run: Run, look: Look) -> Messages:
 
 def _detection_messages(run: Run, look: Look) -> Messages:
     """At every receipt of a list its detections, grey where not used, arrows to their tracks now, and their poses.
-
     An arrow leads from where a detection was sensed to where its track is at the tick that fused it. It is strong where
     the detection came out of sequence, and faint where it did not.
     """
@@ -171,11 +169,7 @@ def _detection_messages(run: Run, look: Look) -> Messages:
         marks = [_mark(where, row, colour if fates[row] in _USED else _GREY) for row in mine]
         arrows = [
             _arrow(
-                positions_m[row],
-                yaws_rad[row],
-                lengths_m[row],
-                0.3,
-                (*colour[:3], 1.0 if fates[row] in LATE else 0.3),
+                positions_m[row], yaws_rad[row], lengths_m[row], 0.3, (*colour[:3], 1.0 if fates[row] in LATE else 0.3)
             )
             for row in mine
             if late and fates[row] in FUSED and lengths_m[row] > 0.0
@@ -220,8 +214,8 @@ def _scenes(topic: str, rows_at: Iterable[tuple[int, IntArray]], entity: Callabl
     """A scene of the entities of the rows at each time; those of the time before that are not in it are removed."""
     before: set[str] = set()
     for at_ns, rows in rows_at:
-        entities = tuple(one for row in rows.tolist() if (one := entity(row)) is not None)
-        names = {one.name for one in entities}
+        entities = tuple(item for row in rows.tolist() if (item := entity(row)) is not None)
+        names = {item.name for item in entities}
         if entities or before:
             yield ViewerMessage(at_ns, at_ns, topic, Scene(entities, tuple(sorted(before - names))))
         before = names

@@ -79,11 +79,7 @@ TARGETS = {
         lambda: [{"x.yaml": content} for content in inputs.shipped("scenarios")],
         [("simulate", "x.yaml", "-o", "out.jsonl", "--overwrite", "--duration", "0.5")],
     ),
-    "sweep": Target(
-        lambda: [{"x.yaml": inputs.SWEEP}],
-        [("sweep", "x.yaml", "-o", "swept", "--jobs", "1")],
-        "x.yaml",
-    ),
+    "sweep": Target(lambda: [{"x.yaml": inputs.SWEEP}], [("sweep", "x.yaml", "-o", "swept", "--jobs", "1")], "x.yaml"),
     "map": _beside(
         "x.csv",
         lambda: [inputs.track_map()],

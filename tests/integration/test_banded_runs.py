@@ -22,10 +22,7 @@ def recording(name: str) -> dict[str, object]:
     return {"recording": shared(f"reference/{name}/stream.jsonl.gz"), **maps}
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["default", *slow("short10", "lidar3_10", "jitter10", "full60")],
-)
+@pytest.mark.parametrize("name", ["default", *slow("short10", "lidar3_10", "jitter10", "full60")])
 def test_whole_runs_are_those_of_the_smoother(name: str) -> None:
     given = recording(name)
     expected, found = (

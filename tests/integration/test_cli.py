@@ -227,8 +227,7 @@ def test_a_truncated_stream_is_replayed_up_to_the_break(fgtrack: Command, stream
 
 
 @pytest.mark.parametrize(
-    ("receipt_ns", "message"),
-    [(START_NS, "receipt"), (START_NS + 10**13, "nothing was received for")],
+    ("receipt_ns", "message"), [(START_NS, "receipt"), (START_NS + 10**13, "nothing was received for")]
 )
 def test_a_recording_with_broken_time_is_replayed_up_to_there(
     fgtrack: Command, tmp_path: Path, receipt_ns: int, message: str

@@ -38,8 +38,7 @@ def test_python_m_runs_the_command_line() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "offered"),
-    [("rep", {"replay", "report"}), ("replay drive.jsonl --pit", {"--pit-map"})],
+    ("words", "offered"), [("rep", {"replay", "report"}), ("replay drive.jsonl --pit", {"--pit-map"})]
 )
 def test_the_shell_completes_commands_and_options(words: str, offered: set[str]) -> None:
     asked = {

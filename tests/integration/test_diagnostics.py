@@ -58,10 +58,10 @@ def test_a_healthy_recording_causes_none(call: Call) -> None:
 
 def test_no_ego(call: Call) -> None:
     code, (line,), _ = replayed(call, drive(ego=False))
-    assert (
-        code,
-        "ego: no state was received, so nothing in its frame can be placed: name its topic" in line,
-    ) == (1, True)
+    assert (code, "ego: no state was received, so nothing in its frame can be placed: name its topic" in line) == (
+        1,
+        True,
+    )
     code, (line,), _ = replayed(call, drive(ego=False, frame="map"))
     assert (code, line.startswith("ego: no state was received, so new objects")) == (0, True)
     assert replayed(call, drive(ego=False, frame="map"), "birth.ego_speed_factor=0.0")[1] == []

@@ -51,10 +51,7 @@ def check_tracked(run: Run) -> None:
     assert found.breaks_per_minute <= 2.0
 
 
-@pytest.mark.parametrize(
-    ("num_opponents", "speed_mps"),
-    [(2, 30.0), *slow((1, 10.0), (1, 65.0), (8, 10.0), (8, 65.0))],
-)
+@pytest.mark.parametrize(("num_opponents", "speed_mps"), [(2, 30.0), *slow((1, 10.0), (1, 65.0), (8, 10.0), (8, 65.0))])
 def test_cars_around_a_driving_ego(num_opponents: int, speed_mps: float) -> None:
     check_tracked(fgtrack.replay(scene(num_opponents, speed_mps)))
 

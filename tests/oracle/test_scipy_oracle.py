@@ -83,11 +83,7 @@ def test_the_dense_joint_of_a_linear_model_is_that_of_scipy() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "draw"),
-    [
-        *product(SMOOTHERS[:2], SMOOTHED),
-        *product(SMOOTHERS[2:], (streams.observed, streams.robust)),
-    ],
+    ("name", "draw"), [*product(SMOOTHERS[:2], SMOOTHED), *product(SMOOTHERS[2:], (streams.observed, streams.robust))]
 )
 def test_a_converged_smoother_solves_least_squares(name: str, draw: Draw) -> None:
     assert apart(name, draw) < SMOOTHED[draw]

@@ -110,10 +110,7 @@ def wrong(report: TuneReport, truth: Truth) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("scene", "seed"),
-    [(ctrv, 11), (ctrv, 12), (urban, 12), (urban, 13)],
-)
+@pytest.mark.parametrize(("scene", "seed"), [(ctrv, 11), (ctrv, 12), (urban, 12), (urban, 13)])
 def test_every_identifiable_standard_deviation_is_found(
     scene: Callable[[int], tuple[Iterator[Message], Config, Truth]], seed: int
 ) -> None:

@@ -316,8 +316,7 @@ def test_what_describes_an_object_is_read_by_paths_and_places_in_lists():
 
 
 @pytest.mark.parametrize(
-    ("given", "expected"),
-    [(7, 7), ("7", 7), (" -7 ", -7), ("", None), ("9223372036854775807", (1 << 63) - 1)],
+    ("given", "expected"), [(7, 7), ("7", 7), (" -7 ", -7), ("", None), ("9223372036854775807", (1 << 63) - 1)]
 )
 def test_an_id_that_is_an_integer_stays_it(given, expected):
     assert object_id(given) == expected

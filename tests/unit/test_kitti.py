@@ -3,17 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.kitti import (
-    CENTRE_PX,
-    FOCAL_PX,
-    RECTIFIED_FROM_IMU,
-    box,
-    calibration,
-    folder,
-    label,
-    oxts,
-    pose,
-)
+from support.kitti import CENTRE_PX, FOCAL_PX, RECTIFIED_FROM_IMU, box, calibration, folder, label, oxts, pose
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
@@ -138,10 +128,7 @@ def test_a_region_too_flat_to_hold_a_car_near_by_begins_at_half_of_the_distance_
 KITTI = "0 7 Car 0 0 0.1 400 170 460 190 1.5 1.6 4.0"
 
 
-@pytest.mark.parametrize(
-    ("score", "value"),
-    [("", None), (" 0.8", 0.8)],
-)
+@pytest.mark.parametrize(("score", "value"), [("", None), (" 0.8", 0.8)])
 def test_results_in_the_form_of_the_data_set_are_detections(tmp_path, score, value):
     x_m, y_m, z_m = RECTIFIED_FROM_IMU @ [20.0, 3.0, -1.5, 1.0]
     line = f"{KITTI} {x_m} {y_m} {z_m} {-0.4 - 0.5 * math.pi}{score}"

@@ -28,11 +28,7 @@ SEEN = (
     Detection(x_m=90.0, y_m=0.0, speed_mps=5.0, class_name="car"),
     Detection(x_m=math.nan, y_m=0.0, speed_mps=5.0, score=0.1, class_name="car"),
 )
-FILTERS = {
-    "score": Filter(min=0.5),
-    "class_name": Filter(none_of=("bush",)),
-    "speed_mps": Filter(min=-70.0, max=70.0),
-}
+FILTERS = {"score": Filter(min=0.5), "class_name": Filter(none_of=("bush",)), "speed_mps": Filter(min=-70.0, max=70.0)}
 RADAR = SensorModel(std={"x_m": 0.3, "y_m": 0.3}, filters=FILTERS)
 
 

@@ -117,11 +117,6 @@ def test_the_status_tells_unconfirmed_from_seen_from_missed() -> None:
     status.append(life.status(0))
     match(life, 0, Scan("both", START_NS, START_NS), HERE)
     status.append(life.status(0))
-    assert status == [
-        TrackStatus.TENTATIVE,
-        TrackStatus.CONFIRMED,
-        TrackStatus.COASTING,
-        TrackStatus.CONFIRMED,
-    ]
+    assert status == [TrackStatus.TENTATIVE, TrackStatus.CONFIRMED, TrackStatus.COASTING, TrackStatus.CONFIRMED]
     life.lives[0] = Life(1, START_NS, num_placed=2, misses=1)
     assert life.status(0) is TrackStatus.TENTATIVE

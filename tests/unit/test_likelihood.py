@@ -42,9 +42,7 @@ def unsettled(series: Series) -> Series:
 
 #: The same sensors, and objects that turn.
 TURNING = replace(
-    SPACE,
-    motion_names=("position", "yaw", "speed", "yaw_rate"),
-    motion=lambda std: CTRV.from_std_per_step(std, 1.0),
+    SPACE, motion_names=("position", "yaw", "speed", "yaw_rate"), motion=lambda std: CTRV.from_std_per_step(std, 1.0)
 )
 
 

@@ -11,13 +11,7 @@ import pytest
 from fgtrack.core.errors import CallError
 from fgtrack.core.plugins import Registry
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
-from fgtrack.estimation.registry import (
-    ESTIMATORS,
-    MOTION_MODELS,
-    estimator,
-    estimator_bank,
-    motion_model,
-)
+from fgtrack.estimation.registry import ESTIMATORS, MOTION_MODELS, estimator, estimator_bank, motion_model
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
 from fgtrack.pipeline.load import plain

@@ -78,10 +78,7 @@ def test_a_late_heading_on_the_other_side_of_half_a_turn_is_predicted_on_the_sho
     assert abs(result.innovation[2]) < 0.1
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["ekf-replay", *slow("iekf-replay", "ukf-replay", "iplf-replay", "imm-replay")],
-)
+@pytest.mark.parametrize("name", ["ekf-replay", *slow("iekf-replay", "ukf-replay", "iplf-replay", "imm-replay")])
 @pytest.mark.parametrize("after_s", [0.0, LAG_S], ids=["birth", "oldest"])
 def test_on_the_oldest_stamp_of_the_window_the_order_of_arrival_does_not_matter(name: str, after_s: float) -> None:
     """Ranges and bearings, of which the first to be fused decides where the others are linearised."""

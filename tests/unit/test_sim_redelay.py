@@ -12,14 +12,7 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.io.errors import TruncatedInput
 from fgtrack.sim.clocks import OffsetClock
-from fgtrack.sim.delays import (
-    ConstantDelay,
-    GammaDelay,
-    LossyDelay,
-    MarkovDelay,
-    NoDelay,
-    UniformDelay,
-)
+from fgtrack.sim.delays import ConstantDelay, GammaDelay, LossyDelay, MarkovDelay, NoDelay, UniformDelay
 from fgtrack.sim.redelay import OTHERS, SensorDelays, redelay
 
 MS = 1_000_000

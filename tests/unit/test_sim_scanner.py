@@ -84,12 +84,7 @@ def test_the_range_rate_is_the_derivative_of_the_range() -> None:
 
 def test_a_sensor_sees_between_its_ranges_and_inside_its_field_of_view_only() -> None:
     sensor = SimulatedSensor(
-        "radar",
-        NO_NOISE,
-        mount=Mount(yaw_rad=math.pi / 2.0),
-        field_of_view_rad=1.0,
-        min_range_m=5.0,
-        max_range_m=50.0,
+        "radar", NO_NOISE, mount=Mount(yaw_rad=math.pi / 2.0), field_of_view_rad=1.0, min_range_m=5.0, max_range_m=50.0
     )
     for x, y, seen in (
         (0.0, 20.0, True),

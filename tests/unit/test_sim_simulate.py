@@ -109,16 +109,7 @@ def test_equal_receipts_are_ordered_truth_ego_sensors() -> None:
     lidar = SimulatedSensor("lidar", {"x_m": 1.0, "y_m": 1.0}, rate_hz=10.0)
     radar = replace(lidar, name="radar")
     scenario = replace(
-        SHORT,
-        sensors=(radar, lidar),
-        opponents=SHORT.opponents[:1],
-        ego_messages=EgoMessages(delay=NoDelay()),
+        SHORT, sensors=(radar, lidar), opponents=SHORT.opponents[:1], ego_messages=EgoMessages(delay=NoDelay())
     )
     first = [m for m in run(scenario) if m.receipt_ns == SHORT.start_ns]
-    assert [getattr(m, "sensor", type(m)) for m in first] == [
-        TruthState,
-        TruthState,
-        EgoState,
-        "radar",
-        "lidar",
-    ]
+    assert [getattr(m, "sensor", type(m)) for m in first] == [TruthState, TruthState, EgoState, "radar", "lidar"]

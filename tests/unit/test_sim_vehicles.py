@@ -71,9 +71,7 @@ def test_a_drawn_vehicle_moves_as_its_motion_model_says(start_s: float, step_s: 
         (lambda: TrackVehicle(arc_m=float("inf"), speed=((0.0, 9.0),)), "arc_m"),
         (
             lambda: TrackVehicle(
-                0.0,
-                speed=((0.0, 9.0),),
-                lane_changes=(LaneChange(0.0, 2.0, 1.0), LaneChange(1.0, 2.0, 0.0)),
+                0.0, speed=((0.0, 9.0),), lane_changes=(LaneChange(0.0, 2.0, 1.0), LaneChange(1.0, 2.0, 0.0))
             ),
             "lane_changes: one must end before the next",
         ),

@@ -190,8 +190,7 @@ def test_the_key_of_a_job_is_that_of_its_content_however_it_is_written(plan: Any
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["seeds: [1]", "set: {association.gate_m: 4.9}", "duration_s: 59.9", "set: {ego.yaw_weight: 0.5}"],
+    "text", ["seeds: [1]", "set: {association.gate_m: 4.9}", "duration_s: 59.9", "set: {ego.yaw_weight: 0.5}"]
 )
 def test_whatever_decides_the_result_changes_the_key(plan: Any, text: str) -> None:
     assert keys(plan(text)) != keys(plan(""))
@@ -216,10 +215,7 @@ def test_the_content_of_every_file_changes_the_key_whatever_its_size_and_time(
 ) -> None:
     track, drive = tmp_path / "track.csv", tmp_path / "drive.jsonl"
     track.write_text("abc")
-    for text, head, file in (
-        (f"set: {{map.track: {track}}}", HEAD, track),
-        ("", recording, drive),
-    ):
+    for text, head, file in ((f"set: {{map.track: {track}}}", HEAD, track), ("", recording, drive)):
         before, time_ns = keys(plan(text, head)), file.stat().st_mtime_ns
         assert keys(plan(text, head)) == before
         file.write_text(file.read_text().replace("c", "d", 1) if file != drive else file.read_text()[:-300] + "\n")

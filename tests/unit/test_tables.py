@@ -148,11 +148,7 @@ def test_a_damaged_file_is_one_line_and_what_is_before_it_is_replayed(tmp_path, 
             [f"{1_700_000_000 + 0.05 * k:.2f}" for k in range(30)],
             r"radar\.csv: .*look like s since 1970: change `time_unit`",
         ),
-        (
-            "ns",
-            [f"{0.05 * k:.2f}" for k in range(100)],
-            r"radar\.csv: .*change `time_unit` \(input\.csv\.detec",
-        ),
+        ("ns", [f"{0.05 * k:.2f}" for k in range(100)], r"radar\.csv: .*change `time_unit` \(input\.csv\.detec"),
         (
             "s",
             [f"{1_700_000_000_000 + 50 * k}" for k in range(30)],

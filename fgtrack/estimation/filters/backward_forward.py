@@ -193,8 +193,8 @@ class BackwardForwardBank:
         mean, covariance = states.means, states.covariances
         rest_s = seconds(self.present_ns - self._grid_ns)
         if rest_s:
-            one = np.ones(len(mean), dtype=np.int64)
-            mean, covariance = self._propagator.propagate(mean, covariance, one, rest_s)
+            item = np.ones(len(mean), dtype=np.int64)
+            mean, covariance = self._propagator.propagate(mean, covariance, item, rest_s)
         return kinematic_states(self._propagator.motion, self.present_ns, mean, covariance)
 
     def smoothed(self) -> list[SmoothedReport]:

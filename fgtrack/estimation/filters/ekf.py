@@ -15,7 +15,6 @@ from fgtrack.models.robust import weight
 from fgtrack.models.sensors import RobustLoss
 
 T = TypeVar("T", float, FloatArray)
-
 _copied = partial(np.array, dtype=np.float64, order="C")
 _KALMAN = "fgtrack.estimation.kernels.kalman"
 _MAX_REWEIGHTINGS = 50
@@ -120,7 +119,6 @@ def correct(
     loss: RobustLoss | None = None,
 ) -> Correction[FloatArray]:
     """Fuse innovations y (m, k) with Jacobians H (m, k, n) or (k, n) and R (m, k, k) (Karle et al. 2023, eqs. 5 to 9).
-
     `measured` is `Measurement.measured`, for the NIS, `loss` the robust loss of all (see `robust_weight`).
     """
     rows = np.arange(y.shape[-1]) if measured is None else np.array(measured, dtype=np.int64)
@@ -148,7 +146,6 @@ def updated_one(
     measured: Sequence[int] | None = None,
 ) -> OneCorrection:
     """One state, (n,) and (n, n), after the innovation y (k,) of a measurement with H (k, n) and R (k, k).
-
     Raises `numpy.linalg.LinAlgError` for one that cannot be fused.
     """
     x, P, y, nis, w, S, fused = correct(mean[None], covariance[None], y[None], H, R[None], measured, loss)

@@ -69,7 +69,6 @@ def negative_log_posterior(
     off: FloatArray, P: FloatArray, residual: FloatArray, R: FloatArray, loss: RobustLoss | None
 ) -> float:
     """Cost that an update minimises: half of off' P^-1 off, and the loss of the residual (k,) in R (k, k).
-
     `off` (n,) is the step from the prior with covariance P (n, n).
     """
     return 0.5 * float(off.dot(psd_solve(P, off))) + penalty(loss, _length(residual, R))
@@ -85,7 +84,6 @@ def reweighted(
     off: FloatArray,
 ) -> OneCorrection:
     """`updated_one` with a measurement that is linearised `off` (n,) from the prior, with the `residual` (k,) there.
-
     Its innovation for the prior is residual + H off. The weight under a robust loss is that of the residual, so the
     step lowers `negative_log_posterior`; at the prior itself it is that of the whole update.
     """

@@ -61,7 +61,6 @@ class ImmReplay(ReplayEkf):
 
     def transition(self, dt_s: float) -> FloatArray:
         """Probability of model j (columns) `dt_s` after model i (rows), shape (m, m); it composes.
-
         exp(G dt) = exp(-r dt) I + (1 - exp(-r dt)) / m, with r = m over the mean sojourn time.
         """
         m, same = len(self._models), math.exp(-self._rate_hz * dt_s)

@@ -25,7 +25,6 @@ Initiation = Literal["one-point", "two-point", "regression"]
   velocity is three standard deviations from zero for a smoother, which relinearises, and ten (0.1 rad) for a filter.
 """
 DEFAULT: Initiation = "regression"
-
 #: For a smoother, a line that is so many standard deviations from standing still is the last one: the solver finds the
 #: rest, in so many Gauss-Newton steps at most.
 CERTAIN_TO_SMOOTHER, SMOOTHER_ITERATIONS = 3.0, 10
@@ -71,7 +70,6 @@ def fixes_of(mean: FloatArray, covariance: FloatArray, later: Iterable[tuple[flo
 
 def straight_lines(fixes: Sequence[Fix], least: int) -> Iterator[Line]:
     """Least-squares lines at constant velocity through the first `least` fixes, and through each one more.
-
     Raises `numpy.linalg.LinAlgError` where all are of one time, or one has no uncertainty.
     """
     information, vector = np.zeros((4, 4)), np.zeros(4)  # of the position at time 0 and the velocity
@@ -89,7 +87,6 @@ def straight_lines(fixes: Sequence[Fix], least: int) -> Iterator[Line]:
 @dataclass(frozen=True)
 class Search:
     """Time for which a smoother restarts along a straight line through the first positions of an object.
-
     A state of unknown heading was linearised at a wrong one, from which the solver may not converge.
     """
 
@@ -107,7 +104,6 @@ class Search:
 
     def next_line(self, fixes: Callable[[], Iterable[Fix]], oldest_ns: int) -> "tuple[Line, Search] | None":
         """The line to restart along, and another search, after measurements from the stamp `oldest_ns` on.
-
         Through as many of the first `fixes` as the method asks for, whatever the order of arrival. None where the last
         line stays, where all fixes are of one time, and where one has no uncertainty.
         """

@@ -43,7 +43,6 @@ class EulerCtrv(ExactPropagator):
 
     def __init__(self, motion: MotionModel, density: FloatArray, *, accelerates: bool = False) -> None:
         """`density`: diagonal of Q per second, shape (n,), along and across the heading first.
-
         `accelerates`: the acceleration drives the speed but is absent from the transition matrix (defect Q5).
         """
         super().__init__(motion)
@@ -77,9 +76,9 @@ def wrapped_yaw(mean: FloatArray) -> FloatArray:
     wrapped = wrap_angles(yaw)
     if wrapped is yaw:
         return mean
-    found = mean.copy()
-    found[..., YAW] = wrapped
-    return found
+    result = mean.copy()
+    result[..., YAW] = wrapped
+    return result
 
 
 class States(Sequence[TrackState]):

@@ -49,7 +49,6 @@ class SaturatedEulerCtrv(EulerCtrv):
 
 class PublishedStorage(BackwardForwardBank):
     """The published object storage.
-
     With `leads` the tracking time leads the clock by up to one step, and never waits (defect Q14). With `is_stale` an
     update in time does not reach the stored present state (defect Q8).
     """

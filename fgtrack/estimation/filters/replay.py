@@ -50,7 +50,6 @@ _stamp = attrgetter("stamp_ns")
 
 class ReplayEkf(WindowedFilter):
     """An EKF that keeps the measurements of a window; its estimates do not depend on the order of arrival.
-
     It rolls back and re-filters later measurements, as robot_localization does. Filters with another prediction or
     correction override `predict` and `correct`. `initiation`: see `Initiation`.
     """
@@ -105,7 +104,6 @@ class ReplayEkf(WindowedFilter):
 
     def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
         """State after `measurement` at the stamp of `mean` (n,) and `covariance` (n, n), with the innovation before it.
-
         Raises `numpy.linalg.LinAlgError` for a measurement that cannot be fused.
         """
         return correct_one(mean, covariance, measurement)

@@ -66,7 +66,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         self.present_ns = now_ns
         self._start_ns = max(self._start_ns, now_ns - self._lag_ns)
         if len(self._rows) < len(self._estimators):
-            self._ask(lambda _, one: one.advance(now_ns), [i for i in self._estimators if i not in self._rows])
+            self._ask(lambda _, item: item.advance(now_ns), [i for i in self._estimators if i not in self._rows])
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`."""
@@ -89,14 +89,14 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         for indices, alike in stacks(measurements):
             seen, ids = alike.seen_by(self._motion), [track_ids[i] for i in indices]
             if _is_plain(seen) and self._rows.keys() >= set(ids):
-                found = self._fused(stamp_ns, [self._rows[track_id] for track_id in ids], seen)
+                values = self._fused(stamp_ns, [self._rows[track_id] for track_id in ids], seen)
             else:
                 for track_id in ids:
                     self._take_out(track_id)
-                found = super().update(stamp_ns, ids, Measurements(seen))
+                values = super().update(stamp_ns, ids, Measurements(seen))
                 for track_id in ids:
                     self._put_in(track_id)
-            for i, result in zip(indices, found, strict=True):
+            for i, result in zip(indices, values, strict=True):
                 results[i] = result
         return results
 
@@ -119,8 +119,8 @@ class ReplayBank(ObjectBank[ReplayEkf]):
             self._order = np.array([self._rows.get(i, -1) for i in self._estimators], dtype=np.int64)
         starts_ns = np.maximum(self._arrays[3][self._order, 1], self._start_ns)
         if len(self._rows) < len(self._estimators):
-            for k, (i, one) in enumerate(self._estimators.items()):
-                starts_ns[k] = starts_ns[k] if i in self._rows else one.window_ns[0]
+            for k, (i, item) in enumerate(self._estimators.items()):
+                starts_ns[k] = starts_ns[k] if i in self._rows else item.window_ns[0]
         return self._order, starts_ns
 
     def _fused(self, stamp_ns: int, rows: Sequence[int], one: Measurement) -> list[UpdateResult]:
@@ -165,18 +165,18 @@ class ReplayBank(ObjectBank[ReplayEkf]):
 
     def _put_in(self, track_id: int) -> None:
         """Move the steps of a filter into the arrays, where these can hold them."""
-        one = self._estimators[track_id]
-        if not all(each.search is None and _is_plain(each.measurement) for each in one.steps):
+        item = self._estimators[track_id]
+        if not all(each.search is None and _is_plain(each.measurement) for each in item.steps):
             return
         (rows, slots), largest = self._arrays[0].shape, self._arrays[4].shape[-1]
-        k = max((len(each.measurement.z) for each in one.steps if each.measurement is not None), default=0)
-        if not self._free or len(one.steps) >= slots or k > largest:
-            self._allocate(rows * (1 + (not self._free)), max(slots, 2 * len(one.steps)), max(k, largest))
+        k = max((len(each.measurement.z) for each in item.steps if each.measurement is not None), default=0)
+        if not self._free or len(item.steps) >= slots or k > largest:
+            self._allocate(rows * (1 + (not self._free)), max(slots, 2 * len(item.steps)), max(k, largest))
         row = self._rows[track_id] = self._free.pop()
         self._order = None
         order, labels, steps, windows, measured = (array[row] for array in self._arrays)
-        windows[:] = len(one.steps), *one.window_ns
-        for slot, each in zip(order, one.steps, strict=False):
+        windows[:] = len(item.steps), *item.window_ns
+        for slot, each in zip(order, item.steps, strict=False):
             steps[slot] = np.vstack([each.mean, each.covariance, *each.predicted])
             labels[slot, :2] = each.stamp_ns, 0
             if each.measurement is not None:
@@ -200,9 +200,9 @@ class ReplayBank(ObjectBank[ReplayEkf]):
                 measurement = Measurement(stamp_ns, measurement_model(names, self._motion), z, R)
             predicted = Prediction(own[n + 1], own[n + 2 : 2 * n + 2], own[2 * n + 2 :])
             chain.append(Step(stamp_ns, measurement, own[0], own[1 : n + 1], predicted))
-        one = self._estimators[track_id]
-        one.resume(chain, *windows[1:].tolist())
-        one.advance(self._start_ns + self._lag_ns)
+        item = self._estimators[track_id]
+        item.resume(chain, *windows[1:].tolist())
+        item.advance(self._start_ns + self._lag_ns)
 
 
 def _is_plain(measurement: Measurement | None) -> bool:

@@ -30,7 +30,6 @@ from fgtrack.models.motion import MotionModel
 
 #: What a filter linearises in this direction stays good.
 CERTAIN = 1.0 / KNOWN_YAW_STD_RAD
-
 #: After this time, and after so many measurements, a filter does not seek the direction any more: the object may be at
 #: rest, and each further measurement costs as much as all before it.
 LONGEST_S, MOST_MEASUREMENTS = 2.0, 25
@@ -96,7 +95,6 @@ class TrackInitiation:
 
     def turned(self) -> Start:
         """The start, turned along the line and as fast, but as uncertain as before: the measurements count from there.
-
         The speed counts a little more than once where line and start are about equally certain of it. Raises as
         `state`.
         """
@@ -159,7 +157,6 @@ def initiated(motion: MotionModel, start: Start, method: str, make: Callable[[St
 
 class Initiated:
     """An `Estimator` that is reinitialised along the first positions until their direction is certain.
-
     A new one that starts along the line (see `TrackInitiation.turned`) fuses all measurements so far, in order of
     stamps.
     """

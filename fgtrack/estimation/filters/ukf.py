@@ -19,8 +19,6 @@ from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.models.measurement import MeasurementModel
 
 _JITTER = 1e-12
-
-
 Regression = tuple[FloatArray, FloatArray, FloatArray]
 """z = E[g(x)] (..., k), A (..., k, n), and the covariance (..., k, k) of e, which is uncorrelated with x, in
 g(x) = z + A (x - m) + e for x ~ N(m, P)."""
@@ -33,7 +31,6 @@ def regression(
     difference: Callable[[FloatArray, FloatArray], FloatArray] = np.subtract,
 ) -> Regression:
     """Statistical linear regression of `g`, (..., n) -> (..., k), over N(mean, covariance), (..., n) and (..., n, n).
-
     Garcia-Fernandez et al. 2015, eqs. 9 to 11. With the points m +- c L_i of the root P = L L', c^2 = n, and the
     differences d+ and d- of g there from g(m): A L_i = (d+ - d-) / 2c, and the noise comes from the bends (d+ + d-) /
     2, so that it is zero of a linear g. Raises `numpy.linalg.LinAlgError` for a covariance that is not semidefinite.
@@ -80,7 +77,6 @@ def _difference(model: MeasurementModel) -> Callable[[FloatArray, FloatArray], F
 
 class UkfReplay(ReplayEkf):
     """Unscented Kalman filter with replay: means over the spread of the state instead of derivatives.
-
     Julier and Uhlmann, Unscented filtering and nonlinear estimation, Proceedings of the IEEE 92(3), 2004, written as
     statistical linear regression (see `regression`). The process noise is that of the mean. What is linear it does as
     `ReplayEkf`.

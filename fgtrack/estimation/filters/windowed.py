@@ -61,7 +61,6 @@ class WindowedFilter(ABC):
     @abstractmethod
     def _fuse(self, measurement: Measurement) -> OneCorrection | None:
         """Fuse a measurement of the window; None where the method ignores it.
-
         Raises `numpy.linalg.LinAlgError`, with all as it was, for one that cannot be fused.
         """
 

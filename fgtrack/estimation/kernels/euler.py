@@ -19,7 +19,6 @@ def propagate(
     yaw_limit_rad: float,
 ) -> None:
     """Move means (m, n) and covariances (m, n, n), each by its own number of `steps` (m,): P' = F P F' + Q dt.
-
     `density`, shape (n,): diagonal of Q, along and across the heading first. An acceleration may drive the speed,
     without a part in F; the yaw goes up to `yaw_limit_rad`.
     """

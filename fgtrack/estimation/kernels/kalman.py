@@ -79,7 +79,6 @@ def correct(
     fused: BoolArray,
 ) -> None:
     """Overwrite means and covariances by x + K y and (I - K H) P (I - K H)' + K R K' with K = P H' S^-1.
-
     Writes S = H P H' + R, the NIS of the `rows` of y, and where S was positive definite and all is finite. Shapes
     (m, n), (m, n, n), (m, k), (1, k, n) or (m, k, n), (m, k, k).
     """

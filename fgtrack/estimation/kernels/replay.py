@@ -55,7 +55,6 @@ def _retrodict(
     motion: int, density: FloatArray, slots: IntArray, labels: IntArray, steps: FloatArray, now: FloatArray
 ) -> bool:
     """Smooth `now`, the state after the last of `slots`, back to the prediction of the first, which is new.
-
     From step to step (Rauch, Tung and Striebel), x_j + C s and P_j + C (P - P_-) C' with the prediction x_-, P_- of the
     step after, the shift s = x - x_- and C = (P_-^-1 F P_j)'. False where some P_- has no root.
     """
@@ -160,7 +159,6 @@ def fuse(
     status: IntArray,
 ) -> None:
     """Put a measurement `new` (m, k + 1, k) into the steps of each of `tracks` (m,), and filter the later ones again.
-
     Writes innovations y (m, k), the NIS of their `rows`, and S (m, k, k), given all that was fused, and the status. A
     failed measurement, and one older than `oldest_ns` or the window of the track, change nothing.
     """

@@ -46,7 +46,6 @@ class Cost(NamedTuple):
 
 class Likelihood:
     """The log-likelihood of the series of a problem about the trajectory at `values` (p,), and its scores.
-
     A function of the logarithms of the parameters `free`, shape (p,); others are those of `values`.
     """
 
@@ -100,7 +99,6 @@ class Likelihood:
 
     def log_std(self, logs: FloatArray) -> FloatArray:
         """Return standard errors of the free logarithms, shape (f,); infinite where there is no information.
-
         The larger one of that of the curvature and the sandwich of curvature and scores summed over blocks of time,
         which holds for correlated innovations too (White 1982, "Maximum likelihood estimation of misspecified models",
         Econometrica 50(1)).
@@ -120,10 +118,10 @@ class Likelihood:
     def _curvature(self, logs: FloatArray) -> FloatArray:
         """Return minus the second derivatives of the log-likelihood, shape (f, f)."""
         f, h = len(logs), _CURVATURE_DIFFERENCE
-        one = h * np.eye(f)
+        item = h * np.eye(f)
         first, second = np.triu_indices(f)
-        rows = np.concatenate([logs[None], logs + one, logs - one])
-        rows = np.concatenate([rows, logs + one[first] + one[second], logs - one[first] - one[second]])
+        rows = np.concatenate([logs[None], logs + item, logs - item])
+        rows = np.concatenate([rows, logs + item[first] + item[second], logs - item[first] - item[second]])
         parts = np.array_split(rows, -(-len(rows) // _ROWS))
         total = np.concatenate([self.totals(self.values(part)) for part in parts])
         middle, up, down = total[0], total[1 : f + 1], total[f + 1 : 2 * f + 1]
@@ -162,8 +160,8 @@ class Problem:
         """Return the number of measured components that count, by parameter, shape (p,); all for the motion."""
         columns = {name: column for column, name in enumerate(self.space.names)}
         counts = np.zeros(len(columns), dtype=np.int64)
-        for one in self.series:
-            for observation in compress(one.observations, one.counted):
+        for item in self.series:
+            for observation in compress(item.observations, item.counted):
                 counts[: self.space.num_motion] += 1
                 counts[[columns[name] for name in [(observation.sensor, ""), *observation.parameters]]] += 1
         return counts
@@ -174,7 +172,6 @@ class Problem:
 
     def maximum(self, start: FloatArray, free: BoolArray) -> tuple[FloatArray, Likelihood]:
         """Return parameters, shape (p,), at the maximum next to `start`, and the likelihood about the trajectory there.
-
         What is not `free` stays as in `start`.
         """
         values = start.copy()

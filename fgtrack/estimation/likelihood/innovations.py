@@ -37,9 +37,9 @@ class Innovations:
 
     def __init__(self, space: NoiseSpace, values: FloatArray, series: Sequence[Series]) -> None:
         self._space = space
-        steps = [filtered(one, space, values) for one in series]
+        steps = [filtered(item, space, values) for item in series]
         motion = space.motion_model(values)
-        self._start = np.array([initial_state(motion, one.start)[1] for one in series])
+        self._start = np.array([initial_state(motion, item.start)[1] for item in series])
         n, columns = motion.dim, {name: column for column, name in enumerate(space.names)}
         d = max(len(step.y) for track in steps for step in track)
         a = max(len(step.assumed[0]) for track in steps for step in track)
@@ -60,10 +60,10 @@ class Innovations:
         """True for steps that have a part in the likelihood, shape (k, t)."""
         self.since_start_s = np.zeros(since_s.shape)
         """Time of each step since the first state, shape (k, t)."""
-        for t, one in enumerate(series):
-            stamps_ns = np.array([each.measurement.stamp_ns for each in one.observations])
-            self.counted[: len(stamps_ns), t] = one.counted
-            self.since_start_s[: len(stamps_ns), t] = (stamps_ns - one.start.stamp_ns) / NS_PER_S
+        for t, item in enumerate(series):
+            stamps_ns = np.array([each.measurement.stamp_ns for each in item.observations])
+            self.counted[: len(stamps_ns), t] = item.counted
+            self.since_start_s[: len(stamps_ns), t] = (stamps_ns - item.start.stamp_ns) / NS_PER_S
         self._since_s = np.nan_to_num(since_s)
         self._about, self._offset = padded(lambda step: step.about, n), padded(lambda step: step.before - step.about, n)
         self._predicted, self._after = padded(lambda step: step.predicted, n), padded(lambda step: step.after, n)
@@ -110,9 +110,9 @@ class Innovations:
             P = propagated(F[:, j], P, Q[:, j])
             H = self._H[k]
             y = self._y[k] - (H @ x[..., None])[..., 0]
-            one = update(P, H, y, R[:, j], self._foreign[k], odds[:, j])
-            x, P = x + one.step, one.covariance
-            log_likelihoods[k], ys[k], Ss[k] = one.log_likelihood, y, one.S
+            item = update(P, H, y, R[:, j], self._foreign[k], odds[:, j])
+            x, P = x + item.step, item.covariance
+            log_likelihoods[k], ys[k], Ss[k] = item.log_likelihood, y, item.S
             if self._has_assumed[k]:
                 y, H, R_assumed = (array[k] for array in self._assumed)
                 K, _ = kalman_gain(P, np.broadcast_to(H, (b, *H.shape)), R_assumed)

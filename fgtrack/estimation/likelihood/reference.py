@@ -83,12 +83,11 @@ def filtered(series: Series, space: NoiseSpace, values: Sequence[float] | FloatA
 
 def without_mixed(series: Series, space: NoiseSpace, values: FloatArray) -> Series:
     """Return `series` where only observations of one object count, as judged at `values`, shape (p,).
-
     Where most of 20 successive innovations are outliers, the track has gone from one object to another, or mixes two
     that pass, which the mixture of `contaminated` does not describe.
     """
     outlier = np.array([step.update.outlier for step in filtered(series, space, values)])
-    stamps_ns = np.array([one.measurement.stamp_ns for one in series.observations])
+    stamps_ns = np.array([item.measurement.stamp_ns for item in series.observations])
     size, margin_ns = min(_WINDOW, len(outlier)), nanoseconds(_MARGIN_S)
     means = np.convolve(outlier, np.full(size, 1.0 / size), mode="valid")
     mixed = np.zeros(len(outlier), dtype=np.bool_)

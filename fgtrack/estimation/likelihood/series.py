@@ -46,7 +46,6 @@ class NoiseSpace:
 
     def noise_parts(self, x: FloatArray, dt_s: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         """Q = rest + sum of value_i^2 part_i at states `x` (..., n) over `dt_s` (...); None if the noise is not white.
-
         The rest has shape (..., n, n), the parts have shape (q, ..., n, n).
         """
         model = self.motion_model(np.ones(self.num_motion))
@@ -61,7 +60,6 @@ class NoiseSpace:
 @dataclass(frozen=True, slots=True)
 class Observation:
     """One measurement of a sensor; the covariance of its error is T diag(std^2) T' + `own` + `foreign`.
-
     The first d components are measured. Those that follow are assumed, as a heading from a map: they move the state,
     but have no part in the likelihood and keep their noise.
     """
@@ -124,7 +122,7 @@ class Series:
     @property
     def counted(self) -> BoolArray:
         """True for observations whose innovations have a part in the likelihood, shape (k,)."""
-        stamps_ns = np.array([one.measurement.stamp_ns for one in self.observations])
+        stamps_ns = np.array([item.measurement.stamp_ns for item in self.observations])
         counted = (stamps_ns - self.initiated_ns >= NS_PER_S * self.settle_s) & (stamps_ns >= self.from_ns)
         counted &= stamps_ns < self.until_ns
         counted[: self.num_initial + self.settle_steps] = False
@@ -133,7 +131,6 @@ class Series:
 
     def initiated(self, motion: MotionModel, method: Initiation) -> "Series":
         """Return it with a nominal trajectory along the first positions, where `start` has no direction of travel.
-
         As in the tracker (see `TrackInitiation`); unchanged where no line leads through the positions.
         """
         search, count = TrackInitiation.of(motion, self.start, method), 0

@@ -19,7 +19,6 @@ Past = tuple[FloatArray, FloatArray, FloatArray]
 
 def fuse_across(mean: FloatArray, covariance: FloatArray, past: Past, measurement: Measurement) -> OneCorrection:
     """The state x, `mean` (m,) and `covariance` (m, m), after a measurement of the state `past`.
-
     S = H P_tau H' + R, x+ = x + C H' S^-1 (z - h(x_tau)), P+ = P - C H' S^-1 H C' with C = Cov(x, x_tau) (Bar-Shalom
     2002, see `A1`), with the weight that a robust loss gives R (see `robust_weight`). Raises
     `numpy.linalg.LinAlgError` where S is not positive definite or the result is not finite.
@@ -42,7 +41,6 @@ def fuse_across(mean: FloatArray, covariance: FloatArray, past: Past, measuremen
 
 class CrossingEkf(RewindForget):
     """An EKF that corrects the present through its cross-covariance with the past (see `fuse_across`).
-
     The corrected present enters the history with an equivalent measurement (see `_absorb`), so a second late
     measurement starts from it; the steps in between stay as they were.
     """

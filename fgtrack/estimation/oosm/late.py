@@ -104,7 +104,6 @@ class RewindForget(WindowedFilter):
 
     def _absorb(self, mean: FloatArray, covariance: FloatArray) -> None:
         """Add a step at the present stamp: its state after a late measurement, `mean` (n,) and `covariance` (n, n).
-
         Its measurement is the equivalent one of Bar-Shalom, Chen and Mallick 2004: H' S^-1 y = P^-1 (x+ - x), H' S^-1 H
         = P^-1 (P - P+) P^-1.
         """
@@ -129,7 +128,6 @@ class Drop(RewindForget):
 
 class AsCurrent(RewindForget):
     """Take a late measurement as if it had been made at the newest stamp fused, as a filter without stamps does.
-
     Exact for: nothing; overconfident, for the object has moved on by speed times lag since.
     """
 

@@ -190,7 +190,6 @@ def find_far(
     indices: IntArray,
 ) -> int:
     """Write the nodes with a `step` longer than `thresholds` (m, n) as rows and indices; return their number.
-
     A `LEAVING_SHARE` of the thresholds holds for nodes before `anchors`, a `SOLVED_SHARE` from `starts` on and after
     the first node that is too far.
     """
@@ -231,7 +230,6 @@ def smoothed(
     covariances: FloatArray,
 ) -> None:
     """Write `steps` and `covariances` of the nodes at `indices`; those computed on the way stay in `step` and `P`.
-
     From index `known` on covariances are known.
     """
     n = step.shape[1]
@@ -273,7 +271,6 @@ def interpolate(
     P: FloatArray,
 ) -> bool:
     """Write means and covariances of states between two nodes over `mean` and `P`; False if noise is not definite.
-
     `mean` is predicted from the left node, `ahead` from there; the right one has mean `right` and covariance P, that
     on the left A and C given it. See `interpolation.between` for Psi, Lambda and Sigma, which is E Q1 E' + Psi Q2 Psi'.
     """

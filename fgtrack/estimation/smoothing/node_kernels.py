@@ -21,7 +21,6 @@ def locate(
     after_s: FloatArray,
 ) -> int:
     """Write index and number of the nodes after `stamps_ns`, or of the last ones, and the times around the stamps.
-
     Return how many are after them.
     """
     num_between = 0

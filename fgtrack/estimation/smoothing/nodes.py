@@ -25,7 +25,6 @@ def _numbered(first: int, tracks: int, nodes: int) -> IntArray:
 
 class Nodes:
     """Arrays of shape (tracks, nodes) with the order of the nodes, and (numbers, ...) with the values of each.
-
     Vectors stand as a last column beside the matrix that moves with them: [F | Q | f(x0)], [P | x], [A | b].
     """
 
@@ -76,7 +75,6 @@ class Nodes:
 
     def nearest(self, tracks: IntArray, stamp_ns: int) -> tuple[IntArray, IntArray]:
         """Return the indices of the newest nodes at most `NEAR_NS` after `stamp_ns`, and the stamps to fuse it at.
-
         These are those of nodes that are at most `NEAR_NS` from it, else `stamp_ns` itself.
         """
         all_ns = self.stamps_ns[tracks]
@@ -159,7 +157,6 @@ class Nodes:
 
     def observe(self, numbers: IntArray, y: FloatArray, H: FloatArray, R: FloatArray, offsets: FloatArray) -> None:
         """Add measurements y = H (x - guess) + N(0, R); guess - x0 is `offsets`, (m, n).
-
         Raises `numpy.linalg.LinAlgError` for an R that is not positive definite.
         """
         self._fit_rows(int(self.num_rows[numbers].max()) + y.shape[1])

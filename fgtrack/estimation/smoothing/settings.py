@@ -12,7 +12,6 @@ from fgtrack.core.types import FloatArray
 from fgtrack.models.motion import MotionModel
 
 _NEVER = 1e9
-
 _RELINEARISE = {"yaw_rad": 0.02, "speed_mps": 1.0, "yaw_rate_radps": 0.05, "accel_mps2": 1.0}
 _NONLINEAR = {"x_m": 0.05, "y_m": 0.05, "vx_mps": 0.2, "vy_mps": 0.2}
 
@@ -57,7 +56,6 @@ class SmootherSettings:
     @classmethod
     def of_options(cls, lag_s: float, options: Mapping[str, Any]) -> "SmootherSettings":
         """Settings that report no lagged and no final states unless `options` ask for them.
-
         Raises `CallError` for an option that does not exist.
         """
         taken = [each.name for each in fields(cls)]
@@ -67,7 +65,6 @@ class SmootherSettings:
 
     def thresholds(self, motion: MotionModel, nonlinear: bool) -> FloatArray:
         """Relinearisation thresholds of the state of `motion`, shape (n,).
-
         Motion models are linear in the position. If some measurement is `nonlinear`, or has a robust loss, the position
         has a threshold as well. Where all is linear, nothing has one.
         """

@@ -22,7 +22,6 @@ STEP_TOLERANCE = 1e-7
 _LEAST_SHARE, _ROUNDING = 1e-6, 1e-9
 #: Nodes behind the window are forgotten when there are so many that nobody needs.
 _MANY = 16
-
 Leaving = tuple[IntArray, list[int], FloatArray, FloatArray]
 """Tracks, stamps, means (m, n) and covariances (m, n, n) of nodes that leave, oldest first for each track."""
 
@@ -59,7 +58,6 @@ class Solver:
 
     def solve(self, tracks: IntArray, starts: IntArray, anchors: IntArray) -> None:
         """Solve windows that have changed from `starts` on and begin at `anchors` from now on.
-
         Raises `numpy.linalg.LinAlgError` if it fails.
         """
         self.eliminate(tracks, starts, self.nodes.count[tracks])
@@ -71,7 +69,6 @@ class Solver:
         self, tracks: IntArray, indices: IntArray, with_previous: BoolArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """Steps (m, n) and covariances (m, n, n) of the nodes at `indices`; `back` and `C` of those before are known.
-
         The latter only where `with_previous`, if the windows are factor graphs.
         """
         nodes, n = self.nodes, self.motion.dim
@@ -82,7 +79,6 @@ class Solver:
 
     def eliminate(self, tracks: IntArray, starts: IntArray, ends: IntArray) -> None:
         """Eliminate the nodes of `tracks` from `starts` up to before `ends`.
-
         Raises `numpy.linalg.LinAlgError` if it fails.
         """
         nodes = self.nodes
@@ -95,7 +91,6 @@ class Solver:
 
     def states_at(self, tracks: IntArray, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return means (m, n) and covariances (m, n, n) of `tracks` at `stamps_ns`, not older than the oldest node.
-
         They are interpolated, or predicted ahead.
         """
         nodes, n = self.nodes, self.motion.dim
@@ -216,7 +211,6 @@ class Solver:
 
     def _marked_nonlinear(self, tracks: IntArray, stamp_ns: int, guesses: FloatArray) -> FloatArray:
         """States at `stamp_ns` after the relinearisation of tracks whose first nonlinear measurement comes now.
-
         From now on, these have other thresholds.
         """
         first = (~self.nodes.is_nonlinear[tracks]).nonzero()[0]
@@ -240,7 +234,6 @@ class Solver:
 
     def _far(self, tracks: IntArray, anchors: IntArray, starts: IntArray) -> tuple[IntArray, IntArray]:
         """Nodes that are too far from their linearisation points: rows of `tracks`, and indices.
-
         The tolerance is smaller for those before `anchors`, which are about to leave, and for those that are solved
         again anyway, from `starts` on.
         """
@@ -283,7 +276,6 @@ class Solver:
 
     def converge(self, track: int, max_iterations: int = 100) -> None:
         """Solve with all states linearised where the last step led, until none moves by more than rounding.
-
         Half a step is taken where a whole one comes no closer, or does not lower the cost: process noise that follows
         its state can make Gauss-Newton oscillate.
         """
@@ -301,7 +293,6 @@ class Solver:
 
     def _cost(self, track: int, means: FloatArray) -> float:
         """Half of the sum of squares of a window at `means` (m, n), and the robust losses of those that have one.
-
         The process noise is that of the linearisation points.
         """
         nodes, n, numbers = self.nodes, self.motion.dim, self.nodes.window(track)

@@ -13,7 +13,6 @@ from fgtrack.models.robust import penalty, weight
 
 #: Stamps at most so far apart share a node of a factor graph: the process noise between them is all but singular.
 NEAR_NS = 1_000
-
 Term = tuple[Measurement, float]
 """A measurement of a node, and the time from the node's stamp to its own, whose process noise is neglected."""
 
@@ -29,7 +28,6 @@ def linearised(term: Term, x: FloatArray, motion: MotionModel) -> tuple[FloatArr
 
 def whitened(term: Term, x: FloatArray, motion: MotionModel) -> FloatArray:
     """Linearise `term` at `x` (n,), weighted by its loss there: rows [G | y] of y = G (x - x0) + N(0, I), (k, n + 1).
-
     Raises `numpy.linalg.LinAlgError` for an R that is not positive definite.
     """
     y, H = linearised(term, x, motion)
@@ -47,7 +45,6 @@ def cost(term: Term, x: FloatArray, motion: MotionModel) -> float:
 
 def overshot(terms: Iterable[Term], origin: FloatArray, mean: FloatArray, motion: MotionModel) -> bool:
     """True if the step from the linearisation point `origin` to `mean`, both (n,), left the linear range of a term.
-
     There the linearisation predicts a measurement wrong by more than a standard deviation.
     """
     for term in terms:

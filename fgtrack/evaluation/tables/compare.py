@@ -55,18 +55,18 @@ def compare(*runs: OneRun | Iterable[OneRun] | Mapping[str, OneRun], streaming: 
     every = evaluated(runs)
     if not every:
         raise CallError("compare: no run is given, name at least one")
-    metrics, compared = {one.label: one.metrics for one in every}, comparisons(every)
+    metrics, compared = {item.label: item.metrics for item in every}, comparisons(every)
     tables = {
         "differences": _differences(compared),
         "tracking": _tracking(metrics),
         "multi_object": _multi_object(metrics),
         "lag": _lag(metrics),
         "consistency": _consistency(metrics),
-        **{f"residuals_{name}": _residuals(name, metrics) for one in metrics.values() for name in one.sensors},
+        **{f"residuals_{name}": _residuals(name, metrics) for item in metrics.values() for name in item.sensors},
         "dispositions": _dispositions(metrics),
     }
     more, sentences = streaming_tables(every) if streaming else ({}, [])
-    details = {"runs": {label: one.as_dict() for label, one in metrics.items()}}
+    details = {"runs": {label: item.as_dict() for label, item in metrics.items()}}
     return Tables(tables | more, details, (*verdict(metrics, compared), *sentences))
 
 
@@ -93,16 +93,16 @@ def _differences(compared: Sequence[Comparison]) -> Table:
 def _tracking(metrics: Mapping[str, Metrics]) -> Table:
     """A row for each run: errors against truth, continuity, number of tracks, time."""
     records = []
-    for label, one in metrics.items():
-        record: dict[str, Any] = {"run": label, "estimator": one.estimator}
-        if one.truth is not None:
-            overall = one.truth.overall
+    for label, item in metrics.items():
+        record: dict[str, Any] = {"run": label, "estimator": item.estimator}
+        if item.truth is not None:
+            overall = item.truth.overall
             record |= {named(name, "rmse"): overall.errors[name].rmse for name in _ERRORS}
-            record |= {"position_nees": one.consistency.position_nees.mean}
+            record |= {"position_nees": item.consistency.position_nees.mean}
             record |= {name: getattr(overall, name) for name in _CONTINUITY}
-            record |= {"false_tracks": one.truth.false_tracks, "precision": one.precision}
-        time_s = one.time_per_tick_s
-        record |= {"num_tracks": one.num_tracks, "num_confirmed": one.num_confirmed}
+            record |= {"false_tracks": item.truth.false_tracks, "precision": item.precision}
+        time_s = item.time_per_tick_s
+        record |= {"num_tracks": item.num_tracks, "num_confirmed": item.num_confirmed}
         records.append(record | {"time_per_tick_p50_s": time_s.p50, "time_per_tick_p99_s": time_s.p99})
     columns = [
         RUN,
@@ -120,15 +120,15 @@ def _tracking(metrics: Mapping[str, Metrics]) -> Table:
         "breaks: resumed after a loss or with another track; switches: the latter",
         f"false: paired with a true object in less than {FALSE_TRACK_SHARE:.0%} of its life",
     ]
-    return Table("Tracking", records, columns, notes=notes if any(one.truth for one in metrics.values()) else ())
+    return Table("Tracking", records, columns, notes=notes if any(item.truth for item in metrics.values()) else ())
 
 
 def _multi_object(metrics: Mapping[str, Metrics]) -> Table:
     """A row for each run with truth: GOSPA and its parts, CLEAR, IDF1, HOTA, switches, time to confirm."""
     records = []
-    for label, one in metrics.items():
-        if one.multi_object is not None and one.truth is not None:
-            of, m2, overall = one.multi_object, one.multi_object.gospa, one.truth.overall
+    for label, item in metrics.items():
+        if item.multi_object is not None and item.truth is not None:
+            of, m2, overall = item.multi_object, item.multi_object.gospa, item.truth.overall
             parts = {part: m2[f"{part}_m2"] for part in ("localisation", "false", "out_of_sight", "missed")}
             parts["missed_in_sight"] = max(parts["missed"] - parts["out_of_sight"], 0.0)
             record = {"run": label, _GOSPA: m2["in_sight_rms_m"], "gospa_rms_m": m2["rms_m"]}
@@ -159,8 +159,8 @@ def _multi_object(metrics: Mapping[str, Metrics]) -> Table:
 def _lag(metrics: Mapping[str, Metrics]) -> Table:
     """A row for each run and lag, where any run has lagged or final states: errors, and how waiting lowers them."""
     records = []
-    for label, one in metrics.items() if any(len(one.lagged) > 1 for one in metrics.values()) else ():
-        for lag in one.lagged:
+    for label, item in metrics.items() if any(len(item.lagged) > 1 for item in metrics.values()) else ():
+        for lag in item.lagged:
             at_s = lag.lag_s if isinstance(lag.lag_s, float) else None
             record: dict[str, Any] = {"run": label, "lag": WINDOW if at_s is None else f"{at_s:g}", "lag_s": at_s}
             record |= {"num_states": lag.errors["position_m"].count}
@@ -193,8 +193,8 @@ def _lag(metrics: Mapping[str, Metrics]) -> Table:
 def _consistency(metrics: Mapping[str, Metrics]) -> Table:
     """A row for each run and normalised square: NEES of the present states, NIS and whiteness of every sensor."""
     records = []
-    for label, one in metrics.items():
-        of = one.consistency
+    for label, item in metrics.items():
+        of = item.consistency
         squares = {"NEES position": of.position_nees} | {f"NIS {sensor}": nis for sensor, nis in of.nis.items()}
         for name, square in squares.items():
             record: dict[str, Any] = {"run": label, "of": name, "num_samples": square.count, "mean": square.mean}
@@ -218,9 +218,9 @@ def _consistency(metrics: Mapping[str, Metrics]) -> Table:
 def _residuals(sensor: str, metrics: Mapping[str, Metrics]) -> Table:
     """A row for each run with the sensor: mean and standard deviation of the innovations, NIS, delay."""
     records = []
-    for label, one in metrics.items():
-        if sensor in one.sensors:
-            mine, nis = one.sensors[sensor], one.consistency.nis[sensor]
+    for label, item in metrics.items():
+        if sensor in item.sensors:
+            mine, nis = item.sensors[sensor], item.consistency.nis[sensor]
             record: dict[str, Any] = {"run": label}
             for name, moments in mine.residuals.items():
                 record |= {named(name, "mean"): moments.mean, named(name, "std"): moments.std}
@@ -243,8 +243,8 @@ def _residuals(sensor: str, metrics: Mapping[str, Metrics]) -> Table:
 def _dispositions(metrics: Mapping[str, Metrics]) -> Table:
     """A row for each run and sensor: dispositions of the detections, and their sum."""
     records = []
-    for label, one in metrics.items():
-        for name, sensor in one.sensors.items():
+    for label, item in metrics.items():
+        for name, sensor in item.sensors.items():
             counts = sensor.dispositions
             refused = sum(count for kind, count in counts.items() if kind not in USED)
             groups = {"fused": sum(counts[k] for k in FUSED), "late": sum(counts[k] for k in LATE), "refused": refused}
@@ -256,6 +256,6 @@ def _dispositions(metrics: Mapping[str, Metrics]) -> Table:
         Column("sum", "detections"),
     ]
     notes = ["fused: also those that started a track", "late: of the fused ones, those out of sequence"]
-    notes += dict.fromkeys(line for one in metrics.values() for line in one.left_out)
+    notes += dict.fromkeys(line for item in metrics.values() for line in item.left_out)
     title = "Dispositions (the outcome of every detection)"
     return Table(title, records, columns, ("run", "sensor"), notes)

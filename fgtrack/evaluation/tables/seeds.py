@@ -131,20 +131,25 @@ def seed_comparisons(sweep: SweepTable) -> list[SeedComparison]:
 
 def _ranked(names: Sequence[str], values: FloatArray, costs: FloatArray) -> tuple[Entry, ...]:
     means = values.mean(axis=1).tolist()
-    return ranked(names, means, costs.mean(axis=1), lambda one, best: paired(costs[one], costs[best]))
+    return ranked(names, means, costs.mean(axis=1), lambda item, best: paired(costs[item], costs[best]))
 
 
 def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) -> Table:
     """Return a row for every comparison and estimator; shown are those of the first metric over several seeds."""
     records = [
-        {**dict(zip(axes, one.point, strict=True)), "metric": one.metric, "estimator": entry.name, "seeds": one.seeds}
+        {
+            **dict(zip(axes, item.point, strict=True)),
+            "metric": item.metric,
+            "estimator": entry.name,
+            "seeds": item.seeds,
+        }
         | {name: value for name, value in entry_record(entry, "mean").items() if name not in ("run", "standing")}
         | {"standing": entry.standing}
-        for one in compared
-        for entry in one.entries
+        for item in compared
+        for entry in item.entries
     ]
     first, keys = compared[0].metric if compared else "", (*axes, "metric", "estimator")
-    points = pd.DataFrame([one.point for one in compared], columns=list(axes))
+    points = pd.DataFrame([item.point for item in compared], columns=list(axes))
     columns = [_point_column(points), Column("estimator", left=True), *entry_columns("mean", "mean"), Column("seeds")]
     notes = ["t intervals of paired differences over seeds; +: best; =: ties with the best, 0 is inside"]
     return Table(first, records, columns, keys, notes, is_main=lambda row: row["metric"] == first and row["seeds"] > 1)

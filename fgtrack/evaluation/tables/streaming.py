@@ -52,10 +52,10 @@ def streaming_tables(runs: Sequence[EvaluatedRun]) -> tuple[dict[str, Table], li
     """Return tables `streaming` and `load`, and sentences on the best of the `runs` with a load of at most 1."""
     load, records, sentences = _load(runs), [], []
     late = {record["run"]: record["load"] for record in load.records if record["load"] > 1.0}
-    for group in comparable([one for one in runs if one.label not in late]):
-        errors = [streaming_errors(one.run, one.matching) for one in group if one.matching is not None]
-        squares = [replace(one, values={when: np.square(m) for when, m in one.values.items()}) for one in errors]
-        labels = [one.label for one in group]
+    for group in comparable([item for item in runs if item.label not in late]):
+        errors = [streaming_errors(item.run, item.matching) for item in group if item.matching is not None]
+        squares = [replace(item, values={when: np.square(m) for when, m in item.values.items()}) for item in errors]
+        labels = [item.label for item in group]
         entries = {when: compared(when, labels, sums) for when, sums in common_sums(squares)[2].items()}
         if len(group) > 1 and entries:
             sentences += [
@@ -89,14 +89,14 @@ def _ready(run: Run) -> tuple[IntArray, Node]:
 def _load(runs: Sequence[EvaluatedRun]) -> Table:
     """A row for each run: time from its tick until an output was ready, late ticks, load."""
     records = []
-    for one in runs:
-        timing, (ready_ns, node) = one.run.tables["timing"], _ready(one.run)
+    for item in runs:
+        timing, (ready_ns, node) = item.run.tables["timing"], _ready(item.run)
         now_ns, is_periodic = timing["now_ns"], node.period_ns is not None
         delay, length_ns = Distribution.of((ready_ns - now_ns) / NS_PER_S), np.ptp(now_ns) if len(now_ns) else 0
         times = {"ready_after_p50_s": delay.p50, "ready_after_p99_s": delay.p99, "ready_after_max_s": delay.max}
         misses = {"deadline_misses": node.misses, "ticks": len(now_ns)} if is_periodic else {}
         load = float(timing["process_ns"].sum() / length_ns) if length_ns else np.nan
-        records.append({"run": one.label, **times, "deadline_misses": None, "ticks": None, **misses, "load": load})
+        records.append({"run": item.label, **times, "deadline_misses": None, "ticks": None, **misses, "load": load})
     columns = [
         RUN,
         Column("ready after\n[ms] p50/p99", "ready_after_p50_s ready_after_p99_s", "{}/{}", MS),

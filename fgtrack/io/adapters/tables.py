@@ -62,12 +62,12 @@ def _read(file: Path, table: CsvTable, role: str) -> tuple[list[Message], DataEr
     skipped, error = None, None
     where = str(file)
     try:
-        found = rows(file, table.delimiter)
-        where, header = next(found)
+        result = rows(file, table.delimiter)
+        where, header = next(result)
         for column in [*chain.from_iterable(map(paths_of, table.columns.values())), *table.filters]:
             if column not in header:
                 raise DataError(f"{where}: has no column {column!r}, but {', '.join(header)}")
-        for where, cells in found:  # noqa: B007 - an error below names it
+        for where, cells in result:  # noqa: B007 - an error below names it
             if (name := _excluding_filter(table, cells)) is not None:
                 left_out.append(f"filters.{name}")
                 skipped = skipped or cells

@@ -63,23 +63,23 @@ def assumed(config: Config, source: InputSource) -> Assumed:
     sensors); what its detections show (`coverages`); usual values: standard deviations, a sensor that looks all around.
     """
     carried = recorded(source)
-    found = Assumed(config).assuming(*_recorded(config, carried))
-    if is_open(found.config):
-        mounts = {name: one.mount for name, one in (found.config.sensors or carried.sensors).items() if one.mount}
+    result = Assumed(config).assuming(*_recorded(config, carried))
+    if is_open(result.config):
+        mounts = {name: item.mount for name, item in (result.config.sensors or carried.sensors).items() if item.mount}
         covered = _covered(source, config, mounts)
         rules: list[Rule] = [_slow_revisits, _noise, _lists, lambda config, _: _recorded(config, carried)]
         rules += [_claim, _offsets, _unplaced, _windows]
         if config.sensors:
-            rules, covered = [], {name: replace(one, persistence=None) for name, one in covered.items()}
+            rules, covered = [], {name: replace(item, persistence=None) for name, item in covered.items()}
         for rule in (*rules, _views, _out_of_view):
-            found = found.assuming(*rule(found.config, covered))
-    config = found.config
+            result = result.assuming(*rule(result.config, covered))
+    config = result.config
     sensors = {
         name: replace(sensor, field_of_view_rad=sensor.field_of_view_rad or math.tau)
         for name, sensor in config.sensors.items()
     }
     ego = replace(config.ego, detection_origin_x_m=config.ego.detection_origin_x_m or 0.0)
-    return replace(found, config=replace(config, ego=ego, sensors=sensors))
+    return replace(result, config=replace(config, ego=ego, sensors=sensors))
 
 
 def is_open(config: Config) -> bool:
@@ -102,8 +102,8 @@ def _covered(source: InputSource, config: Config, mounts: Mapping[str, Mount]) -
                     yield message
 
     named = set(config.input.detections) | set(config.input.csv.detections)
-    found = {name: Coverage() for name in named.difference(config.ignore_sensors)}
-    return dict(sorted((found | coverages(readable(), mounts)).items()))
+    result = {name: Coverage() for name in named.difference(config.ignore_sensors)}
+    return dict(sorted((result | coverages(readable(), mounts)).items()))
 
 
 def _sensor(name: str, reason: str, **settings: object) -> Iterator[Assumption]:
@@ -130,9 +130,9 @@ def _slow_revisits(config: Config, covered: Coverages) -> Iterator[Assumption]:
     The standard deviation of a heading after t without a measurement is sqrt(q t^3 / 3), q the density of the yaw rate;
     above 1 rad a straight line with the noise of `_MANOEUVRES` predicts better. Windows hold two measurements then.
     """
-    intervals_s = [one.revisit_s for one in covered.values() if one.num_lists]
+    intervals_s = [item.revisit_s for item in covered.values() if item.num_lists]
     limit_s = math.cbrt(3.0 / (MotionConfig().std_per_s["yaw_rate"] ** 2 / NOISE_HZ))
-    shortest_s = min((one or 0.0 for one in intervals_s), default=0.0)
+    shortest_s = min((item or 0.0 for item in intervals_s), default=0.0)
     if shortest_s <= limit_s:
         return
     window_s = min(float(math.ceil(2.0 * shortest_s)), _LONGEST_S)
@@ -152,12 +152,12 @@ def _slow_revisits(config: Config, covered: Coverages) -> Iterator[Assumption]:
 def _noise(config: Config, covered: Coverages) -> Iterator[Assumption]:
     """Yield the usual standard deviations of the sensors."""
     cartesian = {"x_m", "y_m"}
-    for name, one in covered.items():
-        twice = {"range_m", "bearing_rad"} if cartesian <= one.measured else cartesian
-        components = one.measured - twice or cartesian
-        usual = ASSUMED_STD | (dict.fromkeys(cartesian, _BOX_STD_M) if one.boxes else {})
+    for name, item in covered.items():
+        twice = {"range_m", "bearing_rad"} if cartesian <= item.measured else cartesian
+        components = item.measured - twice or cartesian
+        usual = ASSUMED_STD | (dict.fromkeys(cartesian, _BOX_STD_M) if item.boxes else {})
         std = {component: usual[component] for component in MEASURABLE if component in components}
-        yield from _sensor(name, USUAL_BOX if one.boxes else USUAL, std=std)
+        yield from _sensor(name, USUAL_BOX if item.boxes else USUAL, std=std)
 
 
 def _lists(config: Config, covered: Coverages) -> Iterator[Assumption]:
@@ -186,7 +186,7 @@ def _lists(config: Config, covered: Coverages) -> Iterator[Assumption]:
 
 def _claim(config: Config, covered: Coverages) -> Iterator[Assumption]:
     """Yield that a track claims what is as near to it as sensors disagree, where that is more than they err."""
-    apart_m = max((one.disagreement_m or 0.0 for one in covered.values()), default=0.0)
+    apart_m = max((item.disagreement_m or 0.0 for item in covered.values()), default=0.0)
     if apart_m > ASSUMED_STD["x_m"] and config.association == GatedMahalanobis():
         reason = f"sensors disagree by {apart_m:.2g} m on each axis, as on large hulls"
         yield Assumption(("association", "claim_m"), float(round(3.0 * apart_m)), reason)
@@ -210,14 +210,14 @@ def _offsets(config: Config, covered: Coverages) -> Iterator[Assumption]:
 
 def _unplaced(config: Config, covered: Coverages) -> Iterator[Assumption]:
     """Yield that sensors of bearings alone are left out beside positions, unless their mount is known."""
-    unplaced = [name for name, one in config.sensors.items() if not one.gives_position and one.mount is None]
-    if unplaced and any(one.gives_position for one in config.sensors.values()):
+    unplaced = [name for name, item in config.sensors.items() if not item.gives_position and item.mount is None]
+    if unplaced and any(item.gives_position for item in config.sensors.values()):
         yield Assumption(("ignore_sensors",), [*config.ignore_sensors, *unplaced], _UNPLACED)
 
 
 def _windows(config: Config, covered: Coverages) -> Iterator[Assumption]:
     """Yield windows that hold two lists of the slowest sensor that takes part."""
-    rates_hz = [one.rate_hz for name, one in covered.items() if one.rate_hz and name not in config.ignore_sensors]
+    rates_hz = [item.rate_hz for name, item in covered.items() if item.rate_hz and name not in config.ignore_sensors]
     needed_s = float(math.ceil(2.0 / min(rates_hz, default=math.inf)))
     lag_s = min(needed_s, _LONGEST_S - config.smoother.ring_s)
     if lag_s > config.smoother.lag_s and config.smoother == SmootherSettings() and config.filter == FilterConfig():
@@ -247,8 +247,8 @@ def _out_of_view(config: Config, covered: Coverages) -> Iterator[Assumption]:
     """Yield the life of a track out of view: with one sensor of positions until its first list without the track,
     else two lists of the slowest sensor, and the longest silence of the one that saw it.
     """
-    periods_s = {name: 1.0 / one.rate_hz for name, one in covered.items() if one.rate_hz}
-    placing = [name for name, one in config.used_sensors.items() if one.gives_position]
+    periods_s = {name: 1.0 / item.rate_hz for name, item in covered.items() if item.rate_hz}
+    placing = [name for name, item in config.used_sensors.items() if item.gives_position]
     default_s = ExistenceRules.out_of_view_s
     if len(placing) == 1 and placing[0] in periods_s:
         longest_s, reason = 0.5 * periods_s[placing[0]], "no other sensor gives positions, half its period"

@@ -75,10 +75,10 @@ class Assumed:
     def assuming(self, *new: Assumption) -> "Assumed":
         """Return it with further assumptions, which replace those of the same keys."""
         raw = plain(self.config)
-        for one in new:
-            raw = with_value(raw, one.path, one.value)
-        paths = {one.path for one in new}
-        kept = [one for one in self.assumptions if one.path not in paths]
+        for item in new:
+            raw = with_value(raw, item.path, item.value)
+        paths = {item.path for item in new}
+        kept = [item for item in self.assumptions if item.path not in paths]
         return Assumed(validate(Config, raw, "assumed"), (*kept, *new)) if new else self
 
     def to_yaml(self, head: Iterable[str] = (), comments: Iterable[tuple[Sequence[str], str]] = ()) -> str:
@@ -97,12 +97,12 @@ class Assumed:
 
     def lines(self) -> list[str]:
         """Return the assumptions in words: a line for each sensor, and one for the rest."""
-        found: dict[str, dict[str, list[str]]] = {}
-        for one in self.assumptions:
-            about = one.path[1] if one.path[0] == "sensors" else "recording"
-            found.setdefault(about, {}).setdefault(one.reason, []).append(one.text)
+        result: dict[str, dict[str, list[str]]] = {}
+        for item in self.assumptions:
+            about = item.path[1] if item.path[0] == "sensors" else "recording"
+            result.setdefault(about, {}).setdefault(item.reason, []).append(item.text)
         lines = []
-        for about, reasons in found.items():
+        for about, reasons in result.items():
             parts = [f"{', '.join(texts)} ({reason})" for reason, texts in reasons.items()]
             lines.append(f"assumed, {about}: {'; '.join(parts)}")
         return lines
@@ -114,9 +114,9 @@ def departures(value: object) -> Any:  # Any: plain values
         return {name: departures(item) for name, item in value.items()}
     if not is_dataclass(value):
         return plain(value)
-    given = {one.name: getattr(value, one.name) for one in fields(value)}
-    defaults = {one.name: one.default for one in fields(value)}
-    defaults |= {one.name: one.default_factory() for one in fields(value) if one.default_factory is not MISSING}
+    given = {entry.name: getattr(value, entry.name) for entry in fields(value)}
+    defaults = {entry.name: entry.default for entry in fields(value)}
+    defaults |= {entry.name: entry.default_factory() for entry in fields(value) if entry.default_factory is not MISSING}
     return {name: departures(item) for name, item in given.items() if name == "kind" or item != defaults[name]}
 
 

@@ -94,14 +94,14 @@ def coverages(messages: Iterable[Message], mounts: Mapping[str, Mount] | None = 
     path = path[np.isfinite(path).all(axis=1)]
     path = path[np.argsort(path[:, 0], kind="stable")]
     path[:, 3] = np.unwrap(path[:, 3])
-    found = {
-        name: one.coverage(first_ns or 0, path, (mounts or {}).get(name)) for name, one in sorted(received.items())
+    result = {
+        name: item.coverage(first_ns or 0, path, (mounts or {}).get(name)) for name, item in sorted(received.items())
     }
-    measured = {name: one.persistence for name, one in found.items() if one.persistence is not None}
+    measured = {name: item.persistence for name, item in result.items() if item.persistence is not None}
     for name, own in measured.items():
-        apart_m = [disagreement_m(one, own.lists) for other, one in measured.items() if other != name]
-        found[name] = replace(found[name], disagreement_m=min(filter(None, apart_m), default=None))
-    return found
+        apart_m = [disagreement_m(item, own.lists) for other, item in measured.items() if other != name]
+        result[name] = replace(result[name], disagreement_m=min(filter(None, apart_m), default=None))
+    return result
 
 
 class _Detections:
@@ -141,7 +141,7 @@ class _Detections:
         sides_m = np.ptp(ranged[:, 1:3], axis=0) if len(ranged) else np.zeros(2)
         enough, has_area = num_lists >= _FEWEST_LISTS, bool(sides_m.all())
         singles = np.count_nonzero(counts == 1)
-        found = Coverage(
+        result = Coverage(
             frozenset(self.measured),
             num_lists,
             int(counts.sum()),
@@ -154,7 +154,7 @@ class _Detections:
         )
         rows, in_map = ranged if len(ranged) else rows, "map" in self.frames
         if len(self.frames) != 1 or len(rows) < _FEWEST or (in_map and not len(path)):
-            return found
+            return result
         numbers, seen_m = rows[:, 0].astype(np.int64), rows[:, 1:3]
         placed_m = seen_m
         if len(path):
@@ -173,26 +173,26 @@ class _Detections:
             area_m2 = max(float(np.prod(extent_m)), 0.5 * _NARROWEST_RAD * reach_m**2)  # one object may keep its place
             order = np.argsort(stamps_s, kind="stable")
             columns = ([column[parts[k]] for k in order] for column in (placed_m, rows[:, 4], ranges_m))
-            found = replace(found, persistence=persistence(Lists(stamps_s[order], *columns)), area_m2=area_m2)
+            result = replace(result, persistence=persistence(Lists(stamps_s[order], *columns)), area_m2=area_m2)
         period_s = float(np.median(np.diff(receipts_s))) if num_lists > 1 else 0.0
         cell_s = max(_CELL_S, _CELL_PERIODS * period_s)
         cell = _CELL_M + _CELL_MPS * cell_s if len(ranged) else _CELL_BEARING
         seen_m = seen_m[_comes_back(np.column_stack([seen_m / cell, receipts_s[numbers] / cell_s]), numbers)]
         if len(seen_m) < _FEWEST:
-            return found
+            return result
         sector = _sector(np.arctan2(seen_m[:, 1], seen_m[:, 0]), "sensor" in self.frames or mount is not None)
         axis_rad, full_rad = sector or (0.0, None)
         range_m = _RANGE_FACTOR * float(np.quantile(np.hypot(*seen_m.T), 1.0 - _OUTSIDE))
         limit_m = float(round(range_m)) if len(ranged) else None
-        return replace(found, axis_rad=axis_rad, field_of_view_rad=full_rad, range_m=limit_m)
+        return replace(result, axis_rad=axis_rad, field_of_view_rad=full_rad, range_m=limit_m)
 
 
 def _revisit_s(stamps_ns: Sequence[int], points_m: Sequence[FloatArray]) -> float | None:
     """Median time since the last list with a detection that could be the same object, in lists in order of receipt."""
     lists = [(stamp_ns, points) for stamp_ns, points in zip(stamps_ns, points_m, strict=True) if len(points)]
-    found, first = list[float](), 0
+    result, first = list[float](), 0
     for k, (stamp_ns, points) in enumerate(lists):
-        if len(found) >= _MOST_REVISITS:
+        if len(result) >= _MOST_REVISITS:
             break
         while lists[first][0] < stamp_ns - nanoseconds(_MEMORY_S):
             first += 1
@@ -201,9 +201,9 @@ def _revisit_s(stamps_ns: Sequence[int], points_m: Sequence[FloatArray]) -> floa
                 elapsed_s = seconds(stamp_ns - earlier_ns)
                 reach_m = _FASTEST_MPS * elapsed_s + _POSITION_M
                 if elapsed_s > 0.0 and (np.abs(earlier_m - point_m).max(axis=1) <= reach_m).any():
-                    found.append(elapsed_s)
+                    result.append(elapsed_s)
                     break
-    return median(found) if len(found) >= _FEWEST_REVISITS else None
+    return median(result) if len(result) >= _FEWEST_REVISITS else None
 
 
 def _position(detection: Detection) -> tuple[float, float, float]:
@@ -226,12 +226,12 @@ def _turned(vectors_m: FloatArray, angles_rad: FloatArray) -> FloatArray:
 
 def _comes_back(points: FloatArray, numbers: IntArray) -> BoolArray:
     """True for `points`, shape (n, 3), in a cell of one of two shifted grids with one of another list of `numbers`."""
-    found = np.zeros(len(points), dtype=bool)
+    result = np.zeros(len(points), dtype=bool)
     for shift in (0.0, 0.5):
         cells = np.unique(np.floor(points + shift), axis=0, return_inverse=True)[1].ravel()
         of_lists = np.unique(np.column_stack([cells, numbers]), axis=0)[:, 0]
-        found |= np.bincount(of_lists)[cells] > 1
-    return found
+        result |= np.bincount(of_lists)[cells] > 1
+    return result
 
 
 def _sector(bearings_rad: FloatArray, axis_known: bool) -> tuple[float, float] | None:

@@ -145,9 +145,9 @@ def _max_range_m(ranges_m: FloatArray, objects: FloatArray) -> float | None:
 
 def _near_clutter_per_m2(trees: Sequence[cKDTree], scores: Sequence[FloatArray], model: Score, odds: float) -> float:
     """Density of clutter of the next list around that of each; before their scores the odds for clutter are `odds`."""
-    ratios = [np.exp((np.nan_to_num(one, nan=model.even) - model.even) / model.scale) for one in scores]
+    ratios = [np.exp((np.nan_to_num(item, nan=model.even) - model.even) / model.scale) for item in scores]
     of_clutter = [odds / (odds + ratio) for ratio in ratios]
-    total, together = sum(float(one.sum()) for one in of_clutter[:-1]), 0.0
+    total, together = sum(float(item.sum()) for item in of_clutter[:-1]), 0.0
     for (tree, own), (after, others) in pairwise(zip(trees, of_clutter, strict=True)):
         for i, near in enumerate(tree.query_ball_tree(after, _LARGEST_ERROR_M)):
             together += float(own[i] * others[near].sum())
@@ -162,8 +162,8 @@ def _best(
     if not near or not after.n:
         return math.inf, centre_m, centre_m
     firsts_m, ratio = np.asarray(before.data)[near], after_s / before_s
-    found = after.query(centre_m + ratio * (centre_m - firsts_m))
-    distances_m, ends = np.asarray(found[0]), np.asarray(found[1])
+    result = after.query(centre_m + ratio * (centre_m - firsts_m))
+    distances_m, ends = np.asarray(result[0]), np.asarray(result[1])
     best = int(np.argmin(distances_m))
     end_m = np.asarray(after.data)[ends[best]]
     velocity_mps = (end_m - firsts_m[best]) / (before_s + after_s)

@@ -17,7 +17,6 @@ from fgtrack.estimation.smoothing.terms import Term, linearised, whitened
 from fgtrack.models.motion import MotionModel
 
 _Loss = mEstimator.Huber | mEstimator.Cauchy | mEstimator.Tukey | mEstimator.GemanMcClure | mEstimator.DCS
-
 _LOSSES: Mapping[str, Callable[[float], _Loss]] = {
     "huber": mEstimator.Huber.Create,
     "cauchy": mEstimator.Cauchy.Create,
@@ -29,7 +28,6 @@ _LOSSES: Mapping[str, Callable[[float], _Loss]] = {
 
 class BatchSolver(IncrementalSolver):
     """Windows that Levenberg-Marquardt solves from their last estimates; a prior replaces what leaves them.
-
     Process noise stays that of the linearisation point; all else is relinearised at every step.
     """
 
@@ -89,7 +87,6 @@ def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float, Q: Fl
 
 def measurement_factor(key: int, term: Term, origin: FloatArray, motion: MotionModel) -> gtsam.NonlinearFactor:
     """Return the factor of `term` on the state at `key`; a linear one takes angles on the branch next to `origin`.
-
     Raises `numpy.linalg.LinAlgError` for a covariance that is not positive definite.
     """
     measurement = term[0]

@@ -21,7 +21,6 @@ _Changed = dict[int, gtsam.JacobianFactor]
 
 class _Graph:
     """The factor graph of a window; its variables have the numbers of the nodes, and the values 0.
-
     iSAM2 with QR, because Cholesky fails for stamps close together. It is given linear factors only, so it never calls
     back into Python: what has to be linearised elsewhere is replaced. It eliminates in the order of the stamps: a late
     measurement leaves alone what is older, and nodes that have left the window are leaves of the Bayes tree.
@@ -45,7 +44,6 @@ class _Graph:
         self, numbers: Sequence[int], num_leaving: int, values: gtsam.Values, first: int, changed: _Changed
     ) -> FloatArray:
         """Return the states of the nodes `numbers`, one after the other, without the first ones, which are leaving.
-
         The factors that have `changed` replace those of the same nodes, from index `first` on; `values` are those of
         new nodes.
         """
@@ -75,7 +73,6 @@ class _Graph:
 
 class IncrementalSolver(Solver):
     """Windows that iSAM2 solves, with factors that a compiled loop linearises, of all tracks at once.
-
     Means and covariances come from a factor graph each; what leaves it is kept as in `Solver`. A track has no graph
     before something is fused: most tracks of clutter end as they began.
     """
@@ -138,7 +135,6 @@ class IncrementalSolver(Solver):
 
     def _update(self, tracks: IntArray, starts: IntArray) -> None:
         """Solve the graphs of `tracks` without what has left the windows, which began at index `starts` before.
-
         Writes `step` of the nodes in the windows. Raises `RuntimeError`, `ValueError` or `IndexError` if it fails; then
         only a new graph helps.
         """
