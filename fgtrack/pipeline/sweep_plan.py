@@ -3,6 +3,7 @@
 import hashlib
 import itertools
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -28,6 +29,7 @@ Value = Any
 KEY_COLUMNS = ("seed", "estimator")
 #: Key of a group of keys that names its values, in a column of the group's own name.
 LABEL = "label"
+_MOST_JOBS = 100_000  # more are a slip of the pen
 #: Roots of keys; those of the configuration have none.
 CONFIG, SCENARIO, DELAYS = "config", "scenario", "delays"
 _KINDS: Mapping[str, Any] = {CONFIG: Config, SCENARIO: Scenario, DELAYS: dict[str, SensorDelays]}
@@ -95,6 +97,8 @@ class SweepConfig:
         axes = [_axis(f"vary.{name}", name, values) for name, values in self.vary.items()]
         if self.one_at_a_time:
             axes.insert(0, _one_at_a_time(self.one_at_a_time))
+        if (count := math.prod(map(len, axes)) * len(self.seeds)) > _MOST_JOBS:
+            raise ValueError(f"vary: {count} combinations of values and seeds, at most {_MOST_JOBS}")
         for points in itertools.product(*axes):
             cells = {column: cell for point in points for column, cell in point.cells.items()}
             yield Point(cells, {key: value for point in points for key, value in point.changes.items()})

@@ -106,6 +106,7 @@ one_at_a_time:
     ("text", "said"),
     [
         ("seed: 3", "seed: unknown key, did you mean 'seeds'"),
+        ("seeds: 100001", "vary: 100001 combinations of values and seeds, at most 100000"),
         ("seeds: [1, 1]", "seeds: name at least one, and each once"),
         ("seeds: [-1]", "seeds.0: Input should be greater than or equal to 0"),
         ("vary: {association.gate_m: 5.0}", "vary.association.gate_m: a list of values is needed"),
