@@ -81,11 +81,12 @@ def test_stamps_that_nobody_set_are_told(tmp_path: Path) -> None:
     assert found.settings == {"sensors.lidar.stamp_from": "receipt"}
 
 
-@pytest.mark.parametrize(("nis", "size"), [(26.0, "small"), (0.2, "large"), (-1e-9, "large")])
-def test_noise_that_does_not_fit_is_told(nis: float, size: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("nis", "size", "times"), [(32.0, "small", 4), (0.2, "large", 0.32), (-1e-9, "large", 0)])
+def test_noise_that_does_not_fit_is_told(nis: float, size: str, times: float, tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", [update(tick=k, nis=nis, x_m=0.1, y_m=0.1) for k in range(40)])
     (found,) = noise_diagnostics(run)
     assert str(found).startswith(f"lidar: mean NIS {nis:.3g}, expected 2: the configured noise is too {size}")
+    assert f"errors were {times} times" in str(found)
     burst = [26.0 if k % 10 == 0 else 1.4 for k in range(40)]
     born = run_of(tmp_path / "born", [update(tick=k, nis=each, x_m=0.1, y_m=0.1) for k, each in enumerate(burst)])
     assert list(noise_diagnostics(born)) == []

@@ -10,6 +10,7 @@ from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.models.oval import make_oval
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_tracker
+from fgtrack.pipeline.config import Config
 from fgtrack.tracking.association import GatedEuclidean
 from fgtrack.tracking.lifecycle import LifecycleRules
 from fgtrack.tracking.tracker import Tracker
@@ -247,3 +248,13 @@ def test_a_heading_from_the_map_is_no_innovation_except_in_the_published_configu
     [update] = report.updates
     assert update.nis is not None
     assert set(update.innovation) == {"x_m", "y_m"} | ({"yaw_rad"} if published else set())
+
+
+def test_a_second_position_is_as_surprising_in_any_direction() -> None:
+    """Without a heading the prior of the estimator, linearised along an arbitrary yaw, spreads along that alone."""
+    nis = []
+    for x_m, y_m in ((1.0, 0.0), (0.0, 1.0)):
+        one = build_tracker(replace(Config(), sensors={"lidar": POINTS}, estimator="ekf-replay"))
+        reports = [tick(one, 100.0 * k, seen((k * x_m, k * y_m), at_ms=100.0 * k)) for k in range(1, 3)]
+        nis.append(reports[1].updates[0].nis)
+    assert nis[0] == pytest.approx(nis[1], rel=1e-4)

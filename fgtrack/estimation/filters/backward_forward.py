@@ -59,16 +59,7 @@ class BackwardForwardBank:
     """EKFs of all objects on a shared time grid, with their stored states (the paper's object storage).
 
     Between two corrections the stored states are pure prediction, so only corrected states are kept, and a state
-    in between is predicted when it is asked for.
-
-    Parameters
-    ----------
-    propagator
-        Motion model in steps.
-    step_ns
-        Grid step, the inverse of the filter frequency.
-    storage_steps
-        Number of grid states that the storage reaches back.
+    in between is predicted when it is asked for. The storage reaches `storage_steps` of `step_ns` back.
     """
 
     def __init__(self, propagator: ExactPropagator, step_ns: int, storage_steps: int) -> None:

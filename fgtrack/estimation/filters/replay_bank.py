@@ -25,14 +25,8 @@ class ReplayBank(ObjectBank[ReplayEkf]):
     """`ReplayEkf` of all objects, whose steps lie in arrays: a compiled loop replays all that a list concerns.
 
     Filters of their own remain where a direction of travel is sought, and where a window has a measurement with a
-    robust loss or of what is not an entry of the state. See `ObjectBank` and `fgtrack.estimation.kernels.replay`.
-
-    Parameters
-    ----------
-    motion
-        A shipped motion model.
-    start, lag_s
-        See `ObjectBank`.
+    robust loss or of what is not an entry of the state. See `ObjectBank` and `fgtrack.estimation.kernels.replay`. The
+    motion model is one of the shipped ones.
     """
 
     def __init__(self, motion: WhiteNoise, start: Callable[[Start], ReplayEkf], lag_s: float) -> None:

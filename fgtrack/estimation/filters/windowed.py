@@ -13,14 +13,8 @@ from fgtrack.models.motion import MotionModel
 class WindowedFilter(ABC):
     """An `Estimator` that refuses what is older than its window and fuses the rest by `_fuse`.
 
-    Parameters
-    ----------
-    motion
-        Motion model; its process noise composes, so a late measurement may split a stretch of time.
-    prior
-        First state; nothing older than it can be fused.
-    lag_s
-        Length of the window behind the newest stamp or the clock.
+    The window reaches `lag_s` behind the newest stamp or the clock, and not beyond the stamp of the `prior`. Process
+    noise of a motion model composes, so a late measurement may split a stretch of time.
     """
 
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
