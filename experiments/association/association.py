@@ -46,7 +46,7 @@ from fgtrack.plotting.paper import styled
 from fgtrack.plotting.style import log_axis, save
 from fgtrack.sim.vehicles import drawn
 from fgtrack.tracking.association import Association, GatedEuclidean, GatedMahalanobis
-from fgtrack.tracking.preprocess import Candidate
+from fgtrack.tracking.preprocess import Candidates, Group
 
 START_NS = 1_790_000_000 * NS_PER_S
 MOTION = CTRV()
@@ -90,13 +90,13 @@ class Scan:
         """Whether what becomes of the detections counts."""
         return self.late and self.settled
 
-    def candidates(self) -> list[Candidate]:
+    def candidates(self) -> Candidates:
         """For the association."""
-        R = (LIDAR_STD_M if self.late else RADAR_STD_M) ** 2 * np.eye(2)
-        found = []
-        for index, z in enumerate(self.positions_m):
-            found.append(Candidate(index, (), Measurement(self.stamp_ns, POSITION, z, R), z, R))
-        return found
+        count = len(self.positions_m)
+        R = np.tile((LIDAR_STD_M if self.late else RADAR_STD_M) ** 2 * np.eye(2), (count, 1, 1))
+        stack = Measurement(self.stamp_ns, POSITION, self.positions_m, R)
+        lines = np.column_stack([self.positions_m, np.full(count, np.nan)])
+        return Candidates(list(range(count)), {}, lines, [Group(np.arange(count), stack, R, None)])
 
 
 class Scene:

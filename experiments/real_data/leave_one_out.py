@@ -79,9 +79,9 @@ def tracked(name: str, source: Path, config: Config, others: Sequence[Labelled])
     assert scores is not None
     clear = scores.clear
     motas = [100.0 * raw_mota(source, _from(config, lowest), run) for lowest in SCORES]
-    recall = 100.0 * clear.pairs / (clear.pairs + clear.misses)
-    numbers = (config.lifecycle.confirm_probability, score.even, score.scale, *motas, 100.0 * clear.mota, recall)
-    return [name, *(f"{number:.2f}" for number in numbers), str(clear.id_switches)]
+    recall = 100.0 * clear["pairs"] / (clear["pairs"] + clear["misses"])
+    numbers = (config.lifecycle.confirm_probability, score.even, score.scale, *motas, 100.0 * clear["mota"], recall)
+    return [name, *(f"{number:.2f}" for number in numbers), f"{clear['id_switches']:.0f}"]
 
 
 def published_from(config: Config, probability: float) -> Config:
