@@ -1,6 +1,7 @@
 """The replaying EKFs of all objects in arrays."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import compress
 from typing import Any
 
@@ -81,17 +82,22 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         """See `TrackBank.update`."""
         results = [UpdateResult(UpdateStatus.FAILED)] * len(track_ids)
         for indices, alike in stacks(measurements):
-            seen, ids = alike.seen_by(self._motion), [track_ids[i] for i in indices]
-            if _is_plain(seen) and self._rows.keys() >= set(ids):
-                values = self._fused(stamp_ns, [self._rows[track_id] for track_id in ids], seen)
-            else:
-                for track_id in ids:
-                    self._take_out(track_id)
-                values = super().update(stamp_ns, ids, Measurements(seen))
-                for track_id in ids:
-                    self._put_in(track_id)
-            for i, result in zip(indices, values, strict=True):
-                results[i] = result
+            seen = alike.seen_by(self._motion)
+            in_arrays = np.array([track_ids[i] in self._rows for i in indices]) & _is_plain(seen)
+            for is_inside in np.unique(in_arrays).tolist():
+                chosen = np.flatnonzero(in_arrays == is_inside)
+                part, rows = replace(seen, z=seen.z[chosen], R=seen.R[chosen]), [indices[k] for k in chosen.tolist()]
+                ids = [track_ids[i] for i in rows]
+                if is_inside:
+                    values = self._fused(stamp_ns, [self._rows[track_id] for track_id in ids], part)
+                else:
+                    for track_id in ids:
+                        self._take_out(track_id)
+                    values = super().update(stamp_ns, ids, Measurements(part))
+                    for track_id in ids:
+                        self._put_in(track_id)
+                for i, result in zip(rows, values, strict=True):
+                    results[i] = result
         return results
 
     def birth(self, track_id: int, prior: Start) -> None:
