@@ -4,10 +4,37 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import njit, wrapped
-from fgtrack.core.types import BoolArray, FloatArray
+from fgtrack.core.compiled import inlined, njit, wrapped
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
 
 _HEADING, _CURVATURE, _LEFT, _RIGHT, _ALONG, _QUANTITIES = 4, 5, 6, 7, 9, 10  # see `fgtrack.models.track_map`
+
+
+@inlined
+def _nearest(x: float, y: float, rows: FloatArray, longest_m: float) -> int:
+    """Return the first of the nearest of points `rows` (n, ...) on a closed line, at most `longest_m` apart."""
+    first, least_m, j, stride = 0, np.inf, 0, math.ceil(math.sqrt(len(rows)))
+    while j < len(rows):  # a bound that lets the search leave out much
+        least_m = min(least_m, math.sqrt((rows[j, 0] - x) ** 2 + (rows[j, 1] - y) ** 2))
+        j += stride
+    least_m, j, least = least_m + 1e-6, 0, np.inf
+    while j < len(rows):
+        squared_m2 = (rows[j, 0] - x) ** 2 + (rows[j, 1] - y) ** 2
+        distance_m = math.sqrt(squared_m2)
+        if squared_m2 < least:
+            first, least, least_m = j, squared_m2, min(distance_m, least_m)
+        # The rows up to there are too near to this one to be nearer to the point than the nearest so far.
+        j += 1 + int(max((distance_m - least_m) / longest_m - 1e-6, 0.0))
+    return first
+
+
+@njit("(float64[:, ::1], Array(float64, 2, 'C', readonly=True), float64)")
+def nearest(points_m: FloatArray, rows: FloatArray, longest_m: float) -> IntArray:
+    """Return for each of `points_m` (m, 2) the first of the nearest points `rows` (n, 2), at most `longest_m` apart."""
+    indices = np.empty(len(points_m), np.int64)
+    for i in range(len(points_m)):
+        indices[i] = _nearest(points_m[i, 0], points_m[i, 1], rows, longest_m)
+    return indices
 
 
 @njit("(float64[:, ::1], Array(float64, 2, 'C', readonly=True), float64)")
@@ -19,13 +46,8 @@ def feet(points_m: FloatArray, segments: FloatArray, longest_m: float) -> tuple[
     """
     quantities, lateral = np.empty((len(points_m), _QUANTITIES)), np.empty(len(points_m))
     for i in range(len(points_m)):
-        x, y, first, least, j = points_m[i, 0], points_m[i, 1], 0, np.inf, 0
-        while j < len(segments):
-            squared_m2 = (segments[j, 0] - x) ** 2 + (segments[j, 1] - y) ** 2
-            if squared_m2 < least:
-                least, first = squared_m2, j
-            # The rows up to there are too near to this one to be nearer to the point than the nearest so far.
-            j += 1 + int(max((math.sqrt(squared_m2) - math.sqrt(least)) / longest_m - 1e-6, 0.0))
+        x, y = points_m[i, 0], points_m[i, 1]
+        first = _nearest(x, y, segments, longest_m)
         at = segments[first]
         if (x - at[0]) * at[2] - (y - at[1]) * at[3] < 0.0:
             at = segments[(first - 1) % len(segments)]

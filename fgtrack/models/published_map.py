@@ -9,6 +9,7 @@ import numpy as np
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.geometry import wrap_angles
+from fgtrack.core.linalg import kernels
 from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.models.track_map import COLUMNS, RoadView, TrackMap
 
@@ -31,6 +32,8 @@ class PublishedMap:
             return np.append(values, 0.999 * (values[0] - values[-1]) + values[-1])
 
         self._line = np.stack([closed("x_ref_m"), closed("y_ref_m")], axis=-1)
+        self._line.flags.writeable = False
+        self._longest_m = float(np.hypot(*np.diff(self._line, axis=0).T).max())
         self._arc = column["s_racetraj_m"]
         if np.diff(self._arc).min() <= 0.0:
             raise DataError("no map for a published look-up: s_racetraj_m does not grow from row to row")
@@ -44,8 +47,8 @@ class PublishedMap:
 
     def view(self, points_m: FloatArray, inner_buffer_m: float, outer_buffer_m: float) -> RoadView:
         """Heading, curvature and whether a point lies further outside than the buffers allow; points (n, 2)."""
-        squared = (self._line[:, 0] - points_m[:, 0:1]) ** 2 + (self._line[:, 1] - points_m[:, 1:2]) ** 2
-        nearest = np.argmin(squared, axis=1)
+        points_m = np.array(points_m, order="C")
+        nearest = kernels("fgtrack.models.feet").nearest(points_m, self._line, self._longest_m)
         along = np.sum(self._segment[nearest] * (points_m - self._line[nearest]), axis=1)
         share = np.abs(along) / self._segment_squared[nearest]
         passed_m = share * np.sqrt(self._segment_squared[nearest])

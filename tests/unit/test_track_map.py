@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from fgtrack.core.errors import DataError
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import FloatArray
+from fgtrack.models.feet import nearest
 from fgtrack.models.track_map import COLUMNS, TrackMap
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -178,3 +179,14 @@ def test_a_file_that_is_not_a_map_is_refused_with_its_row(tmp_path: Path, lines:
     (tmp_path / "map.csv").write_text("\n".join(lines), encoding="latin-1")
     with pytest.raises(DataError, match=rf"map\.csv: not a map .*{message}"):
         TrackMap.read(tmp_path / "map.csv")
+
+
+@pytest.mark.parametrize("spread_m", [1.0, 40.0, 3000.0])
+def test_the_search_finds_the_first_of_the_nearest_rows(spread_m: float) -> None:
+    rng = np.random.default_rng(1)
+    rows = np.ascontiguousarray(OVAL.table[:-1, :2])
+    rows.flags.writeable = False
+    longest_m = float(np.hypot(*np.diff(rows, axis=0).T).max())
+    points = rows[rng.integers(len(rows), size=300)] + rng.normal(scale=spread_m, size=(300, 2))
+    squared = (rows[:, 0] - points[:, :1]) ** 2 + (rows[:, 1] - points[:, 1:]) ** 2
+    np.testing.assert_array_equal(nearest(points, rows, longest_m), squared.argmin(axis=1))
