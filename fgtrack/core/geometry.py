@@ -100,18 +100,3 @@ def body_point(
     arm_x_m, arm_y_m = c * ahead_m - s * left_m, s * ahead_m + c * left_m
     vx_mps, vy_mps = speed_mps * c - yaw_rate_radps * arm_y_m, speed_mps * s + yaw_rate_radps * arm_x_m
     return x_m + arm_x_m, y_m + arm_y_m, vx_mps, vy_mps
-
-
-def body_point_jacobian(yaw_rad: float, arm_m: tuple[float, float], velocity_mps: tuple[float, float]) -> FloatArray:
-    """Derivative (5, 5) of x, y, yaw, vx, vy of `body_point`, with this arm and velocity, by those of the body."""
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    (arm_x_m, arm_y_m), (vx_mps, vy_mps) = arm_m, velocity_mps
-    return np.array(
-        [
-            [1.0, 0.0, -arm_y_m, 0.0, 0.0],
-            [0.0, 1.0, arm_x_m, 0.0, 0.0],
-            [0.0, 0.0, 1.0, 0.0, 0.0],
-            [0.0, 0.0, -vy_mps, c, -arm_y_m],
-            [0.0, 0.0, vx_mps, s, arm_x_m],
-        ]
-    )

@@ -1,6 +1,5 @@
 """The detections of one batch in the map frame, as arrays: errors of the pose in them, and merging."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -13,15 +12,15 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from fgtrack.core.geometry import Real, circular_mean, rotations, wrap_angles
-from fgtrack.core.linalg import congruence, kernels, symmetrise
+from fgtrack.core.geometry import circular_mean, rotations
+from fgtrack.core.linalg import congruence, kernels
 from fgtrack.core.types import BoolArray, Detection, FloatArray, IntArray
 from fgtrack.models.measurement import ANGULAR, COMPONENTS, MIN_RANGE_M, MeasurementModel, SensorPose
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.inbox import Batch, own_covariance
 
-X, Y, YAW, RANGE, BEARING, CURVATURE = (
-    COMPONENTS.index(name) for name in ("x_m", "y_m", "yaw_rad", "range_m", "bearing_rad", "curvature_radpm")
+X, YAW, RANGE, BEARING, CURVATURE = map(
+    COMPONENTS.index, ("x_m", "yaw_rad", "range_m", "bearing_rad", "curvature_radpm")
 )
 
 
@@ -73,18 +72,7 @@ def in_map_frame(batch: Batch, sensor: SensorModel, pose: SensorPose) -> MapDete
     if batch.indices:
         read = map(attrgetter(*measured), map(batch.message.objects.__getitem__, batch.indices))
         values[:, _columns(measured)] = np.array(list(read), dtype=np.float64).reshape(len(values), -1)
-    if batch.message.frame != "map":
-        if "yaw_rad" in sensor.std:
-            values[:, YAW] = wrap_angles(values[:, YAW] + pose.yaw_rad)
-        if "x_m" in sensor.std:
-            values[:, 0], values[:, 1] = _in_map(values[:, 0], values[:, 1], pose)
-    points_m = values[:, :2].copy()
-    if "range_m" in sensor.std:
-        polar = np.isnan(points_m[:, 0])
-        range_m, bearing_rad = values[polar, RANGE], values[polar, BEARING]
-        points_m[polar, 0], points_m[polar, 1] = _in_map(
-            range_m * np.cos(bearing_rad), range_m * np.sin(bearing_rad), pose
-        )
+    points_m = kernels("fgtrack.tracking.kernels").to_map(values, *pose[:3], batch.message.frame != "map")
     none = np.zeros(len(values), dtype=bool)
     return MapDetections(batch, sensor, pose, np.array(batch.indices, dtype=np.int64), values, points_m, none)
 
@@ -137,11 +125,10 @@ def covariances(items: MapDetections, names: tuple[str, ...]) -> FloatArray:
     What the map gave has the sensor's standard deviation for it and is not correlated with the rest. The covariance of
     an average is the mean of those of its detections.
     """
-    sensor, pose = items.sensor, items.pose
-    shared = sensor.noise(names)
-    R = np.empty((len(items.indices), *shared.shape))
-    R[:] = shared
-    offsets_m = items.points_m - np.array(pose[:2])
+    sensor, pose, m = items.sensor, items.pose, len(items.indices)
+    R = np.repeat(sensor.noise(names)[None], m, axis=0)
+    turns = "x_m" in names and not sensor.round
+    offsets_m = items.points_m - np.array(pose[:2]) if turns or sensor.std_growth else items.points_m
     more = sensor.growth(names, np.hypot(offsets_m[:, 0], offsets_m[:, 1])) if sensor.std_growth else None
     if more is not None:
         R[:, np.arange(len(names)), np.arange(len(names))] += more
@@ -152,12 +139,11 @@ def covariances(items: MapDetections, names: tuple[str, ...]) -> FloatArray:
             carried = [name for name in names if name in detection.measured and name in sensor.std]
             here = [names.index(name) for name in carried]
             R[row][np.ix_(here, here)] = own_covariance(detection, carried)
-    if "x_m" in names:
-        if items.batch.message.frame != "map" and carrying:
-            R[carrying] = _turned(R[carrying], np.full(len(carrying), pose.yaw_rad))
-        if not sensor.round and len(carrying) < len(R):
-            rest = np.delete(np.arange(len(R)), carrying)
-            R[rest] = _turned(R[rest], np.arctan2(offsets_m[rest, 1], offsets_m[rest, 0]))
+    if carrying and "x_m" in names and items.batch.message.frame != "map":
+        R[carrying] = _turned(R[carrying], np.full(len(carrying), pose.yaw_rad))
+    if turns and len(carrying) < m:
+        rest = np.delete(np.arange(m), carrying)
+        R[rest] = _turned(R[rest], np.arctan2(offsets_m[rest, 1], offsets_m[rest, 0]))
     for row, index in enumerate(items.indices.tolist() if items.averaged else ()):
         if index in items.averaged:
             R[row] = covariances(items.averaged[index], names).mean(axis=0)
@@ -167,11 +153,6 @@ def covariances(items: MapDetections, names: tuple[str, ...]) -> FloatArray:
 @cache
 def _columns(names: tuple[str, ...]) -> list[int]:
     return [COMPONENTS.index(name) for name in names]
-
-
-def _in_map(x_m: Real, y_m: Real, pose: SensorPose) -> tuple[Real, Real]:
-    c, s = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
-    return pose.x_m + c * x_m - s * y_m, pose.y_m + s * x_m + c * y_m
 
 
 def _turned(R: FloatArray, yaws_rad: FloatArray) -> FloatArray:
@@ -192,34 +173,18 @@ class PoseError(NamedTuple):
     covariance: FloatArray
     """Covariance of e, shape (5, 5)."""
     placement: FloatArray
-    """Derivative of z by the pose, shape (k, 5), or (m, k, 5) of many detections."""
+    """Derivative of z by the pose, shape (m, k, 5)."""
     R: FloatArray
-    """Covariance of the detection itself, without e, shape (k, k) or (m, k, k)."""
+    """Covariances of the detections themselves, without e, shape (m, k, k)."""
 
     def at(self, rows: IntArray | list[int]) -> "PoseError":
         """Return that of some detections."""
         return PoseError(self.covariance, self.placement[rows], self.R[rows])
 
     def noise(self, model: MeasurementModel, pose: SensorPose, x: FloatArray) -> FloatArray:
-        """R + G P_e G' at the states `x` (..., n), shape (..., k, k), or (k, k) where it is the same at all."""
+        """R + G P_e G' at the states `x` (m, n), shape (m, k, k)."""
         G = self.placement - model.pose_jacobian(x, pose) if model.relative else self.placement
-        return self.R + symmetrise(congruence(G, self.covariance))
-
-
-def placement(components: tuple[str, ...], offsets_m: FloatArray, assumed: tuple[str, ...] = ()) -> FloatArray:
-    """Derivative, shape (..., k, 5), of detections that a pose placed in the map, by its x, y, yaw, vx and vy.
-    `offsets_m` (..., 2) is where they lie in the map, seen from the pose. What is `assumed`, as a heading from the map,
-    was not turned by the pose; a speed is over ground, whatever the ego does.
-    """
-    D = np.zeros((*offsets_m.shape[:-1], len(components), 5))
-    for row, name in enumerate(components):
-        if name == "x_m":
-            D[..., row, 0], D[..., row, 2] = 1.0, -offsets_m[..., 1]
-        elif name == "y_m":
-            D[..., row, 1], D[..., row, 2] = 1.0, offsets_m[..., 0]
-        elif name == "yaw_rad" and name not in assumed:
-            D[..., row, 2] = 1.0
-    return D
+        return np.asarray(kernels("fgtrack.tracking.kernels").with_pose_error(G, self.covariance, self.R))
 
 
 class Merge:

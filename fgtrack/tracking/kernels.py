@@ -5,13 +5,77 @@ import math
 import numpy as np
 
 from fgtrack.core.checks import LARGEST
-from fgtrack.core.compiled import cholesky, njit
+from fgtrack.core.compiled import add_congruence, cholesky, njit, wrapped
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.kernels.kalman import innovate
+from fgtrack.models.measurement import COMPONENTS
 
 SOUND, NOT_FINITE, NOT_DEFINITE = range(3)
 _ROUNDING = 1e-9
 """Tolerance of an eigenvalue of a correlation matrix below 0: rounding, where an entry is known for certain."""
+
+X, Y, YAW, RANGE, BEARING, CURVATURE = (
+    COMPONENTS.index(name) for name in ("x_m", "y_m", "yaw_rad", "range_m", "bearing_rad", "curvature_radpm")
+)
+
+
+@njit("(float64[:, ::1], float64, float64, float64, boolean)")
+def to_map(values: FloatArray, x_m: float, y_m: float, yaw_rad: float, moves: bool) -> FloatArray:
+    """Return positions (m, 2) in the map of detections `values` (m, components), NaN where there is none.
+    x, y and yaw are seen from this pose where it `moves` them, and are overwritten; range and bearing always are.
+    """
+    points, c, s = np.empty((len(values), 2)), math.cos(yaw_rad), math.sin(yaw_rad)
+    for i in range(len(values)):
+        row = values[i]
+        if moves:
+            row[X], row[Y] = x_m + c * row[X] - s * row[Y], y_m + s * row[X] + c * row[Y]
+            row[YAW] = wrapped(row[YAW] + yaw_rad)
+        points[i, 0], points[i, 1] = row[X], row[Y]
+        if math.isnan(row[X]):
+            right, up = row[RANGE] * math.cos(row[BEARING]), row[RANGE] * math.sin(row[BEARING])
+            points[i, 0], points[i, 1] = x_m + c * right - s * up, y_m + s * right + c * up
+    return points
+
+
+@njit("(float64[:, ::1], float64, float64, int64[::1])")
+def placement(points: FloatArray, x_m: float, y_m: float, components: IntArray) -> FloatArray:
+    """Derivative (m, k, 5) of detections at `points` (m, 2), placed in the map by the pose of a sensor at x and y.
+    By x, y, yaw, vx and vy of the pose; of the `components` (k,) x, y and yaw depend on it.
+    """
+    D = np.zeros((len(points), len(components), 5))
+    for i in range(len(points)):
+        for a in range(len(components)):
+            if components[a] == X:
+                D[i, a, 0], D[i, a, 2] = 1.0, y_m - points[i, 1]
+            elif components[a] == Y:
+                D[i, a, 1], D[i, a, 2] = 1.0, points[i, 0] - x_m
+            elif components[a] == YAW:
+                D[i, a, 2] = 1.0
+    return D
+
+
+@njit("(float64[:, :, ::1], float64[:, ::1], float64[:, :, ::1])")
+def with_pose_error(G: FloatArray, P: FloatArray, R: FloatArray) -> FloatArray:
+    """Return R + G P G', shapes (m, k, 5), (5, 5) and (m, k, k)."""
+    total, GP = R.copy(), np.empty(G.shape[1:])
+    for i in range(len(R)):
+        add_congruence(G[i], P, GP, total[i])
+    return total
+
+
+@njit("(float64, float64, float64, float64, float64, Array(float64, 2, 'C', readonly=True))")
+def sensor_pose_covariance(
+    yaw_rad: float, arm_x_m: float, arm_y_m: float, vx_mps: float, vy_mps: float, P: FloatArray
+) -> FloatArray:
+    """Return J P J' (5, 5) of x, y, yaw, vx, vy of a point fixed to a body; P is of its x, y, yaw, speed and yaw rate.
+    The point is at this arm from the reference point of the body, and moves so fast (`core.geometry.body_point`).
+    """
+    J, JP, total, c, s = np.zeros((5, 5)), np.empty((5, 5)), np.zeros((5, 5)), math.cos(yaw_rad), math.sin(yaw_rad)
+    J[0, 0] = J[1, 1] = J[2, 2] = 1.0
+    J[0, 2], J[1, 2], J[3, 2], J[4, 2] = -arm_y_m, arm_x_m, -vy_mps, vx_mps
+    J[3, 3], J[3, 4], J[4, 3], J[4, 4] = c, -arm_y_m, s, arm_x_m
+    add_congruence(J, P, JP, total)
+    return total
 
 
 @njit("(float64[:, ::1], float64[:, ::1], float64[::1], int64)")

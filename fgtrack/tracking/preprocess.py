@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fgtrack.core.geometry import body_point, body_point_jacobian
-from fgtrack.core.linalg import congruence, equal_ones
+from fgtrack.core.geometry import body_point
+from fgtrack.core.linalg import equal_ones, kernels
 from fgtrack.core.types import BoolArray, Disposition, FloatArray, IntArray, UpdateRecord
 from fgtrack.estimation.base import Measurement, Measurements
 from fgtrack.models.correlated_errors import split_error
@@ -28,7 +28,6 @@ from fgtrack.tracking.detections import (
     in_map_frame,
     merged,
     move_back,
-    placement,
 )
 from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.inbox import Batch, record
@@ -185,20 +184,17 @@ class Preprocess:
 
     def _on_road(self, items: MapDetections, lost: dict[int, str]) -> MapDetections:
         """Return the detections inside the bounds, with yaw and curvature of the map; `lost` gets the rest."""
-        if not self._road.known or not len(items.placed):
+        if not self._road.known:
             return items
-        placed: IntArray | slice = items.placed if len(items.placed) < len(items.indices) else slice(None)
-        view = self._road.view(items.points_m[placed])
+        view, x_m = self._road.view(items.points_m), items.points_m[:, 0]
+        placed = x_m == x_m  # NaN, of a bearing alone, is not equal to itself
         if items.sensor.yaw_from_map_std_rad is not None:
-            yaw_rad = items.values[placed, YAW]
-            lack = np.isnan(yaw_rad)
-            items.values[placed, YAW] = np.where(lack, view.yaw_rad, yaw_rad)
-            items.map_yaw[placed] |= lack
+            yaw_rad = items.values[:, YAW]
+            items.map_yaw[:] = placed & (yaw_rad != yaw_rad)
+            items.values[:, YAW] = np.where(items.map_yaw, view.yaw_rad, yaw_rad)
         if items.sensor.curvature_from_map_std_radpm is not None:
-            items.values[placed, CURVATURE] = view.curvature_radpm
-        outside = np.zeros(len(items.indices), dtype=bool)
-        outside[placed] = view.outside
-        return _without(items, outside, "map.track", lost)
+            items.values[placed, CURVATURE] = view.curvature_radpm[placed]
+        return _without(items, view.outside & placed, "map.track", lost)
 
     def _candidates(self, items: MapDetections, pose_covariance: FloatArray | None) -> Candidates:
         """Candidates of `items` in their order; those that measure the same components are one group."""
@@ -222,23 +218,24 @@ class Preprocess:
             return
         batch, sensor, pose, points_m = items.batch, items.sensor, items.pose, items.points_m
         columns = (items.values[0] == items.values[0]).nonzero()[0]  # NaN is not equal to itself
-        names = _names(tuple(columns.tolist()))
-        assumed: tuple[str, ...] = ("yaw_rad",) if self._assumes_map_yaw and YAW in columns and items.map_yaw[0] else ()
-        assumed += ("curvature_radpm",) if CURVATURE in columns else ()
-        z, R, model = (
-            items.values.take(columns, axis=1),
-            covariances(items, names),
-            measurement_model(names, self._motion),
+        names, z = _names(tuple(columns.tolist())), items.values.take(columns, axis=1)
+        assumed: tuple[str, ...] = (
+            ("yaw_rad",) if self._assumes_map_yaw and items.map_yaw[0] and "yaw_rad" in names else ()
         )
+        assumed += ("curvature_radpm",) if "curvature_radpm" in names else ()
+        model, R = measurement_model(names, self._motion), covariances(items, names)
         models, white = [model], R
         if sensor.correlation is not None:
             split = [split_error(batch.message.sensor, sensor, model, item, self._motion.state_names) for item in R]
             models, white = [each for each, _ in split], np.array([noise for _, noise in split])
         total, error = white, None
         if pose_covariance is not None:
-            G = np.zeros((len(z), len(names), len(pose)))
-            if batch.message.frame != "map":
-                G = placement(names, points_m - np.array(pose[:2]), assumed)
+            placed = columns
+            if batch.message.frame == "map":
+                placed = np.full(len(columns), -1)
+            elif assumed:
+                placed = np.where([name in assumed for name in names], -1, columns)
+            G = kernels("fgtrack.tracking.kernels").placement(points_m, pose.x_m, pose.y_m, placed)
             x = points_m
             if model.relative:
                 x, is_placed = np.zeros((len(z), self._motion.dim)), not math.isnan(points_m[0, 0])  # all or none
@@ -274,8 +271,8 @@ def _pose_covariance(pose: SensorPose, batch: Batch, sensor: SensorModel, ego: E
         return None
     if batch.message.frame == "map" and not any(name in RELATIVE for name in sensor.std):
         return None
-    arm_m, velocity_mps = (pose.x_m - ego.x_m, pose.y_m - ego.y_m), (pose.vx_mps, pose.vy_mps)
-    return congruence(body_point_jacobian(ego.yaw_rad, arm_m, velocity_mps), ego.covariance)
+    body = ego.yaw_rad, pose.x_m - ego.x_m, pose.y_m - ego.y_m, pose.vx_mps, pose.vy_mps, ego.covariance
+    return np.asarray(kernels("fgtrack.tracking.kernels").sensor_pose_covariance(*body))
 
 
 def _far_along(bearings_rad: FloatArray, pose: SensorPose) -> list[tuple[float, float]]:
