@@ -91,7 +91,8 @@ class GatedEuclidean:
             nis = np.empty(len(pairs.rows))
             for chosen, chosen_nis, _, _ in innovations(pairs, candidates, states):
                 nis[chosen] = chosen_nis
-            pairs = pairs.at(nis <= self.max_nis)
+            inside = nis <= self.max_nis
+            pairs = pairs if inside.all() else pairs.at(inside)
         assignment = assigned(pairs, len(candidates), len(states.means))
         return _refusing(suspects, assignment) if suspects else assignment
 

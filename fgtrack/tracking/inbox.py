@@ -68,15 +68,15 @@ def is_usable(detection: Detection, sensor: SensorModel) -> bool:
     """True if `detection` has valid values and a position or bearing, and is not an empty slot (x = y = 0)."""
     for name in sensor.std:
         value = getattr(detection, name)
-        if value is not None and not abs(value) <= LARGEST:
+        if value is not None and not -LARGEST <= value <= LARGEST:
             return False
     if detection.covariance is not None and not is_valid_covariance(detection, sensor):
         return False
-    if detection.x_m == 0.0 and detection.y_m == 0.0:
+    x_m, y_m = detection.x_m, detection.y_m
+    if x_m == 0.0 and y_m == 0.0:
         return False
-    position = detection.x_m is not None, detection.y_m is not None
-    if "x_m" in sensor.std and any(position):
-        return all(position)
+    if "x_m" in sensor.std and (x_m is not None or y_m is not None):
+        return x_m is not None and y_m is not None
     return "bearing_rad" in sensor.std and detection.bearing_rad is not None
 
 

@@ -47,7 +47,7 @@ class Objects:
 
     def describes(self, detections: Iterable[Detection]) -> bool:
         """True if one of `detections` has a class or size."""
-        return bool(set(map(_description, detections)) - {_NO_DESCRIPTION})
+        return any(map(_NO_DESCRIPTION.__ne__, map(_description, detections)))
 
     def learn(self, track_id: int, detections: Iterable[Detection]) -> None:
         """Add detections of the track."""
@@ -68,7 +68,7 @@ class Objects:
         named = [each.class_name for each in detections] if self._seen else []
         if not any(named):
             return None
-        classes = [self._class(track_id) for track_id in track_ids]
+        classes = [_most(self._seen[i].classes) if i in self._seen else None for i in track_ids]
         if not any(classes):
             return None
         numbers = dict(_GROUPS)
@@ -83,19 +83,18 @@ class Objects:
 
         return differ
 
-    def report(self, track_id: int) -> ObjectReport | None:
-        """Class and size of the object of a track; None if no detection has reported any."""
-        seen = self._seen.get(track_id)
-        if seen is None:
-            return None
-        name = self._class(track_id)
-        share = None if name is None else seen.classes[name] / seen.classes.total()
-        return ObjectReport(name, share, **seen.sizes_m)
+    def reports(self, track_ids: Iterable[int]) -> list[ObjectReport | None]:
+        """Class and size of the object of each track; None if no detection has reported any."""
+        return [self._report(self._seen[i]) if i in self._seen else None for i in track_ids]
 
     def forget(self, track_id: int) -> None:
         """Forget a track that has ended."""
         self._seen.pop(track_id, None)
 
-    def _class(self, track_id: int) -> str | None:
-        seen = self._seen.get(track_id)
-        return max(seen.classes, key=seen.classes.__getitem__) if seen is not None and seen.classes else None
+    def _report(self, seen: _Seen) -> ObjectReport:
+        name = _most(seen.classes)
+        return ObjectReport(name, None if name is None else seen.classes[name] / seen.classes.total(), **seen.sizes_m)
+
+
+def _most(classes: Counter[str]) -> str | None:
+    return max(classes, key=classes.__getitem__) if classes else None

@@ -198,15 +198,16 @@ class Preprocess:
 
     def _candidates(self, items: MapDetections, pose_covariance: FloatArray | None) -> Candidates:
         """Candidates of `items` in their order; those that measure the same components are one group."""
-        kinds = np.empty((len(items.values), len(COMPONENTS) + 1), dtype=bool)
+        m = len(items.values)
+        kinds = np.empty((m, len(COMPONENTS) + 1), dtype=bool)
         np.equal(items.values, items.values, out=kinds[:, :-1])  # NaN is not equal to itself
         np.logical_and(items.map_yaw, kinds[:, YAW], out=kinds[:, -1])
-        if (kinds == kinds[:1]).all():
-            groups = list(self._groups(items, np.arange(len(kinds)), pose_covariance))
+        if m < 2 or (kinds == kinds[0]).all():
+            groups = list(self._groups(items, np.arange(m), pose_covariance))
         else:
             alike = map(np.array, equal_ones(list(map(tuple, kinds.tolist()))))
             groups = [group for rows in alike for group in self._groups(items.at(rows), rows, pose_covariance)]
-        pose, lines = items.pose, np.full((len(kinds), 3), np.nan)
+        pose, lines = items.pose, np.full((m, 3), np.nan)
         lines[:, :2] = items.points_m
         for row in np.isnan(lines[:, 0]).nonzero()[0].tolist():
             lines[row] = pose.x_m, pose.y_m, pose.yaw_rad + items.values[row, BEARING]

@@ -1,11 +1,10 @@
 """The tracker: the steps of a tick, in the order of the paper's algorithm (Karle et al. 2023, figure 2)."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -134,7 +133,7 @@ class Tracker:
         noted, self._records = self._records, []
         bank = self._parts.bank
         states = bank.present()  # first: tracks may end by it
-        own = list(map(self._own, bank.track_ids))
+        own = list(self._own(bank.track_ids))
         return TickReport.made_later(
             self._tick,
             now_ns,
@@ -167,8 +166,8 @@ class Tracker:
         if not states.track_ids:
             return ()
         present = kinematic_states(motion, stamp_ns, states.means, states.covariances)
-        unsound, rows = faults(present), enumerate(zip(states.track_ids, present, strict=True))
-        return tuple(_report(self._own(i), state) for row, (i, state) in rows if row not in unsound)
+        unsound, rows = faults(present), enumerate(zip(self._own(states.track_ids), present, strict=True))
+        return tuple(_report(own, state) for row, (own, state) in rows if row not in unsound)
 
     def _process_if_possible(self, batch: Batch) -> None:
         """Process a batch; after an exception that is not propagated, the rest of it ends as failed."""
@@ -276,21 +275,22 @@ class Tracker:
 
     def _estimate(self, batch: Batch, candidates: Candidates, assignment: Assignment, states: StatesAt) -> None:
         """Fuse the matched candidates, group by group; the records are in the order of the candidates."""
-        bank, results = self._parts.bank, dict[int, tuple[Measurements, int, UpdateResult]]()
+        bank, lifecycle, track_ids = self._parts.bank, self._parts.lifecycle, states.track_ids
+        results: list[tuple[Measurements, int, UpdateResult]] = [None] * len(assignment.pairs)  # type: ignore[list-item]
         chosen, tracks = np.array(assignment.pairs).T
         for group, members, here in candidates.split(chosen):
             of = tracks[here]
             measurements = Measurements(group.seen_at(members, states.means[of]))
-            updated = bank.update(batch.stamp_ns, [states.track_ids[track] for track in of.tolist()], measurements)
-            results.update(zip(here.tolist(), zip(repeat(measurements), range(len(of)), updated), strict=True))
-        for k, (position, track) in enumerate(assignment.pairs):
-            (measurements, index, result), track_id = results[k], states.track_ids[track]
-            nis = result.nis
+            updated = bank.update(batch.stamp_ns, [track_ids[track] for track in of.tolist()], measurements)
+            for index, (k, result) in enumerate(zip(here.tolist(), updated, strict=True)):
+                results[k] = measurements, index, result
+        for (position, track), (measurements, index, result) in zip(assignment.pairs, results, strict=True):
+            track_id, nis = track_ids[track], result.nis
             if result.innovation is not None:
                 self._num_measured[track_id] += 1
                 if candidates.placed[position]:
-                    self._parts.lifecycle.fused(track_id)
-                    if self._undirected.pop(track_id, None) is not None:
+                    lifecycle.fused(track_id)
+                    if self._undirected and self._undirected.pop(track_id, None) is not None:
                         # The estimator's prior, linearised along an unknown direction, spreads along it alone.
                         seen = measurements[index].seen_by(self._parts.motion)
                         with suppress(np.linalg.LinAlgError):
@@ -336,8 +336,9 @@ class Tracker:
         """Note the outcome of a candidate, see `record`, and of the detections that were merged into it."""
         leader = candidates.leaders[position]
         self._records.append((batch.message, leader, disposition, track_id, *more))
-        for index in candidates.merged.get(leader, ()):
-            self._records.append((batch.message, index, Disposition.MERGED, track_id))
+        if candidates.merged:
+            for index in candidates.merged.get(leader, ()):
+                self._records.append((batch.message, index, Disposition.MERGED, track_id))
 
     def _end(self, track_ids: Sequence[int]) -> None:
         for track_id in track_ids:
@@ -347,9 +348,16 @@ class Tracker:
             del self._num_measured[track_id]
             self._parts.lifecycle.forget(track_id)
 
-    def _own(self, track_id: int) -> _Own:
+    def _own(self, track_ids: Sequence[int]) -> Iterable[_Own]:
         parts = self._parts
-        return track_id, parts.lifecycle.status(track_id), self._num_measured[track_id], parts.objects.report(track_id)
+        num_measured = map(self._num_measured.__getitem__, track_ids)
+        return zip(
+            track_ids,
+            map(parts.lifecycle.status, track_ids),
+            num_measured,
+            parts.objects.reports(track_ids),
+            strict=True,
+        )
 
 
 def _made(noted: UpdateRecord | tuple[Any, ...]) -> UpdateRecord:

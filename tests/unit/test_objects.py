@@ -86,12 +86,12 @@ def test_a_track_without_any_word_on_its_object_says_nothing() -> None:
 def test_what_is_known_ends_with_the_track() -> None:
     objects = Objects()
     objects.learn(3, [Detection(class_name="car", height_m=1.5)])
-    assert objects.report(3) == ObjectReport("car", 1.0, height_m=1.5)
+    assert objects.reports([3]) == [ObjectReport("car", 1.0, height_m=1.5)]
     apart = objects.apart([Detection(class_name=name) for name in ("person", None, "car")], [3, 4])
     assert apart is not None
     assert apart(np.array([0, 1, 2, 0]), np.array([0, 0, 0, 1])).tolist() == [True, False, False, False]
     objects.forget(3)
-    assert objects.report(3) is None
+    assert objects.reports([3]) == [None]
     assert objects.apart([Detection(class_name="person")], [3]) is None
 
 
