@@ -15,6 +15,7 @@ from fgtrack.evaluation.tables.compare import compare as tables_of
 from fgtrack.io.run import load_run, write_metrics
 from fgtrack.pipeline.shipped import shipped_folder
 from fgtrack.viewers.export import export as written
+from fgtrack.viewers.geojson import write_geojson
 
 
 def compare(
@@ -46,13 +47,17 @@ def export(
     runs: Runs,
     out: Annotated[Path, Option("-o", "--out", help="MCAP file; --ros2: or a rosbag2 folder; --kitti: a text file.")],
     ros2: Annotated[bool, Option("--ros2", help="Write standard ROS 2 messages instead of Foxglove's own.")] = False,
+    geojson: Annotated[bool, Option("--geojson", help="Write tracks on Earth: .geojson, or .csv for a table.")] = False,
     kitti: Annotated[Path | None, Option(metavar="OXTS", help="Write a KITTI result of this oxts/NNNN.txt.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Export runs for Foxglove, Lichtblick, RViz; or a KITTI result."""
+    """Export runs for Foxglove, Lichtblick, RViz, maps; or a KITTI result."""
+    if (kitti is not None or geojson) and len(runs) != 1:
+        raise CallError(f"--{'geojson' if geojson else 'kitti'}: writes one run, these are {len(runs)}")
+    if geojson:
+        say(f"{out}: {write_geojson(load_run(runs[0]), out, overwrite=overwrite)} tracks")
+        return
     if kitti is not None:
-        if len(runs) != 1:
-            raise CallError(f"--kitti: writes one run, these are {len(runs)}")
         boxes, tracks, without_size = write_kitti_result(load_run(runs[0]), kitti, out, overwrite=overwrite)
         if without_size:
             warn(f"{without_size} tracks are left out: none of their detections has a size")

@@ -71,6 +71,8 @@ class Detection:
     """Confidence of the detector, on a scale of its own."""
     class_name: str | None = None
     """Class: `car`, `truck` ..., in the words of the detector."""
+    id: str | None = None
+    """Identity that the object reports of itself: ICAO address, MMSI, station."""
 
     @property
     def measured(self) -> tuple[str, ...]:
@@ -82,7 +84,7 @@ class Detection:
 #: `Detection` before its covariance.
 MEASURABLE = tuple(takewhile(lambda name: name != "covariance", (each.name for each in fields(Detection))))
 #: What a detection says of its object besides: never measurements of the state, and all may be None.
-DESCRIBING = ("z_m", "length_m", "width_m", "height_m", "score", "class_name")
+DESCRIBING = ("z_m", "length_m", "width_m", "height_m", "score", "class_name", "id")
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +99,8 @@ class DetectionList:
     frame: Frame = "ego"
     left_out: tuple[str, ...] = field(default=(), compare=False)
     """For every object that the reader has left out of the list the setting that says so."""
+    origin_deg: tuple[float, float] | None = None
+    """Latitude and longitude of the origin of the map; None where it is not known."""
 
     def __post_init__(self) -> None:
         if type(self.objects) is not tuple:
@@ -184,6 +188,8 @@ class ObjectReport:
     """Mean over the detections that give it, as the other two."""
     width_m: float | None = None
     height_m: float | None = None
+    id: str | None = None
+    """Identity that most of its detections report."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
+import pydantic
 from pydantic import NonNegativeFloat, StringConstraints
 
 from fgtrack.core.types import Frame
@@ -12,6 +13,16 @@ from fgtrack.models.sensors import Filter
 
 Path = str | Sequence[str]
 """Names of fields with dots between; several paths are the components of a vector, whose length is meant."""
+
+
+@dataclass(frozen=True)
+class Origin:
+    """A position on Earth (WGS84)."""
+
+    latitude_deg: Annotated[float, pydantic.Field(ge=-90.0, le=90.0)]
+    """North of the equator."""
+    longitude_deg: Annotated[float, pydantic.Field(ge=-180.0, le=180.0)]
+    """East of Greenwich."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +59,8 @@ class TopicInput:
     """Paths of the fields, for a type that fgtrack does not know.
 
     `objects` is the list in the message, `stamp` its time (default `header.stamp`), `object_stamp`, `object_id`, the
-    measured components and what describes an object (`score`, `class_name`, sizes) are paths in one object; several
+    measured components (or `latitude_deg` and `longitude_deg`) and what describes an object (`score`, `class_name`,
+    sizes) are paths in one object; several
     paths for one component are a vector, whose length is meant: `speed_mps: [velocity.x, velocity.y]`. A quaternion
     gives its yaw. A mapping converts: `{path: angle, scale: -1, offset: 0, degrees: true}`.
     """
@@ -137,6 +149,9 @@ class InputConfig:
     """Topic of every sensor."""
     truth: TopicInput | tuple[TopicInput, ...] | None = None
     """Topic of the true objects, or a list of topics with an object each."""
+    origin: Origin | None = None
+    """Origin of the plane, x_m to the east and y_m to the north, that latitudes and longitudes are placed in; null: the
+    first position."""
     message_definitions: tuple[str, ...] = ()
     """`.msg` files, or folders of them, of types that neither the recording nor fgtrack defines."""
     kitti: KittiInput = field(default_factory=KittiInput)

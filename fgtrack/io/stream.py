@@ -17,6 +17,7 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.files import open_file
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.io.errors import TruncatedInput, UntilBreak
+from fgtrack.io.geodetic import GEODETIC, LocalPlane
 from fgtrack.io.output import new_file
 from fgtrack.io.source import FileFormat
 from fgtrack.io.validation import InvalidMessageError, validated_message
@@ -32,17 +33,17 @@ _Made = TypeVar("_Made")
 Record = dict[str, Any]
 
 
-def read_stream(path: Path | str) -> Iterator[Message]:
+def read_stream(path: Path | str, plane: LocalPlane | None = None) -> Iterator[Message]:
     """Messages of the stream `path` (gzipped or not) in the order of the file, which is receipt order.
     Unknown keys are ignored with one warning. Raises `TruncatedInput` after what came before a break, and `DataError`.
     """
-    path = Path(path)
+    path, plane = Path(path), plane or LocalPlane()
     unknown: Counter[str] = Counter()
     with closing(_records(path)) as records:
         next(records)
         for line, record in records:
             try:
-                yield _message(record, unknown)
+                yield _message(_placed(record, plane), unknown)
             except InvalidMessageError as error:
                 raise DataError(f"{path}:{line}: {error}") from error
     if unknown:
@@ -61,7 +62,7 @@ def _recognises(path: Path) -> bool:
 FORMAT = FileFormat(
     "an fgtrack stream (.jsonl, .jsonl.gz)",
     _recognises,
-    lambda path, config: partial(read_stream, path),
+    lambda path, config: partial(read_stream, path, LocalPlane(config.origin)),
     lambda path: read_header(path).get(SETTINGS, {}),
     validates=True,
 )
@@ -106,7 +107,9 @@ def _record(message: Message) -> Record:
     if isinstance(message, DetectionList):
         times = {"stamp_ns": message.stamp_ns, "receipt_ns": message.receipt_ns}
         objects = [_given(item) for item in message.objects]
-        return {"type": "detections", "sensor": message.sensor, **times, "frame": message.frame, "objects": objects}
+        origin = {} if message.origin_deg is None else {"origin_deg": message.origin_deg}
+        head = {"type": "detections", "sensor": message.sensor, **times, "frame": message.frame, **origin}
+        return {**head, "objects": objects}
     return {"type": "ego" if isinstance(message, EgoState) else "truth", **_given(message)}
 
 
@@ -159,6 +162,20 @@ def _message(record: Record, unknown: Counter[str]) -> Message:
             raise InvalidMessageError(f"objects: a list expected, not {objects!r:.60}")
         record["objects"] = tuple(_made("objects", Detection, item, unknown) for item in objects)
     return validated_message(_made(str(name), kind, record, unknown))
+
+
+def _placed(record: Record, plane: LocalPlane) -> Record:
+    """`record`, and each of its objects, with its position in `plane` if it has latitude and longitude."""
+    objects = record.get("objects")
+    if isinstance(objects, list) and any(isinstance(item, dict) and GEODETIC[0] in item for item in objects):
+        placed = [_placed(item, plane) if isinstance(item, dict) else item for item in objects]
+        record = {"frame": "map", **record, "objects": placed, "origin_deg": plane.origin_deg}
+    if GEODETIC[0] not in record:
+        return record
+    for name in GEODETIC:
+        if not isinstance(record.get(name), int | float | None):
+            raise InvalidMessageError(f"{name}: a number expected, not {record[name]!a:.60}")
+    return plane.placed(record)
 
 
 def _made(name: str, kind: type[_Made], record: object, unknown: Counter[str]) -> _Made:

@@ -9,6 +9,7 @@ from dataclasses import fields, replace
 from math import isfinite
 from operator import is_
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -121,6 +122,10 @@ def _is_outline(value: object) -> bool:
     return isinstance(value, tuple) and _are_numbers(value) and len(value) >= 6 and len(value) % 2 == 0
 
 
+def _is_position(value: Any) -> bool:  # Any: whatever a reader gives
+    return _are_numbers(value) and len(value) == 2 and None not in value
+
+
 _INTEGER = (_is_integer, "a 64 bit integer")
 _FLAG = (lambda value: isinstance(value, bool | np.bool_), "true or false")
 #: By field its rule and what it expects; all others are numbers.
@@ -128,7 +133,8 @@ _RULES: dict[str, tuple[Callable[[object], bool], str]] = {
     **dict.fromkeys(("stamp_ns", "receipt_ns", "object_id"), _INTEGER),
     **dict.fromkeys(("in_pit", "ignored"), _FLAG),
     "sensor": (lambda value: value != "" and _is_text(value), "a name"),
-    "class_name": (_is_text, "a text"),
+    **dict.fromkeys(("class_name", "id"), (_is_text, "a text")),
+    "origin_deg": (_is_position, "two numbers"),
     "covariance": (_are_numbers, "a list of numbers"),
     "outline_m": (_is_outline, "x and y of at least three corners"),
     "frame": (lambda value: value in FRAMES, f"one of {', '.join(sorted(FRAMES))}"),

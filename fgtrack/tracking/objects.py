@@ -1,4 +1,4 @@
-"""Class and size of the objects of tracks: class by vote of the detections, size by their average."""
+"""Class, identity and size of the objects of tracks: votes of the detections, size by their average."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -21,8 +21,8 @@ _UNKNOWN = 0
 _GROUPS = {name: -1 - number for number, group in enumerate(_ALIKE) for name in group}
 _SIZES = ("length_m", "width_m", "height_m")
 _sizes_m = attrgetter(*_SIZES)
-_description = attrgetter("class_name", *_SIZES)
-_NO_DESCRIPTION = None, None, None, None
+_description = attrgetter("class_name", "id", *_SIZES)
+_NO_DESCRIPTION = None, None, None, None, None
 
 
 @dataclass(slots=True)
@@ -34,6 +34,7 @@ class _Seen:
     """Number of detections with each of `_SIZES`."""
     sizes_m: dict[str, float] = field(default_factory=dict)
     """Their means."""
+    ids: Counter[str] = field(default_factory=Counter)
 
 
 class Objects:
@@ -46,7 +47,7 @@ class Objects:
         self._seen: dict[int, _Seen] = {}
 
     def describes(self, detections: Iterable[Detection]) -> bool:
-        """True if one of `detections` has a class or size."""
+        """True if one of `detections` has a class, size or id."""
         return any(map(_NO_DESCRIPTION.__ne__, map(_description, detections)))
 
     def learn(self, track_id: int, detections: Iterable[Detection]) -> None:
@@ -57,6 +58,8 @@ class Objects:
             seen = self._seen.setdefault(track_id, _Seen())
             if detection.class_name is not None:
                 seen.classes[detection.class_name] += 1
+            if detection.id is not None:
+                seen.ids[detection.id] += 1
             for name, value in zip(_SIZES, _sizes_m(detection), strict=True):
                 if value is not None:
                     seen.num_sizes[name] += 1
@@ -93,8 +96,10 @@ class Objects:
 
     def _report(self, seen: _Seen) -> ObjectReport:
         name = _most(seen.classes)
-        return ObjectReport(name, None if name is None else seen.classes[name] / seen.classes.total(), **seen.sizes_m)
+        share = None if name is None else seen.classes[name] / seen.classes.total()
+        length_m, width_m, height_m = map(seen.sizes_m.get, _SIZES)
+        return ObjectReport(name, share, length_m, width_m, height_m, _most(seen.ids))
 
 
-def _most(classes: Counter[str]) -> str | None:
-    return max(classes, key=classes.__getitem__) if classes else None
+def _most(counts: Counter[str]) -> str | None:
+    return max(counts, key=counts.__getitem__) if counts else None

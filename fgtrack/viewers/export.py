@@ -11,6 +11,7 @@ from fgtrack.evaluation.runs import Runs, evaluated, same_recording
 from fgtrack.io.output import check_apart, check_output
 from fgtrack.io.ros.bag_writer import check_bag, token
 from fgtrack.io.run import Run
+from fgtrack.viewers.geojson import origin_of
 from fgtrack.viewers.ros2 import write_ros2
 from fgtrack.viewers.run_messages import Look, ego_messages, map_messages, run_messages, truth_messages
 from fgtrack.viewers.shapes import ViewerMessage
@@ -26,10 +27,9 @@ def export(runs: Runs, out: Path, *, ros2: bool = False, overwrite: bool = False
     package `foxglove-sdk` is missing, or `out` is no name for the file, exists or lies in a run, and `DataError` if a
     run or its map is damaged, or a time does not fit into the file.
     """
-    write = write_ros2
     if not ros2:
         try:
-            from fgtrack.viewers.foxglove import write_foxglove as write
+            from fgtrack.viewers.foxglove import write_foxglove
         except ModuleNotFoundError as error:
             text = "foxglove-sdk is not installed: `pip install foxglove-sdk`, or export with --ros2"
             raise CallError(text) from error
@@ -39,7 +39,9 @@ def export(runs: Runs, out: Path, *, ros2: bool = False, overwrite: bool = False
     every = evaluated(runs)
     check_apart(out, [item.run.path for item in every])
     messages, notes = viewer_messages({item.label: item.run for item in every})
-    return write(out, messages, overwrite), notes
+    if ros2:
+        return write_ros2(out, messages, overwrite), notes
+    return write_foxglove(out, messages, overwrite, origin_of(every[0].run)), notes
 
 
 def viewer_messages(runs: Mapping[str, Run]) -> tuple[Iterator[ViewerMessage], list[str]]:

@@ -3,16 +3,18 @@
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from foxglove import messages as sdk
 from mcap.writer import Writer
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import EgoState
+from fgtrack.io.geodetic import latitudes_longitudes_deg
 from fgtrack.io.output import new_file
 from fgtrack.viewers.shapes import Entity, Point, Scene, Shape, ViewerMessage
 
@@ -31,10 +33,16 @@ _OUTCOME = {
 }
 
 
-def write_foxglove(path: Path, messages: Iterable[ViewerMessage], overwrite: bool = False) -> dict[str, int]:
+def write_foxglove(
+    path: Path,
+    messages: Iterable[ViewerMessage],
+    overwrite: bool = False,
+    origin_deg: tuple[float, float] | None = None,
+) -> dict[str, int]:
     """Write `messages`, in the order of their log times, to the MCAP file `path`; return their number by topic.
-    The file appears when it is complete. The same messages give the same bytes. Raises `CallError` if something is at
-    `path`, and `DataError` if the disk is full or a time lies before 1970.
+    With an origin, positions are also fixes, for map panels. The file appears when it is complete. The same messages
+    give the same bytes. Raises `CallError` if something is at `path`, and `DataError` if the disk is full or a time
+    lies before 1970.
     """
     channels: dict[str, int] = {}
     counts: Counter[str] = Counter()
@@ -44,7 +52,7 @@ def write_foxglove(path: Path, messages: Iterable[ViewerMessage], overwrite: boo
         for message in messages:
             if (early_ns := min(message.log_ns, message.stamp_ns)) < 0:
                 raise DataError(f"the time {early_ns} ns lies before 1970, which no MCAP file holds")
-            for topic, value in values(message):
+            for topic, value in values(message, origin_deg):
                 is_own = isinstance(value, dict)
                 if topic not in channels:
                     name, encoding, schema = "fgtrack.Outcome", "jsonschema", json.dumps(_OUTCOME).encode()
@@ -60,7 +68,9 @@ def write_foxglove(path: Path, messages: Iterable[ViewerMessage], overwrite: boo
     return dict(counts)
 
 
-def values(message: ViewerMessage) -> Iterator[tuple[str, Any]]:  # Any: messages of Foxglove, which share no type
+def values(
+    message: ViewerMessage, origin_deg: tuple[float, float] | None = None
+) -> Iterator[tuple[str, Any]]:  # Any: messages of Foxglove, which share no type
     """Topics, and what is written to them of `message`."""
     topic = message.topic
     sec, nsec = divmod(message.stamp_ns, NS_PER_S)
@@ -76,9 +86,14 @@ def values(message: ViewerMessage) -> Iterator[tuple[str, Any]]:  # Any: message
             yield "/tf", sdk.FrameTransform(timestamp=time, translation=position, rotation=turn, **frames)
             pose = sdk.Pose(position=position, orientation=turn)
             yield f"{topic}/pose", sdk.PoseInFrame(timestamp=time, frame_id="map", pose=pose)
+            for fix in _fixes([(ego.x_m, ego.y_m)], time, origin_deg):
+                yield f"{topic}/fix", fix
         case tuple() as states:
-            poses = [_pose((item.x_m or 0.0, item.y_m or 0.0), 0.0, item.yaw_rad or 0.0) for item in states]
+            points_m = [(item.x_m or 0.0, item.y_m or 0.0) for item in states]
+            poses = [_pose(at_m, 0.0, item.yaw_rad or 0.0) for at_m, item in zip(points_m, states, strict=True)]
             yield f"{topic}/poses", sdk.PosesInFrame(timestamp=time, frame_id="map", poses=poses)
+            if fixes := _fixes(points_m, time, origin_deg):
+                yield f"{topic}/fixes", sdk.LocationFixes(fixes=fixes)
         case outcome:
             known = {name: value for name, value in outcome.items() if value is not None}
             yield topic, {"header": {"stamp": {"sec": sec, "nsec": nsec}}, **known}
@@ -119,6 +134,16 @@ def _primitive(shape: Shape) -> Any:  # Any: primitives share no type
         case "cylinder":
             common |= {"bottom_scale": 1.0, "top_scale": 1.0}
     return _SOLIDS[shape.kind](size=_vector(*shape.size_m), **common)
+
+
+def _fixes(
+    points_m: Sequence[Point], time: sdk.Timestamp, origin_deg: tuple[float, float] | None
+) -> list[sdk.LocationFix]:
+    """Positions on Earth; none without an origin."""
+    if origin_deg is None or not points_m:
+        return []
+    pairs = zip(*latitudes_longitudes_deg(origin_deg, *np.array(points_m).T), strict=True)
+    return [sdk.LocationFix(timestamp=time, frame_id="map", latitude=a, longitude=b) for a, b in pairs]
 
 
 def _pose(at_m: Point, z_m: float, yaw_rad: float) -> sdk.Pose:

@@ -40,8 +40,11 @@ def detections(draw: st.DrawFn) -> Detection:
         covariance=draw(st.none() | st.lists(numbers, min_size=size, max_size=size).map(tuple)),
         stamp_ns=draw(st.none() | times_ns),
         object_id=draw(st.none() | ids),
-        **{name: draw(st.none() | finite) for name in DESCRIBING if name != "class_name"},  # a reader gives no other
+        **{
+            name: draw(st.none() | finite) for name in DESCRIBING if name not in ("class_name", "id")
+        },  # a reader gives no other
         class_name=draw(st.none() | st.sampled_from(["", "car", "Straßenbahn, 2"])),
+        id=draw(st.none() | st.sampled_from(["4CA911", "244710820"])),
     )
 
 

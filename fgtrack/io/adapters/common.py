@@ -86,6 +86,11 @@ def object_id(value: object) -> int | None:
     return int.from_bytes(blake2b(text.encode(errors="replace"), digest_size=6).digest(), "big") if text else None
 
 
+def identity(value: object) -> str | None:
+    """The identity `value` in one spelling, 4CA911 of 0x4ca911; None of an empty one."""
+    return str(value).strip().upper().removeprefix("0X") or None
+
+
 def exact_ns(time: Decimal | int | str, unit: str = "s") -> int:
     """Integer nanoseconds of a decimal text, to the last one; `ArithmeticError` or `ValueError` if it is not a time."""
     time_ns = round(_DECIMAL.create_decimal(time) * NS_PER_UNIT[unit])

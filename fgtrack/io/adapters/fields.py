@@ -10,20 +10,26 @@ import numpy as np
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import DESCRIBING, MEASURABLE, STATE_NAMES, Detection, EgoState
-from fgtrack.io.adapters.common import ObjectList, RosMessage, frame_of, object_id, stamp_ns, yaw_rad
+from fgtrack.io.adapters.common import ObjectList, RosMessage, frame_of, identity, object_id, stamp_ns, yaw_rad
 from fgtrack.io.config import Field, FieldPath
+from fgtrack.io.geodetic import GEODETIC, LocalPlane
 from fgtrack.models.measurement import ANGULAR
 
-COMPONENTS = ("object_id", *MEASURABLE, *DESCRIBING)
+COMPONENTS = ("object_id", *MEASURABLE, *GEODETIC, *DESCRIBING)
 """Mapped components of a detection."""
 OBJECT_FIELDS = frozenset({"objects", "stamp", "object_stamp", *COMPONENTS})
 """Names in the `fields` of an object list: `objects` is the path of the list, `stamp` that of the
 message's time (default `header.stamp`); the others are paths in one object."""
-EGO_FIELDS = frozenset({"stamp", "in_pit", *STATE_NAMES})
+EGO_FIELDS = frozenset({"stamp", "in_pit", *STATE_NAMES, *GEODETIC})
 """Names in the `fields` of the ego."""
 
 #: Conversions of the components that are not numbers.
-_CONVERSIONS: Mapping[str, Callable[[Any], Any]] = {"object_id": object_id, "class_name": str, "in_pit": bool}
+_CONVERSIONS: Mapping[str, Callable[[Any], Any]] = {
+    "object_id": object_id,
+    "id": identity,
+    "class_name": str,
+    "in_pit": bool,
+}
 
 
 class FieldError(Exception):
@@ -78,13 +84,17 @@ def _float(value: Any, path: str) -> float | None:
         raise FieldError(f"{path}: {str(value)[:40]!r} is not a number") from error
 
 
-def objects_by_fields(message: RosMessage, fields: Mapping[str, FieldPath]) -> ObjectList:
+def objects_by_fields(
+    message: RosMessage, fields: Mapping[str, FieldPath], plane: LocalPlane | None = None
+) -> ObjectList:
     """Object list of `message`; without `objects` in `fields` the message itself is the one object."""
-    objects = []
+    objects, plane = [], plane or LocalPlane()
     for item in items_by_fields(message, fields):
         stamp = _time(item, fields["object_stamp"]) if "object_stamp" in fields else None
-        objects.append(Detection(**mapped(fields, COMPONENTS, partial(value_at, item)), stamp_ns=stamp))
+        values = plane.placed(mapped(fields, COMPONENTS, partial(value_at, item)))
+        objects.append(Detection(**values, stamp_ns=stamp))
     frame = frame_of(message.header) if hasattr(message, "header") else None
+    frame = "map" if GEODETIC[0] in fields else frame
     return ObjectList(_message_stamp(message, fields), frame, tuple(objects))
 
 
@@ -99,10 +109,13 @@ def items_by_fields(message: RosMessage, fields: Mapping[str, FieldPath]) -> lis
     return list(items)
 
 
-def ego_by_fields(message: RosMessage, fields: Mapping[str, FieldPath], receipt_ns: int) -> EgoState:
+def ego_by_fields(
+    message: RosMessage, fields: Mapping[str, FieldPath], receipt_ns: int, plane: LocalPlane | None = None
+) -> EgoState:
     """The ego's state; `x_m`, `y_m`, `yaw_rad` and `speed_mps` must be among `fields`."""
     stamp = _message_stamp(message, fields)
-    values = mapped(fields, (*STATE_NAMES, "in_pit"), partial(value_at, message))
+    plane = plane or LocalPlane()
+    values = plane.placed(mapped(fields, (*STATE_NAMES, "in_pit", *GEODETIC), partial(value_at, message)))
     return EgoState(receipt_ns if stamp is None else stamp, receipt_ns, **values)
 
 

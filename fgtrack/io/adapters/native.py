@@ -21,7 +21,7 @@ EGO, DETECTIONS, TRUTH = (f"fgtrack_msgs/msg/{name}" for name in ("Ego", "Detect
 DETECTION_OPTIONAL = (*MEASURABLE, "covariance", "stamp_ns", "object_id", *DESCRIBING)
 TRUTH_OPTIONAL = (*STATE_NAMES[2:], "outline_m")
 #: Fields that hold numbers in a list, and those that hold a text.
-LISTS, TEXTS = frozenset({"covariance", "outline_m"}), frozenset({"class_name"})
+LISTS, TEXTS = frozenset({"covariance", "outline_m"}), frozenset({"class_name", "id"})
 
 
 def _given(message: RosMessage) -> dict[str, RosMessage]:
@@ -54,7 +54,9 @@ def detections(message: RosMessage, receipt_ns: int) -> DetectionList:
     """The object list of a `fgtrack_msgs/DetectionList`."""
     objects = tuple(Detection(**_given(item)) for item in message.objects)
     stamp = stamp_ns(message.header.stamp)
-    return DetectionList(message.sensor, stamp, receipt_ns, objects, message.header.frame_id)
+    origin_deg: RosMessage = getattr(message, "origin_deg", ())  # recordings of 0.3.0 have none
+    own = tuple(origin_deg.tolist()) if len(origin_deg) else None
+    return DetectionList(message.sensor, stamp, receipt_ns, objects, message.header.frame_id, origin_deg=own)
 
 
 def truth(message: RosMessage, receipt_ns: int) -> TruthState:

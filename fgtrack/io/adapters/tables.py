@@ -23,25 +23,27 @@ from fgtrack.io.adapters.common import exact_ns
 from fgtrack.io.adapters.fields import COMPONENTS, FieldError, mapped, paths_of, single_path
 from fgtrack.io.adapters.fusiontracking import LOG_NAME
 from fgtrack.io.config import CsvTable, InputConfig
+from fgtrack.io.geodetic import GEODETIC, LocalPlane
 from fgtrack.io.source import FileFormat
 
 _ENDINGS = (".csv", ".tsv")
 _LONGEST_HEADER = 1_000_000
 _TIMES = ("stamp", "receipt")
 #: Components of the rows of the ego and of truth, and those that must be there; all others are of detections.
-_NAMES = {"ego": STATE_NAMES, "truth": ("object_id", *STATE_NAMES)}
+_NAMES = {"ego": (*STATE_NAMES, *GEODETIC), "truth": ("object_id", *STATE_NAMES, *GEODETIC)}
 _NEEDS = {"ego": STATE_NAMES[:4], "truth": STATE_NAMES[:2]}
 Cells = Mapping[str, str]
 
 
-def read_tables(tables: Sequence[tuple[Path, CsvTable, str]]) -> Iterator[Message]:
+def read_tables(tables: Sequence[tuple[Path, CsvTable, str]], plane: LocalPlane | None = None) -> Iterator[Message]:
     """Messages of `tables`, given with file and role (`ego`, `truth` or `detections.SENSOR`), in order of receipt.
     Raises `DataError` for a row that does not match the mapping, after all messages up to the receipt before it.
     """
+    plane = plane or LocalPlane()
     keyed: list[tuple[tuple[int, int, int], Message]] = []
     breaks: list[tuple[float, DataError]] = []
     for number, table in enumerate(tables):
-        messages, error = _read(*table)
+        messages, error = _read(*table, plane)
         keyed += [((each.receipt_ns, number, each.stamp_ns), each) for each in messages]
         if error is not None:
             breaks.append((max((each.receipt_ns for each in messages), default=-math.inf), error))
@@ -53,7 +55,7 @@ def read_tables(tables: Sequence[tuple[Path, CsvTable, str]]) -> Iterator[Messag
         raise broken
 
 
-def _read(file: Path, table: CsvTable, role: str) -> tuple[list[Message], DataError | None]:
+def _read(file: Path, table: CsvTable, role: str, plane: LocalPlane) -> tuple[list[Message], DataError | None]:
     """Messages of the rows of a table that pass the filters, and the error that ends it."""
     messages: list[Message] = []
     scans: dict[tuple[int, int], list[Detection]] = {}
@@ -72,7 +74,7 @@ def _read(file: Path, table: CsvTable, role: str) -> tuple[list[Message], DataEr
                 left_out.append(f"filters.{name}")
                 skipped = skipped or cells
                 continue
-            times, values = _times(cells, table), _values(cells, table, role)
+            times, values = _times(cells, table), _values(cells, table, role, plane)
             stamps_ns.append(times[0])
             if role == "ego":
                 messages.append(EgoState(*times, **values))
@@ -92,7 +94,8 @@ def _read(file: Path, table: CsvTable, role: str) -> tuple[list[Message], DataEr
     for (stamp_ns, receipt_ns), objects in scans.items():
         counted, left_out = tuple(left_out), []
         sensor = role.removeprefix("detections.")
-        messages.append(DetectionList(sensor, stamp_ns, receipt_ns, objects, table.frame or "ego", counted))
+        frame = table.frame or ("map" if GEODETIC[0] in table.columns else "ego")
+        messages.append(DetectionList(sensor, stamp_ns, receipt_ns, objects, frame, counted, plane.origin_deg))
     return messages, error
 
 
@@ -130,9 +133,9 @@ def _excluding_filter(table: CsvTable, cells: Cells) -> str | None:
     return None
 
 
-def _values(cells: Cells, table: CsvTable, role: str) -> dict[str, Any]:  # Any: as of `mapped`
+def _values(cells: Cells, table: CsvTable, role: str, plane: LocalPlane) -> dict[str, Any]:  # Any: as of `mapped`
     """Values that a row gives; NaN for a state that must be there, which the tracker counts."""
-    values = mapped(table.columns, _NAMES.get(role, COMPONENTS), lambda column: cells[column] or None)
+    values = plane.placed(mapped(table.columns, _NAMES.get(role, COMPONENTS), lambda column: cells[column] or None))
     values |= {name: math.nan for name in _NEEDS.get(role, ()) if values[name] is None}
     return {name: value for name, value in values.items() if value is not None}
 
@@ -166,7 +169,7 @@ def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
         raise CallError(
             f"{path}: is CSV, name its columns in input.csv: {found} (`fgtrack info {path} --write my.yaml` guesses)"
         )
-    return partial(read_tables, tables)
+    return partial(read_tables, tables, LocalPlane(config.origin))
 
 
 def headers(path: Path) -> dict[Path, list[str]]:
@@ -178,13 +181,14 @@ def headers(path: Path) -> dict[Path, list[str]]:
 def _file(path: Path, table: CsvTable, role: str) -> Path:
     """File of `table`, whose columns are checked."""
     where, columns = f"input.csv.{role}", table.columns.keys()
+    placed = columns | ({"x_m", "y_m"} if columns >= set(GEODETIC) else set())
     known = {*_TIMES, *_NAMES.get(role, COMPONENTS)}
     needed = {"stamp", *_NEEDS.get(role, ())}
     if columns - known:
         raise CallError(
             f"{where}.columns: unknown column {min(columns - known)!r}, known are {', '.join(sorted(known))}"
         )
-    if needed - columns or (role not in _NAMES and columns.isdisjoint(MEASURABLE)):
+    if needed - placed or (role not in _NAMES and placed.isdisjoint(MEASURABLE)):
         measured = "" if role in _NAMES else f" and what is measured, one of {', '.join(MEASURABLE)}"
         raise CallError(f"{where}.columns: must name {', '.join(sorted(needed))}{measured}")
     if table.file is None and path.is_dir():

@@ -55,7 +55,7 @@ float64[] covariance
 """,
     "fgtrack_msgs/msg/Detection": f"""\
 # Bit i of `present` says that the i-th field below was given.
-uint16 present
+uint32 present
 {_COMPONENTS}
 float64[] covariance
 int64 stamp_ns
@@ -66,12 +66,15 @@ float64 width_m
 float64 height_m
 float64 score
 string class_name
+string id
 """,
     "fgtrack_msgs/msg/DetectionList": """\
 # header.frame_id is map, ego or sensor.
 std_msgs/Header header
 string sensor
 Detection[] objects
+# Latitude and longitude of the origin of the map; empty where it is not known.
+float64[] origin_deg
 """,
     "fgtrack_msgs/msg/Truth": """\
 # Bit i of `present` says that the i-th field after it was given.

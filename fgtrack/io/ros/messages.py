@@ -47,6 +47,7 @@ class MessageFactory:
             header=self._header(message.stamp_ns, message.frame),
             sensor=message.sensor,
             objects=[self._detection(item) for item in message.objects],
+            origin_deg=np.array(message.origin_deg or (), dtype=np.float64),
         )
 
     def truth(self, state: TruthState) -> RosMessage:

@@ -1,6 +1,6 @@
 """Converts the topics of a recording to fgtrack's messages, as configured."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,8 +22,9 @@ from fgtrack.io.adapters.fields import (
 from fgtrack.io.adapters.native import DETECTIONS, EGO, NATIVE_ADAPTERS, TRUTH, detections
 from fgtrack.io.adapters.objects import ODOMETRY, ego_from_odometry
 from fgtrack.io.adapters.scans import grouped
-from fgtrack.io.config import InputConfig, TopicInput
+from fgtrack.io.config import FieldPath, InputConfig, TopicInput
 from fgtrack.io.errors import TruncatedInput
+from fgtrack.io.geodetic import GEODETIC, LocalPlane
 from fgtrack.io.ros.bag import Bag, BagTopic, is_bag
 from fgtrack.io.ros.bag_files import settings_of
 from fgtrack.io.source import FileFormat
@@ -38,6 +39,13 @@ _KEYS = {
     "scan_s": ("detections",),
     "object_id": ("truth",),
 }
+_POSITION = {"latitude_deg": "latitude", "longitude_deg": "longitude", "z_m": "altitude"}
+FIX_FIELDS: Mapping[str, Mapping[str, FieldPath]] = {
+    "sensor_msgs/msg/NavSatFix": _POSITION,
+    "geographic_msgs/msg/GeoPointStamped": {name: f"position.{path}" for name, path in _POSITION.items()},
+    "geographic_msgs/msg/GeoPoseStamped": {name: f"pose.position.{path}" for name, path in _POSITION.items()},
+}
+"""Fields of one object on Earth, by type; its altitude is kept as z_m."""
 Convert = Callable[[RosMessage, int], Iterable[Message]]
 """Messages of a ROS message and its receipt."""
 TopicUse = tuple[BagTopic, str, Convert]
@@ -50,11 +58,18 @@ def topic_uses(bag: Bag, config: InputConfig) -> list[TopicUse]:
     Raises `DataError` for a topic that is not there or not named, and `CallError` where `config` does not fit its type.
     """
     names = {topic.name for topic in bag.topics}
+    plane = LocalPlane(config.origin)
     truth = config.truth if isinstance(config.truth, tuple) else (config.truth,) if config.truth else ()
     roles: list[tuple[str, TopicInput, Callable[[BagTopic, TopicInput], Convert]]] = [
-        *([("ego", config.ego, _ego)] if config.ego else []),
-        *((f"detections {name}", item, partial(_detections, sensor=name)) for name, item in config.detections.items()),
-        *(("truth", item, partial(_truths, number=number, topics=len(truth))) for number, item in enumerate(truth)),
+        *([("ego", config.ego, partial(_ego, plane=plane))] if config.ego else []),
+        *(
+            (f"detections {name}", item, partial(_detections, sensor=name, plane=plane))
+            for name, item in config.detections.items()
+        ),
+        *(
+            ("truth", item, partial(_truths, number=number, topics=len(truth), plane=plane))
+            for number, item in enumerate(truth)
+        ),
     ]
     native = [(topic, "messages", _native(topic)) for topic in bag.topics if topic.type in NATIVE_ADAPTERS]
     if native and names.isdisjoint(item.topic for _, item, _ in roles):
@@ -113,10 +128,11 @@ def _listed(bag: Bag) -> str:
 
 def _check_fields(item: TopicInput, names: frozenset[str], needed: tuple[str, ...] = ()) -> None:
     fields = item.fields or {}
+    given = {*fields, "x_m", "y_m"} if fields.keys() >= set(GEODETIC) else fields
     for name in sorted(set(fields) - names):
         raise CallError(f"topic {item.topic}: unknown field {name!r}, known are {', '.join(sorted(names))}")
     for name in needed:
-        if name not in fields:
+        if name not in given:
             raise CallError(f"topic {item.topic}: fields must name {name}")
 
 
@@ -125,11 +141,11 @@ def _native(topic: BagTopic) -> Convert:
     return lambda message, receipt_ns: (adapter(message, receipt_ns),)
 
 
-def _ego(topic: BagTopic, item: TopicInput) -> Convert:
+def _ego(topic: BagTopic, item: TopicInput, plane: LocalPlane) -> Convert:
     fields = item.fields
     if fields is not None:
         _check_fields(item, EGO_FIELDS, ("x_m", "y_m", "yaw_rad", "speed_mps"))
-        return lambda message, receipt_ns: (ego_by_fields(message, fields, receipt_ns),)
+        return lambda message, receipt_ns: (ego_by_fields(message, fields, receipt_ns, plane),)
     if topic.type == EGO:
         return _native(topic)
     if topic.type != ODOMETRY:
@@ -137,8 +153,10 @@ def _ego(topic: BagTopic, item: TopicInput) -> Convert:
     return lambda message, receipt_ns: (ego_from_odometry(message, receipt_ns),)
 
 
-def _detections(topic: BagTopic, item: TopicInput, sensor: str) -> Convert:
-    read = _object_list(topic, item)
+def _detections(topic: BagTopic, item: TopicInput, sensor: str, plane: LocalPlane) -> Convert:
+    if item.fields is None and topic.type in FIX_FIELDS:
+        item = replace(item, fields=FIX_FIELDS[topic.type])
+    read = _object_list(topic, item, plane)
 
     def convert(message: RosMessage, receipt_ns: int) -> Iterable[Message]:
         listed = read(message)
@@ -148,15 +166,17 @@ def _detections(topic: BagTopic, item: TopicInput, sensor: str) -> Convert:
         if item.filters:
             own = objects if item.fields is None else items_by_fields(message, item.fields)
             objects, left_out = split(_judged(item, *pair) for pair in zip(objects, own, strict=True))
-        return (DetectionList(sensor, stamp_ns, receipt_ns, objects, frame, left_out),)
+        return (DetectionList(sensor, stamp_ns, receipt_ns, objects, frame, left_out, plane.origin_deg),)
 
     return convert
 
 
-def _object_list(topic: BagTopic, item: TopicInput) -> Callable[[RosMessage], ObjectList | DetectionList]:
+def _object_list(
+    topic: BagTopic, item: TopicInput, plane: LocalPlane
+) -> Callable[[RosMessage], ObjectList | DetectionList]:
     if item.fields is not None:
         _check_fields(item, OBJECT_FIELDS)
-        return partial(objects_by_fields, fields=item.fields)
+        return partial(objects_by_fields, fields=item.fields, plane=plane)
     if unknown := item.filters.keys() - DETECTION_FIELDS:
         names = ", ".join(sorted(DETECTION_FIELDS))
         raise CallError(f"topic {item.topic}: without fields, filters go by {names}, not by {min(unknown)!r}")
@@ -177,11 +197,11 @@ def _judged(item: TopicInput, detection: Detection, source: RosMessage) -> Detec
     return detection
 
 
-def _truths(topic: BagTopic, item: TopicInput, number: int, topics: int) -> Convert:
+def _truths(topic: BagTopic, item: TopicInput, number: int, topics: int, plane: LocalPlane) -> Convert:
     """Return the adapter of truth; each of several topics has one object, its index is the id if there is no other."""
     if topic.type == TRUTH and item.fields is None and item.object_id is None and not item.filters:
         return _native(topic)
-    read = _detections(topic, item, "truth")
+    read = _detections(topic, item, "truth", plane)
     own = None
     if topics > 1 or item.object_id is not None:
         own = object_id(number if item.object_id is None else item.object_id)

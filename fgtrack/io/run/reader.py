@@ -22,7 +22,16 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, IntArray
 from fgtrack.io.errors import one_line
 from fgtrack.io.run.rows import text_header
-from fgtrack.io.run.schema import COLUMNS, NO_TRACK, OPTIONAL_TABLES, RUN_FORMAT, Column, column, column_type
+from fgtrack.io.run.schema import (
+    ADDED_COLUMNS,
+    COLUMNS,
+    NO_TRACK,
+    OPTIONAL_TABLES,
+    RUN_FORMAT,
+    Column,
+    column,
+    column_type,
+)
 from fgtrack.io.run.writer import LARGEST_META_MB, RunWriter, path_from_run
 from fgtrack.io.yaml_text import safe_yaml
 
@@ -241,6 +250,8 @@ def parsed(table: str, content: bytes | bytearray) -> Table:
         skip_blank_lines=False,
         low_memory=False,
     )
+    for name in ADDED_COLUMNS & set(names) - set(frame.columns):  # of runs of 0.2
+        frame.insert(names.index(name), name, "")
     if tuple(frame.columns) != names or not isinstance(frame.index, pandas.RangeIndex):
         raise ValueError(f"the columns must be {','.join(names)}")
     if "track_id" in names:

@@ -22,7 +22,7 @@ from fgtrack.io.run.schema import COLUMNS, COVARIANCE_STATES
 
 Cell = str | int | float | None
 Row = tuple[Cell, ...]
-_NAMES = frozenset({"sensor", "class_name"})  # columns that hold whatever the input calls things
+_NAMES = frozenset({"sensor", "class_name", "id"})  # columns that hold whatever the input calls things
 
 
 def rows(

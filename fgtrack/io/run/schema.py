@@ -31,17 +31,19 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     "truth": ("stamp_ns", "object_id", *STATE_NAMES),
     "ignored": ("stamp_ns", "object_id", "x_m", "y_m", "outline_m"),
     "ego": ("stamp_ns", "receipt_ns", *STATE_NAMES),
-    "objects": ("track_id", "class_name", "class_share", "length_m", "width_m", "height_m"),
+    "objects": ("track_id", "class_name", "class_share", "length_m", "width_m", "height_m", "id"),
     "detections": ("sensor", "stamp_ns", "receipt_ns", "index", "frame", *MEASURABLE, *DESCRIBING),
 }
 #: Tables that are written only when there is something to write.
 OPTIONAL_TABLES = ("smoothed", "lagged", "truth", "ignored", "ego", "objects", "detections")
+ADDED_COLUMNS = frozenset({"id"})
+"""Columns of texts that older runs may lack."""
 NO_TRACK = -1
 """Track id of an update that belongs to no track."""
 
 # A column holds floats, integers or text, as its name says; the reader of it knows which.
 Column = npt.NDArray[Any]
-_TEXT = frozenset({"status", "sensor", "disposition", "kind", "frame", "class_name", "outline_m"})
+_TEXT = frozenset({"status", "sensor", "disposition", "kind", "frame", "class_name", "id", "outline_m"})
 _INTEGERS = frozenset(
     {
         *("tick", "now_ns", "stamp_ns", "receipt_ns", "process_ns", "track_id", "object_id"),

@@ -14,6 +14,7 @@ from fgtrack.core.types import (
     TickReport,
     TruthState,
 )
+from fgtrack.io.geodetic import GEODETIC
 from fgtrack.io.run.rows import Row, detection_rows, rows, smoothed_rows, state_cells
 from fgtrack.io.run.schema import RUN_FORMAT
 
@@ -68,6 +69,8 @@ class RunSink(ABC):
     def write_detections(self, message: DetectionList) -> None:
         """Take the rows of `detections`."""
         self._received["detections"] += detection_rows(message)
+        if message.origin_deg is not None:
+            self._meta.setdefault("origin", dict(zip(GEODETIC, message.origin_deg, strict=True)))
         if message.left_out:
             self._left_out[message.sensor].update(message.left_out)
 
