@@ -60,13 +60,14 @@ docs: $(DOCS)
 contest: $(TEST)
 	$(BIN)/python experiments/contest.py -o out/contest --jobs 2
 
-# Some 5 minutes; docs/speed.md tells how to read it. OLDER=CHECKOUT compares gtsam's smoother with that of a checkout.
+# Some 5 minutes. AGAINST='COMMAND' runs the published implementation, too (docs/speed.md); PAGE=docs/speed.md updates the page.
+BENCH = $(BIN)/python experiments/bench_speed.py -o out/speed $(if $(AGAINST),--published '$(AGAINST)') $(if $(PAGE),--page $(PAGE))
 bench: $(TEST)
-	$(BIN)/python experiments/bench_speed.py -o out/speed $(if $(OLDER),--against $(OLDER))
+	$(BENCH)
 
-# Every estimator, number of objects, lag and delay, memory: takes several times as long.
+# Every estimator, number of objects, lag and delay: takes several times as long.
 bench-full: $(TEST)
-	$(BIN)/python experiments/bench_speed.py -o out/speed --full $(if $(OLDER),--against $(OLDER))
+	$(BENCH) --full
 
 # A day of race, as fast as it goes, twice: hours. HOURS=6 ESTIMATOR=smoother-banded for others.
 soak: $(TEST)
