@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import compress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -218,24 +219,17 @@ class Preprocess:
         if not len(rows):
             return
         batch, sensor, pose, points_m = items.batch, items.sensor, items.pose, items.points_m
-        columns = (items.values[0] == items.values[0]).nonzero()[0]  # NaN is not equal to itself
-        names, z = _names(tuple(columns.tolist())), items.values.take(columns, axis=1)
-        assumed: tuple[str, ...] = (
-            ("yaw_rad",) if self._assumes_map_yaw and items.map_yaw[0] and "yaw_rad" in names else ()
-        )
-        assumed += ("curvature_radpm",) if "curvature_radpm" in names else ()
-        model, R = measurement_model(names, self._motion), covariances(items, names)
+        measures = tuple((items.values[0] == items.values[0]).tolist())  # NaN is not equal to itself
+        names, columns, assumed, placed = _components(measures, self._assumes_map_yaw and bool(items.map_yaw[0]))
+        z, R = items.values.take(columns, axis=1), covariances(items, names)
+        model = measurement_model(names, self._motion)
         models, white = [model], R
         if sensor.correlation is not None:
             split = [split_error(batch.message.sensor, sensor, model, item, self._motion.state_names) for item in R]
             models, white = [each for each, _ in split], np.array([noise for _, noise in split])
         total, error = white, None
         if pose_covariance is not None:
-            placed = columns
-            if batch.message.frame == "map":
-                placed = np.full(len(columns), -1)
-            elif assumed:
-                placed = np.where([name in assumed for name in names], -1, columns)
+            placed = np.full(len(names), -1) if batch.message.frame == "map" else placed
             G = kernels("fgtrack.tracking.kernels").placement(points_m, pose.x_m, pose.y_m, placed)
             x = points_m
             if model.relative:
@@ -243,7 +237,7 @@ class Preprocess:
                 x[:, :2] = points_m if is_placed else _far_along(z[:, names.index("bearing_rad")], pose)
             error = PoseError(pose_covariance, G, white)
             total = error.noise(models[0], pose, x)
-            R = R + (total - white)
+            R = total if white is R else R + (total - white)
         whole = Group(rows, Measurement(batch.stamp_ns, models[0], z, total, pose, sensor.loss, assumed), R, error)
         if sensor.correlation is None:
             yield whole
@@ -262,8 +256,14 @@ def _without(items: MapDetections, outside: BoolArray, reason: str, lost: dict[i
 
 
 @cache
-def _names(columns: tuple[int, ...]) -> tuple[str, ...]:
-    return tuple(COMPONENTS[column] for column in columns)
+def _components(
+    measures: tuple[bool, ...], assumes_yaw: bool
+) -> tuple[tuple[str, ...], IntArray, tuple[str, ...], IntArray]:
+    """Names and columns of the `COMPONENTS` that are measured, which are assumed, and columns; -1 of an assumed one."""
+    names = tuple(compress(COMPONENTS, measures))
+    known = {"curvature_radpm", "yaw_rad"} if assumes_yaw else {"curvature_radpm"}
+    assumed, columns = tuple(name for name in names if name in known), np.flatnonzero(measures)
+    return names, columns, assumed, np.where([name in assumed for name in names], -1, columns)
 
 
 def _pose_covariance(pose: SensorPose, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> FloatArray | None:
