@@ -178,8 +178,8 @@ def near(
     bearing is from the track to the line of sight.
     """
     limits_m = np.full(len(means), reach_m, dtype=np.float64)
-    find_near = kernels("fgtrack.tracking.kernels").near
-    pairs = Pairs(*find_near(candidates.lines, np.ascontiguousarray(means), limits_m, MOST_NEAR))
+    tracks = np.ascontiguousarray(means), np.argsort(means[:, 0])
+    pairs = Pairs(*kernels("fgtrack.tracking.kernels").near(candidates.lines, *tracks, limits_m, MOST_NEAR))
     return pairs if excluded is None else pairs.at(~excluded(pairs.rows, pairs.columns))
 
 

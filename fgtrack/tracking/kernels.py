@@ -78,36 +78,54 @@ def sensor_pose_covariance(
     return total
 
 
-@njit("(float64[:, ::1], float64[:, ::1], float64[::1], int64)")
+@njit("(float64[:, ::1], float64[:, ::1], int64[::1], float64[::1], int64)")
 def near(
-    points: FloatArray, means: FloatArray, reach_m: FloatArray, most: int
+    points: FloatArray, means: FloatArray, by_x: IntArray, reach_m: FloatArray, most: int
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Return rows, columns and distances of the pairs of `points` and tracks that are at most `reach_m` (n,) apart.
     Of a point in (m, 3) the third entry is NaN, of a line of sight from there its direction. At most so many tracks of
-    each point, the nearest ones.
+    each point, the nearest ones. `by_x` are the tracks in the order of x.
     """
     m, n = len(points), len(means)
-    largest, count = m * min(n, most), 0
+    largest, count, longest = m * min(n, most), 0, 0.0
     rows, columns, distances = np.empty(largest, np.int64), np.empty(largest, np.int64), np.empty(largest)
+    for j in range(n):
+        longest = max(longest, reach_m[j] * (1.0 + 1e-9))
     for i in range(m):
-        first = count
-        for j in range(n):
-            dx, dy, angle = means[j, 0] - points[i, 0], means[j, 1] - points[i, 1], points[i, 2]
+        first, x, y, angle = count, points[i, 0], points[i, 1], points[i, 2]
+        low, high = 0, n if math.isnan(angle) else 0
+        while low < high:  # the first track that is not too far to the left
+            middle = (low + high) // 2
+            if means[by_x[middle], 0] < x - longest:
+                low = middle + 1
+            else:
+                high = middle
+        for at in range(low, n):
+            j = by_x[at]
+            dx, dy = means[j, 0] - x, means[j, 1] - y
             distance = math.sqrt(dx * dx + dy * dy)
             if not math.isnan(angle):
                 off = math.atan2(dy, dx) - angle
                 distance = abs(distance * math.sin(off)) if math.cos(off) > 0.0 else distance
+            elif dx > longest:
+                break
             if distance > reach_m[j]:
                 continue
-            at = count
-            if count - first == most:  # replaces the farthest
-                at = first
-                for k in range(first, count):
-                    at = k if distances[k] > distances[at] else at
-                if distances[at] <= distance:
+            k = count
+            if count - first == most:  # replaces the farthest, which moves to the end
+                for other in range(first, count):
+                    k = other if k == count or distances[other] > distances[k] else k
+                if distances[k] <= distance:
                     continue
-            rows[at], columns[at], distances[at] = i, j, distance
-            count = max(count, at + 1)
+                for other in range(k, count - 1):
+                    columns[other], distances[other] = columns[other + 1], distances[other + 1]
+                count -= 1
+            k = count
+            while k > first and columns[k - 1] > j:  # in the order of the tracks
+                columns[k], distances[k] = columns[k - 1], distances[k - 1]
+                k -= 1
+            rows[count], columns[k], distances[k] = i, j, distance
+            count += 1
     return rows[:count], columns[:count], distances[:count]
 
 

@@ -108,3 +108,18 @@ def test_detections_and_tracks_all_in_one_place_are_not_all_compared(
     peak = peak_bytes(lambda: found.append(association(candidates, tracks)))
     assert peak < 125 * MB, f"{peak / MB:.0f} MB"
     assert len(found[0].pairs) > 2_500
+
+
+@pytest.mark.parametrize("reach_m", [3.0, 50.0])
+def test_the_near_pairs_are_those_of_all_distances(monkeypatch: pytest.MonkeyPatch, reach_m: float) -> None:
+    rng = np.random.default_rng(2)
+    points, tracks = rng.uniform(0.0, 40.0, size=(60, 2)), rng.uniform(0.0, 40.0, size=(50, 2))
+    limits_m = rng.uniform(0.5, 1.0, size=50) * reach_m
+    monkeypatch.setattr("fgtrack.tracking.association.MOST_NEAR", 20)
+    pairs = near(candidates_of([candidate(*point) for point in points]), states(tracks.tolist()).means, limits_m)
+    distances = np.hypot(points[:, :1] - tracks[:, 0], points[:, 1:] - tracks[:, 1])
+    for row, own in enumerate(distances):
+        inside = np.flatnonzero(own <= limits_m)
+        expected = np.sort(inside[np.argsort(own[inside], kind="stable")[:20]])
+        np.testing.assert_array_equal(pairs.columns[pairs.rows == row], expected)
+    np.testing.assert_allclose(pairs.values, distances[pairs.rows, pairs.columns])
