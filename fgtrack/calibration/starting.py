@@ -22,6 +22,7 @@ from fgtrack.io.adapters.native import NATIVE_ADAPTERS
 from fgtrack.io.adapters.objects import ODOMETRY
 from fgtrack.io.adapters.tables import headers, rows
 from fgtrack.io.config import CsvInput, CsvTable, Field, InputConfig, TopicInput
+from fgtrack.io.geodetic import GEODETIC
 from fgtrack.io.guess import Guess, agreeing_with_motion, guesses, time_unit, words_of
 from fgtrack.io.info import OTHER_CLOCK_S, TopicInfo, describe
 from fgtrack.io.ros.bag import Bag
@@ -40,7 +41,7 @@ _GENERAL = frozenset(
     ("perception", "detections", "detection", "objects", "object", "tracks", "track", "list", "sensing", "data", "csv")
 )
 _OTHER_PACKAGES = ("sensor_msgs", "tf2_msgs", "visualization_msgs", "rcl_interfaces", "rosgraph_msgs", "std_msgs")
-_POSITIONS = ({"x_m", "y_m"}, {"range_m", "bearing_rad"}, {"bearing_rad"})
+_POSITIONS = ({"x_m", "y_m"}, {"range_m", "bearing_rad"}, {"bearing_rad"}, set(GEODETIC))
 _NEEDED = {"ego": {"x_m", "y_m", "yaw_rad", "speed_mps"}, "truth": {"x_m", "y_m"}}
 
 
@@ -146,7 +147,7 @@ def _table_part(file: Path, columns: Sequence[str], is_folder: bool, parts: Sequ
     if missing or not any(wanted <= own.keys() for wanted in _POSITIONS):
         raise DataError(f"no column for {', '.join(sorted(missing)) or 'a position'} among {_spreads(values)}")
     is_sensor = not (is_ego or is_truth)
-    known = ("stamp", "receipt", *((*MEASURABLE, *DESCRIBING) if is_sensor else STATE_NAMES))
+    known = ("stamp", "receipt", *((*MEASURABLE, *GEODETIC, *DESCRIBING) if is_sensor else STATE_NAMES))
     used = {key: item for key, item in own.items() if key in known or (key == "object_id" and not is_ego)}
     named = [str(own[key].path) for key in ("x_m", "y_m") if key in own and is_sensor]
     in_map = bool(named) and all(set(words_of(name)) & {"east", "easting", "north", "northing"} for name in named)

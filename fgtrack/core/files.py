@@ -7,6 +7,8 @@ from typing import BinaryIO
 
 from fgtrack.core.errors import DataError
 
+GZIP_MAGIC = b"\x1f\x8b"
+
 
 def open_file(path: Path) -> BinaryIO:
     """`path` opened for reading bytes; raises `OSError` also for a pipe or a device, which may never end."""

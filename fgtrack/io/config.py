@@ -141,6 +141,21 @@ class NuscenesInput:
 
 
 @dataclass(frozen=True)
+class AsterixInput:
+    """Editions, times and stations of ASTERIX recordings."""
+
+    editions: Mapping[int, str] = field(default_factory=dict)
+    """Edition by category, `{21: "0.23"}`; by default the newest."""
+    stamp: Mapping[int, str] = field(default_factory=dict)
+    """Item with the stamp by category; by default of 021 the time of reception of the position, 073."""
+    receipt: Mapping[int, str] = field(default_factory=dict)
+    """Item with the receipt by category; by default of 021 the time of transmission of the report, 077, of the others
+    the newest stamp up to the record."""
+    stations: Mapping[int, Origin] = field(default_factory=dict)
+    """Position of each station, by its SIC, that gives positions relative to itself; by default the origin."""
+
+
+@dataclass(frozen=True)
 class InputConfig:
     """The topics that a replay reads; a recording that fgtrack wrote needs none of it."""
 
@@ -157,3 +172,4 @@ class InputConfig:
     kitti: KittiInput = field(default_factory=KittiInput)
     csv: CsvInput = field(default_factory=CsvInput)
     nuscenes: NuscenesInput = field(default_factory=NuscenesInput)
+    asterix: AsterixInput = field(default_factory=AsterixInput)

@@ -33,7 +33,7 @@ _AXES = {"x": ("x_m", "velocity x", "length_m"), "y": ("y_m", "velocity y", "wid
 #: Ends of names, by component, the first that matches.
 _NAMES = {
     "receipt": "receipt|received|receive|recv|seen|arrival|arrived|rx|"
-    "(receipt|received|receive|recv|arrival|rx|log)_(time|stamp|timestamp)",
+    "(receipt|received|receive|recv|arrival|rx|log|network|sub)_(time|stamp|timestamp)",
     "stamp": "stamp|timestamp|time|t|epoch|secs?|seconds",
     "yaw_rate_radps": "yaw_?rate|turn_rate|heading_rate|omega|angular_(velocity_)?z|gyro_z",
     "range_rate_mps": "range_?rate|doppler|rdot|vr|radial_(velocity|speed)|(velocity|speed)_radial",
@@ -43,13 +43,16 @@ _NAMES = {
     "speed_mps": "speed|velocity|vel|v|sog",
     "velocity x": "vx|dx_dt|vlong",
     "velocity y": "vy|dy_dt|vlat",
+    "latitude_deg": "lat|latitude",
+    "longitude_deg": "lon|lng|long|longitude",
     "x_m": "px|east|easting|e|dx|longitudinal|utm_x",
     "y_m": "py|north|northing|n|dy|lateral|utm_y",
     "length_m": "length|l",
     "width_m": "width|w",
     "height_m": "height|h",
     "score": "score|confidence|prob|probability",
-    "object_id": "id|uid|uuid|(track|object|obj|target|car|vehicle)_?id|mmsi|icao24|track|object|target",
+    "id": "icao|icao24|hex|mmsi|(icao|mode_?s)_?address|station_?id",
+    "object_id": "id|uid|uuid|(track|object|obj|target|car|vehicle)_?id|track|object|target",
     "class_name": "class|class_name|label|category|type|kind|classification",
 }
 _PERIOD_S = (5e-4, 20.0)  # of a source
@@ -164,7 +167,7 @@ def _component(name: str) -> tuple[str | None, str]:
 def _converted(component: str, unit: str, name: str, samples: Sequence[float]) -> Guess:
     finite = [value for value in samples if math.isfinite(value)]
     spread = f"{min(finite):.4g} to {max(finite):.4g}" if finite else "no numbers"
-    if component in ("stamp", "receipt", "object_id", "class_name"):
+    if component in ("stamp", "receipt", "object_id", "id", "class_name"):
         return Guess(name, "by its name")
     is_rate = component in ("speed_mps", "range_rate_mps", "velocity x", "velocity y")
     scale = _SCALES["mps" if is_rate else "m"].get(unit, 1.0)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
 from fgtrack.core.errors import DataError
-from fgtrack.core.files import open_file
+from fgtrack.core.files import GZIP_MAGIC, open_file
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.io.errors import TruncatedInput, UntilBreak
 from fgtrack.io.geodetic import GEODETIC, LocalPlane
@@ -25,7 +25,7 @@ from fgtrack.io.validation import InvalidMessageError, validated_message
 STREAM_FORMAT = "fgtrack-stream/1"
 SETTINGS = "settings"
 """Entry of the header record with what the recording carries of a configuration."""
-GZIP_MAGIC = b"\x1f\x8b"
+PACKED_TABLES = (".csv.gz", ".tsv.gz", ".txt.gz")
 _logger = logging.getLogger(__name__)
 _KINDS: dict[str, type[Message]] = {"ego": EgoState, "detections": DetectionList, "truth": TruthState}
 _Made = TypeVar("_Made")
@@ -56,7 +56,8 @@ def _recognises(path: Path) -> bool:
         return False
     with path.open("rb") as file:
         start = file.read(64)
-    return start.startswith(GZIP_MAGIC) or start.lstrip().startswith(b"{")
+    is_packed = start.startswith(GZIP_MAGIC) and not path.name.endswith(PACKED_TABLES)
+    return is_packed or start.lstrip().startswith(b"{")
 
 
 FORMAT = FileFormat(

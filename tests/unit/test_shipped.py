@@ -35,7 +35,7 @@ def test_maps_and_settings_go_before_what_the_file_says() -> None:
     ("name", "message"),
     [
         ("smothr", "smothr: there is no such configuration file, did you mean 'smoother'?"),
-        ("zzz", "shipped are autoferry, karle2023, karle2023_reference, kitti, open_space, racecar"),
+        ("zzz", "shipped are adsb, airport, ais, autoferry, karle2023, karle2023_reference, kitti, open_space"),
         ("smother.yaml", "smother.yaml: there is no such configuration file"),
         ("some/smoother", "some/smoother: there is no such configuration file"),
     ],

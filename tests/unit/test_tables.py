@@ -1,5 +1,6 @@
 """CSV files by a mapping of their columns."""
 
+import gzip
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -210,3 +211,60 @@ def test_the_mapping_is_written_in_the_configuration(tmp_path):
     raw = {"input": {"csv": {"detections": {"radar": {"file": "radar.csv", "columns": columns}}}}}
     (first, _) = open_input(tmp_path, validate(Config, raw, "test").input).messages()
     assert [item.y_m for item in first.objects] == [-2.0, 2.0]
+
+
+REPORTS = {
+    "flights.csv": "time,received,lat,lon,icao24\n10,11,41.3,2.08,4ca911\n12,14,41.31,2.08,4ca911\n",
+    "ships.csv": "t;mmsi;latitude;longitude\n10;244730036;41.3;2.08\n12;244730036;41.31;2.08\n",
+    "cars.txt.gz": "pub_time(ms) sub_time(ms) utmX(m) utmY(m) v \n1000 1100 0.0 0.0 1 \n1200 1300 0.0 1110.7 1 \n",
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "sensor", "delay_s"),
+    [(n, s, d) for n, s, d in zip(REPORTS, ("adsb", "ais", "reports"), (2.0, 0.0, 0.1), strict=True)],
+)
+def test_position_reports_need_no_mapping(tmp_path, name, sensor, delay_s):
+    text = REPORTS[name].encode()
+    (tmp_path / name).write_bytes(gzip.compress(text) if name.endswith(".gz") else text)
+    for path in (tmp_path, tmp_path / name):
+        last = list(open_input(path).messages())[-1]
+        assert isinstance(last, DetectionList)
+        assert (last.sensor, last.frame) == (sensor, "map")
+        assert (last.receipt_ns - last.stamp_ns) / 1e9 == delay_s
+        assert last.objects[0].y_m == pytest.approx(1110.7, abs=0.5)
+
+
+def test_several_tables_of_reports_are_not_one_recording(tmp_path):
+    for name in ("flights.csv", "ships.csv"):
+        (tmp_path / name).write_text(REPORTS[name])
+    with pytest.raises(CallError, match="holds 2 tables of reports, name one"):
+        open_input(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "time_ns"),
+    [
+        ("2024-01-02 07:41:03Z.515", 1704181263_515000000),
+        ("2024-01-02T07:41:03.515Z", 1704181263_515000000),
+        ("2024-01-02T08:41:03+01:00", 1704181263_000000000),
+    ],
+)
+def test_times_may_be_dates(tmp_path, text, time_ns):
+    (tmp_path / "a.csv").write_text(f"time,lat,lon\n{text},41.3,2.08\n")
+    assert next(open_input(tmp_path).messages()).stamp_ns == time_ns
+
+
+def test_rows_that_repeat_a_position_are_left_out_and_unnamed_columns_ignored(tmp_path):
+    (tmp_path / "a.csv").write_text(
+        "time,lat,lon,hex,no_position,,\n1,41.3,2.08,0x4ca911,P,x,y\n2,41.3,2.08,0x4ca911,N,x,y\n"
+    )
+    (one,) = open_input(tmp_path).messages()
+    assert one.objects[0].id == "4CA911"
+    assert one.left_out == ("filters.no_position",)
+
+
+def test_one_wrong_clock_among_many_does_not_make_a_table_years_long(tmp_path):
+    rows = "".join(f"2024-01-02 07:41:{k % 60:02}.{k},41.3,2.08\n" for k in range(120))
+    (tmp_path / "a.csv").write_text(f"time,lat,lon\n1970-01-01 00:00:00,41.3,2.08\n{rows}")
+    assert len(list(open_input(tmp_path).messages())) == 121

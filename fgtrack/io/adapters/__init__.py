@@ -18,6 +18,8 @@ ADAPTERS = Registry(
             "fusiontracking": "fgtrack.io.adapters.fusiontracking:FORMAT",
             "nuscenes": "fgtrack.io.adapters.nuscenes:FORMAT",
             "kitti": "fgtrack.io.adapters.kitti:FORMAT",
+            "asterix": "fgtrack.io.adapters.asterix:FORMAT",
+            "nmea": "fgtrack.io.adapters.nmea:FORMAT",
             "autoware_auto_perception_msgs/msg/DetectedObjects": f"{_OBJECTS}:autoware_objects",
             "autoware_perception_msgs/msg/DetectedObjects": f"{_OBJECTS}:autoware_objects",
             "autoware_auto_perception_msgs/msg/TrackedObjects": f"{_OBJECTS}:autoware_objects",

@@ -5,29 +5,42 @@ cell a missing value. Columns are converted as in `fields.mapped`. Rows are sort
 """
 
 import csv
+import gzip
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import re
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from datetime import datetime
+from decimal import Decimal
 from functools import partial
 from io import TextIOWrapper
-from itertools import chain
+from itertools import chain, islice
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 from fgtrack.core.errors import CallError, DataError
-from fgtrack.core.files import open_file
+from fgtrack.core.files import GZIP_MAGIC, open_file
 from fgtrack.core.time import wrong_unit
 from fgtrack.core.types import MEASURABLE, STATE_NAMES, Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.io.adapters.common import exact_ns
 from fgtrack.io.adapters.fields import COMPONENTS, FieldError, mapped, paths_of, single_path
 from fgtrack.io.adapters.fusiontracking import LOG_NAME
-from fgtrack.io.config import CsvTable, InputConfig
+from fgtrack.io.config import CsvTable, FieldPath, InputConfig
 from fgtrack.io.geodetic import GEODETIC, LocalPlane
+from fgtrack.io.guess import guesses, time_unit, words_of
 from fgtrack.io.source import FileFormat
+from fgtrack.io.stream import PACKED_TABLES
+from fgtrack.models.sensors import Filter
 
-_ENDINGS = (".csv", ".tsv")
+_ENDINGS = (".csv", ".tsv", *PACKED_TABLES)
 _LONGEST_HEADER = 1_000_000
+_SAMPLES = 200
+_DATE = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)Z?(\.\d+)?(?:Z|([+-]\d\d:\d\d))?")
+_IN_MAP = frozenset(("east", "easting", "north", "northing", "utm"))
+#: Of Flightradar24's granular ADS-B data: P of a message with a position, N of one that repeats the last.
+_HAS_POSITION = {"no_position": Filter(one_of=("P",))}
 _TIMES = ("stamp", "receipt")
 #: Components of the rows of the ego and of truth, and those that must be there; all others are of detections.
 _NAMES = {"ego": (*STATE_NAMES, *GEODETIC), "truth": ("object_id", *STATE_NAMES, *GEODETIC)}
@@ -89,7 +102,9 @@ def _read(file: Path, table: CsvTable, role: str, plane: LocalPlane) -> tuple[li
         error = DataError(f"{where}: {wrong}")
     except DataError as broken:
         error = broken
-    if stamps_ns and (text := wrong_unit(len(stamps_ns), min(stamps_ns), max(stamps_ns), table.time_unit)):
+    stamps_ns.sort()
+    few = len(stamps_ns) // 100  # wrong clocks of single rows
+    if stamps_ns and (text := wrong_unit(len(stamps_ns), stamps_ns[few], stamps_ns[-1 - few], table.time_unit)):
         return [], DataError(f"{file}: {text}: change `time_unit` (input.csv.{role})")
     for (stamp_ns, receipt_ns), objects in scans.items():
         counted, left_out = tuple(left_out), []
@@ -105,12 +120,19 @@ def rows(file: Path, delimiter: str | None = None) -> Iterator[tuple[str, Cells]
     """
     where = f"{file}:1"
     try:
-        with TextIOWrapper(open_file(file), encoding="utf-8-sig", errors="replace", newline="") as text:
+        with (
+            open_file(file) as raw,
+            TextIOWrapper(_unpacked(raw), encoding="utf-8-sig", errors="replace", newline="") as text,
+        ):
             first = text.readline(_LONGEST_HEADER)
             text.seek(0)
-            reader = csv.reader(text, delimiter=delimiter or max(",;\t", key=first.count), skipinitialspace=True)
+            separator, lines = delimiter or max(",;\t", key=first.count), iter(text)
+            if separator not in first and delimiter is None and " " in first.strip():
+                separator, lines = " ", (" ".join(line.split()) for line in text)
+            reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)
             header = [name.strip() for name in next(reader, [])]
-            if len(set(header)) < len(header):
+            named = [name for name in header if name]
+            if len(set(named)) < len(named):
                 raise DataError(f"{where}: has a column twice: {', '.join(header)}")
             yield where, dict(zip(header, header, strict=True))
             for cells in filter(any, reader):
@@ -118,8 +140,24 @@ def rows(file: Path, delimiter: str | None = None) -> Iterator[tuple[str, Cells]
                 if len(cells) != len(header):
                     raise DataError(f"{where}: has {len(cells)} cells, the header has {len(header)}")
                 yield where, dict(zip(header, map(str.strip, cells), strict=True))
-    except (OSError, csv.Error) as error:
+    except (OSError, EOFError, zlib.error, csv.Error) as error:
         raise DataError(f"{where}: cannot be read any further ({error})") from error
+
+
+def _unpacked(raw: BinaryIO) -> BinaryIO:
+    """The file `raw` for reading, unpacked if it is gzipped."""
+    is_packed = raw.read(2) == GZIP_MAGIC
+    raw.seek(0)
+    return cast(BinaryIO, gzip.GzipFile(fileobj=raw)) if is_packed else raw
+
+
+def _time_ns(text: str, unit: str) -> int:
+    """Integer nanoseconds of a number in `unit`, or of a date and time (ISO 8601, UTC unless it has a zone)."""
+    if (date := _DATE.fullmatch(text)) is None:
+        return exact_ns(text, unit)
+    day, time, fraction, zone = date.groups()
+    whole_s = datetime.fromisoformat(f"{day}T{time}{zone or '+00:00'}").timestamp()
+    return exact_ns(Decimal(int(whole_s)) + Decimal(fraction or 0))
 
 
 def _excluding_filter(table: CsvTable, cells: Cells) -> str | None:
@@ -146,7 +184,7 @@ def _times(cells: Cells, table: CsvTable) -> tuple[int, int]:
     for name in _TIMES:
         column = single_path(table.columns.get(name, table.columns["stamp"]))
         try:
-            times.append(exact_ns(cells[column], table.time_unit))
+            times.append(_time_ns(cells[column], table.time_unit))
         except (ArithmeticError, ValueError) as error:
             text = f"{cells[column]!r:.40} is not a time in {table.time_unit}"
             raise FieldError(f"{column}: {text}, or change `time_unit`") from error
@@ -156,14 +194,16 @@ def _times(cells: Cells, table: CsvTable) -> tuple[int, int]:
 
 def _recognises(path: Path) -> bool:
     if path.is_dir():
-        return not (path / "meta.json").exists() and any(file.suffix in _ENDINGS for file in path.iterdir())
-    return path.suffix in _ENDINGS and path.name != LOG_NAME  # which is not an input by itself
+        return not (path / "meta.json").exists() and any(file.name.endswith(_ENDINGS) for file in path.iterdir())
+    return path.name.endswith(_ENDINGS) and path.name != LOG_NAME  # which is not an input by itself
 
 
 def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
     sensors = {f"detections.{name}": table for name, table in config.csv.detections.items()}
     named = {"truth": config.csv.truth, "ego": config.csv.ego, **sensors}
     tables = [(_file(path, table, role), table, role) for role, table in named.items() if table is not None]
+    if not tables:
+        tables = reports_of(path)
     if not tables:
         found = "; ".join(f"{file.name} has {', '.join(columns)}" for file, columns in headers(path).items())
         raise CallError(
@@ -172,9 +212,45 @@ def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
     return partial(read_tables, tables, LocalPlane(config.origin))
 
 
+def reports_of(path: Path) -> list[tuple[Path, CsvTable, str]]:
+    """The one table of position reports at `path`, with a mapping by the names of its columns; empty without any.
+    Taken are times, positions in the map (latitude and longitude, or east and north) and identities; the sensor is
+    `adsb` or `ais` by the column of these, else `reports`. Raises `CallError` where there are several.
+    """
+    tables: list[tuple[Path, CsvTable, str]] = []
+    for file, names in headers(path).items():
+        cells = [each for _, each in islice(rows(file), 1, _SAMPLES)]
+        own = guesses({name: _numbers(each[name] for each in cells) for name in names if name})
+        known = ("stamp", "receipt", *GEODETIC, "id")
+        columns: dict[str, FieldPath] = {key: own[key].path for key in known if key in own}
+        if not {*GEODETIC} <= columns.keys():
+            columns |= {key: own[key].path for key in ("x_m", "y_m") if key in own}
+            if not all(set(words_of(str(columns.get(key, "")))) & _IN_MAP for key in ("x_m", "y_m")):
+                continue
+        if "stamp" not in columns:
+            continue
+        unit, _ = time_unit(str(columns["stamp"]), _numbers(each[str(columns["stamp"])] for each in cells))
+        words = set(words_of(str(columns.get("id", ""))))
+        sensor = "ais" if "mmsi" in words else "adsb" if words else "reports"
+        filters = {name: rule for name, rule in _HAS_POSITION.items() if name in names}
+        table = CsvTable(columns, None, unit, frame="map", filters=filters)  # type: ignore[arg-type]  # of NS_PER_UNIT
+        tables.append((file, table, f"detections.{sensor}"))
+    if len(tables) > 1:
+        raise CallError(f"{path}: holds {len(tables)} tables of reports, name one, as {tables[0][0]}, or input.csv")
+    return tables
+
+
+def _numbers(texts: Iterable[str]) -> list[float]:
+    numbers = []
+    for text in texts:
+        with suppress(ValueError):
+            numbers.append(float(text))
+    return numbers
+
+
 def headers(path: Path) -> dict[Path, list[str]]:
     """Columns of the CSV file `path`, or of every one in the folder, by file. Raises `DataError` as `read_tables`."""
-    files = sorted(file for file in path.iterdir() if file.suffix in _ENDINGS) if path.is_dir() else [path]
+    files = sorted(file for file in path.iterdir() if file.name.endswith(_ENDINGS)) if path.is_dir() else [path]
     return {file: list(next(rows(file))[1]) for file in files}
 
 

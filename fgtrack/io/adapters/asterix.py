@@ -1,0 +1,257 @@
+"""ASTERIX recordings of air traffic surveillance (EUROCONTROL): categories 010, 020, 021, 048 and 062.
+
+Read with libasterix (extra `asterix`), which has every edition and decodes what is asked for. Times are seconds of the
+UTC day; the recording has no date. A category with two times of a position (021) gives stamp and receipt; of the others
+the receipt is the newest stamp up to the record in its file, a lower bound. Records of one sensor with equal times are
+one list.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from heapq import merge
+from itertools import groupby
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.files import open_file
+from fgtrack.core.geometry import wrap_angle
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import Detection, DetectionList, Message
+from fgtrack.io.config import AsterixInput, InputConfig, Origin
+from fgtrack.io.errors import TruncatedInput, UntilBreak
+from fgtrack.io.geodetic import LocalPlane
+from fgtrack.io.source import FileFormat
+
+_DAY_NS = 86_400 * NS_PER_S
+_NM_M, _FOOT_M = 1852.0, 0.3048
+_PER_95 = 2.4477  # radius with 95 % of a circular Gaussian, in standard deviations
+#: Radius in m and speed in m/s that hold 95 % of the errors: NACp and NACv of DO-260B (RTCA, 2009), tables 2-71 and
+#: 2-22; and NUCp of DO-260 (2000), table 2-11, of version 0.
+_NACP_M = {
+    11: 3.0,
+    10: 10.0,
+    9: 30.0,
+    8: 92.6,
+    7: 185.2,
+    6: 555.6,
+    5: 926.0,
+    4: 1852.0,
+    3: 3704.0,
+    2: 7408.0,
+    1: 18520.0,
+}
+_NUCP_M = {9: 3.0, 8: 10.0, 7: 92.6, 6: 185.2, 5: 463.0, 4: 926.0, 3: 1852.0, 2: 9260.0, 1: 18520.0}
+_NACV_MPS = {4: 0.3, 3: 1.0, 2: 3.0, 1: 10.0}
+_UNKNOWN_MPS = 10.0
+_KINDS = {0: "mlat", 1: "mlat", 2: "adsb", 3: "smr", 5: "mlat"}
+"""Sensor by the type of a report of category 010: multilateration, ADS-B, primary RADAR."""
+_TARGET_REPORT = 1
+Record = Any  # libasterix makes a class of every edition of every category
+
+
+class _Category(NamedTuple):
+    """Items of a category, by number or number/part; the first that a record has counts."""
+
+    sensor: str
+    stamp: tuple[str, ...]
+    receipt: tuple[str, ...]
+    """None: there is no second time."""
+    address: str
+    positions: tuple[tuple[str, str, str], ...]
+    """Items with their parts LAT and LON, X and Y, or RHO and THETA."""
+    velocity: tuple[str, str, str]
+    """Item with its parts VX and VY, or speed and direction."""
+    height: str
+    unit_m: float = 1.0
+    """Of X and Y."""
+
+
+_WGS84, _CARTESIAN, _POLAR = ("041", "LAT", "LON"), ("042", "X", "Y"), ("040", "RHO", "THETA")
+_GNSS = (("131", "LAT", "LON"), ("130", "LAT", "LON"))
+_SYSTEM = (("105", "LAT", "LON"), ("100", "X", "Y"))
+_CATEGORIES = {
+    10: _Category("", ("140",), (), "220", (_WGS84, _CARTESIAN, _POLAR), ("202", "VX", "VY"), "090/FL"),
+    20: _Category("mlat", ("140",), (), "220", (_WGS84, _CARTESIAN), ("202", "VX", "VY"), "090/FL"),
+    21: _Category("adsb", ("073", "071", "030"), ("077",), "080", _GNSS, ("160", "GS", "TA"), "145"),
+    48: _Category("radar", ("140",), (), "220", (_POLAR, _CARTESIAN), ("200", "GSP", "HDG"), "090/FL", _NM_M),
+    62: _Category("system", ("070",), (), "380/ADR", _SYSTEM, ("185", "VX", "VY"), "136"),
+}
+
+
+def _recognises(path: Path) -> bool:
+    if path.is_dir():
+        return any(path.glob("*.ast"))
+    return path.suffix == ".ast"
+
+
+def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
+    try:
+        from asterix.base import Bits
+        from asterix.generated import manifest
+    except ImportError as error:
+        raise CallError(f"{path}: is ASTERIX, install its reader: pip install 'fgtrack[asterix]'") from error
+    editions = {number: _edition(manifest["CATS"][number], number, config.asterix) for number in _CATEGORIES}
+    parsers = {number: lambda raw, own=own: own.cv_uap.parse(Bits.from_bytes(raw)) for number, own in editions.items()}
+    files = sorted(path.glob("*.ast")) if path.is_dir() else [path]
+    plane = LocalPlane(config.origin or next(iter(config.asterix.stations.values()), None))
+    return partial(_merged, files, parsers, config.asterix, plane)
+
+
+def _edition(known: Iterable[Any], number: int, given: AsterixInput) -> Any:  # Any: a class of libasterix
+    """The edition of category `number` that is set, else the newest. Raises `CallError` where there is none such."""
+    by_name = {".".join(map(str, each.cv_edition)): each for each in known}
+    name = given.editions.get(number, next(reversed(by_name)))
+    if name not in by_name:
+        raise CallError(f"input.asterix.editions: category {number} has {', '.join(by_name)}, not {name}")
+    return by_name[name]
+
+
+FORMAT = FileFormat("ASTERIX (.ast, or a folder of them)", _recognises, _open)
+
+
+def _merged(files: list[Path], parsers: Mapping[int, Any], given: AsterixInput, plane: LocalPlane) -> Iterator[Message]:
+    readable = [UntilBreak(_reports(file, parsers, given, plane)) for file in files]
+    ordered = merge(*readable, key=attrgetter("receipt_ns"))
+    for _, group in groupby(ordered, key=attrgetter("sensor", "stamp_ns", "receipt_ns")):
+        lists = list(group)
+        yield replace(lists[0], objects=tuple(item for each in lists for item in each.objects))
+    for each in readable:
+        each.raise_error()
+
+
+def _reports(file: Path, parsers: Mapping[int, Any], given: AsterixInput, plane: LocalPlane) -> Iterator[DetectionList]:
+    """Target reports of `file`, a list of one object each, in the order of the file."""
+    newest_ns = day_ns = 0
+    sites = {number: _Site(plane, station) for number, station in given.stations.items()}
+    for number, record in _records(file, parsers):
+        own = _CATEGORIES[number]
+        if number == 10 and _number(record, "000") != _TARGET_REPORT:
+            continue
+        stamp_s = _first(record, (given.stamp[number],) if number in given.stamp else own.stamp)
+        receipt_s = _first(record, (given.receipt[number],) if number in given.receipt else own.receipt)
+        station = _number(record, "010/SIC")
+        item = _detection(record, number, own, sites.get(int(station or 0), _Site(plane, None)), plane)
+        if stamp_s is None or item is None:
+            continue
+        stamp_ns = round(stamp_s * NS_PER_S) + day_ns
+        if abs(stamp_ns - newest_ns) > _DAY_NS // 2 and newest_ns:  # midnight
+            change_ns = _DAY_NS if stamp_ns < newest_ns else -_DAY_NS
+            day_ns, stamp_ns = max(day_ns + change_ns, day_ns), stamp_ns + change_ns
+        receipt_ns = stamp_ns
+        if receipt_s is not None:
+            receipt_ns += round((receipt_s - stamp_s) % 86_400.0 * NS_PER_S)
+        newest_ns = max(newest_ns, receipt_ns)
+        sensor = own.sensor or _KINDS.get(int(_number(record, "020/TYP") or 0), "other")
+        yield DetectionList(sensor, stamp_ns, newest_ns, (item,), "map", origin_deg=plane.origin_deg)
+
+
+def _records(file: Path, parsers: Mapping[int, Any]) -> Iterator[tuple[int, Record]]:
+    """Category and record of everything in `file` that is read. Raises `TruncatedInput` and `DataError`."""
+    at = 0
+    with open_file(file) as blocks:
+        while head := blocks.read(3):
+            number, length = head[0], int.from_bytes(head[1:], "big")
+            content = blocks.read(max(length - 3, 0))
+            if len(head) < 3 or len(content) != length - 3:
+                raise TruncatedInput(f"{file}: breaks off in the block at byte {at}")
+            records = parsers[number](content) if number in parsers else []
+            if isinstance(records, ValueError):
+                hint = f"another edition? (input.asterix.editions: {{{number}: ...}})"
+                raise DataError(f"{file}: cannot decode category {number} at byte {at}, {hint}")
+            for record in records:
+                yield number, record
+            at += length
+
+
+class _Site:
+    """Position of a station in the plane, and the axes of its own plane there: the meridians converge."""
+
+    def __init__(self, plane: LocalPlane, station: Origin | None) -> None:
+        self._x_m = self._y_m = self._turn_rad = 0.0
+        if station is not None:
+            self._x_m, self._y_m = plane.position_m(station.latitude_deg, station.longitude_deg)
+            x_m, y_m = plane.position_m(min(station.latitude_deg + 0.01, 90.0), station.longitude_deg)
+            self._turn_rad = math.atan2(x_m - self._x_m, y_m - self._y_m)
+
+    def position_m(self, x_m: float, y_m: float) -> tuple[float, float]:
+        """Position in the plane of `x_m` to the east and `y_m` to the north of the station."""
+        c, s = math.cos(self._turn_rad), math.sin(self._turn_rad)
+        return self._x_m + c * x_m + s * y_m, self._y_m - s * x_m + c * y_m
+
+
+def _detection(record: Record, number: int, own: _Category, site: _Site, plane: LocalPlane) -> Detection | None:
+    """Object of a target report; None where it has no position."""
+    position = next((at for name in own.positions if (at := _position_m(record, *name, own.unit_m, site, plane))), None)
+    if position is None:
+        return None
+    speed_mps, yaw_rad = _velocity(record, *own.velocity)
+    address, level = _number(record, own.address), _number(record, own.height)
+    return Detection(
+        *position,
+        yaw_rad,
+        speed_mps,
+        covariance=_accuracy(record, speed_mps) if number == 21 else None,
+        z_m=None if level is None else 100.0 * _FOOT_M * level,
+        id=None if address is None else f"{int(address):06X}",
+    )
+
+
+def _position_m(
+    record: Record, item: str, first: str, second: str, unit_m: float, site: _Site, plane: LocalPlane
+) -> tuple[float, float] | None:
+    a, b = _number(record, f"{item}/{first}"), _number(record, f"{item}/{second}")
+    if a is None or b is None:
+        return None
+    if first == "LAT":
+        return plane.position_m(a, b)
+    if first == "RHO":
+        a, b = a * math.sin(math.radians(b)), a * math.cos(math.radians(b))
+    return site.position_m(unit_m * a, unit_m * b)
+
+
+def _velocity(record: Record, item: str, first: str, second: str) -> tuple[float | None, float | None]:
+    """Speed over ground, and its direction where it moves; None where it is not reported."""
+    a, b = _number(record, f"{item}/{first}"), _number(record, f"{item}/{second}")
+    if a is None or b is None:
+        return None, None
+    if first == "VX":
+        return math.hypot(a, b), math.atan2(b, a) if a or b else None
+    return a * _NM_M, wrap_angle(math.radians(90.0 - b)) if a else None
+
+
+def _accuracy(record: Record, speed_mps: float | None) -> tuple[float, ...] | None:
+    """Covariance of the measured components by the accuracy categories; None where the position has none."""
+    radius_m = _NACP_M.get(int(_number(record, "090/NACP") or 0))
+    if not radius_m and _number(record, "210/VN") == 0:
+        radius_m = _NUCP_M.get(int(_number(record, "090/NUCPNIC") or 0))
+    if radius_m is None:
+        return None
+    variances = [(radius_m / _PER_95) ** 2] * 2
+    if speed_mps is not None:
+        std_mps = _NACV_MPS.get(int(_number(record, "090/NUCRNACV") or 0), _UNKNOWN_MPS) / _PER_95
+        variances += [(std_mps / max(speed_mps, std_mps)) ** 2] * bool(speed_mps) + [std_mps**2]
+    size = len(variances)
+    return tuple(variances[row] if row == column else 0.0 for row in range(size) for column in range(size))
+
+
+def _first(record: Record, names: Iterable[str]) -> float | None:
+    return next((value for name in names if (value := _number(record, name)) is not None), None)
+
+
+def _number(record: Record, name: str) -> float | None:
+    """Number of an item, or of its part behind a slash, in the unit of the standard; None where it is not there."""
+    item, _, part = name.partition("/")
+    try:
+        value = record.get_item(item)
+        if value is not None and part:
+            value = value.variation.get_item(part)
+    except (AttributeError, KeyError, ValueError):  # not in this edition
+        return None
+    if value is None:
+        return None
+    content = value.variation.content
+    return float(content.as_quantity() if hasattr(content, "as_quantity") else content.as_uint())

@@ -1,0 +1,103 @@
+"""ASTERIX recordings, made with libasterix."""
+
+import math
+
+import pytest
+
+gen = pytest.importorskip("asterix.generated", reason="libasterix is not installed (extra `asterix`)")
+
+from fgtrack.io.config import AsterixInput, InputConfig, Origin  # noqa: E402
+from fgtrack.io.errors import UntilBreak  # noqa: E402
+from fgtrack.io.source import input_kind, open_input  # noqa: E402
+
+AIRPORT = Origin(41.3, 2.08)
+
+
+def block(kind, *records):
+    return kind.create([kind.cv_record.create(record) for record in records]).unparse().to_bytes()
+
+
+def surface(time_s, x_m, y_m, kind=3, address=None, sic=7):
+    target = {"220": address} if address else {}
+    head = {"010": (("SAC", 0), ("SIC", sic)), "000": 1, "140": (time_s, "s")}
+    where = {"042": (("X", (x_m, "m")), ("Y", (y_m, "m"))), "202": (("VX", (3.0, "m/s")), ("VY", (4.0, "m/s")))}
+    return block(gen.Cat_010_1_1, {**head, "020": ((("TYP", kind), 0, 0, 0, 0, None),), **where, **target})
+
+
+def aircraft(received_s, sent_s, latitude, longitude, kind=gen.Cat_021_2_6, nacp=9, address=0x4CACAA):
+    quality = ((0, 7, None), (0, 0, nacp, None))
+    return block(
+        kind,
+        {
+            "010": (("SAC", 0), ("SIC", 1)),
+            "080": address,
+            "073": (received_s, "s"),
+            "077": (sent_s, "s"),
+            "131": (("LAT", (latitude, "°")), ("LON", (longitude, "°"))),
+            "145": (100.0, "FL"),
+            "160": (("RE", 0), ("GS", (0.1, "NM/s")), ("TA", (90.0, "°"))),
+            "090": quality,
+        },
+    )
+
+
+def lists(path, **settings):
+    return list(open_input(path, InputConfig(**settings)).messages())
+
+
+def test_a_report_of_an_aircraft_has_both_times_identity_and_accuracy(tmp_path):
+    (tmp_path / "a.ast").write_bytes(aircraft(100.5, 100.75, 41.31, 2.08) + aircraft(99.5, 101.0, 41.3, 2.09, nacp=0))
+    assert input_kind(tmp_path) == input_kind(tmp_path / "a.ast") == "asterix"
+    first, second = lists(tmp_path / "a.ast", origin=AIRPORT)
+    (item,) = first.objects
+    assert (first.sensor, first.frame, first.stamp_ns, first.receipt_ns) == (
+        "adsb",
+        "map",
+        100_500_000_000,
+        100_750_000_000,
+    )
+    assert (item.id, item.y_m) == ("4CACAA", pytest.approx(1110.7, abs=1.0))
+    assert (item.speed_mps, item.yaw_rad) == (pytest.approx(185.2, abs=0.3), pytest.approx(0.0, abs=1e-3))
+    assert item.z_m == pytest.approx(10_000 * 0.3048)
+    assert math.sqrt(item.covariance[0]) == pytest.approx(30.0 / 2.4477)
+    assert second.objects[0].covariance is None  # NACp 0: unknown, and a later version
+    assert (second.stamp_ns, second.receipt_ns) == (99_500_000_000, 101_000_000_000)
+
+
+def test_the_items_of_the_times_are_settings(tmp_path):
+    (tmp_path / "a.ast").write_bytes(aircraft(100.5, 100.75, 41.31, 2.08))
+    (one,) = lists(tmp_path / "a.ast", asterix=AsterixInput(stamp={21: "077"}, receipt={21: "077"}))
+    assert one.stamp_ns == one.receipt_ns == 100_750_000_000
+
+
+def test_records_of_one_stamp_are_one_list_and_each_station_has_its_place(tmp_path):
+    smr = surface(50.0, 100.0, 0.0) + surface(50.0, 200.0, 0.0) + surface(49.5, 0.0, 50.0)
+    (tmp_path / "smr.ast").write_bytes(smr)
+    (tmp_path / "mlat.ast").write_bytes(surface(50.25, 0.0, 0.0, kind=1, address=0x4CA911, sic=107))
+    stations = {7: AIRPORT, 107: Origin(AIRPORT.latitude_deg + 0.01, AIRPORT.longitude_deg)}
+    first, late, other = lists(tmp_path, asterix=AsterixInput(stations=stations))
+    assert [item.x_m for item in first.objects] == pytest.approx([100.0, 200.0], abs=1e-3)
+    assert (first.sensor, other.sensor) == ("smr", "mlat")
+    assert (first.objects[0].speed_mps, first.objects[0].yaw_rad) == (5.0, pytest.approx(math.atan2(4.0, 3.0)))
+    assert late.receipt_ns - late.stamp_ns == 500_000_000  # the newest stamp before it
+    assert other.objects[0].y_m == pytest.approx(1110.7, abs=1.0)
+    assert other.objects[0].id == "4CA911"
+
+
+def test_stamps_go_on_at_midnight(tmp_path):
+    (tmp_path / "a.ast").write_bytes(b"".join(surface(t, 0.0, 9.0) for t in (86_399.5, 0.5, 86_399.75, 1.0)))
+    assert [each.stamp_ns / 1e9 for each in lists(tmp_path / "a.ast")] == [86_399.5, 86_400.5, 86_399.75, 86_401.0]
+
+
+def test_a_damaged_file_is_one_line_behind_what_is_before(tmp_path):
+    whole = surface(50.0, 100.0, 0.0)
+    (tmp_path / "a.ast").write_bytes(whole + whole[:-3])
+    readable = UntilBreak(open_input(tmp_path / "a.ast").messages())
+    assert [each.stamp_ns for each in readable] == [50_000_000_000]
+    assert f"breaks off in the block at byte {len(whole)}" in str(readable.error)
+
+
+def test_an_unknown_edition_is_named(tmp_path):
+    (tmp_path / "a.ast").write_bytes(surface(50.0, 100.0, 0.0))
+    with pytest.raises(Exception, match=r"category 21 has 0\.23, .* not 9\.9"):
+        lists(tmp_path / "a.ast", asterix=AsterixInput(editions={21: "9.9"}))
