@@ -15,6 +15,7 @@ The standard deviation of d is that of the jackknife over stretches of time, so 
 stretches count, the larger ones more (Carter, Schnepel, Steigerwald, Review of Economics and Statistics 99, 2017).
 """
 
+import itertools
 import math
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +31,7 @@ from fgtrack.core.geometry import rotations
 from fgtrack.core.linalg import psd_solve
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import DetectionList, EgoState, FloatArray, IntArray, Message
-from fgtrack.io.run import Run
+from fgtrack.io.run import COLUMNS, Run
 from fgtrack.pipeline.clock import corrected
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_in_memory
@@ -184,7 +185,9 @@ def estimate_offsets(
         )
     needs_ego = any(item.frame != "map" for item in lists)
     run = replay_in_memory(heard, config) if run is None else run
-    ego = EgoPath(item for item in heard if isinstance(item, EgoState)) if needs_ego else None
+    poses = run.tables["ego"]  # where the tracker has the ego, as its tracks
+    states = zip(*(poses[name].tolist() for name in COLUMNS["ego"]), strict=True)
+    ego = EgoPath(itertools.starmap(EgoState, states)) if needs_ego else None
     seen = sightings_of(run, lists, config, ego)
     sensors = [name for name in config.sensors if name in counts]
 

@@ -6,6 +6,7 @@ track, the rest is that of the boxes fused by then. The box in the image is the 
 """
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from fgtrack.core.geometry import rotation, wrap_angle
 from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation.matching import confirmed
 from fgtrack.evaluation.placement import update_rows
+from fgtrack.evaluation.truth import ego_states
 from fgtrack.io.adapters.kitti import CLASS_NAMES, is_sequence, view_of_sequence
 from fgtrack.io.adapters.kitti_view import PERIOD_NS, Box, View
 from fgtrack.io.output import check_apart, write_file
@@ -35,7 +37,7 @@ def write_kitti_result(run: Run, sequence: Path, out: Path, *, overwrite: bool =
     if not is_sequence(sequence):
         raise CallError(f"{sequence}: is not a sequence of the KITTI data set, name its oxts/NNNN.txt")
     check_apart(out, [sequence, *(() if run.path is None else (run.path,))])
-    views = view_of_sequence(sequence)
+    views = _located(run, view_of_sequence(sequence))
     states = _states(run, len(views))
     without = set(states["track_id"][states["length_m"].isna()])
     lines, tracks = [], set()
@@ -50,6 +52,16 @@ def write_kitti_result(run: Run, sequence: Path, out: Path, *, overwrite: bool =
         )
     write_file(out, "".join(lines), overwrite)
     return len(lines), len(tracks), len(without - tracks)
+
+
+def _located(run: Run, views: list[View]) -> list[View]:
+    """Return `views` with the positions of the ego in ego.csv, in which the tracks are."""
+    frames_ns = np.arange(len(views)) * PERIOD_NS
+    positions = ego_states(run.tables["ego"], frames_ns)[:, :2].tolist()
+    return [
+        view if math.isnan(x_m) else view._replace(ego=replace(view.ego, x_m=x_m, y_m=y_m))
+        for view, (x_m, y_m) in zip(views, positions, strict=True)
+    ]
 
 
 def _states(run: Run, num_frames: int) -> DataFrame:

@@ -142,4 +142,4 @@ def _build_ego(config: Config) -> EgoTrajectory:
     if "refiltered_ego" in config.defects:
         step_ns = period_ns(config.filter.frequency_hz)
         return PublishedEgo(ego.yaw_weight, ego.yaw_rate_weight, step_ns, _EGO_STORAGE_TICKS, known)
-    return EgoTrajectory(ego.yaw_weight, ego.yaw_rate_weight, std=known)
+    return EgoTrajectory(ego.yaw_weight, ego.yaw_rate_weight, std=known, position_time_s=ego.position_time_s)

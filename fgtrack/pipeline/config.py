@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import Discriminator, Field, NonNegativeFloat, Tag
+from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat, Tag
 
-from fgtrack.core.settings import settings
+from fgtrack.core.settings import require, settings
 from fgtrack.estimation.filters.initiation import DEFAULT, Initiation
 from fgtrack.estimation.registry import ESTIMATORS, motion_model
 from fgtrack.estimation.smoothing.settings import SmootherSettings
@@ -80,12 +80,19 @@ class EgoConfig:
     an error of its own."""
     position_std_m: NonNegativeFloat = 0.0
     """Standard deviation of the ego's x and y where the recording gives no covariance of them."""
+    position_time_s: PositiveFloat | None = None
+    """Time over which their error wanders, as that of GNSS positions: they are then fused with speed and yaw, by their
+    standard deviations. null: positions as reported, with independent errors."""
     yaw_std_rad: NonNegativeFloat = 0.0
     """The same of its yaw."""
     speed_std_mps: NonNegativeFloat = 0.0
     """The same of its speed."""
     yaw_rate_std_radps: NonNegativeFloat = 0.0
     """The same of its yaw rate."""
+
+    def __post_init__(self) -> None:
+        fused = self.position_time_s is not None
+        require(not fused or self.uncertainty != "none", "uncertainty", "`independent` with position_time_s", "none")
 
     @property
     def detection_origin_m(self) -> tuple[float, float]:

@@ -139,9 +139,7 @@ def _drive(
             if isinstance(message, TruthState):
                 writer.write_truth(message)
                 continue
-            if isinstance(message, EgoState):
-                writer.write_ego(message)
-            else:
+            if isinstance(message, DetectionList):
                 writer.write_detections(message)
             yield message
 
@@ -149,6 +147,8 @@ def _drive(
         before_ns = perf_counter_ns()
         for message in tick.messages:
             tracker.receive(message)
+            if isinstance(message, EgoState):
+                writer.write_ego(tracker.located(message))
         report = tracker.tick(tick.now_ns)
         process_ns = perf_counter_ns() - before_ns
         num_detections = sum(len(item.objects) for item in tick.messages if isinstance(item, DetectionList))

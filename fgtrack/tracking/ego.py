@@ -2,7 +2,7 @@
 
 import bisect
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import lru_cache
 from operator import attrgetter
 from typing import NamedTuple
@@ -14,6 +14,7 @@ from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.linalg import ASYMMETRY, congruence, is_covariance, symmetrise
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import EgoState, FloatArray
+from fgtrack.models.dead_reckoning import Reckoned, ReportedErrors, reckoned
 
 #: A detection whose stamp is further than this from any ego state cannot be placed, in a gap neither.
 MAX_EXTRAPOLATION_S = 1.0
@@ -28,6 +29,8 @@ _STRAIGHT_RAD = 1e-6  # half of a turn below which chord and arc are the same
 _FIELDS = [field.name for field in fields(EgoState)]
 _VALUES = attrgetter(*_FIELDS)
 _YAW, _YAW_RATE = _FIELDS.index("yaw_rad"), _FIELDS.index("yaw_rate_radps")
+_REMEMBERED_S = 1.0  # memory of a track; an error of the velocity is independent from one to the next
+_LEAST_STD = 0.01  # m, m/s: no position or speed is reported more exactly
 
 
 class EgoPose(NamedTuple):
@@ -127,14 +130,25 @@ class EgoTrajectory:
     than the sum of half of it, 2 m, and three standard deviations of their positions. A single state that contradicts
     both neighbours is left out; where the states go on from it, the ego has jumped, and is followed. States that never
     fit, of an ego with an unknown speed, are all taken.
+
+    With `position_time_s`, the correlation time of the error of reported positions, these are fused with speed and yaw,
+    see `dead_reckoning`. An error that all poses of a track have in common is no motion of it, so the position of a
+    pose has the variance of a dead reckoning of 1 s, as long as a track remembers, instead of its own.
     """
 
     _straight = False
 
     def __init__(
-        self, yaw_weight: float, yaw_rate_weight: float, std: EgoStd | None = None, memory_s: float = 5.0
+        self,
+        yaw_weight: float,
+        yaw_rate_weight: float,
+        std: EgoStd | None = None,
+        memory_s: float = 5.0,
+        position_time_s: float | None = None,
     ) -> None:
         self._yaw_weight, self._yaw_rate_weight, self._std = yaw_weight, yaw_rate_weight, std
+        self._position_time_s = position_time_s
+        self._reckoned: list[tuple[EgoState, Reckoned]] = []  # states as reported, where they are fused
         self._memory_ns = nanoseconds(memory_s)
         self._newest_ns: int | None = None
         self._last: EgoState | None = None
@@ -164,6 +178,13 @@ class EgoTrajectory:
             return "stamp jumps back"
         self._newest_ns = max(newest_ns, ego.stamp_ns)
         return self._store(ego)
+
+    def located(self, ego: EgoState) -> EgoState:
+        """Return `ego` at the position that is used at its stamp."""
+        if self._position_time_s is None or not is_finite(ego):
+            return ego
+        pose = self.pose_at(ego.stamp_ns, ego.stamp_ns)
+        return ego if pose is None else replace(ego, x_m=pose.x_m, y_m=pose.y_m)
 
     def start_tick(self) -> None:
         """A tick begins; nothing depends on ticks here."""
@@ -213,10 +234,32 @@ class EgoTrajectory:
             self.current = ego
         self._stamps.insert(row, ego.stamp_ns)
         self._states.insert(row, ego)
+        if self._position_time_s is not None:
+            self._reckon(row, self._position_time_s)
         keep = bisect.bisect_left(self._stamps, self._stamps[-1] - self._memory_ns)
         if keep > 64:  # in portions: cutting a list copies it
-            del self._stamps[: keep - 1], self._states[: keep - 1]
+            del self._stamps[: keep - 1], self._states[: keep - 1], self._reckoned[: keep - 1]
         return None
+
+    def _reckon(self, row: int, time_s: float) -> None:
+        """Move the states from a new one at `row` on to where dead reckoning has them."""
+        reported = [self._states[row], *(ego for ego, _ in self._reckoned[row:])]
+        del self._reckoned[row:]
+        for k, ego in enumerate(reported, row):
+            P = _completed(ego.covariance, self._std or EgoStd())
+            P = np.zeros((5, 5)) if P is None else P.copy()
+            variance_m2 = max(0.5 * float(P[0, 0] + P[1, 1]), _LEAST_STD**2)
+            speed_variance = max(float(P[3, 3] + ego.speed_mps**2 * P[2, 2]), _LEAST_STD**2)
+            velocity_mps = ego.speed_mps * math.cos(ego.yaw_rad), ego.speed_mps * math.sin(ego.yaw_rad)
+            errors = ReportedErrors(variance_m2, time_s, speed_variance * _REMEMBERED_S)
+            last = self._reckoned[-1][1] if k else None
+            own = reckoned(last, ego.stamp_ns, (ego.x_m, ego.y_m), velocity_mps, errors)
+            self._reckoned.append((ego, own))
+            P[:2] = P[:, :2] = 0.0
+            P[0, 0] = P[1, 1] = errors.density_m2ps * _REMEMBERED_S
+            x_m, y_m = own.position_m
+            self._states[k] = replace(ego, x_m=x_m, y_m=y_m, covariance=tuple(P.ravel().tolist()))
+        self.current = self._states[-1]
 
     def _extrapolated(self, ego: EgoState, stamp_ns: int) -> EgoPose:
         covariance = None if self._std is None else _completed(ego.covariance, self._std)

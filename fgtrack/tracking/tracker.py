@@ -105,6 +105,10 @@ class Tracker:
         """Number of jumps in the ego's states, see `EgoTrajectory`."""
         return self._parts.ego.jumps
 
+    def located(self, ego: EgoState) -> EgoState:
+        """Return `ego`, which was received, at the position that is used at its stamp."""
+        return self._parts.ego.located(ego)
+
     def receive(self, message: EgoState | DetectionList) -> None:
         """Take a message. Raises `DataError` for a sensor that has no model, and for an unknown frame."""
         if isinstance(message, EgoState):

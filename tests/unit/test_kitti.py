@@ -33,10 +33,10 @@ def test_a_frame_gives_truth_ego_and_the_detections_of_every_folder(tmp_path):
         ("EgoState", 0, ""),
         ("DetectionList", 0, "camera"),
         ("DetectionList", 0, "laser"),
-        ("TruthState", 100_000_000, ""),
-        ("EgoState", 100_000_000, ""),
-        ("DetectionList", 100_000_000, "camera"),
-        ("DetectionList", 100_000_000, "laser"),
+        ("TruthState", 103_600_000, ""),
+        ("EgoState", 103_600_000, ""),
+        ("DetectionList", 103_600_000, "camera"),
+        ("DetectionList", 103_600_000, "laser"),
     ]
     assert [(item.frame, len(item.objects)) for item in lists(drive)] == [
         ("sensor", 0),
@@ -99,6 +99,20 @@ def test_the_map_begins_at_the_first_frame_with_x_to_the_east(tmp_path):
     offset_m = truth.x_m - second.x_m, truth.y_m - second.y_m
     assert offset_m == pytest.approx((10.0 * math.cos(3.5), 10.0 * math.sin(3.5)))
     assert truth.yaw_rad == pytest.approx(3.8 - 2.0 * math.pi)
+
+
+def test_truth_does_not_step_with_the_reported_position(tmp_path):
+    """A parked car, seen from an ego at 10 m/s that reports 0.58 m more from the tenth frame on."""
+    metre_deg = math.degrees(1.0 / 6_378_137.0)
+    at_m = [1.036 * k for k in range(20)]
+    reported_m = [x_m + 0.58 * (k >= 10) for k, x_m in enumerate(at_m)]
+    egos = [oxts(x_m * metre_deg, yaw_rad=0.5 * math.pi, speed_mps=10.0) for x_m in reported_m]
+    labels = [label(k, 1, "Car", 50.0 - x_m, 0.0, 0.0) for k, x_m in enumerate(at_m)]
+    received = messages(folder(tmp_path, oxts=egos, label_02=labels))
+    states = [item for item in received if isinstance(item, EgoState)]
+    assert [state.y_m for state in states] == pytest.approx(reported_m, abs=0.01)
+    parked_m = [item.y_m for item in received if isinstance(item, TruthState)]
+    assert parked_m == pytest.approx([50.0] * 20, abs=0.06)
 
 
 def test_a_neighbouring_class_and_regions_are_ignored(tmp_path):
@@ -261,7 +275,7 @@ def test_a_sequence_is_read_up_to_the_frame_of_a_damaged_line(tmp_path, file, li
     received = []
     with pytest.raises(DataError, match=rf"{file}/0001\.txt:{line}: "):
         received.extend(open_input(folder(tmp_path / "damaged", **files)).messages())
-    assert received == [item for item in intact if item.stamp_ns < end * 100_000_000]
+    assert received == [item for item in intact if item.stamp_ns < end * 103_600_000]
 
 
 def test_what_is_not_finite_in_a_detection_is_left_to_the_tracker_without_a_warning(tmp_path):

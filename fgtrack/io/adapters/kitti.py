@@ -3,7 +3,8 @@
 Geiger, Lenz, Urtasun, "Are we ready for autonomous driving? The KITTI vision benchmark suite", CVPR 2012: a text file
 per sequence in `oxts/ calib/ label_02/`. Every other folder with such a file holds the detections of a sensor of that
 name, in a form of docs/recordings.md. Conventions that the data do not specify:
-- Frame k is at k x 0.1 s and received at once.
+- Frame k is at k x 0.1036 s, see `PERIOD_NS`, and received at once.
+- Labels are relative to the ego: truth is where they are seen from its dead-reckoned position, not the reported one.
 - The map begins where the ego does, in the Mercator projection of the development kit. The ego frame is that of the
   inertial unit, levelled by its roll and pitch.
 - A bearing is from camera 2 and relative to the ego's heading: the sensor's `mount` has no yaw.
