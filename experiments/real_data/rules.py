@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,12 +23,8 @@ LARGEST_JUMP = 3.0
 LARGEST_SHARE = 0.999
 #: Clutter is counted in discs of this radius around each false detection.
 CLUTTER_RADIUS_M = 50.0
-#: Ranges are counted in rings of this width that have so many looks at a vessel.
-RING_M, FEWEST = 20.0, 20
 #: The density of the process noise is what the velocity changes by in this time.
 MANOEUVRE_S = 5.0
-#: A sensor sees as far as it shows a vessel in this share of its lists, at least.
-LEAST_SEEN = 0.8
 SENSORS = ("lidar", "radar")
 
 
@@ -110,16 +105,14 @@ def ruled(config: Config, recordings: Sequence[Recorded]) -> Config:
         ]
         variance = float(np.mean([np.square(_moved(one, near_m)) for one, _ in hits]))
         share, time_s = lasting(tracks, variance)
-        view_m = _view_range_m([one for vessel in vessels for one in vessel])
         crowding = np.median([np.mean(one.crowding_per_m2[name]) for one in recordings if one.crowding_per_m2[name]])
         sensors[name] = replace(
             sensors[name],
             std={"x_m": _digits(math.sqrt(variance)), "y_m": _digits(math.sqrt(variance))},
             near_side_m=_digits(near_m),
             correlation=Correlation(_digits(share, 3), _digits(time_s)),
-            detection_probability=_digits(_detection_probability(vessels, view_m)),
+            detection_probability=_digits(_detection_probability(vessels)),
             clutter_per_m2=_digits(float(crowding)),
-            view_range_m=None if math.isinf(view_m) else view_m,
         )
     speed_mps = _rms([one.speeds_mps for one in recordings])
     per_root_s = _rms([one.changes_mps for one in recordings]) / math.sqrt(MANOEUVRE_S)
@@ -192,23 +185,14 @@ def _correlation_time_s(tracks: Sequence[Sequence[tuple[float, FloatArray]]], ke
     return 200.0
 
 
-def _view_range_m(seen: Sequence[Seen]) -> float:
-    """Where the sensor begins to show a vessel in less than `LEAST_SEEN` of its lists; infinite where it never does."""
-    for ring in range(int(max(one.range_m for one in seen) / RING_M) + 1):
-        hits = [one.error_m is not None for one in seen if ring <= one.range_m / RING_M < ring + 1]
-        if len(hits) >= FEWEST and np.mean(hits) < LEAST_SEEN:
-            return ring * RING_M
-    return math.inf
-
-
-def _detection_probability(vessels: Sequence[Sequence[Seen]], view_m: float) -> float:
-    """That a list shows a vessel which the list before did not: misses come in rows, and a row is what ends a track.
+def _detection_probability(vessels: Sequence[Sequence[Seen]]) -> float:
+    """That a list shows a vessel between two that do, so that it was visible.
 
     One hit and one miss are added to the counts (the rule of succession), so that it lies between 0 and 1.
     """
-    pairs = [pair for vessel in vessels for pair in pairwise(vessel)]
-    after = [b for a, b in pairs if a.error_m is None and max(a.range_m, b.range_m) <= view_m]
-    return (sum(one.error_m is not None for one in after) + 1.0) / (len(after) + 2.0)
+    triples = [triple for vessel in vessels for triple in zip(vessel, vessel[1:], vessel[2:], strict=False)]
+    hits = [b.error_m is not None for a, b, c in triples if a.error_m is not None and c.error_m is not None]
+    return (sum(hits) + 1.0) / (len(hits) + 2.0)
 
 
 def _rms(parts: Sequence[FloatArray]) -> float:
@@ -227,7 +211,7 @@ def numbers(config: Config) -> dict[str, float]:
         assert one.correlation is not None
         values = {"std": one.std["x_m"], "near_side_m": one.near_side_m, "share": one.correlation.share}
         values |= {"time_s": one.correlation.time_s, "detection_probability": one.detection_probability}
-        values |= {"clutter_per_m2": one.clutter_per_m2, "view_range_m": one.view_range_m or math.inf}
+        values |= {"clutter_per_m2": one.clutter_per_m2}
         found |= {f"{name}.{key}": value for key, value in values.items()}
     found["motion.std_per_s.velocity"] = config.motion.std_per_s["velocity"]
     found["birth.speed_std_mps"] = config.birth.speed_std_mps

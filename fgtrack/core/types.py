@@ -203,6 +203,8 @@ class TrackReport:
     num_measured: int
     object: ObjectReport | None = None
     """Class and size; None where no detection gives any."""
+    score: float | None = None
+    """Probability that the object exists (`lifecycle.kind: existence`); None where a lifecycle gives none."""
 
     @property
     def stamp_ns(self) -> int:

@@ -2,7 +2,8 @@
 
 A line per track and frame: `frame track type truncated occluded alpha left top right bottom h w l x y z rotation_y
 score` (Geiger, Lenz, Urtasun 2012, development kit of the tracking benchmark). Position and heading are those of the
-track, the rest is that of the boxes fused by then. The box in the image is the box in space as camera 2 sees it.
+track, the score is its existence probability where it has one; the rest is that of the boxes fused by then. The box in
+the image is the box in space as camera 2 sees it.
 """
 
 import math
@@ -69,13 +70,16 @@ def _states(run: Run, num_frames: int) -> DataFrame:
     timing = run.timing.assign(frame=-(-run.timing["now_ns"] // PERIOD_NS)).drop_duplicates("frame", keep="last")
     timing = timing[timing["frame"].between(0, num_frames - 1)][["tick", "frame"]]
     tracks = run.tracks[confirmed(run.tables["tracks"])] if run.evaluation.confirmed_only else run.tracks
-    states = tracks.fillna(0.0).merge(timing, on="tick").sort_values("tick", kind="stable")
+    states = (
+        tracks.fillna(0.0).assign(score=tracks["score"]).merge(timing, on="tick").sort_values("tick", kind="stable")
+    )
     ahead_s = (states["frame"] * PERIOD_NS - states["now_ns"]) / NS_PER_S
     turned_rad, way_m = ahead_s * states["yaw_rate_radps"], ahead_s * states["speed_mps"]
     middle_rad = states["yaw_rad"] + 0.5 * turned_rad
     moved = {"x_m": states["x_m"] + way_m * np.cos(middle_rad), "y_m": states["y_m"] + way_m * np.sin(middle_rad)}
     states = states.assign(**moved, yaw_rad=states["yaw_rad"] + turned_rad)
-    return pd.merge_asof(states, _boxes(run), on="tick", by="track_id")
+    states = pd.merge_asof(states, _boxes(run), on="tick", by="track_id", suffixes=("", "_of_detections"))
+    return states.assign(score=states["score"].fillna(states.pop("score_of_detections")))
 
 
 def _boxes(run: Run) -> DataFrame:

@@ -137,10 +137,9 @@ class SensorModel:
     loss: RobustLoss | None = None
     """Robust loss of its measurements; null is the Gaussian. A smoother updates the weights while they are in its
     window, a filter once, at the state that the update gives."""
-    detection_probability: OpenProbability = 0.5
-    """Probability that a list shows an object in range and in the field of view (`lifecycle.kind: existence`). By
-    default a list that lacks an object is as likely as one that shows it: RADAR and occluded objects come near that,
-    and successive misses are correlated. A value too large ends tracks, one too small only delays their end."""
+    detection_probability: OpenProbability = 0.9
+    """Probability that a list shows an object that is visible to it (`lifecycle.kind: existence`), as in a list between
+    two that show it. How often objects are hidden, or too small or too far away, is estimated."""
     clutter_per_m2: PositiveFloat = 1e-4
     """False detections in a list for each square metre (`lifecycle.kind: existence`)."""
     score: Score | None = None

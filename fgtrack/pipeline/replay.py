@@ -182,6 +182,8 @@ def _head(
         source["path_from_run"] = relative
     meta: dict[str, object] = {"input": source, "estimator": config.estimator, "versions": versions(), "seed": None}
     meta["effective"] = plain(config.effective)
+    if config.lifecycle.kind == "existence":
+        meta["is_scored"] = True
     return dump(config), meta, next(iter(config.smoother.lagged_s), None)
 
 

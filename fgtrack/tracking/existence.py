@@ -1,39 +1,45 @@
-"""Existence probability of tracks: integrated probabilistic data association.
+"""Existence probability of tracks: integrated probabilistic data association with visibility.
 
-Musicki, Evans, Stankovic: Integrated probabilistic data association, IEEE Trans. Automatic Control 39, 1994; the same
-recursion is that of a Bernoulli filter (Ristic, Vo, Vo, Farina: A tutorial on Bernoulli filters, IEEE Trans. Signal
-Processing 61, 2013). With the existence probability r, an object survives the time dt with probability
-exp(-dt / lifetime), and a list that could have shown it changes the odds r / (1 - r) by the factor
+An object survives the time dt with probability exp(-dt / lifetime). A list of a sensor to which it is visible with
+probability v changes the odds r / (1 - r) of its existence by the factor 1 - v + v l, where the track was matched with
 
-    1 - P_D + P_D L,   L = N(z - h(x); 0, S) / clutter density * p(score | object) / p(score | clutter)
+    l = 1 - P_D + P_D L,   L = N(z - h(x); 0, S) / clutter density * p(score | object) / p(score | clutter)
 
-where the track was matched, and by 1 - P_D where it was not. Approximate are: L is that of the one detection which the
-assignment gives (the probabilities of other assignments are left out), of its position alone, and as it was when the
-detection arrived. Each factor counts at the stamp of its list, whatever the order of arrival within `memory_s`: what
-is late changes what came after it.
+and where it was missed with l = 1 - P_D; see `fgtrack.tracking.visibility` for v, which falls with misses in a row, so
+that a sensor which does not see an object does not end what another sees. Approximate are: L is that of the one
+detection which the assignment gives (the probabilities of other assignments are left out), of its position alone, and
+as it was when the detection arrived. Each list counts at its stamp, whatever the order of arrival within `memory_s`.
 """
 
 import math
-from bisect import bisect_right
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import compress
 from typing import Literal
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from fgtrack.core.linalg import mahalanobis_squared
+from fgtrack.core.geometry import polar
 from fgtrack.core.settings import OpenProbability, settings
-from fgtrack.core.time import nanoseconds, seconds
-from fgtrack.core.types import FloatArray, TrackStatus
+from fgtrack.core.time import nanoseconds
+from fgtrack.core.types import FloatArray, IntArray, TrackStatus
 from fgtrack.estimation.base import StatesAt
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.lifecycle import CountingLifecycle, Scan
 from fgtrack.tracking.preprocess import Candidate, Candidates
+from fgtrack.tracking.visibility import DetectionShares, Histories, Looks
 
-#: Bounds of log-odds: a probability that differs from 0 or 1 by less says nothing more.
-_LARGEST_LOG_ODDS = 30.0
 _SINGULAR = 1e-12
+_LIFE = np.dtype(
+    [
+        *[("confirmed", "?"), ("travelled", "?"), ("first_m", "2f8"), ("misses", "i8")],
+        *[("in_view_ns", "i8"), ("visible_ns", "i8")],
+    ]
+)
+"""True if it was ever confirmed, or as far from its first position as it must be; misses since the last match, and
+the newest stamps at which it was in view and probably visible."""
+_SHARES = (0.02, 0.98)
+"""Bounds of the share of visible objects: nothing is always visible, or never."""
 
 
 @settings
@@ -52,9 +58,16 @@ class ExistenceRules:
     lifetime_s: PositiveFloat = 20.0
     """Mean time for which an object stays: oncoming traffic is near for seconds, a car ahead for minutes. It matters
     where few lists could show an object; elsewhere those that miss it end its track."""
+    visible_share: OpenProbability = 0.7
+    """Share of the time for which an object is visible to a sensor, where nothing was tracked yet: what is hidden, too
+    small or too far away for a sensor is learned by range and bearing."""
+    visible_s: PositiveFloat = 2.0
+    """Time after which visibility to a sensor is forgotten to 1/e: misses come in rows of about that length."""
     out_of_view_s: PositiveFloat = 0.5
     """A track ends where the newest list that could not show it is so much newer than the last one that could: half a
     second bridges a gap between two fields of view, and little is known of an object that nothing sees for longer."""
+    hidden_s: PositiveFloat = 2.0
+    """A track ends that was probably visible to no sensor for so long: what comes back may be another object."""
     min_travel_m: NonNegativeFloat = 0.0
     """A track is not confirmed before it was so far from where it began: what never moves is shore, or moored."""
     memory_s: PositiveFloat = 5.0
@@ -69,58 +82,6 @@ class ExistenceRules:
             raise ValueError("doubt_probability: must not be more than confirm_probability")
 
 
-@dataclass(slots=True)
-class Existence:
-    """The existence probability of one object as a function of time: evidence in order of its stamps."""
-
-    lifetime_s: float
-    stamps_ns: list[int]
-    """Rising; the first is the birth, or the oldest that is remembered."""
-    weights: list[float]
-    """Logarithm of the factor by which each evidence changes the odds; of the first the log-odds themselves."""
-    log_odds: list[float] = field(default_factory=list)
-    """After each evidence."""
-    in_view_ns: int = 0
-    """Stamp of the newest list that could have shown it."""
-    misses: int = 0
-    """Lists since the last match that could have shown it."""
-    confirmed: bool = False
-    first_m: FloatArray | None = None
-    """First position, shape (2,)."""
-    travelled: bool = False
-    """True if it was ever as far from there as a track must be to be confirmed."""
-
-    def learn(self, stamp_ns: int, weight: float) -> None:
-        """Evidence of `stamp_ns`, in any order; what is older than all that is remembered counts as the oldest."""
-        row = max(bisect_right(self.stamps_ns, stamp_ns), 1)
-        self.in_view_ns = max(self.in_view_ns, stamp_ns)
-        self.stamps_ns.insert(row, max(stamp_ns, self.stamps_ns[0]))
-        self.weights.insert(row, weight)
-        del self.log_odds[row:]
-        for k in range(row, len(self.stamps_ns)):
-            self.log_odds.append(_bounded(self._survived(k - 1, self.stamps_ns[k]) + self.weights[k]))
-
-    def probability(self, stamp_ns: int) -> float:
-        """Existence probability at `stamp_ns`, at or after the newest evidence."""
-        return 1.0 / (1.0 + math.exp(-self._survived(-1, stamp_ns)))
-
-    def forget(self, oldest_ns: int) -> None:
-        """Remember what is older than `oldest_ns` by its outcome alone."""
-        keep = max(bisect_right(self.stamps_ns, oldest_ns) - 1, 0)
-        if keep:
-            del self.stamps_ns[:keep], self.weights[:keep], self.log_odds[:keep]
-            self.weights[0] = self.log_odds[0]
-
-    def _survived(self, row: int, stamp_ns: int) -> float:
-        """Log-odds that it exists and is still there at `stamp_ns`, given the evidence up to `row`."""
-        log_odds, dt_s = self.log_odds[row], seconds(stamp_ns - self.stamps_ns[row])
-        if dt_s <= 0.0:
-            return log_odds
-        gone = -math.expm1(-dt_s / self.lifetime_s)
-        dead = math.exp(-log_odds)  # odds r / (1 - r) become r s / (1 - r s) with s = exp(-dt / lifetime)
-        return _bounded(-math.log(dead + gone) - dt_s / self.lifetime_s)
-
-
 class ExistenceLifecycle:
     """Tracks live by the probability that their objects exist; see the module.
     A list says nothing of objects out of its sensor's range and field of view. Without an ego all are in view.
@@ -132,92 +93,134 @@ class ExistenceLifecycle:
         """`detection_origin_m`: origin of the ego frame of detections, seen from the ego reference point."""
         self._rules = rules
         self._sensors = sensors
+        self._index = {name: index for index, name in enumerate(sensors)}
         self._origin_m = detection_origin_m
         self._memory_ns = nanoseconds(rules.memory_s)
         self._out_of_view_ns = nanoseconds(rules.out_of_view_s)
+        self._hidden_ns = nanoseconds(rules.hidden_s)
         self._present_ns = 0
         self._newest_ns = 0  # stamp of the newest list that could have shown something
-        self.lives: dict[int, Existence] = {}
-        """Existence by track id."""
+        self._histories = Histories(len(sensors), rules.lifetime_s, rules.visible_s)
+        priors = [rules.visible_share * sensor.detection_probability for sensor in sensors.values()]
+        self._shares = DetectionShares(self._memory_ns, priors)
+        self._rows: dict[int, int] = {}  # of the arrays, by track id in order of birth
+        self._lives = np.zeros(0, dtype=_LIFE)
+        self._reports: dict[int, tuple[TrackStatus, float]] | None = None  # by track id, once they are asked for
 
     def born(self, track_id: int, scan: Scan, candidate: Candidate) -> None:
         """See `CountingLifecycle.born`."""
         odds = self._rules.birth_probability / (1.0 - self._rules.birth_probability)
-        log_odds = _bounded(math.log(odds) + self._score(scan, candidate))
-        self.lives[track_id] = life = Existence(
-            self._rules.lifetime_s, [scan.stamp_ns], [log_odds], [log_odds], in_view_ns=scan.stamp_ns
-        )
-        life.first_m, life.travelled = candidate.position_m, self._rules.min_travel_m == 0.0
-        self._confirm(life)
+        log_odds = math.log(odds) + self._score(scan, (candidate.leader, *candidate.merged))
+        row = self._rows[track_id] = self._histories.begin(scan.stamp_ns, self._index[scan.sensor], log_odds)
+        if len(self._lives) <= row:
+            self._lives = np.concatenate([self._lives, np.zeros(len(self._histories.counts) - len(self._lives), _LIFE)])
+        self._lives[row] = False, self._rules.min_travel_m == 0.0, candidate.position_m, 0, scan.stamp_ns, scan.stamp_ns
+        self._confirm(np.array([row]))
 
     def matched(self, scan: Scan, candidates: Candidates, pairs: Sequence[tuple[int, int]], states: StatesAt) -> None:
         """See `CountingLifecycle.matched`."""
-        sensor = self._sensors[scan.sensor]
-        P_D = sensor.detection_probability
-        for position, track in pairs:
-            if not candidates.placed[position]:
-                continue
-            life, mean, candidate = self.lives[states.track_ids[track]], states.means[track], candidates[position]
-            life.misses = 0
-            if not life.travelled and life.first_m is not None:
-                life.travelled = math.dist(mean[:2].tolist(), life.first_m.tolist()) >= self._rules.min_travel_m
-            density = _position_density(candidate, mean, states.covariances[track])
-            if density is not None:
-                ratio = density / sensor.clutter_per_m2 * math.exp(self._score(scan, candidate))
-                life.learn(scan.stamp_ns, math.log(1.0 - P_D + P_D * ratio))
-                self._confirm(life)
+        placed = [pair for pair in pairs if candidates.placed[pair[0]]]
+        if not placed:
+            return
+        chosen, tracks = np.array(placed).T
+        rows, means = self._rows_of(states.track_ids[track] for track in tracks.tolist()), states.means[tracks]
+        self._lives["misses"][rows] = 0
+        travelled_m = np.hypot(*(means[:, :2] - self._lives["first_m"][rows]).T)
+        self._lives["travelled"][rows] |= travelled_m >= self._rules.min_travel_m
+        sensor, leaders = self._sensors[scan.sensor], [candidates.leaders[position] for position in chosen.tolist()]
+        scores = [self._score(scan, (leader, *candidates.merged.get(leader, ()))) for leader in leaders]
+        density = _position_densities(candidates, chosen, means, states.covariances[tracks])
+        known, P_D = ~np.isnan(density), sensor.detection_probability
+        ratios = 1.0 - P_D + P_D * density / sensor.clutter_per_m2 * np.exp(scores)
+        self._learn(scan, rows[known], means[known, :2], ratios[known])
+        self._confirm(rows)
 
     def fused(self, track_id: int) -> None:
         """See `CountingLifecycle.fused`; the match has counted already."""
 
     def missed(self, scan: Scan, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
         """See `CountingLifecycle.missed`."""
-        sensor = self._sensors[scan.sensor]
+        sensor, rows = self._sensors[scan.sensor], self._rows_of(track_ids)
         self._newest_ns = max(self._newest_ns, scan.stamp_ns)
-        weight = math.log1p(-sensor.detection_probability)
-        in_view = np.ones(len(track_ids), dtype=bool)
+        ratios = np.full(len(rows), 1.0 - sensor.detection_probability)
         if scan.ego is not None:
-            pose = np.array([scan.ego.x_m, scan.ego.y_m, scan.ego.yaw_rad])
-            in_view = sensor.sees(positions_m, np.broadcast_to(pose, (len(track_ids), 3)), self._origin_m)
-        for track_id in np.asarray(track_ids)[in_view].tolist():
-            life = self.lives[track_id]
-            life.misses += 1
-            life.learn(scan.stamp_ns, weight)
-        return [track_id for track_id in track_ids if self._ends(self.lives[track_id])]
+            poses = np.broadcast_to([scan.ego.x_m, scan.ego.y_m, scan.ego.yaw_rad], (len(rows), 3))
+            ratios[~sensor.sees(positions_m, poses, self._origin_m)] = np.nan
+        self._lives["misses"][rows] += ~np.isnan(ratios)
+        self._learn(scan, rows, positions_m, ratios)
+        return self._ended()
 
     def expired(self, present_ns: int) -> list[int]:
         """See `CountingLifecycle.expired`."""
-        self._present_ns = present_ns
-        for life in self.lives.values():
-            life.forget(present_ns - self._memory_ns)
-        return [track_id for track_id, life in self.lives.items() if self._ends(life)]
+        self._present_ns, self._reports = present_ns, None
+        self._remember(self._histories.forget(present_ns - self._memory_ns))
+        return self._ended()
 
     def forget(self, track_id: int) -> None:
         """See `CountingLifecycle.forget`."""
-        del self.lives[track_id]
+        self._remember(self._histories.end(self._rows.pop(track_id)))
+        self._reports = None
+
+    def probability(self, track_id: int) -> float:
+        """See `CountingLifecycle.probability`; now."""
+        return self._reported[track_id][1]
 
     def status(self, track_id: int) -> TrackStatus:
         """See `CountingLifecycle.status`."""
-        life = self.lives[track_id]
-        if not life.confirmed or life.probability(self._present_ns) < self._rules.doubt_probability:
-            return TrackStatus.TENTATIVE
-        return TrackStatus.COASTING if life.misses else TrackStatus.CONFIRMED
+        return self._reported[track_id][0]
 
-    def _confirm(self, life: Existence) -> None:
-        if life.travelled and life.probability(self._present_ns) >= self._rules.confirm_probability:
-            life.confirmed = True
+    @property
+    def _reported(self) -> dict[int, tuple[TrackStatus, float]]:
+        """Status and probability of all tracks, computed together when the first is asked for."""
+        if self._reports is None:
+            rows = self._rows_of(self._rows)
+            lives, exists = self._lives[rows], self._histories.present(rows, self._present_ns)
+            published = lives["confirmed"] & (exists >= self._rules.doubt_probability)
+            statuses = [
+                TrackStatus.TENTATIVE if not row[0] else TrackStatus.COASTING if row[1] else TrackStatus.CONFIRMED
+                for row in zip(published.tolist(), lives["misses"].tolist(), strict=True)
+            ]
+            self._reports = dict(zip(self._rows, zip(statuses, exists.tolist(), strict=True), strict=True))
+        return self._reports
 
-    def _ends(self, life: Existence) -> bool:
-        if self._newest_ns - life.in_view_ns > self._out_of_view_ns:
-            return True
-        return life.probability(self._present_ns) < self._rules.delete_probability
+    def _rows_of(self, track_ids: Iterable[int]) -> IntArray:
+        return np.array([self._rows[track_id] for track_id in track_ids], dtype=np.int64)
 
-    def _score(self, scan: Scan, candidate: Candidate) -> float:
-        """Logarithm of p(score | object) / p(score | clutter) of the best detection; 0 where there is none."""
+    def _learn(self, scan: Scan, rows: IntArray, positions_m: FloatArray, ratios: FloatArray) -> None:
+        """Add the evidence of a list; `ratios` if visible, NaN where an object is out of view, shape (m,)."""
+        sensor, index, cells = self._sensors[scan.sensor], self._index[scan.sensor], np.zeros(len(rows), dtype=np.int64)
+        if scan.ego is not None:
+            bearing_range = polar(positions_m - np.array([scan.ego.x_m, scan.ego.y_m]))
+            cells = self._shares.cells(bearing_range[:, 1], bearing_range[:, 0] - scan.ego.yaw_rad)
+        shares = self._shares.at(index, scan.stamp_ns, cells) / sensor.detection_probability
+        self._histories.learn(rows, scan.stamp_ns, index, np.clip(shares, *_SHARES), ratios, cells)
+        visible, self._reports = self._histories.last(rows)[0][:, index] >= 0.5, None
+        for name, chosen in (("in_view_ns", ~np.isnan(ratios)), ("visible_ns", visible)):
+            self._lives[name][rows[chosen]] = np.maximum(self._lives[name][rows[chosen]], scan.stamp_ns)
+
+    def _remember(self, looks: Looks) -> None:
+        """Learn the shares of detection from `looks` at confirmed tracks."""
+        if len(looks.rows):
+            self._shares.learn(Looks(*(each[self._lives["confirmed"][looks.rows]] for each in looks)))
+
+    def _confirm(self, rows: IntArray) -> None:
+        exists = self._histories.present(rows, self._present_ns) >= self._rules.confirm_probability
+        self._lives["confirmed"][rows] |= exists & self._lives["travelled"][rows]
+
+    def _ended(self) -> list[int]:
+        """Return the ids of the tracks that end."""
+        rows = self._rows_of(self._rows)
+        lives = self._lives[rows]
+        gone = self._newest_ns - lives["in_view_ns"] > self._out_of_view_ns
+        gone |= self._newest_ns - lives["visible_ns"] > self._hidden_ns
+        improbable = self._histories.present(rows, self._present_ns) < self._rules.delete_probability
+        return list(compress(self._rows, (gone | improbable).tolist()))
+
+    def _score(self, scan: Scan, indices: Iterable[int]) -> float:
+        """Logarithm of p(score | object) / p(score | clutter) of the best of some detections; 0 where there is none."""
         model = self._sensors[scan.sensor].score
         if model is None or not scan.objects:
             return 0.0
-        indices = (candidate.leader, *candidate.merged)
         scores = [score for index in indices if (score := scan.objects[index].score) is not None]
         return min(max((max(scores) - model.even) / model.scale, -10.0), 10.0) if scores else 0.0
 
@@ -225,18 +228,14 @@ class ExistenceLifecycle:
 Lifecycle = CountingLifecycle | ExistenceLifecycle
 
 
-def _position_density(candidate: Candidate, mean: FloatArray, P: FloatArray) -> float | None:
-    """N(z - h(x); 0, S) of the position in 1/m^2; None where the detection gives none, or S is singular to rounding."""
-    if candidate.position_m is None or candidate.position_covariance is None:
-        return None
-    S = P[:2, :2] + candidate.position_covariance
-    variances = float(S[0, 0] * S[1, 1])
-    determinant = variances - float(S[0, 1] * S[1, 0])
-    if determinant <= _SINGULAR * variances:
-        return None
-    squared = float(mahalanobis_squared(candidate.position_m - mean[:2], S))
-    return math.exp(-0.5 * squared) / (2.0 * math.pi * math.sqrt(determinant))
-
-
-def _bounded(log_odds: float) -> float:
-    return min(max(log_odds, -_LARGEST_LOG_ODDS), _LARGEST_LOG_ODDS)
+def _position_densities(candidates: Candidates, chosen: IntArray, means: FloatArray, P: FloatArray) -> FloatArray:
+    """N(z - h(x); 0, S) of the positions of `chosen` (m,) at states (m, n), (m, n, n), in 1/m^2; NaN if singular."""
+    S, y = P[:, :2, :2].copy(), candidates.lines[chosen, :2] - means[:, :2]
+    for group, members, here in candidates.split(chosen):
+        S[here] += group.position_covariances(members)
+    variances = S[:, 0, 0] * S[:, 1, 1]
+    determinant = variances - S[:, 0, 1] * S[:, 1, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        squared = S[:, 1, 1] * y[:, 0] ** 2 + S[:, 0, 0] * y[:, 1] ** 2 - (S[:, 0, 1] + S[:, 1, 0]) * y[:, 0] * y[:, 1]
+        density = np.exp(-0.5 * squared / determinant) / (math.tau * np.sqrt(determinant))
+    return np.where(determinant > _SINGULAR * variances, density, np.nan)

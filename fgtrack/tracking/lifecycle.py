@@ -119,6 +119,10 @@ class CountingLifecycle:
         """The track has ended."""
         del self.lives[track_id]
 
+    def probability(self, track_id: int) -> float | None:
+        """Probability that the object of the track exists; None, as counts give none."""
+        return None
+
     def status(self, track_id: int) -> TrackStatus:
         """Status of the track."""
         life = self.lives[track_id]

@@ -74,6 +74,16 @@ class Group(NamedTuple):
             R = self.error.at(members).noise(own.model, own.pose, x)
         return Measurement(own.stamp_ns, own.model, own.z[members], R, own.pose, own.loss, own.assumed)
 
+    def position_covariances(self, members: IntArray) -> FloatArray:
+        """Covariances of the positions in the map of some `members` (p,), which have one, shape (p, 2, 2)."""
+        own, R = self.stack, self.spread[members]
+        if own.model.components[:2] == ("x_m", "y_m"):
+            return R[:, :2, :2]
+        positions = [
+            measured_position(own.model.components, z, C, own.pose) for z, C in zip(own.z[members], R, strict=True)
+        ]
+        return np.array([each[1] for each in positions if each is not None])
+
 
 class Candidates(Sequence[Candidate]):
     """The candidates of a batch, in the order of the merge; each is made when it is asked for."""

@@ -43,8 +43,8 @@ from fgtrack.tracking.lifecycle import Scan
 from fgtrack.tracking.objects import Objects
 from fgtrack.tracking.preprocess import Candidates, Preprocess
 
-_Own = tuple[int, TrackStatus, int, ObjectReport | None]
-"""Id, status, number of measurements and object of a track."""
+_Own = tuple[int, TrackStatus, int, ObjectReport | None, float | None]
+"""Id, status, number of measurements, object and existence probability of a track."""
 _DISPOSITIONS = {status: Disposition(status.value) for status in UpdateStatus}
 
 
@@ -360,6 +360,7 @@ class Tracker:
             map(parts.lifecycle.status, track_ids),
             num_measured,
             parts.objects.reports(track_ids),
+            map(parts.lifecycle.probability, track_ids),
             strict=True,
         )
 
@@ -369,5 +370,5 @@ def _made(noted: UpdateRecord | tuple[Any, ...]) -> UpdateRecord:
 
 
 def _report(own: _Own, state: TrackState) -> TrackReport:
-    track_id, status, num_measured, described = own
-    return TrackReport(track_id, status, state, num_measured, described)
+    track_id, status, num_measured, described, probability = own
+    return TrackReport(track_id, status, state, num_measured, described, probability)

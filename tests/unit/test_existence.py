@@ -15,7 +15,7 @@ from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
 from fgtrack.tracking.ego import EgoPose
-from fgtrack.tracking.existence import Existence, ExistenceLifecycle, ExistenceRules
+from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules
 from fgtrack.tracking.lifecycle import Scan
 
 SENSORS = {
@@ -40,71 +40,96 @@ def ego(x_m: float = 0.0, y_m: float = 0.0, yaw_rad: float = 0.0) -> EgoPose:
     return EgoPose(x_m, y_m, yaw_rad, 0.0, 0.0)
 
 
-def existing(lifetime_s: float, stamp_ns: int, log_odds: float) -> Existence:
-    return Existence(lifetime_s, [stamp_ns], [log_odds], [log_odds], in_view_ns=stamp_ns)
-
-
 def probability(life: ExistenceLifecycle, at_ms: float = 0.0) -> float:
-    return life.lives[0].probability(START_NS + ms(at_ms))
+    life.expired(START_NS + ms(at_ms))
+    return life.probability(0)
 
 
 def test_a_miss_and_a_match_change_the_probability_as_integrated_data_association_says() -> None:
     life = lifecycle()
     life.born(0, scan(), HERE)
-    r = 0.2
-    life.missed(scan(at_ms=10.0), [0], np.array([[10.0, 0.0]]), np.array([10.0]))
-    r = 0.2 * r / (1.0 - 0.8 * r)
-    assert probability(life, 10.0) == pytest.approx(r, rel=1e-6)
-    match(life, 0, scan(at_ms=20.0), candidate(10.3, 0.0), MEAN, P)
-    S = 0.09 + 0.01
-    density = math.exp(-0.5 * 0.3**2 / S) / (2.0 * math.pi * S)
-    delta = 0.8 - 0.8 * density / 1e-3
-    r = (1.0 - delta) * r / (1.0 - delta * r)
-    assert probability(life, 20.0) == pytest.approx(r, rel=1e-6)
-
-
-def test_an_object_survives_as_long_as_its_lifetime_says() -> None:
-    one = existing(4.0, START_NS, math.log(3.0))
-    assert one.probability(START_NS) == pytest.approx(0.75)
-    assert one.probability(START_NS + ms(6000)) == pytest.approx(0.75 * math.exp(-1.5))
+    r, P_D, v = 0.2, 0.8, 1.0
+    for at_ms, x_m in ((10.0, None), (20.0, 10.3)):
+        v = STILL.visible_share + (v - STILL.visible_share) * math.exp(-0.01 / STILL.visible_s)
+        ratio = 1.0 - P_D
+        if x_m is None:
+            life.missed(scan(at_ms=at_ms), [0], np.array([[10.0, 0.0]]), np.array([10.0]))
+        else:
+            match(life, 0, scan(at_ms=at_ms), candidate(x_m, 0.0), MEAN, P)
+            S = 0.09 + 0.01
+            ratio += P_D * math.exp(-0.5 * (x_m - 10.0) ** 2 / S) / (2.0 * math.pi * S) / 1e-3
+        likelihood = 1.0 - v + v * ratio
+        r, v = r * likelihood / (1.0 - r + r * likelihood), v * ratio / likelihood
+        assert probability(life, at_ms) == pytest.approx(r, rel=1e-6)
 
 
 @pytest.mark.parametrize("gap_s", [400.0, 1e7])
 def test_nothing_survives_a_gap_of_many_lifetimes(gap_s: float) -> None:
-    one = existing(10.0, START_NS, math.log(3.0))
-    assert one.probability(START_NS + ms(1e3 * gap_s)) < 1e-9
     life = lifecycle(ExistenceRules())
     life.born(0, scan(), HERE)
     assert life.expired(START_NS + ms(1e3 * gap_s)) == [0]
-    one.learn(START_NS + ms(1e3 * gap_s), 20.0)
-    assert 0.0 < one.probability(START_NS + ms(1e3 * gap_s)) < 1e-4
+    assert probability(life, 1e3 * gap_s) < 1e-9
+    match(life, 0, scan(at_ms=1e3 * gap_s), HERE, MEAN, P)
+    assert 0.0 < probability(life, 1e3 * gap_s) < 1e-4
 
 
-def test_evidence_counts_at_its_own_stamp_in_whatever_order_it_arrives() -> None:
-    evidence = [(300.0, -1.2), (500.0, 2.5), (900.0, -0.4), (1400.0, 1.0)]
+def test_an_object_survives_as_long_as_its_lifetime_says() -> None:
+    life = lifecycle(ExistenceRules(birth_probability=0.75, lifetime_s=4.0))
+    life.born(0, scan(), HERE)
+    assert probability(life) == pytest.approx(0.75)
+    assert probability(life, 6000.0) == pytest.approx(0.75 * math.exp(-1.5))
+
+
+@pytest.mark.parametrize("learned_s", [0.0, 60.0])
+def test_lists_count_at_their_stamps_in_whatever_order_they_arrive(learned_s: float) -> None:
+    """Also what is learned of where a sensor detects, from lists that have left the memory."""
+    lists = [("lidar", 300.0, True), ("ahead", 500.0, False), ("lidar", 600.0, False), ("ahead", 900.0, True)]
     found = set()
-    for order in permutations(evidence):
-        one = existing(2.0, START_NS, 0.3)
-        for at_ms, weight in order:
-            one.learn(START_NS + ms(at_ms), weight)
-        found.add(one.probability(START_NS + ms(1500)))
+    for order in permutations(lists):
+        life = lifecycle(ExistenceRules(memory_s=2.0))
+        life.born(0, scan(), HERE)
+        for k in range(round(learned_s)):
+            life.expired(START_NS + ms(1000.0 * k))
+            match(life, 0, scan(at_ms=1000.0 * k, ego=ego()), HERE, MEAN, P)
+        life.expired(START_NS + ms(1000.0 * learned_s + 1000.0))
+        for sensor, at_ms, shown in order:
+            seen = scan(sensor, 1000.0 * learned_s + at_ms, ego=ego())
+            if shown:
+                match(life, 0, seen, HERE, MEAN, P)
+            else:
+                life.missed(seen, [0], np.array([[10.0, 0.0]]), np.array([10.0]))
+        found.add(probability(life, 1000.0 * learned_s + 1500.0))
     assert len(found) == 1
-    late = existing(2.0, START_NS, 0.3)
-    late.learn(START_NS + ms(1400), sum(weight for _, weight in evidence))
-    assert late.probability(START_NS + ms(1500)) != pytest.approx(found.pop(), abs=1e-3)
 
 
-def test_what_is_forgotten_changes_nothing_and_what_is_older_counts_as_the_oldest() -> None:
-    one, other = (existing(2.0, START_NS, 0.3) for _ in range(2))
-    for each in (one, other):
-        each.learn(START_NS + ms(300), -1.0)
-        each.learn(START_NS + ms(600), 1.5)
-    other.forget(START_NS + ms(650))
-    assert other.stamps_ns == [START_NS + ms(600)]
-    assert other.probability(START_NS + ms(900)) == one.probability(START_NS + ms(900))
-    one.learn(START_NS + ms(600), 0.7)
-    other.learn(START_NS + ms(100), 0.7)
-    assert other.probability(START_NS + ms(900)) == one.probability(START_NS + ms(900))
+def test_the_misses_of_one_sensor_do_not_end_what_another_sees() -> None:
+    life, there = lifecycle(ExistenceRules(out_of_view_s=2.0)), np.array([[10.0, 0.0]])
+    life.born(0, scan("lidar"), HERE)
+    for k in range(1, 200):
+        if k % 10 == 0:
+            match(life, 0, scan("lidar", 100.0 * k), HERE, MEAN, P)
+        assert life.missed(scan("scored", 100.0 * k), [0], there, np.array([10.0])) == []
+        life.expired(START_NS + ms(100.0 * k))
+    assert life.status(0) is TrackStatus.COASTING
+    assert life.probability(0) > 0.95
+
+
+def test_a_sensor_learns_where_it_shows_nothing_so_that_its_misses_there_cost_little() -> None:
+    costs = []
+    for learned in (False, True):
+        life, there = lifecycle(ExistenceRules()), np.array([[10.0, 0.0]])
+        life.born(0, scan("lidar", ego=ego()), HERE)
+        for k in range(1, 300 if learned else 3):
+            match(life, 0, scan("lidar", 200.0 * k, ego=ego()), HERE, MEAN, P)
+            if learned:
+                life.missed(scan("scored", 200.0 * k, ego=ego()), [0], there, np.array([10.0]))
+            life.expired(START_NS + ms(200.0 * k))
+        life.born(1, scan("lidar", 60_000.0, ego=ego()), HERE)
+        life.expired(START_NS + ms(60_000.0))
+        life.missed(scan("scored", 60_000.0, ego=ego()), [1], there, np.array([10.0]))
+        life.expired(START_NS + ms(60_000.0))
+        costs.append(0.2 - life.probability(1))
+    assert costs[1] < 0.2 * costs[0]
 
 
 @pytest.mark.parametrize(
@@ -116,7 +141,9 @@ def test_a_list_says_nothing_of_what_its_sensor_cannot_see(place: tuple[float, f
     before = probability(life)
     life.missed(scan("ahead", ego=ego()), [0], np.array([place]), np.array([20.0]))
     assert (probability(life) < before) is counts
-    assert bool(life.lives[0].misses) is counts
+    match(life, 0, scan(at_ms=1.0), HERE, MEAN, P)
+    life.missed(scan("ahead", 2.0, ego=ego()), [0], np.array([place]), np.array([20.0]))
+    assert (life.status(0) is TrackStatus.COASTING) is counts
 
 
 def test_a_track_that_left_the_view_of_all_sensors_ends_although_it_is_believed() -> None:
@@ -159,8 +186,13 @@ def test_the_score_of_a_match_counts_as_much_as_its_place() -> None:
         match(life, 0, scan("scored", 10.0, objects=seen), candidate(12.0, 0.0), MEAN, P)
         found.append(probability(life, 10.0))
     odds = [4.0 * p / (1.0 - p) for p in found]  # at birth 1 / 4
-    missed = 1.0 - SENSORS["scored"].detection_probability
-    assert (odds[0] - missed) / (odds[1] - missed) == pytest.approx(math.e, rel=1e-6)
+    missed = scan("scored", 10.0)
+    life = lifecycle()
+    life.born(0, scan("scored"), HERE)
+    life.missed(missed, [0], np.array([[12.0, 0.0]]), np.array([12.0]))
+    p = probability(life, 10.0)
+    at_miss = 4.0 * p / (1.0 - p)
+    assert (odds[0] - at_miss) / (odds[1] - at_miss) == pytest.approx(math.e, rel=1e-6)
 
 
 def test_a_better_score_makes_an_object_more_probable() -> None:

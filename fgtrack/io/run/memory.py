@@ -21,7 +21,7 @@ class MemoryRun(RunSink):
 
     @cached_property
     def _files(self) -> dict[str, bytearray]:
-        return {table: bytearray(text_header(table)) for table in COLUMNS}
+        return {table: bytearray(text_header(table, self.is_scored)) for table in COLUMNS}
 
     def _append(self, table: str, rows: Sequence[Row]) -> None:
         self._files[table] += text(table, rows).encode()

@@ -28,6 +28,7 @@ from fgtrack.io.run.schema import (
     NO_TRACK,
     OPTIONAL_TABLES,
     RUN_FORMAT,
+    SCORE,
     Column,
     column,
     column_type,
@@ -194,7 +195,7 @@ class Run:
         with RunWriter(path, self.config_text, meta, overwrite=overwrite) as writer:
             for table, columns in self.tables.items():
                 if columns.num_rows:
-                    writer.write_rows(table, _lines(table, columns))
+                    writer.write_rows(table, _lines(table, columns, writer.is_scored))
             writer.finish(meta)
 
 
@@ -250,8 +251,8 @@ def parsed(table: str, content: bytes | bytearray) -> Table:
         skip_blank_lines=False,
         low_memory=False,
     )
-    for name in ADDED_COLUMNS & set(names) - set(frame.columns):  # of runs of 0.2
-        frame.insert(names.index(name), name, "")
+    for name in ADDED_COLUMNS.keys() & set(names) - set(frame.columns):  # of runs of 0.2
+        frame.insert(min(names.index(name), frame.shape[1]), name, ADDED_COLUMNS[name])
     if tuple(frame.columns) != names or not isinstance(frame.index, pandas.RangeIndex):
         raise ValueError(f"the columns must be {','.join(names)}")
     if "track_id" in names:
@@ -259,11 +260,13 @@ def parsed(table: str, content: bytes | bytearray) -> Table:
     return Table({name: column(name, frame[name].to_numpy()) for name in names})
 
 
-def _lines(table: str, columns: Table) -> str:
+def _lines(table: str, columns: Table, is_scored: bool) -> str:
     """Lines of the CSV file of `table`, floats with 17 significant digits."""
     import pandas
 
     frame = pandas.DataFrame(columns)
+    if table == "tracks" and not is_scored:
+        frame = frame.drop(columns=SCORE)
     if table == "updates":
         frame["track_id"] = frame["track_id"].astype("Int64").replace(NO_TRACK, pandas.NA)
     return str(frame.to_csv(header=False, index=False, float_format="%.17g", lineterminator="\n"))

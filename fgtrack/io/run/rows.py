@@ -45,7 +45,7 @@ def rows(
 
 def _track_row(tick: tuple[int, int], track: TrackReport) -> Row:
     cells, ids = _state_cells(track.state), (track.state.stamp_ns, track.track_id, track.status.value)
-    return (*tick, *ids, *cells[: len(STATE_NAMES)], track.num_measured, *cells[len(STATE_NAMES) :])
+    return (*tick, *ids, *cells[: len(STATE_NAMES)], track.num_measured, *cells[len(STATE_NAMES) :], track.score)
 
 
 def _update_row(tick: int, update: UpdateRecord) -> Row:
@@ -79,9 +79,10 @@ def text(table: str, cells: Sequence[Row]) -> str:
     return "".join([_line(tuple(map(type, row))) % row for row in cells])
 
 
-def text_header(table: str) -> bytes:
-    """First line of the CSV file of `table`."""
-    return (",".join(COLUMNS[table]) + "\n").encode()
+def text_header(table: str, is_scored: bool = True) -> bytes:
+    """First line of the CSV file of `table`; `is_scored` is that of `RunSink`."""
+    names = COLUMNS[table] if is_scored or table != "tracks" else COLUMNS[table][:-1]
+    return (",".join(names) + "\n").encode()
 
 
 @lru_cache

@@ -1,5 +1,6 @@
 """The layout of a run folder `fgtrack-run/1`: its tables and their columns."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,6 +14,8 @@ RUN_FORMAT = "fgtrack-run/1"
 COVARIANCE_STATES = ("x", "y", "yaw", "speed", "yaw_rate")
 #: Upper triangle of the covariance, row by row.
 COVARIANCE_COLUMNS = tuple(f"p_{a}_{b}" for i, a in enumerate(COVARIANCE_STATES) for b in COVARIANCE_STATES[i:])
+#: Last column of tracks.csv, the existence probability, where the lifecycle gives one.
+SCORE = "score"
 #: Columns of every table of a run folder, in their order.
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "tracks": (
@@ -20,6 +23,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
         *STATE_NAMES,
         "num_measured",
         *COVARIANCE_COLUMNS,
+        SCORE,
     ),
     "updates": (
         *("tick", "sensor", "stamp_ns", "receipt_ns", "index", "disposition", "track_id", "nis"),
@@ -36,8 +40,8 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
 }
 #: Tables that are written only when there is something to write.
 OPTIONAL_TABLES = ("smoothed", "lagged", "truth", "ignored", "ego", "objects", "detections")
-ADDED_COLUMNS = frozenset({"id"})
-"""Columns of texts that older runs may lack."""
+ADDED_COLUMNS: Mapping[str, str | float] = {"id": "", SCORE: math.nan}
+"""Columns that older runs may lack, and their cells then."""
 NO_TRACK = -1
 """Track id of an update that belongs to no track."""
 

@@ -36,6 +36,11 @@ class RunSink(ABC):
         self._objects: dict[int, ObjectReport] = {}  # the last word on tracks that have not ended
         self._received: dict[str, list[Row]] = {name: [] for name in ("truth", "ignored", "ego", "detections")}
 
+    @property
+    def is_scored(self) -> bool:
+        """True if tracks have existence probabilities: a column of `tracks`, which others lack."""
+        return bool(self._meta.get("is_scored"))
+
     def write_tick(self, report: TickReport, process_ns: int, num_detections: int) -> None:
         """Take all rows of one tick, see `rows`, and what was received before it."""
         self._append_received()
@@ -46,7 +51,7 @@ class RunSink(ABC):
         self._append_objects({track.track_id for track in report.tracks})
         self._objects |= {track.track_id: track.object for track in report.tracks if track.object is not None}
         for table, cells in rows(report, process_ns, num_detections, self._smoothed_lag_s):
-            self._append(table, cells)
+            self._append(table, cells if self.is_scored or table != "tracks" else [row[:-1] for row in cells])
 
     def write_smoothed(self, reports: Sequence[SmoothedReport]) -> None:
         """Take rows of `smoothed`; the end of a run may have none."""

@@ -93,7 +93,7 @@ class RunWriter(RunSink):
         try:
             if table not in self._files:
                 self._files[table] = self._open.enter_context(path.open("wb"))
-                self._files[table].write(text_header(table))
+                self._files[table].write(text_header(table, self.is_scored))
             self._files[table].write(lines.encode())
             self._files[table].flush()
         except OSError as error:

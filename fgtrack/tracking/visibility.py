@@ -1,0 +1,272 @@
+"""Existence of objects and their visibility to each sensor: evidence of lists in arrays, and what a sensor shows where.
+
+An object does not exist, or exists and is visible to a sensor, or exists and is not: integrated probabilistic data
+association with an observability state (Musicki, Evans, Stankovic, IEEE Trans. Automatic Control 39, 1994; Musicki,
+Evans, IEEE T-AES 40, 2004). Given that it exists, its visibility to a sensor is a Markov chain in continuous time of
+which only the lists of that sensor tell, so the joint probability is the product of existence and visibilities.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from fgtrack.core.compiled import inlined, njit
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
+
+#: Bounds of log-odds: a probability that differs from 0 or 1 by less says nothing more.
+LARGEST_LOG_ODDS = 30.0
+#: Columns of an evidence: share of visible objects there and likelihood ratio if visible (NaN out of view), then, after
+#: it, log-odds of existence and the probabilities of being visible to each sensor, given that the object exists.
+SHARE, RATIO, LOG_ODDS, VISIBLE = range(4)
+#: Its stamp, sensor and cell, and after it the newest stamp at which each sensor could show the object.
+STAMP, SENSOR, CELL, VIEWED = range(4)
+NEVER = -(2**62)
+_FEWEST_TRACKS, _FEWEST_ENTRIES = 8, 32
+
+
+class Looks(NamedTuple):
+    """Evidence that no late list changes any more, m entries."""
+
+    rows: IntArray
+    """Rows of the tracks."""
+    stamps_ns: IntArray
+    sensors: IntArray
+    cells: IntArray
+    shown: BoolArray
+    """True where the list has shown the object."""
+    weights: FloatArray
+    """Probability that it existed, times the share of an independent look: those in a row show the same."""
+
+
+class Histories:
+    """Evidence of all tracks in order of its stamps, and the probabilities after each, whatever the order of arrival.
+    Entry 0 of a track is its birth, or all that is older than what is remembered.
+    """
+
+    def __init__(self, num_sensors: int, lifetime_s: float, visible_s: float) -> None:
+        """`lifetime_s`: mean time for which objects exist; `visible_s`: time constant of the visibility to a sensor."""
+        self._times_s = lifetime_s, visible_s
+        self.numbers = np.zeros((_FEWEST_TRACKS, _FEWEST_ENTRIES, VISIBLE + num_sensors))
+        self.entries = np.zeros((_FEWEST_TRACKS, _FEWEST_ENTRIES, VIEWED + num_sensors), dtype=np.int64)
+        """See `SHARE` and `STAMP`, shape (tracks, entries, columns)."""
+        self.counts = np.zeros(_FEWEST_TRACKS, dtype=np.int64)
+        """Number of entries of each track, 0 of a free row."""
+
+    def begin(self, stamp_ns: int, sensor: int, log_odds: float) -> int:
+        """Return the row of a new track with these log-odds, visible to the `sensor` that started it."""
+        if self.counts.all():
+            self.counts = np.concatenate([self.counts, np.zeros_like(self.counts)])
+            self._grow(axis=0)
+        row = int(np.argmin(self.counts))
+        numbers, entries = self.numbers[row, 0], self.entries[row, 0]
+        numbers[:], entries[:] = 0.0, NEVER
+        numbers[LOG_ODDS], numbers[VISIBLE + sensor] = min(max(log_odds, -LARGEST_LOG_ODDS), LARGEST_LOG_ODDS), 1.0
+        entries[STAMP] = entries[VIEWED + sensor] = stamp_ns
+        self.counts[row] = 1
+        return row
+
+    def learn(
+        self, rows: IntArray, stamp_ns: int, sensor: int, shares: FloatArray, ratios: FloatArray, cells: IntArray
+    ) -> None:
+        """Add the evidence of a list of `sensor` on the tracks in `rows`, all (m,); see `SHARE`.
+        What is older than all that is remembered counts as the oldest.
+        """
+        if len(rows) and self.counts[rows].max() == self.numbers.shape[1]:
+            self._grow(axis=1)
+        _learn(rows, stamp_ns, sensor, shares, ratios, cells, self.numbers, self.entries, self.counts, *self._times_s)
+
+    def present(self, rows: IntArray, present_ns: int) -> FloatArray:
+        """Return the probabilities that the objects exist at `present_ns`, not before their newest evidence, (m,)."""
+        found: FloatArray = _present(rows, present_ns, self.numbers, self.entries, self.counts, self._times_s[0])
+        return found
+
+    def last(self, rows: IntArray) -> tuple[FloatArray, IntArray]:
+        """Return the visibilities to each sensor and when each could show the objects last, shapes (m, sensors)."""
+        last = self.counts[rows] - 1
+        return self.numbers[rows, last, VISIBLE:], self.entries[rows, last, VIEWED:]
+
+    def forget(self, oldest_ns: int) -> Looks:
+        """Remember what is older than `oldest_ns` by its outcome alone, and return it."""
+        return Looks(*_forget(oldest_ns, self.numbers, self.entries, self.counts, self._times_s[1]))
+
+    def end(self, row: int) -> Looks:
+        """Free the `row` of a track and return its evidence."""
+        one = slice(row, row + 1)
+        looks = _forget(-NEVER, self.numbers[one], self.entries[one], self.counts[one], self._times_s[1])
+        self.counts[row] = 0
+        return Looks(*looks)._replace(rows=np.full(len(looks[0]), row))
+
+    def _grow(self, axis: int) -> None:
+        self.numbers = np.concatenate([self.numbers, np.zeros_like(self.numbers)], axis=axis)
+        self.entries = np.concatenate([self.entries, np.zeros_like(self.entries)], axis=axis)
+
+
+class DetectionShares:
+    """Share of the lists of each sensor that show an object, by range and bearing, learned from tracks.
+    A cell counts looks with and without a detection; with a Beta prior, which is the share of its ring at any bearing,
+    whose prior is the same everywhere. The counts are forgotten slowly. A list is judged by what had left the memory of
+    evidence when its epoch of `memory_ns` began, which no late list changes: the order of arrival does not matter.
+    """
+
+    FORGET_S = 300.0
+    """Time constant of forgetting."""
+    PRIOR_LOOKS = 2.0
+    """Independent looks that a prior is worth."""
+    FIRST_RING_M, NUM_RINGS, NUM_SECTORS = 10.0, 16, 8
+    """Up to the first ring bearings are as one; each further ring is sqrt(2) times as large: up to 1.8 km."""
+
+    def __init__(self, memory_ns: int, priors: Sequence[float]) -> None:
+        """`priors`: the share of each sensor where nothing is known."""
+        self._memory_ns, self._priors = memory_ns, priors
+        self._empty = np.zeros((len(priors), 2, self.NUM_RINGS, self.NUM_SECTORS))
+        self._keep = math.exp(-memory_ns / NS_PER_S / self.FORGET_S)
+        self._counts: dict[int, FloatArray] = {}  # looks without and with a detection, by epoch of their stamps
+        self._known: dict[int, FloatArray] = {}  # sums of counts that lists of an epoch are judged by
+
+    def cells(self, range_m: FloatArray, bearing_rad: FloatArray) -> IntArray:
+        """Return the cells at these ranges and bearings from a sensor, shapes (m,)."""
+        ring = np.floor(2.0 * np.log2(np.maximum(range_m, 1e-3) / self.FIRST_RING_M)) + 1.0
+        sector = np.floor((bearing_rad / math.tau) % 1.0 * self.NUM_SECTORS)
+        ring = np.clip(ring, 0.0, self.NUM_RINGS - 1.0)
+        return np.asarray(ring * self.NUM_SECTORS + np.minimum(sector, self.NUM_SECTORS - 1.0), dtype=np.int64)
+
+    def at(self, sensor: int, stamp_ns: int, cells: IntArray) -> FloatArray:
+        """Return the shares of a list of `sensor` in `cells`, shapes (m,)."""
+        missed, shown = self._judging(stamp_ns // self._memory_ns)[sensor]
+        weight = self.PRIOR_LOOKS
+        ring = (shown.sum(axis=1) + weight * self._priors[sensor]) / ((shown + missed).sum(axis=1) + weight)
+        return np.asarray(((shown + weight * ring[:, None]) / (shown + missed + weight)).ravel()[cells])
+
+    def learn(self, looks: Looks) -> None:
+        """Count `looks`."""
+        epochs = looks.stamps_ns // self._memory_ns
+        for epoch in np.unique(epochs).tolist():
+            counts = self._counts.setdefault(epoch, self._empty.copy())
+            m = epochs == epoch
+            ring, sector = np.divmod(looks.cells[m], self.NUM_SECTORS)
+            np.add.at(counts, (looks.sensors[m], looks.shown[m].astype(np.int64), ring, sector), looks.weights[m])
+
+    def _judging(self, epoch: int) -> FloatArray:
+        """Return the sums of all counts that had left the memory when `epoch` began."""
+        if epoch not in self._known:
+            newest = max(self._known, default=epoch)
+            if epoch < newest:
+                return self._known[min(self._known)]
+            sums = self._known.get(newest, self._empty) * self._keep ** (epoch - newest)
+            for old in sorted(each for each in self._counts if each <= epoch - 2):
+                sums = sums + self._counts.pop(old) * self._keep ** (epoch - 2 - old)
+            self._known[epoch] = sums
+            self._known = dict(sorted(self._known.items())[-3:])
+        return self._known[epoch]
+
+
+@inlined
+def _survived(log_odds: float, dt_ns: int, lifetime_s: float) -> float:
+    """Log-odds after `dt_ns`: odds r / (1 - r) become r s / (1 - r s) with s = exp(-dt / lifetime)."""
+    dt = dt_ns / (NS_PER_S * lifetime_s)
+    if dt <= 0.0:
+        return log_odds
+    return max(-math.log(math.exp(-log_odds) - math.expm1(-dt)) - dt, -LARGEST_LOG_ODDS)
+
+
+@inlined
+def _conclude(numbers: FloatArray, entries: IntArray, k: int, lifetime_s: float, visible_s: float) -> None:
+    """Write the probabilities after entry k of one track.
+    Prediction v = share + (v - share) exp(-dt / visible_s), likelihood 1 - v + v ratio, update v ratio / likelihood.
+    """
+    for j in range(VISIBLE, numbers.shape[1]):
+        numbers[k, j], entries[k, j - VISIBLE + VIEWED] = numbers[k - 1, j], entries[k - 1, j - VISIBLE + VIEWED]
+    own, viewed, stamp_ns = VISIBLE + entries[k, SENSOR], VIEWED + entries[k, SENSOR], entries[k, STAMP]
+    v, ratio = numbers[k, SHARE], numbers[k, RATIO]
+    numbers[k, LOG_ODDS] = _survived(numbers[k - 1, LOG_ODDS], stamp_ns - entries[k - 1, STAMP], lifetime_s)
+    if math.isnan(ratio):  # out of view: what it sees when it is back is not correlated with what it saw
+        numbers[k, own], entries[k, viewed] = 0.0, NEVER
+        return
+    if entries[k, viewed] != NEVER:
+        v += (numbers[k, own] - v) * math.exp((entries[k, viewed] - stamp_ns) / (NS_PER_S * visible_s))
+    likelihood = 1.0 - v + v * ratio
+    numbers[k, own], entries[k, viewed] = v * ratio / likelihood, stamp_ns
+    changed = numbers[k, LOG_ODDS] + math.log(likelihood)
+    numbers[k, LOG_ODDS] = min(max(changed, -LARGEST_LOG_ODDS), LARGEST_LOG_ODDS)
+
+
+@njit(
+    "(int64[::1], int64, int64, float64[::1], float64[::1], int64[::1], float64[:, :, ::1], int64[:, :, ::1],"
+    " int64[::1], float64, float64)"
+)
+def _learn(
+    rows: IntArray,
+    stamp_ns: int,
+    sensor: int,
+    shares: FloatArray,
+    ratios: FloatArray,
+    cells: IntArray,
+    numbers: FloatArray,
+    entries: IntArray,
+    counts: IntArray,
+    lifetime_s: float,
+    visible_s: float,
+) -> None:
+    """Insert an entry into the tracks `rows` in order of stamps, and conclude again from there on."""
+    for m in range(len(rows)):
+        own, at = rows[m], counts[rows[m]]
+        while at > 1 and entries[own, at - 1, STAMP] > stamp_ns:
+            for j in range(VISIBLE):
+                numbers[own, at, j], entries[own, at, j] = numbers[own, at - 1, j], entries[own, at - 1, j]
+            at -= 1
+        counts[own] += 1
+        numbers[own, at, SHARE], numbers[own, at, RATIO] = shares[m], ratios[m]
+        entries[own, at, STAMP] = max(stamp_ns, entries[own, 0, STAMP])
+        entries[own, at, SENSOR], entries[own, at, CELL] = sensor, cells[m]
+        for k in range(at, counts[own]):
+            _conclude(numbers[own], entries[own], k, lifetime_s, visible_s)
+
+
+@njit("float64[::1](int64[::1], int64, float64[:, :, ::1], int64[:, :, ::1], int64[::1], float64)")
+def _present(
+    rows: IntArray, present_ns: int, numbers: FloatArray, entries: IntArray, counts: IntArray, lifetime_s: float
+) -> FloatArray:
+    """Return existence probabilities at `present_ns`, shape (m,)."""
+    result = np.empty(len(rows))
+    for m in range(len(rows)):
+        own, k = rows[m], counts[rows[m]] - 1
+        log_odds = _survived(numbers[own, k, LOG_ODDS], present_ns - entries[own, k, STAMP], lifetime_s)
+        result[m] = 1.0 / (1.0 + math.exp(-log_odds))
+    return result
+
+
+@njit("(int64, float64[:, :, ::1], int64[:, :, ::1], int64[::1], float64)")
+def _forget(
+    oldest_ns: int, numbers: FloatArray, entries: IntArray, counts: IntArray, visible_s: float
+) -> tuple[IntArray, IntArray, IntArray, IntArray, BoolArray, FloatArray]:
+    """Move entries up to `oldest_ns` out of the histories, see `Looks`; the last of them becomes entry 0."""
+    size = 0
+    for own in range(len(counts)):
+        for k in range(1, counts[own]):
+            size += entries[own, k, STAMP] <= oldest_ns
+    rows, stamps_ns = np.empty(size, np.int64), np.empty(size, np.int64)
+    sensors, cells = np.empty(size, np.int64), np.empty(size, np.int64)
+    shown, weights, at = np.empty(size, np.bool_), np.empty(size), 0
+    for own in range(len(counts)):
+        last = 0
+        for k in range(1, counts[own]):
+            if entries[own, k, STAMP] > oldest_ns:
+                break
+            last, sensor = k, entries[own, k, SENSOR]
+            rows[at], stamps_ns[at], sensors[at], cells[at] = own, entries[own, k, STAMP], sensor, entries[own, k, CELL]
+            shown[at] = numbers[own, k, RATIO] > 1.0
+            before_ns, weights[at] = entries[own, k - 1, VIEWED + sensor], 0.0
+            if not math.isnan(numbers[own, k, RATIO]):
+                look = 1.0
+                if before_ns != NEVER:
+                    look = min((stamps_ns[at] - before_ns) / (NS_PER_S * visible_s), 1.0)
+                weights[at] = look / (1.0 + math.exp(-numbers[own, k, LOG_ODDS]))
+            at += 1
+        for k in range(last, counts[own] if last else 0):
+            for j in range(numbers.shape[2]):
+                numbers[own, k - last, j], entries[own, k - last, j] = numbers[own, k, j], entries[own, k, j]
+        counts[own] -= last
+    return rows, stamps_ns, sensors, cells, shown, weights
