@@ -70,6 +70,23 @@ def add_congruence(A: FloatArray, P: FloatArray, AP: FloatArray, out: FloatArray
 
 
 @inlined
+def add_weighted(K: FloatArray, R: FloatArray, KR: FloatArray, out: FloatArray) -> None:
+    """Add K' R K of K (k, n) and the first k rows and columns of R, which is symmetric, to `out`; K' R is written."""
+    k, n = K.shape
+    for a in range(n):
+        for c in range(k):
+            value = 0.0
+            for d in range(k):
+                value += K[d, a] * R[d, c]
+            KR[a, c] = value
+        for b in range(a + 1):
+            value = out[a, b]
+            for c in range(k):
+                value += KR[a, c] * K[c, b]
+            out[a, b] = out[b, a] = value
+
+
+@inlined
 def cholesky(S: FloatArray, n: int, L: FloatArray) -> bool:
     """Write the lower Cholesky factor of the first n rows and columns to L, which may be S; False if there is none."""
     for i in range(n):
@@ -88,20 +105,39 @@ def cholesky(S: FloatArray, n: int, L: FloatArray) -> bool:
 
 @inlined
 def solve(S: FloatArray, columns: FloatArray) -> bool:
-    """Overwrite columns by S^-1 columns and S by its Cholesky factor; False unless S is positive definite."""
-    n = S.shape[0]
+    """Overwrite columns (n, m) by S^-1 columns, and the first n rows and columns of S by their Cholesky factor.
+    False unless they are positive definite.
+    """
+    n = len(columns)
     if not cholesky(S, n, S):
         return False
-    for c in range(columns.shape[1]):
-        for i in range(n):
-            for k in range(i):
+    for i in range(n):
+        for k in range(i):
+            for c in range(columns.shape[1]):
                 columns[i, c] -= S[i, k] * columns[k, c]
+        for c in range(columns.shape[1]):
             columns[i, c] /= S[i, i]
-        for i in range(n - 1, -1, -1):
-            for k in range(i + 1, n):
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            for c in range(columns.shape[1]):
                 columns[i, c] -= S[k, i] * columns[k, c]
+        for c in range(columns.shape[1]):
             columns[i, c] /= S[i, i]
     return True
+
+
+@inlined
+def whiten(S: FloatArray, y: FloatArray) -> float:
+    """Overwrite y (n,) by L^-1 y, and S by its Cholesky factor L; return y' S^-1 y, NaN where there is no root."""
+    total = 0.0
+    if not cholesky(S, len(y), S):
+        return np.nan
+    for i in range(len(y)):
+        for k in range(i):
+            y[i] -= S[i, k] * y[k]
+        y[i] /= S[i, i]
+        total += y[i] * y[i]
+    return total
 
 
 @inlined

@@ -8,92 +8,122 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import add_product_transposed, inlined, merged, njit, product
+from fgtrack.core.compiled import add_product_transposed, copy, inlined, merged, njit, product
 from fgtrack.core.types import FloatArray
 
 #: Kinds of motion: constant turn rate and velocity (or acceleration), constant velocity.
 ARC, LINE = 0, 1
-#: A longer arc is made of parts that turn by so much at most, up to which series and quadrature hold to rounding.
+#: A longer arc is made of parts that turn by so much at most, up to which the series hold to rounding.
 MAX_TURN_RAD = 0.5
 #: An arc of more parts has no finite result: a yaw rate that no object has.
 MAX_PARTS = 10_000
-_LEGENDRE_NODES, _LEGENDRE_WEIGHTS = np.polynomial.legendre.leggauss(7)
-_NODES, _WEIGHTS = 0.5 * (1.0 + _LEGENDRE_NODES), 0.5 * _LEGENDRE_WEIGHTS
-# (iw)^k / (k! (k + j + 1)) add up to the integral over [0, 1] of s^j exp(iws): the factors of w^k by j, k % 2, k // 2.
-_SERIES = np.array(
-    [
-        [[(-1.0) ** (k // 2) / (math.factorial(k) * (k + j + 1)) for k in range(odd, 14, 2)] for odd in (0, 1)]
-        for j in range(3)
-    ]
-)
+_TERMS = 10
+# With the moments K_j of the heading, integrals of s^j exp(iws) over s in [0, r], the functions K_0, r K_0 - K_1, K_1,
+# r K_1 - K_2, 1 and r are sums over k of c_k (iw)^k r^(k + e), with the factors c and the exponent e of each.
+_K = np.arange(2 * _TERMS)
+_MOMENTS = 1.0 / np.array([_K + 1, (_K + 1) * (_K + 2), _K + 2, (_K + 2) * (_K + 3)]) / np.cumprod(np.maximum(_K, 1.0))
+_FACTORS, _EXPONENTS = np.vstack([_MOMENTS, _K == 0, _K == 0]), (1, 2, 2, 3, 0, 1)
+
+
+def _columns(factors: FloatArray) -> FloatArray:
+    """Factors of w^2k in the real part of a sum of c_k (iw)^k, and in the imaginary part over w, shape (terms, 2)."""
+    return np.asarray((factors * np.array([1.0, 1.0, -1.0, -1.0])[_K % 4]).reshape(_TERMS, 2))
+
+
+def _integral(a: int, b: int, conjugate: float = 1.0) -> FloatArray:
+    """`_columns` of the integral over r in [0, 1] of a product; with -1 for b conjugated, of the real part."""
+    factors = np.convolve(_FACTORS[a], _FACTORS[b] * conjugate**_K)[_K] / (_K + _EXPONENTS[a] + _EXPONENTS[b] + 1)
+    return _columns(factors)[:, : 2 if conjugate > 0.0 else 1]
+
+
+def _linear(a: int) -> list[FloatArray]:
+    """Values at 1 and integrals of functions a and a + 1, and the integral of r times the latter: ten columns."""
+    return [_columns(_FACTORS[a]), _columns(_FACTORS[a + 1]), _integral(a, 4), _integral(a + 1, 4), _integral(a + 1, 5)]
+
+
+def _quadratic(a: int, b: int) -> list[FloatArray]:
+    """Integrals of the products a b and (a + 1) (b + 1), and of those with conjugates: six columns."""
+    return [_integral(a, b), _integral(a + 1, b + 1), _integral(a, b, -1.0), _integral(a + 1, b + 1, -1.0)]
+
+
+# At constant speed the first 16 suffice.
+_SERIES = np.hstack([*_linear(0), *_quadratic(0, 0), *_linear(2), *_quadratic(0, 2), *_quadratic(2, 2)])
 
 
 @merged
-def _position_gradient(R: float, yaw_rate: float, speed: float, accel: float, gradient: FloatArray) -> None:
-    """Write the derivatives (4, 2) of the position by yaw, speed, yaw rate and acceleration a time R before.
-    In the frame of the heading at the end: along and left; `speed` is that at the end. With the moments K_j of the
-    heading, integrals of s^j exp(i w s) from the end back, these are as complex numbers i (v K_0 - a K_1), K_0,
-    i (v (R K_0 - K_1) - a (R K_1 - K_2)), R K_0 - K_1.
-    """
-    w, scale = -yaw_rate * R, R
-    for j in range(3):
-        even = odd = 0.0
-        for k in range(6, -1, -1):
-            even, odd = even * w * w + _SERIES[j, 0, k], odd * w * w + _SERIES[j, 1, k]
-        gradient[j, 0], gradient[j, 1] = scale * even, scale * odd * w
-        scale *= R
-    for i in range(2):
-        K0, K1, K2 = gradient[0, i], gradient[1, i], gradient[2, i]
-        gradient[0, i], gradient[1, i] = speed * K0 - accel * K1, K0
-        gradient[2, i], gradient[3, i] = speed * (R * K0 - K1) - accel * (R * K1 - K2), R * K0 - K1
-    for j in range(0, 4, 2):
-        gradient[j, 0], gradient[j, 1] = -gradient[j, 1], gradient[j, 0]
+def _at(values: FloatArray, index: int, w: float) -> complex:
+    return complex(values[index], values[index + 1] * w)
 
 
-@merged
+@inlined
 def _short_arc(x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray) -> None:
-    """Write mean, F and Q after a turn of at most `MAX_TURN_RAD`."""
-    n = len(x)
-    accel, q_accel = (x[5], density[5]) if n > 5 else (0.0, 0.0)
-    heading, speed = x[2] + x[4] * t, x[3] + accel * t
-    c, s = math.cos(heading), math.sin(heading)
-    gradient, cross = np.empty((4, 2)), np.zeros((4, 2))  # cross: integral of g D Phi' for each entry from the yaw on
-    square = real = imag = 0.0  # integrals of |g|^2 D and of g^2 D
-    for node in range(8):
-        R, weight = (t * _NODES[node], t * _WEIGHTS[node]) if node < 7 else (t, 0.0)  # the last one is the start
-        _position_gradient(R, x[4], speed, accel, gradient)
-        for j in range(n - 2):
-            along, left, q = gradient[j, 0], gradient[j, 1], density[j + 2] * weight
-            square += q * (along * along + left * left)
-            real += q * (along * along - left * left)
-            imag += 2.0 * q * along * left
-            for i in range(2):
-                cross[j, i] += q * gradient[j, i]
-        for i in range(2):
-            cross[0, i] += density[4] * weight * R * gradient[2, i]
-            cross[1, i] += q_accel * weight * R * gradient[3, i]
-    real, imag = real * (c * c - s * s) - imag * 2.0 * c * s, imag * (c * c - s * s) + real * 2.0 * c * s
-    for i in range(n):
-        mean[i] = x[i]
+    """Write mean, F and Q after a turn of at most `MAX_TURN_RAD`.
+    As complex numbers, along and left of the heading at the end, where the speed is v, the position depends on yaw,
+    speed, yaw rate and acceleration a time R before by i (v K_0 - a K_1), K_0, i (v (R K_0 - K_1) - a (R K_1 - K_2)),
+    R K_0 - K_1. `unit` has the series of these moments, from the end back; `scaled` those for the yaw and its rate.
+    """
+    n, i = len(x), 1j * t
+    accel, q_accel = (x[5], density[5] * t) if n > 5 else (0.0, 0.0)
+    q_yaw, q_speed, q_rate = density[2] * t, density[3] * t, density[4] * t
+    w, v, a = -x[4] * t, x[3] + accel * t, accel * t
+    unit, scaled, used = np.zeros(38), np.empty(16), 16 if n == 5 else 38
+    for k in range(_TERMS - 1, -1, -1):
+        for p in range(used):
+            unit[p] = unit[p] * (w * w) + _SERIES[k, p]
+    for p in range(10):
+        scaled[p] = v * unit[p] - a * unit[p + 16]
+    for p in range(10, 16):
+        scaled[p] = v * v * unit[p] - 2.0 * v * a * unit[p + 16] + a * a * unit[p + 22]
+    for j in range(n):
+        mean[j] = x[j]
         for k in range(n):
-            F[i, k] = 1.0 if i == k else 0.0
-            Q[i, k] = density[i] * t if i == k else 0.0
-    along, left = gradient[0, 1], -gradient[0, 0]
-    mean[0], mean[1], mean[2], mean[3] = x[0] + c * along - s * left, x[1] + s * along + c * left, heading, speed
-    Q[0, 0] += 0.5 * (square + real)
-    Q[1, 1] += 0.5 * (square - real)
-    Q[0, 1] = Q[1, 0] = 0.5 * imag
-    for j in range(n - 2):
-        k = j + 2
-        F[0, k] = c * gradient[j, 0] - s * gradient[j, 1]
-        F[1, k] = s * gradient[j, 0] + c * gradient[j, 1]
-        Q[0, k] = Q[k, 0] = c * cross[j, 0] - s * cross[j, 1]
-        Q[1, k] = Q[k, 1] = s * cross[j, 0] + c * cross[j, 1]
+            F[j, k] = 1.0 if j == k else 0.0
+            Q[j, k] = density[j] * t if j == k else 0.0
+    mean[2], mean[3] = x[2] + x[4] * t, v
+    turn = complex(math.cos(mean[2]), math.sin(mean[2]))
+    gradient = i * _at(scaled, 0, w), t * _at(unit, 0, w), i * t * _at(scaled, 2, w), t * t * _at(unit, 2, w)
+    cross = (
+        i * (q_yaw * _at(scaled, 4, w) + q_rate * t * t * _at(scaled, 8, w)),
+        t * (q_speed * _at(unit, 4, w) + q_accel * t * t * _at(unit, 8, w)),
+        i * t * q_rate * _at(scaled, 6, w),
+        t * t * q_accel * _at(unit, 6, w),
+    )
+    way = turn * t * _at(scaled, 0, w)
+    size = q_yaw * scaled[14] + q_speed * unit[14] + t * t * (q_rate * scaled[15] + q_accel * unit[15])
+    square = q_speed * _at(unit, 10, w) - q_yaw * _at(scaled, 10, w)
+    square = turn * turn * (square + t * t * (q_accel * _at(unit, 12, w) - q_rate * _at(scaled, 12, w)))
+    mean[0], mean[1] = x[0] + way.real, x[1] + way.imag
+    Q[0, 0] += 0.5 * t * t * (size + square.real)
+    Q[1, 1] += 0.5 * t * t * (size - square.real)
+    Q[0, 1] = Q[1, 0] = 0.5 * t * t * square.imag
+    for k in range(2, n):
+        by, noise = turn * gradient[k - 2], turn * cross[k - 2]
+        F[0, k], F[1, k] = by.real, by.imag
+        Q[0, k] = Q[k, 0] = noise.real
+        Q[1, k] = Q[k, 1] = noise.imag
     for k in range(2, n - 2):  # the yaw by its rate, the speed by the acceleration
         q = density[k + 2]
         F[k, k + 2] = t
         Q[k, k] += q * t * t * t / 3.0
         Q[k, k + 2] = Q[k + 2, k] = 0.5 * q * t * t
+
+
+@merged
+def _long_arc(
+    x: FloatArray, t: float, parts: int, density: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
+) -> None:
+    """Write mean, F and Q after so many short arcs of t each."""
+    n = len(x)
+    before, G, old, GM = np.empty(n), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    _short_arc(x, t, density, mean, F, Q)
+    for _ in range(1, parts):
+        before[:] = mean
+        copy(Q, old)
+        _short_arc(before, t, density, mean, G, Q)
+        product(G, old, GM)
+        add_product_transposed(GM, G, Q)
+        product(G, F, GM)
+        copy(GM, F)
 
 
 @merged
@@ -116,35 +146,20 @@ def _line(x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F: Flo
 def transition(
     kind: int, x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
 ) -> None:
-    """Write mean (n,), F and Q (n, n) of the state x (n,) after t, a long arc part by part."""
-    parts, turn = 1, abs(x[4] * t) if kind == ARC else 0.0
-    if not turn <= MAX_TURN_RAD:
-        if not turn < MAX_TURN_RAD * MAX_PARTS:
-            for i in range(len(x)):
-                mean[i] = math.nan
-                for k in range(len(x)):
-                    F[i, k] = Q[i, k] = math.nan
-            return
-        parts = math.ceil(turn / MAX_TURN_RAD)
-        t /= parts
+    """Write mean (n,), F and Q (n, n) of the state x (n,) after t."""
+    turn = abs(x[4] * t) if kind == ARC else 0.0
     if kind != ARC:
         _line(x, t, density, mean, F, Q)
-        return
-    n = len(x)
-    before, G, old, GM = np.empty(n), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    for part in range(parts):
-        for i in range(n):
-            before[i] = mean[i] if part else x[i]
-            for k in range(n):
-                old[i, k] = Q[i, k]
-        _short_arc(before, t, density, mean, G, Q)
-        if part:
-            product(G, old, GM)
-            add_product_transposed(GM, G, Q)
-            product(G, F, GM)
-        for i in range(n):
-            for k in range(n):
-                F[i, k] = GM[i, k] if part else G[i, k]
+    elif turn <= MAX_TURN_RAD:
+        _short_arc(x, t, density, mean, F, Q)
+    elif turn < MAX_TURN_RAD * MAX_PARTS:
+        parts = math.ceil(turn / MAX_TURN_RAD)
+        _long_arc(x, t / parts, parts, density, mean, F, Q)
+    else:
+        for i in range(len(x)):
+            mean[i] = math.nan
+            for k in range(len(x)):
+                F[i, k] = Q[i, k] = math.nan
 
 
 @njit("(int64, float64[:, ::1], float64[::1], float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, ::1])")

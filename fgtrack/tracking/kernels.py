@@ -5,9 +5,8 @@ import math
 import numpy as np
 
 from fgtrack.core.checks import LARGEST
-from fgtrack.core.compiled import add_congruence, cholesky, njit, wrapped
+from fgtrack.core.compiled import add_congruence, cholesky, copy, njit, whiten, wrapped
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.kernels.kalman import innovate
 from fgtrack.models.measurement import COMPONENTS
 
 SOUND, NOT_FINITE, NOT_DEFINITE = range(3)
@@ -150,11 +149,12 @@ def innovations(
     Innovations y (m, k), Jacobians H (m, k, n) or (1, k, n), covariances P (tracks, n, n), R (m, k, k).
     """
     m, k = y.shape
-    nis, logdet, every = np.empty(m), np.zeros(m), np.arange(k)
-    S, HP = np.empty((k, k)), np.empty((k, P.shape[1]))
+    nis, logdet, S, HP, white = np.empty(m), np.zeros(m), np.empty((k, k)), np.empty((k, P.shape[1])), np.empty(k)
     for i in range(m):
-        nis[i] = innovate(P[tracks[i]], y[i], H[min(i, len(H) - 1)], R[i], every, S, HP)
-        cholesky(S, k, S)
+        copy(R[i], S)
+        add_congruence(H[min(i, len(H) - 1)], P[tracks[i]], HP, S)
+        white[:] = y[i]
+        nis[i] = whiten(S, white)
         for a in range(k):
             logdet[i] += 2.0 * math.log(S[a, a])
     return nis, logdet

@@ -2,52 +2,53 @@
 
 import numpy as np
 
-from fgtrack.core.compiled import add_congruence, add_product_transposed, copy, inlined, njit, product, solve
+from fgtrack.core.compiled import (
+    add_congruence,
+    add_product_transposed,
+    add_weighted,
+    copy,
+    inlined,
+    njit,
+    product,
+    solve,
+    whiten,
+)
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 
 _VECTORS, _MATRICES = "float64[:, ::1]", "float64[:, :, ::1]"
 
 
 @inlined
-def innovate(
-    P: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray, rows: IntArray, S: FloatArray, K: FloatArray
-) -> float:
-    """Write S = H P H' + R and K' = S^-1 H P, and return the NIS of the `rows` of y; NaN where S has no root."""
-    k, d, nis = len(y), len(rows), 0.0
-    copy(R, S)
-    add_congruence(H, P, K, S)
-    marginal, weighted, root = np.empty((d, d)), np.empty((d, 1)), np.empty((k, k))
-    for a in range(d):
-        weighted[a, 0] = y[rows[a]]
-        for b in range(d):
-            marginal[a, b] = S[rows[a], rows[b]]
-    if not solve(marginal, weighted):
-        return np.nan
-    for a in range(d):
-        nis += y[rows[a]] * weighted[a, 0]
-    copy(S, root)
-    return nis if solve(root, K) else np.nan
+def marginal_nis(S: FloatArray, y: FloatArray, rows: IntArray, root: FloatArray, white: FloatArray) -> float:
+    """Return the NIS of the `rows` of y (k,) with covariance S; NaN where that of the rows has no root."""
+    for a in range(len(rows)):
+        white[a] = y[rows[a]]
+        for b in range(a + 1):
+            root[a, b] = S[rows[a], rows[b]]
+    return whiten(root, white[: len(rows)])
 
 
 @inlined
-def correct_one(mean: FloatArray, P: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray, K: FloatArray) -> bool:
-    """Overwrite mean and P by x + K y and (I - K H) P (I - K H)' + K R K', of K transposed; True if all is finite."""
-    n, k, total = len(mean), len(y), 0.0
-    A, AP, KR, gain = np.empty((n, n)), np.empty((n, n)), np.empty((n, k)), np.empty((n, k))
-    for a in range(n):
-        for b in range(k):
-            gain[a, b] = K[b, a]
-            mean[a] += K[b, a] * y[b]
-    product(gain, H, A)
-    for a in range(n):
-        for b in range(n):
-            A[a, b] = (1.0 if a == b else 0.0) - A[a, b]
+def conclude(
+    mean: FloatArray,
+    P: FloatArray,
+    A: FloatArray,
+    K: FloatArray,
+    R: FloatArray,
+    y: FloatArray,
+    AP: FloatArray,
+    KR: FloatArray,
+) -> bool:
+    """Overwrite mean and P by x + K y and A P A' + K R K', A = I - K H, of K transposed; True if all is finite."""
+    total, n = 0.0, len(mean)
     product(A, P, AP)
     for a in range(n):
+        for c in range(len(y)):
+            mean[a] += K[c, a] * y[c]
         for b in range(n):
             P[a, b] = 0.0
     add_product_transposed(AP, A, P)
-    add_congruence(gain, R, KR, P)
+    add_weighted(K, R, KR, P)
     for a in range(n):
         total += abs(mean[a])
         for b in range(n):
@@ -82,8 +83,22 @@ def correct(
     Writes S = H P H' + R, the NIS of the `rows` of y, and where S was positive definite and all is finite. Shapes
     (m, n), (m, n, n), (m, k), (1, k, n) or (m, k, n), (m, k, k).
     """
-    K = np.empty((y.shape[1], mean.shape[1]))
-    for i in range(len(y)):
+    m, k, n = len(y), y.shape[1], mean.shape[1]
+    K, root, white, A, AP = np.empty((k, n)), np.empty((k, k)), np.empty(k), np.empty((n, n)), np.empty((n, n))
+    KR = np.empty((n, k))
+    for i in range(m):
         h = H[min(i, len(H) - 1)]
-        nis[i] = innovate(P[i], y[i], h, R[i], rows, S[i], K)
-        fused[i] = not np.isnan(nis[i]) and correct_one(mean[i], P[i], y[i], h, R[i], K)
+        copy(R[i], S[i])
+        add_congruence(h, P[i], K, S[i])
+        nis[i] = marginal_nis(S[i], y[i], rows, root, white)
+        copy(S[i], root)
+        fused[i] = not np.isnan(nis[i]) and solve(root, K)
+        if not fused[i]:
+            nis[i] = np.nan
+            continue
+        for a in range(n):
+            for b in range(n):
+                A[a, b] = 1.0 if a == b else 0.0
+                for c in range(k):
+                    A[a, b] -= K[c, a] * h[c, b]
+        fused[i] = conclude(mean[i], P[i], A, K, R[i], y[i], AP, KR)

@@ -7,60 +7,80 @@ it, and the cross-covariance of that with the step before. One of `measured` has
 is a prior, is 0. A row of `windows` has the number of the track's steps, and its oldest and newest stamp.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
-from fgtrack.core.compiled import (
-    add_congruence,
-    add_product_transposed,
-    copy,
-    inlined,
-    merged,
-    njit,
-    product,
-    solve,
-    wrapped,
-)
+from fgtrack.core.compiled import add_congruence, add_weighted, copy, inlined, merged, njit, solve, wrapped
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.kernels.kalman import correct_one, innovate
+from fgtrack.estimation.kernels.kalman import conclude, marginal_nis
 from fgtrack.models.transitions import ARC, transition
 
 FAILED, TOO_OLD, IN_SEQUENCE, OUT_OF_SEQUENCE = range(4)
 _YAW = 2
 
 
+class _Work(NamedTuple):
+    """Space for matrices of the size of the state, and of the largest measurement."""
+
+    F: FloatArray
+    A: FloatArray
+    AP: FloatArray
+    ahead: FloatArray
+    """Shape (2 n + 1, n)."""
+    mean: FloatArray
+    S: FloatArray
+    K: FloatArray
+    """Shape (k, n)."""
+    KR: FloatArray
+    """Shape (n, k)."""
+    y: FloatArray
+
+
 @inlined
-def _ahead(motion: int, density: FloatArray, state: FloatArray, late_ns: int, predicted: FloatArray) -> None:
+def _work(n: int, k: int) -> _Work:
+    square, S = np.empty((n, n)), np.empty((k, k))
+    ahead, K, KR = np.empty((2 * n + 1, n)), np.empty((k, n)), np.empty((n, k))
+    return _Work(square, np.empty((n, n)), np.empty((n, n)), ahead, np.empty(n), S, K, KR, np.empty(k))
+
+
+@inlined
+def _ahead(
+    motion: int, density: FloatArray, state: FloatArray, late_ns: int, F: FloatArray, predicted: FloatArray
+) -> None:
     """Write f(x), F P F' + Q and F P, (2 n + 1, n), of the state x, P, (n + 1, n)."""
     n = len(density)
-    F = np.empty((n, n))
     transition(motion, state[0], late_ns / NS_PER_S, density, predicted[0], F, predicted[1 : n + 1])
     add_congruence(F, state[1:], predicted[n + 1 :], predicted[1 : n + 1])
 
 
 @inlined
-def _innovation(x: FloatArray, z: FloatArray, label: IntArray, wraps: bool, y: FloatArray, H: FloatArray) -> None:
-    """Write y = z - H x, and H, which selects entries."""
-    for a in range(len(y)):
+def _innovation(
+    state: FloatArray, label: IntArray, measured: FloatArray, wraps: bool, y: FloatArray, S: FloatArray
+) -> None:
+    """Write y = z - H x and S = H P H' + R, of an H that selects entries."""
+    k = label[1]
+    for a in range(k):
         entry = label[2 + a]
-        y[a] = z[a] - x[entry]
+        y[a] = measured[0, a] - state[0, entry]
         if wraps and entry == _YAW:
             y[a] = wrapped(y[a])
-        for b in range(len(x)):
-            H[a, b] = 1.0 if b == entry else 0.0
+        for b in range(k):
+            S[a, b] = state[1 + entry, label[2 + b]] + measured[1 + a, b]
 
 
 @merged
 def _retrodict(
-    motion: int, density: FloatArray, slots: IntArray, labels: IntArray, steps: FloatArray, now: FloatArray
+    motion: int, density: FloatArray, slots: IntArray, labels: IntArray, steps: FloatArray, work: _Work, now: FloatArray
 ) -> bool:
     """Smooth `now`, the state after the last of `slots`, back to the prediction of the first, which is new.
     From step to step (Rauch, Tung and Striebel), x_j + C s and P_j + C (P - P_-) C' with the prediction x_-, P_- of the
     step after, the shift s = x - x_- and C = (P_-^-1 F P_j)'. False where some P_- has no root.
     """
     n = len(density)
-    ahead, root, C, CD = np.empty((2 * n + 1, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    gain, shift = ahead[n + 1 :], now[0]
+    ahead, root, shift, mean = work.ahead, work.A, now[0], work.mean
+    gain = ahead[n + 1 :]
     for j in range(len(slots) - 1, 0, -1):
         after, left, start = slots[j], slots[j - 1], 0 if j > 1 else n + 1
         late_ns = labels[after, 0] - labels[left, 0]
@@ -68,7 +88,7 @@ def _retrodict(
             continue
         state = steps[left, start : start + n + 1]
         if start:
-            _ahead(motion, density, state, late_ns, ahead)
+            _ahead(motion, density, state, late_ns, work.F, ahead)
         else:
             copy(steps[after, n + 1 :], ahead)
         copy(ahead[1:], root)
@@ -77,18 +97,16 @@ def _retrodict(
         for a in range(n):
             shift[a] -= ahead[0, a]
             for b in range(n):
-                C[a, b] = gain[b, a]
                 root[a, b] = now[1 + a, b] - ahead[1 + a, b]
         if motion == ARC:
             shift[_YAW] = wrapped(shift[_YAW])
-        product(C, root, CD)
         for a in range(n):
-            root[0, a] = state[0, a]
+            mean[a] = state[0, a]
             for b in range(n):
-                root[0, a] += C[a, b] * shift[b]
+                mean[a] += gain[b, a] * shift[b]
         copy(state, now)
-        copy(root[:1], now[:1])
-        add_product_transposed(CD, C, now[1:])
+        shift[:] = mean
+        add_weighted(gain, root, work.AP, now[1:])
     return True
 
 
@@ -101,15 +119,24 @@ def _step(
     late_ns: int,
     label: IntArray,
     measured: FloatArray,
+    work: _Work,
 ) -> bool:
     """Predict the step `after` from that `before`, and fuse its measurement; False where it cannot be fused."""
-    k, n = label[1], len(density)
-    _ahead(motion, density, before[: n + 1], late_ns, after[n + 1 :])
+    k, n, A = label[1], len(density), work.A
+    y, K = work.y[:k], work.K[:k]
+    _ahead(motion, density, before[: n + 1], late_ns, work.F, after[n + 1 :])
     copy(after[n + 1 :], after[: n + 1])
-    y, H, S, K = np.empty(k), np.empty((k, n)), np.empty((k, k)), np.empty((k, n))
-    _innovation(after[0], measured[0], label, motion == ARC, y, H)
-    nis = innovate(after[n + 2 : 2 * n + 2], y, H, measured[1:], label[:0], S, K)
-    if np.isnan(nis) or not correct_one(after[0], after[1 : n + 1], y, H, measured[1:], K):
+    _innovation(after, label, measured, motion == ARC, y, work.S)
+    for c in range(k):
+        K[c] = after[1 + label[2 + c]]
+    if not solve(work.S, K):
+        return False
+    for a in range(n):
+        for b in range(n):
+            A[a, b] = 1.0 if a == b else 0.0
+        for c in range(k):
+            A[a, label[2 + c]] -= K[c, a]
+    if not conclude(after[0], after[1 : n + 1], A, K, measured[1:], y, work.AP, work.KR):
         return False
     if motion == ARC:
         after[0, _YAW] = wrapped(after[0, _YAW])
@@ -163,7 +190,7 @@ def fuse(
     failed measurement, and one older than `oldest_ns` or the window of the track, change nothing.
     """
     k, n, stamp_ns = y.shape[1], len(density), new_label[0]
-    now, H, K = np.empty((n + 1, n)), np.empty((k, n)), np.empty((k, n))
+    now, work = np.empty((n + 1, n)), _work(n, measured.shape[3])
     for i in range(len(tracks)):
         t = tracks[i]
         slots, count, window = order[t], windows[t, 0], windows[t]
@@ -184,13 +211,13 @@ def fuse(
         while j <= last:
             s, left = slots[j], slots[j - 1]
             late_ns = labels[t, s, 0] - labels[t, left, 0]
-            ok = _step(motion, density, steps[t, left], steps[t, s], late_ns, labels[t, s], measured[t, s])
+            ok = _step(motion, density, steps[t, left], steps[t, s], late_ns, labels[t, s], measured[t, s], work)
             if ok and s == own:
                 newest = slots[count]
                 copy(steps[t, newest, n + 1 if index == count else 0 :], now)
-                ok = _retrodict(motion, density, slots[index : count + 1], labels[t], steps[t], now)
-                _innovation(now[0], new[i, 0], new_label, motion == ARC, y[i], H)
-                nis[i] = innovate(now[1:], y[i], H, new[i, 1:], rows, S[i], K)
+                ok = _retrodict(motion, density, slots[index : count + 1], labels[t], steps[t], work, now)
+                _innovation(now, new_label, new[i], motion == ARC, y[i], S[i])
+                nis[i] = marginal_nis(S[i], y[i], rows, work.S, work.y)
                 ok = ok and not np.isnan(nis[i])
             j += 1
             if not ok and fused:  # take it out, and filter the later ones again without it
@@ -219,6 +246,7 @@ def ahead(
 ) -> None:
     """Write the `_ahead` (m, 2 n + 1, n) of `tracks`, but those below 0, at their stamps: from the last step before."""
     n = len(density)
+    F = np.empty((n, n))
     for i in range(len(tracks)):
         t = tracks[i]
         if t < 0:
@@ -227,6 +255,6 @@ def ahead(
         while j > 0 and labels[t, order[t, j], 0] > stamps_ns[i]:
             j -= 1
         s = order[t, j]
-        _ahead(motion, density, steps[t, s, : n + 1], stamps_ns[i] - labels[t, s, 0], predicted[i])
+        _ahead(motion, density, steps[t, s, : n + 1], stamps_ns[i] - labels[t, s, 0], F, predicted[i])
         if motion == ARC:
             predicted[i, 0, _YAW] = wrapped(predicted[i, 0, _YAW])
