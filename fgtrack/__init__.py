@@ -24,6 +24,7 @@ _HOMES = {
     "Estimator": "fgtrack.estimation.base",
     "FgtrackError": "fgtrack.core.errors",
     "Lateness": "fgtrack.pipeline.live",
+    "Ledger": "fgtrack.calibration.ledger",
     "Measurement": "fgtrack.estimation.base",
     "MeasurementModel": "fgtrack.models.measurement",
     "Message": "fgtrack.core.types",
@@ -59,6 +60,7 @@ _HOMES = {
     "estimator": "fgtrack.estimation.registry",
     "evaluate": "fgtrack.evaluation.metrics",
     "initial_state": "fgtrack.estimation.birth",
+    "ledger": "fgtrack.calibration.ledger",
     "list_estimators": "fgtrack.estimation.registry",
     "load_run": "fgtrack.io.run",
     "measurement_model": "fgtrack.models.measurement",
@@ -76,6 +78,8 @@ __all__ = sorted(_HOMES)
 if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two lists equal
     from fgtrack import testing as testing
     from fgtrack.calibration.advise import advise as advise
+    from fgtrack.calibration.ledger import Ledger as Ledger
+    from fgtrack.calibration.ledger import ledger as ledger
     from fgtrack.calibration.page import Advice as Advice
     from fgtrack.calibration.study import Study as Study
     from fgtrack.calibration.study import study as study

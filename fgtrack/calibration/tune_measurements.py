@@ -29,26 +29,48 @@ from fgtrack.tracking.tracker import TrackerParts
 _GATE_PROBABILITY = 0.9999
 
 
+@dataclass(frozen=True, slots=True)
+class Fed:
+    """Call of the bank in a tick: a new track, or measurements of several tracks of one stamp."""
+
+    now_ns: int
+    """Time of the tick."""
+    stamp_ns: int
+    track_ids: Sequence[int]
+    observations: Sequence[Observation] = ()
+    """Of these tracks; none of a new track."""
+    start: Start | None = None
+    """Of a new track."""
+
+
 def recorded(
     messages: Iterable[Message], config: Config, origin: str = "", gate_stds: float = 0.0
 ) -> tuple[list[Series], Run]:
     """Return the series of all tracks, and the run.
     A gate in metres is opened to `gate_stds` standard deviations of the position of each detection.
     """
-    banks: list[_RecordingBank] = []
+    bank, run = watched(messages, config, origin, gate_stds)
+    motion, method = config.motion_model(), config.initiation.method
+    return [series.initiated(motion, method) for series in bank.series()], run
+
+
+def watched(
+    messages: Iterable[Message], config: Config, origin: str = "", gate_stds: float = 0.0
+) -> tuple["RecordingBank", Run]:
+    """Return the bank that was fed, and the run; see `recorded`."""
+    banks: list[RecordingBank] = []
 
     def observed(parts: TrackerParts) -> TrackerParts:
         preprocess = _WatchedPreprocess(parts.preprocess)
         make = partial(build_bank, config, parts.failures)
-        banks.append(_RecordingBank(make, parts.failures, preprocess))
+        banks.append(RecordingBank(make, parts.failures, preprocess))
         association = parts.association
-        if isinstance(association, GatedEuclidean | GatedMahalanobis):
+        if gate_stds and isinstance(association, GatedEuclidean | GatedMahalanobis):
             association = _OpenedGate(association, gate_stds)
         return replace(parts, preprocess=preprocess, bank=banks[0], association=association)
 
     run = replay_in_memory(messages, config, origin=origin, observed=observed)
-    motion, method = config.motion_model(), config.initiation.method
-    return [series.initiated(motion, method) for series in banks[0].series()], run
+    return banks[0], run
 
 
 @dataclass(frozen=True)
@@ -117,19 +139,25 @@ def observation(name: str, sensor: SensorModel, measurement: Measurement, own: b
     return Observation(name, measurement, measured, assumed, T, np.zeros_like(R), positive_part(R - modelled))
 
 
-class _RecordingBank(GuardedBank):
+class RecordingBank(GuardedBank):
     """Keeps the first state and the fused measurements of every track."""
 
     def __init__(self, make: Callable[[], TrackBank], failures: Failures, preprocess: _WatchedPreprocess) -> None:
         super().__init__(make, failures)
         self._preprocess = preprocess
-        self._tracks: dict[int, tuple[Start, list[Observation]]] = {}
+        self.fed: list[Fed] = []
+        """In the order in which it was fed."""
 
     def series(self) -> list[Series]:
         """Return the fused measurements of each track, by rising stamp, in order of birth."""
+        tracks: dict[int, tuple[Start, list[Observation]]] = {}
+        for item in self.fed:
+            if item.start is not None:
+                tracks[item.track_ids[0]] = item.start, []
+            for track_id, each in zip(item.track_ids, item.observations, strict=False):
+                tracks[track_id][1].append(each)
         return [
-            Series(start, sorted(fused, key=lambda item: item.measurement.stamp_ns))
-            for start, fused in self._tracks.values()
+            Series(start, sorted(fused, key=lambda item: item.measurement.stamp_ns)) for start, fused in tracks.values()
         ]
 
     def update(
@@ -137,12 +165,12 @@ class _RecordingBank(GuardedBank):
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
         results = super().update(stamp_ns, track_ids, measurements)
-        for track_id, measurement, result in zip(track_ids, measurements, results, strict=True):
-            if result.innovation is not None:
-                self._tracks[track_id][1].append(self._preprocess.observation(measurement))
+        fused = [row for row, result in enumerate(results) if result.innovation is not None]
+        observations = [self._preprocess.observation(measurements[row]) for row in fused]
+        self.fed.append(Fed(self._now_ns, stamp_ns, [track_ids[row] for row in fused], observations))
         return results
 
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`."""
         super().birth(track_id, prior)
-        self._tracks[track_id] = prior, []
+        self.fed.append(Fed(self._now_ns, prior.stamp_ns, [track_id], start=prior))

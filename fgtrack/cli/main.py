@@ -36,6 +36,7 @@ COMMANDS = {
     "sweep": "sweep",
     "tune": "tune",
     "advise": "calibrate",
+    "ledger": "ledger",
     "verify": "verify",
     "info": "calibrate",
     "convert": "recordings",

@@ -1,0 +1,41 @@
+"""`fgtrack ledger`: where the error of the present comes from."""
+
+from pathlib import Path
+from typing import Annotated
+
+from typer import Option
+
+from fgtrack.calibration.ledger import ledger as explained
+from fgtrack.cli.arguments import ConfigFile, Input, Json, Overwrite
+from fgtrack.cli.show import progress, say, show
+from fgtrack.io.output import check_output, new_file
+from fgtrack.plotting.ledger import waterfall
+from fgtrack.plotting.style import png
+
+
+def ledger(
+    recording: Input,
+    config_file: ConfigFile = None,
+    tuned: Annotated[
+        str | None, Option(metavar="TUNED.yaml", help="Noise that fits, as `fgtrack tune` writes it.")
+    ] = None,
+    figure: Annotated[Path | None, Option(metavar="FILE.png", help="Draw the waterfall there.")] = None,
+    overwrite: Overwrite = False,
+    as_json: Json = False,
+) -> None:
+    """Show how much of the error of the present comes from lateness, policy and noise.
+
+    Repeats the measurements of one association with every policy, each as it came and as if nobody were late. Without
+    truth predicted variances stand for errors. INPUT may be a run folder.
+    """
+    if figure is not None:
+        check_output(figure, overwrite)
+    with progress("ledger"):
+        result = explained(recording, config_file, tuned)
+    if figure is not None:
+        with new_file(figure, overwrite) as file:
+            file.write(png(waterfall(result.waterfall, f"{result.estimator}: error of the present")))
+    show(result.tables, "json" if as_json else None)
+    if not as_json:
+        say("")
+        say(result.sentence)

@@ -1,0 +1,48 @@
+"""The figure of the ledger: the error of the present, and what is left without each of its causes."""
+
+import math
+from collections.abc import Sequence
+from typing import Protocol, Unpack
+
+from matplotlib.figure import Figure
+
+from fgtrack.evaluation.palette import SENSORS
+from fgtrack.plotting.paper import Paper, Sheet, styled
+from fgtrack.plotting.style import GREY
+
+_HEIGHT = 0.72
+
+
+class Part(Protocol):
+    """One line of the waterfall."""
+
+    @property
+    def cause(self) -> str:
+        """Cause that this line takes away."""
+
+    @property
+    def mean_square_m2(self) -> float:
+        """Mean square of what is left."""
+
+
+@styled
+def waterfall(parts: Sequence[Part], title: str, **paper: Unpack[Paper]) -> Figure:
+    """Bars from the error of the present down to what is left without its causes, see `Ledger.waterfall`."""
+    sheet = Sheet(9.0, 1.2 + 0.42 * (len(parts) + 1), paper)
+    axes = sheet.plots(1)[0, 0]
+    ends = [item.mean_square_m2 for item in parts]
+    names = ["error now", *(item.cause for item in parts[1:]), "nobody late"]
+    bars = [(0.0, ends[0], GREY), *((after, before - after, "") for before, after in zip(ends, ends[1:], strict=False))]
+    bars.append((0.0, ends[-1], GREY))
+    for row, (start, length, colour) in enumerate(bars):
+        own = colour or (SENSORS[0] if length > 0.0 else SENSORS[1])
+        axes.barh(row, length, left=start, height=_HEIGHT, color=own)
+        rms = math.sqrt(start + length) if colour else math.sqrt(max(start, 0.0))
+        label = f"{rms:.2f} m" if colour else f"{100.0 * length / ends[0]:+.0f} %, {rms:.2f} m left"
+        axes.text(max(start, start + length) + 0.01 * max(ends), row, label, va="center")
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    axes.set_xlim(0.0, 1.35 * max(ends))
+    axes.set_xlabel("mean square error of the position [m²]")
+    axes.set_title(title)
+    return sheet.figure
