@@ -79,7 +79,7 @@ def ledger(
     """Return the ledger of a recording, given as a path or as its messages.
 
     A run folder stands for its recording and configuration. `config` is a configuration, a file or a shipped name; its
-    estimator is the one whose error is explained. `tuned` is one with the noise that fits the recording, as `fgtrack
+    estimator is the one whose error is explained. `tuned` is one with noise fitted to the recording, as `fgtrack
     tune` writes it: then the ledger has a line for the noise. Without truth predicted variances stand for errors.
     Raises `DataError` where nothing can be judged.
     """

@@ -17,7 +17,7 @@ def ledger(
     recording: Input,
     config_file: ConfigFile = None,
     tuned: Annotated[
-        str | None, Option(metavar="TUNED.yaml", help="Noise that fits, as `fgtrack tune` writes it.")
+        str | None, Option(metavar="TUNED.yaml", help="Fitted noise, as `fgtrack tune` writes it.")
     ] = None,
     figure: Annotated[Path | None, Option(metavar="FILE.png", help="Draw the waterfall there.")] = None,
     overwrite: Overwrite = False,

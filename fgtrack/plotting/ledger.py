@@ -32,8 +32,8 @@ def waterfall(parts: Sequence[Part], title: str, **paper: Unpack[Paper]) -> Figu
     axes = sheet.plots(1)[0, 0]
     ends = [item.mean_square_m2 for item in parts]
     names = ["error now", *(item.cause for item in parts[1:]), "nobody late"]
-    bars = [(0.0, ends[0], GREY), *((after, before - after, "") for before, after in zip(ends, ends[1:], strict=False))]
-    bars.append((0.0, ends[-1], GREY))
+    steps = [(after, before - after, "") for before, after in zip(ends, ends[1:], strict=False)]
+    bars = [(0.0, ends[0], GREY), *steps, (0.0, ends[-1], GREY)]
     for row, (start, length, colour) in enumerate(bars):
         own = colour or (SENSORS[0] if length > 0.0 else SENSORS[1])
         axes.barh(row, length, left=start, height=_HEIGHT, color=own)
