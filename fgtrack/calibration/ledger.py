@@ -5,6 +5,7 @@ another estimator, noise or order of arrival, so that differences are of estimat
 squares of the position error at the same ticks and tracks, so they add up to the difference of their ends.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -218,7 +219,7 @@ class _Books:
             ways.insert(0, ("", estimator, whole))
             ways[1] = (_DECISIONS, *ways[1][1:])
         waterfall = [Part("", _mean(ways[0][2], common), Estimate(math.nan, math.nan, math.nan, 0))]
-        for (_, _, before), (cause, _, after) in zip(ways, ways[1:], strict=False):
+        for (_, _, before), (cause, _, after) in itertools.pairwise(ways):
             if cause == _DECISIONS and np.array_equal(before[common], after[common]):
                 continue
             waterfall.append(Part(cause, _mean(after, common), _difference(before, after, common)))

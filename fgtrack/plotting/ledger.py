@@ -1,5 +1,6 @@
 """The figure of the ledger: the error of the present, and what is left without each of its causes."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Protocol, Unpack
@@ -32,7 +33,7 @@ def waterfall(parts: Sequence[Part], title: str, **paper: Unpack[Paper]) -> Figu
     axes = sheet.plots(1)[0, 0]
     ends = [item.mean_square_m2 for item in parts]
     names = ["error now", *(item.cause for item in parts[1:]), "nobody late"]
-    steps = [(after, before - after, "") for before, after in zip(ends, ends[1:], strict=False)]
+    steps = [(after, before - after, "") for before, after in itertools.pairwise(ends)]
     bars = [(0.0, ends[0], GREY), *steps, (0.0, ends[-1], GREY)]
     for row, (start, length, colour) in enumerate(bars):
         own = colour or (SENSORS[0] if length > 0.0 else SENSORS[1])
