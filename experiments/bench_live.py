@@ -1,12 +1,11 @@
-"""Whether a tracker lasts in a running system: an hour at 50 Hz by the clock of the machine.
+"""An hour in a running system: ticks at 50 Hz by the clock of the machine.
 
     python experiments/bench_live.py                     # an hour
-    python experiments/bench_live.py --duration-s 60     # to see that it works
+    python experiments/bench_live.py --duration-s 60     # a short run
 
-Two processes. One is the vehicle: cars drive lap after lap on the built-in oval, seen by the paper's sensors, and every
-message is sent when it is due. The other one is the tracker: a thread receives, the main thread ticks. Every detection
-that was sent must have ended in one disposition. The table has the memory and the times of the tracker's process, part
-by part.
+One process is the vehicle: cars drive lap after lap on the built-in oval with the paper's sensors, and every message is
+sent when it is due. The other one is the tracker: a thread receives, the main thread ticks. Every detection sent must
+end in one disposition.
 """
 
 import json
@@ -23,7 +22,7 @@ from typing import Annotated
 import numpy as np
 import typer
 from bench_memory import LAPS_START_NS, laps, memory_mb
-from bench_report import plural, progress, put_into, short_machine
+from bench_report import plural, progress, short_machine, table
 from bench_tracker import yardstick_us
 
 import fgtrack
@@ -31,20 +30,19 @@ from fgtrack.core.time import nanoseconds, period_ns
 
 Sent = fgtrack.EgoState | fgtrack.DetectionList
 
-_AHEAD = 10_000  # messages that are made before they are due
 _BEGIN_S = 1.0  # until the first message
 
 
 def sleep_until(due_ns: int) -> None:
-    """Sleep until the clock that stamps are of says so."""
+    """Sleep until a time of the system's clock."""
     left_ns = due_ns - time.time_ns()
     if left_ns > 0:
         time.sleep(left_ns / 1e9)
 
 
 def made_ahead(objects: int, duration_s: float) -> Iterator[Sent]:
-    """Messages of `laps` up to a receipt, made by a thread before they are asked for."""
-    made: queue.Queue[Sent | None] = queue.Queue(_AHEAD)
+    """Messages of `laps` up to a receipt, made by a thread before they are due."""
+    made: queue.Queue[Sent | None] = queue.Queue(10_000)
 
     def make() -> None:
         for message in laps(objects, duration_s):
@@ -58,7 +56,7 @@ def made_ahead(objects: int, duration_s: float) -> Iterator[Sent]:
 
 
 def drive(connection: Connection, objects: int, duration_s: float) -> None:
-    """The vehicle: sends every message when it is due, and in the end how many detections that were, by sensor."""
+    """Send every message when it is due, and in the end the number of detections by sensor."""
     sent: dict[str, int] = {}
     shift_ns = None
     for message in made_ahead(objects, duration_s):
@@ -78,7 +76,7 @@ class Receiver:
     connection: Connection
     tracker: fgtrack.Tracker
     sent: dict[str, int] = field(default_factory=dict)
-    """By sensor, as the vehicle says in the end."""
+    """Detections by sensor."""
     begun: threading.Event = field(default_factory=threading.Event)
     over: threading.Event = field(default_factory=threading.Event)
 
@@ -93,7 +91,7 @@ class Receiver:
 
 @dataclass
 class Part:
-    """What was measured in a part of the time."""
+    """Measurements of a part of the time."""
 
     until_s: float
     memory_mb: float
@@ -106,12 +104,17 @@ class Part:
     skipped: int
     tracks: int
 
-    def row(self) -> str:
-        """As a row of the table."""
+    def row(self) -> tuple[str, ...]:
+        """Return the row of the table."""
         times = (f"{p50:.2f} / {p99:.2f} / {worst:.1f}" for p50, p99, worst in (self.tick_ms, self.cpu_ms))
+        missed = f"{self.missed} of {self.ticks}"
         return (
-            f"| {self.until_s / 60.0:.3g} | {self.memory_mb:.1f} | {' | '.join(times)} "
-            f"| {self.missed} of {self.ticks} | {self.skipped} | {self.tracks} |"
+            f"{self.until_s / 60.0:.3g}",
+            f"{self.memory_mb:.1f}",
+            *times,
+            missed,
+            str(self.skipped),
+            str(self.tracks),
         )
 
 
@@ -140,7 +143,7 @@ def track(receiver: Receiver, hz: float, duration_s: float, num_parts: int) -> l
         if over or (passed_s >= duration_s / num_parts * (len(parts) + 1) and len(parts) + 1 < num_parts):
             times = (len(tick_ms), spread(tick_ms), spread(cpu_ms))
             parts.append(Part(passed_s, memory_mb(), *times, missed, skipped, len(report.tracks)))
-            progress(parts[-1].row())
+            progress(" ".join(parts[-1].row()))
             tick_ms, cpu_ms, missed, skipped = [], [], 0, 0
         if over:
             return parts
@@ -156,7 +159,6 @@ def main(
     objects: int = 3,
     estimator: str = "smoother-banded",
     parts: Annotated[int, typer.Option(help="Rows of the table.")] = 12,
-    page: Annotated[Path | None, typer.Option(help="Put the table into this page, between its marks.")] = None,
 ) -> None:
     """Drive, track, print the table; write live.md and live.json. Exits 1 where a detection is not accounted for."""
     out.mkdir(parents=True, exist_ok=True)
@@ -185,23 +187,19 @@ def main(
         "parts": [asdict(part) for part in measured],
     }
     (out / "live.json").write_text(json.dumps(result, indent=1, default=dict) + "\n", encoding="utf-8")
-    half = [part.memory_mb for part in measured[max(len(measured) // 2 - 1, 0) :]]
+    half_mb = [part.memory_mb for part in measured[max(len(measured) // 2 - 1, 0) :]]
+    header = ["until [min]", "memory [MB]", "tick p50 / p99 / worst [ms]", "of that CPU [ms]", "deadlines missed"]
     lines = [
         machine,
         "",
-        "| until [min] | memory [MB] | tick p50 / p99 / worst [ms] | of that CPU [ms] | deadlines missed "
-        "| ticks skipped | tracks |",
-        f"|{'---|' * 7}",
-        *(part.row() for part in measured),
+        table([*header, "ticks skipped", "tracks"], [part.row() for part in measured]),
         "",
         f"{estimator}, {plural(objects)}, {hz:g} Hz, {measured[-1].until_s / 3600.0:.2g} h: memory grew by "
-        f"{half[-1] - half[0]:.1f} MB in the second half. {sum(sent.values())} detections were sent, "
+        f"{half_mb[-1] - half_mb[0]:.1f} MB in the second half. {sum(sent.values())} detections were sent, "
         f"{sum(counted.values())} ended in a disposition; failures: {sum(tracker.failures.values())}.",
     ]
     text = "\n".join(lines) + "\n"
     (out / "live.md").write_text(text, encoding="utf-8")
-    if page is not None:
-        put_into(page, "live", text)
     print(text, end="")
     if counted != sent:
         raise SystemExit(f"sent {sent}, accounted for {counted}")

@@ -1,11 +1,10 @@
-"""Whether a long recording needs more memory than a short one: a drive of two hours, replayed into a run folder.
+"""Memory over a drive of two hours, replayed into a run folder as `fgtrack replay` does.
 
     python experiments/bench_memory.py                     # minutes
-    python experiments/bench_memory.py --duration-s 300    # to see that it works
+    python experiments/bench_memory.py --duration-s 300    # a short run
 
-Cars drive lap after lap on the built-in oval, seen by the paper's sensors with their delays. The recording is written
-lap by lap, then read and replayed as `fgtrack replay` does; recording and run are removed at the end. The memory of the
-process is read as the run goes.
+Cars drive lap after lap on the built-in oval with the paper's sensors and delays. The recording is written lap by lap;
+recording and run are removed at the end.
 """
 
 import resource
@@ -19,7 +18,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from bench_report import plural, progress, put_into, short_machine
+from bench_report import plural, progress, short_machine, table
 from bench_tracker import SPEED_MPS, scenario, yardstick_us
 
 from fgtrack.core.time import nanoseconds
@@ -55,9 +54,8 @@ def whole_laps() -> tuple[float, float]:
 
 
 def joined(lap: Callable[[int, int], Iterable[Message]], lap_s: float, count: int) -> Iterator[Message]:
-    """Messages of `count` laps in order of receipt, made lap by lap; `lap` is given the number and the begin in ns.
-
-    What a lap says of its very end is left out: the next one begins with it.
+    """Messages of `count` laps in order of receipt; `lap(number, begun_ns)` makes one when the one before has ended.
+    A message stamped at the end of a lap is left to the next one.
     """
     waiting: list[Message] = []
     for number in range(count):
@@ -72,7 +70,7 @@ def joined(lap: Callable[[int, int], Iterable[Message]], lap_s: float, count: in
 
 
 def memory_mb() -> float:
-    """What the process holds now; where the system does not say, the most that it has held so far."""
+    """Memory that the process holds; its peak where the system does not report more."""
     file = Path("/proc/self/statm")
     if file.exists():
         return int(file.read_text().split()[1]) * resource.getpagesize() / _MB
@@ -80,52 +78,37 @@ def memory_mb() -> float:
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder for memory.md, and for the run while it lasts.")] = Path(
+    out: Annotated[Path, typer.Option("-o", help="Folder for the recording and the run while they last.")] = Path(
         "out/speed"
     ),
-    duration_s: Annotated[float, typer.Option(help="Of the recording.")] = 7200.0,
-    recording: Annotated[
-        str, typer.Option(help="Its name, which says the format: a folder is a rosbag2.")
-    ] = "drive.jsonl.gz",
+    duration_s: float = 7200.0,
     objects: int = 2,
     estimator: str = "smoother-banded",
     parts: Annotated[int, typer.Option(help="Rows of the table.")] = 12,
-    page: Annotated[Path | None, typer.Option(help="Put the table into this page, between its marks.")] = None,
 ) -> None:
-    """Replay, print memory and speed over the time of the recording, write memory.md."""
+    """Replay, print memory over the time of the recording."""
     out.mkdir(parents=True, exist_ok=True)
     config = read_config("smoother", track_map="oval", pit_map="oval", estimator=estimator)
-    rows: list[tuple[float, float, float, int]] = []  # recording in s, memory in MB, computed in s, tracks
+    rows: list[tuple[float, float, float, int]] = []  # recording in min, memory in MB, computed in s, tracks
 
     def look(report: TickReport) -> None:
         passed_s = (report.now_ns - LAPS_START_NS) / 1e9
-        if len(rows) < parts and passed_s >= duration_s * (len(rows) + 1) / parts:
-            rows.append((passed_s, memory_mb(), time.perf_counter() - began, len(report.tracks)))
+        if passed_s >= duration_s * (len(rows) + 1) / parts:
+            rows.append((passed_s / 60.0, memory_mb(), time.perf_counter() - began_s, len(report.tracks)))
 
     with tempfile.TemporaryDirectory(dir=out) as folder:
-        drive, run = Path(folder) / recording, Path(folder) / "run"
+        drive = Path(folder) / "drive.jsonl.gz"
         progress("write the recording")
         write_recording(drive, laps(objects, duration_s))
         progress("replay it")
-        began = time.perf_counter()
-        replay(open_input(drive, config.input).messages, config, {estimator: run}, on_tick=look)
-        sizes_mb = [sum(file.stat().st_size for file in path.rglob("*")) / _MB for path in (run, Path(folder))]
-    lines = [
-        short_machine([yardstick_us()]),
-        "",
-        "| recording [min] | memory [MB] | computed for [s] | tracks |",
-        "|---|---|---|---|",
-        *(f"| {s / 60.0:.3g} | {mb:.1f} | {spent_s:.0f} | {count} |" for s, mb, spent_s, count in rows),
-        "",
-        f"{estimator}, {plural(objects)}, {rows[-1][0] / 3600.0:.2g} h, "
-        f"{sizes_mb[1] - sizes_mb[0]:.0f} MB of recording, {sizes_mb[0]:.0f} MB of run folder: "
-        f"from the first row to the last the memory grew by {rows[-1][1] - rows[0][1]:.1f} MB.",
-    ]
-    text = "\n".join(lines) + "\n"
-    (out / "memory.md").write_text(text, encoding="utf-8")
-    if page is not None:
-        put_into(page, "memory", text)
-    print(text, end="")
+        began_s = time.perf_counter()
+        replay(open_input(drive, config.input).messages, config, {estimator: Path(folder) / "run"}, on_tick=look)
+    print(short_machine([yardstick_us()]), end="\n\n")
+    header = ["recording [min]", "memory [MB]", "computed for [s]", "tracks"]
+    print(table(header, [(f"{past_min:.3g}", f"{mb:.1f}", f"{s:.0f}", str(n)) for past_min, mb, s, n in rows]))
+    print(
+        f"\n{estimator}, {plural(objects)}: the memory grew by {rows[-1][1] - rows[0][1]:.1f} MB after the first row."
+    )
 
 
 if __name__ == "__main__":

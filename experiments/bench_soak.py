@@ -1,18 +1,17 @@
-"""Whether a tracker lasts: a day of simulated race at 50 Hz, in one process, as fast as it goes.
+"""A day of simulated race at 50 Hz, in one process, as fast as it goes.
 
     python experiments/bench_soak.py                               # 24 hours of race, twice
-    python experiments/bench_soak.py --hours 0.02 --parts 4        # to see that it works
+    python experiments/bench_soak.py --hours 0.02 --parts 4        # a short run
 
-One car stays in sight; others come and go, as cars that are overtaken or overtake. Lists come late, in bursts, twice or
-never; sensors fall silent; their clocks are off, drift and jitter, and now and then a stamp is off by up to an hour,
-also of the ego. The race is made lap by lap, and the rows that a run folder would hold are counted and hashed as they
-come: nothing but the tracker can grow. Two runs must give the same rows.
+One car stays near the ego; others overtake or are overtaken. Lists are late, bursty, repeated or lost; sensors fall
+silent; their clocks are off, drift and jitter; some stamps are off by up to an hour, also of the ego. The race is made
+lap by lap and the rows of a run folder are only counted and hashed, so that nothing but the tracker can grow.
 """
 
 import gc
 import json
-import sys
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
@@ -23,7 +22,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import typer
 from bench_memory import LAPS_START_NS, joined, memory_mb, whole_laps
-from bench_report import progress, put_into, short_machine
+from bench_report import progress, short_machine, table
 from bench_tracker import NODE_HZ, yardstick_us
 from joblib import Parallel, delayed
 
@@ -48,12 +47,11 @@ _WRONG_S = (-3600.0, -60.0, -5.0, -1.0, 0.5, 5.0, 60.0, 3600.0)
 _WRONG_LIST, _WRONG_EGO, _REPEATED, _NO_NUMBERS = 1e-3, 1e-4, 5e-3, 1e-3
 #: Failures that wrong stamps and false tracks bring about, and no fault of the tracker.
 _OF_THE_DATA = (Failure.STEP_DAMPED,)
-_SETTLED = 6  # of so many parts of the time, the first is for what is built up once
 _MOST_GROWTH = 0.01
 
 
 def race(rng: np.random.Generator, lap_s: float, speed_mps: float) -> Scenario:
-    """One lap: the ego and one car beside it as in every lap, others, delays and clocks drawn."""
+    """Return one lap: the ego and one car beside it as in every lap; others, delays and clocks are drawn."""
     ego_m = 100.0
     cars = [TrackVehicle(arc_m=ego_m + 25.0, lateral_m=3.0, speed=((0.0, speed_mps),))]
     for _ in range(int(rng.integers(0, 4))):
@@ -102,14 +100,14 @@ def messages(hours: float, seed: int) -> Iterator[Sent]:
         return [message for message in drawn if not isinstance(message, TruthState)]
 
     ends_ns = LAPS_START_NS + nanoseconds(3600.0 * hours)
-    for message in spoilt(wrong_rng, joined(lap, lap_s, int(np.ceil(3600.0 * hours / lap_s)))):
+    for message in corrupted(wrong_rng, joined(lap, lap_s, int(np.ceil(3600.0 * hours / lap_s)))):
         if message.receipt_ns > ends_ns:
             return
         yield message
 
 
-def spoilt(rng: np.random.Generator, race_messages: Iterable[Message]) -> Iterator[Sent]:
-    """Wrong stamps, values that are none, and lists that come again, some after others."""
+def corrupted(rng: np.random.Generator, race_messages: Iterable[Message]) -> Iterator[Sent]:
+    """The race with wrong stamps, values that are not numbers, and lists that are repeated, some after others."""
     again: list[DetectionList] = []
     for message in race_messages:
         while again and again[0].receipt_ns <= message.receipt_ns:
@@ -121,8 +119,8 @@ def spoilt(rng: np.random.Generator, race_messages: Iterable[Message]) -> Iterat
             message = replace(message, stamp_ns=message.stamp_ns + nanoseconds(float(rng.choice(_WRONG_S))))
         if isinstance(message, DetectionList):
             if message.objects and rng.random() < _NO_NUMBERS:
-                none = fgtrack.Detection(x_m=float("nan"), y_m=float("nan"))
-                message = replace(message, objects=(none, *message.objects[1:]))
+                invalid = fgtrack.Detection(x_m=float("nan"), y_m=float("nan"))
+                message = replace(message, objects=(invalid, *message.objects[1:]))
             if rng.random() < _REPEATED:
                 due_ns = message.receipt_ns + nanoseconds(float(rng.uniform(0.0, 0.2)))
                 again = sorted([*again, replace(message, receipt_ns=due_ns)], key=lambda one: one.receipt_ns)
@@ -131,7 +129,7 @@ def spoilt(rng: np.random.Generator, race_messages: Iterable[Message]) -> Iterat
 
 
 class HashedRun(RunSink):
-    """Takes a run as it goes and keeps of its rows only their hash and their number."""
+    """Takes a run as it goes; keeps the hash and the number of its rows."""
 
     def __init__(self) -> None:
         super().__init__("", None, 0.3)
@@ -147,18 +145,16 @@ class HashedRun(RunSink):
 
     @property
     def digest(self) -> str:
-        """SHA-256 of all rows so far, in hex; the times that ticks took are 0 in them."""
+        """SHA-256 of all rows so far, in hex; the times of ticks are 0 in them."""
         return self._digest()
 
 
 @dataclass(frozen=True)
 class Part:
-    """What was measured in a part of the race; counts are of all the race up to its end."""
+    """Measurements of a part of the race; counts and rows are of all the race up to its end."""
 
     until_h: float
     memory_mb: float
-    blocks: int
-    """Of memory that Python holds."""
     tick_us: tuple[float, float]
     """Median and 99th percentile of the ticks with detections: time of the processor."""
     yardstick_us: float
@@ -201,21 +197,17 @@ def soak(hours: float, parts: int, estimator: str, seed: int, file: Path) -> lis
         passed_h = (tick.now_ns - LAPS_START_NS) / 3.6e12
         if passed_h >= hours * (len(found) + 1) / parts:
             gc.collect()
-            counts = dict.fromkeys(Disposition, 0)
-            for of_sensor in tracker.counts.values():
-                for disposition, count in of_sensor.items():
-                    counts[Disposition(disposition)] += count
+            counts = sum(map(Counter, tracker.counts.values()), Counter[str]())
             median_us, p99_us = np.quantile(spent_us[:with_lists], (0.5, 0.99)).tolist()
             found.append(
                 Part(
                     passed_h,
                     memory_mb(),
-                    sys.getallocatedblocks(),
                     (median_us, p99_us),
                     yardstick_us(),
                     tracked / ticks,
                     detections,
-                    {str(disposition): count for disposition, count in counts.items()},
+                    {str(each): counts[each] for each in Disposition},
                     dict(tracker.refused),
                     dict(tracker.failures),
                     run.rows,
@@ -224,124 +216,88 @@ def soak(hours: float, parts: int, estimator: str, seed: int, file: Path) -> lis
                 )
             )
             file.write_text(json.dumps([asdict(part) for part in found], indent=1) + "\n", encoding="utf-8")
-            progress(f"{estimator}: {row(found[-1])}")
+            progress(f"{estimator}: {' '.join(row(found[-1]))}")
             tracked = ticks = with_lists = 0
     return found
 
 
-def read(file: Path) -> list[Part]:
-    """The parts that `soak` has written."""
-    parts = json.loads(file.read_text(encoding="utf-8"))
-    return [Part(**{**part, "tick_us": tuple(part["tick_us"])}) for part in parts]
-
-
-def row(part: Part) -> str:
-    """As a row of the table."""
-    median_us, p99_us = part.tick_us
-    return (
-        f"| {part.until_h:.3g} | {part.memory_mb:.1f} | {part.blocks} | {median_us / 1e3:.2f} / {p99_us / 1e3:.2f} "
-        f"| {part.in_yardsticks:.0f} | {part.tracks:.2f} | {part.counts['birth']} | {part.sent} "
-        f"| {sum(part.counts.values())} | {part.digest[:12]} |"
+def row(part: Part) -> tuple[str, ...]:
+    """Return the row of the table."""
+    times = f"{part.tick_us[0] / 1e3:.2f} / {part.tick_us[1] / 1e3:.2f}"
+    counts = (part.counts["birth"], part.sent, sum(part.counts.values()))
+    measured = (
+        f"{part.until_h:.3g}",
+        f"{part.memory_mb:.1f}",
+        times,
+        f"{part.in_yardsticks:.0f}",
+        f"{part.tracks:.2f}",
     )
+    return (*measured, *map(str, counts), part.digest[:12])
 
 
 def problems(runs: Sequence[Sequence[Part]]) -> list[str]:
-    """What of the promises does not hold; runs that broke off are judged as far as they go."""
-    said = []
+    """Return the promises that do not hold; runs that broke off are judged as far as they go."""
+    failed = []
     for number, parts in enumerate(runs, start=1):
-        said += [
+        failed += [
             f"run {number}: {part.sent} detections were sent, {sum(part.counts.values())} ended in a disposition"
             for part in parts
             if part.sent != sum(part.counts.values())
         ][:1]
         failures = {kind: count for kind, count in parts[-1].failures.items() if kind not in _OF_THE_DATA}
         if failures:
-            said.append(f"run {number}: failures: {failures}")
+            failed.append(f"run {number}: failures: {failures}")
         if growth(parts) > _MOST_GROWTH:
-            said.append(f"run {number}: memory grew by {100.0 * growth(parts):.2f} %")
+            failed.append(f"run {number}: memory grew by {100.0 * growth(parts):.2f} %")
     for together in zip(*runs, strict=False):
         if len({(part.digest, part.rows) for part in together}) > 1:
-            said.append(f"the runs differ up to {together[0].until_h:.3g} h")
+            failed.append(f"the runs differ up to {together[0].until_h:.3g} h")
             break
-    return said
-
-
-def settled(parts: Sequence[Part]) -> Sequence[Part]:
-    """From the end of the first sixth of the time on."""
-    return parts[max(len(parts) // _SETTLED - 1, 0) :]
+    return failed
 
 
 def growth(parts: Sequence[Part]) -> float:
-    """Of the memory, from the end of the first sixth of the time to its largest afterwards; as a share."""
-    held = [part.memory_mb for part in settled(parts)]
-    return max(held) / held[0] - 1.0
+    """Return the growth of memory from the end of the first sixth of the time to its largest afterwards; a share."""
+    held_mb = [part.memory_mb for part in parts[max(len(parts) // 6 - 1, 0) :]]
+    return max(held_mb) / held_mb[0] - 1.0
 
 
-def slowing(parts: Sequence[Part]) -> float:
-    """Median tick of the last third over that of the first one, in yardsticks."""
-    third = max(len(parts) // 3, 1)
-    ticks = [part.in_yardsticks for part in parts]
-    return float(np.median(ticks[-third:]) / np.median(ticks[:third]))
-
-
-def table(estimator: str, runs: Sequence[Sequence[Part]], rows: int = 12) -> str:
-    """The first run as Markdown, with what all say."""
+def summary(estimator: str, runs: Sequence[Sequence[Part]], rows: int = 12) -> str:
+    """Return the first run as Markdown, and the comparison of all."""
     first, last = runs[0], runs[0][-1]
-    places = sorted({round((k + 1) * len(first) / rows) - 1 for k in range(rows)} - {-1})
-    hours = [f"{parts[-1].until_h:.3g} h" for parts in runs]
-    alike = min(len(parts) for parts in runs)
-    shares = {name: count / max(last.sent, 1) for name, count in last.counts.items() if count}
+    chosen = sorted({round((k + 1) * len(first) / rows) - 1 for k in range(rows)} - {-1})
+    header = ["until [h]", "memory [MB]", "tick p50 / p99 [ms]", "p50 in yardsticks", "tracks", "births", "sent"]
+    shares = {name: f"{name} {100.0 * count / max(last.sent, 1):.2g} %" for name, count in last.counts.items() if count}
+    refused = [f"{name} {count}" for name, count in sorted(last.refused.items())]
+    failures = [f"{name} {count}" for name, count in last.failures.items()]
+    ticks, third = [part.in_yardsticks for part in first], max(len(first) // 3, 1)
+    slowing = float(np.median(ticks[-third:]) / np.median(ticks[:third]))
     lines = [
         short_machine([part.yardstick_us for part in first]),
-        "",
-        "| until [h] | memory [MB] | blocks | tick p50 / p99 [ms] | p50 in yardsticks | tracks | births "
-        "| sent | with a disposition | digest of all rows |",
-        f"|{'---|' * 10}",
-        *(row(first[place]) for place in places),
-        "",
-        f"{estimator}: {' and '.join(hours)} of race at {NODE_HZ:g} Hz in {last.wall_s / 3600.0:.2g} h. Memory grew by "
+        table([*header, "with a disposition", "digest of all rows"], [row(first[number]) for number in chosen]),
+        f"{estimator}: {len(runs)} times {last.until_h:.3g} h of race in {last.wall_s / 3600.0:.2g} h. Memory grew by "
         f"{100.0 * growth(first):.2f} % after the first sixth, the median tick changed by "
-        f"{100.0 * (slowing(first) - 1.0):.0f} % from the first third to the last. "
-        + (
-            f"{len(runs)} runs have the same {first[alike - 1].rows} rows up to {first[alike - 1].until_h:.3g} h. "
-            if len(runs) > 1
-            else ""
-        )
-        + f"Refused: {', '.join(f'{name} {count}' for name, count in sorted(last.refused.items())) or 'nothing'}; "
-        f"failures: {', '.join(f'{name} {count}' for name, count in last.failures.items()) or 'none'}. "
-        f"Dispositions: {', '.join(f'{name} {100.0 * share:.2g} %' for name, share in shares.items())}.",
-        *(f"\nNOT AS PROMISED: {problem}" for problem in problems(runs)),
+        f"{100.0 * (slowing - 1.0):.0f} % from the first third to the last. "
+        f"Refused: {', '.join(refused) or 'nothing'}; failures: {', '.join(failures) or 'none'}. "
+        f"Dispositions: {', '.join(shares.values())}.",
+        *(f"NOT AS PROMISED: {problem}" for problem in problems(runs)),
     ]
-    return "\n".join(lines) + "\n"
+    return "\n\n".join(lines) + "\n"
 
 
-def draw(estimators: Mapping[str, Sequence[Part]], path: Path) -> None:
-    """Memory, time of a tick, tracks and dispositions over the time of the race."""
-    figure, axes = plt.subplots(4, figsize=(7.0, 7.5), sharex=True, layout="constrained")
-    for name, parts in estimators.items():
-        until_h = [part.until_h for part in parts]
-        (line,) = axes[0].plot(until_h, [part.memory_mb for part in parts], label=name)
-        axes[1].plot(until_h, [part.in_yardsticks for part in parts], color=line.get_color())
-        p99 = [part.tick_us[1] / part.yardstick_us for part in parts]
-        axes[1].plot(until_h, p99, ":", color=line.get_color())
-        axes[2].plot(until_h, [part.tracks for part in parts], color=line.get_color())
-    parts = max(estimators.values(), key=lambda parts: parts[-1].until_h)
-    names = [name for name, count in parts[-1].counts.items() if count]
-    counts = np.array([[part.counts[name] for name in names] for part in parts], dtype=np.float64)
-    of_part = np.diff(counts, axis=0, prepend=0.0)
-    shares = 100.0 * of_part / of_part.sum(axis=1, keepdims=True)
-    for name, share in zip(names, shares.T, strict=True):
-        axes[3].plot([part.until_h for part in parts], share, label=name.replace("_", " "))
-    axes[0].set(ylabel="memory [MB]")
+def draw(estimator: str, parts: Sequence[Part], path: Path) -> None:
+    """Draw memory, time of a tick and tracks over the time of the race."""
+    until_h = [part.until_h for part in parts]
+    figure, axes = plt.subplots(3, figsize=(7.0, 5.5), sharex=True, layout="constrained")
+    axes[0].plot(until_h, [part.memory_mb for part in parts], label=estimator)
+    axes[1].plot(until_h, [part.in_yardsticks for part in parts])
+    axes[1].plot(until_h, [part.tick_us[1] / part.yardstick_us for part in parts], ":", color="C0")
+    axes[2].plot(until_h, [part.tracks for part in parts])
     axes[0].legend(fontsize=8, loc="lower right")
-    axes[1].set(ylabel="tick [yardsticks]\n(dotted: 99 %)")
-    axes[2].set(ylabel="tracks, mean")
-    axes[3].set(ylabel="detections [%]", yscale="log", ylim=(1e-2, 1e2), xlabel="time of the race [h]")
-    figure.legend(*axes[3].get_legend_handles_labels(), fontsize=8, ncols=5, loc="outside lower center")
-    for each in axes:
+    axes[2].set_xlabel("time of the race [h]")
+    for each, label in zip(axes, ("memory [MB]", "tick [yardsticks]\n(dotted: 99 %)", "tracks, mean"), strict=True):
+        each.set(ylabel=label, ylim=(0.0, 1.15 * each.dataLim.ymax))
         each.grid(alpha=0.3)
-        if each is not axes[3]:
-            each.set_ylim(0.0, 1.15 * each.dataLim.ymax)  # a flat line is seen below the edge
     figure.savefig(path, dpi=90, pil_kwargs={"optimize": True})
     plt.close(figure)
 
@@ -354,17 +310,14 @@ def main(
     runs: Annotated[int, typer.Option(help="That must give the same rows.")] = 2,
     jobs: int = 2,
     seed: int = 0,
-    page: Annotated[Path | None, typer.Option(help="Put the table into this page, between its marks.")] = None,
 ) -> None:
     """Race, print the table; write soak.md, soak.png and the parts. Exits 1 where a promise does not hold."""
     out.mkdir(parents=True, exist_ok=True)
     files = [out / f"{estimator}-{number}.json" for number in range(1, runs + 1)]
     measured: list[Any] = Parallel(n_jobs=jobs)(delayed(soak)(hours, parts, estimator, seed, file) for file in files)
-    said = table(estimator, measured)
+    said = summary(estimator, measured)
     (out / "soak.md").write_text(said, encoding="utf-8")
-    draw({estimator: measured[0]}, out / "soak.png")
-    if page is not None:
-        put_into(page, "soak", said)
+    draw(estimator, measured[0], out / "soak.png")
     print(said, end="")
     if problems(measured):
         raise SystemExit(1)
