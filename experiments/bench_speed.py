@@ -19,6 +19,7 @@ import time
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from statistics import median
 from typing import Annotated, Any
@@ -93,24 +94,24 @@ def shortened(cells: Iterable[Cell], duration_s: float) -> list[Cell]:
 
 
 def measure_round(results: Results, passes: dict[Cell, list[Measured]], streams: dict[int, Path], command: str) -> None:
-    """Measure all cells once, those of each number of objects beside the published implementation on its stream."""
+    """Measure all cells once, each number of objects beside the published implementation on its stream."""
     yardsticks_us: dict[int, list[float]] = {}
     for count in sorted({one.count for one in passes}):
-        kept = {}
         if command and count in streams:
             progress(f"published implementation, {count} objects")
             results.published_ms.setdefault(count, []).append(run_published(command, streams[count]))
         for one in [each for each in passes if each.count == count]:
-            key = (count, one.duration_s, one.delay_s)
-            kept[key] = kept.get(key) or traffic(*key)
             progress(f"{one.label}, {count} objects, {one.lag_s:g} s lag")
-            passes[one].append(measure(one, kept[key]))
+            passes[one].append(measure(one, _traffic(count, one.duration_s, one.delay_s)))
             yardsticks_us.setdefault(count, []).append(passes[one][-1].yardstick_us)
     for count, times_us in yardsticks_us.items():
         results.yardsticks_us += times_us
         if not command and count in PUBLISHED_MS_PER_US:
             ms = PUBLISHED_MS_PER_US[count] * median(times_us)
             results.published_ms.setdefault(count, []).append(ms)
+
+
+_traffic = cache(traffic)
 
 
 def run_published(command: str, stream: Path) -> float:
