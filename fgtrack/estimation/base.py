@@ -1,10 +1,11 @@
 """The protocols of estimators and their banks."""
 
 import math
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from fgtrack.models.measurement import AT_ORIGIN, COMPONENTS, MeasurementModel, 
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.models.sensors import RobustLoss
 
+_T = TypeVar("_T")
 _STAMP = f"an integer of at most {LARGEST_NS:.0g}"
 Content = tuple[tuple[str, ...], tuple[float, ...], tuple[str, ...]]
 """Names of what is measured, numbers, names of what is assumed and of the loss; it has an order."""
@@ -119,8 +121,19 @@ class Measurement:
         return float(mahalanobis_squared(innovation, S, self.measured))
 
 
-class Measurements(Sequence[Measurement]):
-    """Measurements of several objects that differ in their numbers alone; each is made when it is asked for."""
+class Lazy(Sequence[_T], Generic[_T]):
+    """Items that are made when they are asked for, by `made`."""
+
+    @abstractmethod
+    def made(self, index: int) -> _T:
+        """Return the item at an index; raises `IndexError` if there is none."""
+
+    def __getitem__(self, index: Any) -> Any:  # Any: there are no slices
+        return self.made(index)
+
+
+class Measurements(Lazy[Measurement]):
+    """Measurements of several objects that differ in their numbers alone."""
 
     def __init__(self, stack: Measurement) -> None:
         self.stack = stack
@@ -129,7 +142,8 @@ class Measurements(Sequence[Measurement]):
     def __len__(self) -> int:
         return len(self.stack.z)
 
-    def __getitem__(self, index: Any) -> Any:  # Any: there are no slices
+    def made(self, index: int) -> Measurement:
+        """See `Lazy.made`."""
         own = self.stack
         return Measurement(own.stamp_ns, own.model, own.z[index], own.R[index], own.pose, own.loss, own.assumed)
 
@@ -155,8 +169,7 @@ class UpdateStatus(StrEnum):
     FAILED = "failed"
 
 
-@dataclass(frozen=True, slots=True)
-class UpdateResult:
+class UpdateResult(NamedTuple):
     """Outcome of one measurement."""
 
     status: UpdateStatus

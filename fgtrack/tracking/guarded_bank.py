@@ -170,7 +170,8 @@ def faults(states: Sequence[TrackState]) -> dict[int, Failure]:
         x, P = states.means, states.covariances
     else:
         x, P = np.array([state.mean for state in states]), np.array([state.covariance for state in states])
-    x, P = np.array(x, dtype=np.float64, order="C"), np.array(P, dtype=np.float64, order="C")
-    codes = kernels("fgtrack.tracking.kernels").faults(x, P)
+    codes = kernels("fgtrack.tracking.kernels").faults(
+        *(np.ascontiguousarray(each, dtype=np.float64) for each in (x, P))
+    )
     kinds = Failure.NOT_FINITE, Failure.NOT_DEFINITE
     return {row: kinds[codes[row] - 1] for row in codes.nonzero()[0].tolist()} if codes.any() else {}

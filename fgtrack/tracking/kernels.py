@@ -164,14 +164,16 @@ def innovations(
 def faults(means: FloatArray, covariances: FloatArray) -> IntArray:
     """Fault of each state (m, n) and (m, n, n), shape (m,): not finite or beyond any vehicle, invalid covariance."""
     m, n = means.shape
-    result, C = np.full(m, SOUND), np.empty((n, n))
+    result, C, std = np.full(m, SOUND), np.empty((n, n)), np.empty(n)
     for i in range(m):
         P, size, total, sound = covariances[i], 0.0, 0.0, True
+        for a in range(n):
+            std[a] = math.sqrt(max(P[a, a], 1e-300))
         for a in range(n):
             size += abs(means[i, a])
             for b in range(n):
                 total += abs(P[a, b])
-                root = math.sqrt(max(P[a, a], 1e-300)) * math.sqrt(max(P[b, b], 1e-300))
+                root = std[a] * std[b]
                 C[a, b] = 1.0 + _ROUNDING if a == b else P[a, b] / root
                 sound = sound and abs(P[a, b] - P[b, a]) / root <= _ROUNDING
             sound = sound and P[a, a] >= 0.0

@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.linalg import kernels
 from fgtrack.core.types import YAW, FloatArray, IntArray, TrackState
+from fgtrack.estimation.base import Lazy
 from fgtrack.estimation.filters.ekf import predict
 from fgtrack.models.measurement import MeasurementModel
 from fgtrack.models.motion import MotionModel
@@ -81,8 +81,8 @@ def wrapped_yaw(mean: FloatArray) -> FloatArray:
     return result
 
 
-class States(Sequence[TrackState]):
-    """States of several objects; each is made when it is asked for."""
+class States(Lazy[TrackState]):
+    """States of several objects."""
 
     def __init__(self, stamps_ns: Sequence[int], means: FloatArray, covariances: FloatArray) -> None:
         self.stamps_ns, self.means, self.covariances = stamps_ns, means, covariances
@@ -91,7 +91,8 @@ class States(Sequence[TrackState]):
     def __len__(self) -> int:
         return len(self.means)
 
-    def __getitem__(self, index: Any) -> Any:  # Any: there are no slices
+    def made(self, index: int) -> TrackState:
+        """See `Lazy.made`."""
         return TrackState(self.stamps_ns[index], self.means[index], self.covariances[index])
 
 

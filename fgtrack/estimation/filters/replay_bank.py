@@ -66,14 +66,15 @@ class ReplayBank(ObjectBank[ReplayEkf]):
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`."""
         rows, starts_ns = self._windows()
-        inside = starts_ns <= stamp_ns
-        track_ids = tuple(compress(self._estimators, inside.tolist()))
+        track_ids, inside = self.track_ids, starts_ns <= stamp_ns
+        if not inside.all():
+            track_ids = tuple(compress(track_ids, inside.tolist()))
         return StatesAt(track_ids, *self._ahead(track_ids, rows[inside], np.full(len(track_ids), stamp_ns)))
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
         rows, starts_ns = self._windows()
-        states = self._ahead(tuple(self._estimators), rows, np.maximum(starts_ns, self.present_ns))
+        states = self._ahead(self.track_ids, rows, np.maximum(starts_ns, self.present_ns))
         return kinematic_states(self._motion, self.present_ns, *states)
 
     def update(
@@ -83,21 +84,21 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         results = [UpdateResult(UpdateStatus.FAILED)] * len(track_ids)
         for indices, alike in stacks(measurements):
             seen = alike.seen_by(self._motion)
-            in_arrays = np.array([track_ids[i] in self._rows for i in indices]) & _is_plain(seen)
-            for is_inside in np.unique(in_arrays).tolist():
-                chosen = np.flatnonzero(in_arrays == is_inside)
-                part, rows = replace(seen, z=seen.z[chosen], R=seen.R[chosen]), [indices[k] for k in chosen.tolist()]
-                ids = [track_ids[i] for i in rows]
-                if is_inside:
-                    values = self._fused(stamp_ns, [self._rows[track_id] for track_id in ids], part)
+            rows = np.array([self._rows.get(track_ids[i], -1) for i in indices])
+            inside = (rows >= 0) & _is_plain(seen)
+            for chosen in filter(len, (inside.nonzero()[0], (~inside).nonzero()[0])):
+                part = seen if len(chosen) == len(rows) else replace(seen, z=seen.z[chosen], R=seen.R[chosen])
+                ids = [track_ids[indices[k]] for k in chosen.tolist()]
+                if inside[chosen[0]]:
+                    values = self._fused(stamp_ns, rows[chosen], part)
                 else:
                     for track_id in ids:
                         self._take_out(track_id)
                     values = super().update(stamp_ns, ids, Measurements(part))
                     for track_id in ids:
                         self._put_in(track_id)
-                for i, result in zip(rows, values, strict=True):
-                    results[i] = result
+                for k, result in zip(chosen.tolist(), values, strict=True):
+                    results[indices[k]] = result
         return results
 
     def birth(self, track_id: int, prior: Start) -> None:
@@ -123,7 +124,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
                 starts_ns[k] = starts_ns[k] if i in self._rows else item.window_ns[0]
         return self._order, starts_ns
 
-    def _fused(self, stamp_ns: int, rows: Sequence[int], one: Measurement) -> list[UpdateResult]:
+    def _fused(self, stamp_ns: int, rows: IntArray, one: Measurement) -> list[UpdateResult]:
         """Outcomes of a stack of measurements of entries of the state."""
         m, k = one.z.shape
         self._make_room(rows, k)
@@ -133,21 +134,23 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         y, S, nis, status = np.empty((m, k)), np.empty((m, k, k)), np.empty(m), np.empty(m, dtype=np.int64)
         lags_ns = self._lag_ns, self._start_ns
         self._kernels.fuse(
-            self._kind, self._density, *self._arrays, np.array(rows), *lags_ns, label, new, measured, y, S, nis, status
+            self._kind, self._density, *self._arrays, rows, *lags_ns, label, new, measured, y, S, nis, status
         )
-        outcomes = zip(status.tolist(), y, nis.tolist(), S, strict=True)
-        return [UpdateResult(_STATUS[code], *(rest if code >= 2 else ())) for code, *rest in outcomes]
+        codes = status.tolist()
+        results = list(map(UpdateResult._make, zip(map(_STATUS.__getitem__, codes), y, nis.tolist(), S, strict=True)))
+        for i in (status <= self._kernels.TOO_OLD).nonzero()[0].tolist():
+            results[i] = UpdateResult(_STATUS[codes[i]])
+        return results
 
-    def _make_room(self, rows: Sequence[int], k: int) -> None:
+    def _make_room(self, rows: IntArray, k: int) -> None:
         """Let there be a free slot for a measurement of `k` components in each of `rows`."""
         order, labels, _, windows, measured = self._arrays
         num_rows, slots = order.shape
-        for row in rows:
-            if windows[row, 0] == slots:
-                stamps_ns = labels[row, order[row], 0]
-                gone = max(np.searchsorted(stamps_ns, max(self._start_ns, windows[row, 1])) - 1, 0)
-                windows[row, 0] -= gone
-                order[row] = np.roll(order[row], -gone)
+        for row in rows[windows[rows, 0] == slots].tolist():
+            stamps_ns = labels[row, order[row], 0]
+            gone = max(np.searchsorted(stamps_ns, max(self._start_ns, windows[row, 1])) - 1, 0)
+            windows[row, 0] -= gone
+            order[row] = np.roll(order[row], -gone)
         largest, is_full = measured.shape[-1], bool((windows[:, 0] == slots).any())
         if k > largest or is_full:
             self._allocate(num_rows, slots * (1 + is_full), max(k, largest))
@@ -155,13 +158,13 @@ class ReplayBank(ObjectBank[ReplayEkf]):
     def _ahead(self, track_ids: Sequence[int], rows: IntArray, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray]:
         """Means (m, n) and covariances (m, n, n) of tracks, each at its stamp, with the yaw in (-pi, pi]."""
         n = self._motion.dim
-        states = np.empty((len(rows), 2 * n + 1, n))
-        self._kernels.ahead(self._kind, self._density, *self._arrays[:4], rows, stamps_ns, states)
+        means, covariances = np.empty((len(rows), n)), np.empty((len(rows), n, n))
+        self._kernels.ahead(self._kind, self._density, *self._arrays[:4], rows, stamps_ns, means, covariances)
         if len(self._rows) < len(self._estimators):
             for i in (rows < 0).nonzero()[0].tolist():
                 state = self._estimators[track_ids[i]].state_at(int(stamps_ns[i]))
-                states[i, 0], states[i, 1 : n + 1] = state.mean, state.covariance
-        return states[:, 0], states[:, 1 : n + 1]
+                means[i], covariances[i] = state.mean, state.covariance
+        return means, covariances
 
     def _put_in(self, track_id: int) -> None:
         """Move the steps of a filter into the arrays, where these can hold them."""

@@ -47,12 +47,18 @@ def _work(n: int, k: int) -> _Work:
 
 @inlined
 def _ahead(
-    motion: int, density: FloatArray, state: FloatArray, late_ns: int, F: FloatArray, predicted: FloatArray
+    motion: int,
+    density: FloatArray,
+    state: FloatArray,
+    late_ns: int,
+    F: FloatArray,
+    mean: FloatArray,
+    P: FloatArray,
+    FP: FloatArray,
 ) -> None:
-    """Write f(x), F P F' + Q and F P, (2 n + 1, n), of the state x, P, (n + 1, n)."""
-    n = len(density)
-    transition(motion, state[0], late_ns / NS_PER_S, density, predicted[0], F, predicted[1 : n + 1])
-    add_congruence(F, state[1:], predicted[n + 1 :], predicted[1 : n + 1])
+    """Write F, f(x) (n,), F P F' + Q and F P, (n, n), of the state x, P, (n + 1, n)."""
+    transition(motion, state[0], late_ns / NS_PER_S, density, mean, F, P)
+    add_congruence(F, state[1:], FP, P)
 
 
 @inlined
@@ -88,7 +94,7 @@ def _retrodict(
             continue
         state = steps[left, start : start + n + 1]
         if start:
-            _ahead(motion, density, state, late_ns, work.F, ahead)
+            _ahead(motion, density, state, late_ns, work.F, ahead[0], ahead[1 : n + 1], gain)
         else:
             copy(steps[after, n + 1 :], ahead)
         copy(ahead[1:], root)
@@ -123,9 +129,9 @@ def _step(
 ) -> bool:
     """Predict the step `after` from that `before`, and fuse its measurement; False where it cannot be fused."""
     k, n, A = label[1], len(density), work.A
-    y, K = work.y[:k], work.K[:k]
-    _ahead(motion, density, before[: n + 1], late_ns, work.F, after[n + 1 :])
-    copy(after[n + 1 :], after[: n + 1])
+    y, K, predicted = work.y[:k], work.K[:k], after[n + 1 :]
+    _ahead(motion, density, before[: n + 1], late_ns, work.F, predicted[0], predicted[1 : n + 1], predicted[n + 1 :])
+    copy(predicted, after[: n + 1])
     _innovation(after, label, measured, motion == ARC, y, work.S)
     for c in range(k):
         K[c] = after[1 + label[2 + c]]
@@ -232,7 +238,7 @@ def fuse(
             window[1] = max(window[1], window[2] - lag_ns)
 
 
-@njit(f"({_STEPS}, int64[::1], int64[::1], float64[:, :, ::1])")
+@njit(f"({_STEPS}, int64[::1], int64[::1], float64[:, ::1], float64[:, :, ::1])")
 def ahead(
     motion: int,
     density: FloatArray,
@@ -242,11 +248,12 @@ def ahead(
     windows: IntArray,
     tracks: IntArray,
     stamps_ns: IntArray,
-    predicted: FloatArray,
+    means: FloatArray,
+    covariances: FloatArray,
 ) -> None:
-    """Write the `_ahead` (m, 2 n + 1, n) of `tracks`, but those below 0, at their stamps: from the last step before."""
+    """Write states (m, n) and (m, n, n) of `tracks`, but those below 0, at their stamps: from the last step before."""
     n = len(density)
-    F = np.empty((n, n))
+    F, FP = np.empty((n, n)), np.empty((n, n))
     for i in range(len(tracks)):
         t = tracks[i]
         if t < 0:
@@ -255,6 +262,7 @@ def ahead(
         while j > 0 and labels[t, order[t, j], 0] > stamps_ns[i]:
             j -= 1
         s = order[t, j]
-        _ahead(motion, density, steps[t, s, : n + 1], stamps_ns[i] - labels[t, s, 0], F, predicted[i])
+        late_ns = stamps_ns[i] - labels[t, s, 0]
+        _ahead(motion, density, steps[t, s, : n + 1], late_ns, F, means[i], covariances[i], FP)
         if motion == ARC:
-            predicted[i, 0, _YAW] = wrapped(predicted[i, 0, _YAW])
+            means[i, _YAW] = wrapped(means[i, _YAW])
