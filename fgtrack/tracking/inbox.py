@@ -12,7 +12,7 @@ from fgtrack.core.checks import LARGEST
 from fgtrack.core.linalg import is_covariance
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import Detection, DetectionList, Disposition, FloatArray, Frame, UpdateRecord
-from fgtrack.estimation.base import Measurement
+from fgtrack.estimation.base import Measurement, UpdateStatus
 from fgtrack.models.sensors import SensorModel
 
 #: In any unit: no sensor is better than this.
@@ -35,7 +35,7 @@ class Batch:
 def record(
     message: DetectionList,
     index: int,
-    disposition: Disposition,
+    disposition: Disposition | UpdateStatus,
     track_id: int | None = None,
     nis: float | None = None,
     measurement: Measurement | None = None,
@@ -52,7 +52,7 @@ def record(
         message.stamp_ns if stamp_ns is None else stamp_ns,
         message.receipt_ns,
         index,
-        disposition,
+        disposition if isinstance(disposition, Disposition) else Disposition(disposition.value),
         track_id,
         nis,
         named,
@@ -137,14 +137,19 @@ class Inbox:
         ended: list[UpdateRecord] = []
         kept: dict[int, list[int]] = {} if message.objects else {message.stamp_ns: []}
         max_delay_ns = self._max_delay_ns.get(message.sensor)
-        for index, stamp_ns in enumerate(stamps(message, sensor)):
+        own_ns, fates = stamps(message, sensor), dict[int, Disposition | None]()
+        for stamp_ns in set(own_ns):
             delay_ns = message.receipt_ns - stamp_ns
-            if not usable[index] or -delay_ns > _MAX_FUTURE_NS:
-                ended.append(record(message, index, Disposition.INVALID))
-            elif max_delay_ns is not None and delay_ns > max_delay_ns:
-                ended.append(record(message, index, Disposition.TOO_OLD))
-            else:
+            is_late = max_delay_ns is not None and delay_ns > max_delay_ns
+            fates[stamp_ns] = Disposition.TOO_OLD if is_late else None
+            if -delay_ns > _MAX_FUTURE_NS:
+                fates[stamp_ns] = Disposition.INVALID
+        for index, (stamp_ns, is_sound) in enumerate(zip(own_ns, usable, strict=True)):
+            fate = fates[stamp_ns] if is_sound else Disposition.INVALID
+            if fate is None:
                 kept.setdefault(stamp_ns, []).append(index)
+            else:
+                ended.append(record(message, index, fate))
         newest_ns = max(kept, default=0)
         for stamp_ns, indices in kept.items():
             self._pending.append(Batch(message, stamp_ns, tuple(indices), last=stamp_ns == newest_ns))

@@ -45,7 +45,6 @@ from fgtrack.tracking.preprocess import Candidates, Preprocess
 
 _Own = tuple[int, TrackStatus, int, ObjectReport | None, float | None]
 """Id, status, number of measurements, object and existence probability of a track."""
-_DISPOSITIONS = {status: Disposition(status.value) for status in UpdateStatus}
 
 
 @dataclass(frozen=True)
@@ -299,7 +298,7 @@ class Tracker:
                         seen = measurements[index].seen_by(self._parts.motion)
                         with suppress(np.linalg.LinAlgError):
                             nis = correct_one(states.means[track], states.covariances[track], seen).nis
-            outcome = _DISPOSITIONS[result.status], track_id, nis, measurements.stack, result.innovation
+            outcome = result.status, track_id, nis, measurements.stack, result.innovation
             self._conclude(batch, candidates, position, *outcome)
 
     def _give_birth(self, batch: Batch, candidates: Candidates, position: int, scan: Scan) -> None:
@@ -333,7 +332,7 @@ class Tracker:
         batch: Batch,
         candidates: Candidates,
         position: int,
-        disposition: Disposition,
+        disposition: Disposition | UpdateStatus,
         track_id: int | None = None,
         *more: object,
     ) -> None:
