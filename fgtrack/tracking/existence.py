@@ -58,7 +58,7 @@ class ExistenceRules:
     lifetime_s: PositiveFloat = 20.0
     """Mean time for which an object stays: oncoming traffic is near for seconds, a car ahead for minutes. It matters
     where few lists could show an object; elsewhere those that miss it end its track."""
-    visible_share: OpenProbability = 0.7
+    visible_share: OpenProbability = 0.9
     """Share of the time for which an object is visible to a sensor, where nothing was tracked yet: what is hidden, too
     small or too far away for a sensor is learned by range and bearing."""
     visible_s: PositiveFloat = 2.0

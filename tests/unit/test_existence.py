@@ -103,7 +103,8 @@ def test_lists_count_at_their_stamps_in_whatever_order_they_arrive(learned_s: fl
 
 
 def test_the_misses_of_one_sensor_do_not_end_what_another_sees() -> None:
-    life, there = lifecycle(ExistenceRules(out_of_view_s=2.0)), np.array([[10.0, 0.0]])
+    rules, there = ExistenceRules(out_of_view_s=2.0, delete_probability=0.002), np.array([[10.0, 0.0]])
+    life = lifecycle(rules)
     life.born(0, scan("lidar"), HERE)
     for k in range(1, 200):
         if k % 10 == 0:
