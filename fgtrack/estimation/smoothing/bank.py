@@ -4,7 +4,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import compress, repeat
-from operator import itemgetter
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,9 +13,9 @@ from fgtrack.core.types import FloatArray, IntArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, stacks
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.failures import Failure, Failures
-from fgtrack.estimation.filters.ekf import correct
 from fgtrack.estimation.filters.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
 from fgtrack.estimation.filters.propagation import kinematic_states
+from fgtrack.estimation.smoothing.node_kernels import innovations, times
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.models.motion import MotionModel
@@ -74,6 +73,8 @@ class SmootherBank:
         self._initiation = checked_initiation(initiation)
         self._searches: dict[int, Search] = {}
         """Initiations of the tracks whose direction is sought, by row."""
+        self._order: tuple[IntArray, tuple[int, ...]] | None = None
+        """Rows and ids of all tracks, until one comes or goes."""
         self._known: dict[int, StatesAt] = {}
         """By stamp, until something changes."""
         self._final: list[SmoothedReport] = []
@@ -87,7 +88,7 @@ class SmootherBank:
     @property
     def track_ids(self) -> tuple[int, ...]:
         """See `TrackBank.track_ids`."""
-        return tuple(self._tracks)
+        return self._all()[1]
 
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`; the nodes that leave are marginalised at the next update."""
@@ -99,9 +100,10 @@ class SmootherBank:
         """See `TrackBank.states_at`."""
         known = self._known.get(stamp_ns)
         if known is None:
-            tracks = np.array([*self._tracks.values()], dtype=np.int64)
+            tracks, track_ids = self._all()
             is_known = self._times(tracks)[2] <= stamp_ns
-            track_ids, tracks = tuple(compress(self._tracks, is_known.tolist())), tracks[is_known]
+            if not is_known.all():
+                track_ids, tracks = tuple(compress(track_ids, is_known.tolist())), tracks[is_known]
             states = self.solver.states_at(tracks, np.full(len(tracks), stamp_ns))
             known = self._known[stamp_ns] = StatesAt(track_ids, *states)
         return known
@@ -110,27 +112,33 @@ class SmootherBank:
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
-        tracks = np.array([*map(self._tracks.__getitem__, track_ids)], dtype=np.int64)
-        newest_ns, start_ns, reach_ns = self._times(tracks)
-        states, results = self.states_at(stamp_ns), [_TOO_OLD] * len(tracks)
+        states, results = self.states_at(stamp_ns), [_TOO_OLD] * len(track_ids)
         row_of = dict(zip(states.track_ids, range(len(states.track_ids)), strict=True))
         for indices, stack in stacks(measurements):
-            inside = (reach_ns[np.array(indices)] <= stamp_ns).nonzero()[0]
-            if not len(inside):
+            inside = [k for k, index in enumerate(indices) if track_ids[index] in row_of]  # else too old
+            if not inside:
                 continue
-            group, alike = np.array(indices)[inside], stack.seen_by(self._motion)
-            alike = replace(alike, z=alike.z[inside], R=alike.R[inside])
-            at = [row_of[track_ids[row]] for row in group.tolist()]
-            y, H = alike.model.linearised(alike.z, states.means[at], alike.pose)
-            H = np.broadcast_to(H, (*y.shape, H.shape[-1])).copy()
-            prior = correct(states.means[at], states.covariances[at], y, H, alike.R, alike.measured)
-            given = y, H, states.means[at], start_ns[group], reach_ns[group]
-            fused = self._fuse(prior.fused.nonzero()[0], tracks[group], alike, *given)
-            late = (stamp_ns < newest_ns[group]) + (stamp_ns < start_ns[group]).astype(int)
-            for row in group.tolist():
-                results[row] = _FAILED
+            alike = stack.seen_by(self._motion)
+            if len(inside) < len(indices):
+                alike = replace(alike, z=alike.z[inside], R=alike.R[inside])
+            group = [indices[k] for k in inside]
+            tracks = np.array([self._tracks[track_ids[index]] for index in group])
+            at = [row_of[track_ids[index]] for index in group]
+            means, P = states.means[at], states.covariances[at]
+            y, H = alike.model.linearised(alike.z, means, alike.pose)
+            R, H = (np.array(each, dtype=np.float64, order="C", ndmin=3) for each in (alike.R, H))
+            alike = replace(alike, R=R)
+            measured = np.arange(y.shape[1]) if alike.measured is None else np.array(alike.measured)
+            S, nis, times = np.empty(R.shape), np.empty(len(y)), self._times(tracks)
+            innovations(P, y, H, R, measured, S, nis)
+            given = y, H if len(H) > 1 else np.repeat(H, len(y), axis=0), means, times[1], times[2]
+            fused = self._fuse(np.isfinite(nis).nonzero()[0], tracks, alike, *given)
+            late = (stamp_ns < times[:2]).sum(axis=0).tolist()
+            for index in group:
+                results[index] = _FAILED
+            outcomes = list(zip(y, nis.tolist(), S, strict=True))
             for k in fused.tolist():
-                results[group[k]] = UpdateResult(_STATUSES[late[k]], y[k], float(prior.nis[k]), prior.S[k])
+                results[group[k]] = UpdateResult(_STATUSES[late[k]], *outcomes[k])
         return results
 
     def birth(self, track_id: int, prior: Start) -> None:
@@ -141,7 +149,7 @@ class SmootherBank:
         search = Search.of(self._motion, prior, self._initiation)
         if search is not None:
             self._searches[track] = search
-        self._tracks[track_id], self._ids[track] = track, track_id
+        self._tracks[track_id], self._ids[track], self._order = track, track_id, None
         self._known.clear()
 
     def remove(self, track_id: int) -> None:
@@ -152,13 +160,12 @@ class SmootherBank:
             states = self.solver.states_at(np.full(len(stamps_ns), track), stamps_ns)
             self._final += self._reports(repeat(track_id), stamps_ns.tolist(), *states)
         self._free.append(track)
+        self._order = None
         self._known.clear()
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
-        if not self._tracks:
-            return []
-        tracks = np.array([*self._tracks.values()], dtype=np.int64)
+        tracks, _ = self._all()
         states = self.solver.states_at(tracks, np.maximum(self.present_ns, self._times(tracks)[2]))
         return kinematic_states(self._motion, self.present_ns, *states)
 
@@ -193,9 +200,15 @@ class SmootherBank:
         if not rows.size:
             return rows
         self._known.clear()
-        of, chosen = tracks[rows], replace(stack, z=stack.z[rows], R=stack.R[rows])
+        of, alike, own = tracks, stack, given
+        if len(rows) < len(tracks):
+            of, alike, own = (
+                tracks[rows],
+                replace(stack, z=stack.z[rows], R=stack.R[rows]),
+                tuple(a[rows] for a in given),
+            )
         try:
-            left = self.solver.fuse(of, chosen, *map(itemgetter(rows), given))
+            left = self.solver.fuse(of, alike, *own)
         except np.linalg.LinAlgError:
             if len(rows) > 1:
                 return np.concatenate([self._fuse(row[None], tracks, stack, *given) for row in rows])
@@ -203,7 +216,7 @@ class SmootherBank:
             return rows[:0]
         if left is not None:
             self._final += self._reports(map(self._ids.__getitem__, left[0].tolist()), *left[1:])
-        for track in self._searches.keys() & set(of.tolist()):
+        for track in self._searches.keys() & set(of.tolist()) if self._searches else ():
             self._initiate(track, stack.stamp_ns)
         if damped := self.solver.damp(of):
             self.failures.add(Failure.STEP_DAMPED, damped)
@@ -221,9 +234,14 @@ class SmootherBank:
             self.solver.restart(track, line)
             self.solver.iterate(np.array([track]), SMOOTHER_ITERATIONS)
 
-    def _times(self, tracks: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    def _all(self) -> tuple[IntArray, tuple[int, ...]]:
+        """Return rows and ids of all tracks in order of birth."""
+        if self._order is None:
+            self._order = np.array([*self._tracks.values()], dtype=np.int64), tuple(self._tracks)
+        return self._order
+
+    def _times(self, tracks: IntArray) -> IntArray:
         """Return the newest stamps of `tracks`, the starts of their windows, and the oldest stamps that are fused."""
-        nodes = self.solver.nodes
-        newest_ns, begin_ns = nodes.stamps_ns[tracks, nodes.count[tracks] - 1], nodes.begin_ns[tracks]
-        start_ns = np.maximum(np.maximum(newest_ns, self._clock_ns) - self._lag_ns, begin_ns)
-        return newest_ns, start_ns, np.maximum(start_ns - self._behind_ns, begin_ns)
+        out = np.empty((3, len(tracks)), dtype=np.int64)
+        times(tracks, self._clock_ns, self._lag_ns, self._behind_ns, self.solver.nodes.arrays, out)
+        return out

@@ -1,8 +1,8 @@
-"""Compiled loops that solve windows: elimination forwards in time and back-substitution, track by track, node by node.
+"""Compiled loops that solve windows: elimination forwards in time and back-substitution, and states at any stamp.
 
 The windows are block-tridiagonal. Elimination is the Kalman filter; what it leaves of each node, given the next one, is
 the gain and the covariance of the Rauch-Tung-Striebel smoother. No process noise is divided by, which vanishes between
-stamps 1 us apart. Arguments are those arrays of `Nodes` that have their names.
+stamps 1 us apart. `nodes` are the `arrays` of `Nodes`, in that order.
 
 All arrays are contiguous, and blocks are copied entry by entry: numba compiles that in a fraction of the time.
 """
@@ -10,16 +10,32 @@ All arrays are contiguous, and blocks are copied entry by entry: numba compiles 
 import numpy as np
 
 from fgtrack.core.compiled import add_congruence, copy, inlined, njit, product, solve
+from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 
 #: Where a measurement leaves less than this of a variance, the short form of its update keeps too few digits.
 _LEAST_SHARE = 1e-6
-#: Nodes that are about to leave the window are relinearised where they have moved by this share of the thresholds.
-LEAVING_SHARE = 0.5
-#: Nodes that are solved again, because an older one has changed, by this one.
-SOLVED_SHARE = 0.25
-TRACKS, ORDER, VECTORS, MATRICES = "int64[::1]", "int64[:, ::1]", "float64[:, ::1]", "float64[:, :, ::1]"
-_WINDOWS = f"{TRACKS}, {TRACKS}, {ORDER}"  # first, count, numbers
+#: Later than any stamp and index.
+NEVER = int(np.iinfo(np.int64).max)
+#: Columns of `tracks`: see `Nodes`.
+COUNT, FIRST, KNOWN, BEGIN_NS, NONLINEAR = range(5)
+#: Columns of `labels`.
+NUM_ROWS, CHANGED, STALE = range(3)
+#: Rows of `values` of a node, and then blocks of n rows.
+STEP, ORIGIN, REFERENCE = range(3)
+BACK, C, FILTERED, PREDICTED, P, F, Q = range(7)
+#: Types of arguments.
+INDICES, TIMES, VECTORS, MATRICES = "int64[::1]", "float64[::1]", "float64[:, ::1]", "float64[:, :, ::1]"
+NODES = f"Tuple((int64[:, ::1], int64[:, ::1], int64[:, ::1], int64[:, ::1], {MATRICES}, {MATRICES}))"
+Arrays = tuple[IntArray, IntArray, IntArray, IntArray, FloatArray, FloatArray]
+"""Tracks, stamps, numbers, labels, values and rows of `Nodes`."""
+
+
+@inlined
+def block(values: FloatArray, at: int, which: int) -> FloatArray:
+    """Return a block of a node, a matrix (n, n) and a vector (n,) beside it."""
+    n = values.shape[2] - 1
+    return values[at, 3 + which * n : 3 + (which + 1) * n]
 
 
 @inlined
@@ -30,49 +46,43 @@ def regularise(Q: FloatArray) -> None:
 
 
 @inlined
-def _predict(left: FloatArray, segment: FloatArray, origin: FloatArray, moved: FloatArray, ahead: FloatArray) -> None:
-    """[F P F' + Q | F x + f - x0] to `ahead`, and F P to `moved`."""
-    n = len(origin)
+def _predict(values: FloatArray, before: int, at: int, moved: FloatArray) -> None:
+    """Write the prediction [F P F' + Q | F x + f - x0], and F P to `moved`."""
+    n = len(moved)
+    left, motion, noise = block(values, before, FILTERED), block(values, before, F), block(values, before, Q)
+    ahead = block(values, at, PREDICTED)
     for i in range(n):
-        mean = segment[i, 2 * n] - origin[i]
+        mean = motion[i, n] - values[at, ORIGIN, i]
         for j in range(n):
-            mean += segment[i, j] * left[j, n]
+            mean += motion[i, j] * left[j, n]
         ahead[i, n] = mean
         for j in range(i + 1):
-            ahead[i, j] = 0.5 * (segment[i, n + j] + segment[j, n + i])
-    add_congruence(segment, left, moved, ahead)
+            ahead[i, j] = 0.5 * (noise[i, j] + noise[j, i])
+    add_congruence(motion, left, moved, ahead)
 
 
 @inlined
-def _condition(
-    left: FloatArray,
-    segment: FloatArray,
-    ahead: FloatArray,
-    gain: FloatArray,
-    E: FloatArray,
-    Q: FloatArray,
-    work: FloatArray,
-    back: FloatArray,
-    C: FloatArray,
-) -> bool:
+def _condition(values: FloatArray, before: int, at: int, gain: FloatArray, E: FloatArray, work: FloatArray) -> bool:
     """A = P F' (F P F' + Q)^-1, b, C = E P E' + A Q A', E = I - A F; `gain` holds F P. False if there is no A."""
-    n = gain.shape[0]
+    n = len(gain)
+    left, motion, ahead = block(values, before, FILTERED), block(values, before, F), block(values, at, PREDICTED)
+    back, rest = block(values, before, BACK), block(values, before, C)
     copy(ahead, E)
     if not solve(E, gain):
         return False
     for i in range(n):
         mean = left[i, n]
         for j in range(n):
-            back[i, j], Q[i, j] = gain[j, i], segment[i, n + j]
+            back[i, j] = gain[j, i]
             mean -= gain[j, i] * ahead[j, n]
             value = 1.0 if i == j else 0.0
             for k in range(n):
-                value -= gain[k, i] * segment[k, j]
+                value -= gain[k, i] * motion[k, j]
             E[i, j] = value
-            C[i, j] = 0.0
+            rest[i, j] = 0.0
         back[i, n] = mean
-    for weights, covariance in ((E, left), (back, Q)):
-        add_congruence(weights, covariance, work, C)
+    add_congruence(E, left, work, rest)
+    add_congruence(back, block(values, before, Q), work, rest)
     return True
 
 
@@ -105,44 +115,26 @@ def _correct(
         add_congruence(E, P, work, state)
 
 
-@njit(
-    f"b1({TRACKS}, {TRACKS}, {TRACKS}, {_WINDOWS}, {VECTORS}, {MATRICES}, {MATRICES}, {TRACKS},"
-    f" {', '.join([MATRICES] * 4)})"
-)
-def eliminate(
-    tracks: IntArray,
-    starts: IntArray,
-    ends: IntArray,
-    first: IntArray,
-    count: IntArray,
-    numbers: IntArray,
-    origin: FloatArray,
-    segment: FloatArray,
-    rows: FloatArray,
-    num_rows: IntArray,
-    predicted: FloatArray,
-    filtered: FloatArray,
-    back: FloatArray,
-    C: FloatArray,
-) -> bool:
+@njit(f"b1({INDICES}, {INDICES}, {INDICES}, {NODES})")
+def eliminate(tracks: IntArray, starts: IntArray, ends: IntArray, nodes: Arrays) -> bool:
     """Eliminate the nodes of `tracks` from `starts` up to before `ends`; True if all is finite."""
-    n = origin.shape[1]
-    A, E, P, work, gain = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty(n)
+    info, _, numbers, labels, values, rows = nodes
+    n = values.shape[2] - 1
+    A, E, D, work, gain = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty(n)
     for t in range(len(tracks)):
         track = tracks[t]
-        for index in range(starts[t], min(ends[t], count[track])):
+        for index in range(starts[t], min(ends[t], info[track, COUNT])):
             at = numbers[track, index]
-            if index > first[track]:  # else the prior of the oldest node in the window, which follows from nothing
-                before = numbers[track, index - 1]
-                _predict(filtered[before], segment[before], origin[at], A, predicted[at])
-                if not _condition(
-                    filtered[before], segment[before], predicted[at], A, E, P, work, back[before], C[before]
-                ):
+            if (
+                index > info[track, FIRST]
+            ):  # else the prior of the oldest node in the window, which follows from nothing
+                _predict(values, numbers[track, index - 1], at, A)
+                if not _condition(values, numbers[track, index - 1], at, A, E, work):
                     return False
-            state, total = filtered[at], 0.0
-            copy(predicted[at], state)
-            for k in range(num_rows[at]):
-                _correct(state, rows[at], k, gain, E, P, work)
+            state, total = block(values, at, FILTERED), 0.0
+            copy(block(values, at, PREDICTED), state)
+            for k in range(labels[at, NUM_ROWS]):
+                _correct(state, rows[at], k, gain, E, D, work)
             for i in range(n):
                 for j in range(n + 1):
                     total += abs(state[i, j])
@@ -151,159 +143,166 @@ def eliminate(
     return True
 
 
-@njit(f"void({TRACKS}, {_WINDOWS}, {MATRICES}, {MATRICES}, {VECTORS})")
-def back_substitute(
-    tracks: IntArray,
-    first: IntArray,
-    count: IntArray,
-    numbers: IntArray,
-    filtered: FloatArray,
-    back: FloatArray,
-    step: FloatArray,
-) -> None:
-    """Write `step` of the nodes in the windows: A (step of the next node) + b."""
-    n = step.shape[1]
-    for track in tracks:
-        later = -1
-        for index in range(count[track] - 1, first[track] - 1, -1):
+@njit(f"void({INDICES}, {INDICES}, {NODES})")
+def back_substitute(tracks: IntArray, anchors: IntArray, nodes: Arrays) -> None:
+    """Let the windows begin at `anchors`, and write the steps of their nodes: A (step of the next node) + b."""
+    info, _, numbers, _, values, _ = nodes
+    n = values.shape[2] - 1
+    for t in range(len(tracks)):
+        track, later = tracks[t], -1
+        info[track, FIRST], info[track, KNOWN] = anchors[t], info[track, COUNT]
+        for index in range(info[track, COUNT] - 1, anchors[t] - 1, -1):
             at = numbers[track, index]
+            back = block(values, at, FILTERED if later < 0 else BACK)
             for i in range(n):
-                value = filtered[at, i, n] if later < 0 else back[at, i, n]
+                value = back[i, n]
                 if later >= 0:
                     for j in range(n):
-                        value += back[at, i, j] * step[later, j]
-                step[at, i] = value
+                        value += back[i, j] * values[later, STEP, j]
+                values[at, STEP, i] = value
             later = at
 
 
-@njit(f"int64({TRACKS}, {TRACKS}, {TRACKS}, {_WINDOWS}, {VECTORS}, {VECTORS}, {TRACKS}, {TRACKS})")
-def find_far(
-    tracks: IntArray,
-    anchors: IntArray,
-    starts: IntArray,
-    first: IntArray,
-    count: IntArray,
-    numbers: IntArray,
-    thresholds: FloatArray,
-    step: FloatArray,
-    rows: IntArray,
-    indices: IntArray,
+@njit(f"int64({INDICES}, {INDICES}, {NODES}, {INDICES}, {TIMES}, {TIMES})")
+def locate(
+    tracks: IntArray, stamps_ns: IntArray, nodes: Arrays, indices: IntArray, until_s: FloatArray, after_s: FloatArray
 ) -> int:
-    """Write the nodes with a `step` longer than `thresholds` (m, n) as rows and indices; return their number.
-    A `LEAVING_SHARE` of the thresholds holds for nodes before `anchors`, a `SOLVED_SHARE` from `starts` on and after
-    the first node that is too far.
+    """Write the indices of the nodes after `stamps_ns`, or of the last ones, and the times around the stamps.
+    Return how many are after them.
     """
-    num = 0
+    info, all_ns, _, _, _, _ = nodes
+    num_between = 0
     for t in range(len(tracks)):
-        is_solved = False
-        for index in range(first[tracks[t]], count[tracks[t]]):
-            at, too_long = numbers[tracks[t], index], False
-            share = LEAVING_SHARE if index < anchors[t] else 1.0
-            if is_solved or index >= starts[t]:
-                share = SOLVED_SHARE
-            for i in range(step.shape[1]):
-                too_long |= abs(step[at, i]) > share * thresholds[t, i]
-            if too_long:
-                is_solved = True
-                rows[num], indices[num] = t, index
-                num += 1
-    return num
+        track, stamp_ns = tracks[t], stamps_ns[t]
+        index, end = -1, info[track, COUNT]  # bisect to the newest node at or before the stamp
+        while end - index > 1:
+            middle = (index + end) // 2
+            if all_ns[track, middle] <= stamp_ns:
+                index = middle
+            else:
+                end = middle
+        until_s[t], after_s[t] = (stamp_ns - all_ns[track, index]) / NS_PER_S, 0.0
+        if until_s[t] > 0.0 and index < info[track, COUNT] - 1:
+            index += 1
+            after_s[t] = (all_ns[track, index] - stamp_ns) / NS_PER_S
+            num_between += 1
+        indices[t] = index
+    return num_between
 
 
-@njit(
-    f"void({TRACKS}, {TRACKS}, {TRACKS}, {_WINDOWS}, {MATRICES}, {MATRICES}, {MATRICES}, {VECTORS}, {MATRICES},"
-    f" {VECTORS}, {MATRICES})"
-)
-def smoothed(
-    tracks: IntArray,
-    indices: IntArray,
-    known: IntArray,
-    first: IntArray,
-    count: IntArray,
-    numbers: IntArray,
-    filtered: FloatArray,
-    back: FloatArray,
-    C: FloatArray,
-    step: FloatArray,
-    P: FloatArray,
-    steps: FloatArray,
-    covariances: FloatArray,
-) -> None:
-    """Write `steps` and `covariances` of the nodes at `indices`; those computed on the way stay in `step` and `P`.
-    From index `known` on covariances are known.
+@njit(f"void({INDICES}, {INDICES}, {TIMES}, {NODES}, {VECTORS})")
+def smooth(tracks: IntArray, indices: IntArray, after_s: FloatArray, nodes: Arrays, means: FloatArray) -> None:
+    """Make the covariances of the nodes at `indices` known, and behind the window the steps; those on the way stay.
+    Write the states that motion starts from: of these nodes, or where `after_s` the conditional one of those before.
     """
-    n = step.shape[1]
+    info, _, numbers, _, values, _ = nodes
+    n = values.shape[2] - 1
     work = np.empty((n, n))
     for t in range(len(tracks)):
         track = tracks[t]
-        for index in range(known[track] - 1, indices[t] - 1, -1):
+        for index in range(info[track, KNOWN] - 1, indices[t] - 1, -1):
             at = numbers[track, index]
-            if index == count[track] - 1:
-                copy(filtered[at], P[at])
+            if index == info[track, COUNT] - 1:
+                copy(block(values, at, FILTERED), block(values, at, P))
                 continue
-            later = numbers[track, index + 1]
-            copy(C[at], P[at])
-            add_congruence(back[at], P[later], work, P[at])
-            if index < first[track]:  # behind the window
+            later, back, known = numbers[track, index + 1], block(values, at, BACK), block(values, at, P)
+            copy(block(values, at, C), known)
+            add_congruence(back, block(values, later, P), work, known)
+            if index < info[track, FIRST]:
                 for i in range(n):
-                    value = back[at, i, n]
+                    values[at, STEP, i] = back[i, n]
                     for j in range(n):
-                        value += back[at, i, j] * step[later, j]
-                    step[at, i] = value
-        known[track] = min(known[track], indices[t])
+                        values[at, STEP, i] += back[i, j] * values[later, STEP, j]
+        info[track, KNOWN] = min(info[track, KNOWN], indices[t])
         at = numbers[track, indices[t]]
-        copy(P[at], covariances[t])
         for i in range(n):
-            steps[t, i] = step[at, i]
+            means[t, i] = values[at, ORIGIN, i] + values[at, STEP, i]
+        if after_s[t] > 0.0:
+            before = numbers[track, indices[t] - 1]
+            back = block(values, before, BACK)
+            for i in range(n):
+                means[t, i] = values[before, ORIGIN, i] + back[i, n]
+                for j in range(n):
+                    means[t, i] += back[i, j] * values[at, STEP, j]
 
 
-@njit(f"b1({', '.join([VECTORS, MATRICES, MATRICES] * 2)}, {VECTORS}, {MATRICES}, {MATRICES}, {MATRICES})")
-def interpolate(
+@inlined
+def _interpolate(
+    values: FloatArray,
+    before: int,
+    at: int,
     mean: FloatArray,
     F1: FloatArray,
     Q1: FloatArray,
     ahead: FloatArray,
     F2: FloatArray,
     Q2: FloatArray,
-    right: FloatArray,
-    A: FloatArray,
-    C: FloatArray,
-    P: FloatArray,
+    work: FloatArray,
 ) -> bool:
-    """Write means and covariances of states between two nodes over `mean` and `P`; False if noise is not definite.
-    `mean` is predicted from the left node, `ahead` from there; the right one has mean `right` and covariance P, that
-    on the left A and C given it. See `interpolation.between` for Psi, Lambda and Sigma, which is E Q1 E' + Psi Q2 Psi'.
+    """Write mean and covariance of a state between two nodes over `mean` and `Q1`.
+    See `rts.between` for Psi, Lambda and Sigma, which is E Q1 E' + Psi Q2 Psi'.
     """
+    n = len(mean)
+    S, gain, Psi, E, Lambda, by_right, half = work[0], work[1], work[2], work[3], work[4], work[5], work[6]
+    for attempt in range(2):
+        copy(Q2, S)
+        add_congruence(F2, Q1, gain, S)
+        if solve(S, gain):
+            break
+        if attempt == 1:
+            return False
+        regularise(Q1)
+        regularise(Q2)
+    for i in range(n):
+        for j in range(n):
+            Psi[i, j] = gain[j, i]
+    product(Psi, F2, E)
+    for i in range(n):
+        for j in range(n):
+            E[i, j] = (1.0 if i == j else 0.0) - E[i, j]
+            mean[i] += Psi[i, j] * (values[at, ORIGIN, j] + values[at, STEP, j] - ahead[j])
+    product(E, F1, Lambda)
+    product(Lambda, block(values, before, BACK), by_right)
+    for i in range(n):
+        for j in range(n):
+            by_right[i, j] += Psi[i, j]
+    copy(Q1, S)
+    for i in range(n):
+        for j in range(n):
+            Q1[i, j] = 0.0
+    add_congruence(by_right, block(values, at, P), half, Q1)
+    add_congruence(Lambda, block(values, before, C), half, Q1)
+    add_congruence(E, S, half, Q1)
+    add_congruence(Psi, Q2, half, Q1)
+    return True
+
+
+@njit(f"b1({INDICES}, {INDICES}, {TIMES}, {NODES}, {', '.join([VECTORS, MATRICES, MATRICES] * 2)})")
+def arrive(
+    tracks: IntArray,
+    indices: IntArray,
+    after_s: FloatArray,
+    nodes: Arrays,
+    mean: FloatArray,
+    F1: FloatArray,
+    Q1: FloatArray,
+    ahead: FloatArray,
+    F2: FloatArray,
+    Q2: FloatArray,
+) -> bool:
+    """Write covariances over `Q1` of states at `mean`, which has moved from where `smooth` let it start.
+    Where `after_s`, the state is between two nodes, and `ahead` is what motion makes of it until the right one. False
+    if noise is not definite there.
+    """
+    _, _, numbers, _, values, _ = nodes
     n = mean.shape[1]
-    S, gain, Psi, E = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    Lambda, by_right, work = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    work = np.empty((7, n, n))
     for t in range(len(mean)):
-        for attempt in range(2):
-            copy(Q2[t], S)
-            add_congruence(F2[t], Q1[t], gain, S)
-            if solve(S, gain):
-                break
-            if attempt == 1:
+        at = numbers[tracks[t], indices[t]]
+        if after_s[t] > 0.0:
+            before = numbers[tracks[t], indices[t] - 1]
+            if not _interpolate(values, before, at, mean[t], F1[t], Q1[t], ahead[t], F2[t], Q2[t], work):
                 return False
-            regularise(Q1[t])
-            regularise(Q2[t])
-        for i in range(n):
-            for j in range(n):
-                Psi[i, j] = gain[j, i]
-        product(Psi, F2[t], E)
-        for i in range(n):
-            for j in range(n):
-                E[i, j] = (1.0 if i == j else 0.0) - E[i, j]
-                mean[t, i] += Psi[i, j] * (right[t, j] - ahead[t, j])
-        product(E, F1[t], Lambda)
-        product(Lambda, A[t], by_right)
-        for i in range(n):
-            for j in range(n):
-                by_right[i, j] += Psi[i, j]
-        copy(P[t], S)
-        for i in range(n):
-            for j in range(n):
-                P[t, i, j] = 0.0
-        for weights, covariance in ((by_right, S), (Lambda, C[t]), (E, Q1[t]), (Psi, Q2[t])):
-            add_congruence(weights, covariance, work, P[t])
+        else:
+            add_congruence(F1[t], block(values, at, P), work[0], Q1[t])
     return True

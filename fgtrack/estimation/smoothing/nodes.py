@@ -1,21 +1,22 @@
 """The nodes of all windows in arrays, and their linearisation.
 
 Each track has a row of nodes in the order of their stamps; the values of a node are kept under its number, which stays
-the same as long as the node exists, so that an insertion moves no values. The first `first` nodes of a row have left
-the window and are kept for detections that are older; those from there up to `count` are the window.
+the same as long as the node exists, so that an insertion moves no values. The first nodes of a row have left the window
+and are kept for detections that are older.
 """
 
 import numpy as np
 
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.estimation.base import Measurements
 from fgtrack.estimation.smoothing import node_kernels
-from fgtrack.estimation.smoothing.terms import NEAR_NS, Term, whitened
-from fgtrack.models.motion import MotionModel
+from fgtrack.estimation.smoothing.kernels import CHANGED, COUNT, FIRST, NEVER, NUM_ROWS, STALE
+from fgtrack.estimation.smoothing.terms import Term, whitened
+from fgtrack.models.motion import MotionModel, WhiteNoise
+from fgtrack.models.transitions import transitions
 
 _FEW_TRACKS, _FEW_NODES, _FEW_COMPONENTS = 4, 16, 4
-#: Later than any stamp and index.
-NEVER = int(np.iinfo(np.int64).max)
 
 
 def _numbered(first: int, tracks: int, nodes: int) -> IntArray:
@@ -23,64 +24,50 @@ def _numbered(first: int, tracks: int, nodes: int) -> IntArray:
     return np.ascontiguousarray(first + np.arange(tracks * nodes).reshape(nodes, tracks).T)
 
 
-class Nodes:
-    """Arrays of shape (tracks, nodes) with the order of the nodes, and (numbers, ...) with the values of each.
-    Vectors stand as a last column beside the matrix that moves with them: [F | Q | f(x0)], [P | x], [A | b].
-    """
+def _is_shipped(motion: MotionModel) -> bool:
+    return type(motion).transition is WhiteNoise.transition
 
-    ORDER = ("stamps_ns", "numbers", "first", "count")
-    _OF_TRACKS = ("count", "first", "known", "begin_ns", "is_nonlinear")
-    _VALUES = (
-        *("origin", "reference", "segment", "rows", "num_rows", "predicted", "filtered", "back", "C"),
-        *("step", "P", "changed"),
-    )
+
+class Nodes:
+    """Arrays of tracks (tracks, ...), with the order of the nodes, and of numbers (size, ...), with their values."""
 
     def __init__(self, motion: MotionModel) -> None:
-        shape = _FEW_TRACKS, _FEW_NODES
         self._motion, n, size = motion, motion.dim, _FEW_TRACKS * _FEW_NODES
-        self.stamps_ns: IntArray = np.full(shape, NEVER)
-        """Shape (tracks, nodes); `NEVER` from `count` on."""
-        self.numbers: IntArray = _numbered(0, *shape)
-        """Shape (tracks, nodes); those from `count` on are free."""
-        self.count: IntArray = np.zeros(_FEW_TRACKS, dtype=np.int64)
-        """Number of nodes of each track."""
-        self.first: IntArray = np.zeros_like(self.count)
-        """Index of the oldest node of the window."""
-        self.known: IntArray = np.zeros_like(self.count)
-        """From this index on `P` is known."""
-        self.begin_ns: IntArray = np.zeros_like(self.count)
-        """Stamp of the first state of each track."""
-        self.is_nonlinear: BoolArray = np.zeros(_FEW_TRACKS, dtype=bool)
-        """True if a track has a measurement that is not linear."""
-        self.origin, self.reference = np.zeros((2, size, n))
-        """Linearisation points x0, and the first of them, which the variables of a factor graph are relative to."""
-        self.segment = np.zeros((size, n, 2 * n + 1))
-        """Motion to the next node: F, the derivative of f at x0, the noise Q, and f(x0)."""
+        self._compiled = motion if isinstance(motion, WhiteNoise) and _is_shipped(motion) else None
+        self.tracks: IntArray = np.zeros((_FEW_TRACKS, 5), dtype=np.int64)
+        """Number of nodes; index of the oldest one of the window; index from which on `P` is known; stamp of the first
+        state; 1 if there was a measurement that is not linear."""
+        self.stamps_ns: IntArray = np.full((_FEW_TRACKS, _FEW_NODES), NEVER)
+        """Shape (tracks, nodes); `NEVER` where there is no node."""
+        self.numbers = _numbered(0, _FEW_TRACKS, _FEW_NODES)
+        """Shape (tracks, nodes); those beyond the number of nodes are free."""
+        self.labels: IntArray = np.zeros((size, 3), dtype=np.int64)
+        """Number of `rows` in use; 1 if something was linearised since a factor graph read it; 1 if the motion to the
+        next node must be linearised."""
+        self.values = np.zeros((size, 3 + 7 * n, n + 1))
+        """Rows and blocks, see `kernels`: vectors stand as a last column beside the matrix that moves with them."""
         self.rows = np.zeros((size, _FEW_COMPONENTS, n + 1))
-        """Measurements: G and y of y = G (x - x0) + N(0, I); unused rows are 0."""
-        self.num_rows: IntArray = np.zeros(size, dtype=np.int64)
-        """Number of `rows` in use."""
-        self.predicted, self.filtered = (np.zeros((size, n, n + 1)) for _ in range(2))
-        """Covariances and means relative to x0, before and after the node's own measurements."""
-        self.back, self.C = np.zeros((size, n, n + 1)), np.zeros((size, n, n))
-        """The node given the next one: x - x0 = A (next - its x0) + b + N(0, C); A and b."""
-        self.step, self.P = np.zeros((size, n)), np.zeros((size, n, n))
-        """Mean relative to x0, and covariance, given everything."""
-        self.changed: BoolArray = np.zeros(size, dtype=bool)
-        """True if the motion to the next node, or a measurement, was linearised since a factor graph read them."""
-        self.terms: dict[int, list[Term]] = {}
-        """Measurements of each node."""
-        self.order = self.first, self.count, self.numbers
-        """Arguments of all loops over the windows."""
+        """Measurements: G and y of y = G (x - x0) + N(0, I)."""
+        self._terms: dict[int, list[tuple[Measurements, int, float]]] = {}
+        self._share()
 
-    def nearest(self, tracks: IntArray, stamp_ns: int) -> tuple[IntArray, IntArray]:
-        """Return the indices of the newest nodes at most `NEAR_NS` after `stamp_ns`, and the stamps to fuse it at.
-        These are those of nodes that are at most `NEAR_NS` from it, else `stamp_ns` itself.
-        """
-        all_ns = self.stamps_ns[tracks]
-        indices = (all_ns <= stamp_ns + NEAR_NS).sum(axis=1) - 1
-        at_ns = all_ns[np.arange(len(tracks)), indices]
-        return indices, np.where(at_ns < stamp_ns - NEAR_NS, stamp_ns, at_ns)
+    def _share(self) -> None:
+        """Name the parts of the arrays."""
+        n = self._motion.dim
+        self.arrays = self.tracks, self.stamps_ns, self.numbers, self.labels, self.values, self.rows
+        """Arguments of all loops."""
+        self.count, self.first = self.tracks[:, COUNT], self.tracks[:, FIRST]
+        self.step, self.origin, self.reference = (self.values[:, row, :n] for row in range(3))
+        """Mean relative to the linearisation point x0, given everything; x0; the first x0, which the variables of a
+        factor graph are relative to."""
+        blocks = [self.values[:, 3 + n * k : 3 + n * (k + 1)] for k in range(7)]
+        self.back, _, self.filtered, self.predicted, _, motion, _ = blocks
+        """[A | b], the node given the next one: x - x0 = A (next - its x0) + b + N(0, C); covariances and means
+        relative to x0 after and before the node's own measurements."""
+        _, self.C, _, _, self.P, self.F, self.Q = (each[..., :n] for each in blocks)
+        """C; covariance given everything; motion f to the next node: its derivative at x0, and its noise."""
+        self.ahead = motion[..., n]
+        """f(x0)."""
 
     def last_before(self, tracks: IntArray, stamps_ns: IntArray) -> IntArray:
         """Return the indices of the newest nodes at or before `stamps_ns`; -1 without such a node."""
@@ -94,87 +81,84 @@ class Nodes:
         """Return the stamps of all nodes of a window."""
         return self.stamps_ns[track, self.first[track] : self.count[track]].copy()
 
+    def terms(self, number: int) -> list[Term]:
+        """Return the measurements of a node."""
+        return [(stack[row], ahead_s) for stack, row, ahead_s in self._terms[number]]
+
     def begin_window(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
         """Make the first node of a new track."""
-        while track >= len(self.count):
+        while track >= len(self.tracks):
             self._grow(axis=0)
         self.stamps_ns[track] = NEVER
-        self.stamps_ns[track, 0] = self.begin_ns[track] = stamp_ns
-        self.count[track], self.first[track], self.known[track], self.is_nonlinear[track] = 1, 0, 0, False
-        number = self.numbers[track, :1]
-        self._empty(number)
+        self.stamps_ns[track, 0] = stamp_ns
+        self.tracks[track] = 1, 0, 0, stamp_ns, 0
+        number = int(self.numbers[track, 0])
+        self._terms[number], self.labels[number] = [], 0
         self.origin[number], self.step[number], self.P[number] = mean, 0.0, covariance
         self.predicted[number] = self.filtered[number] = np.column_stack([covariance, np.zeros(len(mean))])
 
-    def insert_at(self, tracks: IntArray, indices: IntArray, stamp_ns: int, origins: FloatArray) -> None:
-        """Insert nodes at `indices`, one for each of `tracks` that were `saved`, linearised at `origins` (m, n)."""
-        numbers = np.empty(len(tracks), dtype=np.int64)
-        node_kernels.insert(tracks, indices, stamp_ns, self.stamps_ns, self.numbers, self.count, numbers)
-        self._empty(numbers)
-        self.origin[numbers] = origins
+    def note(self, stack: Measurements, numbers: IntArray, is_new: IntArray, ahead_s: FloatArray) -> None:
+        """Keep a stack of measurements, one for each of the nodes `numbers`."""
+        for row, (number, new, time_s) in enumerate(
+            zip(numbers.tolist(), is_new.tolist(), ahead_s.tolist(), strict=True)
+        ):
+            if new:
+                self._terms[number] = []
+            self._terms[number].append((stack, row, time_s))
 
-    def move(self, tracks: IntArray, numbers: IntArray, steps: FloatArray) -> None:
-        """Move the linearisation points of nodes of `tracks`, one each, by `steps` (m, n), and linearise their
-        measurements there.
-        """
-        order = self.first, self.numbers
-        node_kernels.shift(tracks, numbers, steps, *order, self.origin, self.step, self.predicted, self.back, self.rows)
-        for number in numbers.tolist():
-            if any(term.is_nonlinear for term, _ in self.terms[number]):
-                self.linearise_terms(number)
+    def withdraw(self, track: int, index: int, is_new: bool) -> None:
+        """Take the last measurement of a node out, and the node, if it `is_new`."""
+        number, last = self.numbers[track, index], self.count[track] - 1
+        self._terms[int(number)].pop()
+        if is_new:
+            for each, free in ((self.stamps_ns[track], NEVER), (self.numbers[track], number)):
+                each[index:last] = each[index + 1 : last + 1]
+                each[last] = free
+            self.count[track] = last
 
-    def drop(self, tracks: IntArray, many: IntArray) -> None:
-        """Forget so `many` of the oldest nodes of each of `tracks`, which lie behind the windows."""
-        columns = np.arange(self.stamps_ns.shape[1])
-        source = (columns + many[:, None]) % len(columns)
-        is_left = columns < (self.count[tracks] - many)[:, None]
-        stamps_ns = np.take_along_axis(self.stamps_ns[tracks], source, axis=1)
-        self.stamps_ns[tracks] = np.where(is_left, stamps_ns, NEVER)
-        self.numbers[tracks] = np.take_along_axis(self.numbers[tracks], source, axis=1)
-        self.count[tracks] -= many
-        self.first[tracks] -= many
-        self.known[tracks] -= many
+    def make_room(self, tracks: IntArray, k: int) -> None:
+        """Make room for another node in each of `tracks`, and for another `k` components in each node."""
+        if self.count[tracks].max() >= self.stamps_ns.shape[1]:
+            self._grow(axis=1)
+        self._fit_rows(int(self.labels[:, NUM_ROWS].max()) + k)
 
     def linearise_terms(self, number: int) -> None:
         """Linearise all measurements of a node at its linearisation point."""
-        rows = [whitened(term, self.origin[number], self._motion) for term in self.terms[number]]
+        rows = [whitened(term, self.origin[number], self._motion) for term in self.terms(number)]
         used = sum(map(len, rows))
         self._fit_rows(used)
-        self.rows[number], self.num_rows[number], self.changed[number] = 0.0, used, True
+        self.labels[number, :2] = used, 1
         if used:
             self.rows[number, :used] = np.concatenate(rows)
 
-    def linearise_motion(self, tracks: IntArray, indices: IntArray) -> None:
-        """Linearise the motion from the nodes at `indices` to the next ones, where there are any."""
-        inner = indices < self.count[tracks] - 1
-        tracks, indices = tracks[inner], indices[inner]
-        if tracks.size:
-            dt_s = (self.stamps_ns[tracks, indices + 1] - self.stamps_ns[tracks, indices]) / NS_PER_S
-            numbers = self.numbers[tracks, indices]
-            ahead, F, Q = self._motion.transition(self.origin[numbers], dt_s)
-            self.segment[numbers] = np.concatenate([F, Q, ahead[..., None]], axis=-1)
-            self.changed[numbers] = True
+    def linearise(self, tracks: IntArray, starts: IntArray, is_nonlinear: bool) -> None:
+        """Linearise the motion of stale nodes from the one before `starts` on, and if `is_nonlinear` measurements."""
+        compiled = self._compiled
+        if is_nonlinear or compiled is None:
+            rows, indices = np.nonzero(self.labels[self.numbers[tracks], STALE])
+            rows = tracks[rows]
+            stale = self.numbers[rows, indices]
+            for number in stale.tolist() if is_nonlinear else ():
+                if any(of.stack.is_nonlinear or ahead_s for of, _, ahead_s in self._terms[number]):
+                    self.linearise_terms(number)
+        if compiled is not None:
+            node_kernels.linearise_motion(compiled.kind, compiled.density, tracks, starts, self.arrays)
+            return
+        self.labels[stale, STALE] = 0
+        inner = indices < self.count[rows] - 1
+        rows, indices, stale = rows[inner], indices[inner], stale[inner]
+        dt_s = (self.stamps_ns[rows, indices + 1] - self.stamps_ns[rows, indices]) / NS_PER_S
+        self.ahead[stale], self.F[stale], self.Q[stale] = self.transition(self.origin[stale], dt_s)
+        self.labels[stale, CHANGED] = 1
 
-    def observe(self, numbers: IntArray, y: FloatArray, H: FloatArray, R: FloatArray, offsets: FloatArray) -> None:
-        """Add measurements y = H (x - guess) + N(0, R); guess - x0 is `offsets`, (m, n).
-        Raises `numpy.linalg.LinAlgError` for an R that is not positive definite.
-        """
-        self._fit_rows(int(self.num_rows[numbers].max()) + y.shape[1])
-        if not node_kernels.observe(numbers, y, H, R, offsets, self.rows, self.num_rows):
-            raise np.linalg.LinAlgError("a covariance is not positive definite")
-        self.changed[numbers] = True
-
-    def saved(self, tracks: IntArray) -> list[IntArray]:
-        """Return the `ORDER` of `tracks` before an insertion of a node into each, for which room is made."""
-        if self.count[tracks].max() >= self.stamps_ns.shape[1]:
-            self._grow(axis=1)
-        return [getattr(self, name)[tracks] for name in self.ORDER]
-
-    def _empty(self, numbers: IntArray) -> None:
-        self.num_rows[numbers] = 0
-        self.rows[numbers] = 0.0
-        for number in numbers.tolist():
-            self.terms[number] = []
+    def transition(self, x: FloatArray, dt_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return `MotionModel.transition` of states (m, n) after times (m,)."""
+        if self._compiled is None:
+            return self._motion.transition(x, dt_s)
+        m, n = x.shape
+        result = np.empty((m, n)), np.empty((m, n, n)), np.empty((m, n, n))
+        transitions(self._compiled.kind, x, dt_s, self._compiled.density, *result)
+        return result
 
     def _grow(self, axis: int) -> None:
         """Double the tracks, or the nodes of each; a node keeps its number and, if it is of a track, its values."""
@@ -182,16 +166,16 @@ class Nodes:
         used = self.numbers[np.arange(shape[1]) < self.count[:, None]]
         self.stamps_ns = np.concatenate([self.stamps_ns, np.full(shape, NEVER)], axis=axis)
         self.numbers = np.concatenate([self.numbers, _numbered(first, *shape)], axis=axis)
-        for name in self._VALUES:
+        for name in ("labels", "values", "rows"):
             values = getattr(self, name)
             larger = np.zeros((self.numbers.size, *values.shape[1:]), values.dtype)  # only pages of used ones are made
             larger[used] = values[used]
             setattr(self, name, larger)
-        for name in self._OF_TRACKS if axis == 0 else ():
-            values = getattr(self, name)
-            setattr(self, name, np.concatenate([values, np.zeros_like(values)]))
-        self.order = self.first, self.count, self.numbers
+        if axis == 0:
+            self.tracks = np.concatenate([self.tracks, np.zeros_like(self.tracks)])
+        self._share()
 
     def _fit_rows(self, most: int) -> None:
         while most > self.rows.shape[1]:
             self.rows = np.concatenate([self.rows, np.zeros_like(self.rows)], axis=1)
+            self._share()

@@ -6,12 +6,13 @@ import numpy as np
 
 from fgtrack.core.linalg import mahalanobis_squared, noise_root
 from fgtrack.core.time import NS_PER_S, seconds
-from fgtrack.core.types import YAW, BoolArray, FloatArray, IntArray
+from fgtrack.core.types import YAW, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, Measurements
 from fgtrack.estimation.filters.initiation import Fix, Line, along, fixes_of
-from fgtrack.estimation.kernels import kalman
 from fgtrack.estimation.smoothing import kernels, node_kernels
-from fgtrack.estimation.smoothing.nodes import NEVER, Nodes
+from fgtrack.estimation.smoothing.kernels import BEGIN_NS, NEVER, NONLINEAR, STALE
+from fgtrack.estimation.smoothing.node_kernels import BEHIND, NO_ROOM, NOT_DEFINITE, SHARED
+from fgtrack.estimation.smoothing.nodes import Nodes
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.terms import cost, overshot
 from fgtrack.models.motion import MotionModel
@@ -20,10 +21,12 @@ from fgtrack.models.motion import MotionModel
 STEP_TOLERANCE = 1e-7
 #: The least share of a step that is tried, and rounding of a cost.
 _LEAST_SHARE, _ROUNDING = 1e-6, 1e-9
-#: Nodes behind the window are forgotten when there are so many that nobody needs.
-_MANY = 16
 Leaving = tuple[IntArray, list[int], FloatArray, FloatArray]
 """Tracks, stamps, means (m, n) and covariances (m, n, n) of nodes that leave, oldest first for each track."""
+
+
+def _indices(*shape: int) -> IntArray:
+    return np.empty(shape, dtype=np.int64)
 
 
 class Solver:
@@ -44,6 +47,7 @@ class Solver:
         self.motion = motion
         self.nodes = Nodes(motion)
         self._has_final = settings.final
+        self._is_nonlinear = False  # of all tracks
         self._thresholds = np.array([settings.thresholds(motion, nonlinear) for nonlinear in (False, True)])
 
     def begin(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
@@ -60,31 +64,22 @@ class Solver:
         """Solve windows that have changed from `starts` on and begin at `anchors` from now on.
         Raises `numpy.linalg.LinAlgError` if it fails.
         """
-        self.eliminate(tracks, starts, self.nodes.count[tracks])
-        self.nodes.first[tracks] = anchors
-        kernels.back_substitute(tracks, *self.nodes.order, self.nodes.filtered, self.nodes.back, self.nodes.step)
-        self.nodes.known[tracks] = self.nodes.count[tracks]
+        self.eliminate(tracks, starts, np.full(len(tracks), NEVER))
+        kernels.back_substitute(tracks, anchors, self.nodes.arrays)
 
-    def smoothed(
-        self, tracks: IntArray, indices: IntArray, with_previous: BoolArray | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Steps (m, n) and covariances (m, n, n) of the nodes at `indices`; `back` and `C` of those before are known.
-        The latter only where `with_previous`, if the windows are factor graphs.
+    def smoothed(self, tracks: IntArray, indices: IntArray, after_s: FloatArray) -> FloatArray:
+        """Make `P` of the nodes at `indices` known, and where `after_s` what the states of those before depend on.
+        Return the means of these nodes, or where `after_s` those before, shape (m, n).
         """
-        nodes, n = self.nodes, self.motion.dim
-        steps, covariances = np.empty((len(tracks), n)), np.empty((len(tracks), n, n))
-        given = nodes.filtered, nodes.back, nodes.C, nodes.step, nodes.P
-        kernels.smoothed(tracks, indices, nodes.known, *nodes.order, *given, steps, covariances)
-        return steps, covariances
+        means = np.empty((len(tracks), self.motion.dim))
+        kernels.smooth(tracks, indices, after_s, self.nodes.arrays, means)
+        return means
 
     def eliminate(self, tracks: IntArray, starts: IntArray, ends: IntArray) -> None:
         """Eliminate the nodes of `tracks` from `starts` up to before `ends`.
         Raises `numpy.linalg.LinAlgError` if it fails.
         """
-        nodes = self.nodes
-        given = nodes.origin, nodes.segment, nodes.rows, nodes.num_rows
-        result = nodes.predicted, nodes.filtered, nodes.back, nodes.C
-        if not kernels.eliminate(tracks, starts, ends, *nodes.order, *given, *result):
+        if not kernels.eliminate(tracks, starts, ends, self.nodes.arrays):
             raise np.linalg.LinAlgError("a state is not finite")
 
     # --- states
@@ -93,29 +88,14 @@ class Solver:
         """Return means (m, n) and covariances (m, n, n) of `tracks` at `stamps_ns`, not older than the oldest node.
         They are interpolated, or predicted ahead.
         """
-        nodes, n = self.nodes, self.motion.dim
-        indices, numbers = np.empty((2, len(tracks)), dtype=np.int64)
+        nodes, indices = self.nodes, _indices(len(tracks))
         until_s, after_s = np.empty((2, len(tracks)))
-        given = nodes.stamps_ns, nodes.count, nodes.numbers
-        num_between = node_kernels.locate(tracks, stamps_ns, *given, indices, numbers, until_s, after_s)
-        means, covariances = self.smoothed(tracks, indices, after_s > 0.0)
-        means += nodes.origin[numbers]
-        if num_between < len(tracks):  # of no time, or between two nodes, are states ahead what they are
-            ahead, F, Q = self.motion.transition(
-                means, until_s if num_between == 0 else np.where(after_s > 0.0, 0.0, until_s)
-            )
-            covariances, means = kalman.predict(F, covariances, Q)[0], ahead
-        if num_between:
-            k = slice(None) if num_between == len(tracks) else after_s > 0.0
-            left, P = nodes.numbers[tracks[k], indices[k] - 1], covariances[k]
-            back, C = nodes.back[left], nodes.C[left]
-            mean = nodes.origin[left] + np.matvec(back[:, :, :n], means[k] - nodes.origin[numbers[k]]) + back[:, :, n]
-            first = self.motion.transition(mean, until_s[k])
-            second = self.motion.transition(first.mean, after_s[k])
-            if not kernels.interpolate(*first, *second, means[k], back, C, P):
-                raise np.linalg.LinAlgError("process noise is not positive definite")
-            means[k], covariances[k] = first.mean, P
-        return means, covariances
+        num_between = kernels.locate(tracks, stamps_ns, nodes.arrays, indices, until_s, after_s)
+        mean, F, Q = nodes.transition(self.smoothed(tracks, indices, after_s), until_s)
+        ahead = nodes.transition(mean, after_s) if num_between else (mean, F, Q)
+        if not kernels.arrive(tracks, indices, after_s, nodes.arrays, mean, F, Q, *ahead):
+            raise np.linalg.LinAlgError("process noise is not positive definite")
+        return mean, Q
 
     def estimates(self, track: int) -> FloatArray:
         """Means of all nodes in the window, shape (m, n)."""
@@ -126,13 +106,12 @@ class Solver:
         """Return the states of the nodes before `anchors`, if wanted."""
         nodes = self.nodes
         num = anchors - nodes.first[tracks]
-        if not self._has_final or not num.any():
+        if not num.any():
             return None
         rows, columns = np.nonzero(np.arange(int(num.max())) < num[:, None])
         tracks, indices = tracks[rows], nodes.first[tracks[rows]] + columns
-        steps, covariances = self.smoothed(tracks, indices)
-        means = nodes.origin[nodes.numbers[tracks, indices]] + steps
-        return tracks, nodes.stamps_ns[tracks, indices].tolist(), means, covariances
+        means = self.smoothed(tracks, indices, np.zeros(len(tracks)))
+        return tracks, nodes.stamps_ns[tracks, indices].tolist(), means, nodes.P[nodes.numbers[tracks, indices]]
 
     # --- updates
 
@@ -143,62 +122,56 @@ class Solver:
         y: FloatArray,
         H: FloatArray,
         guesses: FloatArray,
-        start_ns: IntArray,
-        reach_ns: IntArray,
+        starts_ns: IntArray,
+        reaches_ns: IntArray,
     ) -> Leaving | None:
-        """Fuse a stack of measurements, one of each of `tracks`, and move the windows up to `start_ns`.
+        """Fuse a stack of measurements, one of each of `tracks`, and move the windows up to `starts_ns`.
 
-        Their innovations at `guesses`, the states (m, n) at their stamp, are `y` (m, k), with Jacobians `H` (m, k, n).
-        One node at or before `start_ns` stays in each window; behind it, what `reach_ns` needs is kept. A measurement
-        that is older changes the prior of its window. Returns the smoothed states of the nodes that left, if wanted.
-        Raises `numpy.linalg.LinAlgError` if it fails; states are as before then.
+        Their innovations at `guesses`, the states (m, n) at their stamp, are `y` (m, k), with Jacobians `H`, (1, k, n)
+        or (m, k, n). One node at or before `starts_ns` stays in each window; behind it, what `reaches_ns` needs is
+        kept. A measurement that is older changes the prior of its window. Returns the smoothed states of the nodes that
+        left, if wanted. Raises `numpy.linalg.LinAlgError` if it fails; states are as before then.
         """
         nodes, stamp_ns = self.nodes, stack.stamp_ns
         guesses = self._marked_nonlinear(tracks, stamp_ns, guesses) if stack.is_nonlinear else guesses
-        anchors = np.maximum(nodes.first[tracks], nodes.last_before(tracks, start_ns))
-        leaving = self._leaving(tracks, anchors)
-        before, stamps_ns = nodes.nearest(tracks, stamp_ns)
-        saved, is_old = nodes.saved(tracks), before < anchors
-        is_new = nodes.stamps_ns[tracks, before] != stamps_ns
-        indices = before + is_new
-        rows, moved = self._move_far(tracks, anchors, before)
-        if is_new.any():
-            nodes.insert_at(tracks[is_new], indices[is_new], stamp_ns, guesses[is_new])
-        moved = moved + (moved >= np.where(is_new, indices, NEVER)[rows])
-        starts = indices.copy()
-        np.minimum.at(starts, rows, moved)
-        anchors = anchors + (is_old & is_new)
-        numbers = nodes.numbers[tracks, indices]
-        ahead_s = (stamp_ns - stamps_ns) / NS_PER_S
-        for number, term in zip(numbers.tolist(), zip(Measurements(stack), ahead_s.tolist(), strict=True), strict=True):
-            nodes.terms[number].append(term)
+        anchors, ahead_s, out = _indices(len(tracks)), np.empty(len(tracks)), _indices(6, len(tracks))
+        node_kernels.anchor(tracks, starts_ns, reaches_ns, anchors, nodes.arrays)
+        leaving = self._leaving(tracks, anchors) if self._has_final else None
+        given = tracks, stamp_ns, y, H, stack.R, guesses, not stack.is_nonlinear, self._thresholds, anchors
+        while (flags := node_kernels.place(*given, nodes.arrays, out, ahead_s)) == NO_ROOM:
+            nodes.make_room(tracks, y.shape[1])
+        numbers, _, is_new, starts, anchors, is_behind = out
+        nodes.note(Measurements(stack), numbers, is_new, ahead_s)
+        firsts = nodes.first[tracks]
         try:
-            to, inner = tracks[is_new], indices[is_new]
-            nodes.linearise_motion(np.concatenate([tracks[rows], to, to]), np.concatenate([moved, inner - 1, inner]))
-            is_linear = np.full(len(tracks), False) if stack.is_nonlinear else ahead_s == 0.0
-            for number in numbers[~is_linear].tolist():
-                nodes.linearise_terms(number)
-            if is_linear.any():
-                linear = numbers[is_linear]
-                given = y[is_linear], H[is_linear], stack.R[is_linear]
-                nodes.observe(linear, *given, guesses[is_linear] - nodes.origin[linear])
-            if is_old.any():
-                self._refilter(tracks[is_old], starts[is_old], anchors[is_old])
-                starts[is_old] = anchors[is_old]
+            if flags & NOT_DEFINITE:
+                raise np.linalg.LinAlgError("a covariance is not positive definite")
+            nodes.linearise(tracks, starts, self._is_nonlinear or bool(flags & SHARED))
+            if flags & BEHIND:
+                rows = is_behind.nonzero()[0]
+                self._refilter(tracks[rows], starts[rows], anchors[rows])
+                starts[rows] = anchors[rows]
             self.solve(tracks, starts, anchors)
         except np.linalg.LinAlgError:
-            for name, values in zip(nodes.ORDER, saved, strict=True):
-                getattr(nodes, name)[tracks] = values
-            for number in numbers.tolist():
-                nodes.terms[number].pop()
-                nodes.linearise_terms(number)
-            nodes.linearise_motion(tracks, before)
-            self._refilter(tracks[is_old], before[is_old], nodes.first[tracks[is_old]])
-            for track in tracks.tolist():
-                self.relinearise(track)
+            self._restore(tracks, out, firsts)
             raise
-        self._forget_before(tracks, reach_ns)
         return leaving
+
+    def _restore(self, tracks: IntArray, placed: IntArray, firsts: IntArray) -> None:
+        """Take what was `placed` out of the windows, which began at `firsts`."""
+        nodes, (numbers, indices, is_new, _, _, is_behind) = self.nodes, placed
+        nodes.first[tracks] = firsts
+        for track, number, index, new in zip(*(a.tolist() for a in (tracks, numbers, indices, is_new)), strict=True):
+            nodes.withdraw(track, index, bool(new))
+            if not new:
+                nodes.linearise_terms(number)
+        before = indices - is_new
+        nodes.labels[nodes.numbers[tracks, before], STALE] = 1
+        nodes.linearise(tracks, before, is_nonlinear=False)
+        rows = is_behind.nonzero()[0]
+        self._refilter(tracks[rows], before[rows], firsts[rows])
+        for track in tracks.tolist():
+            self.relinearise(track)
 
     def _refilter(self, tracks: IntArray, starts: IntArray, anchors: IntArray) -> None:
         """Filter from `starts`, which lie behind the windows, up to `anchors`, where these begin: with other priors."""
@@ -213,62 +186,42 @@ class Solver:
         """States at `stamp_ns` after the relinearisation of tracks whose first nonlinear measurement comes now.
         From now on, these have other thresholds.
         """
-        first = (~self.nodes.is_nonlinear[tracks]).nonzero()[0]
+        first = (self.nodes.tracks[tracks, NONLINEAR] == 0).nonzero()[0]
         if first.size:
-            self.nodes.is_nonlinear[tracks] = True
+            self.nodes.tracks[tracks, NONLINEAR], self._is_nonlinear = 1, True
             for track in tracks[first].tolist():
                 self.relinearise(track, self.estimates(track))
             guesses = guesses.copy()
             guesses[first] = self.states_at(tracks[first], np.full(len(first), stamp_ns))[0]
         return guesses
 
-    def _forget_before(self, tracks: IntArray, stamps_ns: IntArray) -> None:
-        nodes = self.nodes
-        most = nodes.first[tracks] - 1
-        if ((most >= _MANY) & (nodes.stamps_ns[tracks, _MANY - 1] <= stamps_ns)).any():
-            num = np.minimum(nodes.last_before(tracks, stamps_ns), most)
-            many = num >= _MANY
-            nodes.drop(tracks[many], num[many])
-
     # --- relinearisation
 
-    def _far(self, tracks: IntArray, anchors: IntArray, starts: IntArray) -> tuple[IntArray, IntArray]:
-        """Nodes that are too far from their linearisation points: rows of `tracks`, and indices.
-        The tolerance is smaller for those before `anchors`, which are about to leave, and for those that are solved
-        again anyway, from `starts` on.
-        """
-        nodes = self.nodes
-        rows, indices = np.empty((2, int((nodes.count - nodes.first)[tracks].sum())), dtype=np.int64)
-        thresholds = self._thresholds[nodes.is_nonlinear[tracks].astype(int)]
-        num = kernels.find_far(tracks, anchors, starts, *nodes.order, thresholds, nodes.step, rows, indices)
-        return rows[:num], indices[:num]
-
-    def _move_far(self, tracks: IntArray, anchors: IntArray, starts: IntArray) -> tuple[IntArray, IntArray]:
-        """Move the linearisation points of nodes that are `_far`, not yet the motion from there; return as it does."""
-        rows, indices = self._far(tracks, anchors, starts)
-        if rows.size:
-            numbers = self.nodes.numbers[tracks[rows], indices]
-            self.nodes.move(tracks[rows], numbers, self.nodes.step[numbers])
-        return rows, indices
+    def _move_far(self, track: int, moves: bool) -> IntArray:
+        """Move the linearisation points of nodes of a window that are far from them, if it `moves`; return indices."""
+        nodes, indices = self.nodes, _indices(self.nodes.stamps_ns.shape[1])
+        num = node_kernels.move_far(track, 0, NEVER, self._thresholds, nodes.arrays, moves, indices)
+        return indices[:num]
 
     def iterate(self, tracks: IntArray, max_iterations: int) -> None:
         """Take Gauss-Newton steps while a state is further than a threshold from its linearisation point."""
-        for _ in range(max_iterations):
-            rows, indices = self._move_far(tracks, self.nodes.first[tracks], self.nodes.count[tracks])
-            if not rows.size:
-                return
-            self.nodes.linearise_motion(tracks[rows], indices)
-            rows, first_of = np.unique(rows, return_index=True)  # indices rise within a track
-            tracks = tracks[rows]
-            self.solve(tracks, indices[first_of], self.nodes.first[tracks])
+        for track in tracks.tolist() if max_iterations else ():
+            one = np.array([track])
+            for _ in range(max_iterations):
+                moved = self._move_far(track, moves=True)
+                if not moved.size:
+                    break
+                self.nodes.linearise(one, moved[:1], self._is_nonlinear)
+                self.solve(one, moved[:1], self.nodes.first[one])
 
     def relinearise(self, track: int, means: FloatArray | None = None) -> None:
         """Linearise a window at `means`, shape (m, n), or where its linearisation points are, and solve it."""
         nodes, numbers, tracks = self.nodes, self.nodes.window(track), np.array([track])
-        of, first = np.full(len(numbers), track), nodes.first[tracks]
+        first = nodes.first[tracks]
         if means is not None:
-            nodes.move(of, numbers, means - nodes.origin[numbers])
-        nodes.linearise_motion(of, first + np.arange(len(numbers)))
+            node_kernels.shift(np.full(len(numbers), track), numbers, means - nodes.origin[numbers], nodes.arrays)
+        nodes.labels[numbers, STALE] = 1
+        nodes.linearise(tracks, first, is_nonlinear=False)
         for number in numbers.tolist():
             nodes.linearise_terms(number)
         self.forget(track)
@@ -296,45 +249,45 @@ class Solver:
         The process noise is that of the linearisation points.
         """
         nodes, n, numbers = self.nodes, self.motion.dim, self.nodes.window(track)
-        prior, Q = nodes.predicted[numbers[0]], nodes.segment[numbers[:-1], :, n : 2 * n]
+        prior, Q = nodes.predicted[numbers[0]], nodes.Q[numbers[:-1]]
         dt_s = np.diff(nodes.window_stamps_ns(track)) / NS_PER_S
         total = mahalanobis_squared(means[0] - nodes.origin[numbers[0]] - prior[:, n], prior[:, :n])
         gaps = means[1:] - self.motion.predict(means[:-1], dt_s)
         total += sum(((noise_root(each) @ gap) ** 2).sum() for each, gap in zip(Q, gaps, strict=True))
-        terms = ((term, x) for number, x in zip(numbers.tolist(), means, strict=True) for term in nodes.terms[number])
+        terms = ((term, x) for number, x in zip(numbers.tolist(), means, strict=True) for term in nodes.terms(number))
         return 0.5 * float(total) + sum(cost(term, x, self.motion) for term, x in terms)
 
     def damp(self, tracks: IntArray) -> int:
         """Converge in damped steps where the last one left the range of its linearisation; return how many tracks."""
-        nodes, tracks = self.nodes, tracks[self.nodes.is_nonlinear[tracks]]
-        if not tracks.size or self.is_damped:
-            return 0
-        rows, indices = self._far(tracks, nodes.first[tracks], nodes.count[tracks])
-        numbers = nodes.numbers[tracks[rows], indices]
-        far = zip(rows.tolist(), numbers.tolist(), nodes.origin[numbers], nodes.step[numbers], strict=True)
-        overshooting = {row for row, number, x, step in far if overshot(nodes.terms[number], x, x + step, self.motion)}
-        for track in tracks[sorted(overshooting)].tolist():
-            means = nodes.origin[nodes.window(track)]
-            try:
-                self.converge(track)
-            except np.linalg.LinAlgError:
-                self.relinearise(track, means)
-        return len(overshooting)
+        nodes, num = self.nodes, 0
+        if not self._is_nonlinear or self.is_damped:
+            return num
+        for track in tracks[nodes.tracks[tracks, NONLINEAR] > 0].tolist():
+            numbers = nodes.window(track)
+            means, steps = nodes.origin[numbers], nodes.step[numbers]
+            far = (self._move_far(track, moves=False) - nodes.first[track]).tolist()
+            if any(overshot(nodes.terms(numbers[k]), means[k], means[k] + steps[k], self.motion) for k in far):
+                num += 1
+                try:
+                    self.converge(track)
+                except np.linalg.LinAlgError:
+                    self.relinearise(track, means)
+        return num
 
     # --- initiation
 
     def fixes(self, track: int) -> list[Fix]:
         """Positions measured at the nodes, after that of the prior, of a window that nothing has left yet."""
         nodes, numbers = self.nodes, self.nodes.window(track)
-        prior, begin_ns = nodes.predicted[numbers[0]], int(nodes.begin_ns[track])
-        terms = (term for number in numbers.tolist() for term, _ in nodes.terms[number])
+        prior, begin_ns = nodes.predicted[numbers[0]], int(nodes.tracks[track, BEGIN_NS])
+        terms = (term for number in numbers.tolist() for term, _ in nodes.terms(number))
         later = ((seconds(term.stamp_ns - begin_ns), term) for term in terms)
         return fixes_of(nodes.origin[numbers[0]] + prior[:, -1], prior[:, :-1].copy(), later)
 
     def restart(self, track: int, line: Line) -> None:
         """Solve again from states along `line`, with the prior's heading, which must be vague, turned there."""
         nodes, oldest = self.nodes, self.nodes.window(track)[0]
-        times_s = (nodes.window_stamps_ns(track) - nodes.begin_ns[track]) / NS_PER_S
+        times_s = (nodes.window_stamps_ns(track) - nodes.tracks[track, BEGIN_NS]) / NS_PER_S
         means = np.array([along(line, time_s, self.motion.state_names) for time_s in times_s.tolist()])
         if not self.motion.cartesian:
             nodes.predicted[oldest, YAW, -1] = means[0, YAW] - nodes.origin[oldest, YAW]

@@ -51,10 +51,10 @@ class BatchSolver(IncrementalSolver):
             graph.add(gtsam.PriorFactorVector(numbers[0], nodes.origin[numbers[0]] + prior[:, n], noise))
             spans_ns = np.diff(nodes.window_stamps_ns(track)).tolist()
             for left, right, dt_ns in zip(numbers, numbers[1:], spans_ns, strict=False):
-                graph.add(motion_factor(self.motion, left, right, seconds(dt_ns), nodes.segment[left, :, n : 2 * n]))
+                graph.add(motion_factor(self.motion, left, right, seconds(dt_ns), nodes.Q[left]))
             for number in numbers:
                 values.insert(number, last.atVector(number) if last.exists(number) else nodes.origin[number])
-                for term in nodes.terms[number]:
+                for term in nodes.terms(number):
                     graph.add(measurement_factor(number, term, nodes.origin[number], self.motion))
             values = self.optimise(graph, values)
             self._graphs[track] = graph, values

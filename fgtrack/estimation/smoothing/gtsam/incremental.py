@@ -8,9 +8,10 @@ import gtsam
 import numpy as np
 
 from fgtrack.core.linalg import inverse_root, psd_solve, symmetrise
-from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.smoothing import node_kernels
 from fgtrack.estimation.smoothing.bank import SmootherBank
+from fgtrack.estimation.smoothing.kernels import CHANGED, KNOWN
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.models.motion import MotionModel
@@ -88,16 +89,13 @@ class IncrementalSolver(Solver):
         self._graphs.pop(track, None)
         self._known[track] = {}
 
-    def smoothed(
-        self, tracks: IntArray, indices: IntArray, with_previous: BoolArray | None = None
-    ) -> tuple[FloatArray, FloatArray]:
+    def smoothed(self, tracks: IntArray, indices: IntArray, after_s: FloatArray) -> FloatArray:
         """See `Solver.smoothed`; inside the windows from the graphs."""
         nodes, n = self.nodes, self.motion.dim
-        joint = np.zeros(len(tracks), dtype=bool) if with_previous is None else with_previous
-        rows = zip(tracks.tolist(), indices.tolist(), nodes.first[tracks].tolist(), joint.tolist(), strict=True)
-        for track, index, first, has_previous in rows:
+        rows = zip(tracks.tolist(), indices.tolist(), nodes.first[tracks].tolist(), after_s.tolist(), strict=True)
+        for track, index, first, time_s in rows:
             last = max(index, first)
-            key = tuple(nodes.numbers[track, last - (has_previous and index > first) : last + 1].tolist())
+            key = tuple(nodes.numbers[track, last - (time_s > 0.0 and index > first) : last + 1].tolist())
             known = self._known[track]
             if key not in known:
                 has_graph = track in self._graphs  # else nothing was fused: there is one node
@@ -108,7 +106,7 @@ class IncrementalSolver(Solver):
                     nodes.back[left, :, :n], nodes.back[left, :, n] = A, nodes.step[left] - A.dot(nodes.step[number])
                     nodes.C[left] = symmetrise(P[:n, :n] - A.dot(P[n:, :n]))
             nodes.P[key[-1]] = known[key][-n:, -n:]
-        return super().smoothed(tracks, indices)
+        return super().smoothed(tracks, indices, after_s)
 
     def solve(self, tracks: IntArray, starts: IntArray, anchors: IntArray) -> None:
         """See `Solver.solve`."""
@@ -124,7 +122,7 @@ class IncrementalSolver(Solver):
             raise np.linalg.LinAlgError(f"the graph cannot be solved ({error})") from error
         for track in tracks.tolist():
             self._known[track] = {}
-        nodes.known[tracks] = anchors
+        nodes.tracks[tracks, KNOWN] = anchors
 
     def _covariance(self, track: int, *numbers: int) -> FloatArray:
         """Return the joint covariance of one node, shape (n, n), or of two neighbours, (2 n, 2 n)."""
@@ -149,7 +147,7 @@ class IncrementalSolver(Solver):
                 W = inverse_root(prior[:, :-1])
                 factor = gtsam.JacobianFactor(int(window[0]), W, W @ prior[:, -1], _unit(len(W)))
                 graph = self._graphs[track] = _Graph(factor)
-                nodes.changed[window] = True
+                nodes.labels[window, CHANGED] = 1
             values.append(gtsam.Values())
             for number in window.tolist():
                 if number not in graph.slots:
@@ -161,15 +159,14 @@ class IncrementalSolver(Solver):
         changed = self._changed_factors(tracks, starts, sum(map(len, windows)))
         for graph, window, num_leaving, new, factors in zip(graphs, windows, leaving, values, changed, strict=True):
             delta = graph.solve(window.tolist(), num_leaving, new, *factors)
-            if not node_kernels.write_steps(window[num_leaving:], delta, nodes.reference, nodes.origin, nodes.step):
+            if not node_kernels.write_steps(window[num_leaving:], delta, nodes.arrays):
                 raise ValueError("a state is not finite")
 
     def _changed_factors(self, tracks: IntArray, starts: IntArray, most: int) -> list[tuple[int, _Changed]]:
         """Return the factors that have changed, at most so many, of each track, and the first index from `starts`."""
         nodes, n = self.nodes, self.motion.dim
         owners, factors = np.empty((most, 5), dtype=np.int64), np.empty((most, 2 * n + 1, n + nodes.rows.shape[1]))
-        given = nodes.origin, nodes.reference, nodes.segment, nodes.rows, nodes.num_rows, nodes.changed
-        num = node_kernels.changed_factors(tracks, starts, nodes.count, nodes.numbers, *given, owners, factors)
+        num = node_kernels.changed_factors(tracks, starts, nodes.arrays, owners, factors)
         if num < 0:
             raise ValueError("process noise is not positive definite")
         changed: list[tuple[int, _Changed]] = [(0, {}) for _ in tracks]
