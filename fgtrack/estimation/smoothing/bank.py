@@ -15,7 +15,7 @@ from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
 from fgtrack.estimation.filters.propagation import kinematic_states
-from fgtrack.estimation.smoothing.node_kernels import innovations, times
+from fgtrack.estimation.smoothing.node_kernels import innovations, windows
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.models.motion import MotionModel
@@ -101,7 +101,7 @@ class SmootherBank:
         known = self._known.get(stamp_ns)
         if known is None:
             tracks, track_ids = self._all()
-            is_known = self._times(tracks)[2] <= stamp_ns
+            is_known = self._windows(tracks)[2] <= stamp_ns
             if not is_known.all():
                 track_ids, tracks = tuple(compress(track_ids, is_known.tolist())), tracks[is_known]
             states = self.solver.states_at(tracks, np.full(len(tracks), stamp_ns))
@@ -123,22 +123,22 @@ class SmootherBank:
                 alike = replace(alike, z=alike.z[inside], R=alike.R[inside])
             group = [indices[k] for k in inside]
             tracks = np.array([self._tracks[track_ids[index]] for index in group])
-            at = [row_of[track_ids[index]] for index in group]
-            means, P = states.means[at], states.covariances[at]
+            of = np.array([row_of[track_ids[index]] for index in group])
+            means = states.means[of]
             y, H = alike.model.linearised(alike.z, means, alike.pose)
-            R, H = (np.array(each, dtype=np.float64, order="C", ndmin=3) for each in (alike.R, H))
-            alike = replace(alike, R=R)
+            H, R = (np.array(each, dtype=np.float64, order="C", ndmin=3) for each in (H, alike.R))
             measured = np.arange(y.shape[1]) if alike.measured is None else np.array(alike.measured)
-            S, nis, times = np.empty(R.shape), np.empty(len(y)), self._times(tracks)
-            innovations(P, y, H, R, measured, S, nis)
-            given = y, H if len(H) > 1 else np.repeat(H, len(y), axis=0), means, times[1], times[2]
-            fused = self._fuse(np.isfinite(nis).nonzero()[0], tracks, alike, *given)
-            late = (stamp_ns < times[:2]).sum(axis=0).tolist()
+            S, nis, times = np.empty(R.shape), np.empty(len(y)), self._windows(tracks)
+            innovations(states.covariances, of, y, H, R, measured, S, nis)
+            usable = np.isfinite(nis).nonzero()[0]
+            fused = self._fuse(usable, tracks, alike, y, H, means, R, times[3]) if usable.size else usable
+            newest_ns, start_ns, _, _ = times.tolist()
+            outcomes = list(zip(y, nis.tolist(), S, newest_ns, start_ns, strict=True))
             for index in group:
                 results[index] = _FAILED
-            outcomes = list(zip(y, nis.tolist(), S, strict=True))
             for k in fused.tolist():
-                results[group[k]] = UpdateResult(_STATUSES[late[k]], *outcomes[k])
+                *own, newest, start = outcomes[k]
+                results[group[k]] = UpdateResult(_STATUSES[(stamp_ns < newest) + (stamp_ns < start)], *own)
         return results
 
     def birth(self, track_id: int, prior: Start) -> None:
@@ -166,7 +166,7 @@ class SmootherBank:
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
         tracks, _ = self._all()
-        states = self.solver.states_at(tracks, np.maximum(self.present_ns, self._times(tracks)[2]))
+        states = self.solver.states_at(tracks, np.maximum(self.present_ns, self._windows(tracks)[2]))
         return kinematic_states(self._motion, self.present_ns, *states)
 
     def smoothed(self) -> list[SmoothedReport]:
@@ -197,16 +197,11 @@ class SmootherBank:
 
     def _fuse(self, rows: IntArray, tracks: IntArray, stack: Measurement, *given: Any) -> IntArray:
         """Fuse these of a stack of measurements, `given` what `Solver.fuse` takes; return the rows that were fused."""
-        if not rows.size:
-            return rows
         self._known.clear()
         of, alike, own = tracks, stack, given
         if len(rows) < len(tracks):
-            of, alike, own = (
-                tracks[rows],
-                replace(stack, z=stack.z[rows], R=stack.R[rows]),
-                tuple(a[rows] for a in given),
-            )
+            of, alike = tracks[rows], replace(stack, z=stack.z[rows], R=stack.R[rows])
+            own = tuple(each if len(each) == 1 else each[rows] for each in given)
         try:
             left = self.solver.fuse(of, alike, *own)
         except np.linalg.LinAlgError:
@@ -240,8 +235,8 @@ class SmootherBank:
             self._order = np.array([*self._tracks.values()], dtype=np.int64), tuple(self._tracks)
         return self._order
 
-    def _times(self, tracks: IntArray) -> IntArray:
-        """Return the newest stamps of `tracks`, the starts of their windows, and the oldest stamps that are fused."""
-        out = np.empty((3, len(tracks)), dtype=np.int64)
-        times(tracks, self._clock_ns, self._lag_ns, self._behind_ns, self.solver.nodes.arrays, out)
+    def _windows(self, tracks: IntArray) -> IntArray:
+        """Return `node_kernels.windows` of `tracks`, shape (4, m)."""
+        out = np.empty((4, len(tracks)), dtype=np.int64)
+        windows(tracks, self._clock_ns, self._lag_ns, self._behind_ns, self.solver.nodes.arrays, out)
         return out

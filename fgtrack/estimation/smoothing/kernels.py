@@ -22,20 +22,20 @@ COUNT, FIRST, KNOWN, BEGIN_NS, NONLINEAR = range(5)
 #: Columns of `labels`.
 NUM_ROWS, CHANGED, STALE = range(3)
 #: Rows of `values` of a node, and then blocks of n rows.
-STEP, ORIGIN, REFERENCE = range(3)
-BACK, C, FILTERED, PREDICTED, P, F, Q = range(7)
+ORIGIN, REFERENCE = range(2)
+C, FILTERED, PREDICTED, P, F, Q = range(6)
 #: Types of arguments.
 INDICES, TIMES, VECTORS, MATRICES = "int64[::1]", "float64[::1]", "float64[:, ::1]", "float64[:, :, ::1]"
-NODES = f"Tuple((int64[:, ::1], int64[:, ::1], int64[:, ::1], int64[:, ::1], {MATRICES}, {MATRICES}))"
-Arrays = tuple[IntArray, IntArray, IntArray, IntArray, FloatArray, FloatArray]
-"""Tracks, stamps, numbers, labels, values and rows of `Nodes`."""
+NODES = f"Tuple(({'int64[:, ::1], ' * 4}{MATRICES}, {MATRICES}, {MATRICES}))"
+Arrays = tuple[IntArray, IntArray, IntArray, IntArray, FloatArray, FloatArray, FloatArray]
+"""See `Nodes.arrays`."""
 
 
 @inlined
 def block(values: FloatArray, at: int, which: int) -> FloatArray:
     """Return a block of a node, a matrix (n, n) and a vector (n,) beside it."""
     n = values.shape[2] - 1
-    return values[at, 3 + which * n : 3 + (which + 1) * n]
+    return values[at, 2 + which * n : 2 + (which + 1) * n]
 
 
 @inlined
@@ -62,11 +62,13 @@ def _predict(values: FloatArray, before: int, at: int, moved: FloatArray) -> Non
 
 
 @inlined
-def _condition(values: FloatArray, before: int, at: int, gain: FloatArray, E: FloatArray, work: FloatArray) -> bool:
+def _condition(
+    values: FloatArray, back: FloatArray, before: int, at: int, gain: FloatArray, E: FloatArray, work: FloatArray
+) -> bool:
     """A = P F' (F P F' + Q)^-1, b, C = E P E' + A Q A', E = I - A F; `gain` holds F P. False if there is no A."""
     n = len(gain)
     left, motion, ahead = block(values, before, FILTERED), block(values, before, F), block(values, at, PREDICTED)
-    back, rest = block(values, before, BACK), block(values, before, C)
+    rest = block(values, before, C)
     copy(ahead, E)
     if not solve(E, gain):
         return False
@@ -118,7 +120,7 @@ def _correct(
 @njit(f"b1({INDICES}, {INDICES}, {INDICES}, {NODES})")
 def eliminate(tracks: IntArray, starts: IntArray, ends: IntArray, nodes: Arrays) -> bool:
     """Eliminate the nodes of `tracks` from `starts` up to before `ends`; True if all is finite."""
-    info, _, numbers, labels, values, rows = nodes
+    info, _, numbers, labels, backs, values, rows = nodes
     n = values.shape[2] - 1
     A, E, D, work, gain = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty(n)
     for t in range(len(tracks)):
@@ -128,8 +130,9 @@ def eliminate(tracks: IntArray, starts: IntArray, ends: IntArray, nodes: Arrays)
             if (
                 index > info[track, FIRST]
             ):  # else the prior of the oldest node in the window, which follows from nothing
-                _predict(values, numbers[track, index - 1], at, A)
-                if not _condition(values, numbers[track, index - 1], at, A, E, work):
+                before = numbers[track, index - 1]
+                _predict(values, before, at, A)
+                if not _condition(values, backs[before], before, at, A, E, work):
                     return False
             state, total = block(values, at, FILTERED), 0.0
             copy(block(values, at, PREDICTED), state)
@@ -143,24 +146,42 @@ def eliminate(tracks: IntArray, starts: IntArray, ends: IntArray, nodes: Arrays)
     return True
 
 
-@njit(f"void({INDICES}, {INDICES}, {NODES})")
-def back_substitute(tracks: IntArray, anchors: IntArray, nodes: Arrays) -> None:
-    """Let the windows begin at `anchors`, and write the steps of their nodes: A (step of the next node) + b."""
-    info, _, numbers, _, values, _ = nodes
+@njit(f"b1({INDICES}, {INDICES}, {INDICES}, {NODES})")
+def solve_windows(tracks: IntArray, starts: IntArray, anchors: IntArray, nodes: Arrays) -> bool:
+    """Eliminate from `starts` on, let the windows begin at `anchors`, and write steps: A (step of the next node) + b.
+    True if all is finite.
+    """
+    info, _, numbers, _, backs, values, _ = nodes
     n = values.shape[2] - 1
+    steps, ends = np.empty((2, n)), np.empty(len(tracks), dtype=np.int64)
     for t in range(len(tracks)):
-        track, later = tracks[t], -1
-        info[track, FIRST], info[track, KNOWN] = anchors[t], info[track, COUNT]
-        for index in range(info[track, COUNT] - 1, anchors[t] - 1, -1):
-            at = numbers[track, index]
-            back = block(values, at, FILTERED if later < 0 else BACK)
+        ends[t] = NEVER
+    if not eliminate(tracks, starts, ends, nodes):
+        return False
+    for t in range(len(tracks)):
+        track, last = tracks[t], info[tracks[t], COUNT] - 1
+        info[track, FIRST], info[track, KNOWN] = anchors[t], last + 1
+        for index in range(last, anchors[t] - 1, -1):
+            at, step, later = numbers[track, index], steps[index % 2], steps[(index + 1) % 2]
+            back = backs[at] if index < last else block(values, at, FILTERED)
             for i in range(n):
                 value = back[i, n]
-                if later >= 0:
+                if index < last:
                     for j in range(n):
-                        value += back[i, j] * values[later, STEP, j]
-                values[at, STEP, i] = value
-            later = at
+                        value += back[i, j] * later[j]
+                step[i] = value
+            for i in range(n):
+                backs[at, n, i] = step[i]
+    return True
+
+
+@inlined
+def last_before(all_ns: IntArray, count: int, stamp_ns: int) -> int:
+    """Return the index of the newest node at or before `stamp_ns`; -1 without such a node."""
+    index = count - 1
+    while index >= 0 and all_ns[index] > stamp_ns:
+        index -= 1
+    return index
 
 
 @njit(f"int64({INDICES}, {INDICES}, {NODES}, {INDICES}, {TIMES}, {TIMES})")
@@ -170,24 +191,28 @@ def locate(
     """Write the indices of the nodes after `stamps_ns`, or of the last ones, and the times around the stamps.
     Return how many are after them.
     """
-    info, all_ns, _, _, _, _ = nodes
+    info, all_ns, _, _, _, _, _ = nodes
     num_between = 0
     for t in range(len(tracks)):
-        track, stamp_ns = tracks[t], stamps_ns[t]
-        index, end = -1, info[track, COUNT]  # bisect to the newest node at or before the stamp
-        while end - index > 1:
-            middle = (index + end) // 2
-            if all_ns[track, middle] <= stamp_ns:
-                index = middle
-            else:
-                end = middle
-        until_s[t], after_s[t] = (stamp_ns - all_ns[track, index]) / NS_PER_S, 0.0
-        if until_s[t] > 0.0 and index < info[track, COUNT] - 1:
+        of, last = all_ns[tracks[t]], info[tracks[t], COUNT] - 1
+        index = last_before(of, last + 1, stamps_ns[t])
+        until_s[t], after_s[t] = (stamps_ns[t] - of[index]) / NS_PER_S, 0.0
+        if until_s[t] > 0.0 and index < last:
             index += 1
-            after_s[t] = (all_ns[track, index] - stamp_ns) / NS_PER_S
+            after_s[t] = (of[index] - stamps_ns[t]) / NS_PER_S
             num_between += 1
         indices[t] = index
     return num_between
+
+
+@inlined
+def _given(back: FloatArray, later: FloatArray, out: FloatArray) -> None:
+    """Write the mean A x + b of a node given the next one, x being in the last row of `later`."""
+    n = len(back) - 1
+    for i in range(n):
+        out[i] = back[i, n]
+        for j in range(n):
+            out[i] += back[i, j] * later[n, j]
 
 
 @njit(f"void({INDICES}, {INDICES}, {TIMES}, {NODES}, {VECTORS})")
@@ -195,7 +220,7 @@ def smooth(tracks: IntArray, indices: IntArray, after_s: FloatArray, nodes: Arra
     """Make the covariances of the nodes at `indices` known, and behind the window the steps; those on the way stay.
     Write the states that motion starts from: of these nodes, or where `after_s` the conditional one of those before.
     """
-    info, _, numbers, _, values, _ = nodes
+    info, _, numbers, _, backs, values, _ = nodes
     n = values.shape[2] - 1
     work = np.empty((n, n))
     for t in range(len(tracks)):
@@ -205,30 +230,26 @@ def smooth(tracks: IntArray, indices: IntArray, after_s: FloatArray, nodes: Arra
             if index == info[track, COUNT] - 1:
                 copy(block(values, at, FILTERED), block(values, at, P))
                 continue
-            later, back, known = numbers[track, index + 1], block(values, at, BACK), block(values, at, P)
+            later, known = numbers[track, index + 1], block(values, at, P)
             copy(block(values, at, C), known)
-            add_congruence(back, block(values, later, P), work, known)
+            add_congruence(backs[at, :n], block(values, later, P), work, known)
             if index < info[track, FIRST]:
-                for i in range(n):
-                    values[at, STEP, i] = back[i, n]
-                    for j in range(n):
-                        values[at, STEP, i] += back[i, j] * values[later, STEP, j]
+                _given(backs[at], backs[later], backs[at, n])
         info[track, KNOWN] = min(info[track, KNOWN], indices[t])
-        at = numbers[track, indices[t]]
+        at = start = numbers[track, indices[t]]
         for i in range(n):
-            means[t, i] = values[at, ORIGIN, i] + values[at, STEP, i]
+            means[t, i] = backs[at, n, i]
         if after_s[t] > 0.0:
-            before = numbers[track, indices[t] - 1]
-            back = block(values, before, BACK)
-            for i in range(n):
-                means[t, i] = values[before, ORIGIN, i] + back[i, n]
-                for j in range(n):
-                    means[t, i] += back[i, j] * values[at, STEP, j]
+            start = numbers[track, indices[t] - 1]
+            _given(backs[start], backs[at], means[t])
+        for i in range(n):
+            means[t, i] += values[start, ORIGIN, i]
 
 
 @inlined
 def _interpolate(
     values: FloatArray,
+    backs: FloatArray,
     before: int,
     at: int,
     mean: FloatArray,
@@ -260,9 +281,9 @@ def _interpolate(
     for i in range(n):
         for j in range(n):
             E[i, j] = (1.0 if i == j else 0.0) - E[i, j]
-            mean[i] += Psi[i, j] * (values[at, ORIGIN, j] + values[at, STEP, j] - ahead[j])
+            mean[i] += Psi[i, j] * (values[at, ORIGIN, j] + backs[at, n, j] - ahead[j])
     product(E, F1, Lambda)
-    product(Lambda, block(values, before, BACK), by_right)
+    product(Lambda, backs[before], by_right)
     for i in range(n):
         for j in range(n):
             by_right[i, j] += Psi[i, j]
@@ -294,14 +315,14 @@ def arrive(
     Where `after_s`, the state is between two nodes, and `ahead` is what motion makes of it until the right one. False
     if noise is not definite there.
     """
-    _, _, numbers, _, values, _ = nodes
+    _, _, numbers, _, backs, values, _ = nodes
     n = mean.shape[1]
     work = np.empty((7, n, n))
     for t in range(len(mean)):
         at = numbers[tracks[t], indices[t]]
         if after_s[t] > 0.0:
             before = numbers[tracks[t], indices[t] - 1]
-            if not _interpolate(values, before, at, mean[t], F1[t], Q1[t], ahead[t], F2[t], Q2[t], work):
+            if not _interpolate(values, backs, before, at, mean[t], F1[t], Q1[t], ahead[t], F2[t], Q2[t], work):
                 return False
         else:
             add_congruence(F1[t], block(values, at, P), work[0], Q1[t])

@@ -7,7 +7,6 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.kernels.kalman import innovate
 from fgtrack.estimation.smoothing.kernels import (
-    BACK,
     BEGIN_NS,
     CHANGED,
     COUNT,
@@ -23,13 +22,13 @@ from fgtrack.estimation.smoothing.kernels import (
     PREDICTED,
     REFERENCE,
     STALE,
-    STEP,
     TIMES,
     VECTORS,
     Arrays,
     F,
     Q,
     block,
+    last_before,
     regularise,
 )
 from fgtrack.estimation.smoothing.terms import NEAR_NS
@@ -45,47 +44,15 @@ _MANY = 16
 NO_ROOM, BEHIND, SHARED, NOT_DEFINITE = -1, 1, 2, 4
 
 
-@njit(f"void({INDICES}, int64, int64, int64, {NODES}, int64[:, ::1])")
-def times(tracks: IntArray, clock_ns: int, lag_ns: int, behind_ns: int, nodes: Arrays, out: IntArray) -> None:
-    """Write the newest stamps of `tracks`, the starts of their windows, and the oldest stamps that are fused."""
-    info, all_ns, _, _, _, _ = nodes
-    for t in range(len(tracks)):
-        track = tracks[t]
-        newest_ns, begin_ns = all_ns[track, info[track, COUNT] - 1], info[track, BEGIN_NS]
-        start_ns = max(max(newest_ns, clock_ns) - lag_ns, begin_ns)
-        out[0, t], out[1, t], out[2, t] = newest_ns, start_ns, max(start_ns - behind_ns, begin_ns)
-
-
-@njit(f"void({MATRICES}, {VECTORS}, {MATRICES}, {MATRICES}, {INDICES}, {MATRICES}, {TIMES})")
-def innovations(
-    P: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray, measured: IntArray, S: FloatArray, nis: FloatArray
-) -> None:
-    """Write covariances S = H P H' + R (m, k, k) of innovations y (m, k), and the NIS of the `measured` ones; NaN where
-    S has no root. H is (1, k, n) or (m, k, n).
-    """
-    K = np.empty((y.shape[1], P.shape[1]))
-    for i in range(len(y)):
-        nis[i] = innovate(P[i], y[i], H[min(i, len(H) - 1)], R[i], measured, S[i], K)
-
-
-@inlined
-def _last_before(all_ns: IntArray, count: int, stamp_ns: int) -> int:
-    """Return the index of the newest node at or before `stamp_ns`; -1 without such a node."""
-    index = count - 1
-    while index >= 0 and all_ns[index] > stamp_ns:
-        index -= 1
-    return index
-
-
 @inlined
 def _forget(track: int, reach_ns: int, nodes: Arrays) -> None:
     """Forget nodes behind the window that are older than one at or before `reach_ns`, if they are many."""
-    info, stamps_ns, numbers, _, _, _ = nodes
+    info, stamps_ns, numbers, _, _, _, _ = nodes
     count, all_ns, of = info[track, COUNT], stamps_ns[track], numbers[track]
     most = info[track, FIRST] - 1
     if most < _MANY or all_ns[_MANY - 1] > reach_ns:
         return
-    many = min(_last_before(all_ns, count, reach_ns), most)
+    many = min(last_before(all_ns, count, reach_ns), most)
     if many < _MANY:
         return
     forgotten = of[:many].copy()
@@ -97,33 +64,55 @@ def _forget(track: int, reach_ns: int, nodes: Arrays) -> None:
         info[track, column] -= many
 
 
-@njit(f"void({INDICES}, {INDICES}, {INDICES}, {INDICES}, {NODES})")
-def anchor(tracks: IntArray, starts_ns: IntArray, reaches_ns: IntArray, anchors: IntArray, nodes: Arrays) -> None:
-    """Write the indices of the nodes where windows that start at `starts_ns` begin; older ones are kept behind them
-    as far as `reaches_ns` needs.
+@njit(f"void({INDICES}, int64, int64, int64, {NODES}, int64[:, ::1])")
+def windows(tracks: IntArray, clock_ns: int, lag_ns: int, behind_ns: int, nodes: Arrays, out: IntArray) -> None:
+    """Write the newest stamps of `tracks`, the starts of their windows, the oldest stamps that are fused, and the
+    indices of the nodes where the windows will begin; older nodes are kept as far as those stamps need them.
     """
-    info, all_ns, _, _, _, _ = nodes
+    info, all_ns, _, _, _, _, _ = nodes
     for t in range(len(tracks)):
         track = tracks[t]
-        _forget(track, reaches_ns[t], nodes)
-        anchors[t] = max(info[track, FIRST], _last_before(all_ns[track], info[track, COUNT], starts_ns[t]))
+        newest_ns, begin_ns = all_ns[track, info[track, COUNT] - 1], info[track, BEGIN_NS]
+        start_ns = max(max(newest_ns, clock_ns) - lag_ns, begin_ns)
+        out[0, t], out[1, t], out[2, t] = newest_ns, start_ns, max(start_ns - behind_ns, begin_ns)
+        _forget(track, out[2, t], nodes)
+        out[3, t] = max(info[track, FIRST], last_before(all_ns[track], info[track, COUNT], start_ns))
+
+
+@njit(f"void({MATRICES}, {INDICES}, {VECTORS}, {MATRICES}, {MATRICES}, {INDICES}, {MATRICES}, {TIMES})")
+def innovations(
+    P: FloatArray,
+    of: IntArray,
+    y: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+    measured: IntArray,
+    S: FloatArray,
+    nis: FloatArray,
+) -> None:
+    """Write S = H P H' + R (m, k, k) of innovations y (m, k), P being that of row `of`, and the NIS of the `measured`
+    ones; NaN where S has no root. H is (1, k, n) or (m, k, n).
+    """
+    K = np.empty((y.shape[1], P.shape[1]))
+    for i in range(len(y)):
+        nis[i] = innovate(P[of[i]], y[i], H[min(i, len(H) - 1)], R[i], measured, S[i], K)
 
 
 @inlined
 def _shift(track: int, at: int, steps: FloatArray, nodes: Arrays) -> None:
     """Move the linearisation point of a node by `steps`, and all that is relative to it."""
-    info, _, numbers, labels, values, rows = nodes
+    info, _, numbers, labels, backs, values, rows = nodes
     n, oldest = len(steps), info[track, FIRST]
     predicted = block(values, at, PREDICTED)
     for i in range(n):
         values[at, ORIGIN, i] += steps[i]
-        values[at, STEP, i] -= steps[i]
+        backs[at, n, i] -= steps[i]
         predicted[i, n] -= steps[i]
     for k in range(labels[at, NUM_ROWS]):
         for j in range(n):
             rows[at, k, n] -= rows[at, k, j] * steps[j]
     if oldest > 0 and numbers[track, oldest] == at:
-        back = block(values, numbers[track, oldest - 1], BACK)
+        back = backs[numbers[track, oldest - 1]]
         for i in range(n):
             for j in range(n):
                 back[i, n] += back[i, j] * steps[j]
@@ -145,20 +134,19 @@ def move_far(
     Their indices are written. `thresholds` are those of linear and nonlinear tracks, (2, n). A `LEAVING_SHARE` holds
     for nodes before `anchor`, a `SOLVED_SHARE` from `start` on and after the first node that is too far.
     """
-    info, _, numbers, _, values, _ = nodes
-    n, num = values.shape[2] - 1, 0
-    steps = np.empty(n)
+    info, _, numbers, _, backs, _, _ = nodes
+    limits, num = thresholds[info[track, NONLINEAR]], 0
     for index in range(info[track, FIRST], info[track, COUNT]):
-        at, too_long = numbers[track, index], False
+        steps, too_long = backs[numbers[track, index], len(limits)], False
         share = LEAVING_SHARE if index < anchor else 1.0
         if num or index >= start:
             share = SOLVED_SHARE
-        for i in range(n):
-            steps[i] = values[at, STEP, i]
-            too_long |= abs(steps[i]) > share * thresholds[info[track, NONLINEAR], i]
+        for i in range(len(limits)):
+            if abs(steps[i]) > share * limits[i]:
+                too_long = True
         if too_long:
             if moves:
-                _shift(track, at, steps, nodes)
+                _shift(track, numbers[track, index], steps[: len(limits)].copy(), nodes)
             indices[num] = index
             num += 1
     return num
@@ -167,7 +155,7 @@ def move_far(
 @inlined
 def _insert(track: int, index: int, stamp_ns: int, mean: FloatArray, nodes: Arrays) -> None:
     """Insert a node at `index`, linearised at `mean`; later nodes move up."""
-    info, all_ns, numbers, labels, values, _ = nodes
+    info, all_ns, numbers, labels, _, values, _ = nodes
     count = info[track, COUNT]
     at = numbers[track, count]
     for k in range(count, index, -1):
@@ -184,7 +172,7 @@ def _observe(
     at: int, y: FloatArray, H: FloatArray, R: FloatArray, mean: FloatArray, nodes: Arrays, L: FloatArray
 ) -> bool:
     """Append L^-1 [H | y + H (mean - x0)], R = L L', to the rows of a node; False if R is not positive definite."""
-    _, _, _, labels, values, rows = nodes
+    _, _, _, labels, _, values, rows = nodes
     k, n = H.shape
     if not cholesky(R, k, L):
         return False
@@ -223,15 +211,16 @@ def place(
 ) -> int:
     """Move linearisation points that are far, and insert nodes and measurements: innovations y (m, k) at `means`.
     Nodes at most `NEAR_NS` away are shared. Writes number and index of the nodes, 1 of those that are new, where
-    elimination must start and, with nodes inserted behind them, where windows begin, and 1 if the measurement is older;
-    and the time from the node to the measurement. Returns flags; without room, nothing is changed.
+    elimination must start and, with nodes inserted behind them, where windows begin, 1 if the measurement is older, and
+    where the window has begun; and the time from the node to the measurement. Returns flags; without room, nothing is
+    changed.
     """
-    info, all_ns, numbers, labels, _, rows = nodes
+    info, all_ns, numbers, labels, _, _, rows = nodes
     k, flags = y.shape[1], 0
     far, L = np.empty(all_ns.shape[1], dtype=np.int64), np.empty((k, k))
     for t in range(len(tracks)):
         track = tracks[t]
-        index = _last_before(all_ns[track], info[track, COUNT], stamp_ns + NEAR_NS)
+        index = last_before(all_ns[track], info[track, COUNT], stamp_ns + NEAR_NS)
         is_new = all_ns[track, index] < stamp_ns - NEAR_NS
         out[1, t], out[2, t] = index, is_new
         used = 0 if is_new else labels[numbers[track, index], NUM_ROWS]
@@ -251,14 +240,14 @@ def place(
         labels[at, STALE] = 1
         start = far[0] + (is_new and far[0] >= index) if num else index
         out[0, t], out[1, t], out[3, t] = at, index, min(index, start)
-        out[4, t], out[5, t] = anchors[t] + (is_behind and is_new), is_behind
+        out[4, t], out[5, t], out[6, t] = anchors[t] + (is_behind and is_new), is_behind, info[track, FIRST]
     return flags
 
 
 @njit(f"void(int64, {TIMES}, {INDICES}, {INDICES}, {NODES})")
 def linearise_motion(kind: int, density: FloatArray, tracks: IntArray, starts: IntArray, nodes: Arrays) -> None:
     """Linearise the motion from nodes that are stale, the one before `starts` and later ones, to the next ones."""
-    info, all_ns, numbers, labels, values, _ = nodes
+    info, all_ns, numbers, labels, _, values, _ = nodes
     n = values.shape[2] - 1
     mean = np.empty(n)
     for t in range(len(tracks)):
@@ -284,7 +273,7 @@ def changed_factors(tracks: IntArray, starts: IntArray, nodes: Arrays, owners: I
     W (F d_left - d_right) = W e + N(0, I), d relative to the reference, W' W = Q^-1 and e = r_right - f(x0) - F (r_left
     - x0): [(W F)'; -W'; (W e)'] in `factors`; measurements are [G'; 0; (y + G (x0 - r))'].
     """
-    info, _, numbers, labels, values, rows = nodes
+    info, _, numbers, labels, _, values, rows = nodes
     n = values.shape[2] - 1
     L, noise, rhs = np.empty((n, n)), np.empty((n, n)), np.empty((n, 2 * n + 1))
     num = 0
@@ -328,11 +317,11 @@ def changed_factors(tracks: IntArray, starts: IntArray, nodes: Arrays, owners: I
 @njit(f"b1({INDICES}, {TIMES}, {NODES})")
 def write_steps(numbers: IntArray, delta: FloatArray, nodes: Arrays) -> bool:
     """Write the steps of nodes whose states are their reference + `delta`, one by one; True if all are finite."""
-    _, _, _, _, values, _ = nodes
+    _, _, _, _, backs, values, _ = nodes
     n, total = values.shape[2] - 1, 0.0
     for k in range(len(numbers)):
         at = numbers[k]
         for i in range(n):
-            values[at, STEP, i] = values[at, REFERENCE, i] - values[at, ORIGIN, i] + delta[k * n + i]
+            backs[at, n, i] = values[at, REFERENCE, i] - values[at, ORIGIN, i] + delta[k * n + i]
             total += abs(delta[k * n + i])
     return bool(np.isfinite(total))

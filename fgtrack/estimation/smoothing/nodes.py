@@ -11,7 +11,22 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Measurements
 from fgtrack.estimation.smoothing import node_kernels
-from fgtrack.estimation.smoothing.kernels import CHANGED, COUNT, FIRST, NEVER, NUM_ROWS, STALE
+from fgtrack.estimation.smoothing.kernels import (
+    CHANGED,
+    COUNT,
+    FILTERED,
+    FIRST,
+    NEVER,
+    NUM_ROWS,
+    ORIGIN,
+    PREDICTED,
+    REFERENCE,
+    STALE,
+    C,
+    F,
+    P,
+    Q,
+)
 from fgtrack.estimation.smoothing.terms import Term, whitened
 from fgtrack.models.motion import MotionModel, WhiteNoise
 from fgtrack.models.transitions import transitions
@@ -20,8 +35,8 @@ _FEW_TRACKS, _FEW_NODES, _FEW_COMPONENTS = 4, 16, 4
 
 
 def _numbered(first: int, tracks: int, nodes: int) -> IntArray:
-    """Return numbers from `first` on, shape (tracks, nodes); the first nodes of all tracks are neighbours in memory."""
-    return np.ascontiguousarray(first + np.arange(tracks * nodes).reshape(nodes, tracks).T)
+    """Return numbers from `first` on, shape (tracks, nodes); the nodes of a track are neighbours in memory."""
+    return first + np.arange(tracks * nodes).reshape(tracks, nodes)
 
 
 def _is_shipped(motion: MotionModel) -> bool:
@@ -44,7 +59,10 @@ class Nodes:
         self.labels: IntArray = np.zeros((size, 3), dtype=np.int64)
         """Number of `rows` in use; 1 if something was linearised since a factor graph read it; 1 if the motion to the
         next node must be linearised."""
-        self.values = np.zeros((size, 3 + 7 * n, n + 1))
+        self.backs = np.zeros((size, n + 1, n + 1))
+        """[A | b], the node given the next one: x - x0 = A (next - its x0) + b + N(0, C). The last row is the step: the
+        mean relative to the linearisation point x0, given everything."""
+        self.values = np.zeros((size, 2 + 6 * n, n + 1))
         """Rows and blocks, see `kernels`: vectors stand as a last column beside the matrix that moves with them."""
         self.rows = np.zeros((size, _FEW_COMPONENTS, n + 1))
         """Measurements: G and y of y = G (x - x0) + N(0, I)."""
@@ -54,24 +72,17 @@ class Nodes:
     def _share(self) -> None:
         """Name the parts of the arrays."""
         n = self._motion.dim
-        self.arrays = self.tracks, self.stamps_ns, self.numbers, self.labels, self.values, self.rows
+        self.arrays = self.tracks, self.stamps_ns, self.numbers, self.labels, self.backs, self.values, self.rows
         """Arguments of all loops."""
-        self.count, self.first = self.tracks[:, COUNT], self.tracks[:, FIRST]
-        self.step, self.origin, self.reference = (self.values[:, row, :n] for row in range(3))
-        """Mean relative to the linearisation point x0, given everything; x0; the first x0, which the variables of a
-        factor graph are relative to."""
-        blocks = [self.values[:, 3 + n * k : 3 + n * (k + 1)] for k in range(7)]
-        self.back, _, self.filtered, self.predicted, _, motion, _ = blocks
-        """[A | b], the node given the next one: x - x0 = A (next - its x0) + b + N(0, C); covariances and means
-        relative to x0 after and before the node's own measurements."""
-        _, self.C, _, _, self.P, self.F, self.Q = (each[..., :n] for each in blocks)
-        """C; covariance given everything; motion f to the next node: its derivative at x0, and its noise."""
-        self.ahead = motion[..., n]
-        """f(x0)."""
-
-    def last_before(self, tracks: IntArray, stamps_ns: IntArray) -> IntArray:
-        """Return the indices of the newest nodes at or before `stamps_ns`; -1 without such a node."""
-        return np.asarray((self.stamps_ns[tracks] <= stamps_ns[:, None]).sum(axis=1) - 1)
+        self.count, self.first, self.step = self.tracks[:, COUNT], self.tracks[:, FIRST], self.backs[:, n, :n]
+        self.origin, self.reference = self.values[:, ORIGIN, :n], self.values[:, REFERENCE, :n]
+        """x0; the first x0, which the variables of a factor graph are relative to."""
+        blocks = [self.values[:, 2 + n * k : 2 + n * (k + 1)] for k in range(6)]
+        self.filtered, self.predicted, self.ahead = blocks[FILTERED], blocks[PREDICTED], blocks[F][..., n]
+        """Covariances and means relative to x0 after and before the node's own measurements; f(x0), f being the motion
+        to the next node."""
+        self.C, self.P, self.F, self.Q = (blocks[k][..., :n] for k in (C, P, F, Q))
+        """C; covariance given everything; derivative of f at x0; noise of the motion."""
 
     def window(self, track: int) -> IntArray:
         """Return the numbers of all nodes of a window."""
@@ -99,12 +110,10 @@ class Nodes:
 
     def note(self, stack: Measurements, numbers: IntArray, is_new: IntArray, ahead_s: FloatArray) -> None:
         """Keep a stack of measurements, one for each of the nodes `numbers`."""
-        for row, (number, new, time_s) in enumerate(
-            zip(numbers.tolist(), is_new.tolist(), ahead_s.tolist(), strict=True)
-        ):
-            if new:
-                self._terms[number] = []
-            self._terms[number].append((stack, row, time_s))
+        rows = zip(numbers.tolist(), is_new.tolist(), range(len(numbers)), ahead_s.tolist(), strict=True)
+        for number, new, *term in rows:
+            kept = [] if new else self._terms[number]
+            self._terms[number] = [*kept, (stack, *term)]
 
     def withdraw(self, track: int, index: int, is_new: bool) -> None:
         """Take the last measurement of a node out, and the node, if it `is_new`."""
@@ -166,7 +175,7 @@ class Nodes:
         used = self.numbers[np.arange(shape[1]) < self.count[:, None]]
         self.stamps_ns = np.concatenate([self.stamps_ns, np.full(shape, NEVER)], axis=axis)
         self.numbers = np.concatenate([self.numbers, _numbered(first, *shape)], axis=axis)
-        for name in ("labels", "values", "rows"):
+        for name in ("labels", "backs", "values", "rows"):
             values = getattr(self, name)
             larger = np.zeros((self.numbers.size, *values.shape[1:]), values.dtype)  # only pages of used ones are made
             larger[used] = values[used]

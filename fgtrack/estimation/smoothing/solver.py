@@ -64,8 +64,8 @@ class Solver:
         """Solve windows that have changed from `starts` on and begin at `anchors` from now on.
         Raises `numpy.linalg.LinAlgError` if it fails.
         """
-        self.eliminate(tracks, starts, np.full(len(tracks), NEVER))
-        kernels.back_substitute(tracks, anchors, self.nodes.arrays)
+        if not kernels.solve_windows(tracks, starts, anchors, self.nodes.arrays):
+            raise np.linalg.LinAlgError("a state is not finite")
 
     def smoothed(self, tracks: IntArray, indices: IntArray, after_s: FloatArray) -> FloatArray:
         """Make `P` of the nodes at `indices` known, and where `after_s` what the states of those before depend on.
@@ -122,27 +122,25 @@ class Solver:
         y: FloatArray,
         H: FloatArray,
         guesses: FloatArray,
-        starts_ns: IntArray,
-        reaches_ns: IntArray,
+        R: FloatArray,
+        anchors: IntArray,
     ) -> Leaving | None:
-        """Fuse a stack of measurements, one of each of `tracks`, and move the windows up to `starts_ns`.
+        """Fuse a stack of measurements, one of each of `tracks`, and let the windows begin at the indices `anchors`.
 
         Their innovations at `guesses`, the states (m, n) at their stamp, are `y` (m, k), with Jacobians `H`, (1, k, n)
-        or (m, k, n). One node at or before `starts_ns` stays in each window; behind it, what `reaches_ns` needs is
-        kept. A measurement that is older changes the prior of its window. Returns the smoothed states of the nodes that
-        left, if wanted. Raises `numpy.linalg.LinAlgError` if it fails; states are as before then.
+        or (m, k, n), and covariances `R` (m, k, k). A measurement that is older changes the prior of its window.
+        Returns the smoothed states of the nodes that left, if wanted. Raises `numpy.linalg.LinAlgError` if it fails;
+        states are as before then.
         """
         nodes, stamp_ns = self.nodes, stack.stamp_ns
         guesses = self._marked_nonlinear(tracks, stamp_ns, guesses) if stack.is_nonlinear else guesses
-        anchors, ahead_s, out = _indices(len(tracks)), np.empty(len(tracks)), _indices(6, len(tracks))
-        node_kernels.anchor(tracks, starts_ns, reaches_ns, anchors, nodes.arrays)
+        ahead_s, out = np.empty(len(tracks)), _indices(7, len(tracks))
         leaving = self._leaving(tracks, anchors) if self._has_final else None
-        given = tracks, stamp_ns, y, H, stack.R, guesses, not stack.is_nonlinear, self._thresholds, anchors
+        given = tracks, stamp_ns, y, H, R, guesses, not stack.is_nonlinear, self._thresholds, anchors
         while (flags := node_kernels.place(*given, nodes.arrays, out, ahead_s)) == NO_ROOM:
             nodes.make_room(tracks, y.shape[1])
-        numbers, _, is_new, starts, anchors, is_behind = out
+        numbers, _, is_new, starts, anchors, is_behind, _ = out
         nodes.note(Measurements(stack), numbers, is_new, ahead_s)
-        firsts = nodes.first[tracks]
         try:
             if flags & NOT_DEFINITE:
                 raise np.linalg.LinAlgError("a covariance is not positive definite")
@@ -153,13 +151,13 @@ class Solver:
                 starts[rows] = anchors[rows]
             self.solve(tracks, starts, anchors)
         except np.linalg.LinAlgError:
-            self._restore(tracks, out, firsts)
+            self._restore(tracks, out)
             raise
         return leaving
 
-    def _restore(self, tracks: IntArray, placed: IntArray, firsts: IntArray) -> None:
-        """Take what was `placed` out of the windows, which began at `firsts`."""
-        nodes, (numbers, indices, is_new, _, _, is_behind) = self.nodes, placed
+    def _restore(self, tracks: IntArray, placed: IntArray) -> None:
+        """Take what was `placed` out of the windows."""
+        nodes, (numbers, indices, is_new, _, _, is_behind, firsts) = self.nodes, placed
         nodes.first[tracks] = firsts
         for track, number, index, new in zip(*(a.tolist() for a in (tracks, numbers, indices, is_new)), strict=True):
             nodes.withdraw(track, index, bool(new))

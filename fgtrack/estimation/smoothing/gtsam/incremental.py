@@ -103,7 +103,10 @@ class IncrementalSolver(Solver):
                 if len(key) > 1:
                     left, number = key
                     A = psd_solve(P[n:, n:], P[n:, :n]).T  # the state on the left, given this one
-                    nodes.back[left, :, :n], nodes.back[left, :, n] = A, nodes.step[left] - A.dot(nodes.step[number])
+                    nodes.backs[left, :n, :n], nodes.backs[left, :n, n] = (
+                        A,
+                        nodes.step[left] - A.dot(nodes.step[number]),
+                    )
                     nodes.C[left] = symmetrise(P[:n, :n] - A.dot(P[n:, :n]))
             nodes.P[key[-1]] = known[key][-n:, -n:]
         return super().smoothed(tracks, indices, after_s)
