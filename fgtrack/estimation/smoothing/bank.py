@@ -15,7 +15,7 @@ from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
 from fgtrack.estimation.filters.propagation import kinematic_states
-from fgtrack.estimation.smoothing.node_kernels import innovations, windows
+from fgtrack.estimation.smoothing.node_kernels import innovations
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.models.motion import MotionModel
@@ -236,7 +236,7 @@ class SmootherBank:
         return self._order
 
     def _windows(self, tracks: IntArray) -> IntArray:
-        """Return `node_kernels.windows` of `tracks`, shape (4, m)."""
-        out = np.empty((4, len(tracks)), dtype=np.int64)
-        windows(tracks, self._clock_ns, self._lag_ns, self._behind_ns, self.solver.nodes.arrays, out)
-        return out
+        """Return the newest stamps of `tracks`, the starts of their windows, the oldest stamps that are fused, and the
+        indices of the nodes where the windows will begin, shape (4, m).
+        """
+        return self.solver.nodes.windows(tracks, self._clock_ns, self._lag_ns, self._behind_ns)

@@ -46,19 +46,26 @@ def regularise(Q: FloatArray) -> None:
 
 
 @inlined
+def _complement(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
+    """Write I - A B."""
+    product(A, B, out)
+    for i in range(len(out)):
+        for j in range(len(out)):
+            out[i, j] = (1.0 if i == j else 0.0) - out[i, j]
+
+
+@inlined
 def _predict(values: FloatArray, before: int, at: int, moved: FloatArray) -> None:
     """Write the prediction [F P F' + Q | F x + f - x0], and F P to `moved`."""
     n = len(moved)
     left, motion, noise = block(values, before, FILTERED), block(values, before, F), block(values, before, Q)
     ahead = block(values, at, PREDICTED)
-    for i in range(n):
-        mean = motion[i, n] - values[at, ORIGIN, i]
-        for j in range(n):
-            mean += motion[i, j] * left[j, n]
-        ahead[i, n] = mean
-        for j in range(i + 1):
-            ahead[i, j] = 0.5 * (noise[i, j] + noise[j, i])
+    copy(noise, ahead)
     add_congruence(motion, left, moved, ahead)
+    for i in range(n):
+        ahead[i, n] = motion[i, n] - values[at, ORIGIN, i]
+        for j in range(n):
+            ahead[i, n] += motion[i, j] * left[j, n]
 
 
 @inlined
@@ -73,16 +80,11 @@ def _condition(
     if not solve(E, gain):
         return False
     for i in range(n):
-        mean = left[i, n]
+        back[i, n] = left[i, n]
         for j in range(n):
-            back[i, j] = gain[j, i]
-            mean -= gain[j, i] * ahead[j, n]
-            value = 1.0 if i == j else 0.0
-            for k in range(n):
-                value -= gain[k, i] * motion[k, j]
-            E[i, j] = value
-            rest[i, j] = 0.0
-        back[i, n] = mean
+            back[i, j], rest[i, j] = gain[j, i], 0.0
+            back[i, n] -= gain[j, i] * ahead[j, n]
+    _complement(back, motion, E)
     add_congruence(E, left, work, rest)
     add_congruence(back, block(values, before, Q), work, rest)
     return True
@@ -134,16 +136,25 @@ def eliminate(tracks: IntArray, starts: IntArray, ends: IntArray, nodes: Arrays)
                 _predict(values, before, at, A)
                 if not _condition(values, backs[before], before, at, A, E, work):
                     return False
-            state, total = block(values, at, FILTERED), 0.0
+            state = block(values, at, FILTERED)
             copy(block(values, at, PREDICTED), state)
             for k in range(labels[at, NUM_ROWS]):
                 _correct(state, rows[at], k, gain, E, D, work)
             for i in range(n):
-                for j in range(n + 1):
-                    total += abs(state[i, j])
-            if not np.isfinite(total):
-                return False
+                if not np.isfinite(state[i, i] + state[i, n]):
+                    return False
     return True
+
+
+@inlined
+def _given(back: FloatArray, later: FloatArray, out: FloatArray) -> None:
+    """Write the mean A x + b of a node given the next one, x being in the last row of `later`."""
+    n = len(back) - 1
+    for i in range(n):
+        value = back[i, n]
+        for j in range(n):
+            value += back[i, j] * later[n, j]
+        out[i] = value
 
 
 @njit(f"b1({INDICES}, {INDICES}, {INDICES}, {NODES})")
@@ -153,7 +164,7 @@ def solve_windows(tracks: IntArray, starts: IntArray, anchors: IntArray, nodes: 
     """
     info, _, numbers, _, backs, values, _ = nodes
     n = values.shape[2] - 1
-    steps, ends = np.empty((2, n)), np.empty(len(tracks), dtype=np.int64)
+    ends = np.empty(len(tracks), dtype=np.int64)
     for t in range(len(tracks)):
         ends[t] = NEVER
     if not eliminate(tracks, starts, ends, nodes):
@@ -161,17 +172,11 @@ def solve_windows(tracks: IntArray, starts: IntArray, anchors: IntArray, nodes: 
     for t in range(len(tracks)):
         track, last = tracks[t], info[tracks[t], COUNT] - 1
         info[track, FIRST], info[track, KNOWN] = anchors[t], last + 1
-        for index in range(last, anchors[t] - 1, -1):
-            at, step, later = numbers[track, index], steps[index % 2], steps[(index + 1) % 2]
-            back = backs[at] if index < last else block(values, at, FILTERED)
-            for i in range(n):
-                value = back[i, n]
-                if index < last:
-                    for j in range(n):
-                        value += back[i, j] * later[j]
-                step[i] = value
-            for i in range(n):
-                backs[at, n, i] = step[i]
+        newest = numbers[track, last]
+        for i in range(n):
+            backs[newest, n, i] = block(values, newest, FILTERED)[i, n]
+        for index in range(last - 1, anchors[t] - 1, -1):
+            _given(backs[numbers[track, index]], backs[numbers[track, index + 1]], backs[numbers[track, index], n])
     return True
 
 
@@ -203,16 +208,6 @@ def locate(
             num_between += 1
         indices[t] = index
     return num_between
-
-
-@inlined
-def _given(back: FloatArray, later: FloatArray, out: FloatArray) -> None:
-    """Write the mean A x + b of a node given the next one, x being in the last row of `later`."""
-    n = len(back) - 1
-    for i in range(n):
-        out[i] = back[i, n]
-        for j in range(n):
-            out[i] += back[i, j] * later[n, j]
 
 
 @njit(f"void({INDICES}, {INDICES}, {TIMES}, {NODES}, {VECTORS})")
@@ -277,10 +272,9 @@ def _interpolate(
     for i in range(n):
         for j in range(n):
             Psi[i, j] = gain[j, i]
-    product(Psi, F2, E)
+    _complement(Psi, F2, E)
     for i in range(n):
         for j in range(n):
-            E[i, j] = (1.0 if i == j else 0.0) - E[i, j]
             mean[i] += Psi[i, j] * (values[at, ORIGIN, j] + backs[at, n, j] - ahead[j])
     product(E, F1, Lambda)
     product(Lambda, backs[before], by_right)

@@ -17,7 +17,6 @@ from fgtrack.estimation.smoothing.kernels import (
     FILTERED,
     FIRST,
     NEVER,
-    NUM_ROWS,
     ORIGIN,
     PREDICTED,
     REFERENCE,
@@ -125,17 +124,20 @@ class Nodes:
                 each[last] = free
             self.count[track] = last
 
-    def make_room(self, tracks: IntArray, k: int) -> None:
-        """Make room for another node in each of `tracks`, and for another `k` components in each node."""
-        if self.count[tracks].max() >= self.stamps_ns.shape[1]:
+    def windows(self, tracks: IntArray, *limits_ns: int) -> IntArray:
+        """Return `node_kernels.windows` of `tracks`, shape (4, m), with room for another node in each."""
+        out = np.empty((4, len(tracks)), dtype=np.int64)
+        if node_kernels.windows(tracks, *limits_ns, self.arrays, out) >= self.stamps_ns.shape[1]:
             self._grow(axis=1)
-        self._fit_rows(int(self.labels[:, NUM_ROWS].max()) + k)
+        return out
 
     def linearise_terms(self, number: int) -> None:
         """Linearise all measurements of a node at its linearisation point."""
         rows = [whitened(term, self.origin[number], self._motion) for term in self.terms(number)]
         used = sum(map(len, rows))
-        self._fit_rows(used)
+        while used > self.rows.shape[1]:
+            self.rows = np.concatenate([self.rows, np.zeros_like(self.rows)], axis=1)
+            self._share()
         self.labels[number, :2] = used, 1
         if used:
             self.rows[number, :used] = np.concatenate(rows)
@@ -148,8 +150,7 @@ class Nodes:
             rows = tracks[rows]
             stale = self.numbers[rows, indices]
             for number in stale.tolist() if is_nonlinear else ():
-                if any(of.stack.is_nonlinear or ahead_s for of, _, ahead_s in self._terms[number]):
-                    self.linearise_terms(number)
+                self.linearise_terms(number)
         if compiled is not None:
             node_kernels.linearise_motion(compiled.kind, compiled.density, tracks, starts, self.arrays)
             return
@@ -183,8 +184,3 @@ class Nodes:
         if axis == 0:
             self.tracks = np.concatenate([self.tracks, np.zeros_like(self.tracks)])
         self._share()
-
-    def _fit_rows(self, most: int) -> None:
-        while most > self.rows.shape[1]:
-            self.rows = np.concatenate([self.rows, np.zeros_like(self.rows)], axis=1)
-            self._share()

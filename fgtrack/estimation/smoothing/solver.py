@@ -11,7 +11,7 @@ from fgtrack.estimation.base import Measurement, Measurements
 from fgtrack.estimation.filters.initiation import Fix, Line, along, fixes_of
 from fgtrack.estimation.smoothing import kernels, node_kernels
 from fgtrack.estimation.smoothing.kernels import BEGIN_NS, NEVER, NONLINEAR, STALE
-from fgtrack.estimation.smoothing.node_kernels import BEHIND, NO_ROOM, NOT_DEFINITE, SHARED
+from fgtrack.estimation.smoothing.node_kernels import BEHIND, NOT_DEFINITE, NOT_PLAIN
 from fgtrack.estimation.smoothing.nodes import Nodes
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.terms import cost, overshot
@@ -109,9 +109,8 @@ class Solver:
         if not num.any():
             return None
         rows, columns = np.nonzero(np.arange(int(num.max())) < num[:, None])
-        tracks, indices = tracks[rows], nodes.first[tracks[rows]] + columns
-        means = self.smoothed(tracks, indices, np.zeros(len(tracks)))
-        return tracks, nodes.stamps_ns[tracks, indices].tolist(), means, nodes.P[nodes.numbers[tracks, indices]]
+        stamps_ns = nodes.stamps_ns[tracks[rows], nodes.first[tracks[rows]] + columns]
+        return tracks[rows], stamps_ns.tolist(), *self.states_at(tracks[rows], stamps_ns)
 
     # --- updates
 
@@ -137,14 +136,13 @@ class Solver:
         ahead_s, out = np.empty(len(tracks)), _indices(7, len(tracks))
         leaving = self._leaving(tracks, anchors) if self._has_final else None
         given = tracks, stamp_ns, y, H, R, guesses, not stack.is_nonlinear, self._thresholds, anchors
-        while (flags := node_kernels.place(*given, nodes.arrays, out, ahead_s)) == NO_ROOM:
-            nodes.make_room(tracks, y.shape[1])
+        flags = node_kernels.place(*given, nodes.arrays, out, ahead_s)
         numbers, _, is_new, starts, anchors, is_behind, _ = out
         nodes.note(Measurements(stack), numbers, is_new, ahead_s)
         try:
             if flags & NOT_DEFINITE:
                 raise np.linalg.LinAlgError("a covariance is not positive definite")
-            nodes.linearise(tracks, starts, self._is_nonlinear or bool(flags & SHARED))
+            nodes.linearise(tracks, starts, self._is_nonlinear or bool(flags & NOT_PLAIN))
             if flags & BEHIND:
                 rows = is_behind.nonzero()[0]
                 self._refilter(tracks[rows], starts[rows], anchors[rows])
@@ -157,19 +155,11 @@ class Solver:
 
     def _restore(self, tracks: IntArray, placed: IntArray) -> None:
         """Take what was `placed` out of the windows."""
-        nodes, (numbers, indices, is_new, _, _, is_behind, firsts) = self.nodes, placed
-        nodes.first[tracks] = firsts
-        for track, number, index, new in zip(*(a.tolist() for a in (tracks, numbers, indices, is_new)), strict=True):
-            nodes.withdraw(track, index, bool(new))
-            if not new:
-                nodes.linearise_terms(number)
-        before = indices - is_new
-        nodes.labels[nodes.numbers[tracks, before], STALE] = 1
-        nodes.linearise(tracks, before, is_nonlinear=False)
-        rows = is_behind.nonzero()[0]
-        self._refilter(tracks[rows], before[rows], firsts[rows])
-        for track in tracks.tolist():
-            self.relinearise(track)
+        _, indices, is_new, _, _, _, firsts = placed
+        self.nodes.first[tracks] = firsts
+        for track, index, new in zip(tracks.tolist(), indices.tolist(), is_new.tolist(), strict=True):
+            self.nodes.withdraw(track, index, bool(new))
+            self.relinearise(track, start=index - new)
 
     def _refilter(self, tracks: IntArray, starts: IntArray, anchors: IntArray) -> None:
         """Filter from `starts`, which lie behind the windows, up to `anchors`, where these begin: with other priors."""
@@ -212,17 +202,20 @@ class Solver:
                 self.nodes.linearise(one, moved[:1], self._is_nonlinear)
                 self.solve(one, moved[:1], self.nodes.first[one])
 
-    def relinearise(self, track: int, means: FloatArray | None = None) -> None:
-        """Linearise a window at `means`, shape (m, n), or where its linearisation points are, and solve it."""
-        nodes, numbers, tracks = self.nodes, self.nodes.window(track), np.array([track])
+    def relinearise(self, track: int, means: FloatArray | None = None, start: int = NEVER) -> None:
+        """Linearise a window at `means`, shape (m, n), or where its linearisation points are, and solve it.
+        From index `start` on, if that lies behind the window.
+        """
+        nodes, tracks = self.nodes, np.array([track])
         first = nodes.first[tracks]
+        starts = np.minimum(first, start)
+        numbers = nodes.numbers[track, starts[0] : nodes.count[track]].copy()
         if means is not None:
-            node_kernels.shift(np.full(len(numbers), track), numbers, means - nodes.origin[numbers], nodes.arrays)
+            nodes.predicted[numbers[0], :, -1] -= means[0] - nodes.origin[numbers[0]]
+            nodes.origin[numbers] = means
         nodes.labels[numbers, STALE] = 1
-        nodes.linearise(tracks, first, is_nonlinear=False)
-        for number in numbers.tolist():
-            nodes.linearise_terms(number)
-        self.forget(track)
+        nodes.linearise(tracks, starts, is_nonlinear=True)
+        self._refilter(tracks, starts, first)
         self.solve(tracks, first, first)
 
     def converge(self, track: int, max_iterations: int = 100) -> None:

@@ -81,34 +81,26 @@ class IncrementalSolver(Solver):
     def __init__(self, motion: MotionModel, settings: SmootherSettings) -> None:
         super().__init__(motion, settings)
         self._graphs: dict[int, Any] = {}  # Any: a subclass has its own
-        self._known: dict[int, dict[tuple[int, ...], FloatArray]] = {}
-        """Covariances by track and nodes: what is read for a stamp does not depend on what was read for others."""
 
     def forget(self, track: int) -> None:
         """See `Solver.forget`: the next solution makes a new graph."""
         self._graphs.pop(track, None)
-        self._known[track] = {}
 
     def smoothed(self, tracks: IntArray, indices: IntArray, after_s: FloatArray) -> FloatArray:
         """See `Solver.smoothed`; inside the windows from the graphs."""
         nodes, n = self.nodes, self.motion.dim
         rows = zip(tracks.tolist(), indices.tolist(), nodes.first[tracks].tolist(), after_s.tolist(), strict=True)
         for track, index, first, time_s in rows:
+            if track not in self._graphs:  # nothing was fused: there is one node
+                continue
             last = max(index, first)
-            key = tuple(nodes.numbers[track, last - (time_s > 0.0 and index > first) : last + 1].tolist())
-            known = self._known[track]
-            if key not in known:
-                has_graph = track in self._graphs  # else nothing was fused: there is one node
-                known[key] = P = self._covariance(track, *key) if has_graph else nodes.P[key[0]].copy()
-                if len(key) > 1:
-                    left, number = key
-                    A = psd_solve(P[n:, n:], P[n:, :n]).T  # the state on the left, given this one
-                    nodes.backs[left, :n, :n], nodes.backs[left, :n, n] = (
-                        A,
-                        nodes.step[left] - A.dot(nodes.step[number]),
-                    )
-                    nodes.C[left] = symmetrise(P[:n, :n] - A.dot(P[n:, :n]))
-            nodes.P[key[-1]] = known[key][-n:, -n:]
+            left, *right = nodes.numbers[track, last - (time_s > 0.0 and index > first) : last + 1].tolist()
+            P = self._covariance(track, left, *right)
+            for number in right:
+                A = psd_solve(P[n:, n:], P[n:, :n]).T  # the state on the left, given this one
+                nodes.backs[left, :n, :n], nodes.backs[left, :n, n] = A, nodes.step[left] - A.dot(nodes.step[number])
+                nodes.C[left] = symmetrise(P[:n, :n] - A.dot(P[n:, :n]))
+            nodes.P[right[0] if right else left] = P[-n:, -n:]
         return super().smoothed(tracks, indices, after_s)
 
     def solve(self, tracks: IntArray, starts: IntArray, anchors: IntArray) -> None:
@@ -123,8 +115,6 @@ class IncrementalSolver(Solver):
             self._update(tracks, first)
         except (RuntimeError, ValueError, IndexError) as error:
             raise np.linalg.LinAlgError(f"the graph cannot be solved ({error})") from error
-        for track in tracks.tolist():
-            self._known[track] = {}
         nodes.tracks[tracks, KNOWN] = anchors
 
     def _covariance(self, track: int, *numbers: int) -> FloatArray:
@@ -141,9 +131,8 @@ class IncrementalSolver(Solver):
         """
         nodes, zero = self.nodes, np.zeros(self.motion.dim)
         leaving = (nodes.first[tracks] - starts).tolist()
-        windows, graphs, values = [], [], []
-        for track, start in zip(tracks.tolist(), starts.tolist(), strict=True):
-            window = nodes.numbers[track, start : nodes.count[track]].copy()
+        for track, start, num_leaving in zip(tracks.tolist(), starts.tolist(), leaving, strict=True):
+            window, values = nodes.numbers[track, start : nodes.count[track]].copy(), gtsam.Values()
             graph = self._graphs.get(track)
             if graph is None:  # of the prior of the oldest node only
                 prior = nodes.predicted[window[0]]
@@ -151,37 +140,34 @@ class IncrementalSolver(Solver):
                 factor = gtsam.JacobianFactor(int(window[0]), W, W @ prior[:, -1], _unit(len(W)))
                 graph = self._graphs[track] = _Graph(factor)
                 nodes.labels[window, CHANGED] = 1
-            values.append(gtsam.Values())
-            for number in window.tolist():
+            numbers = window.tolist()
+            for number in numbers:
                 if number not in graph.slots:
                     graph.slots[number] = None
-                    values[-1].insert(number, zero)
+                    values.insert(number, zero)
                     nodes.reference[number] = nodes.origin[number]
-            windows.append(window)
-            graphs.append(graph)
-        changed = self._changed_factors(tracks, starts, sum(map(len, windows)))
-        for graph, window, num_leaving, new, factors in zip(graphs, windows, leaving, values, changed, strict=True):
-            delta = graph.solve(window.tolist(), num_leaving, new, *factors)
+            changed = self._changed_factors(track, start)
+            first = min(map(numbers.index, changed), default=0)
+            delta = graph.solve(numbers, num_leaving, values, first, changed)
             if not node_kernels.write_steps(window[num_leaving:], delta, nodes.arrays):
                 raise ValueError("a state is not finite")
 
-    def _changed_factors(self, tracks: IntArray, starts: IntArray, most: int) -> list[tuple[int, _Changed]]:
-        """Return the factors that have changed, at most so many, of each track, and the first index from `starts`."""
+    def _changed_factors(self, track: int, start: int) -> _Changed:
+        """Return the factors of a track, from index `start` on, that have changed."""
         nodes, n = self.nodes, self.motion.dim
-        owners, factors = np.empty((most, 5), dtype=np.int64), np.empty((most, 2 * n + 1, n + nodes.rows.shape[1]))
-        num = node_kernels.changed_factors(tracks, starts, nodes.arrays, owners, factors)
+        most = nodes.count[track] - start
+        owners = np.empty((most, 3), dtype=np.int64)
+        factors = np.empty((most, n + nodes.rows.shape[1], 2 * n + 1))
+        num = node_kernels.changed_factors(track, start, nodes.arrays, owners, factors)
         if num < 0:
             raise ValueError("process noise is not positive definite")
-        changed: list[tuple[int, _Changed]] = [(0, {}) for _ in tracks]
-        for (row, index, number, right, size), each in zip(owners[:num].tolist(), factors, strict=False):
-            A, b, unit = each[:n, :size].T, each[-1, :size], _unit(size)
+        changed: _Changed = {}
+        for (number, right, size), each in zip(owners[:num].tolist(), factors, strict=False):
+            A, b, unit = each[:size, :n], each[:size, -1], _unit(size)
             if right < 0:
-                factor = gtsam.JacobianFactor(number, A, b, unit)
+                changed[number] = gtsam.JacobianFactor(number, A, b, unit)
             else:
-                factor = gtsam.JacobianFactor(number, A, right, each[n:-1, :size].T, b, unit)
-            if not changed[row][1]:
-                changed[row] = index - int(starts[row]), changed[row][1]
-            changed[row][1][number] = factor
+                changed[number] = gtsam.JacobianFactor(number, A, right, each[:size, n:-1], b, unit)
         return changed
 
 
