@@ -80,6 +80,16 @@ def test_an_object_survives_as_long_as_its_lifetime_says() -> None:
     assert probability(life, 6000.0) == pytest.approx(0.75 * math.exp(-1.5))
 
 
+def test_a_track_that_is_hidden_for_too_long_ends_although_it_is_probable() -> None:
+    life, there = lifecycle(replace(STILL, hidden_s=1.0)), np.array([[10.0, 0.0]])
+    life.born(0, scan(), HERE)
+    for k in range(1, 10):
+        match(life, 0, scan(at_ms=100.0 * k), HERE, MEAN, P)
+    ended = [k for k in range(10, 30) if life.missed(scan(at_ms=100.0 * k), [0], there, np.array([10.0]))]
+    assert probability(life, 3000.0) > 0.9
+    assert 20 <= ended[0] <= 23
+
+
 @pytest.mark.parametrize("learned_s", [0.0, 60.0])
 def test_lists_count_at_their_stamps_in_whatever_order_they_arrive(learned_s: float) -> None:
     """Also what is learned of where a sensor detects, from lists that have left the memory."""
@@ -260,3 +270,4 @@ def test_the_tracker_confirms_what_is_seen_again_and_ends_what_is_seen_once(esti
         assert len(report.tracks) == 2 - (k > 1)
     (track,) = report.tracks
     assert (track.status, track.num_measured) == (TrackStatus.CONFIRMED, 6)
+    assert 0.9 < track.score < 1.0

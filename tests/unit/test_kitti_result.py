@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.kitti import RECTIFIED_FROM_IMU, folder, oxts
 from typer.testing import CliRunner
@@ -11,6 +12,7 @@ from fgtrack.cli.main import app
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.evaluation.kitti_result import write_kitti_result
 from fgtrack.io.adapters.kitti_view import Box, read_views
+from fgtrack.io.run import Table
 from fgtrack.pipeline.public import replay
 
 SIZE = "1.5 1.6 4.0"  # height, width, length
@@ -76,12 +78,20 @@ def test_a_result_holds_a_box_of_every_track_at_every_frame(tmp_path, replayed):
         assert fields[2] == "Car"
         assert len(fields) == 18
         assert list(map(float, fields[10:13])) == [1.5, 1.6, 4.0]
-        assert float(fields[17]) == pytest.approx(7.75)
+        assert 0.9 < float(fields[17]) <= 1.0  # its existence probability
         assert [float(value) for value in fields[13:16]] == pytest.approx(list(map(float, label[13:16])), abs=0.1)
         assert math.cos(float(fields[16]) - float(label[16])) > 0.999
         assert [float(value) for value in fields[6:10]] == pytest.approx(list(map(float, label[6:10])), abs=5.0)
         x_m, z_m = float(fields[13]), float(fields[15])
         assert math.cos(float(fields[3 + 2]) - (float(fields[16]) - math.atan2(x_m, z_m))) == pytest.approx(1.0)
+
+
+def test_without_existence_probabilities_the_score_is_that_of_the_detections(tmp_path, replayed):
+    run, oxts_file = replayed
+    tracks = run.tables["tracks"]
+    counted = run.with_tables(tracks=Table({**tracks, "score": np.full(tracks.num_rows, np.nan)}))
+    write_kitti_result(counted, oxts_file, tmp_path / "0001.txt")
+    assert {float(fields[17]) for fields in rows(tmp_path / "0001.txt").values()} == {7.75}
 
 
 def test_without_a_size_nothing_is_written(tmp_path, replayed):

@@ -281,6 +281,21 @@ def test_a_run_in_memory_or_of_a_folder_is_saved_as_it_is(tmp_path):
     assert (memory.run.estimator, memory.run.path) == ("test", None)
 
 
+def test_existence_probabilities_are_a_column_of_runs_that_have_them_and_of_no_others(tmp_path):
+    tracks = tuple(dataclasses.replace(each, score=0.75) for each in report().tracks)
+    scored = dataclasses.replace(report(), tracks=tracks)
+    for name, item in (("scored", scored), ("counted", report())):
+        with RunWriter(tmp_path / name, meta={"is_scored": name == "scored"}) as writer:
+            writer.write_tick(item, process_ns=5, num_detections=2)
+            writer.finish({})
+        load_run(tmp_path / name).save(tmp_path / "copy", overwrite=True)
+        text = (tmp_path / name / "tracks.csv").read_text()
+        assert (tmp_path / "copy/tracks.csv").read_text() == text
+        assert ("score" in text) == (name == "scored")
+    assert load_run(tmp_path / "scored").tracks["score"].tolist() == [0.75, 0.75]
+    assert load_run(tmp_path / "counted").tracks["score"].isna().all()
+
+
 def test_smoothed_holds_final_states_and_those_of_the_first_lag_of_tracks_that_are_there(tmp_path):
     lags_s = (None, 0.1, 0.3)
     smoothed = tuple(SmoothedReport(number, track(number).state, lag_s) for number in (1, 9) for lag_s in lags_s)
