@@ -20,8 +20,8 @@ from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.models.motion import MotionModel
 
-_TOO_OLD, _FAILED = UpdateResult(UpdateStatus.TOO_OLD), UpdateResult(UpdateStatus.FAILED)
-_STATUSES = UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE, UpdateStatus.BEYOND_WINDOW
+_TOO_OLD, _FAILED = (UpdateResult(UpdateStatus.TOO_OLD), UpdateResult(UpdateStatus.FAILED))
+_STATUSES = (UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE, UpdateStatus.BEYOND_WINDOW)
 
 
 class SmootherBank:
@@ -45,7 +45,7 @@ class SmootherBank:
     """
 
     make_solver: ClassVar[type[Solver]] = Solver
-    bank, exact, nonlinear, smooths, initiates = True, "any lag, any number", "at convergence", True, True
+    bank, exact, nonlinear, smooths, initiates = (True, "any lag, any number", "at convergence", True, True)
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class SmootherBank:
     ) -> None:
         self._motion = motion
         self._settings = settings = SmootherSettings.of_options(lag_s, options)
-        self._lag_ns, self._behind_ns = nanoseconds(settings.lag_s), nanoseconds(settings.behind_s)
+        self._lag_ns, self._behind_ns = (nanoseconds(settings.lag_s), nanoseconds(settings.behind_s))
         self._lagged = [(lag_s, nanoseconds(lag_s)) for lag_s in settings.lagged_s]
         self.solver = self.make_solver(motion, settings)
         self.failures = failures or Failures()
@@ -103,7 +103,7 @@ class SmootherBank:
             tracks, track_ids = self._all()
             is_known = self._windows(tracks)[2] <= stamp_ns
             if not is_known.all():
-                track_ids, tracks = tuple(compress(track_ids, is_known.tolist())), tracks[is_known]
+                track_ids, tracks = (tuple(compress(track_ids, is_known.tolist())), tracks[is_known])
             states = self.solver.states_at(tracks, np.full(len(tracks), stamp_ns))
             known = self._known[stamp_ns] = StatesAt(track_ids, *states)
         return known
@@ -112,16 +112,14 @@ class SmootherBank:
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
-        states, results = self.states_at(stamp_ns), [_TOO_OLD] * len(track_ids)
+        states = self.states_at(stamp_ns)
         row_of = dict(zip(states.track_ids, range(len(states.track_ids)), strict=True))
+        results = [_FAILED if track_id in row_of else _TOO_OLD for track_id in track_ids]
+        inside = [k for k, track_id in enumerate(track_ids) if track_id in row_of]
+        if len(inside) < len(results):
+            measurements = [measurements[k] for k in inside]
         for indices, stack in stacks(measurements):
-            inside = [k for k, index in enumerate(indices) if track_ids[index] in row_of]  # else too old
-            if not inside:
-                continue
-            alike = stack.seen_by(self._motion)
-            if len(inside) < len(indices):
-                alike = replace(alike, z=alike.z[inside], R=alike.R[inside])
-            group = [indices[k] for k in inside]
+            group, alike = [inside[k] for k in indices], stack.seen_by(self._motion)
             tracks = np.array([self._tracks[track_ids[index]] for index in group])
             of = np.array([row_of[track_ids[index]] for index in group])
             means = states.means[of]
@@ -132,13 +130,9 @@ class SmootherBank:
             innovations(states.covariances, of, y, H, R, measured, S, nis)
             usable = np.isfinite(nis).nonzero()[0]
             fused = self._fuse(usable, tracks, alike, y, H, means, R, times[3]) if usable.size else usable
-            newest_ns, start_ns, _, _ = times.tolist()
-            outcomes = list(zip(y, nis.tolist(), S, newest_ns, start_ns, strict=True))
-            for index in group:
-                results[index] = _FAILED
-            for k in fused.tolist():
-                *own, newest, start = outcomes[k]
-                results[group[k]] = UpdateResult(_STATUSES[(stamp_ns < newest) + (stamp_ns < start)], *own)
+            rows = list(zip(group, y, nis.tolist(), S, *times[:2].tolist(), strict=True))
+            for index, *own, newest_ns, start_ns in map(rows.__getitem__, fused.tolist()):
+                results[index] = UpdateResult(_STATUSES[(stamp_ns < newest_ns) + (stamp_ns < start_ns)], *own)
         return results
 
     def birth(self, track_id: int, prior: Start) -> None:
@@ -193,7 +187,7 @@ class SmootherBank:
         lag_s: float | None = None,
     ) -> list[SmoothedReport]:
         states = kinematic_states(self._motion, stamps_ns, means, covariances)
-        return list(map(SmoothedReport, track_ids, states, repeat(lag_s)))
+        return [*map(SmoothedReport, track_ids, states, repeat(lag_s))]
 
     def _fuse(self, rows: IntArray, tracks: IntArray, stack: Measurement, *given: Any) -> IntArray:
         """Fuse these of a stack of measurements, `given` what `Solver.fuse` takes; return the rows that were fused."""
@@ -232,7 +226,7 @@ class SmootherBank:
     def _all(self) -> tuple[IntArray, tuple[int, ...]]:
         """Return rows and ids of all tracks in order of birth."""
         if self._order is None:
-            self._order = np.array([*self._tracks.values()], dtype=np.int64), tuple(self._tracks)
+            self._order = (np.array([*self._tracks.values()], dtype=np.int64), tuple(self._tracks))
         return self._order
 
     def _windows(self, tracks: IntArray) -> IntArray:

@@ -25,7 +25,7 @@ NUM_ROWS, CHANGED, STALE = range(3)
 ORIGIN, REFERENCE = range(2)
 C, FILTERED, PREDICTED, P, F, Q = range(6)
 #: Types of arguments.
-INDICES, TIMES, VECTORS, MATRICES = "int64[::1]", "float64[::1]", "float64[:, ::1]", "float64[:, :, ::1]"
+INDICES, TIMES, VECTORS, MATRICES = ("int64[::1]", "float64[::1]", "float64[:, ::1]", "float64[:, :, ::1]")
 NODES = f"Tuple(({'int64[:, ::1], ' * 4}{MATRICES}, {MATRICES}, {MATRICES}))"
 Arrays = tuple[IntArray, IntArray, IntArray, IntArray, FloatArray, FloatArray, FloatArray]
 """See `Nodes.arrays`."""
@@ -58,7 +58,7 @@ def _complement(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
 def _predict(values: FloatArray, before: int, at: int, moved: FloatArray) -> None:
     """Write the prediction [F P F' + Q | F x + f - x0], and F P to `moved`."""
     n = len(moved)
-    left, motion, noise = block(values, before, FILTERED), block(values, before, F), block(values, before, Q)
+    left, motion, noise = (block(values, before, FILTERED), block(values, before, F), block(values, before, Q))
     ahead = block(values, at, PREDICTED)
     copy(noise, ahead)
     add_congruence(motion, left, moved, ahead)
@@ -74,7 +74,7 @@ def _condition(
 ) -> bool:
     """A = P F' (F P F' + Q)^-1, b, C = E P E' + A Q A', E = I - A F; `gain` holds F P. False if there is no A."""
     n = len(gain)
-    left, motion, ahead = block(values, before, FILTERED), block(values, before, F), block(values, at, PREDICTED)
+    left, motion, ahead = (block(values, before, FILTERED), block(values, before, F), block(values, at, PREDICTED))
     rest = block(values, before, C)
     copy(ahead, E)
     if not solve(E, gain):
@@ -119,33 +119,6 @@ def _correct(
         add_congruence(E, P, work, state)
 
 
-@njit(f"b1({INDICES}, {INDICES}, {INDICES}, {NODES})")
-def eliminate(tracks: IntArray, starts: IntArray, ends: IntArray, nodes: Arrays) -> bool:
-    """Eliminate the nodes of `tracks` from `starts` up to before `ends`; True if all is finite."""
-    info, _, numbers, labels, backs, values, rows = nodes
-    n = values.shape[2] - 1
-    A, E, D, work, gain = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty(n)
-    for t in range(len(tracks)):
-        track = tracks[t]
-        for index in range(starts[t], min(ends[t], info[track, COUNT])):
-            at = numbers[track, index]
-            if (
-                index > info[track, FIRST]
-            ):  # else the prior of the oldest node in the window, which follows from nothing
-                before = numbers[track, index - 1]
-                _predict(values, before, at, A)
-                if not _condition(values, backs[before], before, at, A, E, work):
-                    return False
-            state = block(values, at, FILTERED)
-            copy(block(values, at, PREDICTED), state)
-            for k in range(labels[at, NUM_ROWS]):
-                _correct(state, rows[at], k, gain, E, D, work)
-            for i in range(n):
-                if not np.isfinite(state[i, i] + state[i, n]):
-                    return False
-    return True
-
-
 @inlined
 def _given(back: FloatArray, later: FloatArray, out: FloatArray) -> None:
     """Write the mean A x + b of a node given the next one, x being in the last row of `later`."""
@@ -157,26 +130,37 @@ def _given(back: FloatArray, later: FloatArray, out: FloatArray) -> None:
         out[i] = value
 
 
-@njit(f"b1({INDICES}, {INDICES}, {INDICES}, {NODES})")
-def solve_windows(tracks: IntArray, starts: IntArray, anchors: IntArray, nodes: Arrays) -> bool:
+@njit(f"b1({INDICES}, {INDICES}, {INDICES}, b1, {NODES})")
+def solve_windows(tracks: IntArray, starts: IntArray, anchors: IntArray, is_partial: bool, nodes: Arrays) -> bool:
     """Eliminate from `starts` on, let the windows begin at `anchors`, and write steps: A (step of the next node) + b.
-    True if all is finite.
+    If `is_partial`, only eliminate up to the nodes at `anchors`. True if all is finite.
     """
-    info, _, numbers, _, backs, values, _ = nodes
+    info, _, numbers, labels, backs, values, rows = nodes
     n = values.shape[2] - 1
-    ends = np.empty(len(tracks), dtype=np.int64)
+    A, E, D, work, gain = (np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty(n))
     for t in range(len(tracks)):
-        ends[t] = NEVER
-    if not eliminate(tracks, starts, ends, nodes):
-        return False
-    for t in range(len(tracks)):
-        track, last = tracks[t], info[tracks[t], COUNT] - 1
-        info[track, FIRST], info[track, KNOWN] = anchors[t], last + 1
-        newest = numbers[track, last]
+        of, track, count = numbers[tracks[t]], tracks[t], info[tracks[t], COUNT]
+        for index in range(starts[t], anchors[t] + 1 if is_partial else count):
+            at, before, state = (of[index], of[index - 1], block(values, of[index], FILTERED))
+            if (
+                index > info[track, FIRST]
+            ):  # else the prior of the oldest node in the window, which follows from nothing
+                _predict(values, before, at, A)
+                if not _condition(values, backs[before], before, at, A, E, work):
+                    return False
+            copy(block(values, at, PREDICTED), state)
+            for k in range(labels[at, NUM_ROWS]):
+                _correct(state, rows[at], k, gain, E, D, work)
+            for i in range(n):
+                if not np.isfinite(state[i, i] + state[i, n]):
+                    return False
+        if is_partial:
+            continue
+        info[track, FIRST], info[track, KNOWN] = anchors[t], count
         for i in range(n):
-            backs[newest, n, i] = block(values, newest, FILTERED)[i, n]
-        for index in range(last - 1, anchors[t] - 1, -1):
-            _given(backs[numbers[track, index]], backs[numbers[track, index + 1]], backs[numbers[track, index], n])
+            backs[of[count - 1], n, i] = block(values, of[count - 1], FILTERED)[i, n]
+        for index in range(count - 2, anchors[t] - 1, -1):
+            _given(backs[of[index]], backs[of[index + 1]], backs[of[index], n])
     return True
 
 
@@ -259,7 +243,7 @@ def _interpolate(
     See `rts.between` for Psi, Lambda and Sigma, which is E Q1 E' + Psi Q2 Psi'.
     """
     n = len(mean)
-    S, gain, Psi, E, Lambda, by_right, half = work[0], work[1], work[2], work[3], work[4], work[5], work[6]
+    S, gain, Psi, E, Lambda, by_right, half = (work[0], work[1], work[2], work[3], work[4], work[5], work[6])
     for attempt in range(2):
         copy(Q2, S)
         add_congruence(F2, Q1, gain, S)

@@ -70,9 +70,9 @@ def windows(tracks: IntArray, clock_ns: int, lag_ns: int, behind_ns: int, nodes:
     most = 0
     for t in range(len(tracks)):
         track = tracks[t]
-        newest_ns, begin_ns = all_ns[track, info[track, COUNT] - 1], info[track, BEGIN_NS]
+        newest_ns, begin_ns = (all_ns[track, info[track, COUNT] - 1], info[track, BEGIN_NS])
         start_ns = max(max(newest_ns, clock_ns) - lag_ns, begin_ns)
-        out[0, t], out[1, t], out[2, t] = newest_ns, start_ns, max(start_ns - behind_ns, begin_ns)
+        out[0, t], out[1, t], out[2, t] = (newest_ns, start_ns, max(start_ns - behind_ns, begin_ns))
         _forget(track, out[2, t], nodes)
         out[3, t] = max(info[track, FIRST], last_before(all_ns[track], info[track, COUNT], start_ns))
         most = max(most, info[track, COUNT])
@@ -134,9 +134,7 @@ def move_far(
     limits, num = thresholds[info[track, NONLINEAR]], 0
     for index in range(info[track, FIRST], info[track, COUNT]):
         steps, too_long = backs[numbers[track, index], len(limits)], False
-        share = LEAVING_SHARE if index < anchor else 1.0
-        if num or index >= start:
-            share = SOLVED_SHARE
+        share = SOLVED_SHARE if num or index >= start else LEAVING_SHARE if index < anchor else 1.0
         for i in range(len(limits)):
             if abs(steps[i]) > share * limits[i]:
                 too_long = True
@@ -155,7 +153,7 @@ def _insert(track: int, index: int, stamp_ns: int, mean: FloatArray, nodes: Arra
     count = info[track, COUNT]
     at = numbers[track, count]
     for k in range(count, index, -1):
-        all_ns[track, k], numbers[track, k] = all_ns[track, k - 1], numbers[track, k - 1]
+        all_ns[track, k], numbers[track, k] = (all_ns[track, k - 1], numbers[track, k - 1])
     all_ns[track, index], numbers[track, index] = stamp_ns, at
     info[track, COUNT] = count + 1
     labels[at, NUM_ROWS], labels[numbers[track, index - 1], STALE] = 0, 1
@@ -186,8 +184,7 @@ def _observe(
         for j in range(n):
             own[i, j] = H[i, j]
             own[i, n] += H[i, j] * (mean[j] - values[at, ORIGIN, j])
-    labels[at, NUM_ROWS] += k
-    labels[at, CHANGED] = 1
+    labels[at, NUM_ROWS], labels[at, CHANGED] = labels[at, NUM_ROWS] + k, 1
     if not cholesky(R, k, L):
         return False
     _whiten(L, own)
@@ -236,8 +233,8 @@ def place(
         flags |= (BEHIND if is_behind else 0) | (0 if is_plain else NOT_PLAIN)
         labels[at, STALE] = 1
         start = far[0] + (is_new and far[0] >= index) if num else index
-        out[0, t], out[1, t], out[2, t], out[3, t] = at, index, is_new, min(index, start)
-        out[4, t], out[5, t], out[6, t] = anchors[t] + (is_behind and is_new), is_behind, info[track, FIRST]
+        out[0, t], out[1, t], out[2, t], out[3, t] = (at, index, is_new, min(index, start))
+        out[4, t], out[5, t], out[6, t] = (anchors[t] + (is_behind and is_new), is_behind, info[track, FIRST])
     return flags
 
 
@@ -275,8 +272,8 @@ def changed_factors(track: int, start: int, nodes: Arrays, owners: IntArray, fac
     L, noise, moved = np.empty((n, n)), np.empty((n, n)), np.empty(n)
     last = info[track, COUNT] - 1
     for index in range(start, last + 1):
-        left, right = numbers[track, index], -1 if index == last else numbers[track, index + 1]
-        used, size = labels[left, NUM_ROWS], labels[left, NUM_ROWS] + (0 if index == last else n)
+        left, right = (numbers[track, index], -1 if index == last else numbers[track, index + 1])
+        used, size = (labels[left, NUM_ROWS], labels[left, NUM_ROWS] + (0 if index == last else n))
         if not labels[left, CHANGED] or not size:
             continue
         labels[left, CHANGED] = 0
@@ -303,16 +300,3 @@ def changed_factors(track: int, start: int, nodes: Arrays, owners: IntArray, fac
             _whiten(L, own)
         num += 1
     return num
-
-
-@njit(f"b1({INDICES}, {TIMES}, {NODES})")
-def write_steps(numbers: IntArray, delta: FloatArray, nodes: Arrays) -> bool:
-    """Write the steps of nodes whose states are their reference + `delta`, one by one; True if all are finite."""
-    _, _, _, _, backs, values, _ = nodes
-    n, total = values.shape[2] - 1, 0.0
-    for k in range(len(numbers)):
-        at = numbers[k]
-        for i in range(n):
-            backs[at, n, i] = values[at, REFERENCE, i] - values[at, ORIGIN, i] + delta[k * n + i]
-            total += abs(delta[k * n + i])
-    return bool(np.isfinite(total))

@@ -33,27 +33,19 @@ from fgtrack.models.transitions import transitions
 _FEW_TRACKS, _FEW_NODES, _FEW_COMPONENTS = 4, 16, 4
 
 
-def _numbered(first: int, tracks: int, nodes: int) -> IntArray:
-    """Return numbers from `first` on, shape (tracks, nodes); the nodes of a track are neighbours in memory."""
-    return first + np.arange(tracks * nodes).reshape(tracks, nodes)
-
-
-def _is_shipped(motion: MotionModel) -> bool:
-    return type(motion).transition is WhiteNoise.transition
-
-
 class Nodes:
     """Arrays of tracks (tracks, ...), with the order of the nodes, and of numbers (size, ...), with their values."""
 
     def __init__(self, motion: MotionModel) -> None:
         self._motion, n, size = motion, motion.dim, _FEW_TRACKS * _FEW_NODES
-        self._compiled = motion if isinstance(motion, WhiteNoise) and _is_shipped(motion) else None
+        is_own = type(motion).transition is not WhiteNoise.transition
+        self._compiled = None if is_own or not isinstance(motion, WhiteNoise) else motion
         self.tracks: IntArray = np.zeros((_FEW_TRACKS, 5), dtype=np.int64)
         """Number of nodes; index of the oldest one of the window; index from which on `P` is known; stamp of the first
         state; 1 if there was a measurement that is not linear."""
         self.stamps_ns: IntArray = np.full((_FEW_TRACKS, _FEW_NODES), NEVER)
         """Shape (tracks, nodes); `NEVER` where there is no node."""
-        self.numbers = _numbered(0, _FEW_TRACKS, _FEW_NODES)
+        self.numbers = np.arange(size).reshape(_FEW_TRACKS, _FEW_NODES)
         """Shape (tracks, nodes); those beyond the number of nodes are free."""
         self.labels: IntArray = np.zeros((size, 3), dtype=np.int64)
         """Number of `rows` in use; 1 if something was linearised since a factor graph read it; 1 if the motion to the
@@ -71,13 +63,13 @@ class Nodes:
     def _share(self) -> None:
         """Name the parts of the arrays."""
         n = self._motion.dim
-        self.arrays = self.tracks, self.stamps_ns, self.numbers, self.labels, self.backs, self.values, self.rows
+        self.arrays = (self.tracks, self.stamps_ns, self.numbers, self.labels, self.backs, self.values, self.rows)
         """Arguments of all loops."""
-        self.count, self.first, self.step = self.tracks[:, COUNT], self.tracks[:, FIRST], self.backs[:, n, :n]
-        self.origin, self.reference = self.values[:, ORIGIN, :n], self.values[:, REFERENCE, :n]
+        self.count, self.first, self.step = (self.tracks[:, COUNT], self.tracks[:, FIRST], self.backs[:, n, :n])
+        self.origin, self.reference = (self.values[:, ORIGIN, :n], self.values[:, REFERENCE, :n])
         """x0; the first x0, which the variables of a factor graph are relative to."""
         blocks = [self.values[:, 2 + n * k : 2 + n * (k + 1)] for k in range(6)]
-        self.filtered, self.predicted, self.ahead = blocks[FILTERED], blocks[PREDICTED], blocks[F][..., n]
+        self.filtered, self.predicted, self.ahead = (blocks[FILTERED], blocks[PREDICTED], blocks[F][..., n])
         """Covariances and means relative to x0 after and before the node's own measurements; f(x0), f being the motion
         to the next node."""
         self.C, self.P, self.F, self.Q = (blocks[k][..., :n] for k in (C, P, F, Q))
@@ -172,10 +164,9 @@ class Nodes:
 
     def _grow(self, axis: int) -> None:
         """Double the tracks, or the nodes of each; a node keeps its number and, if it is of a track, its values."""
-        shape, first = self.numbers.shape, self.numbers.size
-        used = self.numbers[np.arange(shape[1]) < self.count[:, None]]
-        self.stamps_ns = np.concatenate([self.stamps_ns, np.full(shape, NEVER)], axis=axis)
-        self.numbers = np.concatenate([self.numbers, _numbered(first, *shape)], axis=axis)
+        used = self.numbers[np.arange(self.numbers.shape[1]) < self.count[:, None]]
+        self.stamps_ns = np.concatenate([self.stamps_ns, np.full_like(self.stamps_ns, NEVER)], axis=axis)
+        self.numbers = np.concatenate([self.numbers, self.numbers.size + self.numbers], axis=axis)
         for name in ("labels", "backs", "values", "rows"):
             values = getattr(self, name)
             larger = np.zeros((self.numbers.size, *values.shape[1:]), values.dtype)  # only pages of used ones are made

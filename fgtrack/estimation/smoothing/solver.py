@@ -25,10 +25,6 @@ Leaving = tuple[IntArray, list[int], FloatArray, FloatArray]
 """Tracks, stamps, means (m, n) and covariances (m, n, n) of nodes that leave, oldest first for each track."""
 
 
-def _indices(*shape: int) -> IntArray:
-    return np.empty(shape, dtype=np.int64)
-
-
 class Solver:
     """Windows of many tracks, each by its number; solved in covariance form by compiled loops.
 
@@ -64,7 +60,11 @@ class Solver:
         """Solve windows that have changed from `starts` on and begin at `anchors` from now on.
         Raises `numpy.linalg.LinAlgError` if it fails.
         """
-        if not kernels.solve_windows(tracks, starts, anchors, self.nodes.arrays):
+        self._solve(tracks, starts, anchors, is_partial=False)
+
+    def _solve(self, tracks: IntArray, starts: IntArray, anchors: IntArray, is_partial: bool) -> None:
+        """Solve windows, see `kernels.solve_windows`."""
+        if not kernels.solve_windows(tracks, starts, anchors, is_partial, self.nodes.arrays):
             raise np.linalg.LinAlgError("a state is not finite")
 
     def smoothed(self, tracks: IntArray, indices: IntArray, after_s: FloatArray) -> FloatArray:
@@ -75,20 +75,13 @@ class Solver:
         kernels.smooth(tracks, indices, after_s, self.nodes.arrays, means)
         return means
 
-    def eliminate(self, tracks: IntArray, starts: IntArray, ends: IntArray) -> None:
-        """Eliminate the nodes of `tracks` from `starts` up to before `ends`.
-        Raises `numpy.linalg.LinAlgError` if it fails.
-        """
-        if not kernels.eliminate(tracks, starts, ends, self.nodes.arrays):
-            raise np.linalg.LinAlgError("a state is not finite")
-
     # --- states
 
     def states_at(self, tracks: IntArray, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return means (m, n) and covariances (m, n, n) of `tracks` at `stamps_ns`, not older than the oldest node.
         They are interpolated, or predicted ahead.
         """
-        nodes, indices = self.nodes, _indices(len(tracks))
+        nodes, indices = self.nodes, np.empty(len(tracks), dtype=np.int64)
         until_s, after_s = np.empty((2, len(tracks)))
         num_between = kernels.locate(tracks, stamps_ns, nodes.arrays, indices, until_s, after_s)
         mean, F, Q = nodes.transition(self.smoothed(tracks, indices, after_s), until_s)
@@ -110,7 +103,7 @@ class Solver:
             return None
         rows, columns = np.nonzero(np.arange(int(num.max())) < num[:, None])
         stamps_ns = nodes.stamps_ns[tracks[rows], nodes.first[tracks[rows]] + columns]
-        return tracks[rows], stamps_ns.tolist(), *self.states_at(tracks[rows], stamps_ns)
+        return (tracks[rows], stamps_ns.tolist(), *self.states_at(tracks[rows], stamps_ns))
 
     # --- updates
 
@@ -133,9 +126,9 @@ class Solver:
         """
         nodes, stamp_ns = self.nodes, stack.stamp_ns
         guesses = self._marked_nonlinear(tracks, stamp_ns, guesses) if stack.is_nonlinear else guesses
-        ahead_s, out = np.empty(len(tracks)), _indices(7, len(tracks))
+        ahead_s, out = np.empty(len(tracks)), np.empty((7, len(tracks)), dtype=np.int64)
         leaving = self._leaving(tracks, anchors) if self._has_final else None
-        given = tracks, stamp_ns, y, H, R, guesses, not stack.is_nonlinear, self._thresholds, anchors
+        given = (tracks, stamp_ns, y, H, R, guesses, not stack.is_nonlinear, self._thresholds, anchors)
         flags = node_kernels.place(*given, nodes.arrays, out, ahead_s)
         numbers, _, is_new, starts, anchors, is_behind, _ = out
         nodes.note(Measurements(stack), numbers, is_new, ahead_s)
@@ -149,23 +142,18 @@ class Solver:
                 starts[rows] = anchors[rows]
             self.solve(tracks, starts, anchors)
         except np.linalg.LinAlgError:
-            self._restore(tracks, out)
+            nodes.first[tracks] = out[6]
+            for track, index, new in zip(tracks.tolist(), out[1].tolist(), is_new.tolist(), strict=True):
+                nodes.withdraw(track, index, bool(new))
+                self.relinearise(track, start=index - new)
             raise
         return leaving
-
-    def _restore(self, tracks: IntArray, placed: IntArray) -> None:
-        """Take what was `placed` out of the windows."""
-        _, indices, is_new, _, _, _, firsts = placed
-        self.nodes.first[tracks] = firsts
-        for track, index, new in zip(tracks.tolist(), indices.tolist(), is_new.tolist(), strict=True):
-            self.nodes.withdraw(track, index, bool(new))
-            self.relinearise(track, start=index - new)
 
     def _refilter(self, tracks: IntArray, starts: IntArray, anchors: IntArray) -> None:
         """Filter from `starts`, which lie behind the windows, up to `anchors`, where these begin: with other priors."""
         starts = np.minimum(starts, self.nodes.first[tracks])
         self.nodes.first[tracks] = 0
-        self.eliminate(tracks, starts, anchors + 1)
+        self._solve(tracks, starts, anchors, is_partial=True)
         self.nodes.first[tracks] = anchors
         for track in tracks.tolist():
             self.forget(track)
@@ -187,7 +175,7 @@ class Solver:
 
     def _move_far(self, track: int, moves: bool) -> IntArray:
         """Move the linearisation points of nodes of a window that are far from them, if it `moves`; return indices."""
-        nodes, indices = self.nodes, _indices(self.nodes.stamps_ns.shape[1])
+        nodes, indices = (self.nodes, np.empty(self.nodes.stamps_ns.shape[1], dtype=np.int64))
         num = node_kernels.move_far(track, 0, NEVER, self._thresholds, nodes.arrays, moves, indices)
         return indices[:num]
 
@@ -230,7 +218,10 @@ class Solver:
             longest = float(np.abs(steps).max())
             if longest < STEP_TOLERANCE:
                 return
-            share, most = 1.0 if longest < 0.5 * last else 0.5, self._cost(track, means) * (1.0 + _ROUNDING) + _ROUNDING
+            share, most = (
+                1.0 if longest < 0.5 * last else 0.5,
+                self._cost(track, means) * (1.0 + _ROUNDING) + _ROUNDING,
+            )
             while share > _LEAST_SHARE and self._cost(track, means + share * steps) > most:
                 share *= 0.5
             means, last = means + share * steps, longest
@@ -270,7 +261,7 @@ class Solver:
     def fixes(self, track: int) -> list[Fix]:
         """Positions measured at the nodes, after that of the prior, of a window that nothing has left yet."""
         nodes, numbers = self.nodes, self.nodes.window(track)
-        prior, begin_ns = nodes.predicted[numbers[0]], int(nodes.tracks[track, BEGIN_NS])
+        prior, begin_ns = (nodes.predicted[numbers[0]], int(nodes.tracks[track, BEGIN_NS]))
         terms = (term for number in numbers.tolist() for term, _ in nodes.terms(number))
         later = ((seconds(term.stamp_ns - begin_ns), term) for term in terms)
         return fixes_of(nodes.origin[numbers[0]] + prior[:, -1], prior[:, :-1].copy(), later)

@@ -44,7 +44,7 @@ class BatchSolver(IncrementalSolver):
     def _update(self, tracks: IntArray, starts: IntArray) -> None:
         nodes, n = self.nodes, self.motion.dim
         for track in tracks.tolist():
-            graph, values, numbers = gtsam.NonlinearFactorGraph(), gtsam.Values(), nodes.window(track).tolist()
+            graph, values, numbers = (gtsam.NonlinearFactorGraph(), gtsam.Values(), nodes.window(track).tolist())
             _, last = self._graphs.get(track, (None, values))
             prior = nodes.predicted[numbers[0]]
             noise = gtsam.noiseModel.Gaussian.Covariance(prior[:, :n])

@@ -1,7 +1,6 @@
 """The default solver: gtsam's iSAM2."""
 
 from collections.abc import Sequence
-from functools import cache
 from typing import Any
 
 import gtsam
@@ -18,6 +17,8 @@ from fgtrack.models.motion import MotionModel
 
 _Changed = dict[int, gtsam.JacobianFactor]
 """Factors by node."""
+_PRIOR = -1
+"""Instead of a node: the prior of the oldest one that the graph began with."""
 
 
 class _Graph:
@@ -27,7 +28,7 @@ class _Graph:
     measurement leaves alone what is older, and nodes that have left the window are leaves of the Bayes tree.
     """
 
-    def __init__(self, prior: gtsam.JacobianFactor) -> None:
+    def __init__(self) -> None:
         params = gtsam.ISAM2Params()
         params.setFactorization("QR")
         params.findUnusedFactorSlots = True
@@ -36,7 +37,6 @@ class _Graph:
         gauss_newton.setWildfireThreshold(0.0)
         params.setOptimizationParams(gauss_newton)
         self.isam = gtsam.ISAM2(params)
-        self._prior: gtsam.JacobianFactor | None = prior
         self.slots: dict[int, int | None] = {}
         """Slot of the factor of each node, of its measurements and its motion to the next one, if it has any."""
         self._newest = -1
@@ -51,9 +51,6 @@ class _Graph:
         factors, order = gtsam.GaussianFactorGraph(), gtsam.KeyGroupMap()
         for factor in changed.values():
             factors.push_back(factor)
-        if self._prior is not None:
-            factors.push_back(self._prior)
-            self._prior = None
         if first and numbers[first] == self._newest:  # in one clique with the node before it
             first -= 1
         for group, number in enumerate(numbers[first:]):
@@ -98,7 +95,7 @@ class IncrementalSolver(Solver):
             P = self._covariance(track, left, *right)
             for number in right:
                 A = psd_solve(P[n:, n:], P[n:, :n]).T  # the state on the left, given this one
-                nodes.backs[left, :n, :n], nodes.backs[left, :n, n] = A, nodes.step[left] - A.dot(nodes.step[number])
+                nodes.backs[left, :n, :n], nodes.backs[left, :n, n] = (A, nodes.step[left] - A.dot(nodes.step[number]))
                 nodes.C[left] = symmetrise(P[:n, :n] - A.dot(P[n:, :n]))
             nodes.P[right[0] if right else left] = P[-n:, -n:]
         return super().smoothed(tracks, indices, after_s)
@@ -109,7 +106,7 @@ class IncrementalSolver(Solver):
         first = nodes.first[tracks]
         is_leaving = first < anchors
         if is_leaving.any():
-            self.eliminate(tracks[is_leaving], first[is_leaving], anchors[is_leaving] + 1)
+            self._solve(tracks[is_leaving], first[is_leaving], anchors[is_leaving], is_partial=True)
         nodes.first[tracks] = anchors
         try:
             self._update(tracks, first)
@@ -132,13 +129,13 @@ class IncrementalSolver(Solver):
         nodes, zero = self.nodes, np.zeros(self.motion.dim)
         leaving = (nodes.first[tracks] - starts).tolist()
         for track, start, num_leaving in zip(tracks.tolist(), starts.tolist(), leaving, strict=True):
-            window, values = nodes.numbers[track, start : nodes.count[track]].copy(), gtsam.Values()
-            graph = self._graphs.get(track)
-            if graph is None:  # of the prior of the oldest node only
-                prior = nodes.predicted[window[0]]
-                W = inverse_root(prior[:, :-1])
-                factor = gtsam.JacobianFactor(int(window[0]), W, W @ prior[:, -1], _unit(len(W)))
-                graph = self._graphs[track] = _Graph(factor)
+            window, values = (nodes.numbers[track, start : nodes.count[track]].copy(), gtsam.Values())
+            graph, prior = self._graphs.get(track), _Changed()
+            if graph is None:
+                graph, oldest = _Graph(), nodes.predicted[window[0]]
+                self._graphs[track], W = graph, inverse_root(oldest[:, :-1])
+                unit = gtsam.noiseModel.Unit.Create(len(W))
+                prior[_PRIOR] = gtsam.JacobianFactor(int(window[0]), W, W @ oldest[:, -1], unit)
                 nodes.labels[window, CHANGED] = 1
             numbers = window.tolist()
             for number in numbers:
@@ -148,9 +145,11 @@ class IncrementalSolver(Solver):
                     nodes.reference[number] = nodes.origin[number]
             changed = self._changed_factors(track, start)
             first = min(map(numbers.index, changed), default=0)
-            delta = graph.solve(numbers, num_leaving, values, first, changed)
-            if not node_kernels.write_steps(window[num_leaving:], delta, nodes.arrays):
+            delta = graph.solve(numbers, num_leaving, values, first, changed | prior)
+            if not np.isfinite(delta).all():
                 raise ValueError("a state is not finite")
+            window = window[num_leaving:]
+            nodes.step[window] = nodes.reference[window] - nodes.origin[window] + delta.reshape(len(window), -1)
 
     def _changed_factors(self, track: int, start: int) -> _Changed:
         """Return the factors of a track, from index `start` on, that have changed."""
@@ -163,17 +162,12 @@ class IncrementalSolver(Solver):
             raise ValueError("process noise is not positive definite")
         changed: _Changed = {}
         for (number, right, size), each in zip(owners[:num].tolist(), factors, strict=False):
-            A, b, unit = each[:size, :n], each[:size, -1], _unit(size)
+            A, b, unit = (each[:size, :n], each[:size, -1], gtsam.noiseModel.Unit.Create(size))
             if right < 0:
                 changed[number] = gtsam.JacobianFactor(number, A, b, unit)
             else:
                 changed[number] = gtsam.JacobianFactor(number, A, right, each[:size, n:-1], b, unit)
         return changed
-
-
-@cache
-def _unit(size: int) -> gtsam.noiseModel.Unit:
-    return gtsam.noiseModel.Unit.Create(size)
 
 
 class IncrementalBank(SmootherBank):
