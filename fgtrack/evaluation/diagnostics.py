@@ -50,8 +50,20 @@ _NAME_EGO = "name its topic in the configuration (`fgtrack info` lists the topic
 
 def diagnostics(run: Run) -> list[Diagnostic]:
     """Defects of `run`, as far as its files show them."""
-    kinds = (_angles, _ego, _map, _sensors, _failures, _fragmentation)
+    kinds = (_angles, _ego, _map, _sensors, _failures, _fragmentation, _identities)
     return [diagnostic for kind in kinds for diagnostic in kind(run)]
+
+
+def _identities(run: Run) -> Iterator[Diagnostic]:
+    """Identities that are not of one object."""
+    counts = run.meta.get("id_conflicts") or {}
+    texts = {
+        "reused": "began with the identity of another track: two objects use it, or its stamps or noise are wrong",
+        "changed": "detections of another identity than their track: lower the sensor's wrong_id_probability",
+    }
+    for name, text in texts.items():
+        if counts.get(name):
+            yield Diagnostic("identities", f"{counts[name]} {'tracks ' if name == 'reused' else ''}{text}")
 
 
 def noise_diagnostics(run: Run) -> Iterator[Diagnostic]:

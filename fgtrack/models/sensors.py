@@ -114,6 +114,16 @@ class SensorModel:
     clock_offset_s: Annotated[float, Field(ge=-60.0, le=60.0)] = 0.0
     """Advance of its stamps over the time at which it sensed; subtracted before anything else is done. With
     `stamp_from: receipt` its latency. `fgtrack advise` and `fgtrack offsets` find it."""
+    stamp_std_s: NonNegativeFloat = 0.0
+    """Standard deviation of its stamps: adds the velocity times it to the noise of every detection, along the motion of
+    the track that it is compared with."""
+    wrong_id_probability: OpenProbability = 1e-4
+    """Probability that the identity of a detection, or of its track, is wrong. Where both have one, the NIS of the pair
+    is lower by 2 log((1 - p) / p) if they are equal, and higher by it if they are not."""
+    copies_s: PositiveFloat | None = None
+    """A detection of the same identity and position as one received at most this long before is a copy of its message,
+    heard by another receiver: `duplicate`. A copy with an earlier stamp, received before the first was processed, gives
+    it its stamp. Null: objects that stand report the same position again and again."""
     message_covariance: bool = True
     """Use a detection's own covariance where the message carries one."""
     max_range_m: PositiveFloat | None = None

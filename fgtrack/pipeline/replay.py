@@ -167,6 +167,7 @@ def _drive(
         "detections_ignored": feed.ignored_detections,
         "ego_refused": dict(tracker.refused_ego),
         "ego_jumps": tracker.ego_jumps,
+        "id_conflicts": dict(tracker.id_conflicts),
         **tracker.failures.as_meta(),
         "broken_off": feed.broken,
     }

@@ -14,7 +14,7 @@ from fgtrack.core.linalg import kernels, symmetrise
 from fgtrack.core.settings import OpenProbability, settings
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import StatesAt
-from fgtrack.tracking.objects import Apart
+from fgtrack.tracking.objects import Apart, Evidence
 from fgtrack.tracking.preprocess import Candidates, Group
 
 _OUTSIDE = 1e9  # cost outside the gate: any number of pairs inside is cheaper
@@ -114,10 +114,13 @@ class GatedMahalanobis:
 
     def __call__(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Assignment:
         """See `Association`; the cost adds log det S, so that a vague track does not win by being vague."""
-        reach_m = reaches_m(candidates.groups, states, self.gate_probability, self.max_distance_m)
-        pairs = near(candidates, states.means, reach_m, apart)
+        weight = apart.weight if isinstance(apart, Evidence) else 0.0
+        reach_m = reaches_m(candidates.groups, states, self.gate_probability, self.max_distance_m, weight)
+        pairs = near(candidates, states.means, reach_m, apart.differ if isinstance(apart, Evidence) else apart)
+        more = apart.nis(pairs.rows, pairs.columns) if isinstance(apart, Evidence) else None
         cost, inside = np.empty(len(pairs.rows)), np.empty(len(pairs.rows), dtype=bool)
         for chosen, nis, logdet, k in innovations(pairs, candidates, states) if len(cost) else ():
+            nis = nis if more is None else nis + more[chosen]
             cost[chosen] = nis + logdet
             inside[chosen] = nis <= chi_square_quantile(self.gate_probability, k)
         result = assigned(pairs._replace(values=cost).at(inside), len(candidates), len(states.means))
@@ -194,7 +197,7 @@ def innovations(
     for group, members, chosen in candidates.split(pairs.rows):
         columns = pairs.columns[chosen]
         x = states.means[columns]
-        own = group.seen_at(members, x)
+        own = group.seen_at(members, x, P, columns)
         y, H = own.model.linearised(own.z, x, own.pose)
         H = np.array(H, ndmin=3, order="C")
         nis, logdet = kernels("fgtrack.tracking.kernels").innovations(y, H, P, columns, own.R)
@@ -202,8 +205,11 @@ def innovations(
     return parts
 
 
-def reaches_m(groups: Sequence[Group], states: StatesAt, probability: float, limit_m: float) -> FloatArray:
-    """Largest distance from each track of a candidate with a NIS up to the quantile of `probability`, shape (tracks,).
+def reaches_m(
+    groups: Sequence[Group], states: StatesAt, probability: float, limit_m: float, more_nis: float = 0.0
+) -> FloatArray:
+    """Largest distance from each track of a candidate with a NIS up to the quantile of `probability` and `more_nis`.
+    Shape (tracks,).
     The NIS is at least that of the position alone, which is at least the squared distance over the largest variance of
     S = P + R in any direction. At most `limit_m`, and just that where it is not the position that is measured.
     """
@@ -215,8 +221,11 @@ def reaches_m(groups: Sequence[Group], states: StatesAt, probability: float, lim
             return np.full(len(states.means), limit_m)
         own_m2, quantile = (
             _largest_variances(group.stack.R).max(),
-            chi_square_quantile(probability, len(model.components)),
+            chi_square_quantile(probability, len(model.components)) + more_nis,
         )
+        if group.stamp_error is not None:
+            late = group.stamp_error.noise(model, pose, states.means, states.covariances)
+            own_m2 = own_m2 + late[:, :2, :2].trace(axis1=1, axis2=2)
         squared_m2 = np.maximum(squared_m2, quantile * (_largest_variances(states.covariances) + own_m2))
     return np.minimum(np.sqrt(squared_m2) * _MARGIN, limit_m)
 

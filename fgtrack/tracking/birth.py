@@ -63,6 +63,8 @@ class Birth:
             R = whole_error(measurement.model, measurement.R)
             stds = dict(zip(values, np.sqrt(np.diag(R)).tolist(), strict=True))
             position = np.zeros((2, 2)) if candidate.position_covariance is None else candidate.position_covariance
+            speed_variance = speed_mps**2 + stds.get("speed_mps", self.speed_std_mps) ** 2
+            position = position + candidate.stamp_std_s**2 * speed_variance * np.eye(2)  # in an unknown direction
             cross = position_cross(measurement.model, measurement.z, measurement.pose)
         else:
             stds, cross, turn = {}, {}, rotation(yaw_rad or 0.0)

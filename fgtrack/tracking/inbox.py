@@ -2,7 +2,7 @@
 
 import marshal
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import compress
 from operator import attrgetter
 
@@ -64,8 +64,10 @@ def records(message: DetectionList, disposition: Disposition) -> list[UpdateReco
     return [record(message, index, disposition) for index in range(len(message.objects))]
 
 
-def is_usable(detection: Detection, sensor: SensorModel) -> bool:
-    """True if `detection` has valid values and a position or bearing, and is not an empty slot (x = y = 0)."""
+def is_usable(detection: Detection, sensor: SensorModel, at_origin: bool = False) -> bool:
+    """True if `detection` has valid values and a position or bearing, and is not an empty slot (x = y = 0).
+    With `at_origin` there are no empty slots: the first position of many recordings is the origin of the map.
+    """
     for name in sensor.std:
         value = getattr(detection, name)
         if value is not None and not -LARGEST <= value <= LARGEST:
@@ -73,7 +75,7 @@ def is_usable(detection: Detection, sensor: SensorModel) -> bool:
     if detection.covariance is not None and not is_valid_covariance(detection, sensor):
         return False
     x_m, y_m = detection.x_m, detection.y_m
-    if x_m == 0.0 and y_m == 0.0:
+    if x_m == 0.0 and y_m == 0.0 and not at_origin:
         return False
     if "x_m" in sensor.std and (x_m is not None or y_m is not None):
         return x_m is not None and y_m is not None
@@ -125,13 +127,15 @@ class Inbox:
         self._memory_ns = max([nanoseconds(memory_s), *self._max_delay_ns.values()])
         self._receipts_ns: dict[tuple[str, int, Frame, int], int] = {}  # of lists, in order of receipt
         self._pending: list[Batch] = []
+        self._originals: dict[tuple[str, str | None, float | None, float | None], DetectionList] = {}
 
     def put(self, message: DetectionList) -> list[UpdateRecord]:
         """Receive a message; the records of detections that end here.
         A message is repeated if an earlier one of the sensor had its stamp and contents.
         """
         sensor = self._sensors[message.sensor]
-        usable = [is_usable(detection, sensor) for detection in message.objects]
+        at_origin = message.origin_deg is not None
+        usable = [is_usable(detection, sensor, at_origin) for detection in message.objects]
         if self._is_copy(message, usable):
             return records(message, Disposition.DUPLICATE)
         ended: list[UpdateRecord] = []
@@ -146,6 +150,8 @@ class Inbox:
                 fates[stamp_ns] = Disposition.INVALID
         for index, (stamp_ns, is_sound) in enumerate(zip(own_ns, usable, strict=True)):
             fate = fates[stamp_ns] if is_sound else Disposition.INVALID
+            if fate is None and sensor.copies_s and self._is_heard(message, index, stamp_ns, sensor.copies_s):
+                fate = Disposition.DUPLICATE
             if fate is None:
                 kept.setdefault(stamp_ns, []).append(index)
             else:
@@ -154,6 +160,23 @@ class Inbox:
         for stamp_ns, indices in kept.items():
             self._pending.append(Batch(message, stamp_ns, tuple(indices), last=stamp_ns == newest_ns))
         return ended
+
+    def _is_heard(self, message: DetectionList, index: int, stamp_ns: int, copies_s: float) -> bool:
+        """True if another receiver has heard the message of detection `index`; the earliest stamp in a tick counts."""
+        item = message.objects[index]
+        if item.id is None:
+            return False
+        oldest_ns = message.receipt_ns - nanoseconds(copies_s)
+        while self._originals and self._originals[first := next(iter(self._originals))].receipt_ns < oldest_ns:
+            del self._originals[first]
+        key = message.sensor, item.id, item.x_m, item.y_m
+        original = self._originals.setdefault(key, message)
+        if original is message:
+            return False
+        for row, batch in enumerate(self._pending):
+            if batch.message is original and len(batch.indices) == 1 and stamp_ns < batch.stamp_ns:
+                self._pending[row] = replace(batch, stamp_ns=stamp_ns)
+        return True
 
     def _is_copy(self, message: DetectionList, usable: Sequence[bool]) -> bool:
         """True if `message` repeats one that is remembered; it is remembered from now on.

@@ -1,5 +1,6 @@
 """Class, identity and size of the objects of tracks: votes of the detections, size by their average."""
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -7,7 +8,7 @@ from operator import attrgetter
 
 import numpy as np
 
-from fgtrack.core.types import BoolArray, Detection, IntArray, ObjectReport
+from fgtrack.core.types import BoolArray, Detection, FloatArray, IntArray, ObjectReport
 
 #: Says which pairs of candidates and tracks, as positions in their lists, both (m,), are not one object, shape (m,).
 Apart = Callable[[IntArray, IntArray], BoolArray]
@@ -17,7 +18,8 @@ _ALIKE = (
     ("pedestrian", "person", "person_sitting"),
     ("cyclist", "bicycle", "motorcycle", "rider"),
 )
-_UNKNOWN = 0
+_UNKNOWN, _OTHER = 0, -1
+_MOST_STRAYS = 3
 _GROUPS = {name: -1 - number for number, group in enumerate(_ALIKE) for name in group}
 _SIZES = ("length_m", "width_m", "height_m")
 _sizes_m = attrgetter(*_SIZES)
@@ -37,14 +39,42 @@ class _Seen:
     ids: Counter[str] = field(default_factory=Counter)
 
 
+class Evidence:
+    """Evidence of class and identity on pairs of detections and tracks."""
+
+    def __init__(self, classes: Apart | None, theirs: IntArray, own: IntArray, wrong_id_probability: float) -> None:
+        """`theirs` and `own` number the identities of the detections and of the tracks, 0 of none."""
+        self._classes, self._theirs, self._own = classes, theirs, own
+        self.weight = 2.0 * math.log((1.0 - wrong_id_probability) / wrong_id_probability)
+        """Twice the log-likelihood ratio of equal against different identities."""
+
+    def __call__(self, rows: IntArray, columns: IntArray) -> BoolArray:
+        """True of pairs that differ in class or identity."""
+        return self.differ(rows, columns) | (self.nis(rows, columns) > 0.0)
+
+    def differ(self, rows: IntArray, columns: IntArray) -> BoolArray:
+        """True of pairs that differ in class."""
+        return np.zeros(len(rows), dtype=bool) if self._classes is None else self._classes(rows, columns)
+
+    def nis(self, rows: IntArray, columns: IntArray) -> FloatArray:
+        """Addition to the NIS of the pairs, shape (m,): `weight` of different identities, minus it of equal ones."""
+        a, b = self._theirs[rows], self._own[columns]
+        return np.where((a == _UNKNOWN) | (b == _UNKNOWN), 0.0, np.where(a == b, -self.weight, self.weight))
+
+
 class Objects:
-    """Class and size of each track, and the pairs that they exclude.
+    """Class, identity and size of each track, and the pairs that they exclude.
     A detection with a class may only belong to a track of its class, which is that of most of its detections, or of
-    one like it; one without a class to any.
+    one like it; one without a class to any. Identities are evidence, see `Evidence`.
     """
 
     def __init__(self) -> None:
         self._seen: dict[int, _Seen] = {}
+        self._ids: dict[int, str] = {}  # of most detections, by track
+        self._strays = Counter[str]()  # detections in succession that their track did not match, by identity
+        self.id_conflicts: Counter[str] = Counter()
+        """Identities that were `reused`: a track began with that of another one; or `changed`: a track fused another
+        identity than most of its detections have."""
 
     def describes(self, detections: Iterable[Detection]) -> bool:
         """True if one of `detections` has a class, size or id."""
@@ -59,12 +89,40 @@ class Objects:
             if detection.class_name is not None:
                 seen.classes[detection.class_name] += 1
             if detection.id is not None:
+                if not seen.ids and detection.id in self._ids.values():
+                    self.id_conflicts["reused"] += 1
+                if detection.id != self._ids.get(track_id, detection.id):
+                    self.id_conflicts["changed"] += 1
                 seen.ids[detection.id] += 1
+                self._strays.pop(detection.id, None)
+                self._ids[track_id] = max(seen.ids, key=seen.ids.__getitem__)
             for name, value in zip(_SIZES, _sizes_m(detection), strict=True):
                 if value is not None:
                     seen.num_sizes[name] += 1
                     mean = seen.sizes_m.get(name, 0.0)
                     seen.sizes_m[name] = mean + 1.0 / seen.num_sizes[name] * (value - mean)
+
+    def evidence(
+        self, detections: Sequence[Detection], track_ids: Sequence[int], wrong_id_probability: float
+    ) -> Apart | None:
+        """Return what classes and identities say of pairs of detections and tracks; None where they say nothing."""
+        classes = self.apart(detections, track_ids)
+        ids = [each.id for each in detections] if self._ids else []
+        if not any(ids):
+            return classes
+        numbers: dict[str | None, int] = {name: number for number, name in enumerate(dict.fromkeys(ids), 1) if name}
+        theirs = np.array([numbers.get(name, _UNKNOWN) for name in ids])
+        own = np.array([numbers.get(self._ids[i], _OTHER) if i in self._ids else _UNKNOWN for i in track_ids])
+        return Evidence(classes, theirs, own, wrong_id_probability)
+
+    def is_stray(self, detection: Detection) -> bool:
+        """True if a track that does not match `detection` has its identity, unless three others strayed just before.
+        So far from the track of its own identity it is an outlier, rather than another object of that identity.
+        """
+        if detection.id is None or detection.id not in self._ids.values():
+            return False
+        self._strays[detection.id] += 1
+        return self._strays[detection.id] <= _MOST_STRAYS
 
     def apart(self, detections: Iterable[Detection], track_ids: Sequence[int]) -> Apart | None:
         """Return a test of pairs of detections and tracks for different classes; None if no pair is excluded."""
@@ -93,6 +151,7 @@ class Objects:
     def forget(self, track_id: int) -> None:
         """Forget a track that has ended."""
         self._seen.pop(track_id, None)
+        self._ids.pop(track_id, None)
 
     def _report(self, seen: _Seen) -> ObjectReport:
         name = _most(seen.classes)

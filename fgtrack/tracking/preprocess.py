@@ -10,11 +10,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fgtrack.core.geometry import body_point
-from fgtrack.core.linalg import equal_ones, kernels
+from fgtrack.core.linalg import congruence, equal_ones, kernels, symmetrise
 from fgtrack.core.types import BoolArray, Disposition, FloatArray, IntArray, UpdateRecord
 from fgtrack.estimation.base import Measurement, Measurements
 from fgtrack.models.correlated_errors import split_error
-from fgtrack.models.measurement import COMPONENTS, RELATIVE, SensorPose, measured_position, measurement_model
+from fgtrack.models.measurement import (
+    COMPONENTS,
+    RELATIVE,
+    MeasurementModel,
+    SensorPose,
+    measured_position,
+    measurement_model,
+)
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
@@ -34,6 +41,7 @@ from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.inbox import Batch, record
 
 _FAR_M = 1e6
+_STEP_S = 1e-3  # short enough for any motion, long enough for float64
 
 
 class Candidate(NamedTuple):
@@ -48,11 +56,34 @@ class Candidate(NamedTuple):
     """Position in the map, shape (2,); None where only a bearing was measured."""
     position_covariance: FloatArray | None
     """Shape (2, 2)."""
+    stamp_std_s: float = 0.0
+    """Standard deviation of its stamp, of which nothing is in the covariances."""
 
     @property
     def values(self) -> dict[str, float]:
         """Measured components by name, in the map frame."""
         return dict(zip(self.measurement.model.components, self.measurement.z.tolist(), strict=True))
+
+
+class StampError(NamedTuple):
+    """The error of a stamp in the innovation: an object has moved by its velocity times the error."""
+
+    motion: MotionModel
+    std_s: float
+
+    def rate(self, model: MeasurementModel, pose: SensorPose, x: FloatArray) -> FloatArray:
+        """Derivative of h(x) by the stamp at the states `x` (..., n), shape (..., k): H dx/dt."""
+        moved = model.predict(self.motion.predict(x, _STEP_S), pose)
+        return model.residual(moved, model.predict(x, pose)) / _STEP_S
+
+    def noise(self, model: MeasurementModel, pose: SensorPose, x: FloatArray, P: FloatArray) -> FloatArray:
+        """Covariance sigma_t^2 E[v v'] of v = H dx/dt, shape (m, k, k), at the states `x` (m, n) with covariances `P`.
+        E[v v'] = v(x) v(x)' + D P D' with D = dv/dx: the velocity of a new track is its uncertainty.
+        """
+        v = self.rate(model, pose, x)
+        steps = 1e-3 * np.eye(x.shape[-1])
+        D = np.stack([(self.rate(model, pose, x + step) - v) / step.sum() for step in steps], axis=-1)
+        return self.std_s**2 * (v[..., :, None] * v[..., None, :] + symmetrise(congruence(D, P)))
 
 
 class Group(NamedTuple):
@@ -66,12 +97,16 @@ class Group(NamedTuple):
     """Covariances of the detections with all their errors, shape (m, k, k)."""
     error: PoseError | None
     """Error of the ego in them, stacked; None where it is not considered."""
+    stamp_error: StampError | None = None
+    """Error of the stamp, of which nothing is in `stack` and `spread`; None where it is not considered."""
 
-    def seen_at(self, members: IntArray, x: FloatArray) -> Measurement:
-        """The stack of some `members` (p,), of objects at the states `x` (p, n)."""
+    def seen_at(self, members: IntArray, x: FloatArray, P: FloatArray, of: IntArray) -> Measurement:
+        """The stack of some `members` (p,), of objects at the states `x` (p, n) with covariances P[of] (p, n, n)."""
         own, R = self.stack, self.stack.R[members]
         if self.error is not None and own.model.relative:
             R = self.error.at(members).noise(own.model, own.pose, x)
+        if self.stamp_error is not None:
+            R = R + self.stamp_error.noise(own.model, own.pose, x, P[of])
         return Measurement(own.stamp_ns, own.model, own.z[members], R, own.pose, own.loss, own.assumed)
 
     def position_covariances(self, members: IntArray) -> FloatArray:
@@ -113,6 +148,7 @@ class Candidates(Sequence[Candidate]):
             own,
             point[:2] if self.placed[index] else None,
             None if position is None else position[1],
+            0.0 if group.stamp_error is None else group.stamp_error.std_s,
         )
 
     def split(self, chosen: IntArray) -> list[tuple[Group, IntArray, IntArray]]:
@@ -130,8 +166,8 @@ class Candidates(Sequence[Candidate]):
     def at(self, indices: Sequence[int]) -> "Candidates":
         """Return the candidates at `indices`."""
         groups = [
-            Group(here, replace(own, z=own.z[m], R=own.R[m]), spread[m], error and error.at(m))
-            for (_, own, spread, error), m, here in self.split(np.array(indices))
+            Group(here, replace(own, z=own.z[m], R=own.R[m]), spread[m], error and error.at(m), stamp_error)
+            for (_, own, spread, error, stamp_error), m, here in self.split(np.array(indices))
         ]
         return Candidates([self.leaders[i] for i in indices], self.merged, self.lines[indices], groups)
 
@@ -248,13 +284,16 @@ class Preprocess:
             error = PoseError(pose_covariance, G, white)
             total = error.noise(models[0], pose, x)
             R = total if white is R else R + (total - white)
-        whole = Group(rows, Measurement(batch.stamp_ns, models[0], z, total, pose, sensor.loss, assumed), R, error)
+        late = StampError(self._motion, sensor.stamp_std_s) if sensor.stamp_std_s else None
+        whole = Group(
+            rows, Measurement(batch.stamp_ns, models[0], z, total, pose, sensor.loss, assumed), R, error, late
+        )
         if sensor.correlation is None:
             yield whole
             return
         for k, each in enumerate(models):
             item, m = Measurement(batch.stamp_ns, each, z[k : k + 1], total[k : k + 1], pose, sensor.loss, assumed), [k]
-            yield Group(rows[m], item, R[m], error and error.at(m))
+            yield Group(rows[m], item, R[m], error and error.at(m), late)
 
 
 def _without(items: MapDetections, outside: BoolArray, reason: str, lost: dict[int, str]) -> MapDetections:

@@ -108,6 +108,11 @@ class Tracker:
         """Return `ego`, which was received, at the position that is used at its stamp."""
         return self._parts.ego.located(ego)
 
+    @property
+    def id_conflicts(self) -> Mapping[str, int]:
+        """Number of identities that were reused or changed, see `Objects`."""
+        return self._parts.objects.id_conflicts
+
     def receive(self, message: EgoState | DetectionList) -> None:
         """Take a message. Raises `DataError` for a sensor that has no model, and for an unknown frame."""
         if isinstance(message, EgoState):
@@ -215,9 +220,11 @@ class Tracker:
             self._give_birth(batch, candidates, position, scan)
 
     def _assigned(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Assignment:
-        """Return the assignment of candidates to tracks of the same class."""
-        described = map(batch.message.objects.__getitem__, candidates.leaders)
-        return self._parts.association(candidates, states, self._parts.objects.apart(described, states.track_ids))
+        """Return the assignment of candidates to tracks of the same class, and by their identities."""
+        parts, message = self._parts, batch.message
+        described = list(map(message.objects.__getitem__, candidates.leaders))
+        wrong = parts.sensors[message.sensor].wrong_id_probability
+        return parts.association(candidates, states, parts.objects.evidence(described, states.track_ids, wrong))
 
     def _unclaimed(self, batch: Batch, candidates: Candidates, new: Sequence[int], states: StatesAt) -> list[int]:
         """Return those of `new` that belong to no track which began after the batch's stamp.
@@ -283,7 +290,7 @@ class Tracker:
         chosen, tracks = np.array(assignment.pairs).T
         for group, members, here in candidates.split(chosen):
             of = tracks[here]
-            measurements = Measurements(group.seen_at(members, states.means[of]))
+            measurements = Measurements(group.seen_at(members, states.means[of], states.covariances, of))
             updated = bank.update(batch.stamp_ns, [track_ids[track] for track in of.tolist()], measurements)
             for index, (k, result) in enumerate(zip(here.tolist(), updated, strict=True)):
                 results[k] = measurements, index, result
@@ -303,7 +310,7 @@ class Tracker:
 
     def _give_birth(self, batch: Batch, candidates: Candidates, position: int, scan: Scan) -> None:
         parts, prior, candidate = self._parts, None, candidates[position]
-        if parts.sensors[scan.sensor].births:
+        if parts.sensors[scan.sensor].births and not parts.objects.is_stray(scan.objects[candidate.leader]):
             prior = parts.birth.prior(candidate, parts.road, parts.ego.current, parts.ego.in_pit)
         if prior is None:
             self._conclude(batch, candidates, position, Disposition.GATED)

@@ -57,7 +57,8 @@ def candidates(
 
 def noise_at(found: Candidates, x: FloatArray) -> FloatArray:
     """R of the first candidate at the states `x` (p, n)."""
-    return found.groups[0].seen_at(np.zeros(len(x), dtype=int), x).R
+    first = np.zeros(len(x), dtype=int)
+    return found.groups[0].seen_at(first, x, np.zeros((1, x.shape[-1], x.shape[-1])), first).R
 
 
 def innovation(measurement: Measurement, x: FloatArray) -> FloatArray:
