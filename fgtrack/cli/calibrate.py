@@ -112,6 +112,7 @@ def _topics(found: InputInfo, unused: str) -> Table:
     for item in found.topics:
         record: dict[str, object] = {"topic": item.name, "messages": item.count, "rate_hz": item.rate_hz}
         record |= {f"delay_{name}": None if item.delay is None else item.delay[name] for name in _DELAYS}
+        record |= {f"late_{name}": share for name, share in item.late.items()}
         records.append(record | {"taken_as": item.used_as or unused, "type": item.type})
     columns = [
         Column("topic", left=True),
@@ -124,6 +125,7 @@ def _topics(found: InputInfo, unused: str) -> Table:
             1e3,
             text=whole,
         ),
+        Column("late [%]\nstream/object", "late_stream_share late_object_share", "{}/{}", 1e2, text="{:.1f}".format),
         Column("taken as", "taken_as", left=True),
         Column("type", left=True),
     ]

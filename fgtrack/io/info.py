@@ -36,6 +36,10 @@ class TopicInfo:
     """Its use in a replay with the configuration."""
     note: str | None
     """Why it cannot be decoded, or what is unusual."""
+    late: Mapping[str, float | None]
+    """Shares that are out of sequence: `stream_share` of the messages, with an older stamp than one of the topic before
+    them, and `object_share` of the detections with an identity, with an older stamp than one of it before; None of
+    fewer than two."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,7 @@ def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
     kind = input_kind(path)
     used: dict[BagTopic, str] = {}
     times: dict[BagTopic, list[_Times]] = defaultdict(list)
+    own: dict[BagTopic, list[bool]] = defaultdict(list)
     problem: str | None = None
     if kind == "recording":
         bag = Bag(path, given.message_definitions)
@@ -72,14 +77,17 @@ def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
             problem = str(error) if config else None
         readable = UntilBreak(bag.stamps())
     else:
-        readable = UntilBreak(_stamps(open_input(path, given).messages()))
+        readable = UntilBreak(_stamps(open_input(path, given).messages(), own))
     for topic, receipt_ns, stamp_ns in readable:
         times[topic].append((receipt_ns, stamp_ns))
     if readable.error is not None:
         problem = str(readable.error)
     if kind != "recording":
         used = {topic: topic.type.replace("detections", f"detections {topic.name}") for topic in times}
-    topics = tuple(_topic(topic, times[topic], used.get(topic)) for topic in sorted(times, key=attrgetter("name")))
+    topics = tuple(
+        _topic(topic, times[topic], used.get(topic), own.get(topic, ()))
+        for topic in sorted(times, key=attrgetter("name"))
+    )
     receipts_ns = [receipt_ns for every in times.values() for receipt_ns, _ in every]
     if not receipts_ns:
         return InputInfo(path, kind, None, 0.0, topics, problem)
@@ -89,7 +97,7 @@ def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
     return InputInfo(path, kind, start_ns, seconds(end_ns - start_ns), topics, problem)
 
 
-def _topic(topic: BagTopic, times: Sequence[_Times], used_as: str | None) -> TopicInfo:
+def _topic(topic: BagTopic, times: Sequence[_Times], used_as: str | None, own: Sequence[bool]) -> TopicInfo:
     delays_s = np.array([receipt_ns - stamp_ns for receipt_ns, stamp_ns in times if stamp_ns is not None]) * 1e-9
     delay, rate_hz, note = None, None, topic.problem
     if delays_s.size:
@@ -100,12 +108,29 @@ def _topic(topic: BagTopic, times: Sequence[_Times], used_as: str | None) -> Top
     receipts_ns = {receipt_ns for receipt_ns, _ in times}
     if len(receipts_ns) > 1:
         rate_hz = (len(receipts_ns) - 1) / seconds(max(receipts_ns) - min(receipts_ns))
-    return TopicInfo(topic.name, topic.type, len(times), rate_hz, delay, used_as, note)
+    stamps_ns = np.array([stamp_ns for _, stamp_ns in times if stamp_ns is not None], dtype=np.int64)
+    stream = None
+    if len(stamps_ns) > 1:
+        stream = float(np.mean(stamps_ns[1:] < np.maximum.accumulate(stamps_ns)[:-1]))
+    late = {"stream_share": stream, "object_share": float(np.mean(own)) if own else None}
+    return TopicInfo(topic.name, topic.type, len(times), rate_hz, delay, used_as, note, late)
 
 
-def _stamps(messages: Iterator[Message]) -> Iterator[tuple[BagTopic, int, int | None]]:
-    """Sensor or kind, receipt and stamp of `messages`, as of a recording with a topic for each."""
+def _stamps(
+    messages: Iterator[Message], own: Mapping[BagTopic, list[bool]]
+) -> Iterator[tuple[BagTopic, int, int | None]]:
+    """Sensor or kind, receipt and stamp of `messages`, as of a recording with a topic for each.
+    `own` gets for each detection whose identity came before, True if it is older than the newest of these.
+    """
+    newest_ns: dict[tuple[str, str], int] = {}
     for message in messages:
         kind = "ego" if isinstance(message, EgoState) else "truth"
         name, kind = (message.sensor, "detections") if isinstance(message, DetectionList) else (kind, kind)
-        yield BagTopic(name, kind, None), message.receipt_ns, message.stamp_ns
+        topic = BagTopic(name, kind, None)
+        for item in message.objects if isinstance(message, DetectionList) else ():
+            if item.id is not None:
+                stamp_ns, key = message.stamp_ns if item.stamp_ns is None else item.stamp_ns, (name, item.id)
+                if key in newest_ns:
+                    own[topic].append(stamp_ns < newest_ns[key])
+                newest_ns[key] = max(stamp_ns, newest_ns.get(key, stamp_ns))
+        yield topic, message.receipt_ns, message.stamp_ns
