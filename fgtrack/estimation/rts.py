@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from fgtrack.core.linalg import applied, congruence, product, psd_solve, regular, symmetrise
+from fgtrack.core.linalg import applied, congruence, psd_solve, regular, symmetrise
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.filters.ekf import Prediction, joseph, kalman_gain
 from fgtrack.estimation.filters.propagation import wrapped
@@ -53,4 +53,4 @@ def between(
     except np.linalg.LinAlgError:  # of noise that leaves out a direction
         Psi, _ = kalman_gain(regular(Q1), F2, regular(Q2))
     mean = first + applied(Psi, right - second)
-    return mean, F1 - product(Psi, product(F2, F1)), Psi, joseph(Q1, Psi, F2, Q2)
+    return mean, F1 - Psi @ (F2 @ F1), Psi, joseph(Q1, Psi, F2, Q2)

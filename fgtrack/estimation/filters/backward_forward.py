@@ -109,13 +109,14 @@ class BackwardForwardBank:
         """States at `grid` of all objects that exist there; at the present they are the filters' own."""
         if grid in self._cached:
             return self._cached[grid]
+        n = self._propagator.motion.dim
         rows = {i: each for i, each in self._objects.items() if grid == self._grid or each.oldest <= grid}
         if not rows:
-            return no_states(self._propagator.motion.dim)
+            return no_states(n)
         anchors = [each.anchors[-1] if grid == self._grid else each.at(grid) for each in rows.values()]
         means, covariances = self._propagator.propagate(
-            np.array([anchor.mean for anchor in anchors]),
-            np.array([anchor.covariance for anchor in anchors]),
+            np.concatenate([anchor.mean for anchor in anchors]).reshape(len(anchors), -1),
+            np.concatenate([anchor.covariance for anchor in anchors]).reshape(len(anchors), n, n),
             np.array([grid - anchor.grid for anchor in anchors], dtype=np.int64),
             self._step_s,
         )

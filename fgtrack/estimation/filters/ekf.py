@@ -7,7 +7,7 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from fgtrack.core.linalg import congruence, identity, kernels, product, psd_solve, symmetrise, times_transposed
+from fgtrack.core.linalg import congruence, identity, kernels, psd_solve, symmetrise
 from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.models.motion import MotionModel
@@ -28,14 +28,14 @@ def propagated(F: FloatArray, P: FloatArray, Q: FloatArray) -> FloatArray:
 
 def kalman_gain(P: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Gain K = P H' S^-1 (..., n, k), and innovation covariance S = H P H' + R (..., k, k), which must be regular."""
-    HP = product(H, P)
-    S = times_transposed(HP, H) + R
+    HP = H @ P
+    S = HP @ H.mT + R
     return psd_solve(S, HP).mT, S
 
 
 def joseph(P: FloatArray, K: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
     """Covariance (I - K H) P (I - K H)' + K R K' after a measurement H x + N(0, R) with any gain K, (..., n, n)."""
-    A = identity(P.shape[-1]) - product(K, H)
+    A = identity(P.shape[-1]) - K @ H
     return symmetrise(congruence(A, P) + congruence(K, R))
 
 

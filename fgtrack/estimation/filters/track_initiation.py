@@ -9,7 +9,6 @@ from operator import itemgetter
 import numpy as np
 
 from fgtrack.core.geometry import cartesian, polar
-from fgtrack.core.linalg import product
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
 from fgtrack.estimation.base import KNOWN_YAW_STD_RAD, UNKNOWN_YAW_STD_RAD, Estimator, Measurement, Start, UpdateResult
@@ -121,7 +120,7 @@ class TrackInitiation:
             predicted = Prediction(x, P, P)
             if stamp_ns > at_ns:
                 moved, F, Q = self.motion.transition(nominal, seconds(stamp_ns - at_ns))
-                predicted = Prediction(moved + F @ (x - nominal), propagated(F, P, Q), product(F, P))
+                predicted = Prediction(moved + F @ (x - nominal), propagated(F, P, Q), F @ P)
                 nominal, at_ns = moved, stamp_ns
             x, P = predicted.mean, predicted.covariance
             if measurement is not None:

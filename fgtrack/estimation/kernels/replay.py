@@ -7,8 +7,6 @@ it, and the cross-covariance of that with the step before. One of `measured` has
 is a prior, is 0. A row of `windows` has the number of the track's steps, and its oldest and newest stamp.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from fgtrack.core.compiled import add_congruence, add_weighted, copy, inlined, merged, njit, solve, wrapped
@@ -21,28 +19,15 @@ FAILED, TOO_OLD, IN_SEQUENCE, OUT_OF_SEQUENCE = range(4)
 _YAW = 2
 
 
-class _Work(NamedTuple):
-    """Space for matrices of the size of the state, and of the largest measurement."""
-
-    F: FloatArray
-    A: FloatArray
-    AP: FloatArray
-    ahead: FloatArray
-    """Shape (2 n + 1, n)."""
-    mean: FloatArray
-    S: FloatArray
-    K: FloatArray
-    """Shape (k, n)."""
-    KR: FloatArray
-    """Shape (n, k)."""
-    y: FloatArray
+_Space = tuple[FloatArray, ...]
 
 
 @inlined
-def _work(n: int, k: int) -> _Work:
-    square, S = np.empty((n, n)), np.empty((k, k))
+def _space(n: int, k: int) -> _Space:
+    """Space for F, I - K H, (I - K H) P, a prediction, shape (2 n + 1, n), mean, S, K, K R and y."""
+    square, S, AP = np.empty((n, n)), np.empty((k, k)), np.empty((n, n))
     ahead, K, KR = np.empty((2 * n + 1, n)), np.empty((k, n)), np.empty((n, k))
-    return _Work(square, np.empty((n, n)), np.empty((n, n)), ahead, np.empty(n), S, K, KR, np.empty(k))
+    return square, np.empty((n, n)), AP, ahead, np.empty(n), S, K, KR, np.empty(k)
 
 
 @inlined
@@ -78,15 +63,21 @@ def _innovation(
 
 @merged
 def _retrodict(
-    motion: int, density: FloatArray, slots: IntArray, labels: IntArray, steps: FloatArray, work: _Work, now: FloatArray
+    motion: int,
+    density: FloatArray,
+    slots: IntArray,
+    labels: IntArray,
+    steps: FloatArray,
+    space: _Space,
+    now: FloatArray,
 ) -> bool:
     """Smooth `now`, the state after the last of `slots`, back to the prediction of the first, which is new.
     From step to step (Rauch, Tung and Striebel), x_j + C s and P_j + C (P - P_-) C' with the prediction x_-, P_- of the
     step after, the shift s = x - x_- and C = (P_-^-1 F P_j)'. False where some P_- has no root.
     """
     n = len(density)
-    ahead, root, shift, mean = work.ahead, work.A, now[0], work.mean
-    gain = ahead[n + 1 :]
+    F, root, CD, ahead, mean = space[:5]
+    gain, shift = ahead[n + 1 :], now[0]
     for j in range(len(slots) - 1, 0, -1):
         after, left, start = slots[j], slots[j - 1], 0 if j > 1 else n + 1
         late_ns = labels[after, 0] - labels[left, 0]
@@ -94,7 +85,7 @@ def _retrodict(
             continue
         state = steps[left, start : start + n + 1]
         if start:
-            _ahead(motion, density, state, late_ns, work.F, ahead[0], ahead[1 : n + 1], gain)
+            _ahead(motion, density, state, late_ns, F, ahead[0], ahead[1 : n + 1], gain)
         else:
             copy(steps[after, n + 1 :], ahead)
         copy(ahead[1:], root)
@@ -112,7 +103,7 @@ def _retrodict(
                 mean[a] += gain[b, a] * shift[b]
         copy(state, now)
         shift[:] = mean
-        add_weighted(gain, root, work.AP, now[1:])
+        add_weighted(gain, root, CD, now[1:])
     return True
 
 
@@ -125,24 +116,25 @@ def _step(
     late_ns: int,
     label: IntArray,
     measured: FloatArray,
-    work: _Work,
+    space: _Space,
 ) -> bool:
     """Predict the step `after` from that `before`, and fuse its measurement; False where it cannot be fused."""
-    k, n, A = label[1], len(density), work.A
-    y, K, predicted = work.y[:k], work.K[:k], after[n + 1 :]
-    _ahead(motion, density, before[: n + 1], late_ns, work.F, predicted[0], predicted[1 : n + 1], predicted[n + 1 :])
+    k, n = label[1], len(density)
+    F, A, AP, _, _, S, K, KR, y = space
+    y, K, predicted = y[:k], K[:k], after[n + 1 :]
+    _ahead(motion, density, before[: n + 1], late_ns, F, predicted[0], predicted[1 : n + 1], predicted[n + 1 :])
     copy(predicted, after[: n + 1])
-    _innovation(after, label, measured, motion == ARC, y, work.S)
+    _innovation(after, label, measured, motion == ARC, y, S)
     for c in range(k):
         K[c] = after[1 + label[2 + c]]
-    if not solve(work.S, K):
+    if not solve(S, K):
         return False
     for a in range(n):
         for b in range(n):
             A[a, b] = 1.0 if a == b else 0.0
         for c in range(k):
             A[a, label[2 + c]] -= K[c, a]
-    if not conclude(after[0], after[1 : n + 1], A, K, measured[1:], y, work.AP, work.KR):
+    if not conclude(after[0], after[1 : n + 1], A, K, measured[1:], y, AP, KR):
         return False
     if motion == ARC:
         after[0, _YAW] = wrapped(after[0, _YAW])
@@ -196,7 +188,7 @@ def fuse(
     failed measurement, and one older than `oldest_ns` or the window of the track, change nothing.
     """
     k, n, stamp_ns = y.shape[1], len(density), new_label[0]
-    now, work = np.empty((n + 1, n)), _work(n, measured.shape[3])
+    now, space = np.empty((n + 1, n)), _space(n, measured.shape[3])
     for i in range(len(tracks)):
         t = tracks[i]
         slots, count, window = order[t], windows[t, 0], windows[t]
@@ -208,22 +200,20 @@ def fuse(
             slots[index] = slots[index - 1]
             index -= 1
         slots[index] = own
-        for a in range(k + 2):
-            labels[t, own, a] = new_label[a]
+        labels[t, own, : k + 2] = new_label
         for a in range(k + 1):
-            for b in range(k):
-                measured[t, own, a, b] = new[i, a, b]
+            measured[t, own, a, :k] = new[i, a]
         j, last, fused = index, count, True
         while j <= last:
             s, left = slots[j], slots[j - 1]
             late_ns = labels[t, s, 0] - labels[t, left, 0]
-            ok = _step(motion, density, steps[t, left], steps[t, s], late_ns, labels[t, s], measured[t, s], work)
+            ok = _step(motion, density, steps[t, left], steps[t, s], late_ns, labels[t, s], measured[t, s], space)
             if ok and s == own:
                 newest = slots[count]
                 copy(steps[t, newest, n + 1 if index == count else 0 :], now)
-                ok = _retrodict(motion, density, slots[index : count + 1], labels[t], steps[t], work, now)
+                ok = _retrodict(motion, density, slots[index : count + 1], labels[t], steps[t], space, now)
                 _innovation(now, new_label, new[i], motion == ARC, y[i], S[i])
-                nis[i] = marginal_nis(S[i], y[i], rows, work.S, work.y)
+                nis[i] = marginal_nis(S[i], y[i], rows, space[5], space[8])
                 ok = ok and not np.isnan(nis[i])
             j += 1
             if not ok and fused:  # take it out, and filter the later ones again without it
