@@ -37,6 +37,7 @@ from fgtrack.tracking.association import Assignment, Association
 from fgtrack.tracking.birth import Birth, in_any_direction
 from fgtrack.tracking.ego import EgoPose, EgoTrajectory
 from fgtrack.tracking.existence import Lifecycle
+from fgtrack.tracking.extent import Extents
 from fgtrack.tracking.guarded_bank import faults
 from fgtrack.tracking.inbox import Batch, Inbox, record
 from fgtrack.tracking.lifecycle import Scan
@@ -63,6 +64,8 @@ class TrackerParts:
     birth: Birth
     road: Road
     objects: Objects = field(default_factory=Objects)
+    extents: Extents | None = None
+    """Extents of the tracks; None where a list has at most one detection of an object."""
     failures: Failures = field(default_factory=Failures)
     """Counts what fails inside, shared with `bank`."""
     propagated_exceptions: tuple[type[Exception], ...] = (FgtrackError, MemoryError)
@@ -208,6 +211,8 @@ class Tracker:
             return
         states = self._offered(batch)
         assignment = self._assigned(batch, candidates, states)
+        if parts.extents is not None:
+            candidates, assignment = parts.extents.joined(candidates, assignment, states, batch.stamp_ns)
         self._count(batch, candidates, assignment, states, scan)
         if assignment.pairs:
             self._estimate(batch, candidates, assignment, states)
@@ -354,6 +359,8 @@ class Tracker:
         for track_id in track_ids:
             self._parts.bank.remove(track_id)
             self._parts.objects.forget(track_id)
+            if self._parts.extents is not None:
+                self._parts.extents.forget(track_id)
             self._undirected.pop(track_id, None)
             del self._num_measured[track_id]
             self._parts.lifecycle.forget(track_id)
