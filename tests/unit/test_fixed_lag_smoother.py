@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgtrack.core.types import IntArray
+from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, SensorPose, Start, UpdateStatus
 from fgtrack.estimation.object_bank import OneObject
 from fgtrack.estimation.smoothing.bank import SmootherBank
 from fgtrack.estimation.smoothing.gtsam.batch import BatchBank
 from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalBank, IncrementalSolver
-from fgtrack.models.motion import CTRV, CV, MotionModel
+from fgtrack.models.motion import CTRV, CV, MotionModel, Transition
 
 MS = 1_000_000
 STD = {"x_m": 0.3, "y_m": 0.3}
@@ -141,3 +141,23 @@ def test_a_bank_reports_lagged_states_and_final_ones_once(final: bool, left: lis
     bank.remove(7)
     assert [report.state.stamp_ns for report in bank.smoothed()] == [100 * k * MS for k in rest]
     assert bank.smoothed() == []
+
+
+class OwnTransition(CTRV):
+    """CTRV as a model that is not compiled."""
+
+    def transition(self, x: FloatArray, dt_s: float | FloatArray, *, backwards: bool = False) -> Transition:
+        return super().transition(x, dt_s, backwards=backwards)
+
+
+def test_a_motion_model_in_numpy_gives_what_the_same_one_compiled_gives() -> None:
+    """With detections ahead, late, on a node and beyond the window, and at stamps between nodes."""
+    start = Start(yaw_rad=0.4, yaw_std_rad=0.5, speed_mps=12.0)
+    compiled, numpy = (one_of(model, start, lag_s=0.3, ring_s=1.0) for model in (CTRV(), OwnTransition()))
+    for k, ms in enumerate((100, 300, 200, 200, 500, 400, 700, 150, 650)):
+        for each in (compiled, numpy):
+            each.update(at(ms, 0.012 * ms, 0.2 * (k % 3)))
+    for ms in (150, 450, 700, 900):
+        states = [each.state_at(ms * MS) for each in (compiled, numpy)]
+        np.testing.assert_allclose(states[1].mean, states[0].mean, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(states[1].covariance, states[0].covariance, rtol=1e-10, atol=1e-14)
