@@ -23,6 +23,7 @@ STANDING_NOTE = "+: best; =: ties with the best, as the interval contains 0 (blo
 
 _MARKS: Mapping[Value, str] = {"best": "+", "tie": "=", "worse": " "}
 _ERRORS = {"position_rmse_m": "position_m", "speed_rmse_mps": "speed_mps", "yaw_rmse_rad": "yaw_rad"}
+_NEGLIGIBLE = 1e-6  # of a cost: the rounding of sums in another order
 _SEED = 20040101  # of the bootstrap: the same runs give the same intervals
 
 
@@ -35,7 +36,7 @@ class Entry:
     worse_by: Estimate | None
     """Difference to the best; None of the best itself."""
     standing: Literal["best", "tie", "worse"]
-    """`tie` where the interval of the difference to the best contains 0; `best` only without any tie."""
+    """`tie` where the interval of the difference contains 0 or nothing but rounding; `best` only without any tie."""
 
 
 @dataclass(frozen=True)
@@ -77,10 +78,11 @@ def ranked(
     """Entries from the least of the `costs` to the largest; `worse_by` gives the cost of one index minus another's."""
     best, *others = np.argsort(costs, kind="stable").tolist()
     differences = {k: worse_by(k, best) for k in others}
-    tie = any(not difference.is_significant for difference in differences.values())
+    rounding = _NEGLIGIBLE * float(np.max(costs))
+    worse = {k: d.is_significant and d.high > rounding for k, d in differences.items()}
     return (
-        Entry(names[best], float(values[best]), None, "tie" if tie else "best"),
-        *(Entry(names[k], float(values[k]), d, "worse" if d.is_significant else "tie") for k, d in differences.items()),
+        Entry(names[best], float(values[best]), None, "best" if all(worse.values()) else "tie"),
+        *(Entry(names[k], float(values[k]), d, "worse" if worse[k] else "tie") for k, d in differences.items()),
     )
 
 

@@ -9,7 +9,8 @@ import pytest
 from evaluation_runs import ROUND, WEST, update, write_run
 
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.comparison import Comparison, comparisons
+from fgtrack.evaluation.comparison import Comparison, comparisons, ranked
+from fgtrack.evaluation.intervals import Estimate
 from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.tables.compare import compare
 from fgtrack.io.run import Run
@@ -45,6 +46,13 @@ def trio(tmp_path_factory: pytest.TempPathFactory) -> list[Run]:
     folder = tmp_path_factory.mktemp("trio")
     flips = 0.001 * (-1.0) ** np.arange(TICKS)
     return [a_run(folder / str(k), across) for k, across in enumerate((2.0 * NOISE_M, NOISE_M, NOISE_M + flips))]
+
+
+@pytest.mark.parametrize(("worse_m", "standing"), [(1e-9, "tie"), (1e-5, "worse")])
+def test_a_difference_of_rounding_is_a_tie_however_certain(worse_m: float, standing: str) -> None:
+    certain = Estimate(worse_m, 0.9 * worse_m, 1.1 * worse_m, 40)
+    best, other = ranked(["a", "b"], [0.3, 0.3 + worse_m], [0.3, 0.3 + worse_m], lambda one, other: certain)
+    assert (best.standing, other.standing) == ("tie" if standing == "tie" else "best", standing)
 
 
 def test_the_best_run_and_those_that_tie_with_it_and_how_much_worse_the_others_are(trio: list[Run]) -> None:
