@@ -8,7 +8,6 @@ from typing import Literal
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Message
 from fgtrack.io.output import check_output
-from fgtrack.io.ros.bag_writer import check_bag, write_bag
 from fgtrack.io.stream import SETTINGS, write_stream
 
 Storage = Literal["mcap", "sqlite3"]
@@ -30,6 +29,8 @@ def write_recording(
     """
     if _is_stream(out):
         return write_stream(out, messages, {SETTINGS: settings} if settings else None, overwrite)
+    from fgtrack.io.ros.bag_writer import write_bag  # and with it rosbags, where a bag is written
+
     return write_bag(out, messages, storage, settings=settings, overwrite=overwrite)
 
 
@@ -40,6 +41,8 @@ def check_recording(out: Path, overwrite: bool) -> None:
     elif _FILE_ENDING.search(out.name) and not out.is_dir():
         raise CallError(f"{out}: is written as .jsonl, as .jsonl.gz, or as a rosbag2 folder without such an ending")
     else:
+        from fgtrack.io.ros.bag_writer import check_bag
+
         check_bag(out, overwrite)
 
 

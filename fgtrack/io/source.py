@@ -65,19 +65,20 @@ def input_kind(path: Path) -> str:
     if not path.exists():
         raise CallError(f"{path}: there is no such file or folder")
     # The last registered first: plug-ins, then the built-in ones, which recognise the loosest last.
-    formats = {name: file_format(name) for name in reversed(list(ADAPTERS)) if "/" not in name}
+    names = [name for name in reversed(list(ADAPTERS)) if "/" not in name]
     try:
         if not path.is_file() and not path.is_dir():
             raise DataError(f"{path}: is neither a file nor a folder, write what comes out of it to a file first")
         if path.is_file() and path.stat().st_size == 0:
             raise DataError(f"{path}: is empty")
-        for name, form in formats.items():
+        for name in names:  # loaded one after the other: that of bags is large
+            form = file_format(name)
             with ADAPTERS.blamed(name, f"cannot look at {path}"):
                 if form.recognises(path):
                     return name
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
-    formats_read = ", ".join(form.description for form in reversed(formats.values()))
+    formats_read = ", ".join(file_format(name).description for name in reversed(names))
     raise DataError(f"{path}: is none of the inputs that fgtrack reads: {formats_read}")
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from fgtrack.cli.main import COMMANDS, run
 
-HEAVY = ("gtsam", "scipy", "matplotlib", "numpy", "rosbags", "pydantic")
+HEAVY = ("gtsam", "scipy", "matplotlib", "numba", "numpy", "pandas", "rosbags", "pydantic")
 
 
 def loaded_by(program: str) -> set[str]:
@@ -20,6 +20,19 @@ def loaded_by(program: str) -> set[str]:
 
 def test_the_help_imports_nothing_heavy() -> None:
     assert loaded_by("from fgtrack.cli.main import run; run(['--help'])") == set()
+
+
+@pytest.mark.parametrize("arguments", [["config"], ["config", "-c", "smoother"], ["config", "--list"]])
+def test_the_configuration_is_printed_without_a_compiler_and_without_readers(arguments: list[str]) -> None:
+    loaded = loaded_by(f"from fgtrack.cli.main import run; assert run({arguments!r}) == 0")
+    assert loaded.isdisjoint({"gtsam", "matplotlib", "numba", "pandas", "rosbags"})
+
+
+def test_the_contents_of_a_stream_are_listed_without_a_compiler(tmp_path) -> None:
+    stream = str(tmp_path / "drive.jsonl")
+    assert run(["simulate", "default", "--duration", "0.5", "-o", stream]) == 0
+    loaded = loaded_by(f"from fgtrack.cli.main import run; assert run(['info', {stream!r}]) == 0")
+    assert loaded.isdisjoint({"gtsam", "matplotlib", "numba", "pandas"})
 
 
 def test_every_command_has_a_line_in_the_help_and_a_help_of_its_own(capsys) -> None:

@@ -12,8 +12,8 @@ ADAPTERS = Registry(
     {
         "fgtrack.adapters": {
             "csv": "fgtrack.io.adapters.tables:FORMAT",
-            "stream": "fgtrack.io.stream:FORMAT",
             "recording": "fgtrack.io.ros.topics:FORMAT",
+            "stream": "fgtrack.io.stream:FORMAT",
             "autoferry": "fgtrack.io.adapters.autoferry:FORMAT",
             "fusiontracking": "fgtrack.io.adapters.fusiontracking:FORMAT",
             "nuscenes": "fgtrack.io.adapters.nuscenes:FORMAT",
