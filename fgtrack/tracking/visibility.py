@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgtrack.core.compiled import inlined, njit
+from fgtrack.core.linalg import kernels
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 
@@ -25,6 +25,7 @@ SHARE, RATIO, LOG_ODDS, VISIBLE = range(4)
 STAMP, SENSOR, CELL, VIEWED = range(4)
 NEVER = -(2**62)
 _FEWEST_TRACKS, _FEWEST_ENTRIES = 8, 32
+_KERNELS = "fgtrack.tracking.visibility_kernels"
 
 
 class Looks(NamedTuple):
@@ -76,12 +77,13 @@ class Histories:
         """
         if len(rows) and self.counts[rows].max() == self.numbers.shape[1]:
             self._grow(axis=1)
-        _learn(rows, stamp_ns, sensor, shares, ratios, cells, self.numbers, self.entries, self.counts, *self._times_s)
+        history = self.numbers, self.entries, self.counts, *self._times_s
+        kernels(_KERNELS).learn(rows, stamp_ns, sensor, shares, ratios, cells, *history)
 
     def present(self, rows: IntArray, present_ns: int) -> FloatArray:
         """Return the probabilities that the objects exist at `present_ns`, not before their newest evidence, (m,)."""
-        found: FloatArray = _present(rows, present_ns, self.numbers, self.entries, self.counts, self._times_s[0])
-        return found
+        history = self.numbers, self.entries, self.counts, self._times_s[0]
+        return np.asarray(kernels(_KERNELS).present(rows, present_ns, *history))
 
     def last(self, rows: IntArray) -> tuple[FloatArray, IntArray]:
         """Return the visibilities to each sensor and when each could show the objects last, shapes (m, sensors)."""
@@ -90,12 +92,13 @@ class Histories:
 
     def forget(self, oldest_ns: int) -> Looks:
         """Remember what is older than `oldest_ns` by its outcome alone, and return it."""
-        return Looks(*_forget(oldest_ns, self.numbers, self.entries, self.counts, self._times_s[1]))
+        return Looks(*kernels(_KERNELS).forget(oldest_ns, self.numbers, self.entries, self.counts, self._times_s[1]))
 
     def end(self, row: int) -> Looks:
         """Free the `row` of a track and return its evidence."""
         one = slice(row, row + 1)
-        looks = _forget(-NEVER, self.numbers[one], self.entries[one], self.counts[one], self._times_s[1])
+        history = self.numbers[one], self.entries[one], self.counts[one]
+        looks = kernels(_KERNELS).forget(-NEVER, *history, self._times_s[1])
         self.counts[row] = 0
         return Looks(*looks)._replace(rows=np.full(len(looks[0]), row))
 
@@ -161,112 +164,3 @@ class DetectionShares:
             self._known[epoch] = sums
             self._known = dict(sorted(self._known.items())[-3:])
         return self._known[epoch]
-
-
-@inlined
-def _survived(log_odds: float, dt_ns: int, lifetime_s: float) -> float:
-    """Log-odds after `dt_ns`: odds r / (1 - r) become r s / (1 - r s) with s = exp(-dt / lifetime)."""
-    dt = dt_ns / (NS_PER_S * lifetime_s)
-    if dt <= 0.0:
-        return log_odds
-    return max(-math.log(math.exp(-log_odds) - math.expm1(-dt)) - dt, -LARGEST_LOG_ODDS)
-
-
-@inlined
-def _conclude(numbers: FloatArray, entries: IntArray, k: int, lifetime_s: float, visible_s: float) -> None:
-    """Write the probabilities after entry k of one track.
-    Prediction v = share + (v - share) exp(-dt / visible_s), likelihood 1 - v + v ratio, update v ratio / likelihood.
-    """
-    for j in range(VISIBLE, numbers.shape[1]):
-        numbers[k, j], entries[k, j - VISIBLE + VIEWED] = numbers[k - 1, j], entries[k - 1, j - VISIBLE + VIEWED]
-    own, viewed, stamp_ns = VISIBLE + entries[k, SENSOR], VIEWED + entries[k, SENSOR], entries[k, STAMP]
-    v, ratio = numbers[k, SHARE], numbers[k, RATIO]
-    numbers[k, LOG_ODDS] = _survived(numbers[k - 1, LOG_ODDS], stamp_ns - entries[k - 1, STAMP], lifetime_s)
-    if math.isnan(ratio):  # out of view: what it sees when it is back is not correlated with what it saw
-        numbers[k, own], entries[k, viewed] = 0.0, NEVER
-        return
-    if entries[k, viewed] != NEVER:
-        v += (numbers[k, own] - v) * math.exp((entries[k, viewed] - stamp_ns) / (NS_PER_S * visible_s))
-    likelihood = 1.0 - v + v * ratio
-    numbers[k, own], entries[k, viewed] = v * ratio / likelihood, stamp_ns
-    changed = numbers[k, LOG_ODDS] + math.log(likelihood)
-    numbers[k, LOG_ODDS] = min(max(changed, -LARGEST_LOG_ODDS), LARGEST_LOG_ODDS)
-
-
-@njit(
-    "(int64[::1], int64, int64, float64[::1], float64[::1], int64[::1], float64[:, :, ::1], int64[:, :, ::1],"
-    " int64[::1], float64, float64)"
-)
-def _learn(
-    rows: IntArray,
-    stamp_ns: int,
-    sensor: int,
-    shares: FloatArray,
-    ratios: FloatArray,
-    cells: IntArray,
-    numbers: FloatArray,
-    entries: IntArray,
-    counts: IntArray,
-    lifetime_s: float,
-    visible_s: float,
-) -> None:
-    """Insert an entry into the tracks `rows` in order of stamps, and conclude again from there on."""
-    for m in range(len(rows)):
-        own, at = rows[m], counts[rows[m]]
-        while at > 1 and entries[own, at - 1, STAMP] > stamp_ns:
-            for j in range(VISIBLE):
-                numbers[own, at, j], entries[own, at, j] = numbers[own, at - 1, j], entries[own, at - 1, j]
-            at -= 1
-        counts[own] += 1
-        numbers[own, at, SHARE], numbers[own, at, RATIO] = shares[m], ratios[m]
-        entries[own, at, STAMP] = max(stamp_ns, entries[own, 0, STAMP])
-        entries[own, at, SENSOR], entries[own, at, CELL] = sensor, cells[m]
-        for k in range(at, counts[own]):
-            _conclude(numbers[own], entries[own], k, lifetime_s, visible_s)
-
-
-@njit("float64[::1](int64[::1], int64, float64[:, :, ::1], int64[:, :, ::1], int64[::1], float64)")
-def _present(
-    rows: IntArray, present_ns: int, numbers: FloatArray, entries: IntArray, counts: IntArray, lifetime_s: float
-) -> FloatArray:
-    """Return existence probabilities at `present_ns`, shape (m,)."""
-    result = np.empty(len(rows))
-    for m in range(len(rows)):
-        own, k = rows[m], counts[rows[m]] - 1
-        log_odds = _survived(numbers[own, k, LOG_ODDS], present_ns - entries[own, k, STAMP], lifetime_s)
-        result[m] = 1.0 / (1.0 + math.exp(-log_odds))
-    return result
-
-
-@njit("(int64, float64[:, :, ::1], int64[:, :, ::1], int64[::1], float64)")
-def _forget(
-    oldest_ns: int, numbers: FloatArray, entries: IntArray, counts: IntArray, visible_s: float
-) -> tuple[IntArray, IntArray, IntArray, IntArray, BoolArray, FloatArray]:
-    """Move entries up to `oldest_ns` out of the histories, see `Looks`; the last of them becomes entry 0."""
-    size = 0
-    for own in range(len(counts)):
-        for k in range(1, counts[own]):
-            size += entries[own, k, STAMP] <= oldest_ns
-    rows, stamps_ns = np.empty(size, np.int64), np.empty(size, np.int64)
-    sensors, cells = np.empty(size, np.int64), np.empty(size, np.int64)
-    shown, weights, at = np.empty(size, np.bool_), np.empty(size), 0
-    for own in range(len(counts)):
-        last = 0
-        for k in range(1, counts[own]):
-            if entries[own, k, STAMP] > oldest_ns:
-                break
-            last, sensor = k, entries[own, k, SENSOR]
-            rows[at], stamps_ns[at], sensors[at], cells[at] = own, entries[own, k, STAMP], sensor, entries[own, k, CELL]
-            shown[at] = numbers[own, k, RATIO] > 1.0
-            before_ns, weights[at] = entries[own, k - 1, VIEWED + sensor], 0.0
-            if not math.isnan(numbers[own, k, RATIO]):
-                look = 1.0
-                if before_ns != NEVER:
-                    look = min((stamps_ns[at] - before_ns) / (NS_PER_S * visible_s), 1.0)
-                weights[at] = look / (1.0 + math.exp(-numbers[own, k, LOG_ODDS]))
-            at += 1
-        for k in range(last, counts[own] if last else 0):
-            for j in range(numbers.shape[2]):
-                numbers[own, k - last, j], entries[own, k - last, j] = numbers[own, k, j], entries[own, k, j]
-        counts[own] -= last
-    return rows, stamps_ns, sensors, cells, shown, weights
