@@ -23,7 +23,7 @@ def ledger(
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
-    """Show how much of the error of the present comes from lateness, policy and noise.
+    """Split the error of the present into lateness, policy, noise.
 
     Repeats the measurements of one association with every policy, each as it came and as if nobody were late. Without
     truth predicted variances stand for errors. INPUT may be a run folder.

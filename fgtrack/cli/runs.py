@@ -51,7 +51,7 @@ def export(
     kitti: Annotated[Path | None, Option(metavar="OXTS", help="Write a KITTI result of this oxts/NNNN.txt.")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Export runs for Foxglove, Lichtblick, RViz, maps; or a KITTI result."""
+    """Export runs for Foxglove, Lichtblick, RViz, maps, KITTI."""
     if (kitti is not None or geojson) and len(runs) != 1:
         raise CallError(f"--{'geojson' if geojson else 'kitti'}: writes one run, these are {len(runs)}")
     if geojson:

@@ -186,7 +186,11 @@ def _made(name: str, kind: type[_Made], record: object, unknown: Counter[str]) -
     required = _FIELDS[kind]
     if not record.keys() <= required.keys():
         unknown.update(f"{name}.{key}" for key in record.keys() - required.keys())
-    given = {key: _value(key, value) for key, value in record.items() if value is not None and key in required}
+    given = {
+        key: value if type(value) is float else _value(key, value)  # as nearly always
+        for key, value in record.items()
+        if value is not None and key in required
+    }
     for key, is_needed in required.items():
         if is_needed and key not in given:
             raise InvalidMessageError(f"{key}: is missing")
@@ -196,7 +200,7 @@ def _made(name: str, kind: type[_Made], record: object, unknown: Counter[str]) -
 def _value(key: str, value: Any) -> Any:
     """`value` with lists as tuples, and integers as floats where `key` is a number that can be one."""
     if type(value) is list:
-        return tuple(_value(key, each) for each in value)
+        return tuple([each if type(each) is float else _value(key, each) for each in value])
     return float(value) if type(value) is int and key not in _INTEGERS and value.bit_length() < 1000 else value
 
 

@@ -115,7 +115,7 @@ def _is_text(value: object) -> bool:
 
 
 def _are_numbers(value: object) -> bool:
-    return isinstance(value, tuple) and all(each is None or _is_number(each) for each in value)
+    return isinstance(value, tuple) and all(type(each) is float or each is None or _is_number(each) for each in value)
 
 
 def _is_outline(value: object) -> bool:

@@ -22,7 +22,11 @@ from fgtrack.io.run.schema import COLUMNS, COVARIANCE_STATES
 
 Cell = str | int | float | None
 Row = tuple[Cell, ...]
-_NAMES = frozenset({"sensor", "class_name", "id"})  # columns that hold whatever the input calls things
+#: Indices of the columns that hold whatever the input calls things.
+_QUOTED = {
+    table: [index for index, name in enumerate(names) if name in ("sensor", "class_name", "id")]
+    for table, names in COLUMNS.items()
+}
 
 
 def rows(
@@ -73,8 +77,7 @@ def detection_rows(message: DetectionList) -> list[Row]:
 
 def text(table: str, cells: Sequence[Row]) -> str:
     """Rows as lines of the CSV file of `table`, floats with 17 significant digits."""
-    for name in _NAMES & set(COLUMNS[table]):
-        index = COLUMNS[table].index(name)
+    for index in _QUOTED[table]:
         cells = [(*row[:index], _quoted(row[index]), *row[index + 1 :]) for row in cells]
     return "".join([_line(tuple(map(type, row))) % row for row in cells])
 

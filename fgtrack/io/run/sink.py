@@ -98,8 +98,9 @@ class RunSink(ABC):
 
     def _append_received(self) -> None:
         for table, cells in self._received.items():
-            self._append(table, cells)
-            self._received[table] = []
+            if cells:
+                self._append(table, cells)
+                self._received[table] = []
 
     @abstractmethod
     def _append(self, table: str, rows: Sequence[Row]) -> None:

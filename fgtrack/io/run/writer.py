@@ -89,15 +89,15 @@ class RunWriter(RunSink):
 
     def write_rows(self, table: str, lines: str) -> None:
         """Append `lines` to the CSV file of `table`."""
-        path = self._begin() / f"{table}.csv"
+        folder = self._begin()
         try:
             if table not in self._files:
-                self._files[table] = self._open.enter_context(path.open("wb"))
+                self._files[table] = self._open.enter_context((folder / f"{table}.csv").open("wb"))
                 self._files[table].write(text_header(table, self.is_scored))
             self._files[table].write(lines.encode())
             self._files[table].flush()
         except OSError as error:
-            raise write_error(path, error) from error
+            raise write_error(folder / f"{table}.csv", error) from error
 
     def _begin(self) -> Path:
         """Make the files, with the first tick: a run that fails before leaves nothing."""
