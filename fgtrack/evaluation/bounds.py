@@ -43,6 +43,7 @@ class Bounds(NamedTuple):
 
 
 _NEVER_NS = np.iinfo(np.int64).max
+_DIFFERENCE = 1e-4  # of a state, in any of its units, for numerical derivatives of Q
 
 
 def bounds(
@@ -56,7 +57,7 @@ def bounds(
     """Return the bounds at the ascending times `now_ns`.
 
     With F, Q and H at the true states, and E the mean over trajectories, the information of the newest state is
-    J' = D22 - D12' (J + D11)^-1 D12 with D11 = E[F' Q^-1 F], D12 = -E[F' Q^-1], D22 = E[Q^-1], plus E[H' R^-1 H] of
+    J' = D22 - D12' (J + D11)^-1 D12 with D11 = E[F' Q^-1 F + what Q tells], D12 = -E[F' Q^-1], D22 = E[Q^-1], plus E[H' R^-1 H] of
     each measurement there. A measurement counts from its receipt on, at its own stamp. Where F varies much between
     trajectories the bound is far from what can be reached: see `bounds_along`.
 
@@ -130,11 +131,17 @@ def bounds_along(
 
 
 def _step(motion: MotionModel, states: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Expected information of one step of the chain: D11, D12 and D22 of the recursion."""
+    """Expected information of one step of the chain: D11, D12 and D22 of the recursion.
+    In D11 is also what the noise tells of the state it depends on, 1/2 tr(Q^-1 dQ/dx_i Q^-1 dQ/dx_j).
+    """
     F, Q = motion.jacobian(states, dt_s), motion.process_noise(states, dt_s)
     weight = np.linalg.solve(Q, np.broadcast_to(np.eye(motion.dim), Q.shape))
-    weighted = F.mT @ weight
-    return (weighted @ F).mean(axis=0), -weighted.mean(axis=0), weight.mean(axis=0)
+    weighted, told = F.mT @ weight, []
+    for shift in _DIFFERENCE * np.eye(motion.dim):
+        change = motion.process_noise(states + shift, dt_s) - motion.process_noise(states - shift, dt_s)
+        told.append(weight @ change / (2.0 * _DIFFERENCE))
+    noise = 0.5 * np.einsum("i...ab,j...ba->...ij", told, told)
+    return (weighted @ F + noise).mean(axis=0), -weighted.mean(axis=0), weight.mean(axis=0)
 
 
 def _information(item: ScheduledMeasurement, states: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.replay import ReplayEkf
-from fgtrack.evaluation.bounds import Bounds, ScheduledMeasurement, bounds, bounds_along
+from fgtrack.evaluation.bounds import Bounds, ScheduledMeasurement, _step, bounds, bounds_along
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
 
@@ -107,3 +107,27 @@ def test_a_measurement_before_the_start_is_refused(function: Callable[..., Bound
     early = ScheduledMeasurement(START_NS - 1, START_NS, measurement_model(("x_m", "y_m"), motion), np.eye(2))
     with pytest.raises(ValueError, match="start_ns"):
         function(motion, START_NS, P, [early], straight(motion, x), NOW_NS)
+
+
+def test_noise_that_depends_on_the_state_tells_of_it() -> None:
+    """Its part of the information is the curvature of the divergence between the noises of neighbouring states."""
+    motion, dt_s, h = CTRV(), 0.2, 1e-3
+    x = np.array([0.0, 0.0, 0.7, 8.0, 0.3])
+
+    def divergence(shift: FloatArray) -> float:
+        """Kullback-Leibler divergence of N(0, Q(x)) from N(0, Q(x + shift))."""
+        Q, other = motion.process_noise(x, dt_s), motion.process_noise(x + shift, dt_s)
+        ratio = np.linalg.solve(other, Q)
+        return 0.5 * float(np.trace(ratio) - len(x) - np.linalg.slogdet(ratio)[1])
+
+    J = np.empty((5, 5))
+    for i, a in enumerate(h * np.eye(5)):
+        for j, b in enumerate(h * np.eye(5)):
+            corners = divergence(a + b) - divergence(a - b) - divergence(b - a) + divergence(-a - b)
+            J[i, j] = corners / (4.0 * h * h)
+    F, weight = motion.jacobian(x, dt_s), np.linalg.inv(motion.process_noise(x, dt_s))
+    D11, D12, D22 = _step(motion, x[None], dt_s)
+    np.testing.assert_allclose(D11 - F.T @ weight @ F, J, rtol=1e-3, atol=1e-3 * J.max())
+    np.testing.assert_allclose(D22, weight, rtol=1e-9)
+    np.testing.assert_allclose(D12, -F.T @ weight, rtol=1e-9)
+    assert J[2, 2] > 1.0  # the heading shows in the direction of the noise
