@@ -57,8 +57,8 @@ def bounds(
     """Return the bounds at the ascending times `now_ns`.
 
     With F, Q and H at the true states, and E the mean over trajectories, the information of the newest state is
-    J' = D22 - D12' (J + D11)^-1 D12 with D11 = E[F' Q^-1 F + what Q tells], D12 = -E[F' Q^-1], D22 = E[Q^-1], plus E[H' R^-1 H] of
-    each measurement there. A measurement counts from its receipt on, at its own stamp. Where F varies much between
+    J' = D22 - D12' (J + D11)^-1 D12 with D11 = E[F' Q^-1 F + N], D12 = -E[F' Q^-1], D22 = E[Q^-1], plus E[H' R^-1 H] of each
+    measurement there; N_ij = 1/2 tr(Q^-1 dQ/dx_i Q^-1 dQ/dx_j), as the noise depends on the state. A measurement counts from its receipt on, at its own stamp. Where F varies much between
     trajectories the bound is far from what can be reached: see `bounds_along`.
 
     Parameters
@@ -131,9 +131,7 @@ def bounds_along(
 
 
 def _step(motion: MotionModel, states: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Expected information of one step of the chain: D11, D12 and D22 of the recursion.
-    In D11 is also what the noise tells of the state it depends on, 1/2 tr(Q^-1 dQ/dx_i Q^-1 dQ/dx_j).
-    """
+    """Expected information of one step of the chain: D11, D12 and D22 of the recursion, see `bounds`."""
     F, Q = motion.jacobian(states, dt_s), motion.process_noise(states, dt_s)
     weight = np.linalg.solve(Q, np.broadcast_to(np.eye(motion.dim), Q.shape))
     weighted, told = F.mT @ weight, []
