@@ -51,10 +51,10 @@ def judged(seed: int, duration_s: float | None) -> list[dict[str, object]]:
 
 def lines(results: pd.DataFrame) -> Iterable[str]:
     """Yield the table: means over the seeds with 95 % intervals, policies against the replaying filter in per cent."""
-    values = results.set_index(["quantity", "name", "noise", "seed"])["value"]
+    values = results.set_index(["quantity", "name", "noise", "seed"]).sort_index()["value"]
     yield f"| {' | '.join(['', *(f'{noise} noise [m] | against {REFERENCE} [%]' for noise in NOISES)])} |"
     yield "| --- " * (1 + 2 * len(NOISES)) + "|"
-    for quantity, name in dict.fromkeys((quantity, name) for quantity, name, *_ in values.index):
+    for quantity, name in results[["quantity", "name"]].drop_duplicates().itertuples(index=False):
         cells = []
         for noise in NOISES:
             own = values[quantity, name, noise].to_numpy()
