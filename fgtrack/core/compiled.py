@@ -3,6 +3,7 @@
 Calls of NumPy, BLAS and assignments of slices in compiled code take seconds to compile: loops do not.
 """
 
+import logging
 import math
 from collections.abc import Callable
 from typing import Any
@@ -13,15 +14,31 @@ import numpy as np
 from fgtrack.core.types import FloatArray
 
 
+_LOG = logging.getLogger(__name__)
+_said = set[str]()
+
+
+def _say(text: str) -> None:
+    if text not in _said:
+        _said.add(text)
+        _LOG.warning(text)
+
+
 # Any: numba has no types.
 def njit(signature: str) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that compiles a function once: it is stored in a cache folder, if one can be written."""
+    """Return a decorator that compiles a function once: it is stored in a cache folder, if one can be written.
+    One line of the log says that loops are compiled, another one that they cannot be stored.
+    """
 
     def compiled(function: Callable[..., Any]) -> Any:
         try:
-            return numba.njit(signature, cache=True, error_model="numpy")(function)
-        except RuntimeError:  # no folder to store it in
+            result = numba.njit(signature, cache=True, error_model="numpy")(function)
+        except RuntimeError:
+            _say("compiled loops cannot be stored, so every start compiles them: let NUMBA_CACHE_DIR name a folder")
             return numba.njit(signature, error_model="numpy")(function)
+        if result.stats.cache_misses:
+            _say("compiling numerical loops, once: some 40 s of processor time for all")
+        return result
 
     return compiled
 

@@ -1,0 +1,26 @@
+"""Compiled loops and where they are stored."""
+
+from typing import Any
+
+import numba
+import pytest
+
+from fgtrack.core import compiled
+
+
+def test_loops_that_cannot_be_stored_are_compiled_with_a_line(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def without_cache(signature: str, cache: bool = False, **options: Any) -> Any:
+        if cache:
+            raise RuntimeError("cannot cache function: no locator available")
+        return real(signature, **options)
+
+    real = numba.njit
+    monkeypatch.setattr(compiled.numba, "njit", without_cache)
+    monkeypatch.setattr(compiled, "_said", set())
+    doubled = [compiled.njit("int64(int64)")(lambda x: 2 * x) for _ in range(2)]
+    assert [function(4) for function in doubled] == [8, 8]
+    [line] = caplog.messages
+    assert "cannot be stored" in line
+    assert "NUMBA_CACHE_DIR" in line
