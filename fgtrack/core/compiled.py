@@ -13,7 +13,6 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray
 
-
 _LOG = logging.getLogger(__name__)
 _said = set[str]()
 
