@@ -94,7 +94,8 @@ def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
         from asterix.generated import manifest
     except ImportError as error:
         raise CallError(f"{path}: is ASTERIX, install its reader: pip install 'fgtrack[asterix]'") from error
-    editions = {number: _edition(manifest["CATS"][number], number, config.asterix) for number in _CATEGORIES}
+    known: Any = manifest["CATS"]  # Any: editions by category, which libasterix types as objects
+    editions = {number: _edition(known[number], number, config.asterix) for number in _CATEGORIES}
     parsers = {number: lambda raw, own=own: own.cv_uap.parse(Bits.from_bytes(raw)) for number, own in editions.items()}
     files = sorted(path.glob("*.ast")) if path.is_dir() else [path]
     plane = LocalPlane(config.origin or next(iter(config.asterix.stations.values()), None))
