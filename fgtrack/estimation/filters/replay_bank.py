@@ -137,7 +137,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
             self._kind, self._density, *self._arrays, rows, *lags_ns, label, new, measured, y, S, nis, status
         )
         codes = status.tolist()
-        results = list(map(UpdateResult._make, zip(map(_STATUS.__getitem__, codes), y, nis.tolist(), S, strict=True)))
+        results = list(map(UpdateResult, map(_STATUS.__getitem__, codes), y, nis.tolist(), S))
         for i in (status <= self._kernels.TOO_OLD).nonzero()[0].tolist():
             results[i] = UpdateResult(_STATUS[codes[i]])
         return results
