@@ -47,7 +47,7 @@ def export(
     runs: Runs,
     out: Annotated[Path, Option("-o", "--out", help="MCAP file; --ros2: or a rosbag2 folder; --kitti: a text file.")],
     ros2: Annotated[bool, Option("--ros2", help="Write standard ROS 2 messages instead of Foxglove's own.")] = False,
-    geojson: Annotated[bool, Option("--geojson", help="Write tracks on Earth: .geojson, or .csv for a table.")] = False,
+    geojson: Annotated[bool, Option("--geojson", help="Tracks in latitude and longitude: .geojson, .csv.")] = False,
     kitti: Annotated[Path | None, Option(metavar="OXTS", help="Write a KITTI result of this oxts/NNNN.txt.")] = None,
     overwrite: Overwrite = False,
 ) -> None:

@@ -167,21 +167,23 @@ class WhiteNoise(MotionModel):
 
     def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.predict`."""
-        return self.transition(x, dt_s, backwards=True).mean
+        return self._moved(x, dt_s).mean
 
     def jacobian(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.jacobian`."""
-        return self.transition(x, dt_s, backwards=True).F
+        return self._moved(x, dt_s).F
 
     def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.process_noise`."""
-        return self.transition(x, dt_s).Q
+        return self._moved(x, self.forward(dt_s)).Q
 
-    def transition(self, x: FloatArray, dt_s: float | FloatArray, *, backwards: bool = False) -> Transition:
-        """See `MotionModel.transition`; with `backwards`, a duration may be negative, and Q then means nothing."""
+    def transition(self, x: FloatArray, dt_s: float | FloatArray) -> Transition:
+        """See `MotionModel.transition`."""
+        return self._moved(x, self.forward(dt_s))
+
+    def _moved(self, x: FloatArray, dt_s: float | FloatArray) -> Transition:
+        """`transition` over durations that may be negative: Q then means nothing."""
         t = np.asarray(dt_s, dtype=np.float64)
-        if not backwards and (t < 0.0).any():
-            self.forward(t)
         n, shape = self.dim, x.shape[:-1]
         if shape != t.shape:
             shape = np.broadcast_shapes(shape, t.shape)

@@ -166,7 +166,8 @@ def faults(means: FloatArray, covariances: FloatArray) -> IntArray:
     m, n = means.shape
     result, C, std = np.full(m, SOUND), np.empty((n, n)), np.empty(n)
     for i in range(m):
-        P, size, total, sound = covariances[i], 0.0, 0.0, True
+        P, size, total = covariances[i], 0.0, 0.0
+        sound = P[0, 0] > 0.0 and P[1, 1] > 0.0  # every model has a position; other entries may be 0 for certain
         for a in range(n):
             std[a] = math.sqrt(max(P[a, a], 1e-300))
         for a in range(n):
