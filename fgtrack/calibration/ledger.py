@@ -28,6 +28,7 @@ from fgtrack.evaluation.tables import Column, Table, Tables
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run import Run, load_run
 from fgtrack.io.source import open_input
+from fgtrack.pipeline.assumptions.assumed import assumed, source_of
 from fgtrack.pipeline.build import build_bank
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_in_memory
@@ -100,6 +101,7 @@ class _Books:
     """The recorded association, and squared errors of every way to estimate from it."""
 
     def __init__(self, messages: Sequence[Message], config: Config, tuned: Config | None) -> None:
+        config = assumed(config, source_of(lambda: messages)).config
         self._messages, self._config, self._tuned = messages, config, tuned
         bank, run = watched(messages, replace(config, estimator=REPLAY))
         self._fed, self._run = bank.fed, run

@@ -65,7 +65,11 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
             ("replay", "other.jsonl", "-o", "run"),
             ("replay", "kitti/oxts/0001.txt", "-o", "kitti_run"),
             ("demo", "-o", "demo"),
-            *(words for words, _ in WRITERS if words[0] in ("figure", "report", "export", "tune", "advise", "info")),
+            *(
+                words
+                for words, _ in WRITERS
+                if words[0] in ("figure", "report", "export", "tune", "advise", "info", "ledger")
+            ),
         ):
             assert run(list(words)) == 0
     return folder
@@ -123,6 +127,7 @@ WRITERS = [
     (("tune", "noisy.jsonl", "-o", "tuned.yaml"), "tuned.yaml"),
     (("advise", "drive.jsonl", "-o", "advised.yaml"), "advised.yaml"),
     (("info", "drive.jsonl", "--write", "my.yaml"), "my.yaml"),
+    (("ledger", "noisy.jsonl", "--figure", "ledger.png"), "ledger.png"),
 ]
 #: A sweep goes on where it was, and makes its tables anew.
 ONGOING = [
@@ -148,7 +153,7 @@ def test_every_command_with_an_output_is_in_the_table() -> None:
 def test_what_exists_is_refused_at_once_and_replaced_with_overwrite(
     here: Path, call: Call, words: tuple[str, ...], place: str
 ) -> None:
-    flag = {"-o", "--write"}.intersection(words)
+    flag = {"-o", "--write", "--figure"}.intersection(words)
     out = words[words.index(*flag) + 1] if flag else words[2]
     own = here / place
     if own.is_dir():
@@ -296,7 +301,7 @@ def test_an_output_that_cannot_be_written_is_a_bad_call_everywhere(here: Path, c
     Path("file").write_text("")
     Path("sweep.yaml").write_text(SWEEP)
     for words, _ in [*WRITERS, *ONGOING[:1]]:
-        flag = {"-o", "--write"}.intersection(words)
+        flag = {"-o", "--write", "--figure"}.intersection(words)
         at = words.index(*flag) + 1 if flag else 2
         words = (*words[:at], f"file/x{Path(words[at]).suffix}", *words[at + 1 :])
         code, error = call(*words)

@@ -111,3 +111,7 @@ def test_the_figure_names_every_part(karle: Ledger) -> None:
     [axes] = waterfall(karle.waterfall, "title").axes
     labels = [label.get_text() for label in axes.get_yticklabels()]
     assert labels == ["error now", *(part.cause for part in karle.waterfall[1:]), "nobody late"]
+
+
+def test_sensors_need_no_configuration(messages: list[Message]) -> None:
+    assert math.isfinite(ledger(messages).waterfall[0].mean_square_m2)
