@@ -146,8 +146,8 @@ def test_a_bank_reports_lagged_states_and_final_ones_once(final: bool, left: lis
 class OwnTransition(CTRV):
     """CTRV as a model that is not compiled."""
 
-    def transition(self, x: FloatArray, dt_s: float | FloatArray, *, backwards: bool = False) -> Transition:
-        return super().transition(x, dt_s, backwards=backwards)
+    def transition(self, x: FloatArray, dt_s: float | FloatArray) -> Transition:
+        return super().transition(x, dt_s)
 
 
 def test_a_motion_model_in_numpy_gives_what_the_same_one_compiled_gives() -> None:
