@@ -23,10 +23,10 @@ from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.failures import Failures
 from fgtrack.estimation.likelihood.series import Observation
 from fgtrack.evaluation.intervals import Estimate, within_run
-from fgtrack.evaluation.matching import NO_OBJECT, match
+from fgtrack.evaluation.matching import NO_OBJECT, match, track_errors
 from fgtrack.evaluation.tables import Column, Table, Tables
 from fgtrack.evaluation.truth import true_paths
-from fgtrack.io.run import Run, load_run
+from fgtrack.io.run import load_run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumptions.assumed import assumed, source_of
 from fgtrack.pipeline.build import build_bank
@@ -40,6 +40,7 @@ POLICIES = ("drop", "as-current", PUBLISHED, FORGET, REPLAY, SMOOTHER)
 """Estimators that the ledger compares."""
 WAITS_S = (0.1, 0.3, 1.0)
 """Ages of the states that waiting gives."""
+_WAITING = (REPLAY, SMOOTHER)
 _DECISIONS = "other decisions than those of the replaying EKF"
 _SETTLE_NS, _STEP_NS = NS_PER_S, NS_PER_S // 20  # a track is judged from an age on, and so often
 Arrival = Callable[[Fed], int | None]
@@ -92,7 +93,11 @@ def ledger(
         if (path / "meta.json").is_file():
             run = load_run(path)
             settings = settings if config is not None else read_config(str(run.config_path))
-            path = Path(run.meta["input"]["path"])
+            path = Path((run.meta.get("input") or {}).get("path") or path)
+            if not path.exists() or path == Path(recording):
+                raise DataError(
+                    f"{recording}: its recording is not at {path}, give the recording with -c {run.config_path}"
+                )
         recording = open_input(path, settings.input).messages()
     return _Books(list(recording), settings, fitted).ledger()
 
@@ -118,10 +123,7 @@ class _Books:
     @cached_property
     def _objects(self) -> IntArray | None:
         """Object of each judged tick and track; `NO_OBJECT` without one. None without truth."""
-        return self._paired(self._run)
-
-    def _paired(self, run: Run) -> IntArray | None:
-        matching = match(run)
+        matching = match(self._run)
         if matching is None:
             return None
         full = np.full((len(self._now_ns), len(self._track_ids)), NO_OBJECT)
@@ -202,9 +204,7 @@ class _Books:
         if tuned is not None:
             ways.append(("noise that is not tuned", estimator, self.squares(estimator, tuned)[0]))
         waits = (0.0, *WAITS_S)
-        policies = {
-            name: self.squares(name, best, waits_s=waits if name in (REPLAY, SMOOTHER) else (0.0,)) for name in POLICIES
-        }
+        policies = {name: self.squares(name, best, waits_s=waits if name in _WAITING else (0.0,)) for name in POLICIES}
         if estimator == PUBLISHED:
             ways.append(("its time grid", FORGET, policies[FORGET][0]))
             ways.append(("forgetting what was fused since", REPLAY, policies[REPLAY][0]))
@@ -222,7 +222,7 @@ class _Books:
             ways[1] = (_DECISIONS, *ways[1][1:])
         waterfall = [Part("", _mean(ways[0][2], common), Estimate(math.nan, math.nan, math.nan, 0))]
         for (_, _, before), (cause, _, after) in itertools.pairwise(ways):
-            if cause == _DECISIONS and np.array_equal(before[common], after[common]):
+            if cause == _DECISIONS and np.allclose(before[common], after[common], rtol=1e-9):
                 continue
             waterfall.append(Part(cause, _mean(after, common), _difference(before, after, common)))
         sensors = self._sensors(best, policies[REPLAY][0], common)
@@ -243,9 +243,7 @@ class _Books:
         run = replay_in_memory(self._messages, self._config)
         matching = match(run)
         assert matching is not None
-        paired = np.flatnonzero(matching.paired)
-        true_m, tracks = matching.true_states[paired, :2], matching.tracks.where(matching.paired)
-        squares = (tracks["x_m"] - true_m[:, 0]) ** 2 + (tracks["y_m"] - true_m[:, 1]) ** 2
+        paired, squares = np.flatnonzero(matching.paired), np.square(track_errors(matching).values["position_m"])
         by_object = np.full((len(self._now_ns), len(matching.object_ids) + 1), np.nan)
         by_object[matching.tick_index[paired], matching.object_index[paired]] = squares
         return np.take_along_axis(by_object[self._ticks], self._objects, axis=1)  # NO_OBJECT takes the last column
@@ -325,11 +323,11 @@ class _Books:
         return Table("Same measurements, same noise, same start", records, columns, ("estimator",))
 
     def _waiting(self, policies: Mapping[str, Sequence[FloatArray]]) -> Table:
-        every = [item for name in (REPLAY, SMOOTHER) for item in policies[name]]
+        every = [item for name in _WAITING for item in policies[name]]
         common: BoolArray = np.all(np.isfinite(every), axis=0)
         records = []
         for k, wait_s in enumerate((0.0, *WAITS_S)):
-            filtered, smoothed = (policies[name][k] for name in (REPLAY, SMOOTHER))
+            filtered, smoothed = (policies[name][k] for name in _WAITING)
             record = {"wait_s": wait_s, "filter_m": math.nan, "smoother_m": math.nan}
             if common.any():
                 record |= {

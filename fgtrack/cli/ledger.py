@@ -34,7 +34,8 @@ def ledger(
         result = explained(recording, config_file, tuned)
     if figure is not None:
         with new_file(figure, overwrite) as file:
-            file.write(png(waterfall(result.waterfall, f"{result.estimator}: error of the present")))
+            parts = [(item.cause, item.mean_square_m2) for item in result.waterfall]
+            file.write(png(waterfall(parts, f"{result.estimator}: error of the present")))
     show(result.tables, "json" if as_json else None)
     if not as_json:
         say("")

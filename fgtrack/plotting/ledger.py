@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Protocol, Unpack
+from typing import Unpack
 
 from matplotlib.figure import Figure
 
@@ -14,25 +14,15 @@ from fgtrack.plotting.style import GREY
 _HEIGHT = 0.72
 
 
-class Part(Protocol):
-    """One line of the waterfall."""
-
-    @property
-    def cause(self) -> str:
-        """Cause that this line takes away."""
-
-    @property
-    def mean_square_m2(self) -> float:
-        """Mean square of what is left."""
-
-
 @styled
-def waterfall(parts: Sequence[Part], title: str, **paper: Unpack[Paper]) -> Figure:
-    """Bars from the error of the present down to what is left without its causes, see `Ledger.waterfall`."""
+def waterfall(parts: Sequence[tuple[str, float]], title: str, **paper: Unpack[Paper]) -> Figure:
+    """Bars from the error of the present down to what is left without its causes.
+    `parts` are causes and the mean square, in m^2, that is left without each and all before it; the first is the error.
+    """
     sheet = Sheet(9.0, 1.2 + 0.42 * (len(parts) + 1), paper)
     axes = sheet.plots(1)[0, 0]
-    ends = [item.mean_square_m2 for item in parts]
-    names = ["error now", *(item.cause for item in parts[1:]), "nobody late"]
+    ends = [end for _, end in parts]
+    names = ["error now", *(cause for cause, _ in parts[1:]), "nobody late"]
     steps = [(after, before - after, "") for before, after in itertools.pairwise(ends)]
     bars = [(0.0, ends[0], GREY), *steps, (0.0, ends[-1], GREY)]
     for row, (start, length, colour) in enumerate(bars):

@@ -108,10 +108,18 @@ def test_a_run_folder_stands_for_its_recording(tmp_path: Path) -> None:
 
 
 def test_the_figure_names_every_part(karle: Ledger) -> None:
-    [axes] = waterfall(karle.waterfall, "title").axes
+    [axes] = waterfall([(part.cause, part.mean_square_m2) for part in karle.waterfall], "title").axes
     labels = [label.get_text() for label in axes.get_yticklabels()]
     assert labels == ["error now", *(part.cause for part in karle.waterfall[1:]), "nobody late"]
 
 
 def test_sensors_need_no_configuration(messages: list[Message]) -> None:
     assert math.isfinite(ledger(messages).waterfall[0].mean_square_m2)
+
+
+def test_a_run_folder_without_its_recording_says_so(tmp_path: Path) -> None:
+    recording = fgtrack.simulate("default", duration_s=2.0, seed=1, out=tmp_path / "drive.jsonl")
+    fgtrack.replay(recording, "smoother", estimator="ekf-replay", out=tmp_path / "run")
+    Path(recording).unlink()
+    with pytest.raises(DataError, match=r"run: its recording is not at .*drive.jsonl, give the recording with -c"):
+        ledger(tmp_path / "run")
