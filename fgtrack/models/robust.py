@@ -1,11 +1,16 @@
 """Weight of a measurement under a robust loss, as in iteratively reweighted least squares.
 
-The weight at a whitened residual of length d is rho'(d) / d of the loss rho, which begins as d^2 / 2; c is the width.
+The weight at a whitened residual of length d is rho'(d) / d of the loss rho, which begins as d^2 / 2; c is its width.
+A width is given for one component: of k components c is where the chi distribution with k degrees of freedom has the
+same probability beyond it, so a loss treats the same share of good measurements as outliers whatever they measure.
 Names and forms are those of GTSAM. Weights begin at 1 and never grow with d, so each reweighting lowers prior plus loss
 (Huber and Ronchetti, Robust Statistics, 2009, section 7.8).
 """
 
 import math
+from functools import cache
+
+from scipy.special import chdtrc, chdtri
 
 from fgtrack.models.sensors import RobustLoss
 
@@ -13,9 +18,16 @@ from fgtrack.models.sensors import RobustLoss
 LEAST_WEIGHT = 1e-12
 
 
-def _loss(loss: RobustLoss, d: float) -> tuple[float, float]:
+@cache
+def width(loss: RobustLoss, size: int) -> float:
+    """Width for the length of a whitened residual of `size` components: P(chi_size > width) = P(|N(0, 1)| > c)."""
+    beyond = float(chdtrc(1.0, loss.width**2))
+    return math.sqrt(float(chdtri(float(size), beyond))) if beyond else loss.width
+
+
+def _loss(loss: RobustLoss, d: float, size: int) -> tuple[float, float]:
     """The loss rho(d) and the weight rho'(d) / d; `dcs` is dynamic covariance scaling (Agarwal et al. 2013)."""
-    c = loss.width
+    c = width(loss, size)
     share = c * c / (c * c + d * d)
     if loss.kind == "cauchy":
         return 0.5 * c * c * math.log1p((d / c) ** 2), share
@@ -31,13 +43,13 @@ def _loss(loss: RobustLoss, d: float) -> tuple[float, float]:
     return c * c * (1.5 - 2.0 * share), (2.0 * share) ** 2
 
 
-def weight(loss: RobustLoss, distance: float) -> float:
-    """Weight of a measurement under `loss`, from `LEAST_WEIGHT` to 1, at a whitened residual of length `distance`."""
+def weight(loss: RobustLoss, distance: float, size: int) -> float:
+    """Weight of a measurement of `size` components, from `LEAST_WEIGHT` to 1, at a whitened residual of `distance`."""
     if not math.isfinite(distance):
         return LEAST_WEIGHT
-    return max(_loss(loss, distance)[1], LEAST_WEIGHT)
+    return max(_loss(loss, distance, size)[1], LEAST_WEIGHT)
 
 
-def penalty(loss: RobustLoss | None, distance: float) -> float:
+def penalty(loss: RobustLoss | None, distance: float, size: int) -> float:
     """The loss rho itself; without a `loss` the square, d^2 / 2."""
-    return 0.5 * distance * distance if loss is None else _loss(loss, distance)[0]
+    return 0.5 * distance * distance if loss is None else _loss(loss, distance, size)[0]

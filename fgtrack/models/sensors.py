@@ -61,7 +61,7 @@ class RobustLoss:
     kind: Literal["huber", "cauchy", "tukey", "geman_mcclure", "dcs"]
     """`tukey`, `geman_mcclure` and `dcs` are redescending: they can lose a track for good."""
     width: PositiveFloat
-    """Where the loss leaves the square, in standard deviations (of the whole measurement)."""
+    """Where the loss leaves the square, in standard deviations of one component; of several at the same probability."""
 
 
 @settings

@@ -114,7 +114,7 @@ def slope(function: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatA
 
 def _weight(one: Measurement, y: FloatArray) -> float:
     """Weight of a measurement under its robust loss at the residual `y` (k,)."""
-    return 1.0 if one.loss is None else weight(one.loss, math.sqrt(y @ np.linalg.solve(one.R, y)))
+    return 1.0 if one.loss is None else weight(one.loss, math.sqrt(y @ np.linalg.solve(one.R, y)), len(y))
 
 
 def difference(found: TrackState, expected: TrackState, motion: MotionModel | None = None) -> tuple[float, float]:

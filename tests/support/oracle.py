@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy import linalg
+from scipy import linalg, stats
 from scipy.integrate import solve_ivp
 
 FloatArray = npt.NDArray[np.float64]
@@ -166,7 +166,7 @@ class Sighting:
     R: FloatArray
     eye: Eye = _AT_ORIGIN
     loss: float | None = None
-    """Width of a Huber loss on the length of the whitened residual; None: a Gaussian."""
+    """Width of a Huber loss of one component; None: a Gaussian."""
 
     def residual(self, x: FloatArray, state_names: tuple[str, ...]) -> FloatArray:
         """z - h(x), whitened, shape (k,); angles go the short way round."""
@@ -184,7 +184,8 @@ class Sighting:
         """What the sighting counts at the whitened residual `y`."""
         if self.loss is None:
             return 1.0
-        return 1.0 / max(float(np.linalg.norm(y)) / self.loss, 1.0)
+        beyond = 2.0 * stats.norm.sf(self.loss)  # the same share of good measurements, whatever is measured
+        return 1.0 / max(float(np.linalg.norm(y)) / float(stats.chi.isf(beyond, len(y))), 1.0)
 
 
 def seen(names: tuple[str, ...], x: FloatArray, state_names: tuple[str, ...], eye: Eye) -> FloatArray:

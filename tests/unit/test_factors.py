@@ -14,7 +14,7 @@ from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.smoothing.gtsam.batch import measurement_factor, motion_factor
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, MotionModel
-from fgtrack.models.robust import penalty, weight
+from fgtrack.models.robust import penalty, weight, width
 from fgtrack.models.sensors import RobustLoss
 
 LEFT, RIGHT = 3, 7
@@ -122,24 +122,26 @@ def loss_and_weight(kind: str, width: float, e: float) -> tuple[float, float]:
 def test_a_measurement_factor_is_the_whitened_weighted_residual(kind: str, what: str, loss: str | None) -> None:
     for off in (0.4, 2.0, 5.0):
         item, x = measurement(kind, what, None if loss is None else RobustLoss(loss, 1.5), off)
-        root_weight = 1.0 if loss is None else math.sqrt(loss_and_weight(loss, 1.5, off)[1])
+        own = item.loss and width(item.loss, len(item.R))
+        root_weight = 1.0 if loss is None else math.sqrt(loss_and_weight(loss, own or 0.0, off)[1])
         A, b = linear_parts(measurement_factor(LEFT, (item, 0.0), x, MOTIONS[kind]), values(left=x))
         expected = numeric_jacobian(lambda at, item=item: whitened(item, at), x)
         np.testing.assert_allclose(A, root_weight * expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
         np.testing.assert_allclose(b, -root_weight * whitened(item, x), rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize(("width", "off"), [(1.5, 0.3), (1.5, 1.4), (1.5, 1.6), (1.5, 8.0), (2.5, 2.4), (2.5, 2.6)])
+@pytest.mark.parametrize(("c", "off"), [(1.5, 0.3), (1.5, 1.4), (1.5, 1.6), (1.5, 8.0), (2.5, 2.4), (2.5, 2.6)])
 @pytest.mark.parametrize("kind", LOSSES)
-def test_a_robust_loss_is_its_formula(kind: str, width: float, off: float) -> None:
-    item, x = measurement("ctrv", "position", RobustLoss(kind, width), off)
+def test_a_robust_loss_is_its_formula(kind: str, c: float, off: float) -> None:
+    item, x = measurement("ctrv", "position", RobustLoss(kind, c), off)
     factor = measurement_factor(LEFT, (item, 0.0), x, CTRV())
-    loss, expected_weight = loss_and_weight(kind, width, off)
-    assert factor.error(values(left=x)) == pytest.approx(loss, rel=1e-9)
-    assert penalty(RobustLoss(kind, width), off) == pytest.approx(loss, rel=1e-12)
-    assert weight(RobustLoss(kind, width), off) == pytest.approx(expected_weight, rel=1e-12, abs=1e-12)
+    of_two = width(RobustLoss(kind, c), 2)
+    assert factor.error(values(left=x)) == pytest.approx(loss_and_weight(kind, of_two, off)[0], rel=1e-9)
+    loss, expected_weight = loss_and_weight(kind, c, off)
+    assert penalty(RobustLoss(kind, c), off, 1) == pytest.approx(loss, rel=1e-12)
+    assert weight(RobustLoss(kind, c), off, 1) == pytest.approx(expected_weight, rel=1e-12, abs=1e-12)
     step = 1e-6
-    slope = (loss_and_weight(kind, width, off + step)[0] - loss_and_weight(kind, width, off - step)[0]) / (2 * step)
+    slope = (loss_and_weight(kind, c, off + step)[0] - loss_and_weight(kind, c, off - step)[0]) / (2 * step)
     assert slope == pytest.approx(expected_weight * off, rel=1e-5, abs=1e-6)
 
 

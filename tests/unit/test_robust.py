@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import minimize
+from scipy.stats import chi, norm
 
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement
@@ -12,7 +13,7 @@ from fgtrack.estimation.filters.ekf import correct, correct_one
 from fgtrack.estimation.registry import ESTIMATORS, Claims, estimator
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
-from fgtrack.models.robust import LEAST_WEIGHT, penalty, weight
+from fgtrack.models.robust import LEAST_WEIGHT, penalty, weight, width
 from fgtrack.models.sensors import RobustLoss
 from fgtrack.testing.streams import LINEAR, MS, START, measured
 
@@ -31,7 +32,17 @@ def seen(off: float, loss: RobustLoss | None) -> Measurement:
 def objective(x: FloatArray, measurement: Measurement) -> float:
     r = measurement.z - x[:2]
     distance = float(np.sqrt(r @ np.linalg.solve(R, r)))
-    return float(0.5 * (x - MEAN) @ np.linalg.solve(P, x - MEAN) + penalty(measurement.loss, distance))
+    return float(0.5 * (x - MEAN) @ np.linalg.solve(P, x - MEAN) + penalty(measurement.loss, distance, 2))
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_a_loss_leaves_the_square_for_the_same_share_of_good_measurements(size: int) -> None:
+    loss = RobustLoss("huber", 1.5)
+    distances = np.linalg.norm(np.random.default_rng(0).standard_normal((20_000, size)), axis=1)
+    share = np.mean([weight(loss, float(distance), size) < 1.0 for distance in distances])
+    assert share == pytest.approx(2.0 * norm.sf(1.5), abs=4.0 * 0.0024)  # four standard deviations of a share of 13 %
+    assert width(loss, size) == pytest.approx(chi.isf(2.0 * norm.sf(1.5), size), rel=1e-9)
+    assert width(RobustLoss("huber", 100.0), size) == 100.0  # no probability is left
 
 
 @pytest.mark.parametrize("off", [0.3, 8.0])
@@ -58,8 +69,8 @@ def test_an_inlier_counts_in_full_and_the_nis_is_that_without_a_loss() -> None:
 
 
 def test_a_redescending_loss_ignores_what_is_hopeless() -> None:
-    assert penalty(None, 3.0) == 4.5
-    assert weight(RobustLoss("tukey", 4.7), float("inf")) == LEAST_WEIGHT
+    assert penalty(None, 3.0, 2) == 4.5
+    assert weight(RobustLoss("tukey", 4.7), float("inf"), 2) == LEAST_WEIGHT
     found = correct_one(MEAN, P, seen(1e4, RobustLoss("tukey", 4.7)))
     assert found.weight == LEAST_WEIGHT
     np.testing.assert_allclose(found.mean, MEAN, atol=1e-6)

@@ -51,7 +51,7 @@ def robust_weight(loss: RobustLoss | None, y: FloatArray, spread: FloatArray, R:
         return w
     for _ in range(_MAX_REWEIGHTINGS):
         solved = psd_solve(spread + R / w, y)
-        new = weight(loss, math.sqrt(max(float(solved.dot(R.dot(solved))), 0.0)) / w)
+        new = weight(loss, math.sqrt(max(float(solved.dot(R.dot(solved))), 0.0)) / w, len(y))
         if not new < w * (1.0 - _REWEIGHTING_TOLERANCE):
             break
         w = new

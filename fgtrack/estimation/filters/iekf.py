@@ -71,7 +71,7 @@ def negative_log_posterior(
     """Cost that an update minimises: half of off' P^-1 off, and the loss of the residual (k,) in R (k, k).
     `off` (n,) is the step from the prior with covariance P (n, n).
     """
-    return 0.5 * float(off.dot(psd_solve(P, off))) + penalty(loss, _length(residual, R))
+    return 0.5 * float(off.dot(psd_solve(P, off))) + penalty(loss, _length(residual, R), len(R))
 
 
 def reweighted(
@@ -90,7 +90,7 @@ def reweighted(
     y = residual + H.dot(off)
     if loss is None or not off.any():
         return updated_one(mean, covariance, y, H, R, loss)
-    w = weight(loss, _length(residual, R))
+    w = weight(loss, _length(residual, R), len(R))
     return updated_one(mean, covariance, y, H, R / w)._replace(weight=w)
 
 

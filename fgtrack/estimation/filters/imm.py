@@ -153,4 +153,4 @@ def _beside(motion: MotionModel, other: str | MotionModel) -> MotionModel | None
 def _log_likelihood(corrected: OneCorrection, measurement: Measurement) -> float:
     """Log-likelihood of the innovation by one model, under the loss of the measurement, without common terms."""
     distance = math.sqrt(max(float(mahalanobis_squared(corrected.innovation, corrected.S)), 0.0))
-    return -penalty(measurement.loss, distance) - 0.5 * float(np.linalg.slogdet(corrected.S)[1])
+    return -penalty(measurement.loss, distance, len(measurement.R)) - 0.5 * float(np.linalg.slogdet(corrected.S)[1])

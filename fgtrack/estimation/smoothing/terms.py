@@ -33,14 +33,14 @@ def whitened(term: Term, x: FloatArray, motion: MotionModel) -> FloatArray:
     y, H = linearised(term, x, motion)
     rows = inverse_root(term[0].R) @ np.column_stack([H, y])
     if term[0].loss is not None:
-        rows *= math.sqrt(weight(term[0].loss, float(np.linalg.norm(rows[:, -1]))))
+        rows *= math.sqrt(weight(term[0].loss, float(np.linalg.norm(rows[:, -1])), len(rows)))
     return np.asarray(rows)
 
 
 def cost(term: Term, x: FloatArray, motion: MotionModel) -> float:
     """Half of the squared Mahalanobis distance of `term` from the state `x` (n,), or its robust loss there."""
     y, _ = linearised(term, x, motion)
-    return penalty(term[0].loss, math.sqrt(mahalanobis_squared(y, term[0].R)))
+    return penalty(term[0].loss, math.sqrt(mahalanobis_squared(y, term[0].R)), len(y))
 
 
 def overshot(terms: Iterable[Term], origin: FloatArray, mean: FloatArray, motion: MotionModel) -> bool:

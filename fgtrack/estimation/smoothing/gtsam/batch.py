@@ -15,6 +15,7 @@ from fgtrack.estimation.smoothing.bank import SmootherBank
 from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
 from fgtrack.estimation.smoothing.terms import Term, linearised, whitened
 from fgtrack.models.motion import MotionModel
+from fgtrack.models.robust import width
 
 _Loss = mEstimator.Huber | mEstimator.Cauchy | mEstimator.Tukey | mEstimator.GemanMcClure | mEstimator.DCS
 _LOSSES: Mapping[str, Callable[[float], _Loss]] = {
@@ -104,7 +105,7 @@ def measurement_factor(key: int, term: Term, origin: FloatArray, motion: MotionM
 
     noise, loss = _gaussian(inverse_root(measurement.R)), measurement.loss
     if loss is not None:
-        noise = gtsam.noiseModel.Robust.Create(_LOSSES[loss.kind](loss.width), noise)
+        noise = gtsam.noiseModel.Robust.Create(_LOSSES[loss.kind](width(loss, len(measurement.R))), noise)
     return gtsam.CustomFactor(noise, [key], error)
 
 
