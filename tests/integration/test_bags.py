@@ -266,18 +266,17 @@ def test_a_file_without_chunks_is_read(tmp_path):
 def test_an_unordered_mcap_file_is_read_in_log_time_order_with_and_without_its_end(tmp_path, humble):
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connection = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=humble)
-        data = bytes(humble.serialize_cdr(make_odometry(humble, 5), connection.msgtype))
-        for time_ns in (7, 3, 9):
-            writer.write(connection, time_ns, data)
-        writer.storage.close_chunk()
-        for time_ns in (8, 1):
-            writer.write(connection, time_ns, data)
-    config = InputConfig(ego=TopicInput("/odom"))
-    assert [message.receipt_ns for message in read(tmp_path / "bag", config)] == [1, 3, 7, 8, 9]
+        for number, time_ns in enumerate((7, 3, 9, 7, 8, 1)):
+            if number == 3:
+                writer.storage.close_chunk()
+            data = humble.serialize_cdr(make_odometry(humble, number), connection.msgtype)
+            writer.write(connection, time_ns, bytes(data))
+    config, written = InputConfig(ego=TopicInput("/odom")), [(1, 5), (3, 1), (7, 0), (7, 3), (8, 4), (9, 2)]
+    assert [(message.receipt_ns, message.stamp_ns) for message in read(tmp_path / "bag", config)] == written
     file = storage_file(tmp_path / "bag")
     file.write_bytes(file.read_bytes()[:-10])
     found = list(UntilBreak(open_input(file, config).messages()))
-    assert [message.receipt_ns for message in found] == [1, 3, 7, 8, 9]
+    assert [(message.receipt_ns, message.stamp_ns) for message in found] == written
 
 
 # --- the recordings of other people
