@@ -9,7 +9,7 @@ import numpy as np
 
 from fgtrack.core.geometry import rotation
 from fgtrack.core.linalg import congruence
-from fgtrack.core.types import FloatArray, Message, UpdateRecord
+from fgtrack.core.types import FloatArray, Message
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult
 from fgtrack.estimation.failures import Failures
 from fgtrack.estimation.likelihood.series import Observation, Series, positive_part
@@ -19,11 +19,10 @@ from fgtrack.pipeline.build import build_bank
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.tracking.association import Assignment, GatedEuclidean, GatedMahalanobis
-from fgtrack.tracking.ego import EgoPose
+from fgtrack.tracking.detections import PosedBatch
 from fgtrack.tracking.guarded_bank import GuardedBank
-from fgtrack.tracking.inbox import Batch
 from fgtrack.tracking.objects import Apart
-from fgtrack.tracking.preprocess import Candidate, Candidates, Preprocess
+from fgtrack.tracking.preprocess import Candidate, Candidates, Preprocess, Preprocessed
 from fgtrack.tracking.tracker import TrackerParts
 
 _GATE_PROBABILITY = 0.9999
@@ -101,27 +100,26 @@ class _OpenedGate:
 
 
 class _WatchedPreprocess(Preprocess):
-    """A `Preprocess` that keeps the origin of the noise of the newest batch."""
+    """A `Preprocess` that keeps the origin of the noise of the newest batches."""
 
     def __init__(self, watched: Preprocess) -> None:
-        self._watched = watched
-        self._sensor: tuple[str, SensorModel]
-        self._own: dict[bytes, bool] = {}  # by what is measured
+        self.__dict__.update(vars(watched))
+        self._own: dict[tuple[int, bytes], tuple[str, SensorModel, bool]] = {}  # by stamp and what is measured
 
-    def __call__(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> tuple[Candidates, list[UpdateRecord]]:
-        candidates, records = self._watched(batch, sensor, ego)
-        objects = batch.message.objects
-        self._sensor = batch.message.sensor, sensor
-        self._own = {
-            item.measurement.z.tobytes(): sensor.message_covariance
-            and any(objects[index].covariance is not None for index in (item.leader, *item.merged))
-            for item in candidates
-        }
-        return candidates, records
+    def together(self, batches: Sequence[PosedBatch]) -> list[Preprocessed]:
+        """See `Preprocess.together`."""
+        result, self._own = super().together(batches), {}
+        for (batch, sensor, _, _), (candidates, _) in zip(batches, result, strict=True):
+            for item in candidates:
+                carried = [batch.message.objects[index].covariance for index in (item.leader, *item.merged)]
+                is_own = sensor.message_covariance and any(each is not None for each in carried)
+                self._own[batch.stamp_ns, item.measurement.z.tobytes()] = batch.message.sensor, sensor, is_own
+        return result
 
     def observation(self, measurement: Measurement) -> Observation:
-        """Return a measurement of the newest batch with its noise in parts."""
-        return observation(*self._sensor, measurement, self._own[measurement.z.tobytes()])
+        """Return a measurement of the newest batches with its noise in parts."""
+        name, sensor, is_own = self._own[measurement.stamp_ns, measurement.z.tobytes()]
+        return observation(name, sensor, measurement, is_own)
 
 
 def observation(name: str, sensor: SensorModel, measurement: Measurement, own: bool) -> Observation:

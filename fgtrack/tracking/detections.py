@@ -1,11 +1,12 @@
-"""The detections of one batch in the map frame, as arrays: errors of the pose in them, and merging."""
+"""The detections of batches in the map frame, as arrays: errors of the pose in them, and merging."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from operator import attrgetter
 from types import MappingProxyType
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -17,6 +18,7 @@ from fgtrack.core.linalg import congruence, kernels
 from fgtrack.core.types import BoolArray, Detection, FloatArray, IntArray
 from fgtrack.models.measurement import ANGULAR, COMPONENTS, MIN_RANGE_M, MeasurementModel, SensorPose
 from fgtrack.models.sensors import SensorModel
+from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.inbox import Batch, own_covariance
 
 X, YAW, RANGE, BEARING, CURVATURE = map(
@@ -24,40 +26,49 @@ X, YAW, RANGE, BEARING, CURVATURE = map(
 )
 
 
-class MapDetections(NamedTuple):
-    """Detections of one batch with their components in the map frame."""
+class PosedBatch(NamedTuple):
+    """A batch, the sensor that it is of, and the pose that its detections are seen from."""
 
     batch: Batch
     sensor: SensorModel
+    ego: EgoPose | None
+    """At the stamp of the batch; None where it is unknown."""
     pose: SensorPose
-    """Pose that they are seen from."""
+
+
+class MapDetections(NamedTuple):
+    """Detections of one or several batches, one batch after another, with their components in the map frame."""
+
+    batches: Sequence[PosedBatch]
+    of: IntArray
+    """Indices of their batches, ascending, shape (m,)."""
     indices: IntArray
-    """Positions in the message, shape (m,)."""
+    """Indices in the message, shape (m,)."""
     values: FloatArray
     """In the order of `COMPONENTS`, shape (m, 8); NaN where there is none."""
     points_m: FloatArray
     """Positions in the map, shape (m, 2); NaN where only a bearing was measured."""
     map_yaw: BoolArray
     """True where the yaw is that of the map, shape (m,)."""
-    merged: Mapping[int, tuple[int, ...]] = MappingProxyType({})
-    """Positions of the detections that end as merged, by that of the detection which leads them."""
-    averaged: "Mapping[int, MapDetections]" = MappingProxyType({})
-    """Detections of which the values are averages, by the position of the leading one."""
+    merged: Mapping[tuple[int, int], tuple[int, ...]] = MappingProxyType({})
+    """Indices of the detections that end as merged, by batch and index of the one which leads them."""
+    averaged: "Mapping[tuple[int, int], MapDetections]" = MappingProxyType({})
+    """Detections of which the values are averages, by batch and index of the leading one."""
 
     @property
-    def placed(self) -> IntArray:
-        """Indices of those with a position."""
-        x_m = self.points_m[:, 0]
-        return np.asarray((x_m == x_m).nonzero()[0])  # NaN is not equal to itself
+    def starts(self) -> IntArray:
+        """First row of each batch, and the number of all, shape (batches + 1,)."""
+        return self.of.searchsorted(np.arange(len(self.batches) + 1))
 
     @property
-    def detections(self) -> list[Detection]:
-        """The detections as received."""
-        return list(map(self.batch.message.objects.__getitem__, self.indices.tolist()))
+    def poses(self) -> FloatArray:
+        """Poses of the batches, shape (batches, 5)."""
+        return np.array([each.pose for each in self.batches])
 
-    def at(self, rows: IntArray | BoolArray) -> "MapDetections":
+    def at(self, rows: IntArray | BoolArray | slice) -> "MapDetections":
         """Return the detections at `rows`."""
         return self._replace(
+            of=self.of[rows],
             indices=self.indices[rows],
             values=self.values[rows],
             points_m=self.points_m[rows],
@@ -65,54 +76,63 @@ class MapDetections(NamedTuple):
         )
 
 
-def in_map_frame(batch: Batch, sensor: SensorModel, pose: SensorPose) -> MapDetections:
-    """The detections of `batch`, what `sensor` measures of them, seen from `pose`."""
-    values = np.full((len(batch.indices), len(COMPONENTS)), np.nan)
-    measured = tuple(sensor.std)
-    if batch.indices:
-        read = map(attrgetter(*measured), map(batch.message.objects.__getitem__, batch.indices))
-        values[:, _columns(measured)] = np.array(list(read), dtype=np.float64).reshape(len(values), -1)
-    points_m = kernels("fgtrack.tracking.kernels").to_map(values, *pose[:3], batch.message.frame != "map")
+def in_map_frame(batches: Sequence[PosedBatch]) -> MapDetections:
+    """The detections of `batches`, what their sensors measure of them, seen from their poses."""
+    sizes = [len(each.batch.indices) for each in batches]
+    values, at = np.empty((sum(sizes), len(COMPONENTS))), 0
+    values[:] = np.nan
+    for each, size in zip(batches, sizes, strict=True):
+        if size:
+            read, columns = _reading(tuple(each.sensor.std))
+            rows = list(map(read, map(each.batch.message.objects.__getitem__, each.batch.indices)))
+            values[at : at + size, columns] = np.array(rows, dtype=np.float64).reshape(size, -1)
+            at += size
+    of, indices = np.arange(len(batches)).repeat(sizes), [i for each in batches for i in each.batch.indices]
     none = np.zeros(len(values), dtype=bool)
-    return MapDetections(batch, sensor, pose, np.array(batch.indices, dtype=np.int64), values, points_m, none)
+    items = MapDetections(batches, of, np.array(indices, dtype=np.int64), values, values[:, :2], none)
+    moves = np.array([each.batch.message.frame != "map" for each in batches])
+    points_m = kernels("fgtrack.tracking.kernels").to_map(values, items.starts, items.poses, moves)
+    return items._replace(points_m=points_m)
 
 
-def move_back(items: MapDetections, by_m: float) -> None:
-    """Move all positions away from the sensor by `by_m`, along the line of sight."""
-    offsets_m = items.points_m - np.array(items.pose[:2])
+def move_back(items: MapDetections, by_m: FloatArray) -> None:
+    """Move all positions away from the sensor by `by_m` (batches,), along the line of sight."""
+    offsets_m, own_m = items.points_m - items.poses[items.of, :2], by_m[items.of]
     ranges_m = np.hypot(offsets_m[:, 0], offsets_m[:, 1])
-    moves_m = by_m * offsets_m / np.maximum(ranges_m, MIN_RANGE_M)[:, None]
+    moves_m = own_m[:, None] * offsets_m / np.maximum(ranges_m, MIN_RANGE_M)[:, None]
     items.points_m[:] += moves_m
     items.values[:, :2] += moves_m
-    items.values[:, RANGE] += by_m
+    items.values[:, RANGE] += own_m
 
 
 def merged(items: MapDetections, merge: "Merge") -> MapDetections:
     """Return `items` with those of one object averaged, in the order of the merge; bearings alone are last.
     Averaged are the components that all have; where none of these gives a position, the leading one stands for all.
     """
-    placed = items.placed.tolist()
-    groups = merge.groups(items.points_m if len(placed) == len(items.indices) else items.points_m[placed])
-    if groups is None:
-        if len(placed) == len(items.indices):
-            return items
-        groups = dict(enumerate(zip(range(len(placed)))))
-    rows = list(map(placed.__getitem__, groups))
-    if len(placed) < len(items.indices):
-        rows += np.isnan(items.points_m[:, 0]).nonzero()[0].tolist()
-    result, claimed = items.at(np.array(rows, dtype=np.int64)), set(groups)
-    others, averaged = dict[int, tuple[int, ...]](), dict[int, MapDetections]()
-    for row, members in enumerate(groups.values()):
-        if len(members) == 1:
-            continue
-        index = int(result.indices[row])
+    starts, bearing = items.starts, np.isnan(items.points_m[:, 0])
+    apart = merge.apart(items.points_m, starts)
+    if apart.all() and not bearing.any():
+        return items
+    rows, members_of = list[int](), dict[int, list[int]]()  # by the row that leads
+    for k, (first, end) in enumerate(pairwise(starts.tolist())):
+        placed = (first + np.flatnonzero(~bearing[first:end])).tolist()
+        groups = {row: (row,) for row in range(len(placed))} if apart[k] else merge.groups(items.points_m[placed])
+        for row, group in groups.items():
+            if len(group) > 1:
+                members_of[len(rows)] = [placed[member] for member in group]
+            rows.append(placed[row])
+        rows += (first + np.flatnonzero(bearing[first:end])).tolist()
+    result, claimed = items.at(np.array(rows, dtype=np.int64)), set(rows)
+    others, averaged = dict[tuple[int, int], tuple[int, ...]](), dict[tuple[int, int], MapDetections]()
+    for row, members in members_of.items():
+        key = int(result.of[row]), int(result.indices[row])
         new = [member for member in members if member not in claimed]
         claimed.update(new)
-        others[index] = tuple(items.indices[[placed[member] for member in new]].tolist())
-        parts = items.at(np.array([placed[member] for member in members]))
+        others[key] = tuple(items.indices[new].tolist())
+        parts = items.at(np.array(members))
         columns = np.flatnonzero(~np.isnan(parts.values).any(axis=0)).tolist()
         if X in columns or (RANGE in columns and BEARING in columns):
-            averaged[index] = parts
+            averaged[key] = parts
             result.values[row] = np.nan
             result.values[row, columns] = [merge.mean(COMPONENTS[k], parts.values[:, k]) for k in columns]
             result.points_m[row] = parts.points_m.mean(axis=0)
@@ -121,38 +141,43 @@ def merged(items: MapDetections, merge: "Merge") -> MapDetections:
 
 
 def covariances(items: MapDetections, names: tuple[str, ...]) -> FloatArray:
-    """Covariances of `names` in the map, shape (m, k, k): a detection's own where it has one, else the sensor's R.
-    What the map gave has the sensor's standard deviation for it and is not correlated with the rest. The covariance of
-    an average is the mean of those of its detections.
+    """Covariances of `names` in the map, shape (m, k, k), of detections of one batch.
+    A detection's own where it has one, else the sensor's R. What the map gave has the sensor's standard deviation for
+    it and is not correlated with the rest. The covariance of an average is the mean of those of its detections.
     """
-    sensor, pose, m = items.sensor, items.pose, len(items.indices)
-    R = np.repeat(sensor.noise(names)[None], m, axis=0)
+    (batch, sensor, _, pose), m = items.batches[items.of[0]], len(items.indices)
+    R = np.empty((m, len(names), len(names)))
+    R[:] = sensor.noise(names)
     turns = "x_m" in names and not sensor.round
     offsets_m = items.points_m - np.array(pose[:2]) if turns or sensor.std_growth else items.points_m
     more = sensor.growth(names, np.hypot(offsets_m[:, 0], offsets_m[:, 1])) if sensor.std_growth else None
     if more is not None:
         R[:, np.arange(len(names)), np.arange(len(names))] += more
     carrying = []
-    for row, detection in enumerate(items.detections if sensor.message_covariance else ()):
+    for row, index in enumerate(items.indices.tolist() if sensor.message_covariance else ()):
+        detection = batch.message.objects[index]
         if detection.covariance is not None:
             carrying.append(row)
             carried = [name for name in names if name in detection.measured and name in sensor.std]
             here = [names.index(name) for name in carried]
             R[row][np.ix_(here, here)] = own_covariance(detection, carried)
-    if carrying and "x_m" in names and items.batch.message.frame != "map":
+    if carrying and "x_m" in names and batch.message.frame != "map":
         R[carrying] = _turned(R[carrying], np.full(len(carrying), pose.yaw_rad))
     if turns and len(carrying) < m:
         rest = np.delete(np.arange(m), carrying)
         R[rest] = _turned(R[rest], np.arctan2(offsets_m[rest, 1], offsets_m[rest, 0]))
-    for row, index in enumerate(items.indices.tolist() if items.averaged else ()):
-        if index in items.averaged:
-            R[row] = covariances(items.averaged[index], names).mean(axis=0)
+    for row, key in enumerate(zip(items.of.tolist(), items.indices.tolist(), strict=True) if items.averaged else ()):
+        if key in items.averaged:
+            R[row] = covariances(items.averaged[key], names).mean(axis=0)
     return R
 
 
 @cache
-def _columns(names: tuple[str, ...]) -> list[int]:
-    return [COMPONENTS.index(name) for name in names]
+def _reading(names: tuple[str, ...]) -> tuple[Callable[[Detection], Any], list[int] | slice]:
+    """Return what reads the components `names` of a detection, and their columns; Any: one number or several."""
+    columns = [COMPONENTS.index(name) for name in names]
+    adjoin = columns == list(range(columns[0], columns[0] + len(columns)))
+    return attrgetter(*names), slice(columns[0], columns[-1] + 1) if adjoin else columns
 
 
 def _turned(R: FloatArray, yaws_rad: FloatArray) -> FloatArray:
@@ -190,9 +215,13 @@ class PoseError(NamedTuple):
 class Merge:
     """Finds detections of one list that are the same object, and averages them."""
 
-    def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]] | None:
-        """Members of all groups of `points_m` (n, 2), by the point that leads it; None if each stands for itself."""
-        return None
+    def apart(self, points_m: FloatArray, starts: IntArray) -> BoolArray:
+        """Return for each list, with the `points_m` (n, 2) from one of `starts` to the next, if none are one object."""
+        return np.ones(len(starts) - 1, dtype=bool)
+
+    def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
+        """Members of all groups of `points_m` (n, 2), by the point that leads it."""
+        return {row: (row,) for row in range(len(points_m))}
 
     def mean(self, name: str, values: FloatArray) -> float:
         """Average of component `name`; of angles on the circle."""
@@ -214,14 +243,15 @@ class ConnectedMerge(Merge):
     """Detections at most this far apart are linked."""
     kind: Literal["connected"] = "connected"
 
-    def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]] | None:
+    def apart(self, points_m: FloatArray, starts: IntArray) -> BoolArray:
+        """See `Merge.apart`."""
+        of = np.arange(len(starts) - 1).repeat(np.diff(starts))
+        by_x, distance_m = np.lexsort((points_m[:, 0], of)), self.distance_m * (1.0 + 1e-9)
+        return np.asarray(kernels("fgtrack.tracking.kernels").are_apart(points_m, by_x, starts, distance_m))
+
+    def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
         """See `Merge.groups`; in the order of their first members, which lead."""
-        num, far = len(points_m), True
-        if num > 1:
-            by_x = points_m[np.argsort(points_m[:, 0])]
-            far = kernels("fgtrack.tracking.kernels").are_apart(by_x, self.distance_m * (1.0 + 1e-9))
-        if far:
-            return None
+        num = len(points_m)
         links = cKDTree(points_m).query_pairs(self.distance_m, output_type="ndarray")
         graph = coo_array((np.ones(len(links), dtype=np.int8), links.T), shape=(num, num))
         labels = connected_components(graph, directed=False)[1]

@@ -6,7 +6,7 @@ import numpy as np
 
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.compiled import add_congruence, cholesky, copy, njit, whiten, wrapped
-from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.models.measurement import COMPONENTS
 
 SOUND, NOT_FINITE, NOT_DEFINITE = range(3)
@@ -18,22 +18,47 @@ X, Y, YAW, RANGE, BEARING, CURVATURE = (
 )
 
 
-@njit("(float64[:, ::1], float64, float64, float64, boolean)")
-def to_map(values: FloatArray, x_m: float, y_m: float, yaw_rad: float, moves: bool) -> FloatArray:
+@njit("(float64[:, ::1], int64[::1], float64[:, ::1], b1[::1])")
+def to_map(values: FloatArray, starts: IntArray, poses: FloatArray, moves: BoolArray) -> FloatArray:
     """Return positions (m, 2) in the map of detections `values` (m, components), NaN where there is none.
-    x, y and yaw are seen from this pose where it `moves` them, and are overwritten; range and bearing always are.
+    The rows from `starts[k]` up to the next start are of list k. x, y and yaw are seen from its pose (x, y, yaw ...)
+    where it `moves` them, and are overwritten; range and bearing always are.
     """
-    points, c, s = np.empty((len(values), 2)), math.cos(yaw_rad), math.sin(yaw_rad)
-    for i in range(len(values)):
-        row = values[i]
-        if moves:
-            row[X], row[Y] = x_m + c * row[X] - s * row[Y], y_m + s * row[X] + c * row[Y]
-            row[YAW] = wrapped(row[YAW] + yaw_rad)
-        points[i, 0], points[i, 1] = row[X], row[Y]
-        if math.isnan(row[X]):
-            right, up = row[RANGE] * math.cos(row[BEARING]), row[RANGE] * math.sin(row[BEARING])
-            points[i, 0], points[i, 1] = x_m + c * right - s * up, y_m + s * right + c * up
+    points = np.empty((len(values), 2))
+    for k in range(len(poses)):
+        x_m, y_m, yaw_rad = poses[k, 0], poses[k, 1], poses[k, 2]
+        c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+        for i in range(starts[k], starts[k + 1]):
+            row = values[i]
+            if moves[k]:
+                row[X], row[Y] = x_m + c * row[X] - s * row[Y], y_m + s * row[X] + c * row[Y]
+                row[YAW] = wrapped(row[YAW] + yaw_rad)
+            points[i, 0], points[i, 1] = row[X], row[Y]
+            if math.isnan(row[X]):
+                right, up = row[RANGE] * math.cos(row[BEARING]), row[RANGE] * math.sin(row[BEARING])
+                points[i, 0], points[i, 1] = x_m + c * right - s * up, y_m + s * right + c * up
     return points
+
+
+@njit("(float64[:, ::1], float64[:, ::1], b1[::1], int64[::1], float64[:, ::1])")
+def described(
+    values: FloatArray, points: FloatArray, map_yaw: BoolArray, starts: IntArray, poses: FloatArray
+) -> tuple[IntArray, FloatArray]:
+    """Return which components detections have, as the bits of a number (m,), and their positions and NaN (m, 3).
+    The highest bit is `map_yaw`. Of a bearing alone the position of the sensor, and the direction.
+    """
+    m, num = values.shape
+    codes, lines = np.zeros(m, np.int64), np.empty((m, 3))
+    for k in range(len(poses)):
+        for i in range(starts[k], starts[k + 1]):
+            for a in range(num):
+                codes[i] |= (0 if math.isnan(values[i, a]) else 1) << a
+            if map_yaw[i] and not math.isnan(values[i, YAW]):
+                codes[i] |= 1 << num
+            lines[i, 0], lines[i, 1], lines[i, 2] = points[i, 0], points[i, 1], np.nan
+            if math.isnan(points[i, 0]):
+                lines[i, 0], lines[i, 1], lines[i, 2] = poses[k, 0], poses[k, 1], poses[k, 2] + values[i, BEARING]
+    return codes, lines
 
 
 @njit("(float64[:, ::1], float64, float64, int64[::1])")
@@ -128,17 +153,19 @@ def near(
     return rows[:count], columns[:count], distances[:count]
 
 
-@njit("(float64[:, ::1], float64)")
-def are_apart(points: FloatArray, distance: float) -> bool:
-    """True if no two of `points` (n, 2), which ascend in x, are at most `distance` apart."""
-    for i in range(len(points)):
-        j = i + 1
-        while j < len(points) and points[j, 0] - points[i, 0] <= distance:
-            dx, dy = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
-            if dx * dx + dy * dy <= distance * distance:
-                return False
-            j += 1
-    return True
+@njit("(float64[:, ::1], int64[:], int64[::1], float64)")
+def are_apart(points: FloatArray, by_x: IntArray, starts: IntArray, distance: float) -> BoolArray:
+    """Return for each list if no two of its `points` (n, 2) are at most `distance` apart.
+    `by_x` (n,) has the points of a list from `starts[k]` up to the next start, in the order of x.
+    """
+    apart = np.ones(len(starts) - 1, np.bool_)
+    for k in range(len(apart)):
+        for a in range(starts[k], starts[k + 1]):
+            i, b = by_x[a], a + 1
+            while apart[k] and b < starts[k + 1] and points[by_x[b], 0] - points[i, 0] <= distance:
+                dx, dy = points[by_x[b], 0] - points[i, 0], points[by_x[b], 1] - points[i, 1]
+                apart[k], b = dx * dx + dy * dy > distance * distance, b + 1
+    return apart
 
 
 @njit("(float64[:, ::1], float64[:, :, ::1], float64[:, :, ::1], int64[:], float64[:, :, ::1])")

@@ -4,15 +4,15 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from itertools import compress
-from typing import Any, NamedTuple
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from fgtrack.core.geometry import body_point
 from fgtrack.core.linalg import congruence, equal_ones, kernels, symmetrise
 from fgtrack.core.types import BoolArray, Disposition, FloatArray, IntArray, UpdateRecord
-from fgtrack.estimation.base import Measurement, Measurements
+from fgtrack.estimation.base import Lazy, Measurement, Measurements
 from fgtrack.models.correlated_errors import split_error
 from fgtrack.models.measurement import (
     COMPONENTS,
@@ -26,11 +26,11 @@ from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.detections import (
-    BEARING,
     CURVATURE,
     YAW,
     MapDetections,
     Merge,
+    PosedBatch,
     PoseError,
     covariances,
     in_map_frame,
@@ -120,8 +120,8 @@ class Group(NamedTuple):
         return np.array([each[1] for each in positions if each is not None])
 
 
-class Candidates(Sequence[Candidate]):
-    """The candidates of a batch, in the order of the merge; each is made when it is asked for."""
+class Candidates(Lazy[Candidate]):
+    """The candidates of a batch, in the order of the merge."""
 
     def __init__(
         self, leaders: list[int], merged: Mapping[int, tuple[int, ...]], lines: FloatArray, groups: list[Group]
@@ -137,7 +137,8 @@ class Candidates(Sequence[Candidate]):
     def __len__(self) -> int:
         return len(self.leaders)
 
-    def __getitem__(self, index: Any) -> Any:  # Any: there are no slices
+    def made(self, index: int) -> Candidate:
+        """See `Lazy.made`."""
         leader, point = self.leaders[index], self.lines[index]
         [(group, members, _)] = self.split(np.array([index]))
         own = Measurements(group.stack)[members[0]]
@@ -172,6 +173,10 @@ class Candidates(Sequence[Candidate]):
         return Candidates([self.leaders[i] for i in indices], self.merged, self.lines[indices], groups)
 
 
+Preprocessed = tuple[Candidates, list[UpdateRecord]]
+"""Candidates in the order of the merge, and the records of detections that are out of bounds."""
+
+
 class Preprocess:
     """Transformation to the map, false-positive filter and merge (Karle et al. 2023, sections III-B and III-C)."""
 
@@ -193,87 +198,96 @@ class Preprocess:
         self._origin_m = detection_origin_m
         self._assumes_map_yaw = assumes_map_yaw
 
-    def __call__(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> tuple[Candidates, list[UpdateRecord]]:
-        """Candidates in the order of the merge, and the records of detections that are out of bounds.
+    def __call__(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> Preprocessed:
+        """Return the candidates of a batch, and the records of the detections that are none.
         `ego` is the pose at the batch's stamp; it may be None for detections in the map frame.
         """
-        pose = self._sensor_pose(batch, sensor, ego)
-        items, lost = in_map_frame(batch, sensor, pose), dict[int, str]()
-        if sensor.filters:
-            names = [sensor.refusing(detection) for detection in items.detections]
-            lost = {index: f"filters.{name}" for index, name in zip(batch.indices, names, strict=True) if name}
-            items = items.at(np.array([name is None for name in names], dtype=bool)) if lost else items
-        if ego is not None and sensor.max_range_m is not None:
-            offsets_m = items.points_m - np.array(pose[:2])
-            far = np.hypot(offsets_m[:, 0], offsets_m[:, 1]) > sensor.max_range_m
-            items = _without(items, far, "max_range_m", lost)
-        if ego is not None and sensor.near_side_m:
-            move_back(items, sensor.near_side_m)
-        items = merged(self._on_road(items, lost), self._merge)
-        records = []
-        for index, reason in lost.items():
-            records.append(replace(record(batch.message, index, Disposition.OUT_OF_BOUNDS), reason=reason))
-        return self._candidates(items, _pose_covariance(pose, batch, sensor, ego)), records
+        return self.together([self.posed(batch, sensor, ego)])[0]
 
-    def _sensor_pose(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> SensorPose:
-        """Pose of the frame that the detections are given in, and the velocity of its origin.
+    def posed(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> PosedBatch:
+        """Return `batch` with the pose of the frame that its detections are given in, and the velocity of its origin.
         Of detections in the map the pose that they are seen from: that of the ego, without one the map's origin.
         """
         if ego is None:
-            return SensorPose()
+            return PosedBatch(batch, sensor, None, SensorPose())
         yaw_rad = ego.yaw_rad
         x_m, y_m = self._origin_m
         if batch.message.frame == "sensor":
             x_m, y_m = x_m + sensor.placed.x_m, y_m + sensor.placed.y_m
             yaw_rad += sensor.placed.yaw_rad
         x_m, y_m, vx_mps, vy_mps = body_point(*ego[:5], x_m, y_m)
-        return SensorPose(float(x_m), float(y_m), yaw_rad, float(vx_mps), float(vy_mps))
+        pose = SensorPose(float(x_m), float(y_m), yaw_rad, float(vx_mps), float(vy_mps))
+        return PosedBatch(batch, sensor, ego, pose)
 
-    def _on_road(self, items: MapDetections, lost: dict[int, str]) -> MapDetections:
+    def together(self, batches: Sequence[PosedBatch]) -> list[Preprocessed]:
+        """Return for each of `batches` what `__call__` returns, in one pass over the arrays of all."""
+        items, lost = in_map_frame(batches), [dict[int, str]() for _ in batches]
+        if any(each.sensor.filters for each in batches):
+            items = _filtered(items, lost)
+        limits_m = [each.sensor.max_range_m if each.ego is not None else None for each in batches]
+        if any(limits_m):
+            offsets_m = items.points_m - items.poses[items.of, :2]
+            far = np.hypot(offsets_m[:, 0], offsets_m[:, 1]) > np.array([m or math.inf for m in limits_m])[items.of]
+            items = _without(items, far, "max_range_m", lost)
+        near_sides_m = [0.0 if each.ego is None else each.sensor.near_side_m for each in batches]
+        if any(near_sides_m):
+            move_back(items, np.array(near_sides_m))
+        items = merged(self._on_road(items, lost), self._merge)
+        return [
+            (candidates, [_out_of_bounds(each.batch, *one) for one in out.items()])
+            for each, candidates, out in zip(batches, self._candidates(items), lost, strict=True)
+        ]
+
+    def _on_road(self, items: MapDetections, lost: Sequence[dict[int, str]]) -> MapDetections:
         """Return the detections inside the bounds, with yaw and curvature of the map; `lost` gets the rest."""
         if not self._road.known:
             return items
         view, x_m = self._road.view(items.points_m), items.points_m[:, 0]
         placed = x_m == x_m  # NaN, of a bearing alone, is not equal to itself
-        if items.sensor.yaw_from_map_std_rad is not None:
-            yaw_rad = items.values[:, YAW]
-            items.map_yaw[:] = placed & (yaw_rad != yaw_rad)
-            items.values[:, YAW] = np.where(items.map_yaw, view.yaw_rad, yaw_rad)
-        if items.sensor.curvature_from_map_std_radpm is not None:
-            items.values[placed, CURVATURE] = view.curvature_radpm[placed]
+        for name, column, values in (
+            ("yaw_from_map_std_rad", YAW, view.yaw_rad),
+            ("curvature_from_map_std_radpm", CURVATURE, view.curvature_radpm),
+        ):
+            takes = [getattr(each.sensor, name) is not None for each in items.batches]
+            if any(takes):
+                present = items.values[:, column]
+                filled = placed & (present != present)
+                if not all(takes):
+                    filled &= np.array(takes)[items.of]
+                items.values[:, column] = np.where(filled, values, present)
+                if column == YAW:
+                    items.map_yaw[:] = filled
         return _without(items, view.outside & placed, "map.track", lost)
 
-    def _candidates(self, items: MapDetections, pose_covariance: FloatArray | None) -> Candidates:
-        """Candidates of `items` in their order; those that measure the same components are one group."""
-        m = len(items.values)
-        kinds = np.empty((m, len(COMPONENTS) + 1), dtype=bool)
-        np.equal(items.values, items.values, out=kinds[:, :-1])  # NaN is not equal to itself
-        np.logical_and(items.map_yaw, kinds[:, YAW], out=kinds[:, -1])
-        if m < 2 or (kinds == kinds[0]).all():
-            groups = list(self._groups(items, np.arange(m), pose_covariance))
-        else:
-            alike = map(np.array, equal_ones(list(map(tuple, kinds.tolist()))))
-            groups = [group for rows in alike for group in self._groups(items.at(rows), rows, pose_covariance)]
-        pose, lines = items.pose, np.full((m, 3), np.nan)
-        lines[:, :2] = items.points_m
-        for row in np.isnan(lines[:, 0]).nonzero()[0].tolist():
-            lines[row] = pose.x_m, pose.y_m, pose.yaw_rad + items.values[row, BEARING]
-        return Candidates(items.indices.tolist(), items.merged, lines, groups)
+    def _candidates(self, items: MapDetections) -> Iterator[Candidates]:
+        """Yield the candidates of each batch in their order; those that measure the same components are one group."""
+        starts = items.starts
+        arrays = items.values, items.points_m, items.map_yaw, starts, items.poses
+        codes, lines = kernels("fgtrack.tracking.kernels").described(*arrays)
+        of_batch = [dict[int, tuple[int, ...]]() for _ in items.batches]
+        for (k, index), others in items.merged.items():
+            of_batch[k][index] = others
+        for (first, end), own_merged in zip(pairwise(starts.tolist()), of_batch, strict=True):
+            kinds, groups = equal_ones(codes[first:end].tolist()), list[Group]()
+            for rows in kinds:
+                own = items.at(slice(first, end) if len(kinds) == 1 else first + np.array(rows))
+                groups += self._groups(own, np.array(rows), int(codes[first + rows[0]]))
+            yield Candidates(items.indices[first:end].tolist(), own_merged, lines[first:end], groups)
 
-    def _groups(self, items: MapDetections, rows: IntArray, pose_covariance: FloatArray | None) -> Iterator[Group]:
-        """Yield `items`, which are the candidates `rows` and all measure the same; one by one where errors last."""
-        if not len(rows):
-            return
-        batch, sensor, pose, points_m = items.batch, items.sensor, items.pose, items.points_m
-        measures = tuple((items.values[0] == items.values[0]).tolist())  # NaN is not equal to itself
-        names, columns, assumed, placed = _components(measures, self._assumes_map_yaw and bool(items.map_yaw[0]))
+    def _groups(self, items: MapDetections, rows: IntArray, code: int) -> Iterator[Group]:
+        """Yield `items` of one batch, which are the candidates `rows` and all measure the same.
+        One by one where errors are correlated in time.
+        """
+        posed, points_m = items.batches[items.of[0]], items.points_m
+        batch, sensor, _, pose = posed
+        names, columns, assumed, placed = _components(code, self._assumes_map_yaw)
         z, R = items.values.take(columns, axis=1), covariances(items, names)
         model = measurement_model(names, self._motion)
         models, white = [model], R
         if sensor.correlation is not None:
             split = [split_error(batch.message.sensor, sensor, model, item, self._motion.state_names) for item in R]
             models, white = [each for each, _ in split], np.array([noise for _, noise in split])
-        total, error = white, None
+        total, error, pose_covariance = white, None, _pose_covariance(posed)
         if pose_covariance is not None:
             placed = np.full(len(names), -1) if batch.message.frame == "map" else placed
             G = kernels("fgtrack.tracking.kernels").placement(points_m, pose.x_m, pose.y_m, placed)
@@ -296,27 +310,46 @@ class Preprocess:
             yield Group(rows[m], item, R[m], error and error.at(m), late)
 
 
-def _without(items: MapDetections, outside: BoolArray, reason: str, lost: dict[int, str]) -> MapDetections:
-    """`items` without those `outside`, shape (m,), whose indices `lost` gets with the `reason`."""
-    if not outside.any():
+def _out_of_bounds(batch: Batch, index: int, reason: str) -> UpdateRecord:
+    return replace(record(batch.message, index, Disposition.OUT_OF_BOUNDS), reason=reason)
+
+
+def _filtered(items: MapDetections, lost: Sequence[dict[int, str]]) -> MapDetections:
+    """`items` without those that do not pass the filters of their sensors, as `_without`."""
+    passes = list[bool]()
+    for k, index in zip(items.of.tolist(), items.indices.tolist(), strict=True):
+        batch, sensor, _, _ = items.batches[k]
+        name = sensor.refusing(batch.message.objects[index])
+        passes.append(name is None)
+        if name is not None:
+            lost[k][index] = f"filters.{name}"
+    return items.at(np.array(passes, dtype=bool))
+
+
+def _without(items: MapDetections, outside: BoolArray, reason: str, lost: Sequence[dict[int, str]]) -> MapDetections:
+    """`items` without those `outside`, shape (m,), whose indices `lost` of their batch gets with the `reason`."""
+    if not np.logical_or.reduce(outside):
         return items
-    lost |= dict.fromkeys(items.indices[outside].tolist(), reason)
+    for k, index in zip(items.of[outside].tolist(), items.indices[outside].tolist(), strict=True):
+        lost[k][index] = reason
     return items.at(~outside)
 
 
 @cache
-def _components(
-    measures: tuple[bool, ...], assumes_yaw: bool
-) -> tuple[tuple[str, ...], IntArray, tuple[str, ...], IntArray]:
-    """Names and columns of the `COMPONENTS` that are measured, which are assumed, and columns; -1 of an assumed one."""
-    names = tuple(compress(COMPONENTS, measures))
-    known = {"curvature_radpm", "yaw_rad"} if assumes_yaw else {"curvature_radpm"}
-    assumed, columns = tuple(name for name in names if name in known), np.flatnonzero(measures)
+def _components(code: int, map_yaw_is_assumed: bool) -> tuple[tuple[str, ...], IntArray, tuple[str, ...], IntArray]:
+    """Names and columns of the measured `COMPONENTS`, see the kernel `described`; names that are assumed; columns.
+    Of the last, -1 of what is assumed.
+    """
+    columns = np.array([k for k in range(len(COMPONENTS)) if code >> k & 1])
+    names = tuple(COMPONENTS[k] for k in columns)
+    known = {"curvature_radpm", "yaw_rad"} if map_yaw_is_assumed and code >> len(COMPONENTS) else {"curvature_radpm"}
+    assumed = tuple(name for name in names if name in known)
     return names, columns, assumed, np.where([name in assumed for name in names], -1, columns)
 
 
-def _pose_covariance(pose: SensorPose, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> FloatArray | None:
-    """Covariance of `pose` by that of the ego, shape (5, 5); None where it matters to no detection of `batch`."""
+def _pose_covariance(posed: PosedBatch) -> FloatArray | None:
+    """Covariance of the pose by that of the ego, shape (5, 5); None where it matters to no detection of the batch."""
+    batch, sensor, ego, pose = posed
     if ego is None or ego.covariance is None:
         return None
     if batch.message.frame == "map" and not any(name in RELATIVE for name in sensor.std):

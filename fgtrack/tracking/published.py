@@ -9,17 +9,26 @@ from scipy.spatial import cKDTree
 
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import DetectionList, Disposition, EgoState, FloatArray, TickReport, UpdateRecord
+from fgtrack.core.types import (
+    BoolArray,
+    DetectionList,
+    Disposition,
+    EgoState,
+    FloatArray,
+    IntArray,
+    TickReport,
+    UpdateRecord,
+)
 from fgtrack.estimation.base import StatesAt
 from fgtrack.estimation.filters.published import published_yaw
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Assignment, assigned, near
-from fgtrack.tracking.detections import Merge
+from fgtrack.tracking.detections import ConnectedMerge, Merge, PosedBatch
 from fgtrack.tracking.ego import EgoPose, EgoStd, EgoTrajectory
 from fgtrack.tracking.inbox import Batch, Inbox, is_valid_covariance, record, records
 from fgtrack.tracking.lifecycle import CountingLifecycle, Life, Scan
 from fgtrack.tracking.objects import Apart
-from fgtrack.tracking.preprocess import Candidate, Candidates
+from fgtrack.tracking.preprocess import Candidate, Candidates, Preprocessed
 from fgtrack.tracking.tracker import Tracker, TrackerParts
 
 
@@ -139,10 +148,12 @@ class NeighbourhoodMerge(Merge):
     distance_m: float = 5.1
     """Detections at most this far apart are neighbours."""
 
+    def apart(self, points_m: FloatArray, starts: IntArray) -> BoolArray:
+        """See `Merge.apart`."""
+        return ConnectedMerge(self.distance_m).apart(points_m, starts)
+
     def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
         """See `Merge.groups`; the merged ones first, in the order of a set of index tuples."""
-        if not len(points_m):
-            return {}
         tree = cKDTree(points_m)
         neighbourhoods = [
             tuple(int(i) for i in tree.query_ball_point(point, self.distance_m, return_sorted=True))
@@ -228,8 +239,8 @@ class PublishedTracker(Tracker):
         self._remember()
         return report
 
-    def _process(self, batch: Batch) -> None:
-        super()._process(batch)
+    def _process(self, posed: PosedBatch, preprocessed: Preprocessed | None) -> None:
+        super()._process(posed, preprocessed)
         self._remember()
 
     def _remember(self) -> None:

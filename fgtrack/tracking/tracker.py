@@ -1,11 +1,11 @@
 """The tracker: the steps of a tick, in the order of the paper's algorithm (Karle et al. 2023, figure 2)."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from itertools import chain, repeat
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from fgtrack.core.types import (
     TrackStatus,
     UpdateRecord,
 )
-from fgtrack.estimation.base import Measurements, Start, StatesAt, TrackBank, UpdateResult, UpdateStatus
+from fgtrack.estimation.base import Measurement, Measurements, Start, StatesAt, TrackBank, UpdateResult
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.ekf import correct_one, propagated
 from fgtrack.estimation.filters.propagation import kinematic_states
@@ -35,6 +35,7 @@ from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Assignment, Association
 from fgtrack.tracking.birth import Birth, in_any_direction
+from fgtrack.tracking.detections import PosedBatch
 from fgtrack.tracking.ego import EgoPose, EgoTrajectory
 from fgtrack.tracking.existence import Lifecycle
 from fgtrack.tracking.extent import Extents
@@ -42,7 +43,7 @@ from fgtrack.tracking.guarded_bank import faults
 from fgtrack.tracking.inbox import Batch, Inbox, record
 from fgtrack.tracking.lifecycle import Scan
 from fgtrack.tracking.objects import Objects
-from fgtrack.tracking.preprocess import Candidates, Preprocess
+from fgtrack.tracking.preprocess import Candidates, Preprocess, Preprocessed
 
 _Own = tuple[int, TrackStatus, int, ObjectReport | None, float | None]
 """Id, status, number of measurements, object and existence probability of a track."""
@@ -93,7 +94,7 @@ class Tracker:
         self._parts = parts
         self._tick = -1
         self._next_id = 0
-        self._records: list[UpdateRecord | tuple[Any, ...]] = []  # or what `record` makes one of
+        self._records: list[Iterable[UpdateRecord]] = []  # some are made when they are asked for
         self._num_measured = Counter[int]()  # detections that have changed the state, by track
         self._undirected: dict[int, Start] = {}  # of tracks with one position and an unknown heading, by id
         self._seen: dict[int, set[int]] = {}  # in this tick, by message: tracks that it has matched or started
@@ -127,7 +128,7 @@ class Tracker:
             check_sensor(message.sensor, self._parts.sensors)
         if message.frame not in FRAMES:
             raise DataError(f"{message.sensor}: frame: one of {', '.join(FRAMES)} expected, not {message.frame!r}")
-        self._records += self._parts.inbox.put(message)
+        self._records.append(self._parts.inbox.put(message))
 
     def tick(self, now_ns: int) -> TickReport:
         """Process everything received up to `now_ns`."""
@@ -139,8 +140,9 @@ class Tracker:
         self._parts.bank.advance(now_ns)
         self._parts.ego.start_tick()
         self._seen = {}
-        for batch in batches:
-            self._process_if_possible(batch)
+        posed = list(map(self._posed, batches))
+        for each in zip(posed, self._preprocessed(posed), strict=True):
+            self._process_if_possible(*each)
         noted, self._records = self._records, []
         bank = self._parts.bank
         states = bank.present()  # first: tracks may end by it
@@ -150,7 +152,7 @@ class Tracker:
             now_ns,
             bank.smoothed(),
             tracks=partial(map, _report, own, states),
-            updates=partial(map, _made, noted),
+            updates=partial(chain.from_iterable, noted),
         )
 
     def finish(self) -> tuple[SmoothedReport, ...]:
@@ -180,34 +182,48 @@ class Tracker:
         unsound, rows = faults(present), enumerate(zip(self._own(states.track_ids), present, strict=True))
         return tuple(_report(own, state) for row, (own, state) in rows if row not in unsound)
 
-    def _process_if_possible(self, batch: Batch) -> None:
-        """Process a batch; after an exception that is not propagated, the rest of it ends as failed."""
-        first = len(self._records)
+    def _posed(self, batch: Batch) -> PosedBatch:
+        """Return `batch` with the pose that it is seen from; detections in the map need none."""
+        parts = self._parts
+        ego = parts.ego.pose_at(batch.stamp_ns, parts.bank.present_ns)
+        return parts.preprocess.posed(batch, parts.sensors[batch.message.sensor], ego)
+
+    def _preprocessed(self, batches: Sequence[PosedBatch]) -> Sequence[Preprocessed | None]:
+        """Candidates of `batches` in one pass; of a pass that fails nothing, so that one batch does not fail others."""
         try:
-            self._process(batch)
+            return self._parts.preprocess.together(batches) if batches else ()
+        except Exception as error:
+            if isinstance(error, self._parts.propagated_exceptions):
+                raise
+            return [None] * len(batches)
+
+    def _process_if_possible(self, posed: PosedBatch, preprocessed: Preprocessed | None) -> None:
+        """Process a batch; after an exception that is not propagated, the rest of it ends as failed."""
+        first, batch = len(self._records), posed.batch
+        try:
+            self._process(posed, preprocessed)
         except Exception as error:
             if isinstance(error, self._parts.propagated_exceptions):
                 raise
             self.failures.add(Failure.LIST_FAILED)
             self.failures.note(error)
-            ended = {_made(each).index for each in self._records[first:]}
-            failed = [index for index in batch.indices if index not in ended]
-            self._records += [record(batch.message, index, Disposition.FAILED) for index in failed]
+            made = list(chain.from_iterable(self._records[first:]))
+            ended = {each.index for each in made}
+            made += [record(batch.message, i, Disposition.FAILED) for i in batch.indices if i not in ended]
+            self._records[first:] = [made]
 
-    def _process(self, batch: Batch) -> None:
-        """One object list, at its own stamp: transform, filter, merge, associate, age, estimate, give birth."""
-        parts = self._parts
-        message, present_ns = batch.message, parts.bank.present_ns
-        ego = parts.ego.pose_at(batch.stamp_ns, present_ns)
+    def _process(self, posed: PosedBatch, preprocessed: Preprocessed | None) -> None:
+        """One object list, at its own stamp: associate, age, estimate, give birth."""
+        parts, batch, ego = self._parts, posed.batch, posed.ego
+        message = batch.message
         if ego is None and message.frame != "map":
-            self._records += [record(message, index, Disposition.FAILED) for index in batch.indices]
+            self._records.append([record(message, index, Disposition.FAILED) for index in batch.indices])
             return
-        scan = Scan(message.sensor, batch.stamp_ns, present_ns, ego, message.objects)
-        candidates, out_of_bounds = parts.preprocess(batch, parts.sensors[message.sensor], ego)
-        self._records += out_of_bounds
+        scan = Scan(message.sensor, batch.stamp_ns, parts.bank.present_ns, ego, message.objects)
+        candidates, out_of_bounds = preprocessed or parts.preprocess.together([posed])[0]
+        self._records.append(out_of_bounds)
         if self._is_too_old(batch):
-            for position in range(len(candidates)):
-                self._conclude(batch, candidates, position, Disposition.TOO_OLD)
+            self._conclude(batch, candidates, range(len(candidates)), Disposition.TOO_OLD)
             return
         states = self._offered(batch)
         assignment = self._assigned(batch, candidates, states)
@@ -216,8 +232,7 @@ class Tracker:
         self._count(batch, candidates, assignment, states, scan)
         if assignment.pairs:
             self._estimate(batch, candidates, assignment, states)
-        for position in assignment.refused:
-            self._conclude(batch, candidates, position, Disposition.GATED)
+        self._conclude(batch, candidates, assignment.refused, Disposition.GATED)
         new = assignment.new
         if new and parts.suppress_births_near_newer_tracks:
             new = self._unclaimed(batch, candidates, new, states)
@@ -247,9 +262,8 @@ class Tracker:
         younger = in_any_direction(moved, batch.stamp_ns, self._undirected)
         claims = self._assigned(batch, candidates.at(new), younger)
         for k, track in claims.pairs:
-            self._conclude(batch, candidates, new[k], Disposition.TOO_OLD, younger.track_ids[track])
-        for k in claims.refused:
-            self._conclude(batch, candidates, new[k], Disposition.GATED)
+            self._conclude(batch, candidates, [new[k]], Disposition.TOO_OLD, younger.track_ids[track])
+        self._conclude(batch, candidates, [new[k] for k in claims.refused], Disposition.GATED)
         return [new[k] for k in claims.new]
 
     def _is_too_old(self, batch: Batch) -> bool:
@@ -291,40 +305,40 @@ class Tracker:
     def _estimate(self, batch: Batch, candidates: Candidates, assignment: Assignment, states: StatesAt) -> None:
         """Fuse the matched candidates, group by group; the records are in the order of the candidates."""
         bank, lifecycle, track_ids = self._parts.bank, self._parts.lifecycle, states.track_ids
-        results: list[tuple[Measurements, int, UpdateResult]] = [None] * len(assignment.pairs)  # type: ignore[list-item]
+        outcomes = dict[int, tuple[Measurement, UpdateResult]]()  # by index of the pair
         chosen, tracks = np.array(assignment.pairs).T
         for group, members, here in candidates.split(chosen):
             of = tracks[here]
             measurements = Measurements(group.seen_at(members, states.means[of], states.covariances, of))
-            updated = bank.update(batch.stamp_ns, [track_ids[track] for track in of.tolist()], measurements)
-            for index, (k, result) in enumerate(zip(here.tolist(), updated, strict=True)):
-                results[k] = measurements, index, result
-        for (position, track), (measurements, index, result) in zip(assignment.pairs, results, strict=True):
-            track_id, nis = track_ids[track], result.nis
-            if result.innovation is not None:
-                self._num_measured[track_id] += 1
+            ids = list(map(track_ids.__getitem__, of.tolist()))
+            results = bank.update(batch.stamp_ns, ids, measurements)
+            outcomes.update(zip(here.tolist(), zip(repeat(measurements.stack), results), strict=True))
+            for row, track_id in enumerate(ids) if self._undirected else ():
+                fused = results[row].innovation is not None and candidates.placed[chosen[here[row]]]
+                if fused and self._undirected.pop(track_id, None) is not None:
+                    # The estimator's prior, linearised along an unknown direction, spreads along it alone.
+                    seen, track = measurements[row].seen_by(self._parts.motion), of[row]
+                    with suppress(np.linalg.LinAlgError):
+                        results[row].nis = correct_one(states.means[track], states.covariances[track], seen).nis
+        for k, (position, track) in enumerate(assignment.pairs):
+            if outcomes[k][1].innovation is not None:
+                self._num_measured[track_ids[track]] += 1
                 if candidates.placed[position]:
-                    lifecycle.fused(track_id)
-                    if self._undirected and self._undirected.pop(track_id, None) is not None:
-                        # The estimator's prior, linearised along an unknown direction, spreads along it alone.
-                        seen = measurements[index].seen_by(self._parts.motion)
-                        with suppress(np.linalg.LinAlgError):
-                            nis = correct_one(states.means[track], states.covariances[track], seen).nis
-            outcome = result.status, track_id, nis, measurements.stack, result.innovation
-            self._conclude(batch, candidates, position, *outcome)
+                    lifecycle.fused(track_ids[track])
+        self._records.append(_fused(batch.message, candidates, assignment.pairs, track_ids, outcomes))
 
     def _give_birth(self, batch: Batch, candidates: Candidates, position: int, scan: Scan) -> None:
         parts, prior, candidate = self._parts, None, candidates[position]
         if parts.sensors[scan.sensor].births and not parts.objects.is_stray(scan.objects[candidate.leader]):
             prior = parts.birth.prior(candidate, parts.road, parts.ego.current, parts.ego.in_pit)
         if prior is None:
-            self._conclude(batch, candidates, position, Disposition.GATED)
+            self._conclude(batch, candidates, [position], Disposition.GATED)
             return
         track_id = self._next_id
         self._next_id += 1
         parts.bank.birth(track_id, prior)
         if track_id not in parts.bank.track_ids:
-            self._conclude(batch, candidates, position, Disposition.FAILED)
+            self._conclude(batch, candidates, [position], Disposition.FAILED)
             return
         if prior.yaw_rad is None and not parts.motion.cartesian:
             self._undirected[track_id] = prior
@@ -332,7 +346,7 @@ class Tracker:
         self._num_measured[track_id] = 1
         parts.lifecycle.born(track_id, scan, candidate)
         self._describe(batch, candidates, position, track_id)
-        self._conclude(batch, candidates, position, Disposition.BIRTH, track_id)
+        self._conclude(batch, candidates, [position], Disposition.BIRTH, track_id)
 
     def _describe(self, batch: Batch, candidates: Candidates, position: int, track_id: int) -> None:
         leader = candidates.leaders[position]
@@ -343,17 +357,14 @@ class Tracker:
         self,
         batch: Batch,
         candidates: Candidates,
-        position: int,
-        disposition: Disposition | UpdateStatus,
+        positions: Sequence[int],
+        disposition: Disposition,
         track_id: int | None = None,
-        *more: object,
     ) -> None:
-        """Note the outcome of a candidate, see `record`, and of the detections that were merged into it."""
-        leader = candidates.leaders[position]
-        self._records.append((batch.message, leader, disposition, track_id, *more))
-        if candidates.merged:
-            for index in candidates.merged.get(leader, ()):
-                self._records.append((batch.message, index, Disposition.MERGED, track_id))
+        """Record the outcome of candidates, and of the detections that were merged into them."""
+        for leader in map(candidates.leaders.__getitem__, positions):
+            own = record(batch.message, leader, disposition, track_id)
+            self._records.append((own, *_merged(batch.message, candidates, leader, track_id)))
 
     def _end(self, track_ids: Sequence[int]) -> None:
         for track_id in track_ids:
@@ -378,8 +389,25 @@ class Tracker:
         )
 
 
-def _made(noted: UpdateRecord | tuple[Any, ...]) -> UpdateRecord:
-    return noted if isinstance(noted, UpdateRecord) else record(*noted)
+def _fused(
+    message: DetectionList,
+    candidates: Candidates,
+    pairs: Iterable[tuple[int, int]],
+    track_ids: Sequence[int],
+    outcomes: Mapping[int, tuple[Measurement, UpdateResult]],
+) -> Iterator[UpdateRecord]:
+    """Yield the records of the matched candidates, in their order, and of those that were merged into them."""
+    for k, (position, track) in enumerate(pairs):
+        leader, track_id, (stack, result) = candidates.leaders[position], track_ids[track], outcomes[k]
+        yield record(message, leader, result.status, track_id, result.nis, stack, result.innovation)
+        yield from _merged(message, candidates, leader, track_id)
+
+
+def _merged(
+    message: DetectionList, candidates: Candidates, leader: int, track_id: int | None
+) -> Iterable[UpdateRecord]:
+    """The records of the detections that were merged into that of index `leader`."""
+    return [record(message, index, Disposition.MERGED, track_id) for index in candidates.merged.get(leader, ())]
 
 
 def _report(own: _Own, state: TrackState) -> TrackReport:

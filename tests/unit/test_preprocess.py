@@ -290,3 +290,30 @@ def test_noise_of_range_and_bearing_grows_too_and_a_covariance_of_its_own_does_n
     np.testing.assert_allclose(kept.measurement.R, 0.04 * np.eye(2), atol=1e-12)
     [bearing] = candidates(Detection(bearing_rad=0.1), sensor=replace(polar, std_growth={"bearing_rad": 0.1}))
     np.testing.assert_allclose(bearing.measurement.R, [[0.02**2]])  # how far it is, is not known
+
+
+# --- several batches
+
+
+def test_batches_in_one_pass_give_what_each_gives_alone() -> None:
+    step = Preprocess(StraightRoad(half_width_m=500.0), ConnectedMerge(distance_m=3.0), CTRV(), ORIGIN_M)
+    points = [Detection(x_m=x_m, y_m=0.0) for x_m in (10.0, 11.0, 900.0)]
+    seen = [Detection(range_m=20.0, bearing_rad=0.1), Detection(bearing_rad=0.2), Detection(range_m=900.0)]
+    bearings = replace(POLAR, max_range_m=50.0, near_side_m=0.5)
+    posed = [
+        step.posed(batch(*points), POINTS, EGO),
+        step.posed(batch(frame="sensor"), POLAR, EGO),
+        step.posed(batch(*seen, frame="sensor"), bearings, EGO),
+        step.posed(batch(*points[:1], frame="map"), LIDAR, None),
+    ]
+    together = step.together(posed)
+    alone = [step(each.batch, each.sensor, each.ego) for each in posed]
+    assert [records for _, records in together] == [records for _, records in alone]
+    assert [len(found) for found, _ in together] == [1, 0, 3, 1]
+    for (found, _), (expected, _) in zip(together, alone, strict=True):
+        assert found.leaders == expected.leaders
+        assert found.merged == expected.merged
+        np.testing.assert_array_equal(found.lines, expected.lines)
+        for item, other in zip(found, expected, strict=True):
+            assert item.values == other.values
+            np.testing.assert_array_equal(item.measurement.R, other.measurement.R)

@@ -12,6 +12,8 @@ import pytest
 from fgtrack.core.types import Detection, DetectionList, EgoState, TrackReport, TruthState
 from fgtrack.pipeline.live import EGO, TickTiming, Tracker
 from fgtrack.pipeline.shipped import read_config
+from fgtrack.tracking.detections import PosedBatch
+from fgtrack.tracking.preprocess import Preprocess, Preprocessed
 
 MS = 1_000_000
 NOW_NS = 1_600_000_000_000_000_000
@@ -104,6 +106,27 @@ def test_a_list_whose_processing_raises_ends_as_failed(monkeypatch: pytest.Monke
     assert tracker.failures == {"list failed": 1}
     assert "a defect" in str(tracker.last_failure)
     assert len(report.tracks) == 2
+
+
+def test_a_batch_whose_preprocessing_raises_fails_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    tracker = tracker_of()
+    run(tracker)
+    together = Preprocess.together
+
+    def broken(step: Preprocess, batches: Sequence[PosedBatch]) -> list[Preprocessed]:
+        if any(len(each.batch.indices) == 3 for each in batches):
+            raise KeyError("a defect")
+        return together(step, batches)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Preprocess, "together", broken)
+        late_ns = NOW_NS + 1_000 * MS
+        for num in (3, 2):
+            objects = [Detection(x_m=30.0 * k, y_m=1.0) for k in range(1, num + 1)]
+            tracker.receive(DetectionList("lidar_cluster", late_ns + num, late_ns + num, objects))
+        report = tracker.tick(late_ns + MS)
+    assert [row.disposition == "failed" for row in report.updates] == [False] * 2 + [True] * 3
+    assert tracker.failures == {"list failed": 1}
 
 
 # Threads
