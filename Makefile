@@ -16,7 +16,7 @@ TEST := $(VENV)/.test
 DEV := $(TEST) $(VENV)/.dev
 DOCS := $(TEST) $(VENV)/.docs
 
-.PHONY: demo test test-slow test-matrix lock audit fuzz faults coverage mutants check docs bench bench-full soak soak-live contest clean
+.PHONY: demo test test-fast test-slow test-matrix lock audit fuzz faults coverage mutants check docs bench bench-full soak soak-live contest clean
 
 demo: $(RUN)
 	@$(BIN)/fgtrack demo -o out/demo --overwrite
@@ -26,6 +26,10 @@ test: $(TEST)
 	@$(BIN)/python -c 'import fgtrack.estimation.kernels.replay, fgtrack.estimation.kernels.euler, fgtrack.models.feet' & \
 	    $(BIN)/python -c 'import fgtrack.estimation.smoothing.node_kernels, fgtrack.tracking.kernels, fgtrack.tracking.visibility_kernels'; wait
 	$(BIN)/python -m pytest -n auto $(BY_FILE)
+
+# The tests of the core: within a minute of processor time.
+test-fast: $(TEST)
+	$(BIN)/python -m pytest -n auto $(BY_FILE) tests/unit --fast
 
 # The tests marked slow, and the others with many more random examples.
 test-slow: $(TEST)

@@ -11,7 +11,7 @@ os.environ["PYTHONPATH"] = str(ROOT)
 import fgtrack  # noqa: E402
 
 project = "fgtrack"
-author = "The fgtrack developers"
+author = "fgtrack contributors"
 release = fgtrack.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_gallery.gen_gallery", "reference"]

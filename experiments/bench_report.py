@@ -172,8 +172,8 @@ def short_machine(yardsticks_us: Sequence[float]) -> str:
     return f"{text}; yardstick {median(yardsticks_us):.2f} us ({min(yardsticks_us):.2f} to {max(yardsticks_us):.2f})"
 
 
-def tables(results: Results) -> str:
-    """Return all tables as Markdown."""
+def tables(results: Results, with_ticks: bool = True) -> str:
+    """Return all tables as Markdown; `with_ticks`: also the time of a tick in every cell."""
     published = {count: f"{median(ms):.3g}" for count, ms in results.published_ms.items()}
     matrix = [
         (str(n), published.get(n, "-"), *(results.ratio(label, n).cell() for label in MAIN)) for n in REQUIRED_RATIOS
@@ -193,7 +193,7 @@ def tables(results: Results) -> str:
         table(["times as fast as published, objects", "published [ms]", *MAIN], matrix),
         table([f"p99 in medians (at most {LARGEST_P99}), objects", *MAIN], quantiles),
         table(["requirement", "measured", "required", "holds"], others),
-        table(head, [_ticks(row) for row in kept]),
+        table(head, [_ticks(row) for row in kept]) if with_ticks else "",
         *(
             f"{row.cell.label}, {plural(row.cell.count)}: only {row.tracks:g} tracks"
             for row in results.rows

@@ -194,7 +194,7 @@ def main(
     (out / "speed.json").write_text(json.dumps(finite(results.as_dict()), indent=2) + "\n", encoding="utf-8")
     draw(results, out / "speed.png")
     if page is not None:
-        put_into(page, "speed", text)
+        put_into(page, "speed", tables(results, with_ticks=False))
         draw(results, page.with_suffix(".png"))
     print(text, end="")
 

@@ -6,7 +6,7 @@ Everything that a user imports is here, loaded when it is first used; the subpac
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-__version__ = "0.2.0.dev0"
+__version__ = "0.2.0"
 
 #: Module (or package, of a module) that each public name is loaded from on first use.
 _HOMES = {
