@@ -29,7 +29,7 @@ test: $(TEST)
 
 # The tests of the core: within a minute of processor time.
 test-fast: $(TEST)
-	$(BIN)/python -m pytest -n auto $(BY_FILE) tests/unit --fast
+	$(BIN)/python -m pytest tests/unit -m 'not slow and not long'
 
 # The tests marked slow, and the others with many more random examples.
 test-slow: $(TEST)

@@ -16,6 +16,14 @@ settings.register_profile("thorough", deadline=None, max_examples=200)
 settings.load_profile("fast")
 
 _NIGHTLY = ("_experiment", "_benchmark")
+# Units that take seconds of processor time each; `make test-fast` leaves them out.
+_LONG = (
+    "assumed", "backward_forward", "bearing_sensors", "correlated_errors", "coverage", "crowds", "damping", "entry",
+    "evaluation_consistency", "evaluation_figures", "evaluation_tables", "evaluation_visibility", "extent",
+    "figure_paper", "figure_texts", "figure_views", "geodetic", "identity", "initiated", "language", "ledger",
+    "likelihood", "live", "persistence", "recordings", "replay_bank", "revisits", "run_folder", "run_memory",
+    "running", "sim_redelay", "sim_simulate", "singular_noise", "supply_chain", "sweep_config", "sweep_figures",
+)  # fmt: skip
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -27,7 +35,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Whole folders and the experiments are for the night; `make test` is the suite of a change."""
+    """Mark whole folders and the experiments as slow, for the night, and the long units."""
     for item in items:
         if item.path.parent.name in ("faults", "fuzz", "statistical") or item.path.stem.endswith(_NIGHTLY):
             item.add_marker(pytest.mark.slow)
+        if item.path.parent.name == "unit" and item.path.stem.removeprefix("test_") in _LONG:
+            item.add_marker(pytest.mark.long)
