@@ -6,15 +6,20 @@ Calls of NumPy, BLAS and assignments of slices in compiled code take seconds to 
 import logging
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
+from llvmlite.binding import add_symbol  # type: ignore[import-untyped]  # it has no types
+from numba.core.cgutils import get_or_insert_function
+from numba.core.typing.templates import ConcreteTemplate, infer_global
+from numba.extending import lower_builtin
 
 from fgtrack.core.types import FloatArray
 
 _LOG = logging.getLogger(__name__)
 _said = set[str]()
+_Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def _say(text: str) -> None:
@@ -23,29 +28,61 @@ def _say(text: str) -> None:
         _LOG.warning(text)
 
 
-# Any: numba has no types.
-def njit(signature: str) -> Callable[[Callable[..., Any]], Any]:
+# Any: numba has no types of what is compiled.
+def njit(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that compiles a function once: it is stored in a cache folder, if one can be written.
     One line of the log says that loops are compiled, another one that they cannot be stored.
     """
+    options |= {"no_cfunc_wrapper": True}
 
     def compiled(function: Callable[..., Any]) -> Any:
         try:
-            result = numba.njit(signature, cache=True, error_model="numpy")(function)
+            result = numba.njit(signature, cache=True, error_model="numpy", **options)(function)
         except RuntimeError:
             _say("compiled loops cannot be stored, so every start compiles them: let NUMBA_CACHE_DIR name a folder")
-            return numba.njit(signature, error_model="numpy")(function)
+            return numba.njit(signature, error_model="numpy", **options)(function)
         if result.stats.cache_misses:
-            _say("compiling numerical loops, once: some 40 s of processor time for all")
+            _say("compiling numerical loops, once: some 20 s of processor time for all")
         return result
 
     return compiled
 
 
-#: Decorator of functions that only compiled ones call.
-inlined = numba.njit(error_model="numpy")
-#: Decorator of those with one caller, which are compiled as a part of it: alone they would be compiled twice.
-merged = numba.njit(error_model="numpy", inline="always")
+def shared(signature: str) -> Callable[[_Function], _Function]:
+    """Return a decorator of functions that only compiled ones call, by an address: compiled and stored as by `njit`.
+    Others are optimised and translated once more as a part of each function that calls them.
+    """
+
+    def compiled(function: _Function) -> _Function:
+        (result,) = njit(signature, no_cpython_wrapper=True)(function).overloads.values()
+        name = f"{function.__module__}.{function.__name__} {result.signature}"
+        add_symbol(name, result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
+        template = type(name, (ConcreteTemplate,), {"key": function, "cases": [result.signature]})
+        infer_global(function, numba.types.Function(template))  # type: ignore[no-untyped-call]
+
+        @lower_builtin(function, *result.signature.args)  # type: ignore[no-untyped-call, untyped-decorator]
+        def call(context: Any, builder: Any, own: Any, args: Any) -> Any:
+            of = context.call_conv.get_function_type(own.return_type, own.args)
+            callee = get_or_insert_function(builder.module, of, name)  # type: ignore[no-untyped-call]
+            return context.call_conv.call_function(builder, callee, own.return_type, own.args, args)[1]
+
+        return function
+
+    return compiled
+
+
+def inlined(function: _Function) -> _Function:
+    """Decorate a function that only compiled ones call, which are optimised together with it."""
+    options: Any = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return cast(_Function, numba.njit(error_model="numpy", **options)(function))
+
+
+def merged(function: _Function) -> _Function:
+    """Decorate a function with one caller, which is compiled as a part of it: alone it would be compiled twice."""
+    return cast(_Function, numba.njit(error_model="numpy", inline="always")(function))
+
+
+_READ, _MATRIX = "Array(float64, 2, 'C', readonly=True)", "float64[:, ::1]"
 
 
 @inlined
@@ -56,7 +93,7 @@ def copy(source: FloatArray, out: FloatArray) -> None:
             out[i, j] = source[i, j]
 
 
-@inlined
+@shared(f"void({_READ}, {_READ}, {_MATRIX})")
 def product(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
     """Write A B; columns beyond those that meet are ignored."""
     for i in range(out.shape[0]):
@@ -67,7 +104,7 @@ def product(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
             out[i, j] = value
 
 
-@inlined
+@shared(f"void({_READ}, {_READ}, {_MATRIX})")
 def add_product_transposed(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
     """Add A B', which is symmetric, to `out`: its lower triangle, and the mirror of that."""
     for i in range(A.shape[0]):
@@ -78,14 +115,14 @@ def add_product_transposed(A: FloatArray, B: FloatArray, out: FloatArray) -> Non
             out[i, j] = out[j, i] = value
 
 
-@inlined
+@shared(f"void({_READ}, {_READ}, {_MATRIX}, {_MATRIX})")
 def add_congruence(A: FloatArray, P: FloatArray, AP: FloatArray, out: FloatArray) -> None:
     """Add A P A' to `out`, and write A P."""
     product(A, P, AP)
     add_product_transposed(AP, A, out)
 
 
-@inlined
+@shared(f"void({_READ}, {_READ}, {_MATRIX}, {_MATRIX})")
 def add_weighted(K: FloatArray, R: FloatArray, KR: FloatArray, out: FloatArray) -> None:
     """Add K' R K of K (k, n) and the first k rows and columns of R, which is symmetric, to `out`; K' R is written."""
     k, n = K.shape
@@ -102,7 +139,7 @@ def add_weighted(K: FloatArray, R: FloatArray, KR: FloatArray, out: FloatArray) 
             out[a, b] = out[b, a] = value
 
 
-@inlined
+@shared(f"b1({_READ}, int64, {_MATRIX})")
 def cholesky(S: FloatArray, n: int, L: FloatArray) -> bool:
     """Write the lower Cholesky factor of the first n rows and columns to L, which may be S; False if there is none."""
     for i in range(n):
@@ -119,7 +156,7 @@ def cholesky(S: FloatArray, n: int, L: FloatArray) -> bool:
     return True
 
 
-@inlined
+@shared(f"b1({_MATRIX}, {_MATRIX})")
 def solve(S: FloatArray, columns: FloatArray) -> bool:
     """Overwrite columns (n, m) by S^-1 columns, and the first n rows and columns of S by their Cholesky factor.
     False unless they are positive definite.
@@ -142,7 +179,7 @@ def solve(S: FloatArray, columns: FloatArray) -> bool:
     return True
 
 
-@inlined
+@shared(f"float64({_MATRIX}, float64[::1])")
 def whiten(S: FloatArray, y: FloatArray) -> float:
     """Overwrite y (n,) by L^-1 y, and S by its Cholesky factor L; return y' S^-1 y, NaN where there is no root."""
     total = 0.0

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import add_product_transposed, copy, inlined, merged, njit, product
+from fgtrack.core.compiled import add_product_transposed, copy, inlined, merged, njit, product, shared
 from fgtrack.core.types import FloatArray
 
 #: Kinds of motion: constant turn rate and velocity (or acceleration), constant velocity.
@@ -50,11 +50,6 @@ def _quadratic(a: int, b: int) -> list[FloatArray]:
 _SERIES = np.hstack([*_linear(0), *_quadratic(0, 0), *_linear(2), *_quadratic(0, 2), *_quadratic(2, 2)])
 
 
-@merged
-def _at(values: FloatArray, index: int, w: float) -> complex:
-    return complex(values[index], values[index + 1] * w)
-
-
 @inlined
 def _short_arc(x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray) -> None:
     """Write mean, F and Q after a turn of at most `MAX_TURN_RAD`.
@@ -62,18 +57,23 @@ def _short_arc(x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F
     speed, yaw rate and acceleration a time R before by i (v K_0 - a K_1), K_0, i (v (R K_0 - K_1) - a (R K_1 - K_2)),
     R K_0 - K_1. `unit` has the series of these moments, from the end back; `scaled` those for the yaw and its rate.
     """
-    n, i = len(x), 1j * t
+    n = len(x)
     accel, q_accel = (x[5], density[5] * t) if n > 5 else (0.0, 0.0)
     q_yaw, q_speed, q_rate = density[2] * t, density[3] * t, density[4] * t
     w, v, a = -x[4] * t, x[3] + accel * t, accel * t
-    unit, scaled, used = np.zeros(38), np.empty(16), 16 if n == 5 else 38
+    unit, scaled, moments, used = np.empty(38), np.empty(16), np.empty((2, 8), np.complex128), 16 if n == 5 else 38
+    for p in range(38):
+        unit[p] = 0.0
     for k in range(_TERMS - 1, -1, -1):
         for p in range(used):
             unit[p] = unit[p] * (w * w) + _SERIES[k, p]
-    for p in range(10):
+    for p in range(16):
         scaled[p] = v * unit[p] - a * unit[p + 16]
-    for p in range(10, 16):
-        scaled[p] = v * v * unit[p] - 2.0 * v * a * unit[p + 16] + a * a * unit[p + 22]
+        if p >= 10:
+            scaled[p] = v * v * unit[p] - 2.0 * v * a * unit[p + 16] + a * a * unit[p + 22]
+    for p in range(8):
+        moments[0, p] = complex(scaled[2 * p], scaled[2 * p + 1] * w)
+        moments[1, p] = complex(unit[2 * p], unit[2 * p + 1] * w)
     for j in range(n):
         mean[j] = x[j]
         for k in range(n):
@@ -81,31 +81,28 @@ def _short_arc(x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F
             Q[j, k] = density[j] * t if j == k else 0.0
     mean[2], mean[3] = x[2] + x[4] * t, v
     turn = complex(math.cos(mean[2]), math.sin(mean[2]))
-    gradient = i * _at(scaled, 0, w), t * _at(unit, 0, w), i * t * _at(scaled, 2, w), t * t * _at(unit, 2, w)
-    cross = (
-        i * (q_yaw * _at(scaled, 4, w) + q_rate * t * t * _at(scaled, 8, w)),
-        t * (q_speed * _at(unit, 4, w) + q_accel * t * t * _at(unit, 8, w)),
-        i * t * q_rate * _at(scaled, 6, w),
-        t * t * q_accel * _at(unit, 6, w),
-    )
-    way = turn * t * _at(scaled, 0, w)
+    way = turn * t * moments[0, 0]
     size = q_yaw * scaled[14] + q_speed * unit[14] + t * t * (q_rate * scaled[15] + q_accel * unit[15])
-    square = q_speed * _at(unit, 10, w) - q_yaw * _at(scaled, 10, w)
-    square = turn * turn * (square + t * t * (q_accel * _at(unit, 12, w) - q_rate * _at(scaled, 12, w)))
+    square = q_speed * moments[1, 5] - q_yaw * moments[0, 5]
+    square = turn * turn * (square + t * t * (q_accel * moments[1, 6] - q_rate * moments[0, 6]))
     mean[0], mean[1] = x[0] + way.real, x[1] + way.imag
     Q[0, 0] += 0.5 * t * t * (size + square.real)
     Q[1, 1] += 0.5 * t * t * (size - square.real)
     Q[0, 1] = Q[1, 0] = 0.5 * t * t * square.imag
-    for k in range(2, n):
-        by, noise = turn * gradient[k - 2], turn * cross[k - 2]
+    for k in range(2, n):  # yaw and speed, and then their rates, of which the second is the acceleration
+        which, direction, q = k % 2, turn * (1j * t if k % 2 == 0 else complex(t, 0.0)), density[k] * t
+        by, noise = direction * moments[which, 0], direction * q * moments[which, 2]
+        if k > 3:
+            by, noise = direction * t * moments[which, 1], direction * t * q * moments[which, 3]
+        elif k + 2 < n:
+            noise += direction * (density[k + 2] * t) * t * t * moments[which, 4]
         F[0, k], F[1, k] = by.real, by.imag
         Q[0, k] = Q[k, 0] = noise.real
         Q[1, k] = Q[k, 1] = noise.imag
-    for k in range(2, n - 2):  # the yaw by its rate, the speed by the acceleration
-        q = density[k + 2]
-        F[k, k + 2] = t
-        Q[k, k] += q * t * t * t / 3.0
-        Q[k, k + 2] = Q[k + 2, k] = 0.5 * q * t * t
+        if k > 3:  # the yaw by its rate, the speed by the acceleration
+            F[k - 2, k] = t
+            Q[k - 2, k - 2] += density[k] * t * t * t / 3.0
+            Q[k - 2, k] = Q[k, k - 2] = 0.5 * density[k] * t * t
 
 
 @merged
@@ -117,7 +114,8 @@ def _long_arc(
     before, G, old, GM = np.empty(n), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
     _short_arc(x, t, density, mean, F, Q)
     for _ in range(1, parts):
-        before[:] = mean
+        for j in range(n):
+            before[j] = mean[j]
         copy(Q, old)
         _short_arc(before, t, density, mean, G, Q)
         product(G, old, GM)
@@ -142,7 +140,7 @@ def _line(x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F: Flo
         Q[i, v] = Q[v, i] = q * t**2 / 2.0
 
 
-@inlined
+@shared(f"void(int64, float64[::1], float64, float64[::1], float64[::1], {'float64[:, ::1], ' * 2})")
 def transition(
     kind: int, x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
 ) -> None:

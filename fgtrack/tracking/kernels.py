@@ -180,7 +180,8 @@ def innovations(
     for i in range(m):
         copy(R[i], S)
         add_congruence(H[min(i, len(H) - 1)], P[tracks[i]], HP, S)
-        white[:] = y[i]
+        for a in range(k):
+            white[a] = y[i, a]
         nis[i] = whiten(S, white)
         for a in range(k):
             logdet[i] += 2.0 * math.log(S[a, a])

@@ -24,3 +24,12 @@ def test_loops_that_cannot_be_stored_are_compiled_with_a_line(
     [line] = caplog.messages
     assert "cannot be stored" in line
     assert "NUMBA_CACHE_DIR" in line
+
+
+def test_a_shared_function_is_not_part_of_its_callers() -> None:
+    twice = compiled.shared("int64(int64)")(lambda x: 2 * x)
+    caller = numba.njit("int64(int64)")(lambda x: twice(x) + 1)
+    assert caller(4) == 9
+    [code] = caller.inspect_llvm().values()
+    assert "declare i32 @" in code.replace('@"', "@")
+    assert "shl" not in code

@@ -102,7 +102,8 @@ def _retrodict(
             for b in range(n):
                 mean[a] += gain[b, a] * shift[b]
         copy(state, now)
-        shift[:] = mean
+        for a in range(n):
+            shift[a] = mean[a]
         add_weighted(gain, root, CD, now[1:])
     return True
 
@@ -126,7 +127,8 @@ def _step(
     copy(predicted, after[: n + 1])
     _innovation(after, label, measured, motion == ARC, y, S)
     for c in range(k):
-        K[c] = after[1 + label[2 + c]]
+        for b in range(n):
+            K[c, b] = after[1 + label[2 + c], b]
     if not solve(S, K):
         return False
     for a in range(n):
@@ -200,9 +202,11 @@ def fuse(
             slots[index] = slots[index - 1]
             index -= 1
         slots[index] = own
-        labels[t, own, : k + 2] = new_label
+        for a in range(k + 2):
+            labels[t, own, a] = new_label[a]
         for a in range(k + 1):
-            measured[t, own, a, :k] = new[i, a]
+            for b in range(k):
+                measured[t, own, a, b] = new[i, a, b]
         j, last, fused = index, count, True
         while j <= last:
             s, left = slots[j], slots[j - 1]

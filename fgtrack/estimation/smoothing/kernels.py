@@ -21,9 +21,9 @@ NEVER = int(np.iinfo(np.int64).max)
 COUNT, FIRST, KNOWN, BEGIN_NS, NONLINEAR = range(5)
 #: Columns of `labels`.
 NUM_ROWS, CHANGED, STALE = range(3)
-#: Rows of `values` of a node, and then blocks of n rows.
+#: Rows of `values` of a node, and then blocks of n rows; for each literal integer, `block` would be compiled once more.
 ORIGIN, REFERENCE = range(2)
-C, FILTERED, PREDICTED, P, F, Q = range(6)
+C, FILTERED, PREDICTED, P, F, Q = np.arange(6)
 #: Types of arguments.
 INDICES, TIMES, VECTORS, MATRICES = ("int64[::1]", "float64[::1]", "float64[:, ::1]", "float64[:, :, ::1]")
 NODES = f"Tuple(({'int64[:, ::1], ' * 4}{MATRICES}, {MATRICES}, {MATRICES}))"
@@ -32,7 +32,7 @@ Arrays = tuple[IntArray, IntArray, IntArray, IntArray, FloatArray, FloatArray, F
 
 
 @inlined
-def block(values: FloatArray, at: int, which: int) -> FloatArray:
+def block(values: FloatArray, at: int, which: np.int_) -> FloatArray:
     """Return a block of a node, a matrix (n, n) and a vector (n,) beside it."""
     n = values.shape[2] - 1
     return values[at, 2 + which * n : 2 + (which + 1) * n]
