@@ -17,10 +17,11 @@ def block(kind, *records):
     return kind.create([kind.cv_record.create(record) for record in records]).unparse().to_bytes()
 
 
-def surface(time_s, x_m, y_m, kind=3, address=None, sic=7):
+def surface(time_s, x_m, y_m, kind=3, address=None, sic=7, coasted=0):
     target = {"220": address} if address else {}
+    target |= {"170": ((("CNF", 0), ("TRE", 0), ("CST", coasted), 0, 0, 0, None),)} if coasted else {}
     head = {"010": (("SAC", 0), ("SIC", sic)), "000": 1, "140": (time_s, "s")}
-    where = {"042": (("X", (x_m, "m")), ("Y", (y_m, "m"))), "202": (("VX", (3.0, "m/s")), ("VY", (4.0, "m/s")))}
+    where = {"042": (("X", (x_m, "m")), ("Y", (y_m, "m"))), "202": (("VX", 12), ("VY", 16))}  # in 0.25 m/s
     return block(gen.Cat_010_1_1, {**head, "020": ((("TYP", kind), 0, 0, 0, 0, None),), **where, **target})
 
 
@@ -82,6 +83,11 @@ def test_records_of_one_stamp_are_one_list_and_each_station_has_its_place(tmp_pa
     assert late.receipt_ns - late.stamp_ns == 500_000_000  # the newest stamp before it
     assert other.objects[0].y_m == pytest.approx(1110.7, abs=1.0)
     assert other.objects[0].id == "4CA911"
+
+
+def test_extrapolated_positions_are_left_out(tmp_path):
+    (tmp_path / "a.ast").write_bytes(surface(50.0, 100.0, 0.0) + surface(51.0, 120.0, 0.0, coasted=3))
+    assert [each.stamp_ns for each in lists(tmp_path / "a.ast")] == [50_000_000_000]
 
 
 def test_stamps_go_on_at_midnight(tmp_path):

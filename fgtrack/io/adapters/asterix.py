@@ -3,7 +3,7 @@
 Read with libasterix (extra `asterix`), which has every edition and decodes what is asked for. Times are seconds of the
 UTC day; the recording has no date. A category with two times of a position (021) gives stamp and receipt; of the others
 the receipt is the newest stamp up to the record in its file, a lower bound. Records of one sensor with equal times are
-one list.
+one list. Extrapolated positions (010, 020: bits CST of item 170) are no measurements and are left out.
 """
 
 import math
@@ -68,13 +68,16 @@ class _Category(NamedTuple):
     height: str
     unit_m: float = 1.0
     """Of X and Y."""
+    velocity_lsb_mps: float | None = None
+    """Least significant bit of VX and VY, where libasterix has another one."""
 
 
 _WGS84, _CARTESIAN, _POLAR = ("041", "LAT", "LON"), ("042", "X", "Y"), ("040", "RHO", "THETA")
 _GNSS = (("131", "LAT", "LON"), ("130", "LAT", "LON"))
 _SYSTEM = (("105", "LAT", "LON"), ("100", "X", "Y"))
 _CATEGORIES = {
-    10: _Category("", ("140",), (), "220", (_WGS84, _CARTESIAN, _POLAR), ("202", "VX", "VY"), "090/FL"),
+    # Edition 1.1, 5.2.20: +-8192 m/s in 16 bits, 0.25 m/s; libasterix 1.1 has 1/16 m/s.
+    10: _Category("", ("140",), (), "220", (_WGS84, _CARTESIAN, _POLAR), ("202", "VX", "VY"), "090/FL", 1.0, 0.25),
     20: _Category("mlat", ("140",), (), "220", (_WGS84, _CARTESIAN), ("202", "VX", "VY"), "090/FL"),
     21: _Category("adsb", ("073", "071", "030"), ("077",), "080", _GNSS, ("160", "GS", "TA"), "145"),
     48: _Category("radar", ("140",), (), "220", (_POLAR, _CARTESIAN), ("200", "GSP", "HDG"), "090/FL", _NM_M),
@@ -136,7 +139,7 @@ def _reports(file: Path, parsers: Mapping[int, Any], given: AsterixInput, plane:
         receipt_s = _first(record, (given.receipt[number],) if number in given.receipt else own.receipt)
         station = _number(record, "010/SIC")
         item = _detection(record, number, own, sites.get(int(station or 0), _Site(plane, None)), plane)
-        if stamp_s is None or item is None:
+        if stamp_s is None or item is None or (number in (10, 20) and _number(record, "170/CST")):
             continue
         stamp_ns = round(stamp_s * NS_PER_S) + day_ns
         if abs(stamp_ns - newest_ns) > _DAY_NS // 2 and newest_ns:  # midnight
@@ -189,7 +192,7 @@ def _detection(record: Record, number: int, own: _Category, site: _Site, plane: 
     position = next((at for name in own.positions if (at := _position_m(record, *name, own.unit_m, site, plane))), None)
     if position is None:
         return None
-    speed_mps, yaw_rad = _velocity(record, *own.velocity)
+    speed_mps, yaw_rad = _velocity(record, *own.velocity, own.velocity_lsb_mps)
     address, level = _number(record, own.address), _number(record, own.height)
     return Detection(
         *position,
@@ -214,9 +217,11 @@ def _position_m(
     return site.position_m(unit_m * a, unit_m * b)
 
 
-def _velocity(record: Record, item: str, first: str, second: str) -> tuple[float | None, float | None]:
-    """Speed over ground, and its direction where it moves; None where it is not reported."""
-    a, b = _number(record, f"{item}/{first}"), _number(record, f"{item}/{second}")
+def _velocity(
+    record: Record, item: str, first: str, second: str, lsb: float | None
+) -> tuple[float | None, float | None]:
+    """Speed over ground, and its direction where it moves; None where it is not reported. `lsb`: see `_number`."""
+    a, b = _number(record, f"{item}/{first}", lsb), _number(record, f"{item}/{second}", lsb)
     if a is None or b is None:
         return None, None
     if first == "VX":
@@ -243,8 +248,10 @@ def _first(record: Record, names: Iterable[str]) -> float | None:
     return next((value for name in names if (value := _number(record, name)) is not None), None)
 
 
-def _number(record: Record, name: str) -> float | None:
-    """Number of an item, or of its part behind a slash, in the unit of the standard; None where it is not there."""
+def _number(record: Record, name: str, lsb: float | None = None) -> float | None:
+    """Number of an item, or of its part behind a slash, in the unit of the standard; None where it is not there.
+    `lsb` replaces the least significant bit of the library.
+    """
     item, _, part = name.partition("/")
     try:
         value = record.get_item(item)
@@ -255,4 +262,5 @@ def _number(record: Record, name: str) -> float | None:
     if value is None:
         return None
     content = value.variation.content
-    return float(content.as_quantity() if hasattr(content, "as_quantity") else content.as_uint())
+    scale = 1.0 if lsb is None else lsb / content.cv_lsb
+    return float(scale * content.as_quantity() if hasattr(content, "as_quantity") else content.as_uint())
