@@ -20,6 +20,7 @@ _ALIKE = (
 )
 _UNKNOWN, _OTHER = 0, -1
 _MOST_STRAYS = 3
+_MOST_FORMER = 10_000  # ended tracks that are remembered, the last ones
 _GROUPS = {name: -1 - number for number, group in enumerate(_ALIKE) for name in group}
 _SIZES = ("length_m", "width_m", "height_m")
 _sizes_m = attrgetter(*_SIZES)
@@ -71,6 +72,7 @@ class Objects:
     def __init__(self) -> None:
         self._seen: dict[int, _Seen] = {}
         self._ids: dict[int, str] = {}  # of most detections, by track
+        self._former: dict[str, int] = {}  # tracks that have ended, by identity
         self._strays = Counter[str]()  # detections in succession that their track did not match, by identity
         self.id_conflicts: Counter[str] = Counter()
         """Identities that were `reused`: a track began with that of another one; or `changed`: a track fused another
@@ -124,6 +126,13 @@ class Objects:
         self._strays[detection.id] += 1
         return self._strays[detection.id] <= _MOST_STRAYS
 
+    def former(self, detection: Detection) -> int | None:
+        """Return the track, ended or lost, of which a new one of `detection` takes the number; None without any.
+        An identity is that of one object: what returns with it after a gap, or elsewhere, is the same object.
+        """
+        lost = next((track_id for track_id, name in self._ids.items() if name == detection.id), None)
+        return self._former.pop(detection.id or "", None) if lost is None else lost
+
     def apart(self, detections: Iterable[Detection], track_ids: Sequence[int]) -> Apart | None:
         """Return a test of pairs of detections and tracks for different classes; None if no pair is excluded."""
         named = [each.class_name for each in detections] if self._seen else []
@@ -151,7 +160,10 @@ class Objects:
     def forget(self, track_id: int) -> None:
         """Forget a track that has ended."""
         self._seen.pop(track_id, None)
-        self._ids.pop(track_id, None)
+        if identity := self._ids.pop(track_id, None):
+            self._former[identity] = track_id
+            if len(self._former) > _MOST_FORMER:
+                del self._former[next(iter(self._former))]
 
     def _report(self, seen: _Seen) -> ObjectReport:
         name = _most(seen.classes)

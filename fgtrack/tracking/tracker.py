@@ -334,8 +334,13 @@ class Tracker:
         if prior is None:
             self._conclude(batch, candidates, [position], Disposition.GATED)
             return
-        track_id = self._next_id
-        self._next_id += 1
+        track_id = parts.objects.former(scan.objects[candidate.leader])
+        if track_id is None:
+            track_id = self._next_id
+            self._next_id += 1
+        elif track_id in self._num_measured:  # lost
+            parts.objects.id_conflicts["reused"] += 1
+            self._end([track_id])
         parts.bank.birth(track_id, prior)
         if track_id not in parts.bank.track_ids:
             self._conclude(batch, candidates, [position], Disposition.FAILED)

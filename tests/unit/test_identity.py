@@ -83,6 +83,24 @@ def test_an_outlier_of_a_known_identity_starts_no_track_but_a_reused_identity_do
     reused = run([*lists, *(report(20 + k, 9e3 + 20.0 * k, 9e3, "AAA") for k in range(10))])
     assert reused.tables["updates"]["disposition"].tolist()[20:24] == ["gated", "gated", "gated", "birth"]
     assert reused.meta["id_conflicts"] == {"reused": 1}
+    assert set(reused.tables["tracks"]["track_id"].tolist()) == {0}  # which is there from now on
+    assert reused.tables["tracks"]["y_m"][-1] == pytest.approx(9e3, abs=30.0)
+
+
+@pytest.mark.parametrize("estimator", ["ekf-replay", "smoother-banded", "smoother"])
+def test_an_identity_that_returns_after_the_end_of_its_track_has_the_number_of_before(estimator):
+    def passing(start_s, ids):
+        return [report(start_s + k, 20.0 * k + 3e3 * row, 5.0, name) for k in range(10) for row, name in enumerate(ids)]
+
+    back = run([*passing(0, ("AAA", "BBB", None)), *passing(600, ("CCC", "AAA", None))], estimator=estimator)
+    updates = back.tables["updates"]
+    first, second = (
+        updates["track_id"][np.array([d == "birth" for d in updates["disposition"]])].reshape(2, 3)
+    ).tolist()
+    assert (first, second) == ([0, 1, 2], [3, 0, 4])
+    assert back.meta["id_conflicts"] == {}
+    times_s = back.tables["tracks"]["now_ns"][np.array(back.tables["tracks"]["track_id"]) == 0] / S
+    assert np.diff(times_s).max() > 100.0  # it is not published while it is away
 
 
 def test_a_track_forgets_its_identity_with_its_end():
