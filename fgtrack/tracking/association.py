@@ -114,10 +114,17 @@ class GatedMahalanobis:
 
     def __call__(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Assignment:
         """See `Association`; the cost adds log det S, so that a vague track does not win by being vague."""
-        weight = apart.weight if isinstance(apart, Evidence) else 0.0
-        reach_m = reaches_m(candidates.groups, states, self.gate_probability, self.max_distance_m, weight)
+        reach_m: float | FloatArray = self.max_distance_m
+        if len(candidates) * len(states.means) > MOST_NEAR:
+            weight = apart.weight if isinstance(apart, Evidence) else 0.0
+            reach_m = reaches_m(candidates.groups, states, self.gate_probability, self.max_distance_m, weight)
         pairs = near(candidates, states.means, reach_m, apart.differ if isinstance(apart, Evidence) else apart)
-        more = apart.nis(pairs.rows, pairs.columns) if isinstance(apart, Evidence) else None
+        more = None
+        if isinstance(apart, Evidence):
+            more = apart.nis(pairs.rows, pairs.columns)
+            largest = max(len(group.stack.model.components) for group in candidates.groups)
+            likely = more <= chi_square_quantile(self.gate_probability, largest)
+            pairs, more = pairs.at(likely), more[likely]
         cost, inside = np.empty(len(pairs.rows)), np.empty(len(pairs.rows), dtype=bool)
         for chosen, nis, logdet, k in innovations(pairs, candidates, states) if len(cost) else ():
             nis = nis if more is None else nis + more[chosen]

@@ -20,6 +20,7 @@ import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
 
 from fgtrack.core.geometry import polar
+from fgtrack.core.linalg import kernels
 from fgtrack.core.settings import OpenProbability, settings
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray, IntArray, TrackStatus
@@ -29,7 +30,6 @@ from fgtrack.tracking.lifecycle import CountingLifecycle, Scan
 from fgtrack.tracking.preprocess import Candidate, Candidates
 from fgtrack.tracking.visibility import DetectionShares, Histories, Looks
 
-_SINGULAR = 1e-12
 _LIFE = np.dtype(
     [
         *[("confirmed", "?"), ("travelled", "?"), ("first_m", "2f8"), ("misses", "i8")],
@@ -230,12 +230,9 @@ Lifecycle = CountingLifecycle | ExistenceLifecycle
 
 def _position_densities(candidates: Candidates, chosen: IntArray, means: FloatArray, P: FloatArray) -> FloatArray:
     """N(z - h(x); 0, S) of the positions of `chosen` (m,) at states (m, n), (m, n, n), in 1/m^2; NaN if singular."""
-    S, y = P[:, :2, :2].copy(), candidates.lines[chosen, :2] - means[:, :2]
+    y, R = candidates.lines[chosen, :2] - means[:, :2], np.empty((len(chosen), 2, 2))
     for group, members, here in candidates.split(chosen):
-        S[here] += group.position_covariances(members)
-    variances = S[:, 0, 0] * S[:, 1, 1]
-    determinant = variances - S[:, 0, 1] * S[:, 1, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        squared = S[:, 1, 1] * y[:, 0] ** 2 + S[:, 0, 0] * y[:, 1] ** 2 - (S[:, 0, 1] + S[:, 1, 0]) * y[:, 0] * y[:, 1]
-        density = np.exp(-0.5 * squared / determinant) / (math.tau * np.sqrt(determinant))
-    return np.where(determinant > _SINGULAR * variances, density, np.nan)
+        R[here] = group.position_covariances(members)
+    own, H = np.array(P[:, :2, :2], dtype=np.float64, order="C"), np.eye(2)[None]
+    nis, logdet = kernels("fgtrack.tracking.kernels").innovations(y, H, own, np.arange(len(y)), R)
+    return np.asarray(np.exp(-0.5 * (nis + logdet)) / math.tau)

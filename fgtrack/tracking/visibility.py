@@ -128,6 +128,7 @@ class DetectionShares:
         self._keep = math.exp(-memory_ns / NS_PER_S / self.FORGET_S)
         self._counts: dict[int, FloatArray] = {}  # looks without and with a detection, by epoch of their stamps
         self._known: dict[int, FloatArray] = {}  # sums of counts that lists of an epoch are judged by
+        self._last = [(self._empty, self._empty)] * len(priors)  # such sums, and the shares by them, by sensor
 
     def cells(self, range_m: FloatArray, bearing_rad: FloatArray) -> IntArray:
         """Return the cells at these ranges and bearings from a sensor, shapes (m,)."""
@@ -138,10 +139,14 @@ class DetectionShares:
 
     def at(self, sensor: int, stamp_ns: int, cells: IntArray) -> FloatArray:
         """Return the shares of a list of `sensor` in `cells`, shapes (m,)."""
-        missed, shown = self._judging(stamp_ns // self._memory_ns)[sensor]
-        weight = self.PRIOR_LOOKS
-        ring = (shown.sum(axis=1) + weight * self._priors[sensor]) / ((shown + missed).sum(axis=1) + weight)
-        return np.asarray(((shown + weight * ring[:, None]) / (shown + missed + weight)).ravel()[cells])
+        counts = self._judging(stamp_ns // self._memory_ns)
+        known, shares = self._last[sensor]
+        if known is not counts:
+            (missed, shown), weight = counts[sensor], self.PRIOR_LOOKS
+            ring = (shown.sum(axis=1) + weight * self._priors[sensor]) / ((shown + missed).sum(axis=1) + weight)
+            shares = ((shown + weight * ring[:, None]) / (shown + missed + weight)).ravel()
+            self._last[sensor] = counts, shares
+        return np.asarray(shares[cells])
 
     def learn(self, looks: Looks) -> None:
         """Count `looks`."""
