@@ -233,6 +233,22 @@ def test_final_states_of_a_nonlinear_model_are_near_the_optimum_of_what_had_arri
     assert np.median(differences) < 0.008
 
 
+def test_robust_weights_follow_the_states_within_an_update() -> None:
+    """With one step per update the largest difference is above one standard deviation."""
+    motion, differences, rng = CTRV(), list[float](), np.random.default_rng(1)
+    exact = {"max_iterations": 100, "relinearise": dict.fromkeys(motion.state_names, 1e-6)}
+    one, solved = (OneObject(motion, SmootherBank(motion, 1.0, ring_s=10.0, **given), START) for given in ({}, exact))
+    late = [measured(rng, motion, k * 50 * MS) for k in range(1, 90)]
+    late = [replace(m, z=m.z + (5.0 if rng.random() < 0.15 else 0.0), loss=RobustLoss("huber", 1.5)) for m in late]
+    for k in sorted(range(len(late)), key=lambda k: k + rng.uniform(0.0, 6.0)):
+        one.update(late[k])
+        solved.update(late[k])
+        now_ns = max(late[k].stamp_ns, START.stamp_ns)
+        differences.append(difference(one.state_at(now_ns), solved.state_at(now_ns))[0])
+    assert np.quantile(differences, 0.95) < 0.02
+    assert max(differences) < 0.1
+
+
 def known_apart(found: TrackState, expected: TrackState) -> tuple[float, float]:
     """`difference` of what is known of a kinematic state."""
     known = np.diag(expected.covariance) > 0.0

@@ -210,6 +210,7 @@ class SmootherBank:
         if damped := self.solver.damp(of):
             self.failures.add(Failure.STEP_DAMPED, damped)
         self.solver.iterate(of, self._settings.max_iterations - 1)
+        self.solver.reweight(of[[track not in self._searches for track in of.tolist()]] if self._searches else of)
         return rows
 
     def _initiate(self, track: int, oldest_ns: int) -> None:

@@ -21,6 +21,8 @@ from fgtrack.models.motion import MotionModel
 STEP_TOLERANCE = 1e-7
 #: The least share of a step that is tried, and rounding of a cost.
 _LEAST_SHARE, _ROUNDING = 1e-6, 1e-9
+#: Of a track with a robust loss, whose weights follow its states: value of `NONLINEAR`, share of the thresholds, steps.
+_ROBUST, _ROBUST_SHARE, _ROBUST_STEPS = 2, 0.1, 3
 Leaving = tuple[IntArray, list[int], FloatArray, FloatArray]
 """Tracks, stamps, means (m, n) and covariances (m, n, n) of nodes that leave, oldest first for each track."""
 
@@ -44,7 +46,8 @@ class Solver:
         self.nodes = Nodes(motion)
         self._has_final = settings.final
         self._is_nonlinear = False  # of all tracks
-        self._thresholds = np.array([settings.thresholds(motion, nonlinear) for nonlinear in (False, True)])
+        linear, nonlinear = (settings.thresholds(motion, nonlinear) for nonlinear in (False, True))
+        self._thresholds = np.array([linear, nonlinear, _ROBUST_SHARE * nonlinear])
 
     def begin(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
         """Start the window of a track with its first node."""
@@ -125,7 +128,7 @@ class Solver:
         states are as before then.
         """
         nodes, stamp_ns = self.nodes, stack.stamp_ns
-        guesses = self._marked_nonlinear(tracks, stamp_ns, guesses) if stack.is_nonlinear else guesses
+        guesses = self._marked_nonlinear(tracks, stack, guesses) if stack.is_nonlinear else guesses
         ahead_s, out = np.empty(len(tracks)), np.empty((7, len(tracks)), dtype=np.int64)
         leaving = self._leaving(tracks, anchors) if self._has_final else None
         given = (tracks, stamp_ns, y, H, R, guesses, not stack.is_nonlinear, self._thresholds, anchors)
@@ -158,13 +161,14 @@ class Solver:
         for track in tracks.tolist():
             self.forget(track)
 
-    def _marked_nonlinear(self, tracks: IntArray, stamp_ns: int, guesses: FloatArray) -> FloatArray:
-        """States at `stamp_ns` after the relinearisation of tracks whose first nonlinear measurement comes now.
+    def _marked_nonlinear(self, tracks: IntArray, stack: Measurement, guesses: FloatArray) -> FloatArray:
+        """States at its stamp after the relinearisation of tracks whose first nonlinear or robust measurement comes.
         From now on, these have other thresholds.
         """
-        first = (self.nodes.tracks[tracks, NONLINEAR] == 0).nonzero()[0]
+        level, stamp_ns = 1 if stack.loss is None else _ROBUST, stack.stamp_ns
+        first = (self.nodes.tracks[tracks, NONLINEAR] < level).nonzero()[0]
         if first.size:
-            self.nodes.tracks[tracks, NONLINEAR], self._is_nonlinear = 1, True
+            self.nodes.tracks[tracks[first], NONLINEAR], self._is_nonlinear = level, True
             for track in tracks[first].tolist():
                 self.relinearise(track, self.estimates(track))
             guesses = guesses.copy()
@@ -189,6 +193,11 @@ class Solver:
                     break
                 self.nodes.linearise(one, moved[:1], self._is_nonlinear)
                 self.solve(one, moved[:1], self.nodes.first[one])
+
+    def reweight(self, tracks: IntArray) -> None:
+        """Take steps of tracks with a robust loss, whose weights follow the states."""
+        if self._is_nonlinear:
+            self.iterate(tracks[self.nodes.tracks[tracks, NONLINEAR] == _ROBUST], _ROBUST_STEPS)
 
     def relinearise(self, track: int, means: FloatArray | None = None, start: int = NEVER) -> None:
         """Linearise a window at `means`, shape (m, n), or where its linearisation points are, and solve it.
