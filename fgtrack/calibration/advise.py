@@ -10,6 +10,7 @@ from fgtrack.calibration.arrivals import FEWEST, LONGEST_STORAGE_S, Arrivals, ar
 from fgtrack.calibration.clock_offsets import OffsetReport, estimate_offsets
 from fgtrack.calibration.clocks import bias_findings, clock_findings, stamp_findings
 from fgtrack.calibration.finding import Finding, milliseconds, percent
+from fgtrack.calibration.ledger import SUMMARY_S, Books
 from fgtrack.calibration.outcome import Outcome, harm, noise_findings, objection
 from fgtrack.calibration.page import Advice
 from fgtrack.calibration.trial import TRIAL_S, beginning, suspicions
@@ -51,13 +52,15 @@ def advise(
     set: Mapping[str, object] | None = None,  # noqa: A002 - the name of the option
     reference: str | None = None,
     tune: bool = False,
+    ledger: bool = False,
     on_step: Callable[[str, float], None] = lambda text, share: None,
 ) -> Advice:
     """Return what is late, wrong or inconsistent, and the settings that correct it; `advice.config` has them.
 
     The recording is replayed before and after, and settings that make the tracks worse are not given. `config`, `map`,
     `pit_map` and `set` are as for `fgtrack.replay`; `reference` is the sensor whose clock is right, where two do not
-    agree and the recording has no truth; with `tune`, noise that does not fit is fitted. `on_step` is called before
+    agree and the recording has no truth; with `tune`, noise that does not fit is fitted; with `ledger`,
+    policies for late lists are compared over the first minute. `on_step` is called before
     each step with its name and the share that is done.
 
     Raises `CallError` where the configuration does not fit, and `DataError` where nothing can be read or tracked.
@@ -69,7 +72,7 @@ def advise(
     messages = list(readable)
     broken = None if readable.error is None else str(readable.error)
     result = assumed(resolved, replace(source, messages=lambda: iter(messages)))
-    return Adviser(str(recording), messages, result, reference, on_step).advice(broken, tune)
+    return Adviser(str(recording), messages, result, reference, on_step).advice(broken, tune, ledger)
 
 
 class Adviser:
@@ -91,7 +94,7 @@ class Adviser:
         self._outcomes: list[tuple[Config, Outcome | None]] = []
         self._clocks: OffsetReport | None = None
 
-    def advice(self, broken: str | None = None, tune: bool = False) -> Advice:
+    def advice(self, broken: str | None = None, tune: bool = False, ledger: bool = False) -> Advice:
         """Return the advice after all steps; `broken` is why the recording breaks off, where it does."""
         if self._assumed.assumptions:
             text = f"not configured: {'. '.join(self._assumed.lines())}."
@@ -124,7 +127,10 @@ class Adviser:
             self._take(noise_findings(new))
         if tune and new is not None:
             self._take(self._tuned(new))
-        old, new = self._outcome(before), self._outcome(self._config)
+        old, new, summary = self._outcome(before), self._outcome(self._config), None
+        with suppress(DataError):  # nothing can be judged
+            first = list(beginning(self._tracked, nanoseconds(SUMMARY_S if ledger else 0.0)))
+            summary = Books.of(first, self._config).summary() if ledger else None
         return Advice(
             recording=self._recording,
             findings=tuple(sorted(self._findings, key=lambda one: -one.weight)),
@@ -135,6 +141,7 @@ class Adviser:
             before=old,
             after=new,
             broken=broken,
+            ledger=summary,
         )
 
     def _take(self, findings: Iterable[Finding]) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgtrack.calibration.tune_measurements import Fed, watched
+from fgtrack.calibration.tune_measurements import Fed, RecordingBank, watched
 from fgtrack.core.errors import DataError
 from fgtrack.core.linalg import congruence
 from fgtrack.core.time import NS_PER_S, nanoseconds
@@ -26,7 +26,7 @@ from fgtrack.evaluation.intervals import Estimate, within_run
 from fgtrack.evaluation.matching import NO_OBJECT, match, track_errors
 from fgtrack.evaluation.tables import Column, Table, Tables
 from fgtrack.evaluation.truth import true_paths
-from fgtrack.io.run import load_run
+from fgtrack.io.run import Run, load_run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumptions.assumed import assumed, source_of
 from fgtrack.pipeline.build import build_bank
@@ -41,6 +41,10 @@ POLICIES = ("drop", "as-current", PUBLISHED, FORGET, REPLAY, SMOOTHER)
 WAITS_S = (0.1, 0.3, 1.0)
 """Ages of the states that waiting gives."""
 _WAITING = (REPLAY, SMOOTHER)
+SUMMARY_S = 60.0
+"""A summary is of the beginning of a recording, so long."""
+_WAIT_S = 0.3  # in the summary
+_IN_TIME = f"{REPLAY}, if no list were late"
 _DECISIONS = "other decisions than those of the replaying EKF"
 _SETTLE_NS, _STEP_NS = NS_PER_S, NS_PER_S // 20  # a track is judged from an age on, and so often
 Arrival = Callable[[Fed], int | None]
@@ -78,63 +82,88 @@ def ledger(
     recording: str | Path | Iterable[Message],
     config: str | Path | Config | None = None,
     tuned: str | Path | Config | None = None,
+    *,
+    map: str | Path | None = None,  # noqa: A002 - the name of the option
+    pit_map: str | Path | None = None,
+    set: Sequence[str] | Mapping[str, object] | None = None,  # noqa: A002 - the name of the option
 ) -> Ledger:
     """Return the ledger of a recording, given as a path or as its messages.
 
-    A run folder stands for its recording and configuration. `config` is a configuration, a file or a shipped name; its
-    estimator is the one whose error is explained. `tuned` is one with noise fitted to the recording, as `fgtrack
-    tune` writes it: then the ledger has a line for the noise. Without truth predicted variances stand for errors.
-    Raises `DataError` where nothing can be judged.
+    A run folder stands for its recording and configuration. `config`, `map`, `pit_map` and `set` are as for
+    `fgtrack.replay`; the estimator is the one whose error is explained. Of `tuned`, a configuration as `fgtrack tune`
+    and `advise --tune` write it, noise and clock offsets are taken, and the ledger has a line for each that differs.
+    Without truth predicted variances stand for errors. Raises `DataError` where nothing can be judged.
     """
-    settings, fitted = (item if isinstance(item, Config | None) else read_config(str(item)) for item in (config, tuned))
-    settings = settings or Config()
+    settings = read_config(config, set, track_map=map, pit_map=pit_map)
+    fitted = None if tuned is None else read_config(tuned)
     if isinstance(recording, str | Path):
         path = Path(recording)
         if (path / "meta.json").is_file():
             run = load_run(path)
-            settings = settings if config is not None else read_config(str(run.config_path))
+            if config is None:
+                settings = read_config(str(run.config_path), set, track_map=map, pit_map=pit_map)
             path = Path((run.meta.get("input") or {}).get("path") or path)
             if not path.exists() or path == Path(recording):
                 raise DataError(
                     f"{recording}: its recording is not at {path}, give the recording with -c {run.config_path}"
                 )
         recording = open_input(path, settings.input).messages()
-    return _Books(list(recording), settings, fitted).ledger()
+    messages = list(recording)
+    settings = assumed(settings, source_of(lambda: messages)).config
+    right = _with_clocks(settings, fitted)
+    books = Books.of(messages, right)
+    whole = [] if books.objects is None else [books.published(replay_in_memory(messages, right))]
+    if whole and right != settings:
+        whole.insert(0, books.published(replay_in_memory(messages, settings)))
+    return books.ledger(fitted, whole)
 
 
-class _Books:
-    """The recorded association, and squared errors of every way to estimate from it."""
+def _with_clocks(config: Config, tuned: Config | None) -> Config:
+    """Return `config` with the clock offsets of `tuned`."""
+    own = {} if tuned is None else tuned.sensors
+    sensors = {
+        name: replace(sensor, clock_offset_s=own[name].clock_offset_s) if name in own else sensor
+        for name, sensor in config.sensors.items()
+    }
+    return replace(config, sensors=sensors)
 
-    def __init__(self, messages: Sequence[Message], config: Config, tuned: Config | None) -> None:
-        config = assumed(config, source_of(lambda: messages)).config
-        self._messages, self._config, self._tuned = messages, config, tuned
-        bank, run = watched(messages, replace(config, estimator=REPLAY))
-        self._fed, self._run = bank.fed, run
-        self._noise = {name: {**sensor.std} for name, sensor in config.sensors.items()}
+
+class Books:
+    """The association of a run of the replaying EKF, and squared errors of every way to estimate from it."""
+
+    def __init__(self, bank: RecordingBank, run: Run, config: Config, until_s: float = math.inf) -> None:
         now_ns = run.tables["timing"]["now_ns"]
-        if not len(now_ns) or not self._fed:
+        now_ns = now_ns[: np.searchsorted((now_ns - now_ns[:1]) / NS_PER_S, until_s, side="right")]
+        if not len(now_ns) or not bank.fed:
             raise DataError("no track in this recording: `fgtrack advise` tells why")
+        self._fed = [item for item in bank.fed if item.now_ns <= now_ns[-1]]
+        self._run, self._config, self._now_ns = run, config, now_ns
+        self._noise = {name: {**sensor.std} for name, sensor in config.sensors.items()}
         grid = np.searchsorted(now_ns, np.arange(now_ns[0], now_ns[-1] + 1, _STEP_NS))
         self._ticks = np.unique(grid[grid < len(now_ns)])
-        self._now_ns: IntArray = now_ns
         births = {item.track_ids[0]: item.now_ns for item in self._fed if item.start is not None}
         self._births, self._track_ids = births, list(births)
 
+    @classmethod
+    def of(cls, messages: Sequence[Message], config: Config) -> "Books":
+        """Return the books of a recording. Raises `DataError` where nothing is tracked."""
+        return cls(*watched(messages, replace(config, estimator=REPLAY)), config)
+
     @cached_property
-    def _objects(self) -> IntArray | None:
+    def objects(self) -> IntArray | None:
         """Object of each judged tick and track; `NO_OBJECT` without one. None without truth."""
         matching = match(self._run)
         if matching is None:
             return None
         full = np.full((len(self._now_ns), len(self._track_ids)), NO_OBJECT)
         columns = {track_id: column for column, track_id in enumerate(self._track_ids)}
-        for row in np.flatnonzero(matching.paired).tolist():
+        for row in np.flatnonzero(matching.paired & (matching.tick_index < len(full))).tolist():
             full[matching.tick_index[row], columns[int(matching.tracks["track_id"][row])]] = matching.object_index[row]
         return full[self._ticks]
 
     def _true_m(self, wait_ns: int) -> FloatArray:
         """True positions at each judged tick, so long ago, (ticks, tracks, 2)."""
-        objects, at_ns = self._objects, self._now_ns[self._ticks] - wait_ns
+        objects, at_ns = self.objects, self._now_ns[self._ticks] - wait_ns
         result = np.full((len(self._ticks), len(self._track_ids), 2), np.nan)
         if objects is not None:
             for index, path in enumerate(true_paths(self._run.tables["truth"])):
@@ -163,12 +192,14 @@ class _Books:
             if tick not in judged:
                 continue
             row = int(np.searchsorted(self._ticks, tick))
+            for track_id in [track_id for track_id in bank.track_ids if ends[track_id] < now_ns]:
+                bank.remove(track_id)
             for wait_s, squares, true_m in zip(waits_s, result, truth, strict=True):
                 states = bank.states_at(now_ns - nanoseconds(wait_s))
                 for track_id, mean, P in zip(states.track_ids, states.means, states.covariances, strict=True):
                     if self._births[track_id] + _SETTLE_NS + nanoseconds(wait_s) <= now_ns <= ends[track_id]:
                         column = columns[track_id]
-                        if self._objects is None:
+                        if self.objects is None:
                             squares[row, column] = P[0, 0] + P[1, 1]
                         else:
                             squares[row, column] = float(np.square(mean[:2] - true_m[row, column]).sum())
@@ -196,30 +227,28 @@ class _Books:
         R[np.ix_(measured, measured)] += change
         return replace(item, R=R)
 
-    def ledger(self) -> Ledger:
-        """Return the ledger, see `Ledger`."""
-        config, tuned = self._config, self._tuned
-        best, estimator = tuned or config, config.estimator
-        ways: list[tuple[str, str, FloatArray]] = [("", estimator, self.squares(estimator, config)[0])]
-        if tuned is not None:
-            ways.append(("noise that is not tuned", estimator, self.squares(estimator, tuned)[0]))
+    def ledger(self, tuned: Config | None, whole: Sequence[FloatArray]) -> Ledger:
+        """Return the ledger, see `Ledger`, with the noise of `tuned`.
+        `whole` are the squared errors of the runs themselves, see `published`: with the clocks as they are, where they
+        are wrong, and with right ones.
+        """
+        config, best = self._config, self._with_noise(tuned)
+        estimator = config.estimator
+        causes = ["", "clock offsets"][-len(whole) :] if len(whole) > 1 else [""] * len(whole)
+        ways: list[tuple[str, str, FloatArray]] = list(zip(causes, [estimator] * len(whole), whole, strict=True))
+        ways.append((_DECISIONS if whole else "", estimator, self.squares(estimator, config)[0]))
+        if best != config:
+            ways.append(("noise that is not tuned", estimator, self.squares(estimator, best)[0]))
         waits = (0.0, *WAITS_S)
-        policies = {name: self.squares(name, best, waits_s=waits if name in _WAITING else (0.0,)) for name in POLICIES}
+        policies = {name: self.squares(name, best, waits_s=waits) for name in POLICIES}
         if estimator == PUBLISHED:
             ways.append(("its time grid", FORGET, policies[FORGET][0]))
             ways.append(("forgetting what was fused since", REPLAY, policies[REPLAY][0]))
         elif estimator != REPLAY:
             ways.append((f"{estimator} instead of replay", REPLAY, policies[REPLAY][0]))
-        in_time = self.squares(REPLAY, best, lambda item: item.stamp_ns)[0]
-        ways.append(("late arrival, everything kept", REPLAY, in_time))
-        whole = self._published()
-        every = [item for _, _, item in ways] + [item[0] for item in policies.values()]
-        common: BoolArray = np.all(np.isfinite([*every, *([] if whole is None else [whole])]), axis=0)
-        if not common.any():
-            raise DataError("no track can be judged: none lives for a second, where there is truth at a true object")
-        if whole is not None:
-            ways.insert(0, ("", estimator, whole))
-            ways[1] = (_DECISIONS, *ways[1][1:])
+        policies[_IN_TIME] = self.squares(REPLAY, best, _stamp, waits)
+        ways.append(("late arrival, everything kept", REPLAY, policies[_IN_TIME][0]))
+        common = _common([*(item for _, _, item in ways), *(item[0] for item in policies.values())])
         waterfall = [Part("", _mean(ways[0][2], common), Estimate(math.nan, math.nan, math.nan, 0))]
         for (_, _, before), (cause, _, after) in itertools.pairwise(ways):
             if cause == _DECISIONS and np.allclose(before[common], after[common], rtol=1e-9):
@@ -229,24 +258,38 @@ class _Books:
         tables = Tables(
             {
                 "waterfall": self._waterfall(waterfall),
-                "policies": self._policies(policies, common),
+                "policies": self._policies(policies, 1 + WAITS_S.index(_WAIT_S)),
                 "waiting": self._waiting(policies),
                 "sensors": sensors,
             }
         )
-        return Ledger(estimator, self._objects is not None, tuple(waterfall), tables, _sentence(waterfall, sensors))
+        return Ledger(estimator, self.objects is not None, tuple(waterfall), tables, _sentence(waterfall, sensors))
 
-    def _published(self) -> FloatArray | None:
-        """Squared errors that the run itself publishes at the judged ticks, of the same objects; None without truth."""
-        if self._objects is None:
-            return None
-        run = replay_in_memory(self._messages, self._config)
+    def summary(self) -> Table:
+        """Return the errors of the policies now and 0.3 s ago. Raises `DataError` where nothing can be judged."""
+        waits = (0.0, _WAIT_S)
+        ways = {name: self.squares(name, self._config, waits_s=waits) for name in POLICIES if name != "as-current"}
+        return self._policies(ways | {_IN_TIME: self.squares(REPLAY, self._config, _stamp, waits)})
+
+    def _with_noise(self, tuned: Config | None) -> Config:
+        """Return the configuration with the noise of `tuned`."""
+        if tuned is None:
+            return self._config
+        own = {
+            name: replace(sensor, std=tuned.sensors[name].std) if name in tuned.sensors else sensor
+            for name, sensor in self._config.sensors.items()
+        }
+        return replace(self._config, motion=tuned.motion, sensors=own)
+
+    def published(self, run: Run) -> FloatArray:
+        """Squared errors that `run` itself publishes at the judged ticks, of the same objects; there must be truth."""
         matching = match(run)
         assert matching is not None
+        assert self.objects is not None
         paired, squares = np.flatnonzero(matching.paired), np.square(track_errors(matching).values["position_m"])
-        by_object = np.full((len(self._now_ns), len(matching.object_ids) + 1), np.nan)
+        by_object = np.full((len(matching.now_ns), len(matching.object_ids) + 1), np.nan)
         by_object[matching.tick_index[paired], matching.object_index[paired]] = squares
-        return np.take_along_axis(by_object[self._ticks], self._objects, axis=1)  # NO_OBJECT takes the last column
+        return np.take_along_axis(by_object[self._ticks], self.objects, axis=1)  # NO_OBJECT takes the last column
 
     def _sensors(self, config: Config, kept: FloatArray, common: BoolArray) -> Table:
         newest, late, late_lists = dict[int, int](), dict[str, list[bool]](), set[int]()
@@ -281,7 +324,7 @@ class _Books:
             Column("its lateness costs\n[m] (95 %)", "cost cost_low cost_high", "{} ({} to {})"),
             Column("its late lists are\nworth [m] (95 %)", "worth worth_low worth_high", "{} ({} to {})"),
         ]
-        return Table("Sensors", records, columns, ("sensor",), [_UNIT[self._objects is not None]])
+        return Table("Sensors", records, columns, ("sensor",), [_UNIT[self.objects is not None]])
 
     def _waterfall(self, parts: Sequence[Part]) -> Table:
         records = [
@@ -300,27 +343,26 @@ class _Books:
             Column("its part\n[m^2] (95 %)", "share share_low share_high", "{} ({} to {})", text=_four),
         ]
         return Table(
-            "Where the error of the present comes from",
-            records,
-            columns,
-            ("cause",),
-            [_UNIT[self._objects is not None]],
+            "Where the error of the present comes from", records, columns, ("cause",), [_UNIT[self.objects is not None]]
         )
 
-    def _policies(self, policies: Mapping[str, Sequence[FloatArray]], common: BoolArray) -> Table:
+    def _policies(self, policies: Mapping[str, Sequence[FloatArray]], waited: int = 1) -> Table:
+        """Return the errors of policies now and `_WAIT_S` ago, which are at the first and `waited` of their squares."""
+        now, then = (_common([squares[index] for squares in policies.values()]) for index in (0, waited))
         records = []
-        for name, (squares, *_) in policies.items():
-            record = {"estimator": name, "rms_m": math.sqrt(_mean(squares, common))}
-            records.append(
-                record
-                | (_named("more", _rms_difference(squares, policies[REPLAY][0], common)) if name != REPLAY else {})
-            )
+        for name, squares in policies.items():
+            record = {"estimator": name, "rms_m": math.sqrt(_mean(squares[0], now))}
+            record["waited_m"] = math.sqrt(_mean(squares[waited], then))
+            more = {} if name == REPLAY else _named("more", _rms_difference(squares[0], policies[REPLAY][0], now))
+            records.append(record | more)
         columns = [
             Column("estimator", left=True),
-            Column("position\nRMSE [m]", "rms_m"),
+            Column("position RMSE\nnow [m]", "rms_m"),
             Column("more than ekf-replay\n[m] (95 %)", "more more_low more_high", "{} ({} to {})"),
+            Column(f"of {_WAIT_S:g} s ago\n[m]", "waited_m"),
         ]
-        return Table("Same measurements, same noise, same start", records, columns, ("estimator",))
+        title = "Which is better, and when: same measurements, noise and start"
+        return Table(title, records, columns, ("estimator",), [_UNIT[self.objects is not None]])
 
     def _waiting(self, policies: Mapping[str, Sequence[FloatArray]]) -> Table:
         every = [item for name in _WAITING for item in policies[name]]
@@ -357,6 +399,18 @@ def _four(value: float | str) -> str:
 
 def _when_it_came(item: Fed) -> int:
     return item.now_ns
+
+
+def _stamp(item: Fed) -> int:
+    return item.stamp_ns
+
+
+def _common(squares: Iterable[FloatArray]) -> BoolArray:
+    """True where all are known. Raises `DataError` where nothing is."""
+    common: BoolArray = np.all(np.isfinite([*squares]), axis=0)
+    if not common.any():
+        raise DataError("no track can be judged: none lives for a second, where there is truth at a true object")
+    return common
 
 
 def _sensor(item: Fed) -> str | None:

@@ -38,6 +38,8 @@ class Advice:
     """The same with these changes."""
     broken: str | None
     """Why the recording breaks off, where it does; what came before was used."""
+    ledger: Table | None = field(repr=False, default=None)
+    """Errors of policies with these changes, where they were asked for."""
 
     @property
     def changes(self) -> tuple[Assumption, ...]:
@@ -55,8 +57,9 @@ class Advice:
 
     @property
     def tables(self) -> Tables:
-        """`outcome` of the replays, and `lateness` of each sensor."""
-        return Tables({"outcome": self._outcome(), "lateness": self._lateness()}, verdict=self.sentences)
+        """`outcome` of the replays, `lateness` of each sensor, and `ledger`, where it was asked for."""
+        own = {} if self.ledger is None else {"ledger": self.ledger}
+        return Tables({"outcome": self._outcome(), "lateness": self._lateness(), **own}, verdict=self.sentences)
 
     def __str__(self) -> str:
         return str(self.tables)

@@ -11,7 +11,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fgtrack.calibration.advise import Adviser
+from fgtrack.calibration.ledger import REPLAY, SUMMARY_S, Books
 from fgtrack.calibration.page import Advice
+from fgtrack.calibration.tune_measurements import Watch
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Message
@@ -90,7 +92,7 @@ def _several(count: int, what: str, ending: str = "s") -> str:
     return f"{count or 'no'} {what}{'' if count == 1 else ending}"
 
 
-ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
+ESTIMATORS = ("smoother", REPLAY, "ekf-backward-forward")
 """Estimators of a study."""
 #: Share of the work that is done when a step begins.
 _ADVICE, _REPLAY, _COMPARE, _DRAW, _DONE = 0.02, 0.3, 0.85, 0.9, 1.0
@@ -198,12 +200,24 @@ def study(
                 yield message
             readable.raise_error()
 
-        replay(repeated, known.config, folders, origin=str(source.path), kind=source.kind, overwrite=overwrite)
+        watch = Watch(replace(known.config, estimator=REPLAY))
+        replay(
+            repeated,
+            known.config,
+            folders,
+            origin=str(source.path),
+            kind=source.kind,
+            overwrite=overwrite,
+            observed={REPLAY: watch},
+        )
         on_step("compare", _COMPARE)
         every = evaluated([load_run(folder) for folder in folders.values()])
         tables = compare(*every)
         for folder, one in zip(runs, every, strict=True):
             write_metrics(folder, one.metrics.as_dict())
+        with suppress(DataError):  # without a track to judge there is no ledger
+            books = Books(watch.bank, every[ESTIMATORS.index(REPLAY)].run, known.config, SUMMARY_S)
+            tables = replace(tables, tables={**tables.tables, "ledger": books.summary()})
         lines = _recording(every[0]), _tracks(every[0]), *tables.verdict, _to_do(every[0], tables, advised)
         on_step("draw", _DRAW)
         close_up, late = drawn_close_up(every)

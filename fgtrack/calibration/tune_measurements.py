@@ -57,19 +57,27 @@ def watched(
     messages: Iterable[Message], config: Config, origin: str = "", gate_stds: float = 0.0
 ) -> tuple["RecordingBank", Run]:
     """Return the bank that was fed, and the run; see `recorded`."""
-    banks: list[RecordingBank] = []
+    watch = Watch(config, gate_stds)
+    run = replay_in_memory(messages, config, origin=origin, observed=watch)
+    return watch.bank, run
 
-    def observed(parts: TrackerParts) -> TrackerParts:
-        preprocess = _WatchedPreprocess(parts.preprocess)
-        make = partial(build_bank, config, parts.failures)
-        banks.append(RecordingBank(make, parts.failures, preprocess))
-        association = parts.association
-        if gate_stds and isinstance(association, GatedEuclidean | GatedMahalanobis):
-            association = _OpenedGate(association, gate_stds)
-        return replace(parts, preprocess=preprocess, bank=banks[0], association=association)
 
-    run = replay_in_memory(messages, config, origin=origin, observed=observed)
-    return banks[0], run
+class Watch:
+    """Puts a `RecordingBank` into the tracker of `config`; see `recorded`."""
+
+    bank: "RecordingBank"
+
+    def __init__(self, config: Config, gate_stds: float = 0.0) -> None:
+        self._config, self._gate_stds = config, gate_stds
+
+    def __call__(self, parts: TrackerParts) -> TrackerParts:
+        """Return parts of a tracker with the bank, which is kept."""
+        preprocess, association = _WatchedPreprocess(parts.preprocess), parts.association
+        make = partial(build_bank, self._config, parts.failures)
+        self.bank = RecordingBank(make, parts.failures, preprocess)
+        if self._gate_stds and isinstance(association, GatedEuclidean | GatedMahalanobis):
+            association = _OpenedGate(association, self._gate_stds)
+        return replace(parts, preprocess=preprocess, bank=self.bank, association=association)
 
 
 @dataclass(frozen=True)

@@ -144,6 +144,7 @@ def advise(
     config_file: ConfigFile = None,
     out: Annotated[Path | None, Option("-o", "--out", help="Configuration that follows the advice.")] = None,
     tune: Annotated[bool, Option("--tune", help="Fit noise that does not fit, too.")] = False,
+    ledger: Annotated[bool, Option("--ledger", help="Compare policies for late lists, too.")] = False,
     reference: Reference = None,
     track_map: TrackMap = None,
     pit_map: PitMap = None,
@@ -160,7 +161,7 @@ def advise(
         check_output(out, overwrite)
         check_apart(out, [recording, config_file])
     with progress("advise") as tell:
-        advice = advised(recording, config, reference=reference, tune=tune, on_step=tell)
+        advice = advised(recording, config, reference=reference, tune=tune, ledger=ledger, on_step=tell)
     if out is not None:
         head = [f"Settings for {recording} (fgtrack advise).", "", *advice.comments(), ""]
         write_file(out, Assumed(advice.config, ()).to_yaml(head), overwrite)

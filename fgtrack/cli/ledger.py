@@ -6,7 +6,7 @@ from typing import Annotated
 from typer import Option
 
 from fgtrack.calibration.ledger import ledger as explained
-from fgtrack.cli.arguments import ConfigFile, Input, Json, Overwrite
+from fgtrack.cli.arguments import ConfigFile, Input, Json, Overwrite, PitMap, Settings, TrackMap
 from fgtrack.cli.show import progress, say, show
 from fgtrack.io.output import check_output, new_file
 from fgtrack.plotting.ledger import waterfall
@@ -17,8 +17,12 @@ def ledger(
     recording: Input,
     config_file: ConfigFile = None,
     tuned: Annotated[
-        str | None, Option(metavar="TUNED.yaml", help="Fitted noise, as `fgtrack tune` writes it.")
+        str | None,
+        Option(metavar="TUNED.yaml", help="Fitted noise and clocks, as `fgtrack tune` and `advise --tune` write them."),
     ] = None,
+    track_map: TrackMap = None,
+    pit_map: PitMap = None,
+    settings: Settings = None,
     figure: Annotated[Path | None, Option(metavar="FILE.png", help="Draw the waterfall there.")] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
@@ -31,7 +35,7 @@ def ledger(
     if figure is not None:
         check_output(figure, overwrite)
     with progress("ledger"):
-        result = explained(recording, config_file, tuned)
+        result = explained(recording, config_file, tuned, map=track_map, pit_map=pit_map, set=settings)
     if figure is not None:
         with new_file(figure, overwrite) as file:
             parts = [(item.cause, item.mean_square_m2) for item in result.waterfall]

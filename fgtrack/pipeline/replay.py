@@ -74,17 +74,19 @@ def replay(
     kind: str = "",
     on_tick: Callable[[TickReport], None] = lambda report: None,
     overwrite: bool = False,
+    observed: Mapping[str, Callable[[TrackerParts], TrackerParts]] | None = None,
 ) -> list[dict[str, object]]:
     """Run each estimator of `folders` over the messages into its run folder; return the contents of their meta.json.
     `messages` come in receipt order; where they end in a `DataError`, `broken_off` of the meta data says why. `origin`
-    and `kind` are path and format of the input. Raises `DataError` for an input without messages for the tracker.
+    and `kind` are path and format of the input; `observed` is that of `build_tracker`, by estimator. Raises
+    `DataError` for an input without messages for the tracker.
     """
     config = assumed(config, source_of(messages)).config
     with ExitStack() as claims:
         runs = []
         for estimator, folder in folders.items():
             chosen = replace(config, estimator=estimator)
-            tracker = build_tracker(chosen)
+            tracker = build_tracker(chosen, (observed or {}).get(estimator))
             writer = RunWriter(folder, *_head(chosen, origin, kind, folder), overwrite)
             runs.append((chosen, tracker, claims.enter_context(writer)))
         return [_drive(tracker, messages(), chosen, writer, origin, on_tick) for chosen, tracker, writer in runs]

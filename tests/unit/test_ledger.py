@@ -12,6 +12,7 @@ import fgtrack
 from fgtrack.calibration.ledger import Ledger, ledger
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import DetectionList, Message, TruthState
+from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.shipped import read_config, read_scenario
 from fgtrack.plotting.ledger import waterfall
 from fgtrack.sim.simulate import simulate
@@ -54,6 +55,41 @@ def test_the_parts_add_up_to_the_difference_of_the_ends(karle: Ledger) -> None:
     total = sum(part.share_m2.mean for part in rest)
     assert total == pytest.approx(first.mean_square_m2 - rest[-1].mean_square_m2, abs=1e-12)
     assert rest[-1].share_m2.mean > 0.0  # lateness costs
+
+
+def test_a_wrong_clock_has_a_part(messages: list[Message]) -> None:
+    """The LiDAR's clock is 60 ms slow: its stamps are behind the time at which it measured."""
+    slow = [
+        replace(m, stamp_ns=m.stamp_ns - 60_000_000)
+        if isinstance(m, DetectionList) and m.sensor == "lidar_cluster"
+        else m
+        for m in messages
+    ]
+    config = read_config("tuned", estimator="ekf-replay", **MAPS)
+    right = read_config(config, {"sensors.lidar_cluster.clock_offset_s": -0.06})
+    result = ledger(slow, config, right)
+    first, clock, *rest = result.waterfall
+    assert clock.cause == "clock offsets"
+    assert clock.share_m2.mean > 0.1 * first.mean_square_m2
+    total = clock.share_m2.mean + sum(part.share_m2.mean for part in rest)
+    assert total == pytest.approx(first.mean_square_m2 - rest[-1].mean_square_m2, abs=1e-12)
+    without = ledger(messages, config)  # the same of the clock that is right
+    assert clock.mean_square_m2 == pytest.approx(without.waterfall[0].mean_square_m2, rel=0.02)
+
+
+def test_settings_and_maps_are_those_of_replay(messages: list[Message]) -> None:
+    given = ledger(messages, "tuned", map="oval", pit_map="oval", set={"estimator": "ekf-replay"})
+    assert str(given) == str(ledger(messages, read_config("tuned", estimator="ekf-replay", **MAPS)))
+
+
+def test_advice_has_the_table_where_it_is_asked_for(messages: list[Message], tmp_path: Path) -> None:
+    write_stream(tmp_path / "drive.jsonl", messages)
+    config = read_config("tuned", estimator="ekf-replay", **MAPS)
+    advice = fgtrack.advise(tmp_path / "drive.jsonl", config, ledger=True)
+    names = [row["estimator"] for row in advice.tables.tables["ledger"].records]
+    assert names == ["drop", "ekf-backward-forward", "rewind-forget", "ekf-replay", "smoother-banded", names[-1]]
+    assert names[-1] == "ekf-replay, if no list were late"
+    assert "ledger" not in fgtrack.advise(tmp_path / "drive.jsonl", config).tables.tables
 
 
 def test_the_replaying_filter_has_the_error_of_its_own_run(messages: list[Message]) -> None:
