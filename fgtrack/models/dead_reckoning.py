@@ -11,11 +11,11 @@ p(t + dt) = p(t) + v dt + N(0, q dt), b(t + dt) = exp(-dt / T) b(t) + N(0, (1 - 
 import math
 from typing import NamedTuple
 
-_JITTER_M2 = 0.05**2  # r: rounding, and some milliseconds between a position and its stamp
-_STEP = 9.21  # squared innovation over its variance, of two axes, above which the reported position has stepped: 1 %
-_LARGEST = 3.0  # standard deviations of b: where it would be larger the velocity is wrong, and p is moved along
-_RESTART = 10.0  # standard deviations of b: the vehicle was moved
-_LONGEST_S = 2.0  # of a velocity
+from fgtrack.core.time import seconds
+
+_JITTER_M2 = 0.05**2  # r: rounding, and 5 ms between a position and its stamp at 10 m/s
+_STEP = 9.21  # 99 % quantile of chi-square with two degrees of freedom: above it the reported position has stepped
+_LARGEST = 3.0  # standard deviations of b, which it exceeds in 1 % of the time: beyond, p is wrong
 
 
 class ReportedErrors(NamedTuple):
@@ -50,20 +50,20 @@ def reckoned(
     velocity_mps: tuple[float, float],
     errors: ReportedErrors,
 ) -> Reckoned:
-    """Return the estimate at `stamp_ns` from the `last` one and what is reported.
-    p is at most three standard deviations of b from the reported position. It restarts there, b = 0, without a last
-    estimate, after 2 s, and where it would be more than ten away.
+    """Return the estimate at `stamp_ns` from the `last` one and what is reported; without one, what is reported.
+    p is at most three standard deviations of b from the reported position, whatever the velocity was, or was not
+    reported for.
     """
     variance_m2, time_s, density_m2ps = errors
-    dt_s = math.inf if last is None else (stamp_ns - last.stamp_ns) / 1e9
-    if last is not None and dt_s <= _LONGEST_S:
+    if last is not None:
+        dt_s = seconds(stamp_ns - last.stamp_ns)
         (vx, vy), (old_vx, old_vy) = velocity_mps, last.velocity_mps
         x_m = last.position_m[0] + 0.5 * (old_vx + vx) * dt_s
         y_m = last.position_m[1] + 0.5 * (old_vy + vy) * dt_s
         off_x_m, off_y_m = reported_m[0] - x_m, reported_m[1] - y_m
-        off_m, std_m = math.hypot(off_x_m, off_y_m), math.sqrt(variance_m2)
-        if off_m <= _RESTART * std_m:
-            share = min(_LARGEST * std_m / off_m, 1.0) if off_m else 1.0
+        off_m = math.hypot(off_x_m, off_y_m)
+        if math.isfinite(off_m):
+            share = min(_LARGEST * math.sqrt(variance_m2) / off_m, 1.0) if off_m else 1.0
             x_m, y_m = x_m + (1.0 - share) * off_x_m, y_m + (1.0 - share) * off_y_m
             decay = math.exp(-dt_s / time_s)
             p, pb, b = last.covariance

@@ -19,7 +19,7 @@ _ALIKE = (
     ("cyclist", "bicycle", "motorcycle", "rider"),
 )
 _UNKNOWN, _OTHER = 0, -1
-_MOST_STRAYS = 3
+_MOST_STRAYS = 3  # where one in ten is an outlier, four in a row are as improbable as a wrong identity (1e-4)
 _MOST_FORMER = 10_000  # ended tracks that are remembered, the last ones
 _GROUPS = {name: -1 - number for number, group in enumerate(_ALIKE) for name in group}
 _SIZES = ("length_m", "width_m", "height_m")

@@ -60,12 +60,22 @@ def test_a_wrong_velocity_gives_a_steady_offset_of_at_most_three_standard_deviat
     np.testing.assert_allclose(off_m[100:], off_m[-1:].repeat(200, axis=0), atol=0.01)
 
 
-@pytest.mark.parametrize(("moved_m", "gap_ms"), [(50.0, 100), (0.5, 2500), (math.nan, 100)])
-def test_a_vehicle_that_is_elsewhere_or_silent_restarts_at_its_reported_position(moved_m, gap_ms):
+@pytest.mark.parametrize(("moved_m", "gap_ms"), [(50.0, 100), (50.0, 60_000)])
+def test_a_vehicle_that_was_moved_is_three_standard_deviations_off_at_first(moved_m, gap_ms):
     last = drive(straight(20))[-1]
-    reported_m = last.position_m[0] + moved_m, last.position_m[1]
-    after = reckoned(last, last.stamp_ns + ms(gap_ms), reported_m, VELOCITY_MPS, ERRORS)
-    np.testing.assert_equal((after.position_m, after.error_m), (reported_m, (0.0, 0.0)))
+    reported_m = last.position_m[0] + 0.001 * gap_ms * VELOCITY_MPS[0] + moved_m, last.position_m[1]
+    estimates = [reckoned(last, last.stamp_ns + ms(gap_ms), reported_m, (0.0, 0.0), ERRORS)]
+    for _ in range(600):
+        estimates.append(reckoned(estimates[-1], estimates[-1].stamp_ns + ms(100), reported_m, (0.0, 0.0), ERRORS))
+    off_m = [math.dist(each.position_m, reported_m) for each in estimates]
+    assert 0.5 < off_m[0] <= 1.5
+    assert off_m[-1] < 0.5 * off_m[0]
+
+
+def test_an_estimate_that_is_not_finite_ends_with_the_position_that_was_not():
+    lost = reckoned(drive(straight(20))[-1], START_NS + ms(2000), (math.nan, 0.0), VELOCITY_MPS, ERRORS)
+    after = reckoned(lost, START_NS + ms(2100), (7.0, 8.0), VELOCITY_MPS, ERRORS)
+    assert (after.position_m, after.error_m) == ((7.0, 8.0), (0.0, 0.0))
 
 
 def ego(k: int, off_m: float = 0.0, **more) -> EgoState:
