@@ -86,9 +86,9 @@ def test_the_map_begins_at_the_first_frame_with_x_to_the_east(tmp_path):
             oxts(yaw_rad=3.0),
             oxts(100.0 * metre_deg, 50.0 * metre_deg / math.cos(math.radians(49.0)), 0.0, 0.0, 3.5, 8.0, 0.2, -1.0),
         ],
-        label_02=[label(1, 3, "Car", 10.0, 0.0, 0.3), label(1, 4, "Tram", 10.0, 0.0, 0.3)],
+        label_02=[label(0, 3, "Car", 10.0, 0.0, 0.3), label(0, 4, "Tram", 10.0, 0.0, 0.3)],
     )
-    first, truth, second = messages(drive)
+    truth, first, second = messages(drive)
     assert first == EgoState(0, 0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0)
     assert isinstance(second, EgoState)
     assert (second.x_m, second.y_m) == pytest.approx((50.0, 100.0), abs=0.01)
@@ -96,9 +96,8 @@ def test_the_map_begins_at_the_first_frame_with_x_to_the_east(tmp_path):
     assert (second.speed_mps, second.yaw_rate_radps, second.accel_mps2) == (8.0, 0.2, -1.0)
     assert isinstance(truth, TruthState)
     assert truth.object_id == 3
-    offset_m = truth.x_m - second.x_m, truth.y_m - second.y_m
-    assert offset_m == pytest.approx((10.0 * math.cos(3.5), 10.0 * math.sin(3.5)))
-    assert truth.yaw_rad == pytest.approx(3.8 - 2.0 * math.pi)
+    assert (truth.x_m, truth.y_m) == pytest.approx((10.0 * math.cos(3.0), 10.0 * math.sin(3.0)))
+    assert truth.yaw_rad == pytest.approx(3.3 - 2.0 * math.pi)
 
 
 def test_truth_does_not_step_with_the_reported_position(tmp_path):
