@@ -60,7 +60,11 @@ def test_a_sensor_that_is_not_linear_brings_the_thresholds_of_the_position() -> 
 
 
 class Counted(IncrementalSolver):
-    num_updates = 0
+    num_updates = num_covariances = 0
+
+    def _covariance(self, track: int, *numbers: int) -> FloatArray:
+        Counted.num_covariances += 1
+        return super()._covariance(track, *numbers)
 
     def _update(self, *windows: IntArray) -> None:
         Counted.num_updates += 1
@@ -81,6 +85,16 @@ def test_further_iterations_are_taken_only_while_a_state_moves() -> None:
     Counted.num_updates = 0
     smoother.update(at(100, 3.0))
     assert Counted.num_updates == 5
+
+
+def test_covariances_are_read_from_the_graph_once_until_something_is_fused() -> None:
+    smoother, Counted.num_covariances = one_of(CV(), Start(), CountedBank), 0
+    for k in (1, 2):
+        smoother.update(at(100 * k, 3.0 * k))
+        before = Counted.num_covariances
+        states = [smoother.state_at(stamp_ms * MS) for stamp_ms in (100 * k + 10, 100 * k + 30, 100 * k)]
+        assert Counted.num_covariances == before + 1
+        assert states[0].covariance[0, 0] > states[2].covariance[0, 0]
 
 
 def test_an_object_that_is_never_seen_again_has_no_graph() -> None:

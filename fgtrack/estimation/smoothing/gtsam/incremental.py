@@ -1,6 +1,7 @@
 """The default solver: gtsam's iSAM2."""
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import gtsam
@@ -19,6 +20,7 @@ _Changed = dict[int, gtsam.JacobianFactor]
 """Factors by node."""
 _PRIOR = -1
 """Instead of a node: the prior of the oldest one that the graph began with."""
+_unit = cache(gtsam.noiseModel.Unit.Create)
 
 
 class _Graph:
@@ -78,10 +80,13 @@ class IncrementalSolver(Solver):
     def __init__(self, motion: MotionModel, settings: SmootherSettings) -> None:
         super().__init__(motion, settings)
         self._graphs: dict[int, Any] = {}  # Any: a subclass has its own
+        self._read = set[tuple[int, ...]]()
+        """Nodes, and pairs of them, whose covariances were read since something was solved."""
 
     def forget(self, track: int) -> None:
         """See `Solver.forget`: the next solution makes a new graph."""
         self._graphs.pop(track, None)
+        self._read.clear()
 
     def smoothed(self, tracks: IntArray, indices: IntArray, after_s: FloatArray) -> FloatArray:
         """See `Solver.smoothed`; inside the windows from the graphs."""
@@ -91,8 +96,11 @@ class IncrementalSolver(Solver):
             if track not in self._graphs:  # nothing was fused: there is one node
                 continue
             last = max(index, first)
-            left, *right = nodes.numbers[track, last - (time_s > 0.0 and index > first) : last + 1].tolist()
-            P = self._covariance(track, left, *right)
+            numbers = tuple(nodes.numbers[track, last - (time_s > 0.0 and index > first) : last + 1].tolist())
+            if numbers in self._read:
+                continue
+            P, (left, *right) = self._covariance(track, *numbers), numbers
+            self._read.add(numbers)
             for number in right:
                 A = psd_solve(P[n:, n:], P[n:, :n]).T  # the state on the left, given this one
                 nodes.backs[left, :n, :n], nodes.backs[left, :n, n] = (A, nodes.step[left] - A.dot(nodes.step[number]))
@@ -103,6 +111,7 @@ class IncrementalSolver(Solver):
     def solve(self, tracks: IntArray, starts: IntArray, anchors: IntArray) -> None:
         """See `Solver.solve`."""
         nodes = self.nodes
+        self._read.clear()
         first = nodes.first[tracks]
         is_leaving = first < anchors
         if is_leaving.any():
@@ -134,15 +143,13 @@ class IncrementalSolver(Solver):
             if graph is None:
                 graph, oldest = _Graph(), nodes.predicted[window[0]]
                 self._graphs[track], W = graph, inverse_root(oldest[:, :-1])
-                unit = gtsam.noiseModel.Unit.Create(len(W))
-                prior[_PRIOR] = gtsam.JacobianFactor(int(window[0]), W, W @ oldest[:, -1], unit)
+                prior[_PRIOR] = gtsam.JacobianFactor(int(window[0]), W, W @ oldest[:, -1], _unit(len(W)))
                 nodes.labels[window, CHANGED] = 1
             numbers = window.tolist()
-            for number in numbers:
-                if number not in graph.slots:
-                    graph.slots[number] = None
-                    values.insert(number, zero)
-                    nodes.reference[number] = nodes.origin[number]
+            for number in set(numbers).difference(graph.slots):
+                graph.slots[number] = None
+                values.insert(number, zero)
+                nodes.reference[number] = nodes.origin[number]
             changed = self._changed_factors(track, start)
             first = min(map(numbers.index, changed), default=0)
             delta = graph.solve(numbers, num_leaving, values, first, changed | prior)
@@ -162,7 +169,7 @@ class IncrementalSolver(Solver):
             raise ValueError("process noise is not positive definite")
         changed: _Changed = {}
         for (number, right, size), each in zip(owners[:num].tolist(), factors, strict=False):
-            A, b, unit = (each[:size, :n], each[:size, -1], gtsam.noiseModel.Unit.Create(size))
+            A, b, unit = each[:size, :n], each[:size, -1], _unit(size)
             if right < 0:
                 changed[number] = gtsam.JacobianFactor(number, A, b, unit)
             else:
