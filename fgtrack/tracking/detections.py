@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
+from itertools import accumulate, chain, pairwise
 from operator import attrgetter
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
@@ -40,8 +40,10 @@ class MapDetections(NamedTuple):
     """Detections of one or several batches, one batch after another, with their components in the map frame."""
 
     batches: Sequence[PosedBatch]
-    of: IntArray
-    """Indices of their batches, ascending, shape (m,)."""
+    poses: FloatArray
+    """Their poses, shape (batches, 5)."""
+    starts: IntArray
+    """First row of each batch, and the number m of all rows, shape (batches + 1,)."""
     indices: IntArray
     """Indices in the message, shape (m,)."""
     values: FloatArray
@@ -56,19 +58,14 @@ class MapDetections(NamedTuple):
     """Detections of which the values are averages, by batch and index of the leading one."""
 
     @property
-    def starts(self) -> IntArray:
-        """First row of each batch, and the number of all, shape (batches + 1,)."""
-        return self.of.searchsorted(np.arange(len(self.batches) + 1))
+    def of(self) -> IntArray:
+        """Indices of the batches of all detections, shape (m,)."""
+        return np.arange(len(self.batches)).repeat(np.diff(self.starts))
 
-    @property
-    def poses(self) -> FloatArray:
-        """Poses of the batches, shape (batches, 5)."""
-        return np.array([each.pose for each in self.batches])
-
-    def at(self, rows: IntArray | BoolArray | slice) -> "MapDetections":
-        """Return the detections at `rows`."""
+    def at(self, rows: IntArray | BoolArray) -> "MapDetections":
+        """Return the detections at `rows`, batch by batch."""
         return self._replace(
-            of=self.of[rows],
+            starts=self.of[rows].searchsorted(np.arange(len(self.starts))),
             indices=self.indices[rows],
             values=self.values[rows],
             points_m=self.points_m[rows],
@@ -78,26 +75,24 @@ class MapDetections(NamedTuple):
 
 def in_map_frame(batches: Sequence[PosedBatch]) -> MapDetections:
     """The detections of `batches`, what their sensors measure of them, seen from their poses."""
-    sizes = [len(each.batch.indices) for each in batches]
-    values, at = np.empty((sum(sizes), len(COMPONENTS))), 0
-    values[:] = np.nan
-    for each, size in zip(batches, sizes, strict=True):
-        if size:
-            read, columns = _reading(tuple(each.sensor.std))
-            rows = list(map(read, map(each.batch.message.objects.__getitem__, each.batch.indices)))
-            values[at : at + size, columns] = np.array(rows, dtype=np.float64).reshape(size, -1)
-            at += size
-    of, indices = np.arange(len(batches)).repeat(sizes), [i for each in batches for i in each.batch.indices]
-    none = np.zeros(len(values), dtype=bool)
-    items = MapDetections(batches, of, np.array(indices, dtype=np.int64), values, values[:, :2], none)
+    starts = [0, *accumulate([len(each.batch.indices) for each in batches])]
+    numbers, columns, indices = list[Any](), list[tuple[int, ...]](), list[int]()
+    for batch, sensor, _, _ in batches:
+        read, own = _reading(tuple(sensor.std))
+        numbers += chain.from_iterable(map(read, map(batch.message.objects.__getitem__, batch.indices)))
+        columns.append(own)
+        indices += batch.indices
+    poses, first_rows = np.array([each.pose for each in batches]), np.array(starts)
     moves = np.array([each.batch.message.frame != "map" for each in batches])
-    points_m = kernels("fgtrack.tracking.kernels").to_map(values, items.starts, items.poses, moves)
-    return items._replace(points_m=points_m)
+    read_values = np.array(numbers, dtype=np.float64), np.array(columns)
+    arrays = kernels("fgtrack.tracking.kernels").to_map(*read_values, first_rows, poses, moves)
+    return MapDetections(batches, poses, first_rows, np.array(indices, dtype=np.int64), *arrays)
 
 
 def move_back(items: MapDetections, by_m: FloatArray) -> None:
     """Move all positions away from the sensor by `by_m` (batches,), along the line of sight."""
-    offsets_m, own_m = items.points_m - items.poses[items.of, :2], by_m[items.of]
+    of = items.of
+    offsets_m, own_m = items.points_m - items.poses[of, :2], by_m[of]
     ranges_m = np.hypot(offsets_m[:, 0], offsets_m[:, 1])
     moves_m = own_m[:, None] * offsets_m / np.maximum(ranges_m, MIN_RANGE_M)[:, None]
     items.points_m[:] += moves_m
@@ -109,12 +104,11 @@ def merged(items: MapDetections, merge: "Merge") -> MapDetections:
     """Return `items` with those of one object averaged, in the order of the merge; bearings alone are last.
     Averaged are the components that all have; where none of these gives a position, the leading one stands for all.
     """
-    starts, bearing = items.starts, np.isnan(items.points_m[:, 0])
-    apart = merge.apart(items.points_m, starts)
-    if apart.all() and not bearing.any():
+    bearing, apart = np.isnan(items.points_m[:, 0]), merge.apart(items.points_m, items.starts)
+    if all(apart) and not np.logical_or.reduce(bearing):
         return items
     rows, members_of = list[int](), dict[int, list[int]]()  # by the row that leads
-    for k, (first, end) in enumerate(pairwise(starts.tolist())):
+    for k, (first, end) in enumerate(pairwise(items.starts.tolist())):
         placed = (first + np.flatnonzero(~bearing[first:end])).tolist()
         groups = {row: (row,) for row in range(len(placed))} if apart[k] else merge.groups(items.points_m[placed])
         for row, group in groups.items():
@@ -122,10 +116,10 @@ def merged(items: MapDetections, merge: "Merge") -> MapDetections:
                 members_of[len(rows)] = [placed[member] for member in group]
             rows.append(placed[row])
         rows += (first + np.flatnonzero(bearing[first:end])).tolist()
-    result, claimed = items.at(np.array(rows, dtype=np.int64)), set(rows)
+    result, claimed, of = items.at(np.array(rows, dtype=np.int64)), set(rows), items.of
     others, averaged = dict[tuple[int, int], tuple[int, ...]](), dict[tuple[int, int], MapDetections]()
     for row, members in members_of.items():
-        key = int(result.of[row]), int(result.indices[row])
+        key = int(of[rows[row]]), int(result.indices[row])
         new = [member for member in members if member not in claimed]
         claimed.update(new)
         others[key] = tuple(items.indices[new].tolist())
@@ -140,21 +134,22 @@ def merged(items: MapDetections, merge: "Merge") -> MapDetections:
     return result._replace(merged=others, averaged=averaged)
 
 
-def covariances(items: MapDetections, names: tuple[str, ...]) -> FloatArray:
-    """Covariances of `names` in the map, shape (m, k, k), of detections of one batch.
+def covariances(items: MapDetections, k: int, rows: IntArray | slice, names: tuple[str, ...]) -> FloatArray:
+    """Covariances of `names` in the map, shape (m, k, k), of the `rows` of `items`, which are of batch k.
     A detection's own where it has one, else the sensor's R. What the map gave has the sensor's standard deviation for
     it and is not correlated with the rest. The covariance of an average is the mean of those of its detections.
     """
-    (batch, sensor, _, pose), m = items.batches[items.of[0]], len(items.indices)
+    (batch, sensor, _, pose), indices, points_m = items.batches[k], items.indices[rows].tolist(), items.points_m[rows]
+    m = len(indices)
     R = np.empty((m, len(names), len(names)))
     R[:] = sensor.noise(names)
     turns = "x_m" in names and not sensor.round
-    offsets_m = items.points_m - np.array(pose[:2]) if turns or sensor.std_growth else items.points_m
+    offsets_m = points_m - np.array(pose[:2]) if turns or sensor.std_growth else points_m
     more = sensor.growth(names, np.hypot(offsets_m[:, 0], offsets_m[:, 1])) if sensor.std_growth else None
     if more is not None:
         R[:, np.arange(len(names)), np.arange(len(names))] += more
     carrying = []
-    for row, index in enumerate(items.indices.tolist() if sensor.message_covariance else ()):
+    for row, index in enumerate(indices if sensor.message_covariance else ()):
         detection = batch.message.objects[index]
         if detection.covariance is not None:
             carrying.append(row)
@@ -166,18 +161,18 @@ def covariances(items: MapDetections, names: tuple[str, ...]) -> FloatArray:
     if turns and len(carrying) < m:
         rest = np.delete(np.arange(m), carrying)
         R[rest] = _turned(R[rest], np.arctan2(offsets_m[rest, 1], offsets_m[rest, 0]))
-    for row, key in enumerate(zip(items.of.tolist(), items.indices.tolist(), strict=True) if items.averaged else ()):
-        if key in items.averaged:
-            R[row] = covariances(items.averaged[key], names).mean(axis=0)
+    for row, index in enumerate(indices if items.averaged else ()):
+        if (k, index) in items.averaged:
+            R[row] = covariances(items.averaged[k, index], k, slice(None), names).mean(axis=0)
     return R
 
 
 @cache
-def _reading(names: tuple[str, ...]) -> tuple[Callable[[Detection], Any], list[int] | slice]:
-    """Return what reads the components `names` of a detection, and their columns; Any: one number or several."""
-    columns = [COMPONENTS.index(name) for name in names]
-    adjoin = columns == list(range(columns[0], columns[0] + len(columns)))
-    return attrgetter(*names), slice(columns[0], columns[-1] + 1) if adjoin else columns
+def _reading(names: tuple[str, ...]) -> tuple[Callable[[Detection], Any], tuple[int, ...]]:
+    """Return what reads the components `names` of a detection, a tuple, and their columns, followed by -1."""
+    columns = [*map(COMPONENTS.index, names), *[-1] * (len(COMPONENTS) - len(names))]
+    read = attrgetter(*names)
+    return read if len(names) > 1 else lambda detection: (read(detection),), tuple(columns)
 
 
 def _turned(R: FloatArray, yaws_rad: FloatArray) -> FloatArray:
@@ -215,9 +210,9 @@ class PoseError(NamedTuple):
 class Merge:
     """Finds detections of one list that are the same object, and averages them."""
 
-    def apart(self, points_m: FloatArray, starts: IntArray) -> BoolArray:
+    def apart(self, points_m: FloatArray, starts: IntArray) -> list[bool]:
         """Return for each list, with the `points_m` (n, 2) from one of `starts` to the next, if none are one object."""
-        return np.ones(len(starts) - 1, dtype=bool)
+        return [True] * (len(starts) - 1)
 
     def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
         """Members of all groups of `points_m` (n, 2), by the point that leads it."""
@@ -243,11 +238,15 @@ class ConnectedMerge(Merge):
     """Detections at most this far apart are linked."""
     kind: Literal["connected"] = "connected"
 
-    def apart(self, points_m: FloatArray, starts: IntArray) -> BoolArray:
+    def apart(self, points_m: FloatArray, starts: IntArray) -> list[bool]:
         """See `Merge.apart`."""
-        of = np.arange(len(starts) - 1).repeat(np.diff(starts))
-        by_x, distance_m = np.lexsort((points_m[:, 0], of)), self.distance_m * (1.0 + 1e-9)
-        return np.asarray(kernels("fgtrack.tracking.kernels").are_apart(points_m, by_x, starts, distance_m))
+        if len(points_m) < 2:
+            return super().apart(points_m, starts)
+        by_x, distance_m = np.argsort(points_m[:, 0]), self.distance_m * (1.0 + 1e-9)
+        if len(starts) > 2:
+            by_x = by_x[starts.searchsorted(by_x, side="right").argsort(kind="stable")]
+        apart = kernels("fgtrack.tracking.kernels").are_apart(points_m, by_x, starts, distance_m)
+        return list(apart.tolist())
 
     def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
         """See `Merge.groups`; in the order of their first members, which lead."""

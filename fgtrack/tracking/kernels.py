@@ -18,18 +18,26 @@ X, Y, YAW, RANGE, BEARING, CURVATURE = (
 )
 
 
-@njit("(float64[:, ::1], int64[::1], float64[:, ::1], b1[::1])")
-def to_map(values: FloatArray, starts: IntArray, poses: FloatArray, moves: BoolArray) -> FloatArray:
-    """Return positions (m, 2) in the map of detections `values` (m, components), NaN where there is none.
-    The rows from `starts[k]` up to the next start are of list k. x, y and yaw are seen from its pose (x, y, yaw ...)
-    where it `moves` them, and are overwritten; range and bearing always are.
+@njit("(float64[::1], int64[:, ::1], int64[::1], float64[:, ::1], b1[::1])")
+def to_map(
+    numbers: FloatArray, columns: IntArray, starts: IntArray, poses: FloatArray, moves: BoolArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return components (m, 8) and positions (m, 2) in the map of detections, NaN for none, and m times False.
+    The rows from `starts[k]` up to the next start are of list k. Of each of them `numbers` has the components
+    `columns[k]`, which end with -1. x, y and yaw are seen from the pose k (x, y, yaw ...) where it `moves` them; range
+    and bearing always are.
     """
-    points = np.empty((len(values), 2))
+    m, at = starts[-1], 0
+    values, points = np.full((m, len(COMPONENTS)), np.nan), np.empty((m, 2))
     for k in range(len(poses)):
         x_m, y_m, yaw_rad = poses[k, 0], poses[k, 1], poses[k, 2]
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
         for i in range(starts[k], starts[k + 1]):
             row = values[i]
+            for column in columns[k]:
+                if column >= 0:
+                    row[column] = numbers[at]
+                    at += 1
             if moves[k]:
                 row[X], row[Y] = x_m + c * row[X] - s * row[Y], y_m + s * row[X] + c * row[Y]
                 row[YAW] = wrapped(row[YAW] + yaw_rad)
@@ -37,7 +45,34 @@ def to_map(values: FloatArray, starts: IntArray, poses: FloatArray, moves: BoolA
             if math.isnan(row[X]):
                 right, up = row[RANGE] * math.cos(row[BEARING]), row[RANGE] * math.sin(row[BEARING])
                 points[i, 0], points[i, 1] = x_m + c * right - s * up, y_m + s * right + c * up
-    return points
+    return values, points, np.zeros(m, np.bool_)
+
+
+@njit("(float64[:, ::1], float64[:, ::1], b1[::1], int64[::1], b1[:, ::1], float64[:], float64[:], b1[:])")
+def on_road(
+    values: FloatArray,
+    points: FloatArray,
+    map_yaw: BoolArray,
+    starts: IntArray,
+    takes: BoolArray,
+    heading: FloatArray,
+    curvature: FloatArray,
+    outside: BoolArray,
+) -> BoolArray:
+    """Write a heading of the map that a list k `takes` and that is not measured, and a curvature; shape (lists, 2).
+    Returns which are `outside` (m,), of those with a position.
+    """
+    beyond = np.zeros(len(values), np.bool_)
+    for k in range(len(takes)):
+        for i in range(starts[k], starts[k + 1]):
+            if math.isnan(points[i, 0]):
+                continue
+            beyond[i] = outside[i]
+            if takes[k, 0] and math.isnan(values[i, YAW]):
+                values[i, YAW], map_yaw[i] = heading[i], True
+            if takes[k, 1]:
+                values[i, CURVATURE] = curvature[i]
+    return beyond
 
 
 @njit("(float64[:, ::1], float64[:, ::1], b1[::1], int64[::1], float64[:, ::1])")

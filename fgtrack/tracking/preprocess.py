@@ -26,8 +26,6 @@ from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.detections import (
-    CURVATURE,
-    YAW,
     MapDetections,
     Merge,
     PosedBatch,
@@ -222,16 +220,8 @@ class Preprocess:
     def together(self, batches: Sequence[PosedBatch]) -> list[Preprocessed]:
         """Return for each of `batches` what `__call__` returns, in one pass over the arrays of all."""
         items, lost = in_map_frame(batches), [dict[int, str]() for _ in batches]
-        if any(each.sensor.filters for each in batches):
-            items = _filtered(items, lost)
-        limits_m = [each.sensor.max_range_m if each.ego is not None else None for each in batches]
-        if any(limits_m):
-            offsets_m = items.points_m - items.poses[items.of, :2]
-            far = np.hypot(offsets_m[:, 0], offsets_m[:, 1]) > np.array([m or math.inf for m in limits_m])[items.of]
-            items = _without(items, far, "max_range_m", lost)
-        near_sides_m = [0.0 if each.ego is None else each.sensor.near_side_m for each in batches]
-        if any(near_sides_m):
-            move_back(items, np.array(near_sides_m))
+        if any(s.filters or s.near_side_m or s.max_range_m is not None for _, s, _, _ in batches):
+            items = _restricted(items, lost)
         items = merged(self._on_road(items, lost), self._merge)
         return [
             (candidates, [_out_of_bounds(each.batch, *one) for one in out.items()])
@@ -242,46 +232,33 @@ class Preprocess:
         """Return the detections inside the bounds, with yaw and curvature of the map; `lost` gets the rest."""
         if not self._road.known:
             return items
-        view, x_m = self._road.view(items.points_m), items.points_m[:, 0]
-        placed = x_m == x_m  # NaN, of a bearing alone, is not equal to itself
-        for name, column, values in (
-            ("yaw_from_map_std_rad", YAW, view.yaw_rad),
-            ("curvature_from_map_std_radpm", CURVATURE, view.curvature_radpm),
-        ):
-            takes = [getattr(each.sensor, name) is not None for each in items.batches]
-            if any(takes):
-                present = items.values[:, column]
-                filled = placed & (present != present)
-                if not all(takes):
-                    filled &= np.array(takes)[items.of]
-                items.values[:, column] = np.where(filled, values, present)
-                if column == YAW:
-                    items.map_yaw[:] = filled
-        return _without(items, view.outside & placed, "map.track", lost)
+        takes = [
+            (sensor.yaw_from_map_std_rad is not None, sensor.curvature_from_map_std_radpm is not None)
+            for _, sensor, _, _ in items.batches
+        ]
+        arrays = items.values, items.points_m, items.map_yaw, items.starts, np.array(takes)
+        outside = kernels("fgtrack.tracking.kernels").on_road(*arrays, *self._road.view(items.points_m))
+        return _without(items, outside, "map.track", lost)
 
     def _candidates(self, items: MapDetections) -> Iterator[Candidates]:
         """Yield the candidates of each batch in their order; those that measure the same components are one group."""
-        starts = items.starts
-        arrays = items.values, items.points_m, items.map_yaw, starts, items.poses
+        arrays = items.values, items.points_m, items.map_yaw, items.starts, items.poses
         codes, lines = kernels("fgtrack.tracking.kernels").described(*arrays)
-        of_batch = [dict[int, tuple[int, ...]]() for _ in items.batches]
-        for (k, index), others in items.merged.items():
-            of_batch[k][index] = others
-        for (first, end), own_merged in zip(pairwise(starts.tolist()), of_batch, strict=True):
-            kinds, groups = equal_ones(codes[first:end].tolist()), list[Group]()
-            for rows in kinds:
-                own = items.at(slice(first, end) if len(kinds) == 1 else first + np.array(rows))
-                groups += self._groups(own, np.array(rows), int(codes[first + rows[0]]))
-            yield Candidates(items.indices[first:end].tolist(), own_merged, lines[first:end], groups)
+        for k, (first, end) in enumerate(pairwise(items.starts.tolist())):
+            own, groups = codes[first:end].tolist(), list[Group]()
+            for rows in map(np.array, equal_ones(own)):
+                groups += self._groups(items, k, first, rows, own[rows[0]])
+            others = {index: others for (batch, index), others in items.merged.items() if batch == k}
+            yield Candidates(items.indices[first:end].tolist(), others, lines[first:end], groups)
 
-    def _groups(self, items: MapDetections, rows: IntArray, code: int) -> Iterator[Group]:
-        """Yield `items` of one batch, which are the candidates `rows` and all measure the same.
+    def _groups(self, items: MapDetections, k: int, first: int, rows: IntArray, code: int) -> Iterator[Group]:
+        """Yield the candidates `rows` of batch k, which begins at `first`, and which all measure the same.
         One by one where errors are correlated in time.
         """
-        posed, points_m = items.batches[items.of[0]], items.points_m
-        batch, sensor, _, pose = posed
+        posed, here = items.batches[k], slice(first, first + len(rows)) if rows[-1] < len(rows) else first + rows
+        (batch, sensor, _, pose), points_m = posed, items.points_m[here]
         names, columns, assumed, placed = _components(code, self._assumes_map_yaw)
-        z, R = items.values.take(columns, axis=1), covariances(items, names)
+        z, R = items.values[here].take(columns, axis=1), covariances(items, k, here, names)
         model = measurement_model(names, self._motion)
         models, white = [model], R
         if sensor.correlation is not None:
@@ -305,8 +282,8 @@ class Preprocess:
         if sensor.correlation is None:
             yield whole
             return
-        for k, each in enumerate(models):
-            item, m = Measurement(batch.stamp_ns, each, z[k : k + 1], total[k : k + 1], pose, sensor.loss, assumed), [k]
+        for i, each in enumerate(models):
+            item, m = Measurement(batch.stamp_ns, each, z[i : i + 1], total[i : i + 1], pose, sensor.loss, assumed), [i]
             yield Group(rows[m], item, R[m], error and error.at(m), late)
 
 
@@ -314,16 +291,23 @@ def _out_of_bounds(batch: Batch, index: int, reason: str) -> UpdateRecord:
     return replace(record(batch.message, index, Disposition.OUT_OF_BOUNDS), reason=reason)
 
 
-def _filtered(items: MapDetections, lost: Sequence[dict[int, str]]) -> MapDetections:
-    """`items` without those that do not pass the filters of their sensors, as `_without`."""
-    passes = list[bool]()
+def _restricted(items: MapDetections, lost: Sequence[dict[int, str]]) -> MapDetections:
+    """`items` that pass the filters and the ranges of their sensors, moved back from the near side that is seen."""
+    batches, passes = items.batches, list[bool]()
     for k, index in zip(items.of.tolist(), items.indices.tolist(), strict=True):
-        batch, sensor, _, _ = items.batches[k]
+        batch, sensor, _, _ = batches[k]
         name = sensor.refusing(batch.message.objects[index])
         passes.append(name is None)
         if name is not None:
             lost[k][index] = f"filters.{name}"
-    return items.at(np.array(passes, dtype=bool))
+    items = items.at(np.array(passes, dtype=bool))
+    ranges_m = [each.sensor.max_range_m if each.ego is not None else None for each in batches]
+    of, most_m = items.of, np.array([math.inf if range_m is None else range_m for range_m in ranges_m])
+    offsets_m = items.points_m - items.poses[of, :2]
+    far = np.hypot(offsets_m[:, 0], offsets_m[:, 1]) > most_m[of]
+    items = _without(items, far, "max_range_m", lost)
+    move_back(items, np.array([0.0 if each.ego is None else each.sensor.near_side_m for each in batches]))
+    return items
 
 
 def _without(items: MapDetections, outside: BoolArray, reason: str, lost: Sequence[dict[int, str]]) -> MapDetections:

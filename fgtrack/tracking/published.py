@@ -9,16 +9,7 @@ from scipy.spatial import cKDTree
 
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import (
-    BoolArray,
-    DetectionList,
-    Disposition,
-    EgoState,
-    FloatArray,
-    IntArray,
-    TickReport,
-    UpdateRecord,
-)
+from fgtrack.core.types import DetectionList, Disposition, EgoState, FloatArray, IntArray, TickReport, UpdateRecord
 from fgtrack.estimation.base import StatesAt
 from fgtrack.estimation.filters.published import published_yaw
 from fgtrack.models.sensors import SensorModel
@@ -148,7 +139,7 @@ class NeighbourhoodMerge(Merge):
     distance_m: float = 5.1
     """Detections at most this far apart are neighbours."""
 
-    def apart(self, points_m: FloatArray, starts: IntArray) -> BoolArray:
+    def apart(self, points_m: FloatArray, starts: IntArray) -> list[bool]:
         """See `Merge.apart`."""
         return ConnectedMerge(self.distance_m).apart(points_m, starts)
 

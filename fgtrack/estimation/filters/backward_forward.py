@@ -6,60 +6,30 @@ is the baseline, and not a replay.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from itertools import compress
+from typing import Any
 
 import numpy as np
 
+from fgtrack.core.linalg import kernels
 from fgtrack.core.time import nanoseconds, period_ns, seconds
-from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
+from fgtrack.core.types import FloatArray, IntArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, no_states, stacks
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.filters.ekf import correct
+from fgtrack.estimation.filters.ekf import Correction, correct
 from fgtrack.estimation.filters.propagation import ExactPropagator, kinematic_states
 from fgtrack.models.motion import MotionModel
 
-
-class Anchor(NamedTuple):
-    """A stored state; all states up to the next anchor are predicted from it."""
-
-    grid: int
-    """Grid index of the state."""
-    visible_from: int
-    """Grid index from which a look-up finds it."""
-    mean: FloatArray
-    covariance: FloatArray
-
-
-@dataclass(slots=True)
-class _Storage:
-    """The stored past of one object."""
-
-    anchors: list[Anchor]
-    oldest: int
-    """Grid index before which the object is not known."""
-    newest_fused_ns: int
-
-    def at(self, grid: int) -> Anchor:
-        """The anchor that the state at `grid` is predicted from."""
-        for anchor in reversed(self.anchors):
-            if anchor.visible_from <= grid:
-                return anchor
-        return self.anchors[0]
-
-    def trim(self, oldest: int) -> None:
-        """Forget what is older than `oldest`."""
-        self.oldest = max(self.oldest, oldest)
-        while len(self.anchors) > 1 and self.anchors[1].visible_from <= self.oldest:
-            del self.anchors[0]
+#: In the order of the numbers that the kernels give.
+_STATUS = UpdateStatus.FAILED, UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE
 
 
 class BackwardForwardBank:
     """EKFs of all objects on a shared time grid, with their stored states (the paper's object storage).
 
-    Between two corrections the stored states are pure prediction, so only corrected states are kept, and a state
-    in between is predicted when it is asked for. The storage reaches `storage_steps` of `step_ns` back.
+    States between measurements are not stored but predicted from the anchor before them, see
+    `fgtrack.estimation.kernels.storage`. The storage reaches `storage_steps` of `step_ns` back.
     """
 
     def __init__(self, propagator: ExactPropagator, step_ns: int, storage_steps: int) -> None:
@@ -70,7 +40,12 @@ class BackwardForwardBank:
         self._now_ns: int | None = None
         self._grid_ns = 0  # stamp of the newest grid state
         self._grid = 0  # its index
-        self._objects: dict[int, _Storage] = {}
+        self._kernels = kernels("fgtrack.estimation.kernels.storage")
+        self._rows: dict[int, int] = {}  # of the arrays, by track id in order of birth
+        self._order: IntArray | None = None  # of all tracks by birth, until one comes or goes
+        self._free = list[int]()
+        self._arrays = list[Any]()
+        self._make_room([])
         self._cached: dict[int, StatesAt] = {}  # by grid index; valid until anything changes
 
     @property
@@ -86,7 +61,7 @@ class BackwardForwardBank:
     @property
     def track_ids(self) -> tuple[int, ...]:
         """See `TrackBank.track_ids`."""
-        return tuple(self._objects)
+        return tuple(self._rows)
 
     def advance(self, now_ns: int) -> None:
         """Move the present to the last grid stamp that is not after `now_ns`."""
@@ -102,25 +77,29 @@ class BackwardForwardBank:
             self._grid += steps
             self._grid_ns += steps * self._step_ns
             self._cached.clear()
-        for storage in self._objects.values():
-            storage.trim(self._grid - self._length + 1)
+
+    @property
+    def _oldest(self) -> int:
+        """Oldest grid index that is stored."""
+        return self._grid - self._length + 1
 
     def _at_grid(self, grid: int) -> StatesAt:
         """States at `grid` of all objects that exist there; at the present they are the filters' own."""
         if grid in self._cached:
             return self._cached[grid]
-        n = self._propagator.motion.dim
-        rows = {i: each for i, each in self._objects.items() if grid == self._grid or each.oldest <= grid}
-        if not rows:
-            return no_states(n)
-        anchors = [each.anchors[-1] if grid == self._grid else each.at(grid) for each in rows.values()]
-        means, covariances = self._propagator.propagate(
-            np.concatenate([anchor.mean for anchor in anchors]).reshape(len(anchors), -1),
-            np.concatenate([anchor.covariance for anchor in anchors]).reshape(len(anchors), n, n),
-            np.array([grid - anchor.grid for anchor in anchors], dtype=np.int64),
-            self._step_s,
-        )
-        self._cached[grid] = states = StatesAt(tuple(rows), means, covariances)
+        if self._order is None:
+            self._order = np.array(list(self._rows.values()), dtype=np.int64)
+        rows, track_ids, is_present = self._order, self.track_ids, grid == self._grid
+        known = (self._arrays[2][rows, 1] <= grid) & (grid >= self._oldest) | is_present
+        if not known.all():
+            rows, track_ids = rows[known], tuple(compress(track_ids, known.tolist()))
+        if not track_ids:
+            return no_states(self._propagator.motion.dim)
+        m, n = len(rows), self._propagator.motion.dim
+        means, covariances, steps = np.empty((m, n)), np.empty((m, n, n)), np.empty(m, dtype=np.int64)
+        self._kernels.look_up(grid, is_present, rows, *self._arrays, means, covariances, steps)
+        ahead = self._propagator.propagate(means, covariances, steps, self._step_s)
+        self._cached[grid] = states = StatesAt(track_ids, *ahead)
         return states
 
     def steps_back(self, stamp_ns: int) -> int:
@@ -144,17 +123,11 @@ class BackwardForwardBank:
             x, P = states.means.take(chosen, axis=0), states.covariances.take(chosen, axis=0)
             y, H = alike.model.linearised(alike.z, x, alike.pose, partial(self._propagator.residual, alike.model))
             corrected = correct(x, P, y, H, alike.R, alike.measured, alike.loss)
-            wrapped, nis = self._propagator.wrap(corrected.mean), corrected.nis.tolist()
-            for k in corrected.fused.nonzero()[0].tolist():
-                storage = self._objects[track_ids[indices[k]]]
-                anchor = Anchor(self._grid - back, self._visible_from(back), wrapped[k], corrected.covariance[k])
-                while storage.anchors and storage.anchors[-1].visible_from >= anchor.visible_from:
-                    storage.anchors.pop()  # it replaces all that was stored at and after it
-                storage.anchors.append(anchor)
-                late = storage.newest_fused_ns > stamp_ns
-                storage.newest_fused_ns = max(storage.newest_fused_ns, stamp_ns)
-                status = UpdateStatus.OUT_OF_SEQUENCE if late else UpdateStatus.IN_SEQUENCE
-                results[indices[k]] = UpdateResult(status, corrected.innovation[k], nis[k])
+            ids, nis = [track_ids[i] for i in indices], corrected.nis.tolist()
+            codes = self._stored(back, stamp_ns, ids, corrected)
+            for k, (code, i) in enumerate(zip(codes, indices, strict=True)):
+                if code:
+                    results[i] = UpdateResult(_STATUS[code], corrected.innovation[k], nis[k])
         self._cached.clear()
         return results
 
@@ -166,16 +139,52 @@ class BackwardForwardBank:
         """Start an object on the grid stamp nearest to its first detection."""
         back = max(round((self._grid_ns - prior.stamp_ns) / self._step_ns), 0)
         start = self._grid - back
-        mean, covariance = initial_state(self._propagator.motion, prior)
-        anchor = Anchor(start, start, self._propagator.wrap(mean), covariance)
-        self._objects[track_id] = _Storage([anchor], start, prior.stamp_ns)
-        self._objects[track_id].trim(self._grid - self._length + 1)
+        self._make_room([])
+        row, state = self._free.pop(), initial_state(self._propagator.motion, prior)
+        anchors, states, windows = self._arrays
+        anchors[row, 0], windows[row] = start, (1, start, prior.stamp_ns)
+        states[row, 0, 0], states[row, 0, 1:] = self._propagator.wrap(state[0]), state[1]
+        self._rows[track_id], self._order = row, None
         self._cached.clear()
 
     def remove(self, track_id: int) -> None:
         """See `TrackBank.remove`."""
-        del self._objects[track_id]
+        self._free.append(self._rows.pop(track_id))
+        self._order = None
         self._cached.clear()
+
+    def _stored(
+        self, back: int, stamp_ns: int, track_ids: Sequence[int], corrected: Correction[FloatArray]
+    ) -> list[int]:
+        """Store corrected states at `back` steps ago; return the codes of their status."""
+        rows = [self._rows[track_id] for track_id in track_ids]
+        self._make_room(rows)
+        at = self._grid - back, self._visible_from(back), stamp_ns, np.array(rows)
+        states = self._propagator.wrap(corrected.mean), corrected.covariance
+        codes: list[int] = self._kernels.store(*at, corrected.fused, *states, *self._arrays).tolist()
+        return codes
+
+    def _make_room(self, rows: Sequence[int]) -> None:
+        """Let there be a free row, and a free slot in `rows`; anchors before the oldest state, but the last, go."""
+        num_rows, slots = self._arrays[0].shape[:2] if self._arrays else (0, 16)
+        full = [row for row in rows if self._arrays[2][row, 0] == slots]
+        for row in full:
+            anchors, states, windows = (array[row] for array in self._arrays)
+            gone = max(int(np.searchsorted(anchors[:, 1], max(self._oldest, windows[1]), side="right")) - 1, 0)
+            windows[0] -= gone
+            anchors[: windows[0]], states[: windows[0]] = anchors[gone:].copy(), states[gone:].copy()
+        is_full, n = any(self._arrays[2][row, 0] == slots for row in full), self._propagator.motion.dim
+        if is_full or not self._free:
+            shape = (num_rows if self._free else 2 * num_rows + 8), slots * (1 + is_full)
+            arrays = [
+                np.zeros((*shape, 2), dtype=np.int64),
+                np.zeros((*shape, n + 1, n)),
+                np.zeros((shape[0], 3), np.int64),
+            ]
+            self._free += range(num_rows, shape[0])
+            for new, present in zip(arrays, self._arrays, strict=bool(self._arrays)):
+                new[tuple(map(slice, present.shape))] = present
+            self._arrays = arrays
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; the part of a step beyond the newest grid stamp is predicted."""

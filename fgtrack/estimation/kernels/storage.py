@@ -1,0 +1,72 @@
+"""Stored states of many tracks on a time grid: arrays (tracks, slots, ...) of anchors, from which others are predicted.
+
+A slot of `anchors` has the grid index of a state and that from which a look-up finds it, one of `states` in rows of n,
+the dimension of the state, its mean and covariance (n + 1 rows). A row of `windows` has the number of anchors, in
+ascending order, the grid index before which the track is unknown, and the newest stamp fused.
+"""
+
+import numpy as np
+
+from fgtrack.core.compiled import copy, njit
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
+
+FAILED, IN_SEQUENCE, OUT_OF_SEQUENCE = range(3)
+_STORAGE = "int64[:, :, ::1], float64[:, :, :, ::1], int64[:, ::1]"
+
+
+@njit(f"(int64, b1, int64[:], {_STORAGE}, float64[:, ::1], float64[:, :, ::1], int64[::1])")
+def look_up(
+    grid: int,
+    is_present: bool,
+    rows: IntArray,
+    anchors: IntArray,
+    states: FloatArray,
+    windows: IntArray,
+    means: FloatArray,
+    covariances: FloatArray,
+    steps: IntArray,
+) -> None:
+    """Write the anchors (m, n) and (m, n, n) of the states of `rows` (m,) at `grid`, and the steps to there (m,).
+    At the present that is the newest one, whether a look-up finds it or not.
+    """
+    for i in range(len(rows)):
+        row = rows[i]
+        j = windows[row, 0] - 1
+        while j > 0 and not is_present and anchors[row, j, 1] > grid:
+            j -= 1
+        steps[i] = grid - anchors[row, j, 0]
+        for a in range(means.shape[1]):
+            means[i, a] = states[row, j, 0, a]
+        copy(states[row, j, 1:], covariances[i])
+
+
+@njit(f"(int64, int64, int64, int64[::1], b1[::1], float64[:, ::1], float64[:, :, ::1], {_STORAGE})")
+def store(
+    grid: int,
+    visible_from: int,
+    stamp_ns: int,
+    rows: IntArray,
+    fused: BoolArray,
+    means: FloatArray,
+    covariances: FloatArray,
+    anchors: IntArray,
+    states: FloatArray,
+    windows: IntArray,
+) -> IntArray:
+    """Add an anchor of the measurement at `stamp_ns` to each of `rows` (m,) in which it was `fused`; return the status.
+    The anchor replaces all that was stored at and after it.
+    """
+    status = np.full(len(rows), FAILED)
+    for i in range(len(rows)):
+        if fused[i]:
+            row, window = rows[i], windows[rows[i]]
+            j = window[0]
+            while j > 0 and anchors[row, j - 1, 1] >= visible_from:
+                j -= 1
+            anchors[row, j, 0], anchors[row, j, 1] = grid, visible_from
+            for a in range(means.shape[1]):
+                states[row, j, 0, a] = means[i, a]
+            copy(covariances[i], states[row, j, 1:])
+            status[i] = IN_SEQUENCE if stamp_ns >= window[2] else OUT_OF_SEQUENCE
+            window[0], window[2] = j + 1, max(window[2], stamp_ns)
+    return status
