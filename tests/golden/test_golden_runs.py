@@ -59,7 +59,7 @@ def golden(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         if request.param == "jitter10":
             ticks_ns = [tick["now_ns"] for tick in expected]
             patch.setattr(pipeline, "clock_ticks", lambda messages, node_hz: listed_ticks(messages, ticks_ns))
-        patch.setattr(pipeline, "build_tracker", lambda config: trackers.append(build(config)) or trackers[0])
+        patch.setattr(pipeline, "build_tracker", lambda *made: trackers.append(build(*made)) or trackers[0])
         run = tmp_path_factory.mktemp(request.param) / "run"
         [meta] = pipeline.replay(
             lambda: read_stream(shared(f"reference/{request.param}/stream.jsonl.gz")),
