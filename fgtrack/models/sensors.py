@@ -151,7 +151,7 @@ class SensorModel:
     """Probability that a list shows an object that is visible to it (`lifecycle.kind: existence`), as in a list between
     two that show it. How often objects are hidden, or too small or too far away, is estimated."""
     clutter_per_m2: PositiveFloat = 1e-4
-    """False detections in a list for each square metre (`lifecycle.kind: existence`)."""
+    """False detections in a list for each square metre (`lifecycle.kind: existence`, `association.joint_from`)."""
     score: Score | None = None
     """Evidence of the score of a detection for the existence of its object; null: none."""
     near_side_m: float = 0.0

@@ -21,6 +21,7 @@ from fgtrack.models.published_map import PublishedMap
 from fgtrack.models.road import Road
 from fgtrack.models.track_map import TrackMap
 from fgtrack.pipeline.config import NOISE_HZ, SMOOTHERS, Config, Defect, MapConfig
+from fgtrack.tracking.association import GatedMahalanobis
 from fgtrack.tracking.ego import EgoStd, EgoTrajectory
 from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules, Lifecycle
 from fgtrack.tracking.extent import Extents
@@ -45,6 +46,7 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
         inbox=(SlotInbox if "one_slot" in config.defects else Inbox)(config.sensors),
         preprocess=Preprocess(road, config.merge, motion, config.ego.detection_origin_m, not published_order),
         association=config.association,
+        joint=config.association if isinstance(config.association, GatedMahalanobis) else None,
         extents=None if config.extent is None else Extents(config.extent),
         bank=GuardedBank(lambda: build_bank(config, failures), failures),
         failures=failures,

@@ -5,7 +5,7 @@ from functools import cache
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
-from pydantic import NonNegativeFloat, PositiveFloat
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 from scipy.special import gammaincinv
@@ -111,9 +111,23 @@ class GatedMahalanobis:
     """Largest distance of a pair: as far as an airliner flies in 20 s. The chi-square gate decides below it."""
     claim_m: NonNegativeFloat = 0.0
     """A candidate that belongs to no track starts none nearer than this to one: it is the other end of a long hull."""
+    joint_from: PositiveInt | None = None
+    """Detections from which on a track is updated by all those in its gate, each with the probability that it belongs
+    to the track and to no other one (JPDA, of positions); null: by the assigned one alone. A first state is too
+    uncertain for it. Statuses and dispositions are always those of the assignment."""
 
     def __call__(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Assignment:
-        """See `Association`; the cost adds log det S, so that a vague track does not win by being vague."""
+        """See `Association`."""
+        pairs = self.gated(candidates, states, apart)
+        result = assigned(pairs, len(candidates), len(states.means))
+        if not (self.claim_m and result.new):
+            return result
+        loose = np.array(result.new)
+        claimed = near(candidates, states.means, self.claim_m, apart).rows
+        return _refusing(set(loose[np.isin(loose, claimed)].tolist()), result)
+
+    def gated(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Pairs:
+        """Return the pairs inside the gate with their cost NIS + log det S: a vague track does not win by it."""
         reach_m: float | FloatArray = self.max_distance_m
         if len(candidates) * len(states.means) > MOST_NEAR:
             weight = apart.weight if isinstance(apart, Evidence) else 0.0
@@ -130,12 +144,7 @@ class GatedMahalanobis:
             nis = nis if more is None else nis + more[chosen]
             cost[chosen] = nis + logdet
             inside[chosen] = nis <= chi_square_quantile(self.gate_probability, k)
-        result = assigned(pairs._replace(values=cost).at(inside), len(candidates), len(states.means))
-        if not (self.claim_m and result.new):
-            return result
-        loose = np.array(result.new)
-        claimed = near(candidates, states.means, self.claim_m, apart).rows
-        return _refusing(set(loose[np.isin(loose, claimed)].tolist()), result)
+        return pairs._replace(values=cost).at(inside)
 
 
 def _refusing(suspects: set[int], assignment: Assignment) -> Assignment:

@@ -129,7 +129,7 @@ class ExistenceLifecycle:
         self._lives["travelled"][rows] |= travelled_m >= self._rules.min_travel_m
         sensor, leaders = self._sensors[scan.sensor], [candidates.leaders[position] for position in chosen.tolist()]
         scores = [self._score(scan, (leader, *candidates.merged.get(leader, ()))) for leader in leaders]
-        density = _position_densities(candidates, chosen, means, states.covariances[tracks])
+        density = position_densities(candidates, chosen, means, states.covariances[tracks])
         known, P_D = ~np.isnan(density), sensor.detection_probability
         ratios = 1.0 - P_D + P_D * density / sensor.clutter_per_m2 * np.exp(scores)
         self._learn(scan, rows[known], means[known, :2], ratios[known])
@@ -228,7 +228,7 @@ class ExistenceLifecycle:
 Lifecycle = CountingLifecycle | ExistenceLifecycle
 
 
-def _position_densities(candidates: Candidates, chosen: IntArray, means: FloatArray, P: FloatArray) -> FloatArray:
+def position_densities(candidates: Candidates, chosen: IntArray, means: FloatArray, P: FloatArray) -> FloatArray:
     """N(z - h(x); 0, S) of the positions of `chosen` (m,) at states (m, n), (m, n, n), in 1/m^2; NaN if singular."""
     y, R = candidates.lines[chosen, :2] - means[:, :2], np.empty((len(chosen), 2, 2))
     for group, members, here in candidates.split(chosen):

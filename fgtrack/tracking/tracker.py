@@ -33,7 +33,7 @@ from fgtrack.estimation.object_bank import states_of
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.association import Assignment, Association
+from fgtrack.tracking.association import Assignment, Association, GatedMahalanobis, Pairs
 from fgtrack.tracking.birth import Birth, in_any_direction
 from fgtrack.tracking.detections import PosedBatch
 from fgtrack.tracking.ego import EgoPose, EgoTrajectory
@@ -42,8 +42,9 @@ from fgtrack.tracking.extent import Extents
 from fgtrack.tracking.guarded_bank import faults
 from fgtrack.tracking.inbox import Batch, Inbox, record
 from fgtrack.tracking.lifecycle import Scan
-from fgtrack.tracking.objects import Objects
+from fgtrack.tracking.objects import Apart, Objects
 from fgtrack.tracking.preprocess import Candidates, Preprocess, Preprocessed
+from fgtrack.tracking.soft_association import equivalent, joint_probabilities
 
 _Own = tuple[int, TrackStatus, int, ObjectReport | None, float | None]
 """Id, status, number of measurements, object and existence probability of a track."""
@@ -65,6 +66,8 @@ class TrackerParts:
     birth: Birth
     road: Road
     objects: Objects = field(default_factory=Objects)
+    joint: GatedMahalanobis | None = None
+    """Gate of the detections that update a track together; None where each updates one track."""
     extents: Extents | None = None
     """Extents of the tracks; None where a list has at most one detection of an object."""
     failures: Failures = field(default_factory=Failures)
@@ -241,10 +244,23 @@ class Tracker:
 
     def _assigned(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Assignment:
         """Return the assignment of candidates to tracks of the same class, and by their identities."""
+        return self._parts.association(candidates, states, self._evidence(batch, candidates, states))
+
+    def _evidence(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Apart | None:
         parts, message = self._parts, batch.message
         described = list(map(message.objects.__getitem__, candidates.leaders))
         wrong = parts.sensors[message.sensor].wrong_id_probability
-        return parts.association(candidates, states, parts.objects.evidence(described, states.track_ids, wrong))
+        return parts.objects.evidence(described, states.track_ids, wrong)
+
+    def _joint(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Pairs | None:
+        """Probabilities that candidates belong to tracks with enough detections; None where they are not considered."""
+        rule = self._parts.joint
+        if rule is None or rule.joint_from is None:
+            return None
+        pairs = rule.gated(candidates, states, self._evidence(batch, candidates, states))
+        known = np.array([self._num_measured[track_id] >= rule.joint_from for track_id in states.track_ids])
+        sensor = self._parts.sensors[batch.message.sensor]
+        return joint_probabilities(pairs.at(known[pairs.columns]), candidates, states, sensor)
 
     def _unclaimed(self, batch: Batch, candidates: Candidates, new: Sequence[int], states: StatesAt) -> list[int]:
         """Return those of `new` that belong to no track which began after the batch's stamp.
@@ -307,9 +323,11 @@ class Tracker:
         bank, lifecycle, track_ids = self._parts.bank, self._parts.lifecycle, states.track_ids
         outcomes = dict[int, tuple[Measurement, UpdateResult]]()  # by index of the pair
         chosen, tracks = np.array(assignment.pairs).T
+        joint = self._joint(batch, candidates, states)
         for group, members, here in candidates.split(chosen):
             of = tracks[here]
-            measurements = Measurements(group.seen_at(members, states.means[of], states.covariances, of))
+            each = group.seen_at(members, states.means[of], states.covariances, of)
+            measurements = Measurements(each if joint is None else equivalent(each, of, group, joint, states))
             ids = list(map(track_ids.__getitem__, of.tolist()))
             results = bank.update(batch.stamp_ns, ids, measurements)
             outcomes.update(zip(here.tolist(), zip(repeat(measurements.stack), results), strict=True))

@@ -46,7 +46,7 @@ CONFIGS = {
     "clean": _with_all_sensors(paper(*OVAL)),
     "clean in open space": _with_all_sensors(
         paper(
-            "association={kind: mahalanobis}",
+            "association={kind: mahalanobis, joint_from: 2}",
             "birth={kind: measured}",
             "merge={kind: none}",
             "motion={kind: cv, std_per_s: {velocity: 5.0}}",

@@ -1,16 +1,24 @@
 import math
+from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
-from support.tracking import bearing, candidate, candidates_of, states
+from support.tracking import START_NS, bearing, candidate, candidates_of, ms, states
 
-from fgtrack.core.types import BoolArray, IntArray
+from fgtrack.core.types import BoolArray, Detection, DetectionList, FloatArray, IntArray
+from fgtrack.estimation.base import StatesAt
 from fgtrack.models.measurement import SensorPose
+from fgtrack.models.sensors import SensorModel
+from fgtrack.pipeline.build import build_tracker
+from fgtrack.pipeline.config import Config
 from fgtrack.tracking.association import Assignment, Association, GatedEuclidean, GatedMahalanobis, near
+from fgtrack.tracking.preprocess import Candidates
 from fgtrack.tracking.published import UngatedEuclidean
+from fgtrack.tracking.soft_association import LEAST_INFORMATION, equivalent, joint_probabilities, marginals
 
 ALL = [GatedEuclidean(), GatedEuclidean(max_nis=20.0), GatedMahalanobis(), UngatedEuclidean()]
 
@@ -122,6 +130,7 @@ def test_the_uncertainty_of_a_bearing_is_that_seen_from_the_sensor() -> None:
         (lambda: GatedMahalanobis(gate_probability=1.0), "gate_probability"),
         (lambda: GatedMahalanobis(max_distance_m=0.0), "max_distance_m"),
         (lambda: GatedMahalanobis(claim_m=-1.0), "claim_m"),
+        (lambda: GatedMahalanobis(joint_from=0), "joint_from"),
     ],
 )
 def test_a_gate_that_makes_no_sense_is_named(make, message: str) -> None:
@@ -148,3 +157,119 @@ def test_a_track_claims_no_candidate_of_another_class() -> None:
 
     found = GatedMahalanobis(claim_m=20.0)(seen, tracks, of_another_class)
     assert (found.new, found.refused) == ([1], (0,))
+
+
+def enumerated(weights: FloatArray) -> FloatArray:
+    """The marginal probabilities of pairs, by all joint events."""
+    m, n = weights.shape
+    total, sums = 0.0, np.zeros_like(weights)
+    for event in product(range(-1, n), repeat=m):
+        used = [i for i in event if i >= 0]
+        if len(set(used)) == len(used):
+            probability = math.prod(weights[j, i] for j, i in enumerate(event) if i >= 0)
+            total += probability
+            for j, i in enumerate(event):
+                if i >= 0:
+                    sums[j, i] += probability
+    return sums / total
+
+
+def test_probabilities_of_pairs_are_those_of_all_joint_events() -> None:
+    """Exact on a chain of tracks; within some hundredths where tracks compete for two detections in a circle."""
+    chain = np.array([[5.0, 0.3, 0.0], [0.0, 2.0, 8.0], [0.0, 0.0, 1.5]])
+    np.testing.assert_allclose(marginals(chain), enumerated(chain), atol=1e-9)
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        weights = np.exp(rng.normal(0.0, 2.0, (3, 4)))
+        np.testing.assert_allclose(marginals(weights), enumerated(weights), atol=0.06)
+
+
+def fused(x: FloatArray, P: FloatArray, z: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The Kalman update by one position."""
+    K = P[:, :2] @ np.linalg.inv(P[:2, :2] + R)
+    return x + K @ (z - x[:2]), P - K @ P[:2]
+
+
+def jointly(points: list[tuple[float, float]], tracks: StatesAt) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Equivalent positions of the first candidates, one for each track, their covariances, and the probabilities."""
+    rule, sensor = GatedMahalanobis(), SensorModel(std={"x_m": 0.3, "y_m": 0.3}, clutter_per_m2=1e-2)
+    single = candidates_of([candidate(x, y) for x, y in points])
+    group = single.groups[0]
+    own = group.stack
+    z, R = np.array(points), np.repeat(own.R, len(points), axis=0)
+    stacked = group._replace(rows=np.arange(len(points)), stack=replace(own, z=z, R=R), spread=R)
+    candidates = Candidates(single.leaders, {}, single.lines, [stacked])
+    joint = joint_probabilities(rule.gated(candidates, tracks), candidates, tracks, sensor)
+    of = np.arange(len(tracks.track_ids))
+    seen = stacked.seen_at(of, tracks.means, tracks.covariances, of)
+    result = equivalent(seen, of, stacked, joint, tracks)
+    b = np.zeros((len(of), len(points)))
+    b[joint.columns, joint.rows] = joint.values
+    return result.z, result.R, b
+
+
+def test_the_equivalent_measurement_updates_as_the_mixture_of_all_does() -> None:
+    """Moments of the mixture of the updates by each detection and of no update."""
+    tracks = states([(0.0, 0.0)], variance_m2=0.5)
+    points = [(0.4, 0.1), (-0.3, 0.6)]
+    z, R, b = jointly(points, tracks)
+    x, P = tracks.means[0], tracks.covariances[0]
+    parts = [(1.0 - b[0].sum(), x, P)]
+    parts += [(w, *fused(x, P, np.array(p), 0.09 * np.eye(2))) for w, p in zip(b[0], points, strict=True)]
+    mean = sum(w * m for w, m, _ in parts)
+    covariance = sum(w * (C + np.outer(m - mean, m - mean)) for w, m, C in parts)
+    found = fused(x, P, z[0], R[0])
+    np.testing.assert_allclose(found[0], mean, atol=1e-12)
+    np.testing.assert_allclose(found[1], covariance, atol=1e-12)
+
+
+def test_detections_far_apart_keep_the_mean_and_nearly_the_covariance() -> None:
+    tracks = states([(0.0, 0.0)], variance_m2=4.0)
+    z, R, b = jointly([(4.0, 0.0), (-3.9, 0.0)], tracks)
+    x, P = tracks.means[0], tracks.covariances[0]
+    mean, covariance = fused(x, P, z[0], R[0])
+    assert mean[0] == pytest.approx(4.0 / 4.09 * (b[0] @ [4.0, -3.9]))
+    assert covariance[0, 0] == pytest.approx(4.0 - LEAST_INFORMATION * 16.0 / 4.09)
+    assert np.linalg.eigvalsh(R[0] - 0.09 * np.eye(2))[0] > 0.0
+
+
+def test_a_detection_is_shared_by_the_tracks_that_compete_for_it() -> None:
+    _, _, b_alone = jointly([(0.5, 0.0)], states([(0.0, 0.0)], variance_m2=0.3))
+    points = [(0.5, 0.0), (0.6, 0.0)]
+    near, _, b_near = jointly(points, states([(0.0, 0.0), (1.0, 0.0)], variance_m2=0.3))
+    assert b_near[0, 0] < b_alone[0, 0]
+    assert b_near.sum(axis=0).max() <= 1.0 + 1e-9
+    assert near[0, 0] < near[1, 0]
+
+
+def test_a_track_without_a_probability_keeps_its_detection() -> None:
+    tracks = states([(0.0, 0.0)])
+    items = candidates_of([candidate(0.2, 0.0)])
+    group, of = items.groups[0], np.array([0])
+    seen = group.seen_at(of, tracks.means, tracks.covariances, of)
+    nothing = GatedMahalanobis().gated(items, states([(9.0, 9.0)]))
+    result = equivalent(seen, of, group, nothing, tracks)
+    np.testing.assert_array_equal(result.z, seen.z)
+    np.testing.assert_array_equal(result.R, seen.R)
+
+
+@pytest.mark.parametrize("estimator", ["ekf-replay", "smoother-banded"])
+def test_a_track_with_enough_detections_is_updated_by_all_in_its_gate(estimator: str) -> None:
+    """Clutter 0.4 m to the left pulls it there; its own detection, which is nearer, counts alone before that."""
+
+    def left_m(joint_from: int | None) -> float:
+        association = GatedMahalanobis(joint_from=joint_from)
+        sensor = SensorModel(std={"x_m": 0.3, "y_m": 0.3})
+        config = Config(sensors={"lidar": sensor}, association=association, estimator=estimator)
+        tracker = build_tracker(config)
+        for k in range(3):
+            points = [(20.0, 5.0), (20.0, 5.4)] if k == 2 else [(20.0, 5.0)]
+            stamp_ns = START_NS + ms(100 * k)
+            objects = [Detection(x_m=x, y_m=y) for x, y in points]
+            tracker.receive(DetectionList("lidar", stamp_ns, stamp_ns, objects, "map"))
+            report = tracker.tick(stamp_ns)
+        assert sorted(each.disposition.value for each in report.updates) == ["birth", "in_sequence"]
+        return report.tracks[0].y_m
+
+    assert left_m(3) == left_m(None)
+    assert left_m(2) > left_m(None) + 0.02

@@ -1,0 +1,79 @@
+"""Joint probabilistic data association: a track is updated by all detections that it may have given.
+
+The probability b_ji that detection i stems from the object of track j follows from the joint events in which each
+detection and each track is used at most once (Fortmann, Bar-Shalom, Scheffe, IEEE J. Oceanic Engineering 8, 1983), with
+the weights P_D N(y_ji; 0, S_ji) / clutter density and 1 - P_D. The update by the innovations y_i of a track,
+
+    x + W y,   P - W D W',   y = sum b_i y_i,   D = sum b_i S - sum b_i y_i y_i' + y y',   W = P H' S^-1,
+
+equals that by one measurement with the innovation S D^-1 y and the covariance R + S D^-1 S - S. Estimators fuse and
+repeat that one like any other. Approximate are: the probabilities are those of the arrival, later lists do not change
+them; S is that of the assigned detection; the eigenvalues of S^-1 D are at least `LEAST_INFORMATION`, where innovations
+spread so far that the covariance of the track would grow.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from fgtrack.core.linalg import congruence, symmetrise
+from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.estimation.base import Measurement, StatesAt
+from fgtrack.models.sensors import SensorModel
+from fgtrack.tracking.association import Pairs
+from fgtrack.tracking.existence import position_densities
+from fgtrack.tracking.preprocess import Candidates, Group
+
+LEAST_INFORMATION = 0.05
+"""Of an equivalent measurement, relative to that of a detection."""
+_ITERATIONS = 30
+
+
+def joint_probabilities(pairs: Pairs, candidates: Candidates, states: StatesAt, sensor: SensorModel) -> Pairs:
+    """Return those of `pairs` whose candidates have a position, with the probability that they belong together."""
+    pairs = pairs.at(np.array(candidates.placed, dtype=bool)[pairs.rows])
+    rows, columns, _ = pairs
+    densities = position_densities(candidates, rows, states.means[columns], states.covariances[columns])
+    odds = sensor.detection_probability / (1.0 - sensor.detection_probability)
+    weights = np.zeros((len(states.means), len(candidates)))
+    weights[columns, rows] = odds * np.nan_to_num(densities) / sensor.clutter_per_m2
+    return pairs._replace(values=marginals(weights)[columns, rows])
+
+
+def marginals(weights: FloatArray) -> FloatArray:
+    """Return the probabilities, shape (m, n), that pairs of m tracks and n detections belong together.
+    Sums over all joint events, by belief propagation (Williams, Lau, IEEE T-AES 50, 2014): exact where no tracks
+    compete for two detections in a circle. `weights` (m, n) are relative to a missed detection and clutter.
+    """
+    ratios = np.ones_like(weights)
+    for _ in range(_ITERATIONS):
+        messages = weights * ratios
+        messages = weights / (1.0 + messages.sum(axis=1, keepdims=True) - messages)
+        ratios = 1.0 / (1.0 + messages.sum(axis=0) - messages)
+    messages = weights * ratios
+    return np.asarray(messages / (1.0 + messages.sum(axis=1, keepdims=True)))
+
+
+def equivalent(seen: Measurement, tracks: IntArray, group: Group, joint: Pairs, states: StatesAt) -> Measurement:
+    """Return `seen`, the detections of `group` assigned to `tracks`, as the equivalent measurements; see the module.
+    Tracks that are not in `joint` keep theirs.
+    """
+    z, R = seen.z.copy(), seen.R.copy()
+    members = np.searchsorted(group.rows, joint.rows)
+    in_group = group.rows.take(members, mode="clip") == joint.rows
+    for k, track in enumerate(tracks.tolist()):
+        own = in_group & (joint.columns == track)
+        if not own.any():
+            continue
+        b, x = joint.values[own], states.means[track][None]
+        every = np.concatenate([z[k : k + 1], group.stack.z[members[own]]])
+        y, H = seen.model.linearised(every, np.broadcast_to(x, (len(every), x.shape[1])), seen.pose)
+        L = np.linalg.cholesky(congruence(H if H.ndim == 2 else H[0], states.covariances[track]) + R[k])
+        white = np.linalg.solve(L, y.T)
+        mean = white[:, 1:] @ b
+        D = b.sum() * np.eye(len(mean)) - (b * white[:, 1:]) @ white[:, 1:].T + np.outer(mean, mean)
+        information, axes = np.linalg.eigh(D)
+        inverse = (axes / np.maximum(information, LEAST_INFORMATION)) @ axes.T
+        z[k] += L @ (inverse @ mean - white[:, 0])
+        R[k] = symmetrise(R[k] + L @ (inverse - np.eye(len(mean))) @ L.T)
+    return replace(seen, z=z, R=R)
