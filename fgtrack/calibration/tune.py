@@ -18,7 +18,9 @@ from fgtrack.calibration.tune_space import (
     TunedParameter,
     TuneReport,
     TuneRules,
+    stamp_key,
 )
+from fgtrack.calibration.tune_stamps import StampFit, fitted_stamps, with_stamps
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import BoolArray, FloatArray, Message
 from fgtrack.estimation.likelihood.contaminated import outlier_share
@@ -104,8 +106,9 @@ class _Tuning:
         self._kept = np.isin(noise.keys, rules.keep)
         self._named = np.array([bool(name) for _, name in noise.space.names])  # not the shares of outliers
         self._endless = np.zeros(len(self._kept), dtype=np.bool_)
+        self._configured_stamps, self._stamps = noise.stamp_stds, list[TunedParameter]()
         for key in rules.keep:
-            if key not in noise.keys:
+            if key not in (*noise.keys, *map(stamp_key, self._configured_stamps)):
                 raise CallError(
                     f"keep {key}: is no noise of the configuration, which has {', '.join(filter(None, noise.keys))}"
                 )
@@ -123,7 +126,7 @@ class _Tuning:
             rounds += 1
             parts = zip(series, splits_ns, strict=True)
             first = [replace(item, until_ns=end_ns) for tracks, end_ns in parts for item in tracks]
-            problem = Problem(first, self._space, self._configured)
+            problem = self._fit_stamps(Problem(first, self._space, self._configured), values)
             if rounds == 1:
                 values = self._best_start(problem)
             self._on_step(f"fit {rounds}")
@@ -142,7 +145,7 @@ class _Tuning:
         count = sum(item.count for item in sensors)
         return TuneReport(
             config=self._noise.config_with(values),
-            parameters=parameters,
+            parameters=(*parameters, *self._stamps),
             sensors=sensors,
             held_out=held_out,
             log_likelihood=float(likelihood.totals(values[None])[0]) / count,
@@ -154,6 +157,26 @@ class _Tuning:
             broken=broken,
             runs=tuple(runs),
         )
+
+    def _fit_stamps(self, problem: Problem, values: FloatArray) -> Problem:
+        """Fit the errors of stamps that are configured; return `problem` with them.
+        First of all: where an object moves along the line of sight, the standard deviation there would explain them.
+        """
+        self._stamps = []
+        for name, was_s in self._configured_stamps.items():
+            used_s, key, fit = self._noise.stamp_stds[name], stamp_key(name), StampFit(was_s, math.inf)
+            known: Known = "no"
+            why = "kept as asked"
+            if key not in self._rules.keep:
+                fit = fitted_stamps(problem, values, name, used_s)
+                known = "yes" if fit.std_error <= _KNOWN else "roughly" if fit.std_error <= _ROUGHLY_KNOWN else "no"
+                why = "" if known != "no" else f"flat: standard error {100.0 * fit.std_error:.0f} %"
+            std_s = was_s if known == "no" else float(f"{fit.std_s:.4g}")
+            self._noise = self._noise.with_stamps(name, std_s)
+            problem = with_stamps(problem, values, name, used_s, std_s)
+            error = None if known == "no" else fit.std_error
+            self._stamps.append(TunedParameter(key, was_s, std_s, error, known, why))
+        return problem
 
     def _associated(self, values: FloatArray) -> tuple[list[list[Series]], list[Run]]:
         """Return the series of long tracks and the run of each recording, with the noise of `values`."""

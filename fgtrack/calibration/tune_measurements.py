@@ -156,15 +156,15 @@ class RecordingBank(GuardedBank):
 
     def series(self) -> list[Series]:
         """Return the fused measurements of each track, by rising stamp, in order of birth."""
-        tracks: dict[int, tuple[Start, list[Observation]]] = {}
+        tracks: list[tuple[Start, list[Observation]]] = []
+        newest: dict[int, list[Observation]] = {}  # a number may return with an identity
         for item in self.fed:
             if item.start is not None:
-                tracks[item.track_ids[0]] = item.start, []
+                newest[item.track_ids[0]] = []
+                tracks.append((item.start, newest[item.track_ids[0]]))
             for track_id, each in zip(item.track_ids, item.observations, strict=False):
-                tracks[track_id][1].append(each)
-        return [
-            Series(start, sorted(fused, key=lambda item: item.measurement.stamp_ns)) for start, fused in tracks.values()
-        ]
+                newest[track_id].append(each)
+        return [Series(start, sorted(fused, key=lambda item: item.measurement.stamp_ns)) for start, fused in tracks]
 
     def update(
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]

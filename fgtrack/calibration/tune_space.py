@@ -58,6 +58,16 @@ class ConfigNoise:
         return replace(self.config, motion=motion, sensors={**self.config.sensors, **sensors})
 
     @property
+    def stamp_stds(self) -> dict[str, float]:
+        """Standard deviations of the stamps of the sensors whose stamps err, by sensor."""
+        return {name: item.stamp_std_s for name, item in self.config.used_sensors.items() if item.stamp_std_s}
+
+    def with_stamps(self, sensor: str, std_s: float) -> "ConfigNoise":
+        """Return that of the configuration with stamps of `sensor` that err by `std_s`."""
+        changed = replace(self.config.sensors[sensor], stamp_std_s=std_s)
+        return ConfigNoise(replace(self.config, sensors={**self.config.sensors, sensor: changed}))
+
+    @property
     def _motion_stds(self) -> dict[str, float]:
         """Positive noise parameters of the motion model, by name; none of a plug-in's, which has its own."""
         motion = self.config.motion
@@ -68,6 +78,11 @@ class ConfigNoise:
 
     def _motion_model(self, stds: Mapping[str, float]) -> MotionModel:
         return with_correlated_errors(self._motion_with(stds).model(), self.config.used_sensors)
+
+
+def stamp_key(sensor: str) -> str:
+    """Return the key of the standard deviation of the stamps of `sensor`."""
+    return f"sensors.{sensor}.stamp_std_s"
 
 
 @dataclass(frozen=True)

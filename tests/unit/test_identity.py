@@ -5,9 +5,14 @@ import math
 import numpy as np
 import pytest
 
+from fgtrack.calibration.tune_measurements import recorded
+from fgtrack.calibration.tune_space import ConfigNoise
+from fgtrack.calibration.tune_stamps import fitted_stamps, with_stamps
 from fgtrack.core.types import Detection, DetectionList, Disposition
+from fgtrack.estimation.likelihood.fit import Problem
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.public import replay
+from fgtrack.pipeline.shipped import read_config
 from fgtrack.tracking.objects import Evidence, Objects
 
 S = 10**9
@@ -158,6 +163,22 @@ def test_the_error_of_a_stamp_is_part_of_the_innovation_along_the_motion(estimat
     assert share > 0.99
     assert nis[0.5] == pytest.approx(2.0, abs=0.35)  # 350 values of chi-square with 2: 4 standard deviations are 0.43
     assert not 1.5 < nis[0.0] < 2.6
+
+
+def test_the_error_of_stamps_is_fitted():
+    """Of 200 stamps alone a standard deviation of 0.5 s is known to 0.5 s / sqrt(400) = 0.025 s."""
+    rng, v_mps = np.random.default_rng(5), 200.0
+    errors = rng.normal(size=(200, 3)) * (0.5, 10.0, 10.0)
+    lists = [report(k, v_mps * (k + a) + b, c, "AAA") for k, (a, b, c) in enumerate(errors.tolist())]
+    settings = {**BASE, "motion": {"kind": "cv", "std_per_s": {"velocity": 1.0}}, "birth.speed_std_mps": 250.0}
+    noise = ConfigNoise(read_config(None, {**settings, "sensors.adsb.stamp_std_s": 0.2}))
+    problem = Problem(recorded(lists, noise.config, "", 4.0)[0], noise.space, noise.values)
+    fit = fitted_stamps(problem, noise.values, "adsb", 0.2)
+    assert fit.std_s == pytest.approx(0.5, abs=0.1)
+    assert 0.03 < fit.std_error < 0.1
+    right = with_stamps(problem, noise.values, "adsb", 0.2, fit.std_s)
+    assert fitted_stamps(right, noise.values, "adsb", fit.std_s).std_s == pytest.approx(fit.std_s, rel=0.1)
+    assert noise.with_stamps("adsb", 0.5).stamp_stds == {"adsb": 0.5}
 
 
 def test_the_first_position_on_earth_is_no_empty_slot():
