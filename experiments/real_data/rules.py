@@ -14,6 +14,7 @@ from fgtrack.core.types import FloatArray, TruthState
 from fgtrack.io.source import open_input
 from fgtrack.models.sensors import Correlation
 from fgtrack.pipeline.config import NOISE_HZ, Config
+from fgtrack.tracking.association import GatedMahalanobis
 from fgtrack.tracking.existence import ExistenceRules
 
 #: A jump between successive errors counts as one of so many standard deviations at most: larger ones are another end of
@@ -117,13 +118,15 @@ def ruled(config: Config, recordings: Sequence[Recorded]) -> Config:
     speed_mps = _rms([one.speeds_mps for one in recordings])
     per_root_s = _rms([one.changes_mps for one in recordings]) / math.sqrt(MANOEUVRE_S)
     assert isinstance(config.lifecycle, ExistenceRules)
-    worst_m = max(sensors[name].std["x_m"] for name in SENSORS)
+    stds_m = [sensors[name].std["x_m"] for name in SENSORS]
+    assert isinstance(config.association, GatedMahalanobis)
     return replace(
         config,
         sensors=sensors,
         motion=replace(config.motion, std_per_s={"velocity": _digits(per_root_s * math.sqrt(NOISE_HZ))}),
         birth=replace(config.birth, speed_std_mps=_digits(speed_mps)),
-        lifecycle=replace(config.lifecycle, min_travel_m=_digits(3.0 * worst_m)),
+        lifecycle=replace(config.lifecycle, min_travel_m=_digits(3.0 * max(stds_m))),
+        association=replace(config.association, claim_m=_digits(4.0 * sum(stds_m))),
     )
 
 
@@ -216,4 +219,5 @@ def numbers(config: Config) -> dict[str, float]:
     found["motion.std_per_s.velocity"] = config.motion.std_per_s["velocity"]
     found["birth.speed_std_mps"] = config.birth.speed_std_mps
     found["lifecycle.min_travel_m"] = getattr(config.lifecycle, "min_travel_m", math.nan)
+    found["association.claim_m"] = getattr(config.association, "claim_m", math.nan)
     return found

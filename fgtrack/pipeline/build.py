@@ -1,6 +1,7 @@
 """From a configuration to a tracker."""
 
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,6 @@ from fgtrack.pipeline.config import NOISE_HZ, SMOOTHERS, Config, Defect, MapConf
 from fgtrack.tracking.association import GatedMahalanobis
 from fgtrack.tracking.ego import EgoStd, EgoTrajectory
 from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules, Lifecycle
-from fgtrack.tracking.extent import Extents
 from fgtrack.tracking.guarded_bank import GuardedBank
 from fgtrack.tracking.inbox import Inbox
 from fgtrack.tracking.lifecycle import CountingLifecycle
@@ -40,14 +40,14 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
     road = build_road(config.map, config.defects)
     motion, failures = config.motion_model(), Failures()
     published_order = config.lifecycle.kind == "published"
+    joint = config.association if isinstance(config.association, GatedMahalanobis) else None
     parts = TrackerParts(
         sensors=config.sensors,
         ego=_build_ego(config),
         inbox=(SlotInbox if "one_slot" in config.defects else Inbox)(config.sensors),
         preprocess=Preprocess(road, config.merge, motion, config.ego.detection_origin_m, not published_order),
-        association=config.association,
-        joint=config.association if isinstance(config.association, GatedMahalanobis) else None,
-        extents=None if config.extent is None else Extents(config.extent),
+        association=config.association if joint is None else replace(joint, claim_m=0.0),
+        joint=joint,
         bank=GuardedBank(lambda: build_bank(config, failures), failures),
         failures=failures,
         motion=motion,

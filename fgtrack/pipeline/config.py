@@ -22,7 +22,6 @@ from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.birth import Birth
 from fgtrack.tracking.detections import ConnectedMerge, NoMerge
 from fgtrack.tracking.existence import ExistenceRules
-from fgtrack.tracking.extent import ExtentRules
 from fgtrack.tracking.lifecycle import LifecycleRules
 from fgtrack.tracking.published import NeighbourhoodMerge, UngatedEuclidean
 
@@ -240,8 +239,6 @@ class Config:
     ego: EgoConfig = field(default_factory=EgoConfig)
     merge: MergeConfig = field(default_factory=NoMerge)
     association: AssociationConfig = field(default_factory=GatedMahalanobis)
-    extent: ExtentRules | None = None
-    """Where a list may have several detections of an object; null: it has one."""
     lifecycle: LifecycleConfig = field(default_factory=ExistenceRules)
     birth: Birth = field(default_factory=Birth)
     initiation: InitiationConfig = field(default_factory=InitiationConfig)

@@ -110,7 +110,8 @@ class GatedMahalanobis:
     max_distance_m: PositiveFloat = 5000.0
     """Largest distance of a pair: as far as an airliner flies in 20 s. The chi-square gate decides below it."""
     claim_m: NonNegativeFloat = 0.0
-    """A candidate that belongs to no track starts none nearer than this to one: it is the other end of a long hull."""
+    """A candidate that belongs to no track starts none nearer than this to one: it is the other end of a long hull. A
+    tracker applies it to confirmed tracks: what is near to clutter may well be an object."""
     joint_from: PositiveInt | None = None
     """Detections from which on a track is updated by all those in its gate, each with the probability that it belongs
     to the track and to no other one (JPDA, of positions); null: by the assigned one alone. A first state is too
@@ -120,11 +121,7 @@ class GatedMahalanobis:
         """See `Association`."""
         pairs = self.gated(candidates, states, apart)
         result = assigned(pairs, len(candidates), len(states.means))
-        if not (self.claim_m and result.new):
-            return result
-        loose = np.array(result.new)
-        claimed = near(candidates, states.means, self.claim_m, apart).rows
-        return _refusing(set(loose[np.isin(loose, claimed)].tolist()), result)
+        return claimed(result, candidates, states, self.claim_m, apart) if self.claim_m else result
 
     def gated(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Pairs:
         """Return the pairs inside the gate with their cost NIS + log det S: a vague track does not win by it."""
@@ -145,6 +142,14 @@ class GatedMahalanobis:
             cost[chosen] = nis + logdet
             inside[chosen] = nis <= chi_square_quantile(self.gate_probability, k)
         return pairs._replace(values=cost).at(inside)
+
+
+def claimed(
+    assignment: Assignment, candidates: Candidates, states: StatesAt, claims_m: float | FloatArray, apart: Apart | None
+) -> Assignment:
+    """Return `assignment` in which candidates at most `claims_m`, see `near`, from a track start none."""
+    rows = near(candidates, states.means, claims_m, apart).rows if assignment.new else np.zeros(0)
+    return _refusing(set(rows.tolist()).intersection(assignment.new), assignment)
 
 
 def _refusing(suspects: set[int], assignment: Assignment) -> Assignment:

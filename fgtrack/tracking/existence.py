@@ -114,6 +114,7 @@ class ExistenceLifecycle:
         row = self._rows[track_id] = self._histories.begin(scan.stamp_ns, self._index[scan.sensor], log_odds)
         if len(self._lives) <= row:
             self._lives = np.concatenate([self._lives, np.zeros(len(self._histories.counts) - len(self._lives), _LIFE)])
+        self._reports = None
         self._lives[row] = False, self._rules.min_travel_m == 0.0, candidate.position_m, 0, scan.stamp_ns, scan.stamp_ns
         self._confirm(np.array([row]))
 

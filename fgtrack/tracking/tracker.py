@@ -33,12 +33,11 @@ from fgtrack.estimation.object_bank import states_of
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.association import Assignment, Association, GatedMahalanobis, Pairs
+from fgtrack.tracking.association import Assignment, Association, GatedMahalanobis, Pairs, claimed
 from fgtrack.tracking.birth import Birth, in_any_direction
 from fgtrack.tracking.detections import PosedBatch
 from fgtrack.tracking.ego import EgoPose, EgoTrajectory
 from fgtrack.tracking.existence import Lifecycle
-from fgtrack.tracking.extent import Extents
 from fgtrack.tracking.guarded_bank import faults
 from fgtrack.tracking.inbox import Batch, Inbox, record
 from fgtrack.tracking.lifecycle import Scan
@@ -67,9 +66,8 @@ class TrackerParts:
     road: Road
     objects: Objects = field(default_factory=Objects)
     joint: GatedMahalanobis | None = None
-    """Gate of the detections that update a track together; None where each updates one track."""
-    extents: Extents | None = None
-    """Extents of the tracks; None where a list has at most one detection of an object."""
+    """Gate of the detections that update a track together, and the distance from confirmed tracks within which no
+    detection starts another one; None where each updates one track and any may start one."""
     failures: Failures = field(default_factory=Failures)
     """Counts what fails inside, shared with `bank`."""
     propagated_exceptions: tuple[type[Exception], ...] = (FgtrackError, MemoryError)
@@ -230,8 +228,6 @@ class Tracker:
             return
         states = self._offered(batch)
         assignment = self._assigned(batch, candidates, states)
-        if parts.extents is not None:
-            candidates, assignment = parts.extents.joined(candidates, assignment, states, batch.stamp_ns)
         self._count(batch, candidates, assignment, states, scan)
         if assignment.pairs:
             self._estimate(batch, candidates, assignment, states)
@@ -244,7 +240,12 @@ class Tracker:
 
     def _assigned(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Assignment:
         """Return the assignment of candidates to tracks of the same class, and by their identities."""
-        return self._parts.association(candidates, states, self._evidence(batch, candidates, states))
+        parts, evidence = self._parts, self._evidence(batch, candidates, states)
+        result = parts.association(candidates, states, evidence)
+        if parts.joint is None or not (parts.joint.claim_m and result.new):
+            return result
+        tentative = [parts.lifecycle.status(each) is TrackStatus.TENTATIVE for each in states.track_ids]
+        return claimed(result, candidates, states, np.where(tentative, -1.0, parts.joint.claim_m), evidence)
 
     def _evidence(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Apart | None:
         parts, message = self._parts, batch.message
@@ -393,8 +394,6 @@ class Tracker:
         for track_id in track_ids:
             self._parts.bank.remove(track_id)
             self._parts.objects.forget(track_id)
-            if self._parts.extents is not None:
-                self._parts.extents.forget(track_id)
             self._undirected.pop(track_id, None)
             del self._num_measured[track_id]
             self._parts.lifecycle.forget(track_id)

@@ -11,7 +11,7 @@ from fgtrack.models.oval import make_oval
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import Config
-from fgtrack.tracking.association import GatedEuclidean
+from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.lifecycle import LifecycleRules
 from fgtrack.tracking.tracker import Tracker
 
@@ -125,6 +125,17 @@ def test_a_track_that_begins_ahead_of_the_clock_claims_nothing() -> None:
     tick(one, 100.0, seen((10.0, 0.0), at_ms=100.0, late_ms=-200.0))
     report = tick(one, 120.0, seen((10.5, 0.0), at_ms=110.0, late_ms=10.0))
     assert dispositions(report) == ["birth"]
+
+
+def test_a_confirmed_track_claims_what_is_near_and_a_tentative_one_does_not() -> None:
+    """Two of three measurements: an object 8 m aside starts a track; after the third nothing does."""
+    claiming = GatedMahalanobis(max_distance_m=3.0, claim_m=10.0)
+    one = build_tracker(Config(sensors={"lidar": POINTS}, association=claiming, lifecycle=LifecycleRules()))
+    tick(one, 0.0, seen((9.0, 0.0), at_ms=0.0))
+    assert dispositions(tick(one, 100.0, seen((9.1, 0.0), (9.0, 8.0), at_ms=100.0))) == ["in_sequence", "birth"]
+    tick(one, 200.0, seen((9.2, 0.0), at_ms=200.0))
+    aside = seen((9.3, 0.0), (9.0, -8.0), (9.0, -12.0), at_ms=300.0)
+    assert dispositions(tick(one, 300.0, aside)) == ["in_sequence", "gated", "birth"]
 
 
 def test_where_a_track_was_before_it_began_follows_its_motion() -> None:
