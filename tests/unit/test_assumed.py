@@ -233,12 +233,22 @@ def test_where_sensors_disagree_about_a_hull_a_track_claims_what_is_near() -> No
                 yield replace(one, sensor="lidar", objects=[Detection(x_m=x_m, y_m=y_m)])
 
     found = assumed(Config(), source_of(hull))
-    assert found.config.association.claim_m == pytest.approx(3.0 * 8.0 / 1.18, abs=1.5)
+    apart_m = 8.0 / 1.18
+    assert found.config.association.claim_m == pytest.approx(2.0 * math.sqrt(12.0) * apart_m, abs=3.0)
+    assert found.config.lifecycle.min_travel_m == pytest.approx(3.0 * apart_m / math.sqrt(2.0), abs=1.0)
     assert "nothing begins within" in found.lines()[-1]
     for sensor in found.config.sensors.values():  # half of the variance each, nearly all of it an offset that lasts
         assert sensor.std["x_m"] == sensor.std["y_m"] == pytest.approx(8.0 / 1.18 / math.sqrt(2.0), rel=0.1)
         assert sensor.correlation.share == pytest.approx(1.0 - 1.0 / sensor.std["x_m"] ** 2, abs=0.01)
-    assert assumed(Config(), source_of(forward)).config.association.claim_m == 0.0
+    along = assumed(Config(), source_of(forward)).config
+    assert (along.association.claim_m, along.lifecycle.min_travel_m) == (0.0, 0.0)
+
+    def boxes():  # a detector of vehicles: those that stand are vehicles, too
+        for one in hull():
+            items = [replace(each, length_m=30.0, width_m=8.0) for each in getattr(one, "objects", ())]
+            yield replace(one, objects=items) if items else one
+
+    assert assumed(Config(), source_of(boxes)).config.lifecycle.min_travel_m == 0.0
 
 
 def test_errors_that_differ_from_list_to_list_are_no_offset() -> None:

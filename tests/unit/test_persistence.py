@@ -51,8 +51,6 @@ def test_clutter_that_comes_back_is_dense_around_itself() -> None:
     spread, standing = cars(0.9, 4.0), cars(0.9, 1.0, num_places=6)
     assert spread is not None
     assert standing is not None
-    assert spread.near_clutter_per_m2 is not None
-    assert standing.near_clutter_per_m2 is not None
     # Three of four are at places, and half of these come back within 3 m.
     expected = 0.75 * 0.5 / (9.0 * np.pi)
     assert spread.near_clutter_per_m2 < 0.15 * expected
@@ -88,3 +86,19 @@ def test_sensors_disagree_by_how_far_they_see_an_object_apart(
     found = replace(found, lists=found.lists._replace(stamps_s=stamps_s, points_m=own))
     measured_m = disagreement_m(found, found.lists._replace(points_m=other))
     assert measured_m == (None if expected_m is None else pytest.approx(1.41 * aside_m / 1.18, rel=0.1))
+
+
+@pytest.mark.parametrize("crowded", [False, True])
+def test_the_density_of_clutter_without_scores_is_that_around_clutter(crowded: bool) -> None:
+    """Ten false detections of each list, within 40 m of a point or anywhere in 2 km; three cars stand far away."""
+    rng, points_m = np.random.default_rng(2), []
+    for _ in range(200):
+        false_m = rng.uniform(-1000.0, 1000.0, 2 if crowded else (10, 2)) + rng.uniform(-20.0, 20.0, (10, 2)) * crowded
+        cars_m = 5000.0 + 300.0 * np.arange(3.0)[:, None] + rng.normal(0.0, 0.1, (3, 2))
+        points_m.append(np.concatenate([false_m, cars_m]))
+    ranges_m = [np.hypot(*each.T) for each in points_m]
+    found = persistence(Lists(0.5 * np.arange(200), points_m, [np.full(13, np.nan)] * 200, ranges_m))
+    assert found is not None
+    assert found.score is None
+    expected = 9.0 / (np.pi * 50.0**2) if crowded else 9.0 / 2000.0**2
+    assert found.near_clutter_per_m2 == pytest.approx(expected, rel=0.25)

@@ -38,9 +38,11 @@ _LISTS_OUT_OF_VIEW, _SILENCES = 2.5, 1.5
 """Periods of the slowest sensor, and longest silences of one, for which a track that is out of view lives on."""
 _LEAST_CLUTTER = 0.05
 """False detections of a list that can never be excluded."""
-_LEAST_SHARE, _OFFSET_S = 0.5, 30.0
-"""Share of time-correlated errors below which they are not modelled, and their correlation time: the offset of what a
+_LEAST_SHARE, _LARGEST_SHARE, _OFFSET_S = 0.5, 0.99, 30.0
+"""Bounds of the share of time-correlated errors: fewer are not modelled. Their correlation time: the offset of what a
 sensor sees of a hull changes with its aspect, within tens of seconds."""
+_HULLS = 2.0 * math.sqrt(12.0)
+"""Length of a long hull over the standard deviation, per axis, of the difference of two of its detections."""
 _LONGEST_S = 60.0
 """Of any window."""
 #: Standard deviation per step at 100 Hz, hence a density of 225 m^2/s^3. Singer's model (Estimating optimal tracking
@@ -169,7 +171,7 @@ def _lists(config: Config, covered: Coverages) -> Iterator[Assumption]:
         if one.scans and shown is not None and one.area_m2:
             reason = f"how its detections persist, of {len(shown.lines)} in three lists running"
             clutter_per_m2 = max(shown.clutter_per_list, _LEAST_CLUTTER) / one.area_m2
-            clutter_per_m2 = float(f"{max(clutter_per_m2, shown.near_clutter_per_m2 or 0.0):.2g}")
+            clutter_per_m2 = float(f"{max(clutter_per_m2, shown.near_clutter_per_m2):.2g}")
             score = shown.score and {
                 "even": float(f"{shown.score.even:.3g}"),
                 "scale": float(f"{shown.score.scale:.3g}"),
@@ -185,11 +187,20 @@ def _lists(config: Config, covered: Coverages) -> Iterator[Assumption]:
 
 
 def _claim(config: Config, covered: Coverages) -> Iterator[Assumption]:
-    """Yield that a track claims what is as near to it as sensors disagree, where that is more than they err."""
+    """Yield that a track claims what is as near to it as a hull is long, where sensors disagree by more than they err.
+    Two detections spread evenly over a hull of length l, in any direction, differ by l / sqrt(12) on each axis. Typical
+    objects show it; the hulls that are seen at both ends are twice as long.
+    Positions without boxes are of anything: what has not moved by three standard deviations is shore, or moored.
+    """
     apart_m = max((item.disagreement_m or 0.0 for item in covered.values()), default=0.0)
-    if apart_m > ASSUMED_STD["x_m"] and config.association == GatedMahalanobis():
-        reason = f"sensors disagree by {apart_m:.2g} m on each axis, as on large hulls"
-        yield Assumption(("association", "claim_m"), float(round(3.0 * apart_m)), reason)
+    if apart_m <= ASSUMED_STD["x_m"]:
+        return
+    reason = f"sensors disagree by {apart_m:.2g} m on each axis, as on large hulls"
+    if config.association == GatedMahalanobis():
+        yield Assumption(("association", "claim_m"), float(round(_HULLS * apart_m)), reason)
+    if config.lifecycle == ExistenceRules() and not any(item.boxes for item in covered.values()):
+        travel_m = float(round(3.0 * apart_m / math.sqrt(2.0)))
+        yield Assumption(("lifecycle", "min_travel_m"), travel_m, reason)
 
 
 def _offsets(config: Config, covered: Coverages) -> Iterator[Assumption]:
@@ -203,7 +214,7 @@ def _offsets(config: Config, covered: Coverages) -> Iterator[Assumption]:
         own_m = max(std["x_m"], one.persistence.std_m)
         std_m = float(f"{one.disagreement_m / math.sqrt(2.0):.2g}")
         if (1.0 - _LEAST_SHARE) * std_m**2 >= own_m**2:
-            correlation = {"share": round(1.0 - (own_m / std_m) ** 2, 2), "time_s": _OFFSET_S}
+            correlation = {"share": min(round(1.0 - (own_m / std_m) ** 2, 2), _LARGEST_SHARE), "time_s": _OFFSET_S}
             reason = f"it and another sensor disagree by {one.disagreement_m:.2g} m on each axis, as on large hulls"
             yield from _sensor(name, reason, std={**std, "x_m": std_m, "y_m": std_m}, correlation=correlation)
 

@@ -33,6 +33,7 @@ _WORDS: Mapping[str, Callable[[Any], str]] = {  # Any: of the key
     "lag_s": "smoothers keep {:g} s".format,
     "storage_s": "filters keep {:g} s".format,
     "claim_m": "nothing begins within {:g} m of a track".format,
+    "min_travel_m": "nothing is confirmed that has not moved by {:g} m".format,
     "ignore_sensors": lambda names: f"{', '.join(names)} left out",
     "field_of_view_rad": lambda rad: "sees all around" if rad >= math.tau else f"sees {math.degrees(rad):.0f} degrees",
     "view_range_m": "up to {:g} m".format,

@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from scipy.special import expit, log_expit
 
-from fgtrack.core.types import BoolArray, FloatArray
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.models.sensors import Score
 
 __all__ = ["Lists", "Persistence", "disagreement_m", "persistence"]
@@ -25,6 +25,8 @@ _FEWEST = 30
 _FEWEST_FAR = 5
 _BESIDE_M = np.array([20.0, 20.0])
 """Farther than the hull of any object but large ships."""
+_CROWD_M = 50.0
+"""Clutter comes in crowds, as of a shore or a hedge: what competes with a track is the clutter so near to clutter."""
 _CORE = 3.5
 """Second differences up to so many times their scale belong to one object: all but 0.2 % of a Rayleigh distribution."""
 _PROBABILITY = (0.1, 0.9)
@@ -55,8 +57,8 @@ class Persistence:
 
     detection_probability: float
     clutter_per_list: float
-    near_clutter_per_m2: float | None
-    """Clutter of the next list around clutter; None without `score`."""
+    near_clutter_per_m2: float
+    """Clutter around clutter: in the next list where scores tell it, else in the same list."""
     score: Score | None
     """Model of the scores; None if they are absent, or higher ones are not more often of an object."""
     max_range_m: float | None
@@ -125,13 +127,24 @@ def persistence(lists: Lists) -> Persistence | None:
     share = (hits + 1) / (2 * num_triples + 2)
     probability = float(np.clip(share, *_PROBABILITY))
     of_objects = min(num_triples / probability**2, float(len(misfit)))  # the others' neighbours were missed
-    model, near = _score(np.array(scores), of_object, ~in_triple), None
+    of_clutter, model = len(misfit) - of_objects, _score(np.array(scores), of_object, ~in_triple)
     if model is not None:
         near = _near_clutter_per_m2(trees, lists.scores, model, len(misfit) / max(of_objects, 1.0) - 1.0)
+    else:
+        near = _crowding_per_m2(points_m, np.array([k for k, *_ in lines]), ~in_triple, of_clutter)
     max_range_m = _max_range_m(np.array(ranges_m)[in_triple], of_object[in_triple] / probability**2)
     ends = [(stamps_s[k + 1], *end_m, *velocity_mps) for k, end_m, velocity_mps in compress(lines, in_triple)]
-    clutter = (len(misfit) - of_objects) / len(centres)
+    clutter = of_clutter / len(centres)
     return Persistence(probability, clutter, near, model, max_range_m, np.array(ends), scale, lists)
+
+
+def _crowding_per_m2(points_m: Sequence[FloatArray], numbers: IntArray, loose: BoolArray, of_clutter: float) -> float:
+    """Density of clutter around clutter in its list: `of_clutter` of the `loose` detections of the lists `numbers`."""
+    num_loose, pairs = max(int(loose.sum()), 1), 0
+    for k in np.unique(numbers[loose]).tolist():
+        tree = cKDTree(points_m[k][loose[numbers == k]])
+        pairs += int(tree.count_neighbors(tree, _CROWD_M)) - tree.n
+    return min(of_clutter / num_loose, 1.0) * pairs / (num_loose * math.pi * _CROWD_M**2)
 
 
 def _max_range_m(ranges_m: FloatArray, objects: FloatArray) -> float | None:
