@@ -112,6 +112,14 @@ def stamps(message: DetectionList, sensor: SensorModel) -> list[int]:
     return [message.stamp_ns if each.stamp_ns is None else each.stamp_ns for each in message.objects]
 
 
+_Origin = tuple[str, str | None, float | None, float | None]
+
+
+def _origin(sensor: str, detection: Detection) -> _Origin:
+    """Sensor, identity and position, which copies of one message have in common."""
+    return sensor, detection.id, detection.x_m, detection.y_m
+
+
 _values = attrgetter(*(each.name for each in fields(Detection)))
 
 
@@ -127,7 +135,7 @@ class Inbox:
         self._memory_ns = max([nanoseconds(memory_s), *self._max_delay_ns.values()])
         self._receipts_ns: dict[tuple[str, int, Frame, int], int] = {}  # of lists, in order of receipt
         self._pending: list[Batch] = []
-        self._originals: dict[tuple[str, str | None, float | None, float | None], DetectionList] = {}
+        self._originals: dict[_Origin, DetectionList] = {}
 
     def put(self, message: DetectionList) -> list[UpdateRecord]:
         """Receive a message; the records of detections that end here.
@@ -169,13 +177,18 @@ class Inbox:
         oldest_ns = message.receipt_ns - nanoseconds(copies_s)
         while self._originals and self._originals[first := next(iter(self._originals))].receipt_ns < oldest_ns:
             del self._originals[first]
-        key = message.sensor, item.id, item.x_m, item.y_m
+        key = _origin(message.sensor, item)
         original = self._originals.setdefault(key, message)
         if original is message:
             return False
         for row, batch in enumerate(self._pending):
-            if batch.message is original and len(batch.indices) == 1 and stamp_ns < batch.stamp_ns:
-                self._pending[row] = replace(batch, stamp_ns=stamp_ns)
+            if batch.message is not original or stamp_ns >= batch.stamp_ns:
+                continue
+            alike = tuple(i for i in batch.indices if _origin(message.sensor, original.objects[i]) == key)
+            rest = tuple(i for i in batch.indices if i not in alike)
+            self._pending[row] = replace(batch, indices=rest) if rest else replace(batch, stamp_ns=stamp_ns)
+            if rest and alike:
+                self._pending.append(Batch(original, stamp_ns, alike, last=False))
         return True
 
     def _is_copy(self, message: DetectionList, usable: Sequence[bool]) -> bool:

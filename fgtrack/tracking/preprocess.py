@@ -39,7 +39,7 @@ from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.inbox import Batch, record
 
 _FAR_M = 1e6
-_STEP_S = 1e-3  # short enough for any motion, long enough for float64
+_STEP_S = 1e-5  # short enough for any motion, long enough for float64
 
 
 class Candidate(NamedTuple):
@@ -70,17 +70,17 @@ class StampError(NamedTuple):
     std_s: float
 
     def rate(self, model: MeasurementModel, pose: SensorPose, x: FloatArray) -> FloatArray:
-        """Derivative of h(x) by the stamp at the states `x` (..., n), shape (..., k): H dx/dt."""
+        """Derivative v of h(x) by the stamp at the states `x` (..., n), shape (..., k)."""
         moved = model.predict(self.motion.predict(x, _STEP_S), pose)
         return model.residual(moved, model.predict(x, pose)) / _STEP_S
 
     def noise(self, model: MeasurementModel, pose: SensorPose, x: FloatArray, P: FloatArray) -> FloatArray:
-        """Covariance sigma_t^2 E[v v'] of v = H dx/dt, shape (m, k, k), at the states `x` (m, n) with covariances `P`.
-        E[v v'] = v(x) v(x)' + D P D' with D = dv/dx: the velocity of a new track is its uncertainty.
+        """Covariance sigma_t^2 E[v v'], shape (m, k, k), at the states `x` (m, n) with covariances `P`.
+        E[v v'] = v v' + D P D' with D = dv/dx, which is the derivative of H F by time: the velocity of a new track is
+        its uncertainty.
         """
-        v = self.rate(model, pose, x)
-        steps = 1e-3 * np.eye(x.shape[-1])
-        D = np.stack([(self.rate(model, pose, x + step) - v) / step.sum() for step in steps], axis=-1)
+        v, (moved, F, _) = self.rate(model, pose, x), self.motion.transition(x, _STEP_S)
+        D = (model.jacobian(moved, pose) @ F - model.jacobian(x, pose)) / _STEP_S
         return self.std_s**2 * (v[..., :, None] * v[..., None, :] + symmetrise(congruence(D, P)))
 
 

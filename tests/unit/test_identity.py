@@ -10,9 +10,11 @@ from fgtrack.calibration.tune_space import ConfigNoise
 from fgtrack.calibration.tune_stamps import fitted_stamps, with_stamps
 from fgtrack.core.types import Detection, DetectionList, Disposition
 from fgtrack.estimation.likelihood.fit import Problem
+from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.public import replay
 from fgtrack.pipeline.shipped import read_config
+from fgtrack.tracking.inbox import Inbox
 from fgtrack.tracking.objects import Evidence, Objects
 
 S = 10**9
@@ -116,6 +118,15 @@ def test_a_track_forgets_its_identity_with_its_end():
     objects.forget(0)
     assert not objects.is_stray(Detection(9.0, 9.0, id="AAA"))
     assert objects.evidence([Detection(9.0, 9.0, id="AAA")], [0], 1e-3) is None
+
+
+def test_a_copy_moves_the_stamp_of_its_detection_alone():
+    inbox = Inbox({"adsb": SensorModel(std={"x_m": 10.0, "y_m": 10.0}, scan=False, copies_s=5.0)})
+    both = Detection(1.0, 2.0, id="AAA"), Detection(3.0, 4.0, id="BBB")
+    inbox.put(DetectionList("adsb", 2 * S, 3 * S, both, "map"))
+    inbox.put(DetectionList("adsb", S, 4 * S, both[1:], "map"))
+    batches = inbox.collect()
+    assert [(batch.stamp_ns, batch.indices, batch.last) for batch in batches] == [(S, (1,), False), (2 * S, (0,), True)]
 
 
 def test_what_several_receivers_heard_is_one_measurement_with_the_earliest_stamp():

@@ -8,13 +8,14 @@ from hypothesis import strategies as st
 from support.tracking import StraightRoad, batch
 
 from fgtrack.core.geometry import rotation
-from fgtrack.core.types import Detection, Disposition, Frame
+from fgtrack.core.types import Detection, Disposition, FloatArray, Frame
+from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import Mount, SensorModel
 from fgtrack.tracking.detections import ConnectedMerge, Merge, NoMerge
 from fgtrack.tracking.ego import EgoPose
-from fgtrack.tracking.preprocess import Candidates, Preprocess
+from fgtrack.tracking.preprocess import Candidates, Preprocess, StampError
 from fgtrack.tracking.published import NeighbourhoodMerge
 
 LIDAR = SensorModel(std={"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.4}, mount=Mount(2.0, 1.0, math.pi / 2))
@@ -290,6 +291,28 @@ def test_noise_of_range_and_bearing_grows_too_and_a_covariance_of_its_own_does_n
     np.testing.assert_allclose(kept.measurement.R, 0.04 * np.eye(2), atol=1e-12)
     [bearing] = candidates(Detection(bearing_rad=0.1), sensor=replace(polar, std_growth={"bearing_rad": 0.1}))
     np.testing.assert_allclose(bearing.measurement.R, [[0.02**2]])  # how far it is, is not known
+
+
+# --- errors of stamps
+
+
+@pytest.mark.parametrize("names", [("x_m", "y_m"), ("range_m", "bearing_rad", "range_rate_mps")])
+def test_the_error_of_a_stamp_moves_an_object_by_its_velocity(names: tuple[str, ...]) -> None:
+    motion, pose, std_s = CTRV(), SensorPose(5.0, -3.0, 0.3, 10.0, 1.0), 0.02
+    model, x, P = (
+        measurement_model(names, motion),
+        np.array([40.0, 20.0, 0.7, 30.0, 0.2]),
+        np.diag([1.0, 2, 0.1, 3, 0.2]),
+    )
+
+    def rate(state: FloatArray) -> FloatArray:
+        ahead, behind = (model.predict(motion.predict(state, dt_s), pose) for dt_s in (1e-4, -1e-4))
+        return model.residual(ahead, behind) / 2e-4
+
+    D = np.stack([(rate(x + step) - rate(x - step)) / 2e-3 for step in 1e-3 * np.eye(5)], axis=-1)
+    [found] = StampError(motion, std_s).noise(model, pose, x[None], P[None])
+    v = rate(x)
+    np.testing.assert_allclose(found, std_s**2 * (np.outer(v, v) + D @ P @ D.T), rtol=1e-4)
 
 
 # --- several batches
