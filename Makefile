@@ -23,8 +23,9 @@ demo: $(RUN)
 
 # Importing compiles what numba has not kept yet; in two halves, else each worker would do all of it.
 test: $(TEST)
-	@$(BIN)/python -c 'import fgtrack.estimation.kernels.replay, fgtrack.estimation.kernels.euler, fgtrack.models.feet' & \
-	    $(BIN)/python -c 'import fgtrack.estimation.smoothing.node_kernels, fgtrack.tracking.kernels, fgtrack.tracking.visibility_kernels'; wait
+	@$(BIN)/python -c 'import fgtrack.estimation.kernels.replay, fgtrack.estimation.kernels.euler, fgtrack.models.feet, \
+	    fgtrack.tracking.kernels, fgtrack.tracking.visibility_kernels' & \
+	    $(BIN)/python -c 'import fgtrack.estimation.smoothing.node_kernels'; wait
 	$(BIN)/python -m pytest -n auto $(BY_FILE)
 
 # The tests of the core: within a minute of processor time.

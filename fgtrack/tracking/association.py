@@ -221,7 +221,8 @@ def innovations(
         own = group.seen_at(members, x, P, columns)
         y, H = own.model.linearised(own.z, x, own.pose)
         H = np.array(H, ndmin=3, order="C")
-        nis, logdet = kernels("fgtrack.tracking.kernels").innovations(y, H, P, columns, own.R)
+        every = np.arange(y.shape[1])
+        _, nis, logdet = kernels("fgtrack.estimation.kernels.kalman").innovations(y, H, P, columns, own.R, every)
         parts.append((chosen, nis, logdet, y.shape[-1]))
     return parts
 

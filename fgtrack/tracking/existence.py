@@ -235,5 +235,6 @@ def position_densities(candidates: Candidates, chosen: IntArray, means: FloatArr
     for group, members, here in candidates.split(chosen):
         R[here] = group.position_covariances(members)
     own, H = np.array(P[:, :2, :2], dtype=np.float64, order="C"), np.eye(2)[None]
-    nis, logdet = kernels("fgtrack.tracking.kernels").innovations(y, H, own, np.arange(len(y)), R)
+    rows = np.arange(len(y)), R, np.arange(y.shape[1])
+    _, nis, logdet = kernels("fgtrack.estimation.kernels.kalman").innovations(y, H, own, *rows)
     return np.asarray(np.exp(-0.5 * (nis + logdet)) / math.tau)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from fgtrack.core.checks import LARGEST
-from fgtrack.core.compiled import add_congruence, cholesky, copy, njit, whiten, wrapped
+from fgtrack.core.compiled import add_congruence, cholesky, njit, wrapped
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.models.measurement import COMPONENTS
 
@@ -201,26 +201,6 @@ def are_apart(points: FloatArray, by_x: IntArray, starts: IntArray, distance: fl
                 dx, dy = points[by_x[b], 0] - points[i, 0], points[by_x[b], 1] - points[i, 1]
                 apart[k], b = dx * dx + dy * dy > distance * distance, b + 1
     return apart
-
-
-@njit("(float64[:, ::1], float64[:, :, ::1], float64[:, :, ::1], int64[:], float64[:, :, ::1])")
-def innovations(
-    y: FloatArray, H: FloatArray, P: FloatArray, tracks: IntArray, R: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """NIS y' S^-1 y and log det S with S = H P H' + R of pairs, shapes (m,); NaN where S has no root.
-    Innovations y (m, k), Jacobians H (m, k, n) or (1, k, n), covariances P (tracks, n, n), R (m, k, k).
-    """
-    m, k = y.shape
-    nis, logdet, S, HP, white = np.empty(m), np.zeros(m), np.empty((k, k)), np.empty((k, P.shape[1])), np.empty(k)
-    for i in range(m):
-        copy(R[i], S)
-        add_congruence(H[min(i, len(H) - 1)], P[tracks[i]], HP, S)
-        for a in range(k):
-            white[a] = y[i, a]
-        nis[i] = whiten(S, white)
-        for a in range(k):
-            logdet[i] += 2.0 * math.log(S[a, a])
-    return nis, logdet
 
 
 @njit("int64[::1](float64[:, ::1], float64[:, :, ::1])")

@@ -10,6 +10,7 @@ from fgtrack.core.compiled import (
     inlined,
     njit,
     product,
+    shared,
     solve,
     whiten,
 )
@@ -28,7 +29,7 @@ def marginal_nis(S: FloatArray, y: FloatArray, rows: IntArray, root: FloatArray,
     return whiten(root, white[: len(rows)])
 
 
-@inlined
+@shared(f"b1(float64[::1], {'float64[:, ::1], ' * 4}float64[::1], float64[:, ::1], float64[:, ::1])")
 def conclude(
     mean: FloatArray,
     P: FloatArray,
@@ -54,6 +55,25 @@ def conclude(
         for b in range(n):
             total += abs(P[a, b])
     return total < np.inf
+
+
+@njit(f"({_VECTORS}, {_MATRICES}, {_MATRICES}, int64[:], {_MATRICES}, int64[::1])")
+def innovations(
+    y: FloatArray, H: FloatArray, P: FloatArray, tracks: IntArray, R: FloatArray, rows: IntArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return S = H P H' + R (m, k, k) of innovations y (m, k), and of their `rows` the NIS and log det S, shapes (m,).
+    NaN where S has no root. Jacobians H (m, k, n) or (1, k, n), covariances P (tracks, n, n), R (m, k, k).
+    """
+    m, k = y.shape
+    S, nis, logdet = np.empty((m, k, k)), np.empty(m), np.zeros(m)
+    root, HP, white = np.empty((k, k)), np.empty((k, P.shape[1])), np.empty(k)
+    for i in range(m):
+        copy(R[i], S[i])
+        add_congruence(H[min(i, len(H) - 1)], P[tracks[i]], HP, S[i])
+        nis[i] = marginal_nis(S[i], y[i], rows, root, white)
+        for a in range(len(rows)):
+            logdet[i] += 2.0 * np.log(root[a, a])
+    return S, nis, logdet
 
 
 @njit(f"({_MATRICES}, {_MATRICES}, {_MATRICES})")

@@ -15,7 +15,7 @@ from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
 from fgtrack.estimation.filters.propagation import kinematic_states
-from fgtrack.estimation.smoothing.node_kernels import innovations
+from fgtrack.estimation.kernels.kalman import innovations
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.models.motion import MotionModel
@@ -126,8 +126,7 @@ class SmootherBank:
             y, H = alike.model.linearised(alike.z, means, alike.pose)
             H, R = (np.array(each, dtype=np.float64, order="C", ndmin=3) for each in (H, alike.R))
             measured = np.arange(y.shape[1]) if alike.measured is None else np.array(alike.measured)
-            S, nis, times = np.empty(R.shape), np.empty(len(y)), self._windows(tracks)
-            innovations(states.covariances, of, y, H, R, measured, S, nis)
+            (S, nis, _), times = innovations(y, H, states.covariances, of, R, measured), self._windows(tracks)
             usable = np.isfinite(nis).nonzero()[0]
             fused = self._fuse(usable, tracks, alike, y, H, means, R, times[3]) if usable.size else usable
             rows = list(zip(group, y, nis.tolist(), S, *times[:2].tolist(), strict=True))

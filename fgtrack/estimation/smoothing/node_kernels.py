@@ -2,10 +2,9 @@
 
 import numpy as np
 
-from fgtrack.core.compiled import add_congruence, cholesky, copy, inlined, njit
+from fgtrack.core.compiled import cholesky, copy, inlined, njit
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.kernels.kalman import marginal_nis
 from fgtrack.estimation.smoothing.kernels import (
     BEGIN_NS,
     CHANGED,
@@ -77,28 +76,6 @@ def windows(tracks: IntArray, clock_ns: int, lag_ns: int, behind_ns: int, nodes:
         out[3, t] = max(info[track, FIRST], last_before(all_ns[track], info[track, COUNT], start_ns))
         most = max(most, info[track, COUNT])
     return most
-
-
-@njit(f"void({MATRICES}, {INDICES}, {VECTORS}, {MATRICES}, {MATRICES}, {INDICES}, {MATRICES}, {TIMES})")
-def innovations(
-    P: FloatArray,
-    of: IntArray,
-    y: FloatArray,
-    H: FloatArray,
-    R: FloatArray,
-    measured: IntArray,
-    S: FloatArray,
-    nis: FloatArray,
-) -> None:
-    """Write S = H P H' + R (m, k, k) of innovations y (m, k), P being that of row `of`, and the NIS of the `measured`
-    ones; NaN where it has no root. H is (1, k, n) or (m, k, n).
-    """
-    k = y.shape[1]
-    HP, root, white = np.empty((k, P.shape[1])), np.empty((k, k)), np.empty(k)
-    for i in range(len(y)):
-        copy(R[i], S[i])
-        add_congruence(H[min(i, len(H) - 1)], P[of[i]], HP, S[i])
-        nis[i] = marginal_nis(S[i], y[i], measured, root, white)
 
 
 @inlined
