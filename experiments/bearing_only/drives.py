@@ -231,7 +231,7 @@ def _difference(ekf: Matching | None, smoother: Matching | None) -> str:
     common = sorted(squares[0].keys() & squares[1].keys())
     samples = np.array([[square[key] for square in squares] for key in common])
     ticks = by_stamp(np.array([key[0] for key in common]), samples)
-    found = within_run(ticks, lambda S: np.sqrt(S[1] / S[2]) - np.sqrt(S[0] / S[2]), np.random.default_rng(0))
+    found = within_run(ticks, lambda S: np.sqrt(S[1] / S[2]) - np.sqrt(S[0] / S[2]))
     return f"{found:+.4f}"
 
 

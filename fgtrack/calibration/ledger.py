@@ -432,13 +432,11 @@ def _sums(before: FloatArray, after: FloatArray, common: BoolArray) -> FloatArra
 
 
 def _difference(before: FloatArray, after: FloatArray, common: BoolArray) -> Estimate:
-    rng = np.random.default_rng(0)
-    return within_run(_sums(before, after, common), lambda S: (S[0] - S[1]) / S[2], rng)
+    return within_run(_sums(before, after, common), lambda S: (S[0] - S[1]) / S[2])
 
 
 def _rms_difference(before: FloatArray, after: FloatArray, common: BoolArray) -> Estimate:
-    rng = np.random.default_rng(0)
-    return within_run(_sums(before, after, common), lambda S: np.sqrt(S[0] / S[2]) - np.sqrt(S[1] / S[2]), rng)
+    return within_run(_sums(before, after, common), lambda S: np.sqrt(S[0] / S[2]) - np.sqrt(S[1] / S[2]))
 
 
 def _sentence(parts: Sequence[Part], sensors: Table) -> str:

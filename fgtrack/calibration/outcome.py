@@ -57,7 +57,7 @@ def noise_fits(run: Run) -> list[NoiseFit]:
         if not mine.any():
             continue
         samples = np.stack([updates["nis"][mine], dof[mine].astype(np.float64)], axis=-1)
-        ratio = mean_square(by_stamp(updates["stamp_ns"][mine], samples), np.random.default_rng(0))
+        ratio = mean_square(by_stamp(updates["stamp_ns"][mine], samples))
         white = autocorrelation(updates.where(updates["sensor"] == sensor))
         fits.append(NoiseFit(sensor, int(mine.sum()), ratio, None if white is None else white.lag1))
     return fits

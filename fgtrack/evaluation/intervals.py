@@ -1,4 +1,4 @@
-"""Confidence intervals of 95 %: of differences paired over seeds (t interval), and within one run (block bootstrap)."""
+"""Confidence intervals of 95 %: of differences paired over seeds, and within one run, whose errors are correlated."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -10,10 +10,10 @@ from scipy.special import stdtrit
 from fgtrack.core.types import FloatArray, IntArray
 
 _UPPER = 0.975  # quantile of a two-sided 95 % interval
-_DRAWS = 1000
-_MOST_PIECES = 400  # of a run; finer ones would only make the search for the block length depend on the tick rate
+_MOST_PIECES = 400  # of a run; finer ones would only make the correlation length depend on the tick rate
 _FEWEST_PIECES = 8
-_FEWEST_BLOCKS = 3
+_FEWEST_COSINES = 4
+_LENGTHS = 5.0  # correlation lengths in a run for each cosine
 _IN_A_ROW = 5  # insignificant correlations that end the search for significant ones
 _STEP = 1e-5  # relative, of the numerical gradient
 #: A number from sums over time: takes shape (k, ...), gives shape (...).
@@ -28,7 +28,7 @@ class Estimate:
     low: float
     high: float
     count: int
-    """Independent samples: seeds, or blocks of a run."""
+    """Independent samples: seeds, or degrees of freedom of a run and one."""
 
     @property
     def is_significant(self) -> bool:
@@ -64,15 +64,16 @@ def average(values: Sequence[float] | FloatArray) -> Estimate:
     return _t_interval(float(known.mean()), error, len(known))
 
 
-def within_run(ticks: FloatArray, statistic: Statistic, rng: np.random.Generator) -> Estimate:
-    """The `statistic` of the sums of `ticks` over time and its 95 % interval by a circular block bootstrap.
-    `ticks`, shape (n, k), are in order of time; `statistic` takes sums, shape (k, draws), and gives shape (draws,). A
-    root mean square is sqrt(S[0] / S[1]) of the sums S of squared errors and counts.
+def within_run(ticks: FloatArray, statistic: Statistic) -> Estimate:
+    """The `statistic` of the sums of `ticks` over time and its 95 % interval.
+    `ticks`, shape (n, k), are in order of time; `statistic` takes sums, shape (k, m), and gives shape (m,). A root mean
+    square is sqrt(S[0] / S[1]) of the sums S of squared errors and counts.
 
-    Blocks of ticks, whose errors are correlated, are drawn with replacement, the end of the run joined to its beginning
-    (Politis & Romano 1992). The interval is theta +- t(m - 1) s sqrt(m / (m - 1)), with s the standard deviation of the
-    drawn statistics and m, the `count` of the result, the number of blocks (of `block_length` of the influence of each
-    tick) that fit into the run; quantiles of the draws would be too narrow. Of fewer than eight ticks it is unknown.
+    Ticks, whose errors are correlated, add x_t to first order. The variance of their sum is the mean of 2 (sum of x_t
+    cos(pi j (t + 1/2) / n))^2 over j = 1 ... B (equal-weighted cosines), with Student's t for B degrees of freedom:
+    Lazarus, Lewis, Stock & Watson 2018 (Journal of Business & Economic Statistics 36(4)), after Mueller 2007 (Journal
+    of Econometrics 141(2)). B is a fifth of the `correlation_length`s in the run, at least 4, so that the spectrum is
+    flat over these frequencies. Of fewer than eight ticks it is unknown.
     """
     sums, size = ticks.sum(axis=0), max(1, math.ceil(len(ticks) / _MOST_PIECES))
     pieces = np.add.reduceat(ticks, np.arange(0, len(ticks), size), axis=0) if len(ticks) else ticks
@@ -83,21 +84,15 @@ def within_run(ticks: FloatArray, statistic: Statistic, rng: np.random.Generator
             return Estimate(value, math.nan, math.nan, n)
         steps = np.diag(_STEP * sums)
         change = statistic((sums + steps).T) - statistic((sums - steps).T)  # 0 for a sum of 0: nothing adds to it
-        gradient = np.divide(change, 2.0 * _STEP * sums, out=np.zeros_like(sums), where=sums != 0.0)
-        length = block_length(pieces @ gradient)
-        below = np.concatenate([np.zeros((1, len(sums))), np.cumsum(np.concatenate([pieces, pieces]), axis=0)])
-        starts = rng.integers(0, n, (_DRAWS, math.ceil(n / length)))  # as many pieces in all as there are
-        rest = n - (starts.shape[1] - 1) * length
-        block_sums, rest_sums = (below[of : of + n] - below[:n] for of in (length, rest))
-        drawn = statistic((block_sums[starts[:, :-1]].sum(axis=1) + rest_sums[starts[:, -1]]).T)
-    blocks = n / length
-    error = float(np.nanstd(drawn)) * math.sqrt(blocks / (blocks - 1.0))
-    return _t_interval(value, error, blocks)
+    x = pieces @ np.divide(change, 2.0 * _STEP * sums, out=np.zeros_like(sums), where=sums != 0.0)
+    freedom = min(max(int(n / (_LENGTHS * correlation_length(x))), _FEWEST_COSINES), n // 4)
+    cosines = np.cos(math.pi / n * np.outer(np.arange(1, freedom + 1), np.arange(n) + 0.5))
+    return _t_interval(value, math.sqrt(2.0 * float(np.square(cosines @ x).mean())), freedom + 1)
 
 
-def mean_square(ticks: FloatArray, rng: np.random.Generator) -> Estimate:
+def mean_square(ticks: FloatArray) -> Estimate:
     """S[0] / S[1] of the sums S of `ticks`, see `within_run`; the interval is that of the logarithm, so positive."""
-    log = within_run(ticks, lambda S: np.log(S[0] / S[1]), rng)
+    log = within_run(ticks, lambda S: np.log(S[0] / S[1]))
     with np.errstate(over="ignore"):
         mean, low, high = np.exp([log.mean, log.low, log.high]).tolist()
     return Estimate(mean, low, high, log.count)
@@ -111,31 +106,25 @@ def by_stamp(stamps_ns: IntArray, samples: FloatArray) -> FloatArray:
     return np.stack([np.bincount(index[known], column, len(distinct)) for column in columns], axis=-1)
 
 
-def block_length(values: FloatArray) -> int:
-    """Length of the blocks of a circular bootstrap for the mean of `values`, shape (n,), at most n / 3.
-    The rule of Politis & White 2004 (Econometric Reviews 23) as corrected by Patton, Politis & White 2009:
-    (2 G^2 / D)^(1/3) n^(1/3) with G = sum |k| R(k) and D = 4/3 (sum R(k))^2 over the flat-top window of the
-    autocovariances R, whose width is twice the lag from which on five correlations in a row are insignificant; n / 3
-    where there is no such lag below n / 4.
+def correlation_length(values: FloatArray) -> float:
+    """Sum of the autocorrelations of `values`, shape (n,), over positive and negative lags; between 1 and n.
+    Of the flat-top window of Politis & White 2004 (Econometric Reviews 23), whose width is twice the lag from which on
+    five correlations in a row are insignificant; n where there is no such lag below n / 4.
     """
     n = len(values)
     centred = values - values.mean()
     spectrum = np.fft.rfft(centred, 2 * n)
     R = np.fft.irfft(spectrum.real**2 + spectrum.imag**2)[:n] / n
     if not R[0] > 0.0:
-        return 1
+        return 1.0
     small = (np.abs(R[1:]) < 2.0 * math.sqrt(math.log10(n) / n) * R[0]).tolist()
     last = next((k for k in range(n // 4) if all(small[k : k + _IN_A_ROW])), None)
     if last is None:
-        return n // _FEWEST_BLOCKS
+        return float(n)
     width = min(2 * max(last, 1), n // 2)
     lags = np.arange(1, width + 1)
     weighted = 2.0 * np.minimum(1.0, 2.0 * (1.0 - lags / width)) * R[1 : width + 1]
-    total = float(R[0] + weighted.sum())
-    if not total > 0.0:  # anticorrelated: single values are the safe blocks
-        return 1
-    length: float = (1.5 * (float((lags * weighted).sum()) / total) ** 2 * n) ** (1.0 / 3.0)
-    return min(max(math.ceil(length), 1), n // _FEWEST_BLOCKS)
+    return min(max(1.0 + float(weighted.sum() / R[0]), 1.0), float(n))
 
 
 def _t_interval(mean: float, error: float, count: float) -> Estimate:

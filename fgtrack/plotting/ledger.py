@@ -29,7 +29,7 @@ def waterfall(parts: Sequence[tuple[str, float]], title: str, **paper: Unpack[Pa
         own = colour or (SENSORS[0] if length > 0.0 else SENSORS[1])
         axes.barh(row, length, left=start, height=_HEIGHT, color=own)
         rms = math.sqrt(start + length) if colour else math.sqrt(max(start, 0.0))
-        label = f"{rms:.2f} m" if colour else f"{100.0 * length / ends[0]:+.0f} %, {rms:.2f} m left"
+        label = f"{rms:.2f} m" if colour else f"{100.0 * length / ends[0] + 0.0:.0f} % of it; without: {rms:.2f} m"
         axes.text(max(start, start + length) + 0.01 * max(ends), row, label, va="center")
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(len(names) - 0.4, -0.6)

@@ -17,8 +17,6 @@ from fgtrack.io.run import Run, Table
 WINDOW: Literal["window"] = "window"
 """The lag of a final state: the window's length, or less where the track ended before."""
 
-_SEED = 1  # of the bootstrap: the same run gives the same interval
-
 
 @dataclass(frozen=True)
 class LagMetrics:
@@ -66,9 +64,7 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
         present = matching.tracks.where(rows)
         of_states, of_present = state_errors(states, truth), state_errors(present, matching.true_states[rows])
         squares = np.square(np.stack([of_states["position_m"], of_present["position_m"]], axis=-1))
-        reduction = within_run(
-            by_stamp(states["stamp_ns"], squares), lambda S: 1.0 - np.sqrt(S[0] / S[1]), np.random.default_rng(_SEED)
-        )
+        reduction = within_run(by_stamp(states["stamp_ns"], squares), lambda S: 1.0 - np.sqrt(S[0] / S[1]))
         nees = Moments.of(position_squares(states, truth))
         result.append(LagMetrics(lag_s, _moments(of_states), nees, _moments(of_present), reduction))
     return tuple(result)
