@@ -18,6 +18,7 @@ pytestmark = pytest.mark.slow
 #: Script, options of a short run, what else makes it short, and the rows of its table; a name for the rest.
 SHORT: dict[str, tuple[dict[str, Any], dict[str, Any], str, int]] = {
     "association": ({"runs": 2, "duration_s": 2.0}, {}, "judged.csv", 0),
+    "association/crossings": ({"runs": 2, "duration_s": 2.5, "jobs": 1}, {}, "crossings.csv", 2 * 5),
     "births": ({"objects": 3}, {}, "births.csv", 0),
     "bounds": ({"runs": 2, "duration_s": 3.3, "estimators": "ekf-replay,drop"}, {}, "bounds.csv", 0),
     "doppler": ({"runs": 2}, {"DURATION_S": 1.3, "NAMES": ("ekf-replay", "smoother")}, "doppler.csv", 2 * 5 * 2),
