@@ -66,6 +66,19 @@ def test_the_present_lies_between_grid_stamps_and_its_yaw_is_wrapped() -> None:
     assert state.mean[2] == pytest.approx(-math.pi - 1e-4 + 0.0014)
 
 
+def test_a_full_storage_forgets_the_oldest_states_alone() -> None:
+    short, long = bank(storage_steps=4), bank(storage_steps=50)
+    for made in (short, long):
+        made.birth(0, prior(START_NS))
+        for step in range(1, 20):
+            made.advance(START_NS + step * STEP_NS)
+            made.update(made.present_ns, [0], [position(made.present_ns, 0.4 * step)])
+    for back in range(4):
+        mine, theirs = (made.states_at(made.present_ns - back * STEP_NS) for made in (short, long))
+        assert np.array_equal(mine.means, theirs.means)
+    assert short.states_at(short.present_ns - 4 * STEP_NS).track_ids == ()
+
+
 def test_a_measurement_that_cannot_be_fused_fails_alone_and_changes_nothing() -> None:
     made = bank()
     for track_id in range(3):

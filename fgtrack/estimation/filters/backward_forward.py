@@ -45,7 +45,7 @@ class BackwardForwardBank:
         self._order: IntArray | None = None  # of all tracks by birth, until one comes or goes
         self._free = list[int]()
         self._arrays = list[Any]()
-        self._make_room([])
+        self._allocate(8)
         self._cached: dict[int, StatesAt] = {}  # by grid index; valid until anything changes
 
     @property
@@ -139,7 +139,8 @@ class BackwardForwardBank:
         """Start an object on the grid stamp nearest to its first detection."""
         back = max(round((self._grid_ns - prior.stamp_ns) / self._step_ns), 0)
         start = self._grid - back
-        self._make_room([])
+        if not self._free:
+            self._allocate(2 * len(self._rows))
         row, state = self._free.pop(), initial_state(self._propagator.motion, prior)
         anchors, states, windows = self._arrays
         anchors[row, 0], windows[row] = start, (1, start, prior.stamp_ns)
@@ -157,34 +158,21 @@ class BackwardForwardBank:
         self, back: int, stamp_ns: int, track_ids: Sequence[int], corrected: Correction[FloatArray]
     ) -> list[int]:
         """Store corrected states at `back` steps ago; return the codes of their status."""
-        rows = [self._rows[track_id] for track_id in track_ids]
-        self._make_room(rows)
-        at = self._grid - back, self._visible_from(back), stamp_ns, np.array(rows)
+        rows = np.array([self._rows[track_id] for track_id in track_ids])
+        at = self._oldest, self._grid - back, self._visible_from(back), stamp_ns, rows
         states = self._propagator.wrap(corrected.mean), corrected.covariance
         codes: list[int] = self._kernels.store(*at, corrected.fused, *states, *self._arrays).tolist()
         return codes
 
-    def _make_room(self, rows: Sequence[int]) -> None:
-        """Let there be a free row, and a free slot in `rows`; anchors before the oldest state, but the last, go."""
-        num_rows, slots = self._arrays[0].shape[:2] if self._arrays else (0, 16)
-        full = [row for row in rows if self._arrays[2][row, 0] == slots]
-        for row in full:
-            anchors, states, windows = (array[row] for array in self._arrays)
-            gone = max(int(np.searchsorted(anchors[:, 1], max(self._oldest, windows[1]), side="right")) - 1, 0)
-            windows[0] -= gone
-            anchors[: windows[0]], states[: windows[0]] = anchors[gone:].copy(), states[gone:].copy()
-        is_full, n = any(self._arrays[2][row, 0] == slots for row in full), self._propagator.motion.dim
-        if is_full or not self._free:
-            shape = (num_rows if self._free else 2 * num_rows + 8), slots * (1 + is_full)
-            arrays = [
-                np.zeros((*shape, 2), dtype=np.int64),
-                np.zeros((*shape, n + 1, n)),
-                np.zeros((shape[0], 3), np.int64),
-            ]
-            self._free += range(num_rows, shape[0])
-            for new, present in zip(arrays, self._arrays, strict=bool(self._arrays)):
-                new[tuple(map(slice, present.shape))] = present
-            self._arrays = arrays
+    def _allocate(self, rows: int) -> None:
+        """Make arrays of so many rows with the present contents. An anchor for each step, and two beyond the ends."""
+        slots, n, num = self._length + 2, self._propagator.motion.dim, len(self._arrays[0]) if self._arrays else 0
+        shapes = (rows, slots, 2), (rows, slots, n + 1, n), (rows, 3)
+        arrays = [np.zeros(shape, dtype) for shape, dtype in zip(shapes, (np.int64, np.float64, np.int64), strict=True)]
+        for new, present in zip(arrays, self._arrays, strict=bool(self._arrays)):
+            new[:num] = present
+        self._arrays = arrays
+        self._free += range(num, rows)
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; the part of a step beyond the newest grid stamp is predicted."""

@@ -7,7 +7,7 @@ ascending order, the grid index before which the track is unknown, and the newes
 
 import numpy as np
 
-from fgtrack.core.compiled import copy, njit
+from fgtrack.core.compiled import copy, inlined, njit
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 
 FAILED, IN_SEQUENCE, OUT_OF_SEQUENCE = range(3)
@@ -40,8 +40,21 @@ def look_up(
         copy(states[row, j, 1:], covariances[i])
 
 
-@njit(f"(int64, int64, int64, int64[::1], b1[::1], float64[:, ::1], float64[:, :, ::1], {_STORAGE})")
+@inlined
+def _forget(oldest: int, anchors: IntArray, states: FloatArray, window: IntArray) -> None:
+    """Move the last anchor that a look-up of `oldest` finds, and those after it, to the front."""
+    gone = 0
+    while gone + 1 < window[0] and anchors[gone + 1, 1] <= max(oldest, window[1]):
+        gone += 1
+    window[0] -= gone
+    for j in range(window[0]):
+        anchors[j, 0], anchors[j, 1] = anchors[j + gone, 0], anchors[j + gone, 1]
+        copy(states[j + gone], states[j])
+
+
+@njit(f"(int64, int64, int64, int64, int64[::1], b1[::1], float64[:, ::1], float64[:, :, ::1], {_STORAGE})")
 def store(
+    oldest: int,
     grid: int,
     visible_from: int,
     stamp_ns: int,
@@ -54,12 +67,14 @@ def store(
     windows: IntArray,
 ) -> IntArray:
     """Add an anchor of the measurement at `stamp_ns` to each of `rows` (m,) in which it was `fused`; return the status.
-    The anchor replaces all that was stored at and after it.
+    The anchor replaces all that was stored at and after it; where there is no free slot, those before `oldest` go.
     """
     status = np.full(len(rows), FAILED)
     for i in range(len(rows)):
         if fused[i]:
             row, window = rows[i], windows[rows[i]]
+            if window[0] == anchors.shape[1]:
+                _forget(oldest, anchors[row], states[row], window)
             j = window[0]
             while j > 0 and anchors[row, j - 1, 1] >= visible_from:
                 j -= 1
