@@ -156,6 +156,17 @@ def cholesky(S: FloatArray, n: int, L: FloatArray) -> bool:
     return True
 
 
+@shared(f"void({_READ}, {_MATRIX})")
+def forward(L: FloatArray, columns: FloatArray) -> None:
+    """Overwrite columns (n, m) by L^-1 columns, L (n, n) being lower triangular."""
+    for i in range(len(columns)):
+        for k in range(i):
+            for c in range(columns.shape[1]):
+                columns[i, c] -= L[i, k] * columns[k, c]
+        for c in range(columns.shape[1]):
+            columns[i, c] /= L[i, i]
+
+
 @shared(f"b1({_MATRIX}, {_MATRIX})")
 def solve(S: FloatArray, columns: FloatArray) -> bool:
     """Overwrite columns (n, m) by S^-1 columns, and the first n rows and columns of S by their Cholesky factor.
@@ -164,12 +175,7 @@ def solve(S: FloatArray, columns: FloatArray) -> bool:
     n = len(columns)
     if not cholesky(S, n, S):
         return False
-    for i in range(n):
-        for k in range(i):
-            for c in range(columns.shape[1]):
-                columns[i, c] -= S[i, k] * columns[k, c]
-        for c in range(columns.shape[1]):
-            columns[i, c] /= S[i, i]
+    forward(S, columns)
     for i in range(n - 1, -1, -1):
         for k in range(i + 1, n):
             for c in range(columns.shape[1]):

@@ -61,9 +61,7 @@ def _short_arc(x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F
     accel, q_accel = (x[5], density[5] * t) if n > 5 else (0.0, 0.0)
     q_yaw, q_speed, q_rate = density[2] * t, density[3] * t, density[4] * t
     w, v, a = -x[4] * t, x[3] + accel * t, accel * t
-    unit, scaled, moments, used = np.empty(38), np.empty(16), np.empty((2, 8), np.complex128), 16 if n == 5 else 38
-    for p in range(38):
-        unit[p] = 0.0
+    unit, scaled, moments, used = np.zeros(38), np.empty(16), np.empty((2, 8), np.complex128), 16 if n == 5 else 38
     for k in range(_TERMS - 1, -1, -1):
         for p in range(used):
             unit[p] = unit[p] * (w * w) + _SERIES[k, p]

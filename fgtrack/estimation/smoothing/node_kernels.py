@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fgtrack.core.compiled import cholesky, copy, inlined, njit
+from fgtrack.core.compiled import cholesky, copy, forward, inlined, njit
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.smoothing.kernels import (
@@ -139,16 +139,6 @@ def _insert(track: int, index: int, stamp_ns: int, mean: FloatArray, nodes: Arra
 
 
 @inlined
-def _whiten(L: FloatArray, rows: FloatArray) -> None:
-    """Overwrite rows by L^-1 rows, L being lower triangular."""
-    for j in range(rows.shape[1]):
-        for i in range(len(rows)):
-            for m in range(i):
-                rows[i, j] -= L[i, m] * rows[m, j]
-            rows[i, j] /= L[i, i]
-
-
-@inlined
 def _observe(
     at: int, y: FloatArray, H: FloatArray, R: FloatArray, mean: FloatArray, nodes: Arrays, L: FloatArray
 ) -> bool:
@@ -164,7 +154,7 @@ def _observe(
     labels[at, NUM_ROWS], labels[at, CHANGED] = labels[at, NUM_ROWS] + k, 1
     if not cholesky(R, k, L):
         return False
-    _whiten(L, own)
+    forward(L, own)
     return True
 
 
@@ -274,6 +264,6 @@ def changed_factors(track: int, start: int, nodes: Arrays, owners: IntArray, fac
                 for j in range(n):
                     own[i, j], own[i, n + j] = motion[i, j], -1.0 if i == j else 0.0
                     own[i, 2 * n] += motion[i, j] * moved[j]
-            _whiten(L, own)
+            forward(L, own)
         num += 1
     return num
