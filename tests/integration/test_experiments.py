@@ -96,3 +96,13 @@ def test_forgotten_positions_cost_backward_forward_more(tmp_path: Path) -> None:
     assert [row["estimator"] for row in rows] == list(late.ESTIMATORS)
     *others, forgets = (float(row["cost_m"].split()[0]) for row in rows)
     assert all(0.0 < other < forgets for other in others)
+
+
+def test_a_late_camera_costs_most_where_prompt_positions_are_forgotten(tmp_path: Path) -> None:
+    late = load("late_sensors")
+    late.main(kitti=shared("data/kitti"), out=tmp_path, recordings="0006", late="rrc_car", delays_s="0.3")
+    forgets, *others, drop = table(tmp_path / "late_sensors.csv")
+    assert [row["estimator"] for row in (forgets, *others, drop)] == list(dict.fromkeys(sum(late.GROUPS, ())))
+    for row in (*others, drop):
+        assert float(row["rmse_m"]) < float(forgets["rmse_m"])
+        assert float(row["less_backward_forward_m"].split(" to ")[1].rstrip(")")) < 0.0
