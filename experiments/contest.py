@@ -26,7 +26,6 @@ HERE = Path(__file__).parent
 
 #: By script: the question, and the options of a quick run.
 SCRIPTS: Mapping[str, tuple[str, Sequence[str]]] = {
-    "fitted_noise/fitted_noise.py": ("noise that does not fit", ("--seeds", "2", "--duration-s", "10")),
     "births/births.py": ("initiation", ("--objects", "20")),
     "outliers/outliers.py": ("robust losses", ("--runs", "2")),
     "ego_uncertainty/ego_uncertainty.py": ("uncertainty of the ego", ("--runs", "2")),

@@ -23,7 +23,6 @@ SHORT: dict[str, tuple[dict[str, Any], dict[str, Any], str, int]] = {
     "bounds": ({"runs": 2, "duration_s": 3.3, "estimators": "ekf-replay,drop"}, {}, "bounds.csv", 0),
     "doppler": ({"runs": 2}, {"DURATION_S": 1.3, "NAMES": ("ekf-replay", "smoother")}, "doppler.csv", 2 * 5 * 2),
     "ego_uncertainty": ({"runs": 2, "duration_s": 2.5}, {"COUNTS": (2,)}, "ego_uncertainty.csv", 0),
-    "fitted_noise": ({"seeds": 2, "duration_s": 2.0}, {}, "runs.csv", 2 * 3 * 2),
     "ladder": ({"runs": 2, "lags": "1,4"}, {}, "ladder.csv", 0),
     "lag": ({"runs": 4}, {}, "lag.csv", 0),
     "outliers": ({"runs": 2}, {"NUM_STEPS": 5}, "outliers.csv", 0),

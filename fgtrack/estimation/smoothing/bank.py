@@ -26,6 +26,8 @@ _STATUSES = (UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE, UpdateStatu
 
 class SmootherBank:
     """Fixed-lag smoother, solved in covariance form by compiled code, all objects of a tracker together.
+    The least squares are those of a factor graph (Dellaert & Kaess, IJRR 25(12), 2006), with late measurements as in
+    Ranganathan, Kaess & Dellaert, IROS 2007.
 
     Measurements may arrive in any order: each is fused at a node at its own stamp. The oldest node of a window is the
     newest one at or before its start, so every stamp inside has a left neighbour.

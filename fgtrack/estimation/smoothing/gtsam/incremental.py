@@ -1,4 +1,4 @@
-"""The default solver: gtsam's iSAM2."""
+"""The default solver: gtsam's iSAM2 (Kaess et al., IJRR 31(2), 2012)."""
 
 from collections.abc import Sequence
 from functools import cache
