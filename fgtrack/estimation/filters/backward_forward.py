@@ -44,6 +44,7 @@ class BackwardForwardBank:
         self._rows: dict[int, int] = {}  # of the arrays, by track id in order of birth
         self._order: IntArray | None = None  # of all tracks by birth, until one comes or goes
         self._free = list[int]()
+        self._latest_start = 0  # largest grid index before which a track was unknown
         self._arrays = list[Any]()
         self._allocate(8)
         self._cached: dict[int, StatesAt] = {}  # by grid index; valid until anything changes
@@ -90,8 +91,8 @@ class BackwardForwardBank:
         if self._order is None:
             self._order = np.array(list(self._rows.values()), dtype=np.int64)
         rows, track_ids, is_present = self._order, self.track_ids, grid == self._grid
-        known = (self._arrays[2][rows, 1] <= grid) & (grid >= self._oldest) | is_present
-        if not known.all():
+        if not is_present and grid < max(self._oldest, self._latest_start):
+            known = (self._arrays[2][rows, 1] <= grid) & (grid >= self._oldest)
             rows, track_ids = rows[known], tuple(compress(track_ids, known.tolist()))
         if not track_ids:
             return no_states(self._propagator.motion.dim)
@@ -123,11 +124,11 @@ class BackwardForwardBank:
             x, P = states.means.take(chosen, axis=0), states.covariances.take(chosen, axis=0)
             y, H = alike.model.linearised(alike.z, x, alike.pose, partial(self._propagator.residual, alike.model))
             corrected = correct(x, P, y, H, alike.R, alike.measured, alike.loss)
-            ids, nis = [track_ids[i] for i in indices], corrected.nis.tolist()
-            codes = self._stored(back, stamp_ns, ids, corrected)
-            for k, (code, i) in enumerate(zip(codes, indices, strict=True)):
+            codes = self._stored(back, stamp_ns, [track_ids[i] for i in indices], corrected)
+            made = map(UpdateResult, map(_STATUS.__getitem__, codes), corrected.innovation, corrected.nis.tolist())
+            for i, code, result in zip(indices, codes, made, strict=True):
                 if code:
-                    results[i] = UpdateResult(_STATUS[code], corrected.innovation[k], nis[k])
+                    results[i] = result
         self._cached.clear()
         return results
 
@@ -145,7 +146,7 @@ class BackwardForwardBank:
         anchors, states, windows = self._arrays
         anchors[row, 0], windows[row] = start, (1, start, prior.stamp_ns)
         states[row, 0, 0], states[row, 0, 1:] = self._propagator.wrap(state[0]), state[1]
-        self._rows[track_id], self._order = row, None
+        self._rows[track_id], self._order, self._latest_start = row, None, max(start, self._latest_start)
         self._cached.clear()
 
     def remove(self, track_id: int) -> None:
