@@ -34,6 +34,12 @@ def test_a_recording_becomes_a_page_without_a_configuration(found: Study) -> Non
     assert (found.path / "runs/smoother/metrics.json").exists()
 
 
+def test_policies_for_late_lists_are_compared(found: Study) -> None:
+    rows = found.tables.tables["ledger"].records
+    assert len(rows) == 6
+    assert "if no list were late" in found.report.read_text(encoding="utf-8")
+
+
 def test_the_summary_is_short_and_says_what_to_do(found: Study) -> None:
     assert 4 <= len(found.summary) <= 7
     assert found.summary[0].startswith("In 3 s detections came from lidar_cluster (")
