@@ -54,9 +54,9 @@ class MessageTypes:
         self._stores: dict[Key, Typestore] = {}
         self.problems: dict[Key, str] = {}
         """Why messages of a type cannot be decoded."""
-        known = dict(_shipped_types(ros1))
+        given: Typesdict = {}
         for path in message_definitions:
-            known |= _user_types(Path(path))
+            given |= _user_types(Path(path))
         embedded: dict[Key, Typesdict] = {}
         for key in sorted(set(keys), key=str):
             try:
@@ -65,7 +65,7 @@ class MessageTypes:
                 self.problems[key] = f"its embedded definition cannot be read ({one_line(error)})"
         for key, types in embedded.items():
             try:
-                self.types[key] = _closure(key[0], ChainMap(types, *embedded.values(), known))
+                self.types[key] = _closure(key[0], ChainMap(types, *embedded.values(), given, _shipped_types(ros1)))
             except (ValueError, RecursionError) as error:
                 self.problems[key] = str(error)
 
@@ -124,12 +124,13 @@ def _closure(name: str, known: Mapping[str, Any]) -> Typesdict:
 
     def size_of_type(current: str) -> int:
         if current not in sizes:
-            if current not in known:
+            try:
+                needed[current] = known[current]
+            except KeyError as error:
                 raise ValueError(
                     f"the definition of {current or 'a type without a name'} is not in the recording, "
                     "name its .msg file in message_definitions"
-                )
-            needed[current] = known[current]
+                ) from error
             sizes[current] = _MOST_VALUES + 1  # until it is computed: a type that contains itself is too large
             sizes[current] = sum(size_of(description) for _, description in known[current][1])
         if sizes[current] > _MOST_VALUES:
@@ -140,13 +141,26 @@ def _closure(name: str, known: Mapping[str, Any]) -> Typesdict:
     return needed
 
 
+class _ShippedTypes(dict[str, Any]):  # Any: a type as rosbags holds it
+    """Types by name, defined when they are first needed: those of fgtrack, else those of rosbags, which are many."""
+
+    def __init__(self, ros1: bool) -> None:
+        super().__init__()
+        self._ros1 = ros1
+
+    def __missing__(self, name: str) -> Any:
+        own = DEFINITIONS.get(name)
+        self |= get_types_from_msg(own, name) if own is not None else {name: _types_of_rosbags(self._ros1)[name]}
+        return self[name]
+
+
+_shipped_types = cache(_ShippedTypes)
+
+
 @cache
-def _shipped_types(ros1: bool) -> Typesdict:
+def _types_of_rosbags(ros1: bool) -> Typesdict:
     # Recordings without definitions are from Humble or older.
-    types = dict(get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE).fielddefs)
-    for name, text in DEFINITIONS.items():
-        types |= get_types_from_msg(text, name)
-    return types
+    return get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE).fielddefs
 
 
 def _user_types(path: Path) -> Typesdict:
