@@ -1,5 +1,6 @@
 import math
 import sqlite3
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -8,19 +9,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer as McapWriter
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 from support.messages import START_NS, drive, exact, message_lists, shared
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, TruthState
+from fgtrack.io.adapters.native import DETECTIONS, NATIVE_ADAPTERS, TRUTH
 from fgtrack.io.config import Filter, InputConfig, TopicInput
 from fgtrack.io.errors import TruncatedInput, UntilBreak
 from fgtrack.io.ros.bag import Bag
 from fgtrack.io.ros.bag_writer import write_bag
+from fgtrack.io.ros.definitions import DEFINITIONS
 from fgtrack.io.ros.messages import MessageFactory
+from fgtrack.io.ros.own_messages import own_message
+from fgtrack.io.ros.typestore import MessageTypes
 from fgtrack.io.source import open_input
+from fgtrack.io.validation import validated_message
 
 STORAGES = ("mcap", "sqlite3")
 
@@ -42,6 +50,38 @@ def test_every_field_survives_the_bag_to_the_bit_and_in_order(tmp_path_factory, 
     assert write_bag(path, messages, storage) == len(messages)
     if messages:
         assert exact(read(path)) == exact(messages)
+        bag = Bag(path)
+        found = [NATIVE_ADAPTERS[topic.type](data, log_ns) for topic, log_ns, data in bag.messages(own(bag))]
+        assert exact(map(validated_message, found)) == exact(messages)
+
+
+def own(bag: Bag) -> set[str]:
+    return {topic.name for topic in bag.topics if topic.type in NATIVE_ADAPTERS}
+
+
+def test_wrong_bytes_of_a_type_of_fgtrack_are_refused_and_another_layout_is_read():
+    factory, text = MessageFactory(), DEFINITIONS[TRUTH]
+    state = TruthState(7, 7, 1, 2.0, 3.0, speed_mps=4.0)
+    message = factory.truth(state)
+    whole = bytes(factory.serialize(message))
+    assert own_message(TRUTH, whole, 7) == own_message(TRUTH, whole + bytes(3), 7) == state
+    for data in (*(whole[:size] for size in range(4, len(whole))), whole + bytes(4), whole.replace(b"map\0", b"maps")):
+        with pytest.raises((ValueError, struct.error)):
+            own_message(TRUTH, data, 7)
+    empty = DetectionList("x", 7, 7, [Detection(covariance=())])
+    assert own_message(DETECTIONS, bytes(factory.serialize(factory.detections(empty))), 7) == empty
+    older = typestore_with(text.replace("bool ignored\n", "").replace("float64[] outline_m\n", ""))
+    del message.ignored, message.outline_m
+    data = bytes(older.serialize_cdr(older.types[TRUTH](**vars(message)), TRUTH))
+    key = TRUTH, MessageDefinition(MessageDefinitionFormat.MSG, older.generate_msgdef(TRUTH, ros_version=2)[0])
+    assert NATIVE_ADAPTERS[TRUTH](MessageTypes([key], False).decode(key, data, "", 7), 7) == state
+
+
+def typestore_with(text: str) -> Typestore:
+    """Types of ROS 2 and truth of another definition."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(text, TRUTH))
+    return store
 
 
 def test_two_copies_of_one_file_in_a_folder_are_refused(tmp_path):

@@ -57,8 +57,9 @@ class Bag:
         self.topics = tuple(self._topics.values())
         """Topics by name; a topic with two types is listed twice."""
 
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[BagTopic, int, Any]]:
+    def messages(self, topics: Collection[str], own: bool = False) -> Iterator[tuple[BagTopic, int, Any]]:
         """Yield topic, log time and decoded message of every message on `topics`, in log-time order.
+        With `own`, those of fgtrack's own types come as a `Message`, received at the log time, where their layout is.
         Raises `TruncatedInput` after every message before a break, and `DataError` for what cannot be decoded.
         """
         for topic in self.topics:
@@ -66,7 +67,8 @@ class Bag:
                 raise DataError(f"{self.path}: topic {topic.name} cannot be read: {topic.problem}")
         for connection, log_ns, data in self._records(topics):
             what = f"{self.path}: the message on {connection.topic} at {log_ns} ns"
-            yield self._topics[_topic_and_type(connection)], log_ns, self._types.decode(_key(connection), data, what)
+            decoded = self._types.decode(_key(connection), data, what, log_ns if own else None)
+            yield self._topics[_topic_and_type(connection)], log_ns, decoded
 
     def stamps(self) -> Iterator[tuple[BagTopic, int, int | None]]:
         """Topic, log time and header stamp (None of an unknown type or one without a header) of every message."""

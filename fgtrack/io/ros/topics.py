@@ -104,7 +104,8 @@ FORMAT = FileFormat("a rosbag2 folder, an .mcap, .db3 or ROS 1 .bag file", is_ba
 
 def bag_messages(bag: Bag, uses: list[TopicUse]) -> Iterator[Message]:
     """Messages of `bag` in receipt order, the recorder's; `DataError` for a message that does not fit its use."""
-    for topic, log_ns, data in bag.messages({used.name for used, _, _ in uses}):
+    own = all(role == "messages" for _, role, _ in uses)
+    for topic, log_ns, data in bag.messages({used.name for used, _, _ in uses}, own):
         for convert in [convert for used, _, convert in uses if used is topic]:
             try:
                 yield from convert(data, log_ns)
@@ -138,7 +139,7 @@ def _check_fields(item: TopicInput, names: frozenset[str], needed: tuple[str, ..
 
 def _native(topic: BagTopic) -> Convert:
     adapter = NATIVE_ADAPTERS[topic.type]
-    return lambda message, receipt_ns: (adapter(message, receipt_ns),)
+    return lambda message, receipt_ns: (message if isinstance(message, Message) else adapter(message, receipt_ns),)
 
 
 def _ego(topic: BagTopic, item: TopicInput, plane: LocalPlane) -> Convert:

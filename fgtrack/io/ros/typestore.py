@@ -21,6 +21,7 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.files import read_whole
 from fgtrack.io.errors import one_line
 from fgtrack.io.ros.definitions import DEFINITIONS
+from fgtrack.io.ros.own_messages import LITTLE_ENDIAN, has_own_layout, own_message
 
 Key = tuple[str, MessageDefinition | None]
 """A message type and its definition in the recording: two topics may define one name differently."""
@@ -68,17 +69,22 @@ class MessageTypes:
                 self.types[key] = _closure(key[0], ChainMap(types, *embedded.values(), given, _shipped_types(ros1)))
             except (ValueError, RecursionError) as error:
                 self.problems[key] = str(error)
+        self._own = {key for key, types in self.types.items() if not ros1 and has_own_layout(key[0], types)}
 
     def starts_with_header(self, key: Key) -> bool:
         """True if messages of the type start with a header, and can be decoded."""
         members = self.types[key][key[0]][1] if key in self.types else []
         return bool(members) and members[0][1][1] == "std_msgs/msg/Header"
 
-    def decode(self, key: Key, data: bytes, what: str) -> Any:  # a message has the attributes of its type
-        """Message that is serialized in `data`; `what` names it in the `DataError` of a huge or wrong one."""
+    def decode(self, key: Key, data: bytes, what: str, log_ns: int | None = None) -> Any:  # Any: of its type
+        """Message that is serialized in `data`; `what` names it in the `DataError` of a huge or wrong one.
+        With its log time, one of fgtrack's own types in the present layout is a `Message`.
+        """
         if len(data) > _LARGEST_BYTES:
             raise DataError(f"{what}: has {len(data)} bytes, at most {_LARGEST_BYTES} are decoded")
         try:
+            if log_ns is not None and key in self._own and data.startswith(LITTLE_ENDIAN):
+                return own_message(key[0], data, log_ns)
             if key not in self._stores:
                 self._stores[key] = _registered(self.types[key])
             store = self._stores[key]
