@@ -7,7 +7,7 @@ The scenario. Six objects drawn from the motion model of the paper set out side 
 reports at once, a LiDAR (0.3 m) late; both see an object in nine scans of ten. A late detection is matched with the
 state of every track
 
-- `prior`: at the stamp, from what was sensed before it (`ekf-replay`),
+- `prior`: at the stamp, from what was measured before it (`ekf-replay`),
 - `smoothed`: at the stamp, from everything fused (`smoother`),
 - `moved back`: at the present, moved back to the stamp by the motion model, noise left out (`ekf-replay`),
 - `present`: at the present, as it is (`ekf-replay`),

@@ -22,7 +22,7 @@ every stamp, shape (n, 2 e + 1)."""
 
 
 def late(messages: Sequence[Message], sensor: str, delay_s: float) -> list[Message]:
-    """`messages` with the lists of `sensor` received `delay_s` after they were sensed."""
+    """`messages` with the lists of `sensor` received `delay_s` after they were measured."""
     delays = {sensor: SensorDelays(ConstantDelay(delay_s))}
     return list(redelay(messages, delays, np.random.default_rng(0))[0])
 

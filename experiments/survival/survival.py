@@ -2,7 +2,7 @@
 
     python experiments/survival/survival.py -o out/survival
 
-A LiDAR update that arrives after a RADAR update and was sensed before it starts from the state before both, so the
+A LiDAR update that arrives after a RADAR update and was measured before it starts from the state before both, so the
 RADAR update is gone. Runs of the tracker over LiDAR delays and rates, counted in their updates.csv.
 The tracker ticks at every message: between ticks it sorts what came in, and a tick of 20 ms saves as much delay.
 """

@@ -69,7 +69,7 @@ class Bias(NamedTuple):
 
 @dataclass(frozen=True)
 class SensorOffset:
-    """Clock of one sensor: reported stamp = time at which it sensed + offset."""
+    """Clock of one sensor: reported stamp = time at which it measured + offset."""
 
     sensor: str
     offset_s: float | None
@@ -156,7 +156,7 @@ def estimate_offsets(
 
     Without truth, or where `reference` is named, offsets are differences of two clocks. The reference is then the
     sensor with most detections, but for those that are `doubtful` and those whose clock must be wrong: nothing is
-    received before it was sensed. Nothing is refused for its delay: a wrong stamp looks like one. `run` is one of
+    received before it was measured. Nothing is refused for its delay: a wrong stamp looks like one. `run` is one of
     `messages` in which nothing was refused; without it they are replayed.
 
     Raises `CallError` for an unknown reference, and `DataError` without detections or with fewer than five ego states.

@@ -92,7 +92,7 @@ def clock_text(one: SensorOffset, report: OffsetReport) -> str:
 
 
 def _bound(one: SensorOffset, report: OffsetReport) -> str:
-    """Return which of two clocks cannot be the only wrong one: nothing is received before it was sensed."""
+    """Return which of two clocks cannot be the only wrong one: nothing is received before it was measured."""
     early, late = (report.reference, one.sensor) if (one.offset_s or 0.0) > 0.0 else (one.sensor, report.reference)
     least_s, surely_s = report.least_delays_s.get(early, 0.0), report.surely_late_s(one)
     if least_s <= RECEIPT_S:

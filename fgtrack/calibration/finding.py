@@ -11,7 +11,7 @@ _NICE = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 
 @dataclass(frozen=True)
 class Finding:
-    """A sentence or two with numbers, and settings; `str` tells all of it."""
+    """A sentence or two with numbers, and settings; `str` gives all of it."""
 
     kind: str
     """Subject: `input`, `model`, `clock`, `late`, `window`, `ego`, `noise`, `tune`, `track`."""

@@ -68,7 +68,7 @@ class Ledger:
 
     estimator: str
     with_truth: bool
-    """False where predicted variances stand for errors, which nothing in the recording tells."""
+    """False where predicted variances stand for errors, which the recording does not contain."""
     waterfall: tuple[Part, ...]
     """From the error of the run to that without lateness; the first has no share."""
     tables: Tables = field(repr=False)
@@ -135,7 +135,7 @@ class Books:
         now_ns = run.tables["timing"]["now_ns"]
         now_ns = now_ns[: np.searchsorted((now_ns - now_ns[:1]) / NS_PER_S, until_s, side="right")]
         if not len(now_ns) or not bank.fed:
-            raise DataError("no track in this recording: `fgtrack advise` tells why")
+            raise DataError("no track in this recording: `fgtrack advise` gives the reason")
         self._fed = [item for item in bank.fed if item.now_ns <= now_ns[-1]]
         self._run, self._config, self._now_ns = run, config, now_ns
         self._noise = {name: {**sensor.std} for name, sensor in config.sensors.items()}

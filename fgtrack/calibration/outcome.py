@@ -28,7 +28,7 @@ class NoiseFit:
     sensor: str
     count: int
     ratio: Estimate
-    """Mean NIS over what is expected; the interval knows that innovations resemble each other."""
+    """Mean NIS over what is expected; the interval considers that innovations are correlated."""
     lag1: float | None
     """Autocorrelation of its position innovations at lag 1, of tracks that are long enough; near 0 where its errors are
     white and the noise fits."""

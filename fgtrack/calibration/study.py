@@ -242,7 +242,7 @@ def outputs(out: Path) -> list[Path]:
 
 
 def head_at(late: CloseUp | DataError) -> ReportHead:
-    """Return how a report opens at a late detection; without one it says why."""
+    """Return how a report opens at a late detection; without one it gives the reason."""
     if isinstance(late, DataError):
         return ReportHead(missing=(f"no close-up: {late}",))
     x_m, y_m = late.after.means[-1, :2].tolist()

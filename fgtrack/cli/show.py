@@ -25,7 +25,7 @@ class _Output(Console):
 
 
 def console() -> Console:
-    """Stdout; a file or a pipe is as wide as COLUMNS says, by default wide enough for nearly every table."""
+    """Stdout; a file or a pipe is as wide as COLUMNS specifies, by default wide enough for nearly every table."""
     probe = _Output()
     return probe if probe.is_terminal or os.environ.get("COLUMNS") else _Output(width=_WIDTH_WITHOUT_TERMINAL)
 

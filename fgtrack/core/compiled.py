@@ -31,7 +31,7 @@ def _say(text: str) -> None:
 # Any: numba has no types of what is compiled.
 def njit(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that compiles a function once: it is stored in a cache folder, if one can be written.
-    One line of the log says that loops are compiled, another one that they cannot be stored.
+    One line of the log reports that loops are compiled, another one that they cannot be stored.
     """
     options |= {"no_cfunc_wrapper": True}
 

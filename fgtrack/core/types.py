@@ -1,6 +1,6 @@
 """The values that flow through fgtrack: messages in, track states and update records out.
 
-Every message carries two times: `stamp_ns` (the world was sensed) and `receipt_ns` (the tracker got it).
+Every message carries two times: `stamp_ns` (time of measurement) and `receipt_ns` (the tracker got it).
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -41,7 +41,7 @@ class EgoState:
     covariance: tuple[float, ...] | None = None
     """Row-major 5 x 5, of x, y, yaw, speed and yaw rate (`EGO_COVARIANCE_STATES`); None when the source does not say.
 
-    A variance of 0 says the same of one of them.
+    A variance of 0 means the same of one of them.
     """
 
 
@@ -83,13 +83,13 @@ class Detection:
 #: What a detection may measure, in the order of its covariance and of the residual columns: the fields of
 #: `Detection` before its covariance.
 MEASURABLE = tuple(takewhile(lambda name: name != "covariance", (each.name for each in fields(Detection))))
-#: What a detection says of its object besides: never measurements of the state, and all may be None.
+#: What a detection contains of its object besides: never measurements of the state, and all may be None.
 DESCRIBING = ("z_m", "length_m", "width_m", "height_m", "score", "class_name", "id")
 
 
 @dataclass(frozen=True, slots=True)
 class DetectionList:
-    """The object list of one sensor at one stamp; an empty list says "saw nothing"."""
+    """The object list of one sensor at one stamp; an empty list: nothing was detected."""
 
     sensor: str
     stamp_ns: int
@@ -98,7 +98,7 @@ class DetectionList:
     """Kept as a tuple."""
     frame: Frame = "ego"
     left_out: tuple[str, ...] = field(default=(), compare=False)
-    """For every object that the reader has left out of the list the setting that says so."""
+    """For every object that the reader has left out of the list the setting that excludes it."""
     origin_deg: tuple[float, float] | None = None
     """Latitude and longitude of the origin of the map; None where it is not known."""
 
@@ -170,7 +170,7 @@ class TrackStatus(StrEnum):
     """Confidence in a track."""
 
     TENTATIVE = "tentative"
-    """Not yet confirmed: measured too seldom, or too improbable, as the lifecycle says."""
+    """Not yet confirmed: measured too seldom, or too improbable, according to the lifecycle."""
     CONFIRMED = "confirmed"
     COASTING = "coasting"
     """Not matched by the newest batch that expected to see it."""

@@ -20,7 +20,7 @@ class Failure(StrEnum):
     UPDATE_FAILED = "update failed"
     """A measurement could not be fused; its disposition is `failed`."""
     ESTIMATOR_RAISED = "estimator raised"
-    """An estimator raised an exception when it was asked for states, or told of the clock."""
+    """An estimator raised an exception when it was asked for states, or given the clock."""
     GRAPH_REBUILT = "graph rebuilt"
     """A factor graph could not be solved with a new measurement, and was rebuilt without it."""
     STEP_DAMPED = "step damped"

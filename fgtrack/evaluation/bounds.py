@@ -35,11 +35,11 @@ class Bounds(NamedTuple):
     """Lower bounds of the covariance of the present state at m times, shape (m, n, n) each."""
 
     in_time: FloatArray
-    """If everything arrived when it was sensed."""
+    """If everything arrived when it was measured."""
     arrived: FloatArray
     """From what has arrived, each at its own stamp."""
     dropped: FloatArray
-    """From what has arrived, without what came later than something sensed after it."""
+    """From what has arrived, without what came later than something measured after it."""
 
 
 _NEVER_NS = np.iinfo(np.int64).max
@@ -58,8 +58,8 @@ def bounds(
 
     With F, Q and H at the true states, and E the mean over trajectories, the information of the newest state is
     J' = D22 - D12' (J + D11)^-1 D12 with D11 = E[F' Q^-1 F + N], D12 = -E[F' Q^-1], D22 = E[Q^-1], plus
-    E[H' R^-1 H] of each measurement there. N_ij = 1/2 tr(Q^-1 dQ/dx_i Q^-1 dQ/dx_j) is what the noise says of the state
-    that it depends on. A measurement counts from its receipt on, at its own stamp. Where F varies much between
+    E[H' R^-1 H] of each measurement there. N_ij = 1/2 tr(Q^-1 dQ/dx_i Q^-1 dQ/dx_j) is what the noise
+    informs of the state that it depends on. A measurement counts from its receipt on, at its own stamp. Where F varies much between
     trajectories the bound is far from what can be reached: see `bounds_along`.
 
     Parameters
@@ -79,7 +79,7 @@ def bounds(
     receipts_ns = np.array([item.receipt_ns for item in ordered], dtype=np.int64)
     own_ns = np.array([item.stamp_ns for item in ordered], dtype=np.int64)
     later_ns = np.minimum.accumulate(receipts_ns[::-1])[::-1]
-    kept = np.append(receipts_ns[:-1] <= later_ns[1:], True)[: len(ordered)]  # before everything sensed after them
+    kept = np.append(receipts_ns[:-1] <= later_ns[1:], True)[: len(ordered)]  # before everything measured after them
     index = np.searchsorted(stamps_ns, own_ns)
     gained = [_information(item, states[:, k]) for item, k in zip(ordered, index, strict=True)]
     steps = [_step(motion, states[:, k], seconds(int(ns))) for k, ns in enumerate(np.diff(stamps_ns))]

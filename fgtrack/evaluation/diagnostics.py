@@ -38,7 +38,7 @@ _NO_FAILURE = "step damped"  # not a failure: with bearings damped steps are usu
 _CURES = {
     "gated": "no track was near, none was started: check the gate of `association`, clock, ego.detection_origin_x_m",
     "out_of_bounds": "{reasons}: are these settings meant, is it the right map (--map), and frame of the detections?",
-    "duplicate": "the same list again and again: look at the recording, a sensor or a bridge repeats itself",
+    "duplicate": "the same list repeatedly: check the recording: a sensor or a bridge repeats itself",
     "superseded": "another list of the sensor came in the same tick, and the inbox keeps one: raise clock.node_hz",
     "invalid": "no position, not finite, an invalid covariance, or stamped ahead of its receipt: compare the keys of "
     "sensors.{sensor}.std with what `fgtrack info` shows",

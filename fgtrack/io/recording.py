@@ -1,4 +1,4 @@
-"""Writes a recording: a stream or a rosbag2 folder, as its name says."""
+"""Writes a recording: a stream or a rosbag2 folder, as its name specifies."""
 
 import re
 from collections.abc import Iterable, Mapping

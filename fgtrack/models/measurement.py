@@ -19,7 +19,7 @@ from fgtrack.models.motion import CARTESIAN, MIN_SPEED_MPS, POLAR, MotionModel
 
 #: The gradient of a bearing by the position grows as 1 / range; below this range it stays as it is there.
 MIN_RANGE_M = 1e-6
-#: Far below this speed a curvature says nothing of the yaw rate: an object at rest has no way that could turn.
+#: Far below this speed a curvature gives no yaw rate: an object at rest has no way that could turn.
 SLOW_MPS = 1.0
 #: What a measurement may be of: what a detection measures, and what the map says of a moving object.
 COMPONENTS = (*MEASURABLE, "curvature_radpm")

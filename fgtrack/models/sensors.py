@@ -96,7 +96,7 @@ class SensorModel:
     """Where the sensor measures no yaw: take the map heading as a yaw measurement with this standard deviation."""
     curvature_from_map_std_radpm: PositiveFloat | None = None
     """Take the curvature of the map's line as a measurement of yaw rate over speed with this standard deviation: the
-    yaw rate is speed times curvature, but for what a driver does beside the line; null: the map says nothing of it."""
+    yaw rate is speed times curvature, but for what a driver does beside the line; null: no curvature."""
     std_growth: Mapping[str, NonNegativeFloat] = field(default_factory=dict)
     """By how much the standard deviation of a component grows with each metre of range: its variance is std^2 +
     (std_growth range)^2. A detection's own covariance stays as it is."""
@@ -112,7 +112,7 @@ class SensorModel:
     """A detection's stamp: the list's, its own where it carries one, the mean of those that do, or the receipt, where
     the driver sets none or one of another clock."""
     clock_offset_s: Annotated[float, Field(ge=-60.0, le=60.0)] = 0.0
-    """Advance of its stamps over the time at which it sensed; subtracted before anything else is done. With
+    """Advance of its stamps over the time at which it measured; subtracted before anything else is done. With
     `stamp_from: receipt` its latency. `fgtrack advise` and `fgtrack offsets` find it."""
     stamp_std_s: NonNegativeFloat = 0.0
     """Standard deviation of its stamps: adds the velocity times it to the noise of every detection, along the motion of
@@ -123,7 +123,7 @@ class SensorModel:
     copies_s: PositiveFloat | None = None
     """A detection of the same identity and position as one received at most this long before is a copy of its message,
     heard by another receiver: `duplicate`. A copy with an earlier stamp, received before the first was processed, gives
-    it its stamp. Null: objects that stand report the same position again and again."""
+    it its stamp. Null: objects that stand repeat the same position."""
     message_covariance: bool = True
     """Use a detection's own covariance where the message carries one."""
     max_range_m: PositiveFloat | None = None

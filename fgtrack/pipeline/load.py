@@ -174,7 +174,7 @@ def _first_problem(error: ValidationError, kind: type[Any], text: str) -> str:
     elif first["type"] == "missing":
         names, given = [*names, str(first["loc"][-1])], ""
     elif first["type"] == "union_tag_not_found":
-        message = "needs the key `kind`, which says which of its forms is meant"
+        message = "needs the key `kind`, which selects its form"
     elif first["type"] == "union_tag_invalid":
         given += did_you_mean(first["ctx"]["tag"], first["ctx"]["expected_tags"].replace("'", "").split(", "))
     elif first["type"] == "value_error":

@@ -35,7 +35,7 @@ def replay(
 ) -> Run:
     """Return the run that the command `fgtrack replay` writes.
 
-    A recording that breaks off is replayed up to the break, with a `UserWarning`, and `meta["broken_off"]` says why.
+    A recording that breaks off is replayed up to the break, with a `UserWarning`, the reason in `meta["broken_off"]`.
 
     Parameters
     ----------

@@ -77,8 +77,8 @@ def replay(
     observed: Mapping[str, Callable[[TrackerParts], TrackerParts]] | None = None,
 ) -> list[dict[str, object]]:
     """Run each estimator of `folders` over the messages into its run folder; return the contents of their meta.json.
-    `messages` come in receipt order; where they end in a `DataError`, `broken_off` of the meta data says why. `origin`
-    and `kind` are path and format of the input; `observed` is that of `build_tracker`, by estimator. Raises
+    `messages` come in receipt order; where they end in a `DataError`, `broken_off` of the meta data has the reason.
+    `origin` and `kind` are path and format of the input; `observed` is that of `build_tracker`, by estimator. Raises
     `DataError` for an input without messages for the tracker.
     """
     config = assumed(config, source_of(messages)).config

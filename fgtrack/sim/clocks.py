@@ -1,4 +1,4 @@
-"""Errors of the stamps that a sensor reports: error = reported stamp - the time at which it sensed.
+"""Errors of the stamps that a sensor reports: error = reported stamp - the time at which it measured.
 
 A sensor has a list of clock models; each reads what the one before it reported.
 """
@@ -21,7 +21,7 @@ class OffsetClock:
     """Every stamp is off by the same duration: a clock that was never set, a latency that was left out."""
 
     offset_s: Annotated[float, Field(ge=-_LARGEST_ERROR_S, le=_LARGEST_ERROR_S)]
-    """Positive: stamps are later than the world was sensed."""
+    """Positive: stamps are later than the measurement."""
     kind: Literal["offset"] = "offset"
 
 
@@ -64,8 +64,8 @@ AnyClock = Annotated[OffsetClock | DriftClock | JitterClock | QuantisedClock | A
 def reported_stamps(
     clocks: Sequence[AnyClock], rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray
 ) -> IntArray:
-    """Stamps that a sensor with `clocks` reports of messages in the order in which it sensed, shape (n,) as all others.
-    Each place in the list has a generator of its own: other clocks before or after one leave what it draws.
+    """Stamps that a sensor with `clocks` reports of messages in the order of measurement, shape (n,) as all others.
+    Each entry of the list has a generator of its own: other clocks before or after one leave what it draws.
     """
     for clock, child in zip(clocks, rng.spawn(len(clocks)), strict=True):
         match clock:

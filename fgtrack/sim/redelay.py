@@ -1,6 +1,6 @@
 """The re-delayer: a recorded stream whose detections arrive later, earlier, not at all, or with wrong stamps.
 
-What was sensed stays as it was recorded; so the same drive can be replayed under any delays.
+What was measured stays as it was recorded; so the same drive can be replayed under any delays.
 """
 
 from collections.abc import Iterable, Iterator, Mapping

@@ -39,7 +39,7 @@ def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
 
     Every vehicle and every sensor, and in it the delays, the clock errors, the clutter and the detections of each
     object, draw from a generator of their own: another sensor, delay or clock model leaves everything else as it was. A
-    clock changes what is reported as the stamp, never when or what was sensed. A message that its delay model loses is
+    clock changes what is reported as the stamp, never the measurement. A message that its delay model loses is
     not in the list. Raises `DataError` if the map cannot be read.
     """
     vehicles_rng, ego_rng, sensors_rng = rng.spawn(3)

@@ -24,7 +24,7 @@ List = dict[int, Measurement]
 def gives_each_of_several_objects_what_it_gives_one_alone(subject: Subject, stream: Stream) -> None:
     """Each list has a measurement of most objects; half way one is removed and another one begins."""
     objects = [_shifted(stream, number) for number in range(_NUM_OBJECTS)]
-    lists = [  # of what was sensed together; each object is missing in every fourth list
+    lists = [  # of what was measured together; each object is missing in every fourth list
         {k: item.measurements[index] for k, item in enumerate(objects) if (index + k) % 4}
         for index in range(len(stream.measurements))
     ]

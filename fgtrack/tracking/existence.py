@@ -84,7 +84,7 @@ class ExistenceRules:
 
 class ExistenceLifecycle:
     """Tracks live by the probability that their objects exist; see the module.
-    A list says nothing of objects out of its sensor's range and field of view. Without an ego all are in view.
+    A list does not count for objects out of its sensor's range and field of view. Without an ego all are in view.
     """
 
     def __init__(

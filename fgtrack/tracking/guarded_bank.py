@@ -17,7 +17,7 @@ from fgtrack.estimation.filters.propagation import States
 
 class GuardedBank:
     """Guards a bank: what it raises, and states that cannot be published (see `faults`), end the track concerned.
-    Where it cannot be told which track failed, all tracks of that call end. A `DataError` is an answer, not a failure,
+    Where it is unknown which track failed, all tracks of that call end. A `DataError` is an answer, not a failure,
     and propagates; so does a `CallError` until a first track could be started: the estimator cannot be made as it is
     configured. `make` gives an empty bank.
     """

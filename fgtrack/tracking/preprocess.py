@@ -90,7 +90,7 @@ class Group(NamedTuple):
     rows: IntArray
     """Indices of the candidates, ascending, shape (m,)."""
     stack: Measurement
-    """z (m, k), and R (m, k, k) with the error of the ego as far as the detections alone tell."""
+    """z (m, k), and R (m, k, k) with the error of the ego as far as the detections alone give it."""
     spread: FloatArray
     """Covariances of the detections with all their errors, shape (m, k, k)."""
     error: PoseError | None

@@ -16,7 +16,7 @@ from fgtrack.core.linalg import kernels
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 
-#: Bounds of log-odds: a probability that differs from 0 or 1 by less says nothing more.
+#: Bounds of log-odds: a probability that differs from 0 or 1 by less adds nothing.
 LARGEST_LOG_ODDS = 30.0
 #: Columns of an evidence: share of visible objects there and likelihood ratio if visible (NaN out of view), then, after
 #: it, log-odds of existence and the probabilities of being visible to each sensor, given that the object exists.

@@ -153,7 +153,7 @@ def _past_messages(run: Run, look: Look) -> Messages:
 
 def _detection_messages(run: Run, look: Look) -> Messages:
     """At every receipt of a list its detections, grey where not used, arrows to their tracks now, and their poses.
-    An arrow leads from where a detection was sensed to where its track is at the tick that fused it. It is strong where
+    An arrow leads from the position of a detection to where its track is at the tick that fused it. It is strong where
     the detection came out of sequence, and faint where it did not.
     """
     table, where, rows = run.tables["detections"], placed(run), update_rows(run)

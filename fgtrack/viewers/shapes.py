@@ -59,7 +59,7 @@ class ViewerMessage:
     log_ns: int
     """When its content is known: receipt or tick."""
     stamp_ns: int
-    """When its content was sensed, or is valid."""
+    """When its content was measured, or is valid."""
     topic: str
     content: Scene | tuple[Detection, ...] | EgoState | Mapping[str, float | int | str | None]
     """Shapes, objects in the map, the ego, or the outcome of a detection."""

@@ -115,7 +115,7 @@ def object_list(header: RosMessage, objects: Iterable[Detection], frame: Frame |
 
 
 def yaw_rad(orientation: RosMessage) -> float | None:
-    """Yaw of a quaternion of any norm; None where it is all zero, which says "not known"."""
+    """Yaw of a quaternion of any norm; None where it is all zero, which means "not known"."""
     x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
     if x == y == z == w == 0.0:
         return None

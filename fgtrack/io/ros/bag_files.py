@@ -1,4 +1,4 @@
-"""The files of a recording: which they are, and what its metadata.yaml says."""
+"""The files of a recording: which they are, and the contents of its metadata.yaml."""
 
 import filecmp
 import json

@@ -54,7 +54,7 @@ bool in_pit
 float64[] covariance
 """,
     "fgtrack_msgs/msg/Detection": f"""\
-# Bit i of `present` says that the i-th field below was given.
+# Bit i of `present` is set if the i-th field below was given.
 uint32 present
 {_COMPONENTS}
 float64[] covariance
@@ -77,7 +77,7 @@ Detection[] objects
 float64[] origin_deg
 """,
     "fgtrack_msgs/msg/Truth": """\
-# Bit i of `present` says that the i-th field after it was given.
+# Bit i of `present` is set if the i-th field after it was given.
 std_msgs/Header header
 int64 object_id
 float64 x_m

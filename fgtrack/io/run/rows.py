@@ -66,7 +66,7 @@ def smoothed_rows(reports: Iterable[SmoothedReport]) -> list[Row]:
 
 
 def detection_rows(message: DetectionList) -> list[Row]:
-    """Rows of `detections`: what `message` says of every object, in its own frame."""
+    """Rows of `detections`: what `message` contains of every object, in its own frame."""
     cells: list[Row] = []
     for index, item in enumerate(message.objects):
         stamp_ns = message.stamp_ns if item.stamp_ns is None else item.stamp_ns

@@ -24,7 +24,7 @@ _OUTSIDE, _FEWEST = 0.01, 100
 _CELL_S, _CELL_PERIODS, _CELL_M, _CELL_MPS, _CELL_BEARING = 0.25, 5.0, 3.0, 30.0, 0.3
 #: How near detections follow one another up to the edges of a sector, and the margin of a range.
 _LINK_RAD, _RANGE_FACTOR = 0.2, 1.1
-#: No sensor of vehicles has a narrower sector (20 degrees, long-range RADAR); wider ones are not told from traffic.
+#: No sensor of vehicles has a narrower sector (20 degrees, long-range RADAR); wider ones look like traffic.
 _NARROWEST_RAD, _WIDEST_RAD = 0.35, 2.8
 #: Axes are multiples of 45 degrees, where the middle of the sector is so near to one.
 _AXES_RAD, _AXIS_TOLERANCE_RAD = math.pi / 4.0, 0.15
