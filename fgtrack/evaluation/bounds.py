@@ -58,8 +58,8 @@ def bounds(
 
     With F, Q and H at the true states, and E the mean over trajectories, the information of the newest state is
     J' = D22 - D12' (J + D11)^-1 D12 with D11 = E[F' Q^-1 F + N], D12 = -E[F' Q^-1], D22 = E[Q^-1], plus
-    E[H' R^-1 H] of each measurement there. N_ij = 1/2 tr(Q^-1 dQ/dx_i Q^-1 dQ/dx_j) is what the noise
-    informs of the state that it depends on. A measurement counts from its receipt on, at its own stamp. Where F varies much between
+    E[H' R^-1 H] of each measurement there. N_ij = 1/2 tr(Q^-1 dQ/dx_i Q^-1 dQ/dx_j) is what the noise informs of the
+    state that it depends on. A measurement counts from its receipt on, at its own stamp. Where F varies much between
     trajectories the bound is far from what can be reached: see `bounds_along`.
 
     Parameters

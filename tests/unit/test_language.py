@@ -20,7 +20,8 @@ PAGES = [
 OPENINGS = ("What", "Whether", "Of", "Those", "How", "So")
 BANNED = re.compile(
     r"\b(anew|mend(ed|s)?|spoil(t|s)?|nasty|strangers?|guilty|believed?|in place of|forth and back|noise that fits"
-    r"|unaware|errors that last|lasting errors?|is told|are told|dates that are none|relied)\b"
+    r"|sensed|says nothing|tells (all|why|which|how)|unaware|errors that last|lasting errors?|is told|are told"
+    r"|dates that are none|relied)\b"
 )
 
 
