@@ -10,7 +10,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
-from llvmlite.binding import add_symbol  # type: ignore[import-untyped]  # it has no types
+from llvmlite.binding import add_symbol
 from numba.core.cgutils import get_or_insert_function
 from numba.core.typing.templates import ConcreteTemplate, infer_global
 from numba.extending import lower_builtin
