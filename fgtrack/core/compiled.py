@@ -42,7 +42,7 @@ def njit(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
             _say("compiled loops cannot be stored, so every start compiles them: let NUMBA_CACHE_DIR name a folder")
             return numba.njit(signature, error_model="numpy", **options)(function)
         if result.stats.cache_misses:
-            _say("compiling numerical loops, once: some 20 s of processor time for all")
+            _say("compiling numerical loops, once: some 45 s of processor time for all")
         return result
 
     return compiled
