@@ -7,7 +7,7 @@ AUTOFERRY holds a folder for each scenario. Two tables:
 - `bearings.csv`: the errors of the bearings against interpolated truth: how large they are, what of them is constant
   over a scenario, how long they last, and whether two vessels that are seen at once have the same.
 - `gains.csv`: tracks without cameras, and with cameras whose errors are taken for white or for lasting; differences in
-  pairs, with the interval of a block bootstrap along each scenario.
+  pairs, with the interval of `compare` along each scenario.
 """
 
 import math

@@ -54,7 +54,7 @@ def _ahead(runs: Sequence[EvaluatedRun], horizon_s: float) -> FloatArray:
 def rows(found: Iterable[Sums], estimators: Sequence[str]) -> Iterator[list[str]]:
     """A row of `HEADER` for every quantity and estimator, of all recordings together.
 
-    Intervals are those of a block bootstrap along the recordings, one after the other. The last column is by how much
+    Intervals are those of `compare` along the recordings, one after the other. The last column is by how much
     less the delay costs than with the last estimator.
     """
     found = list(found)
