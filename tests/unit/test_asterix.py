@@ -6,6 +6,7 @@ import pytest
 
 gen = pytest.importorskip("asterix.generated", reason="libasterix is not installed (extra `asterix`)")
 
+from fgtrack.io.adapters.asterix_records import RecordReader  # noqa: E402
 from fgtrack.io.config import AsterixInput, InputConfig, Origin  # noqa: E402
 from fgtrack.io.errors import UntilBreak  # noqa: E402
 from fgtrack.io.source import input_kind, open_input  # noqa: E402
@@ -107,3 +108,42 @@ def test_an_unknown_edition_is_named(tmp_path):
     (tmp_path / "a.ast").write_bytes(surface(50.0, 100.0, 0.0))
     with pytest.raises(Exception, match=r"category 21 has 0\.23, .* not 9\.9"):
         lists(tmp_path / "a.ast", asterix=AsterixInput(editions={21: "9.9"}))
+
+
+def test_numbers_behind_compound_extended_and_repeated_items_are_those_of_the_library(tmp_path):
+    from asterix.base import Bits
+
+    record = {
+        "010": (("SAC", 1), ("SIC", 2)),
+        "070": (36_000.5, "s"),
+        "105": (("LAT", (41.3, "°")), ("LON", (-2.08, "°"))),
+        "185": (("VX", (-3.25, "m/s")), ("VY", (4.0, "m/s"))),
+        "380": {"ADR": 0x4CA911, "ID": "ABC123", "MHG": (90.0, "°")},
+        "080": ((0, 0, 0, 0, 0, None), (1, 0, 0, 0, 0, 0, 0, None)),
+        "290": {"TRK": (1.0, "s"), "SSR": (2.0, "s")},
+        "136": (100.0, "FL"),
+        "510": [(1, 2), (3, 4)],
+    }
+    raw = block(gen.Cat_062_1_21, record, record)
+    names = ["070", "105/LAT", "105/LON", "185/VX", "185/VY", "380/ADR", "136", "290/SSR"]
+    both = list(RecordReader(gen.Cat_062_1_21, names, {})(raw[3:]))
+    (own, _) = gen.Cat_062_1_21.cv_uap.parse(Bits.from_bytes(raw[3:]))
+    expected = {}
+    for name in names:
+        item, _, part = name.partition("/")
+        variation = own.get_item(item).variation
+        content = (variation.get_item(part).variation if part else variation).content
+        expected[name] = content.as_quantity() if hasattr(content, "as_quantity") else content.as_uint()
+    assert both == [expected, expected]
+    (tmp_path / "a.ast").write_bytes(raw)
+    (one,) = lists(tmp_path / "a.ast")
+    assert (one.sensor, one.objects[0].id, one.objects[0].speed_mps) == ("system", "4CA911", math.hypot(3.25, 4.0))
+
+
+def test_a_block_that_ends_inside_a_record_is_named(tmp_path):
+    whole = surface(50.0, 100.0, 0.0)
+    damaged = whole[:1] + (len(whole) - 1).to_bytes(2, "big") + whole[3:-1]
+    (tmp_path / "a.ast").write_bytes(whole + damaged)
+    readable = UntilBreak(open_input(tmp_path / "a.ast").messages())
+    assert len(list(readable)) == 1
+    assert f"cannot decode category 10 at byte {len(whole)}" in str(readable.error)

@@ -1,6 +1,6 @@
 """ASTERIX recordings of air traffic surveillance (EUROCONTROL): categories 010, 020, 021, 048 and 062.
 
-Read with libasterix (extra `asterix`), which has every edition and decodes what is asked for. Times are seconds of the
+Read by the specifications in libasterix (extra `asterix`), which has every edition. Times are seconds of the
 UTC day; the recording has no date. A category with two times of a position (021) gives stamp and receipt; of the others
 the receipt is the newest stamp up to the record in its file, a lower bound. Records of one sensor with equal times are
 one list. Extrapolated positions (010, 020: bits CST of item 170) are no measurements and are left out.
@@ -21,6 +21,7 @@ from fgtrack.core.files import open_file
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Detection, DetectionList, Message
+from fgtrack.io.adapters.asterix_records import Record, RecordReader
 from fgtrack.io.config import AsterixInput, InputConfig, Origin
 from fgtrack.io.errors import TruncatedInput, UntilBreak
 from fgtrack.io.geodetic import LocalPlane
@@ -50,7 +51,7 @@ _UNKNOWN_MPS = 10.0
 _KINDS = {0: "mlat", 1: "mlat", 2: "adsb", 3: "smr", 5: "mlat"}
 """Sensor by the type of a report of category 010: multilateration, ADS-B, primary RADAR."""
 _TARGET_REPORT = 1
-Record = Any  # libasterix makes a class of every edition of every category
+_COMMON = "000", "010/SIC", "020/TYP", "170/CST", "210/VN", "090/NACP", "090/NUCPNIC", "090/NUCRNACV"
 
 
 class _Category(NamedTuple):
@@ -68,8 +69,8 @@ class _Category(NamedTuple):
     height: str
     unit_m: float = 1.0
     """Of X and Y."""
-    velocity_lsb_mps: float | None = None
-    """Least significant bit of VX and VY, where libasterix has another one."""
+    lsb: Mapping[str, float] = {}
+    """Least significant bits, where libasterix has other ones."""
 
 
 _WGS84, _CARTESIAN, _POLAR = ("041", "LAT", "LON"), ("042", "X", "Y"), ("040", "RHO", "THETA")
@@ -77,7 +78,16 @@ _GNSS = (("131", "LAT", "LON"), ("130", "LAT", "LON"))
 _SYSTEM = (("105", "LAT", "LON"), ("100", "X", "Y"))
 _CATEGORIES = {
     # Edition 1.1, 5.2.20: +-8192 m/s in 16 bits, 0.25 m/s; libasterix 1.1 has 1/16 m/s.
-    10: _Category("", ("140",), (), "220", (_WGS84, _CARTESIAN, _POLAR), ("202", "VX", "VY"), "090/FL", 1.0, 0.25),
+    10: _Category(
+        "",
+        ("140",),
+        (),
+        "220",
+        (_WGS84, _CARTESIAN, _POLAR),
+        ("202", "VX", "VY"),
+        "090/FL",
+        lsb={"202/VX": 0.25, "202/VY": 0.25},
+    ),
     20: _Category("mlat", ("140",), (), "220", (_WGS84, _CARTESIAN), ("202", "VX", "VY"), "090/FL"),
     21: _Category("adsb", ("073", "071", "030"), ("077",), "080", _GNSS, ("160", "GS", "TA"), "145"),
     48: _Category("radar", ("140",), (), "220", (_POLAR, _CARTESIAN), ("200", "GSP", "HDG"), "090/FL", _NM_M),
@@ -93,32 +103,35 @@ def _recognises(path: Path) -> bool:
 
 def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
     try:
-        from asterix.base import Bits
         from asterix.generated import manifest
     except ImportError as error:
         raise CallError(f"{path}: is ASTERIX, install its reader: pip install 'fgtrack[asterix]'") from error
     known: Any = manifest["CATS"]  # Any: editions by category, which libasterix types as objects
-    editions = {number: _edition(known[number], number, config.asterix) for number in _CATEGORIES}
-    parsers = {number: lambda raw, own=own: own.cv_uap.parse(Bits.from_bytes(raw)) for number, own in editions.items()}
+    readers = {number: _reader(known[number], number, config.asterix) for number in _CATEGORIES}
     files = sorted(path.glob("*.ast")) if path.is_dir() else [path]
     plane = LocalPlane(config.origin or next(iter(config.asterix.stations.values()), None))
-    return partial(_merged, files, parsers, config.asterix, plane)
+    return partial(_merged, files, readers, config.asterix, plane)
 
 
-def _edition(known: Iterable[Any], number: int, given: AsterixInput) -> Any:  # Any: a class of libasterix
-    """The edition of category `number` that is set, else the newest. Raises `CallError` where there is none such."""
+def _reader(known: Iterable[Any], number: int, given: AsterixInput) -> RecordReader:  # Any: a class of libasterix
+    """Return the reader of the edition of category `number` that is set, else of the newest. Raises `CallError`."""
     by_name = {".".join(map(str, each.cv_edition)): each for each in known}
     name = given.editions.get(number, next(reversed(by_name)))
     if name not in by_name:
         raise CallError(f"input.asterix.editions: category {number} has {', '.join(by_name)}, not {name}")
-    return by_name[name]
+    own = _CATEGORIES[number]
+    pairs = [f"{item}/{part}" for item, *parts in (*own.positions, own.velocity) for part in parts]
+    times = *own.stamp, *own.receipt, *(each[number] for each in (given.stamp, given.receipt) if number in each)
+    return RecordReader(by_name[name], [*_COMMON, *pairs, *times, own.address, own.height], own.lsb)
 
 
 FORMAT = FileFormat("ASTERIX (.ast, or a folder of them)", _recognises, _open)
 
 
-def _merged(files: list[Path], parsers: Mapping[int, Any], given: AsterixInput, plane: LocalPlane) -> Iterator[Message]:
-    readable = [UntilBreak(_reports(file, parsers, given, plane)) for file in files]
+def _merged(
+    files: list[Path], readers: Mapping[int, RecordReader], given: AsterixInput, plane: LocalPlane
+) -> Iterator[Message]:
+    readable = [UntilBreak(_reports(file, readers, given, plane)) for file in files]
     ordered = merge(*readable, key=attrgetter("receipt_ns"))
     for _, group in groupby(ordered, key=attrgetter("sensor", "stamp_ns", "receipt_ns")):
         lists = list(group)
@@ -127,19 +140,23 @@ def _merged(files: list[Path], parsers: Mapping[int, Any], given: AsterixInput, 
         each.raise_error()
 
 
-def _reports(file: Path, parsers: Mapping[int, Any], given: AsterixInput, plane: LocalPlane) -> Iterator[DetectionList]:
+def _reports(
+    file: Path, readers: Mapping[int, RecordReader], given: AsterixInput, plane: LocalPlane
+) -> Iterator[DetectionList]:
     """Target reports of `file`, a list of one object each, in the order of the file."""
     newest_ns = day_ns = 0
-    sites = {number: _Site(plane, station) for number, station in given.stations.items()}
-    for number, record in _records(file, parsers):
+    sites = {float(number): _Site(plane, station) for number, station in given.stations.items()}
+    nowhere = _Site(plane, None)
+    for number, record in _records(file, readers):
         own = _CATEGORIES[number]
-        if number == 10 and _number(record, "000") != _TARGET_REPORT:
+        if number == 10 and record.get("000") != _TARGET_REPORT:
             continue
         stamp_s = _first(record, (given.stamp[number],) if number in given.stamp else own.stamp)
         receipt_s = _first(record, (given.receipt[number],) if number in given.receipt else own.receipt)
-        station = _number(record, "010/SIC")
-        item = _detection(record, number, own, sites.get(int(station or 0), _Site(plane, None)), plane)
-        if stamp_s is None or item is None or (number in (10, 20) and _number(record, "170/CST")):
+        if stamp_s is None or (number in (10, 20) and record.get("170/CST")):
+            continue
+        item = _detection(record, number, own, sites.get(record.get("010/SIC", 0.0), nowhere), plane)
+        if item is None:
             continue
         stamp_ns = round(stamp_s * NS_PER_S) + day_ns
         if abs(stamp_ns - newest_ns) > _DAY_NS // 2 and newest_ns:  # midnight
@@ -149,11 +166,11 @@ def _reports(file: Path, parsers: Mapping[int, Any], given: AsterixInput, plane:
         if receipt_s is not None:
             receipt_ns += round((receipt_s - stamp_s) % 86_400.0 * NS_PER_S)
         newest_ns = max(newest_ns, receipt_ns)
-        sensor = own.sensor or _KINDS.get(int(_number(record, "020/TYP") or 0), "other")
+        sensor = own.sensor or _KINDS.get(int(record.get("020/TYP", 0)), "other")
         yield DetectionList(sensor, stamp_ns, newest_ns, (item,), "map", origin_deg=plane.origin_deg)
 
 
-def _records(file: Path, parsers: Mapping[int, Any]) -> Iterator[tuple[int, Record]]:
+def _records(file: Path, readers: Mapping[int, RecordReader]) -> Iterator[tuple[int, Record]]:
     """Category and record of everything in `file` that is read. Raises `TruncatedInput` and `DataError`."""
     at = 0
     with open_file(file) as blocks:
@@ -162,10 +179,11 @@ def _records(file: Path, parsers: Mapping[int, Any]) -> Iterator[tuple[int, Reco
             content = blocks.read(max(length - 3, 0))
             if len(head) < 3 or len(content) != length - 3:
                 raise TruncatedInput(f"{file}: breaks off in the block at byte {at}")
-            records = parsers[number](content) if number in parsers else []
-            if isinstance(records, ValueError):
+            try:
+                records = list(readers[number](content)) if number in readers else []
+            except (ValueError, IndexError) as error:
                 hint = f"another edition? (input.asterix.editions: {{{number}: ...}})"
-                raise DataError(f"{file}: cannot decode category {number} at byte {at}, {hint}")
+                raise DataError(f"{file}: cannot decode category {number} at byte {at}, {hint}") from error
             for record in records:
                 yield number, record
             at += length
@@ -192,8 +210,8 @@ def _detection(record: Record, number: int, own: _Category, site: _Site, plane: 
     position = next((at for name in own.positions if (at := _position_m(record, *name, own.unit_m, site, plane))), None)
     if position is None:
         return None
-    speed_mps, yaw_rad = _velocity(record, *own.velocity, own.velocity_lsb_mps)
-    address, level = _number(record, own.address), _number(record, own.height)
+    speed_mps, yaw_rad = _velocity(record, *own.velocity)
+    address, level = record.get(own.address), record.get(own.height)
     return Detection(
         *position,
         yaw_rad,
@@ -207,7 +225,7 @@ def _detection(record: Record, number: int, own: _Category, site: _Site, plane: 
 def _position_m(
     record: Record, item: str, first: str, second: str, unit_m: float, site: _Site, plane: LocalPlane
 ) -> tuple[float, float] | None:
-    a, b = _number(record, f"{item}/{first}"), _number(record, f"{item}/{second}")
+    a, b = record.get(f"{item}/{first}"), record.get(f"{item}/{second}")
     if a is None or b is None:
         return None
     if first == "LAT":
@@ -217,11 +235,9 @@ def _position_m(
     return site.position_m(unit_m * a, unit_m * b)
 
 
-def _velocity(
-    record: Record, item: str, first: str, second: str, lsb: float | None
-) -> tuple[float | None, float | None]:
-    """Speed over ground, and its direction where it moves; None where it is not reported. `lsb`: see `_number`."""
-    a, b = _number(record, f"{item}/{first}", lsb), _number(record, f"{item}/{second}", lsb)
+def _velocity(record: Record, item: str, first: str, second: str) -> tuple[float | None, float | None]:
+    """Speed over ground, and its direction where it moves; None where it is not reported."""
+    a, b = record.get(f"{item}/{first}"), record.get(f"{item}/{second}")
     if a is None or b is None:
         return None, None
     if first == "VX":
@@ -231,36 +247,18 @@ def _velocity(
 
 def _accuracy(record: Record, speed_mps: float | None) -> tuple[float, ...] | None:
     """Covariance of the measured components by the accuracy categories; None where the position has none."""
-    radius_m = _NACP_M.get(int(_number(record, "090/NACP") or 0))
-    if not radius_m and _number(record, "210/VN") == 0:
-        radius_m = _NUCP_M.get(int(_number(record, "090/NUCPNIC") or 0))
+    radius_m = _NACP_M.get(int(record.get("090/NACP", 0)))
+    if not radius_m and record.get("210/VN") == 0:
+        radius_m = _NUCP_M.get(int(record.get("090/NUCPNIC", 0)))
     if radius_m is None:
         return None
     variances = [(radius_m / _PER_95) ** 2] * 2
     if speed_mps is not None:
-        std_mps = _NACV_MPS.get(int(_number(record, "090/NUCRNACV") or 0), _UNKNOWN_MPS) / _PER_95
+        std_mps = _NACV_MPS.get(int(record.get("090/NUCRNACV", 0)), _UNKNOWN_MPS) / _PER_95
         variances += [(std_mps / max(speed_mps, std_mps)) ** 2] * bool(speed_mps) + [std_mps**2]
     size = len(variances)
     return tuple(variances[row] if row == column else 0.0 for row in range(size) for column in range(size))
 
 
 def _first(record: Record, names: Iterable[str]) -> float | None:
-    return next((value for name in names if (value := _number(record, name)) is not None), None)
-
-
-def _number(record: Record, name: str, lsb: float | None = None) -> float | None:
-    """Number of an item, or of its part behind a slash, in the unit of the standard; None where it is not there.
-    `lsb` replaces the least significant bit of the library.
-    """
-    item, _, part = name.partition("/")
-    try:
-        value = record.get_item(item)
-        if value is not None and part:
-            value = value.variation.get_item(part)
-    except (AttributeError, KeyError, ValueError):  # not in this edition
-        return None
-    if value is None:
-        return None
-    content = value.variation.content
-    scale = 1.0 if lsb is None else lsb / content.cv_lsb
-    return float(scale * content.as_quantity() if hasattr(content, "as_quantity") else content.as_uint())
+    return next((value for name in names if (value := record.get(name)) is not None), None)
