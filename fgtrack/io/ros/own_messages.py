@@ -13,7 +13,7 @@ from rosbags.interfaces.typing import Typesdict
 from rosbags.typesys import get_types_from_msg
 
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
+from fgtrack.core.types import MEASURABLE, Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.io.adapters.native import DETECTIONS, EGO, TRUTH
 from fgtrack.io.ros.definitions import DEFINITIONS
 
@@ -22,7 +22,7 @@ LITTLE_ENDIAN = b"\0\1"
 _TIME, _LENGTH = Struct("<iI"), Struct("<I")
 _EGO = Struct("<6d??")
 _TRUTH = Struct("<qdd?xH4x4d")
-_MEASURED, _DESCRIBED = Struct("<7d"), Struct("<qq5d")  # of a detection, before and after its covariance
+_MEASURED, _DESCRIBED = Struct(f"<{len(MEASURABLE)}d"), Struct("<qq5d")  # of a detection, around its covariance
 _numbers = lru_cache(maxsize=64)(lambda count: Struct(f"<{count}d"))
 
 
