@@ -1,4 +1,4 @@
-"""docs/extending.md, followed word for word in a folder outside the repository."""
+"""docs/extending.md and its example, followed word for word in a folder outside the repository."""
 
 import os
 import re
@@ -20,11 +20,6 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs/extending.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
-FILES = {
-    match[1]: text
-    for _, text in BLOCKS
-    if (match := re.match(r"# ((?:fgtrack_example/)?[\w.]+)\n", text)) and "behind:" not in text
-}
 BLIPS = "example_msgs/msg/Blips"
 SWEEP = """
 format: fgtrack-sweep/1
@@ -55,10 +50,8 @@ for line in sys.stdin:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The package of the page, installed for programs that `followed` starts."""
-    folder = tmp_path_factory.mktemp("extending")
-    for name, text in FILES.items():
-        (folder / name).parent.mkdir(exist_ok=True)
-        (folder / name).write_text(text, encoding="utf-8")
+    folder = tmp_path_factory.mktemp("extending") / "example"
+    shutil.copytree(ROOT / "docs/example", folder)
     (folder / "sweep.yaml").write_text(SWEEP)
     options = {"TARGET": str(folder / "site"), "NO_DEPS": "1", "NO_BUILD_ISOLATION": "0", "NO_INDEX": "1"}
     env = {f"PIP_{name}": value for name, value in options.items()}
@@ -108,6 +101,11 @@ def test_the_commands_of_the_page_run_and_workers_load_the_package(folder: Path)
 def last_x_m(tracks: str) -> float:
     header, *rows = tracks.splitlines()
     return float(rows[-1].split(",")[header.split(",").index("x_m")])
+
+
+def test_the_page_shows_the_entry_points_of_the_example() -> None:
+    [shown] = [text.split("\n", 1)[1] for language, text in BLOCKS if language == "toml"]
+    assert shown in (ROOT / "docs/example/pyproject.toml").read_text(encoding="utf-8")
 
 
 def test_the_tests_of_the_page_pass(folder: Path) -> None:
