@@ -78,9 +78,9 @@ class Promise:
             return "not measured"
         return "yes" if (self.measured <= self.required if self.at_most else self.measured >= self.required) else "NO"
 
-    def cell(self) -> str:
-        """Return the measured value, its lowest and highest round, and where missed the requirement."""
-        between = f" ({min(self.rounds):.3g} to {max(self.rounds):.3g})" if self.rounds else ""
+    def cell(self, short: bool = False) -> str:
+        """Return the measured value, its lowest and highest round unless `short`, and where missed the requirement."""
+        between = f" ({min(self.rounds):.3g} to {max(self.rounds):.3g})" if self.rounds and not short else ""
         return f"{_short(self.measured)}{between}{f', NOT {self.required:g}' if self.verdict == 'NO' else ''}"
 
 
@@ -172,28 +172,22 @@ def short_machine(yardsticks_us: Sequence[float]) -> str:
     return f"{text}; yardstick {median(yardsticks_us):.2f} us ({min(yardsticks_us):.2f} to {max(yardsticks_us):.2f})"
 
 
-def tables(results: Results, with_ticks: bool = True) -> str:
-    """Return all tables as Markdown; `with_ticks`: also the time of a tick in every cell."""
-    published = {count: f"{median(ms):.3g}" for count, ms in results.published_ms.items()}
-    matrix = [
-        (str(n), published.get(n, "-"), *(results.ratio(label, n).cell() for label in MAIN)) for n in REQUIRED_RATIOS
-    ]
+def tables(results: Results) -> str:
+    """Return all tables as Markdown."""
     quantiles = [(str(n), *(results.p99(label, n).cell() for label in MAIN)) for n in REQUIRED_RATIOS]
     others = [
         (one.what, one.cell(), f"at {'most' if one.at_most else 'least'} {one.required:g}", one.verdict)
         for one in results.others()
     ]
-    kept, judged = [row for row in results.rows if row.tracks >= row.cell.count], results.promises()
-    missed = sum(one.verdict == "NO" for one in judged)
-    source = "its own code, run in turns with fgtrack" if results.is_run else "the yardstick, its code was not run"
+    kept = [row for row in results.rows if row.tracks >= row.cell.count]
     head = ["ticks with detections", "objects", "lag [s]", "delay [s]", "median [ms]", "p99 [ms]", "per detection [us]"]
     parts = [
         short_machine(results.yardsticks_us),
-        f"{missed} of {len(judged)} requirements missed. Published implementation: {source}.",
-        table(["times as fast as published, objects", "published [ms]", *MAIN], matrix),
+        _missed(results),
+        _ratios(results),
         table([f"p99 in medians (at most {LARGEST_P99}), objects", *MAIN], quantiles),
         table(["requirement", "measured", "required", "holds"], others),
-        table(head, [_ticks(row) for row in kept]) if with_ticks else "",
+        table(head, [_ticks(row) for row in kept]),
         *(
             f"{row.cell.label}, {plural(row.cell.count)}: only {row.tracks:g} tracks"
             for row in results.rows
@@ -202,6 +196,52 @@ def tables(results: Results, with_ticks: bool = True) -> str:
         "" if np.isnan(results.stone_soup_us) else f"Stone Soup: {results.stone_soup_us:.3g} us per detection.",
     ]
     return "\n\n".join(filter(None, parts)) + "\n"
+
+
+def page_tables(results: Results) -> str:
+    """Return the answer and the tables of the page, without the spread of the rounds."""
+    fastest = [label for label in MAIN if label in (REPLAY, BANDED, SMOOTHER)]
+    many, few = ([results.ratio(label, n).measured for label in fastest] for n in (max(REQUIRED_RATIOS), 1))
+    answer = (
+        f"With {plural(max(REQUIRED_RATIOS))}, {_times(fastest, many)} times as fast as the published implementation"
+    )
+    p99 = [results.p99(label, n) for n in REQUIRED_RATIOS for label in MAIN]
+    values = [one.measured for one in p99 if not np.isnan(one.measured)] or [float("nan")]
+    kept = sum(one.verdict == "yes" for one in p99)
+    quantiles = f"{min(values):.3g} to {max(values):.3g} ({kept} of {len(p99)} at most {LARGEST_P99:g})"
+    own = machine()
+    parts = [
+        f"{answer}; with {plural(1)}, {_times(fastest, few)}. {_missed(results)}",
+        f"Measured at commit {own['commit']}, {own['processor']}, {own['cores']} cores, Python {own['python']}.",
+        _ratios(results, short=True),
+        table(
+            ["other requirements", "measured"],
+            [*((one.what, one.cell(short=True)) for one in results.others()), ("99 % quantile, in medians", quantiles)],
+        ),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _times(labels: Sequence[str], ratios: Sequence[float]) -> str:
+    return ", ".join(
+        f"`{label}` is {_short(float(f'{ratio:.2g}'))}" for label, ratio in zip(labels, ratios, strict=True)
+    )
+
+
+def _missed(results: Results) -> str:
+    judged = results.promises()
+    source = "was run in turns with fgtrack" if results.is_run else "is stood for by the yardstick"
+    missed = sum(one.verdict == "NO" for one in judged)
+    return f"{missed} of {len(judged)} requirements missed. The published implementation {source}."
+
+
+def _ratios(results: Results, short: bool = False) -> str:
+    published = {count: f"{median(ms):.3g}" for count, ms in results.published_ms.items()}
+    rows = [
+        (str(n), published.get(n, "-"), *(results.ratio(label, n).cell(short) for label in MAIN))
+        for n in REQUIRED_RATIOS
+    ]
+    return table(["times as fast as published, objects", "published [ms]", *MAIN], rows)
 
 
 def _ticks(row: Row) -> tuple[str, ...]:

@@ -4,9 +4,10 @@
     make bench-full                           # also every estimator, more numbers of objects, lags, delays
     make bench AGAINST='COMMAND' PAGE=docs/speed.md
 
-COMMAND runs the published implementation on a stream that is appended to it, and prints as its last line a JSON object
-with `receive_and_handling`: median, 99 % quantile and mean of its ticks with detections in ms. Everything is measured
-in turns, round after round. How to read the tables: docs/speed.md.
+COMMAND passes the messages of a stream, its last argument, to the callbacks of the published node, with ROS replaced by
+stubs. Its last line is JSON with `receive_and_handling`: median, 99 % quantile and mean in ms of the ticks with
+detections. Without AGAINST the yardstick stands for it, `np.dot(F, P).dot(F.T) + Q` on 6 x 6 arrays. Everything is
+measured in turns, round after round. How to read the tables: docs/speed.md.
 """
 
 import json
@@ -39,6 +40,7 @@ from bench_report import (
     Row,
     draw,
     finite,
+    page_tables,
     progress,
     put_into,
     tables,
@@ -157,7 +159,7 @@ def main(
     rounds: Annotated[int, typer.Option(min=1, help="Passes over every cell.")] = 3,
     duration_s: Annotated[float, typer.Option(help="Longest traffic and replay.")] = 60.0,
     objects: Annotated[str, typer.Option(help="Numbers of objects, with commas.")] = ",".join(map(str, ALL_OBJECTS)),
-    page: Annotated[Path | None, typer.Option(help="Put tables and figure into this page.")] = None,
+    page: Annotated[Path | None, typer.Option(help="Put answer, tables and figure into this page.")] = None,
 ) -> None:
     """Measure, print the tables, write speed.md, speed.json and speed.png."""
     out.mkdir(parents=True, exist_ok=True)
@@ -194,7 +196,7 @@ def main(
     (out / "speed.json").write_text(json.dumps(finite(results.as_dict()), indent=2) + "\n", encoding="utf-8")
     draw(results, out / "speed.png")
     if page is not None:
-        put_into(page, "speed", tables(results, with_ticks=False))
+        put_into(page, "speed", page_tables(results))
         draw(results, page.with_suffix(".png"))
     print(text, end="")
 
