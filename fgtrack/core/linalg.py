@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg.lapack import dgesv, dpotrf, dtrtri
 
 from fgtrack.core.checks import LARGEST
-from fgtrack.core.types import FloatArray
+from fgtrack.core.types import FloatArray, IntArray
 
 
 @cache
@@ -83,9 +83,7 @@ def psd_solve(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
     return np.asarray(solution)
 
 
-def mahalanobis_squared(
-    residual: FloatArray, covariance: FloatArray, entries: Sequence[int] | None = None
-) -> FloatArray:
+def mahalanobis_squared(residual: FloatArray, covariance: FloatArray, entries: IntArray | None = None) -> FloatArray:
     """Squared Mahalanobis distance y' S^-1 y, (..., n) and (..., n, n), of the marginal of `entries` if given."""
     if entries is not None:
         residual, covariance = residual[..., entries], covariance[..., entries, :][..., entries]

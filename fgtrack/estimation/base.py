@@ -5,6 +5,7 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
+from functools import cache
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from fgtrack.core.checks import LARGEST, LARGEST_NS, is_number, is_stamp
 from fgtrack.core.errors import CallError
 from fgtrack.core.linalg import equal_ones, mahalanobis_squared
-from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
+from fgtrack.core.types import FloatArray, IntArray, SmoothedReport, TrackState
 from fgtrack.models.measurement import AT_ORIGIN, COMPONENTS, MeasurementModel, SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.models.sensors import RobustLoss
@@ -110,15 +111,18 @@ class Measurement:
         return self.stamp_ns, self.content
 
     @property
-    def measured(self) -> list[int] | None:
-        """Places of the components that were measured; None where all of them were."""
-        if not self.assumed:
-            return None
-        return [index for index, name in enumerate(self.model.components) if name not in self.assumed]
+    def measured(self) -> IntArray:
+        """Indices of the components that were measured, shape (d,)."""
+        return _measured(self.model.components, self.assumed)
 
     def nis(self, innovation: FloatArray, S: FloatArray) -> float:
         """Normalised innovation squared y' S^-1 y of y (k,) and S (k, k), without components that are `assumed`."""
         return float(mahalanobis_squared(innovation, S, self.measured))
+
+
+@cache
+def _measured(components: tuple[str, ...], assumed: tuple[str, ...]) -> IntArray:
+    return np.array([index for index, name in enumerate(components) if name not in assumed], dtype=np.int64)
 
 
 class Lazy(Sequence[_T], Generic[_T]):

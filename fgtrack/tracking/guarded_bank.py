@@ -53,7 +53,7 @@ class GuardedBank:
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`; states that are not finite are left out."""
         states: StatesAt = self._ask("states_at", stamp_ns)
-        if math.isfinite(np.add.reduce(states.means, axis=None) + np.add.reduce(states.covariances, axis=None)):
+        if math.isfinite(np.vdot(states.means, states.means) + np.vdot(states.covariances, states.covariances)):
             return states
         finite = np.isfinite(states.means.sum(axis=1) + states.covariances.sum(axis=(1, 2)))
         return StatesAt(tuple(compress(states.track_ids, finite)), states.means[finite], states.covariances[finite])
@@ -120,7 +120,7 @@ class GuardedBank:
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`; those that are not sound are left out."""
         reports: list[SmoothedReport] = self._ask("smoothed")
-        unsound = faults([report.state for report in reports])
+        unsound = faults([report.state for report in reports]) if reports else {}
         for fault in unsound.values():
             self.failures.add(fault)
         return [report for row, report in enumerate(reports) if row not in unsound] if unsound else reports
@@ -159,6 +159,9 @@ class GuardedBank:
         self.advance(self._now_ns)
 
 
+_KINDS = Failure.NOT_FINITE, Failure.NOT_DEFINITE  # as the kernel numbers them
+
+
 def faults(states: Sequence[TrackState]) -> dict[int, Failure]:
     """Return the faults of kinematic states by their index; nothing where all can be published.
     A state is sound where it is finite, its entries sum up to at most 10^9, and its covariance is symmetric and
@@ -170,8 +173,6 @@ def faults(states: Sequence[TrackState]) -> dict[int, Failure]:
         x, P = states.means, states.covariances
     else:
         x, P = np.array([state.mean for state in states]), np.array([state.covariance for state in states])
-    codes = kernels("fgtrack.tracking.kernels").faults(
-        *(np.ascontiguousarray(each, dtype=np.float64) for each in (x, P))
-    )
-    kinds = Failure.NOT_FINITE, Failure.NOT_DEFINITE
-    return {row: kinds[codes[row] - 1] for row in codes.nonzero()[0].tolist()} if codes.any() else {}
+    x, P = np.ascontiguousarray(x, dtype=np.float64), np.ascontiguousarray(P, dtype=np.float64)
+    codes = kernels("fgtrack.tracking.kernels").faults(x, P)
+    return {row: _KINDS[codes[row] - 1] for row in codes.nonzero()[0].tolist()}

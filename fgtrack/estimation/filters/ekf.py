@@ -1,14 +1,13 @@
 """The extended Kalman filter's two steps, on stacks of independent states."""
 
 import math
-from collections.abc import Sequence
 from functools import partial
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from fgtrack.core.linalg import congruence, identity, kernels, psd_solve, symmetrise
-from fgtrack.core.types import BoolArray, FloatArray
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.robust import weight
@@ -115,13 +114,13 @@ def correct(
     y: FloatArray,
     H: FloatArray,
     R: FloatArray,
-    measured: Sequence[int] | None = None,
+    measured: IntArray | None = None,
     loss: RobustLoss | None = None,
 ) -> Correction[FloatArray]:
     """Fuse innovations y (m, k) with Jacobians H (m, k, n) or (k, n) and R (m, k, k) (Karle et al. 2023, eqs. 5 to 9).
     `measured` is `Measurement.measured`, for the NIS, `loss` the robust loss of all (see `robust_weight`).
     """
-    rows = np.arange(y.shape[-1]) if measured is None else np.array(measured, dtype=np.int64)
+    rows = np.arange(y.shape[-1]) if measured is None else measured
     x, P, y, R = map(_copied, (mean, covariance, y, R))
     H = np.array(H, dtype=np.float64, order="C", ndmin=3)
     S, nis, w, fused = np.empty(R.shape), np.empty(len(x)), np.ones(len(x)), np.empty(len(x), dtype=bool)
@@ -143,7 +142,7 @@ def updated_one(
     H: FloatArray,
     R: FloatArray,
     loss: RobustLoss | None = None,
-    measured: Sequence[int] | None = None,
+    measured: IntArray | None = None,
 ) -> OneCorrection:
     """One state, (n,) and (n, n), after the innovation y (k,) of a measurement with H (k, n) and R (k, k).
     Raises `numpy.linalg.LinAlgError` for one that cannot be fused.

@@ -102,4 +102,4 @@ def kinematic_states(
     """Kinematic states of m states of `motion`, shapes (m, n) and (m, n, n), at these stamps, or at one."""
     means, covariances = motion.kinematic(means, covariances)
     stamps_ns = [stamps_ns] * len(means) if isinstance(stamps_ns, int) else stamps_ns
-    return States(stamps_ns, means if (np.abs(means[:, YAW]) < np.pi).all() else wrapped_yaw(means), covariances)
+    return States(stamps_ns, wrapped_yaw(means), covariances)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from fgtrack.core.checks import LARGEST_NS
-from fgtrack.core.linalg import kernels
-from fgtrack.core.types import FloatArray, IntArray, TrackState
+from fgtrack.core.linalg import equal_ones, kernels
+from fgtrack.core.types import BoolArray, FloatArray, IntArray, TrackState
 from fgtrack.estimation.base import Measurement, Measurements, Start, StatesAt, UpdateResult, UpdateStatus, stacks
 from fgtrack.estimation.filters.ekf import Prediction
 from fgtrack.estimation.filters.propagation import kinematic_states
@@ -39,11 +39,13 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         self._order: IntArray | None = None  # of all tracks by birth, until one comes, goes or moves
         self._free: list[int] = []
         self._arrays = list[Any]()
+        self._shape: tuple[int, ...] = 0, 0, 0  # numbers of tracks, steps and components
         self._allocate(8, 64, 4)
 
-    def _allocate(self, rows: int, slots: int, k: int) -> None:
-        """Make arrays for so many tracks, steps and components with the present contents (see the kernels)."""
-        n = self._motion.dim
+    def _allocate(self, *least: int) -> None:
+        """Make arrays for at least so many tracks, steps and components with the present contents (see the kernels)."""
+        present, n = self._shape[0], self._motion.dim
+        self._shape = rows, slots, k = tuple(map(max, self._shape, least))
         arrays = [
             np.tile(np.arange(slots), (rows, 1)),
             np.zeros((rows, slots, 2 + k), dtype=np.int64),
@@ -51,10 +53,10 @@ class ReplayBank(ObjectBank[ReplayEkf]):
             np.zeros((rows, 3), dtype=np.int64),
             np.zeros((rows, slots, k + 1, k)),
         ]
-        self._free += range(len(self._arrays[0]) if self._arrays else 0, rows)
-        for new, present in zip(arrays, self._arrays, strict=bool(self._arrays)):
-            new[tuple(map(slice, present.shape))] = present
+        for new, old in zip(arrays, self._arrays, strict=bool(self._arrays)):
+            new[tuple(map(slice, old.shape))] = old
         self._arrays = arrays
+        self._free += range(present, rows)
 
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`."""
@@ -65,17 +67,14 @@ class ReplayBank(ObjectBank[ReplayEkf]):
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`."""
-        rows, starts_ns = self._windows()
-        track_ids, inside = self.track_ids, starts_ns <= stamp_ns
-        if not inside.all():
-            track_ids = tuple(compress(track_ids, inside.tolist()))
-        return StatesAt(track_ids, *self._ahead(track_ids, rows[inside], np.full(len(track_ids), stamp_ns)))
+        known, *states = self._states(stamp_ns)
+        if known is None:
+            return StatesAt(self.track_ids, *states)
+        return StatesAt(tuple(compress(self.track_ids, known.tolist())), *(each[known] for each in states))
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
-        rows, starts_ns = self._windows()
-        states = self._ahead(self.track_ids, rows, np.maximum(starts_ns, self.present_ns))
-        return kinematic_states(self._motion, self.present_ns, *states)
+        return kinematic_states(self._motion, self.present_ns, *self._states(self.present_ns, is_present=True)[1:])
 
     def update(
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
@@ -83,21 +82,22 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         """See `TrackBank.update`."""
         results = [UpdateResult(UpdateStatus.FAILED)] * len(track_ids)
         for indices, alike in stacks(measurements):
-            seen = alike.seen_by(self._motion)
-            rows = np.array([self._rows.get(track_ids[i], -1) for i in indices])
-            inside = (rows >= 0) & _is_plain(seen)
-            for chosen in filter(len, (inside.nonzero()[0], (~inside).nonzero()[0])):
-                part = seen if len(chosen) == len(rows) else replace(seen, z=seen.z[chosen], R=seen.R[chosen])
-                ids = [track_ids[indices[k]] for k in chosen.tolist()]
-                if inside[chosen[0]]:
-                    values = self._fused(stamp_ns, rows[chosen], part)
+            seen, ids = alike.seen_by(self._motion), [track_ids[i] for i in indices]
+            is_plain = _is_plain(seen)
+            for chosen in equal_ones([is_plain and i in self._rows for i in ids]):
+                if len(chosen) < len(ids):
+                    part, own = replace(seen, z=seen.z[chosen], R=seen.R[chosen]), [ids[k] for k in chosen]
                 else:
-                    for track_id in ids:
+                    part, own = seen, ids
+                if is_plain and own[0] in self._rows:
+                    values = self._fused(stamp_ns, own, part)
+                else:
+                    for track_id in own:
                         self._take_out(track_id)
-                    values = super().update(stamp_ns, ids, Measurements(part))
-                    for track_id in ids:
+                    values = super().update(stamp_ns, own, Measurements(part))
+                    for track_id in own:
                         self._put_in(track_id)
-                for k, result in zip(chosen.tolist(), values, strict=True):
+                for k, result in zip(chosen, values, strict=True):
                     results[indices[k]] = result
         return results
 
@@ -114,67 +114,53 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         super().remove(track_id)
         self._order = None
 
-    def _windows(self) -> tuple[IntArray, IntArray]:
-        """Rows of all tracks in the arrays, -1 of filters of their own, and starts of their windows, shapes (m,)."""
-        if self._order is None:
-            self._order = np.array([self._rows.get(i, -1) for i in self._estimators], dtype=np.int64)
-        starts_ns = np.maximum(self._arrays[3][self._order, 1], self._start_ns)
-        if len(self._rows) < len(self._estimators):
-            for k, (i, item) in enumerate(self._estimators.items()):
-                starts_ns[k] = starts_ns[k] if i in self._rows else item.window_ns[0]
-        return self._order, starts_ns
-
-    def _fused(self, stamp_ns: int, rows: IntArray, one: Measurement) -> list[UpdateResult]:
+    def _fused(self, stamp_ns: int, track_ids: Sequence[int], one: Measurement) -> list[UpdateResult]:
         """Outcomes of a stack of measurements of entries of the state."""
-        m, k = one.z.shape
-        self._make_room(rows, k)
-        measured = np.arange(k) if one.measured is None else np.array(one.measured)
-        new, label = np.empty((m, k + 1, k)), np.array([stamp_ns, k, *one.model.selected])
-        new[:, 0], new[:, 1:] = one.z, one.R
+        rows, (m, k) = np.array([self._rows[i] for i in track_ids]), one.z.shape
+        if k > self._shape[2]:
+            self._allocate(0, 0, k)
+        z, R = (np.ascontiguousarray(each, dtype=np.float64) for each in (one.z, one.R))
         y, S, nis, status = np.empty((m, k)), np.empty((m, k, k)), np.empty(m), np.empty(m, dtype=np.int64)
-        lags_ns = self._lag_ns, self._start_ns
-        self._kernels.fuse(
-            self._kind, self._density, *self._arrays, rows, *lags_ns, label, new, measured, y, S, nis, status
+        now = self._lag_ns, self._start_ns, stamp_ns, one.model.selected
+        count = self._kernels.fuse(
+            self._kind, self._density, *self._arrays, rows, *now, z, R, one.measured, y, S, nis, status
         )
+        if count == self._shape[1]:
+            self._allocate(0, 2 * count, 0)
         codes = status.tolist()
         results = list(map(UpdateResult, map(_STATUS.__getitem__, codes), y, nis.tolist(), S))
         for i in (status <= self._kernels.TOO_OLD).nonzero()[0].tolist():
             results[i] = UpdateResult(_STATUS[codes[i]])
         return results
 
-    def _make_room(self, rows: IntArray, k: int) -> None:
-        """Let there be a free slot for a measurement of `k` components in each of `rows`."""
-        order, labels, _, windows, measured = self._arrays
-        num_rows, slots = order.shape
-        for row in rows[windows[rows, 0] == slots].tolist():
-            stamps_ns = labels[row, order[row], 0]
-            gone = max(np.searchsorted(stamps_ns, max(self._start_ns, windows[row, 1])) - 1, 0)
-            windows[row, 0] -= gone
-            order[row] = np.roll(order[row], -gone)
-        largest, is_full = measured.shape[-1], bool((windows[:, 0] == slots).any())
-        if k > largest or is_full:
-            self._allocate(num_rows, slots * (1 + is_full), max(k, largest))
-
-    def _ahead(self, track_ids: Sequence[int], rows: IntArray, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Means (m, n) and covariances (m, n, n) of tracks, each at its stamp, with the yaw in (-pi, pi]."""
-        n = self._motion.dim
-        means, covariances = np.empty((len(rows), n)), np.empty((len(rows), n, n))
-        self._kernels.ahead(self._kind, self._density, *self._arrays[:4], rows, stamps_ns, means, covariances)
-        if len(self._rows) < len(self._estimators):
-            for i in (rows < 0).nonzero()[0].tolist():
-                state = self._estimators[track_ids[i]].state_at(int(stamps_ns[i]))
-                means[i], covariances[i] = state.mean, state.covariance
-        return means, covariances
+    def _states(self, stamp_ns: int, is_present: bool = False) -> tuple[BoolArray | None, FloatArray, FloatArray]:
+        """True of the tracks that are known (m,), None if all are, means (m, n) and covariances (m, n, n) of all."""
+        if self._order is None:
+            self._order = np.array([self._rows.get(i, -1) for i in self._estimators], dtype=np.int64)
+        m, n = len(self._order), self._motion.dim
+        known, means, covariances = np.empty(m, dtype=bool), np.empty((m, n)), np.empty((m, n, n))
+        at = self._order, self._start_ns, stamp_ns, is_present
+        count = self._kernels.ahead(self._kind, self._density, *self._arrays[:4], *at, means, covariances, known)
+        if len(self._rows) < m:
+            for k, (track_id, item) in enumerate(self._estimators.items()):
+                if track_id not in self._rows:
+                    start_ns = item.window_ns[0]
+                    known[k] = is_present or start_ns <= stamp_ns
+                    count += known[k]
+                    if known[k]:
+                        state = item.state_at(max(stamp_ns, start_ns))
+                        means[k], covariances[k] = state.mean, state.covariance
+        return None if count == m else known, means, covariances
 
     def _put_in(self, track_id: int) -> None:
         """Move the steps of a filter into the arrays, where these can hold them."""
         item = self._estimators[track_id]
         if not all(each.search is None and _is_plain(each.measurement) for each in item.steps):
             return
-        (rows, slots), largest = self._arrays[0].shape, self._arrays[4].shape[-1]
         k = max((len(each.measurement.z) for each in item.steps if each.measurement is not None), default=0)
+        rows, slots, largest = self._shape
         if not self._free or len(item.steps) >= slots or k > largest:
-            self._allocate(rows * (1 + (not self._free)), max(slots, 2 * len(item.steps)), max(k, largest))
+            self._allocate(rows * (1 + (not self._free)), 2 * len(item.steps), k)
         row = self._rows[track_id] = self._free.pop()
         self._order = None
         order, labels, steps, windows, measured = (array[row] for array in self._arrays)

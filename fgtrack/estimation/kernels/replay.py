@@ -11,7 +11,7 @@ import numpy as np
 
 from fgtrack.core.compiled import add_congruence, add_weighted, copy, inlined, merged, njit, solve, wrapped
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.kernels.kalman import conclude, marginal_nis
 from fgtrack.models.transitions import ARC, transition
 
@@ -145,7 +145,7 @@ def _step(
 
 @inlined
 def _comes_after(label: IntArray, measured: FloatArray, new_label: IntArray, new: FloatArray) -> bool:
-    """True if a step comes after a new measurement: by stamp, and at one stamp by content, whatever came first."""
+    """True if a step comes after a new one: by stamp, and at one stamp by content, whatever came first."""
     k = label[1]
     if label[0] != new_label[0] or k == 0:
         return bool(label[0] > new_label[0])
@@ -159,12 +159,23 @@ def _comes_after(label: IntArray, measured: FloatArray, new_label: IntArray, new
     return False
 
 
+@inlined
+def _forget(oldest_ns: int, slots: IntArray, labels: IntArray, window: IntArray) -> None:
+    """Free the slots of steps before the newest one that is older than `oldest_ns`."""
+    gone = 0
+    while gone + 1 < window[0] and labels[slots[gone + 1], 0] < oldest_ns:
+        gone += 1
+    window[0] -= gone
+    for j in range(window[0] if gone else 0):
+        slots[j], slots[j + gone] = slots[j + gone], slots[j]
+
+
 _STEPS = "int64, float64[::1], int64[:, ::1], int64[:, :, ::1], float64[:, :, :, ::1], int64[:, ::1]"
 
 
 @njit(
-    f"({_STEPS}, float64[:, :, :, ::1], int64[::1], int64, int64, int64[::1], float64[:, :, ::1], int64[::1], "
-    "float64[:, ::1], float64[:, :, ::1], float64[::1], int64[::1])"
+    f"int64({_STEPS}, float64[:, :, :, ::1], int64[::1], int64, int64, int64, int64[::1], float64[:, ::1], "
+    "float64[:, :, ::1], int64[::1], float64[:, ::1], float64[:, :, ::1], float64[::1], int64[::1])"
 )
 def fuse(
     motion: int,
@@ -177,36 +188,43 @@ def fuse(
     tracks: IntArray,
     lag_ns: int,
     oldest_ns: int,
-    new_label: IntArray,
-    new: FloatArray,
+    stamp_ns: int,
+    entries: IntArray,
+    z: FloatArray,
+    R: FloatArray,
     rows: IntArray,
     y: FloatArray,
     S: FloatArray,
     nis: FloatArray,
     status: IntArray,
-) -> None:
-    """Put a measurement `new` (m, k + 1, k) into the steps of each of `tracks` (m,), and filter the later ones again.
+) -> int:
+    """Put a measurement of `entries` of the state into the steps of each of `tracks` (m,); filter the later ones again.
     Writes innovations y (m, k), the NIS of their `rows`, and S (m, k, k), given all that was fused, and the status. A
-    failed measurement, and one older than `oldest_ns` or the window of the track, change nothing.
+    failed measurement, and one older than `oldest_ns` or the window of the track, change nothing. Returns the largest
+    number of steps; every track must have a free slot.
     """
-    k, n, stamp_ns = y.shape[1], len(density), new_label[0]
+    k, n, largest = y.shape[1], len(density), 0
     now, space = np.empty((n + 1, n)), _space(n, measured.shape[3])
     for i in range(len(tracks)):
         t = tracks[i]
-        slots, count, window = order[t], windows[t, 0], windows[t]
+        slots, window = order[t], windows[t]
         if stamp_ns < max(window[1], oldest_ns):
             status[i] = TOO_OLD
             continue
-        index, own = count, slots[count]
-        while index > 1 and _comes_after(labels[t, slots[index - 1]], measured[t, slots[index - 1]], new_label, new[i]):
+        if window[0] + 1 == len(slots):
+            _forget(max(window[1], oldest_ns), slots, labels[t], window)
+        index = count = window[0]
+        own = slots[count]
+        label, new = labels[t, own], measured[t, own]
+        label[0], label[1] = stamp_ns, k
+        for a in range(k):
+            label[2 + a], new[0, a] = entries[a], z[i, a]
+            for b in range(k):
+                new[1 + a, b] = R[i, a, b]
+        while index > 1 and _comes_after(labels[t, slots[index - 1]], measured[t, slots[index - 1]], label, new):
             slots[index] = slots[index - 1]
             index -= 1
         slots[index] = own
-        for a in range(k + 2):
-            labels[t, own, a] = new_label[a]
-        for a in range(k + 1):
-            for b in range(k):
-                measured[t, own, a, b] = new[i, a, b]
         j, last, fused = index, count, True
         while j <= last:
             s, left = slots[j], slots[j - 1]
@@ -216,7 +234,7 @@ def fuse(
                 newest = slots[count]
                 copy(steps[t, newest, n + 1 if index == count else 0 :], now)
                 ok = _retrodict(motion, density, slots[index : count + 1], labels[t], steps[t], space, now)
-                _innovation(now, new_label, new[i], motion == ARC, y[i], S[i])
+                _innovation(now, label, new, motion == ARC, y[i], S[i])
                 nis[i] = marginal_nis(S[i], y[i], rows, space[5], space[8])
                 ok = ok and not np.isnan(nis[i])
             j += 1
@@ -230,9 +248,11 @@ def fuse(
             status[i] = IN_SEQUENCE if stamp_ns >= window[2] else OUT_OF_SEQUENCE
             window[0], window[2] = count + 1, max(window[2], stamp_ns)
             window[1] = max(window[1], window[2] - lag_ns)
+        largest = max(largest, window[0])
+    return largest
 
 
-@njit(f"({_STEPS}, int64[::1], int64[::1], float64[:, ::1], float64[:, :, ::1])")
+@njit(f"int64({_STEPS}, int64[::1], int64, int64, b1, float64[:, ::1], float64[:, :, ::1], b1[::1])")
 def ahead(
     motion: int,
     density: FloatArray,
@@ -241,22 +261,34 @@ def ahead(
     steps: FloatArray,
     windows: IntArray,
     tracks: IntArray,
-    stamps_ns: IntArray,
+    oldest_ns: int,
+    stamp_ns: int,
+    is_present: bool,
     means: FloatArray,
     covariances: FloatArray,
-) -> None:
-    """Write states (m, n) and (m, n, n) of `tracks`, but those below 0, at their stamps: from the last step before."""
-    n = len(density)
+    known: BoolArray,
+) -> int:
+    """Write states (m, n) and (m, n, n) of `tracks`, but those below 0, at a stamp: from the last step before.
+    Known are, and counted, those whose windows have begun; at the present others have their first state.
+    """
+    n, count = len(density), 0
     F, FP = np.empty((n, n)), np.empty((n, n))
     for i in range(len(tracks)):
-        t = tracks[i]
+        t, at_ns = tracks[i], stamp_ns
         if t < 0:
             continue
+        start_ns = max(windows[t, 1], oldest_ns)
+        if is_present:
+            at_ns = max(stamp_ns, start_ns)
+        known[i] = start_ns <= at_ns
+        if not known[i]:
+            continue
+        count += 1
         j = windows[t, 0] - 1
-        while j > 0 and labels[t, order[t, j], 0] > stamps_ns[i]:
+        while j > 0 and labels[t, order[t, j], 0] > at_ns:
             j -= 1
         s = order[t, j]
-        late_ns = stamps_ns[i] - labels[t, s, 0]
-        _ahead(motion, density, steps[t, s, : n + 1], late_ns, F, means[i], covariances[i], FP)
+        _ahead(motion, density, steps[t, s, : n + 1], at_ns - labels[t, s, 0], F, means[i], covariances[i], FP)
         if motion == ARC:
             means[i, _YAW] = wrapped(means[i, _YAW])
+    return count

@@ -127,8 +127,7 @@ class SmootherBank:
             means = states.means[of]
             y, H = alike.model.linearised(alike.z, means, alike.pose)
             H, R = (np.array(each, dtype=np.float64, order="C", ndmin=3) for each in (H, alike.R))
-            measured = np.arange(y.shape[1]) if alike.measured is None else np.array(alike.measured)
-            (S, nis, _), times = innovations(y, H, states.covariances, of, R, measured), self._windows(tracks)
+            (S, nis, _), times = innovations(y, H, states.covariances, of, R, alike.measured), self._windows(tracks)
             usable = np.isfinite(nis).nonzero()[0]
             fused = self._fuse(usable, tracks, alike, y, H, means, R, times[3]) if usable.size else usable
             rows = list(zip(group, y, nis.tolist(), S, *times[:2].tolist(), strict=True))
