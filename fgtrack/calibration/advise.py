@@ -10,9 +10,10 @@ from fgtrack.calibration.arrivals import FEWEST, LONGEST_STORAGE_S, Arrivals, ar
 from fgtrack.calibration.clock_offsets import OffsetReport, estimate_offsets
 from fgtrack.calibration.clocks import bias_findings, clock_findings, stamp_findings
 from fgtrack.calibration.finding import Finding, milliseconds, percent
-from fgtrack.calibration.ledger import SUMMARY_S, Books
+from fgtrack.calibration.ledger import SUMMARY_S, summary
 from fgtrack.calibration.outcome import Outcome, harm, noise_findings, objection
 from fgtrack.calibration.page import Advice
+from fgtrack.calibration.paired_replay import PairedReplay
 from fgtrack.calibration.trial import TRIAL_S, beginning, suspicions
 from fgtrack.calibration.tune import tuned
 from fgtrack.calibration.tune_space import TuneRules
@@ -127,10 +128,10 @@ class Adviser:
             self._take(noise_findings(new))
         if tune and new is not None:
             self._take(self._tuned(new))
-        old, new, summary = self._outcome(before), self._outcome(self._config), None
+        old, new, policies = self._outcome(before), self._outcome(self._config), None
         with suppress(DataError):  # nothing can be judged
             first = list(beginning(self._tracked, nanoseconds(SUMMARY_S if ledger else 0.0)))
-            summary = Books.of(first, self._config).summary() if ledger else None
+            policies = summary(PairedReplay.of(first, self._config)) if ledger else None
         return Advice(
             recording=self._recording,
             findings=tuple(sorted(self._findings, key=lambda one: -one.weight)),
@@ -141,7 +142,7 @@ class Adviser:
             before=old,
             after=new,
             broken=broken,
-            ledger=summary,
+            ledger=policies,
         )
 
     def _take(self, findings: Iterable[Finding]) -> None:

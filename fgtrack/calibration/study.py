@@ -11,8 +11,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fgtrack.calibration.advise import Adviser
-from fgtrack.calibration.ledger import REPLAY, SUMMARY_S, Books
+from fgtrack.calibration.ledger import SUMMARY_S, summary
 from fgtrack.calibration.page import Advice
+from fgtrack.calibration.paired_replay import REPLAY, PairedReplay
 from fgtrack.calibration.tune_measurements import Watch
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
@@ -216,8 +217,8 @@ def study(
         for folder, one in zip(runs, every, strict=True):
             write_metrics(folder, one.metrics.as_dict())
         with suppress(DataError):  # without a track to judge there is no ledger
-            books = Books(watch.bank, every[ESTIMATORS.index(REPLAY)].run, known.config, SUMMARY_S)
-            tables = replace(tables, tables={**tables.tables, "ledger": books.summary()})
+            replays = PairedReplay(watch.bank, every[ESTIMATORS.index(REPLAY)].run, known.config, SUMMARY_S)
+            tables = replace(tables, tables={**tables.tables, "ledger": summary(replays)})
         lines = _recording(every[0]), _tracks(every[0]), *tables.verdict, _to_do(every[0], tables, advised)
         on_step("draw", _DRAW)
         close_up, late = drawn_close_up(every)
