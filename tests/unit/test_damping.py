@@ -1,6 +1,7 @@
 """Steps of the smoother that go further than their linearisation holds are taken again with damping."""
 
 import numpy as np
+import pytest
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
@@ -46,6 +47,7 @@ def tracked(streams: list[list[Measurement]], make: type[SmootherBank]) -> Smoot
     return bank
 
 
+@pytest.mark.slow
 def test_bearings_alone_lead_where_levenberg_marquardt_does() -> None:
     found = [heard(np.random.default_rng(seed)) for seed in (2,)]
     streams = [stream for stream, _ in found]

@@ -176,7 +176,7 @@ def test_the_error_of_a_stamp_is_part_of_the_innovation_along_the_motion(estimat
     assert not 1.5 < nis[0.0] < 2.6
 
 
-def test_the_error_of_stamps_is_fitted():
+def test_the_error_of_stamps_is_fitted() -> None:
     """Of 200 stamps alone a standard deviation of 0.5 s is known to 0.5 s / sqrt(400) = 0.025 s."""
     rng, v_mps = np.random.default_rng(5), 200.0
     errors = rng.normal(size=(200, 3)) * (0.5, 10.0, 10.0)
