@@ -77,7 +77,8 @@ class Watch:
         self.bank = RecordingBank(make, parts.failures, preprocess)
         if self._gate_stds and isinstance(association, GatedEuclidean | GatedMahalanobis):
             association = _OpenedGate(association, self._gate_stds)
-        return replace(parts, preprocess=preprocess, bank=self.bank, association=association)
+        joint = parts.joint and replace(parts.joint, joint_from=None)  # the noise is that of single detections
+        return replace(parts, preprocess=preprocess, bank=self.bank, association=association, joint=joint)
 
 
 @dataclass(frozen=True)
@@ -112,21 +113,21 @@ class _WatchedPreprocess(Preprocess):
 
     def __init__(self, watched: Preprocess) -> None:
         self.__dict__.update(vars(watched))
-        self._own: dict[tuple[int, bytes], tuple[str, SensorModel, bool]] = {}  # by stamp and what is measured
+        self._own: dict[tuple[int, bytes], tuple[str, SensorModel, bool]] = {}  # by pose, one for each batch, and z
 
     def together(self, batches: Sequence[PosedBatch]) -> list[Preprocessed]:
         """See `Preprocess.together`."""
         result, self._own = super().together(batches), {}
-        for (batch, sensor, _, _), (candidates, _) in zip(batches, result, strict=True):
+        for (batch, sensor, _, pose), (candidates, _) in zip(batches, result, strict=True):
             for item in candidates:
                 carried = [batch.message.objects[index].covariance for index in (item.leader, *item.merged)]
                 is_own = sensor.message_covariance and any(each is not None for each in carried)
-                self._own[batch.stamp_ns, item.measurement.z.tobytes()] = batch.message.sensor, sensor, is_own
+                self._own[id(pose), item.measurement.z.tobytes()] = batch.message.sensor, sensor, is_own
         return result
 
     def observation(self, measurement: Measurement) -> Observation:
         """Return a measurement of the newest batches with its noise in parts."""
-        name, sensor, is_own = self._own[measurement.stamp_ns, measurement.z.tobytes()]
+        name, sensor, is_own = self._own[id(measurement.pose), measurement.z.tobytes()]
         return observation(name, sensor, measurement, is_own)
 
 

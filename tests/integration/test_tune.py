@@ -1,6 +1,7 @@
 """`fgtrack tune`: from recordings of known noise to a configuration with that noise."""
 
 import json
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import pytest
 from fgtrack.calibration.tune_measurements import recorded
 from fgtrack.calibration.tune_space import ConfigNoise
 from fgtrack.cli.main import run
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import Detection, DetectionList
 from fgtrack.io.stream import write_stream
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
@@ -73,6 +76,20 @@ def test_a_gate_is_opened_to_the_uncertainty_of_a_bearing_far_away(association: 
 
     assert radar_count(0.0) < 60
     assert radar_count(4.0) > 70
+
+
+def test_equal_detections_of_two_sensors_are_observations_of_both_and_not_joined() -> None:
+    sensors = {"front": {"std": {"x_m": 0.3, "y_m": 0.3}}, "rear": {"std": {"x_m": 0.5, "y_m": 0.5}}}
+    settings = {"sensors": sensors, "association": {"kind": "mahalanobis", "joint_from": 1}, "estimator": "ekf-replay"}
+    config = read_config("open_space", settings)
+    lists = [
+        DetectionList(name, k * NS_PER_S // 10, k * NS_PER_S // 10, (Detection(x_m=0.1 * k, y_m=0.0),), "map")
+        for k in range(20)
+        for name in sensors
+    ]
+    (series,), _ = recorded(lists, config)
+    counts = Counter(one.sensor for one in series.observations)
+    assert min(counts["front"], counts["rear"]) > 15
 
 
 @pytest.mark.slow
