@@ -19,7 +19,6 @@ from typing import Literal
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from fgtrack.core.geometry import polar
 from fgtrack.core.linalg import kernels
 from fgtrack.core.settings import OpenProbability, settings
 from fgtrack.core.time import nanoseconds
@@ -28,7 +27,7 @@ from fgtrack.estimation.base import StatesAt
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.lifecycle import CountingLifecycle, Scan
 from fgtrack.tracking.preprocess import Candidate, Candidates
-from fgtrack.tracking.visibility import DetectionShares, Histories, Looks
+from fgtrack.tracking.visibility import Histories
 
 _LIFE = np.dtype(
     [
@@ -38,8 +37,6 @@ _LIFE = np.dtype(
 )
 """True if it was ever confirmed, or as far from its first position as it must be; misses since the last match, and
 the newest stamps at which it was in view and probably visible."""
-_SHARES = (0.02, 0.98)
-"""Bounds of the share of visible objects: nothing is always visible, or never."""
 
 
 @settings
@@ -59,8 +56,7 @@ class ExistenceRules:
     """Mean time for which an object stays: oncoming traffic is near for seconds, a car ahead for minutes. It matters
     where few lists could show an object; elsewhere those that miss it end its track."""
     visible_share: OpenProbability = 0.9
-    """Share of the time for which an object is visible to a sensor, where nothing was tracked yet: what is hidden, too
-    small or too far away for a sensor is learned by range and bearing."""
+    """Share of the time for which an object is visible to a sensor: less where objects hide each other often."""
     visible_s: PositiveFloat = 2.0
     """Time after which visibility to a sensor is forgotten to 1/e: misses come in rows of about that length."""
     out_of_view_s: PositiveFloat = 0.5
@@ -100,9 +96,7 @@ class ExistenceLifecycle:
         self._hidden_ns = nanoseconds(rules.hidden_s)
         self._present_ns = 0
         self._newest_ns = 0  # stamp of the newest list that could have shown something
-        self._histories = Histories(len(sensors), rules.lifetime_s, rules.visible_s)
-        priors = [rules.visible_share * sensor.detection_probability for sensor in sensors.values()]
-        self._shares = DetectionShares(self._memory_ns, priors)
+        self._histories = Histories(len(sensors), rules.lifetime_s, rules.visible_share, rules.visible_s)
         self._rows: dict[int, int] = {}  # of the arrays, by track id in order of birth
         self._lives = np.zeros(0, dtype=_LIFE)
         self._reports: dict[int, tuple[TrackStatus, float]] | None = None  # by track id, once they are asked for
@@ -133,7 +127,7 @@ class ExistenceLifecycle:
         density = position_densities(candidates, chosen, means, states.covariances[tracks])
         known, P_D = ~np.isnan(density), sensor.detection_probability
         ratios = 1.0 - P_D + P_D * density / sensor.clutter_per_m2 * np.exp(scores)
-        self._learn(scan, rows[known], means[known, :2], ratios[known])
+        self._learn(scan, rows[known], ratios[known])
         self._confirm(rows)
 
     def fused(self, track_id: int) -> None:
@@ -148,18 +142,18 @@ class ExistenceLifecycle:
             poses = np.broadcast_to([scan.ego.x_m, scan.ego.y_m, scan.ego.yaw_rad], (len(rows), 3))
             ratios[~sensor.sees(positions_m, poses, self._origin_m)] = np.nan
         self._lives["misses"][rows] += ~np.isnan(ratios)
-        self._learn(scan, rows, positions_m, ratios)
+        self._learn(scan, rows, ratios)
         return self._ended()
 
     def expired(self, present_ns: int) -> list[int]:
         """See `CountingLifecycle.expired`."""
         self._present_ns, self._reports = present_ns, None
-        self._remember(self._histories.forget(present_ns - self._memory_ns))
+        self._histories.forget(present_ns - self._memory_ns)
         return self._ended()
 
     def forget(self, track_id: int) -> None:
         """See `CountingLifecycle.forget`."""
-        self._remember(self._histories.end(self._rows.pop(track_id)))
+        self._histories.end(self._rows.pop(track_id))
         self._reports = None
 
     def probability(self, track_id: int) -> float:
@@ -187,22 +181,13 @@ class ExistenceLifecycle:
     def _rows_of(self, track_ids: Iterable[int]) -> IntArray:
         return np.array([self._rows[track_id] for track_id in track_ids], dtype=np.int64)
 
-    def _learn(self, scan: Scan, rows: IntArray, positions_m: FloatArray, ratios: FloatArray) -> None:
+    def _learn(self, scan: Scan, rows: IntArray, ratios: FloatArray) -> None:
         """Add the evidence of a list; `ratios` if visible, NaN where an object is out of view, shape (m,)."""
-        sensor, index, cells = self._sensors[scan.sensor], self._index[scan.sensor], np.zeros(len(rows), dtype=np.int64)
-        if scan.ego is not None:
-            bearing_range = polar(positions_m - np.array([scan.ego.x_m, scan.ego.y_m]))
-            cells = self._shares.cells(bearing_range[:, 1], bearing_range[:, 0] - scan.ego.yaw_rad)
-        shares = self._shares.at(index, scan.stamp_ns, cells) / sensor.detection_probability
-        self._histories.learn(rows, scan.stamp_ns, index, np.clip(shares, *_SHARES), ratios, cells)
-        visible, self._reports = self._histories.last(rows)[0][:, index] >= 0.5, None
+        index = self._index[scan.sensor]
+        self._histories.learn(rows, scan.stamp_ns, index, ratios)
+        visible, self._reports = self._histories.visible(rows)[:, index] >= 0.5, None
         for name, chosen in (("in_view_ns", ~np.isnan(ratios)), ("visible_ns", visible)):
             self._lives[name][rows[chosen]] = np.maximum(self._lives[name][rows[chosen]], scan.stamp_ns)
-
-    def _remember(self, looks: Looks) -> None:
-        """Learn the shares of detection from `looks` at confirmed tracks."""
-        if len(looks.rows):
-            self._shares.learn(Looks(*(each[self._lives["confirmed"][looks.rows]] for each in looks)))
 
     def _confirm(self, rows: IntArray) -> None:
         exists = self._histories.present(rows, self._present_ns) >= self._rules.confirm_probability

@@ -6,19 +6,8 @@ import numpy as np
 
 from fgtrack.core.compiled import inlined, njit
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.tracking.visibility import (
-    CELL,
-    LARGEST_LOG_ODDS,
-    LOG_ODDS,
-    NEVER,
-    RATIO,
-    SENSOR,
-    SHARE,
-    STAMP,
-    VIEWED,
-    VISIBLE,
-)
+from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.tracking.visibility import LARGEST_LOG_ODDS, LOG_ODDS, NEVER, RATIO, SENSOR, STAMP, VIEWED, VISIBLE
 
 
 @inlined
@@ -31,14 +20,16 @@ def _survived(log_odds: float, dt_ns: int, lifetime_s: float) -> float:
 
 
 @inlined
-def _conclude(numbers: FloatArray, entries: IntArray, k: int, lifetime_s: float, visible_s: float) -> None:
+def _conclude(
+    numbers: FloatArray, entries: IntArray, k: int, lifetime_s: float, visible_share: float, visible_s: float
+) -> None:
     """Write the probabilities after entry k of one track.
     Prediction v = share + (v - share) exp(-dt / visible_s), likelihood 1 - v + v ratio, update v ratio / likelihood.
     """
     for j in range(VISIBLE, numbers.shape[1]):
         numbers[k, j], entries[k, j - VISIBLE + VIEWED] = numbers[k - 1, j], entries[k - 1, j - VISIBLE + VIEWED]
     own, viewed, stamp_ns = VISIBLE + entries[k, SENSOR], VIEWED + entries[k, SENSOR], entries[k, STAMP]
-    v, ratio = numbers[k, SHARE], numbers[k, RATIO]
+    v, ratio = visible_share, numbers[k, RATIO]
     numbers[k, LOG_ODDS] = _survived(numbers[k - 1, LOG_ODDS], stamp_ns - entries[k - 1, STAMP], lifetime_s)
     if math.isnan(ratio):  # out of view: what it sees when it is back is not correlated with what it saw
         numbers[k, own], entries[k, viewed] = 0.0, NEVER
@@ -52,35 +43,34 @@ def _conclude(numbers: FloatArray, entries: IntArray, k: int, lifetime_s: float,
 
 
 @njit(
-    "(int64[::1], int64, int64, float64[::1], float64[::1], int64[::1], float64[:, :, ::1], int64[:, :, ::1],"
-    " int64[::1], float64, float64)"
+    "(int64[::1], int64, int64, float64[::1], float64[:, :, ::1], int64[:, :, ::1], int64[::1], float64, float64,"
+    " float64)"
 )
 def learn(
     rows: IntArray,
     stamp_ns: int,
     sensor: int,
-    shares: FloatArray,
     ratios: FloatArray,
-    cells: IntArray,
     numbers: FloatArray,
     entries: IntArray,
     counts: IntArray,
     lifetime_s: float,
+    visible_share: float,
     visible_s: float,
 ) -> None:
     """Insert an entry into the tracks `rows` in order of stamps, and conclude again from there on."""
     for m in range(len(rows)):
         own, at = rows[m], counts[rows[m]]
         while at > 1 and entries[own, at - 1, STAMP] > stamp_ns:
-            for j in range(VISIBLE):
-                numbers[own, at, j], entries[own, at, j] = numbers[own, at - 1, j], entries[own, at - 1, j]
+            numbers[own, at, RATIO] = numbers[own, at - 1, RATIO]
+            for j in range(VIEWED):
+                entries[own, at, j] = entries[own, at - 1, j]
             at -= 1
         counts[own] += 1
-        numbers[own, at, SHARE], numbers[own, at, RATIO] = shares[m], ratios[m]
+        numbers[own, at, RATIO], entries[own, at, SENSOR] = ratios[m], sensor
         entries[own, at, STAMP] = max(stamp_ns, entries[own, 0, STAMP])
-        entries[own, at, SENSOR], entries[own, at, CELL] = sensor, cells[m]
         for k in range(at, counts[own]):
-            _conclude(numbers[own], entries[own], k, lifetime_s, visible_s)
+            _conclude(numbers[own], entries[own], k, lifetime_s, visible_share, visible_s)
 
 
 @njit("float64[::1](int64[::1], int64, float64[:, :, ::1], int64[:, :, ::1], int64[::1], float64)")
@@ -96,35 +86,14 @@ def present(
     return result
 
 
-@njit("(int64, float64[:, :, ::1], int64[:, :, ::1], int64[::1], float64)")
-def forget(
-    oldest_ns: int, numbers: FloatArray, entries: IntArray, counts: IntArray, visible_s: float
-) -> tuple[IntArray, IntArray, IntArray, IntArray, BoolArray, FloatArray]:
-    """Move entries up to `oldest_ns` out of the histories, see `Looks`; the last of them becomes entry 0."""
-    size = 0
-    for own in range(len(counts)):
-        for k in range(1, counts[own]):
-            size += entries[own, k, STAMP] <= oldest_ns
-    rows, stamps_ns = np.empty(size, np.int64), np.empty(size, np.int64)
-    sensors, cells = np.empty(size, np.int64), np.empty(size, np.int64)
-    shown, weights, at = np.empty(size, np.bool_), np.empty(size), 0
+@njit("(int64, float64[:, :, ::1], int64[:, :, ::1], int64[::1])")
+def forget(oldest_ns: int, numbers: FloatArray, entries: IntArray, counts: IntArray) -> None:
+    """Drop entries up to `oldest_ns`; the last of them becomes entry 0."""
     for own in range(len(counts)):
         last = 0
-        for k in range(1, counts[own]):
-            if entries[own, k, STAMP] > oldest_ns:
-                break
-            last, sensor = k, entries[own, k, SENSOR]
-            rows[at], stamps_ns[at], sensors[at], cells[at] = own, entries[own, k, STAMP], sensor, entries[own, k, CELL]
-            shown[at] = numbers[own, k, RATIO] > 1.0
-            before_ns, weights[at] = entries[own, k - 1, VIEWED + sensor], 0.0
-            if not math.isnan(numbers[own, k, RATIO]):
-                look = 1.0
-                if before_ns != NEVER:
-                    look = min((stamps_ns[at] - before_ns) / (NS_PER_S * visible_s), 1.0)
-                weights[at] = look / (1.0 + math.exp(-numbers[own, k, LOG_ODDS]))
-            at += 1
+        while last + 1 < counts[own] and entries[own, last + 1, STAMP] <= oldest_ns:
+            last += 1
         for k in range(last, counts[own] if last else 0):
             for j in range(numbers.shape[2]):
                 numbers[own, k - last, j], entries[own, k - last, j] = numbers[own, k, j], entries[own, k, j]
         counts[own] -= last
-    return rows, stamps_ns, sensors, cells, shown, weights

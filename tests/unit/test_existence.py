@@ -92,7 +92,7 @@ def test_a_track_that_is_hidden_for_too_long_ends_although_it_is_probable() -> N
 
 @pytest.mark.parametrize("learned_s", [0.0, 60.0])
 def test_lists_count_at_their_stamps_in_whatever_order_they_arrive(learned_s: float) -> None:
-    """Also what is learned of where a sensor detects, from lists that have left the memory."""
+    """Also after lists that have left the memory."""
     lists = [("lidar", 300.0, True), ("ahead", 500.0, False), ("lidar", 600.0, False), ("ahead", 900.0, True)]
     found = set()
     for order in permutations(lists):
@@ -122,25 +122,7 @@ def test_the_misses_of_one_sensor_do_not_end_what_another_sees() -> None:
         assert life.missed(scan("scored", 100.0 * k), [0], there, np.array([10.0])) == []
         life.expired(START_NS + ms(100.0 * k))
     assert life.status(0) is TrackStatus.COASTING
-    assert life.probability(0) > 0.95
-
-
-def test_a_sensor_learns_where_it_shows_nothing_so_that_its_misses_there_cost_little() -> None:
-    costs = []
-    for learned in (False, True):
-        life, there = lifecycle(ExistenceRules()), np.array([[10.0, 0.0]])
-        life.born(0, scan("lidar", ego=ego()), HERE)
-        for k in range(1, 300 if learned else 3):
-            match(life, 0, scan("lidar", 200.0 * k, ego=ego()), HERE, MEAN, P)
-            if learned:
-                life.missed(scan("scored", 200.0 * k, ego=ego()), [0], there, np.array([10.0]))
-            life.expired(START_NS + ms(200.0 * k))
-        life.born(1, scan("lidar", 60_000.0, ego=ego()), HERE)
-        life.expired(START_NS + ms(60_000.0))
-        life.missed(scan("scored", 60_000.0, ego=ego()), [1], there, np.array([10.0]))
-        life.expired(START_NS + ms(60_000.0))
-        costs.append(0.2 - life.probability(1))
-    assert costs[1] < 0.2 * costs[0]
+    assert life.probability(0) > rules.confirm_probability
 
 
 @pytest.mark.parametrize(
