@@ -169,6 +169,9 @@ def chi_square_quantile(probability: float, freedom: int) -> float:
 def assigned(pairs: Pairs, num_candidates: int, num_tracks: int) -> Assignment:
     """Assignment of as many of `pairs` as possible at least total cost, which are their values."""
     rows, columns, cost = pairs
+    if num_candidates == 1 and len(rows) > 1:
+        best = cost.argmin()
+        rows, columns = rows[best, None], columns[best, None]
     competes = not len(set(rows.tolist())) == len(set(columns.tolist())) == len(rows)
     if competes:
         if num_candidates > num_tracks:
