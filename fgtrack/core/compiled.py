@@ -5,13 +5,17 @@ Calls of NumPy, BLAS and assignments of slices in compiled code take seconds to 
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from hashlib import sha256
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
 from llvmlite.binding import add_symbol
+from numba.core.caching import FunctionCache
 from numba.core.cgutils import get_or_insert_function
+from numba.core.runtime.nrt import rtsys
 from numba.core.typing.templates import ConcreteTemplate, infer_global
 from numba.extending import lower_builtin
 
@@ -28,20 +32,59 @@ def _say(text: str) -> None:
         _LOG.warning(text)
 
 
+_NOT_STORED = "compiled loops cannot be stored, so every start compiles them: let NUMBA_CACHE_DIR name a folder"
+_stamps = dict[str, bytes]()
+
+
 # Any: numba has no types of what is compiled.
+def _stamp(scope: Mapping[str, Any]) -> bytes:
+    """Digest of the source of a module with these global names, of its numbers, and of the compiled modules it uses."""
+    if scope["__name__"] not in _stamps:
+        numbers = [(name, value) for name, value in scope.items() if isinstance(value, (int, float))]
+        used = sorted(_stamps.keys() & {getattr(value, "__module__", None) for value in scope.values()})
+        parts = [Path(scope["__file__"]).read_bytes(), repr(numbers).encode(), *map(_stamps.__getitem__, used)]
+        _stamps[scope["__name__"]] = sha256(b"".join(parts)).digest()
+    return _stamps[scope["__name__"]]
+
+
+class _Cache(FunctionCache):
+    """Stored results of a function, valid until its module or a compiled one that it uses changes.
+    numba compares the function's own file only: a stored caller of a changed `shared` function crashes.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        self._cache_file._source_stamp = _stamp(function.__globals__)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """See numba, without its tables of all types and functions: half a second that only compiling needs."""
+        rtsys.initialize(target_context)
+        return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """See numba; a full disk is no error."""
+        try:
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+        except OSError:
+            _say(_NOT_STORED)
+
+
 def njit(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that compiles a function once: it is stored in a cache folder, if one can be written.
     One line of the log reports that loops are compiled, another one that they cannot be stored.
     """
-    options |= {"no_cfunc_wrapper": True}
+
+    options |= {"error_model": "numpy", "no_cfunc_wrapper": True}
 
     def compiled(function: Callable[..., Any]) -> Any:
+        result: Any = numba.njit(**options)(function)
         try:
-            result = numba.njit(signature, cache=True, error_model="numpy", **options)(function)
-        except RuntimeError:
-            _say("compiled loops cannot be stored, so every start compiles them: let NUMBA_CACHE_DIR name a folder")
-            return numba.njit(signature, error_model="numpy", **options)(function)
-        if result.stats.cache_misses:
+            result._cache = _Cache(function)
+        except RuntimeError:  # numba has no folder to write to
+            _say(_NOT_STORED)
+        result.compile(signature)
+        result.disable_compile()
+        if result.stats.cache_misses and isinstance(result._cache, _Cache):
             _say("compiling numerical loops, once: some 45 s of processor time for all")
         return result
 
