@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
-from rich.progress import Progress
 
 from fgtrack.cli.arguments import Form
 from fgtrack.core.errors import one_line, printable_lines
@@ -62,9 +61,12 @@ def show(tables: Tables | Table, form: Form | None, values: Mapping[str, Any] | 
 def progress(what: str, total: int | None = None) -> Iterator[Callable[..., None]]:
     """A bar on a terminal while the block runs; the function given sets its text after each step or with the share."""
     stderr = Console(stderr=True)
-    with Progress(
-        console=stderr, transient=True, speed_estimate_period=_SPEED_PERIOD_S, disable=not stderr.is_terminal
-    ) as bar:
+    if not stderr.is_terminal:
+        yield lambda *_, **__: None
+        return
+    from rich.progress import Progress
+
+    with Progress(console=stderr, transient=True, speed_estimate_period=_SPEED_PERIOD_S) as bar:
         task = bar.add_task(what, total=total)
 
         def moved(text: str = "", share: float | None = None) -> None:

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtri
 
 from fgtrack.core.diagnostic import EGO, Diagnostic, in_degrees
 from fgtrack.core.geometry import cartesian
@@ -83,6 +82,8 @@ def noise_diagnostics(run: Run) -> Iterator[Diagnostic]:
 
 def misfits(run: Run) -> Iterator[tuple[str, ChiSquareMean]]:
     """The sensors whose mean and median NIS (not a few outliers) are far off on the same side, and their NIS."""
+    from scipy.special import chdtri
+
     for sensor, mine in by_sensor(run.tables["updates"]):
         nis = ChiSquareMean.of(mine["nis"], num_measured(mine))
         if nis.count >= FEWEST and is_far_off(nis):

@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
 
 from fgtrack.core.types import FloatArray, IntArray
 
@@ -129,5 +128,7 @@ def correlation_length(values: FloatArray) -> float:
 
 def _t_interval(mean: float, error: float, count: float) -> Estimate:
     """`mean` with its t interval, `error` being its standard error from `count` independent pieces."""
+    from scipy.special import stdtrit
+
     half = float(stdtrit(count - 1.0, _UPPER)) * error if count > 1.0 else math.nan
     return Estimate(mean, mean - half, mean + half, int(count))

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray, TrackStatus
@@ -119,6 +118,8 @@ def pair(scores: FloatArray, ids: IntArray, tick_index: IntArray, previous: IntA
     """Object of every row, shape (rows,), so that each tick has the largest sum of scores; `NO_OBJECT` without one.
     `scores`, shape (rows, objects), are 0 for pairs that are not allowed; pairs of the tick `previous`, (ticks,), stay.
     """
+    from scipy.optimize import linear_sum_assignment
+
     num_ticks, inside = len(previous), scores > 0.0
     object_index = np.full(len(ids), NO_OBJECT)
     rows, columns = np.nonzero(inside)

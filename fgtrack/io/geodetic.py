@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from pymap3d import enu2geodetic, geodetic2enu
 
 from fgtrack.core.types import FloatArray
 from fgtrack.io.config import Origin
@@ -50,6 +49,8 @@ class LocalPlane:
             return math.nan, math.nan
         if self.origin is None:
             self.origin = Origin(float(latitude_deg), float(longitude_deg))
+        from pymap3d import geodetic2enu
+
         at = self.origin.latitude_deg, self.origin.longitude_deg
         x_m, y_m, up_m = map(float, geodetic2enu(latitude_deg, longitude_deg, 0.0, *at, 0.0))
         if not self._warned and math.hypot(x_m, y_m, up_m) > _FAR_M:
@@ -69,6 +70,8 @@ def latitudes_longitudes_deg(
     """Return latitudes and longitudes, shape (n,) each, of positions (n,) in the plane about `origin_deg`.
     The height above the plane at which that above the ellipsoid is 0 is found by fixed-point iteration.
     """
+    from pymap3d import enu2geodetic
+
     up_m = np.zeros(len(x_m))
     for _ in range(_ITERATIONS):
         latitude_deg, longitude_deg, height_m = enu2geodetic(x_m, y_m, up_m, *origin_deg, 0.0)

@@ -1,12 +1,14 @@
 """A smooth closed curve to drive along: position, heading and curvature with their exact derivatives."""
 
 from dataclasses import dataclass
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from fgtrack.core.types import FloatArray
+
+if TYPE_CHECKING:  # takes half a second to import
+    from scipy.interpolate import CubicSpline
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,8 @@ class Path:
     @classmethod
     def through(cls, points_m: FloatArray) -> Self:
         """Closed path through `points_m`, shape (n + 1, 2), whose last point repeats the first."""
+        from scipy.interpolate import CubicSpline
+
         chords = np.hypot(*np.diff(points_m, axis=0).T)
         u = np.concatenate([[0.0], np.cumsum(chords)])
         return cls(CubicSpline(u, points_m, bc_type="periodic"), float(u[-1]))

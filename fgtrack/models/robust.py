@@ -10,8 +10,6 @@ Names and forms are those of GTSAM. Weights begin at 1 and never grow with d, so
 import math
 from functools import cache
 
-from scipy.special import chdtrc, chdtri
-
 from fgtrack.models.sensors import RobustLoss
 
 #: An outlier that a loss ignores altogether still has a finite covariance.
@@ -21,6 +19,8 @@ LEAST_WEIGHT = 1e-12
 @cache
 def width(loss: RobustLoss, size: int) -> float:
     """Width for the length of a whitened residual of `size` components: P(chi_size > width) = P(|N(0, 1)| > c)."""
+    from scipy.special import chdtrc, chdtri
+
     beyond = float(chdtrc(1.0, loss.width**2))
     return math.sqrt(float(chdtri(float(size), beyond))) if beyond else loss.width
 

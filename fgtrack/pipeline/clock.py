@@ -8,7 +8,6 @@ from typing import NamedTuple
 from fgtrack.core.time import nanoseconds, period_ns
 from fgtrack.core.types import DetectionList, EgoState
 from fgtrack.models.sensors import SensorModel
-from fgtrack.sim.redelay import restamped
 
 Delivered = EgoState | DetectionList
 
@@ -39,6 +38,8 @@ def corrected(message: DetectionList, sensors: Mapping[str, SensorModel]) -> Det
     sensor = sensors.get(message.sensor)
     if sensor is None or (sensor.stamp_from != "receipt" and sensor.clock_offset_s == 0.0):
         return message
+    from fgtrack.sim.redelay import restamped
+
     offset_ns = nanoseconds(sensor.clock_offset_s)
     if sensor.stamp_from == "receipt":
         objects = tuple(item if item.stamp_ns is None else replace(item, stamp_ns=None) for item in message.objects)

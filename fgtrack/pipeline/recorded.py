@@ -4,7 +4,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
@@ -14,7 +14,9 @@ from fgtrack.models.oval import OVAL
 from fgtrack.models.sensors import Mount
 from fgtrack.pipeline.config import EgoConfig, MapConfig
 from fgtrack.pipeline.load import plain
-from fgtrack.sim.scenario import Scenario
+
+if TYPE_CHECKING:
+    from fgtrack.sim.scenario import Scenario
 
 __all__ = ["Recorded", "RecordedSensor", "recorded", "recorded_of"]
 
@@ -61,7 +63,7 @@ def recorded(source: InputSource) -> Recorded:
     return result
 
 
-def recorded_of(scenario: Scenario) -> dict[str, Any]:  # Any: plain values, as the header of a stream has them
+def recorded_of(scenario: "Scenario") -> dict[str, Any]:  # Any: plain values, as the header of a stream has them
     """Return the settings that a recording of `scenario` carries."""
     sensors = {
         item.name: RecordedSensor(

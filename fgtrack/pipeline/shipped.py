@@ -3,13 +3,15 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from fgtrack.core.checks import check_paths
 from fgtrack.core.errors import CallError, did_you_mean
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load, plain, read_yaml, validate
-from fgtrack.sim.scenario import Scenario
+
+if TYPE_CHECKING:  # a replay needs no simulator
+    from fgtrack.sim.scenario import Scenario
 
 Kind = Literal["configuration", "scenario", "sweep"]
 _FOLDERS = {"configuration": ".", "scenario": "scenarios", "sweep": "sweeps"}
@@ -66,8 +68,12 @@ def read_config(
     return replace(config, map=road, estimator=estimator or config.estimator)
 
 
-def read_scenario(name: str | Path | Scenario, folder: Path | None = None, duration_s: float | None = None) -> Scenario:
+def read_scenario(
+    name: "str | Path | Scenario", folder: Path | None = None, duration_s: float | None = None
+) -> "Scenario":
     """The scenario of a file in `folder` or of that shipped name, as long as `duration_s`; raises as `read_config`."""
+    from fgtrack.sim.scenario import Scenario
+
     if isinstance(name, Scenario):
         raw, origin = plain(name), "the given scenario"
     else:

@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat
-from scipy import optimize, special
 
 from fgtrack.core.settings import Probability, require, settings
 from fgtrack.core.types import FloatArray
@@ -63,10 +62,10 @@ class GammaDelay:
     @cached_property
     def shape(self) -> float:
         """Shape k of the gamma part."""
+        from scipy.optimize import brentq
+
         ratio = (self.q90_s - self.min_s) / (self.mean_s - self.min_s)
-        log_shape = optimize.brentq(
-            lambda x: _relative_q90(x) - ratio, math.log(_MIN_SHAPE), math.log(_MAX_SHAPE), xtol=1e-13
-        )
+        log_shape = brentq(lambda x: _relative_q90(x) - ratio, math.log(_MIN_SHAPE), math.log(_MAX_SHAPE), xtol=1e-13)
         return math.exp(log_shape)
 
     @property
@@ -125,8 +124,10 @@ _MIN_SHAPE, _MAX_SHAPE = 0.5, 1e6
 
 def _relative_q90(log_shape: float) -> float:
     """90 % quantile of a gamma distribution over its mean."""
+    from scipy.special import gammaincinv
+
     shape = math.exp(log_shape)
-    return float(special.gammaincinv(shape, 0.9)) / shape
+    return float(gammaincinv(shape, 0.9)) / shape
 
 
 def draw_delays(model: AnyDelay, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:

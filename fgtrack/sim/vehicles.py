@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat
-from scipy.interpolate import CubicHermiteSpline
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.settings import require, settings
@@ -77,6 +76,8 @@ class TrackVehicle:
 
     def _along(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Path parameter and its first two derivatives by time."""
+        from scipy.interpolate import CubicHermiteSpline
+
         knots = np.array(self.speed, dtype=np.float64)
         if len(knots) == 1:
             knots = np.vstack([knots, knots + np.array([1.0, 0.0])])

@@ -6,9 +6,6 @@ from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import min_weight_full_bipartite_matching
-from scipy.special import gammaincinv
 
 from fgtrack.core.linalg import kernels, symmetrise
 from fgtrack.core.settings import OpenProbability, settings
@@ -163,6 +160,8 @@ def _refusing(suspects: set[int], assignment: Assignment) -> Assignment:
 @cache
 def chi_square_quantile(probability: float, freedom: int) -> float:
     """Quantile of the chi-square distribution; importing `scipy.stats` for it would take a second."""
+    from scipy.special import gammaincinv
+
     return float(2.0 * gammaincinv(0.5 * freedom, probability))
 
 
@@ -188,6 +187,9 @@ def _least_cost(
     i: IntArray, j: IntArray, cost: FloatArray, num_rows: int, num_columns: int
 ) -> tuple[IntArray, IntArray]:
     """Rows and columns of the best pairs: each row may take a column of its own instead, outside every gate."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import min_weight_full_bipartite_matching
+
     own = np.arange(num_rows)
     shifted = cost + (1.0 - cost.min())  # a sparse graph has no edges of weight 0
     costs = np.concatenate([shifted, np.full(num_rows, _OUTSIDE)])

@@ -9,9 +9,6 @@ from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from fgtrack.core.geometry import circular_mean, rotations
 from fgtrack.core.linalg import congruence, kernels
@@ -242,19 +239,21 @@ class ConnectedMerge(Merge):
         """See `Merge.apart`."""
         if len(points_m) < 2:
             return super().apart(points_m, starts)
-        by_x, distance_m = np.argsort(points_m[:, 0]), self.distance_m * (1.0 + 1e-9)
+        apart: list[bool] = self._linked(points_m, starts, 1.0 + 1e-9)[1].tolist()
+        return apart
+
+    def _linked(self, points_m: FloatArray, starts: IntArray, margin: float = 1.0) -> tuple[IntArray, BoolArray]:
+        by_x = np.argsort(points_m[:, 0])
         if len(starts) > 2:
             by_x = by_x[starts.searchsorted(by_x, side="right").argsort(kind="stable")]
-        apart = kernels("fgtrack.tracking.kernels").are_apart(points_m, by_x, starts, distance_m)
-        return list(apart.tolist())
+        linked = kernels("fgtrack.tracking.kernels").linked
+        leads, apart = linked(points_m, by_x, starts, self.distance_m * margin)
+        return leads, apart
 
     def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
         """See `Merge.groups`; in the order of their first members, which lead."""
-        num = len(points_m)
-        links = cKDTree(points_m).query_pairs(self.distance_m, output_type="ndarray")
-        graph = coo_array((np.ones(len(links), dtype=np.int8), links.T), shape=(num, num))
-        labels = connected_components(graph, directed=False)[1]
+        leads, _ = self._linked(points_m, np.array([0, len(points_m)]))
         members: dict[int, list[int]] = {}
-        for index, label in enumerate(labels.tolist()):
-            members.setdefault(label, []).append(index)
-        return {group[0]: tuple(group) for group in members.values()}
+        for index, lead in enumerate(leads.tolist()):
+            members.setdefault(lead, []).append(index)
+        return {lead: tuple(group) for lead, group in members.items()}

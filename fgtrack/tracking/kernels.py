@@ -189,18 +189,29 @@ def near(
 
 
 @njit("(float64[:, ::1], int64[:], int64[::1], float64)")
-def are_apart(points: FloatArray, by_x: IntArray, starts: IntArray, distance: float) -> BoolArray:
-    """Return for each list if no two of its `points` (n, 2) are at most `distance` apart.
-    `by_x` (n,) has the points of a list from `starts[k]` up to the next start, in the order of x.
+def linked(points: FloatArray, by_x: IntArray, starts: IntArray, distance: float) -> tuple[IntArray, BoolArray]:
+    """First of the `points` (n, 2) that each one is linked to by steps of at most `distance` in its list, shape (n,).
+    With True for each list without links. `by_x` (n,) has the points of a list from `starts[k]` up to the next start,
+    in the order of x.
     """
-    apart = np.ones(len(starts) - 1, np.bool_)
+    leads, apart = np.arange(len(points)), np.ones(len(starts) - 1, np.bool_)
     for k in range(len(apart)):
         for a in range(starts[k], starts[k + 1]):
             i, b = by_x[a], a + 1
-            while apart[k] and b < starts[k + 1] and points[by_x[b], 0] - points[i, 0] <= distance:
-                dx, dy = points[by_x[b], 0] - points[i, 0], points[by_x[b], 1] - points[i, 1]
-                apart[k], b = dx * dx + dy * dy > distance * distance, b + 1
-    return apart
+            while b < starts[k + 1] and points[by_x[b], 0] - points[i, 0] <= distance:
+                j, b = by_x[b], b + 1
+                dx, dy = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
+                if dx * dx + dy * dy <= distance * distance:
+                    apart[k] = False
+                    first, second = i, j
+                    while leads[first] != first:
+                        first = leads[first]
+                    while leads[second] != second:
+                        second = leads[second]
+                    leads[max(first, second)] = min(first, second)
+    for i in range(len(leads)):
+        leads[i] = leads[leads[i]]  # that of a point before it, which is done
+    return leads, apart
 
 
 @njit("int64[::1](float64[:, ::1], float64[:, :, ::1])")

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.time import nanoseconds
@@ -145,6 +144,8 @@ class NeighbourhoodMerge(Merge):
 
     def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
         """See `Merge.groups`; the merged ones first, in the order of a set of index tuples."""
+        from scipy.spatial import cKDTree
+
         tree = cKDTree(points_m)
         neighbourhoods = [
             tuple(int(i) for i in tree.query_ball_point(point, self.distance_m, return_sorted=True))

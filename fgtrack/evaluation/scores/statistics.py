@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from scipy.special import gammaincinv
 
 from fgtrack.core.geometry import circular_mean, wrap_angle, wrap_angles
 from fgtrack.core.types import FloatArray, IntArray
@@ -90,5 +89,7 @@ class ChiSquareMean:
 
 def chi_square_band(dof: FloatArray, count: IntArray) -> tuple[FloatArray, FloatArray]:
     """Two-sided 95 % band of the mean of `count` squares with `dof` degrees of freedom in all, shape (n,) each."""
+    from scipy.special import gammaincinv
+
     low, high = (2.0 * gammaincinv(dof / 2.0, share) / count for share in (0.025, 0.975))
     return low, high

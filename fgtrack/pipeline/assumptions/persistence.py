@@ -4,15 +4,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import compress, pairwise
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
-from scipy.spatial import cKDTree
-from scipy.special import expit, log_expit
 
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.models.sensors import Score
+
+if TYPE_CHECKING:  # takes half a second to import
+    from scipy.spatial import cKDTree
 
 __all__ = ["Lists", "Persistence", "disagreement_m", "persistence"]
 
@@ -95,6 +95,8 @@ def disagreement_m(one: Persistence, other: Lists) -> float | None:
 
 def persistence(lists: Lists) -> Persistence | None:
     """Persistence of detections; None where too few detections follow one another."""
+    from scipy.spatial import cKDTree
+
     stamps_s, points_m = lists.stamps_s, lists.points_m
     trees = [cKDTree(points) for points in points_m]
     every = max(1, math.ceil(sum(map(len, points_m)) / _MOST_CENTRES))
@@ -140,6 +142,8 @@ def persistence(lists: Lists) -> Persistence | None:
 
 def _crowding_per_m2(points_m: Sequence[FloatArray], numbers: IntArray, loose: BoolArray, of_clutter: float) -> float:
     """Density of clutter around clutter in its list: `of_clutter` of the `loose` detections of the lists `numbers`."""
+    from scipy.spatial import cKDTree
+
     num_loose, pairs = max(int(loose.sum()), 1), 0
     for k in np.unique(numbers[loose]).tolist():
         tree = cKDTree(points_m[k][loose[numbers == k]])
@@ -156,7 +160,7 @@ def _max_range_m(ranges_m: FloatArray, objects: FloatArray) -> float | None:
     return float(ranges_m[known][order][best]) if len(surplus) - best > _FEWEST_FAR else None
 
 
-def _near_clutter_per_m2(trees: Sequence[cKDTree], scores: Sequence[FloatArray], model: Score, odds: float) -> float:
+def _near_clutter_per_m2(trees: "Sequence[cKDTree]", scores: Sequence[FloatArray], model: Score, odds: float) -> float:
     """Density of clutter of the next list around that of each; before their scores the odds for clutter are `odds`."""
     ratios = [np.exp((np.nan_to_num(item, nan=model.even) - model.even) / model.scale) for item in scores]
     of_clutter = [odds / (odds + ratio) for ratio in ratios]
@@ -168,7 +172,7 @@ def _near_clutter_per_m2(trees: Sequence[cKDTree], scores: Sequence[FloatArray],
 
 
 def _best(
-    centre_m: FloatArray, before: cKDTree, after: cKDTree, before_s: float, after_s: float
+    centre_m: FloatArray, before: "cKDTree", after: "cKDTree", before_s: float, after_s: float
 ) -> tuple[float, FloatArray, FloatArray]:
     """Misfit (infinite without one) of the straightest triple about a detection; position and velocity at its end."""
     near = before.query_ball_point(centre_m, _FASTEST_MPS * before_s + _LARGEST_ERROR_M)
@@ -195,6 +199,9 @@ def _scale(misfits: FloatArray, start: float = 0.5) -> float:
 
 def _score(scores: FloatArray, of_object: BoolArray, of_clutter: BoolArray) -> Score | None:
     """Logistic fit to the scores of detections of objects and of clutter, less the odds of their numbers."""
+    from scipy.optimize import minimize
+    from scipy.special import expit, log_expit
+
     known = np.isfinite(scores) & (of_object | of_clutter)
     x, y = scores[known], of_object[known]
     if min(y.sum(), (~y).sum()) < _FEWEST or np.ptp(x) == 0.0:
