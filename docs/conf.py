@@ -21,6 +21,9 @@ include_patterns = ["CHANGELOG.md", "CONTRIBUTING.md", "docs/**.md", "docs/gener
 exclude_patterns = [".venv", ".git", "out", "build", "tests", "fgtrack", "docs/tutorials"]
 html_theme = "furo"
 html_title = "fgtrack"
+html_show_copyright = False
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 default_role = "literal"
 
 myst_heading_anchors = 4
