@@ -88,8 +88,8 @@ class GatedEuclidean:
             nis = np.empty(len(pairs.rows))
             for chosen, chosen_nis, _, _ in innovations(pairs, candidates, states):
                 nis[chosen] = chosen_nis
-            inside = nis <= self.max_nis
-            pairs = pairs if inside.all() else pairs.at(inside)
+            inside = (nis <= self.max_nis).nonzero()[0]
+            pairs = pairs if len(inside) == len(nis) else pairs.at(inside)
         assignment = assigned(pairs, len(candidates), len(states.means))
         return _refusing(suspects, assignment) if suspects else assignment
 
@@ -167,25 +167,21 @@ def chi_square_quantile(probability: float, freedom: int) -> float:
 
 def assigned(pairs: Pairs, num_candidates: int, num_tracks: int) -> Assignment:
     """Assignment of as many of `pairs` as possible at least total cost, which are their values."""
-    rows, columns, cost = pairs
-    if num_candidates == 1 and len(rows) > 1:
-        best = cost.argmin()
-        rows, columns = rows[best, None], columns[best, None]
-    competes = not len(set(rows.tolist())) == len(set(columns.tolist())) == len(rows)
-    if competes:
+    if num_candidates == 1 and len(pairs.rows) > 1:
+        pairs = pairs.at(pairs.values.argmin(axis=0, keepdims=True))
+    i, j = pairs.rows.tolist(), pairs.columns.tolist()
+    if not len(set(i)) == len(set(j)) == len(i):
         if num_candidates > num_tracks:
-            columns, rows = _least_cost(columns, rows, cost, num_tracks, num_candidates)
+            j, i = _least_cost(pairs.columns, pairs.rows, pairs.values, num_tracks, num_candidates)
         else:
-            rows, columns = _least_cost(rows, columns, cost, num_candidates, num_tracks)
-    pairs_made = sorted(zip(rows.tolist(), columns.tolist(), strict=True))
-    new = set(range(num_candidates)).difference(rows.tolist())
-    missed = set(range(num_tracks)).difference(columns.tolist())
-    return Assignment(pairs_made, sorted(new), sorted(missed))
+            i, j = _least_cost(*pairs, num_candidates, num_tracks)
+    new, missed = set(range(num_candidates)).difference(i), set(range(num_tracks)).difference(j)
+    return Assignment(sorted(zip(i, j, strict=True)), sorted(new), sorted(missed))
 
 
 def _least_cost(
     i: IntArray, j: IntArray, cost: FloatArray, num_rows: int, num_columns: int
-) -> tuple[IntArray, IntArray]:
+) -> tuple[list[int], list[int]]:
     """Rows and columns of the best pairs: each row may take a column of its own instead, outside every gate."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import min_weight_full_bipartite_matching
@@ -196,7 +192,7 @@ def _least_cost(
     edges = np.concatenate([i, own]), np.concatenate([j, num_columns + own])
     rows, columns = min_weight_full_bipartite_matching(csr_array((costs, edges), (num_rows, num_columns + num_rows)))
     inside = columns < num_columns
-    return np.asarray(rows[inside], dtype=np.int64), np.asarray(columns[inside], dtype=np.int64)
+    return rows[inside].tolist(), columns[inside].tolist()
 
 
 def near(
@@ -206,8 +202,9 @@ def near(
     Of a candidate with more than `MOST_NEAR` tracks so near, the nearest of them. Distances are in the map; that of a
     bearing is from the track to the line of sight.
     """
-    limits_m = np.full(len(means), reach_m, dtype=np.float64)
-    tracks = np.ascontiguousarray(means), np.argsort(means[:, 0])
+    limits_m = np.empty(len(means))
+    limits_m[:] = reach_m
+    tracks = np.ascontiguousarray(means), means[:, 0].argsort()
     pairs = Pairs(*kernels("fgtrack.tracking.kernels").near(candidates.lines, *tracks, limits_m, MOST_NEAR))
     return pairs if excluded is None else pairs.at(~excluded(pairs.rows, pairs.columns))
 
@@ -221,14 +218,13 @@ def innovations(
     """
     P, parts = np.array(states.covariances, dtype=np.float64, order="C"), []
     for group, members, chosen in candidates.split(pairs.rows):
-        columns = pairs.columns[chosen]
-        x = states.means[columns]
+        columns = pairs.columns.take(chosen)
+        x = states.means.take(columns, axis=0)
         own = group.seen_at(members, x, P, columns)
         y, H = own.model.linearised(own.z, x, own.pose)
-        H = np.array(H, ndmin=3, order="C")
-        every = np.arange(y.shape[1])
+        H, every = np.array(H, ndmin=3, order="C"), np.arange(y.shape[1])
         _, nis, logdet = kernels("fgtrack.estimation.kernels.kalman").innovations(y, H, P, columns, own.R, every)
-        parts.append((chosen, nis, logdet, y.shape[-1]))
+        parts.append((chosen, nis, logdet, len(every)))
     return parts
 
 

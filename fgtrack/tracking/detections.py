@@ -102,7 +102,7 @@ def merged(items: MapDetections, merge: "Merge") -> MapDetections:
     Averaged are the components that all have; where none of these gives a position, the leading one stands for all.
     """
     bearing, apart = np.isnan(items.points_m[:, 0]), merge.apart(items.points_m, items.starts)
-    if all(apart) and not np.logical_or.reduce(bearing):
+    if all(apart) and not len(bearing.nonzero()[0]):
         return items
     rows, members_of = list[int](), dict[int, list[int]]()  # by the row that leads
     for k, (first, end) in enumerate(pairwise(items.starts.tolist())):
@@ -200,8 +200,11 @@ class PoseError(NamedTuple):
 
     def noise(self, model: MeasurementModel, pose: SensorPose, x: FloatArray) -> FloatArray:
         """R + G P_e G' at the states `x` (m, n), shape (m, k, k)."""
-        G = self.placement - model.pose_jacobian(x, pose) if model.relative else self.placement
-        return np.asarray(kernels("fgtrack.tracking.kernels").with_pose_error(G, self.covariance, self.R))
+        R, G = self.R.copy(), self.placement
+        if model.relative:
+            G = G - model.pose_jacobian(x, pose)
+        kernels("fgtrack.tracking.kernels").add_pose_error(G, self.covariance, R)
+        return R
 
 
 class Merge:
@@ -243,7 +246,7 @@ class ConnectedMerge(Merge):
         return apart
 
     def _linked(self, points_m: FloatArray, starts: IntArray, margin: float = 1.0) -> tuple[IntArray, BoolArray]:
-        by_x = np.argsort(points_m[:, 0])
+        by_x = points_m[:, 0].argsort()
         if len(starts) > 2:
             by_x = by_x[starts.searchsorted(by_x, side="right").argsort(kind="stable")]
         linked = kernels("fgtrack.tracking.kernels").linked

@@ -96,45 +96,47 @@ def described(
     return codes, lines
 
 
-@njit("(float64[:, ::1], float64, float64, int64[::1])")
-def placement(points: FloatArray, x_m: float, y_m: float, components: IntArray) -> FloatArray:
-    """Derivative (m, k, 5) of detections at `points` (m, 2), placed in the map by the pose of a sensor at x and y.
-    By x, y, yaw, vx and vy of the pose; of the `components` (k,) x, y and yaw depend on it.
+@njit(
+    "(float64[:, ::1], int64[::1], Array(float64, 1, 'C', readonly=True), float64, float64, float64, "
+    "Array(float64, 2, 'C', readonly=True), float64[:, ::1], float64[:, :, ::1])"
+)
+def pose_error(
+    points: FloatArray,
+    components: IntArray,
+    pose: FloatArray,
+    yaw_rad: float,
+    x_m: float,
+    y_m: float,
+    P: FloatArray,
+    covariance: FloatArray,
+    G: FloatArray,
+) -> None:
+    """Write J P J' (5, 5) of x, y, yaw, vx, vy of the `pose` of a sensor, fixed to a body, and derivatives G (m, k, 5).
+    P is of x, y, yaw, speed and yaw rate of the body, which is at `x_m`, `y_m` (`core.geometry.body_point`). G is that
+    of detections at `points` (m, 2), placed in the map by the pose; of the `components` (k,) x, y and yaw depend on it.
     """
-    D = np.zeros((len(points), len(components), 5))
+    J, JP, c, s = np.zeros((5, 5)), np.empty((5, 5)), math.cos(yaw_rad), math.sin(yaw_rad)
+    right, up = pose[0] - x_m, pose[1] - y_m
+    J[0, 0] = J[1, 1] = J[2, 2] = 1.0
+    J[0, 2], J[1, 2], J[3, 2], J[4, 2] = -up, right, -pose[4], pose[3]
+    J[3, 3], J[3, 4], J[4, 3], J[4, 4] = c, -up, s, right
+    add_congruence(J, P, JP, covariance)
     for i in range(len(points)):
         for a in range(len(components)):
             if components[a] == X:
-                D[i, a, 0], D[i, a, 2] = 1.0, y_m - points[i, 1]
+                G[i, a, 0], G[i, a, 2] = 1.0, pose[1] - points[i, 1]
             elif components[a] == Y:
-                D[i, a, 1], D[i, a, 2] = 1.0, points[i, 0] - x_m
+                G[i, a, 1], G[i, a, 2] = 1.0, points[i, 0] - pose[0]
             elif components[a] == YAW:
-                D[i, a, 2] = 1.0
-    return D
+                G[i, a, 2] = 1.0
 
 
 @njit("(float64[:, :, ::1], float64[:, ::1], float64[:, :, ::1])")
-def with_pose_error(G: FloatArray, P: FloatArray, R: FloatArray) -> FloatArray:
-    """Return R + G P G', shapes (m, k, 5), (5, 5) and (m, k, k)."""
-    total, GP = R.copy(), np.empty(G.shape[1:])
+def add_pose_error(G: FloatArray, P: FloatArray, R: FloatArray) -> None:
+    """Add G P G' to R, shapes (m, k, 5), (5, 5) and (m, k, k)."""
+    GP = np.empty(G.shape[1:])
     for i in range(len(R)):
-        add_congruence(G[i], P, GP, total[i])
-    return total
-
-
-@njit("(float64, float64, float64, float64, float64, Array(float64, 2, 'C', readonly=True))")
-def sensor_pose_covariance(
-    yaw_rad: float, arm_x_m: float, arm_y_m: float, vx_mps: float, vy_mps: float, P: FloatArray
-) -> FloatArray:
-    """Return J P J' (5, 5) of x, y, yaw, vx, vy of a point fixed to a body; P is of its x, y, yaw, speed and yaw rate.
-    The point is at this arm from the reference point of the body, and moves so fast (`core.geometry.body_point`).
-    """
-    J, JP, total, c, s = np.zeros((5, 5)), np.empty((5, 5)), np.zeros((5, 5)), math.cos(yaw_rad), math.sin(yaw_rad)
-    J[0, 0] = J[1, 1] = J[2, 2] = 1.0
-    J[0, 2], J[1, 2], J[3, 2], J[4, 2] = -arm_y_m, arm_x_m, -vy_mps, vx_mps
-    J[3, 3], J[3, 4], J[4, 3], J[4, 4] = c, -arm_y_m, s, arm_x_m
-    add_congruence(J, P, JP, total)
-    return total
+        add_congruence(G[i], P, GP, R[i])
 
 
 @njit("(float64[:, ::1], float64[:, ::1], int64[::1], float64[::1], int64)")

@@ -105,11 +105,13 @@ class Objects:
                     seen.sizes_m[name] = mean + 1.0 / seen.num_sizes[name] * (value - mean)
 
     def evidence(
-        self, detections: Sequence[Detection], track_ids: Sequence[int], wrong_id_probability: float
+        self, detections: Iterable[Detection], track_ids: Sequence[int], wrong_id_probability: float
     ) -> Apart | None:
         """Return what classes and identities say of pairs of detections and tracks; None where they say nothing."""
-        classes = self.apart(detections, track_ids)
-        ids = [each.id for each in detections] if self._ids else []
+        if not self._seen:
+            return None
+        detections = list(detections)
+        classes, ids = self.apart(detections, track_ids), [each.id for each in detections]
         if not any(ids):
             return classes
         numbers: dict[str | None, int] = {name: number for number, name in enumerate(dict.fromkeys(ids), 1) if name}
@@ -135,7 +137,7 @@ class Objects:
 
     def apart(self, detections: Iterable[Detection], track_ids: Sequence[int]) -> Apart | None:
         """Return a test of pairs of detections and tracks for different classes; None if no pair is excluded."""
-        named = [each.class_name for each in detections] if self._seen else []
+        named = [each.class_name for each in detections]
         if not any(named):
             return None
         classes = [_most(self._seen[i].classes) if i in self._seen else None for i in track_ids]

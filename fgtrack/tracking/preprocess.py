@@ -14,14 +14,7 @@ from fgtrack.core.linalg import congruence, equal_ones, kernels, symmetrise
 from fgtrack.core.types import BoolArray, Disposition, FloatArray, IntArray, UpdateRecord
 from fgtrack.estimation.base import Lazy, Measurement, Measurements
 from fgtrack.models.correlated_errors import split_error
-from fgtrack.models.measurement import (
-    COMPONENTS,
-    RELATIVE,
-    MeasurementModel,
-    SensorPose,
-    measured_position,
-    measurement_model,
-)
+from fgtrack.models.measurement import COMPONENTS, MeasurementModel, SensorPose, measured_position, measurement_model
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
@@ -100,12 +93,12 @@ class Group(NamedTuple):
 
     def seen_at(self, members: IntArray, x: FloatArray, P: FloatArray, of: IntArray) -> Measurement:
         """The stack of some `members` (p,), of objects at the states `x` (p, n) with covariances P[of] (p, n, n)."""
-        own, R = self.stack, self.stack.R[members]
+        own, R = self.stack, self.stack.R.take(members, axis=0)
         if self.error is not None and own.model.relative:
             R = self.error.at(members).noise(own.model, own.pose, x)
         if self.stamp_error is not None:
             R = R + self.stamp_error.noise(own.model, own.pose, x, P[of])
-        return Measurement(own.stamp_ns, own.model, own.z[members], R, own.pose, own.loss, own.assumed)
+        return Measurement(own.stamp_ns, own.model, own.z.take(members, axis=0), R, own.pose, own.loss, own.assumed)
 
     def position_covariances(self, members: IntArray) -> FloatArray:
         """Covariances of the positions in the map of some `members` (p,), which have one, shape (p, 2, 2)."""
@@ -255,8 +248,8 @@ class Preprocess:
         """Yield the candidates `rows` of batch k, which begins at `first`, and which all measure the same.
         One by one where errors are correlated in time.
         """
-        posed, here = items.batches[k], slice(first, first + len(rows)) if rows[-1] < len(rows) else first + rows
-        (batch, sensor, _, pose), points_m = posed, items.points_m[here]
+        here = slice(first, first + len(rows)) if rows[-1] < len(rows) else first + rows
+        (batch, sensor, ego, pose), points_m = items.batches[k], items.points_m[here]
         names, columns, assumed, placed = _components(code, self._assumes_map_yaw)
         z, R = items.values[here].take(columns, axis=1), covariances(items, k, here, names)
         model = measurement_model(names, self._motion)
@@ -264,15 +257,19 @@ class Preprocess:
         if sensor.correlation is not None:
             split = [split_error(batch.message.sensor, sensor, model, item, self._motion.state_names) for item in R]
             models, white = [each for each, _ in split], np.array([noise for _, noise in split])
-        total, error, pose_covariance = white, None, _pose_covariance(posed)
-        if pose_covariance is not None:
-            placed = np.full(len(names), -1) if batch.message.frame == "map" else placed
-            G = kernels("fgtrack.tracking.kernels").placement(points_m, pose.x_m, pose.y_m, placed)
-            x = points_m
+        total, error, is_moved = white, None, batch.message.frame != "map"
+        if ego is not None and ego.covariance is not None and (is_moved or model.relative):
+            P, G, components = (
+                np.zeros((5, 5)),
+                np.zeros((*z.shape, 5)),
+                placed if is_moved else np.full(len(names), -1),
+            )
+            body = ego.yaw_rad, ego.x_m, ego.y_m, ego.covariance
+            kernels("fgtrack.tracking.kernels").pose_error(points_m, components, items.poses[k], *body, P, G)
+            x, error = points_m, PoseError(P, G, white)
             if model.relative:
                 x, is_placed = np.zeros((len(z), self._motion.dim)), not math.isnan(points_m[0, 0])  # all or none
                 x[:, :2] = points_m if is_placed else _far_along(z[:, names.index("bearing_rad")], pose)
-            error = PoseError(pose_covariance, G, white)
             total = error.noise(models[0], pose, x)
             R = total if white is R else R + (total - white)
         late = StampError(self._motion, sensor.stamp_std_s) if sensor.stamp_std_s else None
@@ -312,9 +309,10 @@ def _restricted(items: MapDetections, lost: Sequence[dict[int, str]]) -> MapDete
 
 def _without(items: MapDetections, outside: BoolArray, reason: str, lost: Sequence[dict[int, str]]) -> MapDetections:
     """`items` without those `outside`, shape (m,), whose indices `lost` of their batch gets with the `reason`."""
-    if not np.logical_or.reduce(outside):
+    rows = outside.nonzero()[0]
+    if not len(rows):
         return items
-    for k, index in zip(items.of[outside].tolist(), items.indices[outside].tolist(), strict=True):
+    for k, index in zip(items.of[rows].tolist(), items.indices[rows].tolist(), strict=True):
         lost[k][index] = reason
     return items.at(~outside)
 
@@ -329,17 +327,6 @@ def _components(code: int, map_yaw_is_assumed: bool) -> tuple[tuple[str, ...], I
     known = {"curvature_radpm", "yaw_rad"} if map_yaw_is_assumed and code >> len(COMPONENTS) else {"curvature_radpm"}
     assumed = tuple(name for name in names if name in known)
     return names, columns, assumed, np.where([name in assumed for name in names], -1, columns)
-
-
-def _pose_covariance(posed: PosedBatch) -> FloatArray | None:
-    """Covariance of the pose by that of the ego, shape (5, 5); None where it matters to no detection of the batch."""
-    batch, sensor, ego, pose = posed
-    if ego is None or ego.covariance is None:
-        return None
-    if batch.message.frame == "map" and not any(name in RELATIVE for name in sensor.std):
-        return None
-    body = ego.yaw_rad, pose.x_m - ego.x_m, pose.y_m - ego.y_m, pose.vx_mps, pose.vy_mps, ego.covariance
-    return np.asarray(kernels("fgtrack.tracking.kernels").sensor_pose_covariance(*body))
 
 
 def _far_along(bearings_rad: FloatArray, pose: SensorPose) -> list[tuple[float, float]]:

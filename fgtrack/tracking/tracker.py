@@ -248,10 +248,9 @@ class Tracker:
         return claimed(result, candidates, states, np.where(tentative, -1.0, parts.joint.claim_m), evidence)
 
     def _evidence(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Apart | None:
-        parts, message = self._parts, batch.message
-        described = list(map(message.objects.__getitem__, candidates.leaders))
-        wrong = parts.sensors[message.sensor].wrong_id_probability
-        return parts.objects.evidence(described, states.track_ids, wrong)
+        described = map(batch.message.objects.__getitem__, candidates.leaders)
+        wrong = self._parts.sensors[batch.message.sensor].wrong_id_probability
+        return self._parts.objects.evidence(described, states.track_ids, wrong)
 
     def _joint(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Pairs | None:
         """Probabilities that candidates belong to tracks with enough detections; None where they are not considered."""
@@ -327,7 +326,7 @@ class Tracker:
         joint = self._joint(batch, candidates, states)
         for group, members, here in candidates.split(chosen):
             of = tracks[here]
-            each = group.seen_at(members, states.means[of], states.covariances, of)
+            each = group.seen_at(members, states.means.take(of, axis=0), states.covariances, of)
             measurements = Measurements(each if joint is None else equivalent(each, of, group, joint, states))
             ids = list(map(track_ids.__getitem__, of.tolist()))
             results = bank.update(batch.stamp_ns, ids, measurements)
