@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import fgtrack
 
-PERIOD_NS = 20_000_000  # 50 Hz, as `clock.node_hz` says
+PERIOD_NS = 20_000_000  # 50 Hz, as `clock.node_hz`
 PUBLISHED_AGO_NS = 100_000_000  # waiting makes the tracks better: late detections have come by then
 
 Received = fgtrack.EgoState | fgtrack.DetectionList
@@ -40,7 +40,7 @@ def run(
 
 
 def drive(duration_s: float) -> Iterator[Received]:
-    """In place of your sensors: a simulated drive, each message when it is due."""
+    """Instead of your sensors: a simulated drive, each message when it is due."""
     shift_ns = None
     for message in fgtrack.simulate("single_opponent", seed=1, duration_s=duration_s):
         if isinstance(message, fgtrack.TruthState):
@@ -51,7 +51,7 @@ def drive(duration_s: float) -> Iterator[Received]:
 
 
 def show(stamp_ns: int, tracks: tuple[fgtrack.TrackReport, ...]) -> None:
-    """In place of your topic."""
+    """Instead of your topic."""
     for track in tracks:
         print(f"{stamp_ns} track {track.track_id}: {track.x_m:.1f} m, {track.y_m:.1f} m, {track.status}")
 

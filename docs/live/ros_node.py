@@ -67,10 +67,10 @@ class TrackerNode(Node):
         self.create_timer(10.0, self._on_report)
 
     def _begin(self) -> None:
-        """Everything that knows of the past."""
+        """Everything that depends on the past."""
         self.tracker = fgtrack.Tracker.from_config(self._set["config"], map=self._set["map"] or None)
         self._waiting: list[Waiting] = []
-        self._poses: deque[int] = deque(maxlen=1000)  # stamps at which the tracker knows the ego from TF
+        self._poses: deque[int] = deque(maxlen=1000)  # stamps at which the tracker has the ego from TF
         self._odometry: Odometry | None = None
         self.without_pose = 0
 
@@ -103,11 +103,11 @@ class TrackerNode(Node):
     def _give(self, waiting: Waiting, now_ns: int) -> bool:
         """Give a list to the tracker, unless it is worth waiting for the pose at its stamp."""
         frames = {self._set["map_frame"]: "map", self._set["base_frame"]: "ego"}
-        frame = frames.get(waiting.message.header.frame_id, "sensor")  # mounted as the configuration says
+        frame = frames.get(waiting.message.header.frame_id, "sensor")  # mounted as configured
         if frame != "map" and not self._give_pose(Time(nanoseconds=waiting.stamp_ns)):
             if now_ns - waiting.receipt_ns < 1e9 * self._set["tf_wait_s"]:
                 return False
-            self.without_pose += 1  # the tracker extrapolates, or says `failed`
+            self.without_pose += 1  # the tracker extrapolates, or reports `failed`
         centres = [detection.bbox.center.position for detection in waiting.message.detections]
         objects = [fgtrack.Detection(x_m=centre.x, y_m=centre.y) for centre in centres]
         self.tracker.receive(
@@ -116,7 +116,7 @@ class TrackerNode(Node):
         return True
 
     def _give_pose(self, time: Time) -> bool:
-        """Give the pose of the ego at a time to the tracker; whether TF knows it."""
+        """Give the pose of the ego at a time to the tracker; False if TF lacks it."""
         try:
             found = self._buffer.lookup_transform(self._set["map_frame"], self._set["base_frame"], time)
         except TransformException:  # not yet, not any more, or no such frame
@@ -151,7 +151,7 @@ class TrackerNode(Node):
         return message
 
     def _on_report(self) -> None:
-        """What somebody should know who looks at the log."""
+        """Counts for the log."""
         for sensor, late in self.tracker.lateness.items():
             if late.silent_s > 1.0:
                 self.get_logger().warning(f"{sensor}: silent for {late.silent_s:.1f} s")

@@ -63,7 +63,7 @@ def odometry_to_cdr(ego: fgtrack.EgoState) -> bytes:
 
 
 def cdr_to_list(data: bytes, sensor: str, receipt_ns: int) -> fgtrack.DetectionList:
-    """The object list of a sensor. Raises whatever bytes that are none make rosbags raise."""
+    """The object list of a sensor. Raises the errors of rosbags for other bytes."""
     message = TYPES.deserialize_cdr(data, LIST)
     centres = [detection.bbox.center.position for detection in message.detections]
     frame = "map" if message.header.frame_id == "map" else "ego"
@@ -72,7 +72,7 @@ def cdr_to_list(data: bytes, sensor: str, receipt_ns: int) -> fgtrack.DetectionL
 
 
 def cdr_to_ego(data: bytes, receipt_ns: int) -> fgtrack.EgoState:
-    """The ego. Raises whatever bytes that are none make rosbags raise."""
+    """The ego. Raises the errors of rosbags for other bytes."""
     message = TYPES.deserialize_cdr(data, ODOMETRY)
     pose, twist = message.pose.pose, message.twist.twist
     yaw_rad = 2.0 * atan2(pose.orientation.z, pose.orientation.w)

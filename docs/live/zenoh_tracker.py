@@ -38,7 +38,7 @@ class Inlet:
         return self._vehicle_ns if self._sim_time else time.time_ns()
 
     def messages(self, samples: Iterable[zenoh.Sample]) -> Iterator[Received]:
-        """Messages, until the vehicle says how many it has sent; those that cannot be read are counted."""
+        """Messages, until the vehicle reports how many it has sent; those that cannot be read are counted."""
         for sample in samples:
             topic, data = str(sample.key_expr), sample.payload.to_bytes()
             if topic == SENT:
@@ -58,7 +58,7 @@ class Inlet:
 
 
 def main() -> None:
-    """Track until the vehicle has sent everything, and say what became of it."""
+    """Track until the vehicle has sent everything, and report the outcome."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--listen", default="tcp/127.0.0.1:7447")
     parser.add_argument("--sim-time", action="store_true", help="by the clock of the vehicle")

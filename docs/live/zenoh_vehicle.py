@@ -70,7 +70,7 @@ def drive(session: zenoh.Session, tracks: Tracks, duration_s: float, max_lists: 
 
 
 def main() -> None:
-    """Drive, say how much was sent, and which tracks came back."""
+    """Drive, report how much was sent, and which tracks came back."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--connect", default="tcp/127.0.0.1:7447")
     parser.add_argument("--duration-s", type=float, default=60.0)

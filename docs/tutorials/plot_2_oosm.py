@@ -50,7 +50,7 @@ class ShiftedInnovation:
 
 # %%
 # Does it keep the promises of an estimator: too old is refused, nothing is mutated, covariances are positive definite
-# ...? The contract suite says which one breaks, and with which measurements.
+# ...? The contract suite reports which one breaks, and with which measurements.
 from fgtrack.testing import check_estimator
 
 check_estimator(ShiftedInnovation, exact=False)

@@ -45,7 +45,7 @@ print(np.round(past.state.mean, 2))
 print(len(tracker.tracks_at(now_ns - 100_000_000)))
 
 # %%
-# A sensor that the configuration does not know, and a clock that runs backwards: counted, with a reason.
+# A sensor without a configuration, and a clock that runs backwards: counted, with a reason.
 stranger = fgtrack.DetectionList("sonar", now_ns, now_ns, (fgtrack.Detection(x_m=1.0, y_m=0.0),))
 tracker.receive(stranger)
 tracker.tick(now_ns)

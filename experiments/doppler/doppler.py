@@ -1,4 +1,4 @@
-"""Range, a coarse bearing and range rate from a moving sensor, and ranges from two places: who finds the right state?
+"""Range, a coarse bearing and range rate from a moving sensor, and ranges from two points: who finds the right state?
 
     python experiments/doppler/doppler.py -o out/doppler
 

@@ -59,7 +59,7 @@ def advise(
     """Return what is late, wrong or inconsistent, and the settings that correct it; `advice.config` has them.
 
     The recording is replayed before and after, and settings that make the tracks worse are not given. `config`, `map`,
-    `pit_map` and `set` are as for `fgtrack.replay`; `reference` is the sensor whose clock is right, where two do not
+    `pit_map` and `set` are as for `fgtrack.replay`; `reference` is the sensor with the correct clock, where two do not
     agree and the recording has no truth; with `tune`, noise that does not fit is fitted; with `ledger`,
     policies for late lists are compared over the first minute. `on_step` is called before
     each step with its name and the share that is done.
@@ -289,7 +289,7 @@ class Adviser:
         return result
 
     def _fine(self, seen: Mapping[str, Arrivals], outcome: Outcome | None) -> Iterator[str]:
-        """Yield the checks that found nothing."""
+        """Yield the checks without a finding."""
         wrong = {(item.kind, item.about) for item in self._findings}
         kinds = {kind for kind, _ in wrong}
         ego = self._arrivals.get(EGO)

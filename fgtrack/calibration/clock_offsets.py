@@ -5,10 +5,10 @@ the offset d
 
     r(d) = p(s - d) - T(s - d) z = r(0) + d r'(0) + ...
 
-r' is minus the velocity of the object against the turning ego. d is found by Gauss-Newton, with Huber weights. The path
-is that of the truth, or a smoothing spline through the detections of a reference sensor. With truth a constant bias is
-found as well, along and across the motion of the object or of the ego, the one that leaves the smaller residuals. Where
-the velocity hardly changes, bias and offset cannot be distinguished, and the offset is not known.
+r' is minus the velocity of the object against the turning ego. d is estimated by Gauss-Newton, with Huber weights. The
+path is that of the truth, or a smoothing spline through the detections of a reference sensor. With truth a constant
+bias is estimated, too, along and across the motion of the object or of the ego, the one with the smaller residuals.
+Where the velocity hardly changes, bias and offset cannot be distinguished, and the offset is not known.
 
 The standard deviation of d is that of the jackknife over stretches of time, so it includes time-correlated errors
 (Bell, McCaffrey, Survey Methodology 28, 2002). d over it follows Student's t with one degree of freedom less than
@@ -155,7 +155,7 @@ def estimate_offsets(
     """Return the clock offsets of the sensors, from tracks that the tracker of `config` makes.
 
     Without truth, or where `reference` is named, offsets are differences of two clocks. The reference is then the
-    sensor with most detections, but for those that are `doubtful` and those whose clock must be wrong: nothing is
+    sensor with most detections, but for those that are `doubtful` and those with a clock that must be wrong: nothing is
     received before it was measured. Nothing is refused for its delay: a wrong stamp looks like one. `run` is one of
     `messages` in which nothing was refused; without it they are replayed.
 

@@ -72,7 +72,7 @@ def _change(one: Arrivals) -> Iterator[Finding]:
 
 
 def clock_text(one: SensorOffset, report: OffsetReport) -> str:
-    """Return what is known of the clock of a sensor, what bounds it, and what is missing to know more."""
+    """Return what is known of the clock of a sensor, what bounds it, and what is missing to identify it."""
     what = "the truth of the recording" if report.reference == TRUTH else f"the clock of {report.reference}"
     if one.offset_s is None or one.half_s is None:
         return f"its clock offset is not known: {one.why}."
@@ -86,8 +86,8 @@ def clock_text(one: SensorOffset, report: OffsetReport) -> str:
     if report.reference == TRUTH:
         return f"{off} the truth of the recording."
     return (
-        f"{off} those of {report.reference}. {_bound(one, report)} To tell which of the two clocks is wrong takes "
-        f"truth, or a sensor whose clock is known (--reference NAME): {report.reference} is taken to be right."
+        f"{off} those of {report.reference}. {_bound(one, report)} To identify the wrong one of the two clocks takes "
+        f"truth, or a sensor with a known clock (--reference NAME): {report.reference} is taken to be right."
     )
 
 
@@ -104,7 +104,7 @@ def _bound(one: SensorOffset, report: OffsetReport) -> str:
 
 
 def clock_findings(report: OffsetReport, configured_s: Mapping[str, float]) -> Iterator[Finding]:
-    """Yield the sensors whose clock is off, or not known; `configured_s` is what is taken off already."""
+    """Yield the sensors with a clock offset, or an unknown one; `configured_s` is what is taken off already."""
     for one in report.others:
         if one.is_off and one.offset_s is not None:
             total_s = round(configured_s[one.sensor] + one.offset_s, 4)

@@ -18,7 +18,7 @@ class Finding:
     about: str
     """Sensor, `ego`, or what else."""
     weight: float
-    """Importance: above 80 the run is useless without the change, below 30 it is good to know."""
+    """Importance: above 80 the run is useless without the change, below 30 it is a remark."""
     text: str
     settings: Mapping[str, object] = field(default_factory=dict)
     """Values of keys of the configuration that correct it; empty where no setting does."""

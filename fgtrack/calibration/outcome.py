@@ -31,7 +31,7 @@ class NoiseFit:
     """Mean NIS over what is expected; the interval considers that innovations are correlated."""
     lag1: float | None
     """Autocorrelation of its position innovations at lag 1, of tracks that are long enough; near 0 where its errors are
-    white and the noise fits."""
+    white and the noise is consistent."""
 
     @property
     def lasts(self) -> bool:

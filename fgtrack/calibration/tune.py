@@ -134,7 +134,7 @@ class _Tuning:
             values, likelihood, free = self._maximum(problem, values)
             moved = np.abs(np.log(values[free] / before[free]))
             still = (moved <= _SETTLED * likelihood.spread(np.log(values[free]))).all()
-            settled = rounds > 1 and bool(still)  # with the configured noise one cannot tell what is mixed
+            settled = rounds > 1 and bool(still)  # with the configured noise a mixture cannot be identified
         (values, likelihood, parameters), held_out = self._fitted(problem, values), None
         if self._rules.train_share < 1.0:
             held_out = self._held_out(values, series, splits_ns)
@@ -244,7 +244,7 @@ class _Tuning:
 
     def _fitted(self, problem: Problem, start: FloatArray) -> tuple[FloatArray, Likelihood, tuple[TunedParameter, ...]]:
         """Return the maximum; instead of what is not known there, what is configured, or what is nearest to it.
-        The rest is not fitted again: it would make up for what was put there.
+        The rest is not refitted: it would compensate for that.
         """
         count = len(start)
         known: list[Known] = ["no"] * count

@@ -1,4 +1,4 @@
-"""The command line: thin modules, one for each kind of command; the only place that prints and exits."""
+"""The command line: thin modules, one for each kind of command; the only part that prints and exits."""
 
 import gc
 import os

@@ -14,7 +14,7 @@ PitMap = Annotated[str | None, Option("--pit-map", help="Map of the pit lane (CS
 Settings = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help="Override a key; repeatable.")]
 Overwrite = Annotated[bool, Option("--overwrite", help="Replace what such a command wrote there before.")]
 Seed = Annotated[int, Option(min=0, help="Seed of the random generator.")]
-Reference = Annotated[str | None, Option("--reference", help="Sensor whose clock is right, where two do not agree.")]
+Reference = Annotated[str | None, Option("--reference", help="Sensor with the correct clock, where two do not agree.")]
 Runs = Annotated[list[Path], Argument(metavar="RUN...", help="Run folders, or folders of runs, as that of the demo.")]
 Json = Annotated[bool, Option("--json", help="Print JSON instead of tables.")]
 StorageOption = Annotated[Storage, Option("--storage", help="Storage of a rosbag2 folder.")]

@@ -168,7 +168,7 @@ def advise(
     show(advice.tables, "json" if as_json else None, advice.as_dict())
     if out is not None and not as_json:
         again = ["fgtrack", "replay", str(recording), "-c", str(out), "-o", "RUN"]
-        say(f"{out}: written; follow it by `{shlex.join(again)}`")
+        say(f"{out}: written; apply it by `{shlex.join(again)}`")
     if advice.broken is not None:
         raise DataError(f"{located(advice.broken, str(recording))}; used up to there")
 
@@ -184,7 +184,7 @@ def offsets(
 ) -> None:
     """Estimate constant clock offsets of sensors.
 
-    Says which ones are not identifiable.
+    Reports which ones are not identifiable.
     """
     config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
     source = open_input(recording, config.input)

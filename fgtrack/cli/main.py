@@ -149,7 +149,7 @@ def _run(words: Sequence[str], debug: bool) -> int:
 def _failed(message: str, code: int, debug: bool) -> int:
     if debug:
         traceback.print_exc()
-    with suppress(OSError):  # where that cannot be written either, the code is all that can be said
+    with suppress(OSError):  # where that cannot be written either, the exit code is all that remains
         print(f"fgtrack: error: {one_line(message)}", file=sys.stderr, flush=True)
     return code
 

@@ -36,7 +36,7 @@ def tune(
 ) -> None:
     """Fit process and measurement noise to recordings.
 
-    Maximum likelihood of the innovations; truth is not needed. Says which parameters are not identifiable.
+    Maximum likelihood of the innovations; truth is not needed. Reports which parameters are not identifiable.
     """
     check_output(out, overwrite)
     config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)

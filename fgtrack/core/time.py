@@ -1,4 +1,4 @@
-"""Integer nanoseconds and float seconds; the only place where one becomes the other."""
+"""Integer nanoseconds and float seconds; the only conversion between the two."""
 
 NS_PER_S = 1_000_000_000
 NS_PER_UNIT = {"s": NS_PER_S, "ms": 1_000_000, "us": 1000, "ns": 1}

@@ -37,9 +37,9 @@ class EgoState:
     yaw_rate_radps: float = 0.0
     accel_mps2: float = 0.0
     in_pit: bool | None = None
-    """True while the ego drives in the pit lane; None when the source does not say."""
+    """True while the ego drives in the pit lane; None when the source does not contain it."""
     covariance: tuple[float, ...] | None = None
-    """Row-major 5 x 5, of x, y, yaw, speed and yaw rate (`EGO_COVARIANCE_STATES`); None when the source does not say.
+    """Row-major 5 x 5, of x, y, yaw, speed and yaw rate (`EGO_COVARIANCE_STATES`); None where the source has none.
 
     A variance of 0 means the same of one of them.
     """

@@ -107,7 +107,7 @@ class Measurement:
 
     @property
     def order(self) -> tuple[int, Content]:
-        """Place among measurements: by stamp, and at one stamp by content, so that arrival does not matter."""
+        """Order among measurements: by stamp, and at one stamp by content, so that arrival does not matter."""
         return self.stamp_ns, self.content
 
     @property
@@ -183,7 +183,7 @@ class UpdateResult:
     nis: float | None = None
     """Normalised innovation squared against the prior at that stamp, `Measurement.nis`."""
     innovation_covariance: FloatArray | None = None
-    """Covariance S of the innovation, shape (k, k), of estimators that say it."""
+    """Covariance S of the innovation, shape (k, k), of estimators that report it."""
 
 
 #: Standard deviation of a direction of which nothing is known: that of the uniform distribution.

@@ -24,7 +24,7 @@ class Failure(StrEnum):
     GRAPH_REBUILT = "graph rebuilt"
     """A factor graph could not be solved with a new measurement, and was rebuilt without it."""
     STEP_DAMPED = "step damped"
-    """A smoother's step went too far and was taken again with a line search."""
+    """A smoother's step went too far and was repeated with a line search."""
     BIRTH_FAILED = "birth failed"
     """A detection could not start a track."""
     LIST_FAILED = "list failed"

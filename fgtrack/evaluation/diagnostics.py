@@ -206,7 +206,7 @@ def _failures(run: Run) -> Iterator[Diagnostic]:
 
 
 def _fragmentation(run: Run) -> Iterator[Diagnostic]:
-    """Tracks that break off and begin again, and births that die unconfirmed: bad tracking that needs no truth."""
+    """Tracks that break off and restart, and births that die unconfirmed: bad tracking that needs no truth."""
     (lifetimes_s, num_breaks), now_ns = lifetimes_and_breaks(run), run.tables["timing"]["now_ns"]
     total, minutes = len(lifetimes_s), float(lifetimes_s.sum()) / 60.0
     if num_breaks >= max(_FEWEST_BREAKS, _BREAKS_SHARE * total) and num_breaks > MOST_BREAKS_PER_MINUTE * minutes:

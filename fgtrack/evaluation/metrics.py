@@ -75,7 +75,7 @@ class TruthMetrics:
     false_tracks: int
     """Judged tracks paired in less than `FALSE_TRACK_SHARE` of their rows."""
     tracked_visits: int
-    """Times that an object came into sight and was tracked there: TP of the precision, see `tracked_visits`."""
+    """Times that an object came into view and was tracked there: TP of the precision, see `tracked_visits`."""
     overall: ObjectMetrics
     """All objects together."""
 

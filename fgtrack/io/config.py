@@ -56,7 +56,7 @@ class TopicInput:
     frame: Frame | None = None
     """Frame of the positions; by default `map` where the header names a fixed frame, else `ego`."""
     fields: Mapping[str, FieldPath] | None = None
-    """Paths of the fields, for a type that fgtrack does not know.
+    """Paths of the fields, for a type without an adapter.
 
     `objects` is the list in the message, `stamp` its time (default `header.stamp`), `object_stamp`, `object_id`, the
     measured components (or `latitude_deg` and `longitude_deg`) and what describes an object (`score`, `class_name`,

@@ -68,7 +68,7 @@ def latitudes_longitudes_deg(
     origin_deg: tuple[float, float], x_m: FloatArray, y_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return latitudes and longitudes, shape (n,) each, of positions (n,) in the plane about `origin_deg`.
-    The height above the plane at which that above the ellipsoid is 0 is found by fixed-point iteration.
+    The height above the plane at which that above the ellipsoid is 0 results from fixed-point iteration.
     """
     from pymap3d import enu2geodetic
 

@@ -58,7 +58,7 @@ def write_error(path: Path, error: OSError) -> FgtrackError:
     """The error to raise where `path` cannot be written: `DataError` for a full or broken disk, else `CallError`."""
     if error.errno in FULL:
         return DataError(f"{path}: cannot be written ({error.strerror}), free some space")
-    return CallError(f"{path}: cannot be written ({error.strerror or error}), choose another place")
+    return CallError(f"{path}: cannot be written ({error.strerror or error}), choose another path")
 
 
 def write_file(path: Path, text: str, overwrite: bool = True) -> None:

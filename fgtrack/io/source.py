@@ -79,7 +79,7 @@ def input_kind(path: Path) -> str:
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     formats_read = ", ".join(file_format(name).description for name in reversed(names))
-    raise DataError(f"{path}: is none of the inputs that fgtrack reads: {formats_read}")
+    raise DataError(f"{path}: is not an input that fgtrack reads: {formats_read}")
 
 
 def file_format(name: str) -> FileFormat:

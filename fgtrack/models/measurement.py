@@ -2,7 +2,7 @@
 
 x_m, y_m and yaw_rad are in the map frame and speed_mps is over ground along the heading. range_m, bearing_rad
 (0 along the sensor's x axis, counter-clockwise) and range_rate_mps are relative to the sensor. curvature_radpm, left
-turn positive, is that of the way of the object: its yaw rate over its speed. No sensor measures it, a map tells it.
+turn positive, is that of the way of the object: its yaw rate over its speed. No sensor measures it, a map gives it.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,7 +21,7 @@ from fgtrack.models.motion import CARTESIAN, MIN_SPEED_MPS, POLAR, MotionModel
 MIN_RANGE_M = 1e-6
 #: Far below this speed a curvature gives no yaw rate: an object at rest has no way that could turn.
 SLOW_MPS = 1.0
-#: What a measurement may be of: what a detection measures, and what the map says of a moving object.
+#: What a measurement may be of: what a detection measures, and what the map gives for a moving object.
 COMPONENTS = (*MEASURABLE, "curvature_radpm")
 #: Components that are angles.
 ANGULAR = ("yaw_rad", "bearing_rad")
@@ -69,12 +69,12 @@ class MeasurementModel:
 
     @cached_property
     def angular(self) -> tuple[int, ...]:
-        """Places of the components that are angles."""
+        """Indices of the components that are angles."""
         return tuple(index for index, name in enumerate(self.components) if name in ANGULAR)
 
     @cached_property
     def relative(self) -> tuple[int, ...]:
-        """Places of the components that are relative to the sensor."""
+        """Indices of the components that are relative to the sensor."""
         return tuple(index for index, name in enumerate(self.components) if name in RELATIVE)
 
     @cached_property
@@ -106,7 +106,7 @@ class MeasurementModel:
         residual: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
     ) -> tuple[FloatArray, FloatArray]:
         """Innovation y (..., k) of z (..., k) at the states x (..., n), and its Jacobian H (k, n) or (..., k, n).
-        `residual` may take the place of the model's own.
+        `residual` may replace the model's own.
         """
         y = (residual or self.residual)(z, self.predict(x, pose))
         return y, self.selection(x.shape[-1]) if self.linear else self.jacobian(x, pose)
@@ -134,7 +134,7 @@ class MeasurementModel:
         return self._selections[n]
 
     def residual(self, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
-        """Measured minus predicted, shape (..., k), with angles in (-pi, pi]; the only place that wraps."""
+        """Measured minus predicted, shape (..., k), with angles in (-pi, pi]; the only function that wraps."""
         y = np.asarray(z - z_predicted)
         for index in self.angular:
             angles = y[..., index]

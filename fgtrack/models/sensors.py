@@ -91,7 +91,7 @@ class SensorModel:
     """One modality. Positions have their standard deviations along and across the line of sight."""
 
     std: Mapping[str, PositiveFloat]
-    """Standard deviation of each measured component; the keys say what the sensor measures."""
+    """Standard deviation of each measured component; the keys are what the sensor measures."""
     yaw_from_map_std_rad: PositiveFloat | None = None
     """Where the sensor measures no yaw: take the map heading as a yaw measurement with this standard deviation."""
     curvature_from_map_std_radpm: PositiveFloat | None = None
@@ -129,7 +129,7 @@ class SensorModel:
     max_range_m: PositiveFloat | None = None
     """A detection further from the sensor than this is out of bounds: beyond it clutter outweighs objects."""
     filters: Mapping[str, Filter] = field(default_factory=dict)
-    """Which detections are used, by anything that they say: `{score: {min: 0.5}, class_name: {one_of: [car]}}`. The
+    """Which detections are used, by anything that they contain: `{score: {min: 0.5}, class_name: {one_of: [car]}}`. The
     others are out of bounds."""
     view_range_m: PositiveFloat | None = None
     """Range of sight, where that is less than `max_range_m`; for existence and evaluation, no detection is out of
@@ -185,7 +185,7 @@ class SensorModel:
 
     @property
     def gives_position(self) -> bool:
-        """True if its detections say where an object is: x and y, or range and bearing."""
+        """True if its detections give a position: x and y, or range and bearing."""
         return "x_m" in self.std or {"range_m", "bearing_rad"} <= self.std.keys()
 
     @property

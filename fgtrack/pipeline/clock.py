@@ -34,7 +34,7 @@ def clock_ticks(messages: Iterable[Delivered], node_hz: float | None) -> Iterato
 
 
 def corrected(message: DetectionList, sensors: Mapping[str, SensorModel]) -> DetectionList:
-    """Return `message` with its receipt as the stamp, or its clock offset taken off, where `sensors` say so."""
+    """Return `message` with its receipt as the stamp, or its clock offset taken off, where `sensors` specify it."""
     sensor = sensors.get(message.sensor)
     if sensor is None or (sensor.stamp_from != "receipt" and sensor.clock_offset_s == 0.0):
         return message

@@ -113,12 +113,12 @@ Defect = Literal[
 """The map look-up of the published implementation with the heading on the circle (Q4) or through its jump (Q3, Q4);
 (std_per_s dt)^2 in every step dt of the filter, whatever its frequency (Q6); a yaw that sticks at its upper limit (Q2);
 an update without delay that does not reach the stored present state (Q8); the newest list of each sensor alone (Q12);
-an ego low-pass that filters its own output again at every tick (Q13); a tracking time up to a step ahead of the clock
+an ego low-pass that filters its own output at every tick (Q13); a tracking time up to a step ahead of the clock
 (Q14)."""
 
 
 def _lifecycle_kind(value: object) -> str:
-    """Which form of `lifecycle` is meant: by existence where it does not say."""
+    """Which form of `lifecycle` is meant: by existence where it is not specified."""
     kind = value.get("kind", "existence") if isinstance(value, Mapping) else getattr(value, "kind", "existence")
     return "existence" if kind == "existence" else "counting"
 

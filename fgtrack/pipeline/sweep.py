@@ -228,7 +228,7 @@ def _on_cluster(tasks: Mapping[str, Recipe], score: Score, address: str) -> Iter
     try:
         client = distributed.Client(address, timeout=_SCHEDULER_TIMEOUT_S)
     except (OSError, ValueError) as error:
-        raise CallError(f"--dask {address}: no scheduler answers there, start one with `dask scheduler`") from error
+        raise CallError(f"--dask {address}: no scheduler is reachable, start one with `dask scheduler`") from error
     with client, joblib.parallel_config("dask", wait_for_workers_timeout=_SCHEDULER_TIMEOUT_S):
         yield from _results(tasks, score)
 
@@ -236,7 +236,7 @@ def _on_cluster(tasks: Mapping[str, Recipe], score: Score, address: str) -> Iter
 def _results(tasks: Mapping[str, Recipe], score: Score) -> Iterator[_Result]:
     """Yield results of the tasks in the backend of joblib that is set, as they come."""
     parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch=f"{_HANDED_OUT}*n_jobs")
-    resource_tracker.ensure_running()  # started below, it would let interrupts through again
+    resource_tracker.ensure_running()  # started below, it would let interrupts through
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # Ctrl-C is for this process, not for workers
     try:
         results: Generator[_Result] = parallel(joblib.delayed(run_job)(*task, score) for task in tasks.items())
@@ -246,7 +246,7 @@ def _results(tasks: Mapping[str, Recipe], score: Score) -> Iterator[_Result]:
         yield from results
     except Exception as error:  # of a process, a scheduler or a network; the jobs report their own errors
         what = f"the workers failed, perhaps out of memory ({_reason(error):.120})"
-        raise DataError(f"{what}: start the sweep again to go on, or with fewer --jobs") from error
+        raise DataError(f"{what}: rerun the sweep to continue, or with fewer --jobs") from error
     finally:
         with warnings.catch_warnings():  # an interrupt is reported once, in one line
             warnings.filterwarnings("ignore", "[0-9]+ tasks (have|which)", UserWarning)

@@ -104,7 +104,7 @@ def _is_the_kalman_filter_in_sequence(subject: Subject, stream: Stream) -> None:
 def _gives_the_dense_joint_posterior_in_any_order(subject: Subject, stream: Stream) -> None:
     estimator, results = subject.fed(stream)
     refused = [k for k, result in enumerate(results) if result.status not in FUSED]
-    require(not refused, f"of the measurements inside the window the one at place {refused[:1]} is not fused")
+    require(not refused, f"of the measurements inside the window the one at index {refused[:1]} is not fused")
     tolerance = _tolerance(subject, stream)
     _close_to_joint(subject, stream, estimator, _probes_ns(stream), "the dense joint posterior", tolerance)
 
@@ -116,7 +116,7 @@ def _keeps_all_that_it_accepts_and_nothing_else(subject: Subject, stream: Stream
         oldest_ns = estimator.window_ns[0]
         status = estimator.update(measurement).status
         inside = measurement.stamp_ns >= oldest_ns
-        require((status in FUSED) == inside, f"place {place}: {status}, the window begins at {oldest_ns}")
+        require((status in FUSED) == inside, f"index {place}: {status}, the window begins at {oldest_ns}")
         if inside:
             accepted.append(measurement)
             newest_ns = max(newest_ns, measurement.stamp_ns)
@@ -175,7 +175,7 @@ def _counts_each_measurement_as_what_it_is(subject: Subject, stream: Stream) -> 
     estimator = subject.start(stream)
     newest_ns = stream.start.stamp_ns
     for place, measurement in enumerate(stream.measurements):
-        result, what = estimator.update(measurement), f"place {place}"
+        result, what = estimator.update(measurement), f"index {place}"
         late = measurement.stamp_ns < newest_ns
         allowed = (*_LATE, UpdateStatus.TOO_OLD, UpdateStatus.FAILED) if late else (UpdateStatus.IN_SEQUENCE,)
         require(result.status in allowed, f"{what}: {'late' if late else 'in sequence'}, is {result.status}")

@@ -1,4 +1,4 @@
-"""Answers that estimators are held to: plain calculations that share no recursion, graph or factor with any of them.
+"""References of the contract: plain calculations that share no recursion, graph or factor with any of them.
 
 All take the measurements in the order of the stamps or all at once, so there is no order of arrival in them. They share
 motion models (see `check_motion_model`), measurement models and losses.

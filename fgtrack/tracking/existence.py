@@ -49,7 +49,7 @@ class ExistenceRules:
     confirm_probability: OpenProbability = 0.9
     """A track is confirmed from here on."""
     doubt_probability: OpenProbability = 0.5
-    """A confirmed track below this is published as tentative until it is seen again."""
+    """A confirmed track below this is published as tentative until it is detected once more."""
     delete_probability: OpenProbability = 0.02
     """A track below this ends."""
     lifetime_s: PositiveFloat = 20.0

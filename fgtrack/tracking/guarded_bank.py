@@ -1,4 +1,4 @@
-"""A bank that outlives the failures of its estimators: a track that fails ends, is counted, and may be born again."""
+"""A bank that outlives failures of its estimators: a failing track ends, is counted, and may be reinitialised."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence

@@ -10,7 +10,7 @@ import numpy as np
 
 from fgtrack.core.types import BoolArray, Detection, FloatArray, IntArray, ObjectReport
 
-#: Says which pairs of candidates and tracks, as positions in their lists, both (m,), are not one object, shape (m,).
+#: Selects pairs of candidates and tracks, as positions in their lists, both (m,), are not one object, shape (m,).
 Apart = Callable[[IntArray, IntArray], BoolArray]
 #: Classes that a detector may confuse; any other class is like none.
 _ALIKE = (
@@ -107,7 +107,7 @@ class Objects:
     def evidence(
         self, detections: Iterable[Detection], track_ids: Sequence[int], wrong_id_probability: float
     ) -> Apart | None:
-        """Return what classes and identities say of pairs of detections and tracks; None where they say nothing."""
+        """Return the evidence of classes and identities on pairs of detections and tracks; None without any."""
         if not self._seen:
             return None
         detections = list(detections)

@@ -190,7 +190,7 @@ class Preprocess:
         self._assumes_map_yaw = assumes_map_yaw
 
     def __call__(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> Preprocessed:
-        """Return the candidates of a batch, and the records of the detections that are none.
+        """Return the candidates of a batch, and the records of the rejected detections.
         `ego` is the pose at the batch's stamp; it may be None for detections in the map frame.
         """
         return self.together([self.posed(batch, sensor, ego)])[0]

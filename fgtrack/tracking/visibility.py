@@ -2,8 +2,8 @@
 
 An object does not exist, or exists and is visible to a sensor, or exists and is not: integrated probabilistic data
 association with an observability state (Musicki, Evans, Stankovic, IEEE Trans. Automatic Control 39, 1994; Musicki,
-Evans, IEEE T-AES 40, 2004). Given that it exists, its visibility to a sensor is a Markov chain in continuous time of
-which only the lists of that sensor tell, so the joint probability is the product of existence and visibilities.
+Evans, IEEE T-AES 40, 2004). Given that it exists, its visibility to a sensor is a Markov chain in continuous time,
+observed by the lists of that sensor alone, so the joint probability is the product of existence and visibilities.
 """
 
 import numpy as np

@@ -58,7 +58,7 @@ def learn(
     visible_share: float,
     visible_s: float,
 ) -> None:
-    """Insert an entry into the tracks `rows` in order of stamps, and conclude again from there on."""
+    """Insert an entry into the tracks `rows` in order of stamps, and recompute from there on."""
     for m in range(len(rows)):
         own, at = rows[m], counts[rows[m]]
         while at > 1 and entries[own, at - 1, STAMP] > stamp_ns:

@@ -123,7 +123,7 @@ class _Recording:
         }
 
     def detections(self, run: Run) -> Json:
-        """Detections in order of receipt: stamp, sensor, fate (0 unused, 1 used, 2 late), place, their track then."""
+        """Detections in order of receipt: stamp, sensor, fate (0 unused, 1 used, 2 late), position, track."""
         table, updates, where, rows = run.tables["detections"], run.tables["updates"], placed(run), update_rows(run)
         sensors, sensor = np.unique(table["sensor"], return_inverse=True)
         outcome = np.append(updates["disposition"].astype(np.str_), "")[rows]  # row -1 is of none

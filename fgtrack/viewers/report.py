@@ -102,7 +102,7 @@ def _page(runs: Sequence[EvaluatedRun], tables: Tables, pictures: Iterable[tuple
         "scene": json.dumps(scene, allow_nan=False, separators=(",", ":")).replace("<", r"\u003c"),
         "script": _template("viewer.js"),
     }
-    # Each {{name}} is replaced once: what is put in is not searched again.
+    # Each {{name}} is replaced once: inserted text is not searched.
     return re.sub(r"\{\{(\w+)\}\}", lambda match: contents[match[1]], _template("page.html"))
 
 

@@ -188,7 +188,7 @@ def test_without_truth_only_the_difference_of_two_clocks_is_known(call: Call) ->
     advice = fgtrack.advise("drive.jsonl", "c.yaml", reference="radar")
     (clock,) = [one for one in advice.findings if one.kind == "clock"]
     assert "later than those of radar. radar is received 40 ms after its stamps at least" in clock.text
-    assert "of it is the clock of lidar. To tell which of the two clocks is wrong takes truth" in clock.text
+    assert "of it is the clock of lidar. To identify the wrong one of the two clocks takes truth" in clock.text
     code, text = call("offsets", "drive.jsonl", "-c", "c.yaml", "--reference", "radar", "--json")
     assert code == 0
     offsets = json.loads(text)

@@ -184,7 +184,7 @@ def test_no_command_shows_the_help_and_is_a_bad_call(fgtrack: Command) -> None:
     ("content", "message"),
     [
         (b"", "is empty"),
-        (b"hello\n", "is none of the inputs"),
+        (b"hello\n", "is not an input"),
         (b'{"type": "ego"}\n', "starts with a header"),
         (b'{"type": "header", "format": "fgtrack-stream/2"}\n', "of format 'fgtrack-stream/1'"),
     ],

@@ -67,7 +67,7 @@ def test_delays_tell_which_clock_is_wrong_where_the_other_cannot_be_so_early() -
         return clock_text(found.others[0], found)
 
     assert "not earlier by more: at least 60 ms of it is the clock of radar." in text(0.08, 0.02)
-    assert "either clock may be wrong. To tell which of the two clocks is wrong takes truth" in text(0.08, 0.1)
+    assert "either clock may be wrong. To identify the wrong one of the two clocks takes truth" in text(0.08, 0.1)
     assert "radar is received 20 ms after its stamps at least" in text(-0.08, 0.02)
     assert "at least 60 ms of it is the clock of lidar." in text(-0.08, 0.02)
 

@@ -88,7 +88,7 @@ def test_noise_that_fits_is_reported_of_the_best_run(plain: Metrics) -> None:
     found = compared(b=None, a=Estimate(0.2, 0.1, 0.3, 9))
     (_, fits) = verdict(metrics_of(plain, a=TOO_SMALL, b=FITS), [found])
     assert fits == (
-        "The noise fits (judged by b): NEES of the position 2.10 (expected 2, 95 % interval 1.8 to 2.4), "
+        "The noise is consistent (judged by b): NEES of the position 2.10 (expected 2, 95 % interval 1.8 to 2.4), "
         "NIS of radar 4.20 (expected 4)."
     )
 
@@ -96,8 +96,8 @@ def test_noise_that_fits_is_reported_of_the_best_run(plain: Metrics) -> None:
 def test_a_large_nees_that_may_be_chance_is_no_reason_to_tune_and_none_to_say_that_noise_fits(plain: Metrics) -> None:
     chance = replace(FITS, position_nees=ChiSquareMean(99, 5.0, 2.0), position_nees_interval=Estimate(5.0, 1.0, 9.0, 3))
     assert verdict(metrics_of(plain, a=chance), []) == (
-        "Too short a run to tell if the noise fits (judged by a): NEES of the position 5.00 "
-        "(expected 2, 95 % interval 1.0 to 9.0).",
+        "Run too short to assess the noise (judged by a): "
+        "NEES of the position 5.00 (expected 2, 95 % interval 1.0 to 9.0).",
     )
 
 

@@ -51,7 +51,7 @@ def test_clutter_that_comes_back_is_dense_around_itself() -> None:
     spread, standing = cars(0.9, 4.0), cars(0.9, 1.0, num_places=6)
     assert spread is not None
     assert standing is not None
-    # Three of four are at places, and half of these come back within 3 m.
+    # Three of four are at fixed positions, and half of these come back within 3 m.
     expected = 0.75 * 0.5 / (9.0 * np.pi)
     assert spread.near_clutter_per_m2 < 0.15 * expected
     assert 0.5 * expected < standing.near_clutter_per_m2 < 1.2 * expected

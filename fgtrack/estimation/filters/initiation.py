@@ -123,7 +123,7 @@ class Search:
 
 
 def along(line: Line, time_s: float, state_names: Sequence[str]) -> FloatArray:
-    """State (n,) of an object on `line` at `time_s`; what the line does not say is 0."""
+    """State (n,) of an object on `line` at `time_s`; entries that the line does not give are 0."""
     yaw_rad, speed_mps = polar(line.velocity_mps).tolist()
     vx_mps, vy_mps = line.velocity_mps.tolist()
     x_m, y_m = (line.position_m + time_s * line.velocity_mps).tolist()

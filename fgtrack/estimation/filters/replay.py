@@ -1,4 +1,4 @@
-"""Filters of one object that roll back to a late measurement and filter the later ones again."""
+"""Filters of one object that roll back to a late measurement and re-filter the later ones."""
 
 import bisect
 from collections.abc import Sequence

@@ -195,7 +195,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
 
 
 def _is_plain(measurement: Measurement | None) -> bool:
-    """True if a measurement, or what is none, is of entries of the state, without a loss."""
+    """True if a measurement, or None, is of entries of the state, without a loss."""
     if measurement is None:
         return True
     return measurement.loss is None and type(measurement.model) is MeasurementModel and measurement.model.linear

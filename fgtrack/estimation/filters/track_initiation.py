@@ -173,7 +173,7 @@ class Initiated:
         return self._inner.window_ns
 
     def update(self, measurement: Measurement) -> UpdateResult:
-        """See `Estimator.update`; the innovation is that before it begins again."""
+        """See `Estimator.update`; the innovation is that before it is reinitialised."""
         result = self._inner.update(measurement)
         if self._search is not None and result.innovation is not None:
             bisect.insort(self._fused, measurement.seen_by(self._search.motion), key=lambda each: each.order)
@@ -190,7 +190,7 @@ class Initiated:
         self._inner.advance(now_ns)
 
     def _begin_again(self, search: TrackInitiation) -> None:
-        """Let a new estimator that starts along the first positions take the place of the present one, if it can."""
+        """Let a new estimator that starts along the first positions replace the present one, if it can."""
         count = 0
         for measurement in self._fused:
             longer = search.with_measurement(measurement)

@@ -198,7 +198,7 @@ def fuse(
     nis: FloatArray,
     status: IntArray,
 ) -> int:
-    """Put a measurement of `entries` of the state into the steps of each of `tracks` (m,); filter the later ones again.
+    """Put a measurement of `entries` of the state into the steps of each of `tracks` (m,); re-filter the later ones.
     Writes innovations y (m, k), the NIS of their `rows`, and S (m, k, k), given all that was fused, and the status. A
     failed measurement, and one older than `oldest_ns` or the window of the track, change nothing. Returns the largest
     number of steps; every track must have a free slot.
@@ -238,7 +238,7 @@ def fuse(
                 nis[i] = marginal_nis(S[i], y[i], rows, space[5], space[8])
                 ok = ok and not np.isnan(nis[i])
             j += 1
-            if not ok and fused:  # take it out, and filter the later ones again without it
+            if not ok and fused:  # take it out, and re-filter the later ones without it
                 for j in range(index, count):
                     slots[j] = slots[j + 1]
                 slots[count] = own

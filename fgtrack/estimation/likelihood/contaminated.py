@@ -11,7 +11,7 @@ from fgtrack.core.types import FloatArray
 #: How many times as large as nominal the standard deviations of the classes of errors are: nominal, outliers, and what
 #: belongs to another object.
 SCALES = np.array([1.0, 4.0, 40.0])
-#: Largest share of outliers: beyond it the names of the classes would change places.
+#: Largest share of outliers: beyond it the names of the classes would be exchanged.
 MAX_SHARE = 0.15
 #: Of the outliers, the share of each class.
 PARTS = np.array([0.9, 0.1])

@@ -178,7 +178,7 @@ class Problem:
         likelihood = Likelihood(self, values, free)
         for _ in range(_MAX_LINEARISATIONS):
             logs, current = np.log(values[free]), likelihood
-            best = minimize(  # type: ignore[call-overload]  # scipy-stubs know no callback of two results
+            best = minimize(  # type: ignore[call-overload]  # scipy-stubs lack the callback of two results
                 lambda at, of=current: of.cost(at)[:2],
                 logs,
                 jac=True,

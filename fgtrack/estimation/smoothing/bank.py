@@ -39,7 +39,7 @@ class SmootherBank:
     lag_s
         Length of the windows.
     initiation
-        How the direction of travel of a new object is found where nothing else gives one, see `Initiation`.
+        How the direction of travel of a new object is estimated where nothing else gives one, see `Initiation`.
     failures
         Counts how often windows are rebuilt and steps are damped.
     options
@@ -214,7 +214,7 @@ class SmootherBank:
         return rows
 
     def _initiate(self, track: int, oldest_ns: int) -> None:
-        """Begin again from a straight line, where the oldest new stamp asks for it, as long as nothing has left."""
+        """Reinitialise from a straight line, where the oldest new stamp asks for it, as long as nothing has left."""
         if self.solver.nodes.first[track] > 0:  # a node that left stays behind the window
             del self._searches[track]
             return

@@ -35,7 +35,7 @@ from fgtrack.models.transitions import transition
 
 #: Nodes that are about to leave the window are relinearised where they have moved by this share of the thresholds.
 LEAVING_SHARE = 0.5
-#: Nodes that are solved again, because an older one has changed, by this one.
+#: Nodes that are re-solved because an older one has changed, by this one.
 SOLVED_SHARE = 0.25
 #: Nodes behind the window are forgotten when there are so many that nobody needs.
 _MANY = 16

@@ -29,7 +29,7 @@ class SmootherSettings:
     """Reach of `fuse` behind the window; older detections are `too_old`."""
     relinearise: Mapping[str, float] = field(default_factory=_RELINEARISE.copy)
     """An entry of the state that moved further than this from its linearisation point is relinearised: at half of it
-    when it is about to leave the window, at a quarter when it is solved again anyway; see `thresholds` for entries that
+    when it is about to leave the window, at a quarter when it is re-solved anyway; see `thresholds` for entries that
     are not named."""
     max_iterations: int = 1
     """Gauss-Newton steps per update; further ones are taken only while a state moves."""

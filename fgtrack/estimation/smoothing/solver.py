@@ -276,7 +276,7 @@ class Solver:
         return fixes_of(nodes.origin[numbers[0]] + prior[:, -1], prior[:, :-1].copy(), later)
 
     def restart(self, track: int, line: Line) -> None:
-        """Solve again from states along `line`, with the prior's heading, which must be vague, turned there."""
+        """Re-solve from states along `line`, with the prior's heading, which must be vague, turned there."""
         nodes, oldest = self.nodes, self.nodes.window(track)[0]
         times_s = (nodes.window_stamps_ns(track) - nodes.tracks[track, BEGIN_NS]) / NS_PER_S
         means = np.array([along(line, time_s, self.motion.state_names) for time_s in times_s.tolist()])

@@ -46,7 +46,7 @@ def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
 
 
 def tracked_visits(matching: Matching) -> int:
-    """Times that an object came into sight (again after 1 s) and was tracked by a confirmed track, over all objects.
+    """Times that an object came into view (a second or more apart) and was tracked and confirmed, over all objects.
     "A TP object gets a unique identifier while it's inside the detectable area" (Karle et al. 2023, section IV-A).
     """
     paired = matching.paired & confirmed(matching.tracks)

@@ -86,7 +86,7 @@ def clear(scenes: Scenes, gate_m: float) -> dict[str, float]:
 
 def gospa(scenes: Scenes, c_m: float) -> dict[str, FloatArray]:
     """Squares of GOSPA with the cut-off distance `c_m` at every tick: its parts, the total, and that in sight.
-    A pair at c or beyond is none; `out_of_sight_m2` is the part of `missed_m2` that no sensor could see.
+    A pair at c or beyond is not counted; `out_of_sight_m2` is the part of `missed_m2` that no sensor could see.
     """
     gains_m2 = np.maximum(c_m**2 - np.square(scenes.distances_m), 0.0)
     num_ticks, tick_index = len(scenes.present), scenes.tick_index

@@ -91,9 +91,9 @@ def _noise(label: str, one: Metrics) -> Iterator[str]:
         )
     elif far:
         names = ", ".join(texts[name] for name, *_ in far)
-        yield f"Too short a run to tell if the noise fits (judged by {label}): {names}."
+        yield f"Run too short to assess the noise (judged by {label}): {names}."
     elif squares:
-        yield f"The noise fits (judged by {label}): {', '.join(texts.values())}."
+        yield f"The noise is consistent (judged by {label}): {', '.join(texts.values())}."
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -111,7 +111,7 @@ def _numbers(variation: _Spec, name: str, at: int) -> Iterator[_Number]:
     elif hasattr(variation, "cv_items_list"):
         nested = isinstance(variation.cv_items_list[0], list)
         for part in chain.from_iterable(variation.cv_items_list) if nested else variation.cv_items_list:
-            spec, size = part or (None, 1)  # a bit that tells of an extension
+            spec, size = part or (None, 1)  # a bit that announces an extension
             own = getattr(spec, "cv_non_spare", None)
             if own is not None and hasattr(own.cv_rule, "cv_variation"):
                 yield from _numbers(own.cv_rule.cv_variation, f"{name}/{own.cv_name}", at)
@@ -135,7 +135,7 @@ def _end(variation: _Spec) -> _End:
 
 
 def _extended_end(sizes: Iterable[int], block: bytes, at: int) -> int:
-    """Byte behind parts of `sizes`, each of which ends with the bit that tells of another one."""
+    """Byte behind parts of `sizes`, each of which ends with the bit that announces another one."""
     for size in sizes:
         at += size
         if not block[at - 1] & 1:

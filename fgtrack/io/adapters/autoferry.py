@@ -4,7 +4,7 @@ Helgesen, Vasstein, Brekke, Stahl, "Heterogeneous multi-sensor tracking for an a
 littoral environment", 2022; github.com/Autoferry/sensor_fusion_dataset. Choices that the data leave open:
 - Receipt is the newest stamp up to the record in the file, a lower bound: each sensor alone is in order of its times.
 - Scans are aligned to the north: the yaw of the ego frame is 0, and its speed, which would be along that yaw, too.
-- An own-ship position older than one already delivered is not delivered again.
+- An own-ship position older than one already delivered is not delivered twice.
 - LiDAR and RADAR points get the own ship's position and are in the map frame. Bearings stay relative to the ego.
 """
 

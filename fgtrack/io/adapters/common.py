@@ -40,7 +40,7 @@ class ObjectList:
     stamp_ns: int | None
     """None where the message has no stamp; then it is the receipt."""
     frame: Frame | None
-    """None where the message does not say."""
+    """None where the message does not contain it."""
     objects: tuple[Detection, ...]
     left_out: tuple[str, ...] = ()
     """As of a `DetectionList`."""
@@ -61,7 +61,7 @@ def json_values(file: Path, begin: re.Pattern[str] = _A_LIST, **form: Any) -> It
     """Yield values of the list that follows `begin` in the JSON `file`, or keys and values of the object.
     The text of a table may have a gigabyte. `form` is that of a `JSONDecoder`. Raises `DataError` in other files.
     """
-    with reported_as(f"{file}: is not JSON of the expected form, fetch it again"):
+    with reported_as(f"{file}: is not JSON of the expected form, download it once more"):
         text = read_whole(file, _LARGEST_MB).decode()
         gap = begin.match(text)
         if gap is None:

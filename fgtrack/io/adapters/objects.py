@@ -116,7 +116,7 @@ def delphi_esr(message: RosMessage) -> ObjectList:
 
 
 def radar_tracks(message: RosMessage) -> ObjectList:
-    """`radar_msgs/RadarTracks`: position and speed; the radar does not say where an object heads."""
+    """`radar_msgs/RadarTracks`: position and speed; the radar gives no heading."""
     return object_list(message.header, map(_radar_track, message.tracks))
 
 

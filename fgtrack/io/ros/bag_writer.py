@@ -104,7 +104,7 @@ def as_write_error(path: Path) -> Iterator[None]:
         raise
     except Exception as error:
         raise DataError(
-            f"{path}: cannot be written ({one_line(error)}), free some space or choose another place"
+            f"{path}: cannot be written ({one_line(error)}), free some space or choose another path"
         ) from error
 
 

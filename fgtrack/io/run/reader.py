@@ -212,7 +212,7 @@ def load_run(path: Path | str) -> Run:
     except (ValueError, RecursionError) as error:
         raise DataError(f"{file}: is not JSON ({error}), repeat the run") from error
     if not isinstance(meta, dict) or meta.get("format") != RUN_FORMAT:
-        raise DataError(f"{file}: does not say format {RUN_FORMAT!r}, so this is not a run folder")
+        raise DataError(f"{file}: does not contain format {RUN_FORMAT!r}, so this is not a run folder")
     complete = bool(meta.get("complete"))
     tables = {name: _read_table(path / f"{name}.csv", name, complete) for name in COLUMNS}
     if (np.diff(tables["timing"]["tick"]) <= 0).any():

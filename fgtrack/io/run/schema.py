@@ -45,7 +45,7 @@ ADDED_COLUMNS: Mapping[str, str | float] = {"id": "", SCORE: math.nan}
 NO_TRACK = -1
 """Track id of an update that belongs to no track."""
 
-# A column holds floats, integers or text, as its name specifies; the reader of it knows which.
+# A column holds floats, integers or text, as its name specifies; which its reader specifies.
 Column = npt.NDArray[Any]
 _TEXT = frozenset({"status", "sensor", "disposition", "kind", "frame", "class_name", "id", "outline_m"})
 _INTEGERS = frozenset(

@@ -75,7 +75,7 @@ class RunWriter(RunSink):
         return finished
 
     def _replace(self, folder: Path) -> None:
-        (self.path / _META).unlink(missing_ok=True)  # until the end of the exchange there is no run
+        (self.path / _META).unlink(missing_ok=True)  # until both are renamed there is no run
         for name in _FILES:
             if (folder / name).exists():
                 os.replace(folder / name, self.path / name)

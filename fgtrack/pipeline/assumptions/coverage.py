@@ -67,7 +67,7 @@ class Coverage:
     axis_rad: float = 0.0
     """Direction of the middle of its sector, 0 along the axis of the frame of its detections."""
     field_of_view_rad: float | None = None
-    """Full angle of its sector; None where it detects all around, or too seldom to tell."""
+    """Full angle of its sector; None where it detects all around, or too seldom to judge."""
     range_m: float | None = None
     """Up to where it detects; None where it measures no range, or too seldom."""
 
@@ -170,7 +170,7 @@ class _Detections:
             extent_m = np.quantile(seen_m, 1.0 - _OUTSIDE, axis=0) - np.quantile(seen_m, _OUTSIDE, axis=0)
             ranges_m = np.hypot(*seen_m.T)
             reach_m = float(np.quantile(ranges_m, 1.0 - _OUTSIDE))
-            area_m2 = max(float(np.prod(extent_m)), 0.5 * _NARROWEST_RAD * reach_m**2)  # one object may keep its place
+            area_m2 = max(float(np.prod(extent_m)), 0.5 * _NARROWEST_RAD * reach_m**2)  # an object may stand
             order = np.argsort(stamps_s, kind="stable")
             columns = ([column[parts[k]] for k in order] for column in (placed_m, rows[:, 4], ranges_m))
             result = replace(result, persistence=persistence(Lists(stamps_s[order], *columns)), area_m2=area_m2)

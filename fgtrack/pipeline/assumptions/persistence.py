@@ -50,7 +50,7 @@ class Lists(NamedTuple):
 class Persistence:
     """Detection probability, clutter and scores of a sensor, from triples of detections in three successive lists.
     Three detections on a line at constant speed are of one object. How often the next lists continue the line is the
-    detection probability; detections in no triple, beyond those that misses explain, are clutter. Where scores tell
+    detection probability; detections in no triple, beyond those that misses explain, are clutter. Where scores identify
     clutter, its density is also that around clutter, where it competes with a track that began there (Song, Musicki:
     Adaptive clutter measurement density estimation for improved target tracking, IEEE T-AES 2011).
     """
@@ -58,7 +58,7 @@ class Persistence:
     detection_probability: float
     clutter_per_list: float
     near_clutter_per_m2: float
-    """Clutter around clutter: in the next list where scores tell it, else in the same list."""
+    """Clutter around clutter: in the next list where scores identify it, else in the same list."""
     score: Score | None
     """Model of the scores; None if they are absent, or higher ones are not more often of an object."""
     max_range_m: float | None
