@@ -256,6 +256,11 @@ class StatesAt:
     covariances: FloatArray
     """Shape (m, n, n)."""
 
+    def of(self, track_id: int) -> "StatesAt":
+        """Return the state of one track; of no track where it has none."""
+        rows = [row for row, each in enumerate(self.track_ids) if each == track_id]
+        return StatesAt((track_id,) * len(rows), self.means[rows], self.covariances[rows])
+
 
 @runtime_checkable
 class TrackBank(Protocol):

@@ -58,6 +58,15 @@ class GuardedBank:
         finite = np.isfinite(states.means.sum(axis=1) + states.covariances.sum(axis=(1, 2)))
         return StatesAt(tuple(compress(states.track_ids, finite)), states.means[finite], states.covariances[finite])
 
+    def state_of(self, track_id: int, stamp_ns: int) -> StatesAt:
+        """Return the state of one track at `stamp_ns`, see `states_at`; of no track where it has none.
+        A bank with `states_of` is asked for it alone.
+        """
+        if hasattr(self._bank, "states_of"):
+            states: StatesAt = self._ask("states_of", stamp_ns, track_id)
+            return states
+        return self.states_at(stamp_ns).of(track_id)
+
     def update(
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:

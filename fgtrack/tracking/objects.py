@@ -72,6 +72,7 @@ class Objects:
     def __init__(self) -> None:
         self._seen: dict[int, _Seen] = {}
         self._ids: dict[int, str] = {}  # of most detections, by track
+        self._owners: dict[str, set[int]] = {}  # tracks of an identity, of most of their detections
         self._former: dict[str, int] = {}  # tracks that have ended, by identity
         self._strays = Counter[str]()  # detections in succession that their track did not match, by identity
         self.id_conflicts: Counter[str] = Counter()
@@ -91,18 +92,29 @@ class Objects:
             if detection.class_name is not None:
                 seen.classes[detection.class_name] += 1
             if detection.id is not None:
-                if not seen.ids and detection.id in self._ids.values():
+                known = self._ids.get(track_id)
+                if not seen.ids and detection.id in self._owners:
                     self.id_conflicts["reused"] += 1
-                if detection.id != self._ids.get(track_id, detection.id):
+                if known not in (None, detection.id):
                     self.id_conflicts["changed"] += 1
                 seen.ids[detection.id] += 1
                 self._strays.pop(detection.id, None)
-                self._ids[track_id] = max(seen.ids, key=seen.ids.__getitem__)
+                if detection.id != known and seen.ids[detection.id] > seen.ids.get(known or "", 0):
+                    self._disown(track_id)
+                    self._ids[track_id] = detection.id
+                    self._owners.setdefault(detection.id, set()).add(track_id)
             for name, value in zip(_SIZES, _sizes_m(detection), strict=True):
                 if value is not None:
                     seen.num_sizes[name] += 1
                     mean = seen.sizes_m.get(name, 0.0)
                     seen.sizes_m[name] = mean + 1.0 / seen.num_sizes[name] * (value - mean)
+
+    def owner(self, detection: Detection) -> int | None:
+        """Return the one track with the identity of `detection`; None without any, and where its class decides."""
+        if detection.id is None or detection.class_name is not None:
+            return None
+        tracks = self._owners.get(detection.id, ())
+        return next(iter(tracks)) if len(tracks) == 1 else None
 
     def evidence(
         self, detections: Iterable[Detection], track_ids: Sequence[int], wrong_id_probability: float
@@ -123,7 +135,7 @@ class Objects:
         """True if a track that does not match `detection` has its identity, unless three others strayed just before.
         So far from the track of its own identity it is an outlier, rather than another object of that identity.
         """
-        if detection.id is None or detection.id not in self._ids.values():
+        if detection.id is None or detection.id not in self._owners:
             return False
         self._strays[detection.id] += 1
         return self._strays[detection.id] <= _MOST_STRAYS
@@ -132,7 +144,7 @@ class Objects:
         """Return the track, ended or lost, of which a new one of `detection` takes the number; None without any.
         An identity is that of one object: what returns with it after a gap, or elsewhere, is the same object.
         """
-        lost = next((track_id for track_id, name in self._ids.items() if name == detection.id), None)
+        lost = min(self._owners.get(detection.id or "", ()), default=None)
         return self._former.pop(detection.id or "", None) if lost is None else lost
 
     def apart(self, detections: Iterable[Detection], track_ids: Sequence[int]) -> Apart | None:
@@ -162,10 +174,19 @@ class Objects:
     def forget(self, track_id: int) -> None:
         """Forget a track that has ended."""
         self._seen.pop(track_id, None)
-        if identity := self._ids.pop(track_id, None):
+        if identity := self._disown(track_id):
             self._former[identity] = track_id
             if len(self._former) > _MOST_FORMER:
                 del self._former[next(iter(self._former))]
+
+    def _disown(self, track_id: int) -> str | None:
+        """Remove the identity of a track, and return it."""
+        identity = self._ids.pop(track_id, None)
+        if identity is not None:
+            self._owners[identity].discard(track_id)
+            if not self._owners[identity]:
+                del self._owners[identity]
+        return identity
 
     def _report(self, seen: _Seen) -> ObjectReport:
         name = _most(seen.classes)

@@ -25,7 +25,7 @@ from fgtrack.core.types import (
     TrackStatus,
     UpdateRecord,
 )
-from fgtrack.estimation.base import Measurement, Measurements, Start, StatesAt, TrackBank, UpdateResult
+from fgtrack.estimation.base import Measurement, Measurements, Start, StatesAt, UpdateResult
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.ekf import correct_one, propagated
 from fgtrack.estimation.filters.propagation import kinematic_states
@@ -38,13 +38,14 @@ from fgtrack.tracking.birth import Birth, in_any_direction
 from fgtrack.tracking.detections import PosedBatch
 from fgtrack.tracking.ego import EgoPose, EgoTrajectory
 from fgtrack.tracking.existence import Lifecycle
-from fgtrack.tracking.guarded_bank import faults
+from fgtrack.tracking.guarded_bank import GuardedBank, faults
 from fgtrack.tracking.inbox import Batch, Inbox, record
 from fgtrack.tracking.lifecycle import Scan
 from fgtrack.tracking.objects import Apart, Objects
 from fgtrack.tracking.preprocess import Candidates, Preprocess, Preprocessed
 from fgtrack.tracking.soft_association import equivalent, joint_probabilities
 
+_SELDOM = 1e-3  # probability with which a true pair misses the usual gate
 _Own = tuple[int, TrackStatus, int, ObjectReport | None, float | None]
 """Id, status, number of measurements, object and existence probability of a track."""
 
@@ -58,7 +59,7 @@ class TrackerParts:
     inbox: Inbox
     preprocess: Preprocess
     association: Association
-    bank: TrackBank
+    bank: GuardedBank
     motion: MotionModel
     lifecycle: Lifecycle
     suppress_births_near_newer_tracks: bool
@@ -226,8 +227,7 @@ class Tracker:
         if self._is_too_old(batch):
             self._conclude(batch, candidates, range(len(candidates)), Disposition.TOO_OLD)
             return
-        states = self._offered(batch)
-        assignment = self._assigned(batch, candidates, states)
+        states, assignment = self._identified(batch, candidates) or self._associated(batch, candidates)
         self._count(batch, candidates, assignment, states, scan)
         if assignment.pairs:
             self._estimate(batch, candidates, assignment, states)
@@ -237,6 +237,26 @@ class Tracker:
             new = self._unclaimed(batch, candidates, new, states)
         for position in new:
             self._give_birth(batch, candidates, position, scan)
+
+    def _identified(self, batch: Batch, candidates: Candidates) -> tuple[StatesAt, Assignment] | None:
+        """Return the track with the identity of the only candidate, its state and the pair; None outside its gate.
+        Identities that are seldom wrong need no other track: the cost does not depend on the number of tracks.
+        """
+        parts, message, sensor = self._parts, batch.message, self._parts.sensors[batch.message.sensor]
+        jointly = parts.joint is not None and parts.joint.joint_from is not None
+        if len(candidates) != 1 or sensor.scan or jointly or sensor.wrong_id_probability > _SELDOM:
+            return None
+        owner = parts.objects.owner(message.objects[candidates.leaders[0]])
+        if owner is None or owner in self._undirected:
+            return None
+        states = parts.bank.state_of(owner, batch.stamp_ns)
+        assignment = parts.association(candidates, states)
+        return (states, assignment) if assignment.pairs else None
+
+    def _associated(self, batch: Batch, candidates: Candidates) -> tuple[StatesAt, Assignment]:
+        """Return the states of the tracks that `batch` may be associated with, and the assignment."""
+        states = self._offered(batch)
+        return states, self._assigned(batch, candidates, states)
 
     def _assigned(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Assignment:
         """Return the assignment of candidates to tracks of the same class, and by their identities."""

@@ -9,6 +9,7 @@ from fgtrack.calibration.tune_measurements import recorded
 from fgtrack.calibration.tune_space import ConfigNoise
 from fgtrack.calibration.tune_stamps import fitted_stamps, with_stamps
 from fgtrack.core.types import Detection, DetectionList, Disposition
+from fgtrack.estimation.filters.replay_bank import ReplayBank
 from fgtrack.estimation.likelihood.fit import Problem
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.config import Config
@@ -56,6 +57,15 @@ def test_objects_that_touch_keep_their_tracks_by_their_identities():
     assert track_of(named, "AAA") != track_of(named, "BBB")
     assert sorted(named.tables["objects"]["id"].tolist()) == ["AAA", "BBB"]
     assert named.meta["id_conflicts"] == {}
+
+
+def test_a_known_identity_asks_for_no_track_but_its_own(monkeypatch):
+    asked, every = [], ReplayBank.states_at
+    monkeypatch.setattr(ReplayBank, "states_at", lambda self, stamp_ns: asked.append(stamp_ns) or every(self, stamp_ns))
+    lists = [report(k + 0.1 * n, 20.0 * k, 500.0 * (n + 1), f"AAA{n}") for k in range(10) for n in range(8)]
+    result = run(lists, estimator="ekf-replay")
+    assert [track_of(result, f"AAA{n}") for n in range(8)] == [{n} for n in range(8)]
+    assert max(asked) <= 1 * S  # while the first tick begins tracks
 
 
 def test_a_detection_without_identity_joins_the_track_of_one():

@@ -64,6 +64,8 @@ class Banks:
         assert one.track_ids == other.track_ids
         np.testing.assert_allclose(one.means, other.means, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(one.covariances, other.covariances, rtol=1e-9, atol=1e-9)
+        for track_id, mean in zip(one.track_ids, one.means, strict=True):
+            np.testing.assert_array_equal(self.found.states_of(stamp_ns, track_id).means, [mean])
         for state, same in zip(self.found.present(), self.expected.present(), strict=True):
             assert state.stamp_ns == same.stamp_ns
             np.testing.assert_allclose(state.mean, same.mean, rtol=1e-9, atol=1e-9)

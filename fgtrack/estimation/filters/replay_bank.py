@@ -10,7 +10,16 @@ import numpy as np
 from fgtrack.core.checks import LARGEST_NS
 from fgtrack.core.linalg import equal_ones, kernels
 from fgtrack.core.types import BoolArray, FloatArray, IntArray, TrackState
-from fgtrack.estimation.base import Measurement, Measurements, Start, StatesAt, UpdateResult, UpdateStatus, stacks
+from fgtrack.estimation.base import (
+    Measurement,
+    Measurements,
+    Start,
+    StatesAt,
+    UpdateResult,
+    UpdateStatus,
+    no_states,
+    stacks,
+)
 from fgtrack.estimation.filters.ekf import Prediction
 from fgtrack.estimation.filters.propagation import kinematic_states
 from fgtrack.estimation.filters.replay import ReplayEkf, Step
@@ -71,6 +80,16 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         if known is None:
             return StatesAt(self.track_ids, *states)
         return StatesAt(tuple(compress(self.track_ids, known.tolist())), *(each[known] for each in states))
+
+    def states_of(self, stamp_ns: int, track_id: int) -> StatesAt:
+        """Return `states_at` of one track, at a cost that does not depend on the number of the others."""
+        row, n = self._rows.get(track_id, -1), self._motion.dim
+        if row < 0:
+            return self.states_at(stamp_ns).of(track_id)
+        known, means, covariances = np.empty(1, dtype=bool), np.empty((1, n)), np.empty((1, n, n))
+        at = np.array([row]), self._start_ns, stamp_ns, False
+        count = self._kernels.ahead(self._kind, self._density, *self._arrays[:4], *at, means, covariances, known)
+        return StatesAt((track_id,), means, covariances) if count else no_states(n)
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
