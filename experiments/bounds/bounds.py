@@ -31,7 +31,7 @@ from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.registry import ESTIMATORS, OOSM_GROUP, estimator
 from fgtrack.evaluation.bounds import ScheduledMeasurement, bounds, bounds_along
-from fgtrack.evaluation.palette import look
+from fgtrack.evaluation.palette import style_of
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
 from fgtrack.plotting.paper import styled
@@ -293,12 +293,12 @@ def draw(entries: Sequence[Entry], lines: Sequence[Entry], path: Path) -> None:
 
 
 def _draw_bounds(axes: Axes, lines: Sequence[Entry]) -> None:
-    looks = {
+    styles = {
         "in time": {"color": GREY, "linestyle": ":", "label": "bound: all in time"},
         "arrived": {"color": WRONG, "linestyle": "-", "label": "bound: what has arrived"},
         "dropped": {"color": GREY, "linestyle": "--", "label": "bound: late data dropped"},
     }
-    for name, its in looks.items():
+    for name, its in styles.items():
         own = [e for e in lines if e.name == f"bound: {name}"]
         axes.plot([1e3 * e.delay_s for e in own], [e.rmse_m for e in own], linewidth=1.5, **its)
 
@@ -310,7 +310,13 @@ def _draw_estimators(axes: Axes, entries: Sequence[Entry], shown_m: tuple[float,
         if not own:
             continue  # not asked for
         delays_s = np.array([e.delay_s for e in own]) + (index - len(DRAWN) // 2) * DODGE_S
-        its = {"color": look(name).colour, "marker": MARKERS[index], "markersize": 4.5, "linestyle": "", "capsize": 2.0}
+        its = {
+            "color": style_of(name).colour,
+            "marker": MARKERS[index],
+            "markersize": 4.5,
+            "linestyle": "",
+            "capsize": 2.0,
+        }
         bars_m = [2.0 * e.rmse_error_m for e in own]
         axes.errorbar(1e3 * delays_s, [e.rmse_m for e in own], bars_m, label=name, **its)
     axes.set_ylim(*shown_m)

@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 
 from fgtrack.cli.sweep import swept
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.palette import look
+from fgtrack.evaluation.palette import style_of
 
 SWEEP = Path(__file__).parents[2] / "configs/sweeps/bursts.yaml"
 QUICK_SEEDS = 2
@@ -54,7 +54,7 @@ def draw(axis: Axes, found: Found, bad: str, length_s: float) -> None:
             100.0 * shares + 0.6 * (index - 1.5),  # so that bars do not hide each other
             [seeds.mean() for seeds in some],
             yerr=[seeds.std(ddof=1) / np.sqrt(len(seeds)) for seeds in some],
-            color=look(name).colour,
+            color=style_of(name).colour,
             ls="--" if name == "ekf-replay" else "-",
             marker="os^v"[index],
             ms=4,

@@ -35,7 +35,7 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateStatus
 from fgtrack.estimation.registry import ESTIMATORS, EXACT, OOSM_GROUP, Claims, estimator
-from fgtrack.evaluation.palette import looks
+from fgtrack.evaluation.palette import styles
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
 from fgtrack.plotting.paper import styled
@@ -226,16 +226,16 @@ def draw(ladder: dict[int, dict[str, Samples]], path: Path) -> None:
     left, right = figure.subplots(1, 2)
     lags = list(ladder)
     groups = alike(ladder)
-    for index, (names, its) in enumerate(zip(groups, looks([names[0] for names in groups]), strict=True)):
+    for index, (names, its) in enumerate(zip(groups, styles([names[0] for names in groups]), strict=True)):
         curves = [ladder[lag][names[0]] for lag in lags]
         rmse_m, anees = [s.rmse_m for s in curves], [s.anees for s in curves]
         label = ", ".join(names)
         if max(rmse_m) > MAX_RMSE_M or max(anees) > MAX_ANEES:
             label += f"\n(leaves the plot: to {max(rmse_m):.1f} m, NEES {max(anees):.0f})"
         width = 1.0 + 4.0 * (1.0 - index / len(groups))
-        look = {"color": its.colour, "linestyle": its.line, "linewidth": width}
-        left.plot(lags, rmse_m, label=label, **look)
-        right.plot(lags, anees, **look)
+        style = {"color": its.colour, "linestyle": its.line, "linewidth": width}
+        left.plot(lags, rmse_m, label=label, **style)
+        right.plot(lags, anees, **style)
     right.axhline(2.0, color=WRONG, linewidth=0.8, label="as sure as it should be")
     left.set_ylim(0.25, MAX_RMSE_M)
     right.set_ylim(1.5, MAX_ANEES)

@@ -41,7 +41,7 @@ LAGS_S = (1.0, 5.0, 20.0)
 SAME_S = 0.15  # times that differ by less are the same
 STD_RAD = 0.06
 ERRORS = {"white": None, "lasting": Correlation(share=0.9, time_s=5.0)}
-QUANTITIES = ("gospa_in_sight_rms_m", "position_rmse_m")
+QUANTITIES = ("gospa_in_view_rms_m", "position_rmse_m")
 OF_BEARINGS = (
     *("recording", "camera", "bearings", "rms_rad", "mean_rad"),
     *(f"lasts_{lag_s:g}_s" for lag_s in LAGS_S),
@@ -142,7 +142,7 @@ def measured(source: Path, config: Config, seconds: float) -> tuple[list[list[st
         assert metrics.multi_object is not None
         nis = nis_ratios(run)
         values = (
-            *(metrics.multi_object.gospa["in_sight_rms_m"], *bounds(changes[0])),
+            *(metrics.multi_object.gospa["in_view_rms_m"], *bounds(changes[0])),
             *(metrics.truth.overall.errors["position_m"].rmse, *bounds(changes[1])),
             *(100.0 * metrics.multi_object.clear["mota"], 100.0 * metrics.multi_object.identity["idf1"]),
             *(metrics.truth.overall.breaks, metrics.truth.false_tracks),

@@ -13,7 +13,7 @@ from fgtrack.evaluation.scores.prediction import STEP_S, displacements
 from fgtrack.sim.delays import ConstantDelay
 from fgtrack.sim.redelay import SensorDelays, redelay
 
-QUANTITIES = ("position_rmse_m", "gospa_in_sight_rms_m")
+QUANTITIES = ("position_rmse_m", "gospa_in_view_rms_m")
 HEADER = ("quantity", "estimator", "prompt_m", "late_m", "cost_m", "less_than_last_by_m")
 
 Sums = Mapping[str, FloatArray]

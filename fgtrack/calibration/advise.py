@@ -311,5 +311,5 @@ class Adviser:
             found = self._config.effective
             yield f"{found.lag_key} ({found.lag_s:g} s) and max_delay_s"
         if "track" not in kinds and outcome is not None and outcome.truth is not None:
-            tracked = percent(outcome.truth.tracked_share_in_sight)
+            tracked = percent(outcome.truth.tracked_share_in_view)
             yield f"tracks ({outcome.births} beginnings, {tracked} tracked where a sensor could see)"

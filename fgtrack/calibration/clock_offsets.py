@@ -25,7 +25,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from fgtrack.calibration.arrivals import arrivals_of
-from fgtrack.calibration.paths import EgoPath, ObjectPath, Sightings, sightings_of, true_paths
+from fgtrack.calibration.paths import EgoPath, MeasuredPositions, ObjectPath, measured_positions, true_paths
 from fgtrack.core.errors import CallError, DataError, did_you_mean
 from fgtrack.core.geometry import rotations
 from fgtrack.core.linalg import psd_solve
@@ -55,7 +55,7 @@ _LARGEST_HALF_S = 0.05  # an interval that is wider leaves an offset unknown
 RECEIPT_S = 1e-5
 """Stamps that are nearer to the receipt are the receipt."""
 
-_Pair = tuple[Sightings, ObjectPath]
+_Pair = tuple[MeasuredPositions, ObjectPath]
 
 
 class Bias(NamedTuple):
@@ -188,7 +188,7 @@ def estimate_offsets(
     poses = run.tables["ego"]  # where the tracker has the ego, as its tracks
     states = zip(*(poses[name].tolist() for name in COLUMNS["ego"]), strict=True)
     ego = EgoPath(itertools.starmap(EgoState, states)) if needs_ego else None
-    seen = sightings_of(run, lists, config, ego)
+    seen = measured_positions(run, lists, config, ego)
     sensors = [name for name in config.sensors if name in counts]
 
     def against(name: str, paths: Sequence[ObjectPath]) -> OffsetReport:
@@ -215,12 +215,12 @@ def estimate_offsets(
     return against(reference, _paths(seen, reference))
 
 
-def _paths(seen: Mapping[str, Mapping[int, Sightings]], reference: str) -> list[ObjectPath]:
+def _paths(seen: Mapping[str, Mapping[int, MeasuredPositions]], reference: str) -> list[ObjectPath]:
     paths = [ObjectPath.through(item.stamps_ns, item.at(item.stamps_ns)) for item in seen.get(reference, {}).values()]
     return [item for item in paths if item is not None]
 
 
-def _paired(tracks: Mapping[int, Sightings], paths: Sequence[ObjectPath]) -> list[_Pair]:
+def _paired(tracks: Mapping[int, MeasuredPositions], paths: Sequence[ObjectPath]) -> list[_Pair]:
     """Return each track that is near a path with the one that it is nearest to."""
     pairs = []
     for item in tracks.values():

@@ -137,7 +137,7 @@ class Outcome:
         yield "beginnings of tracks", self.births
         yield "tracks confirmed", self.confirmed
         if self.truth is not None:
-            yield "tracked [%]", 100.0 * self.truth.tracked_share_in_sight
+            yield "tracked [%]", 100.0 * self.truth.tracked_share_in_view
             yield "breaks per object and minute", self.breaks_per_minute
             yield "identity switches", self.truth.id_switches
             yield "position RMSE [m]", self.truth.errors["position_m"].rmse
@@ -159,7 +159,7 @@ def harm(before: Outcome, after: Outcome) -> str | None:
             return f"detections of {name} that are used go from {percent(before.used[name])} to {percent(share)}"
     old, new = before.truth, after.truth
     if old is not None and new is not None:
-        was_share, share = old.tracked_share_in_sight, new.tracked_share_in_sight
+        was_share, share = old.tracked_share_in_view, new.tracked_share_in_view
         if share < was_share - _LESS:
             return f"the share of time tracked goes from {percent(was_share)} to {percent(share)}"
         if share > was_share + _LESS:

@@ -12,7 +12,7 @@ from fgtrack.io.info import OTHER_CLOCK_S
 from fgtrack.pipeline.assumptions.assumption import Assumption
 from fgtrack.pipeline.config import Config
 
-__all__ = ["Advice", "whole"]
+__all__ = ["Advice", "rounded_ms"]
 
 _COMMENT = 110  # characters in a line of a file
 
@@ -90,7 +90,7 @@ class Advice:
             Column("sensor", left=True),
             Column("lists"),
             Column("period\n[ms]", "period_s", scale=1e3),
-            Column("delay [ms]\np50/p95/max", "delay_p50_s delay_p95_s delay_max_s", "{}/{}/{}", 1e3, text=whole),
+            Column("delay [ms]\np50/p95/max", "delay_p50_s delay_p95_s delay_max_s", "{}/{}/{}", 1e3, text=rounded_ms),
             Column("overtaken\n[%]", "overtaken", scale=100.0),
             Column("lost\n[%]", "lost", scale=100.0),
         ]
@@ -120,6 +120,6 @@ def _wrapped(texts: Sequence[str]) -> list[str]:
     return [line for text in texts for line in how.wrap(text)]
 
 
-def whole(value: Value) -> str:
+def rounded_ms(value: Value) -> str:
     """Whole milliseconds; of a recorder with another clock than the sensor nothing."""
     return f"{value:.0f}" if abs(float(value)) < 1e3 * OTHER_CLOCK_S else NO_VALUE

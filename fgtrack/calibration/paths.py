@@ -30,7 +30,7 @@ from fgtrack.tracking.ego import EgoPose, is_finite
 from fgtrack.tracking.inbox import Inbox, record
 from fgtrack.tracking.preprocess import Preprocess
 
-__all__ = ["EgoPath", "ObjectPath", "Sightings", "sightings_of", "true_paths"]
+__all__ = ["EgoPath", "ObjectPath", "MeasuredPositions", "measured_positions", "true_paths"]
 
 _FEWEST = 5  # values that a smoothing spline needs
 _GAP_S = 3.0  # a path is not known in longer gaps
@@ -97,7 +97,7 @@ class ObjectPath:
 
 
 @dataclass(frozen=True)
-class Sightings:
+class MeasuredPositions:
     """Positions that one sensor measured of one track."""
 
     stamps_ns: IntArray
@@ -115,9 +115,9 @@ class Sightings:
         moved_m = pose[:, :2] + np.einsum("nij,nj->ni", rotations(pose[:, 2]), self.positions_m)
         return np.where(self.in_map[:, None], self.positions_m, moved_m)
 
-    def chosen(self, rows: BoolArray | slice) -> "Sightings":
+    def chosen(self, rows: BoolArray | slice) -> "MeasuredPositions":
         """Return some of them."""
-        return Sightings(self.stamps_ns[rows], self.positions_m[rows], self.in_map[rows], self.ego)
+        return MeasuredPositions(self.stamps_ns[rows], self.positions_m[rows], self.in_map[rows], self.ego)
 
 
 def true_paths(messages: Iterable[Message]) -> list[ObjectPath]:
@@ -139,9 +139,9 @@ def true_paths(messages: Iterable[Message]) -> list[ObjectPath]:
     return paths
 
 
-def sightings_of(
+def measured_positions(
     run: Run, lists: Sequence[DetectionList], config: Config, ego: EgoPath | None
-) -> dict[str, dict[int, Sightings]]:
+) -> dict[str, dict[int, MeasuredPositions]]:
     """Return what `run` of `lists` fused, transformed and merged as the tracker does, by sensor and track.
     `ego` is None where all detections are in the map frame.
     """
@@ -176,8 +176,8 @@ def sightings_of(
                     is_map = ego is None or message.frame == "map"
                     z_m = item.position_m if is_map else (item.position_m - pose[:2]) @ rotations(pose[2])
                     rows[message.sensor, track_id].append((batch.stamp_ns, z_m, is_map))
-    result: dict[str, dict[int, Sightings]] = {sensor: {} for sensor, _ in rows}
+    result: dict[str, dict[int, MeasuredPositions]] = {sensor: {} for sensor, _ in rows}
     for (sensor, track_id), each in rows.items():
         stamps_ns, positions_m, in_map = map(np.array, zip(*each, strict=True))
-        result[sensor][track_id] = Sightings(stamps_ns, positions_m, in_map, ego)
+        result[sensor][track_id] = MeasuredPositions(stamps_ns, positions_m, in_map, ego)
     return result

@@ -60,7 +60,7 @@ def _recording(one: EvaluatedRun) -> str:
 def _tracks(one: EvaluatedRun) -> str:
     truth = one.metrics.truth
     if truth is not None:
-        of, share = truth.overall, _PERCENT * truth.overall.tracked_share_in_sight
+        of, share = truth.overall, _PERCENT * truth.overall.tracked_share_in_view
         return (
             f"{one.label} tracks the objects {share:.1f} % of the time that a sensor could see them: "
             f"{_several(of.breaks, 'break')}, {_several(of.id_switches, 'identity switch', 'es')}, "

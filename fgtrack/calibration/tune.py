@@ -295,8 +295,8 @@ class _Tuning:
         rest = [
             replace(item, from_ns=at_ns) for tracks, at_ns in zip(series, splits_ns, strict=True) for item in tracks
         ]
-        before, squares_before = self._judged(rest, np.where(self._named, self._configured, trained))
-        after, squares_after = self._judged(rest, trained)
+        before, squares_before = self._scored(rest, np.where(self._named, self._configured, trained))
+        after, squares_after = self._scored(rest, trained)
         if not before:
             return None
         innovations = tuple(
@@ -313,7 +313,7 @@ class _Tuning:
             1.0 - self._rules.train_share, len(before), float(np.mean(before)), float(np.mean(after)), innovations
         )
 
-    def _judged(
+    def _scored(
         self, series: Sequence[Series], values: FloatArray
     ) -> tuple[list[float], dict[tuple[str, str], list[float]]]:
         """Return log-likelihoods of the innovations that count, and squares over variances by sensor and component."""

@@ -76,13 +76,13 @@ class Watch:
         make = partial(build_bank, self._config, parts.failures)
         self.bank = RecordingBank(make, parts.failures, preprocess)
         if self._gate_stds and isinstance(association, GatedEuclidean | GatedMahalanobis):
-            association = _OpenedGate(association, self._gate_stds)
+            association = _WideGate(association, self._gate_stds)
         joint = parts.joint and replace(parts.joint, joint_from=None)  # the noise is that of single detections
         return replace(parts, preprocess=preprocess, bank=self.bank, association=association, joint=joint)
 
 
 @dataclass(frozen=True)
-class _OpenedGate:
+class _WideGate:
     """An `Association` whose gate is opened to so many standard deviations of each detection, and as probable."""
 
     association: GatedEuclidean | GatedMahalanobis

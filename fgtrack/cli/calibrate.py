@@ -12,7 +12,7 @@ from typer import Option
 from fgtrack.calibration.advise import advise as advised
 from fgtrack.calibration.clock_offsets import OffsetReport, estimate_offsets
 from fgtrack.calibration.clocks import clock_text
-from fgtrack.calibration.page import whole
+from fgtrack.calibration.page import rounded_ms
 from fgtrack.calibration.starting import starting_config
 from fgtrack.calibration.trial import TRIAL_S, beginning, samples, suspicions
 from fgtrack.cli.arguments import ConfigFile, Input, Json, Overwrite, PitMap, Reference, Settings, TrackMap
@@ -123,7 +123,7 @@ def _topics(found: InputInfo, unused: str) -> Table:
             " ".join(f"delay_{name}" for name in _DELAYS),
             "{}/{}/{}/{}",
             1e3,
-            text=whole,
+            text=rounded_ms,
         ),
         Column("late [%]\nstream/object", "late_stream_share late_object_share", "{}/{}", 1e2, text="{:.1f}".format),
         Column("taken as", "taken_as", left=True),

@@ -46,7 +46,7 @@ def tune(
         report = tuned(sources, config, TuneRules(keep=tuple(keep or ())), tell)
     shown = {"parameters": _parameters(report.parameters)}
     if report.held_out is not None:
-        shown["held_out"] = _judged(report.held_out)
+        shown["held_out"] = _validation(report.held_out)
     tables, result = Tables(shown), _sensors(report)
     of_recordings = replace(report.config, map=read_config(config_file).map)  # the maps belong to these
     title = f"The noise of {config_file or 'the defaults'}, fitted to {', '.join(sources)} (fgtrack tune)."
@@ -106,7 +106,7 @@ def _sensors(report: TuneReport) -> list[str]:
     return lines
 
 
-def _judged(held_out: HeldOut) -> Table:
+def _validation(held_out: HeldOut) -> Table:
     records: list[dict[str, object]] = [
         {"of": f"{one.sensor} {one.component}", "count": one.count, "before": one.before, "after": one.after}
         | {"expected": 1.0, "band": one.band}

@@ -15,14 +15,14 @@ def epoch_unit(value: float) -> str | None:
 
 def wrong_unit(count: int, first_ns: int, last_ns: int, unit: str = "ns") -> str | None:
     """Sentence about `count` times of one source, read in `unit`, that no recording has; None of plausible ones."""
-    span_s = seconds(last_ns - first_ns)
+    duration_s = seconds(last_ns - first_ns)
     likely = epoch_unit(last_ns / NS_PER_UNIT[unit])
     is_other = likely not in (None, unit)
-    if count >= _FEWEST and count - 1 > _MOST_HZ[is_other] * span_s and (is_other or span_s > 0.0):
+    if count >= _FEWEST and count - 1 > _MOST_HZ[is_other] * duration_s and (is_other or duration_s > 0.0):
         looks = f", they look like {likely} since 1970" if is_other else ""
-        return f"{count} times within {span_s:.3g} s, which no sensor sends: they are not in {unit}{looks}"
-    if span_s > _LONGEST_S:
-        years = span_s / (365.25 * 86400.0)
+        return f"{count} times within {duration_s:.3g} s, which no sensor sends: they are not in {unit}{looks}"
+    if duration_s > _LONGEST_S:
+        years = duration_s / (365.25 * 86400.0)
         return f"is {years:.3g} years long: its times are of several units or clocks (`time_unit` of CSV tables)"
     return None
 

@@ -107,7 +107,7 @@ def _stacked(states: Iterable[TrackState], n: int) -> tuple[FloatArray, FloatArr
     return np.array(means).reshape(-1, n), np.array(covariances).reshape(-1, n, n)
 
 
-class OneObject:
+class SingleObject:
     """A bank with one object, as an `Estimator`: its clock follows the newest stamp.
     `bank` is empty; one on a time grid, such as `BackwardForwardBank`, gives the state of the nearest grid point.
     """

@@ -17,7 +17,7 @@ from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.filters.replay_bank import ReplayBank
 from fgtrack.estimation.filters.track_initiation import initiated
-from fgtrack.estimation.object_bank import ObjectBank, OneObject
+from fgtrack.estimation.object_bank import ObjectBank, SingleObject
 from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel, WhiteNoise
 
 OOSM_GROUP = "fgtrack.oosm"
@@ -144,7 +144,7 @@ def start_estimator(
 
     def made(start: Start) -> Estimator:
         if claims.bank:
-            return OneObject(motion, _made(ESTIMATORS, TrackBank, name, factory, motion, lag_s, **own), start)
+            return SingleObject(motion, _made(ESTIMATORS, TrackBank, name, factory, motion, lag_s, **own), start)
         item: Estimator = _made(ESTIMATORS, Estimator, name, factory, motion, start, lag_s, **own)
         return item
 

@@ -115,7 +115,7 @@ def comparison(group: Sequence[EvaluatedRun]) -> Comparison:
         errors.append(replace(errors_of, values={**squares, POSITION_NEES: position_nees(matching)}))
     most, common, sums = common_sums(errors)
     if all(item.run.evaluation.multi_object for item in group):
-        sums["gospa_in_sight_rms_m"] = _gospa_sums(group)
+        sums["gospa_in_view_rms_m"] = _gospa_sums(group)
     labels = tuple(item.label for item in group)
     quantities = {name: compared(name, labels, ticks) for name, ticks in sums.items() if ticks[:, -1].any()}
     return Comparison(labels, common, most, quantities, sums)
@@ -160,11 +160,11 @@ def _gospa_sums(group: Sequence[EvaluatedRun]) -> FloatArray:
     common_ns = functools.reduce(np.intersect1d, ticks_ns)
     rows = [np.searchsorted(item, common_ns) for item in ticks_ns]
     there = [scenes(item.run, matching) for item, matching in zip(group, matchings, strict=True)]
-    seen = np.any([scene.in_sight[mine] for scene, mine in zip(there, rows, strict=True)], axis=0)
+    seen = np.any([scene.in_view[mine] for scene, mine in zip(there, rows, strict=True)], axis=0)
     columns = []
     for item, scene, mine in zip(group, there, rows, strict=True):
-        in_sight = scene.in_sight.copy()
-        in_sight[mine] = seen
-        squares_m2 = gospa(replace(scene, in_sight=in_sight), item.run.evaluation.gate_m)
-        columns.append(squares_m2["in_sight_m2"][mine])
+        in_view = scene.in_view.copy()
+        in_view[mine] = seen
+        squares_m2 = gospa(replace(scene, in_view=in_view), item.run.evaluation.gate_m)
+        columns.append(squares_m2["in_view_m2"][mine])
     return np.stack([*columns, np.ones(len(common_ns))], axis=-1)

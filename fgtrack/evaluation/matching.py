@@ -35,7 +35,7 @@ class Matching:
     """True where there is truth at the tick's `now_ns`, shape (ticks, objects)."""
     track_ids: IntArray
     """Track paired with each object, shape (ticks, objects); `NO_TRACK` without one."""
-    in_sight: BoolArray
+    in_view: BoolArray
     """True where some sensor could see the object, shape (ticks, objects), see `visible`."""
 
     @property
@@ -56,7 +56,7 @@ class Scenes:
     """Distance of each row from every object, shape (r, objects); infinite where the object is not present."""
     present: BoolArray
     """True where an object is present, shape (t, objects)."""
-    in_sight: BoolArray
+    in_view: BoolArray
     """True where it is present and some sensor could see it, shape (t, objects)."""
 
 
@@ -110,7 +110,7 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
         tick_index=tick_index,
         present=np.stack([np.isfinite(path.at(timing["now_ns"])[:, 0]) for path in paths], axis=-1),
         track_ids=track_ids,
-        in_sight=visible(run, paths, timing["now_ns"]),
+        in_view=visible(run, paths, timing["now_ns"]),
     )
 
 
@@ -186,7 +186,7 @@ def scenes(run: Run, matching: Matching) -> Scenes:
     tick_index, present = (np.cumsum(scored) - 1)[matching.tick_index[rows]], matching.present[scored]
     distances_m = matching.distances_m[rows]
     distances_m = np.where(present[tick_index] & np.isfinite(distances_m), distances_m, np.inf)
-    return Scenes(tick_index, matching.tracks["track_id"][rows], distances_m, present, matching.in_sight[scored])
+    return Scenes(tick_index, matching.tracks["track_id"][rows], distances_m, present, matching.in_view[scored])
 
 
 def confirmed(tracks: Table) -> BoolArray:

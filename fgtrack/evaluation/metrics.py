@@ -48,9 +48,9 @@ class ObjectMetrics:
     """Times that it went on with another track than the last one."""
     time_to_confirm_s: Moments = field(default_factory=Moments)
     """From the first detection to the first confirmed track, a sample for each object, see `times_to_confirm`."""
-    ticks_in_sight: int = 0
+    ticks_in_view: int = 0
     """Ticks at which there is truth and some sensor could see it, see `visible`."""
-    ticks_tracked_in_sight: int = 0
+    ticks_tracked_in_view: int = 0
     """Ticks among them at which a track was paired."""
 
     @property
@@ -59,9 +59,9 @@ class ObjectMetrics:
         return self.ticks_tracked / self.ticks_present if self.ticks_present else math.nan
 
     @property
-    def tracked_share_in_sight(self) -> float:
-        """Share of the ticks in sight at which the object was tracked."""
-        return self.ticks_tracked_in_sight / self.ticks_in_sight if self.ticks_in_sight else math.nan
+    def tracked_share_in_view(self) -> float:
+        """Share of the ticks in view at which the object was tracked."""
+        return self.ticks_tracked_in_view / self.ticks_in_view if self.ticks_in_view else math.nan
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ def _truth_metrics(run: Run, matching: Matching, options: EvaluationConfig) -> T
 
     def together(indices: Sequence[int]) -> ObjectMetrics:
         mine = np.isin(errors.object_index, indices)
-        present, in_sight = matching.present[:, indices], matching.in_sight[:, indices]
+        present, in_view = matching.present[:, indices], matching.in_view[:, indices]
         sequences = [matching.track_ids[matching.present[:, index], index] for index in indices]
         return ObjectMetrics(
             errors={name: Moments.of(values[mine]) for name, values in errors.values.items()},
@@ -197,8 +197,8 @@ def _truth_metrics(run: Run, matching: Matching, options: EvaluationConfig) -> T
             breaks=sum(map(breaks, sequences)),
             id_switches=sum(len(switches(sequence)) for sequence in sequences),
             time_to_confirm_s=Moments.of(confirm_s[indices]),
-            ticks_in_sight=int((present & in_sight).sum()),
-            ticks_tracked_in_sight=int((present & in_sight & tracked[:, indices]).sum()),
+            ticks_in_view=int((present & in_view).sum()),
+            ticks_tracked_in_view=int((present & in_view & tracked[:, indices]).sum()),
         )
 
     ids, inverse = np.unique(matching.tracks["track_id"], return_inverse=True)

@@ -13,7 +13,7 @@ _LINES = ("-", "--", "-.", ":")
 _MARKERS = "os^vDP"
 
 
-class Look(NamedTuple):
+class Style(NamedTuple):
     """Colour, line style and marker of a curve."""
 
     colour: str
@@ -22,30 +22,30 @@ class Look(NamedTuple):
 
 
 #: Those that are compared most. A dashed line on a solid one shows both where two estimators tie.
-_ESTIMATORS: Mapping[str, Look] = {
-    "smoother": Look(_BLUE, "-", "o"),
-    "smoother-batch": Look(_BLUE, "-.", "o"),
-    "smoother-banded": Look(_BLUE, ":", "o"),
-    "ekf-replay": Look(_ORANGE, "--", "s"),
-    "ekf-backward-forward": Look(_GREEN, "-", "^"),
-    "rewind-forget": Look(_GREEN, "--", "^"),
-    "drop": Look(_RED, "-", "v"),
-    "as-current": Look(_PURPLE, "-", "D"),
-    "reorder-buffer": Look(_SKY, "-", "P"),
+_ESTIMATORS: Mapping[str, Style] = {
+    "smoother": Style(_BLUE, "-", "o"),
+    "smoother-batch": Style(_BLUE, "-.", "o"),
+    "smoother-banded": Style(_BLUE, ":", "o"),
+    "ekf-replay": Style(_ORANGE, "--", "s"),
+    "ekf-backward-forward": Style(_GREEN, "-", "^"),
+    "rewind-forget": Style(_GREEN, "--", "^"),
+    "drop": Style(_RED, "-", "v"),
+    "as-current": Style(_PURPLE, "-", "D"),
+    "reorder-buffer": Style(_SKY, "-", "P"),
 }
 
 
-def look(estimator: str) -> Look:
-    """Return how the curves of `estimator` look; of an unknown one as well, always the same."""
+def style_of(estimator: str) -> Style:
+    """Return the style of the curves of `estimator`; of an unknown one always the same."""
     number = crc32(estimator.encode())
-    unknown = Look((_PURPLE, _SKY)[number % 2], _LINES[1:][number // 2 % 3], _MARKERS[number // 8 % len(_MARKERS)])
+    unknown = Style((_PURPLE, _SKY)[number % 2], _LINES[1:][number // 2 % 3], _MARKERS[number // 8 % len(_MARKERS)])
     return _ESTIMATORS.get(estimator, unknown)
 
 
-def looks(estimators: Sequence[str]) -> list[Look]:
-    """Return one look for each of `estimators`, in their order; equal colours get different lines."""
-    result: list[Look] = []
-    for item in map(look, estimators):
+def styles(estimators: Sequence[str]) -> list[Style]:
+    """Return a style for each of `estimators`, in their order; equal colours get different lines."""
+    result: list[Style] = []
+    for item in map(style_of, estimators):
         taken = [other.line for other in result if other.colour == item.colour]
         result.append(item._replace(line=next((line for line in (item.line, *_LINES) if line not in taken), item.line)))
     return result
@@ -54,6 +54,6 @@ def looks(estimators: Sequence[str]) -> list[Look]:
 def distinct_colours(estimators: Sequence[str]) -> list[str]:
     """Return one colour for each of `estimators`: its own, or if that is taken a free one of the palette."""
     result: list[str] = []
-    for own in (look(name).colour for name in estimators):
+    for own in (style_of(name).colour for name in estimators):
         result.append(next((colour for colour in (own, *PALETTE) if colour not in result), own))
     return result

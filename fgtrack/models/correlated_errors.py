@@ -133,7 +133,7 @@ def split_error(
     return ColouredNoiseMeasurement(measurement.components, measurement.state_names, columns, gain), symmetrise(white)
 
 
-def whole_error(measurement: MeasurementModel, white: FloatArray) -> FloatArray:
+def total_error(measurement: MeasurementModel, white: FloatArray) -> FloatArray:
     """Covariance R, shape (k, k), of the correlated error and the rest `white`: the inverse of `split_error`."""
     if not isinstance(measurement, ColouredNoiseMeasurement):
         return white

@@ -212,7 +212,7 @@ def _observed(
     else:
         velocity, by_velocity = cartesian(motion), cartesian_gradient(motion)
     bearing_range, gradient = polar(offset), polar_gradient(offset, MIN_RANGE_M)
-    sight, relative = gradient[..., 1, :], velocity - np.array(pose[3:])
+    line_of_sight, relative = gradient[..., 1, :], velocity - np.array(pose[3:])
     for row, name in enumerate(names):
         if name in POLAR[:2]:
             column = POLAR.index(name)
@@ -223,11 +223,11 @@ def _observed(
         elif name == "bearing_rad":
             z[..., row], G[..., row, :2] = bearing_range[..., 0] - pose.yaw_rad, gradient[..., 0, :]
         elif name == "range_m":
-            z[..., row], G[..., row, :2] = bearing_range[..., 1], sight
+            z[..., row], G[..., row, :2] = bearing_range[..., 1], line_of_sight
         elif name == "range_rate_mps":
-            across = np.vecdot(relative, np.stack([-sight[..., 1], sight[..., 0]], axis=-1))
-            z[..., row], G[..., row, :2] = np.vecdot(relative, sight), across[..., None] * gradient[..., 0, :]
-            G[..., row, 2:4] = (sight[..., None, :] @ by_velocity)[..., 0, :]
+            across = np.vecdot(relative, np.stack([-line_of_sight[..., 1], line_of_sight[..., 0]], axis=-1))
+            z[..., row], G[..., row, :2] = np.vecdot(relative, line_of_sight), across[..., None] * gradient[..., 0, :]
+            G[..., row, 2:4] = (line_of_sight[..., None, :] @ by_velocity)[..., 0, :]
         else:
             speed, turn = x[..., 3], x[..., YAW_RATE]
             least = 1.0 / (speed**2 + SLOW_MPS**2)

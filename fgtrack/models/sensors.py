@@ -132,10 +132,10 @@ class SensorModel:
     """Which detections are used, by anything that they contain: `{score: {min: 0.5}, class_name: {one_of: [car]}}`. The
     others are out of bounds."""
     view_range_m: PositiveFloat | None = None
-    """Range of sight, where that is less than `max_range_m`; for existence and evaluation, no detection is out of
+    """Range of view, where that is less than `max_range_m`; for existence and evaluation, no detection is out of
     bounds by it."""
     max_range_behind_m: PositiveFloat | None = None
-    """Range of sight in the half behind it, where that is less; for existence and evaluation."""
+    """Range of view in the half behind it, where that is less; for existence and evaluation."""
     field_of_view_rad: Annotated[float, Field(gt=0.0, le=math.tau)] | None = None
     """Full angle that it sees, centred on its axis; for existence and evaluation, as these ranges. null: in a replay
     that of the recording, or where it detects in it, if no range is given either; else all around."""

@@ -15,7 +15,7 @@ from fgtrack.estimation.filters.backward_forward import BackwardForwardBank
 from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator
 from fgtrack.estimation.filters.published import PublishedStorage, SaturatedEulerCtrv
 from fgtrack.estimation.filters.track_initiation import initiated
-from fgtrack.estimation.object_bank import ObjectBank, OneObject
+from fgtrack.estimation.object_bank import ObjectBank, SingleObject
 from fgtrack.estimation.registry import estimator_bank
 from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
 from fgtrack.models.published_map import PublishedMap
@@ -106,7 +106,7 @@ def _build_backward_forward(config: Config) -> TrackBank:
     motion = config.motion_model()  # without a map a track may begin in any direction, each at its own time
 
     def one(start: Start) -> Estimator:
-        return initiated(motion, start, config.initiation.method, lambda each: OneObject(motion, bank(), each))
+        return initiated(motion, start, config.initiation.method, lambda each: SingleObject(motion, bank(), each))
 
     return ObjectBank(motion, one, config.filter.storage_s)
 

@@ -14,11 +14,11 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.geometry import rotation
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import YAW, FloatArray, IntArray
-from fgtrack.evaluation.palette import Look
+from fgtrack.evaluation.palette import Style
 from fgtrack.evaluation.runs import Runs, evaluated
 from fgtrack.evaluation.truth import TruePath, true_paths
 from fgtrack.plotting.paper import Paper, Sheet, is_column, styled
-from fgtrack.plotting.style import GREY, legend_above, run_looks
+from fgtrack.plotting.style import GREY, legend_above, run_styles
 
 STEP_S = 0.01
 """Between estimates; that of the grid of the backward-forward EKF, whose states are constant in between."""
@@ -85,16 +85,16 @@ def close_up(runs: Runs, close_ups: Sequence[CloseUp], **paper: Unpack[Paper]) -
     ends_m = [[off_m[-1] for _, off_m in pair] for pair in both]
     texts = ["{:.2f} m before, {:.2f} m after".format(*np.linalg.norm(pair, axis=-1)) for pair in ends_m]
     highest_m = max(float(np.hypot(*off_m.T).max()) for pair in both for _, off_m in pair)
-    looks, late_ms = run_looks(every).values(), (first.now_ns - first.arrival.stamp_ns) / _MS
+    styles, late_ms = run_styles(every).values(), (first.now_ns - first.arrival.stamp_ns) / _MS
     stamp, quantity = "stamp relative to now [ms]", "position error [m]"
     quantity = quantity if truth is not None else f"distance to {every[0].label}\nafterwards [m]"
     if is_column(paper):
         sheet = Sheet(7.0, 4.2, paper)
         axes: Axes = sheet.plots()[0, 0]
-        for run, (before, after), text, look in zip(every, both, texts, looks, strict=True):
-            axes.plot(before[0], np.hypot(*before[1].T), color=look.colour, ls=":", lw=0.9)
+        for run, (before, after), text, style in zip(every, both, texts, styles, strict=True):
+            axes.plot(before[0], np.hypot(*before[1].T), color=style.colour, ls=":", lw=0.9)
             label = f"{run.label}: {text}"
-            axes.plot(after[0], np.hypot(*after[1].T), color=look.colour, ls=look.line, lw=1.5, label=label)
+            axes.plot(after[0], np.hypot(*after[1].T), color=style.colour, ls=style.line, lw=1.5, label=label)
         axes.axvline(-late_ms, color="black", lw=0.8)
         axes.set(xlabel=stamp, ylabel=quantity, ylim=(0.0, 1.05 * highest_m))
         legend_above(axes)
@@ -102,11 +102,11 @@ def close_up(runs: Runs, close_ups: Sequence[CloseUp], **paper: Unpack[Paper]) -
     reach_m = 1.25 * max(0.05, float(np.abs(ends_m).max()))
     sheet = Sheet(max(9.0, 3.0 * len(every)), 7.4, paper)
     rows = sheet.plots(2, len(every), heights=(1.35, 1.0))
-    for k, (run, look) in enumerate(zip(every, looks, strict=True)):
+    for k, (run, style) in enumerate(zip(every, styles, strict=True)):
         above, below = rows[:, k]
-        above.set_title(f"{run.label}\n{texts[k]}", color=look.colour, loc="left")
-        _draw_present(above, look, ends_m[k], reach_m, "reference" if truth is None else "truth")
-        _draw_errors(below, look, close_ups[k], both[k], forgets=run.run.meta.get("estimator") in _FORGET)
+        above.set_title(f"{run.label}\n{texts[k]}", color=style.colour, loc="left")
+        _draw_present(above, style, ends_m[k], reach_m, "reference" if truth is None else "truth")
+        _draw_errors(below, style, close_ups[k], both[k], forgets=run.run.meta.get("estimator") in _FORGET)
         below.set(xlabel=stamp, ylim=(0.0, 1.6 * highest_m))
         for axes in (above, below):
             axes.tick_params(labelleft=not k)
@@ -130,7 +130,7 @@ def _offsets(one: CloseUp, each: Estimates, first: CloseUp, truth: TruePath | No
     return each_ns[regular] / _MS, off_m[regular]
 
 
-def _draw_present(axes: Axes, look: Look, ends_m: Sequence[Any], reach_m: float, centre: str) -> None:
+def _draw_present(axes: Axes, style: Style, ends_m: Sequence[Any], reach_m: float, centre: str) -> None:
     """The present before and after, seen from the reference."""
     ring_m = max([each for each in _RINGS_M if each < 0.8 * reach_m], default=0.5 * reach_m)
     for times in (1, 2, 3):
@@ -139,7 +139,7 @@ def _draw_present(axes: Axes, look: Look, ends_m: Sequence[Any], reach_m: float,
     axes.annotate(centre, (0.0, 0.0), (5, -11), textcoords="offset points", fontsize="small")
     axes.annotate("", ends_m[1], ends_m[0], arrowprops={"arrowstyle": "-|>", "color": "black", "lw": 1.2}, zorder=4)
     for end, word, colour, face in zip(
-        ends_m, ("before", "after"), (GREY, look.colour), ("white", look.colour), strict=True
+        ends_m, ("before", "after"), (GREY, style.colour), ("white", style.colour), strict=True
     ):
         axes.plot([0.0, end[0]], [0.0, end[1]], color=colour, lw=1.0, ls=":", zorder=3)
         axes.plot(*end, "o", color=colour, ms=8.5, mfc=face, mew=1.8, zorder=5)
@@ -149,14 +149,14 @@ def _draw_present(axes: Axes, look: Look, ends_m: Sequence[Any], reach_m: float,
 
 
 def _draw_errors(
-    axes: Axes, look: Look, one: CloseUp, pair: Sequence[tuple[FloatArray, FloatArray]], forgets: bool
+    axes: Axes, style: Style, one: CloseUp, pair: Sequence[tuple[FloatArray, FloatArray]], forgets: bool
 ) -> None:
     """Errors at the stamps up to now; at the bottom the measurements since that of the detection."""
     before, (at_ms, error_m) = ((times_ms, np.hypot(*off_m.T)) for times_ms, off_m in pair)
     axes.plot(*before, color=GREY, ls="--", lw=1.4, label="before it arrives")
-    axes.plot(at_ms, error_m, color=look.colour, lw=1.8, label="after")
+    axes.plot(at_ms, error_m, color=style.colour, lw=1.8, label="after")
     was_m = np.interp(at_ms, *before)
-    axes.fill_between(at_ms, error_m, was_m, where=error_m <= was_m, color=look.colour, alpha=0.18, lw=0)
+    axes.fill_between(at_ms, error_m, was_m, where=error_m <= was_m, color=style.colour, alpha=0.18, lw=0)
     late_ms = (one.arrival.stamp_ns - one.now_ns) / _MS
     axes.axvline(late_ms, ymax=0.66, color="black", lw=0.9)
     marks: dict[str, Any] = {"color": "black", "clip_on": False, "zorder": 6, "ls": "none"}  # Any: keywords

@@ -14,7 +14,7 @@ from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_n
 from fgtrack.evaluation.scores.innovations import num_measured
 from fgtrack.evaluation.scores.statistics import chi_square_band
 from fgtrack.plotting.paper import Paper, Sheet, styled
-from fgtrack.plotting.style import GREY, broken_line, legend_above, log_axis, run_looks, usual_step_ns
+from fgtrack.plotting.style import GREY, broken_line, legend_above, log_axis, run_styles, usual_step_ns
 
 _WINDOWS = 40  # of a run, so many values does each mean of NIS hold
 _SHORTEST, _LONGEST = 5, 100
@@ -43,7 +43,7 @@ def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
             at_ns, index, count = np.unique(since_ns, return_inverse=True, return_counts=True)
             mean, expected = (np.bincount(index, each) / count for each in (values, dof))
             band = chi_square_band(expected * count, count)
-            colour, inside = run_looks([one])[one.label].colour, (mean >= band[0]) & (mean <= band[1])
+            colour, inside = run_styles([one])[one.label].colour, (mean >= band[0]) & (mean <= band[1])
             subject, unit, line = "position", "ticks", ""
         else:
             sensor = name.removeprefix("NIS of ")

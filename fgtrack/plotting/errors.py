@@ -12,12 +12,12 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.matching import Matching, track_errors
-from fgtrack.evaluation.palette import Look
+from fgtrack.evaluation.palette import Style
 from fgtrack.evaluation.runs import EvaluatedRun, Runs, by_recording, evaluated, start_ns
 from fgtrack.evaluation.scores.lagged import final_errors
 from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.plotting.paper import Paper, Sheet, styled
-from fgtrack.plotting.style import broken_line, legend_above, run_looks, usual_step_ns
+from fgtrack.plotting.style import broken_line, legend_above, run_styles, usual_step_ns
 
 #: What is drawn, with its name, its unit, and that unit over the one of the values.
 _QUANTITIES = {
@@ -56,17 +56,17 @@ def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> 
     rows = sheet.plots(len(names), sharex=True)[:, 0]
     for axes, name in zip(rows, names, strict=True):
         what, unit, factor = _QUANTITIES[name]
-        for label, look, step_ns, times_ns, values in curves:
+        for label, style, step_ns, times_ns, values in curves:
             moments = Moments.of(factor * values[name])
             text = f"RMSE {moments.rmse:.3g} {unit}" if moments.count else "never tracked"
             at_ns, rms = moving_rms(times_ns, factor * values[name], nanoseconds(window_s))
             axes.plot(
                 *broken_line(at_ns, at_ns / NS_PER_S, rms, step_ns),
-                color=look.colour,
-                ls=look.line,
+                color=style.colour,
+                ls=style.line,
                 lw=1.4,
                 label=f"{label}: {text}" if axes is rows[0] else text,
-                zorder=2.0 if look.line == "-" else 2.5,  # a dashed line shows what it lies on
+                zorder=2.0 if style.line == "-" else 2.5,  # a dashed line shows what it lies on
             )
         axes.set(ylabel=f"{what} error [{unit}]", ylim=(0.0, None))
         legend_above(axes)
@@ -76,13 +76,13 @@ def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> 
     return sheet.figure
 
 
-_Curve = tuple[str, Look, float, IntArray, Mapping[str, FloatArray]]
-"""Label, look, usual step in ns, rising times in ns since the start of the recording, and errors."""
+_Curve = tuple[str, Style, float, IntArray, Mapping[str, FloatArray]]
+"""Label, style, usual step in ns, rising times in ns since the start of the recording, and errors."""
 
 
 def _curves(runs: Mapping[EvaluatedRun, Matching], object_id: int | None) -> list[_Curve]:
     """Errors of the present states of every run, then of the final ones of those that have them."""
-    looks = run_looks(list(runs))
+    styles = run_styles(list(runs))
     first_ns = {item: start_ns(group) for group in by_recording(list(runs)) for item in group}
     both = [(item, its, "", track_errors(its)) for item, its in runs.items()]
     both += [(item, its, ", final state", final_errors(item.run, its)) for item, its in runs.items()]
@@ -96,11 +96,11 @@ def _curves(runs: Mapping[EvaluatedRun, Matching], object_id: int | None) -> lis
             continue
         rows = np.flatnonzero(wanted)
         rows = rows[np.argsort(result.stamps_ns[rows], kind="stable")]
-        look = looks[item.label]._replace(line=":") if more else looks[item.label]
+        style = styles[item.label]._replace(line=":") if more else styles[item.label]
         if len(rows) or not more:
             values = {name: each[rows] for name, each in result.values.items()}
             times_ns, step_ns = result.stamps_ns[rows] - first_ns[item], usual_step_ns(its.tracks["now_ns"])
-            curves.append((item.label + more, look, step_ns, times_ns, values))
+            curves.append((item.label + more, style, step_ns, times_ns, values))
     return curves
 
 
@@ -127,7 +127,7 @@ def lag(runs: Runs, **paper: Unpack[Paper]) -> Figure:
         raise DataError("no run has tracks with truth, so there are no errors to draw")
     sheet = Sheet(7.0, 4.2, paper)
     axes: Axes = sheet.plots()[0, 0]
-    for one, its in zip(every, run_looks(every).values(), strict=True):
+    for one, its in zip(every, run_styles(every).values(), strict=True):
         curve = [entry for entry in one.metrics.lagged if entry.lag_s == 0.0 or entry.is_lagged]
         rmse_m = [entry.errors["position_m"].rmse for entry in curve]
         given: dict[str, Any] = {"color": its.colour, "ls": its.line, "lw": 1.6}

@@ -33,7 +33,7 @@ def __dir__() -> list[str]:
     return sorted(__all__)
 
 
-_FEW = 3  # of objects, and of runs where they are many: the worst are drawn
+_SHOWN = 3  # of objects, and of runs where they are many: the worst are drawn
 _MOST_RUNS = 6  # that have figures of their own
 
 
@@ -50,7 +50,7 @@ class Planned:
 
 def planned(runs: Sequence[EvaluatedRun]) -> list[Planned]:
     """Return every figure that `runs` have data for; of many objects and runs but the worst few are extras."""
-    extra = {one.label for one in sorted(runs, key=_rmse_m)[:-_FEW]} if len(runs) > _MOST_RUNS else set()
+    extra = {one.label for one in sorted(runs, key=_rmse_m)[:-_SHOWN]} if len(runs) > _MOST_RUNS else set()
     plans = []
     for name, draw, has_data in (
         ("map", map, lambda one: one.run.tables["tracks"].num_rows),
@@ -64,11 +64,11 @@ def planned(runs: Sequence[EvaluatedRun]) -> list[Planned]:
         if (receipts_ns := one.run.tables["updates"]["receipt_ns"]).size:
             streams.setdefault(np.sort(receipts_ns).tobytes(), one)
     for k, one in enumerate(streams.values()):
-        ending, is_extra = f"_{one.label}" if len(streams) > 1 else "", len(streams) > _MOST_RUNS and k >= _FEW
+        ending, is_extra = f"_{one.label}" if len(streams) > 1 else "", len(streams) > _MOST_RUNS and k >= _SHOWN
         plans.append(Planned(f"arrivals{ending}", partial(arrivals, one), is_extra))
     ids = sorted({k for one in runs if one.matching for k in one.matching.object_ids})
-    worst = sorted(ids, key=lambda object_id: max(_rmse_m(one, object_id) for one in runs))[-_FEW:]
-    if len(ids) > _FEW:
+    worst = sorted(ids, key=lambda object_id: max(_rmse_m(one, object_id) for one in runs))[-_SHOWN:]
+    if len(ids) > _SHOWN:
         plans.append(Planned("errors_all_objects", partial(errors, runs)))
     plans += [Planned(f"errors_object_{k}", partial(errors, runs, k), k not in worst) for k in ids]
     if any(entry.is_lagged for one in runs for entry in one.metrics.lagged):

@@ -21,7 +21,7 @@ from PIL import Image
 
 from fgtrack.core.errors import printable_lines
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.evaluation.palette import Look, looks
+from fgtrack.evaluation.palette import Style, styles
 from fgtrack.evaluation.runs import EvaluatedRun
 
 _RC: Any = mpl.rcParams  # Any: its keys are a Literal of all names
@@ -68,9 +68,9 @@ class StyledFigure(Figure):
         return f'<img src="data:image/png;base64,{base64.b64encode(png(self)).decode()}">'
 
 
-def run_looks(runs: Sequence[EvaluatedRun]) -> dict[str, Look]:
-    """Return how the curves of each run look, by label: colours are those of the estimators."""
-    result = looks([str(item.run.meta.get("estimator") or item.label) for item in runs])
+def run_styles(runs: Sequence[EvaluatedRun]) -> dict[str, Style]:
+    """Return the styles of the curves of the runs, by label: colours are those of the estimators."""
+    result = styles([str(item.run.meta.get("estimator") or item.label) for item in runs])
     return {item.label: each for item, each in zip(runs, result, strict=True)}
 
 

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from scipy.special import stdtrit
 
 from fgtrack.core.errors import DataError
-from fgtrack.evaluation.palette import look, looks
+from fgtrack.evaluation.palette import style_of, styles
 from fgtrack.evaluation.tables.seeds import SweepTable, read_sweep
 from fgtrack.plotting.paper import Paper, Sheet, styled
 from fgtrack.plotting.style import legend_above, log_axis
@@ -25,9 +25,9 @@ _NAMES: Mapping[str, str] = {
     "truth.overall.errors.speed_mps.rmse": "speed RMSE [m/s]",
     "truth.overall.errors.yaw_rad.rmse": "yaw RMSE [rad]",
     "consistency.position_nees.mean": "mean NEES of the position",
-    "multi_object.gospa.in_sight_rms_m": "GOSPA of objects in sight [m]",
+    "multi_object.gospa.in_view_rms_m": "GOSPA of objects in view [m]",
     "multi_object.gospa.rms_m": "GOSPA [m]",
-    "truth.overall.tracked_share_in_sight": "share of the time in sight that is tracked",
+    "truth.overall.tracked_share_in_view": "share of the time in view that is tracked",
     "truth.overall.tracked_share": "share of the time that is tracked",
     "truth.false_tracks": "false tracks",
     "truth.overall.id_switches": "identity switches",
@@ -84,7 +84,7 @@ def sweep(table: SweepTable | Path | str, metric: str = _POSITION, **paper: Unpa
     grid = sheet.plots(rows, columns, sharex=True, sharey=True)
     estimators = means["estimator"].unique().tolist()
     for axes, (point, panel) in zip(grid.flat, panels, strict=False):
-        for k, (estimator, its) in enumerate(zip(estimators, looks(estimators), strict=True)):
+        for k, (estimator, its) in enumerate(zip(estimators, styles(estimators), strict=True)):
             mine = panel[panel["estimator"] == estimator].sort_values("at", kind="stable")
             at, mean, half = mine[["at", "mean", "half"]].to_numpy().T
             at += _DODGE * width * (k - (len(estimators) - 1) / 2.0)  # so that bars do not hide each other
@@ -146,7 +146,7 @@ def error_against_delay(table: SweepTable | Path | str | None = None, **paper: U
     for metric, means in curves.items():
         means["ms"] = 1e3 * means[delay].astype(float)
         for name, mine in means.sort_values("ms", kind="stable").groupby("estimator", sort=False):
-            its, later = look(name), metric_words(metric).partition(", ")[2]
+            its, later = style_of(name), metric_words(metric).partition(", ")[2]
             line, marker, label = (":", ".", f"{name}, {later}") if later else (its.line, its.marker, name)
             low, high = mine["mean"] - mine["half"], mine["mean"] + mine["half"]
             axes.fill_between(mine["ms"], low, high, color=its.colour, alpha=0.18, lw=0)

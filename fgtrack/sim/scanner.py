@@ -56,7 +56,7 @@ class Scanner:
         return [tuple(detections[a:b]) for a, b in pairwise(bounds)]
 
     def _see(self, rng: np.random.Generator, states: FloatArray) -> _Detected:
-        """Sightings of one object: none, one or two (a split) in every scan."""
+        """Detections of one object: none, one or two (a split) in every scan."""
         sensor, n, everything = self.sensor, len(states), np.arange(len(states))
         seen = self._visible(everything, states) & (rng.random(n) < sensor.detection_probability)
         split = rng.random(n) < sensor.split_probability
@@ -71,7 +71,7 @@ class Scanner:
         return _joined(parts)
 
     def _clutter(self, rng: np.random.Generator, track: TrackMap | None) -> _Detected:
-        """Sightings of ghosts, measured without noise."""
+        """Detections of ghosts, measured without noise."""
         sensor, clutter = self.sensor, self.sensor.clutter
         scan = np.repeat(np.arange(len(self.ego)), rng.poisson(clutter.mean_per_scan, len(self.ego)))
         m = len(scan)

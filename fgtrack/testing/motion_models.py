@@ -53,7 +53,7 @@ def _equal(values: FloatArray, expected: FloatArray, tolerance: float, what: str
     require(off < tolerance, f"{what} is\n{values}\nexpected\n{expected}")
 
 
-def _has_a_state_that_measurements_know(model: MotionModel, x: FloatArray, dt_s: float) -> None:
+def _has_a_state_that_measurements_determine(model: MotionModel, x: FloatArray, dt_s: float) -> None:
     names = model.state_names
     right = names[:4] in (POLAR, CARTESIAN) and len(set(names)) == len(names)
     require(right, f"state_names are {names}: begin with {POLAR} or {CARTESIAN}, and give each name once")
@@ -182,7 +182,7 @@ def _begins_with_a_sound_covariance(model: MotionModel, x: FloatArray, dt_s: flo
 
 
 _CHECKS: tuple[ModelCheck, ...] = (
-    _has_a_state_that_measurements_know,
+    _has_a_state_that_measurements_determine,
     _flows_on_where_it_stopped,
     _has_the_jacobian_of_its_prediction,
     _has_noise_that_composes,

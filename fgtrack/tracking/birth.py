@@ -13,7 +13,7 @@ from fgtrack.core.settings import settings
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, EgoState
 from fgtrack.estimation.base import Start, StatesAt
-from fgtrack.models.correlated_errors import position_cross, whole_error
+from fgtrack.models.correlated_errors import position_cross, total_error
 from fgtrack.models.road import Road
 from fgtrack.tracking.preprocess import Candidate
 
@@ -60,7 +60,7 @@ class Birth:
         speed_mps = values.get("speed_mps", assumed_mps)
         slow = ego is not None and ego.speed_mps < self.slow_ego_mps
         if self.kind == "measured":
-            R = whole_error(measurement.model, measurement.R)
+            R = total_error(measurement.model, measurement.R)
             stds = dict(zip(values, np.sqrt(np.diag(R)).tolist(), strict=True))
             position = np.zeros((2, 2)) if candidate.position_covariance is None else candidate.position_covariance
             speed_variance = speed_mps**2 + stds.get("speed_mps", self.speed_std_mps) ** 2

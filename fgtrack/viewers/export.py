@@ -13,7 +13,7 @@ from fgtrack.io.ros.bag_writer import check_bag, token
 from fgtrack.io.run import Run
 from fgtrack.viewers.geojson import origin_of
 from fgtrack.viewers.ros2 import write_ros2
-from fgtrack.viewers.run_messages import Look, ego_messages, map_messages, run_messages, truth_messages
+from fgtrack.viewers.run_messages import Style, ego_messages, map_messages, run_messages, truth_messages
 from fgtrack.viewers.shapes import ViewerMessage
 from fgtrack.viewers.states import start_ns
 
@@ -57,17 +57,17 @@ def viewer_messages(runs: Mapping[str, Run]) -> tuple[Iterator[ViewerMessage], l
         ego_messages(first.tables["ego"], at_ns),
         *truth_messages(first.tables["truth"]),
     ]
-    for look, run in zip(_looks(runs), runs.values(), strict=True):
-        parts += run_messages(run, look)
+    for style, run in zip(_styles(runs), runs.values(), strict=True):
+        parts += run_messages(run, style)
     return merge(*parts, key=lambda message: message.log_ns), notes
 
 
-def _looks(runs: Mapping[str, Run]) -> list[Look]:
+def _styles(runs: Mapping[str, Run]) -> list[Style]:
     """One run alone has the topics for itself; of several, each has a name before its topics, and a colour."""
     if len(runs) == 1:
-        return [Look()]
+        return [Style()]
     names: list[str] = []
     for label in runs:
         names.append(token(label) if token(label) not in names else f"{token(label)}_{len(names) + 1}")
     colours = distinct_colours([str(run.meta.get("estimator", "")) for run in runs.values()])
-    return [Look(f"/{name}", colour) for name, colour in zip(names, colours, strict=True)]
+    return [Style(f"/{name}", colour) for name, colour in zip(names, colours, strict=True)]

@@ -33,7 +33,7 @@ _USED = (*FUSED, Disposition.MERGED)
 
 
 @dataclass(frozen=True)
-class Look:
+class Style:
     """Prefix of the topics of a run, and the colour of its tracks."""
 
     prefix: str = ""
@@ -89,19 +89,19 @@ def truth_messages(truth: Table) -> Iterator[Messages]:
     yield _objects("/truth", table["stamp_ns"], table["stamp_ns"], states)
 
 
-def run_messages(run: Run, look: Look) -> Iterator[Messages]:
+def run_messages(run: Run, style: Style) -> Iterator[Messages]:
     """Streams of the messages that show a run alone, each in the order of log times."""
-    yield from _track_messages(run, look)
-    yield _past_messages(run, look)
+    yield from _track_messages(run, style)
+    yield _past_messages(run, style)
     # Final states appear as soon as nothing can change them any more.
     final = located(run.tables["smoothed"].where(run.tables["smoothed"]["kind"] == "final"))
     states = _states(final, run.tables["objects"])
-    yield _objects(f"{look.prefix}/smoothed", final_ns(run, final), final["stamp_ns"], states)
-    yield _detection_messages(run, look)
-    yield _outcome_messages(run, look)
+    yield _objects(f"{style.prefix}/smoothed", final_ns(run, final), final["stamp_ns"], states)
+    yield _detection_messages(run, style)
+    yield _outcome_messages(run, style)
 
 
-def _track_messages(run: Run, look: Look) -> Iterator[Messages]:
+def _track_messages(run: Run, style: Style) -> Iterator[Messages]:
     """At every tick boxes, numbers and speeds, the 2-sigma ellipses of the positions, and the poses."""
     tracks = located(run.tables["tracks"])
     states, axes = _states(tracks, run.tables["objects"]), ellipses(tracks, _DEVIATIONS).tolist()
@@ -114,26 +114,26 @@ def _track_messages(run: Run, look: Look) -> Iterator[Messages]:
         at_m, yaw_rad, size_m = _pose(states[row])
         name = f"{track_id} {states[row].class_name or ''}".strip()
         shapes = [
-            _box(at_m, yaw_rad, size_m, look.of_track(track_id, _OPACITY.get(status, _CONFIRMED))),
+            _box(at_m, yaw_rad, size_m, style.of_track(track_id, _OPACITY.get(status, _CONFIRMED))),
             Shape("text", _WHITE, (0.0, 0.0, _LETTER_M), at_m, size_m[2] + _LABEL_ABOVE_M, text=name),
         ]
         if math.isfinite(speed_mps) and speed_mps:
             turned_rad = yaw_rad if speed_mps > 0.0 else yaw_rad + math.pi
-            shapes.append(_arrow(at_m, turned_rad, abs(speed_mps) * _SPEED_ARROW_S, 0.25, look.of_track(track_id)))
+            shapes.append(_arrow(at_m, turned_rad, abs(speed_mps) * _SPEED_ARROW_S, 0.25, style.of_track(track_id)))
         return Entity(f"track {track_id}", tuple(shapes))
 
     def patch(row: int) -> Entity | None:
         (long_m, short_m, yaw_rad), (at_m, _, (*_, above_m)), track_id = axes[row], _pose(states[row]), facts[row][0]
         size_m = (2.0 * long_m, 2.0 * short_m, 0.02)
-        shape = Shape("cylinder", look.of_track(track_id, 0.6), size_m, at_m, above_m + 0.05, yaw_rad)
+        shape = Shape("cylinder", style.of_track(track_id, 0.6), size_m, at_m, above_m + 0.05, yaw_rad)
         return Entity(f"track {track_id}", (shape,)) if math.isfinite(long_m) else None
 
-    yield _scenes(f"{look.prefix}/tracks", ticks, box)
-    yield _scenes(f"{look.prefix}/ellipses", ticks, patch)
-    yield _objects(f"{look.prefix}/tracks", tracks["now_ns"], tracks["stamp_ns"], states)
+    yield _scenes(f"{style.prefix}/tracks", ticks, box)
+    yield _scenes(f"{style.prefix}/ellipses", ticks, patch)
+    yield _objects(f"{style.prefix}/tracks", tracks["now_ns"], tracks["stamp_ns"], states)
 
 
-def _past_messages(run: Run, look: Look) -> Messages:
+def _past_messages(run: Run, style: Style) -> Messages:
     """At every tick the past of each track as known then: a line through its lagged states to the present one."""
     lagged, present = located(run.tables["lagged"]), located(run.tables["tracks"])
     lagged = lagged.where(lagged["lag_s"] > 0.0)
@@ -146,12 +146,12 @@ def _past_messages(run: Run, look: Look) -> Messages:
 
     def line(k: int) -> Entity:
         track_id, points_m = int(ids[lines[k][0]]), np.stack([x_m[lines[k]], y_m[lines[k]]], axis=-1)
-        return Entity(f"track {track_id}", (_line(points_m.tolist(), _TRACK_LINE_M, look.of_track(track_id)),))
+        return Entity(f"track {track_id}", (_line(points_m.tolist(), _TRACK_LINE_M, style.of_track(track_id)),))
 
-    return _scenes(f"{look.prefix}/past", groups(now_ns[[rows[0] for rows in lines]]) if lines else (), line)
+    return _scenes(f"{style.prefix}/past", groups(now_ns[[rows[0] for rows in lines]]) if lines else (), line)
 
 
-def _detection_messages(run: Run, look: Look) -> Messages:
+def _detection_messages(run: Run, style: Style) -> Messages:
     """At every receipt of a list its detections, grey where not used, arrows to their tracks now, and their poses.
     An arrow leads from the position of a detection to where its track is at the tick that fused it. It is strong where
     the detection came out of sequence, and faint where it did not.
@@ -180,12 +180,12 @@ def _detection_messages(run: Run, look: Look) -> Messages:
             if math.isfinite(sum(positions_m[row]))
         )
         scene = Scene((Entity(sensor, tuple(filter(None, marks)), _SHOWN_S),))
-        yield ViewerMessage(receipt_ns, stamp_ns, f"{look.prefix}/detections", scene)
+        yield ViewerMessage(receipt_ns, stamp_ns, f"{style.prefix}/detections", scene)
         if arrows:
             scene = Scene((Entity(sensor, tuple(arrows), _SHOWN_S),))
-            yield ViewerMessage(receipt_ns, stamp_ns, f"{look.prefix}/arrivals", scene)
+            yield ViewerMessage(receipt_ns, stamp_ns, f"{style.prefix}/arrivals", scene)
         if states:
-            yield ViewerMessage(receipt_ns, stamp_ns, f"{look.prefix}/detections/{token(sensor)}", states)
+            yield ViewerMessage(receipt_ns, stamp_ns, f"{style.prefix}/detections/{token(sensor)}", states)
 
 
 def _mark(where: Placed, row: int, colour: Colour) -> Shape | None:
@@ -200,14 +200,14 @@ def _mark(where: Placed, row: int, colour: Colour) -> Shape | None:
     return _line([(from_x_m, from_y_m), end_m], 0.15, (*colour[:3], 0.5))
 
 
-def _outcome_messages(run: Run, look: Look) -> Messages:
+def _outcome_messages(run: Run, style: Style) -> Messages:
     """Rows of `updates.csv` at their receipts."""
     names = ("receipt_ns", "stamp_ns", "sensor", "index", "disposition", "track_id", "nis")
     rows = sorted(_rows(run.tables["updates"], *names), key=itemgetter(0))
     for receipt_ns, stamp_ns, sensor, index, disposition, track_id, nis in rows:
         values = {"sensor": sensor, "index": index, "disposition": disposition, "nis": _known(nis)}
         values |= {"track_id": None if track_id == NO_TRACK else track_id, "delay_s": seconds(receipt_ns - stamp_ns)}
-        yield ViewerMessage(receipt_ns, stamp_ns, f"{look.prefix}/outcomes", values)
+        yield ViewerMessage(receipt_ns, stamp_ns, f"{style.prefix}/outcomes", values)
 
 
 def _scenes(topic: str, rows_at: Iterable[tuple[int, IntArray]], entity: Callable[[int], Entity | None]) -> Messages:

@@ -11,7 +11,7 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import SmoothedReport, TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateStatus
 from fgtrack.estimation.failures import Failure
-from fgtrack.estimation.object_bank import OneObject, state_of
+from fgtrack.estimation.object_bank import SingleObject, state_of
 from fgtrack.estimation.registry import estimator
 from fgtrack.estimation.smoothing.bank import SmootherBank
 from fgtrack.estimation.smoothing.gtsam.batch import BatchBank
@@ -28,9 +28,9 @@ KINDS = ("huber", "cauchy", "tukey", "geman_mcclure", "dcs")
 TOLERANCES: dict[type[SmootherBank], float] = {SmootherBank: 1e-9, IncrementalBank: 1e-9, BatchBank: 1e-6}
 
 
-def smoother(motion: MotionModel, make: type[SmootherBank], lag_s: float = 0.3) -> tuple[OneObject, SmootherBank]:
+def smoother(motion: MotionModel, make: type[SmootherBank], lag_s: float = 0.3) -> tuple[SingleObject, SmootherBank]:
     bank = make(motion, lag_s, ring_s=10.0, final=True)
-    return OneObject(motion, bank, START), bank
+    return SingleObject(motion, bank, START), bank
 
 
 def final(bank: SmootherBank) -> list[TrackState]:
@@ -237,7 +237,9 @@ def test_robust_weights_follow_the_states_within_an_update() -> None:
     """With one step per update the largest difference is above one standard deviation."""
     motion, differences, rng = CTRV(), list[float](), np.random.default_rng(1)
     exact = {"max_iterations": 100, "relinearise": dict.fromkeys(motion.state_names, 1e-6)}
-    one, solved = (OneObject(motion, SmootherBank(motion, 1.0, ring_s=10.0, **given), START) for given in ({}, exact))
+    one, solved = (
+        SingleObject(motion, SmootherBank(motion, 1.0, ring_s=10.0, **given), START) for given in ({}, exact)
+    )
     late = [measured(rng, motion, k * 50 * MS) for k in range(1, 90)]
     late = [replace(m, z=m.z + (5.0 if rng.random() < 0.15 else 0.0), loss=RobustLoss("huber", 1.5)) for m in late]
     for k in sorted(range(len(late)), key=lambda k: k + rng.uniform(0.0, 6.0)):

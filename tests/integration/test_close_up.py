@@ -9,7 +9,7 @@ from support.pictures import faults
 
 import fgtrack
 from fgtrack.cli.main import run as command
-from fgtrack.evaluation.palette import look
+from fgtrack.evaluation.palette import style_of
 from fgtrack.evaluation.placement import placed
 from fgtrack.plotting.close_up import Arrival, CloseUp
 from fgtrack.plotting.late_detection import close_up_of
@@ -84,7 +84,7 @@ def test_the_picture_shows_errors_before_and_after_and_what_was_forgotten(folder
     for column, (name, one) in enumerate(zip(NAMES, found, strict=True)):
         present, errors = figure.axes[column], figure.axes[len(NAMES) + column]
         before, after = (line for line in errors.lines if line.get_label() in ("before it arrives", "after"))
-        assert after.get_color() == look(name).colour
+        assert after.get_color() == style_of(name).colour
         text = f"{before.get_ydata()[-1]:.2f} m before, {after.get_ydata()[-1]:.2f} m after"
         assert present.get_title(loc="left") == f"{name}\n{text}"
         labels = errors.get_legend_handles_labels()[1]

@@ -15,7 +15,7 @@ import pytest
 
 import fgtrack
 from fgtrack.cli.main import run as command
-from fgtrack.evaluation.palette import look
+from fgtrack.evaluation.palette import style_of
 from fgtrack.evaluation.placement import placed
 from fgtrack.evaluation.runs import evaluated
 from fgtrack.io.run import Table
@@ -120,7 +120,7 @@ def test_it_loads_nothing_and_is_small(page: str) -> None:
 def test_what_is_embedded_is_what_the_run_folders_hold(page: str, folder: Path) -> None:
     shown = embedded(page)
     assert [one["label"] for one in shown["runs"]] == list(NAMES)
-    assert shown["colours"] == [look(name).colour for name in NAMES]
+    assert shown["colours"] == [style_of(name).colour for name in NAMES]
     assert not set(shown["colours"]) & set(shown["sensor_colours"])
     (recording,) = shown["recordings"]
     start_ns = int(recording["start_ns"])

@@ -46,8 +46,8 @@ def check_tracked(run: Run) -> None:
     """Fail unless each object is tracked 95 % of the time in which a sensor could see it, nearly without breaks."""
     found = Outcome.of(run)
     assert found.truth is not None
-    assert found.truth.ticks_in_sight > 100
-    assert found.truth.tracked_share_in_sight >= 0.95
+    assert found.truth.ticks_in_view > 100
+    assert found.truth.tracked_share_in_view >= 0.95
     assert found.breaks_per_minute <= 2.0
 
 

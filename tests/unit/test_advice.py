@@ -15,7 +15,7 @@ from fgtrack.evaluation.metrics import ObjectMetrics
 from fgtrack.evaluation.scores.statistics import Moments
 
 SECOND_NS = 1_000_000_000
-TRUTH = ObjectMetrics({"position_m": Moments()}, ticks_present=6000, ticks_in_sight=6000, ticks_tracked_in_sight=5900)
+TRUTH = ObjectMetrics({"position_m": Moments()}, ticks_present=6000, ticks_in_view=6000, ticks_tracked_in_view=5900)
 GOOD = Outcome(births=20, confirmed=3, used={"radar": 0.9}, noise=(), truth=TRUTH, tick_s=0.02, run=None)
 
 
@@ -24,7 +24,7 @@ def test_harm_is_more_breaks_more_tracks_and_less_that_is_tracked_or_used() -> N
     assert harm(GOOD, replace(GOOD, confirmed=7)) is None, "may be chance"
     assert harm(GOOD, replace(GOOD, births=60)) is None, "of clutter"
     assert harm(GOOD, replace(GOOD, confirmed=20)) == "confirmed tracks go from 3 to 20"
-    less = replace(TRUTH, ticks_tracked_in_sight=5000)
+    less = replace(TRUTH, ticks_tracked_in_view=5000)
     assert harm(GOOD, replace(GOOD, truth=less)) == "the share of time tracked goes from 98 % to 83 %"
     broken = replace(TRUTH, breaks=12)
     assert harm(GOOD, replace(GOOD, truth=broken)) == "breaks go from 0 to 12"

@@ -14,7 +14,7 @@ from fgtrack.models.correlated_errors import (
     CorrelatedErrors,
     position_cross,
     split_error,
-    whole_error,
+    total_error,
     with_correlated_errors,
 )
 from fgtrack.models.measurement import SensorPose, measured_position, measurement_model
@@ -64,7 +64,7 @@ def test_one_detection_is_as_uncertain_as_its_covariance_says(name: str) -> None
     model, white = split_error(name, sensor, plain, R, motion.state_names)
     H = model.jacobian(x, pose)
     assert H[:, 5:] @ H[:, 5:].T + white == pytest.approx(R)
-    assert whole_error(model, white) == pytest.approx(R)
+    assert total_error(model, white) == pytest.approx(R)
     assert white == pytest.approx((1.0 - sensor.correlation.share) * R)  # type: ignore[union-attr]  # both have one
     assert model.predict(x, pose) == pytest.approx(plain.predict(x, pose) + H[:, 5:] @ x[5:])
     numeric = np.stack([(model.predict(x + d, pose) - model.predict(x - d, pose)) / 2e-6 for d in 1e-6 * np.eye(9)]).T

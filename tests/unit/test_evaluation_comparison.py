@@ -72,9 +72,9 @@ def test_the_best_run_and_those_that_tie_with_it_and_how_much_worse_the_others_a
 
 
 def test_gospa_is_that_of_the_metrics(trio: list[Run]) -> None:
-    found = comparison_of(trio).quantities["gospa_in_sight_rms_m"]
+    found = comparison_of(trio).quantities["gospa_in_view_rms_m"]
     expected = {
-        one.label: one.metrics.multi_object.gospa["in_sight_rms_m"] for one in judged(trio) if one.metrics.multi_object
+        one.label: one.metrics.multi_object.gospa["in_view_rms_m"] for one in judged(trio) if one.metrics.multi_object
     }
     assert {entry.name: entry.value for entry in found} == pytest.approx(expected)
     assert found[-1].name == "0"
@@ -122,7 +122,7 @@ def test_nothing_in_common_is_said(tmp_path: Path) -> None:
     first = write_run(tmp_path / "first", tracks, truth=truth)
     found = compare([first, a_run(tmp_path / "last", NOISE_M, first=100)])
     assert "never track the same object at the same stamp" in found.verdict[0]
-    assert set(found["differences"]["quantity"].tolist()) == {"gospa_in_sight_rms_m"}
+    assert set(found["differences"]["quantity"].tolist()) == {"gospa_in_view_rms_m"}
 
 
 def test_runs_of_other_recordings_or_judged_otherwise_are_not_paired(tmp_path: Path, trio: list[Run]) -> None:

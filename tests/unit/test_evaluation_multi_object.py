@@ -81,7 +81,7 @@ def test_gospa_of_a_run_is_what_can_be_counted(story: Run) -> None:
 def test_a_pair_at_the_cut_off_is_a_miss_and_a_false_track() -> None:
     there = Scenes(np.array([0]), np.array([1]), np.array([[2.0]]), np.array([[True]]), np.array([[True]]))
     at, inside = gospa(there, 2.0), gospa(there, 2.0 + 1e-9)
-    names = ("localisation_m2", "missed_m2", "false_m2", "total_m2", "in_sight_m2")
+    names = ("localisation_m2", "missed_m2", "false_m2", "total_m2", "in_view_m2")
     assert [at[name][0] for name in names] == [0.0, 2.0, 2.0, 4.0, 4.0]
     assert [inside[name][0] for name in names] == [4.0, 0.0, 0.0, 4.0, 4.0]
 

@@ -50,14 +50,14 @@ def a_run(
 
 
 def seen(run: Run) -> list[int]:
-    """Objects in sight, which are the same at every tick."""
+    """Objects in view, which are the same at every tick."""
     paths = true_paths(run.tables["truth"])
     found = visible(run, paths, run.tables["timing"]["now_ns"])
     assert (found == found[0]).all()
     return [path.object_id for path, is_seen in zip(paths, found[0], strict=True) if is_seen]
 
 
-def test_an_object_is_in_sight_of_the_sensors_that_were_heard(tmp_path: Path) -> None:
+def test_an_object_is_in_view_of_the_sensors_that_were_heard(tmp_path: Path) -> None:
     assert seen(a_run(tmp_path / "both")) == [1, 2, 3, 5]  # 5 is 19.5 m behind the LiDAR, 6 is 22 m
     assert seen(a_run(tmp_path / "radar", ["radar"])) == [1, 2]  # 3 is 63 degrees to the left
     assert seen(a_run(tmp_path / "lidar", ["lidar"])) == [2, 3, 5]
@@ -71,20 +71,20 @@ def test_what_is_not_known_hides_nothing(tmp_path: Path) -> None:
     assert seen(a_run(tmp_path / "plain", config_text="")) == everything
 
 
-def test_only_objects_in_sight_count_as_missed(tmp_path: Path) -> None:
+def test_only_objects_in_view_count_as_missed(tmp_path: Path) -> None:
     metrics = evaluate(a_run(tmp_path / "run"))
     assert metrics.multi_object is not None
     assert metrics.truth is not None
     found, overall = metrics.multi_object.gospa, metrics.truth.overall
-    # c = 5: five objects are missed, three of them in sight; the pair is exact
+    # c = 5: five objects are missed, three of them in view; the pair is exact
     assert found["missed_m2"] == pytest.approx(5 * 12.5)
-    assert found["out_of_sight_m2"] == pytest.approx(2 * 12.5)
-    assert found["in_sight_rms_m"] == pytest.approx(math.sqrt(3 * 12.5))
+    assert found["out_of_view_m2"] == pytest.approx(2 * 12.5)
+    assert found["in_view_rms_m"] == pytest.approx(math.sqrt(3 * 12.5))
     assert found["rms_m"] == pytest.approx(math.sqrt(5 * 12.5))
-    assert (overall.ticks_present, overall.ticks_in_sight, overall.ticks_tracked_in_sight) == (30, 20, 5)
-    assert metrics.as_dict()["truth"]["overall"]["tracked_share_in_sight"] == 0.25
+    assert (overall.ticks_present, overall.ticks_in_view, overall.ticks_tracked_in_view) == (30, 20, 5)
+    assert metrics.as_dict()["truth"]["overall"]["tracked_share_in_view"] == 0.25
     table = compare(a_run(tmp_path / "again"))["multi_object"]
-    shown = [table[f"gospa_{name}_m"][0] for name in ("in_sight_rms", "missed_in_sight", "out_of_sight", "rms")]
+    shown = [table[f"gospa_{name}_m"][0] for name in ("in_view_rms", "missed_in_view", "out_of_view", "rms")]
     assert shown == pytest.approx([math.sqrt(each * 12.5) for each in (3, 3, 2, 5)])
 
 
@@ -94,7 +94,7 @@ def test_runs_of_one_recording_are_measured_by_one_sight(tmp_path: Path) -> None
     radar = knows.with_tables(updates=knows.tables["updates"].where(knows.tables["updates"]["sensor"] == "radar"))
     for other, missed in ((plain, 5), (radar, 3)):
         table = compare([knows, replace(other, path=None)])["differences"]
-        mine = table[table["quantity"] == "gospa_in_sight_rms_m"]
+        mine = table[table["quantity"] == "gospa_in_view_rms_m"]
         assert mine["value"].tolist() == pytest.approx([math.sqrt(missed * 12.5)] * 2)
 
 

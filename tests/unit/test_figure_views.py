@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray
-from fgtrack.evaluation.palette import look
+from fgtrack.evaluation.palette import style_of
 from fgtrack.evaluation.runs import evaluated
 from fgtrack.plotting import plot
 
@@ -92,7 +92,7 @@ def test_curves_that_coincide_are_both_seen_for_one_is_dashed(tmp_path: Path) ->
     smoother, replay, final = position.lines
     np.testing.assert_allclose(y_of(smoother), y_of(replay))
     assert (smoother.get_linestyle(), replay.get_linestyle()) == ("-", "--")
-    assert final.get_color() == smoother.get_color() == look("smoother").colour != replay.get_color()
+    assert final.get_color() == smoother.get_color() == style_of("smoother").colour != replay.get_color()
     assert str(final.get_label()).startswith("smoother, final state: RMSE 0.1")
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, SensorPose, Start, UpdateStatus
-from fgtrack.estimation.object_bank import OneObject
+from fgtrack.estimation.object_bank import SingleObject
 from fgtrack.estimation.smoothing.bank import SmootherBank
 from fgtrack.estimation.smoothing.gtsam.batch import BatchBank
 from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalBank, IncrementalSolver
@@ -21,11 +21,11 @@ def at(ms: int, x_m: float, y_m: float = 0.0) -> Measurement:
     return Measurement.of(ms * MS, x_m=x_m, y_m=y_m, std=STD)
 
 
-def one_of(motion: MotionModel, start: Start, make: type[SmootherBank] = SmootherBank, **options: Any) -> OneObject:
-    return OneObject(motion, make(motion, **{"lag_s": 1.0, **options}), start)
+def one_of(motion: MotionModel, start: Start, make: type[SmootherBank] = SmootherBank, **options: Any) -> SingleObject:
+    return SingleObject(motion, make(motion, **{"lag_s": 1.0, **options}), start)
 
 
-def largest_step_to_convergence(smoother: OneObject, ms: int) -> float:
+def largest_step_to_convergence(smoother: SingleObject, ms: int) -> float:
     """How far the state at `ms` is from that of convergence, in standard deviations."""
     found = smoother.state_at(ms * MS)
     assert isinstance(smoother.bank, SmootherBank)

@@ -6,7 +6,7 @@ import pytest
 from fgtrack.core.geometry import rotation
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.filters.initiation import Fix, Line, Search, fixes_of, over
-from fgtrack.estimation.object_bank import OneObject
+from fgtrack.estimation.object_bank import SingleObject
 from fgtrack.estimation.smoothing.bank import SmootherBank
 from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.models.motion import CTRV
@@ -22,10 +22,10 @@ def start() -> Start:
     return Start(position_std_m=STD_M, yaw_std_rad=np.pi, speed_std_mps=40.0)
 
 
-def fused(yaw_rad: float, num: int, seed: int = 0, loss: RobustLoss | None = None) -> OneObject:
+def fused(yaw_rad: float, num: int, seed: int = 0, loss: RobustLoss | None = None) -> SingleObject:
     """A smoother after `num` positions of an object at 30 m/s; the same but for the direction."""
     rng = np.random.default_rng(seed)
-    smoother = OneObject(CTRV(), SmootherBank(CTRV(), 1.0, relinearise=EXACT), start())
+    smoother = SingleObject(CTRV(), SmootherBank(CTRV(), 1.0, relinearise=EXACT), start())
     for k in range(1, num + 1):
         along_across = np.array([30.0 * k * PERIOD_NS / 1e9, 0.0]) + STD_M * rng.standard_normal(2)
         x_m, y_m = (rotation(yaw_rad) @ along_across).tolist()
@@ -72,12 +72,12 @@ def test_a_certain_direction_is_not_sought_again(monkeypatch: pytest.MonkeyPatch
     assert not any(over(line, "regression", 3.0) for line in restarts[:-1])
     assert 1 < len(restarts) < 20
     restarts.clear()
-    standing = OneObject(CTRV(), SmootherBank(CTRV(), 0.1), start())
+    standing = SingleObject(CTRV(), SmootherBank(CTRV(), 0.1), start())
     for k in range(1, 20):
         standing.update(Measurement.of(k * PERIOD_NS, x_m=0.0, y_m=0.0, std=STD))
     assert len(restarts) == 5  # until the first node left the window
     restarts.clear()
-    smoother = OneObject(CTRV(), SmootherBank(CTRV(), 1.0, relinearise=EXACT), Start(yaw_rad=0.0))
+    smoother = SingleObject(CTRV(), SmootherBank(CTRV(), 1.0, relinearise=EXACT), Start(yaw_rad=0.0))
     smoother.update(Measurement.of(PERIOD_NS, x_m=1.0, y_m=0.0, std=STD))
     assert not restarts
 

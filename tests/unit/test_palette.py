@@ -2,7 +2,7 @@
 
 import pytest
 
-from fgtrack.evaluation.palette import PALETTE, SENSORS, look, looks
+from fgtrack.evaluation.palette import PALETTE, SENSORS, style_of, styles
 
 
 def luminance(colour: str) -> float:
@@ -20,6 +20,6 @@ def test_every_colour_is_visible_on_white_and_on_dark(page: str) -> None:
 
 
 def test_runs_of_one_estimator_share_the_colour_and_differ_by_the_line() -> None:
-    found = looks(["smoother"] * 4)
-    assert {one.colour for one in found} == {look("smoother").colour}
+    found = styles(["smoother"] * 4)
+    assert {one.colour for one in found} == {style_of("smoother").colour}
     assert len({one.line for one in found}) == 4

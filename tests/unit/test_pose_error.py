@@ -12,7 +12,7 @@ from support.tracking import StraightRoad, batch
 
 from fgtrack.core.types import Detection, FloatArray, Frame
 from fgtrack.estimation.base import Measurement
-from fgtrack.models.correlated_errors import whole_error, with_correlated_errors
+from fgtrack.models.correlated_errors import total_error, with_correlated_errors
 from fgtrack.models.motion import CTRV, CV, MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import Correlation, Mount, SensorModel
@@ -154,6 +154,6 @@ def test_a_lasting_error_of_the_sensor_and_that_of_the_ego_stand_side_by_side(se
     preprocess = Preprocess(Road(), NoMerge(), motion, ORIGIN_M)
     found, _ = preprocess(batch(Detection(**seen)), lasting, EGO._replace(covariance=P))
     x = np.array([130.0, 70.0, 2.0, 15.0, 0.1, 0.5, -0.5])
-    whole = whole_error(found[0].measurement.model, noise_at(found, x[None])[0])
+    whole = total_error(found[0].measurement.model, noise_at(found, x[None])[0])
     np.testing.assert_allclose(whole, noise_at(plain, x[None, :5])[0], rtol=1e-12)
     np.testing.assert_allclose(found[0].position_covariance, plain[0].position_covariance, rtol=1e-12)

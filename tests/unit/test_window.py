@@ -10,7 +10,7 @@ from support.models import MODELS, MOTIONS
 
 from fgtrack.core.time import seconds
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
-from fgtrack.estimation.object_bank import OneObject
+from fgtrack.estimation.object_bank import SingleObject
 from fgtrack.estimation.rts import between
 from fgtrack.estimation.smoothing.bank import SmootherBank
 from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalBank
@@ -37,8 +37,8 @@ def position(offset_ns: int, x_m: float, y_m: float, loss: RobustLoss | None = N
     return Measurement(START_NS + offset_ns, model, np.array([x_m, y_m]), 0.09 * np.eye(2), loss=loss)
 
 
-def smoother(make: type[SmootherBank], *measurements: Measurement) -> OneObject:
-    one = OneObject(CV(), make(CV(), 0.1, ring_s=9.0, final=True), START)
+def smoother(make: type[SmootherBank], *measurements: Measurement) -> SingleObject:
+    one = SingleObject(CV(), make(CV(), 0.1, ring_s=9.0, final=True), START)
     for measurement in measurements:
         one.update(measurement)
     return one

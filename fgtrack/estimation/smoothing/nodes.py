@@ -26,7 +26,7 @@ from fgtrack.estimation.smoothing.kernels import (
     P,
     Q,
 )
-from fgtrack.estimation.smoothing.terms import Term, whitened
+from fgtrack.estimation.smoothing.terms import MeasurementFactor, whitened
 from fgtrack.models.motion import MotionModel, WhiteNoise
 from fgtrack.models.transitions import transitions
 
@@ -57,7 +57,7 @@ class Nodes:
         """Rows and blocks, see `kernels`: vectors stand as a last column beside the matrix that moves with them."""
         self.rows = np.zeros((size, _FEW_COMPONENTS, n + 1))
         """Measurements: G and y of y = G (x - x0) + N(0, I)."""
-        self._terms: dict[int, list[tuple[Measurements, int, float]]] = {}
+        self._factors: dict[int, list[tuple[Measurements, int, float]]] = {}
         self._share()
 
     def _share(self) -> None:
@@ -83,9 +83,9 @@ class Nodes:
         """Return the stamps of all nodes of a window."""
         return self.stamps_ns[track, self.first[track] : self.count[track]].copy()
 
-    def terms(self, number: int) -> list[Term]:
+    def factors(self, number: int) -> list[MeasurementFactor]:
         """Return the measurements of a node."""
-        return [(stack[row], ahead_s) for stack, row, ahead_s in self._terms[number]]
+        return [(stack[row], ahead_s) for stack, row, ahead_s in self._factors[number]]
 
     def begin_window(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
         """Make the first node of a new track."""
@@ -95,21 +95,21 @@ class Nodes:
         self.stamps_ns[track, 0] = stamp_ns
         self.tracks[track] = 1, 0, 0, stamp_ns, 0
         number = int(self.numbers[track, 0])
-        self._terms[number], self.labels[number] = [], 0
+        self._factors[number], self.labels[number] = [], 0
         self.origin[number], self.step[number], self.P[number] = mean, 0.0, covariance
         self.predicted[number] = self.filtered[number] = np.column_stack([covariance, np.zeros(len(mean))])
 
     def note(self, stack: Measurements, numbers: IntArray, is_new: IntArray, ahead_s: FloatArray) -> None:
         """Keep a stack of measurements, one for each of the nodes `numbers`."""
         rows = zip(numbers.tolist(), is_new.tolist(), range(len(numbers)), ahead_s.tolist(), strict=True)
-        for number, new, *term in rows:
-            kept = [] if new else self._terms[number]
-            self._terms[number] = [*kept, (stack, *term)]
+        for number, new, *factor in rows:
+            kept = [] if new else self._factors[number]
+            self._factors[number] = [*kept, (stack, *factor)]
 
     def withdraw(self, track: int, index: int, is_new: bool) -> None:
         """Take the last measurement of a node out, and the node, if it `is_new`."""
         number, last = self.numbers[track, index], self.count[track] - 1
-        self._terms[int(number)].pop()
+        self._factors[int(number)].pop()
         if is_new:
             for each, free in ((self.stamps_ns[track], NEVER), (self.numbers[track], number)):
                 each[index:last] = each[index + 1 : last + 1]
@@ -123,9 +123,9 @@ class Nodes:
             self._grow(axis=1)
         return out
 
-    def linearise_terms(self, number: int) -> None:
+    def linearise_factors(self, number: int) -> None:
         """Linearise all measurements of a node at its linearisation point."""
-        rows = [whitened(term, self.origin[number], self._motion) for term in self.terms(number)]
+        rows = [whitened(factor, self.origin[number], self._motion) for factor in self.factors(number)]
         used = sum(map(len, rows))
         while used > self.rows.shape[1]:
             self.rows = np.concatenate([self.rows, np.zeros_like(self.rows)], axis=1)
@@ -142,7 +142,7 @@ class Nodes:
             rows = tracks[rows]
             stale = self.numbers[rows, indices]
             for number in stale.tolist() if is_nonlinear else ():
-                self.linearise_terms(number)
+                self.linearise_factors(number)
         if compiled is not None:
             node_kernels.linearise_motion(compiled.kind, compiled.density, tracks, starts, self.arrays)
             return

@@ -245,8 +245,10 @@ class Solver:
         total = mahalanobis_squared(means[0] - nodes.origin[numbers[0]] - prior[:, n], prior[:, :n])
         gaps = means[1:] - self.motion.predict(means[:-1], dt_s)
         total += sum(((noise_root(each) @ gap) ** 2).sum() for each, gap in zip(Q, gaps, strict=True))
-        terms = ((term, x) for number, x in zip(numbers.tolist(), means, strict=True) for term in nodes.terms(number))
-        return 0.5 * float(total) + sum(cost(term, x, self.motion) for term, x in terms)
+        factors = (
+            (factor, x) for number, x in zip(numbers.tolist(), means, strict=True) for factor in nodes.factors(number)
+        )
+        return 0.5 * float(total) + sum(cost(factor, x, self.motion) for factor, x in factors)
 
     def damp(self, tracks: IntArray) -> int:
         """Converge in damped steps where the last one left the range of its linearisation; return how many tracks."""
@@ -257,7 +259,7 @@ class Solver:
             numbers = nodes.window(track)
             means, steps = nodes.origin[numbers], nodes.step[numbers]
             far = (self._move_far(track, moves=False) - nodes.first[track]).tolist()
-            if any(overshot(nodes.terms(numbers[k]), means[k], means[k] + steps[k], self.motion) for k in far):
+            if any(overshot(nodes.factors(numbers[k]), means[k], means[k] + steps[k], self.motion) for k in far):
                 num += 1
                 try:
                     self.converge(track)
@@ -271,8 +273,8 @@ class Solver:
         """Positions measured at the nodes, after that of the prior, of a window that nothing has left yet."""
         nodes, numbers = self.nodes, self.nodes.window(track)
         prior, begin_ns = (nodes.predicted[numbers[0]], int(nodes.tracks[track, BEGIN_NS]))
-        terms = (term for number in numbers.tolist() for term, _ in nodes.terms(number))
-        later = ((seconds(term.stamp_ns - begin_ns), term) for term in terms)
+        factors = (factor for number in numbers.tolist() for factor, _ in nodes.factors(number))
+        later = ((seconds(factor.stamp_ns - begin_ns), factor) for factor in factors)
         return fixes_of(nodes.origin[numbers[0]] + prior[:, -1], prior[:, :-1].copy(), later)
 
     def restart(self, track: int, line: Line) -> None:

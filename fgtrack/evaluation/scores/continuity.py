@@ -50,11 +50,11 @@ def tracked_visits(matching: Matching) -> int:
     "A TP object gets a unique identifier while it's inside the detectable area" (Karle et al. 2023, section IV-A).
     """
     paired = matching.paired & confirmed(matching.tracks)
-    tracked = np.zeros_like(matching.in_sight)
+    tracked = np.zeros_like(matching.in_view)
     tracked[matching.tick_index[paired], matching.object_index[paired]] = True
     count = 0
-    for in_sight, has_track in zip(matching.in_sight.T, tracked.T, strict=True):
-        ticks = np.flatnonzero(in_sight)
+    for in_view, has_track in zip(matching.in_view.T, tracked.T, strict=True):
+        ticks = np.flatnonzero(in_view)
         comes = np.diff(matching.now_ns[ticks], prepend=-_SHORTEST_ABSENCE_NS) >= _SHORTEST_ABSENCE_NS
         count += len(np.unique(np.cumsum(comes)[has_track[ticks]]))
     return count

@@ -28,7 +28,7 @@ class MultiObjectMetrics:
 
     gospa: Mapping[str, float]
     """Cut-off distance `c_m`, `ticks`, `mean_m` and root mean square `rms_m` over them, mean squared parts
-    `localisation_m2`, `missed_m2`, `false_m2` and `out_of_sight_m2`, and `in_sight_rms_m` without the last one."""
+    `localisation_m2`, `missed_m2`, `false_m2` and `out_of_view_m2`, and `in_view_rms_m` without the last one."""
     clear: Mapping[str, float]
     """`mota`, mean distance `motp_m` of the pairs, `pairs` (TP), `misses` (FN), `false_positives` (FP), `id_switches`
     (pairs with another track than the object's last one, IDSW)."""
@@ -43,7 +43,7 @@ def multi_object_metrics(scenes: Scenes, gate_m: float) -> MultiObjectMetrics:
     squares_m2 = gospa(scenes, gate_m)
     means_m2 = {name: _mean(values) for name, values in squares_m2.items()}
     roots = {"mean_m": _mean(np.sqrt(squares_m2["total_m2"])), "rms_m": math.sqrt(means_m2.pop("total_m2"))}
-    roots["in_sight_rms_m"] = math.sqrt(means_m2.pop("in_sight_m2"))
+    roots["in_view_rms_m"] = math.sqrt(means_m2.pop("in_view_m2"))
     similarity = np.maximum(0.0, 1.0 - scenes.distances_m / (2.0 * gate_m))
     edges = np.searchsorted(scenes.tick_index, np.arange(1, len(scenes.present)))
     frames = (
@@ -85,8 +85,8 @@ def clear(scenes: Scenes, gate_m: float) -> dict[str, float]:
 
 
 def gospa(scenes: Scenes, c_m: float) -> dict[str, FloatArray]:
-    """Squares of GOSPA with the cut-off distance `c_m` at every tick: its parts, the total, and that in sight.
-    A pair at c or beyond is not counted; `out_of_sight_m2` is the part of `missed_m2` that no sensor could see.
+    """Squares of GOSPA with the cut-off distance `c_m` at every tick: its parts, the total, and that in view.
+    A pair at c or beyond is not counted; `out_of_view_m2` is the part of `missed_m2` that no sensor could see.
     """
     gains_m2 = np.maximum(c_m**2 - np.square(scenes.distances_m), 0.0)
     num_ticks, tick_index = len(scenes.present), scenes.tick_index
@@ -99,9 +99,9 @@ def gospa(scenes: Scenes, c_m: float) -> dict[str, FloatArray]:
     localisation_m2 = np.asarray(np.bincount(ticks, squares_m2, num_ticks), dtype=np.float64)
     missed_m2 = single_m2 * missed.sum(axis=1)
     false_m2 = single_m2 * (np.bincount(tick_index, minlength=num_ticks) - paired.sum(axis=1))
-    unseen_m2, total_m2 = single_m2 * (missed & ~scenes.in_sight).sum(axis=1), localisation_m2 + missed_m2 + false_m2
+    unseen_m2, total_m2 = single_m2 * (missed & ~scenes.in_view).sum(axis=1), localisation_m2 + missed_m2 + false_m2
     parts = {"localisation_m2": localisation_m2, "missed_m2": missed_m2, "false_m2": false_m2}
-    return parts | {"out_of_sight_m2": unseen_m2, "total_m2": total_m2, "in_sight_m2": total_m2 - unseen_m2}
+    return parts | {"out_of_view_m2": unseen_m2, "total_m2": total_m2, "in_view_m2": total_m2 - unseen_m2}
 
 
 def _mean(values: FloatArray) -> float:

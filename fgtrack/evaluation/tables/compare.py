@@ -24,7 +24,7 @@ from fgtrack.evaluation.tables import MS, PERCENT, RUN, Column, Table, Tables, n
 from fgtrack.evaluation.tables.streaming import streaming_tables
 from fgtrack.evaluation.tables.verdict import verdict
 
-_GOSPA = "gospa_in_sight_rms_m"
+_GOSPA = "gospa_in_view_rms_m"
 _ERRORS = {
     "position_m": "pos.\n[m]",
     "along_m": "along\n[m]",
@@ -39,7 +39,7 @@ _QUANTITIES = {
     POSITION_NEES: "NEES pos.",
     _GOSPA: "GOSPA [m]",
 }
-_CONTINUITY = ("tracked_share", "tracked_share_in_sight", "breaks", "id_switches")
+_CONTINUITY = ("tracked_share", "tracked_share_in_view", "breaks", "id_switches")
 _UNITS = {"m": "m", "rad": "rad", "mps": "m/s"}
 _COMMON_SHARE = 0.9  # of the samples that all runs have in common; below it a note counts them
 
@@ -108,7 +108,7 @@ def _tracking(metrics: Mapping[str, Metrics]) -> Table:
         RUN,
         *(Column(heading, named(name, "rmse"), is_extra=name != "position_m") for name, heading in _ERRORS.items()),
         Column("NEES\npos.", "position_nees"),
-        Column("tracked\n[%]", "tracked_share_in_sight", scale=PERCENT),
+        Column("tracked\n[%]", "tracked_share_in_view", scale=PERCENT),
         Column("breaks/\nswitches", "breaks id_switches", "{}/{}"),
         Column("false\ntracks", "false_tracks"),
         Column("preci-\nsion", "precision", is_extra=True),
@@ -116,7 +116,7 @@ def _tracking(metrics: Mapping[str, Metrics]) -> Table:
         Column("ms/tick\np50/p99", "time_per_tick_p50_s time_per_tick_p99_s", "{}/{}", MS),
     ]
     notes = [
-        "errors: RMSE against truth; NEES: mean of the position's; 2 if consistent; tracked: of the ticks in sight",
+        "errors: RMSE against truth; NEES: mean of the position's; 2 if consistent; tracked: of the ticks in view",
         "breaks: resumed after a loss or with another track; switches: the latter",
         f"false: paired with a true object in less than {FALSE_TRACK_SHARE:.0%} of its life",
     ]
@@ -129,9 +129,9 @@ def _multi_object(metrics: Mapping[str, Metrics]) -> Table:
     for label, item in metrics.items():
         if item.multi_object is not None and item.truth is not None:
             of, m2, overall = item.multi_object, item.multi_object.gospa, item.truth.overall
-            parts = {part: m2[f"{part}_m2"] for part in ("localisation", "false", "out_of_sight", "missed")}
-            parts["missed_in_sight"] = max(parts["missed"] - parts["out_of_sight"], 0.0)
-            record = {"run": label, _GOSPA: m2["in_sight_rms_m"], "gospa_rms_m": m2["rms_m"]}
+            parts = {part: m2[f"{part}_m2"] for part in ("localisation", "false", "out_of_view", "missed")}
+            parts["missed_in_view"] = max(parts["missed"] - parts["out_of_view"], 0.0)
+            record = {"run": label, _GOSPA: m2["in_view_rms_m"], "gospa_rms_m": m2["rms_m"]}
             record |= {f"gospa_{part}_m": math.sqrt(square) for part, square in parts.items()}
             record |= {"mota": of.clear["mota"], "idf1": of.identity["idf1"], **of.hota}
             switches, confirm_s = overall.id_switches, overall.time_to_confirm_s.mean
@@ -140,9 +140,9 @@ def _multi_object(metrics: Mapping[str, Metrics]) -> Table:
         RUN,
         Column("GOSPA\n[m]", _GOSPA),
         Column("local.\n[m]", "gospa_localisation_m"),
-        Column("missed\n[m]", "gospa_missed_in_sight_m"),
+        Column("missed\n[m]", "gospa_missed_in_view_m"),
         Column("false\n[m]", "gospa_false_m"),
-        Column("unseen\n[m]", "gospa_out_of_sight_m"),
+        Column("unseen\n[m]", "gospa_out_of_view_m"),
         Column("with\nunseen", "gospa_rms_m"),
         *(Column(f"{name}\n[%]", name.lower(), scale=PERCENT) for name in ("MOTA", "IDF1", "HOTA", "DetA", "AssA")),
         Column("switches", "id_switches"),

@@ -21,12 +21,12 @@ SWEEP_FILE = "sweep.csv"
 #: Metrics that have a better and a worse, in order of preference; the first is shown.
 _BETTER: Mapping[str, Literal["less", "more", "nearer"]] = {
     "truth.overall.errors.*.rmse": "less",
-    "multi_object.gospa.in_sight_rms_m": "less",
+    "multi_object.gospa.in_view_rms_m": "less",
     "multi_object.gospa.rms_m": "less",
     "consistency.position_nees.mean": "nearer",
     "consistency.nis.*.mean": "nearer",
     "lagged.*.errors.*.rmse": "less",
-    "truth.overall.tracked_share_in_sight": "more",
+    "truth.overall.tracked_share_in_view": "more",
     "truth.overall.tracked_share": "more",
     "truth.overall.breaks": "less",
     "truth.overall.id_switches": "less",
@@ -41,8 +41,8 @@ _BETTER: Mapping[str, Literal["less", "more", "nearer"]] = {
 _MAIN: Mapping[str, str] = {
     "truth.overall.errors.position_m.rmse": "pos.\n[m]",
     "consistency.position_nees.mean": "NEES\npos.",
-    "multi_object.gospa.in_sight_rms_m": "GOSPA\n[m]",
-    "truth.overall.tracked_share_in_sight": "tracked\n[%]",
+    "multi_object.gospa.in_view_rms_m": "GOSPA\n[m]",
+    "truth.overall.tracked_share_in_view": "tracked\n[%]",
 }
 
 
@@ -167,7 +167,7 @@ def summary_table(sweep: SweepTable) -> Table:
     columns = [_point_column(sweep.rows[list(sweep.axes)]), Column("estimator", left=True)]
     for name in metrics:
         heading = _MAIN.get(name) or re.sub(r"\.(?!\d)", "\n", name)
-        both, scale = (name, f"{name}.standard_error"), PERCENT if name.endswith("share_in_sight") else 1.0
+        both, scale = (name, f"{name}.standard_error"), PERCENT if name.endswith("share_in_view") else 1.0
         columns.append(Column(heading, both, "{} ± {}", scale, is_extra=name not in main))
     notes = ["± standard error of the mean over the seeds"]
     return Table("Summary", records, [*columns, Column("seeds")], (*sweep.axes, "estimator"), notes)

@@ -33,7 +33,7 @@ def read_scenario(folder: Path) -> Iterator[Message]:
     file = min(folder.glob(_DETECTIONS))
     truth = file.with_name(file.name.replace("_detections", "_groundTruth"))
     states = _truth(truth) if truth.exists() else []
-    return merge(states, _sensed(file), key=lambda message: message.receipt_ns)
+    return merge(states, _measured(file), key=lambda message: message.receipt_ns)
 
 
 FORMAT = FileFormat(
@@ -43,7 +43,7 @@ FORMAT = FileFormat(
 )
 
 
-def _sensed(file: Path) -> Iterator[EgoState | DetectionList]:
+def _measured(file: Path) -> Iterator[EgoState | DetectionList]:
     """Points around the own ship, `[[north...], [east...]]` or `[north, east]`; bearings from the north, clockwise."""
     newest_ns = -LARGEST_NS
     for index, record in enumerate(json_values(file, parse_float=Decimal)):

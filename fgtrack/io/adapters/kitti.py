@@ -109,13 +109,13 @@ def _in_image(detector: Path, frames: Mapping[int, list[Detection | str]]) -> bo
 
 def view_of_sequence(path: Path) -> list[View]:
     """The ego at every frame of the sequence that `path`, a folder or a file of `oxts/`, means; raises as a reader."""
-    views, error = read_views(*_located(path))
+    views, error = read_views(*_folder_and_sequence(path))
     if error is not None:
         raise error
     return views
 
 
-def _located(path: Path, named: int | str | None = None) -> tuple[Path, str]:
+def _folder_and_sequence(path: Path, named: int | str | None = None) -> tuple[Path, str]:
     """Folder and name of the sequence that `path`, a folder or a file of `oxts/`, and `named` mean."""
     if path.is_file():
         return path.parent.parent, path.stem
@@ -138,7 +138,7 @@ def is_sequence(path: Path) -> bool:
 FORMAT = FileFormat(
     "a KITTI tracking folder (oxts/, calib/) or the oxts/NNNN.txt of a sequence in it",
     is_sequence,
-    lambda path, config: partial(read_sequence, *_located(path, config.kitti.sequence), config.kitti),
+    lambda path, config: partial(read_sequence, *_folder_and_sequence(path, config.kitti.sequence), config.kitti),
 )
 
 

@@ -166,7 +166,7 @@ def _detections(topic: BagTopic, item: TopicInput, sensor: str, plane: LocalPlan
         objects, left_out = split(listed.objects)
         if item.filters:
             own = objects if item.fields is None else items_by_fields(message, item.fields)
-            objects, left_out = split(_judged(item, *pair) for pair in zip(objects, own, strict=True))
+            objects, left_out = split(_filtered(item, *pair) for pair in zip(objects, own, strict=True))
         return (DetectionList(sensor, stamp_ns, receipt_ns, objects, frame, left_out, plane.origin_deg),)
 
     return convert
@@ -190,7 +190,7 @@ def _object_list(
     return read
 
 
-def _judged(item: TopicInput, detection: Detection, source: RosMessage) -> Detection | str:
+def _filtered(item: TopicInput, detection: Detection, source: RosMessage) -> Detection | str:
     """`detection`, or the first filter that it does not pass: by its own values, or by a field that it is read from."""
     for name, each in item.filters.items():
         if not each.passes(getattr(detection, name) if name in DETECTION_FIELDS else value_at(source, name)):

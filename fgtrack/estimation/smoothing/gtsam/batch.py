@@ -13,7 +13,7 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.smoothing.bank import SmootherBank
 from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalSolver
-from fgtrack.estimation.smoothing.terms import Term, linearised, whitened
+from fgtrack.estimation.smoothing.terms import MeasurementFactor, linearised, whitened
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.robust import width
 
@@ -55,8 +55,8 @@ class BatchSolver(IncrementalSolver):
                 graph.add(motion_factor(self.motion, left, right, seconds(dt_ns), nodes.Q[left]))
             for number in numbers:
                 values.insert(number, last.atVector(number) if last.exists(number) else nodes.origin[number])
-                for term in nodes.terms(number):
-                    graph.add(measurement_factor(number, term, nodes.origin[number], self.motion))
+                for factor in nodes.factors(number):
+                    graph.add(measurement_factor(number, factor, nodes.origin[number], self.motion))
             values = self.optimise(graph, values)
             self._graphs[track] = graph, values
             for number in numbers:
@@ -86,19 +86,21 @@ def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float, Q: Fl
     return gtsam.CustomFactor(_gaussian(noise_root(Q)), [left, right], error)
 
 
-def measurement_factor(key: int, term: Term, origin: FloatArray, motion: MotionModel) -> gtsam.NonlinearFactor:
-    """Return the factor of `term` on the state at `key`; a linear one takes angles on the branch next to `origin`.
+def measurement_factor(
+    key: int, factor: MeasurementFactor, origin: FloatArray, motion: MotionModel
+) -> gtsam.NonlinearFactor:
+    """Return the factor of `factor` on the state at `key`; a linear one takes angles on the branch next to `origin`.
     Raises `numpy.linalg.LinAlgError` for a covariance that is not positive definite.
     """
-    measurement = term[0]
+    measurement = factor[0]
     if not measurement.is_nonlinear:
-        rows, at = whitened(term, origin, motion), gtsam.Values()
+        rows, at = whitened(factor, origin, motion), gtsam.Values()
         at.insert(key, origin)
         linear = gtsam.JacobianFactor(key, rows[:, :-1], rows[:, -1], gtsam.noiseModel.Unit.Create(len(rows)))
         return gtsam.LinearContainerFactor(linear, at)
 
     def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
-        y, H = linearised(term, values.atVector(key), motion)
+        y, H = linearised(factor, values.atVector(key), motion)
         if jacobians is not None:
             jacobians[0] = H
         return -y
