@@ -130,7 +130,7 @@ class ExistenceLifecycle:
         self._learn(scan, rows[known], ratios[known])
         self._confirm(rows)
 
-    def fused(self, track_id: int) -> None:
+    def fused(self, track_ids: Iterable[int]) -> None:
         """See `CountingLifecycle.fused`; the match has counted already."""
 
     def missed(self, scan: Scan, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:

@@ -1,6 +1,6 @@
 """Life of a track: the status counter of Karle et al. 2023, section III-D."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -82,13 +82,15 @@ class CountingLifecycle:
         for position, track in pairs:
             if candidates.placed[position]:
                 life = self.lives[states.track_ids[track]]
-                life.counter = min(life.counter + add, cap)
-                life.last_seen_ns = max(life.last_seen_ns, scan.stamp_ns)
-                life.misses = 0
+                counter, life.misses = life.counter + add, 0
+                life.counter = counter if counter < cap else cap
+                if scan.stamp_ns > life.last_seen_ns:
+                    life.last_seen_ns = scan.stamp_ns
 
-    def fused(self, track_id: int) -> None:
-        """The associated detection, which gives a position, changed the state."""
-        self.lives[track_id].num_placed += 1
+    def fused(self, track_ids: Iterable[int]) -> None:
+        """The associated detections, which give positions, changed the states."""
+        for track_id in track_ids:
+            self.lives[track_id].num_placed += 1
 
     def missed(self, scan: Scan, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
         """Return the ids that end of tracks, at `positions_m` (n, 2) and so far from the ego, that a list misses."""

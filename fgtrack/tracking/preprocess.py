@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fgtrack.core.geometry import body_point
-from fgtrack.core.linalg import congruence, equal_ones, kernels, symmetrise
+from fgtrack.core.linalg import congruence, kernels, symmetrise
 from fgtrack.core.types import BoolArray, Disposition, FloatArray, IntArray, UpdateRecord
 from fgtrack.estimation.base import Lazy, Measurement, Measurements
 from fgtrack.models.correlated_errors import split_error
@@ -238,9 +238,9 @@ class Preprocess:
         arrays = items.values, items.points_m, items.map_yaw, items.starts, items.poses
         codes, lines = kernels("fgtrack.tracking.kernels").described(*arrays)
         for k, (first, end) in enumerate(pairwise(items.starts.tolist())):
-            own, groups = codes[first:end].tolist(), list[Group]()
-            for rows in map(np.array, equal_ones(own)):
-                groups += self._groups(items, k, first, rows, own[rows[0]])
+            own, groups = codes[first:end], list[Group]()
+            for code in dict.fromkeys(own.tolist()):
+                groups += self._groups(items, k, first, (own == code).nonzero()[0], code)
             others = {index: others for (batch, index), others in items.merged.items() if batch == k}
             yield Candidates(items.indices[first:end].tolist(), others, lines[first:end], groups)
 

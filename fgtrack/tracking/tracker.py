@@ -325,8 +325,7 @@ class Tracker:
         """
         lifecycle, sensor = self._parts.lifecycle, self._parts.sensors[batch.message.sensor]
         seen = self._seen.setdefault(id(batch.message), set())
-        for _, track in assignment.pairs:
-            seen.add(states.track_ids[track])
+        seen.update([states.track_ids[track] for _, track in assignment.pairs])
         lifecycle.matched(scan, candidates, assignment.pairs, states)
         if self._parts.objects.describes(scan.objects):
             for position, track in assignment.pairs:
@@ -340,29 +339,28 @@ class Tracker:
 
     def _estimate(self, batch: Batch, candidates: Candidates, assignment: Assignment, states: StatesAt) -> None:
         """Fuse the matched candidates, group by group; the records are in the order of the candidates."""
-        bank, lifecycle, track_ids = self._parts.bank, self._parts.lifecycle, states.track_ids
+        bank, track_ids = self._parts.bank, states.track_ids
         outcomes = dict[int, tuple[Measurement, UpdateResult]]()  # by index of the pair
         chosen, tracks = np.array(assignment.pairs).T
         joint = self._joint(batch, candidates, states)
         for group, members, here in candidates.split(chosen):
-            of = tracks[here]
+            of = tracks.take(here)
             each = group.seen_at(members, states.means.take(of, axis=0), states.covariances, of)
             measurements = Measurements(each if joint is None else equivalent(each, of, group, joint, states))
             ids = list(map(track_ids.__getitem__, of.tolist()))
             results = bank.update(batch.stamp_ns, ids, measurements)
             outcomes.update(zip(here.tolist(), zip(repeat(measurements.stack), results), strict=True))
+            fused = [track_id for track_id, each in zip(ids, results, strict=True) if each.innovation is not None]
+            self._num_measured.update(fused)
+            if not candidates.placed[chosen[here[0]]]:  # as those of all others
+                continue
+            self._parts.lifecycle.fused(fused)
             for row, track_id in enumerate(ids) if self._undirected else ():
-                fused = results[row].innovation is not None and candidates.placed[chosen[here[row]]]
-                if fused and self._undirected.pop(track_id, None) is not None:
+                if results[row].innovation is not None and self._undirected.pop(track_id, None) is not None:
                     # The estimator's prior, linearised along an unknown direction, spreads along it alone.
                     seen, track = measurements[row].seen_by(self._parts.motion), of[row]
                     with suppress(np.linalg.LinAlgError):
                         results[row].nis = correct_one(states.means[track], states.covariances[track], seen).nis
-        for k, (position, track) in enumerate(assignment.pairs):
-            if outcomes[k][1].innovation is not None:
-                self._num_measured[track_ids[track]] += 1
-                if candidates.placed[position]:
-                    lifecycle.fused(track_ids[track])
         self._records.append(_fused(batch.message, candidates, assignment.pairs, track_ids, outcomes))
 
     def _give_birth(self, batch: Batch, candidates: Candidates, position: int, scan: Scan) -> None:

@@ -111,7 +111,7 @@ def test_the_status_tells_unconfirmed_from_seen_from_missed() -> None:
     status = []
     for _ in range(2):
         match(life, 0, Scan("both", START_NS, START_NS), HERE)
-        life.fused(0)
+        life.fused([0])
         status.append(life.status(0))
     life.missed(Scan("both", START_NS, START_NS), [0], NOWHERE, np.array([1.0]))
     status.append(life.status(0))

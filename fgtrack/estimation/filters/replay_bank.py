@@ -102,13 +102,11 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         results = [UpdateResult(UpdateStatus.FAILED)] * len(track_ids)
         for indices, alike in stacks(measurements):
             seen, ids = alike.seen_by(self._motion), [track_ids[i] for i in indices]
-            is_plain = _is_plain(seen)
-            for chosen in equal_ones([is_plain and i in self._rows for i in ids]):
-                if len(chosen) < len(ids):
-                    part, own = replace(seen, z=seen.z[chosen], R=seen.R[chosen]), [ids[k] for k in chosen]
-                else:
-                    part, own = seen, ids
-                if is_plain and own[0] in self._rows:
+            is_held = list(map(self._rows.__contains__, ids)) if _is_plain(seen) else [False] * len(ids)
+            for chosen in filter(len, [range(len(ids))] if all(is_held) else equal_ones(is_held)):
+                part = seen if len(chosen) == len(ids) else replace(seen, z=seen.z[chosen], R=seen.R[chosen])
+                own = [ids[k] for k in chosen]
+                if is_held[chosen[0]]:
                     values = self._fused(stamp_ns, own, part)
                 else:
                     for track_id in own:
