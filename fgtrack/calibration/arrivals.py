@@ -1,7 +1,8 @@
 """Stamps and receipts of the lists of each sensor: latency, losses, and the window that they need."""
 
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,6 +11,7 @@ from fgtrack.calibration.finding import Finding, milliseconds, nice_above, perce
 from fgtrack.core.diagnostic import EGO
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import DetectionList, EgoState, FloatArray, IntArray, Message
+from fgtrack.io.info import OwnOrder
 from fgtrack.pipeline.config import Config
 from fgtrack.tracking.existence import ExistenceRules
 
@@ -36,6 +38,8 @@ class Arrivals:
     receipts_ns: IntArray
     counts: IntArray
     """Detections of each, shape (n,)."""
+    object_late: float | None = None
+    """Share of the detections with an identity that came after a newer one of it; None of fewer than two."""
 
     @cached_property
     def delays_s(self) -> FloatArray:
@@ -92,13 +96,17 @@ class Arrivals:
 def arrivals_of(messages: Iterable[Message]) -> dict[str, Arrivals]:
     """Return the arrivals of every sensor, and of the ego under `ego`."""
     rows: dict[str, list[tuple[int, int, int]]] = {}
+    order, own = OwnOrder(), defaultdict[str, list[bool]](list)
     for message in messages:
         if isinstance(message, EgoState):
             rows.setdefault(EGO, []).append((message.stamp_ns, message.receipt_ns, 0))
         elif isinstance(message, DetectionList):
             row = message.stamp_ns, message.receipt_ns, len(message.objects)
             rows.setdefault(message.sensor, []).append(row)
-    return {name: Arrivals(name, *np.array(result, dtype=np.int64).T) for name, result in sorted(rows.items())}
+            own[message.sensor] += order.late(message)
+    result = {name: Arrivals(name, *np.array(row, dtype=np.int64).T) for name, row in sorted(rows.items())}
+    shares = {name: float(np.mean(late)) for name, late in own.items() if late}
+    return {name: replace(one, object_late=shares.get(name)) for name, one in result.items()}
 
 
 def overtaken(arrivals: Mapping[str, Arrivals], sensors: Sequence[str]) -> dict[str, float]:

@@ -82,6 +82,7 @@ class Advice:
                 "delay_p95_s": item.quantile_s(0.95),
                 "delay_max_s": float(item.delays_s.max()),
                 "overtaken": self.overtaken[item.name],
+                "object_late": item.object_late,
                 "lost": item.lost,
             }
             for item in self.arrivals
@@ -91,7 +92,7 @@ class Advice:
             Column("lists"),
             Column("period\n[ms]", "period_s", scale=1e3),
             Column("delay [ms]\np50/p95/max", "delay_p50_s delay_p95_s delay_max_s", "{}/{}/{}", 1e3, text=rounded_ms),
-            Column("overtaken\n[%]", "overtaken", scale=100.0),
+            Column("late [%]\nstream/object", "overtaken object_late", "{}/{}", 100.0),
             Column("lost\n[%]", "lost", scale=100.0),
         ]
         return Table("Lists by sensor, with the stamps advised", records, columns, ("sensor",))

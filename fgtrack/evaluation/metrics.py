@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import Disposition
+from fgtrack.core.types import Disposition, IntArray
 from fgtrack.evaluation.diagnostics import excluded_lines
 from fgtrack.evaluation.matching import Matching, confirmed, match, scenes, track_errors
 from fgtrack.evaluation.scores.continuity import breaks, switches, times_to_confirm, tracked_visits
@@ -86,6 +86,8 @@ class SensorMetrics:
 
     dispositions: Mapping[str, int]
     """Detections by disposition, zeros included."""
+    overtaken: int
+    """Detections with an older stamp than one of the sensor that was received before."""
     delay_s: Distribution
     """Receipt minus stamp of the messages that held a detection."""
     residuals: Mapping[str, Moments]
@@ -221,10 +223,17 @@ def _sensor_metrics(run: Run) -> dict[str, SensorMetrics]:
         counts = Counter(updates["disposition"][mine].tolist())
         sensors[sensor] = SensorMetrics(
             dispositions={name.value: counts[name.value] for name in Disposition},
+            overtaken=_overtaken(updates["stamp_ns"][mine], updates["receipt_ns"][mine]),
             delay_s=Distribution.of(message_delays(updates.where(mine))[1]),
             residuals={name: value for name, value in moments.items() if value.count},
         )
     return sensors
+
+
+def _overtaken(stamps_ns: IntArray, receipts_ns: IntArray) -> int:
+    """Return how many of the stamps (m,) are older than one with an earlier receipt."""
+    ordered_ns = stamps_ns[np.lexsort((stamps_ns, receipts_ns))]
+    return int((ordered_ns < np.maximum.accumulate(ordered_ns)).sum())
 
 
 def _plain(value: Any) -> Any:

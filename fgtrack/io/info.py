@@ -37,8 +37,8 @@ class TopicInfo:
     note: str | None
     """Why it cannot be decoded, or what is unusual."""
     late: Mapping[str, float | None]
-    """Shares that are out of sequence: `stream_share` of the messages, with an older stamp than one of the topic before
-    them, and `object_share` of the detections with an identity, with an older stamp than one of it before; None of
+    """Shares that are out of sequence: `stream_share` of the messages, with an older stamp than one of the topic that
+    was received earlier, and `object_share` of the detections with an identity, older than one of it before; None of
     fewer than two."""
 
 
@@ -108,10 +108,10 @@ def _topic(topic: BagTopic, times: Sequence[_Times], used_as: str | None, own: S
     receipts_ns = {receipt_ns for receipt_ns, _ in times}
     if len(receipts_ns) > 1:
         rate_hz = (len(receipts_ns) - 1) / seconds(max(receipts_ns) - min(receipts_ns))
-    stamps_ns = np.array([stamp_ns for _, stamp_ns in times if stamp_ns is not None], dtype=np.int64)
+    ordered_ns = np.array([stamp_ns for _, stamp_ns in sorted(each for each in times if each[1] is not None)])
     stream = None
-    if len(stamps_ns) > 1:
-        stream = float(np.mean(stamps_ns[1:] < np.maximum.accumulate(stamps_ns)[:-1]))
+    if len(ordered_ns) > 1:
+        stream = float(np.mean(ordered_ns[1:] < np.maximum.accumulate(ordered_ns)[:-1]))
     late = {"stream_share": stream, "object_share": float(np.mean(own)) if own else None}
     return TopicInfo(topic.name, topic.type, len(times), rate_hz, delay, used_as, note, late)
 
@@ -122,15 +122,30 @@ def _stamps(
     """Sensor or kind, receipt and stamp of `messages`, as of a recording with a topic for each.
     `own` gets for each detection whose identity came before, True if it is older than the newest of these.
     """
-    newest_ns: dict[tuple[str, str], int] = {}
+    order = OwnOrder()
     for message in messages:
         kind = "ego" if isinstance(message, EgoState) else "truth"
         name, kind = (message.sensor, "detections") if isinstance(message, DetectionList) else (kind, kind)
         topic = BagTopic(name, kind, None)
-        for item in message.objects if isinstance(message, DetectionList) else ():
-            if item.id is not None:
-                stamp_ns, key = message.stamp_ns if item.stamp_ns is None else item.stamp_ns, (name, item.id)
-                if key in newest_ns:
-                    own[topic].append(stamp_ns < newest_ns[key])
-                newest_ns[key] = max(stamp_ns, newest_ns.get(key, stamp_ns))
+        if isinstance(message, DetectionList):
+            own[topic] += order.late(message)
         yield topic, message.receipt_ns, message.stamp_ns
+
+
+class OwnOrder:
+    """Order of the detections of each identity, by sensor."""
+
+    def __init__(self) -> None:
+        self._newest_ns: dict[tuple[str, str], int] = {}
+
+    def late(self, message: DetectionList) -> list[bool]:
+        """Return for each detection whose identity came before, True if it is older than the newest of these."""
+        late = list[bool]()
+        for item in message.objects:
+            if item.id is not None:
+                stamp_ns, key = message.stamp_ns if item.stamp_ns is None else item.stamp_ns, (message.sensor, item.id)
+                newest_ns = self._newest_ns.get(key)
+                if newest_ns is not None:
+                    late.append(stamp_ns < newest_ns)
+                self._newest_ns[key] = stamp_ns if newest_ns is None else max(stamp_ns, newest_ns)
+        return late

@@ -303,8 +303,8 @@ def test_residuals_have_moments_nis_and_delay_and_dispositions_add_up(tables: Ta
     assert tables[lidar]["x_mean_m"].tolist() == [-0.5] * 3  # not shown beside along and across, but there
     table = tables["dispositions"]
     assert rows_of(tables, "dispositions")[-2:] == [
-        "smoother lidar_cluster 2 0 0 1 1 2",
-        "smoother radar_long_range 1 0 0 0 1 1",
+        "smoother lidar_cluster 2 0 0 0 1 1 2",
+        "smoother radar_long_range 1 0 0 0 0 1 1",
     ]
     assert tables.tables["dispositions"].notes[0].startswith("fused:")
     assert sum(int(table[name.value].sum()) for name in Disposition) == table["detections"].sum() == 9

@@ -248,14 +248,27 @@ def _dispositions(metrics: Mapping[str, Metrics]) -> Table:
             counts = sensor.dispositions
             refused = sum(count for kind, count in counts.items() if kind not in USED)
             groups = {"fused": sum(counts[k] for k in FUSED), "late": sum(counts[k] for k in LATE), "refused": refused}
-            records.append({"run": label, "sensor": name, **counts, "detections": sensor.detections, **groups})
+            late = {"overtaken": sensor.overtaken, "detections": sensor.detections}
+            records.append({"run": label, "sensor": name, **counts, **late, **groups})
     occur = [kind.value for kind in Disposition if any(record[kind] for record in records)]
     kinds = [Column(kind.replace("_", "\n"), kind, is_extra=kind != Disposition.MERGED) for kind in occur]
     columns = [
-        *(RUN, Column("sensor", left=True), Column("fused"), Column("late"), Column("refused"), *kinds),
+        *(
+            RUN,
+            Column("sensor", left=True),
+            Column("fused"),
+            Column("late"),
+            Column("overtaken"),
+            Column("refused"),
+            *kinds,
+        ),
         Column("sum", "detections"),
     ]
-    notes = ["fused: also those that started a track", "late: of the fused ones, those out of sequence"]
+    notes = [
+        "fused: also those that started a track",
+        "late: of the fused ones, those older than the newest of their track",
+        "overtaken: received after a newer one of the sensor, whatever its track",
+    ]
     notes += dict.fromkeys(line for item in metrics.values() for line in item.left_out)
     title = "Dispositions (the outcome of every detection)"
     return Table(title, records, columns, ("run", "sensor"), notes)
