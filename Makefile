@@ -16,7 +16,7 @@ TEST := $(VENV)/.test
 DEV := $(TEST) $(VENV)/.dev
 DOCS := $(TEST) $(VENV)/.docs
 
-.PHONY: demo test test-fast test-slow test-matrix lock audit fuzz faults coverage mutants check docs bench bench-full soak soak-live contest clean
+.PHONY: demo test test-fast test-slow test-matrix lock audit fuzz faults coverage mutants check docs picture bench bench-full soak soak-live contest clean
 
 demo: $(RUN)
 	@$(BIN)/fgtrack demo -o out/demo --overwrite
@@ -61,6 +61,10 @@ check: $(DEV)
 
 docs: $(DOCS)
 	$(BIN)/python -m sphinx -W --keep-going -q -c docs . out/docs
+
+# The imports between the folders, for docs/architecture.md.
+picture: $(DEV)
+	$(BIN)/python docs/_ext/import_graph.py
 
 contest: $(TEST)
 	$(BIN)/python experiments/contest.py -o out/contest --jobs 2

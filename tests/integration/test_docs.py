@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache
+from html import unescape
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
@@ -169,6 +170,14 @@ def test_files_named_on_the_pages_for_developers_exist(page: str) -> None:
     for file, test in re.findall(r"^\| [^|]+ \| `(.+)` \| `(.+)` \|$", prose(Path(page)), re.MULTILINE):
         assert (ROOT / "fgtrack" / file).exists(), f"{page}: {file} does not exist"
         assert (ROOT / "tests" / test).exists(), f"{page}: {test} does not exist"
+
+
+def test_the_picture_of_the_architecture_shows_the_imports(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("grimp", reason="import-linter is not installed")
+    monkeypatch.syspath_prepend(str(ROOT / "docs/_ext"))
+    graph = import_module("import_graph")
+    shown = unescape((ROOT / "docs/architecture.svg").read_text(encoding="utf-8"))
+    assert graph.described(graph.imports()[0]) in shown, "run `make picture`"
 
 
 # Commands
