@@ -36,6 +36,14 @@ def test_the_contents_of_a_recording_are_listed_without_a_compiler(name: str, tm
     assert loaded.isdisjoint({"gtsam", "matplotlib", "numba", "pandas"})
 
 
+def test_a_replay_imports_no_tables_of_others_and_no_figures(tmp_path) -> None:
+    recording = str(tmp_path / "drive.jsonl")
+    assert run(["simulate", "default", "--duration", "0.5", "-o", recording]) == 0
+    call = ["replay", recording, "-c", "tuned", "-e", "ekf-replay", "-o", str(tmp_path / "run")]
+    loaded = loaded_by(f"from fgtrack.cli.main import run; assert run({call!r}) == 0")
+    assert loaded.isdisjoint({"gtsam", "matplotlib", "pandas", "rosbags"})
+
+
 def test_every_command_has_a_line_in_the_help_and_a_help_of_its_own(capsys) -> None:
     assert run(["--help"]) == 0
     listed = capsys.readouterr().out.partition("Commands:")[2]
