@@ -22,7 +22,7 @@ from fgtrack.core.types import (
     TruthState,
     UpdateRecord,
 )
-from fgtrack.io.run import COLUMNS, NO_TRACK, MemoryRun, RunWriter, digest, load_run, write_metrics
+from fgtrack.io.run import COLUMNS, NO_TRACK, MemoryRun, RunWriter, digest, load_run, sink, write_metrics
 
 
 def track(track_id: int = 1, size: int = 5, stamp_ns: int = 990) -> TrackReport:
@@ -170,11 +170,12 @@ def test_there_is_no_smoothed_lagged_or_truth_file_without_a_row(tmp_path):
     assert run.tables["truth"]["object_id"].dtype == np.int64
 
 
-def test_a_killed_run_is_readable_up_to_its_last_whole_row(tmp_path):
+def test_a_killed_run_is_readable_up_to_its_last_whole_row(tmp_path, monkeypatch):
     path = tmp_path / "run"
     writer = RunWriter(path)
-    for tick in range(3):
-        writer.write_tick(report(tick), 5, 2)
+    for tick in range(4):
+        monkeypatch.setattr(sink, "monotonic", lambda now_s=5.0 + 0.1 * tick: now_s)
+        writer.write_tick(report(tick), 5, 2)  # the last one within 0.2 s of the one before it
     data = (path / "tracks.csv").read_bytes()
     (path / "tracks.csv").write_bytes(data[:-30])
     run = load_run(path)

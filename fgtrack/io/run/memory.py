@@ -16,6 +16,7 @@ class MemoryRun(RunSink):
     @property
     def run(self) -> Run:
         """The run; it has no path."""
+        self._append_rows()
         tables = {table: parsed(table, content) for table, content in self._files.items()}
         return Run(None, dict(self._meta), self._config_text, tables)
 

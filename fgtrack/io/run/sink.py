@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import astuple
+from time import monotonic
 
 from fgtrack.core.types import (
     DetectionList,
@@ -16,7 +17,10 @@ from fgtrack.core.types import (
 )
 from fgtrack.io.geodetic import GEODETIC
 from fgtrack.io.run.rows import Row, detection_rows, rows, smoothed_rows, state_cells
-from fgtrack.io.run.schema import RUN_FORMAT
+from fgtrack.io.run.schema import COLUMNS, RUN_FORMAT
+
+PERIOD_S = 0.2
+"""Rows are appended together after so much wall time: to write each by itself takes as long as to format it."""
 
 
 class RunSink(ABC):
@@ -34,7 +38,8 @@ class RunSink(ABC):
         self._out_of_bounds: dict[str, Counter[str]] = defaultdict(Counter)  # by setting
         self._left_out: dict[str, Counter[str]] = defaultdict(Counter)  # by the reader and its settings
         self._objects: dict[int, ObjectReport] = {}  # the last word on tracks that have not ended
-        self._received: dict[str, list[Row]] = {name: [] for name in ("truth", "ignored", "ego", "detections")}
+        self._rows: dict[str, list[Row]] = {table: [] for table in COLUMNS}  # not yet appended
+        self._due_s = 0.0
 
     @property
     def is_scored(self) -> bool:
@@ -42,38 +47,37 @@ class RunSink(ABC):
         return bool(self._meta.get("is_scored"))
 
     def write_tick(self, report: TickReport, process_ns: int, num_detections: int) -> None:
-        """Take all rows of one tick, see `rows`, and what was received before it."""
-        self._append_received()
+        """Take all rows of one tick, see `rows`; those of the first tick are appended immediately."""
         for record in report.updates:
             self._counts[record.sensor][record.disposition] += 1
             if record.reason is not None:
                 self._out_of_bounds[record.sensor][record.reason] += 1
-        self._append_objects({track.track_id for track in report.tracks})
+        self._end_objects({track.track_id for track in report.tracks})
         self._objects |= {track.track_id: track.object for track in report.tracks if track.object is not None}
         for table, cells in rows(report, process_ns, num_detections, self._smoothed_lag_s):
-            self._append(table, cells if self.is_scored or table != "tracks" else [row[:-1] for row in cells])
+            self._rows[table] += cells if self.is_scored or table != "tracks" else [row[:-1] for row in cells]
+        if monotonic() >= self._due_s:
+            self._append_rows()
 
     def write_smoothed(self, reports: Sequence[SmoothedReport]) -> None:
         """Take rows of `smoothed`; the end of a run may have none."""
-        self._append("smoothed", smoothed_rows(reports))
+        self._rows["smoothed"] += smoothed_rows(reports)
 
     def write_truth(self, truth: TruthState) -> None:
-        """Take a row of `truth` or `ignored`; it is appended with the next tick, as all that is received."""
+        """Take a row of `truth` or `ignored`."""
         if truth.ignored:
             outline = None if truth.outline_m is None else " ".join(map(repr, map(float, truth.outline_m)))
-            self._received["ignored"].append(
-                (truth.stamp_ns, truth.object_id, float(truth.x_m), float(truth.y_m), outline)
-            )
+            self._rows["ignored"].append((truth.stamp_ns, truth.object_id, float(truth.x_m), float(truth.y_m), outline))
         else:
-            self._received["truth"].append((truth.stamp_ns, truth.object_id, *state_cells(truth)))
+            self._rows["truth"].append((truth.stamp_ns, truth.object_id, *state_cells(truth)))
 
     def write_ego(self, ego: EgoState) -> None:
         """Take a row of `ego`."""
-        self._received["ego"].append((ego.stamp_ns, ego.receipt_ns, *state_cells(ego)))
+        self._rows["ego"].append((ego.stamp_ns, ego.receipt_ns, *state_cells(ego)))
 
     def write_detections(self, message: DetectionList) -> None:
         """Take the rows of `detections`."""
-        self._received["detections"] += detection_rows(message)
+        self._rows["detections"] += detection_rows(message)
         if message.origin_deg is not None:
             self._meta.setdefault("origin", dict(zip(GEODETIC, message.origin_deg, strict=True)))
         if message.left_out:
@@ -81,8 +85,8 @@ class RunSink(ABC):
 
     def finish(self, meta: Mapping[str, object]) -> dict[str, object]:
         """Complete the run with `meta`, the counts per sensor and the digest; return the content of `meta.json`."""
-        self._append_received()
-        self._append_objects(set())
+        self._end_objects(set())
+        self._append_rows()
         counts = {
             sensor: {disposition.value: counter[disposition] for disposition in Disposition}
             for sensor, counter in sorted(self._counts.items())
@@ -91,20 +95,21 @@ class RunSink(ABC):
         self._meta |= {"counts": counts, **bounds, "complete": True, **meta, "digest": self._digest()}
         return dict(self._meta)
 
-    def _append_objects(self, alive: Set[int]) -> None:
-        """Append rows of `objects` of tracks that are not `alive` any more."""
+    def _end_objects(self, alive: Set[int]) -> None:
+        """Take rows of `objects` of tracks that are not `alive` any more."""
         ended = sorted(self._objects.keys() - alive)
-        self._append("objects", [(track_id, *astuple(self._objects.pop(track_id))) for track_id in ended])
+        self._rows["objects"] += [(track_id, *astuple(self._objects.pop(track_id))) for track_id in ended]
 
-    def _append_received(self) -> None:
-        for table, cells in self._received.items():
+    def _append_rows(self) -> None:
+        self._due_s = monotonic() + PERIOD_S
+        for table, cells in self._rows.items():
             if cells:
                 self._append(table, cells)
-                self._received[table] = []
+                self._rows[table] = []
 
     @abstractmethod
     def _append(self, table: str, rows: Sequence[Row]) -> None:
-        """Append `rows`, which may be empty, to `table`."""
+        """Append `rows` to `table`."""
 
     @abstractmethod
     def _digest(self) -> str:

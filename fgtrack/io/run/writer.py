@@ -26,7 +26,7 @@ _FILES = (*(f"{table}.csv" for table in COLUMNS), "metrics.json", "config.yaml",
 
 class RunWriter(RunSink):
     """Writes the run folder `path`, which is locked until the writer is closed; a context manager.
-    Every tick reaches the files before `write_tick` returns: a killed run leaves readable files and a `meta.json` with
+    Every tick reaches the files within 0.2 s: a killed run leaves readable files and a `meta.json` with
     `"complete": false`. An older run stays until `finish`: the new one grows in `new.part` beside it. Other files stay.
     """
 
@@ -84,8 +84,7 @@ class RunWriter(RunSink):
         folder.rmdir()
 
     def _append(self, table: str, rows: Sequence[Row]) -> None:
-        if rows:
-            self.write_rows(table, text(table, rows))
+        self.write_rows(table, text(table, rows))
 
     def write_rows(self, table: str, lines: str) -> None:
         """Append `lines` to the CSV file of `table`."""
