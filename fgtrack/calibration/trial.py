@@ -1,18 +1,20 @@
 """The first seconds of an input as a configuration reads them: what is suspicious, and the first of each message."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import takewhile
 
 import numpy as np
 
 from fgtrack.core.diagnostic import EGO, Diagnostic, in_degrees
 from fgtrack.core.types import DESCRIBING, MEASURABLE, Detection, DetectionList, EgoState, Message, TruthState
+from fgtrack.evaluation.diagnostics import excluded_lines
 from fgtrack.models.measurement import ANGULAR
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.config import Config
 
-__all__ = ["TRIAL_S", "beginning", "samples", "suspicions"]
+__all__ = ["TRIAL_S", "beginning", "passing", "samples", "suspicions"]
 
 TRIAL_S = 5.0
 _SHOWN = (*MEASURABLE, "yaw_rate_radps", *DESCRIBING, "object_id")
@@ -103,6 +105,25 @@ def _measured(name: str, objects: Sequence[Detection], sensor: SensorModel) -> I
         has = ", ".join(component for component in MEASURABLE if component in given) or "nothing"
         what = f"{', '.join(missing)} of its std, but {has}"
         yield Diagnostic(name, f"never measures {what}: change sensors.{name}.std or the fields")
+
+
+def passing(messages: Iterable[Message], config: Config) -> Iterator[str]:
+    """Yield lines on the detections of each sensor, and on those that filters exclude."""
+    counts, out, left_out = (defaultdict[str, Counter[str]](Counter) for _ in range(3))
+    for message in messages:
+        if isinstance(message, DetectionList):
+            sensor = config.sensors[message.sensor]
+            counts[message.sensor] += Counter(lists=1, detections=len(message.objects))
+            out[message.sensor].update(f"filters.{name}" for item in message.objects if (name := sensor.refusing(item)))
+            left_out[message.sensor].update(message.left_out)
+    for name, count in counts.items():
+        yield f"{name}: {count['detections']} detections in {count['lists']} lists"
+    detections = {name: {"detections": count["detections"]} for name, count in counts.items()}
+    yield from excluded_lines({"counts": detections, "out_of_bounds": _any(out), "left_out": _any(left_out)})
+
+
+def _any(counts: Mapping[str, Counter[str]]) -> dict[str, Counter[str]]:
+    return {name: count for name, count in counts.items() if count}
 
 
 def samples(messages: Sequence[Message]) -> dict[str, str]:

@@ -14,13 +14,11 @@ from fgtrack.calibration.clock_offsets import OffsetReport, estimate_offsets
 from fgtrack.calibration.clocks import clock_text
 from fgtrack.calibration.page import rounded_ms
 from fgtrack.calibration.starting import starting_config
-from fgtrack.calibration.trial import TRIAL_S, beginning, samples, suspicions
+from fgtrack.calibration.trial import TRIAL_S, beginning, passing, samples, suspicions
 from fgtrack.cli.arguments import ConfigFile, Input, Json, Overwrite, PitMap, Reference, Settings, TrackMap
 from fgtrack.cli.show import progress, say, sentences, show, warn
 from fgtrack.core.errors import CallError, DataError, FgtrackError
 from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import Message
-from fgtrack.evaluation.diagnostics import excluded_lines
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.info import InputInfo, describe
@@ -28,9 +26,10 @@ from fgtrack.io.output import check_apart, check_output, write_file
 from fgtrack.io.source import open_input
 from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.pipeline.assumptions.assumption import Assumed
+from fgtrack.pipeline.build import build_road
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import plain
-from fgtrack.pipeline.replay import located, replay_in_memory
+from fgtrack.pipeline.replay import Feed, located
 from fgtrack.pipeline.shipped import read_config
 
 _DELAYS = ("mean_s", "p50_s", "p90_s", "max_s")
@@ -46,7 +45,7 @@ def info(
     """Show topics, rates and delays of a recording.
 
     With a configuration (or with the one of --write, which guesses what topics, fields and columns are) also what it
-    would take from them, what a message of each is read as, and what a replay of the first seconds makes of them.
+    would take from them, what a message of each is read as, and the detections of the first seconds.
     """
     if write is not None:
         if config_file is not None:
@@ -80,31 +79,23 @@ def info(
 
 
 def _try_out(recording: Path, config: Config) -> str | None:
-    """Print what the first seconds come to; gives the problem of the recording."""
-    messages, run, problem = list[Message](), None, None
+    """Print what is read in the first seconds; gives the problem of the recording."""
     with progress("first seconds"):
         source = open_input(recording, config.input)
         result = assumed(config, source)
+        build_road(result.config.map, result.config.defects)  # its files are there
         readable = UntilBreak(source.messages())
-        try:
-            messages = list(beginning(readable, nanoseconds(TRIAL_S)))
-            run = replay_in_memory(messages, result.config)
-        except DataError as error:
-            problem = str(error)
+        messages = list(beginning(readable, nanoseconds(TRIAL_S)))
+        feed = Feed(messages, result.config)
+        received = list(feed)
     sentences(result.lines())
     for name, text in samples(messages).items():
         say(f"first of {name}: {text}")
-    if run is not None:
-        for sensor, counts in run.meta["counts"].items():
-            became = ", ".join(f"{count} {fate.replace('_', ' ')}" for fate, count in counts.items() if count)
-            say(f"first {TRIAL_S:g} s of {sensor}: {became or 'no detection'}")
-        for line in excluded_lines(run.meta):
-            say(f"first {TRIAL_S:g} s of {line}")
-        say(f"first {TRIAL_S:g} s: {len(set(run.tables['tracks']['track_id'].tolist()))} tracks")
-        problem = run.meta["broken_off"]
+    for line in passing(received, result.config):
+        say(f"first {TRIAL_S:g} s of {line}")
     for item in suspicions(messages, result.config) if messages else ():
         warn(str(item))
-    return problem if readable.error is None else str(readable.error)
+    return feed.broken if readable.error is None else str(readable.error)
 
 
 def _topics(found: InputInfo, unused: str) -> Table:

@@ -26,7 +26,7 @@ _LONGEST_SILENCE_S = 3600.0
 _PACKAGES = ("fgtrack", "gtsam", "numpy", "scipy", "rosbags")
 
 
-class _Feed:
+class Feed:
     """Messages with corrected stamps, without ignored sensors, up to the break of the input or an invalid message."""
 
     def __init__(self, messages: Iterable[Message], config: Config) -> None:
@@ -133,7 +133,7 @@ def _drive(
 ) -> dict[str, object]:
     """Run `tracker` over `messages` into `writer`; return the contents of meta.json."""
     started_ns = perf_counter_ns()
-    feed = _Feed(messages, config)
+    feed = Feed(messages, config)
     detections_received = 0
 
     def written() -> Iterator[Delivered]:
@@ -198,7 +198,7 @@ def located(problem: str, origin: str) -> str:
 
 def delivered(messages: Iterable[Message], config: Config) -> Iterator[Tick]:
     """Return the ticks of a replay of `messages` with `config`, and the messages of each."""
-    of_tracker = (message for message in _Feed(messages, config) if not isinstance(message, TruthState))
+    of_tracker = (message for message in Feed(messages, config) if not isinstance(message, TruthState))
     return clock_ticks(of_tracker, config.clock.node_hz)
 
 

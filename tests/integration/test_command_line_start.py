@@ -29,10 +29,11 @@ def test_the_configuration_is_printed_without_a_compiler_and_without_readers(arg
 
 
 @pytest.mark.parametrize("name", ["drive.jsonl", "drive"])
-def test_the_contents_of_a_recording_are_listed_without_a_compiler(name: str, tmp_path) -> None:
+@pytest.mark.parametrize("options", [[], ["-c", "smoother"]])
+def test_the_contents_of_a_recording_are_listed_without_a_compiler(options: list[str], name: str, tmp_path) -> None:
     recording = str(tmp_path / name)
     assert run(["simulate", "default", "--duration", "0.5", "-o", recording]) == 0
-    loaded = loaded_by(f"from fgtrack.cli.main import run; assert run(['info', {recording!r}]) == 0")
+    loaded = loaded_by(f"from fgtrack.cli.main import run; assert run({['info', recording, *options]!r}) == 0")
     assert loaded.isdisjoint({"gtsam", "matplotlib", "numba", "pandas"})
 
 

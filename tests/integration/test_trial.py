@@ -114,6 +114,4 @@ def test_the_command_shows_what_is_read_and_what_becomes_of_it(tmp_path):
     code, text = info(tmp_path / "drive.jsonl", tmp_path / "c.yaml")
     assert code == 0
     assert "first of radar (in the frame ego): x_m 31, y_m 1.5, speed_mps -4" in text
-    assert "first 5 s of radar: " in text
-    assert "in sequence" in text
-    assert "tracks" in text
+    assert "first 5 s of radar: 9 detections in 10 lists" in text

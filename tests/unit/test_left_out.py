@@ -75,7 +75,8 @@ def test_a_run_counts_what_was_left_out_by_sensor_and_setting_and_compare_shows_
     assert meta["left_out"] == {}
     assert line in str(fgtrack.compare(fgtrack.load_run(out)))
     tried = CliRunner().invoke(app, ["info", str(stream), "-c", str(config)])
-    assert f"first 5 s of {line}" in tried.output.replace("\n", " ")
+    filtered = line.replace("16", "20").replace("8 by", "12 by")  # filters come first here, also of those invalid
+    assert f"first 5 s of {filtered}" in tried.output.replace("\n", " ")
 
 
 def test_what_a_reader_leaves_out_is_counted_and_stays_with_its_scan() -> None:
