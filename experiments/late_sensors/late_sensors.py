@@ -33,7 +33,7 @@ from fgtrack.sim.delays import ConstantDelay
 from fgtrack.sim.redelay import SensorDelays, redelay
 
 REFERENCE = "ekf-backward-forward"
-GROUPS = ((REFERENCE, "ekf-replay", "smoother-banded"), (REFERENCE, "drop"))
+GROUPS = ((REFERENCE, "rewind-forget", "ekf-replay", "smoother-banded"), (REFERENCE, "drop"))
 SENSORS = {"kitti": ("pointrcnn_car", "rrc_car"), "autoferry": ("lidar", "radar", "infrared", "daylight")}
 CAMERAS = ("infrared", "daylight")
 SEQUENCES = ("0004", "0006", "0008", "0010", "0018")

@@ -97,11 +97,18 @@ def test_forgotten_positions_cost_backward_forward_more(tmp_path: Path) -> None:
     assert all(0.0 < other < forgets for other in others)
 
 
+def test_a_vessel_ends_with_the_misses_of_one_sensor_unless_visibility_is_estimated(tmp_path: Path) -> None:
+    load("real_data", "parts").main(autoferry=shared("data/autoferry"), out=tmp_path, scenarios="scenario4")
+    shipped, without, *others = table(tmp_path / "parts.csv")
+    assert float(without["mota_difference"].split(" to ")[1].rstrip(")")) < 0.0
+    assert float(shipped["mota"]) > max(float(row["mota"]) for row in (without, *others)) - 3.0
+
+
 def test_a_late_camera_costs_most_where_prompt_positions_are_forgotten(tmp_path: Path) -> None:
     late = load("late_sensors")
     late.main(kitti=shared("data/kitti"), out=tmp_path, recordings="0006", late="rrc_car", delays_s="0.3")
-    forgets, *others, drop = table(tmp_path / "late_sensors.csv")
-    assert [row["estimator"] for row in (forgets, *others, drop)] == list(dict.fromkeys(sum(late.GROUPS, ())))
+    forgets, rewinds, *others, drop = table(tmp_path / "late_sensors.csv")
+    assert [row["estimator"] for row in (forgets, rewinds, *others, drop)] == list(dict.fromkeys(sum(late.GROUPS, ())))
     for row in (*others, drop):
         assert float(row["rmse_m"]) < float(forgets["rmse_m"])
         assert float(row["less_backward_forward_m"].split(" to ")[1].rstrip(")")) < 0.0
