@@ -100,7 +100,7 @@ def test_forgotten_positions_cost_backward_forward_more(tmp_path: Path) -> None:
 def test_a_vessel_ends_with_the_misses_of_one_sensor_unless_visibility_is_estimated(tmp_path: Path) -> None:
     load("real_data", "parts").main(autoferry=shared("data/autoferry"), out=tmp_path, scenarios="scenario4")
     shipped, without, *others = table(tmp_path / "parts.csv")
-    assert float(without["mota_difference"].split(" to ")[1].rstrip(")")) < 0.0
+    assert float(without["mota_difference"].split()[0]) < -10.0
     assert float(shipped["mota"]) > max(float(row["mota"]) for row in (without, *others)) - 3.0
 
 
