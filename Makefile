@@ -107,12 +107,15 @@ $(TOOLS):
 # The newest versions that pyproject.toml allows, for every platform and Python from 3.11 on, the same in every file.
 COMPILE = $(TOOLS)/bin/uv pip compile --universal --python-version 3.11 --generate-hashes --no-annotate \
     --no-emit-index-url --quiet --custom-compile-command "make lock"
+# Without rivals, foxglove and live their tests are skipped.
+TESTED := --extra test --extra rivals --extra foxglove --extra live
 lock: $(TOOLS)
 	rm -f $(TOOLS)/all.txt
-	$(COMPILE) requirements/install.in pyproject.toml --extra test --extra dev --extra docs -o $(TOOLS)/all.txt
+	$(COMPILE) requirements/install.in pyproject.toml $(TESTED) --extra dev --extra docs -o $(TOOLS)/all.txt
 	$(COMPILE) -c $(TOOLS)/all.txt requirements/install.in -o requirements/install.txt
 	$(COMPILE) -c $(TOOLS)/all.txt pyproject.toml -o requirements/run.txt
-	for extra in test dev docs; do \
+	$(COMPILE) -c $(TOOLS)/all.txt pyproject.toml $(TESTED) -o requirements/test.txt
+	for extra in dev docs; do \
 	    $(COMPILE) -c $(TOOLS)/all.txt pyproject.toml --extra $$extra -o requirements/$$extra.txt || exit 1; done
 
 # Known weaknesses of what is locked; asks pypi.org.

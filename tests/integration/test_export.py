@@ -29,8 +29,10 @@ from fgtrack.io.ros.bag import Bag
 from fgtrack.io.run import Run, RunWriter, Table, load_run
 from fgtrack.pipeline.shipped import shipped_folder
 from fgtrack.viewers.export import viewer_messages
-from fgtrack.viewers.foxglove import values
 from fgtrack.viewers.shapes import Scene, Shape, ViewerMessage
+
+pytest.importorskip("foxglove", reason="foxglove-sdk is not installed (extra `foxglove`)")
+from fgtrack.viewers.foxglove import values
 
 Times = Counter[tuple[int, int]]
 """Number of messages by log time and publish time, or stamp."""

@@ -31,7 +31,7 @@ def messages() -> Iterator[ModuleType]:
 
 @pytest.fixture(scope="module")
 def tracker_script(messages: ModuleType) -> ModuleType:
-    pytest.importorskip("zenoh", reason="eclipse-zenoh is not installed (extra `test`)")
+    pytest.importorskip("zenoh", reason="eclipse-zenoh is not installed (extra `live`)")
     return load_file(LIVE / "zenoh_tracker.py", "live")
 
 
@@ -115,7 +115,7 @@ def free_port() -> int:
 
 def driven(*options: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """What vehicle and tracker say at the end of a drive."""
-    pytest.importorskip("zenoh", reason="eclipse-zenoh is not installed (extra `test`)")
+    pytest.importorskip("zenoh", reason="eclipse-zenoh is not installed (extra `live`)")
     address = f"tcp/127.0.0.1:{free_port()}"
     tracker_command = ["zenoh_tracker.py", "--listen", address, "--sim-time", "--estimator", "ekf-replay"]
     tracker = start(tracker_command)

@@ -34,7 +34,9 @@ def multi_object(run: Run, options: EvaluationConfig | None = None) -> MultiObje
 
 @pytest.mark.parametrize(("seed", "side_m"), SCENES)
 def test_gospa_and_its_parts_are_those_of_stone_soup(seed: int, side_m: float) -> None:
-    ospametric = pytest.importorskip("stonesoup.metricgenerator.ospametric")
+    ospametric = pytest.importorskip(
+        "stonesoup.metricgenerator.ospametric", reason="stonesoup is not installed (extra `rivals`)"
+    )
     from stonesoup.measures import Euclidean
     from stonesoup.types.state import State
 
@@ -105,7 +107,7 @@ def trackeval_data(trackeval: Any, objects: Positions, tracks: Positions) -> dic
 
 @pytest.mark.parametrize(("seed", "side_m"), SCENES)
 def test_clear_identity_and_hota_are_those_of_trackeval(seed: int, side_m: float) -> None:
-    trackeval = pytest.importorskip("trackeval", reason="trackeval is not installed (extra `test`)")
+    trackeval = pytest.importorskip("trackeval", reason="trackeval is not installed (extra `rivals`)")
     objects, tracks, there = random_scenes(seed, side_m)
     data = trackeval_data(trackeval, objects, tracks)
     quiet = {"PRINT_CONFIG": False}

@@ -169,7 +169,7 @@ def test_a_run_without_an_origin_has_no_map(tmp_path, capsys):
 
 
 def test_map_panels_get_fixes(tmp_path):
-    pytest.importorskip("foxglove", reason="foxglove-sdk is not installed (extra `test`)")
+    pytest.importorskip("foxglove", reason="foxglove-sdk is not installed (extra `foxglove`)")
     from fgtrack.viewers.foxglove import values
     from fgtrack.viewers.shapes import ViewerMessage
 

@@ -125,7 +125,7 @@ def test_the_command_names_the_sequence_and_replaces_with_overwrite_only(tmp_pat
 
 def judged(root: Path, name: str, num_frames: int) -> dict[str, float]:
     """CLEAR of the car class by TrackEval, of `root/gt/label_02` and `root/trackers/fgtrack/data`."""
-    trackeval = pytest.importorskip("trackeval")
+    trackeval = pytest.importorskip("trackeval", reason="trackeval is not installed (extra `rivals`)")
     (root / "gt/evaluate_tracking.seqmap.training").write_text(f"{name} empty 000000 {num_frames:06d}\n")
     dataset = trackeval.datasets.Kitti2DBox(
         {

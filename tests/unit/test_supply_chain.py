@@ -16,7 +16,11 @@ ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 REQUIRED = [Requirement(line) for line in PROJECT["dependencies"]]
-ABSENT = {"asterix": "libasterix", "pyais": "pyais"}  # packages of modules that may not be installed
+ABSENT = {
+    "asterix": "libasterix",
+    "foxglove": "foxglove-sdk",
+    "pyais": "pyais",
+}  # packages of modules that may not be installed
 LOCKED_EXTRAS = ("test", "dev", "docs")
 
 
@@ -50,9 +54,7 @@ def test_what_is_imported_is_asked_for() -> None:
     """Not only by another package, whose next or last version may do without it."""
     asked = {_name(one.name) for one in REQUIRED}
     asked |= {
-        _name(Requirement(line).name)
-        for extra in ("dask", "bench", "foxglove", "ais", "asterix")
-        for line in EXTRAS[extra]
+        _name(Requirement(line).name) for extra in ("dask", "foxglove", "ais", "asterix") for line in EXTRAS[extra]
     }
     installed = packages_distributions()
     imported = {
@@ -74,7 +76,8 @@ def _imported(node: ast.AST) -> list[str]:
 
 @pytest.mark.parametrize("lock", LOCKS[1:])
 def test_a_lock_file_holds_what_the_project_asks_for(lock: str, locked: dict[str, Any]) -> None:
-    lines = [*REQUIRED, *(Requirement(line) for line in EXTRAS.get(lock, []))]
+    extras = ("test", "rivals", "foxglove", "live") if lock == "test" else (lock,)
+    lines = [*REQUIRED, *(Requirement(line) for extra in extras for line in EXTRAS.get(extra, []))]
     assert [one.name for one in lines if _name(one.name) not in locked[lock]] == []
     outside = [one for one in lines if not all(v in one.specifier for v in locked[lock][_name(one.name)][0])]
     assert outside == []
