@@ -36,7 +36,7 @@ SUMMARY_S = 60.0
 """A summary is of the beginning of a recording, so long."""
 _WAITED = 2  # index of the wait of the summary
 _IN_TIME = f"{REPLAY}, if no list were late"
-_DECISIONS = "other decisions than those of the replaying EKF"
+_DECISIONS = "association unlike that of ekf-replay"
 Squares = Sequence[FloatArray]
 """Squared errors of the states of so long ago."""
 
@@ -146,7 +146,7 @@ def _explained(replays: PairedReplay, *, best: Config, runs: Mapping[str, FloatA
     if best != config:
         ways["noise that is not tuned"] = fitted
     if estimator == PUBLISHED:
-        ways["its time grid"] = policies[FORGET][0]
+        ways["time grid of the filter"] = policies[FORGET][0]
         ways["forgetting what was fused since"] = policies[REPLAY][0]
     elif estimator != REPLAY:
         ways[f"{estimator} instead of replay"] = policies[REPLAY][0]

@@ -39,7 +39,9 @@ def ledger(
     if figure is not None:
         with new_file(figure, overwrite) as file:
             parts = [(item.cause, item.mean_square_m2) for item in result.waterfall]
-            file.write(png(waterfall(parts, f"{result.estimator}: error of the present")))
+            predicted = "" if result.with_truth else ", as it predicts it (no truth)"
+            title = f"Where the position error of {result.estimator} comes from{predicted}"
+            file.write(png(waterfall(parts, title)))
     show(result.tables, "json" if as_json else None)
     if not as_json:
         say("")

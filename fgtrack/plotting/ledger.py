@@ -21,19 +21,23 @@ def waterfall(parts: Sequence[tuple[str, float]], title: str, **paper: Unpack[Pa
     """
     sheet = Sheet(9.0, 1.2 + 0.42 * (len(parts) + 1), paper)
     axes = sheet.plots(1)[0, 0]
-    ends = [end for _, end in parts]
-    names = ["error now", *(cause for cause, _ in parts[1:]), "nobody late"]
-    steps = [(after, before - after, "") for before, after in itertools.pairwise(ends)]
-    bars = [(0.0, ends[0], GREY), *steps, (0.0, ends[-1], GREY)]
-    for row, (start, length, colour) in enumerate(bars):
-        own = colour or (SENSORS[0] if length > 0.0 else SENSORS[1])
-        axes.barh(row, length, left=start, height=_HEIGHT, color=own)
-        rms = math.sqrt(start + length) if colour else math.sqrt(max(start, 0.0))
-        label = f"{rms:.2f} m" if colour else f"{100.0 * length / ends[0] + 0.0:.0f} % of it; without: {rms:.2f} m"
-        axes.text(max(start, start + length) + 0.01 * max(ends), row, label, va="center")
+    ends, names = [end for _, end in parts], ["error now", *(cause for cause, _ in parts[1:]), "if nothing were late"]
+    steps = [*itertools.pairwise(ends), (ends[-1], 0.0)]
+    for row, (before, after) in enumerate([(ends[0], 0.0), *steps]):
+        is_end, root = row in (0, len(steps)), f"{math.sqrt(before):.2f} m"
+        colour = GREY if is_end else SENSORS[0] if before > after else SENSORS[1]
+        axes.barh(row, before - after, left=after, height=_HEIGHT, color=colour)
+        label = (
+            root
+            if is_end
+            else f"{round(100.0 * (before - after) / ends[0])} % of it: {root} to {math.sqrt(after):.2f} m"
+        )
+        axes.text(max(before, after) + 0.01 * max(ends), row, label, va="center")
+        if row:  # from the bar above
+            axes.plot([before, before], [row - 1.0 + _HEIGHT / 2, row - _HEIGHT / 2], color=GREY, linewidth=0.8)
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(len(names) - 0.4, -0.6)
-    axes.set_xlim(0.0, 1.35 * max(ends))
-    axes.set_xlabel("mean square error of the position [m²]")
+    axes.set_xlim(0.0, 1.45 * max(ends))
+    axes.set_xlabel("mean square of the position error [m²] (in the labels: its root)")
     axes.set_title(title)
     return sheet.figure

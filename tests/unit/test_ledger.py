@@ -1,6 +1,7 @@
 """Where the error of the present comes from."""
 
 import math
+import pickle
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -48,13 +49,14 @@ def test_the_parts_add_up_to_the_difference_of_the_ends(karle: Ledger) -> None:
     causes = [part.cause for part in rest]
     assert causes[-4:] == [
         "noise that is not tuned",
-        "its time grid",
+        "time grid of the filter",
         "forgetting what was fused since",
         "late arrival, everything kept",
     ]
     total = sum(part.share_m2.mean for part in rest)
     assert total == pytest.approx(first.mean_square_m2 - rest[-1].mean_square_m2, abs=1e-12)
     assert rest[-1].share_m2.mean > 0.0  # lateness costs
+    assert str(pickle.loads(pickle.dumps(karle))) == str(karle)
 
 
 def test_a_wrong_clock_has_a_part(messages: list[Message]) -> None:
@@ -146,7 +148,7 @@ def test_a_run_folder_stands_for_its_recording(tmp_path: Path) -> None:
 def test_the_figure_names_every_part(karle: Ledger) -> None:
     [axes] = waterfall([(part.cause, part.mean_square_m2) for part in karle.waterfall], "title").axes
     labels = [label.get_text() for label in axes.get_yticklabels()]
-    assert labels == ["error now", *(part.cause for part in karle.waterfall[1:]), "nobody late"]
+    assert labels == ["error now", *(part.cause for part in karle.waterfall[1:]), "if nothing were late"]
 
 
 def test_sensors_need_no_configuration(messages: list[Message]) -> None:

@@ -51,6 +51,14 @@ def two_digits(value: Value) -> str:
     return "0" if text == "0.00000" else text
 
 
+def _yes(record: Record) -> bool:
+    return True
+
+
+def _no(record: Record) -> bool:
+    return False
+
+
 @dataclass(frozen=True)
 class Column:
     """One or several numbers of every record, in one cell."""
@@ -68,7 +76,7 @@ class Column:
     """True for text, which is aligned left. The leading columns of text name the rows."""
     is_extra: bool = False
     """True if the column is shown only where the table is shown in full."""
-    bold: Callable[[Record], bool] = lambda record: False
+    bold: Callable[[Record], bool] = _no
 
     def cell(self, record: Record) -> str:
         """Text of the numbers of `record`; a dash without any."""
@@ -116,7 +124,7 @@ class Table:
     """Lines below the table."""
     is_detail: bool = False
     """True for a table that is shown only where a comparison is shown in full."""
-    is_main: Callable[[Record], bool] = lambda record: True
+    is_main: Callable[[Record], bool] = _yes
     """True for the records that are shown unless the table is shown in full."""
 
     __str__ = _text
