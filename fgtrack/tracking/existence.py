@@ -14,7 +14,7 @@ as it was when the detection arrived. Each list counts at its stamp, whatever th
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import compress
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat
@@ -37,6 +37,23 @@ _LIFE = np.dtype(
 )
 """True if it was ever confirmed, or as far from its first position as it must be; misses since the last match, and
 the newest stamps at which it was in view and probably visible."""
+
+
+class _Matches(NamedTuple):
+    """Detections of a list with the tracks that they matched, m."""
+
+    rows: IntArray
+    """Of the tracks, see `ExistenceLifecycle`, shape (m,)."""
+    stamps_ns: IntArray
+    sensors: IntArray
+    scores: FloatArray
+    """See `ExistenceLifecycle._score`."""
+    points_m: FloatArray
+    """Shape (m, 2), and of the states at the stamp (m, 2)."""
+    means_m: FloatArray
+    P: FloatArray
+    """Covariances of the positions of the states, shape (m, 2, 2), and of the detections."""
+    R: FloatArray
 
 
 @settings
@@ -99,6 +116,10 @@ class ExistenceLifecycle:
         self._histories = Histories(len(sensors), rules.lifetime_s, rules.visible_share, rules.visible_s)
         self._rows: dict[int, int] = {}  # of the arrays, by track id in order of birth
         self._lives = np.zeros(0, dtype=_LIFE)
+        self._matches: list[_Matches] = []  # that are not in the histories yet
+        own = sensors.values()
+        self._P_D = np.array([each.detection_probability for each in own])
+        self._clutter = np.array([each.clutter_per_m2 for each in own])
         self._reports: dict[int, tuple[TrackStatus, float]] | None = None  # by track id, once they are asked for
 
     def born(self, track_id: int, scan: Scan, candidate: Candidate) -> None:
@@ -110,7 +131,7 @@ class ExistenceLifecycle:
             self._lives = np.concatenate([self._lives, np.zeros(len(self._histories.counts) - len(self._lives), _LIFE)])
         self._reports = None
         self._lives[row] = False, self._rules.min_travel_m == 0.0, candidate.position_m, 0, scan.stamp_ns, scan.stamp_ns
-        self._confirm(np.array([row]))
+        self._confirm(np.array([row]), self._histories.present(np.array([row]), self._present_ns))
 
     def matched(self, scan: Scan, candidates: Candidates, pairs: Sequence[tuple[int, int]], states: StatesAt) -> None:
         """See `CountingLifecycle.matched`."""
@@ -118,23 +139,38 @@ class ExistenceLifecycle:
         if not placed:
             return
         chosen, tracks = np.array(placed).T
-        rows, means = self._rows_of(states.track_ids[track] for track in tracks.tolist()), states.means[tracks]
-        self._lives["misses"][rows] = 0
-        travelled_m = np.hypot(*(means[:, :2] - self._lives["first_m"][rows]).T)
-        self._lives["travelled"][rows] |= travelled_m >= self._rules.min_travel_m
-        sensor, leaders = self._sensors[scan.sensor], [candidates.leaders[position] for position in chosen.tolist()]
+        leaders = [candidates.leaders[position] for position in chosen.tolist()]
         scores = [self._score(scan, (leader, *candidates.merged.get(leader, ()))) for leader in leaders]
-        density = position_densities(candidates, chosen, means, states.covariances[tracks])
-        known, P_D = ~np.isnan(density), sensor.detection_probability
-        ratios = 1.0 - P_D + P_D * density / sensor.clutter_per_m2 * np.exp(scores)
-        self._learn(scan, rows[known], ratios[known])
-        self._confirm(rows)
+        rows = self._rows_of(states.track_ids[track] for track in tracks.tolist())
+        stamps_ns, sensors = np.full(len(rows), scan.stamp_ns), np.full(len(rows), self._index[scan.sensor])
+        at = candidates.lines[chosen, :2], states.means[tracks, :2], states.covariances[tracks, :2, :2]
+        spreads = position_covariances(candidates, chosen)
+        self._matches.append(_Matches(rows, stamps_ns, sensors, np.array(scores), *at, spreads))
+        self._reports = None
+
+    def _settle(self) -> None:
+        """Add the matches since the last time to the histories: of lists of one detection each, many at once."""
+        if not self._matches:
+            return
+        rows, stamps_ns, sensors, scores, points_m, means_m, P, R = map(
+            np.concatenate, zip(*self._matches, strict=True)
+        )
+        self._matches = []
+        self._lives["misses"][rows] = 0
+        travelled_m = np.hypot(*(means_m - self._lives["first_m"][rows]).T)
+        self._lives["travelled"][rows[travelled_m >= self._rules.min_travel_m]] = True
+        density, P_D = densities(points_m - means_m, P, R), self._P_D[sensors]
+        known = ~np.isnan(density)
+        ratios = 1.0 - P_D + P_D * density / self._clutter[sensors] * np.exp(scores)
+        exists = self._learn(*(each[known] for each in (rows, stamps_ns, sensors, ratios)))
+        self._confirm(rows[known], exists)
 
     def fused(self, track_ids: Iterable[int]) -> None:
         """See `CountingLifecycle.fused`; the match has counted already."""
 
     def missed(self, scan: Scan, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
         """See `CountingLifecycle.missed`."""
+        self._settle()
         sensor, rows = self._sensors[scan.sensor], self._rows_of(track_ids)
         self._newest_ns = max(self._newest_ns, scan.stamp_ns)
         ratios = np.full(len(rows), 1.0 - sensor.detection_probability)
@@ -142,17 +178,20 @@ class ExistenceLifecycle:
             poses = np.broadcast_to([scan.ego.x_m, scan.ego.y_m, scan.ego.yaw_rad], (len(rows), 3))
             ratios[~sensor.sees(positions_m, poses, self._origin_m)] = np.nan
         self._lives["misses"][rows] += ~np.isnan(ratios)
-        self._learn(scan, rows, ratios)
+        stamps_ns, sensors = np.full(len(rows), scan.stamp_ns), np.full(len(rows), self._index[scan.sensor])
+        self._learn(rows, stamps_ns, sensors, ratios)
         return self._ended()
 
     def expired(self, present_ns: int) -> list[int]:
         """See `CountingLifecycle.expired`."""
+        self._settle()
         self._present_ns, self._reports = present_ns, None
         self._histories.forget(present_ns - self._memory_ns)
         return self._ended()
 
     def forget(self, track_id: int) -> None:
         """See `CountingLifecycle.forget`."""
+        self._settle()
         self._histories.end(self._rows.pop(track_id))
         self._reports = None
 
@@ -168,6 +207,7 @@ class ExistenceLifecycle:
     def _reported(self) -> dict[int, tuple[TrackStatus, float]]:
         """Status and probability of all tracks, computed together when the first is asked for."""
         if self._reports is None:
+            self._settle()
             rows = self._rows_of(self._rows)
             lives, exists = self._lives[rows], self._histories.present(rows, self._present_ns)
             published = lives["confirmed"] & (exists >= self._rules.doubt_probability)
@@ -181,17 +221,17 @@ class ExistenceLifecycle:
     def _rows_of(self, track_ids: Iterable[int]) -> IntArray:
         return np.array([self._rows[track_id] for track_id in track_ids], dtype=np.int64)
 
-    def _learn(self, scan: Scan, rows: IntArray, ratios: FloatArray) -> None:
-        """Add the evidence of a list; `ratios` if visible, NaN where an object is out of view, shape (m,)."""
-        index = self._index[scan.sensor]
-        self._histories.learn(rows, scan.stamp_ns, index, ratios)
-        visible, self._reports = self._histories.visible(rows)[:, index] >= 0.5, None
-        for name, chosen in (("in_view_ns", ~np.isnan(ratios)), ("visible_ns", visible)):
-            self._lives[name][rows[chosen]] = np.maximum(self._lives[name][rows[chosen]], scan.stamp_ns)
+    def _learn(self, rows: IntArray, stamps_ns: IntArray, sensors: IntArray, ratios: FloatArray) -> FloatArray:
+        """Add evidence to the histories, `ratios` NaN out of view; returns existence after each, shapes (m,)."""
+        self._reports = None
+        visible, exists = self._histories.learn(rows, stamps_ns, sensors, ratios, self._present_ns)
+        for name, chosen in (("in_view_ns", ~np.isnan(ratios)), ("visible_ns", visible >= 0.5)):
+            np.maximum.at(self._lives[name], rows[chosen], stamps_ns[chosen])
+        return exists
 
-    def _confirm(self, rows: IntArray) -> None:
-        exists = self._histories.present(rows, self._present_ns) >= self._rules.confirm_probability
-        self._lives["confirmed"][rows] |= exists & self._lives["travelled"][rows]
+    def _confirm(self, rows: IntArray, exists: FloatArray) -> None:
+        probable = rows[exists >= self._rules.confirm_probability]
+        self._lives["confirmed"][probable] |= self._lives["travelled"][probable]
 
     def _ended(self) -> list[int]:
         """Return the ids of the tracks that end."""
@@ -215,11 +255,21 @@ Lifecycle = CountingLifecycle | ExistenceLifecycle
 
 
 def position_densities(candidates: Candidates, chosen: IntArray, means: FloatArray, P: FloatArray) -> FloatArray:
-    """N(z - h(x); 0, S) of the positions of `chosen` (m,) at states (m, n), (m, n, n), in 1/m^2; NaN if singular."""
-    y, R = candidates.lines[chosen, :2] - means[:, :2], np.empty((len(chosen), 2, 2))
+    """Return `densities` of the positions of `chosen` (m,) at states (m, n), (m, n, n)."""
+    y_m = candidates.lines[chosen, :2] - means[:, :2]
+    return densities(y_m, P[:, :2, :2], position_covariances(candidates, chosen))
+
+
+def position_covariances(candidates: Candidates, chosen: IntArray) -> FloatArray:
+    """Covariances of the positions of `chosen` (m,), shape (m, 2, 2)."""
+    R = np.empty((len(chosen), 2, 2))
     for group, members, here in candidates.split(chosen):
         R[here] = group.position_covariances(members)
-    own, H = np.array(P[:, :2, :2], dtype=np.float64, order="C"), np.eye(2)[None]
-    rows = np.arange(len(y)), R, np.arange(y.shape[1])
-    _, nis, logdet = kernels("fgtrack.estimation.kernels.kalman").innovations(y, H, own, *rows)
+    return R
+
+
+def densities(y_m: FloatArray, P: FloatArray, R: FloatArray) -> FloatArray:
+    """N(y; 0, P + R) of innovations of positions (m, 2) with both covariances (m, 2, 2), in 1/m^2; NaN if singular."""
+    own, H, every = np.array(P, dtype=np.float64, order="C"), np.eye(2)[None], np.arange(len(y_m))
+    _, nis, logdet = kernels("fgtrack.estimation.kernels.kalman").innovations(y_m, H, own, every, R, np.arange(2))
     return np.asarray(np.exp(-0.5 * (nis + logdet)) / math.tau)

@@ -52,23 +52,23 @@ class Histories:
         self.counts[row] = 1
         return row
 
-    def learn(self, rows: IntArray, stamp_ns: int, sensor: int, ratios: FloatArray) -> None:
-        """Add the evidence of a list of `sensor` on the tracks in `rows`; shapes (m,), see `RATIO`.
-        What is older than all that is remembered counts as the oldest.
+    def learn(
+        self, rows: IntArray, stamps_ns: IntArray, sensors: IntArray, ratios: FloatArray, present_ns: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Add evidence of lists at `stamps_ns` of `sensors` on the tracks in `rows`, one after the other; see `RATIO`.
+        What is older than all that is remembered counts as the oldest. Returns the probabilities, after each, of being
+        visible to its sensor and of existing at `present_ns`, all shapes (m,).
         """
-        if len(rows) and self.counts[rows].max() == self.numbers.shape[1]:
+        while len(rows) and self.counts[rows].max() + np.bincount(rows).max() > self.numbers.shape[1]:
             self._grow(axis=1)
-        history = self.numbers, self.entries, self.counts
-        kernels(_KERNELS).learn(rows, stamp_ns, sensor, ratios, *history, *self._chain)
+        history = self.numbers, self.entries, self.counts, *self._chain
+        visible, exists = kernels(_KERNELS).learn(rows, stamps_ns, sensors, ratios, present_ns, *history)
+        return visible, exists
 
     def present(self, rows: IntArray, present_ns: int) -> FloatArray:
         """Return the probabilities that the objects exist at `present_ns`, not before their newest evidence, (m,)."""
         history = self.numbers, self.entries, self.counts, self._chain[0]
         return np.asarray(kernels(_KERNELS).present(rows, present_ns, *history))
-
-    def visible(self, rows: IntArray) -> FloatArray:
-        """Return the probabilities of being visible to each sensor after the newest evidence, shape (m, sensors)."""
-        return np.asarray(self.numbers[rows, self.counts[rows] - 1, VISIBLE:])
 
     def forget(self, oldest_ns: int) -> None:
         """Remember what is older than `oldest_ns` by its outcome alone."""

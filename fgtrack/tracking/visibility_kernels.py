@@ -42,35 +42,51 @@ def _conclude(
     numbers[k, LOG_ODDS] = min(max(changed, -LARGEST_LOG_ODDS), LARGEST_LOG_ODDS)
 
 
+@inlined
+def _existing(
+    own: int, present_ns: int, numbers: FloatArray, entries: IntArray, counts: IntArray, lifetime_s: float
+) -> float:
+    k = counts[own] - 1
+    log_odds = _survived(numbers[own, k, LOG_ODDS], present_ns - entries[own, k, STAMP], lifetime_s)
+    return 1.0 / (1.0 + math.exp(-log_odds))
+
+
 @njit(
-    "(int64[::1], int64, int64, float64[::1], float64[:, :, ::1], int64[:, :, ::1], int64[::1], float64, float64,"
-    " float64)"
+    "(int64[::1], int64[::1], int64[::1], float64[::1], int64, float64[:, :, ::1], int64[:, :, ::1], int64[::1],"
+    " float64, float64, float64)"
 )
 def learn(
     rows: IntArray,
-    stamp_ns: int,
-    sensor: int,
+    stamps_ns: IntArray,
+    sensors: IntArray,
     ratios: FloatArray,
+    present_ns: int,
     numbers: FloatArray,
     entries: IntArray,
     counts: IntArray,
     lifetime_s: float,
     visible_share: float,
     visible_s: float,
-) -> None:
-    """Insert an entry into the tracks `rows` in order of stamps, and recompute from there on."""
+) -> tuple[FloatArray, FloatArray]:
+    """Insert entries into the tracks `rows`, each in order of stamps, and recompute from there on.
+    Returns the probabilities, after each, of being visible to its sensor and of existing at `present_ns`, (m,).
+    """
+    visible, exists = np.empty(len(rows)), np.empty(len(rows))
     for m in range(len(rows)):
-        own, at = rows[m], counts[rows[m]]
+        own, at, stamp_ns = rows[m], counts[rows[m]], stamps_ns[m]
         while at > 1 and entries[own, at - 1, STAMP] > stamp_ns:
             numbers[own, at, RATIO] = numbers[own, at - 1, RATIO]
             for j in range(VIEWED):
                 entries[own, at, j] = entries[own, at - 1, j]
             at -= 1
         counts[own] += 1
-        numbers[own, at, RATIO], entries[own, at, SENSOR] = ratios[m], sensor
+        numbers[own, at, RATIO], entries[own, at, SENSOR] = ratios[m], sensors[m]
         entries[own, at, STAMP] = max(stamp_ns, entries[own, 0, STAMP])
         for k in range(at, counts[own]):
             _conclude(numbers[own], entries[own], k, lifetime_s, visible_share, visible_s)
+        visible[m] = numbers[own, counts[own] - 1, VISIBLE + sensors[m]]
+        exists[m] = _existing(own, present_ns, numbers, entries, counts, lifetime_s)
+    return visible, exists
 
 
 @njit("float64[::1](int64[::1], int64, float64[:, :, ::1], int64[:, :, ::1], int64[::1], float64)")
@@ -80,9 +96,7 @@ def present(
     """Return existence probabilities at `present_ns`, shape (m,)."""
     result = np.empty(len(rows))
     for m in range(len(rows)):
-        own, k = rows[m], counts[rows[m]] - 1
-        log_odds = _survived(numbers[own, k, LOG_ODDS], present_ns - entries[own, k, STAMP], lifetime_s)
-        result[m] = 1.0 / (1.0 + math.exp(-log_odds))
+        result[m] = _existing(rows[m], present_ns, numbers, entries, counts, lifetime_s)
     return result
 
 

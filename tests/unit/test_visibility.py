@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fgtrack.core.types import FloatArray
-from fgtrack.tracking.visibility import LOG_ODDS, Histories
+from fgtrack.tracking.visibility import LOG_ODDS, VISIBLE, Histories
 
 LIFETIME_S, VISIBLE_S = 7.0, 3.0
 S = 1_000_000_000
@@ -26,7 +26,12 @@ def history(log_odds: float = 0.3, share: float = 0.7) -> Histories:
 
 
 def learn(histories: Histories, time_s: float, sensor: int, ratio: float) -> None:
-    histories.learn(ONE, round(time_s * S), sensor, np.array([ratio]))
+    histories.learn(ONE, np.array([round(time_s * S)]), np.array([sensor]), np.array([ratio]), 0)
+
+
+def visibility(histories: Histories) -> FloatArray:
+    """Probabilities of being visible to each sensor after the newest evidence, shape (1, sensors)."""
+    return histories.numbers[ONE, histories.counts[ONE] - 1, VISIBLE:]
 
 
 def by_all_states(log_odds: float, share: float, until_s: float) -> tuple[float, FloatArray]:
@@ -65,7 +70,7 @@ def test_existence_and_visibility_are_those_of_the_hidden_markov_model_with_all_
         learn(histories, *evidence)
     r, visible = by_all_states(0.3, share, 6.0)
     assert histories.present(ONE, 6 * S) == pytest.approx([r], rel=1e-9)
-    assert histories.visible(ONE)[0] == pytest.approx(visible, rel=1e-9)
+    assert visibility(histories)[0] == pytest.approx(visible, rel=1e-9)
 
 
 def test_evidence_counts_at_its_own_stamp_in_whatever_order_it_arrives() -> None:
@@ -74,7 +79,7 @@ def test_evidence_counts_at_its_own_stamp_in_whatever_order_it_arrives() -> None
         histories = history()
         for evidence in order:
             learn(histories, *evidence)
-        found.add((float(histories.present(ONE, 6 * S)[0]), *histories.visible(ONE)[0].tolist()))
+        found.add((float(histories.present(ONE, 6 * S)[0]), *visibility(histories)[0].tolist()))
     assert len(found) == 1
 
 
@@ -99,10 +104,10 @@ def test_misses_in_a_row_cost_little_more_than_the_first_and_another_sensor_is_n
         lost.append(before - histories.numbers[0, histories.counts[0] - 1, LOG_ODDS])
     assert lost[0] > 1.5
     assert max(lost[3:]) < 0.1
-    visible = histories.visible(ONE)
+    visible = visibility(histories)
     learn(histories, 1.0, 1, 20.0)
-    assert histories.visible(ONE)[0, 0] == visible[0, 0] < 0.05
-    assert histories.visible(ONE)[0, 1] > 0.9
+    assert visibility(histories)[0, 0] == visible[0, 0] < 0.05
+    assert visibility(histories)[0, 1] > 0.9
 
 
 def test_many_tracks_with_long_histories_are_as_each_alone() -> None:
@@ -114,6 +119,6 @@ def test_many_tracks_with_long_histories_are_as_each_alone() -> None:
     alone = history(0.4)
     for k in range(60):
         ratios = rng.uniform(0.1, 4.0, 20)
-        together.learn(rows, (k + 1) * S // 10, k % 2, ratios)
+        together.learn(rows, *(np.full(len(rows), each) for each in ((k + 1) * S // 10, k % 2)), ratios, 0)
         learn(alone, 0.1 * (k + 1), k % 2, ratios[4])
     assert together.present(rows, 6 * S)[4] == alone.present(ONE, 6 * S)[0]
