@@ -64,6 +64,7 @@ app = typer.Typer(
     name="fgtrack",
     cls=_LazyCommands,
     help="Track objects from delayed object lists, and compare how delays are dealt with.",
+    epilog="Exit codes: 0 done, 1 bad data or run, 2 bad call.",
     **{**_STYLE, "add_completion": True},
 )
 
