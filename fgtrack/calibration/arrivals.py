@@ -10,8 +10,8 @@ import numpy as np
 from fgtrack.calibration.finding import Finding, milliseconds, nice_above, percent
 from fgtrack.core.diagnostic import EGO
 from fgtrack.core.time import NS_PER_S
-from fgtrack.core.types import DetectionList, EgoState, FloatArray, IntArray, Message
-from fgtrack.io.info import OwnOrder
+from fgtrack.core.types import BoolArray, DetectionList, EgoState, FloatArray, IntArray, Message
+from fgtrack.io.info import OTHER_CLOCK_S, OwnOrder
 from fgtrack.pipeline.config import Config
 from fgtrack.tracking.existence import ExistenceRules
 
@@ -21,7 +21,6 @@ FEWEST = 20
 """Messages below which nothing is concluded."""
 _REGULAR = 0.2  # of the period: stamps that scatter more have none
 _LONGEST_LOSS = 40  # periods; what is silent for longer was switched off, or had nothing to report
-_OTHER_CLOCK_S = 3600.0
 _LOST = 0.001  # share of detections that may fall beyond a window
 _SPARE = 1.2
 LONGEST_STORAGE_S = 60.0
@@ -47,6 +46,11 @@ class Arrivals:
         return (self.receipts_ns - self.stamps_ns) / NS_PER_S
 
     @cached_property
+    def usable(self) -> BoolArray:
+        """True of stamps within an hour of their receipt, shape (n,); of all where the clocks are unrelated."""
+        return np.asarray((np.abs(self.delays_s) <= OTHER_CLOCK_S) | self.is_other_clock)
+
+    @cached_property
     def steps_s(self) -> FloatArray:
         """Time between neighbouring different stamps."""
         return np.asarray(np.diff(np.unique(self.stamps_ns)) / NS_PER_S, dtype=np.float64)
@@ -64,7 +68,7 @@ class Arrivals:
     @property
     def is_other_clock(self) -> bool:
         """True if stamps and receipts are of unrelated clocks."""
-        return bool(self.stamps_ns.any()) and abs(float(np.median(self.delays_s))) > _OTHER_CLOCK_S
+        return bool(self.stamps_ns.any()) and abs(float(np.median(self.delays_s))) > OTHER_CLOCK_S
 
     @property
     def is_receipt(self) -> bool:
@@ -73,12 +77,12 @@ class Arrivals:
 
     def quantile_s(self, share: float) -> float:
         """Return the delay that so many detections do not exceed; of lists where there are no detections."""
-        weights = self.counts if self.counts.any() else None
-        return float(np.quantile(self.delays_s, share, weights=weights, method="inverted_cdf"))
+        weights = self.counts[self.usable] if self.counts[self.usable].any() else None
+        return float(np.quantile(self.delays_s[self.usable], share, weights=weights, method="inverted_cdf"))
 
     def beyond(self, lag_s: float) -> float:
         """Return the share of the detections with a longer delay."""
-        return float(self.counts[self.delays_s > lag_s].sum() / max(self.counts.sum(), 1))
+        return float(self.counts[(self.delays_s > lag_s) & self.usable].sum() / max(self.counts.sum(), 1))
 
     @property
     def lost(self) -> float | None:

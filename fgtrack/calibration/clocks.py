@@ -41,6 +41,10 @@ def stamp_findings(one: Arrivals) -> Iterator[Finding]:
                 "is ahead of the recorder's by at least that."
             )
             yield Finding("clock", name, 85.0, text)
+        if not one.usable.all():
+            share = percent(1.0 - float(one.usable.mean()))
+            text = f"{share} of its stamps are more than an hour from their receipt: wrong."
+            yield Finding("clock", name, 40.0, text)
         if one.is_receipt and name != EGO:
             text = "every stamp is the receipt, so nothing is known of its delay; a constant one is its clock_offset_s."
             yield Finding("receipt", name, 20.0, text)

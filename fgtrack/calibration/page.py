@@ -80,7 +80,7 @@ class Advice:
                 "period_s": item.period_s,
                 "delay_p50_s": item.quantile_s(0.5),
                 "delay_p95_s": item.quantile_s(0.95),
-                "delay_max_s": float(item.delays_s.max()),
+                "delay_max_s": float(item.delays_s[item.usable].max()),
                 "overtaken": self.overtaken[item.name],
                 "object_late": item.object_late,
                 "lost": item.lost,

@@ -120,9 +120,7 @@ def _topics(found: InputInfo, unused: str) -> Table:
         Column("taken as", "taken_as", left=True),
         Column("type", left=True),
     ]
-    notes = [
-        f"{topic.name}: {topic.note}" for topic in found.topics if topic.note is not None and topic.used_as is None
-    ]
+    notes = [f"{topic.name}: {topic.note}" for topic in found.topics if topic.note is not None]
     extent = "empty"
     if found.start_ns is not None:
         start = datetime.fromtimestamp(found.start_ns // 1_000_000_000, UTC)

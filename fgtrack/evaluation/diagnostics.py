@@ -180,6 +180,8 @@ def _sensors(run: Run) -> Iterator[Diagnostic]:
     for sensor, mine, name, count in _mostly(run):
         if (name == "too_old" and sensor in unset) or (name == "failed" and not run.tables["ego"].num_rows):
             continue
+        if name == "duplicate" and (_section(run, "sensors").get(sensor) or {}).get("copies_s"):
+            continue  # copies of messages that several receivers heard are expected
         by = reasons((run.meta.get("out_of_bounds") or {}).get(sensor, {}))
         cure = _too_old(run, sensor, mine) if name == "too_old" else _CURES[name].format(sensor=sensor, reasons=by)
         yield Diagnostic(sensor, f"{count} of {mine.num_rows} {name}: {cure}")

@@ -105,6 +105,10 @@ def _topic(topic: BagTopic, times: Sequence[_Times], used_as: str | None, own: S
         delay = {"mean_s": float(delays_s.mean()), "p50_s": p50_s, "p90_s": p90_s, "max_s": max_s}
         if abs(p50_s) > OTHER_CLOCK_S:
             note = "its stamps are of another clock than the recorder's (simulated time?)"
+        elif (wrong := np.abs(delays_s) > OTHER_CLOCK_S).any():
+            own_s = delays_s[~wrong]
+            delay |= {"mean_s": float(own_s.mean()), "max_s": float(own_s.max())}
+            note = f"{wrong.sum()} stamps are more than an hour from their receipt, and left out of the delays"
     receipts_ns = {receipt_ns for receipt_ns, _ in times}
     if len(receipts_ns) > 1:
         rate_hz = (len(receipts_ns) - 1) / seconds(max(receipts_ns) - min(receipts_ns))

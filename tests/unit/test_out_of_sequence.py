@@ -4,12 +4,15 @@ from dataclasses import replace
 
 import pytest
 
-from fgtrack.calibration.arrivals import arrivals_of, overtaken
+from fgtrack.calibration.arrivals import arrivals_of, overtaken, window_findings
+from fgtrack.calibration.clocks import stamp_findings
 from fgtrack.core.types import Detection, DetectionList
+from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.io.info import describe
 from fgtrack.io.recording import write_recording
 from fgtrack.pipeline.public import replay
+from fgtrack.pipeline.shipped import read_config
 
 MS = 1_000_000
 
@@ -26,6 +29,33 @@ def test_info_counts_both_meanings(tmp_path):
     (topic,) = describe(tmp_path / "a.jsonl").topics
     assert topic.late["stream_share"] == pytest.approx(3 / 4)
     assert topic.late["object_share"] == pytest.approx(1 / 3)
+
+
+def test_wrong_stamps_are_left_out_of_delays_and_advice(tmp_path):
+    hours_ms = 3_600_000 * 10
+    given = [listed(hours_ms + 100 * k, 0 if k % 50 == 7 else hours_ms + 100 * k - 40, "A") for k in range(500)]
+    write_recording(tmp_path / "a.jsonl", given)
+    (topic,) = describe(tmp_path / "a.jsonl").topics
+    assert topic.delay == pytest.approx(dict.fromkeys(("mean_s", "p50_s", "p90_s", "max_s"), 0.04))
+    assert topic.note.startswith("10 stamps are more than an hour")
+    (one,) = arrivals_of(given).values()
+    assert one.quantile_s(0.999) == pytest.approx(0.04)
+    (found,) = [each for each in stamp_findings(one) if "an hour" in each.text]
+    assert found.text.startswith("2.0 %")
+    config = read_config("adsb")
+    assert not [each for each in window_findings([one], config) if "max_delay_s" in str(each.settings)]
+
+
+def test_copies_that_are_configured_are_no_defect():
+    copies = [
+        replace(listed(10 * k, 10 * k - 5 - n, "A"), receipt_ns=(10 * k + n) * MS)
+        for k in range(1, 40)
+        for n in range(3)
+    ]
+    lists = [replace(each, objects=(Detection(10.0 + each.receipt_ns // (10 * MS), 2.0, id="A"),)) for each in copies]
+    run = replay(lists, "adsb")
+    assert run.meta["counts"]["adsb"]["duplicate"] > 60
+    assert not [each for each in diagnostics(run) if "duplicate" in each.text]
 
 
 def test_what_comes_at_once_is_not_late(tmp_path):
