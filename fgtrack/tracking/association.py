@@ -167,16 +167,29 @@ def chi_square_quantile(probability: float, freedom: int) -> float:
 
 def assigned(pairs: Pairs, num_candidates: int, num_tracks: int) -> Assignment:
     """Assignment of as many of `pairs` as possible at least total cost, which are their values."""
-    if num_candidates == 1 and len(pairs.rows) > 1:
-        pairs = pairs.at(pairs.values.argmin(axis=0, keepdims=True))
     i, j = pairs.rows.tolist(), pairs.columns.tolist()
-    if not len(set(i)) == len(set(j)) == len(i):
-        if num_candidates > num_tracks:
+    if _compete(i, j):
+        pairs = pairs.at(_uncontested(pairs.rows, pairs.columns, pairs.values))
+        pairs = pairs.at(_uncontested(pairs.columns, pairs.rows, pairs.values))
+        i, j = pairs.rows.tolist(), pairs.columns.tolist()
+        if _compete(i, j) and num_candidates > num_tracks:
             j, i = _least_cost(pairs.columns, pairs.rows, pairs.values, num_tracks, num_candidates)
-        else:
+        elif _compete(i, j):
             i, j = _least_cost(*pairs, num_candidates, num_tracks)
     new, missed = set(range(num_candidates)).difference(i), set(range(num_tracks)).difference(j)
     return Assignment(sorted(zip(i, j, strict=True)), sorted(new), sorted(missed))
+
+
+def _compete(i: list[int], j: list[int]) -> bool:
+    return not len(set(i)) == len(set(j)) == len(i)
+
+
+def _uncontested(i: IntArray, j: IntArray, cost: FloatArray) -> BoolArray:
+    """True of all pairs, but of an i with several j that no other i may take only of the cheapest one, shape (m,)."""
+    shared, order = np.bincount(j)[j] > 1, np.lexsort((cost, i))
+    cheapest = np.ones(len(i), dtype=bool)
+    cheapest[order[1:]] = i[order[1:]] != i[order[:-1]]
+    return cheapest | (np.bincount(i, shared)[i] > 0.0)
 
 
 def _least_cost(
