@@ -1,3 +1,4 @@
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -218,3 +219,13 @@ def test_any_history_of_operations_is_that_of_a_bank_of_lists(seed: int, length:
                 track = naive.tracks[track_id]
                 np.testing.assert_allclose(states.means[row], track.means[place], rtol=1e-9, atol=1e-7)
                 np.testing.assert_allclose(states.covariances[row], track.covariances[place], rtol=1e-7, atol=1e-8)
+
+
+def test_a_copy_of_a_bank_goes_on_alone() -> None:
+    original = bank()
+    original.birth(7, Start(stamp_ns=START_NS, yaw_rad=0.0, speed_mps=20.0))
+    clone = copy.deepcopy(original)
+    before = original.states_at(START_NS).means.copy()
+    clone.update(START_NS, [7], [Measurement(START_NS, POSITION, np.array([1.0, 1.0]), 0.1 * np.eye(2))])
+    np.testing.assert_array_equal(original.states_at(START_NS).means, before)
+    assert not np.array_equal(clone.states_at(START_NS).means, before)

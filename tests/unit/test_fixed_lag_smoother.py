@@ -1,5 +1,6 @@
 """What a smoother promises of its window, its relinearisation and its outputs."""
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -175,3 +176,34 @@ def test_a_motion_model_in_numpy_gives_what_the_same_one_compiled_gives() -> Non
         states = [each.state_at(ms * MS) for each in (compiled, numpy)]
         np.testing.assert_allclose(states[1].mean, states[0].mean, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(states[1].covariance, states[0].covariance, rtol=1e-10, atol=1e-14)
+
+
+@pytest.mark.parametrize("make", [SmootherBank, IncrementalBank, BatchBank])
+def test_noise_that_is_no_covariance_fails_updates_and_leaves_the_states(make: type[SmootherBank]) -> None:
+    class Faulty(CV):
+        sign = 1.0
+
+        def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
+            return type(self).sign * super().process_noise(x, dt_s)
+
+        def transition(self, x: FloatArray, dt_s: float | FloatArray) -> Transition:
+            return MotionModel.transition(self, x, dt_s)
+
+    estimator = SingleObject(Faulty(), make(Faulty(), lag_s=1.0), Start())
+    for k in range(1, 10):
+        Faulty.sign = 1.0 if k < 4 else -1e3
+        stamp_ns = k * 100_000_000
+        status = estimator.update(Measurement.of(stamp_ns, x_m=float(k), y_m=0.0, std=0.3)).status
+        assert status is (UpdateStatus.IN_SEQUENCE if k < 4 else UpdateStatus.FAILED)
+        assert 0.0 < estimator.state_at(stamp_ns).covariance[0, 0] < np.inf
+
+
+def test_a_copy_converges_as_its_original() -> None:
+    estimator = SingleObject(CTRV(), SmootherBank(CTRV(), lag_s=1.0), Start(yaw_rad=0.0, speed_mps=10.0))
+    for k in range(1, 6):
+        estimator.update(Measurement.of(k * 100_000_000, x_m=float(k), y_m=0.3 * k * k, std=0.1))
+    clone = copy.deepcopy(estimator)
+    for each in (estimator, clone):
+        each.bank.converge()
+    for k in (1, 3, 5):
+        np.testing.assert_array_equal(clone.state_at(k * 100_000_000).mean, estimator.state_at(k * 100_000_000).mean)

@@ -21,6 +21,7 @@ from fgtrack.estimation.filters.ekf import Correction, correct
 from fgtrack.estimation.filters.propagation import ExactPropagator, kinematic_states
 from fgtrack.models.motion import MotionModel
 
+_KERNELS = "fgtrack.estimation.kernels.storage"
 #: In the order of the numbers that the kernels give.
 _STATUS = UpdateStatus.FAILED, UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE
 
@@ -40,7 +41,6 @@ class BackwardForwardBank:
         self._now_ns: int | None = None
         self._grid_ns = 0  # stamp of the newest grid state
         self._grid = 0  # its index
-        self._kernels = kernels("fgtrack.estimation.kernels.storage")
         self._rows: dict[int, int] = {}  # of the arrays, by track id in order of birth
         self._order: IntArray | None = None  # of all tracks by birth, until one comes or goes
         self._free = list[int]()
@@ -98,7 +98,7 @@ class BackwardForwardBank:
             return no_states(self._propagator.motion.dim)
         m, n = len(rows), self._propagator.motion.dim
         means, covariances, steps = np.empty((m, n)), np.empty((m, n, n)), np.empty(m, dtype=np.int64)
-        self._kernels.look_up(grid, is_present, rows, *self._arrays, means, covariances, steps)
+        kernels(_KERNELS).look_up(grid, is_present, rows, *self._arrays, means, covariances, steps)
         ahead = self._propagator.propagate(means, covariances, steps, self._step_s)
         self._cached[grid] = states = StatesAt(track_ids, *ahead)
         return states
@@ -162,7 +162,7 @@ class BackwardForwardBank:
         rows = np.array([self._rows[track_id] for track_id in track_ids])
         at = self._oldest, self._grid - back, self._visible_from(back), stamp_ns, rows
         states = self._propagator.wrap(corrected.mean), corrected.covariance
-        codes: list[int] = self._kernels.store(*at, corrected.fused, *states, *self._arrays).tolist()
+        codes: list[int] = kernels(_KERNELS).store(*at, corrected.fused, *states, *self._arrays).tolist()
         return codes
 
     def _allocate(self, rows: int) -> None:

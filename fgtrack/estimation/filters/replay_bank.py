@@ -27,6 +27,7 @@ from fgtrack.estimation.object_bank import ObjectBank
 from fgtrack.models.measurement import MeasurementModel, measurement_model
 from fgtrack.models.motion import WhiteNoise
 
+_KERNELS = "fgtrack.estimation.kernels.replay"
 #: In the order of the numbers that the kernels give.
 _STATUS = UpdateStatus.FAILED, UpdateStatus.TOO_OLD, UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE
 
@@ -41,7 +42,6 @@ class ReplayBank(ObjectBank[ReplayEkf]):
 
     def __init__(self, motion: WhiteNoise, start: Callable[[Start], ReplayEkf], lag_s: float) -> None:
         super().__init__(motion, start, lag_s)
-        self._kernels = kernels("fgtrack.estimation.kernels.replay")
         self._kind, self._density = motion.kind, motion.density
         self._start_ns = -int(LARGEST_NS)  # of all windows, by the clock
         self._rows: dict[int, int] = {}  # of tracks in the arrays
@@ -88,7 +88,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
             return self.states_at(stamp_ns).of(track_id)
         known, means, covariances = np.empty(1, dtype=bool), np.empty((1, n)), np.empty((1, n, n))
         at = np.array([row]), self._start_ns, stamp_ns, False
-        count = self._kernels.ahead(self._kind, self._density, *self._arrays[:4], *at, means, covariances, known)
+        count = kernels(_KERNELS).ahead(self._kind, self._density, *self._arrays[:4], *at, means, covariances, known)
         return StatesAt((track_id,), means, covariances) if count else no_states(n)
 
     def present(self) -> Sequence[TrackState]:
@@ -139,14 +139,14 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         z, R = (np.ascontiguousarray(each, dtype=np.float64) for each in (one.z, one.R))
         y, S, nis, status = np.empty((m, k)), np.empty((m, k, k)), np.empty(m), np.empty(m, dtype=np.int64)
         now = self._lag_ns, self._start_ns, stamp_ns, one.model.selected
-        count = self._kernels.fuse(
+        count = kernels(_KERNELS).fuse(
             self._kind, self._density, *self._arrays, rows, *now, z, R, one.measured, y, S, nis, status
         )
         if count == self._shape[1]:
             self._allocate(0, 2 * count, 0)
         codes = status.tolist()
         results = list(map(UpdateResult, map(_STATUS.__getitem__, codes), y, nis.tolist(), S))
-        for i in (status <= self._kernels.TOO_OLD).nonzero()[0].tolist():
+        for i in (status <= kernels(_KERNELS).TOO_OLD).nonzero()[0].tolist():
             results[i] = UpdateResult(_STATUS[codes[i]])
         return results
 
@@ -157,7 +157,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         m, n = len(self._order), self._motion.dim
         known, means, covariances = np.empty(m, dtype=bool), np.empty((m, n)), np.empty((m, n, n))
         at = self._order, self._start_ns, stamp_ns, is_present
-        count = self._kernels.ahead(self._kind, self._density, *self._arrays[:4], *at, means, covariances, known)
+        count = kernels(_KERNELS).ahead(self._kind, self._density, *self._arrays[:4], *at, means, covariances, known)
         if len(self._rows) < m:
             for k, (track_id, item) in enumerate(self._estimators.items()):
                 if track_id not in self._rows:

@@ -5,6 +5,8 @@ the same as long as the node exists, so that an insertion moves no values. The f
 and are kept for detections that are older.
 """
 
+from typing import Any
+
 import numpy as np
 
 from fgtrack.core.time import NS_PER_S
@@ -58,6 +60,10 @@ class Nodes:
         self.rows = np.zeros((size, _FEW_COMPONENTS, n + 1))
         """Measurements: G and y of y = G (x - x0) + N(0, I)."""
         self._factors: dict[int, list[tuple[Measurements, int, float]]] = {}
+        self._share()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:  # Any: of each attribute
+        self.__dict__.update(state)
         self._share()
 
     def _share(self) -> None:
