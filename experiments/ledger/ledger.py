@@ -42,7 +42,6 @@ def judged(seed: int, duration_s: float | None) -> list[dict[str, object]]:
         for row in tables["waiting"].records:
             add("filtered", f"{row['wait_s']:g}", row["filter_m"])
             add("smoothed", f"{row['wait_s']:g}", row["smoother_m"])
-        add("in time", REFERENCE, float(np.sqrt(result.waterfall[-1].mean_square_m2)))
         for row in tables["sensors"].records:
             add("lateness costs", row["sensor"], row["cost"])
             add("late lists are worth", row["sensor"], row["worth"])
