@@ -1,7 +1,7 @@
 """Detections on their way from receipt to the tick that processes them."""
 
 import marshal
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import compress
 from operator import attrgetter
@@ -12,7 +12,7 @@ from fgtrack.core.checks import LARGEST
 from fgtrack.core.linalg import is_covariance
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import Detection, DetectionList, Disposition, FloatArray, Frame, UpdateRecord
-from fgtrack.estimation.base import Measurement, UpdateStatus
+from fgtrack.estimation.base import Measurement, UpdateResult, UpdateStatus
 from fgtrack.models.sensors import SensorModel
 
 #: In any unit: no sensor is better than this.
@@ -62,6 +62,24 @@ def record(
 def records(message: DetectionList, disposition: Disposition) -> list[UpdateRecord]:
     """The same disposition for every detection of `message`."""
     return [record(message, index, disposition) for index in range(len(message.objects))]
+
+
+def merged_records(message: DetectionList, indices: Iterable[int], track_id: int | None) -> list[UpdateRecord]:
+    """The records of the detections `indices` that were merged into another one, of a track if there is one."""
+    return [record(message, index, Disposition.MERGED, track_id) for index in indices]
+
+
+def fused_records(
+    message: DetectionList,
+    matched: Iterable[tuple[int, int, Measurement, UpdateResult]],
+    merged: Mapping[int, tuple[int, ...]],
+) -> Iterator[UpdateRecord]:
+    """Yield the records of matched detections, and of those `merged` into each, by its index.
+    `matched` are index and track of each, its measurement, or one like it, and the outcome.
+    """
+    for index, track_id, measurement, result in matched:
+        yield record(message, index, result.status, track_id, result.nis, measurement, result.innovation)
+        yield from merged_records(message, merged.get(index, ()), track_id)
 
 
 def is_usable(detection: Detection, sensor: SensorModel, at_origin: bool = False) -> bool:

@@ -1,7 +1,7 @@
 """The tracker: the steps of a tick, in the order of the paper's algorithm (Karle et al. 2023, figure 2)."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -17,7 +17,6 @@ from fgtrack.core.types import (
     Disposition,
     EgoState,
     FloatArray,
-    ObjectReport,
     SmoothedReport,
     TickReport,
     TrackReport,
@@ -39,15 +38,13 @@ from fgtrack.tracking.detections import PosedBatch
 from fgtrack.tracking.ego import EgoPose, EgoTrajectory
 from fgtrack.tracking.existence import Lifecycle
 from fgtrack.tracking.guarded_bank import GuardedBank, faults
-from fgtrack.tracking.inbox import Batch, Inbox, record
+from fgtrack.tracking.inbox import Batch, Inbox, fused_records, merged_records, record
 from fgtrack.tracking.lifecycle import Scan
 from fgtrack.tracking.objects import Apart, Objects
 from fgtrack.tracking.preprocess import Candidates, Preprocess, Preprocessed
 from fgtrack.tracking.soft_association import equivalent, joint_probabilities
 
 _SELDOM = 1e-3  # probability with which a true pair misses the usual gate
-_Own = tuple[int, TrackStatus, int, ObjectReport | None, float | None]
-"""Id, status, number of measurements, object and existence probability of a track."""
 
 
 @dataclass(frozen=True)
@@ -148,12 +145,11 @@ class Tracker:
         noted, self._records = self._records, []
         bank = self._parts.bank
         states = bank.present()  # first: tracks may end by it
-        own = list(self._own(bank.track_ids))
         return TickReport.made_later(
             self._tick,
             now_ns,
             bank.smoothed(),
-            tracks=partial(map, _report, own, states),
+            tracks=self._reports(bank.track_ids, states),
             updates=partial(chain.from_iterable, noted),
         )
 
@@ -181,8 +177,8 @@ class Tracker:
         if not states.track_ids:
             return ()
         present = kinematic_states(motion, stamp_ns, states.means, states.covariances)
-        unsound, rows = faults(present), enumerate(zip(self._own(states.track_ids), present, strict=True))
-        return tuple(_report(own, state) for row, (own, state) in rows if row not in unsound)
+        unsound, reports = faults(present), self._reports(states.track_ids, present)()
+        return tuple(report for row, report in enumerate(reports) if row not in unsound)
 
     def _posed(self, batch: Batch) -> PosedBatch:
         """Return `batch` with the pose that it is seen from; detections in the map need none."""
@@ -361,7 +357,11 @@ class Tracker:
                     seen, track = measurements[row].seen_by(self._parts.motion), of[row]
                     with suppress(np.linalg.LinAlgError):
                         results[row].nis = correct_one(states.means[track], states.covariances[track], seen).nis
-        self._records.append(_fused(batch.message, candidates, assignment.pairs, track_ids, outcomes))
+        matched = (
+            (candidates.leaders[position], track_ids[track], *outcomes[k])
+            for k, (position, track) in enumerate(assignment.pairs)
+        )
+        self._records.append(fused_records(batch.message, matched, candidates.merged))
 
     def _give_birth(self, batch: Batch, candidates: Candidates, position: int, scan: Scan) -> None:
         parts, prior, candidate = self._parts, None, candidates[position]
@@ -405,7 +405,7 @@ class Tracker:
         """Record the outcome of candidates, and of the detections that were merged into them."""
         for leader in map(candidates.leaders.__getitem__, positions):
             own = record(batch.message, leader, disposition, track_id)
-            self._records.append((own, *_merged(batch.message, candidates, leader, track_id)))
+            self._records.append((own, *merged_records(batch.message, candidates.merged.get(leader, ()), track_id)))
 
     def _end(self, track_ids: Sequence[int]) -> None:
         for track_id in track_ids:
@@ -415,40 +415,12 @@ class Tracker:
             del self._num_measured[track_id]
             self._parts.lifecycle.forget(track_id)
 
-    def _own(self, track_ids: Sequence[int]) -> Iterable[_Own]:
+    def _reports(self, track_ids: Sequence[int], states: Sequence[TrackState]) -> Callable[[], Iterable[TrackReport]]:
+        """Return what makes the reports of tracks in these `states`, with all else as it is now."""
         parts = self._parts
-        num_measured = map(self._num_measured.__getitem__, track_ids)
-        return zip(
-            track_ids,
-            map(parts.lifecycle.status, track_ids),
-            num_measured,
-            parts.objects.reports(track_ids),
-            map(parts.lifecycle.probability, track_ids),
-            strict=True,
+        statuses, probabilities = (
+            list(map(each, track_ids)) for each in (parts.lifecycle.status, parts.lifecycle.probability)
         )
-
-
-def _fused(
-    message: DetectionList,
-    candidates: Candidates,
-    pairs: Iterable[tuple[int, int]],
-    track_ids: Sequence[int],
-    outcomes: Mapping[int, tuple[Measurement, UpdateResult]],
-) -> Iterator[UpdateRecord]:
-    """Yield the records of the matched candidates, in their order, and of those that were merged into them."""
-    for k, (position, track) in enumerate(pairs):
-        leader, track_id, (stack, result) = candidates.leaders[position], track_ids[track], outcomes[k]
-        yield record(message, leader, result.status, track_id, result.nis, stack, result.innovation)
-        yield from _merged(message, candidates, leader, track_id)
-
-
-def _merged(
-    message: DetectionList, candidates: Candidates, leader: int, track_id: int | None
-) -> Iterable[UpdateRecord]:
-    """The records of the detections that were merged into that of index `leader`."""
-    return [record(message, index, Disposition.MERGED, track_id) for index in candidates.merged.get(leader, ())]
-
-
-def _report(own: _Own, state: TrackState) -> TrackReport:
-    track_id, status, num_measured, described, probability = own
-    return TrackReport(track_id, status, state, num_measured, described, probability)
+        num_measured = list(map(self._num_measured.__getitem__, track_ids))
+        objects = parts.objects.reports(track_ids)
+        return partial(map, TrackReport, track_ids, statuses, states, num_measured, objects, probabilities)
