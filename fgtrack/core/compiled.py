@@ -3,6 +3,7 @@
 Calls of NumPy, BLAS and assignments of slices in compiled code take seconds to compile: loops do not.
 """
 
+import gc
 import logging
 import math
 from collections.abc import Callable, Mapping
@@ -82,8 +83,12 @@ def njit(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
             result._cache = _Cache(function)
         except RuntimeError:  # numba has no folder to write to
             _say(_NOT_STORED)
+        collects = gc.isenabled()
+        gc.disable()  # a compiler makes millions of objects that stay, and to look for cycles is a tenth of its time
         result.compile(signature)
         result.disable_compile()
+        if collects:
+            gc.enable()
         if result.stats.cache_misses and isinstance(result._cache, _Cache):
             _say("compiling numerical loops, once: some 45 s of processor time for all")
         return result
