@@ -1,6 +1,5 @@
 """Entry point: runs a command and turns what went wrong into one line and an exit code."""
 
-import ast
 import logging
 import os
 import resource
@@ -9,6 +8,7 @@ import traceback
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
+from inspect import cleandoc
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any
@@ -71,9 +71,8 @@ app = typer.Typer(
 
 def _help(name: str) -> str:
     """Docstring of a command, read from its source."""
-    module = ast.parse(Path(__file__).with_name(f"{COMMANDS[name]}.py").read_text(encoding="utf-8"))
-    (function,) = (item for item in module.body if isinstance(item, ast.FunctionDef) and item.name == name)
-    return ast.get_docstring(function) or ""
+    source = Path(__file__).with_name(f"{COMMANDS[name]}.py").read_text(encoding="utf-8")
+    return cleandoc(source.partition(f"\ndef {name}(")[2].split('"""')[1])
 
 
 for _name in COMMANDS:

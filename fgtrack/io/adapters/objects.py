@@ -7,9 +7,9 @@ import math
 from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from fgtrack.core.geometry import wrap_angle
+from fgtrack.core.linalg import kernels
 from fgtrack.core.types import Detection, EgoState, FloatArray
 from fgtrack.io.adapters.common import (
     ObjectList,
@@ -123,7 +123,7 @@ def radar_tracks(message: RosMessage) -> ObjectList:
 def _radar_track(item: RosMessage) -> Detection:
     position, velocity = item.position, item.velocity
     values = {"x_m": position.x, "y_m": position.y, "speed_mps": signed_speed_mps(velocity.x, velocity.y, None)}
-    pose = block_diag(_planar_triangle(item.position_covariance), [0.0])
+    pose = kernels("scipy.linalg").block_diag(_planar_triangle(item.position_covariance), [0.0])
     own = covariance(values, pose, _planar_triangle(item.velocity_covariance), velocity)
     return Detection(**values, covariance=own, object_id=_uuid(item.uuid), **_size(item.size))
 
@@ -179,7 +179,7 @@ def _ego_covariance(message: RosMessage) -> tuple[float, ...] | None:
     J = np.eye(2, 3, k=1)  # of speed and yaw rate by vx, vy and yaw rate
     J[0, :2] = -direction if signed_speed_mps(velocity.x, velocity.y, 0.0) < 0.0 else direction
     parts = planar(message.pose.covariance), J @ planar(message.twist.covariance) @ J.T
-    full = block_diag(*(part if _is_known(part) else np.zeros_like(part) for part in parts))
+    full = kernels("scipy.linalg").block_diag(*(part if _is_known(part) else np.zeros_like(part) for part in parts))
     return tuple(full.ravel().tolist()) if full.any() else None
 
 
