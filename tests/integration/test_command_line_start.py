@@ -47,7 +47,7 @@ def test_a_replay_imports_no_tables_of_others_and_no_figures(tmp_path) -> None:
 
 def test_every_command_has_a_line_in_the_help_and_a_help_of_its_own(capsys) -> None:
     assert run(["--help"]) == 0
-    listed = capsys.readouterr().out.partition("Commands:")[2]
+    listed = capsys.readouterr().out.partition("Commands:")[2].partition("Exit codes:")[0]
     assert [line.split()[0] for line in listed.splitlines() if line.strip()] == list(COMMANDS)
     assert "..." not in listed
     for name in COMMANDS:
