@@ -95,10 +95,8 @@ Options = Mapping[str, object]
 #: Name in the table: estimator and its options. One that is not registered is left out.
 CASES: dict[str, tuple[str, Options]] = {
     "ekf-replay": ("ekf-replay", {}),
-    "iekf-replay": ("iekf-replay", {}),
     "ukf-replay": ("ukf-replay", {}),
-    "iplf-replay": ("iplf-replay", {}),
-    "smoother": ("smoother", {}),
+    "smoother-banded": ("smoother-banded", {}),
 }
 
 
@@ -190,7 +188,7 @@ HEADER = ["estimator", "median_m", "q90_m", "rmse_m", "mean_less_ekf_m", "nees",
 
 def main(
     out: Annotated[Path, typer.Option("-o", help="Folder for the table and the figure.")] = Path("out/bearing_only"),
-    runs: Annotated[int, typer.Option(help="Draws in each world.")] = 100,
+    runs: Annotated[int, typer.Option(help="Draws in each world.")] = 24,
     share: Annotated[float, typer.Option(help="Share of each world's duration.")] = 1.0,
     cases: Annotated[str | None, typer.Option(help="Cases, separated by semicolons.")] = None,
     worlds: Annotated[str, typer.Option(help="Worlds, separated by commas.")] = ",".join(WORLDS),

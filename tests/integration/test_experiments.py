@@ -28,7 +28,7 @@ SHORT: dict[str, tuple[dict[str, Any], dict[str, Any], str, int]] = {
     "outliers": ({"runs": 2}, {"NUM_STEPS": 5}, "outliers.csv", 0),
     "rivals": ({"seeds": 1, "duration_s": 4.0, "scenes": "default, fitted noise"}, {}, "runs.csv", 0),
     "survival": ({"duration_s": 3.0}, {}, "survival.csv", 0),
-    "bearing_only": ({"runs": 2, "share": 0.2, "cases": "ekf-replay;smoother"}, {}, "bearing_only.csv", 0),
+    "bearing_only": ({"runs": 2, "share": 0.2, "cases": "ekf-replay;smoother-banded"}, {}, "bearing_only.csv", 0),
     "bearing_only/cameras": ({"runs": 2, "duration_s": 1.5}, {}, "cameras.csv", 3 * 2),
 }
 
