@@ -96,7 +96,8 @@ def body_point(
     The lever arm r from the body's reference point x, y is `ahead_m` and to the `left_m`. Floats, or arrays of one
     shape.
     """
-    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    own = np if isinstance(yaw_rad, np.ndarray) else math  # a third of the time for floats
+    c, s = own.cos(yaw_rad), own.sin(yaw_rad)
     arm_x_m, arm_y_m = c * ahead_m - s * left_m, s * ahead_m + c * left_m
     vx_mps, vy_mps = speed_mps * c - yaw_rate_radps * arm_y_m, speed_mps * s + yaw_rate_radps * arm_x_m
     return x_m + arm_x_m, y_m + arm_y_m, vx_mps, vy_mps

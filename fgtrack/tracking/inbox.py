@@ -3,7 +3,7 @@
 import marshal
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import compress
+from itertools import compress, repeat
 from operator import attrgetter
 
 import numpy as np
@@ -218,12 +218,11 @@ class Inbox:
         oldest_ns = message.receipt_ns - self._memory_ns
         while self._receipts_ns and self._receipts_ns[first := next(iter(self._receipts_ns))] < oldest_ns:
             del self._receipts_ns[first]
-        contents = []
-        for values in map(_values, compress(message.objects, usable)):
-            try:
-                contents.append(marshal.dumps(values, 2))  # 2: without references to what is shared
-            except ValueError:  # numbers of other libraries
-                contents.append(repr(values).encode())
+        values = list(map(_values, compress(message.objects, usable)))
+        try:
+            contents = list(map(marshal.dumps, values, repeat(2)))  # 2: without references to what is shared
+        except ValueError:  # numbers of other libraries
+            contents = [repr(each).encode() for each in values]
         key = (message.sensor, message.stamp_ns, message.frame, hash((len(contents), *sorted(contents))))
         if key in self._receipts_ns:
             return True

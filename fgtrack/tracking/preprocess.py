@@ -207,8 +207,7 @@ class Preprocess:
             x_m, y_m = x_m + sensor.placed.x_m, y_m + sensor.placed.y_m
             yaw_rad += sensor.placed.yaw_rad
         x_m, y_m, vx_mps, vy_mps = body_point(*ego[:5], x_m, y_m)
-        pose = SensorPose(float(x_m), float(y_m), yaw_rad, float(vx_mps), float(vy_mps))
-        return PosedBatch(batch, sensor, ego, pose)
+        return PosedBatch(batch, sensor, ego, SensorPose(x_m, y_m, yaw_rad, vx_mps, vy_mps))
 
     def together(self, batches: Sequence[PosedBatch]) -> list[Preprocessed]:
         """Return for each of `batches` what `__call__` returns, in one pass over the arrays of all."""
