@@ -1,7 +1,6 @@
 """From a configuration to a tracker."""
 
 from collections.abc import Callable, Collection
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +45,7 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
         ego=_build_ego(config),
         inbox=(SlotInbox if "one_slot" in config.defects else Inbox)(config.sensors),
         preprocess=Preprocess(road, config.merge, motion, config.ego.detection_origin_m, not published_order),
-        association=config.association if joint is None else replace(joint, claim_m=0.0),
+        association=config.association,
         joint=joint,
         bank=GuardedBank(lambda: build_bank(config, failures), failures),
         failures=failures,

@@ -107,18 +107,16 @@ class GatedMahalanobis:
     max_distance_m: PositiveFloat = 5000.0
     """Largest distance of a pair: as far as an airliner flies in 20 s. The chi-square gate decides below it."""
     claim_m: NonNegativeFloat = 0.0
-    """A candidate that belongs to no track starts none nearer than this to one: it is the other end of a long hull. A
-    tracker applies it to confirmed tracks: what is near to clutter may well be an object."""
+    """A candidate that belongs to no track starts none nearer than this to a confirmed one: it is the other end of a
+    long hull. What is near to clutter may well be an object."""
     joint_from: PositiveInt | None = None
     """Detections from which on a track is updated by all those in its gate, each with the probability that it belongs
     to the track and to no other one (JPDA, of positions); null: by the assigned one alone. A first state is too
     uncertain for it. Statuses and dispositions are always those of the assignment."""
 
     def __call__(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Assignment:
-        """See `Association`."""
-        pairs = self.gated(candidates, states, apart)
-        result = assigned(pairs, len(candidates), len(states.means))
-        return claimed(result, candidates, states, self.claim_m, apart) if self.claim_m else result
+        """See `Association`; claims are the tracker's."""
+        return assigned(self.gated(candidates, states, apart), len(candidates), len(states.means))
 
     def gated(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Pairs:
         """Return the pairs inside the gate with their cost NIS + log det S: a vague track does not win by it."""

@@ -15,7 +15,7 @@ from fgtrack.models.measurement import SensorPose
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import Config
-from fgtrack.tracking.association import Assignment, Association, GatedEuclidean, GatedMahalanobis, near
+from fgtrack.tracking.association import Assignment, Association, GatedEuclidean, GatedMahalanobis, claimed, near
 from fgtrack.tracking.preprocess import Candidates
 from fgtrack.tracking.published import UngatedEuclidean
 from fgtrack.tracking.soft_association import LEAST_INFORMATION, equivalent, joint_probabilities, marginals
@@ -144,9 +144,9 @@ def test_a_candidate_near_a_track_that_is_not_its_own_starts_none() -> None:
     seen = [candidate(0.5, 0.0, 0.5), candidate(15.0, 0.0, 0.5), candidate(60.0, 0.0, 0.5), candidate(0.0, 3.0, 0.5)]
     free = GatedMahalanobis()(candidates_of(seen), tracks)
     assert (free.pairs, free.new, free.refused) == ([(0, 0)], [1, 2, 3], ())
-    claimed = GatedMahalanobis(claim_m=20.0)(candidates_of(seen), tracks)
-    assert (claimed.pairs, claimed.new, claimed.missed, claimed.refused) == ([(0, 0)], [2], [1], (1, 3))
-    assert GatedMahalanobis(claim_m=20.0)(candidates_of(seen[1:2]), states([])).new == [0]
+    near = claimed(free, candidates_of(seen), tracks, 20.0, None)
+    assert (near.pairs, near.new, near.missed, near.refused) == ([(0, 0)], [2], [1], (1, 3))
+    assert claimed(free, candidates_of(seen), states([]), 20.0, None).new == [1, 2, 3]
 
 
 def test_a_track_claims_no_candidate_of_another_class() -> None:
@@ -155,7 +155,7 @@ def test_a_track_claims_no_candidate_of_another_class() -> None:
     def of_another_class(rows: IntArray, columns: IntArray) -> BoolArray:
         return np.asarray(rows == 1)
 
-    found = GatedMahalanobis(claim_m=20.0)(seen, tracks, of_another_class)
+    found = claimed(Assignment([], [0, 1], [0]), seen, tracks, 20.0, of_another_class)
     assert (found.new, found.refused) == ([1], (0,))
 
 
