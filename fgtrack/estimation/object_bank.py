@@ -149,10 +149,14 @@ class SingleObject:
 
 def states_of(bank: TrackBank, motion: MotionModel, stamp_ns: int) -> StatesAt:
     """States of the tracks of `bank` whose window has begun, at any stamp, in the own form of `motion`."""
-    states = bank.states_at(min(stamp_ns, bank.present_ns))
-    if stamp_ns <= bank.present_ns or not states.track_ids:
+    return ahead_of(bank.states_at(min(stamp_ns, bank.present_ns)), bank.present_ns, motion, stamp_ns)
+
+
+def ahead_of(states: StatesAt, present_ns: int, motion: MotionModel, stamp_ns: int) -> StatesAt:
+    """Return `states` of the present predicted to a stamp after it; those of a stamp up to the present as they are."""
+    if stamp_ns <= present_ns or not states.track_ids:
         return states
-    ahead = predict(states.means, states.covariances, motion, seconds(stamp_ns - bank.present_ns))
+    ahead = predict(states.means, states.covariances, motion, seconds(stamp_ns - present_ns))
     return StatesAt(states.track_ids, *ahead)
 
 

@@ -28,7 +28,7 @@ from fgtrack.estimation.base import Measurement, Measurements, Start, StatesAt, 
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.ekf import correct_one, propagated
 from fgtrack.estimation.filters.propagation import kinematic_states
-from fgtrack.estimation.object_bank import states_of
+from fgtrack.estimation.object_bank import ahead_of, states_of
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
@@ -165,18 +165,21 @@ class Tracker:
         track_ids = self._parts.bank.track_ids
         if track_id not in track_ids:
             raise CallError(f"track {track_id} does not exist: there are {', '.join(map(str, track_ids)) or 'none'}")
-        for track in self.tracks_at(stamp_ns):
-            if track.track_id == track_id:
-                return track
+        bank, motion = self._parts.bank, self._parts.motion
+        known = bank.state_of(track_id, min(stamp_ns, bank.present_ns))
+        for track in self._reports_of(ahead_of(known, bank.present_ns, motion, stamp_ns), stamp_ns):
+            return track
         raise CallError(f"track {track_id} has no state at {stamp_ns} ns: before its window, or not finite")
 
     def tracks_at(self, stamp_ns: int) -> tuple[TrackReport, ...]:
         """All tracks that have a state at a stamp, see `state_at`, in order of birth."""
-        bank, motion = self._parts.bank, self._parts.motion
-        states = states_of(bank, motion, stamp_ns)
+        return self._reports_of(states_of(self._parts.bank, self._parts.motion, stamp_ns), stamp_ns)
+
+    def _reports_of(self, states: StatesAt, stamp_ns: int) -> tuple[TrackReport, ...]:
+        """Tracks with these states at a stamp, those whose states are sound."""
         if not states.track_ids:
             return ()
-        present = kinematic_states(motion, stamp_ns, states.means, states.covariances)
+        present = kinematic_states(self._parts.motion, stamp_ns, states.means, states.covariances)
         unsound, reports = faults(present), self._reports(states.track_ids, present)()
         return tuple(report for row, report in enumerate(reports) if row not in unsound)
 
