@@ -224,6 +224,53 @@ def test_command_lines_can_be_parsed(where: str, line: str) -> None:
         assert name in ESTIMATORS or name.isupper() or not name.strip("."), f"{where}: there is no {name}"
 
 
+#: Files of a reader, and what stands for them.
+OWN = {
+    "RECORDING": "drive.mcap",
+    "INPUT": "drive.mcap",
+    "OUT": "copy.jsonl",
+    "TRACK.csv": "track.csv",
+    "FILE.yaml": "late.yaml",
+    "RUN": "runs/ekf-replay",
+    "out/demo/runs": "runs",
+}
+#: Commands that need recordings that are not here, a cluster, or many minutes.
+ELSEWHERE = re.compile(
+    r"00_00_01|kitti|results\.json|dask|race\.jsonl|default-10\d|sweep (delay|karle2023_table)"
+    r"|simulate race|fgtrack verify( |$)(?!-e)"
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in PAGES if page.name != "extending.md"], ids=str)
+def test_commands_in_blocks_of_a_page_run(page: Path, studied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(studied)
+    for block in blocks(page):
+        for line in block.text.splitlines() if block.language in ("", "sh") and not block.skipped else ():
+            words = shlex.split(re.sub(r"^\.venv/bin/", "", re.sub(r"[\[\]]", "", line)), comments=True)
+            if words[:1] == ["fgtrack"] and not ELSEWHERE.search(line):
+                arguments = [OWN.get(word.removesuffix("..."), word) for word in words[1:]]
+                writes = {"-o", "--write", "--figure", "convert", "simulate"} & set(arguments)
+                overwrite = ["--overwrite"] if writes and "--overwrite" not in arguments else []
+                assert run_command([*arguments, *overwrite]) == 0, f"{page}: {line}"
+
+
+@pytest.fixture(scope="module")
+def studied(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what the commands name: a recording, its map, delays, a configuration and runs."""
+    folder = tmp_path_factory.mktemp("studied")
+    shutil.copy(ROOT / "configs/maps/oval_track.csv", folder / "track.csv")
+    (folder / "late.yaml").write_text("radar: {delay: {kind: none}}\n")
+    bag = folder / "bag"
+    assert run_command(["simulate", "default", "-o", str(bag), "--duration", "12"]) == 0
+    [recording] = bag.glob("*.mcap")
+    for name in ("drive.mcap", "a.mcap", "b.mcap", "c.mcap"):
+        shutil.copy(recording, folder / name)
+    names = ["-e", "smoother,ekf-replay,ekf-backward-forward", "-o", str(folder / "runs")]
+    assert run_command(["replay", str(folder / "drive.mcap"), "-c", "tuned", "--map", "oval", *names]) == 0
+    return folder
+
+
 @pytest.mark.parametrize("block", all_blocks("", "sh"), ids=lambda block: f"{block.page}:{block.line}")
 def test_scripts_that_are_called_exist(block: Block) -> None:
     for script in re.findall(r"^python ([\w/.]+\.py)", block.text, re.MULTILINE):
