@@ -20,7 +20,7 @@ from fgtrack.calibration.tune_space import (
     TuneRules,
     stamp_key,
 )
-from fgtrack.calibration.tune_stamps import StampFit, fitted_stamps, with_stamps
+from fgtrack.calibration.tune_stamps import StampFit, fitted_stamps, stamp_rates, with_stamps
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import BoolArray, FloatArray, Message
 from fgtrack.estimation.likelihood.contaminated import outlier_share
@@ -163,17 +163,18 @@ class _Tuning:
         First of all: where an object moves along the line of sight, the standard deviation there would explain them.
         """
         self._stamps = []
+        rates = stamp_rates(problem, values) if self._configured_stamps else []
         for name, was_s in self._configured_stamps.items():
             used_s, key, fit = self._noise.stamp_stds[name], stamp_key(name), StampFit(was_s, math.inf)
             known: Known = "no"
             why = "kept as asked"
             if key not in self._rules.keep:
-                fit = fitted_stamps(problem, values, name, used_s)
+                fit = fitted_stamps(problem, rates, values, name, used_s)
                 known = "yes" if fit.std_error <= _KNOWN else "roughly" if fit.std_error <= _ROUGHLY_KNOWN else "no"
                 why = "" if known != "no" else f"flat: standard error {100.0 * fit.std_error:.0f} %"
             std_s = was_s if known == "no" else float(f"{fit.std_s:.4g}")
             self._noise = self._noise.with_stamps(name, std_s)
-            problem = with_stamps(problem, values, name, used_s, std_s)
+            problem = with_stamps(problem, rates, name, used_s, std_s)
             error = None if known == "no" else fit.std_error
             self._stamps.append(TunedParameter(key, was_s, std_s, error, known, why))
         return problem

@@ -21,6 +21,9 @@ _REJECTED = 1.92  # loss of log-likelihood at the border of a 95 % interval
 _TOLERANCE = 0.03
 
 
+Rates = Sequence[Sequence[FloatArray]]
+
+
 class StampFit(NamedTuple):
     """Fit of the standard deviation of the stamps of a sensor."""
 
@@ -29,17 +32,18 @@ class StampFit(NamedTuple):
     """Standard error of its logarithm; infinite where the likelihood is flat."""
 
 
-def fitted_stamps(problem: Problem, values: FloatArray, sensor: str, std_s: float) -> StampFit:
+def fitted_stamps(problem: Problem, rates: Rates, values: FloatArray, sensor: str, std_s: float) -> StampFit:
     """Return the fit of `sensor.stamp_std_s` to the series of `problem`, associated with `std_s`, at `values` (p,).
-    The covariance of a detection has the part std_s^2 v v', with v = H dx/dt at the updated state.
+    The covariance of a detection has the part std_s^2 v v', with v of `rates`, see `stamp_rates`.
     """
-    longest = sorted(problem.series, key=lambda item: -len(item.observations))[:_TRACKS]
-    some = [replace(item, observations=item.observations[:_OBSERVATIONS]) for item in longest]
+    longest = sorted(range(len(rates)), key=lambda k: -len(rates[k]))[:_TRACKS]
+    series = [problem.series[k] for k in longest]
+    some = [replace(item, observations=item.observations[:_OBSERVATIONS]) for item in series]
     part, free = replace(problem, series=some), np.ones(len(values), dtype=np.bool_)
-    rates = _rates(part, values)
+    own = [rates[k][:_OBSERVATIONS] for k in longest]
 
     def loss(log_std: float) -> float:
-        changed = _with(part, rates, sensor, std_s, math.exp(log_std))
+        changed = with_stamps(part, own, sensor, std_s, math.exp(log_std))
         return -float(Likelihood(changed, values, free).totals(values[None])[0])
 
     low, high = map(math.log, _RANGE_S)
@@ -50,13 +54,8 @@ def fitted_stamps(problem: Problem, values: FloatArray, sensor: str, std_s: floa
     return StampFit(math.exp(at), 1.0 / math.sqrt(curvature) if is_needed and curvature > 0.0 else math.inf)
 
 
-def with_stamps(problem: Problem, values: FloatArray, sensor: str, was_s: float, std_s: float) -> Problem:
-    """Return `problem` with stamps of `sensor` that err by `std_s` instead of `was_s`."""
-    return _with(problem, _rates(problem, values), sensor, was_s, std_s)
-
-
-def _rates(problem: Problem, values: FloatArray) -> list[list[FloatArray]]:
-    """Derivatives of the measured components of each observation by its stamp, shapes (d,), by series."""
+def stamp_rates(problem: Problem, values: FloatArray) -> Rates:
+    """Return v = H dx/dt at the updated state of each observation at `values` (p,), shapes (d,), by series."""
     error = StampError(problem.space.motion_model(values), 1.0)
 
     def rate(step: Step) -> FloatArray:
@@ -66,7 +65,9 @@ def _rates(problem: Problem, values: FloatArray) -> list[list[FloatArray]]:
     return [list(map(rate, filtered(series, problem.space, values))) for series in problem.series]
 
 
-def _with(problem: Problem, rates: Sequence[Sequence[FloatArray]], sensor: str, was_s: float, std_s: float) -> Problem:
+def with_stamps(problem: Problem, rates: Rates, sensor: str, was_s: float, std_s: float) -> Problem:
+    """Return `problem` with stamps of `sensor` that err by `std_s` instead of `was_s`; see `stamp_rates`."""
+
     def changed(item: Observation, v: FloatArray) -> Observation:
         if item.sensor != sensor:
             return item

@@ -7,7 +7,7 @@ import pytest
 
 from fgtrack.calibration.tune_measurements import recorded
 from fgtrack.calibration.tune_space import ConfigNoise
-from fgtrack.calibration.tune_stamps import fitted_stamps, with_stamps
+from fgtrack.calibration.tune_stamps import fitted_stamps, stamp_rates, with_stamps
 from fgtrack.core.types import Detection, DetectionList, Disposition
 from fgtrack.estimation.filters.replay_bank import ReplayBank
 from fgtrack.estimation.likelihood.fit import Problem
@@ -194,11 +194,12 @@ def test_the_error_of_stamps_is_fitted() -> None:
     settings = {**BASE, "motion": {"kind": "cv", "std_per_s": {"velocity": 1.0}}, "birth.speed_std_mps": 250.0}
     noise = ConfigNoise(read_config(None, {**settings, "sensors.adsb.stamp_std_s": 0.2}))
     problem = Problem(recorded(lists, noise.config, "", 4.0)[0], noise.space, noise.values)
-    fit = fitted_stamps(problem, noise.values, "adsb", 0.2)
+    rates = stamp_rates(problem, noise.values)
+    fit = fitted_stamps(problem, rates, noise.values, "adsb", 0.2)
     assert fit.std_s == pytest.approx(0.5, abs=0.1)
     assert 0.03 < fit.std_error < 0.1
-    right = with_stamps(problem, noise.values, "adsb", 0.2, fit.std_s)
-    assert fitted_stamps(right, noise.values, "adsb", fit.std_s).std_s == pytest.approx(fit.std_s, rel=0.1)
+    right = with_stamps(problem, rates, "adsb", 0.2, fit.std_s)
+    assert fitted_stamps(right, rates, noise.values, "adsb", fit.std_s).std_s == pytest.approx(fit.std_s, rel=0.1)
     assert noise.with_stamps("adsb", 0.5).stamp_stds == {"adsb": 0.5}
 
 
