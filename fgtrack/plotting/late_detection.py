@@ -25,6 +25,7 @@ from fgtrack.plotting.paper import Paper
 from fgtrack.tracking.tracker import Tracker
 
 _BACK_S = 0.15  # before the detection the estimates begin
+_MOST_STEPS = 500  # estimates of each track, however late the detection
 _STATE = ["x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps"]
 _DETECTION = ["sensor", "stamp_ns", "receipt_ns", "index"]
 _SETTLED = 20  # measurements of a track before which it moves for want of a good start
@@ -91,7 +92,8 @@ def close_up_of(run: Run, arrival: Arrival, rule: str = "") -> CloseUp:
         fused_ns += [(item.track_id, item.stamp_ns) for item in report.updates if item.disposition in FUSED[1:]]
         if row is None:
             continue
-        stamps_ns = sorted({*range(now_ns, start_ns - 1, -nanoseconds(STEP_S)), arrival.stamp_ns}, reverse=True)
+        step_ns = nanoseconds(STEP_S) * (1 + (now_ns - start_ns) // nanoseconds(_MOST_STEPS * STEP_S))
+        stamps_ns = sorted({*range(now_ns, start_ns - 1, -step_ns), arrival.stamp_ns}, reverse=True)
         before = {item.track_id: _estimates(tracker, item.track_id, stamps_ns) for item in report.tracks}
         tracker.receive(batch[row])
         updates = tracker.tick(now_ns).updates
