@@ -16,7 +16,7 @@ TEST := $(VENV)/.test
 DEV := $(TEST) $(VENV)/.dev
 DOCS := $(TEST) $(VENV)/.docs
 
-.PHONY: demo test test-fast test-slow test-matrix lock audit fuzz faults coverage mutants check docs picture bench bench-full soak soak-live contest clean
+.PHONY: demo test test-fast test-slow test-matrix lock audit fuzz faults coverage mutants check docs picture bench bench-full soak soak-live fairness clean
 
 demo: $(RUN)
 	@$(BIN)/fgtrack demo -o out/demo --overwrite
@@ -66,8 +66,8 @@ docs: $(DOCS)
 picture: $(DEV)
 	$(BIN)/python docs/_ext/import_graph.py
 
-contest: $(TEST)
-	$(BIN)/python experiments/contest.py -o out/contest --jobs 2
+fairness: $(TEST)
+	$(BIN)/python experiments/fairness.py -o out/fairness --jobs 2
 
 # Some 5 minutes. AGAINST='COMMAND' runs the published implementation, too (docs/speed.md); PAGE=docs/speed.md updates the page.
 BENCH = $(BIN)/python experiments/bench_speed.py -o out/speed $(if $(AGAINST),--published '$(AGAINST)') $(if $(PAGE),--page $(PAGE))

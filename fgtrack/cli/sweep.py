@@ -68,8 +68,8 @@ def swept(sweep_file: Path, out: Path, num_seeds: int | None = None) -> list[dic
 
 def _summarise(table: SweepTable, out: Path, form: Form | None, everything: bool) -> None:
     """Write means and paired differences of the estimators; show the differences of one metric, and the means."""
-    contests = seed_comparisons(table)
-    differences = difference_table(contests, table.axes)
+    comparisons = seed_comparisons(table)
+    differences = difference_table(comparisons, table.axes)
     write_file(out / PAIRED_TABLE, differences.to_csv())
     summary = summary_table(table)
     write_file(out / SUMMARY_TABLE, summary.to_csv())

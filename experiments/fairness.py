@@ -1,10 +1,10 @@
 """All that a comparison of filters and smoothers may be confounded by, measured one after the other.
 
-    python experiments/contest.py -o out/contest --jobs 2
+    python experiments/fairness.py -o out/fairness --jobs 2
 
 Runs the experiments on the noise, the initiation, the losses, the ego and bearings, and measures here
 what needs no script of its own: the sensor's lever arm and the whiteness of the innovations. Prints every table and
-writes them to contest.md.
+writes them to fairness.md.
 """
 
 import subprocess
@@ -90,7 +90,7 @@ def lever_arm(seeds: int, duration_s: float) -> str:
 
 
 def whiteness(seeds: int, duration_s: float) -> str:
-    """Lag-1 correlation of the innovations on noise that fits, by estimator and sensor."""
+    """Lag-1 correlation of the innovations on consistent noise, by estimator and sensor."""
     lines = ["| estimator | sensor | correlation at lag 1 | inside its band |", "| --- | --- | --- | --- |"]
     for estimator in ("smoother", "ekf-replay", "ekf-backward-forward"):
         runs: list[Consistency] = []
@@ -113,14 +113,14 @@ def printed(script: str, out: Path, jobs: int, options: Sequence[str]) -> str:
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder of all tables.")] = Path("out/contest"),
+    out: Annotated[Path, typer.Option("-o", help="Folder of all tables.")] = Path("out/fairness"),
     quick: Annotated[bool, typer.Option(help="A few runs of each, to see that it works.")] = False,
     jobs: Annotated[int, typer.Option(help="Processes.")] = 1,
 ) -> None:
-    """Measure everything, write contest.md."""
+    """Measure everything, write fairness.md."""
     out.mkdir(parents=True, exist_ok=True)
     seeds, duration_s = (2, 5.0) if quick else (10, 20.0)
-    with (out / "contest.md").open("w", encoding="utf-8") as file:
+    with (out / "fairness.md").open("w", encoding="utf-8") as file:
 
         def say(title: str, text: str) -> None:
             part = f"## {title}\n\n{text.strip()}\n\n"
@@ -129,7 +129,7 @@ def main(
             print(part, end="", flush=True)
 
         say("lever arm of a sensor on a turning ego", lever_arm(seeds, duration_s))
-        say("whiteness of innovations on noise that fits", whiteness(seeds, duration_s))
+        say("whiteness of innovations on consistent noise", whiteness(seeds, duration_s))
         for script, (question, short) in SCRIPTS.items():
             say(question, printed(script, out / Path(script).stem, jobs, short if quick else ()))
 
