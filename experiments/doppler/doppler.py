@@ -1,4 +1,4 @@
-"""Range, a coarse bearing and range rate from a moving sensor, and ranges from two points: who finds the right state?
+"""Range, a coarse bearing and range rate from a moving sensor: which estimator and start find the right state?
 
     python experiments/doppler/doppler.py -o out/doppler
 
@@ -13,14 +13,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-import matplotlib.pyplot as plt
 import numpy as np
 import typer
 from joblib import Parallel, delayed
 
 import fgtrack
 from fgtrack.core.geometry import wrap_angle
-from fgtrack.core.linalg import congruence, identity, mahalanobis_squared, psd_solve, symmetrise
+from fgtrack.core.linalg import congruence, mahalanobis_squared
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.filters.propagation import wrapped
@@ -34,7 +33,6 @@ STEP_S, DURATION_S, SETTLED_S = 0.1, 5.0, 1.0
 DOPPLER = measurement_model(("range_m", "bearing_rad", "range_rate_mps"), MOTION)
 DOPPLER_STD = np.array([0.3, np.deg2rad(2.0), 0.1])
 NUM_HEADINGS = 8
-RANGE_STD_M, ANCHORS_M = 0.3, ((0.0, 0.0), (20.0, 0.0))
 FAR_M = 3.0
 WINDOW_S = 2.0
 #: A hypothesis is dropped once it is so much less likely than the best.
@@ -47,13 +45,11 @@ class Scene(NamedTuple):
     """What one run gives to every estimator."""
 
     start: Start
-    first: list[Measurement]
-    """At the stamp of the start; the hypotheses are made of them already."""
     hypotheses: list[Start]
     truth: FloatArray
     """After the start, shape (num, 5)."""
-    measurements: list[list[Measurement]]
-    """Those of each of these stamps."""
+    measurements: list[Measurement]
+    """One at each of these stamps."""
 
 
 class Hypotheses:
@@ -121,29 +117,6 @@ def headings(start: Start, count: int) -> list[Start]:
     return [replace(turned, yaw_rad=wrap_angle(k * sector_rad)) for k in range(count)]
 
 
-def intersections(start: Start, ranges_m: list[float]) -> list[Start]:
-    """Both intersections of the circles of two ranges around `ANCHORS_M`, or where they nearly touch.
-
-    The covariance is that of the two ranges, to first order; it is limited to the mean range.
-    """
-    first, second = (np.array(each) for each in ANCHORS_M)
-    apart_m = float(np.hypot(*(second - first)))
-    along = (second - first) / apart_m
-    across = np.array([-along[1], along[0]])
-    near_m, far_m = ranges_m
-    foot_m = (near_m**2 - far_m**2 + apart_m**2) / (2.0 * apart_m)
-    height_m = math.sqrt(max(near_m**2 - foot_m**2, 0.0))
-    found = []
-    for side in (1.0, -1.0) if height_m > 0.0 else (1.0,):
-        position_m = first + foot_m * along + side * height_m * across
-        offsets_m = [position_m - each for each in (first, second)]
-        H = np.array([each / max(float(np.hypot(*each)), 1e-9) for each in offsets_m])
-        vague = identity(2) / (0.5 * (near_m + far_m)) ** 2
-        covariance = symmetrise(psd_solve(H.T @ H / RANGE_STD_M**2 + vague, identity(2)))
-        found.append(replace(start, position_m=position_m, position_covariance=covariance))
-    return found
-
-
 def driven(x: FloatArray, rng: np.random.Generator) -> Iterator[tuple[int, FloatArray]]:
     """Stamps and true states of an object that starts at `x` (5,)."""
     for k in range(round(DURATION_S / STEP_S)):
@@ -161,66 +134,31 @@ def doppler(rng: np.random.Generator) -> Scene:
     for stamp_ns, state in driven(x, rng):
         pose = SensorPose(15.0 * stamp_ns / 1e9, 0.0, 0.0, 15.0, 0.0)
         exact = DOPPLER.predict(state, pose)
-        measurements.append([Measurement(stamp_ns, DOPPLER, exact + DOPPLER_STD * rng.standard_normal(3), R, pose)])
-        truth.append(state)
-    (first,) = measurements.pop(0)
-    position_m, covariance = measured_position(DOPPLER.components, first.z, R, first.pose) or (first.z, R)
-    start = Start(position_m=position_m, position_covariance=covariance, speed_std_mps=20.0)
-    return Scene(start, [], headings(start, NUM_HEADINGS), np.array(truth[1:]), measurements)
-
-
-def ranging(rng: np.random.Generator) -> Scene:
-    """An object of known heading and speed, of which two sensors at fixed places measure the ranges alone."""
-    side = rng.choice([-1.0, 1.0])
-    yaw_rad = side * (0.5 * np.pi + rng.uniform(-0.8, 0.8))  # away from the line of the sensors
-    x = np.array([rng.uniform(0.0, 20.0), side * rng.uniform(5.0, 15.0), yaw_rad, 5.0, 0.0])
-    truth, measurements = [], []
-    for stamp_ns, state in driven(x, rng):
-        found = []
-        for anchor in ANCHORS_M:
-            range_m = float(np.hypot(*(state[:2] - np.array(anchor)))) + RANGE_STD_M * rng.standard_normal()
-            pose, std = SensorPose(*anchor), {"range_m": RANGE_STD_M}
-            found.append(Measurement.of(stamp_ns, range_m=abs(range_m), std=std, pose=pose))
-        measurements.append(found)
+        measurements.append(Measurement(stamp_ns, DOPPLER, exact + DOPPLER_STD * rng.standard_normal(3), R, pose))
         truth.append(state)
     first = measurements.pop(0)
-    known = Start(
-        position_m=x[:2] + 8.0 * rng.standard_normal(2),
-        position_std_m=8.0,
-        yaw_rad=float(x[2] + 0.15 * rng.standard_normal()),
-        yaw_std_rad=0.15,
-        speed_mps=float(x[3] + rng.standard_normal()),
-        speed_std_mps=1.0,
-    )
-    both = intersections(known, [float(each.z[0]) for each in first])
-    return Scene(known, first, both, np.array(truth[1:]), measurements)
+    position_m, covariance = measured_position(DOPPLER.components, first.z, R, first.pose) or (first.z, R)
+    start = Start(position_m=position_m, position_covariance=covariance, speed_std_mps=20.0)
+    return Scene(start, headings(start, NUM_HEADINGS), np.array(truth[1:]), measurements)
 
 
-SCENES = {"doppler": doppler, "ranging": ranging}
-NAMES = ("ekf-replay", "iekf-replay", "ukf-replay", "iplf-replay", "smoother")
-#: By scene: how the object may start.
-STARTS: dict[str, dict[str, dict[str, str]]] = {
-    "doppler": {"one-point": {"initiation": "one-point"}, "regression": {"initiation": "regression"}, "8 headings": {}},
-    "ranging": {"one start": {}, "two intersections": {}},
-}
+NAMES = ("ekf-replay", "iekf-replay", "ukf-replay", "smoother-banded")
+#: How the object may start.
+STARTS: dict[str, dict[str, str]] = {"one start": {"initiation": "regression"}, "8 headings": {}}
 
 
-def errors_m(scene_name: str, name: str, how: str, seed: int, run: int) -> FloatArray:
+def errors_m(name: str, how: str, seed: int, run: int) -> FloatArray:
     """Position error at the newest stamp, after each stamp of one run, shape (num,)."""
-    scene = SCENES[scene_name](np.random.default_rng([seed, run]))
-    options: dict[str, Any] = dict(STARTS[scene_name][how])
-    if name == "smoother":
+    scene = doppler(np.random.default_rng([seed, run]))
+    options: dict[str, Any] = dict(STARTS[how])
+    if name == NAMES[-1]:
         options |= {"lagged_s": (), "final": False}
-    several = how in ("8 headings", "two intersections")
-    starts = scene.hypotheses if several else [scene.start]
+    starts = scene.hypotheses if how == "8 headings" else [scene.start]
     estimator = Hypotheses([fgtrack.estimator(name, MOTION, each, lag_s=WINDOW_S, **options) for each in starts])
-    for measurement in [] if several else scene.first:
-        estimator.update(measurement)
     found = []
-    for measurements, truth in zip(scene.measurements, scene.truth, strict=True):
-        for measurement in measurements:
-            estimator.update(measurement)
-        state = estimator.state_at(measurements[0].stamp_ns)
+    for measurement, truth in zip(scene.measurements, scene.truth, strict=True):
+        estimator.update(measurement)
+        state = estimator.state_at(measurement.stamp_ns)
         found.append(float(np.hypot(*(state.mean[:2] - truth[:2]))))
     return np.array(found)
 
@@ -236,62 +174,39 @@ def over_runs(values: FloatArray, rng: np.random.Generator) -> Estimate:
     return Estimate(float(np.sqrt((values**2).mean())), *np.quantile(resampled, [0.025, 0.975]).tolist(), len(values))
 
 
-def table(scene: str, found: dict[tuple[str, str], FloatArray], rng: np.random.Generator) -> str:
+def table(found: dict[tuple[str, str], FloatArray], rng: np.random.Generator) -> str:
     """RMSE, median, runs that end far off, and the paired difference to the smoother that starts alike, as Markdown."""
     lines = [
-        f"| {scene} | start | RMSE [m] | median of the runs [m] | runs above {FAR_M:g} m "
+        f"| estimator | start | RMSE [m] | median of the runs [m] | runs above {FAR_M:g} m "
         "| less the smoother's, paired [m] |",
         "|---|---|---|---|---|---|",
     ]
-    for (name, how), errors in found.items():
-        values, reference = rmse_m(errors), rmse_m(found["smoother", how])
-        difference = "" if name == "smoother" else f"{paired(values, reference):+.2f}"
+    for (name, how), values in found.items():
+        difference = "" if name == NAMES[-1] else f"{paired(values, found[NAMES[-1], how]):+.2f}"
         far = f"{int((values > FAR_M).sum())} of {len(values)}"
         cells = f"{over_runs(values, rng):.2f} | {np.median(values):.2f} | {far} | {difference}"
         lines.append(f"| {name} | {how} | {cells} |")
     return "\n".join(lines) + "\n"
 
 
-def draw(results: dict[str, dict[tuple[str, str], FloatArray]], file: Path) -> None:
-    """Root of the mean squared error of all runs over time."""
-    figure, axes = plt.subplots(1, len(results), figsize=(11.0, 4.0), layout="constrained")
-    for axis, (scene, found) in zip(axes, results.items(), strict=True):
-        for (name, how), errors in found.items():
-            style = ["-", "--", ":"][list(STARTS[scene]).index(how)]
-            time_s = STEP_S * np.arange(1, errors.shape[1] + 1)
-            label = f"{name}, {how}"
-            axis.plot(time_s, np.sqrt((errors**2).mean(axis=0)), style, color=f"C{NAMES.index(name)}", label=label)
-        axis.set(xlabel="time since the first measurement [s]", ylabel="position RMSE [m]", yscale="log", title=scene)
-        axis.grid(alpha=0.3, which="both")
-        axis.legend(fontsize=6)
-    figure.savefig(file, dpi=150)
-    plt.close(figure)
-
-
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder for the tables and the figure.")] = Path("out/doppler"),
-    runs: Annotated[int, typer.Option(help="Runs per scene.")] = 20,
+    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path("out/doppler"),
+    runs: int = 20,
     seed: int = 0,
     jobs: Annotated[int, typer.Option(help="Processes.")] = 1,
 ) -> None:
-    """Run every estimator with every start in both scenes, write doppler.csv, doppler.md and doppler.png."""
+    """Run every estimator with every start, write doppler.csv and doppler.md."""
     out.mkdir(parents=True, exist_ok=True)
-    cases = [(scene, name, how) for scene in SCENES for how in STARTS[scene] for name in NAMES]
-    found = Parallel(n_jobs=jobs)(delayed(errors_m)(*case, seed, run) for case in cases for run in range(runs))
-    results: dict[str, dict[tuple[str, str], FloatArray]] = {scene: {} for scene in SCENES}
-    for index, (scene, name, how) in enumerate(cases):
-        results[scene][name, how] = np.array(found[index * runs : (index + 1) * runs])
+    cases = [(name, how) for how in STARTS for name in NAMES]
+    every = Parallel(n_jobs=jobs)(delayed(errors_m)(*case, seed, run) for case in cases for run in range(runs))
+    found = {case: rmse_m(np.array(every[k * runs : (k + 1) * runs])) for k, case in enumerate(cases)}
     with (out / "doppler.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["scene", "estimator", "start", "run", "rmse_m"])
-        for scene, each in results.items():
-            for (name, how), errors in each.items():
-                values = rmse_m(errors).tolist()
-                writer.writerows([scene, name, how, run, f"{value:.4f}"] for run, value in enumerate(values))
-    rng = np.random.default_rng(seed)
-    (out / "doppler.md").write_text("\n".join(table(scene, each, rng) for scene, each in results.items()))
-    draw(results, out / "doppler.png")
-    print((out / "doppler.md").read_text() + f"figure: {out / 'doppler.png'}")
+        writer.writerow(["estimator", "start", "run", "rmse_m"])
+        for (name, how), values in found.items():
+            writer.writerows([name, how, run, f"{value:.4f}"] for run, value in enumerate(values.tolist()))
+    (out / "doppler.md").write_text(table(found, np.random.default_rng(seed)))
+    print((out / "doppler.md").read_text())
 
 
 if __name__ == "__main__":

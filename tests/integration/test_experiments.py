@@ -21,7 +21,7 @@ SHORT: dict[str, tuple[dict[str, Any], dict[str, Any], str, int]] = {
     "association/crossings": ({"runs": 2, "duration_s": 2.5, "jobs": 1}, {}, "crossings.csv", 2 * 5),
     "births": ({"objects": 3}, {}, "births.csv", 0),
     "bounds": ({"runs": 2, "duration_s": 3.3, "estimators": "ekf-replay,drop"}, {}, "bounds.csv", 0),
-    "doppler": ({"runs": 2}, {"DURATION_S": 1.3, "NAMES": ("ekf-replay", "smoother")}, "doppler.csv", 2 * 5 * 2),
+    "doppler": ({"runs": 2}, {"DURATION_S": 1.3, "NAMES": ("ekf-replay", "smoother-banded")}, "doppler.csv", 2 * 2 * 2),
     "ego_uncertainty": ({"runs": 2, "duration_s": 2.5}, {"COUNTS": (2,)}, "ego_uncertainty.csv", 0),
     "ladder": ({"runs": 2, "lags": "1,4"}, {}, "ladder.csv", 0),
     "lag": ({"runs": 4}, {}, "lag.csv", 0),
