@@ -213,7 +213,7 @@ def horizon(data: Path) -> Iterator[dict[str, object]]:
 
 def held_out(data: Path) -> Iterator[dict[str, object]]:
     """Reports of multilateration that the tracker did not get, and its tracks of their addresses at their stamps."""
-    messages, config = read(RECORDINGS["airport, RADAR and multilateration"], data)
+    messages, config = read(replace(RECORDINGS["airport, RADAR and multilateration"], longest_s=600.0), data)
     rng, kept, hidden = np.random.default_rng(1), list[Message](), list[DetectionList]()
     for message in messages:
         assert isinstance(message, DetectionList)
@@ -231,6 +231,22 @@ def held_out(data: Path) -> Iterator[dict[str, object]]:
                 own = [each.state for each in tracks if names.get(each.track_id) == item.id]
                 off_m = [float(np.hypot(each.mean[0] - item.x_m, each.mean[1] - item.y_m)) for each in own]
                 yield {"now_s": tick.now_ns / S, "object": item.id, "error_m": min(off_m, default=np.nan)}
+
+
+def along_across(data: Path) -> tuple[tuple[float, float, float], float]:
+    """Spread of the stamps of one aircraft [s] with its interval, by errors along its motion, and errors across [m]."""
+    recording = RECORDINGS["many receivers, one aircraft"]
+    judge = Judge(read(recording, data)[0], recording.half_s)
+    name = max(judge.reports, key=lambda each: len(judge.reports[each]))
+    late_s, across_m, blocks = list[float](), list[float](), list[float]()
+    for stamp_s, _, *z in judge.reports[name].tolist():
+        at = [judge.position_m(name, stamp_s + shift_s, -np.inf) for shift_s in (-0.5, 0.0, 0.5)]
+        if at[0] is not None and at[1] is not None and at[2] is not None:
+            v, off_m = at[2] - at[0], np.array(z) - at[1]
+            late_s.append(1.4826 * abs(float(v @ off_m)) / float(v @ v))
+            across_m.append(abs(float(v[0] * off_m[1] - v[1] * off_m[0])) / float(np.hypot(*v)))
+            blocks.append(stamp_s // BLOCK_S)
+    return interval(np.array(late_s), np.array(blocks)), 1.4826 * float(np.median(across_m))
 
 
 def simulated(seed: int) -> Iterator[dict[str, object]]:
@@ -279,6 +295,8 @@ def main(
             continue
         rows += policies(name, recording, data)
         pd.DataFrame(rows).to_csv(out / "policies.csv", index=False)
+    if only in "many receivers" and (data / "jal516").exists():
+        print("spread of stamps [s], errors across [m]:", along_across(data))
     if only in "simulated":
         pd.DataFrame(row for seed in range(10) for row in simulated(seed)).to_csv(out / "simulated.csv", index=False)
     if not only and (data / CAR).exists():
@@ -290,6 +308,7 @@ def main(
             tracks["error_m"].dropna().to_numpy(), (tracks["now_s"] // BLOCK_S)[tracks["error_m"].notna()].to_numpy()
         )
         print("held out:", len(tracks), "median, interval", middle, "without track", tracks["error_m"].isna().mean())
+        print("median of addresses", tracks.groupby("object")["error_m"].median().median())
 
 
 if __name__ == "__main__":
