@@ -70,7 +70,7 @@ class _OtherTransitionOfMany(CTRV):
         (_WrongJacobian(), "has the jacobian of its prediction"),
         (_InPlace(), "keeps its inputs"),
         (_Forwards(), "refuses noise of a negative duration"),
-        (_Polar(), "has a state that measurements know"),
+        (_Polar(), "has a state that measurements determine"),
         (_TooSure(), "publishes the entries of its state"),
         (_Whirls(), "publishes the entries of its state"),
         (_NegativeBirth(), "is as it was after a kinematic state"),
