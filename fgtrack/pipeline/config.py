@@ -220,7 +220,8 @@ class Effective:
         x_m, y_m = self.detection_origin_m
         merge = "none" if self.merge_distance_m is None else f"up to {self.merge_distance_m:g} m"
         late = "" if self.reach_s == self.lag_s else f", late detections up to {self.reach_s:g} s"
-        return f"detection origin {x_m:g} m ahead, {y_m:g} m left of the ego; merge {merge}; lag {self.lag_s:g} s{late}"
+        origin = f"detection origin {x_m:g} m ahead, {y_m:g} m left of the ego; " if x_m or y_m else ""
+        return f"{origin}merge {merge}; lag {self.lag_s:g} s{late}"
 
 
 @dataclass(frozen=True)

@@ -58,6 +58,7 @@ def test_what_is_easily_overlooked_is_a_line() -> None:
     assert str(paper().effective) == (
         "detection origin -1.74 m ahead, 0 m left of the ego; merge up to 5.1 m; lag 3.5 s"
     )
+    assert str(Config().effective) == "merge none; lag 3 s"  # no ego frame that detections are shifted to
     smoother = paper("estimator=smoother", "motion.kind=ctrv", "smoother.late=fuse").effective
     assert (smoother.lag_s, smoother.reach_s) == (1.0, 3.0)
     assert str(smoother).endswith("lag 1 s, late detections up to 3 s")
