@@ -310,7 +310,7 @@ def _sentence(parts: Sequence[Part], tables: Mapping[str, Table]) -> str:
     """Return what counts in one sentence."""
     ends = [math.sqrt(item.mean_square_m2) for item in parts]
     steps = zip(parts[1:], ends, ends[1:], strict=False)
-    causes = [f"{item.cause} {before - after:+.2f} m" for item, before, after in steps]
+    causes = [f"{item.cause} {before - after:+z.2f} m" for item, before, after in steps]
     costs = [f"{row['sensor']} {row['cost']:.2f} m" for row in tables["sensors"].records]
-    stays = f"{ends[-1]:.2f} m stay. Lateness by sensor: {', '.join(costs)}."
+    stays = f"{ends[-1]:.2f} m remain. Lateness by sensor: {', '.join(costs)}."
     return f"Error now {ends[0]:.2f} m: {', '.join(causes)}; {stays}"

@@ -103,7 +103,8 @@ def test_the_replaying_filter_has_the_error_of_its_own_run(messages: list[Messag
 
 
 def test_nobody_late_means_no_part_of_lateness(messages: list[Message]) -> None:
-    result = ledger(prompt(messages), read_config("smoother", estimator="ekf-replay", **MAPS))
+    result = ledger(prompt(messages), read_config("smoother", estimator="smoother-banded", **MAPS))
+    assert "smoother-banded instead of replay +0.00 m" in result.sentence
     assert result.waterfall[-1].share_m2.mean == pytest.approx(0.0, abs=1e-12)
     assert all(row["cost"] == pytest.approx(0.0, abs=1e-9) for row in result.tables.tables["sensors"].records)
     assert rms(result, "drop") == pytest.approx(rms(result, "ekf-replay"), rel=1e-9)
