@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fgtrack
-from fgtrack.calibration.ledger import Ledger, ledger
+from fgtrack.calibration.ledger import Ledger, Part, _sentence, ledger
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import DetectionList, Message, TruthState
 from fgtrack.io.stream import write_stream
@@ -103,11 +103,16 @@ def test_the_replaying_filter_has_the_error_of_its_own_run(messages: list[Messag
 
 
 def test_nobody_late_means_no_part_of_lateness(messages: list[Message]) -> None:
-    result = ledger(prompt(messages), read_config("smoother", estimator="smoother-banded", **MAPS))
-    assert "smoother-banded instead of replay +0.00 m" in result.sentence
+    result = ledger(prompt(messages), read_config("smoother", estimator="ekf-replay", **MAPS))
     assert result.waterfall[-1].share_m2.mean == pytest.approx(0.0, abs=1e-12)
     assert all(row["cost"] == pytest.approx(0.0, abs=1e-9) for row in result.tables.tables["sensors"].records)
     assert rms(result, "drop") == pytest.approx(rms(result, "ekf-replay"), rel=1e-9)
+
+
+def test_a_tie_has_no_minus(karle: Ledger) -> None:
+    first = karle.waterfall[0]
+    tie = Part("tie", first.mean_square_m2 + 1e-6, first.share_m2)
+    assert ": tie +0.00 m; " in _sentence([first, tie], karle.tables.tables)
 
 
 def test_a_late_sensor_costs_and_its_late_lists_are_worth_something(karle: Ledger) -> None:
