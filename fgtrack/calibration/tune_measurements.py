@@ -18,7 +18,7 @@ from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_bank
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_in_memory
-from fgtrack.tracking.association import Assignment, GatedEuclidean, GatedMahalanobis
+from fgtrack.tracking.association import Assignment, GatedEuclidean, GatedMahalanobis, Likely
 from fgtrack.tracking.detections import PosedBatch
 from fgtrack.tracking.guarded_bank import GuardedBank
 from fgtrack.tracking.objects import Apart
@@ -88,7 +88,9 @@ class _WideGate:
     association: GatedEuclidean | GatedMahalanobis
     stds: float
 
-    def __call__(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Assignment:
+    def __call__(
+        self, candidates: Candidates, states: StatesAt, apart: Apart | None = None, likely: Likely | None = None
+    ) -> Assignment:
         stds_m = np.array([self._stds_m(candidate, states.means) for candidate in candidates])
         needed_m = self.stds * stds_m.reshape(len(candidates), len(states.means))
         if isinstance(self.association, GatedEuclidean):
@@ -96,7 +98,7 @@ class _WideGate:
         limit_m = float(needed_m.max(initial=self.association.max_distance_m))
         probability = max(self.association.gate_probability, _GATE_PROBABILITY)
         opened = replace(self.association, max_distance_m=limit_m, gate_probability=probability)
-        return opened(candidates, states, apart)
+        return opened(candidates, states, apart, likely)
 
     def _stds_m(self, candidate: Candidate, means: FloatArray) -> FloatArray:
         """Return the largest standard deviation of the position; of a bearing alone, across the line of sight."""

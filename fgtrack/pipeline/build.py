@@ -37,7 +37,7 @@ _EGO_STORAGE_TICKS = 350  # of the published implementation
 def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerParts] | None = None) -> Tracker:
     """Return the tracker that `config` describes, of the parts that `observed` returns for the usual ones."""
     road = build_road(config.map, config.defects)
-    motion, failures = config.motion_model(), Failures()
+    motion, lifecycle, failures = config.motion_model(), build_lifecycle(config), Failures()
     published_order = config.lifecycle.kind == "published"
     joint = config.association if isinstance(config.association, GatedMahalanobis) else None
     parts = TrackerParts(
@@ -50,7 +50,10 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
         bank=GuardedBank(lambda: build_bank(config, failures), failures),
         failures=failures,
         motion=motion,
-        lifecycle=build_lifecycle(config),
+        lifecycle=lifecycle,
+        weigh_births=lifecycle.likely
+        if isinstance(lifecycle, ExistenceLifecycle) and lifecycle.weighs_births
+        else None,
         suppress_births_near_newer_tracks=config.lifecycle.suppress_births_near_newer_tracks,
         birth=config.birth,
         road=road,

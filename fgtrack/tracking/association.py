@@ -1,6 +1,6 @@
 """Gates, and association of candidates with tracks (Karle et al. 2023, section III-D)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Literal, NamedTuple, Protocol
 
@@ -35,6 +35,10 @@ class Pairs(NamedTuple):
         return Pairs(self.rows[chosen], self.columns[chosen], self.values[chosen])
 
 
+#: True of some pairs, shape (m,).
+Likely = Callable[[Pairs], BoolArray]
+
+
 class Assignment(NamedTuple):
     """Outcome of an association."""
 
@@ -51,8 +55,12 @@ class Assignment(NamedTuple):
 class Association(Protocol):
     """Assigns candidates to tracks at least cost."""
 
-    def __call__(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Assignment:
-        """The states are those of the tracks at the candidates' stamp; pairs that are `apart` are not made."""
+    def __call__(
+        self, candidates: Candidates, states: StatesAt, apart: Apart | None = None, likely: Likely | None = None
+    ) -> Assignment:
+        """The states are those of the tracks at the candidates' stamp; pairs that are `apart` are not made.
+        `likely` selects pairs with costs NIS + log det S; the others are not made. Distances are no such costs.
+        """
 
 
 @settings
@@ -69,7 +77,9 @@ class GatedEuclidean:
     max_nis: PositiveFloat | None = None
     """Largest NIS of a pair; null for no limit."""
 
-    def __call__(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Assignment:
+    def __call__(
+        self, candidates: Candidates, states: StatesAt, apart: Apart | None = None, likely: Likely | None = None
+    ) -> Assignment:
         """See `Association`."""
         return self.within(self.gate_m, candidates, states, apart)
 
@@ -114,9 +124,14 @@ class GatedMahalanobis:
     to the track and to no other one (JPDA, of positions); null: by the assigned one alone. A first state is too
     uncertain for it. Statuses and dispositions are always those of the assignment."""
 
-    def __call__(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Assignment:
+    def __call__(
+        self, candidates: Candidates, states: StatesAt, apart: Apart | None = None, likely: Likely | None = None
+    ) -> Assignment:
         """See `Association`; claims are the tracker's."""
-        return assigned(self.gated(candidates, states, apart), len(candidates), len(states.means))
+        pairs = self.gated(candidates, states, apart)
+        if likely is not None and len(pairs.rows):
+            pairs = pairs.at(likely(pairs))
+        return assigned(pairs, len(candidates), len(states.means))
 
     def gated(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Pairs:
         """Return the pairs inside the gate with their cost NIS + log det S: a vague track does not win by it."""

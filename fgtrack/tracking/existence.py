@@ -22,9 +22,10 @@ from pydantic import NonNegativeFloat, PositiveFloat
 from fgtrack.core.linalg import kernels
 from fgtrack.core.settings import OpenProbability, settings
 from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import FloatArray, IntArray, TrackStatus
+from fgtrack.core.types import BoolArray, FloatArray, IntArray, TrackStatus
 from fgtrack.estimation.base import StatesAt
 from fgtrack.models.sensors import SensorModel
+from fgtrack.tracking.association import Pairs
 from fgtrack.tracking.lifecycle import CountingLifecycle, Scan
 from fgtrack.tracking.preprocess import Candidate, Candidates
 from fgtrack.tracking.visibility import Histories
@@ -85,6 +86,9 @@ class ExistenceRules:
     """A track is not confirmed before it was so far from where it began: what never moves is shore, or moored."""
     memory_s: PositiveFloat = 5.0
     """Time for which late lists change the probability at their own stamp; older ones count as if they were so old."""
+    weigh_births: bool = False
+    """True if a position belongs to a track only where that is more probable than clutter or a new object. It matters
+    where tracks coast for long: gates grow until they reach other objects (`association.kind: mahalanobis`)."""
     suppress_births_near_newer_tracks: bool = True
     """True if a late detection near a track that a newer detection has started begins no track of its own."""
 
@@ -105,6 +109,7 @@ class ExistenceLifecycle:
     ) -> None:
         """`detection_origin_m`: origin of the ego frame of detections, seen from the ego reference point."""
         self._rules = rules
+        self.weighs_births = rules.weigh_births
         self._sensors = sensors
         self._index = {name: index for index, name in enumerate(sensors)}
         self._origin_m = detection_origin_m
@@ -188,6 +193,25 @@ class ExistenceLifecycle:
         self._present_ns, self._reports = present_ns, None
         self._histories.forget(present_ns - self._memory_ns)
         return self._ended()
+
+    def likely(self, name: str, track_ids: Sequence[int], pairs: Pairs) -> BoolArray:
+        """True of `pairs` of positions of a sensor and tracks that exist rather than of clutter or new objects, (m,).
+        That is P_D r N(y; 0, S) > (1 - P_D r) clutter / (1 - birth probability), each pair by itself.
+        """
+        sensor, rules = self._sensors[name], self._rules
+
+        def most(exists: float | FloatArray) -> FloatArray:
+            detected = sensor.detection_probability * exists
+            odds = detected / (1.0 - detected) if sensor.scan else detected
+            return 2.0 * np.log(odds * (1.0 - rules.birth_probability) / (math.tau * sensor.clutter_per_m2))
+
+        likely = pairs.values < most(rules.delete_probability)
+        doubtful = (~likely).nonzero()[0]
+        if len(doubtful):
+            self._settle()
+            rows = self._rows_of(track_ids[column] for column in pairs.columns[doubtful].tolist())
+            likely[doubtful] = pairs.values[doubtful] < most(self._histories.present(rows, self._present_ns))
+        return np.asarray(likely)
 
     def forget(self, track_id: int) -> None:
         """See `CountingLifecycle.forget`."""

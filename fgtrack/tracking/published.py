@@ -12,7 +12,7 @@ from fgtrack.core.types import DetectionList, Disposition, EgoState, FloatArray,
 from fgtrack.estimation.base import StatesAt
 from fgtrack.estimation.filters.published import published_yaw
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.association import Assignment, assigned, near
+from fgtrack.tracking.association import Assignment, Likely, assigned, near
 from fgtrack.tracking.detections import ConnectedMerge, Merge, PosedBatch
 from fgtrack.tracking.ego import EgoPose, EgoStd, EgoTrajectory
 from fgtrack.tracking.inbox import Batch, Inbox, is_valid_covariance, record, records
@@ -171,7 +171,9 @@ class UngatedEuclidean:
     gate_m: float = 5.0
     """Largest distance of a pair that is kept."""
 
-    def __call__(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Assignment:
+    def __call__(
+        self, candidates: Candidates, states: StatesAt, apart: Apart | None = None, likely: Likely | None = None
+    ) -> Assignment:
         """See `Association`; torn pairs are born after the detections that had no partner. Nothing is `apart`."""
         pairs = near(candidates, states.means, np.inf)
         rows, columns, distances_m = (array.tolist() for array in pairs)

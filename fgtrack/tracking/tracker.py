@@ -13,6 +13,7 @@ from fgtrack.core.errors import CallError, DataError, FgtrackError, did_you_mean
 from fgtrack.core.time import seconds
 from fgtrack.core.types import (
     FRAMES,
+    BoolArray,
     DetectionList,
     Disposition,
     EgoState,
@@ -32,7 +33,7 @@ from fgtrack.estimation.object_bank import ahead_of, states_of
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.association import Assignment, Association, GatedMahalanobis, Pairs, claimed
+from fgtrack.tracking.association import Assignment, Association, GatedMahalanobis, Likely, Pairs, claimed
 from fgtrack.tracking.birth import Birth, in_any_direction
 from fgtrack.tracking.detections import PosedBatch
 from fgtrack.tracking.ego import EgoPose, EgoTrajectory
@@ -66,6 +67,8 @@ class TrackerParts:
     joint: GatedMahalanobis | None = None
     """Gate of the detections that update a track together, and the distance from confirmed tracks within which no
     detection starts another one; None where each updates one track and any may start one."""
+    weigh_births: Callable[[str, Sequence[int], Pairs], BoolArray] | None = None
+    """See `ExistenceLifecycle.likely`; None where births are not weighed."""
     failures: Failures = field(default_factory=Failures)
     """Counts what fails inside, shared with `bank`."""
     propagated_exceptions: tuple[type[Exception], ...] = (FgtrackError, MemoryError)
@@ -260,11 +263,18 @@ class Tracker:
     def _assigned(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Assignment:
         """Return the assignment of candidates to tracks of the same class, and by their identities."""
         parts, evidence = self._parts, self._evidence(batch, candidates, states)
-        result = parts.association(candidates, states, evidence)
+        result = parts.association(candidates, states, evidence, self._likely(batch, candidates, states))
         if parts.joint is None or not (parts.joint.claim_m and result.new):
             return result
         tentative = [parts.lifecycle.status(each) is TrackStatus.TENTATIVE for each in states.track_ids]
         return claimed(result, candidates, states, np.where(tentative, -1.0, parts.joint.claim_m), evidence)
+
+    def _likely(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Likely | None:
+        """Return the test of pairs against clutter and new objects; None where they are not weighed."""
+        weigh = self._parts.weigh_births
+        if weigh is None or any(group.stack.model.components != ("x_m", "y_m") for group in candidates.groups):
+            return None
+        return partial(weigh, batch.message.sensor, states.track_ids)
 
     def _evidence(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Apart | None:
         described = map(batch.message.objects.__getitem__, candidates.leaders)

@@ -14,6 +14,8 @@ from fgtrack.models.sensors import Score, SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import load
+from fgtrack.pipeline.shipped import read_config
+from fgtrack.tracking.association import Pairs
 from fgtrack.tracking.ego import EgoPose
 from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules
 from fgtrack.tracking.lifecycle import Scan
@@ -253,3 +255,28 @@ def test_the_tracker_confirms_what_is_seen_again_and_ends_what_is_seen_once(esti
     (track,) = report.tracks
     assert (track.status, track.num_measured) == (TrackStatus.CONFIRMED, 6)
     assert 0.9 < track.score < 1.0
+
+
+@pytest.mark.parametrize(("is_scan", "weight"), [(True, 1.0 / (1.0 - 0.8 * 0.5)), (False, 1.0)])
+def test_a_pair_is_weighed_against_clutter_and_new_objects(is_scan: bool, weight: float) -> None:
+    """P_D r N(y; 0, S), of a scan over 1 - P_D r, is just above or below clutter / (1 - birth probability)."""
+    sensors = {"lidar": replace(SENSORS["lidar"], scan=is_scan)}
+    life = ExistenceLifecycle(replace(STILL, birth_probability=0.5), sensors, (0.0, 0.0))
+    life.born(7, scan(), HERE)
+    life.expired(START_NS)
+    density = 1e-3 / (1.0 - 0.5) / (0.8 * 0.5 * weight)
+    cost = -2.0 * math.log(2.0 * math.pi * density)
+    zeros = np.zeros(3, dtype=np.int64)
+    pairs = Pairs(np.arange(3), zeros, np.array([cost - 1e-6, cost + 1e-6, cost - 20.0]))
+    assert life.likely("lidar", [7], pairs).tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("weigh", [False, True])
+def test_a_new_object_does_not_inherit_a_track_that_has_been_silent_for_long(weigh: bool) -> None:
+    """Three minutes after its last report the gate of an aircraft is 80 km wide."""
+    tracker = build_tracker(read_config("adsb", {"lifecycle.weigh_births": weigh}))
+    for at_s, y_m in [*((float(k), 0.0) for k in range(10)), (200.0, 30000.0), (201.0, 30000.0)]:
+        now_ns = START_NS + ms(1e3 * at_s)
+        tracker.receive(DetectionList("adsb", now_ns, now_ns, [Detection(x_m=200.0 * at_s, y_m=y_m)], "map"))
+        report = tracker.tick(now_ns)
+    assert len(report.tracks) == 1 + weigh
