@@ -11,7 +11,7 @@ from fgtrack.core.types import YAW, FloatArray, IntArray, TrackState
 from fgtrack.estimation.base import Lazy
 from fgtrack.estimation.filters.ekf import predict
 from fgtrack.models.measurement import MeasurementModel
-from fgtrack.models.motion import MotionModel
+from fgtrack.models.motion import MotionModel, WhiteNoise
 
 
 class ExactPropagator:
@@ -24,7 +24,11 @@ class ExactPropagator:
         self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
     ) -> tuple[FloatArray, FloatArray]:
         """States (m, n) and (m, n, n), each after its own number of `steps` (m,) of `dt_s`; yaw is not wrapped."""
-        return predict(mean, covariance, self.motion, steps * np.float64(dt_s))
+        if not isinstance(self.motion, WhiteNoise):
+            return predict(mean, covariance, self.motion, steps * np.float64(dt_s))
+        x, P = mean.copy(), covariance.copy()
+        kernels("fgtrack.estimation.kernels.kalman").propagate(self.motion.kind, self.motion.density, x, P, steps, dt_s)
+        return x, P
 
     def wrap(self, mean: FloatArray) -> FloatArray:
         """Means, shape (..., n), with the angles brought back to their range after a correction."""
@@ -53,10 +57,9 @@ class EulerCtrv(ExactPropagator):
         self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
     ) -> tuple[FloatArray, FloatArray]:
         """See `ExactPropagator.propagate`."""
+        x, P = mean.copy(), covariance.copy()
         euler = kernels("fgtrack.estimation.kernels.euler")
-        x, P = (np.array(each, dtype=np.float64, order="C") for each in (mean, covariance))
-        counts = np.array(steps, dtype=np.int64)
-        euler.propagate(x, P, counts, dt_s, self._density, self._accelerates, self.yaw_limit_rad)
+        euler.propagate(x, P, steps, dt_s, self._density, self._accelerates, self.yaw_limit_rad)
         return x, P
 
 

@@ -15,6 +15,7 @@ from fgtrack.core.compiled import (
     whiten,
 )
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.models.transitions import transition
 
 _VECTORS, _MATRICES = "float64[:, ::1]", "float64[:, :, ::1]"
 
@@ -83,6 +84,21 @@ def predict(F: FloatArray, P: FloatArray, Q: FloatArray) -> tuple[FloatArray, Fl
     for i in range(len(P)):
         add_congruence(F[i], P[i], cross[i], Q[i])
     return Q, cross
+
+
+@njit(f"(int64, float64[::1], {_VECTORS}, {_MATRICES}, int64[::1], float64)")
+def propagate(
+    motion: int, density: FloatArray, mean: FloatArray, P: FloatArray, steps: IntArray, dt_s: float
+) -> None:
+    """Move states (m, n) and (m, n, n), each by its own number of `steps` (m,) of `dt_s`: f(x) and F P F' + Q."""
+    n = mean.shape[1]
+    F, FP, Q, x = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty(n)
+    for i in range(len(mean)):
+        for a in range(n):
+            x[a] = mean[i, a]
+        transition(motion, x, steps[i] * dt_s, density, mean[i], F, Q)
+        add_congruence(F, P[i], FP, Q)
+        copy(Q, P[i])
 
 
 @njit(
