@@ -35,6 +35,11 @@ def equal_ones(items: Sequence[Hashable]) -> list[list[int]]:
     return list(groups.values())
 
 
+def stacked(matrices: FloatArray) -> FloatArray:
+    """Return matrices (m, k, n), of one (k, n) a stack of 1, with rows that follow one another in memory."""
+    return np.ascontiguousarray(matrices if matrices.ndim == 3 else matrices[None])
+
+
 def symmetrise(matrix: FloatArray) -> FloatArray:
     """Symmetric part of `matrix`, shape (..., n, n)."""
     both: FloatArray = matrix + matrix.T if matrix.ndim == 2 else matrix + matrix.mT

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
-from fgtrack.core.linalg import kernels, symmetrise
+from fgtrack.core.linalg import kernels, stacked, symmetrise
 from fgtrack.core.settings import OpenProbability, settings
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import StatesAt
@@ -92,16 +92,17 @@ class GatedEuclidean:
         if not is_one:
             limits_m = np.broadcast_to(gates_m, (len(candidates), len(states.means)))
             pairs = pairs.at(pairs.values <= limits_m[pairs.rows, pairs.columns])
-        suspects = set[int]()
+        inside = pairs
         if self.max_nis is not None and len(pairs.rows):
-            suspects = set(pairs.rows.tolist())
             nis = np.empty(len(pairs.rows))
             for chosen, chosen_nis, _, _ in innovations(pairs, candidates, states):
                 nis[chosen] = chosen_nis
-            inside = (nis <= self.max_nis).nonzero()[0]
-            pairs = pairs if len(inside) == len(nis) else pairs.at(inside)
-        assignment = assigned(pairs, len(candidates), len(states.means))
-        return _refusing(suspects, assignment) if suspects else assignment
+            is_inside = nis <= self.max_nis
+            inside = pairs if all(is_inside.tolist()) else pairs.at(is_inside)
+        assignment = assigned(inside, len(candidates), len(states.means))
+        if self.max_nis is None or not assignment.new:
+            return assignment
+        return _refusing(set(pairs.rows.tolist()), assignment)
 
 
 @settings
@@ -181,7 +182,7 @@ def chi_square_quantile(probability: float, freedom: int) -> float:
 def assigned(pairs: Pairs, num_candidates: int, num_tracks: int) -> Assignment:
     """Assignment of as many of `pairs` as possible at least total cost, which are their values."""
     i, j = pairs.rows.tolist(), pairs.columns.tolist()
-    if _compete(i, j):
+    if len(i) > 1 and _compete(i, j):
         pairs = pairs.at(_uncontested(pairs.rows, pairs.columns, pairs.values))
         pairs = pairs.at(_uncontested(pairs.columns, pairs.rows, pairs.values))
         i, j = pairs.rows.tolist(), pairs.columns.tolist()
@@ -189,8 +190,9 @@ def assigned(pairs: Pairs, num_candidates: int, num_tracks: int) -> Assignment:
             j, i = _least_cost(pairs.columns, pairs.rows, pairs.values, num_tracks, num_candidates)
         elif _compete(i, j):
             i, j = _least_cost(*pairs, num_candidates, num_tracks)
-    new, missed = set(range(num_candidates)).difference(i), set(range(num_tracks)).difference(j)
-    return Assignment(sorted(zip(i, j, strict=True)), sorted(new), sorted(missed))
+    new = sorted(set(range(num_candidates)).difference(i)) if len(i) < num_candidates else []
+    missed = sorted(set(range(num_tracks)).difference(j)) if len(j) < num_tracks else []
+    return Assignment(sorted(zip(i, j, strict=True)), new, missed)
 
 
 def _compete(i: list[int], j: list[int]) -> bool:
@@ -242,14 +244,13 @@ def innovations(
     Indices of pairs that measure the same, assumed components included, with NIS and log det S, shapes (p,), and the
     number k of components. NaN where S has no root.
     """
-    P, parts = np.array(states.covariances, dtype=np.float64, order="C"), []
+    P, parts = np.ascontiguousarray(states.covariances), []
     for group, members, chosen in candidates.split(pairs.rows):
-        columns = pairs.columns.take(chosen)
+        columns, own = pairs.columns.take(chosen), group.stack
         x = states.means.take(columns, axis=0)
-        own = group.seen_at(members, x, P, columns)
-        y, H = own.model.linearised(own.z, x, own.pose)
-        H, every = np.array(H, ndmin=3, order="C"), np.arange(y.shape[1])
-        _, nis, logdet = kernels("fgtrack.estimation.kernels.kalman").innovations(y, H, P, columns, own.R, every)
+        y, H = own.model.linearised(own.z.take(members, axis=0), x, own.pose)
+        R, every = group.noise(members, x, P, columns), np.arange(y.shape[1])
+        _, nis, logdet = kernels("fgtrack.estimation.kernels.kalman").innovations(y, stacked(H), P, columns, R, every)
         parts.append((chosen, nis, logdet, len(every)))
     return parts
 

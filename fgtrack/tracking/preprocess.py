@@ -91,14 +91,20 @@ class Group(NamedTuple):
     stamp_error: StampError | None = None
     """Error of the stamp, of which nothing is in `stack` and `spread`; None where it is not considered."""
 
-    def seen_at(self, members: IntArray, x: FloatArray, P: FloatArray, of: IntArray) -> Measurement:
-        """The stack of some `members` (p,), of objects at the states `x` (p, n) with covariances P[of] (p, n, n)."""
-        own, R = self.stack, self.stack.R.take(members, axis=0)
+    def noise(self, members: IntArray, x: FloatArray, P: FloatArray, of: IntArray) -> FloatArray:
+        """R of some `members` (p,), of objects at the states `x` (p, n) with covariances P[of] (p, n, n)."""
+        own = self.stack
+        R = own.R.take(members, axis=0)
         if self.error is not None and own.model.relative:
             R = self.error.at(members).noise(own.model, own.pose, x)
         if self.stamp_error is not None:
             R = R + self.stamp_error.noise(own.model, own.pose, x, P[of])
-        return Measurement(own.stamp_ns, own.model, own.z.take(members, axis=0), R, own.pose, own.loss, own.assumed)
+        return R
+
+    def seen_at(self, members: IntArray, x: FloatArray, P: FloatArray, of: IntArray) -> Measurement:
+        """The stack of some `members`, see `noise`."""
+        own, z, R = self.stack, self.stack.z.take(members, axis=0), self.noise(members, x, P, of)
+        return Measurement(own.stamp_ns, own.model, z, R, own.pose, own.loss, own.assumed)
 
     def position_covariances(self, members: IntArray) -> FloatArray:
         """Covariances of the positions in the map of some `members` (p,), which have one, shape (p, 2, 2)."""
@@ -238,13 +244,15 @@ class Preprocess:
         codes, lines = kernels("fgtrack.tracking.kernels").described(*arrays)
         for k, (first, end) in enumerate(pairwise(items.starts.tolist())):
             own, groups = codes[first:end], list[Group]()
-            for code in dict.fromkeys(own.tolist()):
-                groups += self._groups(items, k, first, (own == code).nonzero()[0], code)
+            kinds = dict.fromkeys(own.tolist())
+            for code in kinds:
+                rows = np.arange(end - first) if len(kinds) == 1 else (own == code).nonzero()[0]
+                groups += self._groups(items, k, first, rows, code)
             others = {index: others for (batch, index), others in items.merged.items() if batch == k}
             yield Candidates(items.indices[first:end].tolist(), others, lines[first:end], groups)
 
-    def _groups(self, items: MapDetections, k: int, first: int, rows: IntArray, code: int) -> Iterator[Group]:
-        """Yield the candidates `rows` of batch k, which begins at `first`, and which all measure the same.
+    def _groups(self, items: MapDetections, k: int, first: int, rows: IntArray, code: int) -> list[Group]:
+        """Return the candidates `rows` of batch k, which begins at `first`, and which all measure the same.
         One by one where errors are correlated in time.
         """
         here = slice(first, first + len(rows)) if rows[-1] < len(rows) else first + rows
@@ -276,11 +284,12 @@ class Preprocess:
             rows, Measurement(batch.stamp_ns, models[0], z, total, pose, sensor.loss, assumed), R, error, late
         )
         if sensor.correlation is None:
-            yield whole
-            return
+            return [whole]
+        groups = []
         for i, each in enumerate(models):
             item, m = Measurement(batch.stamp_ns, each, z[i : i + 1], total[i : i + 1], pose, sensor.loss, assumed), [i]
-            yield Group(rows[m], item, R[m], error and error.at(m), late)
+            groups.append(Group(rows[m], item, R[m], error and error.at(m), late))
+        return groups
 
 
 def _out_of_bounds(batch: Batch, index: int, reason: str) -> UpdateRecord:

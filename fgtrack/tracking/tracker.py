@@ -360,7 +360,8 @@ class Tracker:
             results = bank.update(batch.stamp_ns, ids, measurements)
             outcomes.update(zip(here.tolist(), zip(repeat(measurements.stack), results), strict=True))
             fused = [track_id for track_id, each in zip(ids, results, strict=True) if each.innovation is not None]
-            self._num_measured.update(fused)
+            for track_id in fused:
+                self._num_measured[track_id] += 1
             if not candidates.placed[chosen[here[0]]]:  # as those of all others
                 continue
             self._parts.lifecycle.fused(fused)

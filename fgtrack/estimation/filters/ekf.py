@@ -6,7 +6,7 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from fgtrack.core.linalg import congruence, identity, kernels, psd_solve, symmetrise
+from fgtrack.core.linalg import congruence, identity, kernels, psd_solve, stacked, symmetrise
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.models.motion import MotionModel
@@ -121,9 +121,8 @@ def correct(
     `measured` is `Measurement.measured`, for the NIS, `loss` the robust loss of all (see `robust_weight`).
     """
     rows = np.arange(y.shape[-1]) if measured is None else measured
-    x, P, y, R = map(_copied, (mean, covariance, y, R))
-    H = np.array(H, dtype=np.float64, order="C", ndmin=3)
-    S, nis, w, fused = np.empty(R.shape), np.empty(len(x)), np.ones(len(x)), np.empty(len(x), dtype=bool)
+    m, x, P, H, R = len(mean), _copied(mean), _copied(covariance), stacked(H), np.ascontiguousarray(R)
+    S, nis, w, fused = np.empty(R.shape), np.empty(m), np.ones(m), np.empty(m, dtype=bool)
     fuse = kernels(_KALMAN).correct
     fuse(x, P, y, H, R, rows, S, nis, fused)
     if loss is not None:

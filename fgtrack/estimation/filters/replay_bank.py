@@ -30,6 +30,7 @@ from fgtrack.models.motion import WhiteNoise
 _KERNELS = "fgtrack.estimation.kernels.replay"
 #: In the order of the numbers that the kernels give.
 _STATUS = UpdateStatus.FAILED, UpdateStatus.TOO_OLD, UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE
+_FUSED = _STATUS[2:]
 
 
 class ReplayBank(ObjectBank[ReplayEkf]):
@@ -103,17 +104,11 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         for indices, alike in stacks(measurements):
             seen, ids = alike.seen_by(self._motion), [track_ids[i] for i in indices]
             is_held = list(map(self._rows.__contains__, ids)) if _is_plain(seen) else [False] * len(ids)
-            for chosen in filter(len, [range(len(ids))] if all(is_held) else equal_ones(is_held)):
-                part = seen if len(chosen) == len(ids) else replace(seen, z=seen.z[chosen], R=seen.R[chosen])
-                own = [ids[k] for k in chosen]
-                if is_held[chosen[0]]:
-                    values = self._fused(stamp_ns, own, part)
-                else:
-                    for track_id in own:
-                        self._take_out(track_id)
-                    values = super().update(stamp_ns, own, Measurements(part))
-                    for track_id in own:
-                        self._put_in(track_id)
+            for chosen in equal_ones(is_held):
+                part, own = seen, ids
+                if len(chosen) < len(ids):
+                    part, own = replace(seen, z=seen.z[chosen], R=seen.R[chosen]), [ids[k] for k in chosen]
+                values = self._fused(stamp_ns, own, part) if is_held[chosen[0]] else self._alone(stamp_ns, own, part)
                 for k, result in zip(chosen, values, strict=True):
                     results[indices[k]] = result
         return results
@@ -131,12 +126,21 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         super().remove(track_id)
         self._order = None
 
+    def _alone(self, stamp_ns: int, track_ids: Sequence[int], one: Measurement) -> list[UpdateResult]:
+        """Outcomes of a stack of measurements that need the filters of their objects."""
+        for track_id in track_ids:
+            self._take_out(track_id)
+        results = super().update(stamp_ns, track_ids, Measurements(one))
+        for track_id in track_ids:
+            self._put_in(track_id)
+        return results
+
     def _fused(self, stamp_ns: int, track_ids: Sequence[int], one: Measurement) -> list[UpdateResult]:
         """Outcomes of a stack of measurements of entries of the state."""
-        rows, (m, k) = np.array([self._rows[i] for i in track_ids]), one.z.shape
+        rows, (m, k) = np.array(list(map(self._rows.__getitem__, track_ids))), one.z.shape
         if k > self._shape[2]:
             self._allocate(0, 0, k)
-        z, R = (np.ascontiguousarray(each, dtype=np.float64) for each in (one.z, one.R))
+        z, R = np.ascontiguousarray(one.z, dtype=np.float64), np.ascontiguousarray(one.R, dtype=np.float64)
         y, S, nis, status = np.empty((m, k)), np.empty((m, k, k)), np.empty(m), np.empty(m, dtype=np.int64)
         now = self._lag_ns, self._start_ns, stamp_ns, one.model.selected
         count = kernels(_KERNELS).fuse(
@@ -144,10 +148,10 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         )
         if count == self._shape[1]:
             self._allocate(0, 2 * count, 0)
-        codes = status.tolist()
-        results = list(map(UpdateResult, map(_STATUS.__getitem__, codes), y, nis.tolist(), S))
-        for i in (status <= kernels(_KERNELS).TOO_OLD).nonzero()[0].tolist():
-            results[i] = UpdateResult(_STATUS[codes[i]])
+        statuses = list(map(_STATUS.__getitem__, status.tolist()))
+        results = list(map(UpdateResult, statuses, y, nis.tolist(), S))
+        if UpdateStatus.FAILED in statuses or UpdateStatus.TOO_OLD in statuses:
+            results = [each if each.status in _FUSED else UpdateResult(each.status) for each in results]
         return results
 
     def _states(self, stamp_ns: int, is_present: bool = False) -> tuple[BoolArray | None, FloatArray, FloatArray]:

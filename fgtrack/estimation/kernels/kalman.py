@@ -17,7 +17,8 @@ from fgtrack.core.compiled import (
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.models.transitions import transition
 
-_VECTORS, _MATRICES = "float64[:, ::1]", "float64[:, :, ::1]"
+_VECTORS, _MATRICES, _READ = "float64[:, ::1]", "float64[:, :, ::1]", "Array(float64, 3, 'C', readonly=True)"
+_R = "Array(float64, 2, 'C', readonly=True)"
 
 
 @inlined
@@ -30,7 +31,7 @@ def marginal_nis(S: FloatArray, y: FloatArray, rows: IntArray, root: FloatArray,
     return whiten(root, white[: len(rows)])
 
 
-@shared(f"b1(float64[::1], {'float64[:, ::1], ' * 4}float64[::1], float64[:, ::1], float64[:, ::1])")
+@shared(f"b1(float64[::1], {'float64[:, ::1], ' * 3}{_R}, float64[::1], float64[:, ::1], float64[:, ::1])")
 def conclude(
     mean: FloatArray,
     P: FloatArray,
@@ -58,7 +59,7 @@ def conclude(
     return total < np.inf
 
 
-@njit(f"({_VECTORS}, {_MATRICES}, {_MATRICES}, int64[:], {_MATRICES}, int64[::1])")
+@njit(f"({_VECTORS}, {_READ}, {_READ}, int64[:], {_READ}, int64[::1])")
 def innovations(
     y: FloatArray, H: FloatArray, P: FloatArray, tracks: IntArray, R: FloatArray, rows: IntArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -102,7 +103,7 @@ def propagate(
 
 
 @njit(
-    f"({_VECTORS}, {_MATRICES}, {_VECTORS}, {_MATRICES}, {_MATRICES}, int64[::1], {_MATRICES}, float64[::1], b1[::1])"
+    f"({_VECTORS}, {_MATRICES}, {_VECTORS}, {_READ}, {_READ}, int64[::1], {_MATRICES}, float64[::1], b1[::1])"
 )
 def correct(
     mean: FloatArray,
