@@ -182,21 +182,21 @@ def chi_square_quantile(probability: float, freedom: int) -> float:
 def assigned(pairs: Pairs, num_candidates: int, num_tracks: int) -> Assignment:
     """Assignment of as many of `pairs` as possible at least total cost, which are their values."""
     i, j = pairs.rows.tolist(), pairs.columns.tolist()
-    if len(i) > 1 and _compete(i, j):
+    if _compete(i, j):
         pairs = pairs.at(_uncontested(pairs.rows, pairs.columns, pairs.values))
         pairs = pairs.at(_uncontested(pairs.columns, pairs.rows, pairs.values))
-        i, j = pairs.rows.tolist(), pairs.columns.tolist()
-        if _compete(i, j) and num_candidates > num_tracks:
-            j, i = _least_cost(pairs.columns, pairs.rows, pairs.values, num_tracks, num_candidates)
-        elif _compete(i, j):
-            i, j = _least_cost(*pairs, num_candidates, num_tracks)
+        contested = (np.bincount(pairs.rows)[pairs.rows] > 1) | (np.bincount(pairs.columns)[pairs.columns] > 1)
+        chosen = ~contested
+        if contested.any():
+            chosen[contested.nonzero()[0][_least_cost(pairs.at(contested))]] = True
+        i, j = pairs.rows[chosen].tolist(), pairs.columns[chosen].tolist()
     new = sorted(set(range(num_candidates)).difference(i)) if len(i) < num_candidates else []
     missed = sorted(set(range(num_tracks)).difference(j)) if len(j) < num_tracks else []
-    return Assignment(sorted(zip(i, j, strict=True)), new, missed)
+    return Assignment(list(zip(i, j, strict=True)), new, missed)
 
 
 def _compete(i: list[int], j: list[int]) -> bool:
-    return not len(set(i)) == len(set(j)) == len(i)
+    return len(i) > 1 and not len(set(i)) == len(set(j)) == len(i)
 
 
 def _uncontested(i: IntArray, j: IntArray, cost: FloatArray) -> BoolArray:
@@ -207,20 +207,21 @@ def _uncontested(i: IntArray, j: IntArray, cost: FloatArray) -> BoolArray:
     return cheapest | (np.bincount(i, shared)[i] > 0.0)
 
 
-def _least_cost(
-    i: IntArray, j: IntArray, cost: FloatArray, num_rows: int, num_columns: int
-) -> tuple[list[int], list[int]]:
-    """Rows and columns of the best pairs: each row may take a column of its own instead, outside every gate."""
+def _least_cost(pairs: Pairs) -> IntArray:
+    """Indices of the best of `pairs`: each row may take a column of its own instead, outside every gate."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
-    own = np.arange(num_rows)
-    shifted = cost + (1.0 - cost.min())  # a sparse graph has no edges of weight 0
-    costs = np.concatenate([shifted, np.full(num_rows, _OUTSIDE)])
-    edges = np.concatenate([i, own]), np.concatenate([j, num_columns + own])
-    rows, columns = min_weight_full_bipartite_matching(csr_array((costs, edges), (num_rows, num_columns + num_rows)))
-    inside = columns < num_columns
-    return rows[inside].tolist(), columns[inside].tolist()
+    (rows, i), (columns, j) = (np.unique(each, return_inverse=True) for each in pairs[:2])
+    if len(rows) > len(columns):
+        rows, i, columns, j = columns, j, rows, i
+    own, shape = np.arange(len(rows)), (len(rows), len(columns) + len(rows))
+    shifted = pairs.values + (1.0 - pairs.values.min())  # a sparse graph has no edges of weight 0
+    costs = np.concatenate([shifted, np.full(len(rows), _OUTSIDE)])
+    edges = np.concatenate([i, own]), np.concatenate([j, len(columns) + own])
+    of, taken = min_weight_full_bipartite_matching(csr_array((costs, edges), shape))
+    inside, width, order = taken < len(columns), len(columns), np.lexsort((j, i))
+    return order[(i * width + j)[order].searchsorted(of[inside] * width + taken[inside])]
 
 
 def near(

@@ -73,7 +73,9 @@ class MapDetections(NamedTuple):
 def in_map_frame(batches: Sequence[PosedBatch]) -> MapDetections:
     """The detections of `batches`, what their sensors measure of them, seen from their poses."""
     starts = [0, *accumulate([len(each.batch.indices) for each in batches])]
-    numbers, columns, indices = list[Any](), list[tuple[int, ...]](), list[int]()
+    numbers: list[Any] = []  # numbers or None
+    columns: list[tuple[int, ...]] = []
+    indices: list[int] = []
     for batch, sensor, _, _ in batches:
         read, own = _reading(tuple(sensor.std))
         numbers += chain.from_iterable(map(read, map(batch.message.objects.__getitem__, batch.indices)))

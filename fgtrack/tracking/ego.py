@@ -224,21 +224,23 @@ class EgoTrajectory:
 
     def _insert(self, ego: EgoState) -> str | None:
         """Insert a state by its stamp, a late one unfiltered; the reason, where it is refused."""
-        row = bisect.bisect_left(self._stamps, ego.stamp_ns)
-        if row < len(self._stamps) and self._stamps[row] == ego.stamp_ns:
-            return "repeated stamp"
-        if row == len(self._states):
+        stamps_ns = self._stamps
+        row = bisect.bisect_left(stamps_ns, ego.stamp_ns)
+        if row == len(stamps_ns):
             if self.current is not None:
                 turned_rad = self.current.yaw_rate_radps * ((ego.stamp_ns - self.current.stamp_ns) / NS_PER_S)
                 ego = self._low_passed(ego, self.current.yaw_rad + turned_rad, self.current.yaw_rate_radps)
             self.current = ego
-        self._stamps.insert(row, ego.stamp_ns)
+        elif stamps_ns[row] == ego.stamp_ns:
+            return "repeated stamp"
+        stamps_ns.insert(row, ego.stamp_ns)
         self._states.insert(row, ego)
         if self._position_time_s is not None:
             self._reckon(row, self._position_time_s)
-        keep = bisect.bisect_left(self._stamps, self._stamps[-1] - self._memory_ns)
-        if keep > 64:  # in portions: cutting a list copies it
-            del self._stamps[: keep - 1], self._states[: keep - 1], self._reckoned[: keep - 1]
+        oldest_ns = stamps_ns[-1] - self._memory_ns
+        if len(stamps_ns) > 64 and stamps_ns[64] < oldest_ns:  # in portions: cutting a list copies it
+            gone = bisect.bisect_left(stamps_ns, oldest_ns) - 1
+            del stamps_ns[:gone], self._states[:gone], self._reckoned[:gone]
         return None
 
     def _reckon(self, row: int, time_s: float) -> None:

@@ -166,14 +166,8 @@ class Inbox:
             return records(message, Disposition.DUPLICATE)
         ended: list[UpdateRecord] = []
         kept: dict[int, list[int]] = {} if message.objects else {message.stamp_ns: []}
-        max_delay_ns = self._max_delay_ns.get(message.sensor)
-        own_ns, fates = stamps(message, sensor), dict[int, Disposition | None]()
-        for stamp_ns in set(own_ns):
-            delay_ns = message.receipt_ns - stamp_ns
-            is_late = max_delay_ns is not None and delay_ns > max_delay_ns
-            fates[stamp_ns] = Disposition.TOO_OLD if is_late else None
-            if -delay_ns > _MAX_FUTURE_NS:
-                fates[stamp_ns] = Disposition.INVALID
+        own_ns = stamps(message, sensor)
+        fates = {stamp_ns: self._fate(message, stamp_ns) for stamp_ns in set(own_ns)}
         for index, (stamp_ns, is_sound) in enumerate(zip(own_ns, usable, strict=True)):
             fate = fates[stamp_ns] if is_sound else Disposition.INVALID
             if fate is None and sensor.copies_s and self._is_heard(message, index, stamp_ns, sensor.copies_s):
@@ -186,6 +180,13 @@ class Inbox:
         for stamp_ns, indices in kept.items():
             self._pending.append(Batch(message, stamp_ns, tuple(indices), last=stamp_ns == newest_ns))
         return ended
+
+    def _fate(self, message: DetectionList, stamp_ns: int) -> Disposition | None:
+        """Return how detections of `message` with this stamp end that are too late, or stamped in the future."""
+        delay_ns = message.receipt_ns - stamp_ns
+        if delay_ns < -_MAX_FUTURE_NS:
+            return Disposition.INVALID
+        return Disposition.TOO_OLD if delay_ns > self._max_delay_ns.get(message.sensor, delay_ns) else None
 
     def _is_heard(self, message: DetectionList, index: int, stamp_ns: int, copies_s: float) -> bool:
         """True if another receiver has heard the message of detection `index`; the earliest stamp in a tick counts."""

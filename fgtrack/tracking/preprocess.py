@@ -217,7 +217,8 @@ class Preprocess:
 
     def together(self, batches: Sequence[PosedBatch]) -> list[Preprocessed]:
         """Return for each of `batches` what `__call__` returns, in one pass over the arrays of all."""
-        items, lost = in_map_frame(batches), [dict[int, str]() for _ in batches]
+        lost: list[dict[int, str]] = [{} for _ in batches]
+        items = in_map_frame(batches)
         if any(s.filters or s.near_side_m or s.max_range_m is not None for _, s, _, _ in batches):
             items = _restricted(items, lost)
         items = merged(self._on_road(items, lost), self._merge)
@@ -243,8 +244,8 @@ class Preprocess:
         arrays = items.values, items.points_m, items.map_yaw, items.starts, items.poses
         codes, lines = kernels("fgtrack.tracking.kernels").described(*arrays)
         for k, (first, end) in enumerate(pairwise(items.starts.tolist())):
-            own, groups = codes[first:end], list[Group]()
-            kinds = dict.fromkeys(own.tolist())
+            own = codes[first:end]
+            kinds, groups = dict.fromkeys(own.tolist()), []
             for code in kinds:
                 rows = np.arange(end - first) if len(kinds) == 1 else (own == code).nonzero()[0]
                 groups += self._groups(items, k, first, rows, code)

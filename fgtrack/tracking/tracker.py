@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain, repeat
+from itertools import chain
 
 import numpy as np
 
@@ -349,7 +349,7 @@ class Tracker:
     def _estimate(self, batch: Batch, candidates: Candidates, assignment: Assignment, states: StatesAt) -> None:
         """Fuse the matched candidates, group by group; the records are in the order of the candidates."""
         bank, track_ids = self._parts.bank, states.track_ids
-        outcomes = dict[int, tuple[Measurement, UpdateResult]]()  # by index of the pair
+        outcomes: dict[int, tuple[Measurement, UpdateResult]] = {}  # by index of the pair
         chosen, tracks = np.array(assignment.pairs).T
         joint = self._joint(batch, candidates, states)
         for group, members, here in candidates.split(chosen):
@@ -358,10 +358,12 @@ class Tracker:
             measurements = Measurements(each if joint is None else equivalent(each, of, group, joint, states))
             ids = list(map(track_ids.__getitem__, of.tolist()))
             results = bank.update(batch.stamp_ns, ids, measurements)
-            outcomes.update(zip(here.tolist(), zip(repeat(measurements.stack), results), strict=True))
-            fused = [track_id for track_id, each in zip(ids, results, strict=True) if each.innovation is not None]
-            for track_id in fused:
-                self._num_measured[track_id] += 1
+            fused = []
+            for k, track_id, result in zip(here.tolist(), ids, results, strict=True):
+                outcomes[k] = measurements.stack, result
+                if result.innovation is not None:
+                    fused.append(track_id)
+                    self._num_measured[track_id] += 1
             if not candidates.placed[chosen[here[0]]]:  # as those of all others
                 continue
             self._parts.lifecycle.fused(fused)

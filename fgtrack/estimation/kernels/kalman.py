@@ -88,9 +88,7 @@ def predict(F: FloatArray, P: FloatArray, Q: FloatArray) -> tuple[FloatArray, Fl
 
 
 @njit(f"(int64, float64[::1], {_VECTORS}, {_MATRICES}, int64[::1], float64)")
-def propagate(
-    motion: int, density: FloatArray, mean: FloatArray, P: FloatArray, steps: IntArray, dt_s: float
-) -> None:
+def propagate(motion: int, density: FloatArray, mean: FloatArray, P: FloatArray, steps: IntArray, dt_s: float) -> None:
     """Move states (m, n) and (m, n, n), each by its own number of `steps` (m,) of `dt_s`: f(x) and F P F' + Q."""
     n = mean.shape[1]
     F, FP, Q, x = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty(n)
@@ -102,9 +100,7 @@ def propagate(
         copy(Q, P[i])
 
 
-@njit(
-    f"({_VECTORS}, {_MATRICES}, {_VECTORS}, {_READ}, {_READ}, int64[::1], {_MATRICES}, float64[::1], b1[::1])"
-)
+@njit(f"({_VECTORS}, {_MATRICES}, {_VECTORS}, {_READ}, {_READ}, int64[::1], {_MATRICES}, float64[::1], b1[::1])")
 def correct(
     mean: FloatArray,
     P: FloatArray,
