@@ -236,8 +236,10 @@ class SensorModel:
 
     def growth(self, components: tuple[str, ...], range_m: FloatArray) -> FloatArray | None:
         """Increase (m, k) of the variances in `noise` at `range_m` (m,), 0 at NaN; None where nothing grows."""
+        if self.std_growth.keys().isdisjoint(components):
+            return None
         rates = np.array([self.std_growth.get(name, 0.0) for name in components])
-        return np.nan_to_num(np.outer(range_m, rates) ** 2) if rates.any() else None
+        return np.asarray((np.where(np.isnan(range_m), 0.0, range_m)[:, None] * rates) ** 2)
 
     @cached_property
     def _noises(self) -> dict[tuple[str, ...], FloatArray]:

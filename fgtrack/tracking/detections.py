@@ -146,7 +146,7 @@ def covariances(items: MapDetections, k: int, rows: IntArray | slice, names: tup
     offsets_m = points_m - np.array(pose[:2]) if turns or sensor.std_growth else points_m
     more = sensor.growth(names, np.hypot(offsets_m[:, 0], offsets_m[:, 1])) if sensor.std_growth else None
     if more is not None:
-        R[:, np.arange(len(names)), np.arange(len(names))] += more
+        R.reshape(m, -1)[:, :: len(names) + 1] += more
     carrying = []
     for row, index in enumerate(indices if sensor.message_covariance else ()):
         detection = batch.message.objects[index]
