@@ -244,9 +244,11 @@ class Tracker:
         """Return the track with the identity of the only candidate, its state and the pair; None outside its gate.
         Identities that are seldom wrong need no other track: the cost does not depend on the number of tracks.
         """
-        parts, message, sensor = self._parts, batch.message, self._parts.sensors[batch.message.sensor]
-        jointly = parts.joint is not None and parts.joint.joint_from is not None
-        if len(candidates) != 1 or sensor.scan or jointly or sensor.wrong_id_probability > _SELDOM:
+        parts, message = self._parts, batch.message
+        sensor = parts.sensors[message.sensor]
+        if sensor.scan or len(candidates) != 1 or sensor.wrong_id_probability > _SELDOM:
+            return None
+        if parts.joint is not None and parts.joint.joint_from is not None:
             return None
         owner = parts.objects.owner(message.objects[candidates.leaders[0]])
         if owner is None or owner in self._undirected:

@@ -105,8 +105,8 @@ class BackwardForwardBank:
 
     def steps_back(self, stamp_ns: int) -> int:
         """Grid steps from the present back to the state nearest to `stamp_ns`; the newer one on a tie."""
-        late_ns = self._grid_ns - stamp_ns
-        return max(-((self._step_ns - 2 * late_ns) // (2 * self._step_ns)), 0)
+        back = (2 * (self._grid_ns - stamp_ns) + self._step_ns - 1) // (2 * self._step_ns)
+        return back if back > 0 else 0
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """Stored states nearest to `stamp_ns`, of those objects whose storage reaches back so far."""
@@ -116,9 +116,9 @@ class BackwardForwardBank:
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:
         """Correct the stored states nearest to `stamp_ns`; the present is predicted from them."""
-        states = self.states_at(stamp_ns)
-        rows = {track_id: row for row, track_id in enumerate(states.track_ids)}
         back, results = self.steps_back(stamp_ns), [UpdateResult(UpdateStatus.FAILED)] * len(track_ids)
+        states = self._at_grid(self._grid - back)
+        rows = dict(zip(states.track_ids, range(len(states.track_ids)), strict=True))
         for indices, alike in stacks(measurements):
             chosen = [rows[track_ids[i]] for i in indices]
             x, P = states.means.take(chosen, axis=0), states.covariances.take(chosen, axis=0)
