@@ -3,6 +3,7 @@
 import json
 import logging
 import math
+from dataclasses import replace
 from types import SimpleNamespace as Message
 
 import numpy as np
@@ -57,14 +58,16 @@ def test_the_first_position_is_the_origin_and_what_is_not_on_earth_is_not_a_numb
 
 
 def test_far_positions_warn_once(caplog):
-    plane = LocalPlane(HERE)
+    here = replace(HERE, latitude_deg=41.2)  # of no other test
+    plane, opened_again = LocalPlane(here), LocalPlane(here)
     with caplog.at_level(logging.WARNING):
-        plane.position_m(HERE.latitude_deg + 0.85, HERE.longitude_deg)
+        plane.position_m(here.latitude_deg + 0.85, here.longitude_deg)
         assert not caplog.records
-        plane.position_m(HERE.latitude_deg + 1.0, HERE.longitude_deg)
-        plane.position_m(HERE.latitude_deg + 1.1, HERE.longitude_deg)
+        plane.position_m(here.latitude_deg + 1.0, here.longitude_deg)
+        plane.position_m(here.latitude_deg + 1.1, here.longitude_deg)
+        opened_again.position_m(here.latitude_deg + 1.1, here.longitude_deg)
     assert [record.message for record in caplog.records] == [
-        "a position is 111 km from the origin 41.3000, 2.0800: beyond 100 km set `input.origin` nearer"
+        "a position is 111 km from the origin 41.2000, 2.0800: beyond 100 km set `input.origin` nearer"
     ]
 
 

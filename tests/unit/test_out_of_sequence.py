@@ -3,9 +3,11 @@
 from dataclasses import replace
 
 import pytest
+from typer.testing import CliRunner
 
 from fgtrack.calibration.arrivals import arrivals_of, overtaken, window_findings
 from fgtrack.calibration.clocks import stamp_findings
+from fgtrack.cli.main import app
 from fgtrack.core.types import Detection, DetectionList
 from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.evaluation.metrics import evaluate
@@ -85,3 +87,13 @@ def test_without_identities_only_the_stream_is_known(tmp_path):
     write_recording(tmp_path / "a.jsonl", [listed(10, 5, None), listed(20, 6, None)])
     (topic,) = describe(tmp_path / "a.jsonl").topics
     assert topic.late == {"stream_share": 0.0, "object_share": None}
+
+
+@pytest.mark.parametrize(
+    ("sensor", "shipped"), [("adsb", "adsb"), ("mlat", "airport"), ("ais", "ais"), ("radar", None)]
+)
+def test_info_names_the_shipped_configuration_of_reports(tmp_path, sensor, shipped):
+    write_recording(tmp_path / "a.jsonl", [replace(each, sensor=sensor) for each in GIVEN])
+    shown = CliRunner().invoke(app, ["info", str(tmp_path / "a.jsonl")]).output
+    assert f"`-c {shipped}`" in shown if shipped else "`-c" not in shown
+    assert ("assumed, " in shown) == (shipped is None)
