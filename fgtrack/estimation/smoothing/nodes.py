@@ -32,7 +32,7 @@ from fgtrack.estimation.smoothing.terms import MeasurementFactor, whitened
 from fgtrack.models.motion import MotionModel, WhiteNoise
 from fgtrack.models.transitions import transitions
 
-_FEW_TRACKS, _FEW_NODES, _FEW_COMPONENTS = 4, 16, 4
+_FEW_TRACKS, _FEW_NODES, _FEW_COMPONENTS = 4, 256, 4  # nodes of some seconds: growing copies, unused pages are not made
 
 
 class Nodes:
