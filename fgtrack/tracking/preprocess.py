@@ -102,8 +102,11 @@ class Group(NamedTuple):
         return R
 
     def seen_at(self, members: IntArray, x: FloatArray, P: FloatArray, of: IntArray) -> Measurement:
-        """The stack of some `members`, see `noise`."""
-        own, z, R = self.stack, self.stack.z.take(members, axis=0), self.noise(members, x, P, of)
+        """The stack of some `members`, ascending, see `noise`."""
+        own, varies = self.stack, self.stamp_error is not None or (self.error is not None and self.stack.model.relative)
+        if len(members) == len(own.z) and not varies:
+            return own
+        z, R = own.z.take(members, axis=0), self.noise(members, x, P, of)
         return Measurement(own.stamp_ns, own.model, z, R, own.pose, own.loss, own.assumed)
 
     def position_covariances(self, members: IntArray) -> FloatArray:
