@@ -1,14 +1,17 @@
-"""Is a car tracked as well where the scores were fitted to other drives?
+"""Is a car tracked as well where scores and visibility were fitted to other drives?
 
     python experiments/real_data/leave_one_out.py --kitti KITTI -o out/leave_one_out --jobs 2
 
 KITTI is the folder of the tracking data set. Every sequence is tracked with `sensors.pointrcnn_car.score` from the
-labels of the others: a logistic fit of "is a labelled car" to all their detections, less the prior odds. With several
+labels of the others: a logistic fit of "is a labelled car" to all their detections, less the prior odds. Visibility
+and detection probability are the most likely ones for the scans of their cars from the first detection on. With several
 values of `--published`, the existence probability from which a track is published, a row for each: recall and switches.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -16,13 +19,15 @@ import numpy as np
 import typer
 from joblib import Parallel, delayed
 from scipy.optimize import minimize
+from scipy.special import expit
 from scores import SEQUENCES, kitti_sources, raw, raw_mota, scans, write
 
 import fgtrack
+from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.io.run import Run
+from fgtrack.io.run import NO_TRACK, Run
 from fgtrack.io.source import open_input
 from fgtrack.models.sensors import Score
 from fgtrack.pipeline.config import Config
@@ -33,7 +38,8 @@ SENSOR = "pointrcnn_car"
 SCORES = (2.0, 3.0)
 """Lowest scores with which the detections themselves are judged."""
 HEADER = (
-    *("sequence", "published", "even", "scale", *(f"mota_raw_{score:g}" for score in SCORES)),
+    *("sequence", "published", "even", "scale", "visible_share", "visible_s", "detection_probability"),
+    *(f"mota_raw_{score:g}" for score in SCORES),
     *("mota", "recall", "id_switches"),
 )
 
@@ -45,6 +51,8 @@ class Labelled(NamedTuple):
     """Shape (n,)."""
     is_car: BoolArray
     """Whether each is a labelled car, shape (n,)."""
+    cars: tuple[FloatArray, ...]
+    """Of each car, from its first detection on: time in s of the scans, and 1 where it was detected, shape (m, 2)."""
 
 
 def labelled(source: Path, config: Config, run: Run) -> Labelled:
@@ -53,12 +61,16 @@ def labelled(source: Path, config: Config, run: Run) -> Labelled:
     matching = match(raw(run, seen), config.evaluation)
     assert matching is not None
     scores = np.concatenate([scan.scores for scan in seen])
-    return Labelled(scores[matching.tracks["track_id"]], matching.paired)
+    detected, cars = matching.track_ids != NO_TRACK, []
+    for has, present in zip(detected.T, matching.present.T, strict=True):
+        scans_of = np.flatnonzero(present & np.logical_or.accumulate(has))
+        cars.append(np.column_stack([matching.now_ns[scans_of] / NS_PER_S, has[scans_of]]))
+    return Labelled(scores[matching.tracks["track_id"]], matching.paired, tuple(cars))
 
 
 def fitted(found: Sequence[Labelled]) -> Score:
     """The score model of all of `found`: logit P(car | score) = prior log-odds + (score - even) / scale."""
-    scores, is_car = (np.concatenate(each) for each in zip(*found, strict=True))
+    scores, is_car = (np.concatenate(each) for each in list(zip(*found, strict=True))[:2])
     signs = np.where(is_car, 1.0, -1.0)
 
     def loss(line: FloatArray) -> float:
@@ -69,19 +81,39 @@ def fitted(found: Sequence[Labelled]) -> Score:
     return Score(even=(prior - offset) / slope, scale=1.0 / slope)
 
 
+def visibility(found: Sequence[Labelled]) -> tuple[float, float, float]:
+    """Most likely share of time in which a car is visible, time constant in s and P_D if visible; see `existence`."""
+
+    def loss(unbounded: FloatArray) -> float:
+        share, time_s, P_D = expit(unbounded[0]), math.exp(unbounded[1]), expit(unbounded[2])
+        total = 0.0
+        for car in (car for each in found for car in each.cars):
+            v = 1.0
+            for (before_s, _), (time, has) in pairwise(car.tolist()):
+                v = share + (v - share) * math.exp((before_s - time) / time_s)
+                likelihood = v * P_D if has else 1.0 - v * P_D
+                v, total = v * (P_D if has else 1.0 - P_D) / likelihood, total - math.log(likelihood)
+        return total
+
+    best = minimize(loss, np.array([2.0, 0.0, 3.0]), method="Nelder-Mead").x
+    return float(expit(best[0])), math.exp(best[1]), float(expit(best[2]))
+
+
 def tracked(name: str, source: Path, config: Config, others: Sequence[Labelled]) -> list[str]:
     """The row of one sequence."""
     assert isinstance(config.lifecycle, ExistenceRules)
-    score = fitted(others)
-    sensor = replace(config.sensors[SENSOR], score=score)
-    run = fgtrack.replay(source, replace(config, sensors={**config.sensors, SENSOR: sensor}))
+    score, (share, time_s, P_D) = fitted(others), visibility(others)
+    sensor = replace(config.sensors[SENSOR], score=score, detection_probability=P_D)
+    rules = replace(config.lifecycle, visible_share=share, visible_s=time_s)
+    run = fgtrack.replay(source, replace(config, sensors={**config.sensors, SENSOR: sensor}, lifecycle=rules))
     scores = evaluate(run).multi_object
     assert scores is not None
     clear = scores.clear
     motas = [100.0 * raw_mota(source, _from(config, lowest), run) for lowest in SCORES]
     recall = 100.0 * clear["pairs"] / (clear["pairs"] + clear["misses"])
-    numbers = (config.lifecycle.confirm_probability, score.even, score.scale, *motas, 100.0 * clear["mota"], recall)
-    return [name, *(f"{number:.2f}" for number in numbers), f"{clear['id_switches']:.0f}"]
+    chosen = config.lifecycle.confirm_probability, score.even, score.scale, share, time_s, P_D
+    numbers = (*chosen, *motas, 100.0 * clear["mota"], recall)
+    return [name, *(f"{number:.3g}" for number in numbers), f"{clear['id_switches']:.0f}"]
 
 
 def published_from(config: Config, probability: float) -> Config:
@@ -118,7 +150,9 @@ def main(
     )
     score = fitted(list(labels.values()))
     write(out / "leave_one_out.csv", HEADER, rows)
+    share, time_s, P_D = visibility(list(labels.values()))
     print(f"fitted to all: even {score.even:.2f}, scale {score.scale:.2f}")
+    print(f"visible {share:.2f} of the time, for {time_s:.2f} s, detected with {P_D:.3f}")
 
 
 if __name__ == "__main__":
