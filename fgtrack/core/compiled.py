@@ -19,6 +19,7 @@ from numba.core.cgutils import get_or_insert_function
 from numba.core.runtime.nrt import rtsys
 from numba.core.typing.templates import ConcreteTemplate, infer_global
 from numba.extending import lower_builtin
+from numba.np.arrayobj import make_array, populate_array
 
 from fgtrack.core.types import FloatArray
 
@@ -72,10 +73,11 @@ class _Cache(FunctionCache):
 
 def njit(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that compiles a function once: it is stored in a cache folder, if one can be written.
-    One line of the log reports that loops are compiled, another one that they cannot be stored.
+    One line of the log reports that loops are compiled, another one that they cannot be stored. A function whose
+    signature begins with a number type or void must not allocate arrays, see `scratch`: no references are counted then.
     """
-
-    options |= {"error_model": "numpy", "no_cfunc_wrapper": True}
+    returns_arrays = not signature.partition("(")[0].isidentifier()
+    options |= {"error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": returns_arrays}
 
     def compiled(function: Callable[..., Any]) -> Any:
         result: Any = numba.njit(**options)(function)
@@ -90,10 +92,18 @@ def njit(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
         if collects:
             gc.enable()
         if result.stats.cache_misses and isinstance(result._cache, _Cache):
-            _say("compiling numerical loops, once: some 45 s of processor time for all")
+            _say("compiling numerical loops, once: some 25 s of processor time for all")
         return result
 
     return compiled
+
+
+def _declare(function: Callable[..., Any], signatures: list[Any], lower: Callable[..., Any]) -> None:
+    """Let compiled functions call one with these signatures: `lower` writes their code."""
+    template = type(function.__name__, (ConcreteTemplate,), {"key": function, "cases": signatures})
+    infer_global(function, numba.types.Function(template))  # type: ignore[no-untyped-call]
+    for each in signatures:
+        lower_builtin(function, *each.args)(lower)  # type: ignore[no-untyped-call]
 
 
 def shared(signature: str) -> Callable[[_Function], _Function]:
@@ -105,15 +115,13 @@ def shared(signature: str) -> Callable[[_Function], _Function]:
         (result,) = njit(signature, no_cpython_wrapper=True)(function).overloads.values()
         name = f"{function.__module__}.{function.__name__} {result.signature}"
         add_symbol(name, result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
-        template = type(name, (ConcreteTemplate,), {"key": function, "cases": [result.signature]})
-        infer_global(function, numba.types.Function(template))  # type: ignore[no-untyped-call]
 
-        @lower_builtin(function, *result.signature.args)  # type: ignore[no-untyped-call, untyped-decorator]
         def call(context: Any, builder: Any, own: Any, args: Any) -> Any:
             of = context.call_conv.get_function_type(own.return_type, own.args)
             callee = get_or_insert_function(builder.module, of, name)  # type: ignore[no-untyped-call]
             return context.call_conv.call_function(builder, callee, own.return_type, own.args, args)[1]
 
+        _declare(function, [result.signature], call)
         return function
 
     return compiled
@@ -121,16 +129,38 @@ def shared(signature: str) -> Callable[[_Function], _Function]:
 
 def inlined(function: _Function) -> _Function:
     """Decorate a function that only compiled ones call, which are optimised together with it."""
-    options: Any = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    options: Any = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": False}
     return cast(_Function, numba.njit(error_model="numpy", **options)(function))
 
 
 def merged(function: _Function) -> _Function:
-    """Decorate a function with one caller, which is compiled as a part of it: alone it would be compiled twice."""
+    """Decorate a small function with one caller, which is compiled as a part of it: alone it would be compiled twice.
+    A large one is better `shared`: it is copied statement by statement.
+    """
     return cast(_Function, numba.njit(error_model="numpy", inline="always")(function))
 
 
-_READ, _MATRIX = "Array(float64, 2, 'C', readonly=True)", "float64[:, ::1]"
+def scratch(*shape: int) -> FloatArray:
+    """Return a small array on the stack of the compiled function that calls this, outside its loops."""
+    raise NotImplementedError
+
+
+def _lower_scratch(context: Any, builder: Any, own: Any, shape: Any) -> Any:
+    array = make_array(own.return_type)(context, builder)  # type: ignore[no-untyped-call]
+    strides: list[Any] = []
+    count, size = context.get_constant(numba.types.intp, 1), context.get_constant(numba.types.intp, 8)
+    for length in reversed(shape):
+        strides.insert(0, builder.mul(count, size))
+        count = builder.mul(count, length)
+    data = builder.alloca(context.get_data_type(numba.types.float64), size=count)
+    populate_array(array, data=data, shape=shape, strides=strides, itemsize=size, meminfo=None)  # type: ignore[no-untyped-call]
+    return array._getvalue()
+
+
+_SHAPES: Any = [(numba.types.int64,) * num for num in (1, 2, 3)]
+_declare(scratch, [numba.types.Array(numba.types.float64, len(each), "C")(*each) for each in _SHAPES], _lower_scratch)
+
+READ, MATRIX = "Array(float64, 2, 'C', readonly=True)", "float64[:, ::1]"
 
 
 @inlined
@@ -141,7 +171,7 @@ def copy(source: FloatArray, out: FloatArray) -> None:
             out[i, j] = source[i, j]
 
 
-@shared(f"void({_READ}, {_READ}, {_MATRIX})")
+@shared(f"void({READ}, {READ}, {MATRIX})")
 def product(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
     """Write A B; columns beyond those that meet are ignored."""
     for i in range(out.shape[0]):
@@ -152,7 +182,7 @@ def product(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
             out[i, j] = value
 
 
-@shared(f"void({_READ}, {_READ}, {_MATRIX})")
+@shared(f"void({READ}, {READ}, {MATRIX})")
 def add_product_transposed(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
     """Add A B', which is symmetric, to `out`: its lower triangle, and the mirror of that."""
     for i in range(A.shape[0]):
@@ -163,14 +193,14 @@ def add_product_transposed(A: FloatArray, B: FloatArray, out: FloatArray) -> Non
             out[i, j] = out[j, i] = value
 
 
-@shared(f"void({_READ}, {_READ}, {_MATRIX}, {_MATRIX})")
+@shared(f"void({READ}, {READ}, {MATRIX}, {MATRIX})")
 def add_congruence(A: FloatArray, P: FloatArray, AP: FloatArray, out: FloatArray) -> None:
     """Add A P A' to `out`, and write A P."""
     product(A, P, AP)
     add_product_transposed(AP, A, out)
 
 
-@shared(f"void({_READ}, {_READ}, {_MATRIX}, {_MATRIX})")
+@shared(f"void({READ}, {READ}, {MATRIX}, {MATRIX})")
 def add_weighted(K: FloatArray, R: FloatArray, KR: FloatArray, out: FloatArray) -> None:
     """Add K' R K of K (k, n) and the first k rows and columns of R, which is symmetric, to `out`; K' R is written."""
     k, n = K.shape
@@ -187,7 +217,7 @@ def add_weighted(K: FloatArray, R: FloatArray, KR: FloatArray, out: FloatArray) 
             out[a, b] = out[b, a] = value
 
 
-@shared(f"b1({_READ}, int64, {_MATRIX})")
+@shared(f"b1({READ}, int64, {MATRIX})")
 def cholesky(S: FloatArray, n: int, L: FloatArray) -> bool:
     """Write the lower Cholesky factor of the first n rows and columns to L, which may be S; False if there is none."""
     for i in range(n):
@@ -198,13 +228,13 @@ def cholesky(S: FloatArray, n: int, L: FloatArray) -> bool:
             if j < i:
                 L[i, j] = value / L[j, j]
             elif value > 0.0:
-                L[i, i] = np.sqrt(value)
+                L[i, i] = math.sqrt(value)
             else:
                 return False
     return True
 
 
-@shared(f"void({_READ}, {_MATRIX})")
+@shared(f"void({READ}, {MATRIX})")
 def forward(L: FloatArray, columns: FloatArray) -> None:
     """Overwrite columns (n, m) by L^-1 columns, L (n, n) being lower triangular."""
     for i in range(len(columns)):
@@ -215,7 +245,7 @@ def forward(L: FloatArray, columns: FloatArray) -> None:
             columns[i, c] /= L[i, i]
 
 
-@shared(f"b1({_MATRIX}, {_MATRIX})")
+@shared(f"b1({MATRIX}, {MATRIX})")
 def solve(S: FloatArray, columns: FloatArray) -> bool:
     """Overwrite columns (n, m) by S^-1 columns, and the first n rows and columns of S by their Cholesky factor.
     False unless they are positive definite.
@@ -233,7 +263,7 @@ def solve(S: FloatArray, columns: FloatArray) -> bool:
     return True
 
 
-@shared(f"float64({_MATRIX}, float64[::1])")
+@shared(f"float64({MATRIX}, float64[::1])")
 def whiten(S: FloatArray, y: FloatArray) -> float:
     """Overwrite y (n,) by L^-1 y, and S by its Cholesky factor L; return y' S^-1 y, NaN where there is no root."""
     total = 0.0

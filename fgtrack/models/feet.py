@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import inlined, njit, wrapped
+from fgtrack.core.compiled import njit, shared, wrapped
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 
 _HEADING, _CURVATURE, _LEFT, _RIGHT, _ALONG, _QUANTITIES = 4, 5, 6, 7, 9, 10  # see `fgtrack.models.track_map`
 
 
-@inlined
+@shared("int64(float64, float64, Array(float64, 2, 'C', readonly=True), float64)")
 def _nearest(x: float, y: float, rows: FloatArray, longest_m: float) -> int:
     """Return the first of the nearest of points `rows` (n, ...) on a closed line, at most `longest_m` apart."""
     first, least_m, j, stride = 0, np.inf, 0, math.ceil(math.sqrt(len(rows)))
@@ -28,7 +28,7 @@ def _nearest(x: float, y: float, rows: FloatArray, longest_m: float) -> int:
     return first
 
 
-@njit("(float64[:, ::1], Array(float64, 2, 'C', readonly=True), float64)")
+@njit("int64[::1](float64[:, ::1], Array(float64, 2, 'C', readonly=True), float64)")
 def nearest(points_m: FloatArray, rows: FloatArray, longest_m: float) -> IntArray:
     """Return for each of `points_m` (m, 2) the first of the nearest points `rows` (n, 2), at most `longest_m` apart."""
     indices = np.empty(len(points_m), np.int64)

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import add_product_transposed, copy, inlined, merged, njit, product, shared
+from fgtrack.core.compiled import add_product_transposed, copy, inlined, merged, njit, product, scratch, shared
 from fgtrack.core.types import FloatArray
 
 #: Kinds of motion: constant turn rate and velocity (or acceleration), constant velocity.
@@ -51,6 +51,16 @@ _SERIES = np.hstack([*_linear(0), *_quadratic(0, 0), *_linear(2), *_quadratic(0,
 
 
 @inlined
+def _turned(right: float, up: float, moments: FloatArray, p: int) -> tuple[float, float]:
+    """Product of complex numbers."""
+    real, imag = moments[p, 0], moments[p, 1]
+    return right * real - up * imag, right * imag + up * real
+
+
+_TYPES = f"float64[::1], float64, {'float64[::1], ' * 2}float64[:, ::1], float64[:, ::1]"
+
+
+@shared(f"void({_TYPES})")
 def _short_arc(x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray) -> None:
     """Write mean, F and Q after a turn of at most `MAX_TURN_RAD`.
     As complex numbers, along and left of the heading at the end, where the speed is v, the position depends on yaw,
@@ -61,7 +71,9 @@ def _short_arc(x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F
     accel, q_accel = (x[5], density[5] * t) if n > 5 else (0.0, 0.0)
     q_yaw, q_speed, q_rate = density[2] * t, density[3] * t, density[4] * t
     w, v, a = -x[4] * t, x[3] + accel * t, accel * t
-    unit, scaled, moments, used = np.zeros(38), np.empty(16), np.empty((2, 8), np.complex128), 16 if n == 5 else 38
+    unit, scaled, moments, used = scratch(38), scratch(16), scratch(2, 8, 2), 16 if n == 5 else 38
+    for p in range(38):
+        unit[p] = 0.0
     for k in range(_TERMS - 1, -1, -1):
         for p in range(used):
             unit[p] = unit[p] * (w * w) + _SERIES[k, p]
@@ -69,34 +81,38 @@ def _short_arc(x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F
         scaled[p] = v * unit[p] - a * unit[p + 16]
         if p >= 10:
             scaled[p] = v * v * unit[p] - 2.0 * v * a * unit[p + 16] + a * a * unit[p + 22]
-    for p in range(8):
-        moments[0, p] = complex(scaled[2 * p], scaled[2 * p + 1] * w)
-        moments[1, p] = complex(unit[2 * p], unit[2 * p + 1] * w)
+    for p in range(7):
+        moments[0, p, 0], moments[0, p, 1] = scaled[2 * p], scaled[2 * p + 1] * w
+        moments[1, p, 0], moments[1, p, 1] = unit[2 * p], unit[2 * p + 1] * w
     for j in range(n):
         mean[j] = x[j]
         for k in range(n):
             F[j, k] = 1.0 if j == k else 0.0
             Q[j, k] = density[j] * t if j == k else 0.0
     mean[2], mean[3] = x[2] + x[4] * t, v
-    turn = complex(math.cos(mean[2]), math.sin(mean[2]))
-    way = turn * t * moments[0, 0]
+    c, s = math.cos(mean[2]), math.sin(mean[2])
+    right, up = _turned(c * t, s * t, moments[0], 0)
     size = q_yaw * scaled[14] + q_speed * unit[14] + t * t * (q_rate * scaled[15] + q_accel * unit[15])
-    square = q_speed * moments[1, 5] - q_yaw * moments[0, 5]
-    square = turn * turn * (square + t * t * (q_accel * moments[1, 6] - q_rate * moments[0, 6]))
-    mean[0], mean[1] = x[0] + way.real, x[1] + way.imag
-    Q[0, 0] += 0.5 * t * t * (size + square.real)
-    Q[1, 1] += 0.5 * t * t * (size - square.real)
-    Q[0, 1] = Q[1, 0] = 0.5 * t * t * square.imag
+    for j in range(2):
+        moments[1, 7, j] = q_speed * moments[1, 5, j] - q_yaw * moments[0, 5, j]
+        moments[1, 7, j] += t * t * (q_accel * moments[1, 6, j] - q_rate * moments[0, 6, j])
+    mean[0], mean[1] = x[0] + right, x[1] + up
+    right, up = _turned(c * c - s * s, c * s + s * c, moments[1], 7)
+    Q[0, 0] += 0.5 * t * t * (size + right)
+    Q[1, 1] += 0.5 * t * t * (size - right)
+    Q[0, 1] = Q[1, 0] = 0.5 * t * t * up
     for k in range(2, n):  # yaw and speed, and then their rates, of which the second is the acceleration
-        which, direction, q = k % 2, turn * (1j * t if k % 2 == 0 else complex(t, 0.0)), density[k] * t
-        by, noise = direction * moments[which, 0], direction * q * moments[which, 2]
-        if k > 3:
-            by, noise = direction * t * moments[which, 1], direction * t * q * moments[which, 3]
-        elif k + 2 < n:
-            noise += direction * (density[k + 2] * t) * t * t * moments[which, 4]
-        F[0, k], F[1, k] = by.real, by.imag
-        Q[0, k] = Q[k, 0] = noise.real
-        Q[1, k] = Q[k, 1] = noise.imag
+        of, q, rate = moments[k % 2], density[k] * t, 1 if k > 3 else 0
+        right, up = (-s * t, c * t) if k % 2 == 0 else (c * t, s * t)
+        if rate:
+            right, up = right * t, up * t
+        F[0, k], F[1, k] = _turned(right, up, of, rate)
+        Q[0, k], Q[1, k] = _turned(right * q, up * q, of, 2 + rate)
+        if not rate and k + 2 < n:
+            q = density[k + 2] * t
+            right, up = _turned(right * q * t * t, up * q * t * t, of, 4)
+            Q[0, k], Q[1, k] = Q[0, k] + right, Q[1, k] + up
+        Q[k, 0], Q[k, 1] = Q[0, k], Q[1, k]
         if k > 3:  # the yaw by its rate, the speed by the acceleration
             F[k - 2, k] = t
             Q[k - 2, k - 2] += density[k] * t * t * t / 3.0
@@ -104,22 +120,23 @@ def _short_arc(x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F
 
 
 @merged
-def _long_arc(
+def _arc(
     x: FloatArray, t: float, parts: int, density: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
 ) -> None:
     """Write mean, F and Q after so many short arcs of t each."""
     n = len(x)
-    before, G, old, GM = np.empty(n), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    _short_arc(x, t, density, mean, F, Q)
-    for _ in range(1, parts):
-        for j in range(n):
+    before, G, old, GM = scratch(n), scratch(n, n), scratch(n, n), scratch(n, n)
+    for part in range(parts):
+        for j in range(n if part else 0):
             before[j] = mean[j]
-        copy(Q, old)
-        _short_arc(before, t, density, mean, G, Q)
-        product(G, old, GM)
-        add_product_transposed(GM, G, Q)
-        product(G, F, GM)
-        copy(GM, F)
+        if part:
+            copy(Q, old)
+        _short_arc(before if part else x, t, density, mean, G if part else F, Q)
+        if part:
+            product(G, old, GM)
+            add_product_transposed(GM, G, Q)
+            product(G, F, GM)
+            copy(GM, F)
 
 
 @merged
@@ -134,11 +151,11 @@ def _line(x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F: Flo
         v, q = i + 2, density[i + 2]
         mean[i] += x[v] * t
         F[i, v] = t
-        Q[i, i] += q * t**3 / 3.0
-        Q[i, v] = Q[v, i] = q * t**2 / 2.0
+        Q[i, i] += q * (t * t * t) / 3.0
+        Q[i, v] = Q[v, i] = q * (t * t) / 2.0
 
 
-@shared(f"void(int64, float64[::1], float64, float64[::1], float64[::1], {'float64[:, ::1], ' * 2})")
+@shared(f"void(int64, {_TYPES})")
 def transition(
     kind: int, x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
 ) -> None:
@@ -146,11 +163,9 @@ def transition(
     turn = abs(x[4] * t) if kind == ARC else 0.0
     if kind != ARC:
         _line(x, t, density, mean, F, Q)
-    elif turn <= MAX_TURN_RAD:
-        _short_arc(x, t, density, mean, F, Q)
     elif turn < MAX_TURN_RAD * MAX_PARTS:
-        parts = math.ceil(turn / MAX_TURN_RAD)
-        _long_arc(x, t / parts, parts, density, mean, F, Q)
+        parts = max(math.ceil(turn / MAX_TURN_RAD), 1)
+        _arc(x, t / parts, parts, density, mean, F, Q)
     else:
         for i in range(len(x)):
             mean[i] = math.nan
@@ -158,7 +173,9 @@ def transition(
                 F[i, k] = Q[i, k] = math.nan
 
 
-@njit("(int64, float64[:, ::1], float64[::1], float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, ::1])")
+@njit(
+    "void(int64, float64[:, ::1], float64[::1], float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, ::1])"
+)
 def transitions(
     kind: int, x: FloatArray, dt_s: FloatArray, density: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
 ) -> None:

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import inlined, njit
+from fgtrack.core.compiled import inlined, merged, njit
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.tracking.visibility import LARGEST_LOG_ODDS, LOG_ODDS, NEVER, RATIO, SENSOR, STAMP, VIEWED, VISIBLE
@@ -19,7 +19,7 @@ def _survived(log_odds: float, dt_ns: int, lifetime_s: float) -> float:
     return max(-math.log(math.exp(-log_odds) - math.expm1(-dt)) - dt, -LARGEST_LOG_ODDS)
 
 
-@inlined
+@merged
 def _conclude(
     numbers: FloatArray, entries: IntArray, k: int, lifetime_s: float, visible_share: float, visible_s: float
 ) -> None:
@@ -100,7 +100,7 @@ def present(
     return result
 
 
-@njit("(int64, float64[:, :, ::1], int64[:, :, ::1], int64[::1])")
+@njit("void(int64, float64[:, :, ::1], int64[:, :, ::1], int64[::1])")
 def forget(oldest_ns: int, numbers: FloatArray, entries: IntArray, counts: IntArray) -> None:
     """Drop entries up to `oldest_ns`; the last of them becomes entry 0."""
     for own in range(len(counts)):

@@ -101,3 +101,16 @@ def test_a_shared_function_is_not_part_of_its_callers() -> None:
     [code] = caller.inspect_llvm().values()
     assert "declare i32 @" in code.replace('@"', "@")
     assert "shl" not in code
+
+
+def test_scratch_arrays_do_not_overlap(stored) -> None:
+    head = "from fgtrack.core.compiled import scratch\n"
+    body = "    a, b, c = scratch(n), scratch(n, 2), scratch(2, 3, n)\n    a[:], b[:], c[:] = 1.0, 2.0, 3.0\n"
+    total = "    return a.sum() + b.sum() + c.sum() + c[1, 2, n - 1]\n"
+    call = stored(SHARED, head + "@njit('float64(int64)')\ndef call(n):\n" + body + total).call
+    assert [call(n) for n in (1, 6)] == [1.0 + 4.0 + 18.0 + 3.0, 6.0 + 24.0 + 108.0 + 3.0]
+
+
+def test_a_loop_that_gives_a_number_allocates_nothing(stored) -> None:
+    with pytest.raises(numba.core.errors.TypingError, match="empty"):
+        stored(SHARED, "import numpy as np\n@njit('float64(int64)')\ndef call(n):\n    return np.empty(n)[0]\n")

@@ -2,13 +2,11 @@
 
 import math
 
-import numpy as np
-
-from fgtrack.core.compiled import add_product_transposed, copy, njit, product
+from fgtrack.core.compiled import add_product_transposed, copy, njit, product, scratch
 from fgtrack.core.types import FloatArray, IntArray
 
 
-@njit("(float64[:, ::1], float64[:, :, ::1], int64[::1], float64, float64[::1], b1, float64)")
+@njit("void(float64[:, ::1], float64[:, :, ::1], int64[::1], float64, float64[::1], b1, float64)")
 def propagate(
     mean: FloatArray,
     P: FloatArray,
@@ -23,7 +21,7 @@ def propagate(
     without a part in F; the yaw goes up to `yaw_limit_rad`.
     """
     m, n = mean.shape
-    F, FP, more = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    F, FP, more = scratch(n, n), scratch(n, n), scratch(n, n)
     for j in range(n):
         for k in range(n):
             F[j, k] = 1.0 if j == k else 0.0

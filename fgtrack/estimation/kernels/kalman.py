@@ -1,15 +1,19 @@
 """The Kalman filter on stacks of independent states."""
 
+import math
+
 import numpy as np
 
 from fgtrack.core.compiled import (
+    MATRIX,
+    READ,
     add_congruence,
     add_product_transposed,
     add_weighted,
     copy,
-    inlined,
     njit,
     product,
+    scratch,
     shared,
     solve,
     whiten,
@@ -18,10 +22,9 @@ from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.models.transitions import transition
 
 _VECTORS, _MATRICES, _READ = "float64[:, ::1]", "float64[:, :, ::1]", "Array(float64, 3, 'C', readonly=True)"
-_R = "Array(float64, 2, 'C', readonly=True)"
 
 
-@inlined
+@shared(f"float64({MATRIX}, float64[::1], int64[::1], {MATRIX}, float64[::1])")
 def marginal_nis(S: FloatArray, y: FloatArray, rows: IntArray, root: FloatArray, white: FloatArray) -> float:
     """Return the NIS of the `rows` of y (k,) with covariance S; NaN where that of the rows has no root."""
     for a in range(len(rows)):
@@ -31,7 +34,7 @@ def marginal_nis(S: FloatArray, y: FloatArray, rows: IntArray, root: FloatArray,
     return whiten(root, white[: len(rows)])
 
 
-@shared(f"b1(float64[::1], {'float64[:, ::1], ' * 3}{_R}, float64[::1], float64[:, ::1], float64[:, ::1])")
+@shared(f"b1(float64[::1], {f'{MATRIX}, ' * 3}{READ}, float64[::1], {MATRIX}, {MATRIX})")
 def conclude(
     mean: FloatArray,
     P: FloatArray,
@@ -74,7 +77,7 @@ def innovations(
         add_congruence(H[min(i, len(H) - 1)], P[tracks[i]], HP, S[i])
         nis[i] = marginal_nis(S[i], y[i], rows, root, white)
         for a in range(len(rows)):
-            logdet[i] += 2.0 * np.log(root[a, a])
+            logdet[i] += 2.0 * math.log(root[a, a])
     return S, nis, logdet
 
 
@@ -87,11 +90,11 @@ def predict(F: FloatArray, P: FloatArray, Q: FloatArray) -> tuple[FloatArray, Fl
     return Q, cross
 
 
-@njit(f"(int64, float64[::1], {_VECTORS}, {_MATRICES}, int64[::1], float64)")
+@njit(f"void(int64, float64[::1], {_VECTORS}, {_MATRICES}, int64[::1], float64)")
 def propagate(motion: int, density: FloatArray, mean: FloatArray, P: FloatArray, steps: IntArray, dt_s: float) -> None:
     """Move states (m, n) and (m, n, n), each by its own number of `steps` (m,) of `dt_s`: f(x) and F P F' + Q."""
     n = mean.shape[1]
-    F, FP, Q, x = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty(n)
+    F, FP, Q, x = scratch(n, n), scratch(n, n), scratch(n, n), scratch(n)
     for i in range(len(mean)):
         for a in range(n):
             x[a] = mean[i, a]
@@ -100,7 +103,7 @@ def propagate(motion: int, density: FloatArray, mean: FloatArray, P: FloatArray,
         copy(Q, P[i])
 
 
-@njit(f"({_VECTORS}, {_MATRICES}, {_VECTORS}, {_READ}, {_READ}, int64[::1], {_MATRICES}, float64[::1], b1[::1])")
+@njit(f"void({_VECTORS}, {_MATRICES}, {_VECTORS}, {_READ}, {_READ}, int64[::1], {_MATRICES}, float64[::1], b1[::1])")
 def correct(
     mean: FloatArray,
     P: FloatArray,
@@ -117,15 +120,14 @@ def correct(
     (m, n), (m, n, n), (m, k), (1, k, n) or (m, k, n), (m, k, k).
     """
     m, k, n = len(y), y.shape[1], mean.shape[1]
-    K, root, white, A, AP = np.empty((k, n)), np.empty((k, k)), np.empty(k), np.empty((n, n)), np.empty((n, n))
-    KR = np.empty((n, k))
+    K, root, white, A, AP, KR = scratch(k, n), scratch(k, k), scratch(k), scratch(n, n), scratch(n, n), scratch(n, k)
     for i in range(m):
         h = H[min(i, len(H) - 1)]
         copy(R[i], S[i])
         add_congruence(h, P[i], K, S[i])
         nis[i] = marginal_nis(S[i], y[i], rows, root, white)
         copy(S[i], root)
-        fused[i] = not np.isnan(nis[i]) and solve(root, K)
+        fused[i] = not math.isnan(nis[i]) and solve(root, K)
         if not fused[i]:
             nis[i] = np.nan
             continue

@@ -7,9 +7,21 @@ it, and the cross-covariance of that with the step before. One of `measured` has
 is a prior, is 0. A row of `windows` has the number of the track's steps, and its oldest and newest stamp.
 """
 
-import numpy as np
+import math
 
-from fgtrack.core.compiled import add_congruence, add_weighted, copy, inlined, merged, njit, solve, wrapped
+from fgtrack.core.compiled import (
+    MATRIX,
+    add_congruence,
+    add_weighted,
+    copy,
+    inlined,
+    merged,
+    njit,
+    scratch,
+    shared,
+    solve,
+    wrapped,
+)
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.kernels.kalman import conclude, marginal_nis
@@ -20,14 +32,6 @@ _YAW = 2
 
 
 _Space = tuple[FloatArray, ...]
-
-
-@inlined
-def _space(n: int, k: int) -> _Space:
-    """Space for F, I - K H, (I - K H) P, a prediction, shape (2 n + 1, n), mean, S, K, K R and y."""
-    square, S, AP = np.empty((n, n)), np.empty((k, k)), np.empty((n, n))
-    ahead, K, KR = np.empty((2 * n + 1, n)), np.empty((k, n)), np.empty((n, k))
-    return square, np.empty((n, n)), AP, ahead, np.empty(n), S, K, KR, np.empty(k)
 
 
 @inlined
@@ -46,7 +50,7 @@ def _ahead(
     add_congruence(F, state[1:], FP, P)
 
 
-@inlined
+@shared(f"void({MATRIX}, int64[::1], {MATRIX}, b1, float64[::1], {MATRIX})")
 def _innovation(
     state: FloatArray, label: IntArray, measured: FloatArray, wraps: bool, y: FloatArray, S: FloatArray
 ) -> None:
@@ -61,7 +65,10 @@ def _innovation(
             S[a, b] = state[1 + entry, label[2 + b]] + measured[1 + a, b]
 
 
-@merged
+_SPACE = f"Tuple(({f'{MATRIX}, ' * 4}float64[::1], {f'{MATRIX}, ' * 3}float64[::1]))"
+
+
+@shared(f"b1(int64, float64[::1], int64[::1], int64[:, ::1], float64[:, :, ::1], {_SPACE}, {MATRIX})")
 def _retrodict(
     motion: int,
     density: FloatArray,
@@ -76,7 +83,7 @@ def _retrodict(
     step after, the shift s = x - x_- and C = (P_-^-1 F P_j)'. False where some P_- has no root.
     """
     n = len(density)
-    F, root, CD, ahead, mean = space[:5]
+    F, root, CD, ahead, mean, _, _, _, _ = space
     gain, shift = ahead[n + 1 :], now[0]
     for j in range(len(slots) - 1, 0, -1):
         after, left, start = slots[j], slots[j - 1], 0 if j > 1 else n + 1
@@ -143,7 +150,7 @@ def _step(
     return True
 
 
-@inlined
+@merged
 def _comes_after(label: IntArray, measured: FloatArray, new_label: IntArray, new: FloatArray) -> bool:
     """True if a step comes after a new one: by stamp, and at one stamp by content, whatever came first."""
     k = label[1]
@@ -159,7 +166,7 @@ def _comes_after(label: IntArray, measured: FloatArray, new_label: IntArray, new
     return False
 
 
-@inlined
+@merged
 def _forget(oldest_ns: int, slots: IntArray, labels: IntArray, window: IntArray) -> None:
     """Free the slots of steps before the newest one that is older than `oldest_ns`."""
     gone = 0
@@ -204,7 +211,10 @@ def fuse(
     number of steps; every track must have a free slot.
     """
     k, n, largest = y.shape[1], len(density), 0
-    now, space = np.empty((n + 1, n)), _space(n, measured.shape[3])
+    now, most = scratch(n + 1, n), measured.shape[3]
+    F, A, AP, ahead, mean = scratch(n, n), scratch(n, n), scratch(n, n), scratch(2 * n + 1, n), scratch(n)
+    root, K, KR, white = scratch(most, most), scratch(most, n), scratch(n, most), scratch(most)
+    space = F, A, AP, ahead, mean, root, K, KR, white
     for i in range(len(tracks)):
         t = tracks[i]
         slots, window = order[t], windows[t]
@@ -235,8 +245,8 @@ def fuse(
                 copy(steps[t, newest, n + 1 if index == count else 0 :], now)
                 ok = _retrodict(motion, density, slots[index : count + 1], labels[t], steps[t], space, now)
                 _innovation(now, label, new, motion == ARC, y[i], S[i])
-                nis[i] = marginal_nis(S[i], y[i], rows, space[5], space[8])
-                ok = ok and not np.isnan(nis[i])
+                nis[i] = marginal_nis(S[i], y[i], rows, root, white)
+                ok = ok and not math.isnan(nis[i])
             j += 1
             if not ok and fused:  # take it out, and re-filter the later ones without it
                 for j in range(index, count):
@@ -272,7 +282,7 @@ def ahead(
     Known are, and counted, those whose windows have begun; at the present others have their first state.
     """
     n, count = len(density), 0
-    F, FP = np.empty((n, n)), np.empty((n, n))
+    F, FP = scratch(n, n), scratch(n, n)
     for i in range(len(tracks)):
         t, at_ns = tracks[i], stamp_ns
         if t < 0:

@@ -7,14 +7,14 @@ ascending order, the grid index before which the track is unknown, and the newes
 
 import numpy as np
 
-from fgtrack.core.compiled import copy, inlined, njit
+from fgtrack.core.compiled import copy, merged, njit
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 
 FAILED, IN_SEQUENCE, OUT_OF_SEQUENCE = range(3)
 _STORAGE = "int64[:, :, ::1], float64[:, :, :, ::1], int64[:, ::1]"
 
 
-@njit(f"(int64, b1, int64[:], {_STORAGE}, float64[:, ::1], float64[:, :, ::1], int64[::1])")
+@njit(f"void(int64, b1, int64[:], {_STORAGE}, float64[:, ::1], float64[:, :, ::1], int64[::1])")
 def look_up(
     grid: int,
     is_present: bool,
@@ -40,7 +40,7 @@ def look_up(
         copy(states[row, j, 1:], covariances[i])
 
 
-@inlined
+@merged
 def _forget(oldest: int, anchors: IntArray, states: FloatArray, window: IntArray) -> None:
     """Move the last anchor that a look-up of `oldest` finds, and those after it, to the front."""
     gone = 0

@@ -7,9 +7,23 @@ stamps 1 us apart. `nodes` are the `arrays` of `Nodes`, in that order.
 All arrays are contiguous, and blocks are copied entry by entry: numba compiles that in a fraction of the time.
 """
 
+import math
+
 import numpy as np
 
-from fgtrack.core.compiled import add_congruence, copy, inlined, njit, product, solve
+from fgtrack.core.compiled import (
+    MATRIX,
+    READ,
+    add_congruence,
+    copy,
+    inlined,
+    merged,
+    njit,
+    product,
+    scratch,
+    shared,
+    solve,
+)
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 
@@ -21,21 +35,15 @@ NEVER = int(np.iinfo(np.int64).max)
 COUNT, FIRST, KNOWN, BEGIN_NS, NONLINEAR = range(5)
 #: Columns of `labels`.
 NUM_ROWS, CHANGED, STALE = range(3)
-#: Rows of `values` of a node, and then blocks of n rows; for each literal integer, `block` would be compiled once more.
+#: Rows of `points` of a node, and its `blocks`.
 ORIGIN, REFERENCE = range(2)
-C, FILTERED, PREDICTED, P, F, Q = np.arange(6)
+C, FILTERED, PREDICTED, P, F, Q = range(6)
 #: Types of arguments.
 INDICES, TIMES, VECTORS, MATRICES = ("int64[::1]", "float64[::1]", "float64[:, ::1]", "float64[:, :, ::1]")
-NODES = f"Tuple(({'int64[:, ::1], ' * 4}{MATRICES}, {MATRICES}, {MATRICES}))"
-Arrays = tuple[IntArray, IntArray, IntArray, IntArray, FloatArray, FloatArray, FloatArray]
+BLOCKS = "float64[:, :, :, ::1]"
+NODES = f"Tuple(({'int64[:, ::1], ' * 4}{MATRICES}, {MATRICES}, {BLOCKS}, {MATRICES}))"
+Arrays = tuple[IntArray, IntArray, IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]
 """See `Nodes.arrays`."""
-
-
-@inlined
-def block(values: FloatArray, at: int, which: np.int_) -> FloatArray:
-    """Return a block of a node, a matrix (n, n) and a vector (n,) beside it."""
-    n = values.shape[2] - 1
-    return values[at, 2 + which * n : 2 + (which + 1) * n]
 
 
 @inlined
@@ -45,7 +53,7 @@ def regularise(Q: FloatArray) -> None:
         Q[i, i] += 1e-12 * max(Q[i, i], 1e-6)
 
 
-@inlined
+@shared(f"void({READ}, {READ}, {MATRIX})")
 def _complement(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
     """Write I - A B."""
     product(A, B, out)
@@ -54,28 +62,28 @@ def _complement(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
             out[i, j] = (1.0 if i == j else 0.0) - out[i, j]
 
 
-@inlined
-def _predict(values: FloatArray, before: int, at: int, moved: FloatArray) -> None:
+@merged
+def _predict(points: FloatArray, blocks: FloatArray, before: int, at: int, moved: FloatArray) -> None:
     """Write the prediction [F P F' + Q | F x + f - x0], and F P to `moved`."""
     n = len(moved)
-    left, motion, noise = (block(values, before, FILTERED), block(values, before, F), block(values, before, Q))
-    ahead = block(values, at, PREDICTED)
+    left, motion, noise = (blocks[before, FILTERED], blocks[before, F], blocks[before, Q])
+    ahead = blocks[at, PREDICTED]
     copy(noise, ahead)
     add_congruence(motion, left, moved, ahead)
     for i in range(n):
-        ahead[i, n] = motion[i, n] - values[at, ORIGIN, i]
+        ahead[i, n] = motion[i, n] - points[at, ORIGIN, i]
         for j in range(n):
             ahead[i, n] += motion[i, j] * left[j, n]
 
 
-@inlined
+@shared(f"b1({BLOCKS}, {VECTORS}, int64, int64, {VECTORS}, {VECTORS}, {VECTORS})")
 def _condition(
-    values: FloatArray, back: FloatArray, before: int, at: int, gain: FloatArray, E: FloatArray, work: FloatArray
+    blocks: FloatArray, back: FloatArray, before: int, at: int, gain: FloatArray, E: FloatArray, work: FloatArray
 ) -> bool:
     """A = P F' (F P F' + Q)^-1, b, C = E P E' + A Q A', E = I - A F; `gain` holds F P. False if there is no A."""
     n = len(gain)
-    left, motion, ahead = (block(values, before, FILTERED), block(values, before, F), block(values, at, PREDICTED))
-    rest = block(values, before, C)
+    left, motion, ahead = (blocks[before, FILTERED], blocks[before, F], blocks[at, PREDICTED])
+    rest = blocks[before, C]
     copy(ahead, E)
     if not solve(E, gain):
         return False
@@ -86,11 +94,11 @@ def _condition(
             back[i, n] -= gain[j, i] * ahead[j, n]
     _complement(back, motion, E)
     add_congruence(E, left, work, rest)
-    add_congruence(back, block(values, before, Q), work, rest)
+    add_congruence(back, blocks[before, Q], work, rest)
     return True
 
 
-@inlined
+@shared(f"void({VECTORS}, {VECTORS}, int64, {TIMES}, {VECTORS}, {VECTORS}, {VECTORS})")
 def _correct(
     state: FloatArray, rows: FloatArray, k: int, gain: FloatArray, E: FloatArray, P: FloatArray, work: FloatArray
 ) -> None:
@@ -135,30 +143,30 @@ def solve_windows(tracks: IntArray, starts: IntArray, anchors: IntArray, is_part
     """Eliminate from `starts` on, let the windows begin at `anchors`, and write steps: A (step of the next node) + b.
     If `is_partial`, only eliminate up to the nodes at `anchors`. True if all is finite.
     """
-    info, _, numbers, labels, backs, values, rows = nodes
-    n = values.shape[2] - 1
-    A, E, D, work, gain = (np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty(n))
+    info, _, numbers, labels, backs, points, blocks, rows = nodes
+    n = points.shape[2]
+    A, E, D, work, gain = scratch(n, n), scratch(n, n), scratch(n, n), scratch(n, n), scratch(n)
     for t in range(len(tracks)):
         of, track, count = numbers[tracks[t]], tracks[t], info[tracks[t], COUNT]
         for index in range(starts[t], anchors[t] + 1 if is_partial else count):
-            at, before, state = (of[index], of[index - 1], block(values, of[index], FILTERED))
+            at, before, state = (of[index], of[index - 1], blocks[of[index], FILTERED])
             if (
                 index > info[track, FIRST]
             ):  # else the prior of the oldest node in the window, which follows from nothing
-                _predict(values, before, at, A)
-                if not _condition(values, backs[before], before, at, A, E, work):
+                _predict(points, blocks, before, at, A)
+                if not _condition(blocks, backs[before], before, at, A, E, work):
                     return False
-            copy(block(values, at, PREDICTED), state)
+            copy(blocks[at, PREDICTED], state)
             for k in range(labels[at, NUM_ROWS]):
                 _correct(state, rows[at], k, gain, E, D, work)
             for i in range(n):
-                if not np.isfinite(state[i, i] + state[i, n]):
+                if not math.isfinite(state[i, i] + state[i, n]):
                     return False
         if is_partial:
             continue
         info[track, FIRST], info[track, KNOWN] = anchors[t], count
         for i in range(n):
-            backs[of[count - 1], n, i] = block(values, of[count - 1], FILTERED)[i, n]
+            backs[of[count - 1], n, i] = blocks[of[count - 1], FILTERED][i, n]
         for index in range(count - 2, anchors[t] - 1, -1):
             _given(backs[of[index]], backs[of[index + 1]], backs[of[index], n])
     return True
@@ -180,7 +188,7 @@ def locate(
     """Write the indices of the nodes after `stamps_ns`, or of the last ones, and the times around the stamps.
     Return how many are after them.
     """
-    info, all_ns, _, _, _, _, _ = nodes
+    info, all_ns, _, _, _, _, _, _ = nodes
     num_between = 0
     for t in range(len(tracks)):
         of, last = all_ns[tracks[t]], info[tracks[t], COUNT] - 1
@@ -199,19 +207,19 @@ def smooth(tracks: IntArray, indices: IntArray, after_s: FloatArray, nodes: Arra
     """Make the covariances of the nodes at `indices` known, and behind the window the steps; those on the way stay.
     Write the states that motion starts from: of these nodes, or where `after_s` the conditional one of those before.
     """
-    info, _, numbers, _, backs, values, _ = nodes
-    n = values.shape[2] - 1
-    work = np.empty((n, n))
+    info, _, numbers, _, backs, points, blocks, _ = nodes
+    n = points.shape[2]
+    work = scratch(n, n)
     for t in range(len(tracks)):
         track = tracks[t]
         for index in range(info[track, KNOWN] - 1, indices[t] - 1, -1):
             at = numbers[track, index]
             if index == info[track, COUNT] - 1:
-                copy(block(values, at, FILTERED), block(values, at, P))
+                copy(blocks[at, FILTERED], blocks[at, P])
                 continue
-            later, known = numbers[track, index + 1], block(values, at, P)
-            copy(block(values, at, C), known)
-            add_congruence(backs[at, :n], block(values, later, P), work, known)
+            later, known = numbers[track, index + 1], blocks[at, P]
+            copy(blocks[at, C], known)
+            add_congruence(backs[at, :n], blocks[later, P], work, known)
             if index < info[track, FIRST]:
                 _given(backs[at], backs[later], backs[at, n])
         info[track, KNOWN] = min(info[track, KNOWN], indices[t])
@@ -222,12 +230,16 @@ def smooth(tracks: IntArray, indices: IntArray, after_s: FloatArray, nodes: Arra
             start = numbers[track, indices[t] - 1]
             _given(backs[start], backs[at], means[t])
         for i in range(n):
-            means[t, i] += values[start, ORIGIN, i]
+            means[t, i] += points[start, ORIGIN, i]
 
 
-@inlined
+_STATE = f"{TIMES}, {VECTORS}, {VECTORS}"
+
+
+@shared(f"b1({MATRICES}, {BLOCKS}, {MATRICES}, int64, int64, {_STATE}, {_STATE}, {MATRICES})")
 def _interpolate(
-    values: FloatArray,
+    points: FloatArray,
+    blocks: FloatArray,
     backs: FloatArray,
     before: int,
     at: int,
@@ -259,7 +271,7 @@ def _interpolate(
     _complement(Psi, F2, E)
     for i in range(n):
         for j in range(n):
-            mean[i] += Psi[i, j] * (values[at, ORIGIN, j] + backs[at, n, j] - ahead[j])
+            mean[i] += Psi[i, j] * (points[at, ORIGIN, j] + backs[at, n, j] - ahead[j])
     product(E, F1, Lambda)
     product(Lambda, backs[before], by_right)
     for i in range(n):
@@ -269,8 +281,8 @@ def _interpolate(
     for i in range(n):
         for j in range(n):
             Q1[i, j] = 0.0
-    add_congruence(by_right, block(values, at, P), half, Q1)
-    add_congruence(Lambda, block(values, before, C), half, Q1)
+    add_congruence(by_right, blocks[at, P], half, Q1)
+    add_congruence(Lambda, blocks[before, C], half, Q1)
     add_congruence(E, S, half, Q1)
     add_congruence(Psi, Q2, half, Q1)
     return True
@@ -293,15 +305,15 @@ def arrive(
     Where `after_s`, the state is between two nodes, and `ahead` is what motion makes of it until the right one. False
     if noise is not definite there.
     """
-    _, _, numbers, _, backs, values, _ = nodes
+    _, _, numbers, _, backs, points, blocks, _ = nodes
     n = mean.shape[1]
-    work = np.empty((7, n, n))
+    work = scratch(7, n, n)
     for t in range(len(mean)):
         at = numbers[tracks[t], indices[t]]
         if after_s[t] > 0.0:
             before = numbers[tracks[t], indices[t] - 1]
-            if not _interpolate(values, backs, before, at, mean[t], F1[t], Q1[t], ahead[t], F2[t], Q2[t], work):
+            if not _interpolate(points, blocks, backs, before, at, mean[t], F1[t], Q1[t], ahead[t], F2[t], Q2[t], work):
                 return False
         else:
-            add_congruence(F1[t], block(values, at, P), work[0], Q1[t])
+            add_congruence(F1[t], blocks[at, P], work[0], Q1[t])
     return True

@@ -1,8 +1,6 @@
 """Compiled loops that insert, move, linearise and forget nodes; `nodes` are the `arrays` of `Nodes`, in that order."""
 
-import numpy as np
-
-from fgtrack.core.compiled import cholesky, copy, forward, inlined, njit
+from fgtrack.core.compiled import cholesky, copy, forward, merged, njit, scratch, shared
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.smoothing.kernels import (
@@ -26,7 +24,6 @@ from fgtrack.estimation.smoothing.kernels import (
     Arrays,
     F,
     Q,
-    block,
     last_before,
     regularise,
 )
@@ -43,18 +40,19 @@ _MANY = 16
 BEHIND, NOT_PLAIN, NOT_DEFINITE = 1, 2, 4
 
 
-@inlined
+@merged
 def _forget(track: int, reach_ns: int, nodes: Arrays) -> None:
     """Forget nodes behind the window that are older than one at or before `reach_ns`, if they are many."""
-    info, stamps_ns, numbers, _, _, _, _ = nodes
+    info, stamps_ns, numbers, _, _, _, _, _ = nodes
     count, all_ns, of = info[track, COUNT], stamps_ns[track], numbers[track]
     many = 0 if all_ns[_MANY - 1] > reach_ns else min(last_before(all_ns, count, reach_ns), info[track, FIRST] - 1)
     if many < _MANY:
         return
-    before = of.copy()
     for index in range(count):
-        of[index] = before[(index + many) % count]
-        all_ns[index] = all_ns[index + many] if index + many < count else NEVER
+        later = index + many
+        all_ns[index] = all_ns[later] if later < count else NEVER
+        if later < count:
+            of[index], of[later] = of[later], of[index]
     for column in (COUNT, FIRST, KNOWN):
         info[track, column] -= many
 
@@ -65,7 +63,7 @@ def windows(tracks: IntArray, clock_ns: int, lag_ns: int, behind_ns: int, nodes:
     indices of the nodes where the windows will begin; older nodes are kept as far as those stamps need them. Return the
     largest number of nodes.
     """
-    info, all_ns, _, _, _, _, _ = nodes
+    info, all_ns, _, _, _, _, _, _ = nodes
     most = 0
     for t in range(len(tracks)):
         track = tracks[t]
@@ -78,14 +76,14 @@ def windows(tracks: IntArray, clock_ns: int, lag_ns: int, behind_ns: int, nodes:
     return most
 
 
-@inlined
+@merged
 def _shift(track: int, at: int, steps: FloatArray, nodes: Arrays) -> None:
     """Move the linearisation point of a node by `steps`, and all that is relative to it."""
-    info, _, numbers, labels, backs, values, rows = nodes
+    info, _, numbers, labels, backs, points, blocks, rows = nodes
     n, oldest = len(steps), info[track, FIRST]
-    predicted = block(values, at, PREDICTED)
+    predicted = blocks[at, PREDICTED]
     for i in range(n):
-        values[at, ORIGIN, i] += steps[i]
+        points[at, ORIGIN, i] += steps[i]
         backs[at, n, i] -= steps[i]
         predicted[i, n] -= steps[i]
     for k in range(labels[at, NUM_ROWS]):
@@ -99,34 +97,48 @@ def _shift(track: int, at: int, steps: FloatArray, nodes: Arrays) -> None:
     labels[at, STALE] = 1
 
 
-@njit(f"int64(int64, int64, int64, {VECTORS}, {NODES}, b1, {INDICES})")
-def move_far(
+_MOVE_FAR = f"int64(int64, int64, int64, {VECTORS}, {NODES}, b1, {INDICES})"
+
+
+@shared(_MOVE_FAR)
+def _move_far(
     track: int, anchor: int, start: int, thresholds: FloatArray, nodes: Arrays, moves: bool, indices: IntArray
 ) -> int:
     """Move linearisation points, if it `moves`, where the step is longer than the thresholds; return their number.
-    Their indices are written. `thresholds` are those of linear and nonlinear tracks, (2, n). A `LEAVING_SHARE` holds
-    for nodes before `anchor`, a `SOLVED_SHARE` from `start` on and after the first node that is too far.
+    Of their `indices` so many are written as there is room for. `thresholds` are those of linear and nonlinear tracks,
+    (2, n). A `LEAVING_SHARE` holds for nodes before `anchor`, a `SOLVED_SHARE` from `start` on and after the first node
+    that is too far.
     """
-    info, _, numbers, _, backs, _, _ = nodes
-    limits, num = thresholds[info[track, NONLINEAR]], 0
+    info, _, numbers, _, backs, _, _, _ = nodes
+    limits, num, moved = thresholds[info[track, NONLINEAR]], 0, scratch(thresholds.shape[1])
     for index in range(info[track, FIRST], info[track, COUNT]):
         steps, too_long = backs[numbers[track, index], len(limits)], False
         share = SOLVED_SHARE if num or index >= start else LEAVING_SHARE if index < anchor else 1.0
         for i in range(len(limits)):
+            moved[i] = steps[i]
             if abs(steps[i]) > share * limits[i]:
                 too_long = True
         if too_long:
             if moves:
-                _shift(track, numbers[track, index], steps[: len(limits)].copy(), nodes)
-            indices[num] = index
+                _shift(track, numbers[track, index], moved, nodes)
+            if num < len(indices):
+                indices[num] = index
             num += 1
     return num
 
 
-@inlined
+@njit(_MOVE_FAR)
+def move_far(
+    track: int, anchor: int, start: int, thresholds: FloatArray, nodes: Arrays, moves: bool, indices: IntArray
+) -> int:
+    """See `_move_far`."""
+    return _move_far(track, anchor, start, thresholds, nodes, moves, indices)
+
+
+@merged
 def _insert(track: int, index: int, stamp_ns: int, mean: FloatArray, nodes: Arrays) -> None:
     """Insert a node at `index`, linearised at `mean`; later nodes move up."""
-    info, all_ns, numbers, labels, _, values, _ = nodes
+    info, all_ns, numbers, labels, _, points, _, _ = nodes
     count = info[track, COUNT]
     at = numbers[track, count]
     for k in range(count, index, -1):
@@ -135,22 +147,22 @@ def _insert(track: int, index: int, stamp_ns: int, mean: FloatArray, nodes: Arra
     info[track, COUNT] = count + 1
     labels[at, NUM_ROWS], labels[numbers[track, index - 1], STALE] = 0, 1
     for i in range(len(mean)):
-        values[at, ORIGIN, i] = mean[i]
+        points[at, ORIGIN, i] = mean[i]
 
 
-@inlined
+@merged
 def _observe(
     at: int, y: FloatArray, H: FloatArray, R: FloatArray, mean: FloatArray, nodes: Arrays, L: FloatArray
 ) -> bool:
     """Append L^-1 [H | y + H (mean - x0)], R = L L', to the rows of a node; False if R is not positive definite."""
-    _, _, _, labels, _, values, rows = nodes
+    _, _, _, labels, _, points, _, rows = nodes
     k, n = H.shape
     own = rows[at, labels[at, NUM_ROWS] : labels[at, NUM_ROWS] + k]
     for i in range(k):
         own[i, n] = y[i]
         for j in range(n):
             own[i, j] = H[i, j]
-            own[i, n] += H[i, j] * (mean[j] - values[at, ORIGIN, j])
+            own[i, n] += H[i, j] * (mean[j] - points[at, ORIGIN, j])
     labels[at, NUM_ROWS], labels[at, CHANGED] = labels[at, NUM_ROWS] + k, 1
     if not cholesky(R, k, L):
         return False
@@ -179,17 +191,18 @@ def place(
     """Move linearisation points that are far, and insert nodes and measurements: innovations y (m, k) at `means`.
     Nodes at most `NEAR_NS` away are shared. Writes number and index of the nodes, 1 of those that are new, where
     elimination must start and, with nodes inserted behind them, where windows begin, 1 if the measurement is older, and
-    where the window has begun; and the time from the node to the measurement. Returns flags.
+    where the window has begun, and space; and the time from the node to the measurement. Returns flags.
     """
-    info, all_ns, numbers, labels, _, _, rows = nodes
+    info, all_ns, numbers, labels, _, _, _, rows = nodes
     k, flags = y.shape[1], 0
-    far, L = np.empty(all_ns.shape[1], dtype=np.int64), np.empty((k, k))
+    L = scratch(k, k)
     for t in range(len(tracks)):
         track = tracks[t]
         before = last_before(all_ns[track], info[track, COUNT], stamp_ns + NEAR_NS)
         is_new = all_ns[track, before] < stamp_ns - NEAR_NS
         index, is_behind = before + is_new, before < anchors[t]
-        num = move_far(track, anchors[t], before, thresholds, nodes, True, far)
+        far = out[7, t:]  # of which the next track writes over all but the first
+        num = _move_far(track, anchors[t], before, thresholds, nodes, True, far)
         if is_new:
             _insert(track, index, stamp_ns, means[t], nodes)
         at = numbers[track, index]
@@ -208,17 +221,17 @@ def place(
 @njit(f"void(int64, {TIMES}, {INDICES}, {INDICES}, {NODES})")
 def linearise_motion(kind: int, density: FloatArray, tracks: IntArray, starts: IntArray, nodes: Arrays) -> None:
     """Linearise the motion from nodes that are stale, the one before `starts` and later ones, to the next ones."""
-    info, all_ns, numbers, labels, _, values, _ = nodes
-    n = values.shape[2] - 1
-    mean = np.empty(n)
+    info, all_ns, numbers, labels, _, points, blocks, _ = nodes
+    n = points.shape[2]
+    mean = scratch(n)
     for t in range(len(tracks)):
         track = tracks[t]
         for index in range(max(starts[t] - 1, 0), info[track, COUNT]):
             at = numbers[track, index]
             if labels[at, STALE] and index < info[track, COUNT] - 1:
                 dt_s = (all_ns[track, index + 1] - all_ns[track, index]) / NS_PER_S
-                motion = block(values, at, F)
-                transition(kind, values[at, ORIGIN, :n], dt_s, density, mean, motion, block(values, at, Q))
+                motion = blocks[at, F]
+                transition(kind, points[at, ORIGIN], dt_s, density, mean, motion, blocks[at, Q])
                 for i in range(n):
                     motion[i, n] = mean[i]
                 labels[at, CHANGED] = 1
@@ -234,9 +247,9 @@ def changed_factors(track: int, start: int, nodes: Arrays, owners: IntArray, fac
     W (F d_left - d_right) = W e + N(0, I), d relative to the reference, W' W = Q^-1 and e = r_right - f(x0) - F (r_left
     - x0): [W F | -W | W e] in `factors`; measurements are [G | 0 | y + G (x0 - r)].
     """
-    info, _, numbers, labels, _, values, rows = nodes
-    n, num = values.shape[2] - 1, 0
-    L, noise, moved = np.empty((n, n)), np.empty((n, n)), np.empty(n)
+    info, _, numbers, labels, _, points, blocks, rows = nodes
+    n, num = points.shape[2], 0
+    L, noise, moved = scratch(n, n), scratch(n, n), scratch(n)
     last = info[track, COUNT] - 1
     for index in range(start, last + 1):
         left, right = (numbers[track, index], -1 if index == last else numbers[track, index + 1])
@@ -246,21 +259,21 @@ def changed_factors(track: int, start: int, nodes: Arrays, owners: IntArray, fac
         labels[left, CHANGED] = 0
         owners[num, 0], owners[num, 1], owners[num, 2] = left, right, size
         for j in range(n):
-            moved[j] = values[left, ORIGIN, j] - values[left, REFERENCE, j]
+            moved[j] = points[left, ORIGIN, j] - points[left, REFERENCE, j]
         for k in range(used):
             factors[num, k, 2 * n] = rows[left, k, n]
             for j in range(n):
                 factors[num, k, j], factors[num, k, n + j] = rows[left, k, j], 0.0
                 factors[num, k, 2 * n] += rows[left, k, j] * moved[j]
         if index < last:
-            motion, own = block(values, left, F), factors[num, used:size]
-            copy(block(values, left, Q), noise)
+            motion, own = blocks[left, F], factors[num, used:size]
+            copy(blocks[left, Q], noise)
             if not cholesky(noise, n, L):
                 regularise(noise)
                 if not cholesky(noise, n, L):
                     return -1
             for i in range(n):
-                own[i, 2 * n] = values[right, REFERENCE, i] - motion[i, n]
+                own[i, 2 * n] = points[right, REFERENCE, i] - motion[i, n]
                 for j in range(n):
                     own[i, j], own[i, n + j] = motion[i, j], -1.0 if i == j else 0.0
                     own[i, 2 * n] += motion[i, j] * moved[j]

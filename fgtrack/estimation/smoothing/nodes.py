@@ -55,8 +55,8 @@ class Nodes:
         self.backs = np.zeros((size, n + 1, n + 1))
         """[A | b], the node given the next one: x - x0 = A (next - its x0) + b + N(0, C). The last row is the step: the
         mean relative to the linearisation point x0, given everything."""
-        self.values = np.zeros((size, 2 + 6 * n, n + 1))
-        """Rows and blocks, see `kernels`: vectors stand as a last column beside the matrix that moves with them."""
+        self.points, self.blocks = np.zeros((size, 2, n)), np.zeros((size, 6, n, n + 1))
+        """See `kernels`: vectors stand as a last column beside the matrix that moves with them."""
         self.rows = np.zeros((size, _FEW_COMPONENTS, n + 1))
         """Measurements: G and y of y = G (x - x0) + N(0, I)."""
         self._factors: dict[int, list[tuple[Measurements, int, float]]] = {}
@@ -69,16 +69,17 @@ class Nodes:
     def _share(self) -> None:
         """Name the parts of the arrays."""
         n = self._motion.dim
-        self.arrays = (self.tracks, self.stamps_ns, self.numbers, self.labels, self.backs, self.values, self.rows)
+        kept = (self.tracks, self.stamps_ns, self.numbers, self.labels, self.backs)
+        self.arrays = (*kept, self.points, self.blocks, self.rows)
         """Arguments of all loops."""
         self.count, self.first, self.step = (self.tracks[:, COUNT], self.tracks[:, FIRST], self.backs[:, n, :n])
-        self.origin, self.reference = (self.values[:, ORIGIN, :n], self.values[:, REFERENCE, :n])
+        self.origin, self.reference = (self.points[:, ORIGIN], self.points[:, REFERENCE])
         """x0; the first x0, which the variables of a factor graph are relative to."""
-        blocks = [self.values[:, 2 + n * k : 2 + n * (k + 1)] for k in range(6)]
-        self.filtered, self.predicted, self.ahead = (blocks[FILTERED], blocks[PREDICTED], blocks[F][..., n])
+        self.filtered, self.predicted = (self.blocks[:, FILTERED], self.blocks[:, PREDICTED])
+        self.ahead = self.blocks[:, F, :, n]
         """Covariances and means relative to x0 after and before the node's own measurements; f(x0), f being the motion
         to the next node."""
-        self.C, self.P, self.F, self.Q = (blocks[k][..., :n] for k in (C, P, F, Q))
+        self.C, self.P, self.F, self.Q = (self.blocks[:, k, :, :n] for k in (C, P, F, Q))
         """C; covariance given everything; derivative of f at x0; noise of the motion."""
 
     def window(self, track: int) -> IntArray:
@@ -173,7 +174,7 @@ class Nodes:
         used = self.numbers[np.arange(self.numbers.shape[1]) < self.count[:, None]]
         self.stamps_ns = np.concatenate([self.stamps_ns, np.full_like(self.stamps_ns, NEVER)], axis=axis)
         self.numbers = np.concatenate([self.numbers, self.numbers.size + self.numbers], axis=axis)
-        for name in ("labels", "backs", "values", "rows"):
+        for name in ("labels", "backs", "points", "blocks", "rows"):
             values = getattr(self, name)
             larger = np.zeros((self.numbers.size, *values.shape[1:]), values.dtype)  # only pages of used ones are made
             larger[used] = values[used]

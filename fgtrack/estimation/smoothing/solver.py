@@ -129,11 +129,11 @@ class Solver:
         """
         nodes, stamp_ns = self.nodes, stack.stamp_ns
         guesses = self._marked_nonlinear(tracks, stack, guesses) if stack.is_nonlinear else guesses
-        ahead_s, out = np.empty(len(tracks)), np.empty((7, len(tracks)), dtype=np.int64)
+        ahead_s, out = np.empty(len(tracks)), np.empty((8, len(tracks)), dtype=np.int64)
         leaving = self._leaving(tracks, anchors) if self._has_final else None
         given = (tracks, stamp_ns, y, H, R, guesses, not stack.is_nonlinear, self._thresholds, anchors)
         flags = node_kernels.place(*given, nodes.arrays, out, ahead_s)
-        numbers, _, is_new, starts, anchors, is_behind, _ = out
+        numbers, _, is_new, starts, anchors, is_behind, _, _ = out
         nodes.note(Measurements(stack), numbers, is_new, ahead_s)
         try:
             if flags & NOT_DEFINITE:
