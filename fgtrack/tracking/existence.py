@@ -45,9 +45,9 @@ class _Matches(NamedTuple):
 
     rows: IntArray
     """Of the tracks, see `ExistenceLifecycle`, shape (m,)."""
-    stamps_ns: IntArray
-    sensors: IntArray
-    scores: FloatArray
+    stamp_ns: int
+    sensor: int
+    scores: list[float]
     """See `ExistenceLifecycle._score`."""
     points_m: FloatArray
     """Shape (m, 2), and of the states at the stamp (m, 2)."""
@@ -147,19 +147,20 @@ class ExistenceLifecycle:
         leaders = [candidates.leaders[position] for position in chosen.tolist()]
         scores = [self._score(scan, (leader, *candidates.merged.get(leader, ()))) for leader in leaders]
         rows = self._rows_of(states.track_ids[track] for track in tracks.tolist())
-        stamps_ns, sensors = np.full(len(rows), scan.stamp_ns), np.full(len(rows), self._index[scan.sensor])
-        at = candidates.lines[chosen, :2], states.means[tracks, :2], states.covariances[tracks, :2, :2]
-        spreads = position_covariances(candidates, chosen)
-        self._matches.append(_Matches(rows, stamps_ns, sensors, np.array(scores), *at, spreads))
+        points_m, means_m = candidates.lines.take(chosen, axis=0)[:, :2], states.means.take(tracks, axis=0)[:, :2]
+        P, R = states.covariances.take(tracks, axis=0)[:, :2, :2], position_covariances(candidates, chosen)
+        own = scan.stamp_ns, self._index[scan.sensor], scores, points_m, means_m, P, R
+        self._matches.append(_Matches(rows, *own))
         self._reports = None
 
     def _settle(self) -> None:
         """Add the matches since the last time to the histories: of lists of one detection each, many at once."""
         if not self._matches:
             return
-        rows, stamps_ns, sensors, scores, points_m, means_m, P, R = map(
-            np.concatenate, zip(*self._matches, strict=True)
-        )
+        counts = [len(each.rows) for each in self._matches]
+        tracks, stamps, of, *others = zip(*self._matches, strict=True)
+        rows, stamps_ns, sensors = np.concatenate(tracks), np.repeat(stamps, counts), np.repeat(of, counts)
+        scores, points_m, means_m, P, R = map(np.concatenate, others)
         self._matches = []
         self._lives["misses"][rows] = 0
         travelled_m = np.hypot(*(means_m - self._lives["first_m"][rows]).T)

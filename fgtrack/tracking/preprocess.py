@@ -111,7 +111,7 @@ class Group(NamedTuple):
 
     def position_covariances(self, members: IntArray) -> FloatArray:
         """Covariances of the positions in the map of some `members` (p,), which have one, shape (p, 2, 2)."""
-        own, R = self.stack, self.spread[members]
+        own, R = self.stack, self.spread.take(members, axis=0)
         if own.model.components[:2] == ("x_m", "y_m"):
             return R[:, :2, :2]
         positions = [
