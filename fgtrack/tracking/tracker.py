@@ -436,9 +436,8 @@ class Tracker:
     def _reports(self, track_ids: Sequence[int], states: Sequence[TrackState]) -> Callable[[], Iterable[TrackReport]]:
         """Return what makes the reports of tracks in these `states`, with all else as it is now."""
         parts = self._parts
-        statuses, probabilities = (
-            list(map(each, track_ids)) for each in (parts.lifecycle.status, parts.lifecycle.probability)
-        )
+        statuses = list(map(parts.lifecycle.status, track_ids))
+        probabilities = list(map(parts.lifecycle.probability, track_ids))
         num_measured = list(map(self._num_measured.__getitem__, track_ids))
         objects = parts.objects.reports(track_ids)
         return partial(map, TrackReport, track_ids, statuses, states, num_measured, objects, probabilities)
