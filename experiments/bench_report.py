@@ -81,7 +81,7 @@ class Promise:
     def cell(self, short: bool = False) -> str:
         """Return the measured value, its lowest and highest round unless `short`, and where missed the requirement."""
         between = f" ({min(self.rounds):.3g} to {max(self.rounds):.3g})" if self.rounds and not short else ""
-        return f"{_short(self.measured)}{between}{f', NOT {self.required:g}' if self.verdict == 'NO' else ''}"
+        return f"{_short(self.measured)}{between}{f' (target {self.required:g})' if self.verdict == 'NO' else ''}"
 
 
 @dataclass
