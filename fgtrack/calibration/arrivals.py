@@ -86,8 +86,10 @@ class Arrivals:
 
     @property
     def lost(self) -> float | None:
-        """Share of the lists that never came, by gaps between stamps; None where the stamps have no period."""
-        if len(self.steps_s) < FEWEST:
+        """Share of the lists that never came, by gaps between stamps; None where the stamps have no period.
+        Nor have those of lists of one object with an identity: each object reports by itself.
+        """
+        if len(self.steps_s) < FEWEST or (self.object_late is not None and self.counts.max() == 1):
             return None
         periods = self.steps_s / self.period_s
         off = np.abs(periods - np.rint(periods))

@@ -97,3 +97,12 @@ def test_info_names_the_shipped_configuration_of_reports(tmp_path, sensor, shipp
     shown = CliRunner().invoke(app, ["info", str(tmp_path / "a.jsonl")]).output
     assert f"`-c {shipped}`" in shown if shipped else "`-c" not in shown
     assert ("assumed, " in shown) == (shipped is None)
+
+
+def test_reports_of_several_objects_have_no_period_by_which_some_were_lost():
+    whole_seconds = [1000 * k for k in range(100) if k % 5]
+    periodic = [replace(listed(at + 10, at, None), sensor="radar") for at in whole_seconds]
+    reports = [listed(at + 10, at, "AB"[at // 1000 % 2]) for at in whole_seconds]
+    arrivals = arrivals_of([*periodic, *reports])
+    assert arrivals["radar"].lost == pytest.approx(0.2, abs=0.02)
+    assert arrivals["adsb"].lost is None
