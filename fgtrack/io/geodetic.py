@@ -8,6 +8,7 @@ of sight by d^2 / (2 R^2), some 1e-4 at 100 km, less than the errors of motion m
 import logging
 import math
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,13 @@ GEODETIC = ("latitude_deg", "longitude_deg")
 """Names of mapped fields that give x_m and y_m in the map."""
 _FAR_M = 100e3
 _ITERATIONS = 4  # each leaves d^2 / (2 R^2) of the error in height
-_far_origins = set[tuple[float, float]]()  # that a warning has named: an input is opened several times
 _logger = logging.getLogger(__name__)
+
+
+@cache
+def warn_once(text: str) -> None:
+    """Log a warning, the same text once: an input is opened several times."""
+    _logger.warning(text)
 
 
 class LocalPlane:
@@ -28,6 +34,7 @@ class LocalPlane:
 
     def __init__(self, origin: Origin | None = None) -> None:
         self.origin = origin
+        self._warned = False
 
     @property
     def origin_deg(self) -> tuple[float, float] | None:
@@ -53,10 +60,9 @@ class LocalPlane:
 
         at = self.origin.latitude_deg, self.origin.longitude_deg
         x_m, y_m, up_m = map(float, geodetic2enu(latitude_deg, longitude_deg, 0.0, *at, 0.0))
-        if math.hypot(x_m, y_m, up_m) > _FAR_M and at not in _far_origins:
-            _far_origins.add(at)
-            text = "a position is %.0f km from the origin %.4f, %.4f: beyond 100 km set `input.origin` nearer"
-            _logger.warning(text, math.hypot(x_m, y_m, up_m) / 1e3, *at)
+        if not self._warned and (far_m := math.hypot(x_m, y_m, up_m)) > _FAR_M:
+            self._warned, where = True, f"{far_m / 1e3:.0f} km from the origin {at[0]:.4f}, {at[1]:.4f}"
+            warn_once(f"a position is {where}: beyond 100 km set `input.origin` nearer")
         return (x_m, y_m) if abs(up_m) < _EARTH_M else (math.nan, math.nan)
 
 

@@ -72,7 +72,7 @@ def test_the_items_of_the_times_are_settings(tmp_path):
     assert one.stamp_ns == one.receipt_ns == 100_750_000_000
 
 
-def test_records_of_one_stamp_are_one_list_and_each_station_has_its_place(tmp_path):
+def test_records_of_one_stamp_are_one_list_and_each_station_has_its_place(tmp_path, caplog):
     smr = surface(50.0, 100.0, 0.0) + surface(50.0, 200.0, 0.0) + surface(49.5, 0.0, 50.0)
     (tmp_path / "smr.ast").write_bytes(smr)
     (tmp_path / "mlat.ast").write_bytes(surface(50.25, 0.0, 0.0, kind=1, address=0x4CA911, sic=107))
@@ -84,6 +84,10 @@ def test_records_of_one_stamp_are_one_list_and_each_station_has_its_place(tmp_pa
     assert late.receipt_ns - late.stamp_ns == 500_000_000  # the newest stamp before it
     assert other.objects[0].y_m == pytest.approx(1110.7, abs=1.0)
     assert other.objects[0].id == "4CA911"
+    assert not caplog.records
+    lists(tmp_path)  # the stations are 1.1 km apart
+    (warning,) = caplog.records
+    assert "stations 107 and 7 (SIC) give positions relative to themselves" in warning.message
 
 
 def test_extrapolated_positions_are_left_out(tmp_path):

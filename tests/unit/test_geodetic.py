@@ -65,7 +65,7 @@ def test_far_positions_warn_once(caplog):
         assert not caplog.records
         plane.position_m(here.latitude_deg + 1.0, here.longitude_deg)
         plane.position_m(here.latitude_deg + 1.1, here.longitude_deg)
-        opened_again.position_m(here.latitude_deg + 1.1, here.longitude_deg)
+        opened_again.position_m(here.latitude_deg + 1.0, here.longitude_deg)
     assert [record.message for record in caplog.records] == [
         "a position is 111 km from the origin 41.2000, 2.0800: beyond 100 km set `input.origin` nearer"
     ]

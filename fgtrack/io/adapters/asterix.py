@@ -24,7 +24,7 @@ from fgtrack.core.types import Detection, DetectionList, Message
 from fgtrack.io.adapters.asterix_records import Record, RecordReader
 from fgtrack.io.config import AsterixInput, InputConfig, Origin
 from fgtrack.io.errors import TruncatedInput, UntilBreak
-from fgtrack.io.geodetic import LocalPlane
+from fgtrack.io.geodetic import LocalPlane, warn_once
 from fgtrack.io.source import FileFormat
 
 _DAY_NS = 86_400 * NS_PER_S
@@ -131,22 +131,27 @@ FORMAT = FileFormat("ASTERIX (.ast, or a folder of them)", _recognises, _open)
 def _merged(
     files: list[Path], readers: Mapping[int, RecordReader], given: AsterixInput, plane: LocalPlane
 ) -> Iterator[Message]:
-    readable = [UntilBreak(_reports(file, readers, given, plane)) for file in files]
+    sites = {float(number): _Site(plane, station) for number, station in given.stations.items()}
+    readable = [UntilBreak(_reports(file, readers, given, plane, sites)) for file in files]
     ordered = merge(*readable, key=attrgetter("receipt_ns"))
     for _, group in groupby(ordered, key=attrgetter("sensor", "stamp_ns", "receipt_ns")):
         lists = list(group)
         yield replace(lists[0], objects=tuple(item for each in lists for item in each.objects))
+    unplaced = [f"{number:g}" for number, site in sites.items() if site.misplaces]
+    if len(unplaced) > 1:
+        named = f"the stations {' and '.join(unplaced)} (SIC) give positions relative to themselves"
+        warn_once(f"{named}: set `input.asterix.stations`, without it all are taken to be at one point")
     for each in readable:
         each.raise_error()
 
 
 def _reports(
-    file: Path, readers: Mapping[int, RecordReader], given: AsterixInput, plane: LocalPlane
+    file: Path, readers: Mapping[int, RecordReader], given: AsterixInput, plane: LocalPlane, sites: dict[float, "_Site"]
 ) -> Iterator[DetectionList]:
-    """Target reports of `file`, a list of one object each, in the order of the file."""
+    """Target reports of `file`, a list of one object each, in the order of the file.
+    `sites` by SIC gets those whose stations are not given.
+    """
     newest_ns = day_ns = 0
-    sites = {float(number): _Site(plane, station) for number, station in given.stations.items()}
-    nowhere = _Site(plane, None)
     for number, record in _records(file, readers):
         own = _CATEGORIES[number]
         if number == 10 and record.get("000") != _TARGET_REPORT:
@@ -155,7 +160,10 @@ def _reports(
         receipt_s = _first(record, (given.receipt[number],) if number in given.receipt else own.receipt)
         if stamp_s is None or (number in (10, 20) and record.get("170/CST")):
             continue
-        item = _detection(record, number, own, sites.get(record.get("010/SIC", 0.0), nowhere), plane)
+        station = record.get("010/SIC", 0.0)
+        if station not in sites:
+            sites[station] = _Site(plane, None)
+        item = _detection(record, number, own, sites[station], plane)
         if item is None:
             continue
         stamp_ns = round(stamp_s * NS_PER_S) + day_ns
@@ -194,6 +202,8 @@ class _Site:
 
     def __init__(self, plane: LocalPlane, station: Origin | None) -> None:
         self._x_m = self._y_m = self._turn_rad = 0.0
+        self._given, self.misplaces = station is not None, False
+        """True if a position relative to it was placed without knowing where it is."""
         if station is not None:
             self._x_m, self._y_m = plane.position_m(station.latitude_deg, station.longitude_deg)
             x_m, y_m = plane.position_m(min(station.latitude_deg + 0.01, 90.0), station.longitude_deg)
@@ -201,6 +211,7 @@ class _Site:
 
     def position_m(self, x_m: float, y_m: float) -> tuple[float, float]:
         """Position in the plane of `x_m` to the east and `y_m` to the north of the station."""
+        self.misplaces = not self._given
         c, s = math.cos(self._turn_rad), math.sin(self._turn_rad)
         return self._x_m + c * x_m + s * y_m, self._y_m - s * x_m + c * y_m
 
