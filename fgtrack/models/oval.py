@@ -91,7 +91,7 @@ def _integrate(s: FloatArray, function: Callable[[FloatArray], FloatArray]) -> F
 def _map_along(points: FloatArray, *, half_width_m: float, banking_rad: FloatArray) -> TrackMap:
     """Map with the reference line `points`, shape (n + 1, 2), as its raceline, driven at constant speed."""
     path = Path.through(points)
-    s = path.spline.x
+    s = path.u_m
     frame = path.frame(s)
     curvature = frame.turn / frame.scale
     columns: dict[str, FloatArray | float] = {

@@ -1,14 +1,13 @@
 """A smooth closed curve to drive along: position, heading and curvature with their exact derivatives."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 
 from fgtrack.core.types import FloatArray
 
-if TYPE_CHECKING:  # takes half a second to import
-    from scipy.interpolate import CubicSpline
+_STEPS = 60
 
 
 @dataclass(frozen=True)
@@ -32,21 +31,39 @@ class PathFrame:
 class Path:
     """Periodic cubic spline through points; the parameter u is the arc length along their chords."""
 
-    spline: "CubicSpline[np.float64]"
-    length_m: float
+    u_m: FloatArray
+    """Parameter of the points, shape (n + 1,), from 0 to the length."""
+    coefficients: FloatArray
+    """Position and its three derivatives at the start of each piece, shape (4, n, 2)."""
 
     @classmethod
     def through(cls, points_m: FloatArray) -> Self:
         """Closed path through `points_m`, shape (n + 1, 2), whose last point repeats the first."""
-        from scipy.interpolate import CubicSpline
+        steps = np.diff(points_m, axis=0)
+        h = np.hypot(*steps.T)[:, None]
+        slope, before = steps / h, np.roll(h, 1, axis=0)
+        # Continuous second derivatives: h_- s_- + 2 (h_- + h) s + h s_+ = 6 (slope - slope_-). Each Jacobi step halves
+        # the error.
+        second = total = 3.0 * (slope - np.roll(slope, 1, axis=0)) / (before + h)
+        for _ in range(_STEPS):
+            neighbours = before * np.roll(second, 1, axis=0) + h * np.roll(second, -1, axis=0)
+            second = total - 0.5 * neighbours / (before + h)
+        after = np.roll(second, -1, axis=0)
+        coefficients = points_m[:-1], slope - h * (2.0 * second + after) / 6.0, second, (after - second) / h
+        return cls(np.concatenate([[0.0], np.cumsum(h)]), np.array(coefficients))
 
-        chords = np.hypot(*np.diff(points_m, axis=0).T)
-        u = np.concatenate([[0.0], np.cumsum(chords)])
-        return cls(CubicSpline(u, points_m, bc_type="periodic"), float(u[-1]))
+    @property
+    def length_m(self) -> float:
+        """Length of a lap along the chords."""
+        return float(self.u_m[-1])
 
     def frame(self, u_m: FloatArray) -> PathFrame:
         """Moving frame at `u_m`, shape (n,), of any lap."""
-        (x, y), (x1, y1), (x2, y2), (x3, y3) = (self.spline(u_m, nu).T for nu in range(4))
+        lap_m = np.mod(u_m, self.length_m)
+        piece = np.searchsorted(self.u_m[1:-1], lap_m, side="right")
+        t, (p0, p1, p2, p3) = (lap_m - self.u_m[piece])[:, None], self.coefficients[:, piece]
+        x, y = (p0 + t * (p1 + t * (p2 / 2.0 + t * p3 / 6.0))).T
+        (x1, y1), (x2, y2), (x3, y3) = (p1 + t * (p2 + t * p3 / 2.0)).T, (p2 + t * p3).T, p3.T
         scale_squared = x1 * x1 + y1 * y1
         scale = np.sqrt(scale_squared)
         dot = x1 * x2 + y1 * y2

@@ -2,6 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import FloatArray
@@ -60,3 +61,12 @@ def test_a_path_frame_holds_the_exact_derivatives(oval: TrackMap, fine: bool) ->
     assert_derivative(frame.turn, wrap_angles(ahead.heading_rad - behind.heading_rad), 1e-8)
     assert_derivative(frame.turn_rate, ahead.turn - behind.turn, 2e-6)
     assert_derivative(frame.scale_rate, ahead.scale - behind.scale, 1e-8)
+
+
+def test_a_path_is_the_periodic_cubic_spline() -> None:
+    points = np.vstack([COARSE, COARSE[:1]])
+    path = DrivenPath.through(points)
+    spline = CubicSpline(path.u_m, points, bc_type="periodic")
+    frame, u = path.frame(path.length_m + path.u_m), np.linspace(0.0, path.length_m, 500)
+    np.testing.assert_allclose(np.stack([frame.x_m, frame.y_m], axis=1), points, atol=1e-9)
+    np.testing.assert_allclose(np.stack([path.frame(u).x_m, path.frame(u).y_m], axis=1), spline(u), atol=1e-9)

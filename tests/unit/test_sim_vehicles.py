@@ -33,7 +33,7 @@ def test_yaw_is_the_direction_of_travel_and_the_rates_are_derivatives(times: lis
     yaw_rate = wrap_angles(ahead[:, YAW] - behind[:, YAW]) / (2.0 * h)
     np.testing.assert_allclose(now[:, YAW_RATE], yaw_rate, atol=1e-4)
     # Where a piece of the path begins, the acceleration off the line jumps: a numeric one is half the jump off.
-    knots = PATH.spline.x
+    knots = PATH.u_m
     jump = np.abs(PATH.frame(knots + 1e-9).turn_rate - PATH.frame(knots - 1e-9).turn_rate).max()
     atol = 0.5 * jump * 75.0**2 * 5.0 + 1e-3
     assert atol < 0.1

@@ -1,7 +1,7 @@
 """Summaries of samples: moments that add up over runs, and quantiles."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -79,12 +79,19 @@ class ChiSquareMean:
     @classmethod
     def of(cls, values: FloatArray, dof: IntArray) -> Self:
         """Mean of `values` with `dof` degrees of freedom each, both of shape (n,), ignoring NaN."""
+        mean = cls.without_band(values, dof)
+        if not mean.count:
+            return mean
+        low, high = chi_square_band(np.array([mean.dof * mean.count]), np.array([mean.count]))
+        return replace(mean, band_low=low.item(), band_high=high.item())
+
+    @classmethod
+    def without_band(cls, values: FloatArray, dof: IntArray) -> Self:
+        """See `of`; the band needs SciPy, which takes a quarter of a second to import."""
         known = ~np.isnan(values)
         if not known.any():
             return cls()
-        count = int(known.sum())
-        low, high = chi_square_band(dof[known].sum(keepdims=True), np.array([count]))
-        return cls(count, float(values[known].mean()), float(dof[known].mean()), low.item(), high.item())
+        return cls(int(known.sum()), float(values[known].mean()), float(dof[known].mean()))
 
 
 def chi_square_band(dof: FloatArray, count: IntArray) -> tuple[FloatArray, FloatArray]:
