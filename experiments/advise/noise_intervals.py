@@ -11,13 +11,13 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from fgtrack.calibration.likelihood.fit import Problem
+from fgtrack.calibration.likelihood.series import NoiseSpace, Observation, Series
 from fgtrack.core.geometry import rotation
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.likelihood.fit import Problem
-from fgtrack.estimation.likelihood.series import NoiseSpace, Observation, Series
 from fgtrack.models.motion import CTRV
 
 START = Start(position_m=(3.0, -2.0), yaw_rad=0.3, yaw_std_rad=0.2, speed_mps=20.0, speed_std_mps=2.0)

@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
+from fgtrack.calibration.likelihood.series import Observation
 from fgtrack.calibration.tune_measurements import Fed, RecordingBank, watched
 from fgtrack.core.errors import DataError
 from fgtrack.core.linalg import congruence
@@ -18,7 +19,6 @@ from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray, IntArray, Message
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.failures import Failures
-from fgtrack.estimation.likelihood.series import Observation
 from fgtrack.evaluation.matching import NO_OBJECT, match, track_errors
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.io.run import Run

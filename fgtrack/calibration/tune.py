@@ -8,6 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from fgtrack.calibration.likelihood.contaminated import outlier_share
+from fgtrack.calibration.likelihood.fit import Likelihood, Problem
+from fgtrack.calibration.likelihood.reference import filtered, without_mixed
+from fgtrack.calibration.likelihood.series import Series
 from fgtrack.calibration.tune_measurements import recorded
 from fgtrack.calibration.tune_space import (
     ConfigNoise,
@@ -23,10 +27,6 @@ from fgtrack.calibration.tune_space import (
 from fgtrack.calibration.tune_stamps import StampFit, fitted_stamps, stamp_rates, with_stamps
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import BoolArray, FloatArray, Message
-from fgtrack.estimation.likelihood.contaminated import outlier_share
-from fgtrack.estimation.likelihood.fit import Likelihood, Problem
-from fgtrack.estimation.likelihood.reference import filtered, without_mixed
-from fgtrack.estimation.likelihood.series import Series
 from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import Run
 from fgtrack.io.source import InputSource, open_input

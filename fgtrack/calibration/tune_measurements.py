@@ -7,12 +7,12 @@ from functools import partial
 
 import numpy as np
 
+from fgtrack.calibration.likelihood.series import Observation, Series, positive_part
 from fgtrack.core.geometry import rotation
 from fgtrack.core.linalg import congruence
 from fgtrack.core.types import FloatArray, Message
 from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult
 from fgtrack.estimation.failures import Failures
-from fgtrack.estimation.likelihood.series import Observation, Series, positive_part
 from fgtrack.io.run import Run
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_bank

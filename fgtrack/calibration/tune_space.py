@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
+from fgtrack.calibration.likelihood.series import NoiseSpace
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.likelihood.series import NoiseSpace
 from fgtrack.io.run import Run
 from fgtrack.models.correlated_errors import with_correlated_errors
 from fgtrack.models.motion import MotionModel

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from fgtrack.calibration.likelihood.fit import Likelihood, Problem
+from fgtrack.calibration.likelihood.reference import Step, filtered
+from fgtrack.calibration.likelihood.series import Observation, positive_part
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.likelihood.fit import Likelihood, Problem
-from fgtrack.estimation.likelihood.reference import Step, filtered
-from fgtrack.estimation.likelihood.series import Observation, positive_part
 from fgtrack.tracking.preprocess import StampError
 
 _RANGE_S = 1e-3, 30.0

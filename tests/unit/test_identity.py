@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
+from fgtrack.calibration.likelihood.fit import Problem
 from fgtrack.calibration.tune_measurements import recorded
 from fgtrack.calibration.tune_space import ConfigNoise
 from fgtrack.calibration.tune_stamps import fitted_stamps, stamp_rates, with_stamps
 from fgtrack.core.types import Detection, DetectionList, Disposition
 from fgtrack.estimation.filters.replay_bank import ReplayBank
-from fgtrack.estimation.likelihood.fit import Problem
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.public import replay

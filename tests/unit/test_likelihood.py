@@ -9,6 +9,10 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from fgtrack.calibration.likelihood import contaminated
+from fgtrack.calibration.likelihood.fit import Likelihood, Problem
+from fgtrack.calibration.likelihood.reference import filtered, without_mixed
+from fgtrack.calibration.likelihood.series import NoiseSpace, Observation, Series
 from fgtrack.calibration.tune_measurements import observation
 from fgtrack.calibration.tune_space import ConfigNoise
 from fgtrack.core.geometry import rotation, wrap_angle
@@ -17,10 +21,6 @@ from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.likelihood import contaminated
-from fgtrack.estimation.likelihood.fit import Likelihood, Problem
-from fgtrack.estimation.likelihood.reference import filtered, without_mixed
-from fgtrack.estimation.likelihood.series import NoiseSpace, Observation, Series
 from fgtrack.models.correlated_errors import split_error
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, CV

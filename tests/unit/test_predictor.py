@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from fgtrack.evaluation.scores.predictor import arc_positions, rail_positions
 from fgtrack.models.oval import make_oval
-from fgtrack.models.predictor import arc_positions, rail_positions
 
 TRACK = make_oval()
 AHEAD_S = 0.1 * np.arange(1, 51)

@@ -8,10 +8,10 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.matching import Matching, TrackErrors, confirmed
 from fgtrack.evaluation.placement import roads
+from fgtrack.evaluation.scores.predictor import arc_positions, rail_positions
 from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.evaluation.truth import TRUE_STATE, true_states
 from fgtrack.io.run import Run
-from fgtrack.models.predictor import arc_positions, rail_positions
 
 #: Times ahead of the predictions, in s.
 HORIZONS_S = (1.0, 2.0, 3.0, 5.0)

@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgtrack.calibration.likelihood.contaminated import Update, update
+from fgtrack.calibration.likelihood.series import NoiseSpace, Observation, Series
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.linalg import congruence
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import joseph, kalman_gain, propagated
-from fgtrack.estimation.likelihood.contaminated import Update, update
-from fgtrack.estimation.likelihood.series import NoiseSpace, Observation, Series
 
 _WINDOW, _MOST = 20, 0.5  # of so many successive innovations at most this share may be outliers
 _MARGIN_S = 1.0  # what is nearer to such a stretch is left out as well

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
+from fgtrack.calibration.likelihood.innovations import Evaluation, Innovations
+from fgtrack.calibration.likelihood.series import NoiseSpace, Series
 from fgtrack.core.linalg import psd_solve, symmetrise
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.estimation.likelihood.innovations import Evaluation, Innovations
-from fgtrack.estimation.likelihood.series import NoiseSpace, Series
 
 _PRIOR_LOG_STDS = 3.0, 1.5  # weak, but keep what the data do not determine from running away; of shares of outliers
 _MOST_LOG = 9.2  # beyond a factor of 10^4 there is no maximum: errors of exactly 0 are likelier the smaller std is

@@ -12,13 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fgtrack.calibration.likelihood.contaminated import update
+from fgtrack.calibration.likelihood.reference import Step, filtered
+from fgtrack.calibration.likelihood.series import NoiseSpace, Series
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import joseph, kalman_gain, propagated
-from fgtrack.estimation.likelihood.contaminated import update
-from fgtrack.estimation.likelihood.reference import Step, filtered
-from fgtrack.estimation.likelihood.series import NoiseSpace, Series
 
 
 class Evaluation(NamedTuple):
