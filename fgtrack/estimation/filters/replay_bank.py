@@ -84,13 +84,10 @@ class ReplayBank(ObjectBank[ReplayEkf]):
 
     def states_of(self, stamp_ns: int, track_id: int) -> StatesAt:
         """Return `states_at` of one track, at a cost that does not depend on the number of the others."""
-        row, n = self._rows.get(track_id, -1), self._motion.dim
-        if row < 0:
+        if track_id not in self._rows:
             return self.states_at(stamp_ns).of(track_id)
-        known, means, covariances = np.empty(1, dtype=bool), np.empty((1, n)), np.empty((1, n, n))
-        at = np.array([row]), self._start_ns, stamp_ns, False
-        count = kernels(_KERNELS).ahead(self._kind, self._density, *self._arrays[:4], *at, means, covariances, known)
-        return StatesAt((track_id,), means, covariances) if count else no_states(n)
+        count, _, *states = self._ahead(np.array([self._rows[track_id]]), stamp_ns)
+        return StatesAt((track_id,), *states) if count else no_states(self._motion.dim)
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
@@ -158,11 +155,8 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         """True of the tracks that are known (m,), None if all are, means (m, n) and covariances (m, n, n) of all."""
         if self._order is None:
             self._order = np.array([self._rows.get(i, -1) for i in self._estimators], dtype=np.int64)
-        m, n = len(self._order), self._motion.dim
-        known, means, covariances = np.empty(m, dtype=bool), np.empty((m, n)), np.empty((m, n, n))
-        at = self._order, self._start_ns, stamp_ns, is_present
-        count = kernels(_KERNELS).ahead(self._kind, self._density, *self._arrays[:4], *at, means, covariances, known)
-        if len(self._rows) < m:
+        count, known, means, covariances = self._ahead(self._order, stamp_ns, is_present)
+        if len(self._rows) < len(known):
             for k, (track_id, item) in enumerate(self._estimators.items()):
                 if track_id not in self._rows:
                     start_ns = item.window_ns[0]
@@ -171,7 +165,17 @@ class ReplayBank(ObjectBank[ReplayEkf]):
                     if known[k]:
                         state = item.state_at(max(stamp_ns, start_ns))
                         means[k], covariances[k] = state.mean, state.covariance
-        return None if count == m else known, means, covariances
+        return None if count == len(known) else known, means, covariances
+
+    def _ahead(
+        self, rows: IntArray, stamp_ns: int, is_present: bool = False
+    ) -> tuple[int, BoolArray, FloatArray, FloatArray]:
+        """Return `kernels.replay.ahead` of rows of the arrays: how many and which are known, means and covariances."""
+        m, n = len(rows), self._motion.dim
+        known, means, covariances = np.empty(m, dtype=bool), np.empty((m, n)), np.empty((m, n, n))
+        at = rows, self._start_ns, stamp_ns, is_present
+        count = kernels(_KERNELS).ahead(self._kind, self._density, *self._arrays[:4], *at, means, covariances, known)
+        return count, known, means, covariances
 
     def _put_in(self, track_id: int) -> None:
         """Move the steps of a filter into the arrays, where these can hold them."""
