@@ -16,6 +16,7 @@ import numpy as np
 from llvmlite.binding import add_symbol
 from numba.core.caching import FunctionCache
 from numba.core.cgutils import get_or_insert_function
+from numba.core.compiler import Compiler
 from numba.core.runtime.nrt import rtsys
 from numba.core.typing.templates import ConcreteTemplate, infer_global
 from numba.extending import lower_builtin
@@ -71,13 +72,29 @@ class _Cache(FunctionCache):
             _say(_NOT_STORED)
 
 
+_SKIPPED = {"inline_closure_likes", "with_lifting", "dead_branch_prune", "inline_overloads", "nopython_rewrites"}
+
+
+class _LoopCompiler(Compiler):
+    """numba's compiler without what closures, `with`, branches on types and array expressions need: a twentieth."""
+
+    def define_pipelines(self) -> list[Any]:
+        """See numba."""
+        (full,) = super().define_pipelines()  # type: ignore[no-untyped-call]
+        full.passes[:] = [each for each in full.passes if each[0].name() not in _SKIPPED]
+        return [full]
+
+
+_OPTIONS: dict[str, Any] = {"error_model": "numpy", "pipeline_class": _LoopCompiler}
+
+
 def njit(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that compiles a function once: it is stored in a cache folder, if one can be written.
     One line of the log reports that loops are compiled, another one that they cannot be stored. A function whose
     signature begins with a number type or void must not allocate arrays, see `scratch`: no references are counted then.
     """
     returns_arrays = not signature.partition("(")[0].isidentifier()
-    options |= {"error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": returns_arrays}
+    options |= {**_OPTIONS, "no_cfunc_wrapper": True, "_nrt": returns_arrays}
 
     def compiled(function: Callable[..., Any]) -> Any:
         result: Any = numba.njit(**options)(function)
@@ -129,15 +146,15 @@ def shared(signature: str) -> Callable[[_Function], _Function]:
 
 def inlined(function: _Function) -> _Function:
     """Decorate a function that only compiled ones call, which are optimised together with it."""
-    options: Any = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": False}
-    return cast(_Function, numba.njit(error_model="numpy", **options)(function))
+    options = {**_OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": False}
+    return cast(_Function, numba.njit(**options)(function))
 
 
 def merged(function: _Function) -> _Function:
     """Decorate a small function with one caller, which is compiled as a part of it: alone it would be compiled twice.
     A large one is better `shared`: it is copied statement by statement.
     """
-    return cast(_Function, numba.njit(error_model="numpy", inline="always")(function))
+    return cast(_Function, numba.njit(**_OPTIONS, inline="always")(function))
 
 
 def scratch(*shape: int) -> FloatArray:
