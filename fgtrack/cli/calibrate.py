@@ -30,10 +30,8 @@ from fgtrack.pipeline.build import build_road
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import plain
 from fgtrack.pipeline.replay import Feed, located
-from fgtrack.pipeline.shipped import read_config
+from fgtrack.pipeline.shipped import read_config, suited_reports
 
-#: Shipped configurations by a sensor of recordings of reports, see docs/recordings.md.
-_SHIPPED = {"smr": "airport", "mlat": "airport", "adsb": "adsb", "ais": "ais", "reports": "v2x"}
 _DELAYS = ("mean_s", "p50_s", "p90_s", "max_s")
 
 
@@ -70,11 +68,8 @@ def info(
         )
     else:
         show(topics, None)
-        names = {topic.name for topic in result.topics if config is None}
-        suited = next((_SHIPPED[name] for name in _SHIPPED if name in names), None)
-        used = "without a configuration" if config_file is None else config_file
-        known = f"`-c {suited}` is the shipped configuration of such reports" if suited else f"{used}: {comes_to}"
-        sentences([known])
+        suited = suited_reports(topic.name for topic in result.topics) if config is None else None
+        sentences([suited or f"{config_file or 'without a configuration'}: {comes_to}"])
         if config is None and suited is None:
             with suppress(FgtrackError), progress("detections"):  # whose topics and columns nothing names
                 sentences(assumed(Config(), open_input(recording)).lines())

@@ -16,7 +16,7 @@ from fgtrack.io.run import load_run
 from fgtrack.io.source import open_input
 from fgtrack.pipeline import replay as pipeline
 from fgtrack.pipeline.assumptions.assumed import assumed
-from fgtrack.pipeline.shipped import read_config
+from fgtrack.pipeline.shipped import read_config, suited_reports
 
 
 def replay(
@@ -50,6 +50,8 @@ def replay(
         )
     for line in dict.fromkeys(str(replace(result.config, estimator=name).effective) for name in names):
         say(line)
+    if config_file is None and (suited := suited_reports(result.config.sensors)) is not None:
+        warn(suited)
     runs = [load_run(folder) for folder in folders.values()]
     for line in result.lines():
         say(line)

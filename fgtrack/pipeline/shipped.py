@@ -1,6 +1,6 @@
 """Configurations, scenarios and sweeps that come with the package, by name."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -15,6 +15,8 @@ if TYPE_CHECKING:  # a replay needs no simulator
 
 Kind = Literal["configuration", "scenario", "sweep"]
 _FOLDERS = {"configuration": ".", "scenario": "scenarios", "sweep": "sweeps"}
+#: Configurations by a sensor of recordings of reports, see docs/recordings.md.
+_REPORTS = {"smr": "airport", "mlat": "airport", "adsb": "adsb", "ais": "ais", "reports": "v2x"}
 _PACKAGE = Path(__file__).parents[1]
 
 
@@ -44,6 +46,13 @@ def find_file(kind: Kind, name: str | Path, folder: Path | None = None) -> Path:
 def summary(path: Path) -> str:
     """Purpose of a shipped file: its first line, a comment."""
     return path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
+
+
+def suited_reports(sensors: Iterable[str]) -> str | None:
+    """Return the advice to use the shipped configuration of reports by these sensors; None for other sensors."""
+    names = set(sensors)
+    suited = next((config for name, config in _REPORTS.items() if name in names), None)
+    return suited and f"`-c {suited}` is the shipped configuration of such reports"
 
 
 def read_config(

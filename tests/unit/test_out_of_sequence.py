@@ -97,6 +97,8 @@ def test_info_names_the_shipped_configuration_of_reports(tmp_path, sensor, shipp
     shown = CliRunner().invoke(app, ["info", str(tmp_path / "a.jsonl")]).output
     assert f"`-c {shipped}`" in shown if shipped else "`-c" not in shown
     assert ("assumed, " in shown) == (shipped is None)
+    replayed = CliRunner().invoke(app, ["replay", str(tmp_path / "a.jsonl"), "-o", str(tmp_path / "run")]).output
+    assert ("is the shipped configuration" in replayed) == (shipped is not None)
 
 
 def test_reports_of_several_objects_have_no_period_by_which_some_were_lost():
