@@ -10,13 +10,17 @@ import numpy as np
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.types import FloatArray, IntArray
 
-_LAPACK = "scipy.linalg.lapack"
-
 
 @cache
 def kernels(name: str) -> ModuleType:
-    """Return the module `name`, which is not imported before it is needed: numba and SciPy are large."""
+    """Return the module `name` of compiled loops, which is not imported before it is needed: numba is large."""
     return import_module(name)
+
+
+@cache
+def _lapack() -> ModuleType:
+    """LAPACK of SciPy, which is large, too."""
+    return import_module("scipy.linalg.lapack")
 
 
 @cache
@@ -83,7 +87,7 @@ def psd_solve(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
     """
     if matrix.ndim > 2:
         return np.asarray(np.linalg.solve(matrix, rhs))
-    _, _, solution, info = kernels(_LAPACK).dgesv(matrix, rhs)  # the same routine at a third of the time
+    _, _, solution, info = _lapack().dgesv(matrix, rhs)  # the same routine at a third of the time
     if info:
         raise np.linalg.LinAlgError("singular matrix")
     return np.asarray(solution)
@@ -100,10 +104,10 @@ def mahalanobis_squared(residual: FloatArray, covariance: FloatArray, entries: I
 
 def inverse_root(S: FloatArray) -> FloatArray:
     """Inverse Cholesky factor W of S (n, n), W S W' = I; raises `numpy.linalg.LinAlgError` unless positive definite."""
-    root, info = kernels(_LAPACK).dpotrf(S, lower=1)
+    root, info = _lapack().dpotrf(S, lower=1)
     if info:
         raise np.linalg.LinAlgError("a covariance is not positive definite")
-    return np.asarray(kernels(_LAPACK).dtrtri(root, lower=1)[0])
+    return np.asarray(_lapack().dtrtri(root, lower=1)[0])
 
 
 def noise_root(Q: FloatArray) -> FloatArray:

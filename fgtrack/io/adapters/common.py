@@ -16,7 +16,6 @@ import numpy as np
 from fgtrack.core.checks import is_stamp
 from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.files import read_whole
-from fgtrack.core.linalg import kernels
 from fgtrack.core.time import NS_PER_S, NS_PER_UNIT
 from fgtrack.core.types import MEASURABLE, Detection, FloatArray, Frame
 
@@ -146,12 +145,14 @@ def covariance(
     """
     if pose is None:
         return None
+    from scipy.linalg import block_diag  # takes a tenth of a second to import, and most recordings do not need it
+
     variance = 0.0
     if twist is not None:
         direction = speed_gradient(velocity.x, velocity.y)
         variance = float(direction @ twist[:2, :2] @ direction)
     index = [row for row, name in enumerate(MEASURABLE) if values.get(name) is not None]
-    chosen = kernels("scipy.linalg").block_diag(pose, [variance])[np.ix_(index, index)]
+    chosen = block_diag(pose, [variance])[np.ix_(index, index)]
     return None if (np.diag(chosen) <= 0.0).any() else tuple(chosen.ravel().tolist())  # 0 and -1 are "not known" in ROS
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from fgtrack.core.geometry import wrap_angle
-from fgtrack.core.linalg import kernels
 from fgtrack.core.types import Detection, EgoState, FloatArray
 from fgtrack.io.adapters.common import (
     ObjectList,
@@ -121,9 +120,11 @@ def radar_tracks(message: RosMessage) -> ObjectList:
 
 
 def _radar_track(item: RosMessage) -> Detection:
+    from scipy.linalg import block_diag
+
     position, velocity = item.position, item.velocity
     values = {"x_m": position.x, "y_m": position.y, "speed_mps": signed_speed_mps(velocity.x, velocity.y, None)}
-    pose = kernels("scipy.linalg").block_diag(_planar_triangle(item.position_covariance), [0.0])
+    pose = block_diag(_planar_triangle(item.position_covariance), [0.0])
     own = covariance(values, pose, _planar_triangle(item.velocity_covariance), velocity)
     return Detection(**values, covariance=own, object_id=_uuid(item.uuid), **_size(item.size))
 
@@ -174,12 +175,14 @@ def ego_from_odometry(message: RosMessage, receipt_ns: int) -> EgoState:
 
 def _ego_covariance(message: RosMessage) -> tuple[float, ...] | None:
     """Covariance of x, y, yaw, speed and yaw rate, row-major; of pose and twist each, zero where it is not known."""
+    from scipy.linalg import block_diag
+
     velocity = message.twist.twist.linear
     direction = speed_gradient(velocity.x, velocity.y)
     J = np.eye(2, 3, k=1)  # of speed and yaw rate by vx, vy and yaw rate
     J[0, :2] = -direction if signed_speed_mps(velocity.x, velocity.y, 0.0) < 0.0 else direction
     parts = planar(message.pose.covariance), J @ planar(message.twist.covariance) @ J.T
-    full = kernels("scipy.linalg").block_diag(*(part if _is_known(part) else np.zeros_like(part) for part in parts))
+    full = block_diag(*(part if _is_known(part) else np.zeros_like(part) for part in parts))
     return tuple(full.ravel().tolist()) if full.any() else None
 
 
