@@ -38,7 +38,12 @@ def fitted_stamps(problem: Problem, rates: Rates, values: FloatArray, sensor: st
     """
     longest = sorted(range(len(rates)), key=lambda k: -len(rates[k]))[:_TRACKS]
     series = [problem.series[k] for k in longest]
-    some = [replace(item, observations=item.observations[:_OBSERVATIONS]) for item in series]
+    some = [
+        replace(
+            item, observations=item.observations[:_OBSERVATIONS], mixed=item.mixed.intersection(range(_OBSERVATIONS))
+        )
+        for item in series
+    ]
     part, free = replace(problem, series=some), np.ones(len(values), dtype=np.bool_)
     own = [rates[k][:_OBSERVATIONS] for k in longest]
 

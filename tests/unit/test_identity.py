@@ -1,6 +1,7 @@
 """Identities of detections as evidence, copies of messages, and errors of stamps."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -186,7 +187,7 @@ def test_the_error_of_a_stamp_is_part_of_the_innovation_along_the_motion(estimat
     assert not 1.5 < nis[0.0] < 2.6
 
 
-def test_the_error_of_stamps_is_fitted() -> None:
+def test_the_error_of_stamps_is_fitted(monkeypatch) -> None:
     """Of 200 stamps alone a standard deviation of 0.5 s is known to 0.5 s / sqrt(400) = 0.025 s."""
     rng, v_mps = np.random.default_rng(5), 200.0
     errors = rng.normal(size=(200, 3)) * (0.5, 10.0, 10.0)
@@ -201,6 +202,10 @@ def test_the_error_of_stamps_is_fitted() -> None:
     right = with_stamps(problem, rates, "adsb", 0.2, fit.std_s)
     assert fitted_stamps(right, rates, noise.values, "adsb", fit.std_s).std_s == pytest.approx(fit.std_s, rel=0.1)
     assert noise.with_stamps("adsb", 0.5).stamp_stds == {"adsb": 0.5}
+    # Of long series the first part is taken, whatever was mixed up after it.
+    monkeypatch.setattr("fgtrack.calibration.tune_stamps._OBSERVATIONS", 150)
+    mixed = replace(problem, series=[replace(each, mixed=frozenset((5, 170))) for each in problem.series])
+    assert fitted_stamps(mixed, rates, noise.values, "adsb", 0.2).std_s == pytest.approx(0.5, abs=0.12)
 
 
 def test_the_first_position_on_earth_is_no_empty_slot():
