@@ -31,6 +31,7 @@ PARTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
         SHIPPED: {},
         "visibility": ALWAYS,
         "claim": {"association.claim_m": 0.0},
+        "jumps": {f"sensors.{name}.correlation.jump_probability": 0.0 for name in ("lidar", "radar")},
         "correlation": {"sensors.lidar.correlation": None, "sensors.radar.correlation": None},
         "joint": {"association.joint_from": 8},
     },

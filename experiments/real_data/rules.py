@@ -14,7 +14,7 @@ from fgtrack.core.types import FloatArray, TruthState
 from fgtrack.io.source import open_input
 from fgtrack.models.sensors import Correlation
 from fgtrack.pipeline.config import NOISE_HZ, Config
-from fgtrack.tracking.association import GatedMahalanobis
+from fgtrack.tracking.association import GatedMahalanobis, chi_square_quantile
 from fgtrack.tracking.existence import ExistenceRules
 
 #: A jump between successive errors counts as one of so many standard deviations at most: larger ones are another end of
@@ -96,7 +96,8 @@ def recorded(source: Path, config: Config) -> Recorded:
 
 def ruled(config: Config, recordings: Sequence[Recorded]) -> Config:
     """`config` with the numbers that `recordings` give by the rules."""
-    sensors = dict(config.sensors)
+    assert isinstance(config.association, GatedMahalanobis)
+    sensors, gate = dict(config.sensors), chi_square_quantile(config.association.gate_probability, 2)
     for name in SENSORS:
         vessels = [vessel for one in recordings for vessel in one.seen[name]]
         hits = [(one, one.error_m) for vessel in vessels for one in vessel if one.error_m is not None]
@@ -111,7 +112,7 @@ def ruled(config: Config, recordings: Sequence[Recorded]) -> Config:
             sensors[name],
             std={"x_m": _digits(math.sqrt(variance)), "y_m": _digits(math.sqrt(variance))},
             near_side_m=_digits(near_m),
-            correlation=Correlation(_digits(share, 3), _digits(time_s)),
+            correlation=Correlation(_digits(share, 3), _digits(time_s), _digits(_jump_probability(tracks, gate))),
             detection_probability=_digits(_detection_probability(vessels)),
             clutter_per_m2=_digits(float(crowding)),
         )
@@ -119,14 +120,13 @@ def ruled(config: Config, recordings: Sequence[Recorded]) -> Config:
     per_root_s = _rms([one.changes_mps for one in recordings]) / math.sqrt(MANOEUVRE_S)
     assert isinstance(config.lifecycle, ExistenceRules)
     stds_m = [sensors[name].std["x_m"] for name in SENSORS]
-    assert isinstance(config.association, GatedMahalanobis)
     return replace(
         config,
         sensors=sensors,
         motion=replace(config.motion, std_per_s={"velocity": _digits(per_root_s * math.sqrt(NOISE_HZ))}),
         birth=replace(config.birth, speed_std_mps=_digits(speed_mps)),
         lifecycle=replace(config.lifecycle, min_travel_m=_digits(3.0 * max(stds_m))),
-        association=replace(config.association, claim_m=_digits(4.0 * sum(stds_m))),
+        association=replace(config.association, claim_m=_digits(math.sqrt(gate) * sum(stds_m))),
     )
 
 
@@ -165,9 +165,20 @@ def lasting(tracks: Sequence[Sequence[tuple[float, FloatArray]]], variance: floa
 
 def _half_square_of_jumps(tracks: Sequence[Sequence[tuple[float, FloatArray]]]) -> float:
     """Half the mean square of what successive errors differ by; larger jumps count as the largest."""
-    jumps = np.concatenate([np.diff([error for _, error in one], axis=0).ravel() for one in tracks if len(one) > 1])
-    typical = 1.4826 * float(np.median(np.abs(jumps)))  # the standard deviation, were they normal
+    jumps, typical = _jumps(tracks)
     return 0.5 * float(np.mean(np.minimum(np.square(jumps), (LARGEST_JUMP * typical) ** 2)))
+
+
+def _jump_probability(tracks: Sequence[Sequence[tuple[float, FloatArray]]], gate: float) -> float:
+    """Share of successive errors that differ by more than the `gate`, a squared Mahalanobis distance, lets pass."""
+    jumps, typical = _jumps(tracks)
+    return float(np.mean(np.square(jumps / typical).sum(axis=1) > gate))
+
+
+def _jumps(tracks: Sequence[Sequence[tuple[float, FloatArray]]]) -> tuple[FloatArray, float]:
+    """What successive errors differ by, shape (n, 2), and its standard deviation on an axis, were they normal."""
+    jumps = np.concatenate([np.diff([error for _, error in one], axis=0) for one in tracks if len(one) > 1])
+    return jumps, 1.4826 * float(np.median(np.abs(jumps)))
 
 
 def _correlation_time_s(tracks: Sequence[Sequence[tuple[float, FloatArray]]], kept: float, period_s: float) -> float:
@@ -213,6 +224,7 @@ def numbers(config: Config) -> dict[str, float]:
         one = config.sensors[name]
         assert one.correlation is not None
         values = {"std": one.std["x_m"], "near_side_m": one.near_side_m, "share": one.correlation.share}
+        values |= {"jump_probability": one.correlation.jump_probability}
         values |= {"time_s": one.correlation.time_s, "detection_probability": one.detection_probability}
         values |= {"clutter_per_m2": one.clutter_per_m2}
         found |= {f"{name}.{key}": value for key, value in values.items()}

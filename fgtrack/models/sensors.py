@@ -72,6 +72,9 @@ class Correlation:
     """Correlated share of the variance; the rest is new in every detection."""
     time_s: PositiveFloat = 1.0
     """After this time the correlated part has fallen to 1/e, as the autocorrelation of the errors shows."""
+    jump_probability: float = Field(0.0, ge=0.0, lt=1.0)
+    """Probability that a position's whole error is new, as at the other end of a hull. A detection that a claim refuses
+    then updates a confirmed track without one, if a jump is likelier than clutter; see `association.claim_m`."""
 
 
 @settings

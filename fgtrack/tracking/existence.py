@@ -25,7 +25,7 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import BoolArray, FloatArray, IntArray, TrackStatus
 from fgtrack.estimation.base import StatesAt
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.association import Pairs
+from fgtrack.tracking.association import Assignment, Pairs, assigned, near
 from fgtrack.tracking.lifecycle import CountingLifecycle, Scan
 from fgtrack.tracking.preprocess import Candidate, Candidates
 from fgtrack.tracking.visibility import Histories
@@ -277,6 +277,32 @@ class ExistenceLifecycle:
 
 
 Lifecycle = CountingLifecycle | ExistenceLifecycle
+
+
+def after_jumps(
+    assignment: Assignment, candidates: Candidates, states: StatesAt, reaches_m: FloatArray, sensor: SensorModel
+) -> Assignment:
+    """Return `assignment` in which refused candidates update tracks without one, at most `reaches_m` away.
+    A jump of the error must be likelier than clutter; the whole error counts as new, in `candidates` as well.
+    """
+    if sensor.correlation is None or not assignment.refused:
+        return assignment
+    pairs = near(candidates, states.means, reaches_m)
+    pairs = pairs.at(np.isin(pairs.rows, assignment.refused) & np.isin(pairs.columns, assignment.missed))
+    rows, columns, _ = pairs
+    densities = position_densities(candidates, rows, states.means[columns], states.covariances[columns])
+    ratios = sensor.correlation.jump_probability * sensor.detection_probability * densities / sensor.clutter_per_m2
+    likely = ratios > 1.0
+    jumps = assigned(
+        pairs.at(likely)._replace(values=-np.log(ratios[likely])), len(candidates), len(states.means)
+    ).pairs
+    taken = {candidate for candidate, _ in jumps}
+    candidates.renew(taken)
+    return assignment._replace(
+        pairs=sorted([*assignment.pairs, *jumps]),
+        missed=sorted(set(assignment.missed).difference(track for _, track in jumps)),
+        refused=tuple([each for each in assignment.refused if each not in taken]),
+    )
 
 
 def position_densities(candidates: Candidates, chosen: IntArray, means: FloatArray, P: FloatArray) -> FloatArray:

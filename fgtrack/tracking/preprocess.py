@@ -164,6 +164,12 @@ class Candidates(Lazy[Candidate]):
                 parts.append((group, members[here], here))
         return parts
 
+    def renew(self, chosen: set[int]) -> None:
+        """Take the whole errors of the `chosen` ones as new, whatever the correlated parts are."""
+        for k, group in enumerate(self.groups):
+            if not chosen.isdisjoint(group.rows.tolist()):  # with correlated errors each is a group
+                self.groups[k] = group._replace(stack=replace(group.stack, R=group.spread), error=None)
+
     def at(self, indices: Sequence[int]) -> "Candidates":
         """Return the candidates at `indices`."""
         groups = [

@@ -37,7 +37,7 @@ from fgtrack.tracking.association import Assignment, Association, GatedMahalanob
 from fgtrack.tracking.birth import Birth, in_any_direction
 from fgtrack.tracking.detections import PosedBatch
 from fgtrack.tracking.ego import EgoPose, EgoTrajectory
-from fgtrack.tracking.existence import Lifecycle
+from fgtrack.tracking.existence import Lifecycle, after_jumps
 from fgtrack.tracking.guarded_bank import GuardedBank, faults
 from fgtrack.tracking.inbox import Batch, Inbox, fused_records, merged_records, record
 from fgtrack.tracking.lifecycle import Scan
@@ -269,7 +269,9 @@ class Tracker:
         if parts.joint is None or not (parts.joint.claim_m and result.new):
             return result
         tentative = [parts.lifecycle.status(each) is TrackStatus.TENTATIVE for each in states.track_ids]
-        return claimed(result, candidates, states, np.where(tentative, -1.0, parts.joint.claim_m), evidence)
+        result = claimed(result, candidates, states, np.where(tentative, -1.0, parts.joint.claim_m), evidence)
+        reaches_m = np.where(tentative, -1.0, parts.joint.max_distance_m)
+        return after_jumps(result, candidates, states, reaches_m, parts.sensors[batch.message.sensor])
 
     def _likely(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Likely | None:
         """Return the test of pairs against clutter and new objects; None where they are not weighed."""

@@ -8,10 +8,11 @@ from fgtrack.core.errors import DataError
 from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState, TickReport, TrackStatus
 from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.models.oval import make_oval
-from fgtrack.models.sensors import SensorModel
+from fgtrack.models.sensors import Correlation, SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import Config
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
+from fgtrack.tracking.existence import ExistenceRules
 from fgtrack.tracking.lifecycle import LifecycleRules
 from fgtrack.tracking.tracker import Tracker
 
@@ -136,6 +137,19 @@ def test_a_confirmed_track_claims_what_is_near_and_a_tentative_one_does_not() ->
     tick(one, 200.0, seen((9.2, 0.0), at_ms=200.0))
     aside = seen((9.3, 0.0), (9.0, -8.0), (9.0, -12.0), at_ms=300.0)
     assert dispositions(tick(one, 300.0, aside)) == ["in_sequence", "gated", "birth"]
+
+
+@pytest.mark.parametrize(("probability", "disposition"), [(0.0, "gated"), (0.1, "in_sequence")])
+def test_a_refused_detection_updates_a_track_without_one_where_errors_jump(probability: float, disposition) -> None:
+    """Errors of 3 m of which 0.3 m is new: 6 m aside is outside the gate, and inside that of the whole error."""
+    hull = SensorModel({"x_m": 3.0, "y_m": 3.0}, correlation=Correlation(0.99, 100.0, probability))
+    claiming = GatedMahalanobis(max_distance_m=10.0, claim_m=10.0)
+    one = build_tracker(Config(sensors={"lidar": hull}, association=claiming, lifecycle=ExistenceRules()))
+    for k in range(20):
+        tick(one, 100.0 * k, seen((9.0, 0.0), at_ms=100.0 * k))
+    [record] = tick(one, 2000.0, seen((9.0, 6.0), at_ms=2000.0)).updates
+    assert record.disposition.value == disposition
+    assert probability == 0.0 or (record.nis is not None and record.nis < 9.0)
 
 
 def test_where_a_track_was_before_it_began_follows_its_motion() -> None:
