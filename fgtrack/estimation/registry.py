@@ -18,7 +18,7 @@ from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.filters.replay_bank import ReplayBank
 from fgtrack.estimation.filters.track_initiation import initiated
 from fgtrack.estimation.object_bank import ObjectBank, SingleObject
-from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel, WhiteNoise
+from fgtrack.models.motion import MotionModel, WhiteNoise
 
 OOSM_GROUP = "fgtrack.oosm"
 EXACT = "any lag, any number"
@@ -162,7 +162,7 @@ def estimator_bank(
         bank: TrackBank = _made(ESTIMATORS, TrackBank, name, factory, motion, lag_s, **own)
         return bank
     _check_options(name, factory, 3, own)
-    if factory is ReplayEkf and isinstance(motion, WhiteNoise) and type(motion) in (CTRV, CTRA, CV):
+    if factory is ReplayEkf and isinstance(motion, WhiteNoise) and motion.is_compiled:
         return ReplayBank(motion, lambda start: ReplayEkf(motion, start, lag_s, **own), lag_s)
     return ObjectBank(motion, lambda start: start_estimator(name, factory, motion, start, lag_s, options), lag_s)
 

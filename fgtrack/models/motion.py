@@ -146,6 +146,12 @@ class WhiteNoise(MotionModel):
     kind: ClassVar[int] = 0
     """Kind of its transition in `fgtrack.models.transitions`."""
 
+    @cached_property
+    def is_compiled(self) -> bool:
+        """True if compiled loops may take the transition for its own: no subclass has replaced it, or a part of it."""
+        own, names = type(self), ("predict", "jacobian", "process_noise", "transition")
+        return all(getattr(own, name) is getattr(WhiteNoise, name) for name in names)
+
     def __post_init__(self) -> None:
         not_negative(**{field.name: getattr(self, field.name) for field in fields(self)})
 

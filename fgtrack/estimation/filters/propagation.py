@@ -24,7 +24,7 @@ class ExactPropagator:
         self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
     ) -> tuple[FloatArray, FloatArray]:
         """States (m, n) and (m, n, n), each after its own number of `steps` (m,) of `dt_s`; yaw is not wrapped."""
-        if not isinstance(self.motion, WhiteNoise):
+        if not (isinstance(self.motion, WhiteNoise) and self.motion.is_compiled):
             return predict(mean, covariance, self.motion, steps * np.float64(dt_s))
         x, P = mean.copy(), covariance.copy()
         kernels("fgtrack.estimation.kernels.kalman").propagate(self.motion.kind, self.motion.density, x, P, steps, dt_s)

@@ -40,8 +40,7 @@ class Nodes:
 
     def __init__(self, motion: MotionModel) -> None:
         self._motion, n, size = motion, motion.dim, _FEW_TRACKS * _FEW_NODES
-        is_own = type(motion).transition is not WhiteNoise.transition
-        self._compiled = None if is_own or not isinstance(motion, WhiteNoise) else motion
+        self._compiled = motion if isinstance(motion, WhiteNoise) and motion.is_compiled else None
         self.tracks: IntArray = np.zeros((_FEW_TRACKS, 5), dtype=np.int64)
         """Number of nodes; index of the oldest one of the window; index from which on `P` is known; stamp of the first
         state; 1 if there was a measurement that is not linear."""
