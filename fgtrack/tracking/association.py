@@ -1,6 +1,5 @@
 """Gates, and association of candidates with tracks (Karle et al. 2023, section III-D)."""
 
-import math
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Literal, NamedTuple, Protocol
@@ -174,20 +173,10 @@ def _refusing(suspects: set[int], assignment: Assignment) -> Assignment:
 
 @cache
 def chi_square_quantile(probability: float, freedom: int) -> float:
-    """Quantile of the chi-square distribution; importing SciPy for it would take a quarter of a second.
-    By bisection of the series of the regularised incomplete gamma function (Abramowitz and Stegun, 6.5.29).
-    """
-    a, low, high = 0.5 * freedom, 0.0, 40.0 + 2.0 * freedom
-    for _ in range(64):
-        middle = 0.5 * (low + high)
-        total = term = math.exp(a * math.log(middle) - middle - math.lgamma(a + 1.0))
-        n = 0
-        while n < middle or term > 1e-17 * total:
-            n += 1
-            term *= middle / (a + n)
-            total += term
-        low, high = (low, middle) if total > probability else (middle, high)
-    return low + high
+    """Quantile of the chi-square distribution; importing `scipy.stats` for it would take a second."""
+    from scipy.special import gammaincinv
+
+    return float(2.0 * gammaincinv(0.5 * freedom, probability))
 
 
 def assigned(pairs: Pairs, num_candidates: int, num_tracks: int) -> Assignment:

@@ -15,15 +15,7 @@ from fgtrack.models.measurement import SensorPose
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import Config
-from fgtrack.tracking.association import (
-    Assignment,
-    Association,
-    GatedEuclidean,
-    GatedMahalanobis,
-    chi_square_quantile,
-    claimed,
-    near,
-)
+from fgtrack.tracking.association import Assignment, Association, GatedEuclidean, GatedMahalanobis, claimed, near
 from fgtrack.tracking.preprocess import Candidates
 from fgtrack.tracking.published import UngatedEuclidean
 from fgtrack.tracking.soft_association import LEAST_INFORMATION, equivalent, joint_probabilities, marginals
@@ -87,12 +79,6 @@ def test_what_is_near_but_not_believed_goes_nowhere_and_leaves_the_track_to_othe
     assert GatedEuclidean(max_nis=36.1)(candidates_of([ghost]), tracks) == Assignment([(0, 0)], [], [])
     assert GatedEuclidean(max_nis=35.9)(candidates_of([ghost, far]), tracks) == Assignment([], [1], [0], (0,))
     assert GatedEuclidean(max_nis=35.9)(candidates_of([ghost, other]), tracks) == Assignment([(1, 0)], [], [], (0,))
-
-
-@pytest.mark.parametrize("freedom", [1, 2, 3, 8, 40])
-def test_a_chi_square_quantile_is_that_of_scipy(freedom: int) -> None:
-    for probability in (0.01, 0.5, 0.95, 0.9999):
-        assert chi_square_quantile(probability, freedom) == pytest.approx(chi2.ppf(probability, freedom), rel=1e-11)
 
 
 @pytest.mark.parametrize("probability", [0.9, 0.99])
