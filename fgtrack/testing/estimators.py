@@ -171,13 +171,26 @@ def _reports_the_innovation_against_all_that_it_has_fused(subject: Subject, stre
 
 
 def _counts_each_measurement_as_what_it_is(subject: Subject, stream: Stream) -> None:
-    """The innovation and NIS are finite; an innovation covariance, where given, is that of the NIS."""
-    estimator = subject.start(stream)
-    newest_ns = stream.start.stamp_ns
+    """The innovation and NIS are finite; an innovation covariance, where given, is that of the NIS.
+
+    Every measurement has the same latency: none, one below the lag, and one above the lag. The latency alone makes no
+    measurement out of sequence.
+    """
+    for latency_s in (0.0, 0.4 * LAG_S, 1.6 * LAG_S):
+        _counts_right_with(subject, stream, nanoseconds(latency_s))
+
+
+def _counts_right_with(subject: Subject, stream: Stream, latency_ns: int) -> None:
+    """Require the right status of each measurement of a stream with this latency."""
+    estimator, newest_ns = subject.start(stream), stream.start.stamp_ns
     for place, measurement in enumerate(stream.measurements):
-        result, what = estimator.update(measurement), f"index {place}"
-        late = measurement.stamp_ns < newest_ns
-        allowed = (*_LATE, UpdateStatus.TOO_OLD, UpdateStatus.FAILED) if late else (UpdateStatus.IN_SEQUENCE,)
+        stamp_ns, what = measurement.stamp_ns, f"index {place} with a latency of {latency_ns} ns"
+        if latency_ns:
+            estimator.advance(max(stamp_ns, newest_ns) + latency_ns)
+        may_be_too_old = stamp_ns < estimator.window_ns[0] or 0 < nanoseconds(subject.claims.held_s) < latency_ns
+        result, late = estimator.update(measurement), stamp_ns < newest_ns
+        allowed = [*_LATE, UpdateStatus.TOO_OLD, UpdateStatus.FAILED] if late else [UpdateStatus.IN_SEQUENCE]
+        allowed += [UpdateStatus.TOO_OLD] * may_be_too_old
         require(result.status in allowed, f"{what}: {'late' if late else 'in sequence'}, is {result.status}")
         y, S, nis = result.innovation, result.innovation_covariance, result.nis
         complete = (result.status in FUSED) == (y is not None) == (nis is not None)
@@ -190,7 +203,7 @@ def _counts_each_measurement_as_what_it_is(subject: Subject, stream: Stream) -> 
                 own = measurement.nis(y, S)
                 right = np.allclose(S, S.T, 1e-9) and abs(own - nis) <= 1e-6 * (1.0 + own)
                 require(right, f"{what}: the NIS is {nis}, not {own} by the covariance\n{S}")
-        newest_ns = max(newest_ns, measurement.stamp_ns)
+            newest_ns = max(newest_ns, stamp_ns)
     end_ns = estimator.window_ns[1]
     require(0 <= newest_ns - end_ns <= NEAR_NS, f"window_ns ends at {end_ns}, newest is {newest_ns}")
 

@@ -43,6 +43,23 @@ class SaysInSequence(ReplayEkf):
         return result if result.nis is None else replace(result, status=UpdateStatus.IN_SEQUENCE)
 
 
+class TakesLatencyForDisorder(ReplayEkf):
+    """Calls a measurement out of sequence where the clock is far ahead of its stamp."""
+
+    now_ns = 0
+
+    def advance(self, now_ns: int) -> None:
+        super().advance(now_ns)
+        self.now_ns = now_ns
+
+    def update(self, measurement: Measurement) -> UpdateResult:
+        now_ns, result = self.now_ns, super().update(measurement)
+        is_in_sequence = result.status is UpdateStatus.IN_SEQUENCE
+        if is_in_sequence and now_ns - measurement.stamp_ns > 300_000_000:
+            return replace(result, status=UpdateStatus.OUT_OF_SEQUENCE)
+        return result
+
+
 class Lopsided(ReplayEkf):
     def state_at(self, stamp_ns: int) -> TrackState:
         state = super().state_at(stamp_ns)
@@ -166,6 +183,7 @@ class GivesOneForAll(FilterBank):
         (DoublesTheNoise, "is the kalman filter in sequence"),
         (DoublesTheNoise, "reports the innovation against all that it has fused"),
         (SaysInSequence, "counts each measurement as what it is"),
+        (TakesLatencyForDisorder, "counts each measurement as what it is"),
         (Lopsided, "gives symmetric positive definite covariances"),
         (Random, "gives the same bits for the same input"),
         (SharesItsState, "changes no input and no output later"),

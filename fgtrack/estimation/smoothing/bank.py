@@ -21,7 +21,6 @@ from fgtrack.estimation.smoothing.solver import Solver
 from fgtrack.models.motion import MotionModel
 
 _TOO_OLD, _FAILED = (UpdateResult(UpdateStatus.TOO_OLD), UpdateResult(UpdateStatus.FAILED))
-_STATUSES = (UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE, UpdateStatus.BEYOND_WINDOW)
 
 
 class SmootherBank:
@@ -132,7 +131,7 @@ class SmootherBank:
             fused = self._fuse(usable, tracks, alike, y, H, means, R, times[3]) if usable.size else usable
             rows = list(zip(group, y, nis.tolist(), S, *times[:2].tolist(), strict=True))
             for index, *own, newest_ns, start_ns in map(rows.__getitem__, fused.tolist()):
-                results[index] = UpdateResult(_STATUSES[(stamp_ns < newest_ns) + (stamp_ns < start_ns)], *own)
+                results[index] = UpdateResult(_status(stamp_ns, newest_ns, start_ns), *own)
         return results
 
     def birth(self, track_id: int, prior: Start) -> None:
@@ -235,3 +234,14 @@ class SmootherBank:
         indices of the nodes where the windows will begin, shape (4, m).
         """
         return self.solver.nodes.windows(tracks, self._clock_ns, self._lag_ns, self._behind_ns)
+
+
+def _status(stamp_ns: int, newest_ns: int, start_ns: int) -> UpdateStatus:
+    """Return the status of a fused measurement, from the newest stamp of its track and the start of the window.
+
+    The window follows the clock. With a latency above the lag, it begins after the newest stamp of the track, and a
+    measurement that is older than the window may still be the newest one of the track.
+    """
+    if stamp_ns >= newest_ns:
+        return UpdateStatus.IN_SEQUENCE
+    return UpdateStatus.OUT_OF_SEQUENCE if stamp_ns >= start_ns else UpdateStatus.BEYOND_WINDOW
