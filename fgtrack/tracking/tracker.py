@@ -230,9 +230,10 @@ class Tracker:
             self._conclude(batch, candidates, range(len(candidates)), Disposition.TOO_OLD)
             return
         states, assignment = self._identified(batch, candidates) or self._associated(batch, candidates)
-        self._count(batch, candidates, assignment, states, scan)
+        self._match(batch, candidates, assignment, states, scan)
         if assignment.pairs:
             self._estimate(batch, candidates, assignment, states)
+        self._miss(batch, assignment, states, scan)
         self._conclude(batch, candidates, assignment.refused, Disposition.GATED)
         new = assignment.new
         if new and parts.suppress_births_near_newer_tracks:
@@ -330,21 +331,26 @@ class Tracker:
             return np.zeros(len(track_ids))
         return np.asarray(np.hypot(positions_m[:, 0] - ego.x_m, positions_m[:, 1] - ego.y_m))
 
-    def _count(
+    def _match(
         self, batch: Batch, candidates: Candidates, assignment: Assignment, states: StatesAt, scan: Scan
     ) -> None:
-        """Lives of matched and missed tracks, where it is positions that are seen; tracks that run out end here.
-        A track is missed by a message as a whole, so only its last batch counts.
-        """
-        lifecycle, sensor = self._parts.lifecycle, self._parts.sensors[batch.message.sensor]
+        """Lives of matched tracks, where it is positions that are seen, and the objects that detections describe."""
         seen = self._seen.setdefault(id(batch.message), set())
         seen.update([states.track_ids[track] for _, track in assignment.pairs])
-        lifecycle.matched(scan, candidates, assignment.pairs, states)
+        self._parts.lifecycle.matched(scan, candidates, assignment.pairs, states)
         if self._parts.objects.describes(scan.objects):
             for position, track in assignment.pairs:
                 self._describe(batch, candidates, position, states.track_ids[track])
+
+    def _miss(self, batch: Batch, assignment: Assignment, states: StatesAt, scan: Scan) -> None:
+        """Lives of missed tracks, where it is positions that are seen; tracks that run out end here.
+        A track is missed by a message as a whole, so only its last batch counts. The list may end a track that it has
+        matched, where clutter explains the match better. So tracks end after the list has been fused.
+        """
+        lifecycle, sensor = self._parts.lifecycle, self._parts.sensors[batch.message.sensor]
         if not assignment.missed or not batch.last or not (sensor.gives_position and sensor.scan):
             return
+        seen = self._seen[id(batch.message)]
         rows = [track for track in assignment.missed if states.track_ids[track] not in seen]
         if rows:
             missed, positions_m = [states.track_ids[track] for track in rows], states.means[rows, :2]

@@ -283,3 +283,22 @@ def test_a_second_position_is_as_surprising_in_any_direction() -> None:
         reports = [tick(one, 100.0 * k, seen((k * x_m, k * y_m), at_ms=100.0 * k)) for k in range(1, 3)]
         nis.append(reports[1].updates[0].nis)
     assert nis[0] == pytest.approx(nis[1], rel=1e-4)
+
+
+@pytest.mark.parametrize("estimator", list(ESTIMATORS))
+def test_a_list_fuses_the_detection_of_a_track_that_it_ends_and_those_of_all_others(estimator: str) -> None:
+    clear, cluttered = (replace(POINTS, clutter_per_m2=density) for density in (1e-4, 0.1))
+    rules = ExistenceRules(birth_probability=0.1)
+    config = replace(Config(), sensors={"lidar": clear, "radar": cluttered}, estimator=estimator, lifecycle=rules)
+    one = build_tracker(config)
+    for k in range(10):
+        tick(one, 100.0 * k, seen((20.0 + k, 0.0), (20.0 + k, 60.0), (20.0 + k, -60.0), at_ms=100.0 * k))
+    tick(one, 1000.0, seen((30.0, 0.0), (30.0, 60.0), (200.0, 200.0), at_ms=1000.0, sensor="radar"))
+    report = tick(one, 1100.0, seen((200.0, 200.0), (31.3, 0.0), at_ms=1100.0, sensor="radar"))
+    assert [(row.index, row.disposition.value, row.track_id) for row in report.updates] == [
+        (0, "in_sequence", 3),
+        (1, "in_sequence", 0),
+    ]
+    assert ids(report) == [0, 1, 2]  # clutter explains the second detection of track 3 better
+    assert report.tracks[0].num_measured == 12
+    assert not +one.failures.counts
