@@ -203,7 +203,11 @@ class Start:
     """Shape (2, 2)."""
     position_cross: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Covariance of the position with further entries of the state, by their names: where it is off by an error that
-    lasts, this entry is known to be opposite."""
+    lasts, this entry is known to be opposite. `yaw_rad` and `speed_mps` may be named for every motion model."""
+    yaw_cross: Mapping[str, float] = field(default_factory=dict)
+    """Covariance of the yaw with `speed_mps`, and with entries of the state behind the speed, by their names."""
+    speed_cross: Mapping[str, float] = field(default_factory=dict)
+    """Covariance of the speed with entries of the state behind the speed, by their names."""
     yaw_rad: float | None = None
     """Direction of travel; None where it is unknown."""
     yaw_std_rad: float | None = None
@@ -219,7 +223,7 @@ class Start:
         _check("Start: stamp_ns", self.stamp_ns, _STAMP, is_stamp(self.stamp_ns))
         for each in fields(self):
             name, value = each.name, getattr(self, each.name)
-            if value is each.default or name in ("stamp_ns", "position_cross"):
+            if value is each.default or name == "stamp_ns" or name.endswith("_cross"):
                 continue
             shape = _SHAPES.get(name, ())
             least = 0.0 if "_std_" in name else -_MOST

@@ -150,3 +150,15 @@ def position_cross(measurement: MeasurementModel, z: FloatArray, pose: SensorPos
     x_m, y_m = (-G @ measurement.gain).tolist()
     names = [measurement.state_names[column] for column in measurement.columns]
     return dict(zip(names, zip(x_m, y_m, strict=True), strict=True))
+
+
+def component_cross(measurement: MeasurementModel, component: str) -> dict[str, float]:
+    """Covariance of an entry of the state that is measured as `component`, with the correlated errors, by name.
+
+    The entry begins as the measured value, z - gain e, so the covariance is the negative row of the gain.
+    """
+    if not isinstance(measurement, ColouredNoiseMeasurement) or component not in measurement.components:
+        return {}
+    gains = measurement.gain[measurement.components.index(component)]
+    names = [measurement.state_names[column] for column in measurement.columns]
+    return dict(zip(names, (-gains).tolist(), strict=True))

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import PositiveFloat
@@ -11,9 +11,10 @@ from pydantic import PositiveFloat
 from fgtrack.core.geometry import rotation
 from fgtrack.core.settings import settings
 from fgtrack.core.time import seconds
-from fgtrack.core.types import YAW, EgoState
-from fgtrack.estimation.base import Start, StatesAt
-from fgtrack.models.correlated_errors import position_cross, total_error
+from fgtrack.core.types import YAW, EgoState, FloatArray
+from fgtrack.estimation.base import Measurement, Start, StatesAt
+from fgtrack.models.correlated_errors import component_cross, position_cross, total_error
+from fgtrack.models.measurement import position_gradient
 from fgtrack.models.road import Road
 from fgtrack.tracking.preprocess import Candidate
 
@@ -62,18 +63,18 @@ class Birth:
         if self.kind == "measured":
             R = total_error(measurement.model, measurement.R)
             stds = dict(zip(values, np.sqrt(np.diag(R)).tolist(), strict=True))
+            crosses = _crosses(measurement, R)
             position = np.zeros((2, 2)) if candidate.position_covariance is None else candidate.position_covariance
             speed_variance = speed_mps**2 + stds.get("speed_mps", self.speed_std_mps) ** 2
             position = position + candidate.stamp_std_s**2 * speed_variance * np.eye(2)  # in an unknown direction
-            cross = position_cross(measurement.model, measurement.z, measurement.pose)
         else:
-            stds, cross, turn = {}, {}, rotation(yaw_rad or 0.0)
+            stds, crosses, turn = {}, {}, rotation(yaw_rad or 0.0)
             position = turn @ np.diag([self.along_std_m**2, self.across_std_m**2]) @ turn.T
         return Start(
             stamp_ns=measurement.stamp_ns,
             position_m=candidate.position_m,
             position_covariance=position,
-            position_cross=cross,
+            **crosses,
             yaw_rad=yaw_rad,
             yaw_std_rad=stds.get("yaw_rad", self.yaw_std_rad) if yaw_rad is not None else None,
             speed_mps=speed_mps,
@@ -83,6 +84,25 @@ class Birth:
             accel_mps2=ego.accel_mps2 if ego is not None and slow else 0.0,
             accel_std_mps2=self.accel_std_mps2,
         )
+
+
+def _crosses(measurement: Measurement, R: FloatArray) -> dict[str, Any]:
+    """Return the cross-covariances of a `Start` with what the measurement of covariance R, shape (k, k), measures.
+
+    The position is a function of z. Its covariance with a yaw or speed of the same z is G R, with the derivative G.
+    """
+    components, model = measurement.model.components, measurement.model
+    position = position_cross(model, measurement.z, measurement.pose)
+    yaw, speed = component_cross(model, "yaw_rad"), component_cross(model, "speed_mps")
+    G = position_gradient(components, measurement.z, measurement.pose)
+    measured = [name for name in ("yaw_rad", "speed_mps") if name in components]
+    if G is not None:
+        for name in measured:
+            x_m, y_m = (G @ R[:, components.index(name)]).tolist()
+            position[name] = x_m, y_m
+    if len(measured) == 2:
+        yaw["speed_mps"] = float(R[components.index("yaw_rad"), components.index("speed_mps")])
+    return {"position_cross": position, "yaw_cross": yaw, "speed_cross": speed}
 
 
 def in_any_direction(states: StatesAt, stamp_ns: int, starts: Mapping[int, Start]) -> StatesAt:
