@@ -10,7 +10,7 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from fgtrack.core.checks import LARGEST, LARGEST_NS, is_number, is_stamp
+from fgtrack.core.checks import LARGEST, LARGEST_NS, as_stamp, is_number
 from fgtrack.core.errors import CallError
 from fgtrack.core.linalg import equal_ones, mahalanobis_squared
 from fgtrack.core.types import FloatArray, IntArray, SmoothedReport, TrackState
@@ -19,7 +19,6 @@ from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.models.sensors import RobustLoss
 
 _T = TypeVar("_T")
-_STAMP = f"an integer of at most {LARGEST_NS:.0g}"
 Content = tuple[tuple[str, ...], tuple[float, ...], tuple[str, ...]]
 """Names of what is measured, numbers, names of what is assumed and of the loss; it has an order."""
 
@@ -39,6 +38,10 @@ class Measurement:
     """Robust loss; None is the Gaussian."""
     assumed: tuple[str, ...] = ()
     """Components that are prior knowledge, as a heading from the map: fused like the others, but not measured."""
+
+    def __post_init__(self) -> None:
+        if type(self.stamp_ns) is not int or not -LARGEST_NS <= self.stamp_ns <= LARGEST_NS:
+            object.__setattr__(self, "stamp_ns", as_stamp("measurement: stamp_ns", self.stamp_ns))
 
     @classmethod
     def of(
@@ -72,7 +75,7 @@ class Measurement:
             std = dict.fromkeys(names, std)
         if std is not None and std.keys() != values.keys():
             raise CallError(f"measurement of {', '.join(names)}: std must name the same, names {', '.join(std)}")
-        _check("measurement: stamp_ns", stamp_ns, _STAMP, is_stamp(stamp_ns))
+        stamp_ns = as_stamp("measurement: stamp_ns", stamp_ns)
         for name, value in (*values.items(), *(std or {}).items()):
             _check(f"measurement of {name}", value, "a number, finite and at most 1e9", is_number(value))
         z = np.array([values[name] for name in names], dtype=np.float64)
@@ -220,7 +223,7 @@ class Start:
     accel_std_mps2: float = 1.0
 
     def __post_init__(self) -> None:
-        _check("Start: stamp_ns", self.stamp_ns, _STAMP, is_stamp(self.stamp_ns))
+        object.__setattr__(self, "stamp_ns", as_stamp("Start: stamp_ns", self.stamp_ns))
         for each in fields(self):
             name, value = each.name, getattr(self, each.name)
             if value is each.default or name == "stamp_ns" or name.endswith("_cross"):
@@ -229,6 +232,8 @@ class Start:
             least = 0.0 if "_std_" in name else -_MOST
             rule = f"finite{'' if least else ' and not negative'}, of shape {shape} and at most {_MOST:g}"
             _check(f"Start: {name}", value, rule, _is_array(value, shape, least))
+            if not shape and type(value) is not float:
+                object.__setattr__(self, name, float(value))
 
 
 _MOST = LARGEST**4

@@ -5,6 +5,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from fgtrack.core.checks import as_stamp
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
@@ -126,6 +127,7 @@ class SingleObject:
 
     def advance(self, now_ns: int) -> None:
         """See `Estimator.advance`."""
+        now_ns = as_stamp("now_ns", now_ns)
         if now_ns > self.bank.present_ns:
             self.bank.advance(now_ns)
 
@@ -144,7 +146,7 @@ class SingleObject:
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`."""
-        return state_of(self.bank, self._motion, 0, stamp_ns)
+        return state_of(self.bank, self._motion, 0, as_stamp("stamp_ns", stamp_ns))
 
 
 def states_of(bank: TrackBank, motion: MotionModel, stamp_ns: int) -> StatesAt:

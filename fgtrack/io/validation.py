@@ -4,12 +4,15 @@ A wrong input is a `DataError` with its position, after everything before it. Me
 the tracker counts them. Describing ones (size, score) become None.
 """
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
+from itertools import chain
 from math import isfinite
-from operator import is_
+from numbers import Real
+from operator import index, is_
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -27,10 +30,12 @@ from fgtrack.core.types import (
 )
 from fgtrack.io.errors import one_line
 
-__all__ = ["InvalidMessageError", "validated", "validated_detection", "validated_message"]
+__all__ = ["InvalidMessageError", "validated", "validated_detection", "validated_head", "validated_message"]
 
 _MOST_OBJECTS = 100_000
 _INT64 = range(-(1 << 63), 1 << 63)
+_Item = TypeVar("_Item", bound=Message | Detection)
+_Message = TypeVar("_Message", bound=Message)
 
 
 class InvalidMessageError(Exception):
@@ -54,23 +59,33 @@ def validated(path: Path, messages: Callable[[], Iterator[Message]], done: bool 
 
 
 def validated_message(message: Message) -> Message:
-    """Return `message`, its detections as of `validated_detection`. Raises `InvalidMessageError`."""
+    """Return `message` with plain values: itself, if all are plain. Raises `InvalidMessageError`.
+
+    Plain are `int`, `float`, `bool`, `str` and tuples of `float`. Numbers of NumPy become plain ones, and covariances
+    may be lists or arrays, flat or square. Detections are as of `validated_detection`.
+    """
     if not isinstance(message, DetectionList | EgoState | TruthState):
         raise InvalidMessageError(f"a {type(message).__name__} is not a message")
-    _check_fields(message)
-    if not is_stamp(message.receipt_ns):  # all windows are counted from it
-        raise _invalid("receipt_ns", f"at most {LARGEST_NS:.0g} ns from 0", message.receipt_ns)
+    message = validated_head(message)
     if isinstance(message, DetectionList):
-        if len(message.objects) > _MOST_OBJECTS:
-            many = f"a list of {len(message.objects)} objects"
-            raise InvalidMessageError(f"{message.sensor}: {many}, at most {_MOST_OBJECTS} are read")
         objects = []
-        for index, item in enumerate(message.objects):
+        for place, item in enumerate(message.objects):
             try:
                 objects.append(validated_detection(item))
             except InvalidMessageError as error:
-                raise InvalidMessageError(f"{message.sensor}: objects[{index}]: {error}") from error
+                raise InvalidMessageError(f"{message.sensor}: objects[{place}]: {error}") from error
         return message if all(map(is_, objects, message.objects)) else replace(message, objects=tuple(objects))
+    return message
+
+
+def validated_head(message: _Message) -> _Message:
+    """Return `message` with plain values in all fields but `objects`. Raises `InvalidMessageError`."""
+    message = _plain(message)
+    if not is_stamp(message.receipt_ns):  # all windows are counted from it
+        raise _invalid("receipt_ns", f"at most {LARGEST_NS:.0g} ns from 0", message.receipt_ns)
+    if isinstance(message, DetectionList) and len(message.objects) > _MOST_OBJECTS:
+        many = f"a list of {len(message.objects)} objects"
+        raise InvalidMessageError(f"{message.sensor}: {many}, at most {_MOST_OBJECTS} are read")
     if isinstance(message, EgoState) and message.covariance is not None:
         size = len(EGO_COVARIANCE_STATES)
         if len(message.covariance) != size**2:
@@ -79,10 +94,14 @@ def validated_message(message: Message) -> Message:
 
 
 def validated_detection(item: Detection) -> Detection:
-    """`item`, describing numbers that are not finite replaced by None; `InvalidMessageError` for a wrong type."""
+    """`item` with plain values, describing numbers that are not finite replaced by None.
+
+    A covariance may have nulls, which become NaN: the tracker counts the detection as invalid. Raises
+    `InvalidMessageError` for a wrong type.
+    """
     if not isinstance(item, Detection):
         raise InvalidMessageError(f"a {type(item).__name__} is not a detection")
-    _check_fields(item)
+    item = _plain(item)
     undefined = dict[str, None]()
     for name in _NUMBERS:
         value = getattr(item, name)
@@ -91,58 +110,131 @@ def validated_detection(item: Detection) -> Detection:
     return replace(item, **undefined) if undefined else item
 
 
-def _check_fields(item: Message | Detection) -> None:
-    for name, (holds, expected), is_optional in _FIELDS[type(item)]:
+def _plain(item: _Item) -> _Item:
+    """Return `item` with plain values: itself, if all are plain. Raises `InvalidMessageError`."""
+    changed = dict[str, Any]()
+    for name, (plain, expected), is_optional in _FIELDS[type(item)]:
         value = getattr(item, name)
-        if type(value) is float and holds is _is_number:  # as nearly always
+        if type(value) is float and plain is _number:  # as nearly always
             continue
-        if not (is_optional if value is None else holds(value)):
-            raise _invalid(name, expected, value)
+        if value is None and is_optional:
+            continue
+        try:
+            own = plain(value)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise _invalid(name, expected, value) from error
+        if own is not value:
+            changed[name] = own
+    return replace(item, **changed) if changed else item
 
 
-def _is_integer(value: object) -> bool:
-    return value in _INT64 if type(value) is int else isinstance(value, np.integer)
+def _integer(value: Any) -> int:
+    if isinstance(value, bool | np.bool_):
+        raise TypeError
+    number: int = value if type(value) is int else index(value)
+    if number not in _INT64:
+        raise OverflowError
+    return number
 
 
-def _is_number(value: object) -> bool:
-    if type(value) is int:
-        return value.bit_length() <= 1000
-    return isinstance(value, (float, np.floating, np.integer))
+def _number(value: Any) -> float:
+    if isinstance(value, float):
+        return value if type(value) is float else float(value)
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value[()]
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise TypeError
+    return float(value)
 
 
-def _is_text(value: object) -> bool:
-    return isinstance(value, str) and value.encode(errors="replace").decode() == value
+def _flag(value: Any) -> bool:
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError
+    return bool(value)
 
 
-def _are_numbers(value: object) -> bool:
-    return isinstance(value, tuple) and all(type(each) is float or each is None or _is_number(each) for each in value)
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError
+    if value.encode(errors="replace").decode() != value:
+        raise ValueError
+    return value if type(value) is str else str(value)
 
 
-def _is_outline(value: object) -> bool:
-    return isinstance(value, tuple) and _are_numbers(value) and len(value) >= 6 and len(value) % 2 == 0
+def _name(value: Any) -> str:
+    if not (text := _text(value)):
+        raise ValueError
+    return text
 
 
-def _is_position(value: Any) -> bool:  # Any: whatever a reader gives
-    return _are_numbers(value) and len(value) == 2 and None not in value
+def _frame(value: Any) -> str:
+    if (text := _text(value)) not in FRAMES:
+        raise ValueError
+    return text
 
 
-_INTEGER = (_is_integer, "a 64 bit integer")
-_FLAG = (lambda value: isinstance(value, bool | np.bool_), "true or false")
-#: By field its rule and what it expects; all others are numbers.
-_RULES: dict[str, tuple[Callable[[object], bool], str]] = {
+def _numbers(value: Any) -> tuple[float, ...]:
+    """Plain numbers of a sequence."""
+    if type(value) is tuple and all(type(each) is float for each in value):  # as nearly always
+        return value
+    return tuple(map(_number, _items(value)))
+
+
+def _items(value: Any) -> Sequence[Any]:
+    """Entries of a list, a tuple, an array or another sequence."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if not isinstance(value, Sequence) or isinstance(value, str | bytes | bytearray):
+        raise TypeError
+    return value
+
+
+def _covariance(value: Any) -> tuple[float, ...]:
+    """Plain numbers of a matrix, flat in the order of its rows, or square; NaN instead of None."""
+    if type(value) is tuple and all(type(each) is float for each in value):  # as nearly always
+        return value
+    entries = _items(value)
+    if entries and not any(each is None or isinstance(each, Real) for each in entries):
+        rows = [_items(row) for row in entries]
+        if any(len(row) != len(rows) for row in rows):
+            raise ValueError
+        entries = list(chain.from_iterable(rows))
+    return tuple(math.nan if each is None else _number(each) for each in entries)
+
+
+def _outline(value: Any) -> tuple[float, ...]:
+    numbers = _numbers(value)
+    if len(numbers) < 6 or len(numbers) % 2:
+        raise ValueError
+    return numbers
+
+
+def _position(value: Any) -> tuple[float, ...]:
+    numbers = _numbers(value)
+    if len(numbers) != 2:
+        raise ValueError
+    return numbers
+
+
+_Rule = tuple[Callable[[Any], object], str]
+"""What makes a value plain, or raises; and what it expects, in words."""
+_INTEGER: _Rule = (_integer, "a 64 bit integer")
+_FLAG: _Rule = (_flag, "true or false")
+#: By field its rule; all others are numbers.
+_RULES: dict[str, _Rule] = {
     **dict.fromkeys(("stamp_ns", "receipt_ns", "object_id"), _INTEGER),
     **dict.fromkeys(("in_pit", "ignored"), _FLAG),
-    "sensor": (lambda value: value != "" and _is_text(value), "a name"),
-    **dict.fromkeys(("class_name", "id"), (_is_text, "a text")),
-    "origin_deg": (_is_position, "two numbers"),
-    "covariance": (_are_numbers, "a list of numbers"),
-    "outline_m": (_is_outline, "x and y of at least three corners"),
-    "frame": (lambda value: value in FRAMES, f"one of {', '.join(sorted(FRAMES))}"),
+    "sensor": (_name, "a name"),
+    **dict.fromkeys(("class_name", "id"), (_text, "a text")),
+    "origin_deg": (_position, "two numbers"),
+    "covariance": (_covariance, "a list of numbers"),
+    "outline_m": (_outline, "x and y of at least three corners"),
+    "frame": (_frame, f"one of {', '.join(sorted(FRAMES))}"),
 }
 _NUMBERS = tuple(name for name in DESCRIBING if name not in _RULES)
-_FIELDS = {
+_FIELDS: dict[type, list[tuple[str, _Rule, bool]]] = {
     kind: [
-        (each.name, _RULES.get(each.name, (_is_number, "a number")), each.default is None)
+        (each.name, _RULES.get(each.name, (_number, "a number")), each.default is None)
         for each in fields(kind)
         if each.name not in ("objects", "left_out")
     ]

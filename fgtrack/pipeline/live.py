@@ -25,12 +25,11 @@ from fgtrack.core.types import (
     UpdateRecord,
 )
 from fgtrack.io.run import Node
-from fgtrack.io.validation import InvalidMessageError, validated_detection
+from fgtrack.io.validation import InvalidMessageError, validated_detection, validated_head
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import corrected
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import read_config
-from fgtrack.tracking.inbox import records
 
 __all__ = ["Lateness", "TickTiming", "Tracker"]
 
@@ -38,6 +37,9 @@ __all__ = ["Lateness", "TickTiming", "Tracker"]
 EGO = "ego"
 #: Number of newest durations of which quantiles are calculated.
 NEWEST = 1000
+#: Number of sensors without a model that are counted by name; all further ones are counted as `OTHERS`.
+MOST_UNKNOWN = 100
+OTHERS = "other sensors"
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +114,7 @@ class Tracker:
         self.config = config
         self._tracker = build_tracker(config, lambda parts: replace(parts, propagated_exceptions=(DataError,)))
         self._refused: Counter[str] = Counter()
+        self._unknown: dict[str, None] = {}
         self._records: list[UpdateRecord] = []
         self._counts: dict[str, Counter[str]] = {}
         self._last = TickReport(-1, 0, (), ())
@@ -189,28 +192,35 @@ class Tracker:
             message = self._arrivals.popleft()
             try:
                 self._take(message)
+            except InvalidMessageError as error:
+                kind = "object list" if isinstance(message, DetectionList) else "ego state"
+                self._refuse(message, f"{kind}: {_rule(error)}")
             except Exception as error:
-                self._refused[f"message cannot be read ({type(error).__name__})"] += 1
-                if isinstance(message, DetectionList):
-                    self._records += [
-                        UpdateRecord(str(message.sensor), message.stamp_ns, message.receipt_ns, i, Disposition.INVALID)
-                        for i in range(len(message.objects))
-                    ]
+                self._refuse(message, f"message cannot be read ({type(error).__name__})")
+
+    def _refuse(self, message: EgoState | DetectionList, reason: str) -> None:
+        """Count a message that is not used, and its detections as invalid."""
+        self._refused[reason] += 1
+        if isinstance(message, DetectionList):
+            sensor = message.sensor if isinstance(message.sensor, str) else OTHERS
+            times_ns = _recorded_ns(message.stamp_ns), _recorded_ns(message.receipt_ns)
+            rows = range(len(message.objects))
+            self._records += [UpdateRecord(sensor, *times_ns, row, Disposition.INVALID) for row in rows]
 
     def _take(self, message: EgoState | DetectionList) -> None:
         if not isinstance(message, EgoState | DetectionList):
             self._refused["neither ego state nor object list"] += 1
             return
-        stamp_ns, receipt_ns = integer(message.stamp_ns), integer(message.receipt_ns)
-        if not (0 <= stamp_ns <= LARGEST_NS and 0 <= receipt_ns <= LARGEST_NS):
-            raise OverflowError("stamps are nanoseconds since 1970")
+        message = validated_head(message)
+        for what in ("stamp_ns", "receipt_ns"):
+            if not 0 <= getattr(message, what) <= LARGEST_NS:
+                raise InvalidMessageError(f"{what}: nanoseconds since 1970 expected")
         name = EGO
         if isinstance(message, DetectionList):
             name = message.sensor
             if name not in self.config.sensors:
                 if name not in self.config.ignore_sensors:
-                    self._refused[f"sensor {name!r} has no model"] += 1
-                    self._records += records(message, Disposition.INVALID)
+                    self._refuse(message, f"sensor {self._counted(name)!r} has no model")
                 return
             objects = tuple(map(self._usable, message.objects))
             message = corrected(replace(message, objects=objects), self.config.sensors)
@@ -219,14 +229,21 @@ class Tracker:
         self._receipts_ns[name] = max(message.receipt_ns, self._receipts_ns.get(name, 0))
         self._tracker.receive(message)
 
+    def _counted(self, sensor: str) -> str:
+        """Return the name under which a sensor is counted: of the unknown ones, the first have their own."""
+        if sensor in self.config.sensors or sensor in self._unknown:
+            return sensor
+        if len(self._unknown) == MOST_UNKNOWN:
+            return OTHERS
+        self._unknown[sensor] = None
+        return sensor
+
     def _usable(self, item: Detection) -> Detection:
-        """Return `item` with its covariance, maybe a list or an array, as a tuple; an invalid one for wrong types."""
+        """Return `item` with plain values; an invalid one for wrong types."""
         try:
-            if isinstance(item, Detection) and isinstance(item.covariance, list | np.ndarray):
-                item = replace(item, covariance=tuple(np.ravel(item.covariance).tolist()))
             return validated_detection(item)
-        except (InvalidMessageError, ValueError) as error:
-            self._refused[f"detection: {str(error).partition(', not ')[0]}"] += 1
+        except InvalidMessageError as error:
+            self._refused[f"detection: {_rule(error)}"] += 1
             return Detection()
 
     def tick(self, now_ns: int) -> TickReport:
@@ -246,7 +263,7 @@ class Tracker:
             self._ticks_ns.append(perf_counter_ns() - begun_ns)
             self._node.done_ns(now_ns, self._ticks_ns[-1])
             for update in report.updates:
-                self._counts.setdefault(update.sensor, Counter())[str(update.disposition)] += 1
+                self._counts.setdefault(self._counted(update.sensor), Counter())[str(update.disposition)] += 1
             if self._last.tick < 0:
                 self._first_tick_ns = now_ns
             elif self._node.period_ns is not None:
@@ -275,10 +292,23 @@ class Tracker:
             return self._tracker.finish()
 
 
+def _rule(error: InvalidMessageError) -> str:
+    """Return what was expected; the value is left out, because every value would be a reason of its own."""
+    return str(error).partition(", not ")[0]
+
+
+def _recorded_ns(value: object) -> int:
+    """Return a time of a refused message for its records; 0 where it is not an integer."""
+    try:
+        return integer(value)  # type: ignore[arg-type]  # whatever was received
+    except Exception:
+        return 0
+
+
 def _stamp(name: str, value: int) -> int:
     """Return `value` as an integer. Raises `CallError` for an invalid time."""
     try:
-        stamp_ns = integer(value)
+        stamp_ns = -1 if isinstance(value, bool | np.bool_) else integer(value)
     except TypeError:
         stamp_ns = -1
     if not 0 <= stamp_ns <= LARGEST_NS:

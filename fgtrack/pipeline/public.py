@@ -13,6 +13,7 @@ from fgtrack.core.types import Message
 from fgtrack.io.recording import Storage, check_recording, write_recording
 from fgtrack.io.run import Run, load_run
 from fgtrack.io.source import open_input
+from fgtrack.io.validation import InvalidMessageError, validated_message
 from fgtrack.pipeline import replay as pipeline
 from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.pipeline.config import Config
@@ -80,10 +81,11 @@ def _messages(recording: Iterable[Message]) -> Iterator[Message]:
     """Yield the messages of `recording`. Raises `CallError` for other objects."""
     if not isinstance(recording, Iterable):
         raise CallError(f"recording: must be a path or messages, is a {type(recording).__name__}")
-    for message in recording:
-        if not isinstance(message, Message):
-            raise CallError(f"recording: a {type(message).__name__} is no message")
-        yield message
+    for count, message in enumerate(recording, 1):
+        try:
+            yield validated_message(message)
+        except InvalidMessageError as error:
+            raise CallError(f"recording: message {count}: {error}") from error
 
 
 @overload

@@ -114,7 +114,7 @@ def _consistent(before: EgoState, after: EgoState) -> bool:
     if off_m <= _SLACK_M:  # as nearly always
         return True
     given = [ego.covariance for ego in (before, after) if ego.covariance is not None]
-    variance_m2 = sum(max(each[0] + each[6], 0.0) for each in given)  # of x and y
+    variance_m2 = sum(max(0.0, each[0] + each[6]) for each in given)  # of x and y; NaN counts as 0
     return off_m <= _SLACK_M + _SHARE * abs(travelled_m) + _SIGMAS * math.sqrt(variance_m2)
 
 

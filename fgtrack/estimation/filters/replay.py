@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import NamedTuple
 
+from fgtrack.core.checks import as_stamp
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
@@ -67,6 +68,7 @@ class ReplayEkf(WindowedFilter):
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: the filter's state, from the measurements up to that stamp."""
+        stamp_ns = as_stamp("stamp_ns", stamp_ns)
         before = self.steps[max(bisect.bisect_right(self.steps, stamp_ns, key=_stamp) - 1, 0)]
         mean, covariance, _ = self._ahead(before, stamp_ns)
         return track_state(self._motion, stamp_ns, mean, covariance)

@@ -8,6 +8,7 @@ from operator import itemgetter
 
 import numpy as np
 
+from fgtrack.core.checks import as_stamp
 from fgtrack.core.geometry import cartesian, polar
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
@@ -186,7 +187,7 @@ class Initiated:
 
     def advance(self, now_ns: int) -> None:
         """See `Estimator.advance`."""
-        self._clock_ns = max(self._clock_ns, now_ns)
+        self._clock_ns = max(self._clock_ns, as_stamp("now_ns", now_ns))
         self._inner.advance(now_ns)
 
     def _begin_again(self, search: TrackInitiation) -> None:

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
+from fgtrack.core.checks import as_stamp
 from fgtrack.core.time import nanoseconds
 from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
 from fgtrack.estimation.filters.ekf import OneCorrection
@@ -29,7 +30,7 @@ class WindowedFilter(ABC):
 
     def advance(self, now_ns: int) -> None:
         """See `Estimator.advance`."""
-        self._start_ns = max(self._start_ns, now_ns - self._lag_ns)
+        self._start_ns = max(self._start_ns, as_stamp("now_ns", now_ns) - self._lag_ns)
         self._forget_before(self._start_ns)
 
     def update(self, measurement: Measurement) -> UpdateResult:

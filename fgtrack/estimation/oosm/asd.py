@@ -4,6 +4,7 @@ import bisect
 
 import numpy as np
 
+from fgtrack.core.checks import as_stamp
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
@@ -44,6 +45,7 @@ class AccumulatedStateDensity(WindowedFilter):
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: smoothed, from all measurements."""
+        stamp_ns = as_stamp("stamp_ns", stamp_ns)
         (_, mean, covariance), block = self._with_state(stamp_ns)
         return track_state(self._motion, stamp_ns, mean[block].copy(), covariance[block, block].copy())
 

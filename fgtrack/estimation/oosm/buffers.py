@@ -1,5 +1,6 @@
 """Hold measurements back until the late ones have come, as in industry."""
 
+from fgtrack.core.checks import as_stamp
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import TrackState
@@ -48,6 +49,7 @@ class DelayedHorizon:
 
     def advance(self, now_ns: int) -> None:
         """See `Estimator.advance`."""
+        now_ns = as_stamp("now_ns", now_ns)
         self._now_ns = max(self._now_ns, now_ns)
         self._ordered.advance(now_ns)
 
@@ -62,6 +64,7 @@ class DelayedHorizon:
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: after the front it is pure prediction."""
+        stamp_ns = as_stamp("stamp_ns", stamp_ns)
         front_ns = max(self._front_ns, self.window_ns[0])
         if stamp_ns <= front_ns:
             return self._ordered.state_at(stamp_ns)
