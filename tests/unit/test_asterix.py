@@ -100,6 +100,38 @@ def test_stamps_go_on_at_midnight(tmp_path):
     assert [each.stamp_ns / 1e9 for each in lists(tmp_path / "a.ast")] == [86_399.5, 86_400.5, 86_399.75, 86_401.0]
 
 
+STEP_S = 1.0 / 128.0
+"""Resolution of the times."""
+
+
+@pytest.mark.parametrize("sent_s", [-2.0, -1.0, -0.25, -STEP_S, 0.0, STEP_S, 0.5, 30.0, 3600.0])
+@pytest.mark.parametrize("received_s", [0.0, STEP_S, 0.25, 100.5, 43_200.0, 86_399.5, 86_400.0 - STEP_S])
+def test_the_delay_between_two_times_of_day_has_a_sign_and_crosses_midnight(tmp_path, received_s, sent_s):
+    (tmp_path / "a.ast").write_bytes(aircraft(received_s, (received_s + sent_s) % 86_400.0, 41.3, 2.08))
+    (one,) = lists(tmp_path / "a.ast")
+    assert one.stamp_ns == round(received_s * 1e9)
+    assert one.receipt_ns - one.stamp_ns == round(sent_s * 1e9)
+
+
+def test_reports_that_are_sent_before_they_are_received_stay_on_their_day(tmp_path):
+    times_s = [86_399.0 + 0.25 * k for k in range(40)]
+    sent_s = [time_s + (-STEP_S if k % 4 == 0 else 0.5) for k, time_s in enumerate(times_s)]
+    reports = zip(times_s, sent_s, strict=True)
+    (tmp_path / "a.ast").write_bytes(
+        b"".join(aircraft(time_s % 86_400.0, end_s % 86_400.0, 41.3, 2.08) for time_s, end_s in reports)
+    )
+    found = lists(tmp_path / "a.ast")
+    assert [each.stamp_ns for each in found] == [round(time_s * 1e9) for time_s in times_s]
+    newest_s = [max(sent_s[: k + 1]) for k in range(len(sent_s))]
+    assert [each.receipt_ns for each in found] == [round(time_s * 1e9) for time_s in newest_s]
+
+
+def test_a_first_report_of_just_after_midnight_that_was_sent_before_moves_no_other(tmp_path):
+    reports = ((STEP_S, 86_400.0 - STEP_S), (0.25, 0.75), (86_399.75, 0.5), (1.0, 1.25))
+    (tmp_path / "a.ast").write_bytes(b"".join(aircraft(*times_s, 41.3, 2.08) for times_s in reports))
+    assert [each.stamp_ns / 1e9 for each in lists(tmp_path / "a.ast")] == [STEP_S, 0.25, -0.25, 1.0]
+
+
 def test_a_damaged_file_is_one_line_behind_what_is_before(tmp_path):
     whole = surface(50.0, 100.0, 0.0)
     (tmp_path / "a.ast").write_bytes(whole + whole[:-3])

@@ -151,7 +151,7 @@ def _reports(
     """Target reports of `file`, a list of one object each, in the order of the file.
     `sites` by SIC gets those whose stations are not given.
     """
-    newest_ns = day_ns = 0
+    newest_ns: int | None = None
     for number, record in _records(file, readers):
         own = _CATEGORIES[number]
         if number == 10 and record.get("000") != _TARGET_REPORT:
@@ -166,16 +166,20 @@ def _reports(
         item = _detection(record, number, own, sites[station], plane)
         if item is None:
             continue
-        stamp_ns = round(stamp_s * NS_PER_S) + day_ns
-        if abs(stamp_ns - newest_ns) > _DAY_NS // 2 and newest_ns:  # midnight
-            change_ns = _DAY_NS if stamp_ns < newest_ns else -_DAY_NS
-            day_ns, stamp_ns = max(day_ns + change_ns, day_ns), stamp_ns + change_ns
-        receipt_ns = stamp_ns
-        if receipt_s is not None:
-            receipt_ns += round((receipt_s - stamp_s) % 86_400.0 * NS_PER_S)
-        newest_ns = max(newest_ns, receipt_ns)
+        stamp_ns = _on_nearest_day(stamp_s, newest_ns)
+        receipt_ns = stamp_ns if receipt_s is None else _on_nearest_day(receipt_s, stamp_ns)
+        newest_ns = receipt_ns if newest_ns is None else max(newest_ns, receipt_ns)
         sensor = own.sensor or _KINDS.get(int(record.get("020/TYP", 0)), "other")
         yield DetectionList(sensor, stamp_ns, newest_ns, (item,), "map", origin_deg=plane.origin_deg)
+
+
+def _on_nearest_day(time_s: float, near_ns: int | None) -> int:
+    """Return a time of day as a stamp, on the day that brings it nearest to `near_ns`; on day 0 without one.
+
+    The second time of a report may lie before the first: their clocks are rounded to 1/128 s.
+    """
+    time_ns = round(time_s * NS_PER_S)
+    return time_ns if near_ns is None else time_ns + _DAY_NS * round((near_ns - time_ns) / _DAY_NS)
 
 
 def _records(file: Path, readers: Mapping[int, RecordReader]) -> Iterator[tuple[int, Record]]:
