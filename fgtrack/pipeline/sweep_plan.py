@@ -6,16 +6,16 @@ import json
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, NonNegativeInt
 
-from fgtrack.core.errors import CallError, FgtrackError
+from fgtrack.core.errors import CallError, DataError, FgtrackError
 from fgtrack.estimation.registry import ESTIMATORS, MOTION_MODELS
-from fgtrack.io.source import InputSource, open_input
+from fgtrack.io.config import InputConfig
+from fgtrack.io.source import open_input
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import key_and_value, load, names_of, plain, read_yaml, texts_of, validate, with_value
 from fgtrack.pipeline.replay import versions
@@ -151,6 +151,8 @@ class Job:
     recipe: Recipe | None
     problem: str | None = None
     """Why the grid point cannot be run, where there is no recipe."""
+    is_data_bad: bool = False
+    """True if the problem is a file that cannot be read, and not a setting."""
 
 
 @dataclass(frozen=True)
@@ -184,48 +186,89 @@ def load_plan(path: Path, recording: Path | None = None, settings: Sequence[str]
     base = {CONFIG: plain(config)}
     code = [ESTIMATORS.sources(), MOTION_MODELS.sources(), versions()]
     recipe: dict[str, Value] = {"estimators": sweep.estimators, "recording": None, "code": code}
+    recorded = None
     if sweep.input is None:
         base[SCENARIO] = plain(read_scenario(str(sweep.scenario), folder, sweep.duration_s))
     else:
         base[DELAYS] = {} if sweep.delays is None else read_yaml(folder / sweep.delays)
-        source = open_input((folder / sweep.input).resolve(), config.input)
-        recipe |= {"recording": str(source.path), "messages": _hash(source)}
+        recorded = _Recorded((folder / sweep.input).resolve())
+        recipe["recording"] = str(recorded.path)
     base = _with_keys(base, sweep.set, f"{path}: set")
     points = list(sweep.grid())
-    jobs = tuple(job for point in points for job in _jobs(base, recipe, point, sweep.seeds))
-    if all(job.recipe is None for job in jobs):
+    jobs = tuple(job for point in points for job in _jobs(base, recipe, point, sweep.seeds, recorded))
+    if all(job.recipe is None and not job.is_data_bad for job in jobs):
         raise CallError(f"{path}: {jobs[0].problem}")
     named = (sweep.input, sweep.delays, sweep.config, sweep.scenario)
     inputs = (path, *(folder / name for name in named if name is not None))
     return Plan(tuple(points[0].cells), jobs, sweep.estimators, sweep.metrics, inputs)
 
 
-def _jobs(base: Mapping[str, Value], recipe: Recipe, point: Point, seeds: Sequence[int]) -> list[Job]:
+class _Recorded:
+    """The recording of a sweep, which each point reads by its own configuration of the input."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._known: dict[str, tuple[str, Mapping[str, object]] | FgtrackError] = {}
+
+    def read(self, config: InputConfig) -> tuple[str, Mapping[str, object]]:
+        """Return the hash of the settings and messages that this configuration gives, and the settings.
+
+        The hash is that of the content of all files that are read. Raises `CallError` where the configuration does not
+        fit the recording, and `DataError` where one of these files cannot be read.
+        """
+        name = repr(config)
+        if name not in self._known:
+            try:
+                self._known[name] = self._read(config)
+            except FgtrackError as error:
+                self._known[name] = error
+        known = self._known[name]
+        if isinstance(known, FgtrackError):
+            raise known
+        return known
+
+    def _read(self, config: InputConfig) -> tuple[str, Mapping[str, object]]:
+        source = open_input(self.path, config)
+        settings = source.settings()
+        result = hashlib.sha256(repr(settings).encode())
+        for message in source.messages():
+            result.update(repr(message).encode())
+        return result.hexdigest(), settings
+
+
+def _jobs(
+    base: Mapping[str, Value], recipe: Recipe, point: Point, seeds: Sequence[int], recorded: _Recorded | None
+) -> list[Job]:
     """Return the jobs of one grid point, one for each seed."""
     cells = tuple(point.cells.values())
     try:
         values = _with_keys(base, point.changes, "vary")
-        values = {name: plain(validate(_KINDS[name], value, name)) for name, value in values.items()}
-    except CallError as error:
+        valid = {name: validate(_KINDS[name], value, name) for name, value in values.items()}
+        values = {name: plain(value) for name, value in valid.items()}
+        read: dict[str, Value] = {}
+        texts = list(texts_of(values))
+        if recorded is not None:
+            read["messages"], settings = recorded.read(valid[CONFIG].input)
+            texts += texts_of(plain(settings))
+        read["files"] = {text: _sha256(_content(text)) for text in texts if os.path.isfile(text)}
+    except (CallError, DataError) as error:
         where = ", ".join(f"{name}={cell!s:.80}" for name, cell in point.cells.items())
-        return [Job(cells, seed, "", None, f"{where}: {error}" if cells else str(error)) for seed in seeds]
-    files = {text: _sha256(Path(text).read_bytes()) for text in texts_of(values) if os.path.isfile(text)}
+        problem = f"{where}: {error}" if cells else str(error)
+        return [Job(cells, seed, "", None, problem, isinstance(error, DataError)) for seed in seeds]
     jobs = []
     for seed in seeds:
-        seeded = {**recipe, **values, "files": files, "seed": seed}
+        seeded = {**recipe, **values, **read, "seed": seed}
         content = json.dumps({**seeded, "recording": None}, sort_keys=True)
         jobs.append(Job(cells, seed, _sha256(content.encode())[:32], seeded))
     return jobs
 
 
-def _hash(source: InputSource) -> str:
-    """Return the hash of all settings and messages of an input, up to its break."""
-    result = hashlib.sha256()
-    with suppress(FgtrackError):
-        result.update(repr(source.settings()).encode())
-        for message in source.messages():
-            result.update(repr(message).encode())
-    return result.hexdigest()
+def _content(name: str) -> bytes:
+    """Return the content of a file that a job reads. Raises `DataError`."""
+    try:
+        return Path(name).read_bytes()
+    except OSError as error:
+        raise DataError(f"{name}: cannot be read ({error.strerror})") from error
 
 
 def _sha256(data: bytes) -> str:

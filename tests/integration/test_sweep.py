@@ -319,6 +319,36 @@ vary:
     assert means[2] != means[3]  # the seed draws the delays
 
 
+def test_a_changed_file_that_the_sweep_names_is_read_again(tmp_path: Path) -> None:
+    drive = tmp_path / "drive"
+    drive.mkdir()
+    columns = "{stamp: t, x_m: x, y_m: y}"
+
+    def write(name: str, offset_m: float) -> None:
+        rows = [f"{0.05 * k:.2f},{20.0 + 0.5 * k},{offset_m if k > 20 else 0.0}" for k in range(40)]
+        (drive / name).write_text("\n".join(["t,x,y", *rows, ""]))
+
+    for name in ("near.csv", "far.csv"):
+        write(name, 0.5)
+    sensors = "{radar: {std: {x_m: 1.0, y_m: 1.0}}}"
+    table = f"{{file: near.csv, frame: map, columns: {columns}}}"
+    (tmp_path / "csv.yaml").write_text(f"input: {{csv: {{detections: {{radar: {table}}}}}}}\nsensors: {sensors}\n")
+    head = "format: fgtrack-sweep/1\ninput: drive\nconfig: csv.yaml\nestimators: [ekf-replay]\n"
+    key = "input.csv.detections.radar.file"
+    metric = "consistency.nis.radar.mean"
+    for name, more in (("vary", f"vary: {{{key}: [near.csv, far.csv]}}"), ("set", f"set: {{{key}: far.csv}}")):
+        (tmp_path / f"{name}.yaml").write_text(f"{head}{more}\n")
+        write("far.csv", 0.5)
+        found = []
+        for out, offset_m in (("kept", 0.5), ("kept", 1.5), ("new", 1.5)):
+            write("far.csv", offset_m)
+            call = ["sweep", str(tmp_path / f"{name}.yaml"), "-o", str(tmp_path / f"{out}_{name}"), "--jobs", "1"]
+            assert run(call) == 0
+            found.append([row[metric] for row in rows(tmp_path / f"{out}_{name}/sweep.csv")])
+        assert found[1] == found[2]
+        assert found[0][-1] != found[1][-1]
+
+
 def test_a_script_gets_the_table_that_is_there_or_runs_the_first_seeds(tmp_path: Path) -> None:
     sweep = write_sweep(
         tmp_path, "duration_s: 0.5\nestimators: [ekf-replay]\nseeds: 2\nvary: {association.gate_m: [5.0, 3.0]}\n"

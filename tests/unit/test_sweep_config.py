@@ -224,6 +224,141 @@ def test_the_content_of_every_file_changes_the_key_whatever_its_size_and_time(
         assert keys(plan(text, head)) != before
 
 
+TABLES_HEAD = """
+format: fgtrack-sweep/1
+input: drive
+config: csv.yaml
+estimators: [ekf-replay]
+set: {map.track: none, sensors.radar.std: {x_m: 1.0, y_m: 1.0}}
+"""
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    """A folder of CSV files, with two files of detections, and its configuration."""
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    rows = [f"{0.05 * k:.2f},{20.0 + 0.5 * k},1.0" for k in range(40)]
+    for name in ("radar.csv", "other.csv"):
+        (folder / name).write_text("\n".join(["t,x,y", *rows, ""]))
+    ego = [f"{0.05 * k:.2f},{0.5 * k},0.0,0.0,10.0" for k in range(40)]
+    (folder / "ego.csv").write_text("\n".join(["t,x,y,yaw,v", *ego, ""]))
+    columns = "{stamp: t, x_m: x, y_m: y}"
+    (tmp_path / "csv.yaml").write_text(
+        "input:\n  csv:\n"
+        "    ego: {file: ego.csv, columns: {stamp: t, x_m: x, y_m: y, yaw_rad: yaw, speed_mps: v}}\n"
+        f"    detections: {{radar: {{file: radar.csv, frame: map, columns: {columns}}}}}\n"
+    )
+    return folder
+
+
+def moved(file: Path) -> None:
+    """Change one digit of a CSV file; its size and time stay."""
+    time_ns, text = file.stat().st_mtime_ns, file.read_text()
+    file.write_text(text.replace("20.5", "26.5").replace("0.05,0.5", "0.05,0.6"))
+    assert file.read_text() != text
+    os.utime(file, ns=(time_ns, time_ns))
+
+
+FILE = "input.csv.detections.radar.file"
+
+
+@pytest.mark.parametrize(
+    ("text", "changed", "stale"),
+    [
+        (f"vary: {{{FILE}: [radar.csv, other.csv]}}", "other.csv", [False, True]),
+        (f"vary: {{{FILE}: [radar.csv, other.csv]}}", "radar.csv", [True, False]),
+        (f"vary: {{{FILE}: [radar.csv, other.csv]}}", "ego.csv", [True, True]),
+        (f"one_at_a_time: {{{FILE}: [other.csv]}}", "other.csv", [False, True]),
+        (f"vary: {{{FILE}: [other.csv], clock.node_hz: [20.0, 50.0]}}", "other.csv", [True, True]),
+        (f"vary: {{{FILE}: [other.csv]}}", "radar.csv", [False]),
+        ("vary: {clock.node_hz: [20.0, 50.0]}", "other.csv", [False, False]),
+    ],
+)
+def test_the_files_that_a_point_reads_decide_its_key(
+    plan: Any, drive: Path, text: str, changed: str, stale: list[bool]
+) -> None:
+    before = keys(plan(text, TABLES_HEAD))
+    assert keys(plan(text, TABLES_HEAD)) == before
+    moved(drive / changed)
+    after = keys(plan(text, TABLES_HEAD))
+    assert [a != b for a, b in zip(before, after, strict=True)] == stale
+
+
+def test_a_file_that_is_set_for_all_points_decides_their_keys(plan: Any, drive: Path) -> None:
+    head = TABLES_HEAD.replace("set: {", f"set: {{{FILE}: other.csv, ")
+    before = keys(plan("", head))
+    moved(drive / "radar.csv")
+    assert keys(plan("", head)) == before
+    moved(drive / "other.csv")
+    assert keys(plan("", head)) != before
+
+
+def test_the_base_need_not_fit_where_every_point_does(plan: Any, drive: Path) -> None:
+    (drive / "radar.csv").unlink()
+    (job,) = plan(f"vary: {{{FILE}: [other.csv]}}", TABLES_HEAD).jobs
+    assert job.problem is None
+
+
+@pytest.mark.parametrize("damage", ["missing", "unreadable", "no number"])
+def test_a_file_that_cannot_be_read_is_a_problem_of_the_points_that_read_it(
+    plan: Any, drive: Path, damage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text, other = f"vary: {{{FILE}: [radar.csv, other.csv]}}", drive / "other.csv"
+    good = keys(plan(text, TABLES_HEAD))
+    if damage == "missing":
+        other.unlink()
+    elif damage == "no number":
+        other.write_text(other.read_text().replace("20.5", "far"))
+    else:
+        opened = Path.open
+
+        def refuse(path: Path, *arguments: Any, **options: Any) -> Any:
+            if path.name == "other.csv":
+                raise PermissionError(13, "Permission denied")
+            return opened(path, *arguments, **options)
+
+        monkeypatch.setattr(Path, "open", refuse)
+    made = plan(text, TABLES_HEAD)
+    assert [job.problem is None for job in made.jobs] == [True, False]
+    assert keys(made) == [good[0], ""]
+    assert "other.csv" in made.jobs[1].problem
+    assert made.jobs[1].problem.isprintable()
+
+
+def test_a_recording_that_breaks_off_is_a_bad_cell_and_not_a_bad_call(
+    plan: Any, recording: str, tmp_path: Path
+) -> None:
+    drive = tmp_path / "drive.jsonl"
+    drive.write_text(drive.read_text()[:-30])
+    (job,) = plan("", recording).jobs
+    assert (job.recipe, job.is_data_bad) == (None, True)
+    assert "breaks off in the middle of record" in str(job.problem)
+
+
+def test_a_map_that_the_recording_carries_decides_the_key(plan: Any, tmp_path: Path) -> None:
+    track = tmp_path / "track.csv"
+    track.write_text("abc")
+    messages = simulate(read_scenario("default"), np.random.default_rng(0))[:50]
+    write_stream(tmp_path / "drive.jsonl", messages, {"settings": {"map": {"track": str(track)}}})
+    head = "format: fgtrack-sweep/1\ninput: drive.jsonl\nestimators: [ekf-replay]\n"
+    before = keys(plan("", head))
+    track.write_text("abd")
+    assert keys(plan("", head)) != before
+
+
+def test_a_map_that_cannot_be_read_is_a_problem_in_a_line(plan: Any, tmp_path: Path, monkeypatch: Any) -> None:
+    track = tmp_path / "track.csv"
+    track.write_text("abc")
+
+    def refuse(path: Path) -> bytes:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    (job,) = plan(f"set: {{map.track: {track}}}").jobs
+    assert job.problem == f"{track}: cannot be read (Permission denied)"
+
+
 # --- on another recording
 
 
