@@ -20,6 +20,7 @@ from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.tracking.association import Assignment, GatedEuclidean, GatedMahalanobis, Likely
 from fgtrack.tracking.detections import PosedBatch
+from fgtrack.tracking.facing import SIGNED, Facings
 from fgtrack.tracking.guarded_bank import GuardedBank
 from fgtrack.tracking.objects import Apart
 from fgtrack.tracking.preprocess import Candidate, Candidates, Preprocess, Preprocessed
@@ -88,17 +89,27 @@ class _WideGate:
     association: GatedEuclidean | GatedMahalanobis
     stds: float
 
+    @property
+    def reads_yaws(self) -> bool:
+        return self.association.reads_yaws
+
     def __call__(
-        self, candidates: Candidates, states: StatesAt, apart: Apart | None = None, likely: Likely | None = None
+        self,
+        candidates: Candidates,
+        states: StatesAt,
+        apart: Apart | None = None,
+        likely: Likely | None = None,
+        facings: Facings | None = None,
     ) -> Assignment:
         stds_m = np.array([self._stds_m(candidate, states.means) for candidate in candidates])
         needed_m = self.stds * stds_m.reshape(len(candidates), len(states.means))
         if isinstance(self.association, GatedEuclidean):
-            return self.association.within(np.maximum(self.association.gate_m, needed_m), candidates, states, apart)
+            gates_m = np.maximum(self.association.gate_m, needed_m)
+            return self.association.within(gates_m, candidates, states, apart, facings)
         limit_m = float(needed_m.max(initial=self.association.max_distance_m))
         probability = max(self.association.gate_probability, _GATE_PROBABILITY)
         opened = replace(self.association, max_distance_m=limit_m, gate_probability=probability)
-        return opened(candidates, states, apart, likely)
+        return opened(candidates, states, apart, likely, facings)
 
     def _stds_m(self, candidate: Candidate, means: FloatArray) -> FloatArray:
         """Return the largest standard deviation of the position; of a bearing alone, across the line of sight."""
@@ -115,7 +126,9 @@ class _WatchedPreprocess(Preprocess):
 
     def __init__(self, watched: Preprocess) -> None:
         self.__dict__.update(vars(watched))
-        self._own: dict[tuple[int, bytes], tuple[str, SensorModel, bool]] = {}  # by pose, one for each batch, and z
+        self._own: dict[
+            tuple[int, bytes], tuple[str, SensorModel, bool]
+        ] = {}  # by pose, one for each batch, and content
 
     def together(self, batches: Sequence[PosedBatch]) -> list[Preprocessed]:
         """See `Preprocess.together`."""
@@ -124,13 +137,20 @@ class _WatchedPreprocess(Preprocess):
             for item in candidates:
                 carried = [batch.message.objects[index].covariance for index in (item.leader, *item.merged)]
                 is_own = sensor.message_covariance and any(each is not None for each in carried)
-                self._own[id(pose), item.measurement.z.tobytes()] = batch.message.sensor, sensor, is_own
+                self._own[id(pose), _content(item.measurement)] = batch.message.sensor, sensor, is_own
         return result
 
     def observation(self, measurement: Measurement) -> Observation:
         """Return a measurement of the newest batches with its noise in parts."""
-        name, sensor, is_own = self._own[id(measurement.pose), measurement.z.tobytes()]
+        name, sensor, is_own = self._own[id(measurement.pose), _content(measurement)]
         return observation(name, sensor, measurement, is_own)
+
+
+def _content(measurement: Measurement) -> bytes:
+    """Return the values of `measurement` that no reading changes, see `fgtrack.tracking.facing`."""
+    names = measurement.model.components
+    kept = [k for k, name in enumerate(names) if name not in ("yaw_rad", *SIGNED)]
+    return measurement.z[kept].tobytes()
 
 
 def observation(name: str, sensor: SensorModel, measurement: Measurement, own: bool) -> Observation:

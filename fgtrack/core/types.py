@@ -17,6 +17,8 @@ IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 Frame = Literal["map", "ego", "sensor"]
 FRAMES: tuple[Frame, ...] = get_args(Frame)
+YawWord = Literal["flipped", "unused"]
+"""What a tracker says of a measured yaw: it is half a turn off and was turned, or it misfits otherwise and was left."""
 #: State columns of tracks.csv; a motion model's state is a leading part of them.
 STATE_NAMES = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2")
 X, Y, YAW, SPEED, YAW_RATE, ACCEL = range(6)
@@ -258,6 +260,8 @@ class UpdateRecord:
     """Measured minus predicted, by name of `MEASURABLE`."""
     reason: str | None = None
     """The setting by which it is out of bounds; None of other dispositions."""
+    yaw: YawWord | None = None
+    """`flipped` if the yaw is half a turn off, `unused` if it misfits otherwise and the innovation lacks it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,6 +32,7 @@ _FEWEST_BREAKS, _BREAKS_SHARE = 3, 0.25  # of all confirmed tracks; fewer are th
 _DEAD_SHARE = 0.5  # of the detections used, beginning a track that is never confirmed; of clutter it is below
 _GAP_S, _OVERLAP_S = 5.0, 2.0  # a track continues one that ended at most so long before, or after, it began
 _NEAR_M, _DEPARTURE = 3.0, 0.3  # from its prediction: noise, and a turn of 0.3 rad or 30 % of its speed
+_YAWS_SHARE = 0.05  # of the yaws of a sensor that are half a turn off, or that misfit: fewer are outliers
 _NO_FAILURE = "step damped"  # not a failure: with bearings damped steps are usual
 #: Cause and cure of dispositions that most detections of a sensor may have.
 _CURES = {
@@ -49,7 +50,7 @@ _NAME_EGO = "name its topic in the configuration (`fgtrack info` lists the topic
 
 def diagnostics(run: Run) -> list[Diagnostic]:
     """Defects of `run`, as far as its files show them."""
-    kinds = (_angles, _ego, _map, _sensors, _failures, _fragmentation, _identities)
+    kinds = (_angles, _ego, _map, _sensors, _failures, _fragmentation, _identities, _yaws)
     return [diagnostic for kind in kinds for diagnostic in kind(run)]
 
 
@@ -63,6 +64,21 @@ def _identities(run: Run) -> Iterator[Diagnostic]:
     for name, text in texts.items():
         if counts.get(name):
             yield Diagnostic("identities", f"{counts[name]} {'tracks ' if name == 'reused' else ''}{text}")
+
+
+def _yaws(run: Run) -> Iterator[Diagnostic]:
+    """Sensors with many yaws that are half a turn off, or that misfit in another way."""
+    for sensor, counts in dict(run.meta.get("yaws") or {}).items():
+        total = counts.get("yaws", 0)
+        flipped, unused_yaws = counts.get("flipped", 0), counts.get("unused", 0)
+        if total >= FEWEST and flipped > _YAWS_SHARE * total:
+            text = f"{flipped} of {total} yaws are half a turn off: each was turned, and the front follows from all of them"
+            yield Diagnostic(sensor, text)
+        if total >= FEWEST and unused_yaws > _YAWS_SHARE * total:
+            text = (
+                f"{unused_yaws} of {total} yaws misfit, only their positions were used: its yaw errors are larger than "
+            )
+            yield Diagnostic(sensor, f"{text}configured (sensors.{sensor}.std), or some yaws are those of another side")
 
 
 def noise_diagnostics(run: Run) -> Iterator[Diagnostic]:

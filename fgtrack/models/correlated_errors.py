@@ -81,6 +81,11 @@ class ColouredNoiseMeasurement(MeasurementModel):
     gain: FloatArray
     """Shape (k, number of errors)."""
 
+    def part(self, rows: Sequence[int]) -> MeasurementModel:
+        """See `MeasurementModel.part`."""
+        components = tuple(self.components[row] for row in rows)
+        return ColouredNoiseMeasurement(components, self.state_names, self.columns, self.gain[list(rows)])
+
     def predict(self, x: FloatArray, pose: SensorPose = AT_ORIGIN) -> FloatArray:
         """See `MeasurementModel.predict`."""
         return np.asarray(super().predict(x, pose) + x.take(self.columns, axis=-1) @ self.gain.T)

@@ -143,6 +143,10 @@ class MeasurementModel:
                 y[..., index] = wrapped
         return y
 
+    def part(self, rows: Sequence[int]) -> "MeasurementModel":
+        """Return the model of the components `rows` alone, in ascending order."""
+        return _shared_model(tuple(self.components[row] for row in rows), self.state_names)
+
     @cached_property
     def _cartesian(self) -> bool:
         return self.state_names[:4] == CARTESIAN

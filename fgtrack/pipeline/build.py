@@ -24,6 +24,7 @@ from fgtrack.pipeline.config import NOISE_HZ, SMOOTHERS, Config, Defect, MapConf
 from fgtrack.tracking.association import GatedMahalanobis
 from fgtrack.tracking.ego import EgoStd, EgoTrajectory
 from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules, Lifecycle
+from fgtrack.tracking.facing import Facing
 from fgtrack.tracking.guarded_bank import GuardedBank
 from fgtrack.tracking.inbox import Inbox
 from fgtrack.tracking.lifecycle import CountingLifecycle
@@ -56,6 +57,7 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
         else None,
         suppress_births_near_newer_tracks=config.lifecycle.suppress_births_near_newer_tracks,
         birth=config.birth,
+        facing=Facing(motion.cartesian) if config.association.reads_yaws else None,
         road=road,
     )
     return (PublishedTracker if published_order else Tracker)(parts if observed is None else observed(parts))

@@ -155,6 +155,12 @@ class Tracker:
             return {sensor: dict(counts) for sensor, counts in self._counts.items()}
 
     @property
+    def yaws(self) -> Mapping[str, Mapping[str, int]]:
+        """Numbers by sensor: measured `yaws` of tracks, those `flipped` by half a turn, those `unused` as they misfit."""
+        with self._turn:
+            return {sensor: dict(counts) for sensor, counts in self._tracker.yaws.items()}
+
+    @property
     def failures(self) -> Mapping[str, int]:
         """Number of failures inside, and of their consequences; see `Failure` for the kinds."""
         with self._turn:

@@ -170,6 +170,7 @@ def _drive(
         "ego_refused": dict(tracker.refused_ego),
         "ego_jumps": tracker.ego_jumps,
         "id_conflicts": dict(tracker.id_conflicts),
+        "yaws": {sensor: dict(counts) for sensor, counts in sorted(tracker.yaws.items())},
         **tracker.failures.as_meta(),
         "broken_off": feed.broken,
     }

@@ -11,6 +11,7 @@ from fgtrack.core.linalg import kernels, stacked, symmetrise
 from fgtrack.core.settings import OpenProbability, settings
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import StatesAt
+from fgtrack.tracking.facing import Facings, is_read, read
 from fgtrack.tracking.objects import Apart, Evidence
 from fgtrack.tracking.preprocess import Candidates, Group
 
@@ -55,11 +56,21 @@ class Assignment(NamedTuple):
 class Association(Protocol):
     """Assigns candidates to tracks at least cost."""
 
+    @property
+    def reads_yaws(self) -> bool:
+        """True if its gate is a likelihood, in which a yaw may be half a turn off."""
+
     def __call__(
-        self, candidates: Candidates, states: StatesAt, apart: Apart | None = None, likely: Likely | None = None
+        self,
+        candidates: Candidates,
+        states: StatesAt,
+        apart: Apart | None = None,
+        likely: Likely | None = None,
+        facings: Facings | None = None,
     ) -> Assignment:
         """The states are those of the tracks at the candidates' stamp; pairs that are `apart` are not made.
         `likely` selects pairs with costs NIS + log det S; the others are not made. Distances are no such costs.
+        Without `facings` every yaw is taken as it is.
         """
 
 
@@ -77,14 +88,29 @@ class GatedEuclidean:
     max_nis: PositiveFloat | None = None
     """Largest NIS of a pair; null for no limit."""
 
+    @property
+    def reads_yaws(self) -> bool:
+        """See `Association`; without `max_nis` every pair inside the gate is fused as it is."""
+        return self.max_nis is not None
+
     def __call__(
-        self, candidates: Candidates, states: StatesAt, apart: Apart | None = None, likely: Likely | None = None
+        self,
+        candidates: Candidates,
+        states: StatesAt,
+        apart: Apart | None = None,
+        likely: Likely | None = None,
+        facings: Facings | None = None,
     ) -> Assignment:
         """See `Association`."""
-        return self.within(self.gate_m, candidates, states, apart)
+        return self.within(self.gate_m, candidates, states, apart, facings)
 
     def within(
-        self, gates_m: float | FloatArray, candidates: Candidates, states: StatesAt, apart: Apart | None = None
+        self,
+        gates_m: float | FloatArray,
+        candidates: Candidates,
+        states: StatesAt,
+        apart: Apart | None = None,
+        facings: Facings | None = None,
     ) -> Assignment:
         """Return the assignment with other gates; `gates_m` broadcasts to (candidates, tracks)."""
         is_one = isinstance(gates_m, float)
@@ -94,10 +120,8 @@ class GatedEuclidean:
             pairs = pairs.at(pairs.values <= limits_m[pairs.rows, pairs.columns])
         inside = pairs
         if self.max_nis is not None and len(pairs.rows):
-            nis = np.empty(len(pairs.rows))
-            for chosen, chosen_nis, _, _ in innovations(pairs, candidates, states):
-                nis[chosen] = chosen_nis
-            is_inside = nis <= self.max_nis
+            largest = self.max_nis
+            _, is_inside = weighed(pairs, candidates, states, facings, lambda k: largest)
             inside = pairs if all(is_inside.tolist()) else pairs.at(is_inside)
         assignment = assigned(inside, len(candidates), len(states.means))
         if self.max_nis is None or not assignment.new:
@@ -125,16 +149,28 @@ class GatedMahalanobis:
     to the track and to no other one (JPDA, of positions); null: by the assigned one alone. A first state is too
     uncertain for it. Statuses and dispositions are always those of the assignment."""
 
+    @property
+    def reads_yaws(self) -> bool:
+        """See `Association`."""
+        return True
+
     def __call__(
-        self, candidates: Candidates, states: StatesAt, apart: Apart | None = None, likely: Likely | None = None
+        self,
+        candidates: Candidates,
+        states: StatesAt,
+        apart: Apart | None = None,
+        likely: Likely | None = None,
+        facings: Facings | None = None,
     ) -> Assignment:
         """See `Association`; claims are the tracker's."""
-        pairs = self.gated(candidates, states, apart)
+        pairs = self.gated(candidates, states, apart, facings)
         if likely is not None and len(pairs.rows):
             pairs = pairs.at(likely(pairs))
         return assigned(pairs, len(candidates), len(states.means))
 
-    def gated(self, candidates: Candidates, states: StatesAt, apart: Apart | None = None) -> Pairs:
+    def gated(
+        self, candidates: Candidates, states: StatesAt, apart: Apart | None = None, facings: Facings | None = None
+    ) -> Pairs:
         """Return the pairs inside the gate with their cost NIS + log det S: a vague track does not win by it."""
         reach_m: float | FloatArray = self.max_distance_m
         if len(candidates) * len(states.means) > MOST_NEAR:
@@ -147,11 +183,9 @@ class GatedMahalanobis:
             largest = max(len(group.stack.model.components) for group in candidates.groups)
             likely = more <= chi_square_quantile(self.gate_probability, largest)
             pairs, more = pairs.at(likely), more[likely]
-        cost, inside = np.empty(len(pairs.rows)), np.empty(len(pairs.rows), dtype=bool)
-        for chosen, nis, logdet, k in innovations(pairs, candidates, states) if len(cost) else ():
-            nis = nis if more is None else nis + more[chosen]
-            cost[chosen] = nis + logdet
-            inside[chosen] = nis <= chi_square_quantile(self.gate_probability, k)
+        cost, inside = weighed(
+            pairs, candidates, states, facings, lambda k: chi_square_quantile(self.gate_probability, k), more
+        )
         return pairs._replace(values=cost).at(inside)
 
 
@@ -176,7 +210,7 @@ def chi_square_quantile(probability: float, freedom: int) -> float:
     """Quantile of the chi-square distribution; importing `scipy.stats` for it would take a second."""
     from scipy.special import gammaincinv
 
-    return float(2.0 * gammaincinv(0.5 * freedom, probability))
+    return float(2.0 * gammaincinv(0.5 * freedom, probability)) if freedom else 0.0
 
 
 def assigned(pairs: Pairs, num_candidates: int, num_tracks: int) -> Assignment:
@@ -238,22 +272,44 @@ def near(
     return pairs if excluded is None else pairs.at(~excluded(pairs.rows, pairs.columns))
 
 
-def innovations(
-    pairs: Pairs, candidates: Candidates, states: StatesAt
-) -> list[tuple[IntArray, FloatArray, FloatArray, int]]:
-    """Return the innovations of `pairs` of `candidates` and tracks with these states.
-    Indices of pairs that measure the same, assumed components included, with NIS and log det S, shapes (p,), and the
-    number k of components. NaN where S has no root.
+def _innovations_of(
+    group: Group, members: IntArray, columns: IntArray, states: StatesAt
+) -> tuple[FloatArray, FloatArray, int]:
+    """Return NIS and log det S of `members` of `group` with the tracks `columns`, all (p,), and the number k."""
+    P, own = np.ascontiguousarray(states.covariances), group.stack
+    x = states.means.take(columns, axis=0)
+    y, H = own.model.linearised(own.z.take(members, axis=0), x, own.pose)
+    R, every = group.noise(members, x, P, columns), np.arange(y.shape[1])
+    _, nis, logdet = kernels("fgtrack.estimation.kernels.kalman").innovations(y, stacked(H), P, columns, R, every)
+    return nis, logdet, len(every)
+
+
+def weighed(
+    pairs: Pairs,
+    candidates: Candidates,
+    states: StatesAt,
+    facings: Facings | None,
+    limit: Callable[[int], float],
+    more: FloatArray | None = None,
+) -> tuple[FloatArray, BoolArray]:
+    """Return the costs NIS + log det S of `pairs` (m,), and True of those inside the gate.
+    The `limit` of a NIS depends on the number of components; `more` (m,) is added to the NIS. With `facings` the cost
+    is that of the likeliest reading of a yaw, see `fgtrack.tracking.facing`, and one reading has to be inside.
     """
-    P, parts = np.ascontiguousarray(states.covariances), []
-    for group, members, chosen in candidates.split(pairs.rows):
-        columns, own = pairs.columns.take(chosen), group.stack
-        x = states.means.take(columns, axis=0)
-        y, H = own.model.linearised(own.z.take(members, axis=0), x, own.pose)
-        R, every = group.noise(members, x, P, columns), np.arange(y.shape[1])
-        _, nis, logdet = kernels("fgtrack.estimation.kernels.kalman").innovations(y, stacked(H), P, columns, R, every)
-        parts.append((chosen, nis, logdet, len(every)))
-    return parts
+    cost, inside = np.empty(len(pairs.rows)), np.empty(len(pairs.rows), dtype=bool)
+    for group, members, chosen in candidates.split(pairs.rows) if len(cost) else ():
+        columns = pairs.columns.take(chosen)
+        own_more = None if more is None else more[chosen]
+        if facings is not None and is_read(group):
+            limits = [limit(k) for k in range(len(group.stack.model.components) + 1)]
+            found = read(group, members, columns, states, facings, limits, own_more)
+            cost[chosen], inside[chosen] = found.costs, found.readings >= 0
+            continue
+        nis, logdet, k = _innovations_of(group, members, columns, states)
+        nis = nis if own_more is None else nis + own_more
+        cost[chosen] = nis + logdet
+        inside[chosen] = nis <= limit(k)
+    return cost, inside
 
 
 def reaches_m(

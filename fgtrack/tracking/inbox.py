@@ -11,7 +11,7 @@ import numpy as np
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.linalg import is_covariance
 from fgtrack.core.time import NS_PER_S, nanoseconds
-from fgtrack.core.types import Detection, DetectionList, Disposition, FloatArray, Frame, UpdateRecord
+from fgtrack.core.types import Detection, DetectionList, Disposition, FloatArray, Frame, UpdateRecord, YawWord
 from fgtrack.estimation.base import Measurement, UpdateResult, UpdateStatus
 from fgtrack.models.sensors import SensorModel
 
@@ -40,6 +40,7 @@ def record(
     nis: float | None = None,
     measurement: Measurement | None = None,
     innovation: FloatArray | None = None,
+    yaw: YawWord | None = None,
 ) -> UpdateRecord:
     """Return the record of detection `index` of `message`; the innovation is that of `measurement`, or one like it."""
     stamp_ns, named = message.objects[index].stamp_ns, dict[str, float]()
@@ -56,6 +57,7 @@ def record(
         track_id,
         nis,
         named,
+        yaw=yaw,
     )
 
 
@@ -73,12 +75,13 @@ def fused_records(
     message: DetectionList,
     matched: Iterable[tuple[int, int, Measurement, UpdateResult]],
     merged: Mapping[int, tuple[int, ...]],
+    yaws: Iterable[YawWord | None],
 ) -> Iterator[UpdateRecord]:
     """Yield the records of matched detections, and of those `merged` into each, by its index.
-    `matched` are index and track of each, its measurement, or one like it, and the outcome.
+    `matched` are index and track of each, its measurement, or one like it, and the outcome; `yaws` the words on yaws.
     """
-    for index, track_id, measurement, result in matched:
-        yield record(message, index, result.status, track_id, result.nis, measurement, result.innovation)
+    for (index, track_id, measurement, result), yaw in zip(matched, yaws, strict=True):
+        yield record(message, index, result.status, track_id, result.nis, measurement, result.innovation, yaw)
         yield from merged_records(message, merged.get(index, ()), track_id)
 
 

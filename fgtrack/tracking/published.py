@@ -15,6 +15,7 @@ from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Assignment, Likely, assigned, near
 from fgtrack.tracking.detections import ConnectedMerge, Merge, PosedBatch
 from fgtrack.tracking.ego import EgoPose, EgoStd, EgoTrajectory
+from fgtrack.tracking.facing import Facings
 from fgtrack.tracking.inbox import Batch, Inbox, is_valid_covariance, record, records
 from fgtrack.tracking.lifecycle import CountingLifecycle, Life, Scan
 from fgtrack.tracking.objects import Apart
@@ -171,8 +172,18 @@ class UngatedEuclidean:
     gate_m: float = 5.0
     """Largest distance of a pair that is kept."""
 
+    @property
+    def reads_yaws(self) -> bool:
+        """See `Association`."""
+        return False
+
     def __call__(
-        self, candidates: Candidates, states: StatesAt, apart: Apart | None = None, likely: Likely | None = None
+        self,
+        candidates: Candidates,
+        states: StatesAt,
+        apart: Apart | None = None,
+        likely: Likely | None = None,
+        facings: Facings | None = None,
     ) -> Assignment:
         """See `Association`; torn pairs are born after the detections that had no partner. Nothing is `apart`."""
         pairs = near(candidates, states.means, np.inf)

@@ -12,6 +12,7 @@ them; S is that of the assigned detection; the eigenvalues of S^-1 D are at leas
 spread so far that the covariance of the track would grow.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +23,7 @@ from fgtrack.estimation.base import Measurement, StatesAt
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Pairs
 from fgtrack.tracking.existence import position_densities
+from fgtrack.tracking.facing import REVERSED, SIGNED
 from fgtrack.tracking.preprocess import Candidates, Group
 
 LEAST_INFORMATION = 0.05
@@ -54,11 +56,18 @@ def marginals(weights: FloatArray) -> FloatArray:
     return np.asarray(messages / (1.0 + messages.sum(axis=1, keepdims=True)))
 
 
-def equivalent(seen: Measurement, tracks: IntArray, group: Group, joint: Pairs, states: StatesAt) -> Measurement:
+def equivalent(
+    seen: Measurement, tracks: IntArray, group: Group, joint: Pairs, states: StatesAt, readings: IntArray | None = None
+) -> Measurement:
     """Return `seen`, the detections of `group` assigned to `tracks`, as the equivalent measurements; see the module.
-    Tracks that are not in `joint` keep theirs.
+    Tracks that are not in `joint` keep theirs. `seen` is as its `readings` (m,) say, see `fgtrack.tracking.facing`. Of
+    other detections a yaw is the nearer one of the two that are half a turn apart, and a speed has the same sign.
     """
     z, R = seen.z.copy(), seen.R.copy()
+    names = seen.model.components
+    columns = [group.stack.model.components.index(name) for name in names]
+    yaw = names.index("yaw_rad") if "yaw_rad" in names and readings is not None else None
+    signed = [row for row, name in enumerate(names) if name in SIGNED]
     members = np.searchsorted(group.rows, joint.rows)
     in_group = group.rows.take(members, mode="clip") == joint.rows
     for k, track in enumerate(tracks.tolist()):
@@ -66,8 +75,12 @@ def equivalent(seen: Measurement, tracks: IntArray, group: Group, joint: Pairs, 
         if not own.any():
             continue
         b, x = joint.values[own], states.means[track][None]
-        every = np.concatenate([z[k : k + 1], group.stack.z[members[own]]])
+        every = np.concatenate([z[k : k + 1], group.stack.z[members[own]][:, columns]])
+        if readings is not None and readings[k] & REVERSED:
+            every[1:, signed] *= -1.0
         y, H = seen.model.linearised(every, np.broadcast_to(x, (len(every), x.shape[1])), seen.pose)
+        if yaw is not None:
+            y[1:, yaw] -= math.pi * np.round(y[1:, yaw] / math.pi)
         L = np.linalg.cholesky(congruence(H if H.ndim == 2 else H[0], states.covariances[track]) + R[k])
         white = np.linalg.solve(L, y.T)
         mean = white[:, 1:] @ b

@@ -1,7 +1,7 @@
 """The tracker: the steps of a tick, in the order of the paper's algorithm (Karle et al. 2023, figure 2)."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -18,6 +18,7 @@ from fgtrack.core.types import (
     Disposition,
     EgoState,
     FloatArray,
+    IntArray,
     SmoothedReport,
     TickReport,
     TrackReport,
@@ -38,11 +39,12 @@ from fgtrack.tracking.birth import Birth, in_any_direction
 from fgtrack.tracking.detections import PosedBatch
 from fgtrack.tracking.ego import EgoPose, EgoTrajectory
 from fgtrack.tracking.existence import Lifecycle, after_jumps
+from fgtrack.tracking.facing import Facing, Facings, YawsRead, as_read
 from fgtrack.tracking.guarded_bank import GuardedBank, faults
 from fgtrack.tracking.inbox import Batch, Inbox, fused_records, merged_records, record
 from fgtrack.tracking.lifecycle import Scan
 from fgtrack.tracking.objects import Apart, Objects
-from fgtrack.tracking.preprocess import Candidates, Preprocess, Preprocessed
+from fgtrack.tracking.preprocess import Candidates, Group, Preprocess, Preprocessed
 from fgtrack.tracking.soft_association import equivalent, joint_probabilities
 
 _SELDOM = 1e-3  # probability with which a true pair misses the usual gate
@@ -69,6 +71,8 @@ class TrackerParts:
     detection starts another one; None where each updates one track and any may start one."""
     weigh_births: Callable[[str, Sequence[int], Pairs], BoolArray] | None = None
     """See `ExistenceLifecycle.likely`; None where births are not weighed."""
+    facing: Facing | None = None
+    """Belief about the fronts of tracks; None where every yaw is taken as it is."""
     failures: Failures = field(default_factory=Failures)
     """Counts what fails inside, shared with `bank`."""
     propagated_exceptions: tuple[type[Exception], ...] = (FgtrackError, MemoryError)
@@ -119,6 +123,11 @@ class Tracker:
         """Number of identities that were reused or changed, see `Objects`."""
         return self._parts.objects.id_conflicts
 
+    @property
+    def yaws(self) -> Mapping[str, Mapping[str, int]]:
+        """By sensor: numbers of `yaws` of matched detections, and of the `flipped` and `unused` ones, see `Facing`."""
+        return {} if self._parts.facing is None else self._parts.facing.counts
+
     def receive(self, message: EgoState | DetectionList) -> None:
         """Take a message. Raises `DataError` for a sensor that has no model, and for an unknown frame."""
         if isinstance(message, EgoState):
@@ -146,12 +155,14 @@ class Tracker:
         for each in zip(posed, self._preprocessed(posed), strict=True):
             self._process_if_possible(*each)
         noted, self._records = self._records, []
-        bank = self._parts.bank
+        bank, facing = self._parts.bank, self._parts.facing
         states = bank.present()  # first: tracks may end by it
+        if facing is not None:
+            states = facing.published(bank.track_ids, states)
         return TickReport.made_later(
             self._tick,
             now_ns,
-            bank.smoothed(),
+            self._smoothed(),
             tracks=self._reports(bank.track_ids, states),
             updates=partial(chain.from_iterable, noted),
         )
@@ -159,7 +170,11 @@ class Tracker:
     def finish(self) -> tuple[SmoothedReport, ...]:
         """End all tracks; gives the final smoothed states that were still inside a window."""
         self._end(self._parts.bank.track_ids)
-        return tuple(self._parts.bank.smoothed())
+        return tuple(self._smoothed())
+
+    def _smoothed(self) -> Sequence[SmoothedReport]:
+        reports, facing = self._parts.bank.smoothed(), self._parts.facing
+        return reports if facing is None else facing.smoothed(reports)
 
     def state_at(self, track_id: int, stamp_ns: int) -> TrackReport:
         """A track at any stamp in or after its window: smoothed or filtered in the past, predicted ahead of now.
@@ -182,7 +197,9 @@ class Tracker:
         """Tracks with these states at a stamp, those whose states are sound."""
         if not states.track_ids:
             return ()
-        present = kinematic_states(self._parts.motion, stamp_ns, states.means, states.covariances)
+        present: Sequence[TrackState] = kinematic_states(self._parts.motion, stamp_ns, states.means, states.covariances)
+        if self._parts.facing is not None:
+            present = self._parts.facing.seen(states.track_ids, present)
         unsound, reports = faults(present), self._reports(states.track_ids, present)()
         return tuple(report for row, report in enumerate(reports) if row not in unsound)
 
@@ -255,7 +272,7 @@ class Tracker:
         if owner is None or owner in self._undirected:
             return None
         states = parts.bank.state_of(owner, batch.stamp_ns)
-        assignment = parts.association(candidates, states)
+        assignment = parts.association(candidates, states, facings=self._facings(batch, states))
         return (states, assignment) if assignment.pairs else None
 
     def _associated(self, batch: Batch, candidates: Candidates) -> tuple[StatesAt, Assignment]:
@@ -266,7 +283,8 @@ class Tracker:
     def _assigned(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Assignment:
         """Return the assignment of candidates to tracks of the same class, and by their identities."""
         parts, evidence = self._parts, self._evidence(batch, candidates, states)
-        result = parts.association(candidates, states, evidence, self._likely(batch, candidates, states))
+        likely = self._likely(batch, candidates, states)
+        result = parts.association(candidates, states, evidence, likely, self._facings(batch, states))
         if parts.joint is None or not (parts.joint.claim_m and result.new):
             return result
         tentative = [parts.lifecycle.status(each) is TrackStatus.TENTATIVE for each in states.track_ids]
@@ -286,12 +304,18 @@ class Tracker:
         wrong = self._parts.sensors[batch.message.sensor].wrong_id_probability
         return self._parts.objects.evidence(described, states.track_ids, wrong)
 
+    def _facings(self, batch: Batch, states: StatesAt) -> Facings | None:
+        """Return the belief about the fronts of the tracks; None where every yaw is taken as it is."""
+        facing = self._parts.facing
+        return None if facing is None else facing.at(batch.message.sensor, states.track_ids)
+
     def _joint(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Pairs | None:
         """Probabilities that candidates belong to tracks with enough detections; None where they are not considered."""
         rule = self._parts.joint
         if rule is None or rule.joint_from is None:
             return None
-        pairs = rule.gated(candidates, states, self._evidence(batch, candidates, states))
+        evidence = self._evidence(batch, candidates, states)
+        pairs = rule.gated(candidates, states, evidence, self._facings(batch, states))
         known = np.array([self._num_measured[track_id] >= rule.joint_from for track_id in states.track_ids])
         sensor = self._parts.sensors[batch.message.sensor]
         return joint_probabilities(pairs.at(known[pairs.columns]), candidates, states, sensor)
@@ -362,10 +386,9 @@ class Tracker:
         outcomes: dict[int, tuple[Measurement, UpdateResult]] = {}  # by index of the pair
         chosen, tracks = np.array(assignment.pairs).T
         joint = self._joint(batch, candidates, states)
-        for group, members, here in candidates.split(chosen):
-            of = tracks.take(here)
-            each = group.seen_at(members, states.means.take(of, axis=0), states.covariances, of)
-            measurements = Measurements(each if joint is None else equivalent(each, of, group, joint, states))
+        read = self._read(batch, candidates, assignment, states)
+        for group, here, of, each, ways in _seen(candidates, chosen, tracks, states, read):
+            measurements = Measurements(each if joint is None else equivalent(each, of, group, joint, states, ways))
             ids = list(map(track_ids.__getitem__, of.tolist()))
             results = bank.update(batch.stamp_ns, ids, measurements)
             fused = []
@@ -387,7 +410,15 @@ class Tracker:
             (candidates.leaders[position], track_ids[track], *outcomes[k])
             for k, (position, track) in enumerate(assignment.pairs)
         )
-        self._records.append(fused_records(batch.message, matched, candidates.merged))
+        words = [None] * len(assignment.pairs) if read is None else read.words
+        self._records.append(fused_records(batch.message, matched, candidates.merged, words))
+
+    def _read(self, batch: Batch, candidates: Candidates, assignment: Assignment, states: StatesAt) -> YawsRead | None:
+        """Return the readings of the matched candidates; None where every yaw is taken as it is."""
+        facing = self._parts.facing
+        if facing is None:
+            return None
+        return facing.read(batch.message.sensor, batch.stamp_ns, candidates, assignment.pairs, states)
 
     def _give_birth(self, batch: Batch, candidates: Candidates, position: int, scan: Scan) -> None:
         parts, prior, candidate = self._parts, None, candidates[position]
@@ -411,6 +442,8 @@ class Tracker:
             self._undirected[track_id] = prior
         self._seen.setdefault(id(batch.message), set()).add(track_id)
         self._num_measured[track_id] = 1
+        if parts.facing is not None:
+            parts.facing.born(track_id, scan.sensor, prior, candidate.measurement)
         parts.lifecycle.born(track_id, scan, candidate)
         self._describe(batch, candidates, position, track_id)
         self._conclude(batch, candidates, [position], Disposition.BIRTH, track_id)
@@ -438,6 +471,8 @@ class Tracker:
             self._parts.bank.remove(track_id)
             self._parts.objects.forget(track_id)
             self._undirected.pop(track_id, None)
+            if self._parts.facing is not None:
+                self._parts.facing.forget(track_id)
             del self._num_measured[track_id]
             self._parts.lifecycle.forget(track_id)
 
@@ -449,3 +484,20 @@ class Tracker:
         num_measured = list(map(self._num_measured.__getitem__, track_ids))
         objects = parts.objects.reports(track_ids)
         return partial(map, TrackReport, track_ids, statuses, states, num_measured, objects, probabilities)
+
+
+def _seen(
+    candidates: Candidates, chosen: IntArray, tracks: IntArray, states: StatesAt, read: YawsRead | None
+) -> Iterator[tuple[Group, IntArray, IntArray, Measurement, IntArray | None]]:
+    """Yield the measurements of the `chosen` candidates of `tracks`, both (m,), as they are `read`.
+    Each stack with its group, the indices of its pairs, their tracks and readings.
+    """
+    for group, members, here in candidates.split(chosen):
+        of = tracks.take(here)
+        each = group.seen_at(members, states.means.take(of, axis=0), states.covariances, of)
+        if read is None:
+            yield group, here, of, each, None
+            continue
+        ways = read.readings[here]
+        for rows, part in as_read(each, ways):
+            yield group, here[rows], of[rows], part, ways[rows]

@@ -13,15 +13,7 @@ from fgtrack.models.measurement import SensorPose
 from fgtrack.models.motion import CTRV
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.association import (
-    Assignment,
-    GatedEuclidean,
-    GatedMahalanobis,
-    Pairs,
-    assigned,
-    innovations,
-    near,
-)
+from fgtrack.tracking.association import Assignment, GatedEuclidean, GatedMahalanobis, Pairs, assigned, near, weighed
 from fgtrack.tracking.detections import NoMerge
 from fgtrack.tracking.preprocess import Candidate, Preprocess
 
@@ -82,11 +74,9 @@ def test_an_association_is_that_of_all_pairs(bearings: bool, seed: int) -> None:
     tracks = states([(x, y) for x, y in rng.uniform(0.0, 40.0, size=(30, 2))])
     tracks.covariances[:] *= rng.uniform(0.1, 30.0, size=(30, 1, 1))
     pairs, shape = near(candidates, tracks.means, np.inf), (len(candidates), 30)
-    cost, inside = np.empty(len(pairs.rows)), np.empty(len(pairs.rows), dtype=bool)
-    for chosen, nis, logdet, k in innovations(pairs, candidates, tracks):
-        cost[chosen] = nis + logdet
-        limit = {1: 10.8275661707, 2: 13.8155105580}[k]  # chi-square quantiles of 0.999
-        inside[chosen] = (nis <= limit) & (pairs.values[chosen] <= 9.0)
+    limits = {1: 10.8275661707, 2: 13.8155105580}  # chi-square quantiles of 0.999
+    cost, inside = weighed(pairs, candidates, tracks, None, limits.__getitem__)
+    inside &= pairs.values <= 9.0
     rule = GatedMahalanobis(gate_probability=0.999, max_distance_m=9.0)
     assert rule(candidates, tracks) == densely_assigned(cost.reshape(shape), inside.reshape(shape))
 
