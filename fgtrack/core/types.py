@@ -18,7 +18,7 @@ BoolArray = npt.NDArray[np.bool_]
 Frame = Literal["map", "ego", "sensor"]
 FRAMES: tuple[Frame, ...] = get_args(Frame)
 YawWord = Literal["flipped", "unused"]
-"""What a tracker says of a measured yaw: it is half a turn off and was turned, or it misfits otherwise and was left."""
+"""Defect of a measured yaw: it is half a turn off and was turned, or it misfits in another way and was not used."""
 #: State columns of tracks.csv; a motion model's state is a leading part of them.
 STATE_NAMES = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2")
 X, Y, YAW, SPEED, YAW_RATE, ACCEL = range(6)

@@ -72,7 +72,7 @@ def _yaws(run: Run) -> Iterator[Diagnostic]:
         total = counts.get("yaws", 0)
         flipped, unused_yaws = counts.get("flipped", 0), counts.get("unused", 0)
         if total >= FEWEST and flipped > _YAWS_SHARE * total:
-            text = f"{flipped} of {total} yaws are half a turn off: each was turned, and the front follows from all of them"
+            text = f"{flipped} of {total} yaws are half a turn off: they were turned, the front follows from all yaws"
             yield Diagnostic(sensor, text)
         if total >= FEWEST and unused_yaws > _YAWS_SHARE * total:
             text = (

@@ -156,7 +156,7 @@ class Tracker:
 
     @property
     def yaws(self) -> Mapping[str, Mapping[str, int]]:
-        """Numbers by sensor: measured `yaws` of tracks, those `flipped` by half a turn, those `unused` as they misfit."""
+        """Numbers by sensor: `yaws` of tracks, `flipped` ones by half a turn, and `unused` ones that misfit."""
         with self._turn:
             return {sensor: dict(counts) for sensor, counts in self._tracker.yaws.items()}
 

@@ -1,7 +1,7 @@
 """Which end of an object is its front: the readings of yaws that a detector may have turned.
 
 The states (yaw, speed) and (yaw + pi, -speed) are the same motion. An estimator keeps the one that it began with, and a
-hidden variable of each track tells whether its yaw is that of the front or of the rear. The yaws z of a sensor are
+hidden variable of each track is the end, front or rear, to which its yaw belongs. The yaws z of a sensor are
 right, half a turn off, or anything with the probabilities a, e and u. Their likelihood is
 
     p(z | front) = a N(z - yaw) + e N(z - yaw - pi) + u / (2 pi)
@@ -41,8 +41,8 @@ _PRIOR = (18.0, 1.0, 1.0)
 _MEMORY = 200.0
 #: Largest log-likelihood ratio of one detection: a detector that errs often errs in rows.
 _MOST_EVIDENCE = math.log(3.0)
-#: Rates at which front and rear of a state change places: seldom, and where the yaw is the direction of the velocity,
-#: as of a Cartesian state, whenever an object begins to drive backwards.
+#: Rates at which the yaw of a state changes between front and rear: seldom. Where it is the direction of the velocity,
+#: as of a Cartesian state, it does so whenever an object begins to drive backwards.
 _SWITCH_HZ, _CARTESIAN_SWITCH_HZ = 0.001, 0.05
 #: Log-odds from which a published track is turned.
 _SURE = math.log(9.0)
@@ -76,7 +76,7 @@ class Readings(NamedTuple):
 
 
 class YawsRead(NamedTuple):
-    """What the likeliest readings of detections are."""
+    """Likeliest readings of detections, and the defects of their yaws."""
 
     readings: IntArray
     """Bits `HALF_TURN`, `WITHOUT_YAW`, `REVERSED`, shape (m,)."""
@@ -132,7 +132,7 @@ def read(
 
 
 def as_read(measurements: Measurement, readings: IntArray) -> list[tuple[IntArray | slice, Measurement]]:
-    """Return the stack `measurements` as its `readings` (m,) say, and the rows of each part."""
+    """Return the stack `measurements` as read by its `readings` (m,), and the rows of each part."""
     if not readings.any():
         return [(slice(None), measurements)]
     names, z, R = measurements.model.components, measurements.z.copy(), measurements.R.copy()
@@ -292,7 +292,7 @@ def _bounded(log_ratio: float) -> float:
 
 
 def _later(log_odds: float, switch_hz: float, dt_s: float) -> float:
-    """Return the log-odds after `dt_s`, in which front and rear change places with the rate `switch_hz`."""
+    """Return the log-odds after `dt_s`, in which front and rear are exchanged with the rate `switch_hz`."""
     if dt_s <= 0.0:
         return log_odds
     changed = -0.5 * math.expm1(-2.0 * switch_hz * dt_s)

@@ -60,7 +60,7 @@ def equivalent(
     seen: Measurement, tracks: IntArray, group: Group, joint: Pairs, states: StatesAt, readings: IntArray | None = None
 ) -> Measurement:
     """Return `seen`, the detections of `group` assigned to `tracks`, as the equivalent measurements; see the module.
-    Tracks that are not in `joint` keep theirs. `seen` is as its `readings` (m,) say, see `fgtrack.tracking.facing`. Of
+    Tracks that are not in `joint` keep theirs. `seen` has its `readings` (m,), see `fgtrack.tracking.facing`. Of
     other detections a yaw is the nearer one of the two that are half a turn apart, and a speed has the same sign.
     """
     z, R = seen.z.copy(), seen.R.copy()
