@@ -4,13 +4,19 @@ Calls of NumPy, BLAS and assignments of slices in compiled code take seconds to 
 """
 
 import gc
+import json
 import logging
 import math
+import pickle
+import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, cast
+from uuid import uuid4
 
+import llvmlite
 import numba
 import numpy as np
 from llvmlite.binding import add_symbol
@@ -18,6 +24,7 @@ from numba.core.caching import FunctionCache
 from numba.core.cgutils import get_or_insert_function
 from numba.core.compiler import Compiler
 from numba.core.runtime.nrt import rtsys
+from numba.core.serialize import dumps
 from numba.core.typing.templates import ConcreteTemplate, infer_global
 from numba.extending import lower_builtin
 from numba.np.arrayobj import make_array, populate_array
@@ -36,6 +43,7 @@ def _say(text: str) -> None:
 
 
 _NOT_STORED = "compiled loops cannot be stored, so every start compiles them: let NUMBA_CACHE_DIR name a folder"
+_DAMAGED = "stored loops are damaged or cannot be read: these are compiled again (all of them in some 25 s)"
 _stamps = dict[str, bytes]()
 
 
@@ -50,19 +58,115 @@ def _stamp(scope: Mapping[str, Any]) -> bytes:
     return _stamps[scope["__name__"]]
 
 
+class _Store:
+    """Files of the compiled code of one function: an index, `.nbi`, and the code of each signature, `.nbc`.
+
+    It has the methods of numba's `IndexDataCacheFile`. The index is JSON and has the SHA-256 of each code, so that a
+    damaged file is recognised before it is unpickled or run. A code file is named after its content, so that processes
+    that write at the same time do not mix their files.
+    """
+
+    def __init__(self, folder: str, name: str, stamp: bytes) -> None:
+        self._folder, self._name = Path(folder), name
+        self._index_path = self._folder / f"{name}.nbi"
+        versions = numba.__version__, llvmlite.__version__, sys.version
+        self._stamp = sha256(stamp + repr(versions).encode()).hexdigest()
+
+    def load(self, key: object) -> Any:
+        """Return what was saved under `key`, or None. Raises `OSError` or `ValueError` for damaged files."""
+        stamp, digests = self._read()
+        digest = digests.get(_key_text(key))
+        if digest is None or stamp != self._stamp:  # of another source or version
+            return None
+        try:
+            code = self._code_path(digest).read_bytes()
+        except FileNotFoundError:
+            return None
+        if sha256(code).hexdigest() != digest:
+            raise ValueError(f"{self._code_path(digest)}: is damaged")
+        return pickle.loads(code)
+
+    def save(self, key: object, data: object) -> None:
+        """Save `data`; damaged files are replaced. Raises `OSError`."""
+        code: bytes = dumps(data)  # type: ignore[no-untyped-call]
+        try:
+            stamp, stored = self._read()
+        except (OSError, ValueError):
+            stamp, stored = "", {}
+        kept = stored if stamp == self._stamp else {}
+        digests = {**kept, _key_text(key): sha256(code).hexdigest()}
+        _replace(self._code_path(digests[_key_text(key)]), code)
+        self._write(digests)
+        for unused in set(stored.values()) - set(digests.values()):
+            self._code_path(unused).unlink(missing_ok=True)
+
+    def flush(self) -> None:
+        """Forget all codes. Raises `OSError`."""
+        self._write({})
+
+    def _code_path(self, digest: str) -> Path:
+        return self._folder / f"{self._name}.{digest[:16]}.nbc"
+
+    def _read(self) -> tuple[str, dict[str, str]]:
+        """Return the stamp of the index and the digests of codes by key. Raises `OSError` or `ValueError`."""
+        try:
+            index = json.loads(self._index_path.read_bytes())
+        except FileNotFoundError:
+            return "", {}
+        except RecursionError as error:
+            raise ValueError(f"{self._index_path}: is damaged") from error
+        if not isinstance(index, dict) or not isinstance(digests := index.get("digests"), dict):
+            raise ValueError(f"{self._index_path}: is damaged")
+        if not all(isinstance(digest, str) and digest.isalnum() for digest in digests.values()):
+            raise ValueError(f"{self._index_path}: is damaged")
+        return str(index.get("stamp")), digests
+
+    def _write(self, digests: Mapping[str, str]) -> None:
+        _replace(self._index_path, json.dumps({"stamp": self._stamp, "digests": digests}).encode())
+
+
+def _key_text(key: object) -> str:
+    """Return a text for a signature and a processor."""
+    return sha256(repr(key).encode()).hexdigest()[:16]
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Write a file under another name, and let it replace the one at `path`. Raises `OSError`."""
+    part = path.with_name(f"{path.name}.{uuid4().hex[:16]}.part")
+    try:
+        part.write_bytes(content)
+        part.replace(path)
+    except OSError:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise
+
+
 class _Cache(FunctionCache):
     """Stored results of a function, valid until its module or a compiled one that it uses changes.
     numba compares the function's own file only: a stored caller of a changed `shared` function crashes.
     """
 
+    is_damaged = False
+    """True if its files could not be read."""
+
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)  # type: ignore[no-untyped-call]
-        self._cache_file._source_stamp = _stamp(function.__globals__)
+        # Another name than numba's own, whose files of earlier versions have other contents.
+        name = f"{self._impl.filename_base}-fgtrack"
+        self._cache_file = _Store(self.cache_path, name, _stamp(function.__globals__))  # type: ignore[assignment]  # same methods
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """See numba, without its tables of all types and functions: half a second that only compiling needs."""
+        """See numba, without its tables of all types and functions: half a second that only compiling needs.
+        Damaged files are the same as missing ones, with a line of the log.
+        """
         rtsys.initialize(target_context)
-        return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+        try:
+            return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+        except Exception:  # whatever the reader of a damaged file raises
+            self.is_damaged = True
+            _say(_DAMAGED)
+            return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """See numba; a full disk is no error."""
@@ -108,7 +212,7 @@ def njit(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
         result.disable_compile()
         if collects:
             gc.enable()
-        if result.stats.cache_misses and isinstance(result._cache, _Cache):
+        if result.stats.cache_misses and isinstance(result._cache, _Cache) and not result._cache.is_damaged:
             _say("compiling numerical loops, once: some 25 s of processor time for all")
         return result
 

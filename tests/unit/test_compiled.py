@@ -1,5 +1,8 @@
 """Compiled loops and where they are stored."""
 
+import os
+import pickle
+import subprocess
 import sys
 from collections.abc import Callable
 from importlib import util
@@ -7,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 import pytest
 
 from fgtrack.core import compiled
@@ -92,6 +96,160 @@ def test_a_disk_that_becomes_full_is_no_error(
     monkeypatch.setattr(compiled.FunctionCache, "save_overload", full)
     assert stored(SHARED, CALLER).call(3) == 7.0
     assert sum("cannot be stored" in line for line in caplog.messages) == 1
+
+
+def truncated(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+def random_bytes(file: Path) -> None:
+    file.write_bytes(np.random.default_rng(1).bytes(file.stat().st_size))
+
+
+def one_bit(file: Path) -> None:
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 0b100
+    file.write_bytes(content)
+
+
+def nested(file: Path) -> None:
+    file.write_bytes(b"[" * 100_000)
+
+
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "empty": lambda file: file.write_bytes(b""),
+    "zeros": lambda file: file.write_bytes(bytes(file.stat().st_size)),
+    "null": lambda file: file.write_bytes(b"null"),
+    "truncated": truncated,
+    "random bytes": random_bytes,
+    "one bit": one_bit,
+    "nested": nested,
+    "longer": lambda file: file.write_bytes(file.read_bytes() + b"more"),
+    "pickle": lambda file: file.write_bytes(pickle.dumps(("0.60", {}))),
+}
+
+
+def files(tmp_path: Path, pattern: str) -> list[Path]:
+    """Stored files of the modules of this test."""
+    return sorted((tmp_path / "cache").rglob(pattern))
+
+
+@pytest.mark.parametrize("damage", DAMAGES, ids=lambda name: name.replace(" ", "-"))
+@pytest.mark.parametrize("pattern", ["caller*.nbc", "caller*.nbi", "callee*.nbc", "callee*.nbi", "*.nb[ci]"])
+def test_damaged_files_are_replaced_with_one_line(
+    stored, tmp_path: Path, caplog: pytest.LogCaptureFixture, pattern: str, damage: str
+) -> None:
+    assert stored(SHARED, CALLER).call(3) == 7.0
+    caplog.clear()
+    damaged = files(tmp_path, pattern)
+    assert damaged
+    for file in damaged:
+        DAMAGES[damage](file)
+    assert stored(SHARED, CALLER).call(3) == 7.0
+    [line] = caplog.messages
+    assert "damaged" in line
+    caplog.clear()
+    compiled._said.clear()
+    healed = stored(SHARED, CALLER).call
+    assert healed(3) == 7.0
+    assert healed.stats.cache_hits
+    assert not caplog.messages
+
+
+def test_the_code_of_another_function_is_not_run(stored, tmp_path: Path) -> None:
+    """Files that were mixed up by a copy are whole, but not those of the function."""
+    body = "@njit('float64(int64)')\ndef other(x):\n    return 5.0 * twice(x)\n"
+    module = stored(SHARED, CALLER + body)
+    assert (module.call(3), module.other(3)) == (7.0, 30.0)
+    for suffix in ("nbc", "nbi"):
+        [call], [other] = files(tmp_path, f"caller.call*.{suffix}"), files(tmp_path, f"caller.other*.{suffix}")
+        call.write_bytes(other.read_bytes())
+        module = stored(SHARED, CALLER + body)
+        assert (module.call(3), module.other(3)) == (7.0, 30.0)
+
+
+@pytest.mark.parametrize("pattern", ["caller*.nbc", "caller*.nbi"])
+def test_a_file_that_cannot_be_read_is_replaced(
+    stored, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, pattern: str
+) -> None:
+    """Permissions mean nothing to root, so the reading itself is refused."""
+    assert stored(SHARED, CALLER).call(3) == 7.0
+    caplog.clear()
+    [refused] = files(tmp_path, pattern)
+    inode, read = refused.stat().st_ino, Path.read_bytes
+
+    def read_bytes(path: Path) -> bytes:
+        if path == refused and path.stat().st_ino == inode:
+            raise PermissionError(13, "Permission denied")
+        return read(path)
+
+    monkeypatch.setattr(Path, "read_bytes", read_bytes)
+    assert stored(SHARED, CALLER).call(3) == 7.0
+    assert sum("damaged or cannot be read" in line for line in caplog.messages) == 1
+    assert stored(SHARED, CALLER).call.stats.cache_hits
+
+
+@pytest.mark.parametrize("pattern", ["caller*.nbc", "caller*.nbi"])
+def test_a_folder_instead_of_a_file_is_no_error(
+    stored, tmp_path: Path, caplog: pytest.LogCaptureFixture, pattern: str
+) -> None:
+    assert stored(SHARED, CALLER).call(3) == 7.0
+    [file] = files(tmp_path, pattern)
+    file.unlink()
+    file.mkdir()
+    assert stored(SHARED, CALLER).call(3) == 7.0
+    assert sum("damaged or cannot be read" in line for line in caplog.messages) == 1
+    assert not list(tmp_path.rglob("*.part"))
+
+
+@pytest.mark.parametrize("part", [".nbc.", ".nbi."])
+def test_a_disk_that_is_full_in_the_middle_leaves_no_part_and_no_damage(
+    stored, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, part: str
+) -> None:
+    write = Path.write_bytes
+
+    def write_bytes(path: Path, content: bytes) -> int:
+        if part in path.name:
+            write(path, content[: len(content) // 2])
+            raise OSError(28, "No space left on device")
+        return write(path, content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", write_bytes)
+        assert stored(SHARED, CALLER).call(3) == 7.0
+    assert sum("cannot be stored" in line for line in caplog.messages) == 1
+    assert not list(tmp_path.rglob("*.part"))
+    caplog.clear()
+    compiled._said.clear()
+    assert stored(SHARED, CALLER).call(3) == 7.0
+    assert stored(SHARED, CALLER).call.stats.cache_hits
+    assert not [line for line in caplog.messages if "damaged" in line]
+
+
+def test_what_was_stored_of_an_earlier_source_does_not_pile_up(stored, tmp_path: Path) -> None:
+    for factor in (2, 3, 4):
+        assert stored(SHARED.replace("2 *", f"{factor} *"), CALLER).call(3) == 3.0 * factor + 1.0
+        assert len(files(tmp_path, "callee*.nbc")) == len(files(tmp_path, "caller*.nbc")) == 1
+    again = stored(SHARED.replace("2 *", "4 *"), CALLER).call
+    assert again.stats.cache_hits
+
+
+@pytest.mark.long
+def test_other_processes_find_what_is_stored_even_if_two_write_at_once(tmp_path: Path) -> None:
+    (tmp_path / "callee.py").write_text(f"from fgtrack.core.compiled import shared\n{SHARED}")
+    head = "from fgtrack.core.compiled import njit\nfrom callee import twice\nOFFSET = 1\n"
+    (tmp_path / "caller.py").write_text(f"{head}{CALLER}print(call(3), sum(call.stats.cache_hits.values()))\n")
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path)}
+    command = sys.executable, str(tmp_path / "caller.py")
+
+    def start() -> subprocess.Popen[str]:
+        return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+    for process in [start(), start()]:
+        out, error = process.communicate(timeout=120.0)
+        assert out.startswith("7.0 "), error
+    out, error = start().communicate(timeout=120.0)
+    assert out == "7.0 1\n", error
 
 
 def test_a_shared_function_is_not_part_of_its_callers() -> None:
