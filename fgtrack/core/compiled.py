@@ -29,7 +29,7 @@ from numba.core.typing.templates import ConcreteTemplate, infer_global
 from numba.extending import lower_builtin
 from numba.np.arrayobj import make_array, populate_array
 
-from fgtrack.core.types import FloatArray
+from fgtrack.core.types import FloatArray, IntArray
 
 _LOG = logging.getLogger(__name__)
 _said = set[str]()
@@ -282,6 +282,23 @@ _SHAPES: Any = [(numba.types.int64,) * num for num in (1, 2, 3)]
 _declare(scratch, [numba.types.Array(numba.types.float64, len(each), "C")(*each) for each in _SHAPES], _lower_scratch)
 
 READ, MATRIX = "Array(float64, 2, 'C', readonly=True)", "float64[:, ::1]"
+
+
+@inlined
+def check_rows(rows: IntArray, first: int, end: int) -> None:
+    """Raise `IndexError` for one of `rows` that is less than `first`, or not less than `end`.
+    Compiled loops check no index: one beyond an end reads or writes other memory. Each call checks those that it gets.
+    """
+    for i in range(len(rows)):
+        if rows[i] < first or rows[i] >= end:
+            raise IndexError("a row number lies beyond the end of the arrays")
+
+
+@inlined
+def check(holds: bool) -> None:
+    """Raise `IndexError` unless the arrays of a call are as large as its loops need them."""
+    if not holds:
+        raise IndexError("an array is smaller than another one of the same call")
 
 
 @inlined

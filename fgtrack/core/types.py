@@ -297,7 +297,8 @@ class TickReport:
         makers = self.__dict__.get("makers", {})
         if name not in makers:
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
-        self.__dict__[name] = made = tuple(makers.pop(name)())
+        self.__dict__[name] = made = tuple(makers[name]())
+        del makers[name]
         return made
 
     def __getstate__(self) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Counters of failures inside estimators and of their treatment."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from traceback import format_exception
@@ -26,19 +26,31 @@ class Failure(StrEnum):
     STEP_DAMPED = "step damped"
     """A smoother's step went too far and was repeated with a line search."""
     BIRTH_FAILED = "birth failed"
-    """A detection could not start a track."""
+    """A detection could not start a track; its disposition is `failed`."""
     LIST_FAILED = "list failed"
-    """The processing of an object list raised an exception; what was left of it is `failed`."""
+    """The processing of an object list, or of a part, raised an exception; what was left of that is `failed`."""
+    STEP_FAILED = "step failed"
+    """A step beside the estimate, as the count of the life of a track, raised an exception and was left out."""
     TRACK_ENDED = "track ended"
     """A track that failed ended."""
 
 
 class EstimatorError(Exception):
-    """Estimators raised: `causes` by track; `answers` are the results of the other estimators."""
+    """Estimators of some tracks raised, and those of the others answered."""
 
-    def __init__(self, causes: dict[int, Exception], answers: Mapping[int, Any]) -> None:  # Any: depends on the call
+    def __init__(
+        self,
+        causes: Mapping[int, Exception],
+        answers: Mapping[int, Any],  # Any: depends on the call
+        unchanged: Collection[int] = (),
+    ) -> None:
         super().__init__(f"estimators of the tracks {', '.join(map(str, causes))} raised")
-        self.causes, self.answers = causes, answers
+        self.causes = causes
+        """What was raised, by track."""
+        self.answers = answers
+        """Results of the other tracks."""
+        self.unchanged = frozenset(unchanged)
+        """Those of the `causes` whose states are as they were before the call; the states of the rest are unknown."""
 
 
 @dataclass
@@ -63,10 +75,11 @@ class Failures:
         if len(self.ended) < 100:
             self.ended.append({"track_id": track_id, "now_ns": now_ns, "failure": failure.value})
 
-    def note(self, what: str | Exception) -> None:
+    def note(self, what: str | BaseException) -> None:
         """Remember the message of a failure, or its exception."""
-        if isinstance(what, Exception):
-            line, self.last = f"{type(what).__name__}: {what}", "".join(format_exception(what))
+        if isinstance(what, BaseException):
+            name = "not enough memory" if isinstance(what, MemoryError) else type(what).__name__
+            line, self.last = f"{name}: {what}", "".join(format_exception(what))
         else:
             line = self.last = what
         self.first = self.first or " ".join(line.split())

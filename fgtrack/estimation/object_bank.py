@@ -1,6 +1,7 @@
 """A bank of independent estimators, and the estimator of one object from a bank."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -17,6 +18,45 @@ from fgtrack.models.motion import MotionModel
 
 _E = TypeVar("_E", bound=Estimator)
 _T = TypeVar("_T")
+
+
+class Outcomes:
+    """Outcomes of an update of several tracks, part by part: what one part raises does not concern the others."""
+
+    def __init__(self) -> None:
+        self._answers = dict[int, UpdateResult]()
+        self._causes = dict[int, Exception]()
+        self._unchanged = set[int]()
+
+    def add(self, track_ids: Sequence[int], fuse: Callable[[], Sequence[UpdateResult]]) -> None:
+        """Note what `fuse` returns for these tracks, or what it raises; but a `DataError` propagates."""
+        try:
+            self._answers.update(zip(track_ids, fuse(), strict=True))
+        except DataError:
+            raise
+        except EstimatorError as error:
+            self._answers.update(error.answers)
+            self._causes.update(error.causes)
+            self._unchanged.update(error.unchanged)
+        except Exception as error:
+            self._causes.update(dict.fromkeys(track_ids, error))
+
+    def results(self, track_ids: Sequence[int]) -> list[UpdateResult]:
+        """Return the results of all tracks. Raises `EstimatorError` if some raised."""
+        if self._causes:
+            raise EstimatorError(self._causes, self._answers, self._unchanged)
+        return [self._answers[track_id] for track_id in track_ids]
+
+
+@contextmanager
+def changing_nothing(track_ids: Sequence[int]) -> Iterator[None]:
+    """Turn an exception into an `EstimatorError`, in which the states of these tracks are as before."""
+    try:
+        yield
+    except DataError:
+        raise
+    except Exception as error:
+        raise EstimatorError(dict.fromkeys(track_ids, error), {}, track_ids) from error
 
 
 class ObjectBank(Generic[_E]):
@@ -56,7 +96,7 @@ class ObjectBank(Generic[_E]):
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
         seen = dict(zip(track_ids, measurements, strict=True))
-        result = self._ask(lambda track_id, estimator: _checked(estimator.update(seen[track_id])), track_ids)
+        result = self._ask(lambda track_id, item: _checked(item.update(seen[track_id]), seen[track_id]), track_ids)
         return [result[track_id] for track_id in track_ids]
 
     def birth(self, track_id: int, prior: Start) -> None:
@@ -97,15 +137,26 @@ class ObjectBank(Generic[_E]):
         return state
 
 
-def _checked(result: UpdateResult) -> UpdateResult:
+def _checked(result: UpdateResult, measurement: Measurement) -> UpdateResult:
     if not isinstance(result, UpdateResult):
         raise TypeError(f"update must return an UpdateResult, returned a {type(result).__name__}")
+    if result.innovation is not None and np.shape(result.innovation) != measurement.z.shape:
+        raise ValueError(f"the innovation of {measurement.z.shape} has the shape {np.shape(result.innovation)}")
     return result
 
 
 def _stacked(states: Iterable[TrackState], n: int) -> tuple[FloatArray, FloatArray]:
     means, covariances = [state.mean for state in states], [state.covariance for state in states]
     return np.array(means).reshape(-1, n), np.array(covariances).reshape(-1, n, n)
+
+
+@contextmanager
+def _own_cause() -> Iterator[None]:
+    """Raise, instead of an `EstimatorError` of the only track, what its estimator raised."""
+    try:
+        yield
+    except EstimatorError as error:
+        raise error.causes.get(0, error) from error
 
 
 class SingleObject:
@@ -139,14 +190,16 @@ class SingleObject:
         if not (np.isfinite(measurement.z).all() and np.isfinite(measurement.R).all()):
             return UpdateResult(UpdateStatus.FAILED)  # before the clock moves
         self.advance(stamp_ns)
-        result = self.bank.update(stamp_ns, [0], [measurement.seen_by(self._motion)])[0]
+        with _own_cause():
+            result = self.bank.update(stamp_ns, [0], [measurement.seen_by(self._motion)])[0]
         if result.status is not UpdateStatus.FAILED:
             self._newest_ns = max(self._newest_ns, stamp_ns)
         return result
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`."""
-        return state_of(self.bank, self._motion, 0, as_stamp("stamp_ns", stamp_ns))
+        with _own_cause():
+            return state_of(self.bank, self._motion, 0, as_stamp("stamp_ns", stamp_ns))
 
 
 def states_of(bank: TrackBank, motion: MotionModel, stamp_ns: int) -> StatesAt:

@@ -89,7 +89,8 @@ class Tracker:
 
     `receive` takes messages in the order of their arrival, `tick` processes those since the last one. Messages that
     cannot be used are counted in `refused`, and every detection ends in exactly one disposition of `counts`. An
-    exception of an estimator ends or reinitialises its track, counted in `failures`.
+    exception of an estimator ends or reinitialises its track, counted in `failures`. A tick that is interrupted, or
+    that has not enough memory to publish, raises; the next one goes on, and no detection is lost.
 
     `receive` may be called by any thread and never waits; other calls, by any thread as well, take turns.
 
@@ -116,6 +117,7 @@ class Tracker:
         self._refused: Counter[str] = Counter()
         self._unknown: dict[str, None] = {}
         self._records: list[UpdateRecord] = []
+        self._uncounted: TickReport | None = None  # of a tick that was interrupted
         self._counts: dict[str, Counter[str]] = {}
         self._last = TickReport(-1, 0, (), ())
         self._first_tick_ns = 0
@@ -195,7 +197,7 @@ class Tracker:
     def _take_arrivals(self) -> None:
         """Give the tracker all received messages."""
         for _ in range(len(self._arrivals)):  # messages that come meanwhile may wait
-            message = self._arrivals.popleft()
+            message = self._arrivals[0]  # it stays there if an interrupt comes
             try:
                 self._take(message)
             except InvalidMessageError as error:
@@ -203,6 +205,7 @@ class Tracker:
                 self._refuse(message, f"{kind}: {_rule(error)}")
             except Exception as error:
                 self._refuse(message, f"message cannot be read ({type(error).__name__})")
+            self._arrivals.popleft()
 
     def _refuse(self, message: EgoState | DetectionList, reason: str) -> None:
         """Count a message that is not used, and its detections as invalid."""
@@ -263,13 +266,16 @@ class Tracker:
                 return replace(self._last, updates=(), smoothed=())
             begun_ns = perf_counter_ns()
             self._take_arrivals()
-            report = self._tracker.tick(now_ns)
+            if self._uncounted is not None:
+                self._records += self._uncounted.updates
+            self._uncounted = report = self._tracker.tick(now_ns)
             report = replace(report, updates=(*self._records, *report.updates))
-            self._records = []
+            counts = Counter((update.sensor, str(update.disposition)) for update in report.updates)
+            self._records, self._uncounted = [], None
             self._ticks_ns.append(perf_counter_ns() - begun_ns)
             self._node.done_ns(now_ns, self._ticks_ns[-1])
-            for update in report.updates:
-                self._counts.setdefault(self._counted(update.sensor), Counter())[str(update.disposition)] += 1
+            for (sensor, disposition), count in counts.items():
+                self._counts.setdefault(self._counted(sensor), Counter())[disposition] += count
             if self._last.tick < 0:
                 self._first_tick_ns = now_ns
             elif self._node.period_ns is not None:

@@ -217,7 +217,9 @@ class ExistenceLifecycle:
     def forget(self, track_id: int) -> None:
         """See `CountingLifecycle.forget`."""
         self._settle()
-        self._histories.end(self._rows.pop(track_id))
+        row = self._rows.pop(track_id, None)
+        if row is not None:
+            self._histories.end(row)
         self._reports = None
 
     def probability(self, track_id: int) -> float:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import compress
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
@@ -14,12 +14,15 @@ from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, Upd
 from fgtrack.estimation.failures import EstimatorError, Failure, Failures
 from fgtrack.estimation.filters.propagation import States
 
+_T = TypeVar("_T")
+
 
 class GuardedBank:
     """Guards a bank: what it raises, and states that cannot be published (see `faults`), end the track concerned.
-    Where it is unknown which track failed, all tracks of that call end. A `DataError` is an answer, not a failure,
-    and propagates; so does a `CallError` until a first track could be started: the estimator cannot be made as it is
-    configured. `make` gives an empty bank.
+    Where it is unknown which track failed, all tracks of that call end. A track whose state is known to be as before
+    goes on (`EstimatorError.unchanged`). A `DataError` is an answer, not a failure, and propagates; so does a
+    `CallError` until a first track could be started: the estimator cannot be made as it is configured. `make` gives an
+    empty bank.
     """
 
     def __init__(self, make: Callable[[], TrackBank], failures: Failures | None = None) -> None:
@@ -48,11 +51,11 @@ class GuardedBank:
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`."""
         self._now_ns = now_ns
-        self._ask("advance", now_ns)
+        self._ask(lambda bank: bank.advance(now_ns), changes=True)
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`; states that are not finite are left out."""
-        states: StatesAt = self._ask("states_at", stamp_ns)
+        states = self._ask(lambda bank: bank.states_at(stamp_ns))
         if math.isfinite(np.vdot(states.means, states.means) + np.vdot(states.covariances, states.covariances)):
             return states
         finite = np.isfinite(states.means.sum(axis=1) + states.covariances.sum(axis=(1, 2)))
@@ -63,63 +66,89 @@ class GuardedBank:
         A bank with `states_of` is asked for it alone.
         """
         if hasattr(self._bank, "states_of"):
-            states: StatesAt = self._ask("states_of", stamp_ns, track_id)
+            states: StatesAt = self._ask(lambda bank: getattr(bank, "states_of")(stamp_ns, track_id))  # noqa: B009
             return states
         return self.states_at(stamp_ns).of(track_id)
 
     def update(
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:
-        """See `TrackBank.update`; a measurement whose update raises has failed, and its track ends."""
-        results = [UpdateResult(UpdateStatus.FAILED)] * len(track_ids)
+        """See `TrackBank.update`; a measurement whose update raises has failed, and so has one of an ended track.
+        What propagates, and an interrupt, leaves states unknown, so it ends the tracks of the call as well.
+        """
+        results = [UpdateResult(UpdateStatus.FAILED) for _ in track_ids]
+        alive = [row for row, track_id in enumerate(track_ids) if track_id in self._alive]
+        ids = [track_ids[row] for row in alive]
+        given = set(ids)
+        if len(ids) < len(results):
+            measurements = [measurements[row] for row in alive]
         try:
-            results = self._bank.update(stamp_ns, track_ids, measurements)
-        except DataError:
-            raise
-        except EstimatorError as error:
-            results = [error.answers.get(track_id, results[0]) for track_id in track_ids]
-            self._end(error.causes, Failure.UPDATE_FAILED)
-        except Exception as error:
-            self._end(dict.fromkeys(track_ids, error), Failure.UPDATE_FAILED)
-        for result in results:
+            answers = self._updated(stamp_ns, ids, measurements) if ids else {}
+        except BaseException as error:
+            self._end(dict.fromkeys(ids, error), Failure.UPDATE_FAILED)
+            if isinstance(error, DataError) or not isinstance(error, Exception):
+                raise
+            answers = {}
+        for row in alive:
+            results[row] = answers.get(track_ids[row], results[row])
+        for track_id, result in zip(track_ids, results, strict=True):
             if result.nis is None and result.status is UpdateStatus.FAILED:
                 self.failures.add(Failure.UPDATE_FAILED)
+                if track_id in answers or track_id not in given:
+                    self.failures.note(f"a measurement of track {track_id} could not be fused")
         return results
+
+    def _updated(
+        self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+    ) -> Mapping[int, UpdateResult]:
+        """Return the results by track; tracks that raise end, unless their states are as before, and have none."""
+        try:
+            results = self._bank.update(stamp_ns, track_ids, measurements)
+        except EstimatorError as error:
+            ended = {each: cause for each, cause in error.causes.items() if each not in error.unchanged}
+            for each in error.unchanged:
+                self.failures.note(error.causes[each])
+            self._end(ended, Failure.UPDATE_FAILED)
+            return {each: error.answers[each] for each in track_ids if each in error.answers}
+        if not {*map(type, results)} <= {UpdateResult}:
+            raise TypeError(f"update must return results, returned {results!r:.200}")
+        return dict(zip(track_ids, results, strict=True))
 
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`; where it fails, there is no such track afterwards."""
+        self._alive[track_id] = None
         try:
             self._bank.birth(track_id, prior)
-        except Exception as error:
-            if isinstance(error, CallError) and not self._can_start:
+        except BaseException as error:
+            if track_id in self._bank.track_ids:
+                self.remove(track_id)
+            self._alive.pop(track_id, None)
+            if not isinstance(error, Exception) or (isinstance(error, CallError) and not self._can_start):
                 raise
             self.failures.note(error)
             self.failures.add(Failure.BIRTH_FAILED)
-            if track_id in self._bank.track_ids:
-                self._bank.remove(track_id)
         else:
-            self._alive[track_id] = None
             self._can_start = True
 
     def remove(self, track_id: int) -> None:
         """See `TrackBank.remove`. A track that a failure has ended need not be there."""
         if track_id not in self._alive:
             return
-        del self._alive[track_id]
         try:
             self._bank.remove(track_id)
         except Exception as error:
             self.failures.add(Failure.ESTIMATOR_RAISED)
-            if isinstance(error, EstimatorError):
+            if isinstance(error, EstimatorError) and track_id not in self._bank.track_ids:
                 self.failures.note(error)
             else:
+                self._alive.pop(track_id)
                 self._start_over(error)
+        self._alive.pop(track_id, None)
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; all are sound."""
         while True:
-            states: Sequence[TrackState] = self._ask("present")
-            unsound = faults(states)
+            states, unsound = self._ask(lambda bank: self._checked(bank.present()))
             if not unsound:
                 return states
             for track_id, fault in [(self.track_ids[row], fault) for row, fault in unsound.items()]:
@@ -128,20 +157,29 @@ class GuardedBank:
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`; those that are not sound are left out."""
-        reports: list[SmoothedReport] = self._ask("smoothed")
-        unsound = faults([report.state for report in reports]) if reports else {}
+        reports, unsound = self._ask(lambda bank: _smoothed(bank.smoothed()))
         for fault in unsound.values():
             self.failures.add(fault)
         return [report for row, report in enumerate(reports) if row not in unsound] if unsound else reports
 
-    def _ask(self, method: str, *arguments: int) -> Any:  # Any: what the method returns
-        """Return the bank's answer, when the tracks that prevent one have ended."""
+    def _checked(self, states: Sequence[TrackState]) -> tuple[Sequence[TrackState], dict[int, Failure]]:
+        """Return present states and their faults. Raises `ValueError` for another number of states than of tracks."""
+        if len(states) != len(self._alive):
+            raise ValueError(f"present gives {len(states)} states of {len(self._alive)} tracks")
+        return states, faults(states)
+
+    def _ask(self, question: Callable[[TrackBank], _T], *, changes: bool = False) -> _T:
+        """Return the bank's answer, when the tracks that prevent one have ended.
+        Raises `MemoryError` where there is not enough for the answer, unless the question `changes` states.
+        """
         while True:
             try:
-                return getattr(self._bank, method)(*arguments)
+                return question(self._bank)
             except DataError:
                 raise
             except Exception as error:
+                if isinstance(error, MemoryError) and not changes:
+                    raise
                 self.failures.add(Failure.ESTIMATOR_RAISED)
                 if isinstance(error, EstimatorError) and error.causes.keys() & self._alive.keys():
                     self._end(error.causes, Failure.ESTIMATOR_RAISED)
@@ -151,7 +189,7 @@ class GuardedBank:
                     text = f"the estimator fails even without tracks ({type(error).__name__}: {error})"
                     raise DataError(text) from error
 
-    def _end(self, causes: Mapping[int, str | Exception], failure: Failure) -> None:
+    def _end(self, causes: Mapping[int, str | BaseException], failure: Failure) -> None:
         for track_id, cause in causes.items():
             if track_id in self._alive:  # else it has ended with another one
                 self.failures.note(cause)
@@ -161,11 +199,16 @@ class GuardedBank:
     def _start_over(self, error: Exception) -> None:
         """Take a new bank, as the state of this one is unknown: all its tracks end."""
         self.failures.note(error)
+        self._bank = self._make()
         for track_id in self._alive:
             self.failures.end(track_id, self._now_ns, Failure.ESTIMATOR_RAISED)
         self._alive.clear()
-        self._bank = self._make()
         self.advance(self._now_ns)
+
+
+def _smoothed(reports: list[SmoothedReport]) -> tuple[list[SmoothedReport], dict[int, Failure]]:
+    """Return smoothed states and their faults."""
+    return reports, faults([report.state for report in reports]) if reports else {}
 
 
 _KINDS = Failure.NOT_FINITE, Failure.NOT_DEFINITE  # as the kernel numbers them

@@ -71,18 +71,22 @@ def merged_records(message: DetectionList, indices: Iterable[int], track_id: int
     return [record(message, index, Disposition.MERGED, track_id) for index in indices]
 
 
-def fused_records(
-    message: DetectionList,
-    matched: Iterable[tuple[int, int, Measurement, UpdateResult]],
-    merged: Mapping[int, tuple[int, ...]],
-    yaws: Iterable[YawWord | None],
-) -> Iterator[UpdateRecord]:
-    """Yield the records of matched detections, and of those `merged` into each, by its index.
-    `matched` are index and track of each, its measurement, or one like it, and the outcome; `yaws` the words on yaws.
-    """
-    for (index, track_id, measurement, result), yaw in zip(matched, yaws, strict=True):
-        yield record(message, index, result.status, track_id, result.nis, measurement, result.innovation, yaw)
-        yield from merged_records(message, merged.get(index, ()), track_id)
+@dataclass(frozen=True, slots=True)
+class FusedRecords:
+    """The records of matched detections, and of those merged into each; made whenever they are asked for."""
+
+    message: DetectionList
+    matched: Sequence[tuple[int, int, Measurement | None, UpdateResult]]
+    """Index and track of each, its measurement, or one like it, and the outcome."""
+    merged: Mapping[int, tuple[int, ...]]
+    """Indices of the detections that were merged into each, by its index."""
+    yaws: Sequence[YawWord | None]
+    """Words on the yaws of the matched ones."""
+
+    def __iter__(self) -> Iterator[UpdateRecord]:
+        for (index, track_id, measurement, result), yaw in zip(self.matched, self.yaws, strict=True):
+            yield record(self.message, index, result.status, track_id, result.nis, measurement, result.innovation, yaw)
+            yield from merged_records(self.message, self.merged.get(index, ()), track_id)
 
 
 def is_usable(detection: Detection, sensor: SensorModel, at_origin: bool = False) -> bool:

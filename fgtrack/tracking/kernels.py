@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from fgtrack.core.checks import LARGEST
-from fgtrack.core.compiled import add_congruence, cholesky, njit, wrapped
+from fgtrack.core.compiled import add_congruence, check, check_rows, cholesky, inlined, njit, wrapped
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.models.measurement import COMPONENTS
 
@@ -18,6 +18,18 @@ X, Y, YAW, RANGE, BEARING, CURVATURE = (
 )
 
 
+@inlined
+def _checked_starts(starts: IntArray, num_lists: int, num_rows: int) -> int:
+    """Return the number of rows. Raises `IndexError` unless the `starts` of lists ascend from 0 to at most `num_rows`.
+    There is no limit below 0.
+    """
+    check(len(starts) == num_lists + 1 and starts[0] == 0)
+    for k in range(num_lists):
+        check(starts[k] <= starts[k + 1])
+    check(num_rows < 0 or starts[num_lists] <= num_rows)
+    return int(starts[num_lists])
+
+
 @njit("(float64[::1], int64[:, ::1], int64[::1], float64[:, ::1], b1[::1])")
 def to_map(
     numbers: FloatArray, columns: IntArray, starts: IntArray, poses: FloatArray, moves: BoolArray
@@ -27,7 +39,13 @@ def to_map(
     `columns[k]`, which end with -1. x, y and yaw are seen from the pose k (x, y, yaw ...) where it `moves` them; range
     and bearing always are.
     """
-    m, at = starts[-1], 0
+    m, at, needed = _checked_starts(starts, len(poses), -1), 0, 0
+    check(len(columns) >= len(poses) and len(moves) >= len(poses) and poses.shape[1] >= 3)
+    for k in range(len(poses)):
+        check_rows(columns[k], -1, len(COMPONENTS))
+        for column in columns[k]:
+            needed += starts[k + 1] - starts[k] if column >= 0 else 0
+    check(len(numbers) >= needed)
     values, points = np.full((m, len(COMPONENTS)), np.nan), np.empty((m, 2))
     for k in range(len(poses)):
         x_m, y_m, yaw_rad = poses[k, 0], poses[k, 1], poses[k, 2]
@@ -62,6 +80,8 @@ def on_road(
     """Write a heading of the map that a list k `takes` and that is not measured, and a curvature; shape (lists, 2).
     Returns which are `outside` (m,), of those with a position.
     """
+    m = _checked_starts(starts, len(takes), len(values))
+    check(len(points) >= m and len(map_yaw) >= m and len(heading) >= m and len(curvature) >= m and len(outside) >= m)
     beyond = np.zeros(len(values), np.bool_)
     for k in range(len(takes)):
         for i in range(starts[k], starts[k + 1]):
@@ -83,6 +103,7 @@ def described(
     The highest bit is `map_yaw`. Of a bearing alone the position of the sensor, and the direction.
     """
     m, num = values.shape
+    check(_checked_starts(starts, len(poses), m) <= min(len(points), len(map_yaw)) and poses.shape[1] >= 3)
     codes, lines = np.zeros(m, np.int64), np.empty((m, 3))
     for k in range(len(poses)):
         for i in range(starts[k], starts[k + 1]):
@@ -115,6 +136,8 @@ def pose_error(
     P is of x, y, yaw, speed and yaw rate of the body, which is at `x_m`, `y_m` (`core.geometry.body_point`). G is that
     of detections at `points` (m, 2), placed in the map by the pose; of the `components` (k,) x, y and yaw depend on it.
     """
+    check(len(pose) >= 5 and len(P) == 5 and P.shape[1] == 5 and covariance.shape[0] == 5 and covariance.shape[1] == 5)
+    check(len(G) >= len(points) and G.shape[1] >= len(components) and G.shape[2] >= 5)
     J, JP, c, s = np.zeros((5, 5)), np.empty((5, 5)), math.cos(yaw_rad), math.sin(yaw_rad)
     right, up = pose[0] - x_m, pose[1] - y_m
     J[0, 0] = J[1, 1] = J[2, 2] = 1.0
@@ -134,6 +157,8 @@ def pose_error(
 @njit("(float64[:, :, ::1], float64[:, ::1], float64[:, :, ::1])")
 def add_pose_error(G: FloatArray, P: FloatArray, R: FloatArray) -> None:
     """Add G P G' to R, shapes (m, k, 5), (5, 5) and (m, k, k)."""
+    check(len(G) >= len(R) and len(P) == G.shape[2] and P.shape[1] == G.shape[2])
+    check(R.shape[1] == G.shape[1] and R.shape[2] == G.shape[1])
     GP = np.empty(G.shape[1:])
     for i in range(len(R)):
         add_congruence(G[i], P, GP, R[i])
@@ -148,6 +173,8 @@ def near(
     each point, the nearest ones. `by_x` are the tracks in the order of x.
     """
     m, n = len(points), len(means)
+    check(len(by_x) >= n and len(reach_m) >= n and most > 0 and points.shape[1] >= 3)
+    check_rows(by_x, 0, n)
     largest, count, longest = m * min(n, most), 0, 0.0
     rows, columns, distances = np.empty(largest, np.int64), np.empty(largest, np.int64), np.empty(largest)
     for j in range(n):
@@ -196,6 +223,8 @@ def linked(points: FloatArray, by_x: IntArray, starts: IntArray, distance: float
     With True for each list without links. `by_x` (n,) has the points of a list from `starts[k]` up to the next start,
     in the order of x.
     """
+    check(_checked_starts(starts, len(starts) - 1, len(points)) <= len(by_x))
+    check_rows(by_x, 0, len(points))
     leads, apart = np.arange(len(points)), np.ones(len(starts) - 1, np.bool_)
     for k in range(len(apart)):
         for a in range(starts[k], starts[k + 1]):
@@ -220,6 +249,7 @@ def linked(points: FloatArray, by_x: IntArray, starts: IntArray, distance: float
 def faults(means: FloatArray, covariances: FloatArray) -> IntArray:
     """Fault of each state (m, n) and (m, n, n), shape (m,): not finite or beyond any vehicle, invalid covariance."""
     m, n = means.shape
+    check(len(covariances) >= m and covariances.shape[1] == n and covariances.shape[2] == n)
     result, C, std = np.full(m, SOUND), np.empty((n, n)), np.empty(n)
     for i in range(m):
         P, size, total = covariances[i], 0.0, 0.0

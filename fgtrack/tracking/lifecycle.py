@@ -118,8 +118,8 @@ class CountingLifecycle:
         return [i for i, life in self.lives.items() if present_ns - life.last_seen_ns > self._forget_ns]
 
     def forget(self, track_id: int) -> None:
-        """The track has ended."""
-        del self.lives[track_id]
+        """The track has ended, or could not begin."""
+        self.lives.pop(track_id, None)
 
     def probability(self, track_id: int) -> float | None:
         """Probability that the object of the track exists; None, as counts give none."""

@@ -2,10 +2,10 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain
+from itertools import chain, repeat
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import (
     FRAMES,
     BoolArray,
+    Detection,
     DetectionList,
     Disposition,
     EgoState,
@@ -26,11 +27,12 @@ from fgtrack.core.types import (
     TrackStatus,
     UpdateRecord,
 )
-from fgtrack.estimation.base import Measurement, Measurements, Start, StatesAt, UpdateResult
+from fgtrack.estimation.base import Measurement, Measurements, Start, StatesAt, UpdateResult, UpdateStatus
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.ekf import correct_one, propagated
 from fgtrack.estimation.filters.propagation import kinematic_states
 from fgtrack.estimation.object_bank import ahead_of, states_of
+from fgtrack.models.measurement import AT_ORIGIN
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
@@ -41,7 +43,7 @@ from fgtrack.tracking.ego import EgoPose, EgoTrajectory
 from fgtrack.tracking.existence import Lifecycle, after_jumps
 from fgtrack.tracking.facing import Facing, Facings, YawsRead, as_read
 from fgtrack.tracking.guarded_bank import GuardedBank, faults
-from fgtrack.tracking.inbox import Batch, Inbox, fused_records, merged_records, record
+from fgtrack.tracking.inbox import Batch, FusedRecords, Inbox, merged_records, record
 from fgtrack.tracking.lifecycle import Scan
 from fgtrack.tracking.objects import Apart, Objects
 from fgtrack.tracking.preprocess import Candidates, Group, Preprocess, Preprocessed
@@ -93,7 +95,8 @@ class Tracker:
     """Tracks objects from object lists that arrive late.
 
     Messages come in through `receive` in receipt order; `tick` processes what came in since the last one.
-    Every detection received ends in exactly one record of exactly one tick.
+    Every detection received ends in exactly one record of exactly one tick. After an exception, or an interrupt, the
+    next tick goes on: it reports what was processed, and processes what was not.
     """
 
     def __init__(self, parts: TrackerParts) -> None:
@@ -101,6 +104,8 @@ class Tracker:
         self._tick = -1
         self._next_id = 0
         self._records: list[Iterable[UpdateRecord]] = []  # some are made when they are asked for
+        self._waiting: list[Batch] = []  # collected, and not processed to the end
+        self._begun: tuple[int, Batch] | None = None  # the first of them, and the index of its first record
         self._num_measured = Counter[int]()  # detections that have changed the state, by track
         self._undirected: dict[int, Start] = {}  # of tracks with one position and an unknown heading, by id
         self._seen: dict[int, set[int]] = {}  # in this tick, by message: tracks that it has matched or started
@@ -144,28 +149,26 @@ class Tracker:
     def tick(self, now_ns: int) -> TickReport:
         """Process everything received up to `now_ns`."""
         self._tick += 1
-        batches = self._parts.inbox.collect()
-        expired = self._parts.lifecycle.expired(now_ns)
-        if expired:
-            self._end(expired)
-        self._parts.bank.advance(now_ns)
-        self._parts.ego.start_tick()
+        parts, bank = self._parts, self._parts.bank
+        self._fail_rest()  # of a tick that was interrupted
+        self._waiting += parts.inbox.collect()
+        with self._contained(Failure.STEP_FAILED):
+            self._end(parts.lifecycle.expired(now_ns))
+        bank.advance(now_ns)
+        with self._contained(Failure.STEP_FAILED):
+            parts.ego.start_tick()
         self._seen = {}
-        posed = list(map(self._posed, batches))
+        posed = list(map(self._posed, self._waiting))
         for each in zip(posed, self._preprocessed(posed), strict=True):
             self._process_if_possible(*each)
+        smoothed = self._smoothed()
+        states = bank.present()  # tracks may end by both
+        if parts.facing is not None:
+            states = parts.facing.published(bank.track_ids, states)
+        tracks = self._reports(bank.track_ids, states)
         noted, self._records = self._records, []
-        bank, facing = self._parts.bank, self._parts.facing
-        states = bank.present()  # first: tracks may end by it
-        if facing is not None:
-            states = facing.published(bank.track_ids, states)
-        return TickReport.made_later(
-            self._tick,
-            now_ns,
-            self._smoothed(),
-            tracks=self._reports(bank.track_ids, states),
-            updates=partial(chain.from_iterable, noted),
-        )
+        updates = partial(chain.from_iterable, noted)
+        return TickReport.made_later(self._tick, now_ns, smoothed, tracks=tracks, updates=updates)
 
     def finish(self) -> tuple[SmoothedReport, ...]:
         """End all tracks; gives the final smoothed states that were still inside a window."""
@@ -203,11 +206,24 @@ class Tracker:
         unsound, reports = faults(present), self._reports(states.track_ids, present)()
         return tuple(report for row, report in enumerate(reports) if row not in unsound)
 
+    @contextmanager
+    def _contained(self, failure: Failure) -> Iterator[None]:
+        """Count what a step raises as `failure`, and go on without the step; some exceptions propagate."""
+        try:
+            yield
+        except Exception as error:
+            if isinstance(error, self._parts.propagated_exceptions):
+                raise
+            self.failures.add(failure)
+            self.failures.note(error)
+
     def _posed(self, batch: Batch) -> PosedBatch:
         """Return `batch` with the pose that it is seen from; detections in the map need none."""
-        parts = self._parts
-        ego = parts.ego.pose_at(batch.stamp_ns, parts.bank.present_ns)
-        return parts.preprocess.posed(batch, parts.sensors[batch.message.sensor], ego)
+        parts, sensor = self._parts, self._parts.sensors[batch.message.sensor]
+        with self._contained(Failure.STEP_FAILED):
+            ego = parts.ego.pose_at(batch.stamp_ns, parts.bank.present_ns)
+            return parts.preprocess.posed(batch, sensor, ego)
+        return PosedBatch(batch, sensor, None, AT_ORIGIN)
 
     def _preprocessed(self, batches: Sequence[PosedBatch]) -> Sequence[Preprocessed | None]:
         """Candidates of `batches` in one pass; of a pass that fails nothing, so that one batch does not fail others."""
@@ -219,19 +235,33 @@ class Tracker:
             return [None] * len(batches)
 
     def _process_if_possible(self, posed: PosedBatch, preprocessed: Preprocessed | None) -> None:
-        """Process a batch; after an exception that is not propagated, the rest of it ends as failed."""
-        first, batch = len(self._records), posed.batch
-        try:
-            self._process(posed, preprocessed)
-        except Exception as error:
-            if isinstance(error, self._parts.propagated_exceptions):
+        """Process a batch, the first that waits; after an exception or an interrupt, the rest of it ends as failed."""
+        self._begun = len(self._records), posed.batch
+        with self._contained(Failure.LIST_FAILED):
+            try:
+                self._process(posed, preprocessed)
+            except BaseException:
+                self._fail_rest()
                 raise
-            self.failures.add(Failure.LIST_FAILED)
-            self.failures.note(error)
-            made = list(chain.from_iterable(self._records[first:]))
-            ended = {each.index for each in made}
-            made += [record(batch.message, i, Disposition.FAILED) for i in batch.indices if i not in ended]
-            self._records[first:] = [made]
+        self._close()
+
+    def _fail_rest(self) -> None:
+        """Let those detections of the batch that was begun end as failed that have no record.
+        Where that is interrupted, or has not enough memory, it is repeated in the next tick.
+        """
+        if self._begun is not None:
+            first, batch = self._begun
+            ended = {each.index for each in chain.from_iterable(self._records[first:])}
+            rest = [index for index in batch.indices if index not in ended]
+            self._records.append([record(batch.message, index, Disposition.FAILED) for index in rest])
+            self._close()
+
+    def _close(self) -> None:
+        """Note that all detections of the batch that was begun have records."""
+        if self._begun is not None:
+            if self._waiting and self._waiting[0] is self._begun[1]:
+                del self._waiting[0]
+            self._begun = None
 
     def _process(self, posed: PosedBatch, preprocessed: Preprocessed | None) -> None:
         """One object list, at its own stamp: associate, age, estimate, give birth."""
@@ -247,10 +277,12 @@ class Tracker:
             self._conclude(batch, candidates, range(len(candidates)), Disposition.TOO_OLD)
             return
         states, assignment = self._identified(batch, candidates) or self._associated(batch, candidates)
-        self._match(batch, candidates, assignment, states, scan)
+        with self._contained(Failure.STEP_FAILED):
+            self._match(batch, candidates, assignment, states, scan)
         if assignment.pairs:
             self._estimate(batch, candidates, assignment, states)
-        self._miss(batch, assignment, states, scan)
+        with self._contained(Failure.STEP_FAILED):
+            self._miss(batch, assignment, states, scan)
         self._conclude(batch, candidates, assignment.refused, Disposition.GATED)
         new = assignment.new
         if new and parts.suppress_births_near_newer_tracks:
@@ -381,37 +413,32 @@ class Tracker:
             self._end(lifecycle.missed(scan, missed, positions_m, self._ranges_m(missed, positions_m, scan.ego)))
 
     def _estimate(self, batch: Batch, candidates: Candidates, assignment: Assignment, states: StatesAt) -> None:
-        """Fuse the matched candidates, group by group; the records are in the order of the candidates."""
-        bank, track_ids = self._parts.bank, states.track_ids
+        """Fuse the matched candidates, group by group; the records are in the order of the candidates.
+        A group that raises has failed, and what others have fused is recorded whatever happens afterwards.
+        """
         outcomes: dict[int, tuple[Measurement, UpdateResult]] = {}  # by index of the pair
         chosen, tracks = np.array(assignment.pairs).T
-        joint = self._joint(batch, candidates, states)
-        read = self._read(batch, candidates, assignment, states)
-        for group, here, of, each, ways in _seen(candidates, chosen, tracks, states, read):
-            measurements = Measurements(each if joint is None else equivalent(each, of, group, joint, states, ways))
-            ids = list(map(track_ids.__getitem__, of.tolist()))
-            results = bank.update(batch.stamp_ns, ids, measurements)
-            fused = []
-            for k, track_id, result in zip(here.tolist(), ids, results, strict=True):
-                outcomes[k] = measurements.stack, result
-                if result.innovation is not None:
-                    fused.append(track_id)
-                    self._num_measured[track_id] += 1
-            if not candidates.placed[chosen[here[0]]]:  # as those of all others
-                continue
-            self._parts.lifecycle.fused(fused)
-            for row, track_id in enumerate(ids) if self._undirected else ():
-                if results[row].innovation is not None and self._undirected.pop(track_id, None) is not None:
-                    # The estimator's prior, linearised along an unknown direction, spreads along it alone.
-                    seen, track = measurements[row].seen_by(self._parts.motion), of[row]
-                    with suppress(np.linalg.LinAlgError):
-                        results[row].nis = correct_one(states.means[track], states.covariances[track], seen).nis
-        matched = (
-            (candidates.leaders[position], track_ids[track], *outcomes[k])
-            for k, (position, track) in enumerate(assignment.pairs)
-        )
-        words = [None] * len(assignment.pairs) if read is None else read.words
-        self._records.append(fused_records(batch.message, matched, candidates.merged, words))
+        read: YawsRead | None = None
+        try:
+            joint = self._joint(batch, candidates, states)
+            read = self._read(batch, candidates, assignment, states)
+            for group, members, here in candidates.split(chosen):
+                with self._contained(Failure.LIST_FAILED):
+                    for pairs, of, each, ways in _seen(group, members, here, tracks, states, read):
+                        stack = each if joint is None else equivalent(each, of, group, joint, states, ways)
+                        own = Measurements(stack), of, states
+                        results = self._fused(batch.stamp_ns, *own, outcomes, pairs.tolist())
+                        if candidates.placed[chosen[here[0]]]:  # as all others
+                            with self._contained(Failure.STEP_FAILED):
+                                self._placed(*own, results)
+        finally:
+            failed, leaders = (None, UpdateResult(UpdateStatus.FAILED)), candidates.leaders
+            matched = [
+                (leaders[position], states.track_ids[track], *outcomes.get(k, failed))
+                for k, (position, track) in enumerate(assignment.pairs)
+            ]
+            words = [None] * len(matched) if read is None else read.words
+            self._records.append(FusedRecords(batch.message, matched, candidates.merged, words))
 
     def _read(self, batch: Batch, candidates: Candidates, assignment: Assignment, states: StatesAt) -> YawsRead | None:
         """Return the readings of the matched candidates; None where every yaw is taken as it is."""
@@ -420,33 +447,87 @@ class Tracker:
             return None
         return facing.read(batch.message.sensor, batch.stamp_ns, candidates, assignment.pairs, states)
 
+    def _fused(
+        self,
+        stamp_ns: int,
+        measurements: Measurements,
+        of: IntArray,
+        states: StatesAt,
+        outcomes: dict[int, tuple[Measurement, UpdateResult]],
+        pairs: Sequence[int],
+    ) -> list[UpdateResult]:
+        """Fuse measurements of the tracks whose states have the indices `of` (m,); note the outcomes of `pairs`."""
+        ids = list(map(states.track_ids.__getitem__, of.tolist()))
+        results = self._parts.bank.update(stamp_ns, ids, measurements)
+        outcomes.update(zip(pairs, zip(repeat(measurements.stack), results), strict=True))
+        for track_id, result in zip(ids, results, strict=True):
+            if result.innovation is not None:
+                self._num_measured[track_id] += 1
+        return results
+
+    def _placed(
+        self, measurements: Measurements, of: IntArray, states: StatesAt, results: Sequence[UpdateResult]
+    ) -> None:
+        """Count the fused ones of these measurements, which give positions, for the lives of their tracks."""
+        ids = list(map(states.track_ids.__getitem__, of.tolist()))
+        fused = [row for row, result in enumerate(results) if result.innovation is not None]
+        self._parts.lifecycle.fused([ids[row] for row in fused])
+        for row in fused if self._undirected else ():
+            if self._undirected.pop(ids[row], None) is not None:
+                # The estimator's prior, linearised along an unknown direction, spreads along it alone.
+                seen, track = measurements[row].seen_by(self._parts.motion), of[row]
+                with suppress(np.linalg.LinAlgError):
+                    results[row].nis = correct_one(states.means[track], states.covariances[track], seen).nis
+
     def _give_birth(self, batch: Batch, candidates: Candidates, position: int, scan: Scan) -> None:
-        parts, prior, candidate = self._parts, None, candidates[position]
-        if parts.sensors[scan.sensor].births and not parts.objects.is_stray(scan.objects[candidate.leader]):
-            prior = parts.birth.prior(candidate, parts.road, parts.ego.current, parts.ego.in_pit)
-        if prior is None:
-            self._conclude(batch, candidates, [position], Disposition.GATED)
-            return
-        track_id = parts.objects.former(scan.objects[candidate.leader])
+        """Start a track, if the sensor and the birth rules want one; a track whose start fails leaves nothing."""
+        first, track_id = len(self._records), None
+        try:
+            with self._contained(Failure.BIRTH_FAILED):
+                prior = self._prior(candidates, position, scan)
+                if prior is None:
+                    self._conclude(batch, candidates, [position], Disposition.GATED)
+                    return
+                track_id = self._number(scan.objects[candidates.leaders[position]])
+                self._parts.bank.birth(track_id, prior)
+                if track_id in self._parts.bank.track_ids:
+                    self._begin(track_id, batch, candidates, position, scan, prior)
+                    self._conclude(batch, candidates, [position], Disposition.BIRTH, track_id)
+        finally:
+            if len(self._records) == first:
+                self._conclude(batch, candidates, [position], Disposition.FAILED)
+                self._end([] if track_id is None else [track_id])
+
+    def _prior(self, candidates: Candidates, position: int, scan: Scan) -> Start | None:
+        """Return the state that a track begins with; None where the candidate may start no track."""
+        parts, candidate = self._parts, candidates[position]
+        if not parts.sensors[scan.sensor].births or parts.objects.is_stray(scan.objects[candidate.leader]):
+            return None
+        return parts.birth.prior(candidate, parts.road, parts.ego.current, parts.ego.in_pit)
+
+    def _number(self, detection: Detection) -> int:
+        """Return the number of a new track: that of a former one with the identity of `detection`, if there is one."""
+        track_id = self._parts.objects.former(detection)
         if track_id is None:
-            track_id = self._next_id
             self._next_id += 1
-        elif track_id in self._num_measured:  # lost
-            parts.objects.id_conflicts["reused"] += 1
+            return self._next_id - 1
+        if track_id in self._num_measured:  # lost
+            self._parts.objects.id_conflicts["reused"] += 1
             self._end([track_id])
-        parts.bank.birth(track_id, prior)
-        if track_id not in parts.bank.track_ids:
-            self._conclude(batch, candidates, [position], Disposition.FAILED)
-            return
-        if prior.yaw_rad is None and not parts.motion.cartesian:
+        return track_id
+
+    def _begin(
+        self, track_id: int, batch: Batch, candidates: Candidates, position: int, scan: Scan, prior: Start
+    ) -> None:
+        """Note what the tracker keeps of a track that the bank has started."""
+        if prior.yaw_rad is None and not self._parts.motion.cartesian:
             self._undirected[track_id] = prior
         self._seen.setdefault(id(batch.message), set()).add(track_id)
         self._num_measured[track_id] = 1
-        if parts.facing is not None:
-            parts.facing.born(track_id, scan.sensor, prior, candidate.measurement)
-        parts.lifecycle.born(track_id, scan, candidate)
+        if self._parts.facing is not None:
+            self._parts.facing.born(track_id, scan.sensor, prior, candidates[position].measurement)
+        self._parts.lifecycle.born(track_id, scan, candidates[position])
         self._describe(batch, candidates, position, track_id)
-        self._conclude(batch, candidates, [position], Disposition.BIRTH, track_id)
 
     def _describe(self, batch: Batch, candidates: Candidates, position: int, track_id: int) -> None:
         leader = candidates.leaders[position]
@@ -467,14 +548,15 @@ class Tracker:
             self._records.append((own, *merged_records(batch.message, candidates.merged.get(leader, ()), track_id)))
 
     def _end(self, track_ids: Sequence[int]) -> None:
+        """End tracks; one whose end raises leaves nothing either, and others end all the same."""
         for track_id in track_ids:
-            self._parts.bank.remove(track_id)
-            self._parts.objects.forget(track_id)
             self._undirected.pop(track_id, None)
-            if self._parts.facing is not None:
-                self._parts.facing.forget(track_id)
-            del self._num_measured[track_id]
-            self._parts.lifecycle.forget(track_id)
+            self._num_measured.pop(track_id, None)
+            parts = self._parts
+            facing = () if parts.facing is None else (parts.facing.forget,)
+            for forget in (parts.bank.remove, parts.objects.forget, *facing, parts.lifecycle.forget):
+                with self._contained(Failure.STEP_FAILED):
+                    forget(track_id)
 
     def _reports(self, track_ids: Sequence[int], states: Sequence[TrackState]) -> Callable[[], Iterable[TrackReport]]:
         """Return what makes the reports of tracks in these `states`, with all else as it is now."""
@@ -487,17 +569,16 @@ class Tracker:
 
 
 def _seen(
-    candidates: Candidates, chosen: IntArray, tracks: IntArray, states: StatesAt, read: YawsRead | None
-) -> Iterator[tuple[Group, IntArray, IntArray, Measurement, IntArray | None]]:
-    """Yield the measurements of the `chosen` candidates of `tracks`, both (m,), as they are `read`.
-    Each stack with its group, the indices of its pairs, their tracks and readings.
+    group: Group, members: IntArray, here: IntArray, tracks: IntArray, states: StatesAt, read: YawsRead | None
+) -> Iterator[tuple[IntArray, IntArray, Measurement, IntArray | None]]:
+    """Yield the measurements of the `members` of a group, whose pairs have the indices `here`, as they are `read`.
+    `tracks` are those of all pairs. Each stack comes with the indices of its pairs, their tracks and readings.
     """
-    for group, members, here in candidates.split(chosen):
-        of = tracks.take(here)
-        each = group.seen_at(members, states.means.take(of, axis=0), states.covariances, of)
-        if read is None:
-            yield group, here, of, each, None
-            continue
-        ways = read.readings[here]
-        for rows, part in as_read(each, ways):
-            yield group, here[rows], of[rows], part, ways[rows]
+    of = tracks.take(here)
+    each = group.seen_at(members, states.means.take(of, axis=0), states.covariances, of)
+    if read is None:
+        yield here, of, each, None
+        return
+    ways = read.readings[here]
+    for rows, part in as_read(each, ways):
+        yield here[rows], of[rows], part, ways[rows]

@@ -33,8 +33,8 @@ class Histories:
         they are visible to a sensor, and its time constant.
         """
         self._chain = lifetime_s, visible_share, visible_s
-        self.numbers = np.zeros((_FEWEST_TRACKS, _FEWEST_ENTRIES, VISIBLE + num_sensors))
-        self.entries = np.zeros((_FEWEST_TRACKS, _FEWEST_ENTRIES, VIEWED + num_sensors), dtype=np.int64)
+        self.numbers: FloatArray = np.zeros((_FEWEST_TRACKS, _FEWEST_ENTRIES, VISIBLE + num_sensors))
+        self.entries: IntArray = np.zeros((_FEWEST_TRACKS, _FEWEST_ENTRIES, VIEWED + num_sensors), dtype=np.int64)
         """See `RATIO` and `STAMP`, shape (tracks, entries, columns)."""
         self.counts = np.zeros(_FEWEST_TRACKS, dtype=np.int64)
         """Number of entries of each track, 0 of a free row."""
@@ -42,7 +42,6 @@ class Histories:
     def begin(self, stamp_ns: int, sensor: int, log_odds: float) -> int:
         """Return the row of a new track with these log-odds, visible to the `sensor` that started it."""
         if self.counts.all():
-            self.counts = np.concatenate([self.counts, np.zeros_like(self.counts)])
             self._grow(axis=0)
         row = int(np.argmin(self.counts))
         numbers, entries = self.numbers[row, 0], self.entries[row, 0]
@@ -79,5 +78,11 @@ class Histories:
         self.counts[row] = 0
 
     def _grow(self, axis: int) -> None:
-        self.numbers = np.concatenate([self.numbers, np.zeros_like(self.numbers)], axis=axis)
-        self.entries = np.concatenate([self.entries, np.zeros_like(self.entries)], axis=axis)
+        """Double the tracks, or the entries of each; all is allocated before anything changes."""
+        rows, columns = shape = [*self.numbers.shape[:2]]
+        shape[axis] *= 2
+        numbers = np.zeros((*shape, self.numbers.shape[2]))
+        entries = np.zeros((*shape, self.entries.shape[2]), dtype=np.int64)
+        counts = np.zeros(shape[0], dtype=np.int64)
+        numbers[:rows, :columns], entries[:rows, :columns], counts[:rows] = self.numbers, self.entries, self.counts
+        self.numbers, self.entries, self.counts = numbers, entries, counts

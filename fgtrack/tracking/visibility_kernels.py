@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import inlined, merged, njit
+from fgtrack.core.compiled import check, check_rows, inlined, merged, njit
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.tracking.visibility import LARGEST_LOG_ODDS, LOG_ODDS, NEVER, RATIO, SENSOR, STAMP, VIEWED, VISIBLE
@@ -51,6 +51,16 @@ def _existing(
     return 1.0 / (1.0 + math.exp(-log_odds))
 
 
+@inlined
+def _check(rows: IntArray, numbers: FloatArray, entries: IntArray, counts: IntArray) -> None:
+    """Raise `IndexError` for rows, or numbers of entries, beyond the ends of the arrays."""
+    check_rows(rows, 0, len(counts))
+    check(len(numbers) >= len(counts) and len(entries) >= len(counts) and numbers.shape[1] == entries.shape[1])
+    check(numbers.shape[2] - VISIBLE == entries.shape[2] - VIEWED)
+    for i in range(len(rows)):
+        check_rows(counts[rows[i] : rows[i] + 1], 1, entries.shape[1] + 1)
+
+
 @njit(
     "(int64[::1], int64[::1], int64[::1], float64[::1], int64, float64[:, :, ::1], int64[:, :, ::1], int64[::1],"
     " float64, float64, float64)"
@@ -71,9 +81,14 @@ def learn(
     """Insert entries into the tracks `rows`, each in order of stamps, and recompute from there on.
     Returns the probabilities, after each, of being visible to its sensor and of existing at `present_ns`, (m,).
     """
+    _check(rows, numbers, entries, counts)
+    num_entries, num_sensors = entries.shape[1], entries.shape[2] - VIEWED
+    check_rows(sensors, 0, num_sensors)
+    check(len(stamps_ns) >= len(rows) and len(sensors) >= len(rows) and len(ratios) >= len(rows))
     visible, exists = np.empty(len(rows)), np.empty(len(rows))
     for m in range(len(rows)):
         own, at, stamp_ns = rows[m], counts[rows[m]], stamps_ns[m]
+        check(at < num_entries)
         while at > 1 and entries[own, at - 1, STAMP] > stamp_ns:
             numbers[own, at, RATIO] = numbers[own, at - 1, RATIO]
             for j in range(VIEWED):
@@ -94,6 +109,7 @@ def present(
     rows: IntArray, present_ns: int, numbers: FloatArray, entries: IntArray, counts: IntArray, lifetime_s: float
 ) -> FloatArray:
     """Return existence probabilities at `present_ns`, shape (m,)."""
+    _check(rows, numbers, entries, counts)
     result = np.empty(len(rows))
     for m in range(len(rows)):
         result[m] = _existing(rows[m], present_ns, numbers, entries, counts, lifetime_s)
@@ -103,6 +119,8 @@ def present(
 @njit("void(int64, float64[:, :, ::1], int64[:, :, ::1], int64[::1])")
 def forget(oldest_ns: int, numbers: FloatArray, entries: IntArray, counts: IntArray) -> None:
     """Drop entries up to `oldest_ns`; the last of them becomes entry 0."""
+    check(len(numbers) >= len(counts) and len(entries) >= len(counts))
+    check_rows(counts, 0, entries.shape[1] + 1)
     for own in range(len(counts)):
         last = 0
         while last + 1 < counts[own] and entries[own, last + 1, STAMP] <= oldest_ns:

@@ -19,6 +19,7 @@ from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, 
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import Correction, correct
 from fgtrack.estimation.filters.propagation import ExactPropagator, kinematic_states
+from fgtrack.estimation.object_bank import Outcomes, changing_nothing
 from fgtrack.models.motion import MotionModel
 
 _KERNELS = "fgtrack.estimation.kernels.storage"
@@ -46,7 +47,7 @@ class BackwardForwardBank:
         self._free = list[int]()
         self._latest_start = 0  # largest grid index before which a track was unknown
         self._arrays = list[Any]()
-        self._allocate(8)
+        self._allocate(1)
         self._cached: dict[int, StatesAt] = {}  # by grid index; valid until anything changes
 
     @property
@@ -116,19 +117,27 @@ class BackwardForwardBank:
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:
         """Correct the stored states nearest to `stamp_ns`; the present is predicted from them."""
-        back, results = self.steps_back(stamp_ns), [UpdateResult(UpdateStatus.FAILED)] * len(track_ids)
-        states = self._at_grid(self._grid - back)
-        rows = dict(zip(states.track_ids, range(len(states.track_ids)), strict=True))
+        outcomes = Outcomes()
         for indices, alike in stacks(measurements):
-            chosen = [rows[track_ids[i]] for i in indices]
+            ids = [track_ids[i] for i in indices]
+            outcomes.add(ids, partial(self._update, stamp_ns, ids, alike))
+        return outcomes.results(track_ids)
+
+    def _update(self, stamp_ns: int, track_ids: Sequence[int], alike: Measurement) -> list[UpdateResult]:
+        """Return the outcomes of a stack of measurements."""
+        with changing_nothing(track_ids):
+            back = self.steps_back(stamp_ns)
+            states = self._at_grid(self._grid - back)
+            rows = dict(zip(states.track_ids, range(len(states.track_ids)), strict=True))
+            chosen = [rows[track_id] for track_id in track_ids]
             x, P = states.means.take(chosen, axis=0), states.covariances.take(chosen, axis=0)
             y, H = alike.model.linearised(alike.z, x, alike.pose, partial(self._propagator.residual, alike.model))
             corrected = correct(x, P, y, H, alike.R, alike.measured, alike.loss)
-            codes = self._stored(back, stamp_ns, [track_ids[i] for i in indices], corrected)
-            made = map(UpdateResult, map(_STATUS.__getitem__, codes), corrected.innovation, corrected.nis.tolist())
-            for i, code, result in zip(indices, codes, made, strict=True):
-                if code:
-                    results[i] = result
+        codes = self._stored(back, stamp_ns, track_ids, corrected)
+        made = map(UpdateResult, map(_STATUS.__getitem__, codes), corrected.innovation, corrected.nis.tolist())
+        results = [
+            result if code else UpdateResult(UpdateStatus.FAILED) for code, result in zip(codes, made, strict=True)
+        ]
         self._cached.clear()
         return results
 
@@ -142,11 +151,12 @@ class BackwardForwardBank:
         start = self._grid - back
         if not self._free:
             self._allocate(2 * len(self._rows))
-        row, state = self._free.pop(), initial_state(self._propagator.motion, prior)
+        row, state = self._free[-1], initial_state(self._propagator.motion, prior)
         anchors, states, windows = self._arrays
         anchors[row, 0], windows[row] = start, (1, start, prior.stamp_ns)
         states[row, 0, 0], states[row, 0, 1:] = self._propagator.wrap(state[0]), state[1]
-        self._rows[track_id], self._order, self._latest_start = row, None, max(start, self._latest_start)
+        self._rows[track_id], self._order = self._free.pop(), None
+        self._latest_start = max(start, self._latest_start)
         self._cached.clear()
 
     def remove(self, track_id: int) -> None:
@@ -172,8 +182,8 @@ class BackwardForwardBank:
         arrays = [np.zeros(shape, dtype) for shape, dtype in zip(shapes, (np.int64, np.float64, np.int64), strict=True)]
         for new, present in zip(arrays, self._arrays, strict=bool(self._arrays)):
             new[:num] = present
-        self._arrays = arrays
-        self._free += range(num, rows)
+        free = [*self._free, *range(num, rows)]
+        self._arrays, self._free = arrays, free
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; the part of a step beyond the newest grid stamp is predicted."""

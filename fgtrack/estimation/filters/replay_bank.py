@@ -1,7 +1,9 @@
 """The replaying EKFs of all objects in arrays."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from itertools import compress
 from typing import Any
 
@@ -20,17 +22,18 @@ from fgtrack.estimation.base import (
     no_states,
     stacks,
 )
+from fgtrack.estimation.failures import EstimatorError
 from fgtrack.estimation.filters.ekf import Prediction
 from fgtrack.estimation.filters.propagation import kinematic_states
 from fgtrack.estimation.filters.replay import ReplayEkf, Step
-from fgtrack.estimation.object_bank import ObjectBank
+from fgtrack.estimation.object_bank import ObjectBank, Outcomes, changing_nothing
 from fgtrack.models.measurement import MeasurementModel, measurement_model
 from fgtrack.models.motion import WhiteNoise
 
 _KERNELS = "fgtrack.estimation.kernels.replay"
 #: In the order of the numbers that the kernels give.
 _STATUS = UpdateStatus.FAILED, UpdateStatus.TOO_OLD, UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE
-_FUSED = _STATUS[2:]
+_FUSED, _NO_ROOM = _STATUS[2:], len(_STATUS)
 
 
 class ReplayBank(ObjectBank[ReplayEkf]):
@@ -55,7 +58,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
     def _allocate(self, *least: int) -> None:
         """Make arrays for at least so many tracks, steps and components with the present contents (see the kernels)."""
         present, n = self._shape[0], self._motion.dim
-        self._shape = rows, slots, k = tuple(map(max, self._shape, least))
+        rows, slots, k = shape = tuple(map(max, self._shape, least))
         arrays = [
             np.tile(np.arange(slots), (rows, 1)),
             np.zeros((rows, slots, 2 + k), dtype=np.int64),
@@ -63,10 +66,15 @@ class ReplayBank(ObjectBank[ReplayEkf]):
             np.zeros((rows, 3), dtype=np.int64),
             np.zeros((rows, slots, k + 1, k)),
         ]
-        for new, old in zip(arrays, self._arrays, strict=bool(self._arrays)):
-            new[tuple(map(slice, old.shape))] = old
-        self._arrays = arrays
-        self._free += range(present, rows)
+        if self._arrays:
+            order, labels, steps, windows, measured = self._arrays
+            track, place = np.nonzero(np.arange(order.shape[1]) < windows[:, :1])
+            used = track, order[track, place]  # only the pages of used slots are made
+            arrays[0][:present, : order.shape[1]], arrays[3][:present] = order, windows
+            arrays[1][*used, : labels.shape[2]], arrays[2][used] = labels[used], steps[used]
+            arrays[4][*used, : measured.shape[2], : measured.shape[3]] = measured[used]
+        free = [*self._free, *range(present, rows)]
+        self._arrays, self._shape, self._free = arrays, shape, free
 
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`."""
@@ -97,59 +105,80 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
-        results = [UpdateResult(UpdateStatus.FAILED)] * len(track_ids)
+        outcomes = Outcomes()
         for indices, alike in stacks(measurements):
-            seen, ids = alike.seen_by(self._motion), [track_ids[i] for i in indices]
-            is_held = list(map(self._rows.__contains__, ids)) if _is_plain(seen) else [False] * len(ids)
-            for chosen in equal_ones(is_held):
-                part, own = seen, ids
-                if len(chosen) < len(ids):
-                    part, own = replace(seen, z=seen.z[chosen], R=seen.R[chosen]), [ids[k] for k in chosen]
-                values = self._fused(stamp_ns, own, part) if is_held[chosen[0]] else self._alone(stamp_ns, own, part)
-                for k, result in zip(chosen, values, strict=True):
-                    results[indices[k]] = result
-        return results
+            ids = [track_ids[i] for i in indices]
+            outcomes.add(ids, partial(self._update, stamp_ns, ids, alike))
+        return outcomes.results(track_ids)
+
+    def _update(self, stamp_ns: int, track_ids: Sequence[int], one: Measurement) -> list[UpdateResult]:
+        """Return the outcomes of a stack of measurements."""
+        with changing_nothing(track_ids):
+            seen = one.seen_by(self._motion)
+            is_held = list(map(self._rows.__contains__, track_ids)) if _is_plain(seen) else [False] * len(track_ids)
+        outcomes = Outcomes()
+        for chosen in equal_ones(is_held):
+            part, ids = seen, track_ids
+            if len(chosen) < len(track_ids):
+                part, ids = replace(seen, z=seen.z[chosen], R=seen.R[chosen]), [track_ids[k] for k in chosen]
+            fuse = self._fused if is_held[chosen[0]] else self._alone
+            outcomes.add(ids, partial(fuse, stamp_ns, ids, part))
+        return outcomes.results(track_ids)
 
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`."""
         super().birth(track_id, prior)
         self._order = None
-        self._put_in(track_id)
+        self._put_in([track_id])
 
     def remove(self, track_id: int) -> None:
         """See `TrackBank.remove`."""
-        if track_id in self._rows:
-            self._free.append(self._rows.pop(track_id))
         super().remove(track_id)
         self._order = None
+        if track_id in self._rows:
+            self._free.append(self._rows.pop(track_id))
 
     def _alone(self, stamp_ns: int, track_ids: Sequence[int], one: Measurement) -> list[UpdateResult]:
         """Outcomes of a stack of measurements that need the filters of their objects."""
-        for track_id in track_ids:
-            self._take_out(track_id)
-        results = super().update(stamp_ns, track_ids, Measurements(one))
-        for track_id in track_ids:
-            self._put_in(track_id)
+        with changing_nothing(track_ids):
+            for track_id in track_ids:
+                self._take_out(track_id)
+        try:
+            results = super().update(stamp_ns, track_ids, Measurements(one))
+        except EstimatorError as error:
+            self._put_in(error.answers)
+            raise
+        self._put_in(track_ids)
         return results
 
     def _fused(self, stamp_ns: int, track_ids: Sequence[int], one: Measurement) -> list[UpdateResult]:
         """Outcomes of a stack of measurements of entries of the state."""
-        rows, (m, k) = np.array(list(map(self._rows.__getitem__, track_ids))), one.z.shape
-        if k > self._shape[2]:
-            self._allocate(0, 0, k)
-        z, R = np.ascontiguousarray(one.z, dtype=np.float64), np.ascontiguousarray(one.R, dtype=np.float64)
-        y, S, nis, status = np.empty((m, k)), np.empty((m, k, k)), np.empty(m), np.empty(m, dtype=np.int64)
-        now = self._lag_ns, self._start_ns, stamp_ns, one.model.selected
-        count = kernels(_KERNELS).fuse(
-            self._kind, self._density, *self._arrays, rows, *now, z, R, one.measured, y, S, nis, status
-        )
-        if count == self._shape[1]:
-            self._allocate(0, 2 * count, 0)
-        statuses = list(map(_STATUS.__getitem__, status.tolist()))
-        results = list(map(UpdateResult, statuses, y, nis.tolist(), S))
-        if UpdateStatus.FAILED in statuses or UpdateStatus.TOO_OLD in statuses:
-            results = [each if each.status in _FUSED else UpdateResult(each.status) for each in results]
-        return results
+        with changing_nothing(track_ids):
+            rows, (m, k) = np.array(list(map(self._rows.__getitem__, track_ids))), one.z.shape
+            if k > self._shape[2]:
+                self._allocate(0, 0, k)
+            z, R = np.ascontiguousarray(one.z, dtype=np.float64), np.ascontiguousarray(one.R, dtype=np.float64)
+            y, S, nis, status = np.empty((m, k)), np.empty((m, k, k)), np.empty(m), np.empty(m, dtype=np.int64)
+            now = self._lag_ns, self._start_ns, stamp_ns, one.model.selected
+            fuse = partial(kernels(_KERNELS).fuse, self._kind, self._density, *self._arrays, rows, *now, z, R)
+        if not fuse(one.measured, y, S, nis, status):
+            return _results(y, S, nis, status)
+        outcomes = Outcomes()
+        for is_full in (False, True):
+            chosen = ((status == _NO_ROOM) == is_full).nonzero()[0]
+            ids = [track_ids[k] for k in chosen.tolist()]
+            if is_full:
+                part = replace(one, z=z[chosen], R=R[chosen])
+                outcomes.add(ids, partial(self._fused_in_more_room, stamp_ns, ids, part))
+            else:
+                outcomes.add(ids, partial(_results, y[chosen], S[chosen], nis[chosen], status[chosen]))
+        return outcomes.results(track_ids)
+
+    def _fused_in_more_room(self, stamp_ns: int, track_ids: Sequence[int], one: Measurement) -> list[UpdateResult]:
+        """Return `_fused` of tracks whose slots are all in use, after the slots have doubled."""
+        with changing_nothing(track_ids):
+            self._allocate(0, 2 * self._shape[1], 0)
+        return self._fused(stamp_ns, track_ids, one)
 
     def _states(self, stamp_ns: int, is_present: bool = False) -> tuple[BoolArray | None, FloatArray, FloatArray]:
         """True of the tracks that are known (m,), None if all are, means (m, n) and covariances (m, n, n) of all."""
@@ -157,15 +186,21 @@ class ReplayBank(ObjectBank[ReplayEkf]):
             self._order = np.array([self._rows.get(i, -1) for i in self._estimators], dtype=np.int64)
         count, known, means, covariances = self._ahead(self._order, stamp_ns, is_present)
         if len(self._rows) < len(known):
-            for k, (track_id, item) in enumerate(self._estimators.items()):
-                if track_id not in self._rows:
-                    start_ns = item.window_ns[0]
-                    known[k] = is_present or start_ns <= stamp_ns
-                    count += known[k]
-                    if known[k]:
-                        state = item.state_at(max(stamp_ns, start_ns))
-                        means[k], covariances[k] = state.mean, state.covariance
+            apart = [track_id for track_id in self._estimators if track_id not in self._rows]
+            states = self._ask(lambda _, item: self._state_of(item, stamp_ns, is_present), apart)
+            for k, track_id in enumerate(self._estimators):
+                state = states.get(track_id)
+                if state is not None:
+                    known[k], means[k], covariances[k] = True, state.mean, state.covariance
+                    count += 1
+                elif track_id in states:
+                    known[k] = False
         return None if count == len(known) else known, means, covariances
+
+    def _state_of(self, item: ReplayEkf, stamp_ns: int, is_present: bool) -> TrackState | None:
+        """Return the state of a filter; at the present its first one instead of none."""
+        start_ns = item.window_ns[0]
+        return self._state(item, max(stamp_ns, start_ns)) if is_present or start_ns <= stamp_ns else None
 
     def _ahead(
         self, rows: IntArray, stamp_ns: int, is_present: bool = False
@@ -177,17 +212,21 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         count = kernels(_KERNELS).ahead(self._kind, self._density, *self._arrays[:4], *at, means, covariances, known)
         return count, known, means, covariances
 
-    def _put_in(self, track_id: int) -> None:
-        """Move the steps of a filter into the arrays, where these can hold them."""
-        item = self._estimators[track_id]
-        if not all(each.search is None and _is_plain(each.measurement) for each in item.steps):
-            return
+    def _put_in(self, track_ids: Iterable[int]) -> None:
+        """Move the steps of filters into the arrays, where these can hold them; without memory they stay filters."""
+        with suppress(MemoryError):
+            for track_id in track_ids:
+                item = self._estimators[track_id]
+                if all(each.search is None and _is_plain(each.measurement) for each in item.steps):
+                    self._put(track_id, item)
+
+    def _put(self, track_id: int, item: ReplayEkf) -> None:
+        """Move the steps of a filter into the arrays."""
         k = max((len(each.measurement.z) for each in item.steps if each.measurement is not None), default=0)
         rows, slots, largest = self._shape
         if not self._free or len(item.steps) >= slots or k > largest:
             self._allocate(rows * (1 + (not self._free)), 2 * len(item.steps), k)
-        row = self._rows[track_id] = self._free.pop()
-        self._order = None
+        row = self._free[-1]
         order, labels, steps, windows, measured = (array[row] for array in self._arrays)
         windows[:] = len(item.steps), *item.window_ns
         for slot, each in zip(order, item.steps, strict=False):
@@ -197,13 +236,13 @@ class ReplayBank(ObjectBank[ReplayEkf]):
                 own, d = each.measurement, len(each.measurement.z)
                 labels[slot, 1 : d + 2] = d, *own.model.selected
                 measured[slot, 0, :d], measured[slot, 1 : d + 1, :d] = own.z, own.R
+        self._rows[track_id], self._order = self._free.pop(), None
 
     def _take_out(self, track_id: int) -> None:
         """Move the steps of a filter out of the arrays, if they are there."""
-        row, n, self._order = self._rows.pop(track_id, None), self._motion.dim, None
+        row, n = self._rows.get(track_id), self._motion.dim
         if row is None:
             return
-        self._free.append(row)
         order, labels, steps, windows, measured = (array[row] for array in self._arrays)
         chain = list[Step]()
         for slot in order[: windows[0]].tolist():
@@ -217,6 +256,17 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         item = self._estimators[track_id]
         item.resume(chain, *windows[1:].tolist())
         item.advance(self._start_ns + self._lag_ns)
+        self._free.append(self._rows.pop(track_id))
+        self._order = None
+
+
+def _results(y: FloatArray, S: FloatArray, nis: FloatArray, status: IntArray) -> list[UpdateResult]:
+    """Return the outcomes of innovations (m, k), covariances (m, k, k), NIS and status as the kernels write them."""
+    statuses = list(map(_STATUS.__getitem__, status.tolist()))
+    results = list(map(UpdateResult, statuses, y, nis.tolist(), S))
+    if UpdateStatus.FAILED in statuses or UpdateStatus.TOO_OLD in statuses:
+        results = [each if each.status in _FUSED else UpdateResult(each.status) for each in results]
+    return results
 
 
 def _is_plain(measurement: Measurement | None) -> bool:

@@ -2,7 +2,7 @@
 
 import math
 
-from fgtrack.core.compiled import add_product_transposed, copy, njit, product, scratch
+from fgtrack.core.compiled import add_product_transposed, check, copy, njit, product, scratch
 from fgtrack.core.types import FloatArray, IntArray
 
 
@@ -21,6 +21,8 @@ def propagate(
     without a part in F; the yaw goes up to `yaw_limit_rad`.
     """
     m, n = mean.shape
+    check(n >= (6 if accelerates else 5) and len(density) >= n and len(steps) >= m)
+    check(len(P) >= m and P.shape[1] == n and P.shape[2] == n)
     F, FP, more = scratch(n, n), scratch(n, n), scratch(n, n)
     for j in range(n):
         for k in range(n):

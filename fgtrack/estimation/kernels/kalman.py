@@ -10,6 +10,8 @@ from fgtrack.core.compiled import (
     add_congruence,
     add_product_transposed,
     add_weighted,
+    check,
+    check_rows,
     copy,
     njit,
     product,
@@ -70,6 +72,11 @@ def innovations(
     NaN where S has no root. Jacobians H (m, k, n) or (1, k, n), covariances P (tracks, n, n), R (m, k, k).
     """
     m, k = y.shape
+    check_rows(tracks, 0, len(P))
+    check_rows(rows, 0, k)
+    check(len(tracks) >= m and len(R) >= m and (len(H) == 1 or len(H) >= m))
+    check(H.shape[1] == k and H.shape[2] == P.shape[1] and P.shape[2] == P.shape[1])
+    check(R.shape[1] == k and R.shape[2] == k)
     S, nis, logdet = np.empty((m, k, k)), np.empty(m), np.zeros(m)
     root, HP, white = np.empty((k, k)), np.empty((k, P.shape[1])), np.empty(k)
     for i in range(m):
@@ -84,6 +91,7 @@ def innovations(
 @njit(f"({_MATRICES}, {_MATRICES}, {_MATRICES})")
 def predict(F: FloatArray, P: FloatArray, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return covariances F P F' + Q, written over Q, and cross-covariances F P, shapes (m, n, n)."""
+    check(F.shape == P.shape and Q.shape == P.shape)
     cross = np.empty(P.shape)
     for i in range(len(P)):
         add_congruence(F[i], P[i], cross[i], Q[i])
@@ -94,6 +102,7 @@ def predict(F: FloatArray, P: FloatArray, Q: FloatArray) -> tuple[FloatArray, Fl
 def propagate(motion: int, density: FloatArray, mean: FloatArray, P: FloatArray, steps: IntArray, dt_s: float) -> None:
     """Move states (m, n) and (m, n, n), each by its own number of `steps` (m,) of `dt_s`: f(x) and F P F' + Q."""
     n = mean.shape[1]
+    check(len(P) >= len(mean) and len(steps) >= len(mean) and P.shape[1] == n and P.shape[2] == n)
     F, FP, Q, x = scratch(n, n), scratch(n, n), scratch(n, n), scratch(n)
     for i in range(len(mean)):
         for a in range(n):
@@ -120,6 +129,11 @@ def correct(
     (m, n), (m, n, n), (m, k), (1, k, n) or (m, k, n), (m, k, k).
     """
     m, k, n = len(y), y.shape[1], mean.shape[1]
+    check_rows(rows, 0, k)
+    check(len(mean) >= m and len(P) >= m and len(R) >= m and len(S) >= m and len(nis) >= m and len(fused) >= m)
+    check(len(H) == 1 or len(H) >= m)
+    check(P.shape[1] == n and P.shape[2] == n and H.shape[1] == k and H.shape[2] == n)
+    check(R.shape[1] == k and R.shape[2] == k and S.shape[1] == k and S.shape[2] == k)
     K, root, white, A, AP, KR = scratch(k, n), scratch(k, k), scratch(k), scratch(n, n), scratch(n, n), scratch(n, k)
     for i in range(m):
         h = H[min(i, len(H) - 1)]

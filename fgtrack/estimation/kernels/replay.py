@@ -13,6 +13,8 @@ from fgtrack.core.compiled import (
     MATRIX,
     add_congruence,
     add_weighted,
+    check,
+    check_rows,
     copy,
     inlined,
     merged,
@@ -27,7 +29,7 @@ from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.kernels.kalman import conclude, marginal_nis
 from fgtrack.models.transitions import ARC, transition
 
-FAILED, TOO_OLD, IN_SEQUENCE, OUT_OF_SEQUENCE = range(4)
+FAILED, TOO_OLD, IN_SEQUENCE, OUT_OF_SEQUENCE, NO_ROOM = range(5)
 _YAW = 2
 
 
@@ -180,6 +182,22 @@ def _forget(oldest_ns: int, slots: IntArray, labels: IntArray, window: IntArray)
 _STEPS = "int64, float64[::1], int64[:, ::1], int64[:, :, ::1], float64[:, :, :, ::1], int64[:, ::1]"
 
 
+@inlined
+def _check(
+    tracks: IntArray, least: int, order: IntArray, labels: IntArray, steps: FloatArray, windows: IntArray, n: int
+) -> None:
+    """Raise `IndexError` for tracks, or numbers of steps, beyond the ends of the arrays of states of dimension n."""
+    size, slots = order.shape
+    check_rows(tracks, least, size)
+    check(labels.shape[0] == size and steps.shape[0] == size and windows.shape[0] == size)
+    check(labels.shape[1] == slots and steps.shape[1] == slots and windows.shape[1] >= 3)
+    check(steps.shape[2] == 3 * n + 2 and steps.shape[3] == n)
+    for i in range(len(tracks)):
+        if tracks[i] >= 0:
+            check_rows(windows[tracks[i], :1], 1, slots + 1)
+            check_rows(order[tracks[i]], 0, slots)
+
+
 @njit(
     f"int64({_STEPS}, float64[:, :, :, ::1], int64[::1], int64, int64, int64, int64[::1], float64[:, ::1], "
     "float64[:, :, ::1], int64[::1], float64[:, ::1], float64[:, :, ::1], float64[::1], int64[::1])"
@@ -207,10 +225,17 @@ def fuse(
 ) -> int:
     """Put a measurement of `entries` of the state into the steps of each of `tracks` (m,); re-filter the later ones.
     Writes innovations y (m, k), the NIS of their `rows`, and S (m, k, k), given all that was fused, and the status. A
-    failed measurement, and one older than `oldest_ns` or the window of the track, change nothing. Returns the largest
-    number of steps; every track must have a free slot.
+    failed measurement, and one older than `oldest_ns` or the window of the track, change nothing. Where all slots of a
+    track are in use, nothing changes either. Returns the number of these tracks.
     """
-    k, n, largest = y.shape[1], len(density), 0
+    m, k, n, num_without_room = len(tracks), y.shape[1], len(density), 0
+    _check(tracks, 0, order, labels, steps, windows, n)
+    check(measured.shape[0] == order.shape[0] and measured.shape[1] == order.shape[1] and measured.shape[2] > k)
+    check(measured.shape[3] >= k and labels.shape[2] >= k + 2 and len(entries) >= k and z.shape[1] >= k)
+    check(len(y) == m and len(z) == m and len(R) == m and len(S) == m and len(nis) == m and len(status) == m)
+    check(R.shape[1] >= k and R.shape[2] >= k and S.shape[1] >= k and S.shape[2] >= k)
+    check_rows(entries, 0, n)
+    check_rows(rows, 0, k)
     now, most = scratch(n + 1, n), measured.shape[3]
     F, A, AP, ahead, mean = scratch(n, n), scratch(n, n), scratch(n, n), scratch(2 * n + 1, n), scratch(n)
     root, K, KR, white = scratch(most, most), scratch(most, n), scratch(n, most), scratch(most)
@@ -221,8 +246,11 @@ def fuse(
         if stamp_ns < max(window[1], oldest_ns):
             status[i] = TOO_OLD
             continue
-        if window[0] + 1 == len(slots):
+        if window[0] + 1 >= len(slots):
             _forget(max(window[1], oldest_ns), slots, labels[t], window)
+        if window[0] == len(slots):
+            status[i], num_without_room = NO_ROOM, num_without_room + 1
+            continue
         index = count = window[0]
         own = slots[count]
         label, new = labels[t, own], measured[t, own]
@@ -258,8 +286,7 @@ def fuse(
             status[i] = IN_SEQUENCE if stamp_ns >= window[2] else OUT_OF_SEQUENCE
             window[0], window[2] = count + 1, max(window[2], stamp_ns)
             window[1] = max(window[1], window[2] - lag_ns)
-        largest = max(largest, window[0])
-    return largest
+    return num_without_room
 
 
 @njit(f"int64({_STEPS}, int64[::1], int64, int64, b1, float64[:, ::1], float64[:, :, ::1], b1[::1])")
@@ -282,6 +309,8 @@ def ahead(
     Known are, and counted, those whose windows have begun; at the present others have their first state.
     """
     n, count = len(density), 0
+    _check(tracks, -1, order, labels, steps, windows, n)
+    check(len(means) == len(tracks) and len(covariances) == len(tracks) and len(known) == len(tracks))
     F, FP = scratch(n, n), scratch(n, n)
     for i in range(len(tracks)):
         t, at_ns = tracks[i], stamp_ns

@@ -7,11 +7,22 @@ ascending order, the grid index before which the track is unknown, and the newes
 
 import numpy as np
 
-from fgtrack.core.compiled import copy, merged, njit
+from fgtrack.core.compiled import check, check_rows, copy, inlined, merged, njit
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 
 FAILED, IN_SEQUENCE, OUT_OF_SEQUENCE = range(3)
 _STORAGE = "int64[:, :, ::1], float64[:, :, :, ::1], int64[:, ::1]"
+
+
+@inlined
+def _check(rows: IntArray, anchors: IntArray, states: FloatArray, windows: IntArray, n: int) -> None:
+    """Raise `IndexError` for rows, or numbers of anchors, beyond the ends of the arrays of states of dimension n."""
+    size, slots = anchors.shape[0], anchors.shape[1]
+    check_rows(rows, 0, size)
+    check(states.shape[0] == size and windows.shape[0] == size and states.shape[1] == slots)
+    check(states.shape[2] == n + 1 and states.shape[3] == n and anchors.shape[2] >= 2 and windows.shape[1] >= 3)
+    for i in range(len(rows)):
+        check_rows(windows[rows[i], :1], 1, slots + 1)
 
 
 @njit(f"void(int64, b1, int64[:], {_STORAGE}, float64[:, ::1], float64[:, :, ::1], int64[::1])")
@@ -29,6 +40,8 @@ def look_up(
     """Write the anchors (m, n) and (m, n, n) of the states of `rows` (m,) at `grid`, and the steps to there (m,).
     At the present that is the newest one, whether a look-up finds it or not.
     """
+    _check(rows, anchors, states, windows, means.shape[1])
+    check(len(means) >= len(rows) and len(covariances) >= len(rows) and len(steps) >= len(rows))
     for i in range(len(rows)):
         row = rows[i]
         j = windows[row, 0] - 1
@@ -69,6 +82,8 @@ def store(
     """Add an anchor of the measurement at `stamp_ns` to each of `rows` (m,) in which it was `fused`; return the status.
     The anchor replaces all that was stored at and after it; where there is no free slot, those before `oldest` go.
     """
+    _check(rows, anchors, states, windows, means.shape[1])
+    check(len(means) >= len(rows) and len(covariances) >= len(rows) and len(fused) >= len(rows))
     status = np.full(len(rows), FAILED)
     for i in range(len(rows)):
         if fused[i]:
@@ -78,6 +93,8 @@ def store(
             j = window[0]
             while j > 0 and anchors[row, j - 1, 1] >= visible_from:
                 j -= 1
+            if j == anchors.shape[1]:  # no slot is free
+                continue
             anchors[row, j, 0], anchors[row, j, 1] = grid, visible_from
             for a in range(means.shape[1]):
                 states[row, j, 0, a] = means[i, a]

@@ -12,15 +12,14 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray, IntArray, SmoothedReport, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, stacks
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.failures import Failure, Failures
+from fgtrack.estimation.failures import EstimatorError, Failure, Failures
 from fgtrack.estimation.filters.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
 from fgtrack.estimation.filters.propagation import kinematic_states
 from fgtrack.estimation.kernels.kalman import innovations
+from fgtrack.estimation.object_bank import Outcomes, changing_nothing
 from fgtrack.estimation.smoothing.settings import SmootherSettings
-from fgtrack.estimation.smoothing.solver import Solver
+from fgtrack.estimation.smoothing.solver import NotFusedError, Solver
 from fgtrack.models.motion import MotionModel
-
-_TOO_OLD, _FAILED = (UpdateResult(UpdateStatus.TOO_OLD), UpdateResult(UpdateStatus.FAILED))
 
 
 class SmootherBank:
@@ -98,78 +97,158 @@ class SmootherBank:
         self._known.clear()  # which tracks are known at a stamp depends on the clock
 
     def states_at(self, stamp_ns: int) -> StatesAt:
-        """See `TrackBank.states_at`."""
+        """See `TrackBank.states_at`. Raises `EstimatorError` if some tracks have no state."""
         known = self._known.get(stamp_ns)
         if known is None:
             tracks, track_ids = self._all()
             is_known = self._windows(tracks)[2] <= stamp_ns
             if not is_known.all():
                 track_ids, tracks = (tuple(compress(track_ids, is_known.tolist())), tracks[is_known])
-            states = self.solver.states_at(tracks, np.full(len(tracks), stamp_ns))
+            states = self._states(tracks, np.full(len(tracks), stamp_ns))
             known = self._known[stamp_ns] = StatesAt(track_ids, *states)
         return known
+
+    def _states(self, tracks: IntArray, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return `Solver.states_at`. Raises `EstimatorError` for the tracks of which the solver raises."""
+        try:
+            return self.solver.states_at(tracks, stamps_ns)
+        except MemoryError:
+            raise
+        except Exception:
+            causes = dict[int, Exception]()
+            for row, track in enumerate(tracks.tolist()):
+                try:
+                    self.solver.states_at(tracks[row : row + 1], stamps_ns[row : row + 1])
+                except Exception as error:
+                    causes[self._ids[track]] = error
+            if causes:
+                raise EstimatorError(causes, {}) from None
+            raise
 
     def update(
         self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
-        states = self.states_at(stamp_ns)
-        row_of = dict(zip(states.track_ids, range(len(states.track_ids)), strict=True))
-        results = [_FAILED if track_id in row_of else _TOO_OLD for track_id in track_ids]
-        inside = [k for k, track_id in enumerate(track_ids) if track_id in row_of]
-        if len(inside) < len(results):
-            measurements = [measurements[k] for k in inside]
-        for indices, stack in stacks(measurements):
-            group, alike = [inside[k] for k in indices], stack.seen_by(self._motion)
-            tracks = np.array([self._tracks[track_ids[index]] for index in group])
-            of = np.array([row_of[track_ids[index]] for index in group])
-            means = states.means[of]
+        with changing_nothing(track_ids):
+            states = self.states_at(stamp_ns)
+            row_of = dict(zip(states.track_ids, range(len(states.track_ids)), strict=True))
+            inside = [k for k, track_id in enumerate(track_ids) if track_id in row_of]
+            if len(inside) < len(track_ids):
+                measurements = [measurements[k] for k in inside]
+            parts = stacks(measurements)
+        outcomes, outside = Outcomes(), [track_id for track_id in track_ids if track_id not in row_of]
+        outcomes.add(outside, lambda: [UpdateResult(UpdateStatus.TOO_OLD) for _ in outside])
+        for indices, stack in parts:
+            ids = [track_ids[inside[k]] for k in indices]
+            outcomes.add(ids, partial(self._update, ids, stack, states, [row_of[each] for each in ids]))
+        return outcomes.results(track_ids)
+
+    def _update(
+        self, track_ids: Sequence[int], stack: Measurement, states: StatesAt, of: Sequence[int]
+    ) -> list[UpdateResult]:
+        """Return the outcomes of a stack of measurements of tracks, whose `states` are in the rows `of`.
+        Of a stack that raises, the measurements of the tracks whose states are as before are fused alone.
+        """
+        try:
+            return self._fused(track_ids, stack, states, of)
+        except EstimatorError as error:
+            if len(track_ids) == 1:
+                raise
+            outcomes = Outcomes()
+            alone = [k for k, track_id in enumerate(track_ids) if track_id in error.unchanged]
+            others = [track_id for track_id in track_ids if track_id not in error.unchanged]
+            outcomes.add(others, partial(_raised, error, others))
+            for k in alone:
+                one = replace(stack, z=stack.z[k : k + 1], R=stack.R[k : k + 1])
+                outcomes.add([track_ids[k]], partial(self._update, [track_ids[k]], one, states, [of[k]]))
+            return outcomes.results(track_ids)
+
+    def _fused(
+        self, track_ids: Sequence[int], stack: Measurement, states: StatesAt, of: Sequence[int]
+    ) -> list[UpdateResult]:
+        """Return the outcomes of `_update` of all tracks together. Raises `EstimatorError` for those that raise."""
+        with changing_nothing(track_ids):
+            alike, tracks = stack.seen_by(self._motion), np.array([self._tracks[each] for each in track_ids])
+            rows = np.array(of)
+            means = states.means[rows]
             y, H = alike.model.linearised(alike.z, means, alike.pose)
-            H, R = (np.array(each, dtype=np.float64, order="C", ndmin=3) for each in (H, alike.R))
-            (S, nis, _), times = innovations(y, H, states.covariances, of, R, alike.measured), self._windows(tracks)
-            usable = np.isfinite(nis).nonzero()[0]
-            fused = self._fuse(usable, tracks, alike, y, H, means, R, times[3]) if usable.size else usable
-            rows = list(zip(group, y, nis.tolist(), S, *times[:2].tolist(), strict=True))
-            for index, *own, newest_ns, start_ns in map(rows.__getitem__, fused.tolist()):
-                results[index] = UpdateResult(_status(stamp_ns, newest_ns, start_ns), *own)
+            H = np.array(H, dtype=np.float64, order="C", ndmin=3)
+            R = np.array(alike.R, dtype=np.float64, order="C", ndmin=3)
+            (S, nis, _), times = innovations(y, H, states.covariances, rows, R, alike.measured), self._windows(tracks)
+            usable, given = np.isfinite(nis).nonzero()[0], (y, H, means, R, times[3])
+            if len(usable) < len(tracks):
+                alike, tracks = replace(alike, z=alike.z[usable], R=alike.R[usable]), tracks[usable]
+                given = y[usable], H if len(H) == 1 else H[usable], means[usable], R[usable], times[3, usable]
+        results = [UpdateResult(UpdateStatus.FAILED) for _ in track_ids]
+        if not usable.size:
+            return results
+        self._known.clear()
+        own = [track_ids[k] for k in usable.tolist()]
+        try:
+            left = self.solver.fuse(tracks, alike, *given)
+        except NotFusedError as error:
+            if len(own) == 1 and not error.lost and isinstance(error.cause, np.linalg.LinAlgError):
+                self.failures.add(Failure.GRAPH_REBUILT)
+                return results
+            lost, causes = {self._ids[track] for track in error.lost}, dict.fromkeys(own, error.cause)
+            answers = {each: result for each, result in zip(track_ids, results, strict=True) if each not in causes}
+            raise EstimatorError(causes, answers, causes.keys() - lost) from error
+        made = list(zip(y, nis.tolist(), S, *times[:2].tolist(), strict=True))
+        for index in usable.tolist():
+            *outcome, newest_ns, start_ns = made[index]
+            results[index] = UpdateResult(_status(alike.stamp_ns, newest_ns, start_ns), *outcome)
+        if left is not None:
+            self._final += self._reports(map(self._ids.__getitem__, left[0].tolist()), *left[1:])
+        causes = self._improved(tracks, alike.stamp_ns)
+        if causes:
+            answers = dict(zip(track_ids, results, strict=True))
+            raise EstimatorError(causes, {each: answers[each] for each in track_ids if each not in causes})
         return results
 
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`."""
-        track = self._free.pop() if self._free else len(self._tracks)
+        track = self._free[-1] if self._free else len(self._tracks)
         self.solver.begin(track, prior.stamp_ns, *initial_state(self._motion, prior))
         self._searches.pop(track, None)
         search = Search.of(self._motion, prior, self._initiation)
         if search is not None:
             self._searches[track] = search
+        if self._free:
+            self._free.pop()
         self._tracks[track_id], self._ids[track], self._order = track, track_id, None
         self._known.clear()
 
     def remove(self, track_id: int) -> None:
-        """See `TrackBank.remove`; what was still inside the window becomes final."""
+        """See `TrackBank.remove`; what was still inside the window becomes final.
+        Raises `EstimatorError` where these states cannot be computed: the track is removed all the same.
+        """
         track = self._tracks.pop(track_id)
-        if self._settings.final:
-            stamps_ns = self.solver.nodes.window_stamps_ns(track)
-            states = self.solver.states_at(np.full(len(stamps_ns), track), stamps_ns)
-            self._final += self._reports(repeat(track_id), stamps_ns.tolist(), *states)
         self._free.append(track)
         self._order = None
         self._known.clear()
+        if self._settings.final:
+            try:
+                stamps_ns = self.solver.nodes.window_stamps_ns(track)
+                states = self.solver.states_at(np.full(len(stamps_ns), track), stamps_ns)
+                self._final += self._reports(repeat(track_id), stamps_ns.tolist(), *states)
+            except Exception as error:
+                raise EstimatorError({track_id: error}, {}) from error
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
         tracks, _ = self._all()
-        states = self.solver.states_at(tracks, np.maximum(self.present_ns, self._windows(tracks)[2]))
+        states = self._states(tracks, np.maximum(self.present_ns, self._windows(tracks)[2]))
         return kinematic_states(self._motion, self.present_ns, *states)
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`."""
-        reports, self._final = self._final, []
+        reports = list[SmoothedReport]()
         for lag_s, lag_ns in self._lagged:
             stamp_ns = self.present_ns - lag_ns
             states = self.states_at(stamp_ns)
             reports += self._reports(states.track_ids, stamp_ns, states.means, states.covariances, lag_s)
-        return reports
+        final, self._final = self._final, []
+        return final + reports
 
     def converge(self, max_iterations: int = 50) -> None:
         """Relinearise until nothing moves; for comparisons."""
@@ -188,29 +267,31 @@ class SmootherBank:
         states = kinematic_states(self._motion, stamps_ns, means, covariances)
         return [*map(SmoothedReport, track_ids, states, repeat(lag_s))]
 
-    def _fuse(self, rows: IntArray, tracks: IntArray, stack: Measurement, *given: Any) -> IntArray:
-        """Fuse these of a stack of measurements, `given` what `Solver.fuse` takes; return the rows that were fused."""
-        self._known.clear()
-        of, alike, own = tracks, stack, given
-        if len(rows) < len(tracks):
-            of, alike = tracks[rows], replace(stack, z=stack.z[rows], R=stack.R[rows])
-            own = tuple(each if len(each) == 1 else each[rows] for each in given)
+    def _improved(self, tracks: IntArray, stamp_ns: int) -> dict[int, Exception]:
+        """Improve windows that have changed; return what they raise, by track id. Others are improved all the same."""
+        causes = dict[int, Exception]()
         try:
-            left = self.solver.fuse(of, alike, *own)
-        except np.linalg.LinAlgError:
-            if len(rows) > 1:
-                return np.concatenate([self._fuse(row[None], tracks, stack, *given) for row in rows])
-            self.failures.add(Failure.GRAPH_REBUILT)
-            return rows[:0]
-        if left is not None:
-            self._final += self._reports(map(self._ids.__getitem__, left[0].tolist()), *left[1:])
-        for track in self._searches.keys() & set(of.tolist()) if self._searches else ():
-            self._initiate(track, stack.stamp_ns)
-        if damped := self.solver.damp(of):
+            self._improve(tracks, stamp_ns)
+        except Exception:
+            for row, track in enumerate(tracks.tolist()):
+                try:
+                    self.solver.relinearise(track)  # it may be between two steps
+                    self._improve(tracks[row : row + 1], stamp_ns)
+                except Exception as error:
+                    causes[self._ids[track]] = error
+        return causes
+
+    def _improve(self, tracks: IntArray, stamp_ns: int) -> None:
+        """Initiate, damp and iterate windows with a new measurement at `stamp_ns`."""
+        for track in self._searches.keys() & set(tracks.tolist()) if self._searches else ():
+            self._initiate(track, stamp_ns)
+        if damped := self.solver.damp(tracks):
             self.failures.add(Failure.STEP_DAMPED, damped)
-        self.solver.iterate(of, self._settings.max_iterations - 1)
-        self.solver.reweight(of[[track not in self._searches for track in of.tolist()]] if self._searches else of)
-        return rows
+        self.solver.iterate(tracks, self._settings.max_iterations - 1)
+        settled = tracks
+        if self._searches:
+            settled = tracks[[track not in self._searches for track in tracks.tolist()]]
+        self.solver.reweight(settled)
 
     def _initiate(self, track: int, oldest_ns: int) -> None:
         """Reinitialise from a straight line, where the oldest new stamp asks for it, as long as nothing has left."""
@@ -245,3 +326,11 @@ def _status(stamp_ns: int, newest_ns: int, start_ns: int) -> UpdateStatus:
     if stamp_ns >= newest_ns:
         return UpdateStatus.IN_SEQUENCE
     return UpdateStatus.OUT_OF_SEQUENCE if stamp_ns >= start_ns else UpdateStatus.BEYOND_WINDOW
+
+
+def _raised(error: EstimatorError, track_ids: Sequence[int]) -> list[UpdateResult]:
+    """Return the answers of `error` for these tracks. Raises an `EstimatorError` of those that have none."""
+    causes = {track_id: error.causes[track_id] for track_id in track_ids if track_id in error.causes}
+    if causes:
+        raise EstimatorError(causes, {each: error.answers[each] for each in track_ids if each not in causes})
+    return [error.answers[track_id] for track_id in track_ids]

@@ -15,6 +15,8 @@ from fgtrack.core.compiled import (
     MATRIX,
     READ,
     add_congruence,
+    check,
+    check_rows,
     copy,
     inlined,
     merged,
@@ -31,6 +33,8 @@ from fgtrack.core.types import FloatArray, IntArray
 _LEAST_SHARE = 1e-6
 #: Later than any stamp and index.
 NEVER = int(np.iinfo(np.int64).max)
+#: Instead of the number of a node.
+NONE = -1
 #: Columns of `tracks`: see `Nodes`.
 COUNT, FIRST, KNOWN, BEGIN_NS, NONLINEAR = range(5)
 #: Columns of `labels`.
@@ -44,6 +48,32 @@ BLOCKS = "float64[:, :, :, ::1]"
 NODES = f"Tuple(({'int64[:, ::1], ' * 4}{MATRICES}, {MATRICES}, {BLOCKS}, {MATRICES}))"
 Arrays = tuple[IntArray, IntArray, IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]
 """See `Nodes.arrays`."""
+
+
+@inlined
+def check_nodes(tracks: IntArray, nodes: Arrays, spare: int) -> None:
+    """Raise `IndexError` for tracks, or numbers of nodes, beyond the ends of the arrays.
+    With `spare` 1 each of the tracks needs the number of another node.
+    """
+    info, all_ns, numbers, labels, backs, points, blocks, rows = nodes
+    size, n = len(labels), points.shape[2]
+    check_rows(tracks, 0, len(info))
+    check(len(all_ns) == len(info) and len(numbers) == len(info) and all_ns.shape[1] == numbers.shape[1])
+    check(len(backs) == size and len(points) == size and len(blocks) == size and len(rows) == size)
+    check(backs.shape[1] == n + 1 and backs.shape[2] == n + 1 and blocks.shape[2] == n and blocks.shape[3] == n + 1)
+    check(rows.shape[2] == n + 1)
+    for t in range(len(tracks)):
+        own = info[tracks[t]]
+        check(0 <= own[FIRST] < own[COUNT] <= all_ns.shape[1] - spare and 0 <= own[KNOWN] <= own[COUNT])
+        check_rows(numbers[tracks[t], : own[COUNT] + spare], 0, size)
+
+
+@inlined
+def check_indices(indices: IntArray, tracks: IntArray, nodes: Arrays) -> None:
+    """Raise `IndexError` for one of the `indices` of nodes, one of each of `tracks`, that the track does not have."""
+    check(len(indices) >= len(tracks))
+    for t in range(len(tracks)):
+        check_rows(indices[t : t + 1], 0, nodes[0][tracks[t], COUNT])
 
 
 @inlined
@@ -145,6 +175,11 @@ def solve_windows(tracks: IntArray, starts: IntArray, anchors: IntArray, is_part
     """
     info, _, numbers, labels, backs, points, blocks, rows = nodes
     n = points.shape[2]
+    check_nodes(tracks, nodes, 0)
+    check_indices(anchors, tracks, nodes)
+    check(len(starts) >= len(tracks))
+    for t in range(len(tracks)):
+        check(starts[t] >= 0)
     A, E, D, work, gain = scratch(n, n), scratch(n, n), scratch(n, n), scratch(n, n), scratch(n)
     for t in range(len(tracks)):
         of, track, count = numbers[tracks[t]], tracks[t], info[tracks[t], COUNT]
@@ -190,9 +225,12 @@ def locate(
     """
     info, all_ns, _, _, _, _, _, _ = nodes
     num_between = 0
+    check_nodes(tracks, nodes, 0)
+    check(min(len(stamps_ns), len(indices), len(until_s), len(after_s)) >= len(tracks))
     for t in range(len(tracks)):
         of, last = all_ns[tracks[t]], info[tracks[t], COUNT] - 1
         index = last_before(of, last + 1, stamps_ns[t])
+        check(index >= 0)
         until_s[t], after_s[t] = (stamps_ns[t] - of[index]) / NS_PER_S, 0.0
         if until_s[t] > 0.0 and index < last:
             index += 1
@@ -209,9 +247,13 @@ def smooth(tracks: IntArray, indices: IntArray, after_s: FloatArray, nodes: Arra
     """
     info, _, numbers, _, backs, points, blocks, _ = nodes
     n = points.shape[2]
+    check_nodes(tracks, nodes, 0)
+    check_indices(indices, tracks, nodes)
+    check(min(len(after_s), len(means)) >= len(tracks) and means.shape[1] == n)
     work = scratch(n, n)
     for t in range(len(tracks)):
         track = tracks[t]
+        check(indices[t] > 0 or not after_s[t] > 0.0)
         for index in range(info[track, KNOWN] - 1, indices[t] - 1, -1):
             at = numbers[track, index]
             if index == info[track, COUNT] - 1:
@@ -307,9 +349,15 @@ def arrive(
     """
     _, _, numbers, _, backs, points, blocks, _ = nodes
     n = mean.shape[1]
+    check_nodes(tracks, nodes, 0)
+    check_indices(indices, tracks, nodes)
+    check(len(mean) <= min(len(tracks), len(after_s), len(F1), len(Q1), len(ahead), len(F2), len(Q2)))
+    check(n == points.shape[2] and ahead.shape[1] == n and F1.shape[1:] == (n, n) and Q1.shape[1:] == (n, n))
+    check(F2.shape[1:] == (n, n) and Q2.shape[1:] == (n, n))
     work = scratch(7, n, n)
     for t in range(len(mean)):
         at = numbers[tracks[t], indices[t]]
+        check(indices[t] > 0 or not after_s[t] > 0.0)
         if after_s[t] > 0.0:
             before = numbers[tracks[t], indices[t] - 1]
             if not _interpolate(points, blocks, backs, before, at, mean[t], F1[t], Q1[t], ahead[t], F2[t], Q2[t], work):

@@ -1,6 +1,6 @@
 """Compiled loops that insert, move, linearise and forget nodes; `nodes` are the `arrays` of `Nodes`, in that order."""
 
-from fgtrack.core.compiled import cholesky, copy, forward, merged, njit, scratch, shared
+from fgtrack.core.compiled import check, check_rows, cholesky, copy, forward, merged, njit, scratch, shared
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.smoothing.kernels import (
@@ -24,6 +24,8 @@ from fgtrack.estimation.smoothing.kernels import (
     Arrays,
     F,
     Q,
+    check_indices,
+    check_nodes,
     last_before,
     regularise,
 )
@@ -65,6 +67,8 @@ def windows(tracks: IntArray, clock_ns: int, lag_ns: int, behind_ns: int, nodes:
     """
     info, all_ns, _, _, _, _, _, _ = nodes
     most = 0
+    check_nodes(tracks, nodes, 0)
+    check(len(out) >= 4 and out.shape[1] >= len(tracks) and all_ns.shape[1] >= _MANY)
     for t in range(len(tracks)):
         track = tracks[t]
         newest_ns, begin_ns = (all_ns[track, info[track, COUNT] - 1], info[track, BEGIN_NS])
@@ -132,6 +136,11 @@ def move_far(
     track: int, anchor: int, start: int, thresholds: FloatArray, nodes: Arrays, moves: bool, indices: IntArray
 ) -> int:
     """See `_move_far`."""
+    info, _, _, _, _, points, _, _ = nodes
+    check(0 <= track < len(info) and thresholds.shape[1] == points.shape[2] and len(thresholds) >= 3)
+    check(0 <= info[track, NONLINEAR] < len(thresholds))
+    check(0 <= info[track, FIRST] < info[track, COUNT] <= nodes[2].shape[1])
+    check_rows(nodes[2][track, : info[track, COUNT]], 0, len(nodes[3]))
     return _move_far(track, anchor, start, thresholds, nodes, moves, indices)
 
 
@@ -193,8 +202,15 @@ def place(
     elimination must start and, with nodes inserted behind them, where windows begin, 1 if the measurement is older, and
     where the window has begun, and space; and the time from the node to the measurement. Returns flags.
     """
-    info, all_ns, numbers, labels, _, _, _, rows = nodes
-    k, flags = y.shape[1], 0
+    info, all_ns, numbers, labels, _, points, _, rows = nodes
+    m, n, k, flags = len(tracks), points.shape[2], y.shape[1], 0
+    check_nodes(tracks, nodes, 1)
+    check_indices(anchors, tracks, nodes)
+    check(min(len(y), len(R), len(means), len(ahead_s)) >= m and (len(H) == 1 or len(H) >= m))
+    check(H.shape[1] == k and H.shape[2] == n and R.shape[1] == k and R.shape[2] == k and means.shape[1] == n)
+    check(len(out) >= 8 and out.shape[1] >= m and thresholds.shape[1] == n)
+    for t in range(m):
+        check(0 <= info[tracks[t], NONLINEAR] < len(thresholds))
     L = scratch(k, k)
     for t in range(len(tracks)):
         track = tracks[t]
@@ -223,6 +239,8 @@ def linearise_motion(kind: int, density: FloatArray, tracks: IntArray, starts: I
     """Linearise the motion from nodes that are stale, the one before `starts` and later ones, to the next ones."""
     info, all_ns, numbers, labels, _, points, blocks, _ = nodes
     n = points.shape[2]
+    check_nodes(tracks, nodes, 0)
+    check(len(starts) >= len(tracks) and len(density) >= n)
     mean = scratch(n)
     for t in range(len(tracks)):
         track = tracks[t]
@@ -250,7 +268,11 @@ def changed_factors(track: int, start: int, nodes: Arrays, owners: IntArray, fac
     info, _, numbers, labels, _, points, blocks, rows = nodes
     n, num = points.shape[2], 0
     L, noise, moved = scratch(n, n), scratch(n, n), scratch(n)
+    check(0 <= track < len(info) and 0 <= start <= info[track, COUNT] <= numbers.shape[1])
+    check_rows(numbers[track, : info[track, COUNT]], 0, len(labels))
     last = info[track, COUNT] - 1
+    check(min(len(owners), len(factors)) >= last + 1 - start and owners.shape[1] >= 3)
+    check(factors.shape[1] >= n + rows.shape[1] and factors.shape[2] >= 2 * n + 1)
     for index in range(start, last + 1):
         left, right = (numbers[track, index], -1 if index == last else numbers[track, index + 1])
         used, size = (labels[left, NUM_ROWS], labels[left, NUM_ROWS] + (0 if index == last else n))

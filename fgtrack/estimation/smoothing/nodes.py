@@ -2,7 +2,8 @@
 
 Each track has a row of nodes in the order of their stamps; the values of a node are kept under its number, which stays
 the same as long as the node exists, so that an insertion moves no values. The first nodes of a row have left the window
-and are kept for detections that are older.
+and are kept for detections that are older. A row takes a number when it needs one, and keeps it: memory follows the
+nodes that exist, and not the longest window times the number of tracks.
 """
 
 from typing import Any
@@ -18,7 +19,9 @@ from fgtrack.estimation.smoothing.kernels import (
     COUNT,
     FILTERED,
     FIRST,
+    KNOWN,
     NEVER,
+    NONE,
     ORIGIN,
     PREDICTED,
     REFERENCE,
@@ -32,22 +35,23 @@ from fgtrack.estimation.smoothing.terms import MeasurementFactor, whitened
 from fgtrack.models.motion import MotionModel, WhiteNoise
 from fgtrack.models.transitions import transitions
 
-_FEW_TRACKS, _FEW_NODES, _FEW_COMPONENTS = 4, 256, 4  # nodes of some seconds: growing copies, unused pages are not made
+_FEW_TRACKS, _FEW_NODES, _FEW_VALUES, _FEW_COMPONENTS = 4, 64, 256, 4
 
 
 class Nodes:
     """Arrays of tracks (tracks, ...), with the order of the nodes, and of numbers (size, ...), with their values."""
 
     def __init__(self, motion: MotionModel) -> None:
-        self._motion, n, size = motion, motion.dim, _FEW_TRACKS * _FEW_NODES
+        self._motion, n, size = motion, motion.dim, _FEW_VALUES
         self._compiled = motion if isinstance(motion, WhiteNoise) and motion.is_compiled else None
         self.tracks: IntArray = np.zeros((_FEW_TRACKS, 5), dtype=np.int64)
         """Number of nodes; index of the oldest one of the window; index from which on `P` is known; stamp of the first
         state; 1 if there was a measurement that is not linear."""
         self.stamps_ns: IntArray = np.full((_FEW_TRACKS, _FEW_NODES), NEVER)
         """Shape (tracks, nodes); `NEVER` where there is no node."""
-        self.numbers = np.arange(size).reshape(_FEW_TRACKS, _FEW_NODES)
-        """Shape (tracks, nodes); those beyond the number of nodes are free."""
+        self.numbers: IntArray = np.full((_FEW_TRACKS, _FEW_NODES), NONE)
+        """Shape (tracks, nodes); those beyond the number of nodes are free, `NONE` where the row has no number yet."""
+        self._num_numbers = 0  # that rows have
         self.labels: IntArray = np.zeros((size, 3), dtype=np.int64)
         """Number of `rows` in use; 1 if something was linearised since a factor graph read it; 1 if the motion to the
         next node must be linearised."""
@@ -97,6 +101,8 @@ class Nodes:
         """Make the first node of a new track."""
         while track >= len(self.tracks):
             self._grow(axis=0)
+        if self.numbers[track, 0] == NONE:
+            self._take_numbers(np.array([track]), np.array([0]))
         self.stamps_ns[track] = NEVER
         self.stamps_ns[track, 0] = stamp_ns
         self.tracks[track] = 1, 0, 0, stamp_ns, 0
@@ -106,36 +112,42 @@ class Nodes:
         self.predicted[number] = self.filtered[number] = np.column_stack([covariance, np.zeros(len(mean))])
 
     def note(self, stack: Measurements, numbers: IntArray, is_new: IntArray, ahead_s: FloatArray) -> None:
-        """Keep a stack of measurements, one for each of the nodes `numbers`."""
+        """Keep a stack of measurements, one for each of the nodes `numbers`: all or none."""
+        kept = dict[int, list[tuple[Measurements, int, float]]]()
         rows = zip(numbers.tolist(), is_new.tolist(), range(len(numbers)), ahead_s.tolist(), strict=True)
         for number, new, *factor in rows:
-            kept = [] if new else self._factors[number]
-            self._factors[number] = [*kept, (stack, *factor)]
+            kept[number] = [*([] if new else self._factors[number]), (stack, *factor)]
+        self._factors.update(kept)
 
-    def withdraw(self, track: int, index: int, is_new: bool) -> None:
-        """Take the last measurement of a node out, and the node, if it `is_new`."""
+    def withdraw(self, track: int, index: int, *, is_new: bool, is_noted: bool) -> None:
+        """Take the last measurement of a node out, if it `is_noted`, and the node, if it `is_new`."""
         number, last = self.numbers[track, index], self.count[track] - 1
-        self._factors[int(number)].pop()
+        if is_noted:
+            self._factors[int(number)].pop()
         if is_new:
             for each, free in ((self.stamps_ns[track], NEVER), (self.numbers[track], number)):
                 each[index:last] = each[index + 1 : last + 1]
                 each[last] = free
             self.count[track] = last
+        self.tracks[track, KNOWN] = self.count[track]
 
     def windows(self, tracks: IntArray, *limits_ns: int) -> IntArray:
         """Return `node_kernels.windows` of `tracks`, shape (4, m), with room for another node in each."""
         out = np.empty((4, len(tracks)), dtype=np.int64)
         if node_kernels.windows(tracks, *limits_ns, self.arrays, out) >= self.stamps_ns.shape[1]:
             self._grow(axis=1)
+        counts = self.count[tracks]
+        lacking = self.numbers[tracks, counts] == NONE
+        if lacking.any():
+            self._take_numbers(tracks[lacking], counts[lacking])
         return out
 
     def linearise_factors(self, number: int) -> None:
         """Linearise all measurements of a node at its linearisation point."""
         rows = [whitened(factor, self.origin[number], self._motion) for factor in self.factors(number)]
         used = sum(map(len, rows))
-        while used > self.rows.shape[1]:
-            self.rows = np.concatenate([self.rows, np.zeros_like(self.rows)], axis=1)
-            self._share()
+        if used > self.rows.shape[1]:
+            self._resize(len(self.labels), used)
         self.labels[number, :2] = used, 1
         if used:
             self.rows[number, :used] = np.concatenate(rows)
@@ -144,7 +156,8 @@ class Nodes:
         """Linearise the motion of stale nodes from the one before `starts` on, and if `is_nonlinear` measurements."""
         compiled = self._compiled
         if is_nonlinear or compiled is None:
-            rows, indices = np.nonzero(self.labels[self.numbers[tracks], STALE])
+            is_node = np.arange(self.numbers.shape[1]) < self.count[tracks, None]
+            rows, indices = np.nonzero(is_node & (self.labels[self.numbers[tracks], STALE] > 0))
             rows = tracks[rows]
             stale = self.numbers[rows, indices]
             for number in stale.tolist() if is_nonlinear else ():
@@ -169,15 +182,36 @@ class Nodes:
         return result
 
     def _grow(self, axis: int) -> None:
-        """Double the tracks, or the nodes of each; a node keeps its number and, if it is of a track, its values."""
-        used = self.numbers[np.arange(self.numbers.shape[1]) < self.count[:, None]]
-        self.stamps_ns = np.concatenate([self.stamps_ns, np.full_like(self.stamps_ns, NEVER)], axis=axis)
-        self.numbers = np.concatenate([self.numbers, self.numbers.size + self.numbers], axis=axis)
-        for name in ("labels", "backs", "points", "blocks", "rows"):
-            values = getattr(self, name)
-            larger = np.zeros((self.numbers.size, *values.shape[1:]), values.dtype)  # only pages of used ones are made
-            larger[used] = values[used]
-            setattr(self, name, larger)
-        if axis == 0:
-            self.tracks = np.concatenate([self.tracks, np.zeros_like(self.tracks)])
+        """Double the tracks, or the nodes of each. All is allocated before anything changes, as in other growth."""
+        shape = [*self.stamps_ns.shape]
+        shape[axis] *= 2
+        stamps_ns, numbers = np.full(shape, NEVER), np.full(shape, NONE)
+        tracks = np.zeros((shape[0], self.tracks.shape[1]), dtype=np.int64)
+        rows, columns = self.stamps_ns.shape
+        stamps_ns[:rows, :columns], numbers[:rows, :columns], tracks[:rows] = self.stamps_ns, self.numbers, self.tracks
+        self.stamps_ns, self.numbers, self.tracks = stamps_ns, numbers, tracks
+        self._share()
+
+    def _take_numbers(self, tracks: IntArray, indices: IntArray) -> None:
+        """Give each of `tracks` (m,) a number for another node, at the index where it has none yet."""
+        first, end = self._num_numbers, self._num_numbers + len(tracks)
+        if end > len(self.labels):
+            self._resize(max(end, 2 * len(self.labels)), self.rows.shape[1])
+        self.numbers[tracks, indices], self._num_numbers = np.arange(first, end), end
+
+    def _resize(self, size: int, num_rows: int) -> None:
+        """Make room for the values of `size` numbers, with at least `num_rows` rows of measurements each."""
+        used, width = self._num_numbers, self.rows.shape[1]
+        while width < num_rows:
+            width *= 2
+        names, larger = ("labels", "backs", "points", "blocks", "rows"), []
+        for name in names:
+            values: Any = getattr(self, name)  # Any: of integers or numbers
+            shape = size, *values.shape[1:]
+            if name == "rows":
+                shape = size, width, values.shape[2]
+            larger.append(np.zeros(shape, values.dtype))  # only pages of used numbers are made
+            larger[-1][:used, : values.shape[1]] = values[:used]
+        for name, values in zip(names, larger, strict=True):
+            setattr(self, name, values)
         self._share()

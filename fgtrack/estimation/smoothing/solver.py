@@ -1,5 +1,6 @@
 """The windows of all tracks: measurements inserted, relinearised where a state moved, solved, and read at any stamp."""
 
+from collections.abc import Collection
 from typing import ClassVar
 
 import numpy as np
@@ -25,6 +26,14 @@ _LEAST_SHARE, _ROUNDING = 1e-6, 1e-9
 _ROBUST, _ROBUST_SHARE, _ROBUST_STEPS = 2, 0.1, 3
 Leaving = tuple[IntArray, list[int], FloatArray, FloatArray]
 """Tracks, stamps, means (m, n) and covariances (m, n, n) of nodes that leave, oldest first for each track."""
+
+
+class NotFusedError(Exception):
+    """Measurements could not be fused. All states are as before, but those of `lost` tracks are unknown."""
+
+    def __init__(self, cause: Exception, lost: Collection[int] = ()) -> None:
+        super().__init__(f"not fused ({cause})")
+        self.cause, self.lost = cause, frozenset(lost)
 
 
 class Solver:
@@ -124,18 +133,22 @@ class Solver:
 
         Their innovations at `guesses`, the states (m, n) at their stamp, are `y` (m, k), with Jacobians `H`, (1, k, n)
         or (m, k, n), and covariances `R` (m, k, k). A measurement that is older changes the prior of its window.
-        Returns the smoothed states of the nodes that left, if wanted. Raises `numpy.linalg.LinAlgError` if it fails;
-        states are as before then.
+        Returns the smoothed states of the nodes that left, if wanted. Raises `NotFusedError` where a step raises.
         """
         nodes, stamp_ns = self.nodes, stack.stamp_ns
-        guesses = self._marked_nonlinear(tracks, stack, guesses) if stack.is_nonlinear else guesses
         ahead_s, out = np.empty(len(tracks)), np.empty((8, len(tracks)), dtype=np.int64)
-        leaving = self._leaving(tracks, anchors) if self._has_final else None
+        try:
+            guesses = self._marked_nonlinear(tracks, stack, guesses) if stack.is_nonlinear else guesses
+            leaving = self._leaving(tracks, anchors) if self._has_final else None
+        except Exception as error:
+            raise NotFusedError(error, self._not_restored(tracks)) from error
         given = (tracks, stamp_ns, y, H, R, guesses, not stack.is_nonlinear, self._thresholds, anchors)
         flags = node_kernels.place(*given, nodes.arrays, out, ahead_s)
-        numbers, _, is_new, starts, anchors, is_behind, _, _ = out
-        nodes.note(Measurements(stack), numbers, is_new, ahead_s)
+        numbers, indices, is_new, starts, anchors, is_behind, _, _ = out
+        is_noted = False
         try:
+            nodes.note(Measurements(stack), numbers, is_new, ahead_s)
+            is_noted = True
             if flags & NOT_DEFINITE:
                 raise np.linalg.LinAlgError("a covariance is not positive definite")
             nodes.linearise(tracks, starts, self._is_nonlinear or bool(flags & NOT_PLAIN))
@@ -144,13 +157,26 @@ class Solver:
                 self._refilter(tracks[rows], starts[rows], anchors[rows])
                 starts[rows] = anchors[rows]
             self.solve(tracks, starts, anchors)
-        except np.linalg.LinAlgError:
+        except Exception as error:
             nodes.first[tracks] = out[6]
-            for track, index, new in zip(tracks.tolist(), out[1].tolist(), is_new.tolist(), strict=True):
-                nodes.withdraw(track, index, bool(new))
-                self.relinearise(track, start=index - new)
-            raise
+            for track, index, new in zip(tracks.tolist(), indices.tolist(), is_new.tolist(), strict=True):
+                nodes.withdraw(track, index, is_new=bool(new), is_noted=is_noted)
+            raise NotFusedError(error, self._not_restored(tracks, indices - is_new)) from error
         return leaving
+
+    def _not_restored(self, tracks: IntArray, starts: IntArray | None = None) -> list[int]:
+        """Solve windows without a measurement that was withdrawn, see `relinearise`; return those that raise.
+        A window that cannot be solved without it either keeps its last states.
+        """
+        lost = list[int]()
+        for row, track in enumerate(tracks.tolist()):
+            try:
+                self.relinearise(track, start=NEVER if starts is None else int(starts[row]))
+            except np.linalg.LinAlgError:
+                pass
+            except Exception:
+                lost.append(track)
+        return lost
 
     def _refilter(self, tracks: IntArray, starts: IntArray, anchors: IntArray) -> None:
         """Filter from `starts`, which lie behind the windows, up to `anchors`, where these begin: with other priors."""
