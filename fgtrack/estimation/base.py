@@ -2,7 +2,7 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from functools import cache
@@ -269,6 +269,13 @@ class StatesAt:
         """Return the state of one track; of no track where it has none."""
         rows = [row for row, each in enumerate(self.track_ids) if each == track_id]
         return StatesAt((track_id,) * len(rows), self.means[rows], self.covariances[rows])
+
+    def without(self, track_ids: Collection[int]) -> "StatesAt":
+        """Return the states of all tracks but these; itself where no state is left out."""
+        rows = [row for row, each in enumerate(self.track_ids) if each not in track_ids]
+        if len(rows) == len(self.track_ids):
+            return self
+        return StatesAt(tuple([self.track_ids[row] for row in rows]), self.means[rows], self.covariances[rows])
 
 
 @runtime_checkable

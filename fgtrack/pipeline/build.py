@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from fgtrack.core.diagnostic import EGO
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import period_ns, seconds
 from fgtrack.estimation.base import Estimator, Start, TrackBank
@@ -27,6 +28,7 @@ from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules, Lifec
 from fgtrack.tracking.facing import Facing
 from fgtrack.tracking.guarded_bank import GuardedBank
 from fgtrack.tracking.inbox import Inbox
+from fgtrack.tracking.latency import Watermarks
 from fgtrack.tracking.lifecycle import CountingLifecycle
 from fgtrack.tracking.preprocess import Preprocess
 from fgtrack.tracking.published import PublishedEgo, PublishedLifecycle, PublishedTracker, SlotInbox
@@ -59,6 +61,7 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
         birth=config.birth,
         facing=Facing(motion.cartesian) if config.association.reads_yaws else None,
         road=road,
+        watermarks=Watermarks(config.sensors, [EGO]),
     )
     return (PublishedTracker if published_order else Tracker)(parts if observed is None else observed(parts))
 
@@ -68,7 +71,8 @@ def build_lifecycle(config: Config) -> Lifecycle:
     rules = config.lifecycle
     if isinstance(rules, ExistenceRules):
         return ExistenceLifecycle(rules, config.sensors, config.ego.detection_origin_m)
-    return (PublishedLifecycle if rules.kind == "published" else CountingLifecycle)(rules, config.sensors)
+    kind = PublishedLifecycle if rules.kind == "published" else CountingLifecycle
+    return kind(rules, config.sensors, config.ego.detection_origin_m)
 
 
 def build_road(config: MapConfig, defects: Collection[Defect] = ()) -> Road:

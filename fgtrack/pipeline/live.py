@@ -30,13 +30,10 @@ from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import corrected
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.shipped import read_config
+from fgtrack.tracking.latency import NEWEST
 
 __all__ = ["Lateness", "TickTiming", "Tracker"]
 
-#: Name of the ego among the sensors of `Tracker.lateness`.
-EGO = "ego"
-#: Number of newest durations of which quantiles are calculated.
-NEWEST = 1000
 #: Number of sensors without a model that are counted by name; all further ones are counted as `OTHERS`.
 MOST_UNKNOWN = 100
 OTHERS = "other sensors"
@@ -122,9 +119,6 @@ class Tracker:
         self._last = TickReport(-1, 0, (), ())
         self._first_tick_ns = 0
         self._arrivals: deque[EgoState | DetectionList] = deque()
-        self._messages: Counter[str] = Counter()
-        self._receipts_ns: dict[str, int] = {}
-        self._delays_ns: dict[str, deque[int]] = {name: deque(maxlen=NEWEST) for name in (*config.sensors, EGO)}
         self._ticks_ns: deque[int] = deque(maxlen=NEWEST)
         self._node = Node(None if config.clock.node_hz is None else period_ns(config.clock.node_hz))
         self._skipped = 0
@@ -179,9 +173,10 @@ class Tracker:
         with self._turn:
             self._take_arrivals()
             result = {}
-            for name, newest_ns in self._delays_ns.items():
-                silent_s = seconds(self._last.now_ns - self._receipts_ns.get(name, self._first_tick_ns))
-                result[name] = Lateness(self._messages[name], *_spread_s(newest_ns), max(silent_s, 0.0))
+            for name, one in self._tracker.delays.items():
+                since_ns = self._first_tick_ns if one.newest_receipt_ns is None else one.newest_receipt_ns
+                silent_s = max(seconds(self._last.now_ns - since_ns), 0.0)
+                result[name] = Lateness(one.messages, *_spread_s(one.newest_ns), silent_s)
             return result
 
     @property
@@ -224,7 +219,6 @@ class Tracker:
         for what in ("stamp_ns", "receipt_ns"):
             if not 0 <= getattr(message, what) <= LARGEST_NS:
                 raise InvalidMessageError(f"{what}: nanoseconds since 1970 expected")
-        name = EGO
         if isinstance(message, DetectionList):
             name = message.sensor
             if name not in self.config.sensors:
@@ -233,9 +227,6 @@ class Tracker:
                 return
             objects = tuple(map(self._usable, message.objects))
             message = corrected(replace(message, objects=objects), self.config.sensors)
-        self._messages[name] += 1
-        self._delays_ns[name].append(message.receipt_ns - message.stamp_ns)
-        self._receipts_ns[name] = max(message.receipt_ns, self._receipts_ns.get(name, 0))
         self._tracker.receive(message)
 
     def _counted(self, sensor: str) -> str:

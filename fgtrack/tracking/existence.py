@@ -6,12 +6,18 @@ probability v changes the odds r / (1 - r) of its existence by the factor 1 - v 
     l = 1 - P_D + P_D L,   L = N(z - h(x); 0, S) / clutter density * p(score | object) / p(score | clutter)
 
 and where it was missed with l = 1 - P_D; see `fgtrack.tracking.visibility` for v, which falls with misses in a row, so
-that a sensor which does not see an object does not end what another sees. Approximate are: L is that of the one
-detection which the assignment gives (the probabilities of other assignments are left out), of its position alone, and
-as it was when the detection arrived. Each list counts at its stamp, whatever the order of arrival within `memory_s`.
+that a sensor which does not see an object does not end what another sees. A track ends at the stamp of a list, by the
+lists up to that stamp, once the lists of all sensors that could show its object have come up to there, or should have
+come: see `fgtrack.tracking.latency`. Until then a track that has become improbable is suspended: it is not published,
+and newer lists are not compared with it.
+
+Approximate are: L is that of the one detection which the assignment gives (the probabilities of other assignments are
+left out), of its position alone, and as it was when the detection arrived. Each list counts at its stamp, whatever the
+order of arrival within `memory_s`.
 """
 
 import math
+from bisect import bisect_right, insort
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import compress
 from typing import Literal, NamedTuple
@@ -26,18 +32,26 @@ from fgtrack.core.types import BoolArray, FloatArray, IntArray, TrackStatus
 from fgtrack.estimation.base import StatesAt
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Assignment, Pairs, assigned, near
+from fgtrack.tracking.latency import FOREVER, NEVER, Views, decided_ns
 from fgtrack.tracking.lifecycle import CountingLifecycle, Scan
 from fgtrack.tracking.preprocess import Candidate, Candidates
 from fgtrack.tracking.visibility import Histories
 
-_LIFE = np.dtype(
-    [
-        *[("confirmed", "?"), ("travelled", "?"), ("first_m", "2f8"), ("misses", "i8")],
-        *[("in_view_ns", "i8"), ("visible_ns", "i8")],
-    ]
-)
-"""True if it was ever confirmed, or as far from its first position as it must be; misses since the last match, and
-the newest stamps at which it was in view and probably visible."""
+
+def _life(num_sensors: int) -> np.dtype[np.void]:
+    """Return what is known of one track.
+
+    True if it was ever confirmed, or as far from its first position as it must be; misses since the last match, and
+    the newest stamps at which it was in view and probably visible. Then by sensor: true if the sensor could show it at
+    the newest stamp `judged_ns` for which that is known, and the newest stamp at which the sensor could.
+    """
+    return np.dtype(
+        [
+            *[("confirmed", "?"), ("travelled", "?"), ("first_m", "2f8"), ("misses", "i8")],
+            *[("in_view_ns", "i8"), ("visible_ns", "i8"), ("judged_ns", "i8")],
+            *[("could_show", "?", (num_sensors,)), ("expected_ns", "i8", (num_sensors,))],
+        ]
+    )
 
 
 class _Matches(NamedTuple):
@@ -112,15 +126,18 @@ class ExistenceLifecycle:
         self.weighs_births = rules.weigh_births
         self._sensors = sensors
         self._index = {name: index for index, name in enumerate(sensors)}
-        self._origin_m = detection_origin_m
+        self._views = Views(sensors, detection_origin_m)
         self._memory_ns = nanoseconds(rules.memory_s)
         self._out_of_view_ns = nanoseconds(rules.out_of_view_s)
         self._hidden_ns = nanoseconds(rules.hidden_s)
         self._present_ns = 0
-        self._newest_ns = 0  # stamp of the newest list that could have shown something
+        self._watermarks_ns = np.full(len(sensors), FOREVER)
+        self._processed_ns = FOREVER  # all lists before it that have come are processed
+        self._scans_ns: list[int] = []  # stamps of lists that could have shown something, ascending
+        self._suspended: tuple[int, ...] = ()
         self._histories = Histories(len(sensors), rules.lifetime_s, rules.visible_share, rules.visible_s)
         self._rows: dict[int, int] = {}  # of the arrays, by track id in order of birth
-        self._lives = np.zeros(0, dtype=_LIFE)
+        self._lives = np.zeros(0, dtype=_life(len(sensors)))
         self._matches: list[_Matches] = []  # that are not in the histories yet
         own = sensors.values()
         self._P_D = np.array([each.detection_probability for each in own])
@@ -133,10 +150,15 @@ class ExistenceLifecycle:
         log_odds = math.log(odds) + self._score(scan, (candidate.leader, *candidate.merged))
         row = self._rows[track_id] = self._histories.begin(scan.stamp_ns, self._index[scan.sensor], log_odds)
         if len(self._lives) <= row:
-            self._lives = np.concatenate([self._lives, np.zeros(len(self._histories.counts) - len(self._lives), _LIFE)])
+            more = np.zeros(len(self._histories.counts) - len(self._lives), self._lives.dtype)
+            self._lives = np.concatenate([self._lives, more])
         self._reports = None
-        self._lives[row] = False, self._rules.min_travel_m == 0.0, candidate.position_m, 0, scan.stamp_ns, scan.stamp_ns
-        self._confirm(np.array([row]), self._histories.present(np.array([row]), self._present_ns))
+        could_show = self._views.at_birth(candidate.position_m, scan.ego, self._index[scan.sensor])
+        stamps_ns = (scan.stamp_ns,) * 3
+        expected_ns = np.where(could_show, scan.stamp_ns, NEVER)
+        has_travelled = self._rules.min_travel_m == 0.0
+        self._lives[row] = False, has_travelled, candidate.position_m, 0, *stamps_ns, could_show, expected_ns
+        self._confirm(np.array([row]), self._histories.present(np.array([row]), scan.stamp_ns))
 
     def matched(self, scan: Scan, candidates: Candidates, pairs: Sequence[tuple[int, int]], states: StatesAt) -> None:
         """See `CountingLifecycle.matched`."""
@@ -163,6 +185,7 @@ class ExistenceLifecycle:
         scores, points_m, means_m, P, R = map(np.concatenate, others)
         self._matches = []
         self._lives["misses"][rows] = 0
+        self._lives["could_show"][rows, sensors] = True
         travelled_m = np.hypot(*(means_m - self._lives["first_m"][rows]).T)
         self._lives["travelled"][rows[travelled_m >= self._rules.min_travel_m]] = True
         density, P_D = densities(points_m - means_m, P, R), self._P_D[sensors]
@@ -177,26 +200,42 @@ class ExistenceLifecycle:
     def missed(self, scan: Scan, track_ids: Sequence[int], positions_m: FloatArray, ranges_m: FloatArray) -> list[int]:
         """See `CountingLifecycle.missed`."""
         self._settle()
-        sensor, rows = self._sensors[scan.sensor], self._rows_of(track_ids)
-        self._newest_ns = max(self._newest_ns, scan.stamp_ns)
-        ratios = np.full(len(rows), 1.0 - sensor.detection_probability)
-        if scan.ego is not None:
-            poses = np.broadcast_to([scan.ego.x_m, scan.ego.y_m, scan.ego.yaw_rad], (len(rows), 3))
-            ratios[~sensor.sees(positions_m, poses, self._origin_m)] = np.nan
+        sensor, rows, own = self._sensors[scan.sensor], self._rows_of(track_ids), self._index[scan.sensor]
+        insort(self._scans_ns, scan.stamp_ns)
+        could_show = self._views.of(positions_m, scan.ego)
+        newest = scan.stamp_ns >= self._lives["judged_ns"][rows]
+        self._lives["could_show"][rows[newest]] = could_show[newest]
+        self._lives["judged_ns"][rows[newest]] = scan.stamp_ns
+        expected_ns = np.where(could_show, scan.stamp_ns, NEVER)
+        self._lives["expected_ns"][rows] = np.maximum(self._lives["expected_ns"][rows], expected_ns)
+        ratios = np.where(could_show[:, own], 1.0 - sensor.detection_probability, np.nan)
         self._lives["misses"][rows] += ~np.isnan(ratios)
-        stamps_ns, sensors = np.full(len(rows), scan.stamp_ns), np.full(len(rows), self._index[scan.sensor])
+        stamps_ns, sensors = np.full(len(rows), scan.stamp_ns), np.full(len(rows), own)
         self._learn(rows, stamps_ns, sensors, ratios)
+        self._processed_ns = scan.stamp_ns
         return self._ended()
 
-    def expired(self, present_ns: int) -> list[int]:
+    def expired(self, present_ns: int, watermarks_ns: IntArray | None = None, processed_ns: int = FOREVER) -> list[int]:
         """See `CountingLifecycle.expired`."""
         self._settle()
-        self._present_ns, self._reports = present_ns, None
-        self._histories.forget(present_ns - self._memory_ns)
+        self._present_ns, self._processed_ns, self._reports = present_ns, processed_ns, None
+        if watermarks_ns is not None:
+            self._watermarks_ns = watermarks_ns
+        oldest_ns = min([present_ns, *self._watermarks_ns.tolist()])
+        self._histories.forget(oldest_ns - self._memory_ns)
+        del self._scans_ns[: max(bisect_right(self._scans_ns, oldest_ns) - 1, 0)]
         return self._ended()
 
-    def likely(self, name: str, track_ids: Sequence[int], pairs: Pairs) -> BoolArray:
-        """True of `pairs` of positions of a sensor and tracks that exist rather than of clutter or new objects, (m,).
+    def suspended(self, stamp_ns: int | None = None) -> frozenset[int]:
+        """See `CountingLifecycle.suspended`."""
+        if stamp_ns is None or not self._suspended:
+            return frozenset(self._suspended)
+        self._settle()
+        improbable = self._histories.known(self._rows_of(self._suspended), stamp_ns) < self._rules.delete_probability
+        return frozenset(compress(self._suspended, improbable.tolist()))
+
+    def likely(self, name: str, stamp_ns: int, track_ids: Sequence[int], pairs: Pairs) -> BoolArray:
+        """True of `pairs` of positions of a list and tracks that exist rather than of clutter or new objects, (m,).
         That is P_D r N(y; 0, S) > (1 - P_D r) clutter / (1 - birth probability), each pair by itself.
         """
         sensor, rules = self._sensors[name], self._rules
@@ -211,7 +250,7 @@ class ExistenceLifecycle:
         if len(doubtful):
             self._settle()
             rows = self._rows_of(track_ids[column] for column in pairs.columns[doubtful].tolist())
-            likely[doubtful] = pairs.values[doubtful] < most(self._histories.present(rows, self._present_ns))
+            likely[doubtful] = pairs.values[doubtful] < most(self._histories.present(rows, stamp_ns))
         return np.asarray(likely)
 
     def forget(self, track_id: int) -> None:
@@ -220,6 +259,7 @@ class ExistenceLifecycle:
         row = self._rows.pop(track_id, None)
         if row is not None:
             self._histories.end(row)
+        self._suspended = tuple([each for each in self._suspended if each != track_id])
         self._reports = None
 
     def probability(self, track_id: int) -> float:
@@ -232,12 +272,15 @@ class ExistenceLifecycle:
 
     @property
     def _reported(self) -> dict[int, tuple[TrackStatus, float]]:
-        """Status and probability of all tracks, computed together when the first is asked for."""
+        """Status and probability of all tracks, computed together when the first is asked for.
+        The probability is that of now. The status follows from what is known: a late sensor leaves its tracks no doubt.
+        """
         if self._reports is None:
             self._settle()
             rows = self._rows_of(self._rows)
             lives, exists = self._lives[rows], self._histories.present(rows, self._present_ns)
-            published = lives["confirmed"] & (exists >= self._rules.doubt_probability)
+            known = self._histories.present(rows, self._known_ns(rows))
+            published = lives["confirmed"] & (known >= self._rules.doubt_probability)
             statuses = [
                 TrackStatus.TENTATIVE if not row[0] else TrackStatus.COASTING if row[1] else TrackStatus.CONFIRMED
                 for row in zip(published.tolist(), lives["misses"].tolist(), strict=True)
@@ -249,25 +292,48 @@ class ExistenceLifecycle:
         return np.array([self._rows[track_id] for track_id in track_ids], dtype=np.int64)
 
     def _learn(self, rows: IntArray, stamps_ns: IntArray, sensors: IntArray, ratios: FloatArray) -> FloatArray:
-        """Add evidence to the histories, `ratios` NaN out of view; returns existence after each, shapes (m,)."""
+        """Add evidence to the histories, `ratios` NaN out of view; returns existence, see `Histories.learn`, (m,)."""
         self._reports = None
-        visible, exists = self._histories.learn(rows, stamps_ns, sensors, ratios, self._present_ns)
-        for name, chosen in (("in_view_ns", ~np.isnan(ratios)), ("visible_ns", visible >= 0.5)):
+        visible, exists = self._histories.learn(rows, stamps_ns, sensors, ratios)
+        in_view = ~np.isnan(ratios)
+        for name, chosen in (("in_view_ns", in_view), ("visible_ns", visible >= 0.5)):
             np.maximum.at(self._lives[name], rows[chosen], stamps_ns[chosen])
+        np.maximum.at(self._lives["expected_ns"], (rows[in_view], sensors[in_view]), stamps_ns[in_view])
         return exists
 
     def _confirm(self, rows: IntArray, exists: FloatArray) -> None:
         probable = rows[exists >= self._rules.confirm_probability]
         self._lives["confirmed"][probable] |= self._lives["travelled"][probable]
 
+    def _decided_ns(self, rows: IntArray) -> IntArray:
+        """Stamps up to which all lists that could show the objects have come and are processed, (m,)."""
+        lives, watermarks_ns = self._lives[rows], np.minimum(self._watermarks_ns, self._processed_ns)
+        return decided_ns(watermarks_ns, lives["could_show"], lives["expected_ns"])
+
+    def _known_ns(self, rows: IntArray) -> IntArray:
+        """Stamps at which existence is judged, (m,): those of `_decided_ns`, at most now."""
+        return np.minimum(self._decided_ns(rows), self._present_ns)
+
     def _ended(self) -> list[int]:
-        """Return the ids of the tracks that end."""
+        """Return the ids of the tracks that end, and suspend those that end if nothing more shows them."""
         rows = self._rows_of(self._rows)
-        lives = self._lives[rows]
-        gone = self._newest_ns - lives["in_view_ns"] > self._out_of_view_ns
-        gone |= self._newest_ns - lives["visible_ns"] > self._hidden_ns
-        improbable = self._histories.present(rows, self._present_ns) < self._rules.delete_probability
-        return list(compress(self._rows, (gone | improbable).tolist()))
+        lives, decided = self._lives[rows], self._decided_ns(rows)
+        newest_ns = self._newest_scan_ns(decided)
+        gone = newest_ns - lives["in_view_ns"] > self._out_of_view_ns
+        gone |= newest_ns - lives["visible_ns"] > self._hidden_ns
+        known_ns, least = np.minimum(decided, self._present_ns), self._rules.delete_probability
+        improbable = self._histories.present(rows, known_ns) < least
+        chosen = (improbable & ~gone).nonzero()[0]
+        awaited = chosen[self._histories.known(rows[chosen], known_ns[chosen]) >= least]
+        track_ids = tuple(self._rows)
+        self._suspended = tuple([track_ids[row] for row in awaited.tolist()])
+        improbable[awaited] = False
+        return list(compress(track_ids, (gone | improbable).tolist()))
+
+    def _newest_scan_ns(self, until_ns: IntArray) -> IntArray:
+        """Newest stamps up to `until_ns` of lists that could have shown something, (m,); `NEVER` if there is none."""
+        stamps_ns = np.array([NEVER, *self._scans_ns])
+        return np.asarray(stamps_ns[stamps_ns.searchsorted(until_ns, side="right") - 1])
 
     def _score(self, scan: Scan, indices: Iterable[int]) -> float:
         """Logarithm of p(score | object) / p(score | clutter) of the best of some detections; 0 where there is none."""

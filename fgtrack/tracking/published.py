@@ -17,6 +17,7 @@ from fgtrack.tracking.detections import ConnectedMerge, Merge, PosedBatch
 from fgtrack.tracking.ego import EgoPose, EgoStd, EgoTrajectory
 from fgtrack.tracking.facing import Facings
 from fgtrack.tracking.inbox import Batch, Inbox, is_valid_covariance, record, records
+from fgtrack.tracking.latency import FOREVER
 from fgtrack.tracking.lifecycle import CountingLifecycle, Life, Scan
 from fgtrack.tracking.objects import Apart
 from fgtrack.tracking.preprocess import Candidate, Candidates, Preprocessed
@@ -219,10 +220,10 @@ class PublishedLifecycle(CountingLifecycle):
     def _ages(self, sensor: str, range_m: float) -> bool:
         return self._sensors[sensor].ages != "always" and super()._ages(sensor, range_m)
 
-    def _ends(self, life: Life, present_ns: int) -> bool:
-        return life.counter <= 0 or present_ns - life.last_seen_ns > self._forget_ns
+    def _ends(self, life: Life, scan: Scan) -> bool:
+        return life.counter <= 0 or scan.present_ns - life.last_seen_ns > self._forget_ns
 
-    def expired(self, present_ns: int) -> list[int]:
+    def expired(self, present_ns: int, watermarks_ns: IntArray | None = None, processed_ns: int = FOREVER) -> list[int]:
         """See `CountingLifecycle.expired`; never, without a list."""
         return []
 

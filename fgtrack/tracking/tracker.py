@@ -9,6 +9,7 @@ from itertools import chain, repeat
 
 import numpy as np
 
+from fgtrack.core.diagnostic import EGO
 from fgtrack.core.errors import CallError, DataError, FgtrackError, did_you_mean
 from fgtrack.core.time import seconds
 from fgtrack.core.types import (
@@ -43,7 +44,8 @@ from fgtrack.tracking.ego import EgoPose, EgoTrajectory
 from fgtrack.tracking.existence import Lifecycle, after_jumps
 from fgtrack.tracking.facing import Facing, Facings, YawsRead, as_read
 from fgtrack.tracking.guarded_bank import GuardedBank, faults
-from fgtrack.tracking.inbox import Batch, FusedRecords, Inbox, merged_records, record
+from fgtrack.tracking.inbox import Batch, FusedRecords, Inbox, merged_records, record, stamps
+from fgtrack.tracking.latency import FOREVER, Delays, Watermarks
 from fgtrack.tracking.lifecycle import Scan
 from fgtrack.tracking.objects import Apart, Objects
 from fgtrack.tracking.preprocess import Candidates, Group, Preprocess, Preprocessed
@@ -67,11 +69,13 @@ class TrackerParts:
     suppress_births_near_newer_tracks: bool
     birth: Birth
     road: Road
+    watermarks: Watermarks
+    """Learns the usual delays, of the sensors and the `EGO`."""
     objects: Objects = field(default_factory=Objects)
     joint: GatedMahalanobis | None = None
     """Gate of the detections that update a track together, and the distance from confirmed tracks within which no
     detection starts another one; None where each updates one track and any may start one."""
-    weigh_births: Callable[[str, Sequence[int], Pairs], BoolArray] | None = None
+    weigh_births: Callable[[str, int, Sequence[int], Pairs], BoolArray] | None = None
     """See `ExistenceLifecycle.likely`; None where births are not weighed."""
     facing: Facing | None = None
     """Belief about the fronts of tracks; None where every yaw is taken as it is."""
@@ -124,6 +128,11 @@ class Tracker:
         return self._parts.ego.located(ego)
 
     @property
+    def delays(self) -> Mapping[str, Delays]:
+        """Delays of the messages of each sensor, and of the ego under `EGO`."""
+        return self._parts.watermarks.delays
+
+    @property
     def id_conflicts(self) -> Mapping[str, int]:
         """Number of identities that were reused or changed, see `Objects`."""
         return self._parts.objects.id_conflicts
@@ -136,6 +145,7 @@ class Tracker:
     def receive(self, message: EgoState | DetectionList) -> None:
         """Take a message. Raises `DataError` for a sensor that has no model, and for an unknown frame."""
         if isinstance(message, EgoState):
+            self.delays[EGO].add(message.stamp_ns, message.receipt_ns)
             reason = self._parts.ego.receive(message)
             if reason is not None:
                 self.refused_ego[reason] += 1
@@ -144,6 +154,8 @@ class Tracker:
             check_sensor(message.sensor, self._parts.sensors)
         if message.frame not in FRAMES:
             raise DataError(f"{message.sensor}: frame: one of {', '.join(FRAMES)} expected, not {message.frame!r}")
+        own_ns = stamps(message, self._parts.sensors[message.sensor]) or [message.stamp_ns]
+        self.delays[message.sensor].add(min(own_ns), message.receipt_ns, max(own_ns))
         self._records.append(self._parts.inbox.put(message))
 
     def tick(self, now_ns: int) -> TickReport:
@@ -152,8 +164,7 @@ class Tracker:
         parts, bank = self._parts, self._parts.bank
         self._fail_rest()  # of a tick that was interrupted
         self._waiting += parts.inbox.collect()
-        with self._contained(Failure.STEP_FAILED):
-            self._end(parts.lifecycle.expired(now_ns))
+        self._expire(now_ns, min((batch.stamp_ns for batch in self._waiting), default=FOREVER))
         bank.advance(now_ns)
         with self._contained(Failure.STEP_FAILED):
             parts.ego.start_tick()
@@ -161,11 +172,14 @@ class Tracker:
         posed = list(map(self._posed, self._waiting))
         for each in zip(posed, self._preprocessed(posed), strict=True):
             self._process_if_possible(*each)
+            self.delays[each[0].batch.message.sensor].processed(each[0].batch.stamp_ns)
+        if posed:
+            self._expire(now_ns, FOREVER)
         smoothed = self._smoothed()
         states = bank.present()  # tracks may end by both
         if parts.facing is not None:
             states = parts.facing.published(bank.track_ids, states)
-        tracks = self._reports(bank.track_ids, states)
+        tracks = self._reports(*self._published(bank.track_ids, states))
         noted, self._records = self._records, []
         updates = partial(chain.from_iterable, noted)
         return TickReport.made_later(self._tick, now_ns, smoothed, tracks=tracks, updates=updates)
@@ -183,7 +197,8 @@ class Tracker:
         """A track at any stamp in or after its window: smoothed or filtered in the past, predicted ahead of now.
         Raises `CallError` for a track that does not exist, a stamp before its window, and a state that is not sound.
         """
-        track_ids = self._parts.bank.track_ids
+        suspended = self._parts.lifecycle.suspended()
+        track_ids = [each for each in self._parts.bank.track_ids if each not in suspended]
         if track_id not in track_ids:
             raise CallError(f"track {track_id} does not exist: there are {', '.join(map(str, track_ids)) or 'none'}")
         bank, motion = self._parts.bank, self._parts.motion
@@ -197,7 +212,8 @@ class Tracker:
         return self._reports_of(states_of(self._parts.bank, self._parts.motion, stamp_ns), stamp_ns)
 
     def _reports_of(self, states: StatesAt, stamp_ns: int) -> tuple[TrackReport, ...]:
-        """Tracks with these states at a stamp, those whose states are sound."""
+        """Tracks with these states at a stamp, those that are not suspended and whose states are sound."""
+        states = states.without(self._parts.lifecycle.suspended())
         if not states.track_ids:
             return ()
         present: Sequence[TrackState] = kinematic_states(self._parts.motion, stamp_ns, states.means, states.covariances)
@@ -216,6 +232,23 @@ class Tracker:
                 raise
             self.failures.add(failure)
             self.failures.note(error)
+
+    def _published(
+        self, track_ids: Sequence[int], states: Sequence[TrackState]
+    ) -> tuple[Sequence[int], Sequence[TrackState]]:
+        """Return the tracks with these states that are not suspended."""
+        suspended = self._parts.lifecycle.suspended()
+        if not suspended:
+            return track_ids, states
+        rows = [row for row, track_id in enumerate(track_ids) if track_id not in suspended]
+        return [track_ids[row] for row in rows], [states[row] for row in rows]
+
+    def _expire(self, now_ns: int, processed_ns: int) -> None:
+        """End tracks by the time that has passed, where all lists before `processed_ns` that came are processed."""
+        parts = self._parts
+        with self._contained(Failure.STEP_FAILED):
+            watermarks_ns = parts.watermarks.at(now_ns, parts.bank.window_start_ns)
+            self._end(parts.lifecycle.expired(now_ns, watermarks_ns, processed_ns))
 
     def _posed(self, batch: Batch) -> PosedBatch:
         """Return `batch` with the pose that it is seen from; detections in the map need none."""
@@ -329,7 +362,7 @@ class Tracker:
         weigh = self._parts.weigh_births
         if weigh is None or any(group.stack.model.components != ("x_m", "y_m") for group in candidates.groups):
             return None
-        return partial(weigh, batch.message.sensor, states.track_ids)
+        return partial(weigh, batch.message.sensor, batch.stamp_ns, states.track_ids)
 
     def _evidence(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Apart | None:
         described = map(batch.message.objects.__getitem__, candidates.leaders)
@@ -359,6 +392,7 @@ class Tracker:
         """
         bank, motion = self._parts.bank, self._parts.motion
         now, back_s = bank.states_at(bank.present_ns), seconds(bank.present_ns - batch.stamp_ns)
+        now = now.without(self._parts.lifecycle.suspended())
         rows = [row for row, track_id in enumerate(now.track_ids) if track_id not in states.track_ids]
         if not rows:
             return list(new)
@@ -378,7 +412,8 @@ class Tracker:
 
     def _offered(self, batch: Batch) -> StatesAt:
         """The tracks that `batch` may be associated with, at its stamp."""
-        states = self._parts.bank.states_at(batch.stamp_ns)
+        ended = self._parts.lifecycle.suspended(batch.stamp_ns)
+        states = self._parts.bank.states_at(batch.stamp_ns).without(ended)
         return in_any_direction(states, batch.stamp_ns, self._undirected) if self._undirected else states
 
     def _ranges_m(self, track_ids: Sequence[int], positions_m: FloatArray, ego: EgoPose | None) -> FloatArray:

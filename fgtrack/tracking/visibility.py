@@ -52,22 +52,30 @@ class Histories:
         return row
 
     def learn(
-        self, rows: IntArray, stamps_ns: IntArray, sensors: IntArray, ratios: FloatArray, present_ns: int
+        self, rows: IntArray, stamps_ns: IntArray, sensors: IntArray, ratios: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Add evidence of lists at `stamps_ns` of `sensors` on the tracks in `rows`, one after the other; see `RATIO`.
         What is older than all that is remembered counts as the oldest. Returns the probabilities, after each, of being
-        visible to its sensor and of existing at `present_ns`, all shapes (m,).
+        visible to its sensor, and the largest ones of existing at its stamp or that of newer evidence, all shapes (m,).
         """
         while len(rows) and self.counts[rows].max() + np.bincount(rows).max() > self.numbers.shape[1]:
             self._grow(axis=1)
         history = self.numbers, self.entries, self.counts, *self._chain
-        visible, exists = kernels(_KERNELS).learn(rows, stamps_ns, sensors, ratios, present_ns, *history)
+        visible, exists = kernels(_KERNELS).learn(rows, stamps_ns, sensors, ratios, *history)
         return visible, exists
 
-    def present(self, rows: IntArray, present_ns: int) -> FloatArray:
-        """Return the probabilities that the objects exist at `present_ns`, not before their newest evidence, (m,)."""
+    def present(self, rows: IntArray, stamps_ns: IntArray | int) -> FloatArray:
+        """Return the probabilities that the objects exist at `stamps_ns`, not before their newest evidence, (m,)."""
+        return self._existing(rows, stamps_ns, is_known=False)
+
+    def known(self, rows: IntArray, stamps_ns: IntArray | int) -> FloatArray:
+        """Return the probabilities that the objects exist at `stamps_ns`, by the evidence up to there alone, (m,)."""
+        return self._existing(rows, stamps_ns, is_known=True)
+
+    def _existing(self, rows: IntArray, stamps_ns: IntArray | int, is_known: bool) -> FloatArray:
+        own_ns = np.array(np.broadcast_to(stamps_ns, rows.shape), dtype=np.int64)
         history = self.numbers, self.entries, self.counts, self._chain[0]
-        return np.asarray(kernels(_KERNELS).present(rows, present_ns, *history))
+        return np.asarray(kernels(_KERNELS).existing(rows, own_ns, is_known, *history))
 
     def forget(self, oldest_ns: int) -> None:
         """Remember what is older than `oldest_ns` by its outcome alone."""

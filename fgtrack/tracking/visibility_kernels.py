@@ -43,11 +43,9 @@ def _conclude(
 
 
 @inlined
-def _existing(
-    own: int, present_ns: int, numbers: FloatArray, entries: IntArray, counts: IntArray, lifetime_s: float
-) -> float:
-    k = counts[own] - 1
-    log_odds = _survived(numbers[own, k, LOG_ODDS], present_ns - entries[own, k, STAMP], lifetime_s)
+def _existing(own: int, k: int, stamp_ns: int, numbers: FloatArray, entries: IntArray, lifetime_s: float) -> float:
+    """Probability at `stamp_ns`, by the evidence up to entry k and not before it."""
+    log_odds = _survived(numbers[own, k, LOG_ODDS], stamp_ns - entries[own, k, STAMP], lifetime_s)
     return 1.0 / (1.0 + math.exp(-log_odds))
 
 
@@ -62,7 +60,7 @@ def _check(rows: IntArray, numbers: FloatArray, entries: IntArray, counts: IntAr
 
 
 @njit(
-    "(int64[::1], int64[::1], int64[::1], float64[::1], int64, float64[:, :, ::1], int64[:, :, ::1], int64[::1],"
+    "(int64[::1], int64[::1], int64[::1], float64[::1], float64[:, :, ::1], int64[:, :, ::1], int64[::1],"
     " float64, float64, float64)"
 )
 def learn(
@@ -70,7 +68,6 @@ def learn(
     stamps_ns: IntArray,
     sensors: IntArray,
     ratios: FloatArray,
-    present_ns: int,
     numbers: FloatArray,
     entries: IntArray,
     counts: IntArray,
@@ -79,7 +76,8 @@ def learn(
     visible_s: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Insert entries into the tracks `rows`, each in order of stamps, and recompute from there on.
-    Returns the probabilities, after each, of being visible to its sensor and of existing at `present_ns`, (m,).
+    Returns the probabilities of being visible to its sensor, after each, and of existing, the largest one at the stamps
+    from each entry on, shapes (m,).
     """
     _check(rows, numbers, entries, counts)
     num_entries, num_sensors = entries.shape[1], entries.shape[2] - VIEWED
@@ -97,22 +95,36 @@ def learn(
         counts[own] += 1
         numbers[own, at, RATIO], entries[own, at, SENSOR] = ratios[m], sensors[m]
         entries[own, at, STAMP] = max(stamp_ns, entries[own, 0, STAMP])
+        exists[m] = 0.0
         for k in range(at, counts[own]):
             _conclude(numbers[own], entries[own], k, lifetime_s, visible_share, visible_s)
+            exists[m] = max(exists[m], _existing(own, k, NEVER, numbers, entries, lifetime_s))
         visible[m] = numbers[own, counts[own] - 1, VISIBLE + sensors[m]]
-        exists[m] = _existing(own, present_ns, numbers, entries, counts, lifetime_s)
     return visible, exists
 
 
-@njit("float64[::1](int64[::1], int64, float64[:, :, ::1], int64[:, :, ::1], int64[::1], float64)")
-def present(
-    rows: IntArray, present_ns: int, numbers: FloatArray, entries: IntArray, counts: IntArray, lifetime_s: float
+@njit("float64[::1](int64[::1], int64[::1], boolean, float64[:, :, ::1], int64[:, :, ::1], int64[::1], float64)")
+def existing(
+    rows: IntArray,
+    stamps_ns: IntArray,
+    is_known: bool,
+    numbers: FloatArray,
+    entries: IntArray,
+    counts: IntArray,
+    lifetime_s: float,
 ) -> FloatArray:
-    """Return existence probabilities at `present_ns`, shape (m,)."""
+    """Return existence probabilities at `stamps_ns` (m,), shape (m,).
+    They follow from all evidence, or, where `is_known`, from the evidence up to these stamps. A newer list that could
+    not show the object is no evidence.
+    """
     _check(rows, numbers, entries, counts)
+    check(len(stamps_ns) >= len(rows))
     result = np.empty(len(rows))
     for m in range(len(rows)):
-        result[m] = _existing(rows[m], present_ns, numbers, entries, counts, lifetime_s)
+        own, k = rows[m], counts[rows[m]] - 1
+        while k > 0 and entries[own, k, STAMP] > stamps_ns[m] and (is_known or math.isnan(numbers[own, k, RATIO])):
+            k -= 1
+        result[m] = _existing(own, k, stamps_ns[m], numbers, entries, lifetime_s)
     return result
 
 

@@ -27,6 +27,7 @@ SENSORS = {
 }
 STILL = ExistenceRules(lifetime_s=1e9)
 HERE = candidate(10.0, 0.0)
+BEHIND = np.array([-10.0, 0.0, 0.0, 0.0, 0.0])
 MEAN, P = np.array([10.0, 0.0, 0.0, 0.0, 0.0]), 0.01 * np.eye(5)
 
 
@@ -152,6 +153,78 @@ def test_a_track_that_left_the_view_of_all_sensors_ends_although_it_is_believed(
         assert ended == ([0] if at_ms > 540.0 else [])
 
 
+def late(at_ms: float, late_ms: float) -> np.ndarray:
+    """Watermarks of the sensors, where the lists of the first are so late and those of the others are not."""
+    now_ns = START_NS + ms(at_ms)
+    return np.array([now_ns - ms(late_ms), now_ns, now_ns])
+
+
+@pytest.mark.parametrize("late_ms", [0.0, 700.0, 3000.0])
+def test_a_track_out_of_view_waits_for_the_lists_of_a_late_sensor(late_ms: float) -> None:
+    """The sensor ahead sees nothing of it; the other one stops after five lists."""
+    life, there = lifecycle(replace(STILL, out_of_view_s=0.5)), np.array([[-10.0, 0.0]])
+    for at_ms in np.arange(0.0, late_ms, 100.0):
+        life.missed(scan("ahead", at_ms, ego=ego()), [], np.zeros((0, 2)), np.zeros(0))
+    life.born(0, scan("lidar", 0.0, ego=ego()), candidate(-10.0, 0.0))
+    ended = []
+    for k in range(1, 60):
+        at_ms = late_ms + 100.0 * k
+        life.expired(START_NS + ms(at_ms), late(at_ms, late_ms), START_NS + ms(100.0 * k))
+        if k < 5:
+            match(life, 0, scan("lidar", 100.0 * k, ego=ego()), candidate(-10.0, 0.0), BEHIND, P)
+        life.missed(scan("ahead", at_ms, ego=ego()), [0], there, np.array([10.0]))
+        ended += [k] * len(life.expired(START_NS + ms(at_ms), late(at_ms, late_ms)))
+    assert ended[0] == 10  # its list of 1.0 s should have come, 0.6 s after the last one that showed it
+
+
+def test_a_track_that_a_late_list_may_still_show_is_suspended_and_comes_back() -> None:
+    life, there = lifecycle(), np.array([[10.0, 0.0]])
+    life.born(0, scan("lidar", ego=ego()), HERE)
+    at_ms = 1000.0
+    life.expired(START_NS + ms(at_ms), late(at_ms, 950.0))
+    for k in range(20):
+        assert life.missed(scan("ahead", at_ms + 40.0 * k, ego=ego()), [0], there, np.array([10.0])) == []
+    now_ms = at_ms + 40.0 * 20
+    assert life.expired(START_NS + ms(now_ms), late(now_ms, 950.0)) == []
+    assert life.suspended() == {0}
+    assert life.suspended(START_NS + ms(500.0)) == frozenset()  # nothing had missed it yet
+    assert life.suspended(START_NS + ms(now_ms)) == {0}
+    match(life, 0, scan("lidar", 500.0, ego=ego()), HERE, MEAN, P)
+    assert life.expired(START_NS + ms(now_ms), late(now_ms, 950.0)) == []
+    assert life.suspended() == frozenset()
+    assert life.status(0) is not TrackStatus.TENTATIVE
+
+
+def test_a_suspended_track_ends_when_the_lists_that_could_show_it_should_have_come() -> None:
+    life, there = lifecycle(), np.array([[10.0, 0.0]])
+    life.born(0, scan("lidar", ego=ego()), HERE)
+    life.expired(START_NS + ms(1000.0), late(1000.0, 950.0))
+    improbable_ms = None
+    for k in range(20):
+        life.missed(scan("ahead", 1000.0 + 40.0 * k, ego=ego()), [0], there, np.array([10.0]))
+        life.expired(START_NS + ms(1000.0 + 40.0 * k), late(1000.0 + 40.0 * k, 950.0))
+        if improbable_ms is None and life.suspended():
+            improbable_ms = 1000.0 + 40.0 * k
+    ended = [at_ms for at_ms in range(1800, 3000, 10) if life.expired(START_NS + ms(at_ms), late(at_ms, 950.0)) == [0]]
+    assert ended[0] == improbable_ms + 950.0
+
+
+@pytest.mark.parametrize("order", [(1, 2), (2, 1)])
+@pytest.mark.parametrize("lifetime_s", [0.5, 20.0])
+def test_a_track_is_confirmed_at_the_stamp_of_a_list_however_late_it_comes(
+    order: tuple[int, int], lifetime_s: float
+) -> None:
+    life = lifecycle(replace(STILL, lifetime_s=lifetime_s))
+    life.born(0, scan("lidar", ego=ego()), candidate(-10.0, 0.0))
+    for k in range(30):  # that cannot show it
+        life.missed(scan("ahead", 100.0 * k, ego=ego()), [0], np.array([[-10.0, 0.0]]), np.array([10.0]))
+    for k in order:
+        match(life, 0, scan("lidar", 100.0 * k, ego=ego()), candidate(-10.0, 0.0), BEHIND, P)
+    life.expired(START_NS + ms(3000.0), late(3000.0, 2900.0))
+    assert life.status(0) is TrackStatus.CONFIRMED
+    assert life.probability(0) < math.exp(-2.8 / lifetime_s)  # the probability is that of now
+
+
 @pytest.mark.parametrize("angle_rad", np.linspace(0.0, 3.0, 5))
 def test_a_position_on_an_endless_line_proves_nothing(angle_rad: float) -> None:
     """As of a RADAR whose range is good to 1e9 m."""
@@ -268,7 +341,7 @@ def test_a_pair_is_weighed_against_clutter_and_new_objects(is_scan: bool, weight
     cost = -2.0 * math.log(2.0 * math.pi * density)
     zeros = np.zeros(3, dtype=np.int64)
     pairs = Pairs(np.arange(3), zeros, np.array([cost - 1e-6, cost + 1e-6, cost - 20.0]))
-    assert life.likely("lidar", [7], pairs).tolist() == [True, False, True]
+    assert life.likely("lidar", START_NS, [7], pairs).tolist() == [True, False, True]
 
 
 @pytest.mark.parametrize("weigh", [False, True])

@@ -1,3 +1,5 @@
+from itertools import permutations
+
 import numpy as np
 import pytest
 from support.tracking import START_NS, candidate, match, ms
@@ -15,7 +17,7 @@ SENSORS = {
     "blind": SensorModel(std=STD, counter_init=4, counter_add=0, ages="never"),
 }
 HERE = candidate(0.0, 0.0)
-NOWHERE = np.zeros((2, 2))
+NOWHERE = np.zeros((3, 2))
 KINDS = [CountingLifecycle, PublishedLifecycle]
 
 
@@ -103,6 +105,56 @@ def test_time_alone_ends_a_track_but_the_published_one_needs_a_list() -> None:
     assert published.expired(late_ns) == []
     assert published.missed(Scan("blind", late_ns - 1, late_ns - 1), [0], NOWHERE, np.array([10.0])) == []
     assert published.missed(Scan("blind", late_ns, late_ns), [0], NOWHERE, np.array([10.0])) == [0]
+
+
+@pytest.mark.parametrize("order", list(permutations(range(4))))
+def test_matches_and_misses_count_in_order_of_their_stamps(order: tuple[int, ...]) -> None:
+    """With a cap of 6: 5 + 2 -> 6, then 5, 4, and + 2 -> 6."""
+    life = lifecycle(counter_cap=6)
+    life.born(0, Scan("far", START_NS, START_NS), HERE)
+    seen = [("far", True), ("both", False), ("both", False), ("far", True)]
+    for k in order:
+        sensor, is_match = seen[k]
+        scan = Scan(sensor, START_NS + ms(10 * (k + 1)), START_NS + ms(500))
+        if is_match:
+            match(life, 0, scan, HERE)
+        else:
+            assert life.missed(scan, [0], NOWHERE, np.array([10.0])) == []
+    assert life.lives[0].counter == 6
+    life.expired(START_NS + ms(500))
+    assert (life.lives[0].counter, life.lives[0].settled) == (6, 6)
+
+
+@pytest.mark.parametrize("comes", [True, False])
+def test_a_track_waits_for_the_lists_that_could_show_it(comes: bool) -> None:
+    """Of a sensor whose lists are 2.5 s late, while another one misses the object 3 times."""
+    life, late_ns = lifecycle(forget_s=1.0), 2_500_000_000
+    life.born(0, Scan("both", START_NS, START_NS + late_ns), HERE)
+
+    def watermarks(at_ms: float) -> np.ndarray:
+        fast_ns = START_NS + ms(at_ms)
+        return np.array([fast_ns, fast_ns, fast_ns - late_ns, fast_ns])
+
+    assert life.expired(START_NS + late_ns, watermarks(2500.0)) == []
+    for k in range(1, 4):  # at 2.51, 2.52 and 2.53 s
+        scan = Scan("near", START_NS + late_ns + ms(10 * k), START_NS + late_ns + ms(10 * k))
+        assert life.missed(scan, [0], NOWHERE, np.array([10.0])) == []
+    assert life.lives[0].counter == 0
+    if comes:
+        for k in range(1, 4):
+            match(life, 0, Scan("both", START_NS + ms(700 * k), START_NS + late_ns + ms(700 * k)), HERE)
+        assert life.lives[0].counter == 2 + 3 * 2 - 3
+    assert life.expired(START_NS + ms(3500), watermarks(3500.0)) == []
+    ended = [at_ms for at_ms in range(3500, 7000, 10) if life.expired(START_NS + ms(at_ms), watermarks(at_ms))]
+    assert ended[0] == (2100 + 2500 + 1000 + 10 if comes else 2500 + 1000 + 10)
+
+
+def test_times_are_compared_with_the_present_where_late_lists_are_not_awaited() -> None:
+    life = lifecycle(forget_s=1.0, awaits_late_lists=False)
+    life.born(0, Scan("both", START_NS, START_NS), HERE)
+    late = np.full(4, START_NS - ms(2500))
+    assert life.expired(START_NS + ms(1000), late) == []
+    assert life.expired(START_NS + ms(1000) + 1, late) == [0]
 
 
 def test_the_status_tells_unconfirmed_from_seen_from_missed() -> None:

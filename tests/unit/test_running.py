@@ -9,8 +9,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from fgtrack.core.diagnostic import EGO
 from fgtrack.core.types import Detection, DetectionList, EgoState, TrackReport, TruthState
-from fgtrack.pipeline.live import EGO, TickTiming, Tracker
+from fgtrack.pipeline.live import TickTiming, Tracker
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.tracking.detections import PosedBatch
 from fgtrack.tracking.preprocess import Preprocess, Preprocessed

@@ -26,7 +26,7 @@ def history(log_odds: float = 0.3, share: float = 0.7) -> Histories:
 
 
 def learn(histories: Histories, time_s: float, sensor: int, ratio: float) -> None:
-    histories.learn(ONE, np.array([round(time_s * S)]), np.array([sensor]), np.array([ratio]), 0)
+    histories.learn(ONE, np.array([round(time_s * S)]), np.array([sensor]), np.array([ratio]))
 
 
 def visibility(histories: Histories) -> FloatArray:
@@ -119,6 +119,6 @@ def test_many_tracks_with_long_histories_are_as_each_alone() -> None:
     alone = history(0.4)
     for k in range(60):
         ratios = rng.uniform(0.1, 4.0, 20)
-        together.learn(rows, *(np.full(len(rows), each) for each in ((k + 1) * S // 10, k % 2)), ratios, 0)
+        together.learn(rows, *(np.full(len(rows), each) for each in ((k + 1) * S // 10, k % 2)), ratios)
         learn(alone, 0.1 * (k + 1), k % 2, ratios[4])
     assert together.present(rows, 6 * S)[4] == alone.present(ONE, 6 * S)[0]
