@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rosbags.rosbag1 import Writer as Rosbag1Writer
@@ -16,8 +17,9 @@ from support import kitti
 
 import fgtrack
 from fgtrack.io.ros.bag_writer import write_bag
-from fgtrack.io.stream import write_stream
+from fgtrack.io.stream import STREAM_FORMAT, write_stream
 from fgtrack.pipeline.shipped import shipped_folder
+from fuzz import scene
 
 Files = Mapping[str, bytes]
 
@@ -32,11 +34,132 @@ def drive() -> tuple[fgtrack.EgoState | fgtrack.DetectionList, ...]:
     return _drive(2.0)
 
 
+@cache
+def short_drive() -> tuple[fgtrack.EgoState | fgtrack.DetectionList, ...]:
+    """Half a second of one car, with delays."""
+    return _drive(0.5)
+
+
 def stream(messages: Sequence[fgtrack.Message] = ()) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.jsonl"
         write_stream(path, messages or drive())
         return path.read_bytes()
+
+
+def all_fields() -> Files:
+    """A stream of the drive of `scene`, which has every field, and its sensors as a configuration."""
+    lines = [{"type": "header", "format": STREAM_FORMAT}]
+    for record in scene.drive():
+        at_ns = record.pop("at_ns")
+        lines.append(record)
+        if record["type"] == "ego":
+            x_m, y_m = scene.place_m("ahead", record["stamp_ns"])
+            lines.append(
+                {
+                    "type": "truth",
+                    "stamp_ns": record["stamp_ns"],
+                    "receipt_ns": at_ns,
+                    "object_id": 1,
+                    "x_m": x_m,
+                    "y_m": y_m,
+                    "yaw_rad": 0.0,
+                    "speed_mps": 11.0,
+                }
+            )
+    text = "".join(f"{json.dumps(line)}\n" for line in lines)
+    return {"x.jsonl": text.encode(), "x.yaml": json.dumps({"sensors": scene.SENSORS}).encode()}
+
+
+def latitudes() -> bytes:
+    """A stream of positions as latitude and longitude, with identities."""
+    lines: list[dict[str, object]] = [{"type": "header", "format": STREAM_FORMAT}]
+    for k in range(20):
+        now_ns = scene.START_NS + k * 10**8
+        item = {
+            "latitude_deg": 48.0 + 1e-6 * k,
+            "longitude_deg": 11.0 + 1e-5 * k,
+            "altitude_m": 500.0,
+            "identity": "4CA911",
+            "id": "4CA911",
+        }
+        times = {"stamp_ns": now_ns, "receipt_ns": now_ns + 10**7}
+        lines.append({"type": "detections", "sensor": "gnss", **times, "objects": [item]})
+    return "".join(f"{json.dumps(line)}\n" for line in lines).encode()
+
+
+def aircraft() -> list[dict[str, float]]:
+    """Reports of two aircraft, with their times of measurement and of receipt."""
+    return [
+        {
+            "address": 0x4CACAA + k % 2,
+            "sic": 1,
+            "measured_s": 100.0 + 0.5 * k,
+            "received_s": 100.25 + 0.5 * k,
+            "latitude_deg": 41.3 + 0.01 * (k % 2),
+            "longitude_deg": 2.08 + 0.001 * k,
+            "flight_level": 100.0,
+            "speed_nmps": 0.1,
+            "course_deg": 90.0,
+            "nacp": 9,
+        }
+        for k in range(16)
+    ]
+
+
+def asterix(records: Sequence[Mapping[str, Any]]) -> bytes:
+    """Reports of category 021. Raises what libasterix raises for numbers that the format cannot hold."""
+    import asterix.generated as gen
+
+    blocks = []
+    for each in records:
+        position = (("LAT", (each["latitude_deg"], "°")), ("LON", (each["longitude_deg"], "°")))
+        motion = (("RE", 0), ("GS", (each["speed_nmps"], "NM/s")), ("TA", (each["course_deg"], "°")))
+        items = {
+            "010": (("SAC", 0), ("SIC", each["sic"])),
+            "080": each["address"],
+            "073": (each["measured_s"], "s"),
+            "077": (each["received_s"], "s"),
+            "131": position,
+            "145": (each["flight_level"], "FL"),
+            "160": motion,
+            "090": ((0, 7, None), (0, 0, each["nacp"], None)),
+        }
+        kind = gen.Cat_021_2_6
+        blocks.append(kind.create([kind.cv_record.create(items)]).unparse().to_bytes())
+    return b"".join(blocks)
+
+
+def ships() -> list[dict[str, Any]]:
+    """Reports of two ships, with the time of receipt of each."""
+    return [
+        {
+            "received_s": 1_397_678_300 + 3 * k,
+            "mmsi": 244730036 + k % 2,
+            "msg_type": 1,
+            "lat": 53.36 + 0.01 * (k % 2),
+            "lon": 5.21 + 0.0003 * k,
+            "speed": 10.0,
+            "course": 90.0,
+            "second": (20 + 3 * k - 1) % 60,
+        }
+        for k in range(16)
+    ]
+
+
+def nmea(records: Sequence[Mapping[str, Any]]) -> bytes:
+    """Sentences with tag blocks. Raises what pyais raises for values that a sentence cannot hold."""
+    import pyais
+
+    lines = []
+    for each in records:
+        given = {key: value for key, value in each.items() if key != "received_s"}
+        time = f"c:{each['received_s']}"
+        check = 0
+        for byte in time.encode():
+            check ^= byte
+        lines += [f"\\{time}*{check:02X}\\{line}" for line in pyais.encode_dict(given, sentence_type="VDM")]
+    return ("\n".join(lines) + "\n").encode()
 
 
 def straight() -> bytes:
@@ -122,9 +245,9 @@ def nuscenes() -> Files:
     return {"in/results.json": json.dumps({"meta": {}, "results": boxes}).encode(), **files}
 
 
-def bag(storage: str) -> bytes:
+def bag(storage: str, messages: Sequence[fgtrack.Message] = ()) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
-        write_bag(Path(folder) / "bag", drive(), storage)
+        write_bag(Path(folder) / "bag", messages or drive(), storage)
         (file,) = (file for file in (Path(folder) / "bag").iterdir() if file.suffix != ".yaml")
         return file.read_bytes()
 
@@ -161,10 +284,10 @@ def track_map() -> bytes:
     return (Path(__file__).parents[2] / "configs/maps/oval_track.csv").read_bytes()
 
 
-def run_folder() -> Files:
+def run_folder(messages: Sequence[fgtrack.Message] = ()) -> Files:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run"
-        fgtrack.replay(iter(drive()), "smoother", out=path)
+        fgtrack.replay(iter(messages or drive()), "smoother", out=path)
         return {f"in/{file.name}": file.read_bytes() for file in path.iterdir()}
 
 

@@ -21,6 +21,8 @@ class Target:
     """Words of the commands, called in the folder of the files."""
     corrupted: str | None = None
     """End of the names of the files that are corrupted, else any."""
+    needs: str | None = None
+    """Package that reads the input, where that need not be installed."""
 
 
 _REPLAY = ("--overwrite", "-o", RUN, "-e")
@@ -86,6 +88,33 @@ TARGETS = {
         ("replay", "x.jsonl", "-c", "smoother", "--map", "x.csv", *_REPLAY, "ekf-replay"),
         ("replay", "x.jsonl", "-c", "karle2023_reference", "--map", "x.csv", "-o", RUN, "--overwrite"),
     ),
+    "fields": Target(
+        lambda: [inputs.all_fields()],
+        [
+            ("info", "x.jsonl", "-c", "x.yaml"),
+            ("replay", "x.jsonl", "-c", "x.yaml", *_REPLAY, "smoother-banded"),
+            ("compare", RUN),
+        ],
+        ".jsonl",
+    ),
+    "latitudes": Target(
+        lambda: [{"x.jsonl": inputs.latitudes()}],
+        [
+            ("info", "x.jsonl"),
+            ("replay", "x.jsonl", "--overwrite", "-o", RUN),
+            ("export", RUN, "--geojson", "-o", "x.geojson", "--overwrite"),
+        ],
+    ),
+    "ais": Target(
+        lambda: [{"x.log": inputs.nmea(inputs.ships())}],
+        [("info", "x.log"), ("replay", "x.log", "-c", "ais", *_REPLAY, "ekf-replay")],
+        needs="pyais",
+    ),
+    "asterix": Target(
+        lambda: [{"x.ast": inputs.asterix(inputs.aircraft())}],
+        [("info", "x.ast"), ("replay", "x.ast", "-c", "adsb", *_REPLAY, "ekf-replay")],
+        needs="asterix",
+    ),
     "delays": _beside(
         "x.yaml", lambda: [inputs.DELAYS], ("convert", "x.jsonl", "out.jsonl", "--delays", "x.yaml", "--overwrite")
     ),
@@ -106,5 +135,21 @@ TARGETS = {
             ("export", "in", "-o", "bag", "--ros2", "--overwrite"),
         ],
         ".csv",
+    ),
+}
+
+#: As `TARGETS`, with shorter recordings, where one value more or less matters as much.
+SHORT = TARGETS | {
+    "stream": _recording("x.jsonl", lambda: inputs.stream(inputs.short_drive())),
+    "gzip": _recording("x.jsonl.gz", lambda: gzip.compress(inputs.stream(inputs.short_drive()), mtime=0)),
+    "mcap": _recording("x.mcap", lambda: inputs.bag("mcap", inputs.short_drive())),
+    "sqlite3": _recording("x.db3", lambda: inputs.bag("sqlite3", inputs.short_drive())),
+    "smoother": Target(
+        lambda: [{"x.jsonl": inputs.stream(inputs.short_drive())}],
+        [("replay", "x.jsonl", "-c", "open_space", "--set", _MERGE, *_REPLAY, "smoother")],
+    ),
+    "run": Target(
+        lambda: [inputs.run_folder(inputs.short_drive())],
+        [("compare", "in"), ("export", "in", "-o", "x.mcap", "--overwrite"), ("ledger", "in")],
     ),
 }
