@@ -16,7 +16,7 @@ TEST := $(VENV)/.test
 DEV := $(TEST) $(VENV)/.dev
 DOCS := $(TEST) $(VENV)/.docs
 
-.PHONY: demo test test-fast test-slow test-matrix lock audit fuzz faults coverage mutants check docs picture bench bench-full soak soak-live fairness clean
+.PHONY: demo test test-fast test-slow test-matrix lock audit fuzz fuzz-values faults coverage mutants check docs picture bench bench-full soak soak-live fairness clean
 
 demo: $(RUN)
 	@$(BIN)/fgtrack demo -o out/demo --overwrite
@@ -39,7 +39,11 @@ test-slow: $(TEST)
 
 # Half an hour for each of the kinds of input; what is found is kept in out/fuzz. SECONDS=60 SEED=1 for others.
 fuzz: $(TEST)
-	$(BIN)/python -m pytest tests/fuzz -n auto -m slow --fuzz-seconds $(or $(SECONDS),1800) --fuzz-seed $(or $(SEED),0)
+	$(BIN)/python -m pytest tests/fuzz/test_fuzz.py -n auto -m slow --fuzz-seconds $(or $(SECONDS),1800) --fuzz-seed $(or $(SEED),0)
+
+# Some 20 minutes of a processor: 10,000 wrong values in files and live messages. CHANGES=1000 SEED=1 for others.
+fuzz-values: $(TEST)
+	$(BIN)/python -m pytest tests/fuzz/test_values.py -n auto -m slow --changes $(or $(CHANGES),10000) --fuzz-seed $(or $(SEED),0)
 
 # Some 15 minutes: 400 kills, full disks, folders of others. KILLS=1000 SEED=1 for others.
 faults: $(TEST)

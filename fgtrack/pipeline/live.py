@@ -279,6 +279,10 @@ class Tracker:
 
         Raises `CallError` for a track that does not exist, a stamp before its window and an invalid one.
         """
+        try:
+            track_id = integer(track_id)
+        except TypeError as error:
+            raise CallError(f"track_id: must be an integer, is {track_id!r:.60}") from error
         stamp_ns = _stamp("stamp_ns", stamp_ns)
         with self._turn:
             return self._tracker.state_at(track_id, stamp_ns)
@@ -315,5 +319,5 @@ def _stamp(name: str, value: int) -> int:
     except TypeError:
         stamp_ns = -1
     if not 0 <= stamp_ns <= LARGEST_NS:
-        raise CallError(f"{name}: must be integer nanoseconds since 1970, is {value!r}")
+        raise CallError(f"{name}: must be integer nanoseconds since 1970, is {value!r:.60}")
     return stamp_ns

@@ -30,6 +30,11 @@ _TICK_NS = 10**8
 _SOURCES = ("ego", *scene.SENSORS)
 _COUNTS = (1, 1, 2, 3, 4)
 _NEAR_M = 4.0
+#: Times that no clock gives; the integers among them are before the drive.
+_ODD_NS: tuple[Any, ...] = (
+    *(None, math.nan, math.inf, "1", 1.5, 1e18, -1, 2**63, 2**70, -(2**63), True, [], np.array([1, 2]), b"1"),
+    *(0, 1, np.uint64(5), np.int32(7), scene.START_NS - 3600 * 10**9, np.float64(1e18), np.array(5), object()),
+)
 _LONGEST_S, _LONGEST_LINE = 20.0, 300
 _HIDDEN = (Failure.LIST_FAILED, Failure.ESTIMATOR_RAISED, Failure.NOT_FINITE, Failure.NOT_DEFINITE)
 
@@ -138,7 +143,7 @@ def _problems(name: str, case: Case) -> Iterator[str]:
     tracker, began_s = tracker_of(name), time.process_time()
     received, kept = 0, {}
     arrivals = list(case.arrivals)
-    last_ns = arrivals[-1]["at_ns"]
+    begin_ns, last_ns = scene.START_NS + round(CHANGED_S[0] * 1e9), arrivals[-1]["at_ns"]
     for now_ns in range(scene.START_NS, last_ns + _TICK_NS, _TICK_NS):
         while arrivals and arrivals[0]["at_ns"] <= now_ns:
             try:
@@ -152,7 +157,9 @@ def _problems(name: str, case: Case) -> Iterator[str]:
                 received += len(message.objects)
         report = tracker.tick(now_ns)
         yield from _unsound(report)
-        if now_ns == scene.START_NS + round(CHANGED_S[0] * 1e9) - _TICK_NS:
+        if now_ns == begin_ns:
+            _ask_oddly(tracker, report)
+        if now_ns == begin_ns - _TICK_NS:
             kept = {car: _tracks_near(report, car) for car in case.cars}
             if not all(kept.values()):
                 yield f"the drive that is right is not tracked: {kept}"
@@ -185,6 +192,19 @@ def _ask(tracker: fgtrack.Tracker, report: fgtrack.TickReport) -> None:
     delays_s = [each.delay_worst_s for each in tracker.lateness.values() if each.delay_worst_s is not None]
     assert all(map(math.isfinite, delays_s))
     assert tracker.timing.ticks > 0
+
+
+def _ask_oddly(tracker: fgtrack.Tracker, report: fgtrack.TickReport) -> None:
+    """Ask for impossible times and tracks: each is refused by a `CallError`, or an earlier tick by a count."""
+    for odd in _ODD_NS:
+        with suppress(fgtrack.CallError):
+            again = tracker.tick(odd)
+            assert again.now_ns == report.now_ns
+        for track_id in (odd, *[track.track_id for track in report.tracks[:1]]):
+            with suppress(fgtrack.CallError):
+                tracker.state_at(track_id, odd)
+        with suppress(fgtrack.CallError):
+            tracker.tracks_at(odd)
 
 
 def _unsound(report: fgtrack.TickReport) -> Iterator[str]:

@@ -92,7 +92,7 @@ TARGETS = {
         lambda: [inputs.all_fields()],
         [
             ("info", "x.jsonl", "-c", "x.yaml"),
-            ("replay", "x.jsonl", "-c", "x.yaml", *_REPLAY, "smoother-banded"),
+            ("replay", "x.jsonl", "-c", "x.yaml", *_REPLAY, "ekf-replay"),
             ("compare", RUN),
         ],
         ".jsonl",
@@ -150,6 +150,7 @@ SHORT = TARGETS | {
     ),
     "run": Target(
         lambda: [inputs.run_folder(inputs.short_drive())],
-        [("compare", "in"), ("export", "in", "-o", "x.mcap", "--overwrite"), ("ledger", "in")],
+        [("compare", "in"), ("export", "in", "-o", "x.mcap", "--overwrite")],
+        ".csv",
     ),
 }

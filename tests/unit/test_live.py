@@ -49,6 +49,19 @@ def test_the_end_of_a_run_gives_the_final_states_of_the_window() -> None:
     assert tracker.tick(report.now_ns + 20 * MS).tracks == ()
 
 
+@pytest.mark.parametrize("name", ["ekf-replay", "smoother-banded"])
+@pytest.mark.parametrize("track_id", [np.array(0), np.array([0, 1]), 0.0, "0", None, [0], 7], ids=repr)
+def test_a_track_id_that_is_not_one_is_refused_and_no_track_ends(name: str, track_id: Any) -> None:
+    tracker, report = started(name)
+    if isinstance(track_id, np.ndarray) and track_id.shape == ():
+        assert tracker.state_at(track_id, report.now_ns).track_id == 0
+    else:
+        with pytest.raises(CallError, match="track_id: must be an integer|track 7 does not exist"):
+            tracker.state_at(track_id, report.now_ns)
+    assert [track.track_id for track in tracker.tracks_at(report.now_ns)] == [0]
+    assert tracker.failures == {}
+
+
 @pytest.mark.parametrize("name", ["ekf-replay", "smoother", "ekf-backward-forward"])
 def test_a_track_can_be_asked_for_any_time_in_or_after_its_window(name: str) -> None:
     tracker, report = started(name)

@@ -145,6 +145,12 @@ def test_without_tables_the_setting_is_named(tmp_path):
     assert [type(item) for item in messages(path, tables="meta")] == [EgoState, DetectionList] * 2
 
 
+def test_a_path_may_be_relative(tmp_path, monkeypatch):
+    path = data(tmp_path / "scenes")
+    monkeypatch.chdir(tmp_path)
+    assert len(messages(path.relative_to(tmp_path))) == 6
+
+
 @pytest.mark.parametrize(
     ("yaws_rad", "course_rad"), [((0.0, 3.0), 2.9), ((0.0, 3.0), 0.1), ((3.0, -3.0), math.pi)], ids=repr
 )

@@ -68,7 +68,10 @@ def _results(file: Path) -> Iterator[tuple[str, Json]]:
 
 def _tables(file: Path, settings: NuscenesInput) -> Path:
     beside = sorted(each.parent for each in file.parent.glob("v1.0-*/ego_pose.json"))
-    folder = file.parent / (settings.tables or (beside[0] if len(beside) == 1 else ""))
+    if settings.tables is not None:
+        folder = file.parent / settings.tables
+    else:
+        folder = beside[0] if len(beside) == 1 else file.parent
     if not (folder / "ego_pose.json").is_file():
         raise CallError(f"{file}: no folder with ego_pose.json is beside it, name one as input.nuscenes.tables")
     return folder
