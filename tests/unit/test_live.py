@@ -56,7 +56,7 @@ def test_a_track_id_that_is_not_one_is_refused_and_no_track_ends(name: str, trac
     if isinstance(track_id, np.ndarray) and track_id.shape == ():
         assert tracker.state_at(track_id, report.now_ns).track_id == 0
     else:
-        with pytest.raises(CallError, match="track_id: must be an integer|track 7 does not exist"):
+        with pytest.raises(CallError, match=r"track_id: must be an integer|track 7 does not exist"):
             tracker.state_at(track_id, report.now_ns)
     assert [track.track_id for track in tracker.tracks_at(report.now_ns)] == [0]
     assert tracker.failures == {}
