@@ -83,6 +83,8 @@ class Claims:
     """Where stamps nearly coincide, the tolerance grows to this many times `rounding_bound` of the suite."""
     retrodicts: bool = False
     """True if a filter predicts the innovation of a late measurement from everything fused, as smoothers do."""
+    iterates: bool = False
+    """True if an update of a nonlinear measurement is linearised at its own result."""
     spreads: bool = False
     """True if predictions of a nonlinear model are averages over the spread of the state, not values at its mean."""
     mixes: bool = False

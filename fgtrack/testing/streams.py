@@ -1,16 +1,18 @@
 """Random streams of measurements in random orders of arrival."""
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fgtrack.core.time import NS_PER_S, seconds
+from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.models.measurement import SensorPose, measurement_model
+from fgtrack.models.measurement import AT_ORIGIN, RELATIVE, SensorPose, measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
 from fgtrack.models.sensors import RobustLoss
+from fgtrack.testing.equations import linearised, residual
 
 MS, US = 1_000_000, 1_000
 LAG_S = 1.0
@@ -24,9 +26,18 @@ START = Start(
     speed_std_mps=3.0,
     yaw_rate_radps=0.1,
 )
+#: Standard deviations of components other than 0.5.
+_STD = {"yaw_rad": 0.1, "bearing_rad": 0.03, "range_rate_mps": 0.3}
 LINEAR, NONLINEAR = CV(velocity_density_m2ps3=5.0), CTRV()
 _POSITION = ("x_m", "y_m")
-COMPONENTS = (_POSITION, (*_POSITION, "speed_mps"), (*_POSITION, "yaw_rad"), (*_POSITION, "range_m"))
+COMPONENTS = (
+    _POSITION,
+    (*_POSITION, "speed_mps"),
+    (*_POSITION, "yaw_rad"),
+    (*_POSITION, "range_m"),
+    ("range_m", "bearing_rad"),
+    ("range_m", "bearing_rad", "range_rate_mps"),
+)
 
 
 @dataclass(frozen=True)
@@ -41,6 +52,11 @@ class Stream:
     def stamps_ns(self) -> list[int]:
         """Stamps of the start and of the measurements, each once, in order."""
         return sorted({self.start.stamp_ns, *(m.stamp_ns for m in self.measurements)})
+
+    @property
+    def content(self) -> Hashable:
+        """All of the stream, as a value that two equal streams share."""
+        return self.motion, repr(self.start), tuple(item.order for item in self.measurements)
 
     @property
     def newest_ns(self) -> int:
@@ -59,17 +75,20 @@ class Stream:
 def measured(
     rng: np.random.Generator, motion: MotionModel, offset_ns: int, names: Sequence[str] = _POSITION
 ) -> Measurement:
-    """`names` of an object that drives straight on, `offset_ns` after the start."""
-    travelled_m = 20.0 * seconds(offset_ns)
-    x_m, y_m = 3.0 + travelled_m * np.cos(0.4), -2.0 + travelled_m * np.sin(0.4)
-    truth = {"x_m": x_m, "y_m": y_m, "yaw_rad": 0.4, "speed_mps": 20.0, "range_m": np.hypot(x_m, y_m)}
-    std = np.array([0.1 if name == "yaw_rad" else 0.5 for name in names])
-    z = np.array([truth[name] for name in names]) + std * rng.standard_normal(len(names))
-    return Measurement(START.stamp_ns + offset_ns, measurement_model(tuple(names), motion), z, np.diag(std**2))
+    """`names` of an object that drives straight on, `offset_ns` after the start.
+
+    A range, a bearing or a Doppler is seen from a vehicle that follows beside the object and turns.
+    """
+    after_s = seconds(offset_ns)
+    x = np.array([3.0 + 20.0 * after_s * np.cos(0.4), -2.0 + 20.0 * after_s * np.sin(0.4), 0.4, 20.0, 0.0])
+    beside = SensorPose(20.0 + 15.0 * after_s, -9.0 + 4.0 * after_s, 2.0 + 0.5 * after_s, 15.0, 4.0)
+    pose = beside if set(names) & set(RELATIVE) else AT_ORIGIN
+    seen = _seen(rng, START.stamp_ns + offset_ns, x, {name: _STD.get(name, 0.5) for name in names}, pose)
+    return replace(seen, model=measurement_model(tuple(names), motion))
 
 
 def regular(motion: MotionModel, rng: np.random.Generator, num: int = 12) -> Stream:
-    """In time order, every 50 ms; in a nonlinear model now and then with yaw, speed or range."""
+    """In time order, every 50 ms; in a nonlinear model any of `COMPONENTS`."""
     return Stream(motion, tuple(measured(rng, motion, k * 50 * MS, _names(rng, motion)) for k in range(1, num + 1)))
 
 
@@ -89,9 +108,11 @@ def one_late(steps: int, rng: np.random.Generator) -> Stream:
     return Stream(LINEAR, tuple(measured(rng, LINEAR, ns) for ns in (*stamps_ns, late_ns)))
 
 
-def mild(rng: np.random.Generator) -> Stream:
-    """A car that is well known from the start and passes a yaw of pi, seen by LiDAR and RADAR of a turning observer.
-    The LiDAR measures position and yaw, the RADAR range, bearing and Doppler from a pose with an arm and a velocity.
+def informative(rng: np.random.Generator) -> Stream:
+    """A turning car that passes a yaw of pi, seen from near by four sensors in turn, every 20 ms.
+
+    Three of the four sensors measure a range, a bearing or a Doppler precisely, from a pose that moves and turns.
+    Every row of every Jacobian therefore moves the result by many standard deviations.
     """
     start = replace(
         START,
@@ -104,30 +125,49 @@ def mild(rng: np.random.Generator) -> Stream:
         yaw_rate_radps=0.5,
         yaw_rate_std_radps=0.05,
     )
-    noise = {"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.15}, {"range_m": 0.5, "bearing_rad": 0.02, "range_rate_mps": 0.1}
+    sensors = (
+        {"range_m": 0.1, "bearing_rad": 0.005, "range_rate_mps": 0.1},
+        {"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.15},
+        {"speed_mps": 0.3, "bearing_rad": 0.01},
+        {"range_m": 0.2, "range_rate_mps": 0.1},
+    )
     mean, P = initial_state(NONLINEAR, start)
-    x, measurements = mean + np.linalg.cholesky(P) @ rng.standard_normal(len(mean)), list[Measurement]()
+    x = mean + np.linalg.cholesky(P) @ rng.standard_normal(len(mean))
+    measurements = []
     for k in range(1, 25):
-        root = np.linalg.cholesky(NONLINEAR.process_noise(x, 0.025))
-        x = NONLINEAR.predict(x, 0.025) + root @ rng.standard_normal(len(x))
-        std = np.array(list(noise[k % 2].values()))
-        turned_rad = 0.01 * k - 0.3
-        pose = SensorPose(np.sin(turned_rad) * 50.0, -np.cos(turned_rad) * 50.0, turned_rad - 1.95, 19.0, -6.0)
-        model, pose = measurement_model(tuple(noise[k % 2]), NONLINEAR), pose if k % 2 else SensorPose()
-        z = model.residual(model.predict(x, pose) + std * rng.standard_normal(3), np.zeros(3))
-        measurements.append(Measurement(start.stamp_ns + k * 25 * MS, model, z, np.diag(std**2), pose))
+        after_s = 0.02 * k
+        pose = SensorPose(24.0 - 4.0 * after_s, 24.0 - 3.0 * after_s, 0.6 * after_s - 1.3, -4.0, -3.0)
+        std = sensors[k % len(sensors)]
+        measurements.append(_seen(rng, start.stamp_ns + k * 20 * MS, _turned(x, after_s), std, pose))
     return Stream(NONLINEAR, tuple(measurements), start)
 
 
-def mild_robust(rng: np.random.Generator) -> Stream:
-    """The same with positions of which every other one is an outlier, under a Huber loss."""
-    stream = mild(rng)
+def _turned(x: FloatArray, after_s: float) -> FloatArray:
+    """A state (n,) after a time at constant speed and yaw rate, which is not 0."""
+    yaw_rad, radius_m = x[2] + x[4] * after_s, x[3] / x[4]
+    east_m, north_m = np.sin(yaw_rad) - np.sin(x[2]), np.cos(x[2]) - np.cos(yaw_rad)
+    return np.array([x[0] + radius_m * east_m, x[1] + radius_m * north_m, yaw_rad, *x[3:]])
+
+
+def with_outliers(rng: np.random.Generator) -> Stream:
+    """The same with a Huber loss. Half of the measurements have errors of eight standard deviations."""
+    stream = informative(rng)
     measurements = []
-    for item in stream.measurements[1::2]:
+    for item in stream.measurements:
         off = np.sqrt(np.diag(item.R)) * rng.normal(0.0, 8.0, len(item.z)) * (rng.random() < 0.5)
-        off[2:] = 0.0
+        off[[name == "yaw_rad" for name in item.model.components]] = 0.0
         measurements.append(replace(item, z=item.z + off, loss=RobustLoss("huber", 1.5)))
     return replace(stream, measurements=tuple(measurements))
+
+
+def _seen(
+    rng: np.random.Generator, stamp_ns: int, x: FloatArray, std: Mapping[str, float], pose: SensorPose
+) -> Measurement:
+    """A measurement of the nonlinear state x (n,) from `pose`, with the standard deviations `std` by component."""
+    names, sigma = tuple(std), np.array(list(std.values()))
+    z = linearised(names, NONLINEAR.state_names, x, pose).z + sigma * rng.standard_normal(len(sigma))
+    z = residual(names, z, np.zeros(len(z)))
+    return Measurement(stamp_ns, measurement_model(names, NONLINEAR), z, np.diag(sigma**2), pose)
 
 
 def _names(rng: np.random.Generator, motion: MotionModel) -> tuple[str, ...]:

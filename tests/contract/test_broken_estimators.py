@@ -1,20 +1,22 @@
 """An estimator that breaks one promise is found out by that promise, with measurements that show it."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from fgtrack.core.types import TrackState
+from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus
 from fgtrack.estimation.filters.ekf import correct_one
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.object_bank import ObjectBank
+from fgtrack.models.measurement import AT_ORIGIN, MeasurementModel
 from fgtrack.models.motion import MotionModel
 from fgtrack.testing import BrokenPromiseError, check_estimator, estimator_checks
 
 ANY_ORDER = "gives the dense joint posterior in any order"
-NEAR = "comes near the posterior of a nonlinear model"
+NEAR = "gives the posterior of a nonlinear model"
 SEVERAL = "gives each of several objects what it gives one alone"
 
 
@@ -100,8 +102,8 @@ class FusesWhatIsNoNumber(ReplayEkf):
 class ForgetsWithTheClock(ReplayEkf):
     def advance(self, now_ns: int) -> None:
         super().advance(now_ns)
-        if now_ns > self.window_ns[1] and self._steps:
-            self._steps[-1].mean = self._steps[-1].mean + 1e-3
+        if now_ns > self.window_ns[1]:
+            self.steps[-1] = replace(self.steps[-1], mean=self.steps[-1].mean + 1e-3)
 
 
 class StandsStill(ReplayEkf):
@@ -164,7 +166,7 @@ class RemovesTheNext(FilterBank):
 
 class ShowsAnother(FilterBank):
     def present(self) -> list[TrackState]:
-        return super().present()[::-1]
+        return list(super().present())[::-1]
 
 
 class GivesOneForAll(FilterBank):
@@ -173,37 +175,84 @@ class GivesOneForAll(FilterBank):
         return replace(states, means=np.repeat(states.means[:1], len(states.means), axis=0))
 
 
-@pytest.mark.parametrize(
-    ("broken", "promise"),
-    [
-        (DropsLateData, ANY_ORDER),
-        (DropsLateData, "gives the estimate of the time order in any order"),
-        (DropsLateData, "keeps all that it accepts and nothing else"),
-        (ForgetsEqualStamps, ANY_ORDER),
-        (DoublesTheNoise, "is the kalman filter in sequence"),
-        (DoublesTheNoise, "reports the innovation against all that it has fused"),
-        (SaysInSequence, "counts each measurement as what it is"),
-        (TakesLatencyForDisorder, "counts each measurement as what it is"),
-        (Lopsided, "gives symmetric positive definite covariances"),
-        (Random, "gives the same bits for the same input"),
-        (SharesItsState, "changes no input and no output later"),
-        (FusesWhatIsTooOld, "reports what is too old and stays as it was"),
-        (FusesWhatIsNoNumber, "stays as it was after a failure and fuses the next"),
-        (ForgetsWithTheClock, "moves only the window with the clock"),
-        (StandsStill, "predicts ahead by the motion model"),
-        (WithQuadrupleNoise, NEAR),
-        (WithoutPose, NEAR),
-        (WithoutLoss, NEAR),
-        (SaysAnotherCovariance, "counts each measurement as what it is"),
-        (RemovesTheNext, SEVERAL),
-        (ShowsAnother, SEVERAL),
-        (GivesOneForAll, SEVERAL),
-    ],
+#: Each broken estimator, the promise that it breaks, and the fault that the promise must name.
+BROKEN = (
+    (DropsLateData, ANY_ORDER, "differs from the dense joint posterior"),
+    (DropsLateData, "gives the estimate of the time order in any order", "differs from that of the time order"),
+    (DropsLateData, "keeps all that it accepts and nothing else", "differs from that of these"),
+    (ForgetsEqualStamps, ANY_ORDER, "differs from the dense joint posterior"),
+    (DoublesTheNoise, "is the kalman filter in sequence", "differs from the Kalman filter's"),
+    (DoublesTheNoise, "reports the innovation against all that it has fused", r"the innovation .* off by"),
+    (SaysInSequence, "counts each measurement as what it is", "late, is in_sequence"),
+    (TakesLatencyForDisorder, "counts each measurement as what it is", "in sequence, is out_of_sequence"),
+    (Lopsided, "gives symmetric positive definite covariances", "is not symmetric"),
+    (Random, "gives the same bits for the same input", "states differ"),
+    (SharesItsState, "changes no input and no output later", "changes later"),
+    (FusesWhatIsTooOld, "reports what is too old and stays as it was", "a stamp before .* changes the state"),
+    (FusesWhatIsNoNumber, "stays as it was after a failure and fuses the next", "that is not a number is "),
+    (ForgetsWithTheClock, "moves only the window with the clock", "differs from that before the clock moved"),
+    (StandsStill, "predicts ahead by the motion model", "differs from the prediction of the newest one"),
+    (WithQuadrupleNoise, NEAR, "differs from that of a plain calculation"),
+    (WithoutPose, NEAR, "differs from that of a plain calculation"),
+    (WithoutLoss, NEAR, "differs from that of a plain calculation"),
+    (SaysAnotherCovariance, "counts each measurement as what it is", "the NIS is .* by the covariance"),
+    (RemovesTheNext, SEVERAL, r"its objects are \(0, 1, 2, 4"),
+    (ShowsAnother, SEVERAL, "the present state of object 0 is "),
+    (GivesOneForAll, SEVERAL, "the state of object 1 .* differs from what it is alone"),
 )
-def test_a_broken_estimator_is_found_out(broken: type, promise: str) -> None:
+
+
+@pytest.mark.parametrize(("broken", "promise", "fault"), BROKEN)
+def test_a_broken_estimator_is_found_out_by_the_promise_that_it_breaks(broken: type, promise: str, fault: str) -> None:
+    """An exception of the broken estimator would be a fault of this test: its text begins with the exception's name."""
     with pytest.raises(BrokenPromiseError, match="measurements in the order of arrival") as error:
         estimator_checks(broken)[promise]()
     assert list(error.value.promises) == [promise]
+    said = error.value.promises[promise]
+    assert re.search(fault, said.partition("measurements in the order")[0])
+    assert not re.match(r"\w+(Error|Exception): ", said)
+
+
+def test_every_broken_estimator_of_this_file_is_tested() -> None:
+    bases = {Sees, FilterBank}
+    broken = {each for each in globals().values() if isinstance(each, type) and each.__module__ == __name__} - bases
+    assert broken == {each for each, _, _ in BROKEN}
+
+
+#: Components of which the derivative is negated.
+ROWS = ("range_m", "bearing_rad", "range_rate_mps", "x_m", "y_m", "yaw_rad", "speed_mps")
+
+
+@pytest.mark.parametrize("row", ROWS)
+@pytest.mark.parametrize("name", ["ekf-replay", "iekf-replay", "ekf-backward-forward"])
+def test_a_wrong_sign_in_a_row_of_the_measurement_jacobian_breaks_the_nonlinear_promise(
+    monkeypatch: pytest.MonkeyPatch, name: str, row: str
+) -> None:
+    """The estimator and all of its streams are as they are; the shipped measurement model alone is wrong."""
+    check = estimator_checks(name)[NEAR]
+    check()
+    negate_row(monkeypatch, row)
+    with pytest.raises(BrokenPromiseError) as error:
+        check()
+    assert list(error.value.promises) == [NEAR]
+    off = re.match(
+        r"the state at .* differs from that of a plain calculation by (\S+) standard", error.value.promises[NEAR]
+    )
+    assert off is not None
+    assert float(off[1]) > 0.01  # a thousand times the tolerance, which is 1e-7, or 1e-5 of the filter that iterates
+
+
+def negate_row(monkeypatch: pytest.MonkeyPatch, row: str) -> None:
+    """Negate the derivative of the component `row` in every shipped measurement model."""
+    linear, nonlinear = MeasurementModel.selection, MeasurementModel.jacobian
+
+    def sign(model: MeasurementModel) -> FloatArray:
+        return np.where([name == row for name in model.components], -1.0, 1.0)[:, None]
+
+    monkeypatch.setattr(MeasurementModel, "selection", lambda model, n: sign(model) * linear(model, n))
+    monkeypatch.setattr(
+        MeasurementModel, "jacobian", lambda model, x, pose=AT_ORIGIN: sign(model) * nonlinear(model, x, pose)
+    )
 
 
 @pytest.mark.parametrize("kind", [Sees, FilterBank])

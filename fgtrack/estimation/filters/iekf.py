@@ -25,6 +25,7 @@ class IekfReplay(ReplayEkf):
     prediction is the last. A linear measurement is fused as by `ReplayEkf`.
     """
 
+    iterates = True
     _max_iterations, _tolerance = 10, 1e-6
 
     def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:

@@ -112,6 +112,7 @@ class IplfReplay(UkfReplay):
     is linear it does as `ReplayEkf`.
     """
 
+    iterates = True
     _max_iterations, _tolerance = 10, 1e-2
 
     def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
