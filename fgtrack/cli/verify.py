@@ -1,4 +1,4 @@
-"""`fgtrack verify`: the contract suite over the estimators and motion models that are installed."""
+"""`fgtrack verify`: the contract suites over estimators, motion models and measurement models."""
 
 from typing import Annotated
 
@@ -9,7 +9,10 @@ from fgtrack.cli.show import progress, say, show
 from fgtrack.core.errors import DataError
 from fgtrack.estimation.registry import ESTIMATORS, MOTION_MODELS, Claims
 from fgtrack.evaluation.tables import Column, Table
-from fgtrack.testing import BrokenPromiseError, estimator_checks, motion_model_checks
+from fgtrack.models.correlated_errors import CorrelatedErrors
+from fgtrack.models.measurement import COMPONENTS
+from fgtrack.models.motion import CTRV
+from fgtrack.testing import BrokenPromiseError, estimator_checks, measurement_model_checks, motion_model_checks
 
 _COLUMNS = (
     Column("name", left=True),
@@ -24,8 +27,9 @@ def verify(
 ) -> None:
     """Check the contract of estimators, in any order of arrival.
 
-    All estimators and motion models that are installed, plug-ins included, on simulated streams, against plain
-    calculations. Exit code 1 where a promise is broken.
+    All estimators and motion models that are installed, plug-ins included, and all measured components, against plain
+    calculations. Shipped models are compared with their differential equations and definitions, entry by entry. Exit
+    code 1 where a promise is broken.
     """
     names = list(ESTIMATORS.loaded()) if name is None else [ESTIMATORS.resolve(name)]
     broken: dict[str, dict[str, str]] = {}
@@ -36,6 +40,9 @@ def verify(
         if name is None:
             models = MOTION_MODELS.loaded().items()
             suites |= {each: ("motion model", motion_model_checks(model())) for each, model in models}
+            errors = CorrelatedErrors(CTRV(), (("sensor.x_m", 1.0), ("sensor.y_m", 2.0)))
+            suites["correlated errors"] = ("motion model", motion_model_checks(errors))
+            suites |= {each: ("measurement", measurement_model_checks(each)) for each in COMPONENTS}
         for each, (_, checks) in suites.items():
             for check in checks.values():
                 try:
@@ -46,7 +53,7 @@ def verify(
         {"name": each, "exact": claim or "-", "promises": len(checks), "broken": len(broken.get(each, ()))}
         for each, (claim, checks) in suites.items()
     ]
-    table = Table("Contract of estimators and motion models", records, _COLUMNS, ("name",))
+    table = Table("Contract of estimators and models", records, _COLUMNS, ("name",))
     promises = sum(len(checks) for _, checks in suites.values())
     values = {"met": not broken, "promises": promises, "checked": list(suites), "broken": broken}
     show(table, "json" if as_json else None, values)

@@ -1,7 +1,16 @@
-"""The contract suites: what every estimator and every motion model must do, as checks that name the broken promise."""
+"""The contract suites of estimators, motion models and measurement models, as checks that name the broken promise."""
 
 from fgtrack.testing.estimators import check_estimator, estimator_checks
+from fgtrack.testing.measurement_models import check_measurement_models, measurement_model_checks
 from fgtrack.testing.motion_models import check_motion_model, motion_model_checks
 from fgtrack.testing.promise import BrokenPromiseError
 
-__all__ = ["BrokenPromiseError", "check_estimator", "check_motion_model", "estimator_checks", "motion_model_checks"]
+__all__ = [
+    "BrokenPromiseError",
+    "check_estimator",
+    "check_measurement_models",
+    "check_motion_model",
+    "estimator_checks",
+    "measurement_model_checks",
+    "motion_model_checks",
+]

@@ -57,7 +57,7 @@ def _close(
 
 @dataclass(frozen=True)
 class _Problem:
-    """What a reference is calculated from: equal problems have the same result, which is calculated once."""
+    """Input of a reference. Equal problems have the same result, which is calculated once."""
 
     content: Hashable
     claims: Claims

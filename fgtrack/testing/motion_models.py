@@ -1,14 +1,17 @@
-"""Promises of every motion model: predict, and publish a state."""
+"""Promises of every motion model: predict, and publish a state; and of shipped ones, to obey their equation."""
 
 import math
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.types import ACCEL, STATE_NAMES, FloatArray
-from fgtrack.models.motion import CARTESIAN, POLAR, MotionModel
+from fgtrack.core.linalg import kernels
+from fgtrack.core.types import ACCEL, STATE_NAMES, YAW_RATE, FloatArray
+from fgtrack.models.motion import CARTESIAN, POLAR, MotionModel, WhiteNoise
+from fgtrack.testing.equations import Moments, MotionEquation, equation_of, moments
 from fgtrack.testing.promise import BrokenPromiseError, WrongError, fault, require, run_all, sound
 from fgtrack.testing.references import slope
 
@@ -20,29 +23,137 @@ _SMALL = 1e-6
 _NUM_STATES = 20
 #: Of every other state a short duration as between two measurements, of the rest up to a long gap.
 _LONGEST_S = 0.5, 4.0
+#: Entries of Jacobians and covariances must agree with the equation to this share.
+_ENTRY_TOLERANCE = 1e-7
 
 
-def check_motion_model(model: MotionModel, seed: int = 0) -> None:
-    """Raise `BrokenPromiseError` unless `model` keeps the contract, with the state and duration that show it."""
-    run_all(repr(model), motion_model_checks(model, seed))
+def check_motion_model(model: MotionModel, seed: int = 0, equation: MotionEquation | None = None) -> None:
+    """Raise `BrokenPromiseError` unless `model` keeps the contract, with the state and duration that show it.
+
+    With an `equation`, mean, Jacobian and noise must also be those of the stochastic differential equation. A shipped
+    model has an equation of its own.
+    """
+    run_all(repr(model), motion_model_checks(model, seed, equation))
 
 
-def motion_model_checks(model: MotionModel, seed: int = 0) -> dict[str, Callable[[], None]]:
+def motion_model_checks(
+    model: MotionModel, seed: int = 0, equation: MotionEquation | None = None
+) -> dict[str, Callable[[], None]]:
     """The checks of `check_motion_model` one by one, by name of the promise: for `pytest.mark.parametrize`."""
-    names = {check.__name__.removeprefix("_").replace("_", " "): check for check in _CHECKS}
-    return {name: partial(_run, name, check, model, seed) for name, check in names.items()}
+    checks: dict[str, Callable[[], None]] = {
+        _name(check): partial(_run, _name(check), check, model, seed) for check in _CHECKS
+    }
+    equation = equation or equation_of(model)
+    if equation is None:
+        return checks
+    cases = _EquationCases(model, seed, equation)
+    of_equation = list(_EQUATION_CHECKS)
+    if isinstance(model, WhiteNoise) and model.is_compiled:
+        of_equation.append(_moves_in_compiled_loops_as_by_its_equation)
+    return checks | {_name(check): partial(_run_equation, _name(check), check, cases) for check in of_equation}
+
+
+def _name(check: Callable[..., None]) -> str:
+    return check.__name__.removeprefix("_").replace("_", " ")
 
 
 def _run(name: str, check: ModelCheck, model: MotionModel, seed: int) -> None:
-    rng = np.random.default_rng(seed)
+    for x, dt_s in _cases(model, seed):
+        if wrong := fault(check, model, x, dt_s):
+            raise BrokenPromiseError(repr(model), {name: f"{wrong}\nx = {x.tolist()}, dt_s = {dt_s!r}"})
+
+
+def _cases(model: MotionModel, seed: int) -> list[tuple[FloatArray, float]]:
+    """Random states (n,) of a model, with durations."""
+    rng, cases = np.random.default_rng(seed), list[tuple[FloatArray, float]]()
     for number in range(_NUM_STATES):
         kinematic = rng.normal(size=6) * [50.0, 50.0, 2.0, 20.0, 0.3, 2.0]
         x = model.from_kinematic(kinematic, np.eye(6))[0]
         others = [float(name not in STATE_NAMES) for name in model.state_names[4:]]
         x[4:] += others * rng.normal(size=model.dim - 4)
         dt_s = 0.0 if number == 0 else float(rng.uniform(1e-3, _LONGEST_S[number % 2]))
-        if wrong := fault(check, model, x, dt_s):
-            raise BrokenPromiseError(repr(model), {name: f"{wrong}\nx = {x.tolist()}, dt_s = {dt_s!r}"})
+        cases.append((x, dt_s))
+    return cases
+
+
+@dataclass(frozen=True)
+class _EquationCases:
+    """A motion model, and the equation that it must obey."""
+
+    model: MotionModel
+    seed: int
+    equation: MotionEquation
+
+    @cached_property
+    def states(self) -> tuple[FloatArray, FloatArray]:
+        """States (m, n) and durations (m,). An object at rest, a straight course and a spin are among them."""
+        cases = _cases(self.model, self.seed)
+        x, dt_s = np.array([case[0] for case in cases]), np.array([case[1] for case in cases])
+        x[1, 2:], x[2, 4:] = 0.0, 0.0
+        if self.model.dim > YAW_RATE:
+            x[3, YAW_RATE] = -3.0
+        return x, dt_s
+
+    @cached_property
+    def expected(self) -> Moments:
+        """Mean, Jacobian and noise of the equation at the states."""
+        return moments(self.equation, *self.states)
+
+
+def _run_equation(name: str, check: Callable[[_EquationCases, int], None], cases: _EquationCases) -> None:
+    x, dt_s = cases.states
+    for case in range(len(x)):
+        if wrong := fault(check, cases, case):
+            text = f"{wrong}\nx = {x[case].tolist()}, dt_s = {float(dt_s[case])!r}"
+            raise BrokenPromiseError(repr(cases.model), {name: text})
+
+
+def _each_equal(values: FloatArray, expected: FloatArray, scale: FloatArray | float, what: str) -> None:
+    """Require that each entry of `values` is that of `expected`, relative to its own size and its `scale`."""
+    require(np.shape(values) == expected.shape, f"{what} has shape {np.shape(values)}, expected {expected.shape}")
+    off = np.abs(values - expected) / (np.abs(expected) + scale)
+    worst = np.unravel_index(np.argmax(off), off.shape)
+    entry = ", ".join(str(index) for index in worst)
+    require(
+        off[worst] < _ENTRY_TOLERANCE,
+        f"{what}: entry {entry} is {values[worst]!r}, by the equation {expected[worst]!r}",
+    )
+
+
+def _obeys_its_equation(cases: _EquationCases, case: int) -> None:
+    x, dt_s = cases.states
+    for mean in cases.model.predict(x[case], float(dt_s[case])), cases.model.transition(x[case], dt_s[case]).mean:
+        _each_equal(mean, cases.expected.mean[case], 1.0, "the predicted state")
+
+
+def _has_the_jacobian_of_its_equation(cases: _EquationCases, case: int) -> None:
+    x, dt_s = cases.states
+    for F in cases.model.jacobian(x[case], float(dt_s[case])), cases.model.transition(x[case], dt_s[case]).F:
+        _each_equal(F, cases.expected.F[case], 1.0, "jacobian")
+
+
+def _has_the_noise_of_its_equation(cases: _EquationCases, case: int) -> None:
+    """Composition does not show the density: a density that is 10 % off composes perfectly."""
+    x, dt_s = cases.states
+    expected = cases.expected.Q[case]
+    sigma = np.sqrt(np.diag(expected))
+    scale = np.outer(sigma, sigma) + np.finfo(np.float64).tiny
+    for Q in cases.model.process_noise(x[case], float(dt_s[case])), cases.model.transition(x[case], dt_s[case]).Q:
+        _each_equal(Q, expected, scale, "process_noise")
+
+
+def _moves_in_compiled_loops_as_by_its_equation(cases: _EquationCases, case: int) -> None:
+    """Compiled filters take the transition without a call of the model."""
+    model, (x, dt_s) = cases.model, cases.states
+    assert isinstance(model, WhiteNoise)  # the only models that compiled loops take
+    mean, P = x[case][None].copy(), np.diag(1.0 + np.arange(model.dim))[None]
+    F, Q = cases.expected.F[case], cases.expected.Q[case]
+    expected = F @ P[0] @ F.T + Q
+    propagate = kernels("fgtrack.estimation.kernels.kalman").propagate
+    propagate(model.kind, model.density, mean, P, np.ones(1, dtype=np.int64), float(dt_s[case]))
+    _each_equal(mean[0], cases.expected.mean[case], 1.0, "the state in a compiled loop")
+    sigma = np.sqrt(np.diag(expected))
+    _each_equal(P[0], expected, np.outer(sigma, sigma), "the covariance in a compiled loop")
 
 
 def _equal(values: FloatArray, expected: FloatArray, tolerance: float, what: str) -> None:
@@ -78,7 +189,7 @@ def _has_noise_that_composes(model: MotionModel, x: FloatArray, dt_s: float) -> 
     F = model.jacobian(between, b)
     parts = F @ model.process_noise(x, a) @ F.T + model.process_noise(between, b)
     Q = model.process_noise(x, dt_s)
-    scale = np.sqrt(np.outer(np.diag(Q), np.diag(Q))) + np.finfo(np.float64).tiny
+    scale = np.sqrt(np.abs(np.outer(np.diag(Q), np.diag(Q)))) + np.finfo(np.float64).tiny
     _equal(parts / scale, Q / scale, 1e-6, "F(b) Q(a) F(b)' + Q(b) scaled like Q(a + b),")
 
 
@@ -195,3 +306,4 @@ _CHECKS: tuple[ModelCheck, ...] = (
     _is_as_it_was_after_a_kinematic_state,
     _begins_with_a_sound_covariance,
 )
+_EQUATION_CHECKS = (_obeys_its_equation, _has_the_jacobian_of_its_equation, _has_the_noise_of_its_equation)
