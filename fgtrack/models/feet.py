@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import njit, shared, wrapped
+from fgtrack.core.compiled import check, njit, shared, wrapped
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 
 _HEADING, _CURVATURE, _LEFT, _RIGHT, _ALONG, _QUANTITIES = 4, 5, 6, 7, 9, 10  # see `fgtrack.models.track_map`
@@ -31,6 +31,7 @@ def _nearest(x: float, y: float, rows: FloatArray, longest_m: float) -> int:
 @njit("int64[::1](float64[:, ::1], Array(float64, 2, 'C', readonly=True), float64)")
 def nearest(points_m: FloatArray, rows: FloatArray, longest_m: float) -> IntArray:
     """Return for each of `points_m` (m, 2) the first of the nearest points `rows` (n, 2), at most `longest_m` apart."""
+    check(len(rows) > 0 and rows.shape[1] >= 2 and points_m.shape[1] >= 2)
     indices = np.empty(len(points_m), np.int64)
     for i in range(len(points_m)):
         indices[i] = _nearest(points_m[i, 0], points_m[i, 1], rows, longest_m)
@@ -44,6 +45,7 @@ def feet(points_m: FloatArray, segments: FloatArray, longest_m: float) -> tuple[
     point of the line, has the point on its normal: Re((q - t e) (B + t dB)) = 0 with q from the start of the segment to
     the point, e the segment, and B, dB the inverse of the heading and its change, as complex numbers.
     """
+    check(len(segments) > 0 and segments.shape[1] >= 2 * _QUANTITIES and points_m.shape[1] >= 2)
     quantities, lateral = np.empty((len(points_m), _QUANTITIES)), np.empty(len(points_m))
     for i in range(len(points_m)):
         x, y = points_m[i, 0], points_m[i, 1]

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import add_product_transposed, copy, inlined, merged, njit, product, scratch, shared
+from fgtrack.core.compiled import add_product_transposed, check, copy, inlined, merged, njit, product, scratch, shared
 from fgtrack.core.types import FloatArray
 
 #: Kinds of motion: constant turn rate and velocity (or acceleration), constant velocity.
@@ -180,5 +180,8 @@ def transitions(
     kind: int, x: FloatArray, dt_s: FloatArray, density: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
 ) -> None:
     """Write mean (m, n), F and Q (m, n, n) of states (m, n) after `dt_s` (m,)."""
+    n = x.shape[1]
+    check(min(len(dt_s), len(mean), len(F), len(Q)) >= len(x) and len(density) >= n and mean.shape[1] == n)
+    check(F.shape[1] == n and F.shape[2] == n and Q.shape[1] == n and Q.shape[2] == n)
     for k in range(len(x)):
         transition(kind, x[k], dt_s[k], density, mean[k], F[k], Q[k])

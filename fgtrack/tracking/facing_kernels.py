@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import add_congruence, copy, inlined, njit, whiten
+from fgtrack.core.compiled import add_congruence, check, check_rows, copy, inlined, njit, whiten
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 
 #: Bits of a reading; 0 takes the detection as it was measured.
@@ -88,6 +88,9 @@ def turned(
     """Return which kinematic states (m, n) and (m, n, n) have the yaw of the rear, shape (m,).
     The belief of `log_odds` (m,) and of the speed changes what was true `before` where it is beyond `sure`.
     """
+    m = len(means)
+    check(min(len(covariances), len(log_odds), len(before)) >= m and means.shape[1] > 3)
+    check(covariances.shape[1] > 3 and covariances.shape[2] > 3)
     result = before.copy()
     for i in range(len(means)):
         belief = log_odds[i] + _forwards(means[i, 3], covariances[i, 3, 3])
@@ -128,6 +131,11 @@ def read(
     reading, with `more` (m,), is at most the limit of its number of components, `limits` (k + 1,).
     """
     m, k = y.shape
+    check_rows(tracks, 0, min(len(x), len(P), len(log_odds)))
+    check(min(len(z), len(tracks), len(R), len(more)) >= m and (len(H) == 1 or len(H) >= m))
+    check(z.shape[1] >= k and H.shape[1] == k and H.shape[2] == P.shape[1] and P.shape[2] == P.shape[1])
+    check(R.shape[1] == k and R.shape[2] == k and x.shape[1] > 3 and P.shape[1] > 3)
+    check(-1 <= yaw < k and len(signed) >= k and len(shares) >= 3 and len(limits) > k)
     readings, costs, evidence = np.full(m, OUTSIDE), np.full(m, np.inf), np.zeros((m, 3))
     order, S, root = np.empty(k, np.int64), np.empty((k, k)), np.empty((k, k))
     HP, white, weights, logs = np.empty((k, P.shape[1])), np.empty(k), np.zeros((2, 2 * _NUM_YAW)), np.empty(6)

@@ -48,6 +48,10 @@ class GuardedBank:
         """See `TrackBank.track_ids`."""
         return tuple(self._alive)
 
+    def holds(self, track_id: int) -> bool:
+        """Return True if there is such a track; the cost does not depend on their number."""
+        return track_id in self._alive
+
     def advance(self, now_ns: int) -> None:
         """See `TrackBank.advance`."""
         self._now_ns = now_ns

@@ -525,7 +525,7 @@ class Tracker:
                     return
                 track_id = self._number(scan.objects[candidates.leaders[position]])
                 self._parts.bank.birth(track_id, prior)
-                if track_id in self._parts.bank.track_ids:
+                if self._parts.bank.holds(track_id):
                     self._begin(track_id, batch, candidates, position, scan, prior)
                     self._conclude(batch, candidates, [position], Disposition.BIRTH, track_id)
         finally:

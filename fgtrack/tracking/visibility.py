@@ -6,6 +6,8 @@ Evans, IEEE T-AES 40, 2004). Given that it exists, its visibility to a sensor is
 observed by the lists of that sensor alone, so the joint probability is the product of existence and visibilities.
 """
 
+from heapq import heappop, heappush
+
 import numpy as np
 
 from fgtrack.core.linalg import kernels
@@ -38,17 +40,19 @@ class Histories:
         """See `RATIO` and `STAMP`, shape (tracks, entries, columns)."""
         self.counts = np.zeros(_FEWEST_TRACKS, dtype=np.int64)
         """Number of entries of each track, 0 of a free row."""
+        self._free = [*range(_FEWEST_TRACKS)]  # rows, a heap: the first one is taken next
 
     def begin(self, stamp_ns: int, sensor: int, log_odds: float) -> int:
         """Return the row of a new track with these log-odds, visible to the `sensor` that started it."""
-        if self.counts.all():
+        if not self._free:
             self._grow(axis=0)
-        row = int(np.argmin(self.counts))
+        row: int = self._free[0]
         numbers, entries = self.numbers[row, 0], self.entries[row, 0]
         numbers[:], entries[:] = 0.0, NEVER
         numbers[LOG_ODDS], numbers[VISIBLE + sensor] = min(max(log_odds, -LARGEST_LOG_ODDS), LARGEST_LOG_ODDS), 1.0
         entries[STAMP] = entries[VIEWED + sensor] = stamp_ns
         self.counts[row] = 1
+        heappop(self._free)
         return row
 
     def learn(
@@ -83,7 +87,9 @@ class Histories:
 
     def end(self, row: int) -> None:
         """Free the `row` of a track."""
-        self.counts[row] = 0
+        if self.counts[row]:
+            self.counts[row] = 0
+            heappush(self._free, row)
 
     def _grow(self, axis: int) -> None:
         """Double the tracks, or the entries of each; all is allocated before anything changes."""
@@ -93,4 +99,5 @@ class Histories:
         entries = np.zeros((*shape, self.entries.shape[2]), dtype=np.int64)
         counts = np.zeros(shape[0], dtype=np.int64)
         numbers[:rows, :columns], entries[:rows, :columns], counts[:rows] = self.numbers, self.entries, self.counts
-        self.numbers, self.entries, self.counts = numbers, entries, counts
+        free = self._free if axis else [*range(rows, shape[0])]  # tracks are doubled where none is free
+        self.numbers, self.entries, self.counts, self._free = numbers, entries, counts, free

@@ -103,6 +103,7 @@ def propagate(motion: int, density: FloatArray, mean: FloatArray, P: FloatArray,
     """Move states (m, n) and (m, n, n), each by its own number of `steps` (m,) of `dt_s`: f(x) and F P F' + Q."""
     n = mean.shape[1]
     check(len(P) >= len(mean) and len(steps) >= len(mean) and P.shape[1] == n and P.shape[2] == n)
+    check(len(density) >= n)
     F, FP, Q, x = scratch(n, n), scratch(n, n), scratch(n, n), scratch(n)
     for i in range(len(mean)):
         for a in range(n):

@@ -51,21 +51,27 @@ Arrays = tuple[IntArray, IntArray, IntArray, IntArray, FloatArray, FloatArray, F
 
 
 @inlined
-def check_nodes(tracks: IntArray, nodes: Arrays, spare: int) -> None:
-    """Raise `IndexError` for tracks, or numbers of nodes, beyond the ends of the arrays.
-    With `spare` 1 each of the tracks needs the number of another node.
+def check_track(track: int, nodes: Arrays, spare: int) -> None:
+    """Raise `IndexError` for a track, or the number of a node, beyond the ends of the arrays.
+    With `spare` 1 the track needs the number of another node.
     """
     info, all_ns, numbers, labels, backs, points, blocks, rows = nodes
     size, n = len(labels), points.shape[2]
-    check_rows(tracks, 0, len(info))
+    check(0 <= track < len(info))
     check(len(all_ns) == len(info) and len(numbers) == len(info) and all_ns.shape[1] == numbers.shape[1])
     check(len(backs) == size and len(points) == size and len(blocks) == size and len(rows) == size)
     check(backs.shape[1] == n + 1 and backs.shape[2] == n + 1 and blocks.shape[2] == n and blocks.shape[3] == n + 1)
     check(rows.shape[2] == n + 1)
+    own = info[track]
+    check(0 <= own[FIRST] < own[COUNT] <= all_ns.shape[1] - spare and 0 <= own[KNOWN] <= own[COUNT])
+    check_rows(numbers[track, : own[COUNT] + spare], 0, size)
+
+
+@inlined
+def check_nodes(tracks: IntArray, nodes: Arrays, spare: int) -> None:
+    """See `check_track`."""
     for t in range(len(tracks)):
-        own = info[tracks[t]]
-        check(0 <= own[FIRST] < own[COUNT] <= all_ns.shape[1] - spare and 0 <= own[KNOWN] <= own[COUNT])
-        check_rows(numbers[tracks[t], : own[COUNT] + spare], 0, size)
+        check_track(tracks[t], nodes, spare)
 
 
 @inlined

@@ -1,6 +1,6 @@
 """Compiled loops that insert, move, linearise and forget nodes; `nodes` are the `arrays` of `Nodes`, in that order."""
 
-from fgtrack.core.compiled import check, check_rows, cholesky, copy, forward, merged, njit, scratch, shared
+from fgtrack.core.compiled import check, cholesky, copy, forward, merged, njit, scratch, shared
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.smoothing.kernels import (
@@ -26,6 +26,7 @@ from fgtrack.estimation.smoothing.kernels import (
     Q,
     check_indices,
     check_nodes,
+    check_track,
     last_before,
     regularise,
 )
@@ -137,10 +138,8 @@ def move_far(
 ) -> int:
     """See `_move_far`."""
     info, _, _, _, _, points, _, _ = nodes
-    check(0 <= track < len(info) and thresholds.shape[1] == points.shape[2] and len(thresholds) >= 3)
-    check(0 <= info[track, NONLINEAR] < len(thresholds))
-    check(0 <= info[track, FIRST] < info[track, COUNT] <= nodes[2].shape[1])
-    check_rows(nodes[2][track, : info[track, COUNT]], 0, len(nodes[3]))
+    check_track(track, nodes, 0)
+    check(thresholds.shape[1] == points.shape[2] and 0 <= info[track, NONLINEAR] < len(thresholds))
     return _move_far(track, anchor, start, thresholds, nodes, moves, indices)
 
 
@@ -268,8 +267,8 @@ def changed_factors(track: int, start: int, nodes: Arrays, owners: IntArray, fac
     info, _, numbers, labels, _, points, blocks, rows = nodes
     n, num = points.shape[2], 0
     L, noise, moved = scratch(n, n), scratch(n, n), scratch(n)
-    check(0 <= track < len(info) and 0 <= start <= info[track, COUNT] <= numbers.shape[1])
-    check_rows(numbers[track, : info[track, COUNT]], 0, len(labels))
+    check_track(track, nodes, 0)
+    check(0 <= start <= info[track, COUNT])
     last = info[track, COUNT] - 1
     check(min(len(owners), len(factors)) >= last + 1 - start and owners.shape[1] >= 3)
     check(factors.shape[1] >= n + rows.shape[1] and factors.shape[2] >= 2 * n + 1)

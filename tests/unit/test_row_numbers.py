@@ -1,0 +1,122 @@
+"""Compiled loops check no index, so each call checks the row numbers and the sizes of the arrays that it is given."""
+
+import inspect
+from collections.abc import Iterator
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+import pytest
+from support.raising import MS, START_NS, lists, make
+
+MODULES = (
+    "fgtrack.estimation.kernels.kalman",
+    "fgtrack.estimation.kernels.replay",
+    "fgtrack.estimation.kernels.storage",
+    "fgtrack.estimation.smoothing.kernels",
+    "fgtrack.estimation.smoothing.node_kernels",
+    "fgtrack.tracking.facing_kernels",
+    "fgtrack.tracking.kernels",
+    "fgtrack.tracking.visibility_kernels",
+)
+#: Names of arguments that are row numbers, or indices of what a row has.
+ROW_NUMBERS = {"tracks", "rows", "indices", "anchors", "by_x", "sensors", "entries"}
+#: Arguments by whose length a call is as long as it is, or that may have any length.
+LENGTHS = {
+    "arrive.mean", "correct.rows", "correct.y", "faults.means", "forget.counts", "fuse.rows", "innovations.rows",
+    "innovations.y", "learn.counts", "learn.rows", "linearise_motion.tracks", "locate.tracks", "look_up.rows",
+    "move_far.indices", "near.points", "place.H", "place.tracks", "present.counts", "present.rows", "propagate.mean",
+    "read.y", "smooth.tracks", "solve_windows.tracks", "store.rows", "turned.means", "windows.tracks",
+}  # fmt: skip
+Calls = dict[str, list[Any]]
+
+
+def _compiled(module: Any) -> Iterator[str]:
+    for name, value in vars(module).items():
+        if hasattr(value, "py_func") and value.signatures and value.py_func.__module__ == module.__name__:
+            yield name
+
+
+def _copied(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(map(_copied, value))
+    return value.copy() if isinstance(value, np.ndarray) else value
+
+
+@pytest.fixture(scope="module")
+def calls() -> Calls:
+    """The arguments of a call of each compiled function, by module and name, of trackers that run."""
+    recorded, patch = Calls(), pytest.MonkeyPatch()
+    for path in MODULES:
+        module = import_module(path)
+        for name in _compiled(module):
+            own = getattr(module, name)
+
+            def called(*arguments: Any, _own: Any = own, _key: str = f"{path}.{name}") -> Any:
+                sized = [len(each) for each in arguments if isinstance(each, np.ndarray)]
+                if min(sized, default=0) > 1 or _key not in recorded:
+                    recorded[_key] = [_own, *map(_copied, arguments)]
+                return _own(*arguments)
+
+            patch.setattr(module, name, called)
+            for user in ("fgtrack.estimation.smoothing.bank", "fgtrack.tracking.association"):
+                if getattr(import_module(user), name, None) is own:
+                    patch.setattr(import_module(user), name, called)
+    for estimator in ("ekf-replay", "smoother", "smoother-banded", "ekf-backward-forward"):
+        tracker = make(estimator)
+        for k, messages in enumerate(lists(9)):
+            for message in messages:
+                tracker.receive(message)
+            tracker.tick(START_NS + 100 * k * MS)
+    patch.undo()
+    return recorded
+
+
+def _with(arguments: list[Any], place: int, value: Any) -> list[Any]:
+    given = list(map(_copied, arguments))
+    given[place] = value
+    return given
+
+
+def test_a_row_number_beyond_an_end_is_refused(calls: Calls) -> None:
+    tried, accepted = 0, list[str]()
+    for key, (function, *arguments) in calls.items():
+        names = list(inspect.signature(function.py_func).parameters)
+        for place, (name, value) in enumerate(zip(names, arguments, strict=True)):
+            is_row = isinstance(value, np.ndarray) and value.dtype == np.int64 and value.ndim == 1
+            if name not in ROW_NUMBERS or not is_row or not len(value):
+                continue
+            for wrong in (-3, 10**6, 2**40):
+                broken = value.copy()
+                broken[-1] = wrong
+                tried += 1
+                if name == "indices" and key.endswith(("locate", "move_far")):  # written, not read
+                    continue
+                try:
+                    function(*_with(arguments, place, broken))
+                except IndexError:
+                    continue
+                accepted.append(f"{key}: {name} {wrong}")
+    assert tried > 30
+    assert not accepted
+
+
+def test_an_array_that_is_too_small_is_refused(calls: Calls) -> None:
+    tried, accepted = 0, set[str]()
+    for key, (function, *arguments) in calls.items():
+        names = list(inspect.signature(function.py_func).parameters)
+        for place, (name, value) in enumerate(zip(names, arguments, strict=True)):
+            parts = value if isinstance(value, tuple) else (value,)
+            for row, part in enumerate(parts):
+                if not isinstance(part, np.ndarray) or not len(part) or not part.flags.writeable:
+                    continue
+                less = np.ascontiguousarray(part[: len(part) // 2])
+                given = (*parts[:row], less, *parts[row + 1 :]) if isinstance(value, tuple) else less
+                tried += 1
+                try:
+                    function(*_with(arguments, place, given))
+                except IndexError:
+                    continue
+                accepted.add(f"{key.rpartition('.')[2]}.{name}{row if isinstance(value, tuple) else ''}")
+    assert tried > 80
+    assert accepted <= LENGTHS, " ".join(sorted(accepted - LENGTHS))
