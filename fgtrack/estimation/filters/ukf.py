@@ -3,22 +3,39 @@
 The 2 n sigma points are those of the cubature rule of third degree (Arasaratnam and Haykin, Cubature Kalman filters,
 IEEE Transactions on Automatic Control 54(6), 2009), at sqrt(n) standard deviations along the columns of the
 covariance's root. They give no weight to the mean, so every covariance stays positive semidefinite.
+
+These points lie sqrt(n) standard deviations from the mean. Where an angle is so uncertain that they would lie round the
+circle, the functions of the angle are not polynomials of low degree, and the rule fails. Those directions of the
+covariance's root get a rule of their own (see `DenseRule`): equidistant points, at most a radian apart. In the
+other directions, in which the functions are nearly affine, the cubature rule stays. All weights stay positive.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
+from fgtrack.core.geometry import polar_gradient, wrap_angles
 from fgtrack.core.linalg import identity, symmetrise
-from fgtrack.core.types import FloatArray
+from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.filters.ekf import OneCorrection, Prediction, updated_one
 from fgtrack.estimation.filters.iekf import descended, largest_move, negative_log_posterior, reweighted
 from fgtrack.estimation.filters.replay import ReplayEkf
-from fgtrack.models.measurement import MeasurementModel
+from fgtrack.models.measurement import MIN_RANGE_M, MeasurementModel
+from fgtrack.models.motion import MIN_SPEED_MPS
 
 _JITTER = 1e-12
+#: A direction of a covariance's root is wide where an angle changes by more: cubature points reach twice as far.
+WIDE_RAD = 0.25
+#: The same of the direction, and the relative range, of a line of sight.
+WIDE_SIGHT_RAD = 0.1
+_REACH = 5.0  # standard deviations up to which equidistant points lie
+_SIGHT_RAD, _MOST_RAD = 2.0, 10.0  # largest spreads that make points denser
+_ROUNDING = 1e-9  # share of a direction that is none
+_STEP_RAD, _MOST_STEPS = 1e-9, 50  # in the search for a mean on the circle
 Regression = tuple[FloatArray, FloatArray, FloatArray]
 """z = E[g(x)] (..., k), A (..., k, n), and the covariance (..., k, k) of e, which is uncorrelated with x, in
 g(x) = z + A (x - m) + e for x ~ N(m, P)."""
@@ -46,6 +63,85 @@ def regression(
     return values[..., 0, :] + shift, np.linalg.solve(L.mT, slopes).mT, symmetrise(noise)
 
 
+class DenseRule(NamedTuple):
+    """Points of a Gaussian with weights: many in the directions in which angles are uncertain."""
+
+    points: FloatArray
+    """Shape (m, n)."""
+    weights: FloatArray
+    """Positive, shape (m,); their sum is 1."""
+    xi: FloatArray
+    """The points as (x - mean) = root xi, shape (m, n)."""
+    root: FloatArray
+    """Shape (n, n)."""
+
+    @classmethod
+    def of(cls, mean: FloatArray, covariance: FloatArray, turns: FloatArray, sights: FloatArray) -> "DenseRule | None":
+        """Return the rule of N(mean, covariance), (n,) and (n, n); None where no direction is wide.
+
+        The rows of `turns`, shape (a, n), are gradients of angles whose sines and cosines count. The rows of `sights`,
+        shape (b, n), are gradients of the direction and of the logarithm of the range of a line of sight. Rows may be
+        0. A direction of the covariance's root is wide, and gets equidistant points, where an angle changes by more
+        than `WIDE_RAD`, or one of a line of sight by more than `WIDE_SIGHT_RAD`.
+
+        For a Gaussian and a smooth periodic function, this trapezoidal rule converges exponentially (Trefethen and
+        Weideman, The exponentially convergent trapezoidal rule, SIAM Review 56(3), 2014). The other directions get the
+        cubature rule, which is exact where a function is affine in them, as for marginalised sigma points (Morelande
+        and Moran, An unscented transformation for conditionally linear models, ICASSP 2007).
+        """
+        n, root, gradients = len(mean), _root(covariance), np.vstack([sights, turns])
+        # Directions on which the angles depend come first, the others leave them alone: few directions are wide, and a
+        # turned world has turned points.
+        root = root @ np.linalg.qr((gradients[gradients.any(axis=1)] @ root).T, mode="complete")[0]
+        spreads_rad = np.abs(turns @ root).max(axis=0, initial=0.0)
+        seen_rad = np.minimum(np.abs(sights @ root).max(axis=0, initial=0.0), _SIGHT_RAD)
+        if seen_rad.max() > WIDE_SIGHT_RAD:  # a line of sight needs both of its directions
+            is_seen = seen_rad > _ROUNDING * seen_rad.max()
+            spreads_rad = np.where(is_seen, np.maximum(spreads_rad, np.maximum(seen_rad, 1.0)), spreads_rad)
+        wide, narrow = (spreads_rad > WIDE_RAD).nonzero()[0], (spreads_rad <= WIDE_RAD).nonzero()[0]
+        if not len(wide):
+            return None
+        xi, weights = np.zeros((1, n)), np.ones(1)
+        for row in wide.tolist():
+            at, share = _equidistant(min(float(spreads_rad[row]), _MOST_RAD))
+            xi, weights = np.repeat(xi, len(at), axis=0), np.outer(weights, share).ravel()
+            xi[:, row] = np.tile(at, len(xi) // len(at))
+        if len(narrow):
+            unit = len(narrow) ** 0.5 * identity(n)[narrow]
+            xi = (xi[:, None, :] + np.concatenate([unit, -unit])).reshape(-1, n)
+            weights = np.repeat(weights, 2 * len(narrow)) / (2 * len(narrow))
+        return cls(mean + xi @ root.T, weights, xi, root)
+
+    def regression(self, values: FloatArray, centre: FloatArray, circular: Sequence[int] = ()) -> Regression:
+        """Return the regression of `values` (m, k) of a function at the points; `centre` (k,) is near its mean.
+
+        The `circular` components are angles: their mean is the one from which the wrapped differences cancel.
+        """
+        mean, apart = centre, values - centre
+        for _ in range(_MOST_STEPS):
+            apart[:, circular] = wrap_angles(apart[:, circular])
+            step = self.weights @ apart
+            mean, apart = mean + step, apart - step
+            if not len(circular) or np.abs(step[circular]).max() < _STEP_RAD:
+                break
+        slopes = (self.weights[:, None] * apart).T @ self.xi
+        left = apart - self.xi @ slopes.T
+        noise = symmetrise((self.weights[:, None] * left).T @ left)
+        return mean, np.asarray(np.linalg.solve(self.root.T, slopes.T).T), noise
+
+
+def _equidistant(spread_rad: float) -> tuple[FloatArray, FloatArray]:
+    """Points of a standard Gaussian at most a radian apart where a unit is `spread_rad`, and weights; variance 1.
+
+    None lies at the mean: beyond the sensor, such a line of points would see it at half a turn, with either sign.
+    """
+    step, num = min(1.0, 1.0 / spread_rad), math.ceil(_REACH * max(1.0, spread_rad))
+    at = step * (np.arange(-num, num) + 0.5)
+    weights = np.exp(-0.5 * at**2)
+    weights /= weights.sum()
+    return at / np.sqrt(weights @ at**2), weights
+
+
 def _root(covariance: FloatArray) -> FloatArray:
     """L with L L' = covariance; of one that is only semidefinite after a tiny increase."""
     try:
@@ -59,7 +155,28 @@ def _root(covariance: FloatArray) -> FloatArray:
 def measurement_regression(measurement: Measurement, mean: FloatArray, covariance: FloatArray) -> Regression:
     """Regression of what `measurement` measures. Angles are averaged on the circle, but for entries of the state."""
     model, pose = measurement.model, measurement.pose
-    return regression(lambda x: model.predict(x, pose), mean, covariance, _difference(model))
+    rule = _rule_of(measurement, mean, covariance)
+    if rule is None:
+        return regression(lambda x: model.predict(x, pose), mean, covariance, _difference(model))
+    circular = [k for k in model.angular if model.components[k] not in model.state_names]
+    return rule.regression(model.predict(rule.points, pose), model.predict(mean, pose), circular)
+
+
+def _rule_of(measurement: Measurement, mean: FloatArray, covariance: FloatArray) -> DenseRule | None:
+    """Return the dense rule for a measurement, where its line of sight or a heading in it is uncertain."""
+    model, n = measurement.model, len(mean)
+    turns, sights = np.zeros((1, n)), np.zeros((4, n))
+    is_cartesian = "yaw_rad" not in model.state_names
+    if model.relative:
+        offset = mean[:2] - np.array(measurement.pose[:2])
+        sights[:2, :2] = polar_gradient(offset, MIN_RANGE_M)
+        sights[1] /= max(float(np.hypot(*offset)), MIN_RANGE_M)
+    if "range_rate_mps" in model.components and not is_cartesian:
+        turns[0, YAW] = 1.0
+    if "yaw_rad" in model.components and is_cartesian:
+        sights[2:, 2:4] = polar_gradient(mean[2:4], MIN_SPEED_MPS)
+        sights[3] /= max(float(np.hypot(*mean[2:4])), MIN_SPEED_MPS)
+    return DenseRule.of(mean, covariance, turns, sights)
 
 
 @cache
@@ -78,7 +195,8 @@ def _difference(model: MeasurementModel) -> Callable[[FloatArray, FloatArray], F
 class UkfReplay(ReplayEkf):
     """Unscented Kalman filter with replay: means over the spread of the state instead of derivatives.
     Julier and Uhlmann, Unscented filtering and nonlinear estimation, Proceedings of the IEEE 92(3), 2004, written as
-    statistical linear regression (see `regression`). The process noise is that of the mean. What is linear it does as
+    statistical linear regression (see `regression`). The process noise is that of the mean, and its
+    average where the yaw is uncertain (see `DenseRule`). What is linear it does as
     `ReplayEkf`.
     """
 
@@ -88,9 +206,27 @@ class UkfReplay(ReplayEkf):
         """See `ReplayEkf.predict`."""
         if self._motion.linear:
             return super().predict(mean, covariance, dt_s)
-        after, A, noise = regression(lambda x: self._motion.predict(x, dt_s), mean, covariance)
-        AP, Q = A @ covariance, self._motion.process_noise(mean, dt_s)
+        rule = self._turning_rule(mean, covariance, dt_s)
+        if rule is None:
+            after, A, noise = regression(lambda x: self._motion.predict(x, dt_s), mean, covariance)
+            Q = self._motion.process_noise(mean, dt_s)
+        else:
+            centre = self._motion.predict(mean, dt_s)
+            after, A, noise = rule.regression(self._motion.predict(rule.points, dt_s), centre)
+            Q = np.tensordot(rule.weights, self._motion.process_noise(rule.points, dt_s), axes=1)
+        AP = A @ covariance
         return Prediction(after, symmetrise(AP @ A.mT + noise + Q), AP)
+
+    def _turning_rule(self, mean: FloatArray, covariance: FloatArray, dt_s: float) -> DenseRule | None:
+        """Return the dense rule for a prediction, where the yaw before or after it is uncertain."""
+        names = self._motion.state_names[: len(mean)]
+        if "yaw_rad" not in names:
+            return None
+        turns = np.zeros((2, len(mean)))
+        turns[:, names.index("yaw_rad")] = 1.0
+        if "yaw_rate_radps" in names:
+            turns[1, names.index("yaw_rate_radps")] = dt_s
+        return DenseRule.of(mean, covariance, turns, np.zeros((0, len(mean))))
 
     def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
         """See `ReplayEkf.correct`."""
