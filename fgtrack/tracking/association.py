@@ -1,7 +1,7 @@
 """Gates, and association of candidates with tracks (Karle et al. 2023, section III-D)."""
 
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -11,7 +11,7 @@ from fgtrack.core.linalg import kernels, stacked, symmetrise
 from fgtrack.core.settings import OpenProbability, settings
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import StatesAt
-from fgtrack.tracking.facing import Facings, is_read, read
+from fgtrack.tracking.facing import Facings, Readings, is_read, read
 from fgtrack.tracking.objects import Apart, Evidence
 from fgtrack.tracking.preprocess import Candidates, Group
 
@@ -51,6 +51,8 @@ class Assignment(NamedTuple):
     """Tracks without a candidate, ascending."""
     refused: tuple[int, ...] = ()
     """Candidates that neither belong to a track nor may start one."""
+    readings: tuple[Readings, ...] = ()
+    """Readings of the pairs that were compared, where a detection may be read in several ways."""
 
 
 class Association(Protocol):
@@ -118,12 +120,13 @@ class GatedEuclidean:
         if not is_one:
             limits_m = np.broadcast_to(gates_m, (len(candidates), len(states.means)))
             pairs = pairs.at(pairs.values <= limits_m[pairs.rows, pairs.columns])
-        inside = pairs
+        inside, readings = pairs, list[Readings]()
         if self.max_nis is not None and len(pairs.rows):
-            largest = self.max_nis
-            _, is_inside = weighed(pairs, candidates, states, facings, lambda k: largest)
+            _, is_inside, readings = weighed(pairs, candidates, states, facings, partial(_same_limits, self.max_nis))
             inside = pairs if all(is_inside.tolist()) else pairs.at(is_inside)
         assignment = assigned(inside, len(candidates), len(states.means))
+        if readings:
+            assignment = assignment._replace(readings=tuple(readings))
         if self.max_nis is None or not assignment.new:
             return assignment
         return _refusing(set(pairs.rows.tolist()), assignment)
@@ -163,15 +166,21 @@ class GatedMahalanobis:
         facings: Facings | None = None,
     ) -> Assignment:
         """See `Association`; claims are the tracker's."""
-        pairs = self.gated(candidates, states, apart, facings)
+        pairs, readings = self._gated(candidates, states, apart, facings)
         if likely is not None and len(pairs.rows):
             pairs = pairs.at(likely(pairs))
-        return assigned(pairs, len(candidates), len(states.means))
+        assignment = assigned(pairs, len(candidates), len(states.means))
+        return assignment._replace(readings=tuple(readings)) if readings else assignment
 
     def gated(
         self, candidates: Candidates, states: StatesAt, apart: Apart | None = None, facings: Facings | None = None
     ) -> Pairs:
         """Return the pairs inside the gate with their cost NIS + log det S: a vague track does not win by it."""
+        return self._gated(candidates, states, apart, facings)[0]
+
+    def _gated(
+        self, candidates: Candidates, states: StatesAt, apart: Apart | None, facings: Facings | None
+    ) -> tuple[Pairs, list[Readings]]:
         reach_m: float | FloatArray = self.max_distance_m
         if len(candidates) * len(states.means) > MOST_NEAR:
             weight = apart.weight if isinstance(apart, Evidence) else 0.0
@@ -183,10 +192,9 @@ class GatedMahalanobis:
             largest = max(len(group.stack.model.components) for group in candidates.groups)
             likely = more <= chi_square_quantile(self.gate_probability, largest)
             pairs, more = pairs.at(likely), more[likely]
-        cost, inside = weighed(
-            pairs, candidates, states, facings, lambda k: chi_square_quantile(self.gate_probability, k), more
-        )
-        return pairs._replace(values=cost).at(inside)
+        limits = partial(_quantiles, self.gate_probability)
+        cost, inside, readings = weighed(pairs, candidates, states, facings, limits, more)
+        return pairs._replace(values=cost).at(inside), readings
 
 
 def claimed(
@@ -210,7 +218,19 @@ def chi_square_quantile(probability: float, freedom: int) -> float:
     """Quantile of the chi-square distribution; importing `scipy.stats` for it would take a second."""
     from scipy.special import gammaincinv
 
-    return float(2.0 * gammaincinv(0.5 * freedom, probability)) if freedom else 0.0
+    return float(2.0 * gammaincinv(0.5 * freedom, probability))
+
+
+@cache
+def _quantiles(probability: float, most: int) -> FloatArray:
+    """`chi_square_quantile` of 0 to `most` degrees of freedom, shape (most + 1,)."""
+    return np.array([0.0, *(chi_square_quantile(probability, freedom) for freedom in range(1, most + 1))])
+
+
+@cache
+def _same_limits(limit: float, most: int) -> FloatArray:
+    """One limit for any number of components up to `most`, shape (most + 1,)."""
+    return np.full(most + 1, limit)
 
 
 def assigned(pairs: Pairs, num_candidates: int, num_tracks: int) -> Assignment:
@@ -274,14 +294,14 @@ def near(
 
 def _innovations_of(
     group: Group, members: IntArray, columns: IntArray, states: StatesAt
-) -> tuple[FloatArray, FloatArray, int]:
-    """Return NIS and log det S of `members` of `group` with the tracks `columns`, all (p,), and the number k."""
+) -> tuple[FloatArray, FloatArray]:
+    """Return NIS and log det S of `members` of `group` with the tracks `columns`, all (p,); NaN where S has no root."""
     P, own = np.ascontiguousarray(states.covariances), group.stack
     x = states.means.take(columns, axis=0)
     y, H = own.model.linearised(own.z.take(members, axis=0), x, own.pose)
     R, every = group.noise(members, x, P, columns), np.arange(y.shape[1])
     _, nis, logdet = kernels("fgtrack.estimation.kernels.kalman").innovations(y, stacked(H), P, columns, R, every)
-    return nis, logdet, len(every)
+    return nis, logdet
 
 
 def weighed(
@@ -289,27 +309,28 @@ def weighed(
     candidates: Candidates,
     states: StatesAt,
     facings: Facings | None,
-    limit: Callable[[int], float],
+    limits: Callable[[int], FloatArray],
     more: FloatArray | None = None,
-) -> tuple[FloatArray, BoolArray]:
-    """Return the costs NIS + log det S of `pairs` (m,), and True of those inside the gate.
-    The `limit` of a NIS depends on the number of components; `more` (m,) is added to the NIS. With `facings` the cost
-    is that of the likeliest reading of a yaw, see `fgtrack.tracking.facing`, and one reading has to be inside.
+) -> tuple[FloatArray, BoolArray, list[Readings]]:
+    """Return the costs NIS + log det S of `pairs` (m,), True of those inside the gate, and readings.
+    `limits` gives the largest NIS of 0 to k components, shape (k + 1,); `more` (m,) is added to the NIS. With `facings`
+    the cost is that of the likeliest reading of a yaw, see `fgtrack.tracking.facing`, and one reading has to be inside.
     """
-    cost, inside = np.empty(len(pairs.rows)), np.empty(len(pairs.rows), dtype=bool)
+    cost, inside, readings = np.empty(len(pairs.rows)), np.empty(len(pairs.rows), dtype=bool), list[Readings]()
     for group, members, chosen in candidates.split(pairs.rows) if len(cost) else ():
         columns = pairs.columns.take(chosen)
         own_more = None if more is None else more[chosen]
+        own_limits = limits(len(group.stack.model.components))
         if facings is not None and is_read(group):
-            limits = [limit(k) for k in range(len(group.stack.model.components) + 1)]
-            found = read(group, members, columns, states, facings, limits, own_more)
-            cost[chosen], inside[chosen] = found.costs, found.readings >= 0
+            found = read(group, members, columns, states, facings, own_limits, own_more)
+            cost[chosen], inside[chosen] = found.costs, found.codes >= 0
+            readings.append(found)
             continue
-        nis, logdet, k = _innovations_of(group, members, columns, states)
+        nis, logdet = _innovations_of(group, members, columns, states)
         nis = nis if own_more is None else nis + own_more
         cost[chosen] = nis + logdet
-        inside[chosen] = nis <= limit(k)
-    return cost, inside
+        inside[chosen] = nis <= own_limits[-1]
+    return cost, inside, readings
 
 
 def reaches_m(

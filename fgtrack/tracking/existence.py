@@ -366,6 +366,8 @@ def after_jumps(
     ).pairs
     taken = {candidate for candidate, _ in jumps}
     candidates.renew(taken)
+    if jumps:
+        assignment = assignment._replace(readings=())  # those of jumps are of the whole error
     return assignment._replace(
         pairs=sorted([*assignment.pairs, *jumps]),
         missed=sorted(set(assignment.missed).difference(track for _, track in jumps)),

@@ -19,15 +19,15 @@ as in a Markov chain. The shares a, e and u of each sensor are learned.
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.linalg import kernels, stacked
-from fgtrack.core.time import seconds
 from fgtrack.core.types import ACCEL, SPEED, YAW, BoolArray, FloatArray, IntArray, SmoothedReport, TrackState, YawWord
 from fgtrack.estimation.base import Measurement, Start, StatesAt
 from fgtrack.estimation.filters.propagation import States
@@ -36,11 +36,11 @@ from fgtrack.tracking.preprocess import Candidates, Group
 #: Components that are opposite where front and rear are exchanged.
 SIGNED = ("speed_mps", "curvature_radpm")
 #: Numbers of yaws that count as seen before the first one: right, half a turn off, anything.
-_PRIOR = (18.0, 1.0, 1.0)
+_PRIOR = np.array([18.0, 1.0, 1.0])
 #: Of a sensor so many yaws are remembered: a detector may begin to flip.
-_MEMORY = 200.0
+MEMORY = 200.0
 #: Largest log-likelihood ratio of one detection: a detector that errs often errs in rows.
-_MOST_EVIDENCE = math.log(3.0)
+MOST_EVIDENCE = math.log(3.0)
 #: Rates at which the yaw of a state changes between front and rear: seldom. Where it is the direction of the velocity,
 #: as of a Cartesian state, it does so whenever an object begins to drive backwards.
 _SWITCH_HZ, _CARTESIAN_SWITCH_HZ = 0.001, 0.05
@@ -48,9 +48,9 @@ _SWITCH_HZ, _CARTESIAN_SWITCH_HZ = 0.001, 0.05
 _SURE = math.log(9.0)
 _RIGHT = np.array([1.0, 0.0, 0.0])
 _KERNELS = "fgtrack.tracking.facing_kernels"
-#: Bits of a reading, as the kernels have them.
+#: Bits of a reading; 0 takes the detection as it was measured.
 HALF_TURN, WITHOUT_YAW, REVERSED = 1, 2, 4
-_LOG_RATIO, _FLIPPED, _OTHER = range(3)
+_WORDS: "dict[int, YawWord]" = {1: "flipped", 2: "unused"}  # by the defect that the kernels number
 
 
 class Facings(NamedTuple):
@@ -65,9 +65,14 @@ class Facings(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """Ways to read the detections of pairs, their costs, and their evidence."""
+    """Ways to read detections of a group as those of tracks, their costs, and their evidence."""
 
-    readings: IntArray
+    group: Group
+    members: IntArray
+    """Indices in the group, ascending, shape (m,)."""
+    columns: IntArray
+    """Indices of the tracks, ascending for each member, shape (m,)."""
+    codes: IntArray
     """Bits `HALF_TURN`, `WITHOUT_YAW`, `REVERSED`, or -1 outside the gate, shape (m,)."""
     costs: FloatArray
     """Shape (m,)."""
@@ -84,12 +89,27 @@ class YawsRead(NamedTuple):
     """None of a yaw that is used as it is, and where none is measured."""
 
 
+class _Kind(NamedTuple):
+    """Properties of measured components."""
+
+    yaw: int
+    """Index of the yaw, -1 without one."""
+    signed: BoolArray
+    """True of those in `SIGNED`, shape (k,)."""
+    is_read: bool
+    """True if a detection may be read in several ways."""
+
+
+@cache
+def _kind(names: tuple[str, ...]) -> _Kind:
+    yaw = names.index("yaw_rad") if "yaw_rad" in names else -1
+    signed = np.array([name in SIGNED for name in names])
+    return _Kind(yaw, signed, yaw >= 0 or bool(signed.any()))
+
+
 def is_read(group: Group) -> bool:
     """True if a detection of `group` may be read in several ways."""
-    return not _READ.isdisjoint(group.stack.model.components)
-
-
-_READ = {"yaw_rad", *SIGNED}
+    return _kind(group.stack.model.components).is_read
 
 
 def read(
@@ -98,37 +118,37 @@ def read(
     columns: IntArray,
     states: StatesAt,
     facings: Facings,
-    limits: Sequence[float],
+    limits: FloatArray,
     more: FloatArray | None = None,
 ) -> Readings:
     """Return the readings of pairs of `members` (m,) of `group` and the tracks `columns` (m,) in these `states`.
     `limits` (k + 1,) are the largest NIS by number of components, `more` (m,) is added to the NIS.
     """
-    own, names = group.stack, group.stack.model.components
+    own, kind = group.stack, _kind(group.stack.model.components)
     x = states.means.take(columns, axis=0)
     z = own.z.take(members, axis=0)
     y, H = own.model.linearised(z, x, own.pose)
     P = np.ascontiguousarray(states.covariances)
     R = group.noise(members, x, P, columns)
-    yaw = names.index("yaw_rad") if "yaw_rad" in names else -1
-    measures_yaw = yaw >= 0 and "yaw_rad" not in own.assumed
-    readings, costs, evidence = kernels(_KERNELS).read(
-        np.ascontiguousarray(y),
+    learns = "yaw_rad" not in own.assumed  # the same map is no new evidence
+    found = kernels(_KERNELS).read(
+        y,
         z,
         stacked(H),
         np.ascontiguousarray(states.means),
         P,
         columns,
-        np.ascontiguousarray(R),
-        yaw,
-        np.array([name in SIGNED for name in names]),
+        R,
+        kind.yaw,
+        kind.signed,
         facings.cartesian,
         facings.log_odds,
-        facings.shares if measures_yaw else _RIGHT,
+        facings.shares if learns else _RIGHT,
+        learns,
         np.zeros(len(columns)) if more is None else more,
-        np.array(limits, dtype=np.float64),
+        limits,
     )
-    return Readings(readings, costs, evidence)
+    return Readings(group, members, columns, *found)
 
 
 def as_read(measurements: Measurement, readings: IntArray) -> list[tuple[IntArray | slice, Measurement]]:
@@ -158,15 +178,6 @@ def as_read(measurements: Measurement, readings: IntArray) -> list[tuple[IntArra
     return parts
 
 
-@dataclass(slots=True)
-class _Front:
-    """Belief about the front of one track."""
-
-    log_odds: float
-    stamp_ns: int
-    is_turned: bool = False
-
-
 class Facing:
     """Belief about the front of each track, and the shares of wrong yaws of each sensor; see the module."""
 
@@ -174,130 +185,161 @@ class Facing:
         """`cartesian`: the states have velocities instead of yaw and speed."""
         self._cartesian = cartesian
         self._switch_hz = _CARTESIAN_SWITCH_HZ if cartesian else _SWITCH_HZ
-        self._fronts: dict[int, _Front] = {}
+        self._rows: dict[int, int] = {}  # of the arrays, by track
+        self._last_ids: tuple[int, ...] = ()
+        self._last_rows = np.zeros(0, dtype=np.int64)
+        self._free: list[int] = []
+        self._log_odds = np.zeros(0)
+        self._stamps_ns = np.zeros(0, dtype=np.int64)
+        self._turned = np.zeros(0, dtype=bool)
+        self._is_any_turned = False
         self._ended = set[int]()  # tracks that were published turned, until their last states are published
         self._seen: dict[str, FloatArray] = {}  # by sensor: numbers of yaws that were right, flipped, anything
+        self._shares: dict[str, FloatArray] = {}  # of the numbers, until they change
         self.counts: dict[str, Counter[str]] = {}
         """By sensor: number of `yaws` that tracks used, of those `flipped`, and of those `unused`."""
 
-    def at(self, sensor: str, track_ids: Iterable[int]) -> Facings:
+    def at(self, sensor: str, track_ids: tuple[int, ...]) -> Facings:
         """Return the belief about some tracks for the detections of `sensor`."""
-        fronts = self._fronts
-        log_odds = np.array([fronts[i].log_odds if i in fronts else 0.0 for i in track_ids], dtype=np.float64)
-        return Facings(log_odds, self._shares_of(sensor), self._cartesian)
+        return Facings(self._log_odds[self._rows_of(track_ids)], self._shares_of(sensor), self._cartesian)
+
+    def _rows_of(self, track_ids: tuple[int, ...]) -> IntArray:
+        """Return rows of the arrays, shape (m,); those of the last call where the tracks are the same."""
+        if track_ids != self._last_ids:
+            self._last_ids = track_ids
+            self._last_rows = np.array([self._rows[track_id] for track_id in track_ids], dtype=np.int64)
+        return self._last_rows
 
     def _shares_of(self, sensor: str) -> FloatArray:
-        counts = np.array(_PRIOR) + self._seen.get(sensor, 0.0)
-        return np.asarray(counts / counts.sum())
+        shares = self._shares.get(sensor)
+        if shares is None:
+            counts = _PRIOR + self._seen.get(sensor, 0.0)
+            shares = self._shares[sensor] = counts / counts.sum()
+        return shares
 
     def born(self, track_id: int, sensor: str, start: Start, first: Measurement) -> None:
         """Begin the belief about a track with this `start` of its `first` measurement, by `sensor`."""
-        log_odds = 0.0 if start.yaw_rad is None else _MOST_EVIDENCE
+        log_odds = 0.0 if start.yaw_rad is None else MOST_EVIDENCE
         if "yaw_rad" in first.model.components and "yaw_rad" not in first.assumed:
             right, flip, _ = self._shares_of(sensor).tolist()
-            log_odds = _bounded(math.log(right / flip))
-        self._fronts[track_id] = _Front(log_odds, start.stamp_ns)
+            log_odds = min(max(math.log(right / flip), -MOST_EVIDENCE), MOST_EVIDENCE)
+        if not self._free:
+            present = len(self._log_odds)
+            more = max(present, 8)
+            self._log_odds = np.concatenate([self._log_odds, np.zeros(more)])
+            self._stamps_ns = np.concatenate([self._stamps_ns, np.zeros(more, dtype=np.int64)])
+            self._turned = np.concatenate([self._turned, np.zeros(more, dtype=bool)])
+            self._free = list(range(present, present + more))
+        row = self._rows[track_id] = self._free.pop()
+        self._log_odds[row], self._stamps_ns[row], self._turned[row] = log_odds, start.stamp_ns, False
+        self._last_ids = ()
 
     def read(
-        self, sensor: str, stamp_ns: int, candidates: Candidates, pairs: Sequence[tuple[int, int]], states: StatesAt
-    ) -> "YawsRead":
-        """Return the likeliest readings of `pairs`.
-        The belief about the tracks and the shares of `sensor` learn from them.
+        self,
+        sensor: str,
+        stamp_ns: int,
+        candidates: Candidates,
+        pairs: Sequence[tuple[int, int]],
+        found: Sequence[Readings],
+        states: StatesAt,
+    ) -> YawsRead | None:
+        """Return the likeliest readings of the assigned `pairs`, None where all are taken as they are.
+        The belief about the tracks and the shares of `sensor` learn from them. `found` are the readings of the pairs
+        that the association has compared; without them the `pairs` are read here.
         """
-        result = YawsRead(np.zeros(len(pairs), dtype=np.int64), [None] * len(pairs))
         if not any(map(is_read, candidates.groups)):
-            return result
+            return None
+        useful = [each for each in found if _learns(each.group) or each.codes.max(initial=0) > 0]
+        if found and not useful:
+            return None
         rows, columns = np.array(pairs).T
-        facings = self.at(sensor, states.track_ids)
+        keys = rows * len(states.means) + columns
+        useful = useful or self._read(sensor, candidates, rows, columns, states)
+        readings, words = np.zeros(len(pairs), dtype=np.int64), list[YawWord | None]([None] * len(pairs))
+        for each in useful:
+            own = each.group.rows.take(each.members) * len(states.means) + each.columns
+            at = own.searchsorted(keys)
+            here = (own.take(at, mode="clip") == keys).nonzero()[0]
+            at = at[here]
+            readings[here] = codes = np.maximum(each.codes[at], 0)
+            if _learns(each.group) and len(here):
+                has_yaw = _kind(each.group.stack.model.components).yaw >= 0
+                of = self._rows_of(states.track_ids)[columns[here]]
+                for k, word in self._learn(sensor, stamp_ns, of, codes, each.evidence[at], has_yaw):
+                    words[here[k]] = word
+        return YawsRead(readings, words) if readings.any() or any(words) else None
+
+    def _read(
+        self, sensor: str, candidates: Candidates, rows: IntArray, columns: IntArray, states: StatesAt
+    ) -> list[Readings]:
+        """Return the readings of candidates `rows` as those of the tracks `columns`, both (m,), without a gate."""
+        facings, result = self.at(sensor, states.track_ids), list[Readings]()
         for group, members, here in candidates.split(rows):
             if is_read(group):
-                of = columns.take(here)
-                limits = [math.inf] * (len(group.stack.model.components) + 1)
-                found = read(group, members, of, states, facings, limits)
-                result.readings[here] = np.maximum(found.readings, 0)
-                if "yaw_rad" not in group.stack.assumed:  # the same map is no new evidence
-                    has_yaw = "yaw_rad" in group.stack.model.components
-                    track_ids = [states.track_ids[column] for column in of.tolist()]
-                    words = self._learn(sensor, stamp_ns, found, track_ids, has_yaw)
-                    for k, word in zip(here.tolist(), words, strict=True):
-                        result.words[k] = word
+                limits = np.full(len(group.stack.model.components) + 1, np.inf)
+                result.append(read(group, members, columns[here], states, facings, limits))
         return result
 
     def _learn(
-        self, sensor: str, stamp_ns: int, found: Readings, track_ids: Sequence[int], has_yaw: bool
-    ) -> list[YawWord | None]:
-        """Learn from the evidence of detections of tracks; return the word on each yaw."""
-        words = list[YawWord | None]()
-        for reading, track_id, (ratio, flipped, other) in zip(
-            found.readings.tolist(), track_ids, found.evidence.tolist(), strict=True
-        ):
-            front = self._fronts[track_id]
-            front.log_odds = _later(front.log_odds, self._switch_hz, seconds(stamp_ns - front.stamp_ns))
-            front.log_odds += _bounded(ratio)
-            front.stamp_ns = max(front.stamp_ns, stamp_ns)
-            word: YawWord | None = None
-            if has_yaw:
-                own, counts = self._seen.setdefault(sensor, np.zeros(3)), self.counts.setdefault(sensor, Counter())
-                own *= min(1.0, _MEMORY / (own.sum() + 1.0))
-                own += 1.0 - flipped - other, flipped, other
-                word = "unused" if reading & WITHOUT_YAW else "flipped" if flipped > 0.5 else None
-                counts["yaws"] += 1
-                if word is not None:
-                    counts[word] += 1
-            words.append(word)
+        self, sensor: str, stamp_ns: int, rows: IntArray, codes: IntArray, evidence: FloatArray, has_yaw: bool
+    ) -> list[tuple[int, YawWord]]:
+        """Learn from readings (m,) of detections of the tracks in `rows`; return the yaws with a defect, and which."""
+        seen = self._seen.setdefault(sensor, np.zeros(3)) if has_yaw else np.zeros(3)
+        arrays = self._log_odds, self._stamps_ns, seen
+        defects = kernels(_KERNELS).learn(rows, stamp_ns, codes, evidence, has_yaw, self._switch_hz, *arrays)
+        if not has_yaw:
+            return []
+        self._shares.pop(sensor, None)
+        counts = self.counts.setdefault(sensor, Counter())
+        counts["yaws"] += len(rows)
+        words = [(k, _WORDS[defects[k]]) for k in defects.nonzero()[0].tolist()]
+        counts.update([word for _, word in words])
         return words
 
-    def published(self, track_ids: Sequence[int], states: Sequence[TrackState]) -> Sequence[TrackState]:
+    def published(self, track_ids: tuple[int, ...], states: Sequence[TrackState]) -> Sequence[TrackState]:
         """Return the kinematic present `states` of tracks, with the yaw of the front; the belief is decided here."""
-        fronts = self._fronts
-        own = [fronts[track_id] for track_id in track_ids]
-        if not own:
+        if not track_ids:
             return states
-        means, covariances = _arrays(states)
-        log_odds, before = np.array([each.log_odds for each in own]), np.array([each.is_turned for each in own])
-        after = kernels(_KERNELS).turned(means, covariances, log_odds, before, _SURE)
-        if not after.any():
-            if before.any():
-                for each in own:
-                    each.is_turned = False
+        if isinstance(states, States) and not self._is_any_turned:
+            may_turn = states.means[:, SPEED].min() < 0.0 or self._log_odds.min() < -_SURE
+            if not may_turn:
+                return states
+        rows = self._rows_of(track_ids)
+        before = self._turned[rows]
+        after = kernels(_KERNELS).turned(*_arrays(states), self._log_odds[rows], before, _SURE)
+        if not (self._is_any_turned or after.any()):
             return states
-        for each, is_turned in zip(own, after.tolist(), strict=True):
-            each.is_turned = is_turned
-        return turned(states, after)
+        self._turned[rows] = after
+        self._is_any_turned = bool(after.any())
+        return turned(states, after) if self._is_any_turned else states
 
-    def seen(self, track_ids: Sequence[int], states: Sequence[TrackState]) -> Sequence[TrackState]:
+    def seen(self, track_ids: tuple[int, ...], states: Sequence[TrackState]) -> Sequence[TrackState]:
         """Return kinematic `states` of tracks at any stamp, with the yaw of what is published as their front."""
-        rows = np.array([self._fronts[track_id].is_turned for track_id in track_ids], dtype=bool)
-        return turned(states, rows) if rows.any() else states
+        return turned(states, self._turned[self._rows_of(track_ids)]) if self._is_any_turned else states
 
     def smoothed(self, reports: Sequence[SmoothedReport]) -> Sequence[SmoothedReport]:
         """Return all smoothed `reports` of a tick, with the yaw of what is published as the front of their tracks."""
-        fronts, ended, self._ended = self._fronts, self._ended, set()
-        backwards = ended.union(track_id for track_id, each in fronts.items() if each.is_turned)
-        if not backwards:
+        ended, self._ended = self._ended, set()
+        if not (self._is_any_turned or ended):
             return reports
+        backwards = ended.union(track_id for track_id, row in self._rows.items() if self._turned[row])
         return [
             replace(each, state=_turned_one(each.state)) if each.track_id in backwards else each for each in reports
         ]
 
     def forget(self, track_id: int) -> None:
         """Forget a track that has ended, but for its last smoothed states."""
-        if self._fronts.pop(track_id).is_turned:
+        row = self._rows.pop(track_id)
+        self._last_ids = ()
+        self._log_odds[row] = 0.0
+        self._free.append(row)
+        if self._turned[row]:
             self._ended.add(track_id)
 
 
-def _bounded(log_ratio: float) -> float:
-    """Return the evidence of one detection, which errs with those before it, see `_MOST_EVIDENCE`."""
-    return min(max(log_ratio, -_MOST_EVIDENCE), _MOST_EVIDENCE)
-
-
-def _later(log_odds: float, switch_hz: float, dt_s: float) -> float:
-    """Return the log-odds after `dt_s`, in which front and rear are exchanged with the rate `switch_hz`."""
-    if dt_s <= 0.0:
-        return log_odds
-    changed = -0.5 * math.expm1(-2.0 * switch_hz * dt_s)
-    odds = math.exp(log_odds)
-    return math.log((odds * (1.0 - changed) + changed) / (odds * changed + 1.0 - changed))
+def _learns(group: Group) -> bool:
+    """True if detections of `group` are evidence of the front: those with the heading of the map are not."""
+    return "yaw_rad" not in group.stack.assumed
 
 
 def _arrays(states: Sequence[TrackState]) -> tuple[FloatArray, FloatArray]:

@@ -5,14 +5,16 @@ import math
 import numpy as np
 
 from fgtrack.core.compiled import add_congruence, check, check_rows, copy, inlined, njit, whiten
+from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.tracking.facing import HALF_TURN, MEMORY, MOST_EVIDENCE, REVERSED, WITHOUT_YAW
 
-#: Bits of a reading; 0 takes the detection as it was measured.
-HALF_TURN, WITHOUT_YAW, REVERSED = 1, 2, 4
 #: No reading of the pair lies inside the gate.
 OUTSIDE = -1
 #: Columns of the evidence of a pair.
 LOG_RATIO, FLIPPED, OTHER = range(3)
+#: Defects of a yaw.
+NO_DEFECT, IS_FLIPPED, IS_UNUSED = range(3)
 #: A moving object moves backwards with this probability.
 BACKWARDS = 0.05
 #: Far below this speed the direction of motion is no evidence: an object at rest may creep either way.
@@ -52,7 +54,7 @@ def _weigh(shares: FloatArray, is_signed: bool, weights: FloatArray) -> None:
 
 
 @inlined
-def _learn(
+def _compare(
     logs: FloatArray, weights: FloatArray, front: float, rear: float, has_yaw: bool, signs: int, evidence: FloatArray
 ) -> None:
     """Write the log-likelihood ratio of the facing, and the probabilities that the yaw is half a turn off, or anything.
@@ -102,7 +104,7 @@ def turned(
 @njit(
     "(float64[:, ::1], float64[:, ::1], Array(float64, 3, 'C', readonly=True), float64[:, ::1],"
     " Array(float64, 3, 'C', readonly=True), int64[:], Array(float64, 3, 'C', readonly=True), int64, b1[::1], b1,"
-    " float64[::1], float64[::1], float64[::1], float64[::1])"
+    " float64[::1], float64[::1], b1, float64[::1], float64[::1])"
 )
 def read(
     y: FloatArray,
@@ -117,6 +119,7 @@ def read(
     cartesian: bool,
     log_odds: FloatArray,
     shares: FloatArray,
+    learns: bool,
     more: FloatArray,
     limits: FloatArray,
 ) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -125,7 +128,7 @@ def read(
     Innovations y and values z (m, k), Jacobians H (m, k, n) or (1, k, n), states x (tracks, n) with covariances P,
     R (m, k, k). `yaw` is the index of the yaw, -1 without one; `signed` (k,) are components that are opposite where
     front and rear are exchanged. `log_odds` (tracks,) are those of the facing without the speed, `shares` (3,) those of
-    yaws that are right, half a turn off, and anything.
+    yaws that are right, half a turn off, and anything. Without `learns` there is no evidence.
 
     The cost is NIS + log det S - 2 log of the weight over that of a right yaw. A pair is inside if the NIS of one
     reading, with `more` (m,), is at most the limit of its number of components, `limits` (k + 1,).
@@ -155,7 +158,7 @@ def read(
     else:
         weights[0, 0], weights[1, _NUM_YAW if signs == 2 else 0] = 1.0, 1.0
     for i in range(m):
-        t, least, inside = tracks[i], np.inf, False
+        t, least, least_logdet, inside = tracks[i], np.inf, 0.0, False
         speed, variance = x[t, 3], P[t, 3, 3]
         if cartesian:
             speed = math.sqrt(x[t, 2] ** 2 + x[t, 3] ** 2)
@@ -167,6 +170,8 @@ def read(
         copy(R[i], S)
         add_congruence(H[min(i, len(H) - 1)], P[t], HP, S)
         for sign in range(signs):
+            if sign == 1 and inside and not learns and least < least_logdet + SURE - 2.0 * math.log(rear / usual):
+                break  # no NIS is small enough
             for a in range(k):
                 own = order[a]
                 white[a] = y[i, own] - 2.0 * z[i, own] if sign == 1 and signed[own] else y[i, own]
@@ -181,10 +186,16 @@ def read(
                 logdet += 2.0 * math.log(root[a, a])
             last = white[k - 1]
             rest = nis - last * last if yaw >= 0 else nis
+            if not rest + more[i] <= limits[k]:
+                for way in range(_NUM_YAW):
+                    logs[sign * _NUM_YAW + way] = -np.inf
+                continue
             for way in range(_NUM_YAW if yaw >= 0 else 1):
                 entry, code, own_nis, own_logdet, limit = sign * _NUM_YAW + way, sign * REVERSED, nis, logdet, limits[k]
                 if yaw >= 0 and way < 2:
                     own_logdet += 2.0 * math.log(root[k - 1, k - 1])
+                if entry == 0:
+                    least_logdet = own_logdet
                 if way == 1:
                     turn = last - math.copysign(math.pi, y[i, yaw]) / root[k - 1, k - 1]
                     code, own_nis = code + HALF_TURN, rest + turn * turn
@@ -203,5 +214,49 @@ def read(
         if not inside:
             readings[i] = OUTSIDE
             continue
-        _learn(logs, weights, front, rear, yaw >= 0, signs, evidence[i])
+        if learns:
+            _compare(logs, weights, front, rear, yaw >= 0, signs, evidence[i])
     return readings, costs, evidence
+
+
+@njit("int64[::1](int64[::1], int64, int64[::1], float64[:, ::1], b1, float64, float64[::1], int64[::1], float64[::1])")
+def learn(
+    rows: IntArray,
+    stamp_ns: int,
+    codes: IntArray,
+    evidence: FloatArray,
+    has_yaw: bool,
+    switch_hz: float,
+    log_odds: FloatArray,
+    stamps_ns: IntArray,
+    seen: FloatArray,
+) -> IntArray:
+    """Add the `evidence` (m, 3) of detections with these reading `codes` (m,) to the belief about the tracks in `rows`.
+    Between two detections front and rear are exchanged with the rate `switch_hz`. With a yaw the numbers of right,
+    flipped and other yaws that were `seen` (3,) are updated. Returns the defects of the yaws (m,).
+    """
+    check_rows(rows, 0, min(len(log_odds), len(stamps_ns)))
+    check(min(len(codes), len(evidence)) >= len(rows) and evidence.shape[1] >= 3 and len(seen) >= 3)
+    defects = np.zeros(len(rows), np.int64)
+    for i in range(len(rows)):
+        row = rows[i]
+        dt_s = (stamp_ns - stamps_ns[row]) / NS_PER_S
+        if dt_s > 0.0:
+            changed = -0.5 * math.expm1(-2.0 * switch_hz * dt_s)
+            odds = math.exp(log_odds[row])
+            log_odds[row] = math.log((odds * (1.0 - changed) + changed) / (odds * changed + 1.0 - changed))
+            stamps_ns[row] = stamp_ns
+        belief = log_odds[row] + min(max(evidence[i, LOG_RATIO], -MOST_EVIDENCE), MOST_EVIDENCE)
+        log_odds[row] = min(max(belief, -_LARGEST_LOG_ODDS), _LARGEST_LOG_ODDS)
+        if not has_yaw:
+            continue
+        flipped, other = evidence[i, FLIPPED], evidence[i, OTHER]
+        kept = min(1.0, MEMORY / (seen[0] + seen[1] + seen[2] + 1.0))
+        seen[0] = seen[0] * kept + 1.0 - flipped - other
+        seen[1] = seen[1] * kept + flipped
+        seen[2] = seen[2] * kept + other
+        if codes[i] & WITHOUT_YAW:
+            defects[i] = IS_UNUSED
+        elif flipped > 0.5:
+            defects[i] = IS_FLIPPED
+    return defects

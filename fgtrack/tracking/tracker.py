@@ -480,7 +480,8 @@ class Tracker:
         facing = self._parts.facing
         if facing is None:
             return None
-        return facing.read(batch.message.sensor, batch.stamp_ns, candidates, assignment.pairs, states)
+        pairs, readings = assignment.pairs, assignment.readings
+        return facing.read(batch.message.sensor, batch.stamp_ns, candidates, pairs, readings, states)
 
     def _fused(
         self,

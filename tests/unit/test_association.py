@@ -65,7 +65,7 @@ def test_everything_is_paired_or_left_over_exactly_once(association: Association
     rng = np.random.default_rng(seed)
     items = [candidate(x, y) for x, y in rng.uniform(0.0, 12.0, size=(rng.integers(0, 6), 2))]
     tracks = states([(x, y) for x, y in rng.uniform(0.0, 12.0, size=(rng.integers(0, 6), 2))])
-    pairs, new, missed, refused = association(candidates_of(items), tracks)
+    pairs, new, missed, refused, _ = association(candidates_of(items), tracks)
     assert sorted([*(i for i, _ in pairs), *new, *refused]) == list(range(len(items)))
     assert sorted([j for _, j in pairs] + missed) == list(range(len(tracks.track_ids)))
     assert pairs == sorted(pairs)

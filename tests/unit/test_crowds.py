@@ -74,8 +74,8 @@ def test_an_association_is_that_of_all_pairs(bearings: bool, seed: int) -> None:
     tracks = states([(x, y) for x, y in rng.uniform(0.0, 40.0, size=(30, 2))])
     tracks.covariances[:] *= rng.uniform(0.1, 30.0, size=(30, 1, 1))
     pairs, shape = near(candidates, tracks.means, np.inf), (len(candidates), 30)
-    limits = {1: 10.8275661707, 2: 13.8155105580}  # chi-square quantiles of 0.999
-    cost, inside = weighed(pairs, candidates, tracks, None, limits.__getitem__)
+    limits = np.array([0.0, 10.8275661707, 13.8155105580])  # chi-square quantiles of 0.999
+    cost, inside, _ = weighed(pairs, candidates, tracks, None, lambda k: limits[: k + 1])
     inside &= pairs.values <= 9.0
     rule = GatedMahalanobis(gate_probability=0.999, max_distance_m=9.0)
     assert rule(candidates, tracks) == densely_assigned(cost.reshape(shape), inside.reshape(shape))

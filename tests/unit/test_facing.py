@@ -26,6 +26,7 @@ VARIANCES = {"x_m": 0.09, "y_m": 0.09, "yaw_rad": 0.01, "speed_mps": 0.04}
 P = np.diag([0.1, 0.1, 0.02, 1.0, 0.1])
 P[0, 2] = P[2, 0] = 0.02
 SURE_FRONT = 30.0
+UNLIMITED = np.full(4, math.inf)
 POLAR_MOTION = CTRV()
 
 
@@ -54,9 +55,9 @@ def facings_of(*log_odds: float, shares: FloatArray = SHARES, cartesian: bool = 
 
 def reading_of(row: dict[str, float], mean: Sequence[float], log_odds: float = SURE_FRONT, **more: Any) -> int:
     group, zero = group_of([row], **more), np.zeros(1, dtype=np.int64)
-    limits = [math.inf] * (len(row) + 1)
+    limits = np.full(len(row) + 1, math.inf)
     found = read(group, zero, zero, tracks_of(mean), facings_of(log_odds), limits)
-    return int(found.readings[0])
+    return int(found.codes[0])
 
 
 def at(yaw_rad: float, **more: float) -> dict[str, float]:
@@ -77,15 +78,15 @@ def test_a_yaw_is_read_as_it_is_turned_or_not_at_all(yaw_rad: float, expected: i
 def test_an_uncertain_yaw_is_taken_from_the_nearer_end_and_never_left() -> None:
     wide = P + np.diag([0.0, 0.0, 3.0, 0.0, 0.0])
     group, zero = group_of([at(0.3 + 1.2)]), np.zeros(1, dtype=np.int64)
-    found = read(group, zero, zero, tracks_of(DRIVING, covariance=wide), facings_of(SURE_FRONT), [math.inf] * 4)
-    assert found.readings[0] == 0
+    found = read(group, zero, zero, tracks_of(DRIVING, covariance=wide), facings_of(SURE_FRONT), UNLIMITED)
+    assert found.codes[0] == 0
 
 
 def test_a_track_that_is_known_by_its_rear_expects_yaws_half_a_turn_off() -> None:
     backwards = [0.0, 0.0, 0.3, -8.0, 0.0]
     group, zero = group_of([at(0.3), at(0.3 + math.pi)]), np.zeros(2, dtype=np.int64)
-    found = read(group, np.arange(2), zero, tracks_of(backwards), facings_of(-20.0), [math.inf] * 4)
-    assert found.readings.tolist() == [0, HALF_TURN]
+    found = read(group, np.arange(2), zero, tracks_of(backwards), facings_of(-20.0), UNLIMITED)
+    assert found.codes.tolist() == [0, HALF_TURN]
     assert found.costs[0] > found.costs[1] + 2.0 * math.log(SHARES[0] / SHARES[1]) - 1.0
     assert found.evidence[0, 1] > 0.95
     assert found.evidence[1, 1] < 1e-6
@@ -126,7 +127,7 @@ def expected_terms(row: dict[str, float], mean: Sequence[float], front: bool) ->
 def test_the_evidence_is_the_ratio_of_the_two_densities(yaw_rad: float, speed: dict[str, float]) -> None:
     row, mean = at(yaw_rad, **speed), [0.0, 0.0, 0.3, 0.5, 0.0]
     group, zero = group_of([row]), np.zeros(1, dtype=np.int64)
-    found = read(group, zero, zero, tracks_of(mean), facings_of(0.0), [math.inf] * (len(row) + 1))
+    found = read(group, zero, zero, tracks_of(mean), facings_of(0.0), np.full(len(row) + 1, math.inf))
     front, rear = (sum(expected_terms(row, mean, is_front)) for is_front in (True, False))
     assert found.evidence[0, 0] == pytest.approx(math.log(front / rear), rel=1e-9, abs=1e-9)
 
@@ -134,7 +135,7 @@ def test_the_evidence_is_the_ratio_of_the_two_densities(yaw_rad: float, speed: d
 def test_the_cost_of_a_right_yaw_is_that_of_its_innovation() -> None:
     group, zero = group_of([at(0.35)]), np.zeros(1, dtype=np.int64)
     tracks = tracks_of(DRIVING)
-    found = read(group, zero, zero, tracks, facings_of(SURE_FRONT), [math.inf] * 4)
+    found = read(group, zero, zero, tracks, facings_of(SURE_FRONT), UNLIMITED)
     S = P[:3, :3] + group.stack.R[0]
     y = np.array([0.1, -0.2, 0.05])
     assert found.costs[0] == pytest.approx(y @ np.linalg.solve(S, y) + np.linalg.slogdet(S)[1], rel=1e-9)
@@ -144,7 +145,7 @@ def test_the_cost_is_that_of_the_likeliest_reading() -> None:
     """Costs differ from -2 log p by what all readings of one detection have in common."""
     rows = [at(0.35), at(0.3 + math.pi), at(0.3 + 1.5)]
     group, zeros = group_of(rows), np.zeros(3, dtype=np.int64)
-    found = read(group, np.arange(3), zeros, tracks_of(DRIVING), facings_of(SURE_FRONT), [math.inf] * 4)
+    found = read(group, np.arange(3), zeros, tracks_of(DRIVING), facings_of(SURE_FRONT), UNLIMITED)
     common = 3.0 * math.log(math.tau) - 2.0 * math.log(SHARES[0])
     for cost, row in zip(found.costs, rows, strict=True):
         assert cost + common == pytest.approx(-2.0 * math.log(max(expected_terms(row, DRIVING, True))), rel=1e-6)
@@ -203,8 +204,8 @@ def test_the_heading_of_the_map_is_compared_modulo_pi_and_always_used() -> None:
 def test_a_cartesian_state_faces_along_its_velocity() -> None:
     group, zero = group_of([at(0.0), at(math.pi)], CV()), np.zeros(2, dtype=np.int64)
     tracks = tracks_of([0.0, 0.0, 6.0, 0.0], covariance=0.1 * np.eye(4))
-    found = read(group, np.arange(2), zero, tracks, facings_of(0.0, cartesian=True), [math.inf] * 4)
-    assert found.readings.tolist() == [0, HALF_TURN]
+    found = read(group, np.arange(2), zero, tracks, facings_of(0.0, cartesian=True), UNLIMITED)
+    assert found.codes.tolist() == [0, HALF_TURN]
     assert found.costs[1] > found.costs[0]
 
 
@@ -263,13 +264,14 @@ class Tracks:
         for yaw_rad in yaws_rad:
             self.stamp_ns += 100_000_000
             state = tracks_of([0.0, 0.0, 0.3, speed_mps, 0.0])
-            found = self.facing.read(sensor, self.stamp_ns, candidates_of(group_of([at(yaw_rad)])), [(0, 0)], state)
-            words += found.words
+            candidates = candidates_of(group_of([at(yaw_rad)]))
+            found = self.facing.read(sensor, self.stamp_ns, candidates, [(0, 0)], (), state)
+            words.append(None if found is None else found.words[0])
         return words
 
     def yaw_speed(self, speed_mps: float = 0.0) -> tuple[float, float]:
         state = TrackState(self.stamp_ns, np.array([0.0, 0.0, 0.3, speed_mps, 0.1]), np.eye(5))
-        [published] = self.facing.published([0], [state])
+        [published] = self.facing.published((0,), [state])
         return float(published.mean[2]), float(published.mean[3])
 
 
@@ -348,10 +350,10 @@ def test_shares_of_wrong_yaws_are_learned_by_sensor() -> None:
         tracks.see(BACK if kind < 0.3 else 0.3 + 1.5 if kind < 0.4 else 0.3, speed_mps=8.0)
         tracks.see(0.3, speed_mps=8.0, sensor="camera")
     spread = 3.0 * math.sqrt(0.3 * 0.7 / 200.0)
-    shares = tracks.facing.at("lidar", [0]).shares
+    shares = tracks.facing.at("lidar", (0,)).shares
     assert abs(shares[1] - 0.3) < spread
     assert abs(shares[2] - 0.1) < spread
-    assert tracks.facing.at("camera", [0]).shares[0] > 0.98
+    assert tracks.facing.at("camera", (0,)).shares[0] > 0.98
     counts = tracks.facing.counts["lidar"]
     assert counts["yaws"] == 400
     assert abs(counts["flipped"] - 120) < 3.0 * math.sqrt(400 * 0.3 * 0.7)
@@ -362,7 +364,7 @@ def test_a_detector_that_begins_to_flip_is_noticed_within_its_memory() -> None:
     tracks = Tracks()
     tracks.see(*[0.3] * 2000, speed_mps=8.0)
     tracks.see(*[0.3, BACK] * 150, speed_mps=8.0)
-    assert tracks.facing.at("lidar", [0]).shares[1] > 0.3
+    assert tracks.facing.at("lidar", (0,)).shares[1] > 0.3
 
 
 def test_late_yaws_are_the_same_evidence() -> None:
@@ -373,7 +375,7 @@ def test_late_yaws_are_the_same_evidence() -> None:
         for yaw_rad in order:
             tracks.stamp_ns = START_NS - 100_000_000
             tracks.see(yaw_rad)
-        results.append(float(tracks.facing.at("lidar", [0]).log_odds[0]))
+        results.append(float(tracks.facing.at("lidar", (0,)).log_odds[0]))
     assert results[0] == pytest.approx(results[1], abs=0.2)
 
 
@@ -385,7 +387,7 @@ def test_old_evidence_of_a_cartesian_state_fades_sooner() -> None:
         tracks.see(*[0.3] * 20)
         tracks.stamp_ns += 10_000_000_000
         tracks.see(0.3)
-        left.append(float(tracks.facing.at("lidar", [0]).log_odds[0]))
+        left.append(float(tracks.facing.at("lidar", (0,)).log_odds[0]))
     assert left[1] < 2.0 * math.log(3.0) < 4.0 * math.log(3.0) < left[0]
 
 
@@ -396,3 +398,47 @@ def test_measurements_of_one_stack_come_apart_and_keep_their_tracks() -> None:
         ([0], ("x_m", "y_m", "yaw_rad")),
         ([1], ("x_m", "y_m")),
     ]
+
+
+def test_the_readings_of_the_association_are_those_of_the_pairs_alone() -> None:
+    """The association has compared all pairs; the assigned ones are looked up by their candidates and tracks."""
+    states = tracks_of([0.0, 0.0, 0.0, 8.0, 0.0], [20.0, 0.0, 1.0, 8.0, 0.0], [40.0, 0.0, 2.0, 8.0, 0.0])
+    rows = [{"x_m": 40.1, "y_m": 0.0, "yaw_rad": 2.0 - math.pi}, {"x_m": 0.1, "y_m": 0.0, "yaw_rad": 0.1}]
+    rows.append({"x_m": 20.1, "y_m": 0.0, "yaw_rad": 2.5})
+    candidates = candidates_of(group_of(rows))
+    results = []
+    for is_given in (True, False):
+        facing = Facing(cartesian=False)
+        for track_id in range(3):
+            first = Measurement(START_NS, measurement_model(("x_m", "y_m"), CTRV()), np.zeros(2), np.eye(2))
+            facing.born(track_id, "lidar", Start(stamp_ns=START_NS, yaw_rad=0.0), first)
+        found = GatedMahalanobis()(candidates, states, facings=facing.at("lidar", states.track_ids))
+        assert found.pairs == [(0, 2), (1, 0), (2, 1)]
+        given = found.readings if is_given else ()
+        read_yaws = facing.read("lidar", START_NS + 1, candidates, found.pairs, given, states)
+        assert read_yaws is not None
+        results.append((read_yaws.readings.tolist(), read_yaws.words, facing.at("lidar", (0, 1, 2)).log_odds.tolist()))
+    assert results[0] == results[1]
+    assert results[0][0] == [HALF_TURN, 0, WITHOUT_YAW]
+    assert results[0][1] == ["flipped", None, "unused"]
+
+
+def test_yaws_that_arrive_late_for_ever_leave_a_finite_belief() -> None:
+    tracks = Tracks()
+    for _ in range(2000):
+        tracks.stamp_ns = START_NS - 200_000_000
+        tracks.see(0.3)
+    tracks.stamp_ns = START_NS + 1_000_000_000
+    tracks.see(0.3)
+    assert 1.0 < tracks.facing.at("lidar", (0,)).log_odds[0] < 40.0
+
+
+def test_rows_of_ended_tracks_are_used_again() -> None:
+    facing = Facing(cartesian=False)
+    first = Measurement(START_NS, measurement_model(("x_m", "y_m"), CTRV()), np.zeros(2), np.eye(2))
+    for track_id in range(1000):
+        facing.born(track_id, "lidar", Start(stamp_ns=START_NS), first)
+        if track_id >= 20:
+            facing.forget(track_id - 20)
+    assert len(facing._log_odds) <= 32
+    assert facing.at("lidar", tuple(range(980, 1000))).log_odds.tolist() == [0.0] * 20
