@@ -12,9 +12,10 @@ the yaw as it is, turned by pi, or no yaw. The tracker decides it when it associ
 they were read. A history needs no change when the belief about the front changes: only published states turn.
 
 A speed and the curvature of a path are along the front. Where the yaw of the state is that of the rear, they are read
-with the opposite sign. Position, yaw rate and Doppler shift do not depend on the front. The belief about the front
-follows from the yaws and the signs of speeds, and from the motion: objects seldom drive backwards. Old evidence fades,
-as in a Markov chain. The shares a, e and u of each sensor are learned.
+with the opposite sign. The sign is changed only where that is sure: at rest the nearer one of both signs would bias the
+speed. Position, yaw rate and Doppler shift do not depend on the front. The belief about the front follows from the yaws
+and the signs of speeds, and from the motion: objects seldom drive backwards. Old evidence fades, as in a Markov chain.
+The shares a, e and u of each sensor are learned.
 """
 
 import math

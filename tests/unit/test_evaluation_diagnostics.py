@@ -162,3 +162,24 @@ def test_births_that_die_unconfirmed_are_told_where_they_are_most_detections(tmp
     assert (
         diagnostics(run_of(tmp_path / "good", lists(Disposition.BIRTH, 30) + lists(Disposition.IN_SEQUENCE, 30))) == []
     )
+
+
+@pytest.mark.parametrize(
+    ("counts", "texts"),
+    [
+        ({"yaws": 100, "flipped": 5, "unused": 5}, []),
+        ({"yaws": 29, "flipped": 20}, []),
+        ({"yaws": 100, "flipped": 6}, ["6 of 100 yaws are half a turn off"]),
+        ({"yaws": 200, "unused": 30}, ["30 of 200 yaws misfit"]),
+        ({"yaws": 200, "flipped": 50, "unused": 30}, ["50 of 200 yaws are half a turn off", "30 of 200 yaws misfit"]),
+    ],
+)
+def test_many_wrong_yaws_are_a_diagnostic_with_their_number(
+    counts: dict[str, int], texts: list[str], tmp_path: Path
+) -> None:
+    run = run_of(tmp_path / "run", lists(Disposition.IN_SEQUENCE))
+    run.meta["yaws"] = {"lidar": counts}
+    found = diagnostics(run)
+    assert [each.about for each in found] == ["lidar"] * len(texts)
+    for each, text in zip(found, texts, strict=True):
+        assert each.text.startswith(text)
