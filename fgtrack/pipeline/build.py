@@ -8,7 +8,7 @@ import numpy as np
 
 from fgtrack.core.diagnostic import EGO
 from fgtrack.core.errors import CallError
-from fgtrack.core.time import period_ns, seconds
+from fgtrack.core.time import nanoseconds, period_ns, seconds
 from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.failures import Failures
 from fgtrack.estimation.filters.backward_forward import BackwardForwardBank
@@ -24,6 +24,7 @@ from fgtrack.models.track_map import TrackMap
 from fgtrack.pipeline.config import NOISE_HZ, SMOOTHERS, Config, Defect, MapConfig
 from fgtrack.tracking.association import GatedMahalanobis
 from fgtrack.tracking.ego import EgoStd, EgoTrajectory
+from fgtrack.tracking.ego_growth import EgoGrowth
 from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules, Lifecycle
 from fgtrack.tracking.facing import Facing
 from fgtrack.tracking.guarded_bank import GuardedBank
@@ -33,6 +34,7 @@ from fgtrack.tracking.lifecycle import CountingLifecycle
 from fgtrack.tracking.preprocess import Preprocess
 from fgtrack.tracking.published import PublishedEgo, PublishedLifecycle, PublishedTracker, SlotInbox
 from fgtrack.tracking.tracker import Tracker, TrackerParts
+from fgtrack.tracking.waiting import PoseWait
 
 _EGO_STORAGE_TICKS = 350  # of the published implementation
 
@@ -43,9 +45,11 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
     motion, lifecycle, failures = config.motion_model(), build_lifecycle(config), Failures()
     published_order = config.lifecycle.kind == "published"
     joint = config.association if isinstance(config.association, GatedMahalanobis) else None
+    ego = _build_ego(config)
     parts = TrackerParts(
         sensors=config.sensors,
-        ego=_build_ego(config),
+        ego=ego,
+        wait=_build_wait(config, ego),
         inbox=(SlotInbox if "one_slot" in config.defects else Inbox)(config.sensors),
         preprocess=Preprocess(road, config.merge, motion, config.ego.detection_origin_m, not published_order),
         association=config.association,
@@ -154,4 +158,16 @@ def _build_ego(config: Config) -> EgoTrajectory:
     if "refiltered_ego" in config.defects:
         step_ns = period_ns(config.filter.frequency_hz)
         return PublishedEgo(ego.yaw_weight, ego.yaw_rate_weight, step_ns, _EGO_STORAGE_TICKS, known)
-    return EgoTrajectory(ego.yaw_weight, ego.yaw_rate_weight, std=known, position_time_s=ego.position_time_s)
+    noise = {"speed": 15.0, **config.motion.std_per_s}  # of a plug-in as of traffic
+    density_m2ps3 = noise.get("velocity", noise["speed"]) ** 2 / NOISE_HZ
+    growth = None if known is None else EgoGrowth(ego.accel_std_mps2, ego.yaw_accel_std_radps2, density_m2ps3)
+    time_s = ego.position_time_s
+    return EgoTrajectory(ego.yaw_weight, ego.yaw_rate_weight, std=known, position_time_s=time_s, growth=growth)
+
+
+def _build_wait(config: Config, ego: EgoTrajectory) -> PoseWait | None:
+    """Return what decides which lists wait for an ego message; None where none waits."""
+    if not config.ego.wait_s:
+        return None
+    most_age_ns = nanoseconds(0.5 * config.effective.reach_s)
+    return PoseWait(ego, config.sensors, nanoseconds(config.ego.wait_s), most_age_ns)

@@ -33,6 +33,17 @@ def clock_ticks(messages: Iterable[Delivered], node_hz: float | None) -> Iterato
         next_ns = due_ns + step_ns
 
 
+def with_last(ticks: Iterable[Tick]) -> Iterator[tuple[Tick, bool]]:
+    """Yield each of `ticks`, and True with the last one."""
+    before: Tick | None = None
+    for tick in ticks:
+        if before is not None:
+            yield before, False
+        before = tick
+    if before is not None:
+        yield before, True
+
+
 def corrected(message: DetectionList, sensors: Mapping[str, SensorModel]) -> DetectionList:
     """Return `message` with its receipt as the stamp, or its clock offset taken off, where `sensors` specify it."""
     sensor = sensors.get(message.sensor)

@@ -265,8 +265,7 @@ class Tracker:
             self._records, self._uncounted = [], None
             self._ticks_ns.append(perf_counter_ns() - begun_ns)
             self._node.done_ns(now_ns, self._ticks_ns[-1])
-            for (sensor, disposition), count in counts.items():
-                self._counts.setdefault(self._counted(sensor), Counter())[disposition] += count
+            self._add(counts)
             if self._last.tick < 0:
                 self._first_tick_ns = now_ns
             elif self._node.period_ns is not None:
@@ -294,9 +293,19 @@ class Tracker:
             return self._tracker.tracks_at(stamp_ns)
 
     def finish(self) -> tuple[SmoothedReport, ...]:
-        """End all tracks; return the smoothed states that were still inside a window."""
+        """End all tracks; return the smoothed states that were still inside a window.
+
+        Lists that still wait for an ego message are processed first, and `counts` has their detections.
+        """
         with self._turn:
-            return self._tracker.finish()
+            final = self._tracker.finish()
+            self._add(Counter((update.sensor, str(update.disposition)) for update in self._tracker.last_updates))
+            return final
+
+    def _add(self, counts: Mapping[tuple[str, str], int]) -> None:
+        """Add numbers of detections by sensor and disposition to `counts`."""
+        for (sensor, disposition), count in counts.items():
+            self._counts.setdefault(self._counted(sensor), Counter())[disposition] += count
 
 
 def _rule(error: InvalidMessageError) -> str:

@@ -16,7 +16,7 @@ from fgtrack.io.errors import UntilBreak
 from fgtrack.io.run import MemoryRun, Run, RunWriter, path_from_run
 from fgtrack.pipeline.assumptions.assumed import assumed, is_open, source_of
 from fgtrack.pipeline.build import build_tracker
-from fgtrack.pipeline.clock import Delivered, Tick, clock_ticks, corrected
+from fgtrack.pipeline.clock import Delivered, Tick, clock_ticks, corrected, with_last
 from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.load import dump, plain
 from fgtrack.tracking.tracker import Tracker, TrackerParts, check_sensor
@@ -145,13 +145,13 @@ def _drive(
                 writer.write_detections(message)
             yield message
 
-    for tick in clock_ticks(written(), config.clock.node_hz):
+    for tick, is_last in with_last(clock_ticks(written(), config.clock.node_hz)):
         before_ns = perf_counter_ns()
         for message in tick.messages:
             tracker.receive(message)
             if isinstance(message, EgoState):
                 writer.write_ego(tracker.located(message))
-        report = tracker.tick(tick.now_ns)
+        report = tracker.tick(tick.now_ns, is_last)
         process_ns = perf_counter_ns() - before_ns
         num_detections = sum(len(item.objects) for item in tick.messages if isinstance(item, DetectionList))
         detections_received += num_detections

@@ -2,6 +2,7 @@
 
 import bisect
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from functools import lru_cache
 from operator import attrgetter
@@ -12,16 +13,17 @@ import numpy as np
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.linalg import ASYMMETRY, congruence, is_covariance, symmetrise
-from fgtrack.core.time import NS_PER_S, nanoseconds
+from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
 from fgtrack.core.types import EgoState, FloatArray
 from fgtrack.models.dead_reckoning import Reckoned, ReportedErrors, reckoned
+from fgtrack.tracking.ego_growth import EgoGrowth
 
 #: A detection whose stamp is further than this from any ego state cannot be placed, in a gap neither.
 MAX_EXTRAPOLATION_S = 1.0
 LARGEST_STEP_BACK_S = 1.0
 """A state that is older than the newest one by more than this has a wrong stamp."""
 _LARGEST_STEP_BACK_NS = nanoseconds(LARGEST_STEP_BACK_S)
-_MAX_EXTRAPOLATION_NS = nanoseconds(MAX_EXTRAPOLATION_S)
+MAX_EXTRAPOLATION_NS = nanoseconds(MAX_EXTRAPOLATION_S)
 _MAX_FUTURE_NS = NS_PER_S  # a state stamped further ahead of its receipt has a wrong stamp
 CONTRADICTS = "contradicts its neighbours"
 _LONGEST_S, _SLACK_M, _SHARE, _SIGMAS = 1.0, 2.0, 0.5, 3.0  # see `EgoTrajectory`
@@ -43,6 +45,8 @@ class EgoPose(NamedTuple):
     yaw_rate_radps: float = 0.0
     covariance: FloatArray | None = None
     """Covariance of the five above, shape (5, 5), read-only; None where it is unknown or not requested."""
+    extrapolated_s: float = 0.0
+    """Time from the nearest state to a pose that is extrapolated; below 0 before the first state, 0 between states."""
 
 
 def is_finite(ego: EgoState) -> bool:
@@ -145,7 +149,9 @@ class EgoTrajectory:
         std: EgoStd | None = None,
         memory_s: float = 5.0,
         position_time_s: float | None = None,
+        growth: EgoGrowth | None = None,
     ) -> None:
+        self._growth = growth
         self._yaw_weight, self._yaw_rate_weight, self._std = yaw_weight, yaw_rate_weight, std
         self._position_time_s = position_time_s
         self._reckoned: list[tuple[EgoState, Reckoned]] = []  # states as reported, where they are fused
@@ -189,6 +195,29 @@ class EgoTrajectory:
     def start_tick(self) -> None:
         """A tick begins; nothing depends on ticks here."""
 
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the newest state that poses are taken from; None before the first."""
+        return self._stamps[-1] if self._stamps else None
+
+    def placed(self, stamp_ns: int, present_ns: int, range_m: Callable[[], float | None]) -> EgoPose | None:
+        """Return `pose_at` for a list that is placed by it; `range_m` returns the usual distance of its objects.
+
+        The error of an extrapolated pose lasts for several lists: its growth counts as `EgoGrowth` describes.
+        """
+        pose = self.pose_at(stamp_ns, present_ns)
+        if pose is None or self._growth is None or not pose.extrapolated_s:
+            return pose
+        ego = self._nearest(stamp_ns)
+        return self._grown(ego, stamp_ns, self._growth.shared(ego, pose.extrapolated_s, stamp_ns, range_m()))
+
+    def growth_at(self, stamp_ns: int) -> FloatArray | None:
+        """Covariance that extrapolation from the nearest state to `stamp_ns` adds, shape (5, 5); None if unknown."""
+        if self._growth is None or not self._stamps:
+            return None
+        nearest = self._nearest(stamp_ns)
+        return self._growth.covariance(nearest, seconds(stamp_ns - nearest.stamp_ns))
+
     def pose_at(self, stamp_ns: int, present_ns: int) -> EgoPose | None:
         """Pose at `stamp_ns`, or None where it is unknown; `present_ns` is the tracking time.
         Beyond its ends, and into a gap, the trajectory is extrapolated for a limited time. A gap is longer than all
@@ -196,14 +225,21 @@ class EgoTrajectory:
         """
         if not self._stamps:
             return None
-        row = bisect.bisect_left(self._stamps, stamp_ns)
-        around = self._states[max(row - 1, 0) : row + 1]
-        if len(around) == 2 and around[1].stamp_ns - around[0].stamp_ns <= 2 * _MAX_EXTRAPOLATION_NS:
+        around = self._around(stamp_ns)
+        if len(around) == 2 and around[1].stamp_ns - around[0].stamp_ns <= 2 * MAX_EXTRAPOLATION_NS:
             return self._interpolated(around[0], around[1], stamp_ns)
-        nearest = min(around, key=lambda ego: abs(stamp_ns - ego.stamp_ns))
-        if abs(stamp_ns - nearest.stamp_ns) > _MAX_EXTRAPOLATION_NS:
+        nearest = self._nearest(stamp_ns)
+        if abs(stamp_ns - nearest.stamp_ns) > MAX_EXTRAPOLATION_NS:
             return None
         return self._extrapolated(nearest, stamp_ns)
+
+    def _around(self, stamp_ns: int) -> Sequence[EgoState]:
+        """Return the states before and after `stamp_ns`, at least one of them."""
+        row = bisect.bisect_left(self._stamps, stamp_ns)
+        return self._states[max(row - 1, 0) : row + 1]
+
+    def _nearest(self, stamp_ns: int) -> EgoState:
+        return min(self._around(stamp_ns), key=lambda ego: abs(stamp_ns - ego.stamp_ns))
 
     def _store(self, ego: EgoState) -> str | None:
         """Take a state; the reason, where it is refused, or one that was held back."""
@@ -219,6 +255,8 @@ class EgoTrajectory:
             return self._insert(ego)
         self._fits = _consistent(held, ego)
         self.jumps += self._fits
+        if self._growth is not None:
+            self._growth.jumped(held.stamp_ns)
         reason = self._insert(held)
         return self._insert(ego) or reason
 
@@ -237,6 +275,8 @@ class EgoTrajectory:
         self._states.insert(row, ego)
         if self._position_time_s is not None:
             self._reckon(row, self._position_time_s)
+        if self._growth is not None and row == len(stamps_ns) - 1:
+            self._growth.learn(self._states, stamps_ns, self._moved)
         oldest_ns = stamps_ns[-1] - self._memory_ns
         if len(stamps_ns) > 64 and stamps_ns[64] < oldest_ns:  # in portions: cutting a list copies it
             gone = bisect.bisect_left(stamps_ns, oldest_ns) - 1
@@ -264,8 +304,24 @@ class EgoTrajectory:
         self.current = self._states[-1]
 
     def _extrapolated(self, ego: EgoState, stamp_ns: int) -> EgoPose:
+        elapsed_s = seconds(stamp_ns - ego.stamp_ns)
+        growth = self._growth.covariance(ego, elapsed_s) if self._growth is not None and elapsed_s else None
+        return self._grown(ego, stamp_ns, growth)
+
+    def _grown(self, ego: EgoState, stamp_ns: int, growth: FloatArray | None) -> EgoPose:
+        """Return the pose of `ego` at another stamp, whose covariance grows by `growth`, shape (5, 5)."""
         covariance = None if self._std is None else _completed(ego.covariance, self._std)
-        return extrapolated(ego, stamp_ns, covariance, self._straight)
+        pose = extrapolated(ego, stamp_ns, covariance, self._straight)
+        if growth is None:
+            return pose
+        total = growth if pose.covariance is None else pose.covariance + growth
+        total.flags.writeable = False
+        return pose._replace(covariance=total, extrapolated_s=seconds(stamp_ns - ego.stamp_ns))
+
+    def _moved(self, ego: EgoState, stamp_ns: int) -> tuple[float, float, float]:
+        """Return x, y and yaw of `ego` at another stamp."""
+        x_m, y_m, yaw_rad, *_ = extrapolated(ego, stamp_ns, straight=self._straight)
+        return x_m, y_m, yaw_rad
 
     def _low_passed(self, ego: EgoState, yaw_rad: float, yaw_rate_radps: float) -> EgoState:
         """`ego` with its yaw and yaw rate drawn towards the given ones."""

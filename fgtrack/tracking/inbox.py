@@ -1,7 +1,7 @@
 """Detections on their way from receipt to the tick that processes them."""
 
 import marshal
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import compress, repeat
 from operator import attrgetter
@@ -14,6 +14,7 @@ from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import Detection, DetectionList, Disposition, FloatArray, Frame, UpdateRecord, YawWord
 from fgtrack.estimation.base import Measurement, UpdateResult, UpdateStatus
 from fgtrack.models.sensors import SensorModel
+from fgtrack.tracking.latency import FOREVER
 
 #: In any unit: no sensor is better than this.
 SMALLEST_STD = 1e-6
@@ -30,6 +31,8 @@ class Batch:
     """Positions, in the message, of the detections to process."""
     last: bool = True
     """True for the newest batch of its message; only detections with stamps of their own make several."""
+    since_ns: int | None = None
+    """First tick at which the batch had to wait, see `Inbox.collect`; None if it never had to."""
 
 
 def record(
@@ -237,8 +240,30 @@ class Inbox:
         self._receipts_ns[key] = message.receipt_ns
         return False
 
-    def collect(self) -> list[Batch]:
-        """Everything received since the last call, oldest stamp first."""
-        batches = sorted(self._pending, key=attrgetter("stamp_ns"))
-        self._pending = []
-        return batches
+    @property
+    def held_ns(self) -> int:
+        """Oldest stamp of what `collect` has not returned; `FOREVER` where there is nothing."""
+        return min((batch.stamp_ns for batch in self._pending), default=FOREVER)
+
+    def collect(self, now_ns: int = 0, waits: Callable[[Batch, int], bool] | None = None) -> list[Batch]:
+        """Return everything received and not yet returned, oldest stamp first.
+
+        `waits` is asked about batches at the tick `now_ns`. A batch that waits stays here until the next call. With it
+        stay all batches of its message, by which together tracks are missed, and what its sensor has stamped later.
+        """
+        pending, held, first_ns = sorted(self._pending, key=attrgetter("stamp_ns")), set[int](), dict[str, int]()
+        if waits is None:
+            self._pending = []
+            return pending
+        for batch in pending:
+            sensor, stamp_ns = batch.message.sensor, batch.stamp_ns
+            if first_ns.get(sensor, stamp_ns) < stamp_ns or waits(batch, now_ns):
+                held.add(id(batch.message))
+                first_ns.setdefault(sensor, stamp_ns)
+        ready = [batch for batch in pending if id(batch.message) not in held]
+        self._pending = [
+            replace(batch, since_ns=now_ns) if batch.since_ns is None else batch
+            for batch in self._pending
+            if id(batch.message) in held
+        ]
+        return ready

@@ -1,6 +1,6 @@
 """Deviations of the published implementation of Karle et al. 2023, each defect a component of its own."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -116,8 +116,8 @@ class SlotInbox(Inbox):
             return []
         return [record(batch.message, index, Disposition.SUPERSEDED) for index in batch.indices]
 
-    def collect(self) -> list[Batch]:
-        """See `Inbox.collect`; equal stamps keep the order of the sensors."""
+    def collect(self, now_ns: int = 0, waits: Callable[[Batch, int], bool] | None = None) -> list[Batch]:
+        """See `Inbox.collect`; equal stamps keep the order of the sensors, and nothing waits."""
         batches = [self._slots[name] for name in self._sensors if name in self._slots]
         self._slots = {}
         return sorted(batches, key=lambda batch: batch.stamp_ns)
@@ -239,9 +239,9 @@ class PublishedTracker(Tracker):
         super().__init__(parts)
         self._last_known: dict[int, FloatArray] = {}
 
-    def tick(self, now_ns: int) -> TickReport:
+    def tick(self, now_ns: int, is_last: bool = False) -> TickReport:
         """See `Tracker.tick`."""
-        report = super().tick(now_ns)
+        report = super().tick(now_ns, is_last)
         self._remember()
         return report
 

@@ -45,11 +45,12 @@ from fgtrack.tracking.existence import Lifecycle, after_jumps
 from fgtrack.tracking.facing import Facing, Facings, YawsRead, as_read
 from fgtrack.tracking.guarded_bank import GuardedBank, faults
 from fgtrack.tracking.inbox import Batch, FusedRecords, Inbox, merged_records, record, stamps
-from fgtrack.tracking.latency import FOREVER, Delays, Watermarks
+from fgtrack.tracking.latency import Delays, Watermarks
 from fgtrack.tracking.lifecycle import Scan
 from fgtrack.tracking.objects import Apart, Objects
 from fgtrack.tracking.preprocess import Candidates, Group, Preprocess, Preprocessed
 from fgtrack.tracking.soft_association import equivalent, joint_probabilities
+from fgtrack.tracking.waiting import PoseWait, places, range_of
 
 _SELDOM = 1e-3  # probability with which a true pair misses the usual gate
 
@@ -79,6 +80,8 @@ class TrackerParts:
     """See `ExistenceLifecycle.likely`; None where births are not weighed."""
     facing: Facing | None = None
     """Belief about the fronts of tracks; None where every yaw is taken as it is."""
+    wait: PoseWait | None = None
+    """Decides which lists wait for an ego message; None where none waits."""
     failures: Failures = field(default_factory=Failures)
     """Counts what fails inside, shared with `bank`."""
     propagated_exceptions: tuple[type[Exception], ...] = (FgtrackError, MemoryError)
@@ -117,6 +120,8 @@ class Tracker:
         """Counts of internal failures and of the tracks that they have ended."""
         self.refused_ego: Counter[str] = Counter()
         """Ego messages that were not used, by reason."""
+        self.last_updates: tuple[UpdateRecord, ...] = ()
+        """Records of the detections that `finish` has processed, which no tick has."""
 
     @property
     def ego_jumps(self) -> int:
@@ -158,23 +163,22 @@ class Tracker:
         self.delays[message.sensor].add(min(own_ns), message.receipt_ns, max(own_ns))
         self._records.append(self._parts.inbox.put(message))
 
-    def tick(self, now_ns: int) -> TickReport:
-        """Process everything received up to `now_ns`."""
+    def tick(self, now_ns: int, is_last: bool = False) -> TickReport:
+        """Process everything received up to `now_ns`, but for lists that wait for an ego message.
+
+        At a tick that `is_last` no list waits any longer.
+        """
         self._tick += 1
         parts, bank = self._parts, self._parts.bank
         self._fail_rest()  # of a tick that was interrupted
-        self._waiting += parts.inbox.collect()
-        self._expire(now_ns, min((batch.stamp_ns for batch in self._waiting), default=FOREVER))
+        self._waiting += parts.inbox.collect(now_ns, None if is_last else parts.wait)
+        held_ns = parts.inbox.held_ns
+        self._expire(now_ns, min([held_ns, *(batch.stamp_ns for batch in self._waiting)]))
         bank.advance(now_ns)
         with self._contained(Failure.STEP_FAILED):
             parts.ego.start_tick()
-        self._seen = {}
-        posed = list(map(self._posed, self._waiting))
-        for each in zip(posed, self._preprocessed(posed), strict=True):
-            self._process_if_possible(*each)
-            self.delays[each[0].batch.message.sensor].processed(each[0].batch.stamp_ns)
-        if posed:
-            self._expire(now_ns, FOREVER)
+        if self._process_waiting():
+            self._expire(now_ns, held_ns)
         smoothed = self._smoothed()
         states = bank.present()  # tracks may end by both
         if parts.facing is not None:
@@ -185,7 +189,14 @@ class Tracker:
         return TickReport.made_later(self._tick, now_ns, smoothed, tracks=tracks, updates=updates)
 
     def finish(self) -> tuple[SmoothedReport, ...]:
-        """End all tracks; gives the final smoothed states that were still inside a window."""
+        """End all tracks; gives the final smoothed states that were still inside a window.
+
+        Lists that still wait for an ego message are processed first; `last_updates` has their records.
+        """
+        self._fail_rest()
+        self._waiting += self._parts.inbox.collect()
+        self._process_waiting()
+        self.last_updates, self._records = tuple(chain.from_iterable(self._records)), []
         self._end(self._parts.bank.track_ids)
         return tuple(self._smoothed())
 
@@ -250,11 +261,23 @@ class Tracker:
             watermarks_ns = parts.watermarks.at(now_ns, parts.bank.window_start_ns)
             self._end(parts.lifecycle.expired(now_ns, watermarks_ns, processed_ns))
 
+    def _process_waiting(self) -> bool:
+        """Process all batches that were collected; return True if there was one."""
+        self._seen = {}
+        posed = list(map(self._posed, self._waiting))
+        for each in zip(posed, self._preprocessed(posed), strict=True):
+            self._process_if_possible(*each)
+            self.delays[each[0].batch.message.sensor].processed(each[0].batch.stamp_ns)
+        return bool(posed)
+
     def _posed(self, batch: Batch) -> PosedBatch:
         """Return `batch` with the pose that it is seen from; detections in the map need none."""
         parts, sensor = self._parts, self._parts.sensors[batch.message.sensor]
         with self._contained(Failure.STEP_FAILED):
-            ego = parts.ego.pose_at(batch.stamp_ns, parts.bank.present_ns)
+            if places(batch, sensor):
+                ego = parts.ego.placed(batch.stamp_ns, parts.bank.present_ns, partial(range_of, batch))
+            else:
+                ego = parts.ego.pose_at(batch.stamp_ns, parts.bank.present_ns)
             return parts.preprocess.posed(batch, sensor, ego)
         return PosedBatch(batch, sensor, None, AT_ORIGIN)
 
