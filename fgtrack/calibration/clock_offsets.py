@@ -49,8 +49,9 @@ _ROUNDS = 10
 _HUBER = 1.5
 _LARGEST_STEP_S, _REACH_S = 0.2, 1.0
 _BIAS_STDS, _SMALLEST_BIAS_M = 4.0, 0.2  # a bias that is no chance, and that a calibration would find
-_SURE = 0.995  # an offset is accepted where 0 is outside of the 99 % interval of Student's t ...
-_SMALLEST_OFFSET_S = 0.01  # ... if it matters
+_SURE = 0.995  # an offset is accepted where 0 is outside of the 99 % interval of Student's t, if it matters
+SMALLEST_OFFSET_S = 0.01
+"""A smaller offset does not matter."""
 _LARGEST_HALF_S = 0.05  # an interval that is wider leaves an offset unknown
 RECEIPT_S = 1e-5
 """Stamps that are nearer to the receipt are the receipt."""
@@ -98,8 +99,22 @@ class SensorOffset:
     @property
     def is_off(self) -> bool:
         """True if the offset is no chance, and matters."""
-        least_s = max(self._times_std_s(_SURE), _SMALLEST_OFFSET_S)
+        least_s = max(self._times_std_s(_SURE), SMALLEST_OFFSET_S)
         return self.half_s is not None and self.offset_s is not None and abs(self.offset_s) >= least_s
+
+    @property
+    def agrees(self) -> bool:
+        """True if the clock is known and its 95 % interval contains 0."""
+        return self.is_known and not self.is_off and self._is_within(self.half_s)
+
+    @property
+    def is_small(self) -> bool:
+        """True if the 95 % interval excludes 0, but the offset is too small to matter."""
+        is_outside = self.is_known and not self.is_off and not self._is_within(self.half_s)
+        return is_outside and self._is_within(SMALLEST_OFFSET_S)
+
+    def _is_within(self, limit_s: float | None) -> bool:
+        return limit_s is not None and self.offset_s is not None and abs(self.offset_s) <= limit_s
 
     def _times_std_s(self, share: float) -> float:
         if self.offset_s is None or not self.std_s or self.dof is None:

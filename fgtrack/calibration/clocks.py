@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from fgtrack.calibration.arrivals import FEWEST, Arrivals
-from fgtrack.calibration.clock_offsets import RECEIPT_S, TRUTH, OffsetReport, SensorOffset
+from fgtrack.calibration.clock_offsets import RECEIPT_S, SMALLEST_OFFSET_S, TRUTH, OffsetReport, SensorOffset
 from fgtrack.calibration.finding import Finding, milliseconds, percent
 from fgtrack.core.diagnostic import EGO
 from fgtrack.pipeline.config import EgoConfig
@@ -83,10 +83,15 @@ def clock_text(one: SensorOffset, report: OffsetReport) -> str:
     half, offset = milliseconds(one.half_s), f"{1e3 * one.offset_s:+.0f} ms"
     if not one.is_known:
         return f"its clock offset from {what} is not known: {offset} ± {half}."
-    if not one.is_off:
+    if one.agrees:
         return f"its stamps agree with {what} (offset {offset} ± {half})."
     side = "later" if one.offset_s > 0.0 else "earlier"
-    off = f"its stamps are {milliseconds(abs(one.offset_s))} (± {half}) {side} than"
+    amount = f"{milliseconds(abs(one.offset_s))} (± {half}) {side} than"
+    if one.is_small:
+        return f"its stamps are {amount} {what}: less than {milliseconds(SMALLEST_OFFSET_S)}, which does not matter."
+    if not one.is_off:
+        return f"its stamps may be {amount} {what}: the 95 % interval excludes 0, that of 99 % does not."
+    off = f"its stamps are {amount}"
     if report.reference == TRUTH:
         return f"{off} the truth of the recording."
     return (

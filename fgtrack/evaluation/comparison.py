@@ -18,12 +18,13 @@ from fgtrack.io.run import EvaluationConfig
 POSITION_NEES = "position_nees"
 """The quantity that is the better the nearer it is to 2."""
 
-STANDING_NOTE = "+: best; =: ties with the best, as the interval contains 0"
+STANDING_NOTE = "+: best; =: not resolved from the best, 0 is in the interval"
 """Meaning of the marks of `entry_columns`, for a table within a run."""
 
 _MARKS: Mapping[Value, str] = {"best": "+", "tie": "=", "worse": " "}
 _ERRORS = {"position_rmse_m": "position_m", "speed_rmse_mps": "speed_mps", "yaw_rmse_rad": "yaw_rad"}
-_NEGLIGIBLE = 1e-6  # of a cost: the rounding of sums in another order
+NEGLIGIBLE = 1e-6
+"""Share of a cost that is rounding: of sums in another order."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ def ranked(
     """Entries from the least of the `costs` to the largest; `worse_by` gives the cost of one index minus another's."""
     best, *others = np.argsort(costs, kind="stable").tolist()
     differences = {k: worse_by(k, best) for k in others}
-    rounding = _NEGLIGIBLE * float(np.max(costs))
+    rounding = NEGLIGIBLE * float(np.max(costs))
     worse = {k: d.is_significant and d.high > rounding for k, d in differences.items()}
     return (
         Entry(names[best], float(values[best]), None, "best" if all(worse.values()) else "tie"),

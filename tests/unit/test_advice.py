@@ -82,6 +82,24 @@ def test_an_offset_is_set_where_it_is_known_and_not_0_and_said_where_it_is_not_k
 
 
 @pytest.mark.parametrize(
+    ("offset_s", "std_s", "said"),
+    [  # half of the 95 % interval is 2.57 standard deviations, of the 99 % interval 4.03
+        (0.004, 0.002, "its stamps agree with the clock of lidar (offset +4 ms ± 5 ms)."),
+        (0.0, 0.002, "its stamps agree with the clock of lidar (offset +0 ms ± 5 ms)."),
+        (0.008, 0.002, "are 8 ms (± 5 ms) later than the clock of lidar: less than 10 ms, which does not matter."),
+        (-0.008, 0.001, "are 8 ms (± 3 ms) earlier than the clock of lidar: less than 10 ms, which does not matter."),
+        (0.03, 0.01, "may be 30 ms (± 26 ms) later than the clock of lidar: the 95 % interval excludes 0, that of 99"),
+        (0.012, 0.002, "its stamps are 12 ms (± 5 ms) later than those of lidar."),
+    ],
+)
+def test_stamps_agree_only_where_the_printed_interval_contains_0(offset_s: float, std_s: float, said: str) -> None:
+    found = report(offset_s, 0.1, std_s)
+    text = clock_text(found.others[0], found)
+    assert said in text
+    assert ("agree" in text) == (abs(offset_s) <= 2.571 * std_s)
+
+
+@pytest.mark.parametrize(
     ("mean", "count", "consistent"), [(1.2, 500, True), (3.16, 500, False), (0.5, 500, False), (1.0, 5, False)]
 )
 def test_noise_is_fine_only_where_its_mean_is_that_expected(mean: float, count: int, consistent: bool) -> None:

@@ -53,11 +53,33 @@ def first(plain: Metrics, found: Comparison) -> str:
     return verdict(dict.fromkeys(found.runs, plain), [found])[0]
 
 
-def test_a_tie_and_a_worse_run_are_told_with_their_intervals(plain: Metrics) -> None:
+def test_a_difference_that_is_not_resolved_and_a_worse_run_are_told_with_their_intervals(plain: Metrics) -> None:
     found = compared(a=None, b=Estimate(0.0001, -0.0004, 0.0005, 9), c=Estimate(0.18, 0.15, 0.21, 9))
     assert first(plain, found) == (
-        "a and b tie at the newest stamp (position RMSE 0.400 m, difference 0.10 mm, 95 % interval -0.40 to 0.50); "
-        "c is 0.18 m worse (0.15 to 0.21)."
+        "The difference between a and b at the newest stamp is not resolved (position RMSE 0.400 m, b is worse by "
+        "0.10 mm, 95 % interval -0.40 to 0.50); c is 0.18 m worse (0.15 to 0.21)."
+    )
+
+
+def test_of_several_differences_that_are_not_resolved_the_largest_is_told(plain: Metrics) -> None:
+    found = compared(a=None, b=Estimate(0.01, -0.01, 0.03, 9), c=Estimate(0.02, -0.03, 0.07, 9))
+    assert first(plain, found) == (
+        "The differences between a, b and c at the newest stamp are not resolved (position RMSE 0.400 m, the largest "
+        "is 0.020 m, 95 % interval -0.030 to 0.070)."
+    )
+
+
+def test_runs_that_differ_by_rounding_alone_tie(plain: Metrics) -> None:
+    rounding, chance = Estimate(1e-10, -1e-10, 3e-10, 9), Estimate(1e-10, -1e-3, 1e-3, 9)
+    assert first(plain, compared(a=None, b=rounding)) == "a and b tie at the newest stamp (position RMSE 0.400 m)."
+    assert "not resolved" in first(plain, compared(a=None, b=rounding, c=chance))
+
+
+def test_a_run_too_short_for_an_interval_is_not_called_a_tie(plain: Metrics) -> None:
+    unknown = Estimate(0.05, float("nan"), float("nan"), 0)
+    assert first(plain, compared(a=None, b=unknown)) == (
+        "The difference between a and b at the newest stamp is not resolved (position RMSE 0.400 m, b is worse by "
+        "0.050 m, too short a run for an interval)."
     )
 
 

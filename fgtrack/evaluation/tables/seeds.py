@@ -13,7 +13,7 @@ import pandas as pd
 from fgtrack.core.errors import CallError, DataError, did_you_mean
 from fgtrack.core.files import open_text
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.comparison import Entry, entry_columns, entry_record, ranked
+from fgtrack.evaluation.comparison import STANDING_NOTE, Entry, entry_columns, entry_record, ranked
 from fgtrack.evaluation.intervals import paired
 from fgtrack.evaluation.tables import PERCENT, Column, DataFrame, Table
 
@@ -151,7 +151,7 @@ def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) ->
     first, keys = compared[0].metric if compared else "", (*axes, "metric", "estimator")
     points = pd.DataFrame([item.point for item in compared], columns=list(axes))
     columns = [_point_column(points), Column("estimator", left=True), *entry_columns("mean", "mean"), Column("seeds")]
-    notes = ["t intervals of paired differences over seeds; +: best; =: ties with the best, 0 is inside"]
+    notes = ["t intervals of paired differences over seeds", STANDING_NOTE]
     return Table(first, records, columns, keys, notes, is_main=lambda row: row["metric"] == first and row["seeds"] > 1)
 
 

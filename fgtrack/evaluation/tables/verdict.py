@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from fgtrack.evaluation.comparison import Comparison, Entry
+from fgtrack.evaluation.comparison import NEGLIGIBLE, Comparison, Entry
 from fgtrack.evaluation.diagnostics import FEWEST, is_far_off
 from fgtrack.evaluation.intervals import UNKNOWN
 from fgtrack.evaluation.metrics import Metrics
@@ -44,18 +44,33 @@ def verdict(metrics: Mapping[str, Metrics], compared: Sequence[Comparison]) -> t
 
 
 def who_is_best(entries: Sequence[Entry], when: str) -> str:
-    """A sentence on a position RMSE: which is best or ties `when`, and how much worse the others are."""
+    """A sentence on a position RMSE: the best run `when`, and how much worse the others are.
+
+    A difference whose interval contains 0 is not resolved. Runs tie where they differ by rounding alone.
+    """
     best, *others = entries
-    ties = [entry for entry in others if entry.standing == "tie"]
+    near = [entry for entry in others if entry.standing == "tie"]
     worse = [entry for entry in others if entry.standing == "worse"]
     value = f"position RMSE {short(best.value)} m"
-    if ties:
-        difference = f"{'difference' if len(ties) == 1 else 'largest difference'} {_metres(ties[-1])}"
-        first = f"{_listed([best.name, *(one.name for one in ties)])} tie {when} ({value}, {difference})"
-    else:
+    names = _listed([best.name, *(one.name for one in near)])
+    if not near:
         first = f"{best.name} is best {when} ({value})"
+    elif all(_is_rounding(entry, best.value) for entry in near):
+        first = f"{names} tie {when} ({value})"
+    elif len(near) == 1:
+        difference = f"{near[0].name} is worse by {_metres(near[0])}"
+        first = f"The difference between {names} {when} is not resolved ({value}, {difference})"
+    else:
+        difference = f"the largest is {_metres(near[-1])}"
+        first = f"The differences between {names} {when} are not resolved ({value}, {difference})"
     named = ", ".join(f"{entry.name} is {_metres(entry, ' worse')}" for entry in worse)
     return f"{first}; {named}." if named else f"{first}."
+
+
+def _is_rounding(entry: Entry, value: float) -> bool:
+    """True if the whole interval of the difference is rounding of a value."""
+    worse = entry.worse_by or UNKNOWN
+    return max(abs(worse.low), abs(worse.high)) <= NEGLIGIBLE * value
 
 
 def _metres(entry: Entry, what: str = "") -> str:
