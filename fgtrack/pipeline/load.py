@@ -164,7 +164,8 @@ def _first_problem(error: ValidationError, kind: type[Any], text: str) -> str:
     names, inside = list[str](), json.loads(text)
     part: Any
     for part in first["loc"]:  # tags of unions are not written in the file
-        if isinstance(inside, list) or (isinstance(inside, Mapping) and part in inside):
+        is_entry = isinstance(inside, list) and isinstance(part, int) and part < len(inside)
+        if is_entry or (isinstance(inside, Mapping) and part in inside):
             names, inside = [*names, str(part)], inside[part]
     message, given = first["msg"].removeprefix("Value error, "), f", not {_short(first['input'])}"
     if first["type"] == _UNKNOWN:

@@ -35,6 +35,9 @@ class UniformDelay:
     max_s: NonNegativeFloat
     kind: Literal["uniform"] = "uniform"
 
+    def __post_init__(self) -> None:
+        require(self.max_s >= self.min_s, "max_s", "must not be below min_s", self.max_s)
+
 
 @settings
 class GammaDelay:

@@ -29,6 +29,9 @@ class Clutter:
     speed_mps: tuple[float, float] = (0.0, 0.0)
     """Range of the speed that clutter seems to have, along the track or in any direction."""
 
+    def __post_init__(self) -> None:
+        require(self.speed_mps[1] >= self.speed_mps[0], "speed_mps", "must be (smallest, largest)", self.speed_mps)
+
 
 @settings
 class SimulatedSensor:
@@ -73,6 +76,8 @@ class SimulatedSensor:
         require("x_m" not in std or std.isdisjoint(POLAR), "std", "positions or range and bearing", sorted(std))
         require(self.jitter_s < 1.0 / self.rate_hz, "jitter_s", "must be below a period", self.jitter_s)
         require(self.max_range_m > self.min_range_m, "max_range_m", "must exceed min_range_m", self.max_range_m)
+        apart_m = self.split_distance_m
+        require(apart_m[1] >= apart_m[0], "split_distance_m", "must be (smallest, largest)", apart_m)
         require(seen, "max_range_behind_m", "must lie in (min_range_m, max_range_m]", behind_m)
         require(all(a <= b for a, b in self.drop_outs), "drop_outs", "must be (start, end)", self.drop_outs)
 

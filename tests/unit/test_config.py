@@ -7,7 +7,7 @@ from support.paper import paper
 from fgtrack.core.errors import CallError
 from fgtrack.pipeline.build import build_bank, build_tracker
 from fgtrack.pipeline.config import Config, Effective
-from fgtrack.pipeline.load import dump, load, read_yaml
+from fgtrack.pipeline.load import dump, load, read_yaml, validate, with_value
 from fgtrack.pipeline.sweep_plan import SweepConfig
 from fgtrack.sim.scenario import Scenario
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
@@ -199,6 +199,22 @@ def test_a_path_through_a_single_value_is_refused(tmp_path: Path) -> None:
     path = written(tmp_path, "filter: {storage_s: 2.0}\n")
     with pytest.raises(CallError, match="a single value"):
         load(Config, path, ["filter.storage_s.x=1"])
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "named"),
+    [
+        ("ego.speed", [[4.0, 52.0], [64.0]], r"ego\.speed\.1\.1"),
+        ("ego.speed", [[], [64.0, 1.0]], r"ego\.speed\.0\.0"),
+        ("sensors.0.clutter.speed_mps", [1.0], r"sensors\.0\.clutter\.speed_mps\.1"),
+        ("sensors.1.drop_outs", [[1.0]], r"sensors\.1\.drop_outs\.0\.1"),
+        ("sensors.1.split_distance_m", [], r"sensors\.1\.split_distance_m\.0"),
+    ],
+)
+def test_a_pair_that_lacks_a_value_is_named(key: str, value: object, named: str) -> None:
+    raw = read_yaml(Path(__file__).parents[2] / "configs/scenarios/default.yaml")
+    with pytest.raises(CallError, match=rf"^it: {named}: Field required"):
+        validate(Scenario, with_value(raw, key.split("."), value), "it")
 
 
 def test_an_empty_file_is_the_default_and_a_missing_one_an_error(tmp_path: Path) -> None:

@@ -233,6 +233,14 @@ def test_an_input_is_a_folder_of_one_sequence_a_file_or_a_sequence_by_name(tmp_p
         messages(tmp_path, sequence=7)
 
 
+def _with_zeros(name):
+    """A calibration in which all numbers of a matrix are 0."""
+    lines = calibration().splitlines()
+    return "\n".join(
+        f"{name}: {' '.join(['0'] * (len(line.split()) - 1))}" if line.startswith(name) else line for line in lines
+    )
+
+
 @pytest.mark.parametrize(
     ("files", "where"),
     [
@@ -240,6 +248,10 @@ def test_an_input_is_a_folder_of_one_sequence_a_file_or_a_sequence_by_name(tmp_p
         ({"oxts": [oxts(yaw_rad=math.inf)]}, r"oxts/0001\.txt:1: "),
         ({"calib": ["P2: 1 2 x"]}, r"calib/0001\.txt:1: "),
         ({"calib": ["P2: 1 2 3"]}, r"calib/0001\.txt: "),
+        ({"calib": [calibration().replace("P2: ", "P2: nan ", 1)]}, r"calib/0001\.txt:3: .*not finite"),
+        ({"calib": [calibration().replace("P2: ", "P2: 1e300 ", 1)]}, r"calib/0001\.txt:3: .*too large"),
+        ({"calib": [_with_zeros("P2")]}, r"calib/0001\.txt: is not a calibration .*P2 cannot be inverted"),
+        ({"calib": [_with_zeros("R_rect")]}, r"calib/0001\.txt: is not a calibration .*Tr cannot be inverted"),
         ({"laser": [pose(0, 1.0, 2.0, 0.0), "0,2,3"]}, r"laser/0001\.txt:2: .*3 fields"),
         ({"laser": ["car"]}, r"laser/0001\.txt:1: "),
         ({"laser": [pose(7, 1.0, 2.0, 0.0)]}, r"laser/0001\.txt:1: .*of frame 7"),

@@ -100,6 +100,25 @@ def test_what_ros_generates_in_idl_is_read() -> None:
     assert dict(members)["names"][0] == Nodetype.SEQUENCE
 
 
+@pytest.mark.parametrize(
+    "text", ["=", "/*x", '"', '\\"', "@", "@ ", "@(", "@a ", "//", "#\n", "=(", "sequence<", "sequence ", "= ", "a=1 "]
+)
+def test_a_hostile_definition_in_idl_is_refused_in_a_moment(text: str) -> None:
+    """Expressions that look for an end from each beginning would take minutes for these 150,000 characters."""
+    key = (NAME, MessageDefinition(MessageDefinitionFormat.IDL, text * (150_000 // len(text))))
+    assert NAME in "".join(name for name, _ in MessageTypes([key], ros1=False).problems)
+
+
+def test_constants_that_compute_are_refused_wherever_they_stand() -> None:
+    for constant in ("1 + 1 * 2", "(1)", "1 << 3", "a == b ? 1 : (2)", "= = 2 / 3"):
+        text = IDL.replace("a_msgs::msg::C, 4", "long, 4").replace(
+            "module a_msgs", f"const long K = {constant};\nmodule a_msgs", 1
+        )
+        key = (NAME, MessageDefinition(MessageDefinitionFormat.IDL, text))
+        [problem] = MessageTypes([key], ros1=False).problems.values()
+        assert "computes a constant" in problem
+
+
 def test_every_type_of_ros_is_small_enough() -> None:
     for store in (Stores.ROS2_HUMBLE, Stores.ROS1_NOETIC):
         keys = [(name, None) for name in get_typestore(store).fielddefs]

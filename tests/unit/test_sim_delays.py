@@ -126,6 +126,7 @@ def test_a_chain_in_time_forgets_over_a_gap_and_stays_at_equal_stamps() -> None:
     [
         (lambda: ConstantDelay(delay_s=float("nan")), "delay_s"),
         (lambda: UniformDelay(min_s=0.2, max_s=-0.1), "max_s"),
+        (lambda: UniformDelay(min_s=0.08, max_s=1e-9), "max_s: must not be below min_s, is 1e-09"),
         (lambda: GammaDelay(0.1, 0.1, 0.2), "mean_s"),
         (lambda: GammaDelay(0.1, 0.2, 0.2), "q90_s: no gamma fits"),
         (lambda: LossyDelay(probability=-0.1), "probability"),

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import DataError
 from fgtrack.core.files import read_whole
 from fgtrack.core.geometry import rotation, wrap_angle
@@ -107,14 +108,24 @@ def _calibration(file: Path) -> tuple[FloatArray, FloatArray]:
     matrices = {}
     for where, (name, *values) in lines_of(file):
         with reported_as(where):
-            matrices[name.strip(":").replace("R0_", "R_").replace("_to_", "_")] = np.array(values, dtype=np.float64)
+            matrix = np.array(values, dtype=np.float64)
+            if not (np.abs(matrix) <= LARGEST).all():
+                raise ValueError("a number is not finite, or too large")
+            matrices[name.strip(":").replace("R0_", "R_").replace("_to_", "_")] = matrix
     with reported_as(f"{file}: is not a calibration of the data set"):
         rectified_from_camera = np.eye(4)
         rectified_from_camera[:3, :3] = matrices["R_rect"].reshape(3, 3)
         camera_from_velodyne, velodyne_from_imu = (
             np.vstack([matrices[name].reshape(3, 4), [0.0, 0.0, 0.0, 1.0]]) for name in ("Tr_velo_cam", "Tr_imu_velo")
         )
-        return matrices["P2"].reshape(3, 4), rectified_from_camera @ camera_from_velodyne @ velodyne_from_imu
+        projection, rectified_from_imu = (
+            matrices["P2"].reshape(3, 4),
+            rectified_from_camera @ camera_from_velodyne @ velodyne_from_imu,
+        )
+        for name, matrix in (("P2", projection[:, :3]), ("R_rect and Tr", rectified_from_imu[:3, :3])):
+            if np.linalg.matrix_rank(matrix) < len(matrix):
+                raise ValueError(f"{name} cannot be inverted")
+        return projection, rectified_from_imu
 
 
 def read_views(folder: Path, sequence: str) -> tuple[list[View], DataError | None]:

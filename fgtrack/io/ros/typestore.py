@@ -38,9 +38,10 @@ _MEMBER_NAME = re.compile(r"(?!__|.{256})[A-Za-z_]\w*", re.ASCII)
 _BASE_NAME = re.compile(r"[a-z]+[0-9]*", re.ASCII)
 _SEPARATOR = "=" * 80 + "\n"
 _EMPTY_LINE = re.compile(r"^[ \t]*(?:#[^\n]*)?\n", re.MULTILINE)
-_IDL_TEXT = re.compile(r'"(?:\\.|[^"\\])*"')
-_IDL_REMARK = re.compile(r"/\*.*?\*/|//[^\n]*|^#[^\n]*|@\s*[\w:]*(?:\s*\([^()]*\))?", re.DOTALL | re.MULTILINE)
-_IDL_COSTLY = re.compile(r"=[^;]*[()*/%|^&~<]|(?:sequence\s*<\s*){4}")
+# In these, what is not closed reaches to the end: else its end is looked for again from every following beginning.
+_IDL_TEXT = re.compile(r'"(?:\\.|[^"\\])*(?:"|\\?\Z)', re.DOTALL)
+_IDL_REMARK = re.compile(r"/\*.*?(?:\*/|\Z)|//[^\n]*|^#[^\n]*|@\s*[\w:]*(?:\s*\([^()]*\))?", re.DOTALL | re.MULTILINE)
+_IDL_COSTLY = re.compile(r"=[^;=()*/%|^&~<]*[()*/%|^&~<]|(?:sequence\s*<\s*){4}")
 
 
 class MessageTypes:
