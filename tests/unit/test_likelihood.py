@@ -184,6 +184,66 @@ def test_a_nonlinear_model_is_linearised_about_the_filter() -> None:
     )
 
 
+#: The LiDAR measures x. Its y is assumed, as from a map, with a noise that is not a parameter.
+HALF_ASSUMED = replace(SPACE, sensors={"lidar": ("x_m",), "radar": ("x_m", "y_m")})
+ASSUMED_STD_M = 0.9
+
+
+def half_assumed(track: Series) -> Series:
+    """The track where the LiDAR's x is measured and its y is assumed."""
+    seen = [
+        replace(
+            one,
+            measurement=replace(one.measurement, R=ASSUMED_STD_M**2 * np.eye(2)),
+            measured=(0,),
+            assumed=(1,),
+            axes=np.eye(1),
+            own=np.zeros((1, 1)),
+            foreign=np.zeros((1, 1)),
+        )
+        if one.sensor == "lidar"
+        else one
+        for one in track.observations
+    ]
+    return unsettled(replace(track, observations=seen))
+
+
+def filtered_by_hand(series: Series, values: FloatArray) -> float:
+    """Log density of all measured components, each given all earlier components, measured or assumed."""
+    motion, total = SPACE.motion_model(values), 0.0
+    (x, P), before_s = initial_state(motion, START), 0.0
+    for one in series.observations:
+        stamp_s = one.measurement.stamp_ns / NS_PER_S
+        F = motion.jacobian(x, stamp_s - before_s)
+        P = F @ P @ F.T + motion.process_noise(x, stamp_s - before_s)
+        x, before_s = F @ x, stamp_s
+        std = values[1:2] if one.sensor == "lidar" else values[2:4]
+        parts = [(np.arange(len(std)), one.axes @ np.diag(std**2) @ one.axes.T, True)]
+        if one.assumed:
+            parts.append((np.array([1]), np.array([[ASSUMED_STD_M**2]]), False))
+        for rows, R, is_measured in parts:
+            H = np.eye(4)[rows]
+            y, S = one.measurement.z[rows] - H @ x, H @ P @ H.T + R
+            total += float(multivariate_normal(np.zeros(len(rows)), S).logpdf(y)) if is_measured else 0.0
+            K = P @ H.T @ np.linalg.inv(S)
+            x, P = x + K @ y, P - K @ S @ K.T
+    return total
+
+
+def test_assumed_components_move_the_state_and_have_no_part_in_the_likelihood() -> None:
+    rng = np.random.default_rng(8)
+    tracks = [half_assumed(drawn(rng, VALUES, num)) for num in (30, 17)]
+    values = np.array([0.8, 0.5, 1.5, 1.0, 1e-60, 1e-60])
+    likelihood = Likelihood(Problem(tracks, HALF_ASSUMED, values), values, np.ones(6, dtype=bool))
+    rows = values * np.exp(0.5 * rng.standard_normal((4, 6)))
+    rows[:, 4:] = 1e-60
+    expected = [sum(filtered_by_hand(track, row) for track in tracks) for row in rows]
+    assert likelihood.totals(rows) == pytest.approx(expected, abs=1e-6)
+    for row, total in zip(rows, expected, strict=True):
+        steps = [step for track in tracks for step in filtered(track, HALF_ASSUMED, row)]
+        assert sum(step.update.log_likelihood for step in steps) == pytest.approx(total, abs=1e-6)
+
+
 def turning(seed: int, num: int) -> tuple[FloatArray, Series]:
     """Parameters and a track of CTRV that heads away from the direction that its start has, which is none."""
     values, rng = np.array([0.1, 0.05, 0.5, 0.1, *VALUES[1:5], 0.01, 0.01]), np.random.default_rng(seed)
