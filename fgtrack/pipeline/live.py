@@ -37,6 +37,9 @@ __all__ = ["Lateness", "TickTiming", "Tracker"]
 #: Number of sensors without a model that are counted by name; all further ones are counted as `OTHERS`.
 MOST_UNKNOWN = 100
 OTHERS = "other sensors"
+#: A receipt that is further ahead of the tick is of a wrong clock; from a smaller error the tracker recovers by itself,
+#: when the time has come.
+MOST_AHEAD_NS = 60 * NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +122,7 @@ class Tracker:
         self._last = TickReport(-1, 0, (), ())
         self._first_tick_ns = 0
         self._arrivals: deque[EgoState | DetectionList] = deque()
+        self._ready: deque[EgoState | DetectionList] = deque()  # checked, for the next tick
         self._ticks_ns: deque[int] = deque(maxlen=NEWEST)
         self._node = Node(None if config.clock.node_hz is None else period_ns(config.clock.node_hz))
         self._skipped = 0
@@ -186,11 +190,14 @@ class Tracker:
             return TickTiming(self._last.tick + 1, *_spread_s(self._ticks_ns), self._node.misses, self._skipped)
 
     def receive(self, message: EgoState | DetectionList) -> None:
-        """Take a message in the order of arrival; detections of an unknown sensor are `invalid` at the next tick."""
+        """Take a message in the order of arrival; detections of an unknown sensor are `invalid` at the next tick.
+
+        A receipt that lies more than a minute ahead of that tick is replaced by its time.
+        """
         self._arrivals.append(message)
 
     def _take_arrivals(self) -> None:
-        """Give the tracker all received messages."""
+        """Check all received messages, and keep those that can be used for the next tick."""
         for _ in range(len(self._arrivals)):  # messages that come meanwhile may wait
             message = self._arrivals[0]  # it stays there if an interrupt comes
             try:
@@ -225,9 +232,26 @@ class Tracker:
                 if name not in self.config.ignore_sensors:
                     self._refuse(message, f"sensor {self._counted(name)!r} has no model")
                 return
-            objects = tuple(map(self._usable, message.objects))
-            message = corrected(replace(message, objects=objects), self.config.sensors)
-        self._tracker.receive(message)
+            message = replace(message, objects=tuple(map(self._usable, message.objects)))
+        self._ready.append(message)
+
+    def _deliver(self, now_ns: int) -> None:
+        """Give the tracker all messages that can be used. None was received after the tick at `now_ns`.
+
+        A receipt far ahead of the tick is of a wrong clock. The tick is taken instead: else the message would pass for
+        a recent one, and those that come later for old ones, until the clock has caught up.
+        """
+        while self._ready:
+            message = self._ready[0]  # it stays there if an interrupt comes
+            if message.receipt_ns - now_ns > MOST_AHEAD_NS:
+                message = replace(message, receipt_ns=now_ns)
+            try:
+                if isinstance(message, DetectionList):
+                    message = corrected(message, self.config.sensors)
+                self._tracker.receive(message)
+            except Exception as error:
+                self._refuse(message, f"message cannot be read ({type(error).__name__})")
+            self._ready.popleft()
 
     def _counted(self, sensor: str) -> str:
         """Return the name under which a sensor is counted: of the unknown ones, the first have their own."""
@@ -257,6 +281,7 @@ class Tracker:
                 return replace(self._last, updates=(), smoothed=())
             begun_ns = perf_counter_ns()
             self._take_arrivals()
+            self._deliver(now_ns)
             if self._uncounted is not None:
                 self._records += self._uncounted.updates
             self._uncounted = report = self._tracker.tick(now_ns)

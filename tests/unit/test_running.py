@@ -258,3 +258,41 @@ def test_it_counts_missed_deadlines_and_skipped_ticks(
     assert (timing.ticks, timing.deadline_misses, timing.skipped) == (4, misses, skipped)
     assert timing.worst_s == max(durations_ms) / 1e3
     assert timing.median_s == pytest.approx(np.median(durations_ms) / 1e3)
+
+
+# Clocks that are wrong
+
+
+def far_ahead(kind: str, ahead_ns: int, at_ns: int) -> EgoState | DetectionList:
+    """A message of a clock that is ahead: of the receipt alone (`receipt`), or of both times."""
+    stamp_ns = at_ns if kind.endswith("receipt") else at_ns + ahead_ns
+    if kind.startswith("ego"):
+        return EgoState(stamp_ns, at_ns + ahead_ns, 10.0, 0.0, 0.0, 20.0)
+    return DetectionList("lidar_cluster", stamp_ns, at_ns + ahead_ns, [Detection(x_m=31.0, y_m=1.0)], frame="ego")
+
+
+@pytest.mark.parametrize("ahead_s", [62, 3600, 10 * 365 * 86_400])
+@pytest.mark.parametrize("kind", ["ego", "ego receipt", "list", "list receipt"])
+def test_one_message_of_a_clock_that_is_ahead_hides_no_later_one(kind: str, ahead_s: float) -> None:
+    """All later lists are fused, and a silent sensor is silent."""
+    tracker = Tracker("open_space", estimator="ekf-replay")
+    for k in range(40):
+        at_ns = NOW_NS + k * 50 * MS
+        if k == 10:
+            tracker.receive(far_ahead(kind, round(ahead_s * 1e9), at_ns + 10 * MS))
+        tracker.receive(EgoState(at_ns, at_ns, 1.0 * k, 0.0, 0.0, 20.0))
+        position = Detection(x_m=30.0 - 0.5 * k + 0.01 * (k % 3), y_m=1.0)
+        tracker.receive(DetectionList("lidar_cluster", at_ns, at_ns + 30 * MS, [position], frame="ego"))
+        report = tracker.tick(at_ns + 30 * MS)
+    assert len(report.tracks) == 1
+    counts = tracker.counts["lidar_cluster"]
+    fused = sum(counts.get(name, 0) for name in ("birth", "in_sequence", "out_of_sequence"))
+    assert fused >= 40
+    assert sum(counts.values()) == 40 + kind.startswith("list")
+    assert sum(tracker.refused.values()) <= 1
+    tracker.tick(at_ns + 10_030 * MS)
+    for name in ("lidar_cluster", "ego"):
+        assert tracker.lateness[name].silent_s == pytest.approx(10.0, abs=0.1)
+        worst_s = tracker.lateness[name].delay_worst_s
+        assert worst_s is not None
+        assert worst_s < 0.1
