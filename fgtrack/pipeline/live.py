@@ -287,10 +287,10 @@ class Tracker:
             self._uncounted = report = self._tracker.tick(now_ns)
             report = replace(report, updates=(*self._records, *report.updates))
             counts = Counter((update.sensor, str(update.disposition)) for update in report.updates)
-            self._records, self._uncounted = [], None
+            # One statement, so that an interrupt comes before or after it.
+            self._counts, self._records, self._uncounted = self._with(counts), [], None
             self._ticks_ns.append(perf_counter_ns() - begun_ns)
             self._node.done_ns(now_ns, self._ticks_ns[-1])
-            self._add(counts)
             if self._last.tick < 0:
                 self._first_tick_ns = now_ns
             elif self._node.period_ns is not None:
@@ -324,13 +324,16 @@ class Tracker:
         """
         with self._turn:
             final = self._tracker.finish()
-            self._add(Counter((update.sensor, str(update.disposition)) for update in self._tracker.last_updates))
+            updates = self._tracker.last_updates
+            self._counts = self._with(Counter((update.sensor, str(update.disposition)) for update in updates))
             return final
 
-    def _add(self, counts: Mapping[tuple[str, str], int]) -> None:
-        """Add numbers of detections by sensor and disposition to `counts`."""
+    def _with(self, counts: Mapping[tuple[str, str], int]) -> dict[str, Counter[str]]:
+        """Return the numbers of detections by sensor and disposition with the `counts` of a tick."""
+        result = {sensor: own.copy() for sensor, own in self._counts.items()}
         for (sensor, disposition), count in counts.items():
-            self._counts.setdefault(self._counted(sensor), Counter())[disposition] += count
+            result.setdefault(self._counted(sensor), Counter())[disposition] += count
+        return result
 
 
 def _rule(error: InvalidMessageError) -> str:

@@ -184,9 +184,10 @@ class Tracker:
         if parts.facing is not None:
             states = parts.facing.published(bank.track_ids, states)
         tracks = self._reports(*self._published(bank.track_ids, states))
-        noted, self._records = self._records, []
-        updates = partial(chain.from_iterable, noted)
-        return TickReport.made_later(self._tick, now_ns, smoothed, tracks=tracks, updates=updates)
+        updates = partial(chain.from_iterable, self._records)
+        report = TickReport.made_later(self._tick, now_ns, smoothed, tracks=tracks, updates=updates)
+        self._records = []  # last: until here an interrupt leaves them for the next tick
+        return report
 
     def finish(self) -> tuple[SmoothedReport, ...]:
         """End all tracks; gives the final smoothed states that were still inside a window.

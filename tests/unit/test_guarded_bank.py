@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 
 import numpy as np
+import pytest
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import TrackState
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateResult, UpdateStatus
 from fgtrack.estimation.filters.replay import ReplayEkf
-from fgtrack.estimation.object_bank import ObjectBank
+from fgtrack.estimation.object_bank import ObjectBank, changing_nothing
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.tracking.guarded_bank import GuardedBank
 
@@ -146,3 +147,57 @@ def test_a_bank_that_cannot_remove_a_track_is_replaced() -> None:
     bank.remove(0)
     assert (bank.track_ids, len(bank.present())) == ((), 0)
     assert counted(bank) == {"estimator raised": 1, "track ended": 1}
+
+
+def test_a_track_whose_state_is_as_before_goes_on() -> None:
+    class Full(ObjectBank[Moody]):
+        def update(
+            self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+        ) -> list[UpdateResult]:
+            with changing_nothing(track_ids):
+                raise MemoryError("no array of 8 GB")
+
+    bank = GuardedBank(lambda: Full(MOTION, Moody, 1.0))
+    bank.advance(0)
+    for track_id in range(2):
+        bank.birth(track_id, Start(yaw_rad=0.0))
+    seen = [Measurement.of(0, x_m=0.0, y_m=0.0, std=0.3)] * 2
+    assert [result.status for result in bank.update(0, [0, 1], seen)] == [UpdateStatus.FAILED] * 2
+    assert bank.track_ids == (0, 1)
+    assert counted(bank) == {"update failed": 2}
+    assert bank.failures.first == "not enough memory: no array of 8 GB"
+
+
+def test_a_track_that_has_ended_is_not_updated_and_the_others_are() -> None:
+    bank = bank_of(0.0, 100.0)
+    bank.remove(1)
+    bank.advance(600 * MS)
+    seen = [Measurement.of(600 * MS, x_m=x, y_m=0.0, std=0.3) for x in (6.0, 106.0)]
+    results = bank.update(600 * MS, [0, 1], seen)
+    assert [result.status for result in results] == [UpdateStatus.IN_SEQUENCE, UpdateStatus.FAILED]
+    assert counted(bank) == {"update failed": 1}
+    assert bank.failures.first == "a measurement of track 1 could not be fused"
+    assert bank.track_ids == (0,)
+
+
+@pytest.mark.parametrize("answer", [[], [None], [UpdateResult(UpdateStatus.IN_SEQUENCE)] * 2])
+def test_tracks_of_an_update_without_a_result_each_end(answer: list[UpdateResult]) -> None:
+    class Careless(ObjectBank[Moody]):
+        def update(
+            self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+        ) -> list[UpdateResult]:
+            return answer
+
+    bank = GuardedBank(lambda: Careless(MOTION, Moody, 1.0))
+    bank.advance(0)
+    bank.birth(0, Start(yaw_rad=0.0))
+    assert bank.update(0, [0], [Measurement.of(0, x_m=0.0, y_m=0.0, std=0.3)])[0].status is UpdateStatus.FAILED
+    assert counted(bank) == {"update failed": 1, "track ended": 1}
+    assert bank.track_ids == ()
+
+
+def test_bad_data_propagates_and_leaves_no_track_in_an_unknown_state() -> None:
+    bank = bank_of(0.0, 100.0)
+    with pytest.raises(DataError, match="not this one"):
+        step(bank, 600 * MS, [6.0, 3000.0])
+    assert bank.track_ids == ()
