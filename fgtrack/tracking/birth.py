@@ -105,16 +105,30 @@ def _crosses(measurement: Measurement, R: FloatArray) -> dict[str, Any]:
     return {"position_cross": position, "yaw_cross": yaw, "speed_cross": speed}
 
 
-def in_any_direction(states: StatesAt, stamp_ns: int, starts: Mapping[int, Start]) -> StatesAt:
+def in_any_direction(
+    states: StatesAt,
+    stamp_ns: int,
+    starts: Mapping[int, Start],
+    directed: Mapping[int, tuple[Start, int]] | None = None,
+) -> StatesAt:
     """Return `states` at `stamp_ns` with the positions of the tracks of `starts` as uncertain in any direction.
     A state with a yaw that is unknown is linearised along that yaw, and its predicted position spreads along it alone.
     Until a second position gives the direction, the position gets the same variance across, (speed_std dt)^2.
+
+    `directed` are tracks with a second position, and its stamp. Before that stamp a filter knows the first position
+    alone: its position spreads by at least half of speed_std dt along the yaw. A smoother knows both.
     """
-    rows = [row for row, track_id in enumerate(states.track_ids) if track_id in starts]
     covariances = states.covariances.copy()
-    for row in rows:
-        start, yaw_rad = starts[states.track_ids[row]], float(states.means[row, YAW])
+    for row, track_id in enumerate(states.track_ids):
+        start, until_ns = starts.get(track_id), stamp_ns
+        if start is None:
+            start, until_ns = (directed or {}).get(track_id, (None, stamp_ns))
+            if start is None or until_ns <= stamp_ns:
+                continue
+        yaw_rad = float(states.means[row, YAW])
         std_m = start.speed_std_mps * seconds(stamp_ns - start.stamp_ns)
-        across = std_m * np.array([-math.sin(yaw_rad), math.cos(yaw_rad)])
-        covariances[row, :2, :2] += np.outer(across, across)
+        along, across = np.array([[math.cos(yaw_rad), math.sin(yaw_rad)], [-math.sin(yaw_rad), math.cos(yaw_rad)]])
+        if until_ns > stamp_ns and along @ covariances[row, :2, :2] @ along < (0.5 * std_m) ** 2:
+            continue
+        covariances[row, :2, :2] += np.outer(std_m * across, std_m * across)
     return replace(states, covariances=covariances)

@@ -124,6 +124,7 @@ class ExistenceLifecycle:
         """`detection_origin_m`: origin of the ego frame of detections, seen from the ego reference point."""
         self._rules = rules
         self.weighs_births = rules.weigh_births
+        self.birth_probability = rules.birth_probability
         self._sensors = sensors
         self._index = {name: index for index, name in enumerate(sensors)}
         self._views = Views(sensors, detection_origin_m)
@@ -253,6 +254,11 @@ class ExistenceLifecycle:
             likely[doubtful] = pairs.values[doubtful] < most(self._histories.present(rows, stamp_ns))
         return np.asarray(likely)
 
+    def existing(self, track_ids: Sequence[int], stamp_ns: int) -> FloatArray:
+        """See `CountingLifecycle.existing`."""
+        self._settle()
+        return self._histories.present(self._rows_of(track_ids), stamp_ns)
+
     def forget(self, track_id: int) -> None:
         """See `CountingLifecycle.forget`."""
         self._settle()
@@ -373,6 +379,20 @@ def after_jumps(
         missed=sorted(set(assignment.missed).difference(track for _, track in jumps)),
         refused=tuple([each for each in assignment.refused if each not in taken]),
     )
+
+
+def explained(
+    pairs: Pairs, candidates: Candidates, states: StatesAt, odds: FloatArray, others_per_m2: float, more_nis: FloatArray
+) -> BoolArray:
+    """True of `pairs` of positions and tracks that are at least as likely as clutter or a new object, shape (m,).
+
+    That is odds N(y; 0, S) exp(-more_nis / 2) >= others_per_m2. The `odds` (m,) are those that the list shows the
+    object of the track, `others_per_m2` is the density of clutter and new objects, and `more_nis` (m,) the evidence of
+    identities. A pair without a density stays.
+    """
+    rows, columns, _ = pairs
+    densities = position_densities(candidates, rows, states.means[columns], states.covariances[columns])
+    return ~(odds * densities * np.exp(-0.5 * more_nis) < others_per_m2)
 
 
 def position_densities(candidates: Candidates, chosen: IntArray, means: FloatArray, P: FloatArray) -> FloatArray:

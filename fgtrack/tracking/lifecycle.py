@@ -91,6 +91,9 @@ class CountingLifecycle:
     confirms nor keeps a track.
     """
 
+    birth_probability = 0.5
+    """Probability that an unassociated detection stems from an object; counts give none."""
+
     def __init__(
         self,
         rules: LifecycleRules,
@@ -219,6 +222,10 @@ class CountingLifecycle:
     def forget(self, track_id: int) -> None:
         """The track has ended, or could not begin."""
         self.lives.pop(track_id, None)
+
+    def existing(self, track_ids: Sequence[int], stamp_ns: int) -> FloatArray:
+        """Probabilities that the objects of tracks exist at a stamp, shape (m,); 1 / 2, as counts give none."""
+        return np.full(len(track_ids), 0.5)
 
     def probability(self, track_id: int) -> float | None:
         """Probability that the object of the track exists; None, as counts give none."""

@@ -41,13 +41,13 @@ from fgtrack.tracking.association import Assignment, Association, GatedMahalanob
 from fgtrack.tracking.birth import Birth, in_any_direction
 from fgtrack.tracking.detections import PosedBatch
 from fgtrack.tracking.ego import EgoPose, EgoTrajectory
-from fgtrack.tracking.existence import Lifecycle, after_jumps
+from fgtrack.tracking.existence import Lifecycle, after_jumps, explained
 from fgtrack.tracking.facing import Facing, Facings, YawsRead, as_read
 from fgtrack.tracking.guarded_bank import GuardedBank, faults
 from fgtrack.tracking.inbox import Batch, FusedRecords, Inbox, merged_records, record, stamps
-from fgtrack.tracking.latency import Delays, Watermarks
+from fgtrack.tracking.latency import FOREVER, NEVER, Delays, Watermarks
 from fgtrack.tracking.lifecycle import Scan
-from fgtrack.tracking.objects import Apart, Objects
+from fgtrack.tracking.objects import Apart, Evidence, Objects
 from fgtrack.tracking.preprocess import Candidates, Group, Preprocess, Preprocessed
 from fgtrack.tracking.soft_association import equivalent, joint_probabilities
 from fgtrack.tracking.waiting import PoseWait, places, range_of
@@ -115,6 +115,8 @@ class Tracker:
         self._begun: tuple[int, Batch] | None = None  # the first of them, and the index of its first record
         self._num_measured = Counter[int]()  # detections that have changed the state, by track
         self._undirected: dict[int, Start] = {}  # of tracks with one position and an unknown heading, by id
+        self._directed: dict[int, tuple[Start, int]] = {}  # of those that have a second position since, and its stamp
+        self._newborn: dict[int, tuple[str, int]] = {}  # sensors of first positions, and stamps of second ones, by id
         self._seen: dict[int, set[int]] = {}  # in this tick, by message: tracks that it has matched or started
         self.failures = parts.failures
         """Counts of internal failures and of the tracks that they have ended."""
@@ -177,6 +179,7 @@ class Tracker:
         bank.advance(now_ns)
         with self._contained(Failure.STEP_FAILED):
             parts.ego.start_tick()
+        self._forget_first(bank.window_start_ns)
         if self._process_waiting():
             self._expire(now_ns, held_ns)
         smoothed = self._smoothed()
@@ -270,6 +273,13 @@ class Tracker:
             self._process_if_possible(*each)
             self.delays[each[0].batch.message.sensor].processed(each[0].batch.stamp_ns)
         return bool(posed)
+
+    def _forget_first(self, oldest_ns: int) -> None:
+        """Forget the first positions of tracks whose second one no late list can precede."""
+        if self._newborn:
+            self._newborn = {i: each for i, each in self._newborn.items() if each[1] >= oldest_ns}
+        if self._directed:
+            self._directed = {i: each for i, each in self._directed.items() if each[1] >= oldest_ns}
 
     def _posed(self, batch: Batch) -> PosedBatch:
         """Return `batch` with the pose that it is seen from; detections in the map need none."""
@@ -372,7 +382,7 @@ class Tracker:
     def _assigned(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Assignment:
         """Return the assignment of candidates to tracks of the same class, and by their identities."""
         parts, evidence = self._parts, self._evidence(batch, candidates, states)
-        likely = self._likely(batch, candidates, states)
+        likely = self._likely(batch, candidates, states, evidence)
         result = parts.association(candidates, states, evidence, likely, self._facings(batch, states))
         if parts.joint is None or not (parts.joint.claim_m and result.new):
             return result
@@ -381,12 +391,54 @@ class Tracker:
         reaches_m = np.where(tentative, -1.0, parts.joint.max_distance_m)
         return after_jumps(result, candidates, states, reaches_m, parts.sensors[batch.message.sensor])
 
-    def _likely(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Likely | None:
-        """Return the test of pairs against clutter and new objects; None where they are not weighed."""
-        weigh = self._parts.weigh_births
-        if weigh is None or any(group.stack.model.components != ("x_m", "y_m") for group in candidates.groups):
+    def _likely(self, batch: Batch, candidates: Candidates, states: StatesAt, evidence: Apart | None) -> Likely | None:
+        """Return the test of pairs against clutter and new objects; None where no pair is tested."""
+        weigh, tests = self._parts.weigh_births, list[Likely]()
+        if weigh is not None and all(group.stack.model.components == ("x_m", "y_m") for group in candidates.groups):
+            tests.append(partial(weigh, batch.message.sensor, batch.stamp_ns, states.track_ids))
+        newborn = self._newborn_of_others(batch, states)
+        if newborn.any():
+            tests.append(partial(self._explained, newborn, batch, candidates, states, evidence))
+        if not tests:
             return None
-        return partial(weigh, batch.message.sensor, batch.stamp_ns, states.track_ids)
+        return lambda pairs: np.all([test(pairs) for test in tests], axis=0)
+
+    def _newborn_of_others(self, batch: Batch, states: StatesAt) -> BoolArray:
+        """True of tracks with one position so far, or up to the stamp, of a list of another sensor, shape (m,).
+        The next list of that sensor shows the object again. Until then its velocity is unknown, and the gate wide.
+        """
+        if not self._newborn:
+            return np.zeros(len(states.track_ids), dtype=bool)
+        sensors, own = self._parts.sensors, batch.message.sensor
+        first = [self._newborn.get(track_id, (own, NEVER)) for track_id in states.track_ids]
+        others = [name != own and sensors[name].scan and batch.stamp_ns < until_ns for name, until_ns in first]
+        return np.array(others, dtype=bool)
+
+    def _explained(
+        self,
+        newborn: BoolArray,
+        batch: Batch,
+        candidates: Candidates,
+        states: StatesAt,
+        evidence: Apart | None,
+        pairs: Pairs,
+    ) -> BoolArray:
+        """True of pairs, but of those of `newborn` tracks that clutter or a new object explains better, shape (m,)."""
+        result = np.ones(len(pairs.rows), dtype=bool)
+        placed = np.array([candidates.placed[row] for row in pairs.rows.tolist()], dtype=bool)
+        chosen = (newborn[pairs.columns] & placed).nonzero()[0]
+        if len(chosen):
+            tested, lifecycle = pairs.at(chosen), self._parts.lifecycle
+            sensor = self._parts.sensors[batch.message.sensor]
+            ids = [states.track_ids[column] for column in tested.columns.tolist()]
+            detected = sensor.detection_probability * lifecycle.existing(ids, batch.stamp_ns)
+            odds = detected / (1.0 - detected) if sensor.scan else detected
+            others_per_m2 = sensor.clutter_per_m2 / (1.0 - lifecycle.birth_probability)
+            more_nis = np.zeros(len(chosen))
+            if isinstance(evidence, Evidence):
+                more_nis = evidence.nis(tested.rows, tested.columns)
+            result[chosen] = explained(tested, candidates, states, odds, others_per_m2, more_nis)
+        return result
 
     def _evidence(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Apart | None:
         described = map(batch.message.objects.__getitem__, candidates.leaders)
@@ -423,7 +475,7 @@ class Tracker:
         x, F = now.means[rows], motion.jacobian(now.means[rows], -back_s)
         P = propagated(F, now.covariances[rows], motion.process_noise(x, back_s))
         moved = StatesAt(tuple(now.track_ids[row] for row in rows), motion.predict(x, -back_s), P)
-        younger = in_any_direction(moved, batch.stamp_ns, self._undirected)
+        younger = in_any_direction(moved, batch.stamp_ns, self._undirected, self._directed)
         claims = self._assigned(batch, candidates.at(new), younger)
         for k, track in claims.pairs:
             self._conclude(batch, candidates, [new[k]], Disposition.TOO_OLD, younger.track_ids[track])
@@ -438,7 +490,9 @@ class Tracker:
         """The tracks that `batch` may be associated with, at its stamp."""
         ended = self._parts.lifecycle.suspended(batch.stamp_ns)
         states = self._parts.bank.states_at(batch.stamp_ns).without(ended)
-        return in_any_direction(states, batch.stamp_ns, self._undirected) if self._undirected else states
+        if not (self._undirected or self._directed):
+            return states
+        return in_any_direction(states, batch.stamp_ns, self._undirected, self._directed)
 
     def _ranges_m(self, track_ids: Sequence[int], positions_m: FloatArray, ego: EgoPose | None) -> FloatArray:
         """Distances from the ego to tracks at `positions_m` (n, 2), both at the stamp of the batch."""
@@ -532,8 +586,16 @@ class Tracker:
         ids = list(map(states.track_ids.__getitem__, of.tolist()))
         fused = [row for row, result in enumerate(results) if result.innovation is not None]
         self._parts.lifecycle.fused([ids[row] for row in fused])
-        for row in fused if self._undirected else ():
-            if self._undirected.pop(ids[row], None) is not None:
+        for row in fused:
+            track_id, stamp_ns = ids[row], measurements.stack.stamp_ns
+            if track_id in self._newborn:
+                name, until_ns = self._newborn[track_id]
+                self._newborn[track_id] = name, min(until_ns, stamp_ns)
+            if track_id in self._directed:
+                start, until_ns = self._directed[track_id]
+                self._directed[track_id] = start, min(until_ns, stamp_ns)
+            if track_id in self._undirected:
+                self._directed[track_id] = self._undirected.pop(track_id), stamp_ns
                 # The estimator's prior, linearised along an unknown direction, spreads along it alone.
                 seen, track = measurements[row].seen_by(self._parts.motion), of[row]
                 with suppress(np.linalg.LinAlgError):
@@ -584,6 +646,7 @@ class Tracker:
             self._undirected[track_id] = prior
         self._seen.setdefault(id(batch.message), set()).add(track_id)
         self._num_measured[track_id] = 1
+        self._newborn[track_id] = scan.sensor, FOREVER
         if self._parts.facing is not None:
             self._parts.facing.born(track_id, scan.sensor, prior, candidates[position].measurement)
         self._parts.lifecycle.born(track_id, scan, candidates[position])
@@ -611,6 +674,8 @@ class Tracker:
         """End tracks; one whose end raises leaves nothing either, and others end all the same."""
         for track_id in track_ids:
             self._undirected.pop(track_id, None)
+            self._directed.pop(track_id, None)
+            self._newborn.pop(track_id, None)
             self._num_measured.pop(track_id, None)
             parts = self._parts
             facing = () if parts.facing is None else (parts.facing.forget,)

@@ -227,6 +227,35 @@ def test_an_object_that_is_gone_leaves_no_track_after_the_usual_delay(estimator:
     assert gone_s + delay_s < last_s[1] < last_s[0] + delay_s + 0.2
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("estimator", ["ekf-replay", "imm-replay", "smoother-banded", "smoother"])
+@pytest.mark.parametrize(
+    ("rates_hz", "ahead_s", "noise_m"),
+    [
+        ((10.0, 10.0), (0.2, 0.0), 0.3),
+        ((2.0, 2.0), (0.45, 0.0), 0.1),
+        ((25.0, 5.0), (0.0, 0.95), 1.0),
+        ((4.0, 4.0, 4.0, 4.0), (0.0, 0.3, 0.9, 0.1), 0.3),
+    ],
+)
+def test_a_clock_that_is_ahead_swaps_no_objects(
+    estimator: str, rates_hz: tuple[float, ...], ahead_s: tuple[float, ...], noise_m: float
+) -> None:
+    """A first detection of one object, with an unknown velocity, does not take those of another, 60 m away."""
+    watched = [Watched(rate_hz, 0.06, ahead) for rate_hz, ahead in zip(rates_hz, ahead_s, strict=True)]
+    found = tracked(Tracker(config(len(watched), estimator, noise_m)), watched, 6.0, noise_m, seed=2)
+    assert min(found.shares) >= SHARE
+    assert found.ids == [1] * len(watched)
+
+
+@pytest.mark.parametrize("estimator", ["ekf-replay", "smoother-banded"])
+def test_nor_do_sensors_that_take_turns(estimator: str) -> None:
+    """At 2 Hz each, a quarter of a second apart: no list is late, and none ahead."""
+    watched = [Watched(2.0, 0.05), Watched(2.0, 0.05, 0.1)]
+    found = tracked(Tracker(config(2, estimator)), watched, 7.0, seed=4)
+    assert found == Found([1.0, 1.0], [1, 1])
+
+
 def test_a_live_tracker_and_a_replay_await_the_same_lists() -> None:
     watched = [Watched(10.0), Watched(5.0, 1.1), Watched(2.0, 2.0)]
     configured, made = config(3, "ekf-replay"), messages(watched, 6.0, seed=5)

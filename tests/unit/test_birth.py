@@ -6,7 +6,7 @@ from support.tracking import START_NS, StraightRoad, bearing, ms
 
 from fgtrack.core.geometry import rotation
 from fgtrack.core.types import EgoState
-from fgtrack.estimation.base import Measurement, StatesAt
+from fgtrack.estimation.base import Measurement, Start, StatesAt
 from fgtrack.estimation.birth import initial_state
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV
@@ -97,3 +97,18 @@ def test_a_bearing_alone_starts_nothing() -> None:
 def test_a_deviation_that_makes_no_sense_is_named(name: str) -> None:
     with pytest.raises(ValueError, match=name):
         Birth(kind="fixed", **{name: 0.0})
+
+
+@pytest.mark.parametrize(
+    ("is_smoothed", "dt_s", "spreads"), [(False, 0.4, True), (True, 0.4, False), (False, 0.6, False)]
+)
+def test_before_its_second_position_a_filtered_state_spreads_in_any_direction(
+    is_smoothed: bool, dt_s: float, spreads: bool
+) -> None:
+    """The second position is 0.5 s after the first one; a smoother has used both."""
+    start = Start(stamp_ns=START_NS, speed_std_mps=30.0)
+    P = np.diag([0.2 if is_smoothed else 0.1 + (30.0 * dt_s) ** 2, 0.1, 1.0, 900.0, 0.1])
+    one = StatesAt((4,), np.zeros((1, 5)), P[None])
+    found = in_any_direction(one, START_NS + ms(1e3 * dt_s), {}, {4: (start, START_NS + ms(500))})
+    assert found.covariances[0, 1, 1] == pytest.approx(0.1 + (30.0 * dt_s) ** 2 * spreads)
+    np.testing.assert_array_equal(found.covariances[0, 0], P[0])

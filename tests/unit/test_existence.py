@@ -6,10 +6,11 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from support.tracking import START_NS, candidate, match, ms
+from support.tracking import START_NS, candidate, candidates_of, match, ms
 
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Detection, DetectionList, TrackStatus
+from fgtrack.estimation.base import StatesAt
 from fgtrack.models.sensors import Score, SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.config import Config
@@ -17,7 +18,7 @@ from fgtrack.pipeline.load import load
 from fgtrack.pipeline.shipped import read_config
 from fgtrack.tracking.association import Pairs
 from fgtrack.tracking.ego import EgoPose
-from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules
+from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules, explained
 from fgtrack.tracking.lifecycle import Scan
 
 SENSORS = {
@@ -353,3 +354,17 @@ def test_a_new_object_does_not_inherit_a_track_that_has_been_silent_for_long(wei
         tracker.receive(DetectionList("adsb", now_ns, now_ns, [Detection(x_m=200.0 * at_s, y_m=y_m)], "map"))
         report = tracker.tick(now_ns)
     assert len(report.tracks) == 1 + weigh
+
+
+@pytest.mark.parametrize("offset_m", [0.0, 5.0, 20.0, 60.0])
+@pytest.mark.parametrize("more_nis", [0.0, -18.4])
+def test_a_pair_is_explained_by_a_track_that_is_likelier_than_others(offset_m: float, more_nis: float) -> None:
+    """The gate of a newborn is wide; clutter is nearer than 20 m, unless the identities are equal."""
+    P = np.diag([100.0, 100.0, 1.0, 1e4, 1.0])
+    tracks = StatesAt((0,), np.array([[10.0, 0.0, 0.0, 0.0, 0.0]]), P[None])
+    pairs = Pairs(np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64), np.zeros(1))
+    given = candidates_of([candidate(10.0 + offset_m, 0.0)])
+    density = math.exp(-0.5 * (offset_m**2 / 100.09 + more_nis)) / (2.0 * math.pi * 100.09)
+    found = explained(pairs, given, tracks, np.array([0.2]), 1e-4, np.array([more_nis]))
+    assert found.tolist() == [0.2 * density >= 1e-4]
+    assert found[0] == (offset_m < (10.0 if more_nis == 0.0 else 50.0))
