@@ -93,6 +93,16 @@ def test_two_copies_of_one_file_in_a_folder_are_refused(tmp_path):
         read(tmp_path / "bag")
 
 
+@pytest.mark.parametrize("covariance", [(), (1.0,), (1.0, 0.0, 0.0), (0.1,) * 9, (float("nan"), 0.0, 0.0, 1.0)])
+def test_a_covariance_that_is_none_is_written_as_it_is(tmp_path, covariance):
+    """The tracker counts such a detection as invalid, from a bag as from a stream."""
+    items = (Detection(x_m=20.0, y_m=1.0, covariance=covariance), Detection(x_m=40.0, y_m=1.0))
+    messages = [DetectionList("radar", 1_000, 2_000, items, "map")]
+    write_bag(tmp_path / "bag", messages)
+    [found] = read(tmp_path / "bag")
+    assert exact([found]) == exact(messages)
+
+
 def test_a_stamp_that_ros_cannot_hold_is_one_line(tmp_path):
     with pytest.raises(DataError, match="1901 to 2038"):
         write_bag(tmp_path / "bag", [EgoState(1 << 62, 0, 0.0, 0.0, 0.0, 0.0)])

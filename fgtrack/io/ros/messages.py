@@ -145,10 +145,11 @@ def _optional(value: Detection | TruthState, names: tuple[str, ...]) -> dict[str
 
 
 def _full_covariance(item: Detection) -> FloatArray | None:
-    """Covariance of the pose, shape (6, 6); None where the detection has none."""
-    if item.covariance is None:
+    """Covariance of the pose, shape (6, 6); None where the detection has none, or not one of what it measures."""
+    size = len(item.measured)
+    if item.covariance is None or len(item.covariance) != size**2:
         return None
-    given, pose = np.asarray(item.covariance).reshape(len(item.measured), -1), np.zeros((6, 6))
+    given, pose = np.asarray(item.covariance).reshape(size, size), np.zeros((6, 6))
     axes = {"x_m": 0, "y_m": 1, "yaw_rad": 5}
     kept = [index for index, name in enumerate(item.measured) if name in axes]
     rows = [axes[item.measured[index]] for index in kept]
