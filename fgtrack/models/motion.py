@@ -6,7 +6,7 @@ may be negative for `predict` and `jacobian`. Only `MeasurementModel.residual` w
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import ClassVar, NamedTuple, Self
 
@@ -153,23 +153,23 @@ class WhiteNoise(MotionModel):
         return all(getattr(own, name) is getattr(WhiteNoise, name) for name in names)
 
     def __post_init__(self) -> None:
-        not_negative(**{field.name: getattr(self, field.name) for field in fields(self)})
+        not_negative(**{name: getattr(self, name) for name in self.density_names()})
 
     @classmethod
-    def from_std_per_step(cls, std: Mapping[str, float], frequency_hz: float) -> Self:
+    def from_std_per_step(cls, std: Mapping[str, float], frequency_hz: float, **others: float) -> Self:
         """Model with the noise of a filter that adds (std / frequency_hz)^2 per step: densities std^2 / frequency_hz.
         `std` is per second, as in Karle et al. 2023, by the names of all densities up to `_density_`: `position`,
-        `yaw`, ...
+        `yaw`, ... `others` are the parameters of the model that are no densities.
         """
         names = {name.partition("_density_")[0]: name for name in cls.density_names()}
         if set(std) != set(names):
             raise ValueError(f"std of {cls.__name__}: give {', '.join(names)}, not {', '.join(std) or 'nothing'}")
-        return cls(**{names[key]: value * value / frequency_hz for key, value in std.items()})
+        return cls(**{names[key]: value * value / frequency_hz for key, value in std.items()}, **others)
 
     @classmethod
     def density_names(cls) -> tuple[str, ...]:
         """Names of the density fields, in the order of the state."""
-        return tuple(field.name for field in fields(cls) if "_density_" in field.name)
+        return tuple(each.name for each in fields(cls) if "_density_" in each.name)
 
     def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.predict`."""
@@ -198,7 +198,7 @@ class WhiteNoise(MotionModel):
         times_s = np.array(t, order="C").reshape(-1)
         result = Transition(np.empty((*shape, n)), np.empty((*shape, n, n)), np.empty((*shape, n, n)))
         flat = result.mean.reshape(-1, n), result.F.reshape(-1, n, n), result.Q.reshape(-1, n, n)
-        kernels("fgtrack.models.transitions").transitions(self.kind, states, times_s, self.density, *flat)
+        kernels("fgtrack.models.transitions").transitions(self.kind, states, times_s, self.noise, *flat)
         return result
 
     @cached_property
@@ -207,30 +207,61 @@ class WhiteNoise(MotionModel):
         first, *others = (getattr(self, name) for name in self.density_names())
         return np.array([first, first, *others])
 
+    @cached_property
+    def noise(self) -> FloatArray:
+        """Parameters of the compiled transition: the densities, then those that its kind has besides."""
+        return self.density
+
 
 @dataclass(frozen=True)
 class CTRV(WhiteNoise):
     """Constant turn rate and velocity; state x, y, yaw, speed, yaw rate.
 
-    x(t) + i y(t) = x + i y + speed * integral over s in [0, t] of exp(i (yaw + yaw_rate s)), exact at any yaw rate.
-    White noise drives each entry. The defaults are those of Karle et al. 2023: std per second 0.2, 0.3, 1, 0.5 at 100
-    Hz.
+    x(t) + i y(t) = x + i y + speed * integral over s in [0, t] of exp(i yaw(s)), exact at any yaw rate. White noise
+    drives each entry. The default densities are those of Karle et al. 2023: std per second 0.2, 0.3, 1, 0.5 at 100 Hz.
+
+    The yaw rate is stationary, an Ornstein-Uhlenbeck process: it relaxes to zero at the rate `relaxation_hz`. Without
+    measurements its standard deviation becomes `yaw_rate_std_radps`, however long that takes. The yaw of a slow object
+    has more noise: positions do not show it, see docs/estimators.md.
     """
 
     position_density_m2ps: float = 0.2**2 / 100.0
     yaw_density_rad2ps: float = 0.3**2 / 100.0
     speed_density_m2ps3: float = 1.0**2 / 100.0
     yaw_rate_density_rad2ps3: float = 0.5**2 / 100.0
+    yaw_rate_std_radps: float = field(default=0.5, kw_only=True)
+    """Standard deviation of the yaw rate of any object at any time; infinity for a random walk."""
+    slow_mps: float = field(default=1.0, kw_only=True)
+    """Speed below which the yaw has more noise."""
+    resting_yaw_rad2ps: float = field(default=4.0, kw_only=True)
+    """Spectral density that is added to that of the yaw, times 1 / (1 + (speed / slow_mps)^2)^2."""
 
     state_names: ClassVar[tuple[str, ...]] = STATE_NAMES[:ACCEL]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        not_negative(resting_yaw_rad2ps=self.resting_yaw_rad2ps)
+        for name in ("yaw_rate_std_radps", "slow_mps"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name}: must be positive, is {getattr(self, name)}")
+
+    @property
+    def relaxation_hz(self) -> float:
+        """Rate at which the yaw rate relaxes to zero: its density over twice the variance `yaw_rate_std_radps`^2."""
+        return 0.5 * self.yaw_rate_density_rad2ps3 / self.yaw_rate_std_radps**2
+
+    @cached_property
+    def noise(self) -> FloatArray:
+        """See `WhiteNoise.noise` and `fgtrack.models.transitions`."""
+        return np.array([*self.density, self.relaxation_hz, self.slow_mps, self.resting_yaw_rad2ps])
 
 
 @dataclass(frozen=True)
 class CTRA(CTRV):
     """Constant turn rate and acceleration: CTRV with the acceleration along the heading as sixth entry.
 
-    x(t) + i y(t) = x + i y + integral over s in [0, t] of (speed + accel s) exp(i (yaw + yaw_rate s)); by default with
-    the noise of Karle et al. 2023 (see `CTRV`), for the acceleration std 3 per second at 100 Hz.
+    x(t) + i y(t) = x + i y + integral over s in [0, t] of (speed + accel s) exp(i yaw(s)); by default with the noise of
+    Karle et al. 2023 (see `CTRV`), for the acceleration std 3 per second at 100 Hz.
     """
 
     accel_density_m2ps5: float = 3.0**2 / 100.0

@@ -1,127 +1,178 @@
 """Transitions of the shipped motion models, compiled: mean, Jacobian F and noise covariance Q of states after a time.
 
 The noise is the definition, Q = integral over s in [0, t] of Phi(t, s) D Phi(t, s)', with the diagonal D of spectral
-densities and the Jacobian Phi(t, s) of the flow from the mean at s over t - s.
+densities at the mean at s, and the Jacobian Phi(t, s) of the flow from there over t - s.
+
+The parameters `noise` are the spectral densities of the entries of the state, shape (n,). Those of `ARC` are followed
+by the rate at which the yaw rate relaxes, in 1/s, by the speed below which an object counts as slow, in m/s, and by
+the density that is added to that of the yaw of an object at rest, in rad^2/s.
 """
 
 import math
 
 import numpy as np
 
-from fgtrack.core.compiled import add_product_transposed, check, copy, inlined, merged, njit, product, scratch, shared
+from fgtrack.core.compiled import add_product_transposed, copy, merged, njit, product, scratch, shared
 from fgtrack.core.types import FloatArray
 
 #: Kinds of motion: constant turn rate and velocity (or acceleration), constant velocity.
 ARC, LINE = 0, 1
-#: A longer arc is made of parts that turn by so much at most, up to which the series hold to rounding.
-MAX_TURN_RAD = 0.5
+#: Number of parameters of `ARC` behind its densities.
+NUM_OTHERS = 3
+#: A longer arc is made of parts that turn by this angle at most, where the quadrature holds to rounding.
+MAX_TURN_RAD = 0.25
+#: A part lasts at most this share of the time in which the yaw rate relaxes to 1/e.
+MAX_RELAXATION = 0.25
+#: In a part the speed changes at most by this share of the speed over which the noise of the yaw changes.
+MAX_SPEED_CHANGE = 0.25
 #: An arc of more parts has no finite result: a yaw rate that no object has.
 MAX_PARTS = 10_000
-_TERMS = 10
-# With the moments K_j of the heading, integrals of s^j exp(iws) over s in [0, r], the functions K_0, r K_0 - K_1, K_1,
-# r K_1 - K_2, 1 and r are sums over k of c_k (iw)^k r^(k + e), with the factors c and the exponent e of each.
-_K = np.arange(2 * _TERMS)
-_MOMENTS = 1.0 / np.array([_K + 1, (_K + 1) * (_K + 2), _K + 2, (_K + 2) * (_K + 3)]) / np.cumprod(np.maximum(_K, 1.0))
-_FACTORS, _EXPONENTS = np.vstack([_MOMENTS, _K == 0, _K == 0]), (1, 2, 2, 3, 0, 1)
+_NUM_NODES = 6
 
 
-def _columns(factors: FloatArray) -> FloatArray:
-    """Factors of w^2k in the real part of a sum of c_k (iw)^k, and in the imaginary part over w, shape (terms, 2)."""
-    return np.asarray((factors * np.array([1.0, 1.0, -1.0, -1.0])[_K % 4]).reshape(_TERMS, 2))
+def _integrals(nodes: FloatArray, weights: FloatArray) -> FloatArray:
+    """Matrix that gives integrals from 0 to each node, and to 1, of the polynomial through values at the nodes.
+
+    Shape (nodes + 1, nodes). The nodes lie in [0, 1].
+    """
+    powers = np.arange(len(nodes))
+    values = nodes[:, None] ** powers
+    integrals = nodes[:, None] ** (powers + 1) / (powers + 1)
+    return np.vstack([np.linalg.solve(values.T, integrals.T).T, weights])
 
 
-def _integral(a: int, b: int, conjugate: float = 1.0) -> FloatArray:
-    """`_columns` of the integral over r in [0, 1] of a product; with -1 for b conjugated, of the real part."""
-    factors = np.convolve(_FACTORS[a], _FACTORS[b] * conjugate**_K)[_K] / (_K + _EXPONENTS[a] + _EXPONENTS[b] + 1)
-    return _columns(factors)[:, : 2 if conjugate > 0.0 else 1]
-
-
-def _linear(a: int) -> list[FloatArray]:
-    """Values at 1 and integrals of functions a and a + 1, and the integral of r times the latter: ten columns."""
-    return [_columns(_FACTORS[a]), _columns(_FACTORS[a + 1]), _integral(a, 4), _integral(a + 1, 4), _integral(a + 1, 5)]
-
-
-def _quadratic(a: int, b: int) -> list[FloatArray]:
-    """Integrals of the products a b and (a + 1) (b + 1), and of those with conjugates: six columns."""
-    return [_integral(a, b), _integral(a + 1, b + 1), _integral(a, b, -1.0), _integral(a + 1, b + 1, -1.0)]
-
-
-# At constant speed the first 16 suffice.
-_SERIES = np.hstack([*_linear(0), *_quadratic(0, 0), *_linear(2), *_quadratic(0, 2), *_quadratic(2, 2)])
-
-
-@inlined
-def _turned(right: float, up: float, moments: FloatArray, p: int) -> tuple[float, float]:
-    """Product of complex numbers."""
-    real, imag = moments[p, 0], moments[p, 1]
-    return right * real - up * imag, right * imag + up * real
-
+# Gauss-Legendre quadrature on [0, 1]; integrals up to its nodes by collocation (Hairer, Norsett and Wanner, Solving
+# Ordinary Differential Equations I, section II.7).
+_roots, _root_weights = np.polynomial.legendre.leggauss(_NUM_NODES)
+_NODES, _WEIGHTS = 0.5 * (_roots + 1.0), 0.5 * _root_weights
+_INTEGRALS = _integrals(_NODES, _WEIGHTS)
+# Factors 1/1!, 1/2!, ... of the series of (exp(b r) - 1) / b, and alternating ones of those of sine and cosine.
+_GROWTH = 1.0 / np.cumprod(np.arange(1.0, 11.0))
+_COS = np.array([(-1.0) ** k / math.factorial(2 * k) for k in range(7)])
+_SIN = np.array([(-1.0) ** k / math.factorial(2 * k + 1) for k in range(7)])
 
 _TYPES = f"float64[::1], float64, {'float64[::1], ' * 2}float64[:, ::1], float64[:, ::1]"
 
 
+@merged
+def _relaxed(r: float, b: float) -> float:
+    """Value of (exp(b r) - 1) / b for |b r| <= `MAX_RELAXATION`."""
+    total = 0.0
+    for k in range(len(_GROWTH) - 1, -1, -1):
+        total = total * b * r + _GROWTH[k]
+    return r * total
+
+
 @shared(f"void({_TYPES})")
-def _short_arc(x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray) -> None:
+def _short_arc(x: FloatArray, t: float, noise: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray) -> None:
     """Write mean, F and Q after a turn of at most `MAX_TURN_RAD`.
-    As complex numbers, along and left of the heading at the end, where the speed is v, the position depends on yaw,
-    speed, yaw rate and acceleration a time R before by i (v K_0 - a K_1), K_0, i (v (R K_0 - K_1) - a (R K_1 - K_2)),
-    R K_0 - K_1. `unit` has the series of these moments, from the end back; `scaled` those for the yaw and its rate.
+
+    Positions are complex numbers along and left of the heading at the end. At a time r t before the end the yaw rate is
+    w p(r) and the heading is -w t g(r), with the yaw rate w at the end, p = exp(b r), g = (p - 1) / b and b the time t
+    times the rate of relaxation. With integrals over s in [0, r] of the velocity V(s) and of the direction U(s), the
+    final position depends on yaw, speed, yaw rate and acceleration at r by i t int V, t int U,
+    i t^2 (g(r) int V - int g V) / p(r) and t^2 (r int U - int s U).
     """
     n = len(x)
-    accel, q_accel = (x[5], density[5] * t) if n > 5 else (0.0, 0.0)
-    q_yaw, q_speed, q_rate = density[2] * t, density[3] * t, density[4] * t
-    w, v, a = -x[4] * t, x[3] + accel * t, accel * t
-    unit, scaled, moments, used = scratch(38), scratch(16), scratch(2, 8, 2), 16 if n == 5 else 38
-    for p in range(38):
-        unit[p] = 0.0
-    for k in range(_TERMS - 1, -1, -1):
-        for p in range(used):
-            unit[p] = unit[p] * (w * w) + _SERIES[k, p]
-    for p in range(16):
-        scaled[p] = v * unit[p] - a * unit[p + 16]
-        if p >= 10:
-            scaled[p] = v * v * unit[p] - 2.0 * v * a * unit[p + 16] + a * a * unit[p + 22]
-    for p in range(7):
-        moments[0, p, 0], moments[0, p, 1] = scaled[2 * p], scaled[2 * p + 1] * w
-        moments[1, p, 0], moments[1, p, 1] = unit[2 * p], unit[2 * p + 1] * w
+    accel = x[5] if n > 5 else 0.0
+    b = noise[n] * t
+    last_g = _relaxed(1.0, b)
+    last_p = 1.0 + b * last_g
+    w = x[4] / last_p
+    v = x[3] + accel * t
     for j in range(n):
         mean[j] = x[j]
         for k in range(n):
             F[j, k] = 1.0 if j == k else 0.0
-            Q[j, k] = density[j] * t if j == k else 0.0
-    mean[2], mean[3] = x[2] + x[4] * t, v
+            Q[j, k] = 0.0
+    mean[2], mean[3], mean[4] = x[2] + w * t * last_g, v, w
+    nodes = scratch(_NUM_NODES, 6)
+    for j in range(_NUM_NODES):
+        r = _NODES[j]
+        g = _relaxed(r, b)
+        angle = -w * t * g
+        square = angle * angle
+        along, left = 0.0, 0.0
+        for k in range(len(_COS) - 1, -1, -1):
+            along = along * square + _COS[k]
+            left = left * square + _SIN[k]
+        left *= angle
+        ratio = (v - accel * r * t) / noise[n + 1]
+        slowness = 1.0 / (1.0 + ratio * ratio)
+        nodes[j, 0], nodes[j, 1], nodes[j, 2], nodes[j, 3] = along, left, g, noise[n + 2] * slowness * slowness
+        nodes[j, 4], nodes[j, 5] = g * along, g * left
     c, s = math.cos(mean[2]), math.sin(mean[2])
-    right, up = _turned(c * t, s * t, moments[0], 0)
-    size = q_yaw * scaled[14] + q_speed * unit[14] + t * t * (q_rate * scaled[15] + q_accel * unit[15])
-    for j in range(2):
-        moments[1, 7, j] = q_speed * moments[1, 5, j] - q_yaw * moments[0, 5, j]
-        moments[1, 7, j] += t * t * (q_accel * moments[1, 6, j] - q_rate * moments[0, 6, j])
-    mean[0], mean[1] = x[0] + right, x[1] + up
-    right, up = _turned(c * c - s * s, c * s + s * c, moments[1], 7)
-    Q[0, 0] += 0.5 * t * t * (size + right)
-    Q[1, 1] += 0.5 * t * t * (size - right)
-    Q[0, 1] = Q[1, 0] = 0.5 * t * t * up
-    for k in range(2, n):  # yaw and speed, and then their rates, of which the second is the acceleration
-        of, q, rate = moments[k % 2], density[k] * t, 1 if k > 3 else 0
-        right, up = (-s * t, c * t) if k % 2 == 0 else (c * t, s * t)
-        if rate:
-            right, up = right * t, up * t
-        F[0, k], F[1, k] = _turned(right, up, of, rate)
-        Q[0, k], Q[1, k] = _turned(right * q, up * q, of, 2 + rate)
-        if not rate and k + 2 < n:
-            q = density[k + 2] * t
-            right, up = _turned(right * q * t * t, up * q * t * t, of, 4)
-            Q[0, k], Q[1, k] = Q[0, k] + right, Q[1, k] + up
-        Q[k, 0], Q[k, 1] = Q[0, k], Q[1, k]
-        if k > 3:  # the yaw by its rate, the speed by the acceleration
-            F[k - 2, k] = t
-            Q[k - 2, k - 2] += density[k] * t * t * t / 3.0
-            Q[k - 2, k] = Q[k, k - 2] = 0.5 * density[k] * t * t
+    for i in range(_NUM_NODES + 1):
+        is_end = i == _NUM_NODES
+        r, g, p = (1.0, last_g, last_p) if is_end else (_NODES[i], nodes[i, 2], 1.0 + b * nodes[i, 2])
+        unit_x, unit_y, turned_x, turned_y = 0.0, 0.0, 0.0, 0.0
+        for j in range(_NUM_NODES):
+            share = _INTEGRALS[i, j]
+            unit_x += share * nodes[j, 0]
+            unit_y += share * nodes[j, 1]
+            turned_x += share * nodes[j, 4]
+            turned_y += share * nodes[j, 5]
+        unit_x, unit_y = t * unit_x, t * unit_y
+        way_x, way_y, late_x, late_y = v * unit_x, v * unit_y, 0.0, 0.0
+        turned_x, turned_y = v * t * turned_x, v * t * turned_y
+        if n > 5:  # minus the acceleration times the time
+            for j in range(_NUM_NODES):
+                share = t * _INTEGRALS[i, j] * _NODES[j]
+                late_x += share * nodes[j, 0]
+                late_y += share * nodes[j, 1]
+                turned_x -= accel * t * share * nodes[j, 4]
+                turned_y -= accel * t * share * nodes[j, 5]
+            way_x -= accel * t * late_x
+            way_y -= accel * t * late_y
+        for k in range(2, n):
+            # The derivatives of position, yaw or speed, and its rate at the end by entry k at r.
+            if k == 2:
+                right, up, first, second = -way_y, way_x, 1.0, 0.0
+            elif k == 3:
+                right, up, first, second = unit_x, unit_y, 1.0, 0.0
+            elif k == 4:
+                right, up = -t * (g * way_y - turned_y) / p, t * (g * way_x - turned_x) / p
+                first, second = t * g / p, 1.0 / p
+            else:
+                right, up, first, second = t * (r * unit_x - late_x), t * (r * unit_y - late_y), t * r, 1.0
+            own = 2 + k % 2
+            if is_end:
+                F[0, k], F[1, k] = c * right - s * up, s * right + c * up
+                F[own, k] = first
+                if k > 3:
+                    F[k, k] = second
+                continue
+            q = noise[k] + nodes[i, 3] if k == 2 else noise[k]
+            q *= t * _WEIGHTS[i]
+            Q[0, 0] += q * right * right
+            Q[0, 1] += q * right * up
+            Q[1, 1] += q * up * up
+            Q[0, own] += q * right * first
+            Q[1, own] += q * up * first
+            Q[own, own] += q * first * first
+            if k > 3:
+                Q[0, k] += q * right * second
+                Q[1, k] += q * up * second
+                Q[own, k] += q * first * second
+                Q[k, k] += q * second * second
+        if is_end:
+            mean[0] += c * way_x - s * way_y
+            mean[1] += s * way_x + c * way_y
+    right, cross, up = Q[0, 0], Q[0, 1], Q[1, 1]
+    Q[0, 0] = c * c * right - 2.0 * c * s * cross + s * s * up + noise[0] * t
+    Q[1, 1] = s * s * right + 2.0 * c * s * cross + c * c * up + noise[1] * t
+    Q[0, 1] = Q[1, 0] = c * s * (right - up) + (c * c - s * s) * cross
+    for k in range(2, n):
+        right, up = Q[0, k], Q[1, k]
+        Q[0, k] = Q[k, 0] = c * right - s * up
+        Q[1, k] = Q[k, 1] = s * right + c * up
+    for k in range(4, n):
+        Q[k, k - 2] = Q[k - 2, k]
 
 
 @merged
 def _arc(
-    x: FloatArray, t: float, parts: int, density: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
+    x: FloatArray, t: float, parts: int, noise: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
 ) -> None:
     """Write mean, F and Q after so many short arcs of t each."""
     n = len(x)
@@ -131,7 +182,7 @@ def _arc(
             before[j] = mean[j]
         if part:
             copy(Q, old)
-        _short_arc(before if part else x, t, density, mean, G if part else F, Q)
+        _short_arc(before if part else x, t, noise, mean, G if part else F, Q)
         if part:
             product(G, old, GM)
             add_product_transposed(GM, G, Q)
@@ -140,32 +191,44 @@ def _arc(
 
 
 @merged
-def _line(x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray) -> None:
+def _line(x: FloatArray, t: float, noise: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray) -> None:
     """Write mean, F and Q of constant velocity, state x, y, vx, vy: q [[t^3/3, t^2/2], [t^2/2, t]] on each axis."""
     for i in range(4):
         mean[i] = x[i]
         for k in range(4):
             F[i, k] = 1.0 if i == k else 0.0
-            Q[i, k] = density[i] * t if i == k else 0.0
+            Q[i, k] = noise[i] * t if i == k else 0.0
     for i in range(2):
-        v, q = i + 2, density[i + 2]
+        v, q = i + 2, noise[i + 2]
         mean[i] += x[v] * t
         F[i, v] = t
         Q[i, i] += q * (t * t * t) / 3.0
         Q[i, v] = Q[v, i] = q * (t * t) / 2.0
 
 
+@merged
+def _num_parts(x: FloatArray, t: float, noise: FloatArray) -> float:
+    """Number of short arcs that the transition over t is made of, as a float that may be infinite."""
+    n = len(x)
+    parts = max(abs(x[4] * t) / MAX_TURN_RAD, abs(noise[n] * t) / MAX_RELAXATION, 1.0)
+    if n > 5 and noise[n + 2] > 0.0:
+        speed, last = x[3], x[3] + x[5] * t
+        slowest = 0.0 if speed * last < 0.0 else min(abs(speed), abs(last))
+        parts = max(parts, abs(x[5] * t) / (MAX_SPEED_CHANGE * math.hypot(slowest, noise[n + 1])))
+    return math.ceil(parts) if parts < MAX_PARTS else math.inf
+
+
 @shared(f"void(int64, {_TYPES})")
 def transition(
-    kind: int, x: FloatArray, t: float, density: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
+    kind: int, x: FloatArray, t: float, noise: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
 ) -> None:
     """Write mean (n,), F and Q (n, n) of the state x (n,) after t."""
-    turn = abs(x[4] * t) if kind == ARC else 0.0
     if kind != ARC:
-        _line(x, t, density, mean, F, Q)
-    elif turn < MAX_TURN_RAD * MAX_PARTS:
-        parts = max(math.ceil(turn / MAX_TURN_RAD), 1)
-        _arc(x, t / parts, parts, density, mean, F, Q)
+        _line(x, t, noise, mean, F, Q)
+        return
+    parts = _num_parts(x, t, noise)
+    if parts <= MAX_PARTS:
+        _arc(x, t / parts, int(parts), noise, mean, F, Q)
     else:
         for i in range(len(x)):
             mean[i] = math.nan
@@ -177,11 +240,8 @@ def transition(
     "void(int64, float64[:, ::1], float64[::1], float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, ::1])"
 )
 def transitions(
-    kind: int, x: FloatArray, dt_s: FloatArray, density: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
+    kind: int, x: FloatArray, dt_s: FloatArray, noise: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
 ) -> None:
     """Write mean (m, n), F and Q (m, n, n) of states (m, n) after `dt_s` (m,)."""
-    n = x.shape[1]
-    check(min(len(dt_s), len(mean), len(F), len(Q)) >= len(x) and len(density) >= n and mean.shape[1] == n)
-    check(F.shape[1] == n and F.shape[2] == n and Q.shape[1] == n and Q.shape[2] == n)
     for k in range(len(x)):
-        transition(kind, x[k], dt_s[k], density, mean[k], F[k], Q[k])
+        transition(kind, x[k], dt_s[k], noise, mean[k], F[k], Q[k])

@@ -1,5 +1,6 @@
 """The configuration of a run. The defaults are those of open space; a YAML file overrides them."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -177,6 +178,13 @@ class MotionConfig:
     """Process noise as the paper gives it: each step of 1 / `NOISE_HZ` adds (std_per_s / NOISE_HZ)^2, hence the density
     std_per_s^2 / NOISE_HZ. `ctra` takes `accel` as well, `cv` takes `velocity` alone; of `ctrv_euler` `accel` is an
     acceleration that drives the speed but is never estimated (Q5)."""
+    yaw_rate_std_radps: PositiveFloat = 0.5
+    """Standard deviation of the yaw rate of any object at any time (`ctrv`, `ctra`). A yaw rate that nothing measures
+    relaxes to zero with this uncertainty; `.inf` lets it drift without limit."""
+    slow_mps: PositiveFloat = 1.0
+    """Speed below which the yaw has more process noise (`ctrv`, `ctra`), because positions do not show it."""
+    resting_yaw_rad2ps: NonNegativeFloat = 4.0
+    """Spectral density of that noise at rest; it falls with the speed v as 1 / (1 + (v / slow_mps)^2)^2."""
     parameters: Mapping[str, float] = field(default_factory=dict)
     """Keyword parameters of a plug-in, which has no `std_per_s`."""
 
@@ -202,7 +210,16 @@ class MotionConfig:
         if self.is_plug_in:
             return motion_model(self.kind, self.parameters)
         model = CTRA if self.is_driven else _BUILT_IN_MOTION[self.kind]
-        return model.from_std_per_step(self.std_per_s, NOISE_HZ)
+        others: dict[str, float] = {}
+        if self.kind == "ctrv_euler":
+            others = {"yaw_rate_std_radps": math.inf, "resting_yaw_rad2ps": 0.0}
+        elif issubclass(model, CTRV):
+            others = {
+                "yaw_rate_std_radps": self.yaw_rate_std_radps,
+                "slow_mps": self.slow_mps,
+                "resting_yaw_rad2ps": self.resting_yaw_rad2ps,
+            }
+        return model.from_std_per_step(self.std_per_s, NOISE_HZ, **others)
 
 
 #: Estimators that take all settings of `smoother`.

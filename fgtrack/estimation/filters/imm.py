@@ -1,7 +1,7 @@
 """The interacting multiple model filter, in continuous time, so that late measurements can be rewound to."""
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
@@ -146,7 +146,8 @@ def _beside(motion: MotionModel, other: str | MotionModel) -> MotionModel | None
     default = "ctrv" if isinstance(motion, CTRA) else "ctra" if isinstance(motion, CTRV) else ""
     if not (other or default):
         return None
-    same = {name: getattr(motion, name) for name in CTRV.density_names()} if other in ("", default) else {}
+    alike = isinstance(motion, CTRV) and other in ("", default)
+    same = {each.name: getattr(motion, each.name) for each in fields(CTRV)} if alike else {}
     return motion_model(other or default, same)
 
 

@@ -27,7 +27,7 @@ class ExactPropagator:
         if not (isinstance(self.motion, WhiteNoise) and self.motion.is_compiled):
             return predict(mean, covariance, self.motion, steps * np.float64(dt_s))
         x, P = mean.copy(), covariance.copy()
-        kernels("fgtrack.estimation.kernels.kalman").propagate(self.motion.kind, self.motion.density, x, P, steps, dt_s)
+        kernels("fgtrack.estimation.kernels.kalman").propagate(self.motion.kind, self.motion.noise, x, P, steps, dt_s)
         return x, P
 
     def wrap(self, mean: FloatArray) -> FloatArray:

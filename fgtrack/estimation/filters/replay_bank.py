@@ -46,7 +46,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
 
     def __init__(self, motion: WhiteNoise, start: Callable[[Start], ReplayEkf], lag_s: float) -> None:
         super().__init__(motion, start, lag_s)
-        self._kind, self._density = motion.kind, motion.density
+        self._kind, self._noise = motion.kind, motion.noise
         self._start_ns = -int(LARGEST_NS)  # of all windows, by the clock
         self._rows: dict[int, int] = {}  # of tracks in the arrays
         self._order: IntArray | None = None  # of all tracks by birth, until one comes, goes or moves
@@ -160,7 +160,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
             z, R = np.ascontiguousarray(one.z, dtype=np.float64), np.ascontiguousarray(one.R, dtype=np.float64)
             y, S, nis, status = np.empty((m, k)), np.empty((m, k, k)), np.empty(m), np.empty(m, dtype=np.int64)
             now = self._lag_ns, self._start_ns, stamp_ns, one.model.selected
-            fuse = partial(kernels(_KERNELS).fuse, self._kind, self._density, *self._arrays, rows, *now, z, R)
+            fuse = partial(kernels(_KERNELS).fuse, self._kind, self._noise, *self._arrays, rows, *now, z, R)
         if not fuse(one.measured, y, S, nis, status):
             return _results(y, S, nis, status)
         outcomes = Outcomes()
@@ -209,7 +209,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         m, n = len(rows), self._motion.dim
         known, means, covariances = np.empty(m, dtype=bool), np.empty((m, n)), np.empty((m, n, n))
         at = rows, self._start_ns, stamp_ns, is_present
-        count = kernels(_KERNELS).ahead(self._kind, self._density, *self._arrays[:4], *at, means, covariances, known)
+        count = kernels(_KERNELS).ahead(self._kind, self._noise, *self._arrays[:4], *at, means, covariances, known)
         return count, known, means, covariances
 
     def _put_in(self, track_ids: Iterable[int]) -> None:

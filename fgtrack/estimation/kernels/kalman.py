@@ -99,7 +99,7 @@ def predict(F: FloatArray, P: FloatArray, Q: FloatArray) -> tuple[FloatArray, Fl
 
 
 @njit(f"void(int64, float64[::1], {_VECTORS}, {_MATRICES}, int64[::1], float64)")
-def propagate(motion: int, density: FloatArray, mean: FloatArray, P: FloatArray, steps: IntArray, dt_s: float) -> None:
+def propagate(motion: int, noise: FloatArray, mean: FloatArray, P: FloatArray, steps: IntArray, dt_s: float) -> None:
     """Move states (m, n) and (m, n, n), each by its own number of `steps` (m,) of `dt_s`: f(x) and F P F' + Q."""
     n = mean.shape[1]
     check(len(P) >= len(mean) and len(steps) >= len(mean) and P.shape[1] == n and P.shape[2] == n)
@@ -108,7 +108,7 @@ def propagate(motion: int, density: FloatArray, mean: FloatArray, P: FloatArray,
     for i in range(len(mean)):
         for a in range(n):
             x[a] = mean[i, a]
-        transition(motion, x, steps[i] * dt_s, density, mean[i], F, Q)
+        transition(motion, x, steps[i] * dt_s, noise, mean[i], F, Q)
         add_congruence(F, P[i], FP, Q)
         copy(Q, P[i])
 

@@ -39,7 +39,7 @@ _Space = tuple[FloatArray, ...]
 @inlined
 def _ahead(
     motion: int,
-    density: FloatArray,
+    noise: FloatArray,
     state: FloatArray,
     late_ns: int,
     F: FloatArray,
@@ -48,7 +48,7 @@ def _ahead(
     FP: FloatArray,
 ) -> None:
     """Write F, f(x) (n,), F P F' + Q and F P, (n, n), of the state x, P, (n + 1, n)."""
-    transition(motion, state[0], late_ns / NS_PER_S, density, mean, F, P)
+    transition(motion, state[0], late_ns / NS_PER_S, noise, mean, F, P)
     add_congruence(F, state[1:], FP, P)
 
 
@@ -73,7 +73,7 @@ _SPACE = f"Tuple(({f'{MATRIX}, ' * 4}float64[::1], {f'{MATRIX}, ' * 3}float64[::
 @shared(f"b1(int64, float64[::1], int64[::1], int64[:, ::1], float64[:, :, ::1], {_SPACE}, {MATRIX})")
 def _retrodict(
     motion: int,
-    density: FloatArray,
+    noise: FloatArray,
     slots: IntArray,
     labels: IntArray,
     steps: FloatArray,
@@ -84,7 +84,7 @@ def _retrodict(
     From step to step (Rauch, Tung and Striebel), x_j + C s and P_j + C (P - P_-) C' with the prediction x_-, P_- of the
     step after, the shift s = x - x_- and C = (P_-^-1 F P_j)'. False where some P_- has no root.
     """
-    n = len(density)
+    n = steps.shape[2]
     F, root, CD, ahead, mean, _, _, _, _ = space
     gain, shift = ahead[n + 1 :], now[0]
     for j in range(len(slots) - 1, 0, -1):
@@ -94,7 +94,7 @@ def _retrodict(
             continue
         state = steps[left, start : start + n + 1]
         if start:
-            _ahead(motion, density, state, late_ns, F, ahead[0], ahead[1 : n + 1], gain)
+            _ahead(motion, noise, state, late_ns, F, ahead[0], ahead[1 : n + 1], gain)
         else:
             copy(steps[after, n + 1 :], ahead)
         copy(ahead[1:], root)
@@ -120,7 +120,7 @@ def _retrodict(
 @merged
 def _step(
     motion: int,
-    density: FloatArray,
+    noise: FloatArray,
     before: FloatArray,
     after: FloatArray,
     late_ns: int,
@@ -129,10 +129,10 @@ def _step(
     space: _Space,
 ) -> bool:
     """Predict the step `after` from that `before`, and fuse its measurement; False where it cannot be fused."""
-    k, n = label[1], len(density)
+    k, n = label[1], before.shape[1]
     F, A, AP, _, _, S, K, KR, y = space
     y, K, predicted = y[:k], K[:k], after[n + 1 :]
-    _ahead(motion, density, before[: n + 1], late_ns, F, predicted[0], predicted[1 : n + 1], predicted[n + 1 :])
+    _ahead(motion, noise, before[: n + 1], late_ns, F, predicted[0], predicted[1 : n + 1], predicted[n + 1 :])
     copy(predicted, after[: n + 1])
     _innovation(after, label, measured, motion == ARC, y, S)
     for c in range(k):
@@ -204,7 +204,7 @@ def _check(
 )
 def fuse(
     motion: int,
-    density: FloatArray,
+    noise: FloatArray,
     order: IntArray,
     labels: IntArray,
     steps: FloatArray,
@@ -228,7 +228,7 @@ def fuse(
     failed measurement, and one older than `oldest_ns` or the window of the track, change nothing. Where all slots of a
     track are in use, nothing changes either. Returns the number of these tracks.
     """
-    m, k, n, num_without_room = len(tracks), y.shape[1], len(density), 0
+    m, k, n, num_without_room = len(tracks), y.shape[1], steps.shape[3], 0
     _check(tracks, 0, order, labels, steps, windows, n)
     check(measured.shape[0] == order.shape[0] and measured.shape[1] == order.shape[1] and measured.shape[2] > k)
     check(measured.shape[3] >= k and labels.shape[2] >= k + 2 and len(entries) >= k and z.shape[1] >= k)
@@ -267,11 +267,11 @@ def fuse(
         while j <= last:
             s, left = slots[j], slots[j - 1]
             late_ns = labels[t, s, 0] - labels[t, left, 0]
-            ok = _step(motion, density, steps[t, left], steps[t, s], late_ns, labels[t, s], measured[t, s], space)
+            ok = _step(motion, noise, steps[t, left], steps[t, s], late_ns, labels[t, s], measured[t, s], space)
             if ok and s == own:
                 newest = slots[count]
                 copy(steps[t, newest, n + 1 if index == count else 0 :], now)
-                ok = _retrodict(motion, density, slots[index : count + 1], labels[t], steps[t], space, now)
+                ok = _retrodict(motion, noise, slots[index : count + 1], labels[t], steps[t], space, now)
                 _innovation(now, label, new, motion == ARC, y[i], S[i])
                 nis[i] = marginal_nis(S[i], y[i], rows, root, white)
                 ok = ok and not math.isnan(nis[i])
@@ -292,7 +292,7 @@ def fuse(
 @njit(f"int64({_STEPS}, int64[::1], int64, int64, b1, float64[:, ::1], float64[:, :, ::1], b1[::1])")
 def ahead(
     motion: int,
-    density: FloatArray,
+    noise: FloatArray,
     order: IntArray,
     labels: IntArray,
     steps: FloatArray,
@@ -308,7 +308,7 @@ def ahead(
     """Write states (m, n) and (m, n, n) of `tracks`, but those below 0, at a stamp: from the last step before.
     Known are, and counted, those whose windows have begun; at the present others have their first state.
     """
-    n, count = len(density), 0
+    n, count = steps.shape[3], 0
     _check(tracks, -1, order, labels, steps, windows, n)
     check(len(means) == len(tracks) and len(covariances) == len(tracks) and len(known) == len(tracks))
     F, FP = scratch(n, n), scratch(n, n)
@@ -327,7 +327,7 @@ def ahead(
         while j > 0 and labels[t, order[t, j], 0] > at_ns:
             j -= 1
         s = order[t, j]
-        _ahead(motion, density, steps[t, s, : n + 1], at_ns - labels[t, s, 0], F, means[i], covariances[i], FP)
+        _ahead(motion, noise, steps[t, s, : n + 1], at_ns - labels[t, s, 0], F, means[i], covariances[i], FP)
         if motion == ARC:
             means[i, _YAW] = wrapped(means[i, _YAW])
     return count

@@ -234,7 +234,7 @@ def place(
 
 
 @njit(f"void(int64, {TIMES}, {INDICES}, {INDICES}, {NODES})")
-def linearise_motion(kind: int, density: FloatArray, tracks: IntArray, starts: IntArray, nodes: Arrays) -> None:
+def linearise_motion(kind: int, noise: FloatArray, tracks: IntArray, starts: IntArray, nodes: Arrays) -> None:
     """Linearise the motion from nodes that are stale, the one before `starts` and later ones, to the next ones."""
     info, all_ns, numbers, labels, _, points, blocks, _ = nodes
     n = points.shape[2]
@@ -248,7 +248,7 @@ def linearise_motion(kind: int, density: FloatArray, tracks: IntArray, starts: I
             if labels[at, STALE] and index < info[track, COUNT] - 1:
                 dt_s = (all_ns[track, index + 1] - all_ns[track, index]) / NS_PER_S
                 motion = blocks[at, F]
-                transition(kind, points[at, ORIGIN], dt_s, density, mean, motion, blocks[at, Q])
+                transition(kind, points[at, ORIGIN], dt_s, noise, mean, motion, blocks[at, Q])
                 for i in range(n):
                     motion[i, n] = mean[i]
                 labels[at, CHANGED] = 1

@@ -163,7 +163,7 @@ class Nodes:
             for number in stale.tolist() if is_nonlinear else ():
                 self.linearise_factors(number)
         if compiled is not None:
-            node_kernels.linearise_motion(compiled.kind, compiled.density, tracks, starts, self.arrays)
+            node_kernels.linearise_motion(compiled.kind, compiled.noise, tracks, starts, self.arrays)
             return
         self.labels[stale, STALE] = 0
         inner = indices < self.count[rows] - 1
@@ -178,7 +178,7 @@ class Nodes:
             return self._motion.transition(x, dt_s)
         m, n = x.shape
         result = np.empty((m, n)), np.empty((m, n, n)), np.empty((m, n, n))
-        transitions(self._compiled.kind, x, dt_s, self._compiled.density, *result)
+        transitions(self._compiled.kind, x, dt_s, self._compiled.noise, *result)
         return result
 
     def _grow(self, axis: int) -> None:

@@ -4,19 +4,22 @@ The second is the "rail" of the published node of Karle et al. 2023, without its
 for a fifth of a second, then along the track, at the same share of the way from one bound to the other.
 """
 
+import math
+
 import numpy as np
 
 from fgtrack.core.types import FloatArray
 from fgtrack.models.motion import CTRV
 from fgtrack.models.track_map import TrackMap
 
+_ARC = CTRV(yaw_rate_std_radps=math.inf)
 ARC_S = 0.2
 """Time for which `rail_positions` are on the arc before they follow the track."""
 
 
 def arc_positions(states: FloatArray, ahead_s: FloatArray) -> FloatArray:
-    """Positions (n, m, 2) of states x, y, yaw, speed, yaw rate (n, 5) after `ahead_s` (m,), on their arcs (`CTRV`)."""
-    return np.asarray(CTRV().predict(states[:, None], ahead_s)[..., :2])
+    """Positions (n, m, 2) of states x, y, yaw, speed, yaw rate (n, 5) after `ahead_s` (m,), on arcs of constant turn rate."""
+    return np.asarray(_ARC.predict(states[:, None], ahead_s)[..., :2])
 
 
 def rail_positions(track: TrackMap, states: FloatArray, ahead_s: FloatArray) -> FloatArray:
