@@ -233,7 +233,7 @@ class CTRV(WhiteNoise):
     """Standard deviation of the yaw rate of any object at any time; infinity for a random walk."""
     slow_mps: float = field(default=1.0, kw_only=True)
     """Speed below which the yaw has more noise."""
-    resting_yaw_rad2ps: float = field(default=4.0, kw_only=True)
+    resting_yaw_rad2ps: float = field(default=6.0, kw_only=True)
     """Spectral density that is added to that of the yaw, times 1 / (1 + (speed / slow_mps)^2)^2."""
 
     state_names: ClassVar[tuple[str, ...]] = STATE_NAMES[:ACCEL]

@@ -183,7 +183,7 @@ class MotionConfig:
     relaxes to zero with this uncertainty; `.inf` lets it drift without limit."""
     slow_mps: PositiveFloat = 1.0
     """Speed below which the yaw has more process noise (`ctrv`, `ctra`), because positions do not show it."""
-    resting_yaw_rad2ps: NonNegativeFloat = 4.0
+    resting_yaw_rad2ps: NonNegativeFloat = 6.0
     """Spectral density of that noise at rest; it falls with the speed v as 1 / (1 + (v / slow_mps)^2)^2."""
     parameters: Mapping[str, float] = field(default_factory=dict)
     """Keyword parameters of a plug-in, which has no `std_per_s`."""

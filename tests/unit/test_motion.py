@@ -15,8 +15,11 @@ from fgtrack.models.motion import CTRA, CTRV, CV, MIN_SPEED_MPS, MotionModel
 
 MODELS: tuple[MotionModel, ...] = (CTRV(), CTRA(), CV(velocity_density_m2ps3=0.5))
 ARCS: tuple[CTRV, ...] = (CTRV(), CTRA())
+TURNS: tuple[CTRV, ...] = (CTRV(yaw_rate_std_radps=math.inf), CTRA(yaw_rate_std_radps=math.inf))
+RESTLESS = CTRV(yaw_rate_density_rad2ps3=2.0, slow_mps=2.0), CTRA(yaw_rate_density_rad2ps3=2.0, slow_mps=2.0)
 every_model = pytest.mark.parametrize("model", MODELS, ids=lambda model: type(model).__name__)
 every_arc = pytest.mark.parametrize("model", ARCS, ids=lambda model: type(model).__name__)
+every_turn = pytest.mark.parametrize("model", TURNS, ids=lambda model: type(model).__name__)
 
 YAW_RATES_RADPS = st.one_of(
     st.floats(-1.0, 1.0), st.sampled_from([0.0, 5e-324, 1e-300, 1e-17, -1e-12, 1e-8, -1e-5, 1e-3, 0.5, -4.0])
@@ -40,7 +43,9 @@ def derivative_in_time(model: MotionModel, x: FloatArray) -> FloatArray:
     if model.cartesian:
         return np.array([x[2], x[3], 0.0, 0.0])
     accel = x[5] if model.dim == 6 else 0.0
-    rates = np.array([x[3] * math.cos(x[2]), x[3] * math.sin(x[2]), x[4], accel, 0.0, 0.0])
+    assert isinstance(model, CTRV)
+    relaxation_hz = model.yaw_rate_density_rad2ps3 / (2.0 * model.yaw_rate_std_radps**2)
+    rates = np.array([x[3] * math.cos(x[2]), x[3] * math.sin(x[2]), x[4], accel, -relaxation_hz * x[4], 0.0])
     return rates[: model.dim]
 
 
@@ -70,17 +75,29 @@ def test_the_flow_solves_its_differential_equation(model: MotionModel, kinematic
     assert_allclose(model.predict(x, dt_s), solution.y[:, -1], rtol=1e-9, atol=1e-6)
 
 
-@every_arc
-def test_process_noise_of_an_arc_is_the_integral_of_its_definition(model: CTRV) -> None:
-    x = np.array([1.0, 2.0, 0.4, 30.0, 0.6, -4.0])[: model.dim]
-    densities = np.array([0.0004, 0.0004, 0.0009, 0.01, 0.0025, 0.09])[: model.dim]
+@pytest.mark.parametrize("model", [*ARCS, *TURNS, *RESTLESS])
+@pytest.mark.parametrize("speed_mps", [30.0, 1.5, 0.0, -3.0])
+def test_process_noise_of_an_arc_is_the_integral_of_its_definition(model: CTRV, speed_mps: float) -> None:
+    x = np.array([1.0, 2.0, 0.4, speed_mps, 0.6, 4.0])[: model.dim]
 
     def integrand(s: float) -> FloatArray:
-        transition = model.jacobian(model.predict(x, s), 1.5 - s)
+        at = model.predict(x, s)
+        densities = model.density.copy()
+        densities[2] += model.resting_yaw_rad2ps / (1.0 + (at[3] / model.slow_mps) ** 2) ** 2
+        transition = model.jacobian(at, 1.5 - s)
         return transition @ np.diag(densities) @ transition.T
 
     integral = quad_vec(integrand, 0.0, 1.5, epsrel=1e-12)[0]
-    assert_close_to_scale(model.process_noise(x, 1.5), integral, rtol=1e-11)
+    assert_close_to_scale(model.process_noise(x, 1.5), integral, rtol=1e-10)
+
+
+@every_arc
+def test_an_unmeasured_yaw_rate_keeps_its_variance_at_any_time(model: CTRV) -> None:
+    """Ornstein-Uhlenbeck: the stationary variance is carried on by F and Q, over a second or a day."""
+    for dt_s in (0.02, 1.0, 600.0):
+        x = np.zeros(model.dim)
+        F, Q = model.jacobian(x, dt_s), model.process_noise(x, dt_s)
+        assert F[4, 4] ** 2 * 0.25 + Q[4, 4] == pytest.approx(0.25, rel=1e-9)
 
 
 def test_process_noise_of_constant_velocity_is_that_of_van_loan() -> None:
@@ -109,7 +126,7 @@ def test_an_arc_becomes_the_straight_line_as_the_yaw_rate_vanishes(model: CTRV) 
         assert_allclose(model.jacobian(x, 1.5), model.jacobian(straight, 1.5), rtol=1e-14, atol=1e-13)
 
 
-@every_arc
+@every_turn
 @pytest.mark.parametrize("yaw_rate", [1e-9, 1e-3, 0.5, 3.9, 4.1, -20.0, 300.0])
 def test_an_arc_is_exact_relative_to_its_own_length(model: CTRV, yaw_rate: float) -> None:
     """The circle from chord and half angle, where nothing cancels; CTRA without acceleration."""

@@ -19,7 +19,7 @@ BUSY = TrackVehicle(
     speed=((0.0, 60.0), (10.0, 75.0), (30.0, 50.0), (35.0, 70.0)),
     lane_changes=(LaneChange(1.0, 3.0, 4.0), LaneChange(4.0, 2.0, 0.0), LaneChange(25.0, 6.0, -5.0)),
 )
-STILL = CTRV(0.0, 0.0, 0.0, 0.0)
+STILL = CTRV(0.0, 0.0, 0.0, 0.0, resting_yaw_rad2ps=0.0)
 
 
 @given(st.lists(st.floats(0.01, 60.0), min_size=1, max_size=50))
@@ -44,7 +44,7 @@ def test_a_drawn_vehicle_without_noise_drives_the_exact_arc() -> None:
     vehicle = DrawnVehicle(1.0, 2.0, 3.0, 60.0, 0.3, motion=STILL)
     times = np.array([0.0, 0.0049, 0.01, 1.2345, 20.0])
     states = vehicle.trajectory(np.random.default_rng(0), 20.0).states(times)
-    expected = CTRV().predict(np.array([1.0, 2.0, 3.0, 60.0, 0.3]), times)
+    expected = STILL.predict(np.array([1.0, 2.0, 3.0, 60.0, 0.3]), times)
     expected[:, YAW] = wrap_angles(expected[:, YAW])
     np.testing.assert_allclose(states[:, :5], expected, atol=1e-9)
     assert (states[:, ACCEL] == 0.0).all()

@@ -14,7 +14,7 @@ from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.initiation import Initiation
 from fgtrack.estimation.filters.track_initiation import TrackInitiation
 from fgtrack.models.correlated_errors import CorrelatedErrors
-from fgtrack.models.motion import MotionModel, WhiteNoise
+from fgtrack.models.motion import CTRV, MotionModel, WhiteNoise
 
 
 @dataclass(frozen=True)
@@ -45,12 +45,15 @@ class NoiseSpace:
         return self.motion(dict(zip(self.motion_names, map(float, values), strict=False)))
 
     def noise_parts(self, x: FloatArray, dt_s: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        """Q = rest + sum of value_i^2 part_i at states `x` (..., n) over `dt_s` (...); None if the noise is not white.
-        The rest has shape (..., n, n), the parts have shape (q, ..., n, n).
+        """Q = rest + sum of value_i^2 part_i at states `x` (..., n) over `dt_s` (...); None if Q has no such parts.
+        Q has none where the noise is not white, and where a yaw rate relaxes: F depends on the density there. The rest
+        has shape (..., n, n), the parts have shape (q, ..., n, n).
         """
         model = self.motion_model(np.ones(self.num_motion))
         base = model.base if isinstance(model, CorrelatedErrors) else model
         if not (self.num_motion and isinstance(base, WhiteNoise)):
+            return None
+        if isinstance(base, CTRV) and base.relaxation_hz > 0.0:
             return None
         rest = self.motion_model(np.zeros(self.num_motion)).process_noise(x, dt_s)
         units = np.eye(self.num_motion)
