@@ -11,6 +11,7 @@ __version__ = "0.2.0"
 #: Module (or package, of a module) that each public name is loaded from on first use.
 _HOMES = {
     "Advice": "fgtrack.calibration.page",
+    "CT": "fgtrack.models.motion",
     "CTRA": "fgtrack.models.motion",
     "CTRV": "fgtrack.models.motion",
     "CV": "fgtrack.models.motion",
@@ -122,6 +123,7 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.models.measurement import MeasurementModel as MeasurementModel
     from fgtrack.models.measurement import SensorPose as SensorPose
     from fgtrack.models.measurement import measurement_model as measurement_model
+    from fgtrack.models.motion import CT as CT
     from fgtrack.models.motion import CTRA as CTRA
     from fgtrack.models.motion import CTRV as CTRV
     from fgtrack.models.motion import CV as CV

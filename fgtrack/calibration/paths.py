@@ -149,7 +149,9 @@ def measured_positions(
     fused = updates.where(np.isin(updates["disposition"], list(FUSED)) & (updates["track_id"] != NO_TRACK))
     keys = zip(*(fused[name].tolist() for name in ("sensor", "stamp_ns", "receipt_ns", "index")), strict=True)
     tracks = dict(zip(keys, fused["track_id"].tolist(), strict=True))
-    preprocess = Preprocess(Road(), config.merge, config.motion.model(), config.ego.detection_origin_m)
+    preprocess = Preprocess(
+        Road(), config.merge, config.motion.model(config.used_sensors), config.ego.detection_origin_m
+    )
     sensors = {
         name: replace(
             sensor,

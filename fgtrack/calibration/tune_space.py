@@ -77,7 +77,7 @@ class ConfigNoise:
         return replace(self.config.motion, std_per_s={**self.config.motion.std_per_s, **stds})
 
     def _motion_model(self, stds: Mapping[str, float]) -> MotionModel:
-        return with_correlated_errors(self._motion_with(stds).model(), self.config.used_sensors)
+        return with_correlated_errors(self._motion_with(stds).model(self.config.used_sensors), self.config.used_sensors)
 
 
 def stamp_key(sensor: str) -> str:

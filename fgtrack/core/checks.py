@@ -51,3 +51,10 @@ def not_negative(**values: float) -> None:
     for name, value in values.items():
         if not 0.0 <= value < math.inf:
             raise ValueError(f"{name}: must be finite and not negative, is {value}")
+
+
+def positive(**values: float) -> None:
+    """Raise a `ValueError` that names the value unless it is above 0; it may be infinite."""
+    for name, value in values.items():
+        if not value > 0.0:
+            raise ValueError(f"{name}: must be positive, is {value}")

@@ -60,7 +60,7 @@ ESTIMATORS = Registry(
 )
 MOTION_MODELS = Registry(
     "motion model",
-    {"fgtrack.motion_models": {name: f"fgtrack.models.motion:{name.upper()}" for name in ("ctrv", "ctra", "cv")}},
+    {"fgtrack.motion_models": {name: f"fgtrack.models.motion:{name.upper()}" for name in ("ctrv", "ctra", "ct", "cv")}},
 )
 Factory = Callable[..., Any]  # Any: an estimator or a bank, see the module
 

@@ -1,4 +1,4 @@
-"""Motion models: exact flow, Jacobian and composing process noise of CTRV, CTRA and CV.
+"""Motion models: exact flow, Jacobian and composing process noise of CTRV, CTRA, CT and CV.
 
 All functions broadcast a state `x`, shape (..., n), and a duration `dt_s`, a float or an array of shape (...), which
 may be negative for `predict` and `jacobian`. Only `MeasurementModel.residual` wraps the yaw.
@@ -12,7 +12,7 @@ from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from fgtrack.core.checks import not_negative
+from fgtrack.core.checks import not_negative, positive
 from fgtrack.core.errors import CallError
 from fgtrack.core.geometry import cartesian, cartesian_gradient, polar, polar_gradient
 from fgtrack.core.linalg import congruence, kernels, symmetrise
@@ -213,6 +213,11 @@ class WhiteNoise(MotionModel):
         return self.density
 
 
+def relaxation_hz(density: float, std: float) -> float:
+    """Rate of the Ornstein-Uhlenbeck process with this spectral density and stationary standard deviation, in 1/s."""
+    return 0.5 * density / (std * std)
+
+
 @dataclass(frozen=True)
 class CTRV(WhiteNoise):
     """Constant turn rate and velocity; state x, y, yaw, speed, yaw rate.
@@ -241,14 +246,12 @@ class CTRV(WhiteNoise):
     def __post_init__(self) -> None:
         super().__post_init__()
         not_negative(resting_yaw_rad2ps=self.resting_yaw_rad2ps)
-        for name in ("yaw_rate_std_radps", "slow_mps"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name}: must be positive, is {getattr(self, name)}")
+        positive(yaw_rate_std_radps=self.yaw_rate_std_radps, slow_mps=self.slow_mps)
 
     @property
     def relaxation_hz(self) -> float:
-        """Rate at which the yaw rate relaxes to zero: its density over twice the variance `yaw_rate_std_radps`^2."""
-        return 0.5 * self.yaw_rate_density_rad2ps3 / self.yaw_rate_std_radps**2
+        """Rate at which the yaw rate relaxes to zero, see `relaxation_hz`."""
+        return relaxation_hz(self.yaw_rate_density_rad2ps3, self.yaw_rate_std_radps)
 
     @cached_property
     def noise(self) -> FloatArray:
@@ -267,6 +270,46 @@ class CTRA(CTRV):
     accel_density_m2ps5: float = 3.0**2 / 100.0
 
     state_names: ClassVar[tuple[str, ...]] = STATE_NAMES
+
+
+@dataclass(frozen=True)
+class CT(WhiteNoise):
+    """Coordinated turn: constant turn rate with the velocity along the axes of the map; x, y, vx, vy, yaw rate.
+
+    The velocity turns with the yaw rate, which relaxes to zero as that of `CTRV`. White noise acceleration drives vx
+    and vy alike. Positions are linear in this state but for the yaw rate, so it takes no false evidence of a heading
+    from an object at rest. It has no heading where the speed is zero: take `CTRV` where a sensor measures the yaw. By
+    default with the noise of Karle et al. 2023 (see `CTRV`).
+    """
+
+    position_density_m2ps: float = 0.2**2 / 100.0
+    velocity_density_m2ps3: float = 1.0**2 / 100.0
+    yaw_rate_density_rad2ps3: float = 0.5**2 / 100.0
+    yaw_rate_std_radps: float = field(default=0.5, kw_only=True)
+    """Standard deviation of the yaw rate of any object at any time; infinity for a random walk."""
+
+    state_names: ClassVar[tuple[str, ...]] = (*CARTESIAN, "yaw_rate_radps")
+    kind: ClassVar[int] = 2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        positive(yaw_rate_std_radps=self.yaw_rate_std_radps)
+
+    @property
+    def relaxation_hz(self) -> float:
+        """See `CTRV.relaxation_hz`."""
+        return relaxation_hz(self.yaw_rate_density_rad2ps3, self.yaw_rate_std_radps)
+
+    @cached_property
+    def density(self) -> FloatArray:
+        """See `WhiteNoise.density`; vx and vy have the same."""
+        q_position, q_velocity, q_yaw_rate = (getattr(self, name) for name in self.density_names())
+        return np.array([q_position, q_position, q_velocity, q_velocity, q_yaw_rate])
+
+    @cached_property
+    def noise(self) -> FloatArray:
+        """See `WhiteNoise.noise` and `fgtrack.models.transitions`."""
+        return np.array([*self.density, self.relaxation_hz])
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.io.config import InputConfig
 from fgtrack.io.run import EvaluationConfig
 from fgtrack.models.correlated_errors import with_correlated_errors
-from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
+from fgtrack.models.motion import CT, CTRA, CTRV, CV, MotionModel, WhiteNoise
 from fgtrack.models.road import OPEN_SPACE
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.load import dump, load, plain, with_settings
@@ -165,21 +165,40 @@ class InitiationConfig:
 NOISE_HZ = 100.0
 #: Of traffic: 1.5 m/s and 0.2 rad/s of change within a second.
 _STD_PER_S = {"position": 0.3, "yaw": 0.1, "speed": 15.0, "yaw_rate": 2.0}
-_BUILT_IN_MOTION: Mapping[str, type[CTRV | CV]] = {"ctrv_euler": CTRV, "ctrv": CTRV, "ctra": CTRA, "cv": CV}
+_BUILT_IN_MOTION: Mapping[str, type[WhiteNoise]] = {
+    "ctrv_euler": CTRV,
+    "ctrv": CTRV,
+    "ctra": CTRA,
+    "ct": CT,
+    "cv": CV,
+    "auto": CTRV,
+}
+
+
+def _turns(model: MotionModel) -> bool:
+    """True if the state has yaw, speed and yaw rate."""
+    return not model.cartesian and "yaw_rate_radps" in model.state_names
+
+
+def _gives_yaw(sensor: SensorModel) -> bool:
+    """True if detections of `sensor` have a yaw, measured or from the map."""
+    return "yaw_rad" in sensor.std or sensor.yaw_from_map_std_rad is not None
 
 
 @dataclass(frozen=True)
 class MotionConfig:
     """Motion model and its process noise."""
 
-    kind: str = "ctrv"
-    """`ctrv`, `ctra`, `cv`, `ctrv_euler` (the paper's steps), or the name of a plug-in."""
+    kind: str = "auto"
+    """`ctrv`, `ctra`, `ct`, `cv`, `ctrv_euler` (the paper's steps), or the name of a plug-in. `auto` is `ctrv` where a
+    sensor measures the yaw or takes it from the map, else `ct`: the heading of an object at rest is then unknown."""
     std_per_s: Mapping[str, NonNegativeFloat] = field(default_factory=_STD_PER_S.copy)
     """Process noise as the paper gives it: each step of 1 / `NOISE_HZ` adds (std_per_s / NOISE_HZ)^2, hence the density
-    std_per_s^2 / NOISE_HZ. `ctra` takes `accel` as well, `cv` takes `velocity` alone; of `ctrv_euler` `accel` is an
-    acceleration that drives the speed but is never estimated (Q5)."""
+    std_per_s^2 / NOISE_HZ. `ctra` takes `accel` as well, `ct` takes `position`, `velocity` and `yaw_rate`, `cv` takes
+    `velocity` alone. `auto` takes those of `ctrv`, and uses `speed` as `velocity` for `ct`. Of `ctrv_euler` `accel` is
+    an acceleration that drives the speed but is never estimated (Q5)."""
     yaw_rate_std_radps: PositiveFloat = 0.5
-    """Standard deviation of the yaw rate of any object at any time (`ctrv`, `ctra`). A yaw rate that nothing measures
+    """Standard deviation of the yaw rate of any object at any time (`ctrv`, `ctra`, `ct`). A yaw rate that nothing measures
     relaxes to zero with this uncertainty; `.inf` lets it drift without limit."""
     slow_mps: PositiveFloat = 1.0
     """Speed below which the yaw has more process noise (`ctrv`, `ctra`), because positions do not show it."""
@@ -205,14 +224,23 @@ class MotionConfig:
         """True if the model takes `parameters` and no `std_per_s`."""
         return self.kind not in _BUILT_IN_MOTION
 
-    def model(self) -> MotionModel:
-        """The motion model, with the densities; raises `ValueError` where `std_per_s` does not fit it."""
+    def model(self, sensors: Mapping[str, SensorModel] | None = None) -> MotionModel:
+        """The motion model, with the densities; raises `ValueError` where `std_per_s` does not fit it.
+
+        `sensors` decide what `auto` is: `ctrv` where there are none.
+        """
         if self.is_plug_in:
             return motion_model(self.kind, self.parameters)
+        if self.kind == "auto" and sensors and not any(map(_gives_yaw, sensors.values())):
+            names = {"position": "position", "speed": "velocity", "yaw_rate": "yaw_rate"}
+            std = {names[name]: value for name, value in self.std_per_s.items() if name in names}
+            return CT.from_std_per_step(std, NOISE_HZ, yaw_rate_std_radps=self.yaw_rate_std_radps)
         model = CTRA if self.is_driven else _BUILT_IN_MOTION[self.kind]
         others: dict[str, float] = {}
         if self.kind == "ctrv_euler":
             others = {"yaw_rate_std_radps": math.inf, "resting_yaw_rad2ps": 0.0}
+        elif issubclass(model, CT):
+            others = {"yaw_rate_std_radps": self.yaw_rate_std_radps}
         elif issubclass(model, CTRV):
             others = {
                 "yaw_rate_std_radps": self.yaw_rate_std_radps,
@@ -290,9 +318,9 @@ class Config:
             raise ValueError("defects: noise_per_step and saturated_yaw are of motion.kind ctrv_euler")
         for name, sensor in self.sensors.items():
             if sensor.correlation is not None and self.motion.kind == "ctrv_euler":
-                raise ValueError(f"sensors.{name}.correlation: needs motion.kind ctrv, ctra or cv")
+                raise ValueError(f"sensors.{name}.correlation: needs motion.kind ctrv, ctra, ct or cv")
             curvature = sensor.curvature_from_map_std_radpm
-            if curvature is not None and "yaw_rate_radps" not in self.motion.model().state_names:
+            if curvature is not None and not _turns(self.motion.model(self.sensors)):
                 raise ValueError(f"sensors.{name}.curvature_from_map_std_radpm: needs motion.kind ctrv or ctra")
 
     @classmethod
@@ -330,4 +358,4 @@ class Config:
 
     def motion_model(self) -> MotionModel:
         """The motion model of the tracks, with the errors of sensors that are correlated in time."""
-        return with_correlated_errors(self.motion.model(), self.used_sensors)
+        return with_correlated_errors(self.motion.model(self.used_sensors), self.used_sensors)

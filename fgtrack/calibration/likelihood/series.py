@@ -14,7 +14,7 @@ from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.initiation import Initiation
 from fgtrack.estimation.filters.track_initiation import TrackInitiation
 from fgtrack.models.correlated_errors import CorrelatedErrors
-from fgtrack.models.motion import CTRV, MotionModel, WhiteNoise
+from fgtrack.models.motion import CT, CTRV, MotionModel, WhiteNoise
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class NoiseSpace:
         base = model.base if isinstance(model, CorrelatedErrors) else model
         if not (self.num_motion and isinstance(base, WhiteNoise)):
             return None
-        if isinstance(base, CTRV) and base.relaxation_hz > 0.0:
+        if isinstance(base, (CT, CTRV)) and base.relaxation_hz > 0.0:
             return None
         rest = self.motion_model(np.zeros(self.num_motion)).process_noise(x, dt_s)
         units = np.eye(self.num_motion)

@@ -17,7 +17,7 @@ from fgtrack.estimation.filters.propagation import wrapped
 from fgtrack.estimation.filters.replay import Mixture, ReplayEkf, Step
 from fgtrack.estimation.registry import motion_model
 from fgtrack.models.correlated_errors import CorrelatedErrors
-from fgtrack.models.motion import CTRA, CTRV, MotionModel
+from fgtrack.models.motion import CT, CTRA, CTRV, CV, MotionModel
 from fgtrack.models.robust import penalty
 
 #: Of no model the probability falls below this, so that it can come back.
@@ -32,7 +32,8 @@ class ImmReplay(ReplayEkf):
     step of the window keeps the states by both models and their probabilities, so the order of arrival does not matter.
     With one model it is `ReplayEkf`. The innovation of a late measurement is predicted from those before it alone.
 
-    `other` is a model or its name; by default CTRA with the noise of `motion` beside CTRV, and CTRV beside CTRA.
+    `other` is a model or its name; by default CTRA with the noise of `motion` beside CTRV, CTRV beside CTRA, and
+    CV beside CT.
     `stay_s` is the mean sojourn time in each.
     """
 
@@ -134,6 +135,12 @@ def _converted(
     """A state of `model` in the form of another one that is `wanted`."""
     if model.state_names == wanted.state_names:
         return mean, covariance
+    if model.cartesian and wanted.cartesian:
+        selection = np.array([[float(a == b) for b in model.state_names] for a in wanted.state_names])
+        missing = [
+            0.0 if row.any() else wanted.start_variance(wanted.state_names[k]) for k, row in enumerate(selection)
+        ]
+        return selection @ mean, congruence(selection, covariance) + np.diag(missing)
     return wanted.from_kinematic(*model.kinematic(mean, covariance))
 
 
@@ -143,6 +150,8 @@ def _beside(motion: MotionModel, other: str | MotionModel) -> MotionModel | None
         raise CallError("takes no sensors with correlated errors")
     if isinstance(other, MotionModel):
         return other
+    if isinstance(motion, CT) and not other:
+        return CV(motion.velocity_density_m2ps3)
     default = "ctrv" if isinstance(motion, CTRA) else "ctra" if isinstance(motion, CTRV) else ""
     if not (other or default):
         return None

@@ -72,13 +72,7 @@ _SPACE = f"Tuple(({f'{MATRIX}, ' * 4}float64[::1], {f'{MATRIX}, ' * 3}float64[::
 
 @shared(f"b1(int64, float64[::1], int64[::1], int64[:, ::1], float64[:, :, ::1], {_SPACE}, {MATRIX})")
 def _retrodict(
-    motion: int,
-    noise: FloatArray,
-    slots: IntArray,
-    labels: IntArray,
-    steps: FloatArray,
-    space: _Space,
-    now: FloatArray,
+    motion: int, noise: FloatArray, slots: IntArray, labels: IntArray, steps: FloatArray, space: _Space, now: FloatArray
 ) -> bool:
     """Smooth `now`, the state after the last of `slots`, back to the prediction of the first, which is new.
     From step to step (Rauch, Tung and Striebel), x_j + C s and P_j + C (P - P_-) C' with the prediction x_-, P_- of the
