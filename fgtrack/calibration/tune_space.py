@@ -71,7 +71,8 @@ class ConfigNoise:
     def _motion_stds(self) -> dict[str, float]:
         """Positive noise parameters of the motion model, by name; none of a plug-in's, which has its own."""
         motion = self.config.motion
-        return {} if motion.is_plug_in else {name: value for name, value in motion.std_per_s.items() if value > 0.0}
+        names = motion.noise_names(self.config.used_sensors)
+        return {name: motion.std_per_s[name] for name in names if motion.std_per_s[name] > 0.0}
 
     def _motion_with(self, stds: Mapping[str, float]) -> MotionConfig:
         return replace(self.config.motion, std_per_s={**self.config.motion.std_per_s, **stds})

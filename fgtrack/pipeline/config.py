@@ -175,6 +175,10 @@ _BUILT_IN_MOTION: Mapping[str, type[WhiteNoise]] = {
 }
 
 
+#: Names of the noise of `CT` by those of `CTRV`, which `motion.kind: auto` takes.
+_OF_CT = {"position": "position", "speed": "velocity", "yaw_rate": "yaw_rate"}
+
+
 def _turns(model: MotionModel) -> bool:
     """True if the state has yaw, speed and yaw rate."""
     return not model.cartesian and "yaw_rate_radps" in model.state_names
@@ -224,6 +228,16 @@ class MotionConfig:
         """True if the model takes `parameters` and no `std_per_s`."""
         return self.kind not in _BUILT_IN_MOTION
 
+    def _is_cartesian(self, sensors: Mapping[str, SensorModel] | None) -> bool:
+        """True if `auto` is `ct` with `sensors`."""
+        return self.kind == "auto" and bool(sensors) and not any(map(_gives_yaw, (sensors or {}).values()))
+
+    def noise_names(self, sensors: Mapping[str, SensorModel] | None = None) -> tuple[str, ...]:
+        """Names in `std_per_s` that the model has with `sensors`, see `model`."""
+        if self.is_plug_in:
+            return ()
+        return tuple(name for name in self.std_per_s if name in _OF_CT or not self._is_cartesian(sensors))
+
     def model(self, sensors: Mapping[str, SensorModel] | None = None) -> MotionModel:
         """The motion model, with the densities; raises `ValueError` where `std_per_s` does not fit it.
 
@@ -231,9 +245,8 @@ class MotionConfig:
         """
         if self.is_plug_in:
             return motion_model(self.kind, self.parameters)
-        if self.kind == "auto" and sensors and not any(map(_gives_yaw, sensors.values())):
-            names = {"position": "position", "speed": "velocity", "yaw_rate": "yaw_rate"}
-            std = {names[name]: value for name, value in self.std_per_s.items() if name in names}
+        if self._is_cartesian(sensors):
+            std = {_OF_CT[name]: self.std_per_s[name] for name in self.noise_names(sensors)}
             return CT.from_std_per_step(std, NOISE_HZ, yaw_rate_std_radps=self.yaw_rate_std_radps)
         model = CTRA if self.is_driven else _BUILT_IN_MOTION[self.kind]
         others: dict[str, float] = {}

@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 import numpy as np
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.linalg import identity, mahalanobis_squared, symmetrise
+from fgtrack.core.linalg import congruence, identity, mahalanobis_squared, symmetrise
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
