@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import add_product_transposed, copy, inlined, merged, njit, product, scratch, shared
+from fgtrack.core.compiled import add_product_transposed, check, copy, inlined, merged, njit, product, scratch, shared
 from fgtrack.core.types import FloatArray
 
 #: Kinds of motion: constant turn rate and velocity (or acceleration), constant velocity, and constant turn rate with
@@ -51,6 +51,17 @@ _COS = np.array([(-1.0) ** k / math.factorial(2 * k) for k in range(7)])
 _SIN = np.array([(-1.0) ** k / math.factorial(2 * k + 1) for k in range(7)])
 
 _TYPES = f"float64[::1], float64, {'float64[::1], ' * 2}float64[:, ::1], float64[:, ::1]"
+
+
+@inlined
+def check_noise(kind: int, noise: FloatArray, n: int) -> None:
+    """Raise `IndexError` unless `noise` has the parameters of a motion of this `kind` with n entries of the state."""
+    if kind == ARC:
+        check(n >= 5 and len(noise) >= n + 3)
+    elif kind == TURN:
+        check(n == 5 and len(noise) >= n + 1)
+    else:
+        check(n == 4 and len(noise) >= n)
 
 
 @inlined
@@ -338,5 +349,8 @@ def transitions(
     kind: int, x: FloatArray, dt_s: FloatArray, noise: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
 ) -> None:
     """Write mean (m, n), F and Q (m, n, n) of states (m, n) after `dt_s` (m,)."""
+    m, n = x.shape
+    check_noise(kind, noise, n)
+    check(len(dt_s) >= m and mean.shape == x.shape and F.shape == (m, n, n) and Q.shape == (m, n, n))
     for k in range(len(x)):
         transition(kind, x[k], dt_s[k], noise, mean[k], F[k], Q[k])

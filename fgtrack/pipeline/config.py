@@ -202,8 +202,8 @@ class MotionConfig:
     `velocity` alone. `auto` takes those of `ctrv`, and uses `speed` as `velocity` for `ct`. Of `ctrv_euler` `accel` is
     an acceleration that drives the speed but is never estimated (Q5)."""
     yaw_rate_std_radps: PositiveFloat = 0.5
-    """Standard deviation of the yaw rate of any object at any time (`ctrv`, `ctra`, `ct`). A yaw rate that nothing measures
-    relaxes to zero with this uncertainty; `.inf` lets it drift without limit."""
+    """Standard deviation of the yaw rate of any object at any time (`ctrv`, `ctra`, `ct`). A yaw rate that nothing
+    measures relaxes to zero with this uncertainty; `.inf` lets it drift without limit."""
     slow_mps: PositiveFloat = 1.0
     """Speed below which the yaw has more process noise (`ctrv`, `ctra`), because positions do not show it."""
     resting_yaw_rad2ps: NonNegativeFloat = 6.0

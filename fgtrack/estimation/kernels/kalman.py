@@ -21,7 +21,7 @@ from fgtrack.core.compiled import (
     whiten,
 )
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.models.transitions import transition
+from fgtrack.models.transitions import check_noise, transition
 
 _VECTORS, _MATRICES, _READ = "float64[:, ::1]", "float64[:, :, ::1]", "Array(float64, 3, 'C', readonly=True)"
 
@@ -103,7 +103,7 @@ def propagate(motion: int, noise: FloatArray, mean: FloatArray, P: FloatArray, s
     """Move states (m, n) and (m, n, n), each by its own number of `steps` (m,) of `dt_s`: f(x) and F P F' + Q."""
     n = mean.shape[1]
     check(len(P) >= len(mean) and len(steps) >= len(mean) and P.shape[1] == n and P.shape[2] == n)
-    check(len(density) >= n)
+    check_noise(motion, noise, n)
     F, FP, Q, x = scratch(n, n), scratch(n, n), scratch(n, n), scratch(n)
     for i in range(len(mean)):
         for a in range(n):

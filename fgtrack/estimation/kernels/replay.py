@@ -27,7 +27,7 @@ from fgtrack.core.compiled import (
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.kernels.kalman import conclude, marginal_nis
-from fgtrack.models.transitions import ARC, transition
+from fgtrack.models.transitions import ARC, check_noise, transition
 
 FAILED, TOO_OLD, IN_SEQUENCE, OUT_OF_SEQUENCE, NO_ROOM = range(5)
 _YAW = 2
@@ -223,6 +223,7 @@ def fuse(
     track are in use, nothing changes either. Returns the number of these tracks.
     """
     m, k, n, num_without_room = len(tracks), y.shape[1], steps.shape[3], 0
+    check_noise(motion, noise, n)
     _check(tracks, 0, order, labels, steps, windows, n)
     check(measured.shape[0] == order.shape[0] and measured.shape[1] == order.shape[1] and measured.shape[2] > k)
     check(measured.shape[3] >= k and labels.shape[2] >= k + 2 and len(entries) >= k and z.shape[1] >= k)
@@ -303,6 +304,7 @@ def ahead(
     Known are, and counted, those whose windows have begun; at the present others have their first state.
     """
     n, count = steps.shape[3], 0
+    check_noise(motion, noise, n)
     _check(tracks, -1, order, labels, steps, windows, n)
     check(len(means) == len(tracks) and len(covariances) == len(tracks) and len(known) == len(tracks))
     F, FP = scratch(n, n), scratch(n, n)

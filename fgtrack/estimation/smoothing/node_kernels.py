@@ -31,7 +31,7 @@ from fgtrack.estimation.smoothing.kernels import (
     regularise,
 )
 from fgtrack.estimation.smoothing.terms import NEAR_NS
-from fgtrack.models.transitions import transition
+from fgtrack.models.transitions import check_noise, transition
 
 #: Nodes that are about to leave the window are relinearised where they have moved by this share of the thresholds.
 LEAVING_SHARE = 0.5
@@ -239,7 +239,8 @@ def linearise_motion(kind: int, noise: FloatArray, tracks: IntArray, starts: Int
     info, all_ns, numbers, labels, _, points, blocks, _ = nodes
     n = points.shape[2]
     check_nodes(tracks, nodes, 0)
-    check(len(starts) >= len(tracks) and len(density) >= n)
+    check(len(starts) >= len(tracks))
+    check_noise(kind, noise, n)
     mean = scratch(n)
     for t in range(len(tracks)):
         track = tracks[t]

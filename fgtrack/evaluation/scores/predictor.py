@@ -18,7 +18,7 @@ ARC_S = 0.2
 
 
 def arc_positions(states: FloatArray, ahead_s: FloatArray) -> FloatArray:
-    """Positions (n, m, 2) of states x, y, yaw, speed, yaw rate (n, 5) after `ahead_s` (m,), on arcs of constant turn rate."""
+    """Positions (n, m, 2) of states x, y, yaw, speed, yaw rate (n, 5) after `ahead_s` (m,), on arcs."""
     return np.asarray(_ARC.predict(states[:, None], ahead_s)[..., :2])
 
 
