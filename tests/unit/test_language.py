@@ -13,12 +13,6 @@ MODULES = sorted((ROOT / "fgtrack").rglob("*.py"))
 DOCS = sorted((ROOT / "docs").glob("*.md"))
 EXPERIMENTS = sorted((ROOT / "experiments").rglob("README.md"))
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS, *EXPERIMENTS]
-#: Words of a page at most, as `wc -w` counts them.
-LIMITS = {
-    "README": 600, "index": 300, "first-minute": 500, "recordings": 1900, "delays": 1500, "advise": 1400, "ledger": 700,
-    "live": 1000, "sweeps": 900, "inspecting": 1200, "exactness": 1100, "baseline": 700, "configuration": 1900,
-    "run-folder": 1100, "metrics": 1950, "api": 300, "extending": 1500, "testing": 950, "speed": 500, "security": 400,
-}  # fmt: skip
 #: Words with which no docstring begins: it begins with what is returned, or with a noun.
 OPENINGS = ("What", "Whether", "Of", "Those", "How", "So")
 #: Words of which the field has others: an index, a result, reported, specified, recomputed, corrected, unusual.
@@ -66,17 +60,3 @@ def test_a_page_uses_the_words_of_the_field(page: Path) -> None:
     text = re.sub("```.*?```|`[^`]*`", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
     banned = BANNED.search(text)
     assert banned is None, f"{page.name}: {banned}"
-
-
-def words(*pages: Path) -> int:
-    return sum(len(page.read_text(encoding="utf-8").split()) for page in pages)
-
-
-@pytest.mark.parametrize("page", [ROOT / "README.md", *DOCS], ids=lambda page: page.stem)
-def test_a_page_is_no_longer_than_its_limit(page: Path) -> None:
-    assert words(page) <= LIMITS.get(page.stem, 1000)
-
-
-def test_documentation_and_experiments_have_their_limits() -> None:
-    assert words(*DOCS) <= 24_000
-    assert words(*EXPERIMENTS) <= 9_000
