@@ -92,12 +92,13 @@ def test_a_track_that_is_known_by_its_rear_expects_yaws_half_a_turn_off() -> Non
     assert found.evidence[1, 1] < 1e-6
 
 
-def expected_terms(row: dict[str, float], mean: Sequence[float], front: bool) -> list[float]:
+def expected_terms(row: dict[str, float], mean: Sequence[float], front: bool, cross: float = 0.0) -> list[float]:
     """The terms of p(z | front or rear) as the definition has it, by SciPy: right, flipped, anything."""
     names = list(row)
     x = np.array(mean)
     H = np.eye(5)[[["x_m", "y_m", "yaw_rad", "speed_mps"].index(name) for name in names]]
     R = np.diag([VARIANCES[name] for name in names])
+    R[0, -1] = R[-1, 0] = cross
     z = np.array(list(row.values()))
     right, flip, other = SHARES
     has_speed = "speed_mps" in names
@@ -116,7 +117,8 @@ def expected_terms(row: dict[str, float], mean: Sequence[float], front: bool) ->
         y = (z - H @ x)[kept]
         if has_speed and reverse:
             y[-1] = -z[-1] - x[3]
-        return float(multivariate_normal(np.zeros(len(kept)), (H @ P @ H.T + R)[np.ix_(kept, kept)]).pdf(y))
+        D = np.diag([-1.0 if reverse and name == "speed_mps" else 1.0 for name in names])
+        return float(multivariate_normal(np.zeros(len(kept)), (H @ P @ H.T + D @ R @ D)[np.ix_(kept, kept)]).pdf(y))
 
     flips = [density(front, reverse) for reverse in (False, True)] if has_speed else [density(front, False)]
     return [right * density(not front, not front), flip * float(np.mean(flips)), other * without(not front) / math.tau]
@@ -125,10 +127,14 @@ def expected_terms(row: dict[str, float], mean: Sequence[float], front: bool) ->
 @pytest.mark.parametrize("speed", [{}, {"speed_mps": 1.1}, {"speed_mps": -0.4}])
 @pytest.mark.parametrize("yaw_rad", [0.4, 1.4, -2.6, 3.0])
 def test_the_evidence_is_the_ratio_of_the_two_densities(yaw_rad: float, speed: dict[str, float]) -> None:
+    """With a speed, its error and that of x are correlated."""
+    cross = 0.04 if speed else 0.0
     row, mean = at(yaw_rad, **speed), [0.0, 0.0, 0.3, 0.5, 0.0]
     group, zero = group_of([row]), np.zeros(1, dtype=np.int64)
+    if speed:
+        group.stack.R[:, 0, -1] = group.stack.R[:, -1, 0] = cross
     found = read(group, zero, zero, tracks_of(mean), facings_of(0.0), np.full(len(row) + 1, math.inf))
-    front, rear = (sum(expected_terms(row, mean, is_front)) for is_front in (True, False))
+    front, rear = (sum(expected_terms(row, mean, is_front, cross)) for is_front in (True, False))
     assert found.evidence[0, 0] == pytest.approx(math.log(front / rear), rel=1e-9, abs=1e-9)
 
 
