@@ -448,3 +448,18 @@ def test_rows_of_ended_tracks_are_used_again() -> None:
             facing.forget(track_id - 20)
     assert len(facing._log_odds) <= 32
     assert facing.at("lidar", tuple(range(980, 1000))).log_odds.tolist() == [0.0] * 20
+
+
+def test_the_heading_of_the_map_is_turned_for_a_track_known_by_its_rear_and_teaches_nothing() -> None:
+    tracks = Tracks()
+    candidates = candidates_of(group_of([at(0.3 + math.pi)], assumed=("yaw_rad",)))
+    states = tracks_of(DRIVING)
+    before = tracks.facing.at("lidar", (0,))
+    found = GatedMahalanobis()(candidates, states, facings=before)
+    result = tracks.facing.read("lidar", START_NS + 1, candidates, found.pairs, found.readings, states)
+    assert result is not None
+    assert (result.readings.tolist(), result.words) == ([HALF_TURN], [None])
+    after = tracks.facing.at("lidar", (0,))
+    assert (after.log_odds == before.log_odds).all()
+    assert (after.shares == before.shares).all()
+    assert tracks.facing.counts == {}
