@@ -1,11 +1,14 @@
 """Warnings about a recording or a run."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from fgtrack.core.geometry import may_be_radians
+import numpy as np
 
-__all__ = ["EGO", "Diagnostic", "in_degrees"]
+from fgtrack.core.geometry import may_be_radians
+from fgtrack.core.types import BoolArray, FloatArray
+
+__all__ = ["EGO", "Diagnostic", "in_degrees", "too_late"]
 
 EGO = "ego"
 """Subject of a diagnostic about the ego."""
@@ -34,3 +37,28 @@ def in_degrees(about: str, name: str, least: float, most: float) -> Diagnostic |
         return None
     text = f"{name} goes up to {max(-least, most):.4g}: degrees? Convert it by `{{path: ..., degrees: true}}`"
     return Diagnostic(about, text, spoils=True)
+
+
+_LATE_SHARE, _FEWEST_LATE = 0.01, 3  # less is chance
+
+
+def too_late(
+    sensor: str, delays_s: FloatArray, limits: Iterable[tuple[str, float | None]], refused: BoolArray | None = None
+) -> Diagnostic | None:
+    """Return the diagnostic of a sensor whose delays, shape (n,), are longer than a configured time; None if few are.
+
+    `limits` are keys of the configuration and their times in seconds, None where there is no limit. `refused` is true
+    of what was not used, shape (n,); None if everything too late was not.
+    """
+    for key, limit_s in limits:
+        if limit_s is None or not len(delays_s):
+            continue
+        late = int(np.count_nonzero((delays_s > limit_s) & (True if refused is None else refused)))
+        if late >= max(_FEWEST_LATE, _LATE_SHARE * len(delays_s)):
+            share, most_s = 100.0 * late / len(delays_s), float(np.quantile(delays_s, 0.99))
+            text = (
+                f"{share:.3g} % come later than {key} {limit_s:g} s allows and are not used; 99 % come within "
+                f"{most_s:.3g} s: raise {key} above it, or correct the clock"
+            )
+            return Diagnostic(sensor, text)
+    return None

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fgtrack.core.diagnostic import EGO, Diagnostic, in_degrees
+from fgtrack.core.diagnostic import EGO, Diagnostic, in_degrees, too_late
 from fgtrack.core.geometry import cartesian
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
@@ -50,7 +50,7 @@ _NAME_EGO = "name its topic in the configuration (`fgtrack info` lists the topic
 
 def diagnostics(run: Run) -> list[Diagnostic]:
     """Defects of `run`, as far as its files show them."""
-    kinds = (_angles, _ego, _map, _sensors, _failures, _fragmentation, _identities, _yaws)
+    kinds = (_angles, _ego, _map, _sensors, _latency, _failures, _fragmentation, _identities, _yaws)
     return [diagnostic for kind in kinds for diagnostic in kind(run)]
 
 
@@ -203,11 +203,28 @@ def _sensors(run: Run) -> Iterator[Diagnostic]:
         yield Diagnostic(sensor, f"{count} of {mine.num_rows} {name}: {cure}")
 
 
+def _latency(run: Run) -> Iterator[Diagnostic]:
+    """Delays longer than what the estimator or the inbox allows, where they do not explain most of the detections."""
+    explained = {sensor for sensor, _, _, _ in _mostly(run)}
+    for sensor, mine in by_sensor(run.tables["updates"]):
+        if sensor not in explained and mine["stamp_ns"].any():
+            delays_s, refused = (mine["receipt_ns"] - mine["stamp_ns"]) / NS_PER_S, mine["disposition"] == "too_old"
+            if late := too_late(sensor, delays_s, _limits(run, sensor, "reach_s"), refused):
+                yield late
+
+
+def _limits(run: Run, sensor: str, window_s: str) -> list[tuple[str, float | None]]:
+    """Keys of a sensor's largest delay and of the window, with their times; `window_s` names the time of the window."""
+    window, own = run.meta.get("effective") or {}, _section(run, "sensors").get(sensor) or {}
+    return [
+        (f"sensors.{sensor}.max_delay_s", own.get("max_delay_s")),
+        (str(window.get("lag_key")), window.get(window_s, window.get("lag_s"))),
+    ]
+
+
 def _too_old(run: Run, sensor: str, updates: Table) -> str:
     delay_s = float(np.median(updates["receipt_ns"] - updates["stamp_ns"])) / NS_PER_S
-    window = run.meta.get("effective") or {}
-    own = f"sensors.{sensor}.max_delay_s", (_section(run, "sensors").get(sensor) or {}).get("max_delay_s")
-    for key, limit_s in (own, (window.get("lag_key"), window.get("lag_s"))):
+    for key, limit_s in _limits(run, sensor, "lag_s"):
         if limit_s is not None and delay_s > limit_s:
             return f"median delay {delay_s:.3g} s, allowed {limit_s:g} s: raise {key}, or correct the clock"
     return f"median delay {delay_s:.3g} s, but no track is as old as these detections: check births, gate and clock"

@@ -12,6 +12,7 @@ from typing import Self
 import numpy as np
 
 from fgtrack.core.checks import LARGEST_NS
+from fgtrack.core.diagnostic import too_late
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import NS_PER_S, period_ns, seconds
 from fgtrack.core.types import (
@@ -44,7 +45,7 @@ MOST_AHEAD_NS = 60 * NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class Lateness:
-    """Delays of the newest 1,000 messages of a sensor, or of the ego: receipt minus stamp of the message."""
+    """Delays of the newest 1,000 messages of a sensor, or of the ego: receipt minus the oldest stamp of the message."""
 
     messages: int
     """All that were received."""
@@ -126,6 +127,7 @@ class Tracker:
         self._ticks_ns: deque[int] = deque(maxlen=NEWEST)
         self._node = Node(None if config.clock.node_hz is None else period_ns(config.clock.node_hz))
         self._skipped = 0
+        self._warnings: dict[str, str] = {}  # by sensor
         self._turn = threading.RLock()
 
     @classmethod
@@ -182,6 +184,21 @@ class Tracker:
                 silent_s = max(seconds(self._last.now_ns - since_ns), 0.0)
                 result[name] = Lateness(one.messages, *_spread_s(one.newest_ns), silent_s)
             return result
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Lines on sensors whose lists come later than the configuration allows, each once, with the key to set."""
+        with self._turn:
+            self._take_arrivals()
+            window = self.config.effective
+            for name, sensor in self.config.used_sensors.items():
+                if name not in self._warnings:
+                    delays_s = np.array(self._tracker.delays[name].newest_ns) / NS_PER_S
+                    limits = [(f"sensors.{name}.max_delay_s", sensor.max_delay_s), (window.lag_key, window.reach_s)]
+                    late = too_late(name, delays_s, limits)
+                    if late is not None:
+                        self._warnings[name] = str(late)
+            return tuple(self._warnings.values())
 
     @property
     def timing(self) -> TickTiming:

@@ -115,8 +115,8 @@ def in_any_direction(
     A state with a yaw that is unknown is linearised along that yaw, and its predicted position spreads along it alone.
     Until a second position gives the direction, the position gets the same variance across, (speed_std dt)^2.
 
-    `directed` are tracks with a second position, and its stamp. Before that stamp a filter knows the first position
-    alone: its position spreads by at least half of speed_std dt along the yaw. A smoother knows both.
+    `directed` are tracks with a second position, and its stamp. Before that stamp the state of a filter follows from
+    the first position alone: it spreads by at least half of speed_std dt along the yaw. A smoother has used both.
     """
     covariances = states.covariances.copy()
     for row, track_id in enumerate(states.track_ids):

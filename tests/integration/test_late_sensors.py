@@ -256,6 +256,22 @@ def test_nor_do_sensors_that_take_turns(estimator: str) -> None:
     assert found == Found([1.0, 1.0], [1, 1])
 
 
+@pytest.mark.parametrize(("estimator", "key"), [("ekf-replay", "filter.storage_s"), ("smoother", "smoother.lag_s")])
+def test_an_estimator_with_a_shorter_memory_than_a_delay_warns_once(estimator: str, key: str) -> None:
+    watched = [Watched(10.0), Watched(10.0, lambda at_s: 0.1 if at_s < 2.0 else 2.6)]
+    for reach_s, is_warned in ((1.5, True), (3.0, False)):
+        tracker = Tracker(config(2, estimator, reach_s=reach_s, smoother__ring_s=0.0, smoother__late="drop"))
+        for message in messages(watched, 6.0):
+            tracker.receive(message)
+            tracker.tick(message.receipt_ns)
+        found = tracker.warnings
+        assert found == tracker.warnings
+        assert [(f"{key} {reach_s:g} s" in one, "s1: " in one, "2.6 s" in one) for one in found] == (
+            [(True,) * 3] * is_warned
+        )
+        assert bool(tracker.counts["s1"].get("too_old")) is is_warned
+
+
 def test_a_live_tracker_and_a_replay_await_the_same_lists() -> None:
     watched = [Watched(10.0), Watched(5.0, 1.1), Watched(2.0, 2.0)]
     configured, made = config(3, "ekf-replay"), messages(watched, 6.0, seed=5)

@@ -74,6 +74,21 @@ def test_too_old_names_the_limit_that_was_passed(tmp_path: Path) -> None:
     assert "allowed 3 s: raise filter.storage_s" in by_storage.text
 
 
+@pytest.mark.parametrize(("share", "is_warned"), [(0.2, True), (0.005, False)])
+def test_delays_longer_than_the_memory_of_the_estimator_are_told_once(
+    share: float, is_warned: bool, tmp_path: Path
+) -> None:
+    """Most detections come in time."""
+    rows = []
+    for k in range(1000):
+        is_late = k % round(1.0 / share) == 0
+        fate = Disposition.TOO_OLD if is_late else Disposition.IN_SEQUENCE
+        rows.append(update(tick=k, disposition=fate, delay_ns=3_500_000_000 if is_late else 100_000_000))
+    run = run_of(tmp_path / "run", rows, CONFIG.replace("{max_delay_s: 0.4}", "{}"), FILTER)
+    text = "lidar: 20 % come later than filter.storage_s 3 s allows and are not used; 99 % come within 3.5 s: raise"
+    assert [text in each for each in map(str, diagnostics(run)) if "later than" in each] == [True] * is_warned
+
+
 def test_stamps_that_nobody_set_are_told(tmp_path: Path) -> None:
     unset = [UpdateRecord("lidar", 0, 10**18 + k, 0, Disposition.IN_SEQUENCE) for k in range(3)]
     (found,) = diagnostics(run_of(tmp_path / "a", unset))
