@@ -1,5 +1,6 @@
-"""The error of an input that breaks off in the middle, and how to work with what comes before the break."""
+"""Errors of readers in words, and the error of an input that breaks off in the middle."""
 
+import re
 from collections.abc import Iterable, Iterator
 from typing import Generic, TypeVar
 
@@ -11,6 +12,46 @@ _T = TypeVar("_T")
 def one_line(error: BaseException) -> str:
     """Text of `error` in one line of at most 200 characters."""
     return " ".join(str(error)[:2000].split())[:200] or type(error).__name__
+
+
+#: What the type of a value is called in a file.
+_IN_FILES = {
+    "NoneType": "null",
+    "bool": "true or false",
+    "str": "a text",
+    "string": "a text",
+    "bytes": "bytes",
+    "dict": "an object with names",
+    "list": "a list",
+    "tuple": "a list",
+    "ndarray": "an array",
+    **dict.fromkeys(("int", "float", "Decimal", "decimal.Decimal"), "a number"),
+}
+#: Where Python's messages name the type of the value that was found.
+_FOUND = re.compile(
+    r"^'([\w.]+)' object|^(string|list|tuple) indices|, not '([\w.]+)'$|cannot unpack .*? ([\w.]+) object"
+)
+_OTHER_LENGTH = re.compile(r"values to unpack|^zip\(\) argument|index out of range")
+
+
+def cause(error: BaseException) -> str:
+    """Return what an exception of a reader says of the value that it met, in words and in one line."""
+    text = one_line(error)
+    if isinstance(error, KeyError):
+        return f"{error.args[0]!r:.60} is missing" if error.args else "a name is missing"
+    if isinstance(error, TypeError | AttributeError):
+        found = _FOUND.search(text)
+        name = next(filter(None, found.groups())) if found else ""
+        return f"{_IN_FILES.get(name, 'a value')} where the format has something else"
+    if isinstance(error, UnicodeDecodeError):
+        return "bytes that are not text in UTF-8"
+    if isinstance(error, RecursionError):
+        return "values are nested too deeply"
+    if _OTHER_LENGTH.search(text):
+        return "a list has another length"
+    if isinstance(error, ArithmeticError):
+        return "a number is out of range"
+    return text
 
 
 class TruncatedInput(DataError):  # noqa: N818 - it names what the input is; the readers have given all before it

@@ -28,7 +28,7 @@ from fgtrack.core.types import (
     Message,
     TruthState,
 )
-from fgtrack.io.errors import one_line
+from fgtrack.io.errors import cause
 
 __all__ = ["InvalidMessageError", "validated", "validated_detection", "validated_head", "validated_message"]
 
@@ -54,8 +54,9 @@ def validated(path: Path, messages: Callable[[], Iterator[Message]], done: bool 
     except (FgtrackError, MemoryError):
         raise
     except Exception as error:  # whatever a foreign input makes a reader raise
-        what = f"{type(error).__name__}: {one_line(error)}"
-        raise DataError(f"{path}: cannot be read beyond message {count} ({what}): repair or convert it") from error
+        raise DataError(
+            f"{path}: cannot be read beyond message {count} ({cause(error)}): repair or convert it"
+        ) from error
 
 
 def validated_message(message: Message) -> Message:

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from fuzz import values
+
 #: What numbers and texts are replaced by.
 ODD: tuple[Any, ...] = (
     *(0, -1, 1, 3, 10**6, 10**18, -(2**31) - 1, 2**63 - 1, 2**63, 10**30, 0.0, -0.0, 0.5, 1e-300, 1e-9, 1e9, -1e19),
@@ -104,15 +106,18 @@ def _json(rng: np.random.Generator, content: bytes) -> bytes:
     """A value anywhere in a document of JSON, or in one of its lines."""
     lines = [content] if content[:1] not in b"{[" or b"\n{" not in content else content.splitlines()
     place = int(rng.integers(len(lines)))
-    lines[place] = json.dumps(_corrupted(rng, json.loads(lines[place]))).encode()
+    document = {"": json.loads(lines[place])}
+    values.change(rng, document)
+    lines[place] = json.dumps(document.get("")).encode()
     return b"\n".join(lines) + b"\n"
 
 
 def _yaml(rng: np.random.Generator, content: bytes) -> bytes:
     from ruamel.yaml import YAML  # slow
 
-    text = io.StringIO()
-    YAML(typ="safe", pure=True).dump(_corrupted(rng, YAML(typ="safe", pure=True).load(content)), text)
+    text, document = io.StringIO(), YAML(typ="safe", pure=True).load(content)
+    values.change(rng, document)
+    YAML(typ="safe", pure=True).dump(document, text)
     return text.getvalue().encode("utf-8", "replace")
 
 
@@ -146,32 +151,6 @@ def _mcap(rng: np.random.Generator, content: bytes) -> bytes:
 
 def _odd(rng: np.random.Generator) -> Any:
     return ODD[rng.integers(len(ODD))]
-
-
-def _corrupted(rng: np.random.Generator, value: Any) -> Any:
-    """A value inside `value` replaced by something odd, left out, doubled or renamed; `value` is changed."""
-    places = [(value, key) for key in _keys(value)]
-    for inner, key in places:  # grows
-        places += [(inner[key], below) for below in _keys(inner[key])]
-    if not places:
-        return _odd(rng)
-    inner, key = places[rng.integers(len(places))]
-    match rng.integers(8):
-        case 0:
-            del inner[key]
-        case 1 if isinstance(inner, list):
-            inner.insert(key, inner[key])
-        case 1:
-            inner[str(_odd(rng))] = inner[key]
-        case 2:
-            inner[key] = [inner[key]]
-        case _:
-            inner[key] = _odd(rng)
-    return value
-
-
-def _keys(value: Any) -> list[Any]:
-    return list(value) if isinstance(value, dict) else list(range(len(value))) if isinstance(value, list) else []
 
 
 _BY_SUFFIX: dict[str, tuple[Mutation, ...]] = {

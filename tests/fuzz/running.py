@@ -15,6 +15,8 @@ from fuzz.inputs import Files
 from fuzz.targets import RUN, Target
 
 MOST_MB, LONGEST_S, LONGEST_LINE = 2000.0, 20.0, 2000
+#: What a user cannot read: exceptions that tell nothing of the file.
+_OF_PYTHON = re.compile(r"\b(Key|Type|Attribute|Index|Assertion|Name|UnboundLocal|Recursion)Error\b")
 _WARNING = re.compile(r"\.py:\d+: \w*Warning")
 
 
@@ -45,6 +47,8 @@ def problem_of(server: Server, target: Target, files: Files, folder: Path, right
 def _problem(done: Outcome) -> str | None:
     if "internal error" in done.said or "Traceback" in done.said or _WARNING.search(done.said):
         return done.said.strip()[-600:]
+    if _OF_PYTHON.search(done.said):
+        return f"speaks of Python: {done.said.strip()[-600:]}"
     if done.code not in (0, 1, 2) or (done.code and not done.said.strip()):
         return f"exit code {done.code}, said {done.said!r}"
     for line in done.said.splitlines():

@@ -120,9 +120,13 @@ def test_of_several_scenes_one_is_named(tmp_path):
     ("table", "text", "complaint"),
     [
         ("ego_pose", "[{", r"ego_pose\.json: is not JSON"),
-        ("ego_pose", '[{"token": "p0"}]', r"not those of nuScenes \(KeyError: 'translation'\)"),
+        ("ego_pose", '[{"token": "p0"}]', r"sample_data\.json or ego_pose\.json .* \('translation' is missing\)"),
         ("sample", "3", r"sample\.json: is not JSON of the expected form"),
-        ("sample_annotation", '[{"sample_token": "s0", "instance_token": "zz"}]', "not those of nuScenes"),
+        (
+            "sample_annotation",
+            '[{"sample_token": "s0", "instance_token": "zz"}]',
+            r"not a table of nuScenes \('zz' is missing\)",
+        ),
     ],
 )
 def test_damaged_tables_are_one_line(tmp_path, table, text, complaint):
@@ -143,6 +147,12 @@ def test_without_tables_the_setting_is_named(tmp_path):
     assert len(messages(path, tables="meta")) == 6
     (tmp_path / "meta/sample_annotation.json").unlink()
     assert [type(item) for item in messages(path, tables="meta")] == [EgoState, DetectionList] * 2
+
+
+def test_damaged_boxes_are_named_with_their_sample(tmp_path):
+    path = data(tmp_path, boxes={"s0": [box(110.0), None]})
+    with pytest.raises(DataError, match=r"results\.json: sample 's0': .* \(null where the format has something else\)"):
+        messages(path)
 
 
 def test_a_path_may_be_relative(tmp_path, monkeypatch):

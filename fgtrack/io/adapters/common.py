@@ -18,6 +18,7 @@ from fgtrack.core.errors import DataError, FgtrackError
 from fgtrack.core.files import read_whole
 from fgtrack.core.time import NS_PER_S, NS_PER_UNIT
 from fgtrack.core.types import MEASURABLE, Detection, FloatArray, Frame
+from fgtrack.io.errors import cause
 
 PLANAR = [0, 1, 5]
 """Indices of x, y and the rotation about z in a covariance of ROS."""
@@ -53,7 +54,7 @@ def reported_as(text: str) -> Iterator[None]:
     except FgtrackError:
         raise
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
-        raise DataError(f"{text} ({type(error).__name__}: {str(error)[:200]})") from error
+        raise DataError(f"{text} ({cause(error)})") from error
 
 
 def json_values(file: Path, begin: re.Pattern[str] = _A_LIST, **form: Any) -> Iterator[Any]:  # Any: parsed JSON

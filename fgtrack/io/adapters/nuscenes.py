@@ -45,17 +45,20 @@ Json = Any
 def read_scene(file: Path, settings: NuscenesInput) -> Iterator[Message]:
     """Messages of a scene in the order of receipt; at one stamp the truth first, then the ego, then the boxes."""
     tables = _tables(file, settings)
-    with reported_as(f"{file}: it or its tables in {tables} are not those of nuScenes"):
+    with reported_as(f"{tables}: scene.json or sample.json is not a table of nuScenes"):
         samples = _samples(tables, file, settings)
+    with reported_as(f"{file}: is not a list of boxes by sample"):
         boxes = {token: listed for token, listed in _results(file) if token in samples}
+    with reported_as(f"{tables}: sample_data.json or ego_pose.json is not a table of nuScenes"):
         egos = _egos(tables, samples)
+    with reported_as(f"{tables}: category.json, instance.json or sample_annotation.json is not a table of nuScenes"):
         truth = _truth(tables, samples, settings)
-        lists = [
-            DetectionList(settings.sensor, stamp_ns, stamp_ns, objects, "map", left_out)
-            for token, stamp_ns in samples.items()
-            if token in boxes
-            for objects, left_out in [split(_boxes(boxes[token], settings))]
-        ]
+    lists = []
+    for token, stamp_ns in samples.items():
+        if token in boxes:
+            with reported_as(f"{file}: sample {token!r:.60}: is not a list of boxes"):
+                objects, left_out = split(_boxes(boxes[token], settings))
+            lists.append(DetectionList(settings.sensor, stamp_ns, stamp_ns, objects, "map", left_out))
     messages: list[Message] = [*truth, *egos, *lists]
     yield from sorted(messages, key=attrgetter("receipt_ns"))
 
