@@ -17,7 +17,7 @@ from fgtrack.calibration.paired_replay import PairedReplay
 from fgtrack.calibration.trial import TRIAL_S, beginning, suspicions
 from fgtrack.calibration.tune import tuned
 from fgtrack.calibration.tune_space import TuneRules
-from fgtrack.core.diagnostic import EGO
+from fgtrack.core.diagnostic import EGO, late_ego
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DetectionList, Message
@@ -119,7 +119,7 @@ class Adviser:
         shares = overtaken(seen, sensors)
         self._take(self._late(shares))
         self._take(window_findings([one for one in seen.values() if one.has_stamps], self._config))
-        self._take(self._ego())
+        self._take(self._ego(seen))
         self._on_step("tracking", 0.3)
         self._take(self._diagnostics(self._outcome(self._config)))
         self._withdraw_harm(before)
@@ -191,8 +191,9 @@ class Adviser:
     def _diagnostics(self, outcome: Outcome | None) -> Iterator[Finding]:
         """Yield the diagnostics of a run with the settings, except of sensors with a known problem."""
         known = {one.about for one in self._findings if one.weight >= _USELESS}
+        told = {one.text for one in self._findings}
         for one in [] if outcome is None else diagnostics(outcome.run):
-            if one.about not in known:
+            if one.about not in known and f"{one.text}." not in told:
                 yield Finding("track", one.about, 70.0, f"{one.text}.", one.settings)
 
     def _offsets(self) -> Iterator[Finding]:
@@ -227,8 +228,8 @@ class Adviser:
             )
             yield Finding("late", "estimator", 60.0, text, {"estimator": "ekf-replay"})
 
-    def _ego(self) -> Iterator[Finding]:
-        """Yield gaps and low rates of the ego."""
+    def _ego(self, seen: Mapping[str, Arrivals]) -> Iterator[Finding]:
+        """Yield gaps and low rates of the ego, and that it is later than the lists of `seen` that it places."""
         one = self._arrivals.get(EGO)
         if one is None or len(one.stamps_ns) < FEWEST or not one.has_stamps:
             return
@@ -240,10 +241,15 @@ class Adviser:
                 "detections in the middle cannot be transformed to the map, and fail."
             )
             yield Finding("ego", EGO, 65.0, text)
+        lists = (item for item in self._messages if isinstance(item, DetectionList))
+        moving = {item.sensor for item in lists if item.frame != "map"}
+        delays_s = {name: each.quantile_s(0.5) for name, each in seen.items() if name in moving and each.has_stamps}
+        if late := late_ego(one.quantile_s(0.5), delays_s):
+            yield Finding("ego", EGO, 55.0, f"{late.text}.")
         if one.period_s > _SLOW_EGO_S:
             text = (
-                f"one state every {milliseconds(one.period_s)}: between them the pose is that of constant speed and "
-                "yaw rate, which fails in a turn. Record it more often."
+                f"one state every {milliseconds(one.period_s)}: between them the pose is estimated, and "
+                "uncertain in a turn. Record it more often."
             )
             yield Finding("ego", EGO, 35.0, text)
 

@@ -8,10 +8,11 @@ import numpy as np
 from fgtrack.core.geometry import may_be_radians
 from fgtrack.core.types import BoolArray, FloatArray
 
-__all__ = ["EGO", "Diagnostic", "in_degrees", "too_late"]
+__all__ = ["EGO", "Diagnostic", "in_degrees", "late_ego", "too_late"]
 
 EGO = "ego"
 """Subject of a diagnostic about the ego."""
+_LATE_S = 0.05  # two or three states of an ego at 50 Hz
 
 
 @dataclass(frozen=True)
@@ -62,3 +63,22 @@ def too_late(
             )
             return Diagnostic(sensor, text)
     return None
+
+
+def late_ego(ego_delay_s: float, delays_s: Mapping[str, float]) -> Diagnostic | None:
+    """Return the diagnostic that the ego's messages come later than those of sensors; None where they do not.
+
+    `ego_delay_s` is the usual time from stamp to receipt of the ego's messages, `delays_s` that of the lists of each
+    sensor that the ego's pose places.
+    """
+    sooner = {name: delay_s for name, delay_s in delays_s.items() if ego_delay_s - delay_s > _LATE_S}
+    if not sooner:
+        return None
+    later_ms = 1e3 * (ego_delay_s - min(sooner.values()))
+    own = ", ".join(f"{name} {1e3 * delay_s:.0f} ms" for name, delay_s in sooner.items())
+    text = (
+        f"its states come up to {later_ms:.0f} ms later than the lists that they place (delay {1e3 * ego_delay_s:.0f} "
+        f"ms, {own}): these wait up to ego.wait_s, or are placed by an extrapolated pose and count as less certain; "
+        "send the ego's states sooner, or correct their clock"
+    )
+    return Diagnostic(EGO, text)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fgtrack.core.diagnostic import EGO, Diagnostic, in_degrees, too_late
+from fgtrack.core.diagnostic import EGO, Diagnostic, in_degrees, late_ego, too_late
 from fgtrack.core.geometry import cartesian
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray
@@ -146,13 +146,15 @@ def _angles(run: Run) -> Iterator[Diagnostic]:
 
 
 def _ego(run: Run) -> Iterator[Diagnostic]:
-    """No ego where it is needed, or reasons for which more than half of its states were refused."""
+    """No ego where it is needed, a late one, or reasons for which more than half of its states were refused."""
     num_states = run.tables["ego"].num_rows
     if not num_states and any(name == "failed" for _, _, name, _ in _mostly(run)):
         yield Diagnostic(EGO, f"no state was received, so nothing in its frame can be placed: {_NAME_EGO}")
     elif not num_states and _ego_speeds_births(run):
         text = f"no state was received, so new objects are assumed to stand still: {_NAME_EGO}"
         yield Diagnostic(EGO, f"{text}, or set birth.ego_speed_factor to 0", _STANDING)
+    if num_states and (late := late_ego(_delay_s(run.tables["ego"]), _placed_delays_s(run))):
+        yield late
     if jumps := run.meta.get("ego_jumps"):
         times = "once" if jumps == 1 else f"{jumps} times"
         yield Diagnostic(EGO, f"its position jumps {times}: detections are misplaced there, cut the recording in parts")
@@ -160,6 +162,18 @@ def _ego(run: Run) -> Iterator[Diagnostic]:
         if 0 < num_states < 2 * count:
             text = f"{count} of {num_states} states not used, {reason}: look at the clock of its driver"
             yield Diagnostic(EGO, text)
+
+
+def _placed_delays_s(run: Run) -> dict[str, float]:
+    """Median delay [s] of the lists of each sensor that has detections in a moving frame."""
+    detections = run.tables["detections"]
+    moving = detections.where(detections["frame"] != "map")
+    return {name: _delay_s(mine) for name, mine in by_sensor(moving)}
+
+
+def _delay_s(table: Table) -> float:
+    """Median delay [s] of the rows of a table, from stamp to receipt."""
+    return float(np.median(table["receipt_ns"] - table["stamp_ns"])) / NS_PER_S
 
 
 def _map(run: Run) -> Iterator[Diagnostic]:
@@ -223,7 +237,7 @@ def _limits(run: Run, sensor: str, window_s: str) -> list[tuple[str, float | Non
 
 
 def _too_old(run: Run, sensor: str, updates: Table) -> str:
-    delay_s = float(np.median(updates["receipt_ns"] - updates["stamp_ns"])) / NS_PER_S
+    delay_s = _delay_s(updates)
     for key, limit_s in _limits(run, sensor, "lag_s"):
         if limit_s is not None and delay_s > limit_s:
             return f"median delay {delay_s:.3g} s, allowed {limit_s:g} s: raise {key}, or correct the clock"

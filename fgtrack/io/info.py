@@ -1,13 +1,14 @@
 """Contents of an input: its topics or sensors with counts, rates and delays."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
 
+from fgtrack.core.diagnostic import late_ego
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import seconds, wrong_unit
 from fgtrack.core.types import DetectionList, EgoState, Message
@@ -67,6 +68,7 @@ def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
     used: dict[BagTopic, str] = {}
     times: dict[BagTopic, list[_Times]] = defaultdict(list)
     own: dict[BagTopic, list[bool]] = defaultdict(list)
+    still = set[str]()
     problem: str | None = None
     if kind == "recording":
         bag = Bag(path, given.message_definitions)
@@ -77,16 +79,19 @@ def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
             problem = str(error) if config else None
         readable = UntilBreak(bag.stamps())
     else:
-        readable = UntilBreak(_stamps(open_input(path, given).messages(), own))
+        readable = UntilBreak(_stamps(open_input(path, given).messages(), own, still))
     for topic, receipt_ns, stamp_ns in readable:
         times[topic].append((receipt_ns, stamp_ns))
     if readable.error is not None:
         problem = str(readable.error)
     if kind != "recording":
         used = {topic: topic.type.replace("detections", f"detections {topic.name}") for topic in times}
-    topics = tuple(
-        _topic(topic, times[topic], used.get(topic), own.get(topic, ()))
-        for topic in sorted(times, key=attrgetter("name"))
+    topics = _with_late_ego(
+        [
+            _topic(topic, times[topic], used.get(topic), own.get(topic, ()))
+            for topic in sorted(times, key=attrgetter("name"))
+        ],
+        still,
     )
     receipts_ns = [receipt_ns for every in times.values() for receipt_ns, _ in every]
     if not receipts_ns:
@@ -120,11 +125,24 @@ def _topic(topic: BagTopic, times: Sequence[_Times], used_as: str | None, own: S
     return TopicInfo(topic.name, topic.type, len(times), rate_hz, delay, used_as, note, late)
 
 
+def _with_late_ego(topics: Sequence[TopicInfo], still: Set[str]) -> tuple[TopicInfo, ...]:
+    """Return `topics`, with a note at that of the ego if it is later than those of sensors that are not `still`."""
+    delays_s = {topic.name: topic.delay["p50_s"] for topic in topics if topic.delay is not None and topic.note is None}
+    lists = {each.name for each in topics if (each.used_as or "").startswith("detections")} - still
+    placed_s = {name: delay_s for name, delay_s in delays_s.items() if name in lists}
+    noted = []
+    for topic in topics:
+        late = late_ego(delays_s[topic.name], placed_s) if topic.used_as == "ego" and topic.name in delays_s else None
+        noted.append(topic if late is None else replace(topic, note=late.text))
+    return tuple(noted)
+
+
 def _stamps(
-    messages: Iterator[Message], own: Mapping[BagTopic, list[bool]]
+    messages: Iterator[Message], own: Mapping[BagTopic, list[bool]], still: set[str]
 ) -> Iterator[tuple[BagTopic, int, int | None]]:
     """Sensor or kind, receipt and stamp of `messages`, as of a recording with a topic for each.
-    `own` gets for each detection whose identity came before, True if it is older than the newest of these.
+    `own` gets for each detection whose identity came before, True if it is older than the newest of these. `still` gets
+    the sensors with detections in the map, which no ego places.
     """
     order = OwnOrder()
     for message in messages:
@@ -133,6 +151,8 @@ def _stamps(
         topic = BagTopic(name, kind, None)
         if isinstance(message, DetectionList):
             own[topic] += order.late(message)
+            if message.frame == "map":
+                still.add(message.sensor)
         yield topic, message.receipt_ns, message.stamp_ns
 
 

@@ -2,7 +2,7 @@
 
 import threading
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import index as integer
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 
 from fgtrack.core.checks import LARGEST_NS
-from fgtrack.core.diagnostic import too_late
+from fgtrack.core.diagnostic import EGO, late_ego, too_late
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import NS_PER_S, period_ns, seconds
 from fgtrack.core.types import (
@@ -128,6 +128,7 @@ class Tracker:
         self._node = Node(None if config.clock.node_hz is None else period_ns(config.clock.node_hz))
         self._skipped = 0
         self._warnings: dict[str, str] = {}  # by sensor
+        self._placed: dict[str, None] = {}  # sensors with lists in the frame of the ego or their own
         self._turn = threading.RLock()
 
     @classmethod
@@ -187,7 +188,10 @@ class Tracker:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Lines on sensors whose lists come later than the configuration allows, each once, with the key to set."""
+        """Lines on sensors whose lists come later than the configuration allows, each once, with the key to set.
+
+        Another line names an ego whose states are later than the lists that they place.
+        """
         with self._turn:
             self._take_arrivals()
             window = self.config.effective
@@ -198,7 +202,16 @@ class Tracker:
                     late = too_late(name, delays_s, limits)
                     if late is not None:
                         self._warnings[name] = str(late)
-            return tuple(self._warnings.values())
+            return *self._warnings.values(), *self._late_ego()
+
+    def _late_ego(self) -> Iterator[str]:
+        """Yield the line on an ego that is late by the newest messages."""
+        delays_s = {name: _spread_s(self._tracker.delays[name].newest_ns)[0] for name in (EGO, *self._placed)}
+        known_s = {name: delay_s for name, delay_s in delays_s.items() if delay_s is not None}
+        ego_s = known_s.pop(EGO, None)
+        late = None if ego_s is None else late_ego(ego_s, known_s)
+        if late is not None:
+            yield str(late)
 
     @property
     def timing(self) -> TickTiming:
@@ -265,6 +278,8 @@ class Tracker:
             try:
                 if isinstance(message, DetectionList):
                     message = corrected(message, self.config.sensors)
+                    if message.frame != "map":
+                        self._placed[message.sensor] = None
                 self._tracker.receive(message)
             except Exception as error:
                 self._refuse(message, f"message cannot be read ({type(error).__name__})")

@@ -14,7 +14,7 @@ from fgtrack.core.checks import LARGEST
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.linalg import ASYMMETRY, congruence, is_covariance, symmetrise
 from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
-from fgtrack.core.types import EgoState, FloatArray
+from fgtrack.core.types import YAW, EgoState, FloatArray
 from fgtrack.models.dead_reckoning import Reckoned, ReportedErrors, reckoned
 from fgtrack.tracking.ego_growth import EgoGrowth
 
@@ -33,6 +33,8 @@ _VALUES = attrgetter(*_FIELDS)
 _YAW, _YAW_RATE = _FIELDS.index("yaw_rad"), _FIELDS.index("yaw_rate_radps")
 _REMEMBERED_S = 1.0  # memory of a track; an error of the velocity is independent from one to the next
 _LEAST_STD = 0.01  # m, m/s: no position or speed is reported more exactly
+_FAR_APART_NS = nanoseconds(0.15)  # two states; at 70 m/s and 0.3 rad/s their chord is 6 cm off the arc
+_ROUNDING = np.diag(np.square([_LEAST_STD, _LEAST_STD, 1e-3, _LEAST_STD, 1e-3]))  # of x, y, yaw, speed, yaw rate
 
 
 class EgoPose(NamedTuple):
@@ -334,7 +336,7 @@ class EgoTrajectory:
     def _interpolated(self, before: EgoState, after: EgoState, stamp_ns: int) -> EgoPose:
         """Pose between two states, the short way round, with the mean of their covariances (None counts as zero).
         The error of (1 - share) a + share b has at most this covariance, and just this where the two errors are the
-        same, as those of a localisation within a moment nearly are.
+        same, as those of a localisation within a moment nearly are. Between states that are far apart see `_bridged`.
         """
         share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
         covariance = newer = None
@@ -343,6 +345,8 @@ class EgoTrajectory:
         if covariance is not newer:
             older, newer = (np.zeros((5, 5)) if item is None else item for item in (covariance, newer))
             covariance = (1.0 - share) * older + share * newer
+        if self._growth is not None and after.stamp_ns - before.stamp_ns > _FAR_APART_NS and 0.0 < share < 1.0:
+            return self._bridged(self._growth, before, after, stamp_ns, covariance)
         return EgoPose(
             before.x_m + share * (after.x_m - before.x_m),
             before.y_m + share * (after.y_m - before.y_m),
@@ -351,3 +355,24 @@ class EgoTrajectory:
             before.yaw_rate_radps + share * (after.yaw_rate_radps - before.yaw_rate_radps),
             covariance,
         )
+
+    def _bridged(
+        self, growth: EgoGrowth, before: EgoState, after: EgoState, stamp_ns: int, covariance: FloatArray | None
+    ) -> EgoPose:
+        """Pose between two states that are far apart: the states extrapolated from either side, by their certainties.
+
+        What drives the ego before the stamp is independent of what drives it after, so the two are fused as
+        independent estimates. To the covariance of the result comes the `covariance` that the states have.
+        """
+        means, weights = list[FloatArray](), list[FloatArray]()
+        for ego in (before, after):
+            mean = np.array(extrapolated(ego, stamp_ns)[:5])
+            mean[YAW] = mean[YAW] if not means else means[0][YAW] + wrap_angle(mean[YAW] - means[0][YAW])
+            means.append(mean)
+            weights.append(np.linalg.inv(growth.covariance(ego, seconds(stamp_ns - ego.stamp_ns)) + _ROUNDING))
+        own = symmetrise(np.asarray(np.linalg.inv(weights[0] + weights[1]), dtype=np.float64))
+        mean = own @ (weights[0] @ means[0] + weights[1] @ means[1])
+        x_m, y_m, yaw_rad, speed_mps, yaw_rate_radps = mean.tolist()
+        total = own if covariance is None else own + covariance
+        total.flags.writeable = False
+        return EgoPose(x_m, y_m, yaw_rad, speed_mps, yaw_rate_radps, total)

@@ -50,6 +50,13 @@ def test_the_uncertainty_fits_what_the_vehicle_does(vehicle: Drive, wait_s: floa
     assert LOW < mean_nees(vehicle, SEEDS, wait_s=wait_s) < HIGH
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("late_s", [0.0, 0.4])
+@pytest.mark.parametrize("ego_hz", [1.0, 3.0])
+def test_positions_between_two_states_of_a_slow_ego_are_consistent(ego_hz: float, late_s: float) -> None:
+    assert LOW < mean_nees(replace(CAR, ego_hz=ego_hz, late_s=late_s), SEEDS) < HIGH
+
+
 @pytest.mark.slow
 def test_the_default_smoother_is_consistent_with_a_late_ego() -> None:
     assert LOW < mean_nees(replace(CAR, late_s=0.45), SEEDS, "smoother") < HIGH

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -98,6 +99,32 @@ def test_between_two_states_and_with_an_unknown_uncertainty_nothing_grows() -> N
     plain = EgoTrajectory(1.0, 1.0)
     plain.receive(states[0])
     assert plain.pose_at(START_NS + ms(300.0), 0).covariance is None
+
+
+@pytest.mark.parametrize("apart", [10, 25, 50])
+def test_between_states_that_are_far_apart_the_pose_follows_the_bend_and_has_an_uncertainty(apart: int) -> None:
+    states = drive(1.0, 0.2, speed_mps=15.0)
+    source, line = trajectory(states[::apart]), EgoTrajectory(1.0, 1.0)
+    for each in states[::apart]:
+        line.receive(each)
+    squares = []
+    for truth in states[1300 : 1300 + 4 * apart]:
+        if (truth.stamp_ns - START_NS) % ms(20.0 * apart):
+            pose, straight = source.pose_at(truth.stamp_ns, 0), line.pose_at(truth.stamp_ns, 0)
+            error = np.subtract(pose[:5], [truth.x_m, truth.y_m, truth.yaw_rad, truth.speed_mps, truth.yaw_rate_radps])
+            squares.append((error[2] ** 2 / pose.covariance[2, 2], error[:2] @ error[:2], error[2] ** 2))
+            squares[-1] += ((straight.yaw_rad - truth.yaw_rad) ** 2,)
+    yaw_nees, _, own, linear = np.mean(squares, axis=0)
+    assert yaw_nees < 1.5
+    assert own < linear
+
+
+def test_states_whose_speeds_are_wrong_do_not_throw_the_pose_out_of_the_gap() -> None:
+    states = [replace(each, speed_mps=0.0, yaw_rate_radps=0.0) for each in drive(1.0, 0.1)[::25]]
+    source = trajectory(states)
+    for before, after in pairwise(states[-5:]):
+        pose = source.pose_at((before.stamp_ns + after.stamp_ns) // 2, 0)
+        assert min(before.x_m, after.x_m) <= pose.x_m <= max(before.x_m, after.x_m)
 
 
 def test_before_the_first_state_a_pose_is_as_uncertain_as_after_the_last() -> None:
