@@ -179,7 +179,8 @@ class EgoGrowth:
         back = math.copysign(1.0, duration_s)
         signs = np.array([1.0, 1.0, 1.0, back, back])  # backwards in time, speed and yaw rate are reversed
         x = signs * [ego.x_m, ego.y_m, ego.yaw_rad, ego.speed_mps, ego.yaw_rate_radps]
-        motions = CTRV(0.0, 0.0, along, 0.0), CTRV(0.0, 0.0, 0.0, turn)
+        free: dict[str, float] = {"yaw_rate_std_radps": math.inf, "resting_yaw_rad2ps": 0.0}  # a mere integral
+        motions = CTRV(0.0, 0.0, along, 0.0, **free), CTRV(0.0, 0.0, 0.0, turn, **free)
         by_accel, by_yaw_accel = (
             np.asarray(signs[:, None] * motion.process_noise(x, abs(duration_s)) * signs) for motion in motions
         )
