@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import FloatArray
 from fgtrack.models.correlated_errors import CorrelatedErrors
-from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
+from fgtrack.models.motion import CT, CTRA, CTRV, CV, MotionModel
 
 #: Tolerances of the integrator; states are in m, rad and s.
 _RELATIVE, _ABSOLUTE = 1e-11, 1e-14
@@ -49,30 +49,47 @@ class Moments(NamedTuple):
 
 
 def _ctrv(model: CTRV) -> MotionEquation:
-    position, yaw, speed, yaw_rate = (
-        model.position_density_m2ps,
-        model.yaw_density_rad2ps,
-        model.speed_density_m2ps3,
-        model.yaw_rate_density_rad2ps3,
-    )
+    relaxation_hz = _relaxation_hz(model.yaw_rate_density_rad2ps3, model.yaw_rate_std_radps)
+    position, speed, yaw_rate = model.position_density_m2ps, model.speed_density_m2ps3, model.yaw_rate_density_rad2ps3
     return MotionEquation(
-        drift=lambda x: [x[3] * np.cos(x[2]), x[3] * np.sin(x[2]), x[4], 0.0, 0.0],
-        diffusion=lambda x: np.diag([position, position, yaw, speed, yaw_rate]),
+        drift=lambda x: [x[3] * np.cos(x[2]), x[3] * np.sin(x[2]), x[4], 0.0, -relaxation_hz * x[4]],
+        diffusion=lambda x: _diagonal(position, position, _yaw_density(model, x), speed, yaw_rate),
     )
 
 
 def _ctra(model: CTRA) -> MotionEquation:
-    position, yaw, speed, yaw_rate, accel = (
-        model.position_density_m2ps,
-        model.yaw_density_rad2ps,
-        model.speed_density_m2ps3,
-        model.yaw_rate_density_rad2ps3,
-        model.accel_density_m2ps5,
-    )
+    relaxation_hz = _relaxation_hz(model.yaw_rate_density_rad2ps3, model.yaw_rate_std_radps)
+    position, speed, yaw_rate = model.position_density_m2ps, model.speed_density_m2ps3, model.yaw_rate_density_rad2ps3
+    accel = model.accel_density_m2ps5
     return MotionEquation(
-        drift=lambda x: [x[3] * np.cos(x[2]), x[3] * np.sin(x[2]), x[4], x[5], 0.0, 0.0],
-        diffusion=lambda x: np.diag([position, position, yaw, speed, yaw_rate, accel]),
+        drift=lambda x: [x[3] * np.cos(x[2]), x[3] * np.sin(x[2]), x[4], x[5], -relaxation_hz * x[4], 0.0],
+        diffusion=lambda x: _diagonal(position, position, _yaw_density(model, x), speed, yaw_rate, accel),
     )
+
+
+def _ct(model: CT) -> MotionEquation:
+    relaxation_hz = _relaxation_hz(model.yaw_rate_density_rad2ps3, model.yaw_rate_std_radps)
+    position, velocity = model.position_density_m2ps, model.velocity_density_m2ps3
+    return MotionEquation(
+        drift=lambda x: [x[2], x[3], -x[4] * x[3], x[4] * x[2], -relaxation_hz * x[4]],
+        diffusion=lambda x: np.diag([position, position, velocity, velocity, model.yaw_rate_density_rad2ps3]),
+    )
+
+
+def _relaxation_hz(density: float, std: float) -> float:
+    """Rate r of dw = -r w dt + noise of a spectral density, whose stationary variance density / (2 r) is std^2."""
+    return density / (2.0 * std**2)
+
+
+def _yaw_density(model: CTRV, x: Any) -> Any:
+    """Spectral density of the yaw at the states x (n, ...): a slow object has more."""
+    return model.yaw_density_rad2ps + model.resting_yaw_rad2ps / (1.0 + (x[3] / model.slow_mps) ** 2) ** 2
+
+
+def _diagonal(*entries: Any) -> FloatArray:
+    """Diagonal matrices of entries that are numbers or arrays (m,), shape (m, n, n)."""
+    rows = np.stack(np.broadcast_arrays(*entries), axis=-1)
+    return np.asarray(rows[..., None] * np.eye(len(entries)))
 
 
 def _cv(model: CV) -> MotionEquation:
@@ -90,8 +107,10 @@ def _with_errors(model: CorrelatedErrors) -> MotionEquation:
     times_s = [time_s for _, time_s in model.times_s]
 
     def diffusion(x: Any) -> FloatArray:
-        D = np.diag([0.0] * n + [2.0 / time_s for time_s in times_s])
-        D[:n, :n] = base.diffusion(x[:n])
+        of_object = np.asarray(base.diffusion(x[:n]))
+        D = np.zeros((*of_object.shape[:-2], len(x), len(x)))
+        D[..., :n, :n] = of_object
+        D[..., range(n, len(x)), range(n, len(x))] = [2.0 / time_s for time_s in times_s]
         return D
 
     return MotionEquation(
@@ -105,6 +124,7 @@ def _with_errors(model: CorrelatedErrors) -> MotionEquation:
 EQUATIONS: dict[type[MotionModel], Callable[[Any], MotionEquation]] = {
     CTRV: _ctrv,
     CTRA: _ctra,
+    CT: _ct,
     CV: _cv,
     CorrelatedErrors: _with_errors,
 }

@@ -13,7 +13,7 @@ import numpy as np
 from fgtrack.core.types import STATE_NAMES, FloatArray
 from fgtrack.models.correlated_errors import CorrelatedErrors, split_error, total_error
 from fgtrack.models.measurement import COMPONENTS, MeasurementModel, SensorPose, measured_position, measurement_model
-from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
+from fgtrack.models.motion import CT, CTRA, CTRV, CV, MotionModel
 from fgtrack.models.sensors import Correlation, SensorModel
 from fgtrack.testing import equations
 from fgtrack.testing.equations import Linearisation
@@ -22,7 +22,7 @@ from fgtrack.testing.promise import BrokenPromiseError, fault, require, run_all
 _NUM_STATES = 6
 #: Entries of measurements and Jacobians must agree with the definition to this share.
 _TOLERANCE = 1e-9
-_MOTIONS: tuple[MotionModel, ...] = (CTRV(), CTRA(), CV(), CorrelatedErrors(CTRV(), (("sensor.x_m", 1.0),)))
+_MOTIONS: tuple[MotionModel, ...] = (CTRV(), CTRA(), CT(), CV(), CorrelatedErrors(CTRV(), (("sensor.x_m", 1.0),)))
 
 
 class Case(NamedTuple):

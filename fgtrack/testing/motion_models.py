@@ -150,7 +150,7 @@ def _moves_in_compiled_loops_as_by_its_equation(cases: _EquationCases, case: int
     F, Q = cases.expected.F[case], cases.expected.Q[case]
     expected = F @ P[0] @ F.T + Q
     propagate = kernels("fgtrack.estimation.kernels.kalman").propagate
-    propagate(model.kind, model.density, mean, P, np.ones(1, dtype=np.int64), float(dt_s[case]))
+    propagate(model.kind, model.noise, mean, P, np.ones(1, dtype=np.int64), float(dt_s[case]))
     _each_equal(mean[0], cases.expected.mean[case], 1.0, "the state in a compiled loop")
     sigma = np.sqrt(np.diag(expected))
     _each_equal(P[0], expected, np.outer(sigma, sigma), "the covariance in a compiled loop")

@@ -22,7 +22,7 @@ from fgtrack.estimation.registry import ESTIMATORS, MOTION_MODELS
 from fgtrack.models import transitions
 from fgtrack.models.correlated_errors import CorrelatedErrors
 from fgtrack.models.measurement import AT_ORIGIN, COMPONENTS, MeasurementModel, SensorPose, measurement_model
-from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel, WhiteNoise
+from fgtrack.models.motion import CT, CTRA, CTRV, CV, MotionModel, WhiteNoise
 from fgtrack.testing import BrokenPromiseError, measurement_model_checks, motion_model_checks
 from fgtrack.testing.equations import EQUATIONS
 
@@ -39,7 +39,7 @@ VALUE, BY_STATE, BY_POSE = (
 SPLITS = "splits an error that is correlated in time"
 FACTORS = (1.1, -1.0)
 
-WHITE: tuple[WhiteNoise, ...] = (CTRV(), CTRA(), CV())
+WHITE: tuple[WhiteNoise, ...] = (CTRV(), CTRA(), CT(), CV())
 ERRORS = CorrelatedErrors(CV(), (("sensor.x_m", 1.0), ("sensor.y_m", 2.0)))
 MODELS: tuple[MotionModel, ...] = (*WHITE, ERRORS)
 by_type = pytest.mark.parametrize("model", MODELS, ids=lambda model: type(model).__name__)
@@ -96,10 +96,10 @@ def sabotage(patch: pytest.MonkeyPatch, model: MotionModel, what: str, entry: En
     right = transitions.transitions
 
     def transition(
-        kind: int, x: FloatArray, dt_s: FloatArray, density: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
+        kind: int, x: FloatArray, dt_s: FloatArray, noise: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
     ) -> None:
-        right(kind, x, dt_s, density, mean, F, Q)
-        if x.shape[1] == model.dim:
+        right(kind, x, dt_s, noise, mean, F, Q)
+        if isinstance(model, WhiteNoise) and kind == model.kind and x.shape[1] == model.dim:
             change(mean, F, Q)
 
     patch.setattr(transitions, "transitions", transition)
@@ -122,7 +122,7 @@ def _changed(
 
 
 def test_every_shipped_motion_model_has_an_equation_and_is_sabotaged_here() -> None:
-    shipped = {MOTION_MODELS.load(name) for name in ("ctrv", "ctra", "cv")} | {CorrelatedErrors}
+    shipped = {MOTION_MODELS.load(name) for name in ("ctrv", "ctra", "ct", "cv")} | {CorrelatedErrors}
     assert set(EQUATIONS) == shipped == {type(model) for model in MODELS}
 
 
@@ -153,20 +153,28 @@ def test_a_fault_of_one_motion_model_breaks_no_promise_of_another(
 
 
 @pytest.mark.parametrize(
-    ("model", "field"),
-    [(model, field) for model in WHITE for field in model.density_names()],
-    ids=lambda value: value if isinstance(value, str) else type(value).__name__,
+    ("model", "index"),
+    [
+        (model, int(index))
+        for model in WHITE
+        for index in np.flatnonzero(model.noise)
+        if index not in ((1, 3) if model.cartesian else (1,))  # the second axis has the noise of the first one
+    ],
+    ids=lambda value: str(value) if isinstance(value, int) else type(value).__name__,
 )
-def test_a_density_that_is_10_percent_off_composes_and_is_found_by_the_equation(
-    monkeypatch: pytest.MonkeyPatch, model: WhiteNoise, field: str
+def test_a_parameter_that_is_10_percent_off_composes_and_is_found_by_the_equation(
+    monkeypatch: pytest.MonkeyPatch, model: WhiteNoise, index: int
 ) -> None:
-    """A parameter that counts for more than is documented."""
-    checks, kind = motion_model_checks(model), type(model)
+    """A density, or another parameter of the compiled transition, that counts for more than is documented."""
     promised = {MEAN, JACOBIAN, NOISE, COMPILED, COMPOSES}
+    checks, noise = motion_model_checks(model), model.noise.copy()
     assert broken(checks, promised) == set()
-    more = kind(**{name: getattr(model, name) * (1.1 if name == field else 1.0) for name in model.density_names()})
-    monkeypatch.setitem(model.__dict__, "density", more.density)
-    assert broken(checks, promised) == {NOISE, COMPILED}
+    noise[index : index + (2 if index == 0 or (index == 2 and model.cartesian) else 1)] *= 1.1
+    monkeypatch.setitem(model.__dict__, "noise", noise)
+    found = broken(checks, promised)
+    assert {NOISE, COMPILED} <= found
+    assert COMPOSES not in found
+    assert ({MEAN, JACOBIAN} & found == set()) == (index != model.dim)  # the rate at which a yaw rate relaxes
 
 
 @pytest.mark.slow
@@ -174,9 +182,9 @@ def test_a_fault_in_the_source_of_the_compiled_transition_is_found(tmp_path: Pat
     """The package is copied, mutated and compiled: verify compares the machine code, and not a second writing."""
     shutil.copytree(Path(fgtrack.__file__).parent, tmp_path / "fgtrack", ignore=shutil.ignore_patterns("__pycache__"))
     file = tmp_path / "fgtrack" / "models" / "transitions.py"
-    text, right = file.read_text(), "q_yaw, q_speed, q_rate = density[2] * t,"
+    text, right = file.read_text(), "q = noise[k] + extra[i] if k == 2 else noise[k]"
     assert text.count(right) == 1
-    file.write_text(text.replace(right, "q_yaw, q_speed, q_rate = 1.1 * density[2] * t,"))
+    file.write_text(text.replace(right, "q = noise[k] + extra[i] if k == 2 else 1.1 * noise[k]"))
     script = (
         "from fgtrack.models.motion import CTRV\n"
         "from fgtrack.testing import BrokenPromiseError, check_motion_model\n"
