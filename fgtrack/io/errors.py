@@ -27,7 +27,7 @@ _IN_FILES = {
     "ndarray": "an array",
     **dict.fromkeys(("int", "float", "Decimal", "decimal.Decimal"), "a number"),
 }
-#: Where Python's messages name the type of the value that was found.
+#: The type of the rejected value in Python's messages.
 _FOUND = re.compile(
     r"^'([\w.]+)' object|^(string|list|tuple) indices|, not '([\w.]+)'$|cannot unpack .*? ([\w.]+) object"
 )
@@ -35,7 +35,7 @@ _OTHER_LENGTH = re.compile(r"values to unpack|^zip\(\) argument|index out of ran
 
 
 def cause(error: BaseException) -> str:
-    """Return what an exception of a reader says of the value that it met, in words and in one line."""
+    """Return the complaint of a reader's exception about a value, in words and on one line."""
     text = one_line(error)
     if isinstance(error, KeyError):
         return f"{error.args[0]!r:.60} is missing" if error.args else "a name is missing"
