@@ -114,6 +114,7 @@ def followed(given: Drive, seed: int, estimator: str = "ekf-replay", **settings:
     """Track a drive with the noise that it has; `settings` are those of the ego."""
     sensors = {"lidar": SensorModel(std={"x_m": given.noise_m, "y_m": given.noise_m})}
     config = replace(Config(sensors=sensors), estimator=estimator)
+    config = config.replace({"motion.kind": "ctrv"})  # as the object moves
     config = config.replace({f"ego.{name}": value for name, value in settings.items()})
     tracker, heard, outcome = build_tracker(config), drive(given, seed), Outcome(math.nan, math.nan, 0.0)
     squares, nees, ticks = list[float](), list[float](), 0
