@@ -69,6 +69,8 @@ def findings_in_messages(server: Server, name: str, seed: int, changes: int, fol
                 yield f"{name} {number - 1}: {line}"
         if done.code != 0:
             yield f"{name} {number - 1}: ends with {done.code}"
+        if not any(line.startswith("case ") for line in lines):
+            return  # it ends before its first case, and would do so again
 
 
 @pytest.mark.parametrize("name", live.ESTIMATORS)
