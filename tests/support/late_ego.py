@@ -1,7 +1,7 @@
 """A winding drive past an object, with an ego whose messages come late."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -138,8 +138,3 @@ def followed(given: Drive, seed: int, estimator: str = "ekf-replay", **settings:
         outcome.nees, outcome.rmse_m = float(np.mean(nees)), math.sqrt(np.mean(squares))
         outcome.tracked = len(nees) / ticks
     return outcome
-
-
-def mean_nees(given: Drive, seeds: Sequence[int], estimator: str = "ekf-replay", **settings: object) -> float:
-    """Mean NEES over several drives."""
-    return float(np.mean([followed(given, seed, estimator, **settings).nees for seed in seeds]))
