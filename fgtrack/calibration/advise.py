@@ -229,7 +229,7 @@ class Adviser:
             yield Finding("late", "estimator", 60.0, text, {"estimator": "ekf-replay"})
 
     def _ego(self, seen: Mapping[str, Arrivals]) -> Iterator[Finding]:
-        """Yield gaps and low rates of the ego, and that it is later than the lists of `seen` that it places."""
+        """Yield gaps and low rates of the ego, and an ego that is later than the lists of `seen` that need it."""
         one = self._arrivals.get(EGO)
         if one is None or len(one.stamps_ns) < FEWEST or not one.has_stamps:
             return

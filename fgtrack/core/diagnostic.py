@@ -69,7 +69,7 @@ def late_ego(ego_delay_s: float, delays_s: Mapping[str, float]) -> Diagnostic | 
     """Return the diagnostic that the ego's messages come later than those of sensors; None where they do not.
 
     `ego_delay_s` is the usual time from stamp to receipt of the ego's messages, `delays_s` that of the lists of each
-    sensor that the ego's pose places.
+    sensor whose lists need the ego's pose.
     """
     sooner = {name: delay_s for name, delay_s in delays_s.items() if ego_delay_s - delay_s > _LATE_S}
     if not sooner:
@@ -77,7 +77,7 @@ def late_ego(ego_delay_s: float, delays_s: Mapping[str, float]) -> Diagnostic | 
     later_ms = 1e3 * (ego_delay_s - min(sooner.values()))
     own = ", ".join(f"{name} {1e3 * delay_s:.0f} ms" for name, delay_s in sooner.items())
     text = (
-        f"its states come up to {later_ms:.0f} ms later than the lists that they place (delay {1e3 * ego_delay_s:.0f} "
+        f"its states come up to {later_ms:.0f} ms later than the lists that need them (delay {1e3 * ego_delay_s:.0f} "
         f"ms, {own}): these wait up to ego.wait_s, or are placed by an extrapolated pose and count as less certain; "
         "send the ego's states sooner, or correct their clock"
     )

@@ -142,7 +142,7 @@ def _stamps(
 ) -> Iterator[tuple[BagTopic, int, int | None]]:
     """Sensor or kind, receipt and stamp of `messages`, as of a recording with a topic for each.
     `own` gets for each detection whose identity came before, True if it is older than the newest of these. `still` gets
-    the sensors with detections in the map, which no ego places.
+    the sensors with detections in the map, which need no ego.
     """
     order = OwnOrder()
     for message in messages:

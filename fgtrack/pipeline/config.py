@@ -91,8 +91,8 @@ class EgoConfig:
     yaw_rate_std_radps: NonNegativeFloat = 0.0
     """The same of its yaw rate."""
     wait_s: Annotated[float, Field(ge=0.0, le=60.0)] = 1.0
-    """Longest time that a list which the ego pose places waits for an ego state at or after its stamp, but not beyond
-    half of the window of the estimator. Then, or with 0 at once, it is placed by an extrapolated pose."""
+    """Longest time for which a list that needs the ego pose waits for an ego state at or after its stamp. The list
+    waits for at most half of the window of the estimator. Then, or with 0 at once, the pose is extrapolated."""
     accel_std_mps2: PositiveFloat = 1.0
     """Standard deviation of the ego's acceleration, by which an extrapolated pose grows uncertain, until the ego's
     states have shown their own."""

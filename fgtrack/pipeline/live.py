@@ -190,7 +190,7 @@ class Tracker:
     def warnings(self) -> tuple[str, ...]:
         """Lines on sensors whose lists come later than the configuration allows, each once, with the key to set.
 
-        Another line names an ego whose states are later than the lists that they place.
+        Another line names an ego whose states are later than the lists that need them.
         """
         with self._turn:
             self._take_arrivals()

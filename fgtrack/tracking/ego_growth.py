@@ -1,4 +1,4 @@
-"""What an extrapolated ego pose does not know: how the ego accelerates and turns meanwhile.
+"""Uncertainty of an extrapolated ego pose: how the ego may accelerate and turn meanwhile.
 
 The ego is driven by white noise in its acceleration and in its yaw acceleration, as the objects are (`models.motion`).
 Extrapolated over t, its yaw then has the variance q t^3 / 3, and its way along the heading as well. The densities q are
@@ -12,7 +12,7 @@ The same error stays for several lists, because the ego goes on to accelerate. T
 stamps d apart have errors with the correlation exp(-d / T). A track averages over lists with weights exp(-age / M). The
 variance of that average is as large as with white errors that are larger by 1 + 2 * sum of exp(-d (1 / T + 1 / M)) over
 the lists before. So many times the plain variance is what a list counts with. The first list counts with the plain one,
-and all lists together tell no more than the error that they share allows. T is learned as the densities are.
+and all lists together contain no more information than their common error allows. T is learned as the densities are.
 
 M follows from the Kalman filter of an object whose velocity is driven by white noise of density q, measured with white
 errors of spectral density S. Its bandwidth is w = (q / S)^(1/4), and M = k / w. Errors of variance V that last have
@@ -156,7 +156,7 @@ class EgoGrowth:
     def shared(self, ego: EgoState, duration_s: float, stamp_ns: int, range_m: float | None = None) -> FloatArray:
         """Return `covariance` as it counts for a list at `stamp_ns`, and note that the list shares the error.
 
-        `range_m` is the usual distance of its objects, None where nothing tells it.
+        `range_m` is the usual distance of its objects, None where it is unknown.
         """
         range_m = _RANGE_M if range_m is None else range_m
         parts, (_, times_s) = self._parts(ego, duration_s), self._of(abs(duration_s))

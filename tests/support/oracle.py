@@ -33,7 +33,7 @@ class Flow(NamedTuple):
 
 @dataclass(frozen=True)
 class Dynamics:
-    """dx = f(x) dt + noise, white, independent of the state and of that of the other entries.
+    """dx = f(x) dt + noise, white, independent of that of the other entries.
 
     `names` of the state are those of CTRV (x, y, yaw, speed, yaw rate), CTRA (and acceleration) or CV (x, y, vx, vy).
     """
@@ -41,6 +41,12 @@ class Dynamics:
     names: tuple[str, ...]
     densities: tuple[float, ...]
     """Spectral density of the noise of each entry."""
+    relaxation_hz: float = 0.0
+    """Rate at which the yaw rate relaxes to zero."""
+    slow_mps: float = 1.0
+    """Speed below which the yaw has more noise."""
+    resting_yaw: float = 0.0
+    """Density that is added to that of the yaw at rest."""
 
     @classmethod
     def of(cls, names: tuple[str, ...], density: Mapping[str, float]) -> "Dynamics":
@@ -48,6 +54,14 @@ class Dynamics:
         drives = {"x_m": "position", "y_m": "position", "vx_mps": "velocity", "vy_mps": "velocity"}
         keys = [drives.get(name, name.rpartition("_")[0]) for name in names]
         return cls(names, tuple(density.get(key, 0.0) for key in keys))
+
+    def diffusion(self, x: FloatArray) -> FloatArray:
+        """Spectral densities at the states `x` as diagonal matrices, shape (m, n, n)."""
+        D = np.tile(np.diag(self.densities), (len(x), 1, 1))
+        if "yaw_rad" in self.names:
+            yaw, speed = self._column["yaw_rad"], x[:, self._column["speed_mps"]]
+            D[:, yaw, yaw] += self.resting_yaw / (1.0 + (speed / self.slow_mps) ** 2) ** 2
+        return D
 
     @property
     def _column(self) -> dict[str, int]:
@@ -62,6 +76,7 @@ class Dynamics:
         yaw, speed = x[:, at["yaw_rad"]], x[:, at["speed_mps"]]
         f[:, 0], f[:, 1] = speed * np.cos(yaw), speed * np.sin(yaw)
         f[:, at["yaw_rad"]] = x[:, at["yaw_rate_radps"]]
+        f[:, at["yaw_rate_radps"]] = -self.relaxation_hz * x[:, at["yaw_rate_radps"]]
         if "accel_mps2" in at:
             f[:, at["speed_mps"]] = x[:, at["accel_mps2"]]
         return f
@@ -76,6 +91,7 @@ class Dynamics:
         A[:, 0, at["yaw_rad"]], A[:, 0, at["speed_mps"]] = -speed * np.sin(yaw), np.cos(yaw)
         A[:, 1, at["yaw_rad"]], A[:, 1, at["speed_mps"]] = speed * np.cos(yaw), np.sin(yaw)
         A[:, at["yaw_rad"], at["yaw_rate_radps"]] = 1.0
+        A[:, at["yaw_rate_radps"], at["yaw_rate_radps"]] = -self.relaxation_hz
         if "accel_mps2" in at:
             A[:, at["speed_mps"], at["accel_mps2"]] = 1.0
         return A
@@ -87,14 +103,13 @@ class Dynamics:
         durations keep their digits.
         """
         m, n = x.shape
-        D = np.diag(self.densities)
         start = np.concatenate([x, np.tile(np.eye(n).ravel(), (m, 1)), np.zeros((m, n * n))], axis=1)
 
         def derivative(_: float, flat: FloatArray) -> FloatArray:
             packed = flat.reshape(m, -1)
             F, Q = packed[:, n : n + n * n].reshape(m, n, n), packed[:, n + n * n :].reshape(m, n, n)
             A = self.slopes(packed[:, :n]) * t[:, None, None]
-            AQ = A @ Q
+            AQ, D = A @ Q, self.diffusion(packed[:, :n])
             rates = self.rates(packed[:, :n]) * t[:, None]
             return np.concatenate(
                 [rates, (A @ F).reshape(m, -1), (AQ + np.swapaxes(AQ, 1, 2) + D).reshape(m, -1)], axis=1

@@ -95,7 +95,13 @@ def problem_of(motion: MotionModel, prior: Start, sightings: Sequence[Sighting])
     start = kinematic_start(motion.state_names, values, (*std, prior.yaw_rate_std_radps, prior.accel_std_mps2))
     names = motion.density_names() if isinstance(motion, CTRV | CV) else ()
     density = {name.partition("_density_")[0]: getattr(motion, name) for name in names}
-    return Problem(Dynamics.of(motion.state_names, density), prior.stamp_ns, start, tuple(sightings))
+    dynamics = Dynamics.of(motion.state_names, density)
+    if isinstance(motion, CTRV):
+        relaxation_hz = 0.5 * motion.yaw_rate_density_rad2ps3 / motion.yaw_rate_std_radps**2
+        dynamics = replace(
+            dynamics, relaxation_hz=relaxation_hz, slow_mps=motion.slow_mps, resting_yaw=motion.resting_yaw_rad2ps
+        )
+    return Problem(dynamics, prior.stamp_ns, start, tuple(sightings))
 
 
 # A sensor measures the state x at a stamp.

@@ -120,6 +120,7 @@ class IncrementalSolver(Solver):
         try:
             self._update(tracks, first)
         except (RuntimeError, ValueError, IndexError) as error:
+            nodes.tracks[tracks, KNOWN] = anchors  # the states that were read last
             for track in tracks.tolist():  # its graph may lack nodes
                 self.forget(track)
             raise np.linalg.LinAlgError(f"the graph cannot be solved ({error})") from error
