@@ -30,6 +30,9 @@ class Scan(NamedTuple):
     """All detections of the message."""
 
 
+_MANY_CHANGES = 16  # of a counter, from which on those that no late list can precede are settled
+
+
 @dataclass(slots=True)
 class Life:
     """Counters of one track."""
@@ -186,7 +189,7 @@ class CountingLifecycle:
         """True if a track ends at a list that misses it."""
         if not self._awaits:
             return life.counter <= 0
-        return life.ends_ns <= self._decided_ns(life, scan.stamp_ns)
+        return life.ends_ns != FOREVER and life.ends_ns <= self._decided_ns(life, scan.stamp_ns)
 
     def _decided_ns(self, life: Life, processed_ns: int) -> int:
         """Stamp up to which all lists that could show the object have come and are processed."""
@@ -205,6 +208,9 @@ class CountingLifecycle:
             self._watermarks_ns = watermarks_ns
         ended = []
         for track_id, life in self.lives.items():
+            is_seen = present_ns - life.last_seen_ns <= self._forget_ns
+            if is_seen and life.ends_ns == FOREVER and len(life.changes) < _MANY_CHANGES:
+                continue
             decided = min(self._decided_ns(life, processed_ns), present_ns)
             if life.ends_ns <= decided or decided - life.last_seen_ns > self._forget_ns:
                 ended.append(track_id)

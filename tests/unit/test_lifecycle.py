@@ -122,6 +122,17 @@ def test_matches_and_misses_count_in_order_of_their_stamps(order: tuple[int, ...
             assert life.missed(scan, [0], NOWHERE, np.array([10.0])) == []
     assert life.lives[0].counter == 6
     life.expired(START_NS + ms(500))
+    assert life.lives[0].counter == 6
+
+
+def test_counts_that_no_late_list_can_precede_are_settled() -> None:
+    life = lifecycle(counter_cap=6)
+    life.born(0, Scan("far", START_NS, START_NS), HERE)
+    for k in range(1, 50):
+        stamp_ns = START_NS + ms(10 * k)
+        match(life, 0, Scan("far", stamp_ns, stamp_ns), HERE)
+        assert life.expired(stamp_ns) == []
+        assert len(life.lives[0].changes) < 20
     assert (life.lives[0].counter, life.lives[0].settled) == (6, 6)
 
 
