@@ -135,8 +135,15 @@ def test_most_states_refused_and_jumps_of_the_ego_are_told(
 
 def test_angles_in_degrees_are_told(tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", [update(tick=k) for k in range(40)])
-    ego = {"yaw_rad": np.array([0.1, 67.0, np.nan])}
-    of_radar = {"sensor": np.array(["radar", "radar"]), "bearing_rad": np.array([-12.0, 6.0])}
+    stamps_ns = np.arange(3)
+    ego = {"yaw_rad": np.array([0.1, 67.0, np.nan]), "stamp_ns": stamps_ns, "receipt_ns": stamps_ns}
+    of_radar = {
+        "sensor": np.array(["radar", "radar"]),
+        "bearing_rad": np.array([-12.0, 6.0]),
+        "frame": np.array(["map", "map"]),
+        "stamp_ns": np.arange(2),
+        "receipt_ns": np.arange(2),
+    }
     found = diagnostics(run.with_tables(ego=Table(ego), detections=Table(of_radar)))
     assert [str(one).split(":")[:2] for one in found[:2]] == [
         ["ego", " yaw_rad goes up to 67"],

@@ -82,7 +82,7 @@ def test_the_contract_holds_with_an_unknown_direction(name: str) -> None:
 
     vars(unknown).update({**vars(Claims.of(made)), "bank": False, "initiates": True})
     checks = estimator_checks(unknown, seed=3, num_streams=3)
-    del checks["comes near the posterior of a nonlinear model"]  # of which the heading is known at the start
+    del checks["gives the posterior of a nonlinear model"]  # of which the heading is known at the start
     for check in checks.values():
         check()
 
