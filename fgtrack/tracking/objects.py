@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
 
@@ -74,7 +74,7 @@ class Objects:
         self._ids: dict[int, str] = {}  # of most detections, by track
         self._owners: dict[str, set[int]] = {}  # tracks of an identity, of most of their detections
         self._former: dict[str, int] = {}  # tracks that have ended, by identity
-        self._strays = Counter[str]()  # detections in succession that their track did not match, by identity
+        self._strays: dict[str, tuple[int, Hashable]] = {}  # by identity, see `is_stray`: their number, newest list
         self.id_conflicts: Counter[str] = Counter()
         """Identities that were `reused`: a track began with that of another one; or `changed`: a track fused another
         identity than most of its detections have."""
@@ -131,14 +131,18 @@ class Objects:
         own = np.array([numbers.get(self._ids[i], _OTHER) if i in self._ids else _UNKNOWN for i in track_ids])
         return Evidence(classes, theirs, own, wrong_id_probability)
 
-    def is_stray(self, detection: Detection) -> bool:
-        """True if a track that does not match `detection` has its identity, unless three others strayed just before.
-        So far from the track of its own identity it is an outlier, rather than another object of that identity.
+    def is_stray(self, detection: Detection, of: Hashable) -> bool:
+        """True if a track that does not match `detection` has its identity, unless three lists strayed just before.
+        So far from the track of its own identity it is an outlier, rather than another object of that identity. The
+        list `of` the detection counts once: of several detections with one identity in a list, most must be wrong.
         """
         if detection.id is None or detection.id not in self._owners:
             return False
-        self._strays[detection.id] += 1
-        return self._strays[detection.id] <= _MOST_STRAYS
+        count, newest = self._strays.get(detection.id, (0, None))
+        if newest != of:
+            count += 1
+        self._strays[detection.id] = count, of
+        return count <= _MOST_STRAYS
 
     def former(self, detection: Detection) -> int | None:
         """Return the track, ended or lost, of which a new one of `detection` takes the number; None without any.

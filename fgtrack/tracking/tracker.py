@@ -623,7 +623,9 @@ class Tracker:
     def _prior(self, candidates: Candidates, position: int, scan: Scan) -> Start | None:
         """Return the state that a track begins with; None where the candidate may start no track."""
         parts, candidate = self._parts, candidates[position]
-        if not parts.sensors[scan.sensor].births or parts.objects.is_stray(scan.objects[candidate.leader]):
+        if not parts.sensors[scan.sensor].births:
+            return None
+        if parts.objects.is_stray(scan.objects[candidate.leader], (scan.sensor, scan.stamp_ns)):
             return None
         return parts.birth.prior(candidate, parts.road, parts.ego.current, parts.ego.in_pit)
 

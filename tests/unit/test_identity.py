@@ -124,11 +124,20 @@ def test_an_identity_that_returns_after_the_end_of_its_track_has_the_number_of_b
 def test_a_track_forgets_its_identity_with_its_end():
     objects = Objects()
     objects.learn(0, [Detection(0.0, 0.0, id="AAA")])
-    assert objects.is_stray(Detection(9.0, 9.0, id="AAA"))
-    assert not objects.is_stray(Detection(9.0, 9.0, id="BBB"))
+    assert objects.is_stray(Detection(9.0, 9.0, id="AAA"), 1)
+    assert not objects.is_stray(Detection(9.0, 9.0, id="BBB"), 1)
     objects.forget(0)
-    assert not objects.is_stray(Detection(9.0, 9.0, id="AAA"))
+    assert not objects.is_stray(Detection(9.0, 9.0, id="AAA"), 2)
     assert objects.evidence([Detection(9.0, 9.0, id="AAA")], [0], 1e-3) is None
+
+
+def test_a_list_with_one_identity_many_times_counts_as_one_stray():
+    objects, stray = Objects(), Detection(9.0, 9.0, id="AAA")
+    objects.learn(0, [Detection(0.0, 0.0, id="AAA")])
+    assert all(objects.is_stray(stray, stamp_ns) for stamp_ns in (1, 1, 1, 1, 1, 2, 2, 3, 3))
+    assert not objects.is_stray(stray, 4)
+    objects.learn(0, [Detection(0.0, 0.0, id="AAA")])
+    assert objects.is_stray(stray, 5)
 
 
 def test_a_copy_moves_the_stamp_of_its_detection_alone():
