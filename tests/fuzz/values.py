@@ -164,7 +164,8 @@ def _covariance_of_programs(rng: np.random.Generator, value: Any) -> Any:
     changed = _covariance(rng, value)
     forms = (tuple, np.array, lambda each: np.array(each, dtype=np.float32), lambda each: np.asmatrix(each), list)
     try:
-        return forms[rng.integers(len(forms))](changed)
+        with np.errstate(all="ignore"):
+            return forms[rng.integers(len(forms))](changed)
     except (TypeError, ValueError):
         return changed
 

@@ -263,6 +263,14 @@ def test_the_variance_of_the_speed_is_that_along_the_velocity(vx, vy):
     assert found[3, 4] == pytest.approx(0.6 * 0.02)  # backwards, both the speed and vx are negative
 
 
+@pytest.mark.parametrize("velocity", [math.inf, 1e308, math.nan])
+def test_a_velocity_or_covariance_without_limits_is_read_without_a_warning(velocity):
+    message = uncertain_odometry(velocity, velocity, POSE_COVARIANCE, square(6, c00=1e308, c11=math.inf, c55=1.0))
+    assert ego_from_odometry(message, 7).covariance[0] == 1.0
+    (item,) = read("nav_msgs/msg/Odometry", message).objects
+    assert not math.isfinite(item.covariance[-1])
+
+
 @pytest.mark.parametrize(
     "unknown",
     [
@@ -271,6 +279,8 @@ def test_the_variance_of_the_speed_is_that_along_the_velocity(vx, vy):
         (math.nan, *(1.0,) * 35),
         square(6, c00=1.0, c11=1.0, c55=1e3),
         square(6, c00=1.0, c11=1.0),
+        square(6, c00=1.0, c11=1.0, c55=-math.inf),
+        square(6, c00=1.0, c11=1.0, c55=1e-3, c01=math.inf),
     ],
 )
 def test_a_part_that_is_not_known_is_zero_and_nothing_at_all_is_none(unknown):

@@ -131,12 +131,14 @@ def signed_speed_mps(vx_mps: float, vy_mps: float, heading_rad: float | None) ->
     return -speed if forward < 0.0 else speed
 
 
+@np.errstate(all="ignore")  # the tracker counts what is not finite
 def speed_gradient(vx_mps: float, vy_mps: float) -> FloatArray:
     """Derivative, shape (2,), of the length of the velocity; along x where that is 0."""
     speed = math.hypot(vx_mps, vy_mps)
     return np.array([vx_mps, vy_mps]) / speed if speed > 0.0 else np.array([1.0, 0.0])
 
 
+@np.errstate(all="ignore")  # as above
 def covariance(
     values: Mapping[str, float | None], pose: FloatArray | None, twist: FloatArray | None = None, velocity: Any = None
 ) -> tuple[float, ...] | None:

@@ -173,6 +173,7 @@ def ego_from_odometry(message: RosMessage, receipt_ns: int) -> EgoState:
     )
 
 
+@np.errstate(all="ignore")  # a part that is not finite is not known
 def _ego_covariance(message: RosMessage) -> tuple[float, ...] | None:
     """Covariance of x, y, yaw, speed and yaw rate, row-major; of pose and twist each, zero where it is not known."""
     from scipy.linalg import block_diag
