@@ -34,6 +34,8 @@ def stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, st
     """Function that loads the modules `callee` and `caller`, whose loops are stored in a folder of this test."""
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr(compiled, "_said", set())
+    # Python takes its own byte code for that of a source of the same size and second.
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
 
     def load(callee: str, caller: str) -> Any:
         head = "from fgtrack.core.compiled import inlined, njit, shared\nOFFSET = 1\n"
