@@ -42,8 +42,9 @@ def parked(
         one.advance(stamp_ns)
         if k / rate_hz > 5.0:
             state = one.state_at(stamp_ns)
-            means.append(state.mean[:5])
-            covariances.append(state.covariance[:5, :5])
+            mean, covariance = motion.kinematic(state.mean, state.covariance)
+            means.append(mean[:5])
+            covariances.append(covariance[:5, :5])
     return np.array(means), np.array(covariances)
 
 
