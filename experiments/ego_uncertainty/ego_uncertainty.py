@@ -64,7 +64,7 @@ class Result:
 def scenario(count: int, duration_s: float) -> Scenario:
     """The ego and `count` objects around it; what the ego says of itself is exact."""
     motion = MOTION.model()
-    still = replace(motion, **dict.fromkeys(vars(motion), 0.0))
+    still = replace(motion, **dict.fromkeys(motion.density_names(), 0.0), resting_yaw_rad2ps=0.0)
     angles = 2.0 * np.pi * np.arange(count) / count + 0.3
     places = RANGE_M * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     exact = dict.fromkeys(
