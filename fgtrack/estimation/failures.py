@@ -28,7 +28,7 @@ class Failure(StrEnum):
     BIRTH_FAILED = "birth failed"
     """A detection could not start a track; its disposition is `failed`."""
     LIST_FAILED = "list failed"
-    """The processing of an object list, or of a part, raised an exception; what was left of that is `failed`."""
+    """The processing of an object list, or of a part, raised an exception; its remaining detections are `failed`."""
     STEP_FAILED = "step failed"
     """A step beside the estimate, as the count of the life of a track, raised an exception and was left out."""
     TRACK_ENDED = "track ended"
@@ -36,7 +36,7 @@ class Failure(StrEnum):
 
 
 class EstimatorError(Exception):
-    """Estimators of some tracks raised, and those of the others answered."""
+    """The estimators of some tracks raised; the other estimators returned results."""
 
     def __init__(
         self,

@@ -126,7 +126,7 @@ def _topic(topic: BagTopic, times: Sequence[_Times], used_as: str | None, own: S
 
 
 def _with_late_ego(topics: Sequence[TopicInfo], still: Set[str]) -> tuple[TopicInfo, ...]:
-    """Return `topics`, with a note at that of the ego if it is later than those of sensors that are not `still`."""
+    """Return `topics`. The topic of the ego gets a note if the ego is later than the sensors that are not `still`."""
     delays_s = {topic.name: topic.delay["p50_s"] for topic in topics if topic.delay is not None and topic.note is None}
     lists = {each.name for each in topics if (each.used_as or "").startswith("detections")} - still
     placed_s = {name: delay_s for name, delay_s in delays_s.items() if name in lists}

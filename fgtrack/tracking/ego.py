@@ -15,6 +15,7 @@ from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.linalg import ASYMMETRY, congruence, is_covariance, symmetrise
 from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
 from fgtrack.core.types import YAW, EgoState, FloatArray
+from fgtrack.estimation.filters.ekf import joseph, kalman_gain
 from fgtrack.models.dead_reckoning import Reckoned, ReportedErrors, reckoned
 from fgtrack.tracking.ego_growth import EgoGrowth
 
@@ -35,6 +36,7 @@ _REMEMBERED_S = 1.0  # memory of a track; an error of the velocity is independen
 _LEAST_STD = 0.01  # m, m/s: no position or speed is reported more exactly
 _FAR_APART_NS = nanoseconds(0.15)  # two states; at 70 m/s and 0.3 rad/s their chord is 6 cm off the arc
 _ROUNDING = np.diag(np.square([_LEAST_STD, _LEAST_STD, 1e-3, _LEAST_STD, 1e-3]))  # of x, y, yaw, speed, yaw rate
+_ALL = np.eye(5)  # both extrapolated states give every component
 
 
 class EgoPose(NamedTuple):
@@ -364,14 +366,12 @@ class EgoTrajectory:
         What drives the ego before the stamp is independent of what drives it after, so the two are fused as
         independent estimates. To the covariance of the result comes the `covariance` that the states have.
         """
-        means, weights = list[FloatArray](), list[FloatArray]()
-        for ego in (before, after):
-            mean = np.array(extrapolated(ego, stamp_ns)[:5])
-            mean[YAW] = mean[YAW] if not means else means[0][YAW] + wrap_angle(mean[YAW] - means[0][YAW])
-            means.append(mean)
-            weights.append(np.linalg.inv(growth.covariance(ego, seconds(stamp_ns - ego.stamp_ns)) + _ROUNDING))
-        own = symmetrise(np.asarray(np.linalg.inv(weights[0] + weights[1]), dtype=np.float64))
-        mean = own @ (weights[0] @ means[0] + weights[1] @ means[1])
+        first, second = (np.array(extrapolated(ego, stamp_ns)[:5]) for ego in (before, after))
+        P, R = (growth.covariance(ego, seconds(stamp_ns - ego.stamp_ns)) + _ROUNDING for ego in (before, after))
+        difference = second - first
+        difference[YAW] = wrap_angle(difference[YAW])
+        gain, _ = kalman_gain(P, _ALL, R)
+        mean, own = first + gain @ difference, joseph(P, gain, _ALL, R)
         x_m, y_m, yaw_rad, speed_mps, yaw_rate_radps = mean.tolist()
         total = own if covariance is None else own + covariance
         total.flags.writeable = False

@@ -108,7 +108,7 @@ class EgoGrowth:
         self._add(stamp_ns, min(step_s, 1.0), found)
 
     def _add(self, stamp_ns: int, weight_s: float, found: FloatArray) -> None:
-        """Add accelerations, shape (durations, 2), NaN where there are none, which count for `weight_s`."""
+        """Add accelerations, shape (durations, 2), with the weight `weight_s`. NaN marks a duration without states."""
         known = np.isfinite(found)
         keep = math.exp(-weight_s / _FORGET_S)
         for sums in (self._weights_s, self._squares, self._pairs, self._products, self._spacings_s):

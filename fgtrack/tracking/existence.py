@@ -11,9 +11,9 @@ lists up to that stamp, once the lists of all sensors that could show its object
 come: see `fgtrack.tracking.latency`. Until then a track that has become improbable is suspended: it is not published,
 and newer lists are not compared with it.
 
-Approximate are: L is that of the one detection which the assignment gives (the probabilities of other assignments are
-left out), of its position alone, and as it was when the detection arrived. Each list counts at its stamp, whatever the
-order of arrival within `memory_s`.
+Three things are approximate. L is the likelihood of the assigned detection alone, without other assignments. It is the
+likelihood of the position alone. It is computed when the detection arrives, and not again. Each list counts at its
+stamp, whatever the order of arrival within `memory_s`.
 """
 
 import math
@@ -39,7 +39,7 @@ from fgtrack.tracking.visibility import Histories
 
 
 def _life(num_sensors: int) -> np.dtype[np.void]:
-    """Return what is known of one track.
+    """Return the type of the record of one track.
 
     True if it was ever confirmed, or as far from its first position as it must be; misses since the last match, and
     the newest stamps at which it was in view and probably visible. Then by sensor: true if the sensor could show it at
@@ -337,7 +337,7 @@ class ExistenceLifecycle:
         return list(compress(track_ids, (gone | improbable).tolist()))
 
     def _newest_scan_ns(self, until_ns: IntArray) -> IntArray:
-        """Newest stamps up to `until_ns` of lists that could have shown something, (m,); `NEVER` if there is none."""
+        """Newest stamps up to `until_ns` of lists that could have shown the objects, (m,); `NEVER` without a list."""
         stamps_ns = np.array([NEVER, *self._scans_ns])
         return np.asarray(stamps_ns[stamps_ns.searchsorted(until_ns, side="right") - 1])
 

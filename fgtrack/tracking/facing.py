@@ -198,14 +198,14 @@ class Facing:
         self._seen: dict[str, FloatArray] = {}  # by sensor: numbers of yaws that were right, flipped, anything
         self._shares: dict[str, FloatArray] = {}  # of the numbers, until they change
         self.counts: dict[str, Counter[str]] = {}
-        """By sensor: number of `yaws` that tracks used, of those `flipped`, and of those `unused`."""
+        """Numbers of yaws by sensor: all `yaws` of detections that tracks used, `flipped` yaws and `unused` yaws."""
 
     def at(self, sensor: str, track_ids: tuple[int, ...]) -> Facings:
         """Return the belief about some tracks for the detections of `sensor`."""
         return Facings(self._log_odds[self._rows_of(track_ids)], self._shares_of(sensor), self._cartesian)
 
     def _rows_of(self, track_ids: tuple[int, ...]) -> IntArray:
-        """Return rows of the arrays, shape (m,); those of the last call where the tracks are the same."""
+        """Return rows of the arrays, shape (m,). The rows of the last call are kept for the same tracks."""
         if track_ids != self._last_ids:
             self._last_ids = track_ids
             self._last_rows = np.array([self._rows[track_id] for track_id in track_ids], dtype=np.int64)

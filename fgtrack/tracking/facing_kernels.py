@@ -29,7 +29,7 @@ _LOG_TURN = math.log(2.0 * math.pi)
 
 @inlined
 def _forwards(speed_mps: float, variance: float) -> float:
-    """Return log p(speed | the yaw is that of the front) - log p(speed | it is that of the rear).
+    """Return the log-likelihood of the speed if the yaw points forwards, minus the one if the yaw points backwards.
     With f = P(speed > 0) that is log (f (1 - b) + (1 - f) b) / (f b + (1 - f) (1 - b)), b = `BACKWARDS`.
     """
     f = 0.5 * math.erfc(-speed_mps / math.sqrt(2.0 * (variance + SLOW_MPS * SLOW_MPS)))

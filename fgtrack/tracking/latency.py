@@ -68,7 +68,7 @@ class Delays:
         self._processed_ns = max(self._processed_ns, stamp_ns)
 
     def usual_ns(self, most_ns: int = FOREVER) -> int:
-        """Return the longest usual delay, of those up to `most_ns`; `most_ns` where there is none so short.
+        """Return the longest usual delay up to `most_ns`; `most_ns` if all delays are longer.
 
         The delay of the newest message counts as usual: a delay that has changed is followed at once.
         """

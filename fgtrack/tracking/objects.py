@@ -133,7 +133,7 @@ class Objects:
 
     def is_stray(self, detection: Detection, of: Hashable) -> bool:
         """True if a track that does not match `detection` has its identity, unless three lists strayed just before.
-        So far from the track of its own identity it is an outlier, rather than another object of that identity. The
+        A detection that far from the track of its identity is an outlier, not another object. The
         list `of` the detection counts once: of several detections with one identity in a list, most must be wrong.
         """
         if detection.id is None or detection.id not in self._owners:

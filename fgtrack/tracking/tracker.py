@@ -630,7 +630,7 @@ class Tracker:
         return parts.birth.prior(candidate, parts.road, parts.ego.current, parts.ego.in_pit)
 
     def _number(self, detection: Detection) -> int:
-        """Return the number of a new track: that of a former one with the identity of `detection`, if there is one."""
+        """Return the number of a new track. A former track with the identity of `detection` passes on its number."""
         track_id = self._parts.objects.former(detection)
         if track_id is None:
             self._next_id += 1
@@ -673,7 +673,7 @@ class Tracker:
             self._records.append((own, *merged_records(batch.message, candidates.merged.get(leader, ()), track_id)))
 
     def _end(self, track_ids: Sequence[int]) -> None:
-        """End tracks; one whose end raises leaves nothing either, and others end all the same."""
+        """End tracks. A track whose end raises is forgotten as well, and the remaining tracks still end."""
         for track_id in track_ids:
             self._undirected.pop(track_id, None)
             self._directed.pop(track_id, None)

@@ -268,7 +268,7 @@ class SmootherBank:
         return [*map(SmoothedReport, track_ids, states, repeat(lag_s))]
 
     def _improved(self, tracks: IntArray, stamp_ns: int) -> dict[int, Exception]:
-        """Improve windows that have changed; return what they raise, by track id. Others are improved all the same."""
+        """Improve windows that have changed; return exceptions by track id. All windows are tried."""
         causes = dict[int, Exception]()
         try:
             self._improve(tracks, stamp_ns)

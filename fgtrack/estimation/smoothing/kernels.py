@@ -76,7 +76,7 @@ def check_nodes(tracks: IntArray, nodes: Arrays, spare: int) -> None:
 
 @inlined
 def check_indices(indices: IntArray, tracks: IntArray, nodes: Arrays) -> None:
-    """Raise `IndexError` for one of the `indices` of nodes, one of each of `tracks`, that the track does not have."""
+    """Raise `IndexError` if a track lacks the node of its index; `indices` has one index for each of `tracks`."""
     check(len(indices) >= len(tracks))
     for t in range(len(tracks)):
         check_rows(indices[t : t + 1], 0, nodes[0][tracks[t], COUNT])

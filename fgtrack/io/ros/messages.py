@@ -145,7 +145,7 @@ def _optional(value: Detection | TruthState, names: tuple[str, ...]) -> dict[str
 
 
 def _full_covariance(item: Detection) -> FloatArray | None:
-    """Covariance of the pose, shape (6, 6); None where the detection has none, or not one of what it measures."""
+    """Covariance of the pose, shape (6, 6); None if the detection has no covariance, or one of another size."""
     size = len(item.measured)
     if item.covariance is None or len(item.covariance) != size**2:
         return None
