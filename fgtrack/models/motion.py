@@ -103,6 +103,21 @@ class MotionModel(ABC):
             J[..., YAW:YAW_RATE, 2:4] = polar_gradient(x[..., 2:4], MIN_SPEED_MPS)
         return mean, symmetrise(congruence(J, P))
 
+    def published(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance as `kinematic` gives them, with the yaw of a Cartesian state to second order.
+
+        With the velocity errors a along and b across the heading, the yaw error is b / speed - a b / speed^2. A slow
+        object needs the second term. Its variance is (var(a) var(b) + cov(a, b)^2) / speed^4 (Bar-Shalom, Li and
+        Kirubarajan 2001, section 10.3.2). Third-order terms cancel where a and b are equally uncertain.
+        """
+        mean, covariance = self.kinematic(x, P)
+        if not self.cartesian:
+            return mean, covariance
+        slowest_mps = np.maximum(mean[..., SPEED], MIN_SPEED_MPS)
+        product = covariance[..., YAW, YAW] * covariance[..., SPEED, SPEED] + covariance[..., YAW, SPEED] ** 2
+        covariance[..., YAW, YAW] += product / slowest_mps**2
+        return mean, covariance
+
     def from_kinematic(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """State and covariance P of this model from a kinematic state; a missing entry is 0 with `start_variance`.
         To the first-order covariance of a Cartesian velocity comes the variance of the product of speed error and yaw

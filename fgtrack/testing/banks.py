@@ -106,7 +106,7 @@ def _publishes_the_present(bank: TrackBank, motion: MotionModel) -> None:
     require(len(shown) == len(bank.track_ids), f"present() gives {len(shown)} states of {len(bank.track_ids)} objects")
     for number, state in zip(bank.track_ids, shown, strict=True):
         own = state_of(bank, motion, number, bank.present_ns)
-        expected = _known(TrackState(own.stamp_ns, *motion.kinematic(own.mean, own.covariance)), motion)
+        expected = _known(TrackState(own.stamp_ns, *motion.published(own.mean, own.covariance)), motion)
         result, what = _known(state, motion), f"the present state of object {number}"
         sound(result.mean, result.covariance, what)
         same = state.stamp_ns == bank.present_ns and max(difference(result, expected)) < _TOGETHER

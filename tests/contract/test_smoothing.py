@@ -210,7 +210,7 @@ def test_final_states_are_the_dense_joint_of_what_had_arrived_when_the_node_left
             joint = dense_joint(motion, START, arrived, [state.stamp_ns for state in states])
             for state in states:
                 expected = joint[state.stamp_ns]
-                mean, covariance = motion.kinematic(expected.mean, expected.covariance)
+                mean, covariance = motion.published(expected.mean, expected.covariance)
                 assert max(known_apart(state, TrackState(state.stamp_ns, mean, covariance))) < TOLERANCES[make]
             stamps_ns += [state.stamp_ns for state in states]
             arrived += [] if measurement is None else [measurement]

@@ -42,7 +42,7 @@ def parked(
         one.advance(stamp_ns)
         if k / rate_hz > 5.0:
             state = one.state_at(stamp_ns)
-            mean, covariance = motion.kinematic(state.mean, state.covariance)
+            mean, covariance = motion.published(state.mean, state.covariance)
             means.append(mean[:5])
             covariances.append(covariance[:5, :5])
     return np.array(means), np.array(covariances)

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.models.motion import CTRA, CTRV, CV, MIN_SPEED_MPS, MotionModel
+from fgtrack.models.motion import CT, CTRA, CTRV, CV, MIN_SPEED_MPS, MotionModel
 
 MODELS: tuple[MotionModel, ...] = (CTRV(), CTRA(), CV(velocity_density_m2ps3=0.5))
 ARCS: tuple[CTRV, ...] = (CTRV(), CTRA())
@@ -193,6 +193,27 @@ def test_the_kinematic_view_of_constant_velocity_is_its_linear_image() -> None:
         J = (model.kinematic(x[i] + step, P[:4])[0] - model.kinematic(x[i] - step, P[:4])[0]).T / 2e-5
         assert_allclose(covariance[i], J @ P[i] @ J.T, rtol=1e-6, atol=1e-8)
     assert_array_equal(covariance[:, 4, :], 0.0)
+
+
+@pytest.mark.parametrize("ratio", [0.03, 0.06, 0.12])
+def test_the_published_yaw_of_a_slow_object_is_as_uncertain_as_samples_of_its_velocity(ratio: float) -> None:
+    model, rng, x = CT(), np.random.default_rng(6), np.array([1.0, 2.0, 3.0, 4.0, 0.1])
+    P = np.eye(5)
+    P[2:4, 2:4] *= 25.0 * ratio
+    samples = rng.multivariate_normal(x, P, 400_000)
+    mean = model.published(x, P)[0][2]
+    errors = (np.arctan2(samples[:, 3], samples[:, 2]) - mean + math.pi) % math.tau - math.pi
+    first, second = model.kinematic(x, P)[1][2, 2], model.published(x, P)[1][2, 2]
+    assert first == pytest.approx(ratio)
+    assert second == pytest.approx(ratio + ratio**2)
+    assert abs(second - np.var(errors)) < 0.5 * abs(first - np.var(errors))
+
+
+def test_correlated_errors_along_and_across_the_heading_make_the_published_yaw_less_certain() -> None:
+    P = np.eye(5)
+    P[2, 3] = P[3, 2] = 0.5
+    x = np.array([0.0, 0.0, 2.0, 0.0, 0.0])
+    assert CT().published(x, P)[1][2, 2] == pytest.approx(1.0 / 2.0**2 + (1.0 + 0.5**2) / 2.0**4)
 
 
 def test_at_speed_zero_the_heading_is_unknown_but_finite() -> None:

@@ -102,7 +102,7 @@ class States(Lazy[TrackState]):
 def kinematic_states(
     motion: MotionModel, stamps_ns: int | Sequence[int], means: FloatArray, covariances: FloatArray
 ) -> States:
-    """Kinematic states of m states of `motion`, shapes (m, n) and (m, n, n), at these stamps, or at one."""
-    means, covariances = motion.kinematic(means, covariances)
+    """Published kinematic states of m states of `motion`, shapes (m, n) and (m, n, n), at these stamps, or at one."""
+    means, covariances = motion.published(means, covariances)
     stamps_ns = [stamps_ns] * len(means) if isinstance(stamps_ns, int) else stamps_ns
     return States(stamps_ns, wrapped_yaw(means), covariances)
