@@ -14,7 +14,14 @@ project = "fgtrack"
 author = "fgtrack contributors"
 release = fgtrack.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "sphinx_gallery.gen_gallery", "reference"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_gallery.gen_gallery",
+    "reference",
+]
 root_doc = "docs/index"
 html_extra_path = ["_ext/index.html"]  # leads from out/docs/index.html to the root page
 include_patterns = ["CHANGELOG.md", "CONTRIBUTING.md", "docs/**.md", "docs/generated/**.rst", "experiments/**.md"]

@@ -51,7 +51,9 @@ def made_ahead(objects: int, duration_s: float) -> Iterator[Sent]:
         made.put(None)
 
     threading.Thread(target=make, daemon=True).start()
-    while (message := made.get()) is not None and message.receipt_ns - LAPS_START_NS <= nanoseconds(duration_s):
+    while (
+        message := made.get()
+    ) is not None and message.receipt_ns - LAPS_START_NS <= nanoseconds(duration_s):
         yield message
 
 
@@ -106,7 +108,10 @@ class Part:
 
     def row(self) -> tuple[str, ...]:
         """Return the row of the table."""
-        times = (f"{p50:.2f} / {p99:.2f} / {worst:.1f}" for p50, p99, worst in (self.tick_ms, self.cpu_ms))
+        times = (
+            f"{p50:.2f} / {p99:.2f} / {worst:.1f}"
+            for p50, p99, worst in (self.tick_ms, self.cpu_ms)
+        )
         missed = f"{self.missed} of {self.ticks}"
         return (
             f"{self.until_s / 60.0:.3g}",
@@ -123,7 +128,9 @@ def spread(values: Sequence[float]) -> list[float]:
     return np.quantile(values, (0.5, 0.99, 1.0)).tolist()
 
 
-def track(receiver: Receiver, hz: float, duration_s: float, num_parts: int) -> list[Part]:
+def track(
+    receiver: Receiver, hz: float, duration_s: float, num_parts: int
+) -> list[Part]:
     """Tick at multiples of the period, from the first message until the vehicle has stopped."""
     step_ns = period_ns(hz)
     receiver.begun.wait()
@@ -140,9 +147,14 @@ def track(receiver: Receiver, hz: float, duration_s: float, num_parts: int) -> l
         done_ns = time.time_ns()
         missed += done_ns > due_ns + step_ns
         passed_s = (due_ns - begun_ns) / 1e9
-        if over or (passed_s >= duration_s / num_parts * (len(parts) + 1) and len(parts) + 1 < num_parts):
+        if over or (
+            passed_s >= duration_s / num_parts * (len(parts) + 1)
+            and len(parts) + 1 < num_parts
+        ):
             times = (len(tick_ms), spread(tick_ms), spread(cpu_ms))
-            parts.append(Part(passed_s, memory_mb(), *times, missed, skipped, len(report.tracks)))
+            parts.append(
+                Part(passed_s, memory_mb(), *times, missed, skipped, len(report.tracks))
+            )
             progress(" ".join(parts[-1].row()))
             tick_ms, cpu_ms, missed, skipped = [], [], 0, 0
         if over:
@@ -153,8 +165,12 @@ def track(receiver: Receiver, hz: float, duration_s: float, num_parts: int) -> l
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder for live.md and live.json.")] = Path("out/live"),
-    duration_s: Annotated[float, typer.Option(help="By the clock of the machine.")] = 3600.0,
+    out: Annotated[
+        Path, typer.Option("-o", help="Folder for live.md and live.json.")
+    ] = Path("out/live"),
+    duration_s: Annotated[
+        float, typer.Option(help="By the clock of the machine.")
+    ] = 3600.0,
     hz: Annotated[float, typer.Option(help="Ticks in a second.")] = 50.0,
     objects: int = 3,
     estimator: str = "smoother-banded",
@@ -164,11 +180,17 @@ def main(
     out.mkdir(parents=True, exist_ok=True)
     machine = short_machine([yardstick_us()])
     tracker = fgtrack.Tracker.from_config(
-        "smoother", map="oval", pit_map="oval", estimator=estimator, set={"clock.node_hz": hz}
+        "smoother",
+        map="oval",
+        pit_map="oval",
+        estimator=estimator,
+        set={"clock.node_hz": hz},
     )
     context = multiprocessing.get_context("spawn")
     receiving, sending = context.Pipe(duplex=False)
-    vehicle = context.Process(target=drive, args=(sending, objects, duration_s), daemon=True)
+    vehicle = context.Process(
+        target=drive, args=(sending, objects, duration_s), daemon=True
+    )
     vehicle.start()
     sending.close()
     receiver = Receiver(receiving, tracker)
@@ -176,7 +198,9 @@ def main(
     measured = track(receiver, hz, duration_s, parts)
     vehicle.join()
     sent = receiver.sent
-    counted = {sensor: sum(counts.values()) for sensor, counts in tracker.counts.items()}
+    counted = {
+        sensor: sum(counts.values()) for sensor, counts in tracker.counts.items()
+    }
     result = {
         "sent": sent,
         "counts": tracker.counts,
@@ -186,9 +210,17 @@ def main(
         "timing": asdict(tracker.timing),
         "parts": [asdict(part) for part in measured],
     }
-    (out / "live.json").write_text(json.dumps(result, indent=1, default=dict) + "\n", encoding="utf-8")
+    (out / "live.json").write_text(
+        json.dumps(result, indent=1, default=dict) + "\n", encoding="utf-8"
+    )
     half_mb = [part.memory_mb for part in measured[max(len(measured) // 2 - 1, 0) :]]
-    header = ["until [min]", "memory [MB]", "tick p50 / p99 / worst [ms]", "of that CPU [ms]", "deadlines missed"]
+    header = [
+        "until [min]",
+        "memory [MB]",
+        "tick p50 / p99 / worst [ms]",
+        "of that CPU [ms]",
+        "deadlines missed",
+    ]
     lines = [
         machine,
         "",

@@ -21,14 +21,14 @@ import typer
 from bench_report import plural, progress, short_machine, table
 from bench_tracker import SPEED_MPS, scenario, yardstick_us
 
+from fgtrack.config.shipped import read_config
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Message, TickReport
-from fgtrack.io.recording import write_recording
-from fgtrack.io.source import open_input
+from fgtrack.inputs.recording import write_recording
+from fgtrack.inputs.source import open_input
 from fgtrack.models.oval import make_oval
 from fgtrack.models.path import Path as Track
 from fgtrack.pipeline.replay import replay
-from fgtrack.pipeline.shipped import read_config
 from fgtrack.sim.simulate import simulate
 
 _MB = 1 << 20
@@ -41,7 +41,9 @@ def laps(objects: int, duration_s: float) -> Iterator[Message]:
     one_lap = scenario(objects, lap_s, speed_mps=speed_mps)
 
     def lap(number: int, begun_ns: int) -> Iterable[Message]:
-        return simulate(replace(one_lap, start_ns=begun_ns), np.random.default_rng(number))
+        return simulate(
+            replace(one_lap, start_ns=begun_ns), np.random.default_rng(number)
+        )
 
     return joined(lap, lap_s, int(np.ceil(duration_s / lap_s)))
 
@@ -53,7 +55,9 @@ def whole_laps() -> tuple[float, float]:
     return lap_s, length_m / lap_s
 
 
-def joined(lap: Callable[[int, int], Iterable[Message]], lap_s: float, count: int) -> Iterator[Message]:
+def joined(
+    lap: Callable[[int, int], Iterable[Message]], lap_s: float, count: int
+) -> Iterator[Message]:
     """Messages of `count` laps in order of receipt; `lap(number, begun_ns)` makes one when the one before has ended.
     A message stamped at the end of a lap is left to the next one.
     """
@@ -61,7 +65,9 @@ def joined(lap: Callable[[int, int], Iterable[Message]], lap_s: float, count: in
     for number in range(count):
         begun_ns = LAPS_START_NS + number * nanoseconds(lap_s)
         ended_ns = begun_ns + nanoseconds(lap_s)
-        waiting += [message for message in lap(number, begun_ns) if message.stamp_ns < ended_ns]
+        waiting += [
+            message for message in lap(number, begun_ns) if message.stamp_ns < ended_ns
+        ]
         waiting.sort(key=lambda message: message.receipt_ns)
         ready = sum(message.receipt_ns < ended_ns for message in waiting)
         yield from waiting[:ready]
@@ -74,13 +80,18 @@ def memory_mb() -> float:
     file = Path("/proc/self/statm")
     if file.exists():
         return int(file.read_text().split()[1]) * resource.getpagesize() / _MB
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (_MB if sys.platform == "darwin" else 1024)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (
+        _MB if sys.platform == "darwin" else 1024
+    )
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder for the recording and the run while they last.")] = Path(
-        "out/speed"
-    ),
+    out: Annotated[
+        Path,
+        typer.Option(
+            "-o", help="Folder for the recording and the run while they last."
+        ),
+    ] = Path("out/speed"),
     duration_s: float = 7200.0,
     objects: int = 2,
     estimator: str = "smoother-banded",
@@ -88,13 +99,24 @@ def main(
 ) -> None:
     """Replay, print memory over the time of the recording."""
     out.mkdir(parents=True, exist_ok=True)
-    config = read_config("smoother", track_map="oval", pit_map="oval", estimator=estimator)
-    rows: list[tuple[float, float, float, int]] = []  # recording in min, memory in MB, computed in s, tracks
+    config = read_config(
+        "smoother", track_map="oval", pit_map="oval", estimator=estimator
+    )
+    rows: list[
+        tuple[float, float, float, int]
+    ] = []  # recording in min, memory in MB, computed in s, tracks
 
     def look(report: TickReport) -> None:
         passed_s = (report.now_ns - LAPS_START_NS) / 1e9
         if passed_s >= duration_s * (len(rows) + 1) / parts:
-            rows.append((passed_s / 60.0, memory_mb(), time.perf_counter() - began_s, len(report.tracks)))
+            rows.append(
+                (
+                    passed_s / 60.0,
+                    memory_mb(),
+                    time.perf_counter() - began_s,
+                    len(report.tracks),
+                )
+            )
 
     with tempfile.TemporaryDirectory(dir=out) as folder:
         drive = Path(folder) / "drive.jsonl.gz"
@@ -102,10 +124,23 @@ def main(
         write_recording(drive, laps(objects, duration_s))
         progress("replay it")
         began_s = time.perf_counter()
-        replay(open_input(drive, config.input).messages, config, {estimator: Path(folder) / "run"}, on_tick=look)
+        replay(
+            open_input(drive, config.input).messages,
+            config,
+            {estimator: Path(folder) / "run"},
+            on_tick=look,
+        )
     print(short_machine([yardstick_us()]), end="\n\n")
     header = ["recording [min]", "memory [MB]", "computed for [s]", "tracks"]
-    print(table(header, [(f"{past_min:.3g}", f"{mb:.1f}", f"{s:.0f}", str(n)) for past_min, mb, s, n in rows]))
+    print(
+        table(
+            header,
+            [
+                (f"{past_min:.3g}", f"{mb:.1f}", f"{s:.0f}", str(n))
+                for past_min, mb, s, n in rows
+            ],
+        )
+    )
     print(
         f"\n{estimator}, {plural(objects)}: the memory grew by {rows[-1][1] - rows[0][1]:.1f} MB after the first row."
     )

@@ -28,7 +28,12 @@ REQUIRED_RATIOS = {
 MAIN = tuple(REQUIRED_RATIOS[1])
 LARGEST_P99 = 2.5  # medians
 LARGEST_MS = {(REPLAY, 1000): 20.0, (BANDED, 300): 20.0}
-COSTED = (10, 50, 200, 1000)  # objects, whose cost must not grow; a tenth is within the noise
+COSTED = (
+    10,
+    50,
+    200,
+    1000,
+)  # objects, whose cost must not grow; a tenth is within the noise
 REQUIRED_READING, LARGEST_REPLAY_S = 20.0, {REPLAY: 3.0, BANDED: 5.0}
 PUBLISHED_MS_PER_US = {1: 0.56, 10: 3.45, 50: 20.4}
 """Median tick of the published implementation in ms per microsecond of yardstick, where its code is not at hand."""
@@ -50,15 +55,22 @@ class Row:
     """Times as fast as the published implementation, by round."""
 
     @classmethod
-    def of(cls, cell: Cell, rounds: Sequence[Measured], published_ms: Sequence[float]) -> "Row":
+    def of(
+        cls, cell: Cell, rounds: Sequence[Measured], published_ms: Sequence[float]
+    ) -> "Row":
         """Return the row of all rounds; `published_ms`: medians of the published implementation, by round, if any."""
         medians_ms = [median(one.ticks_ms) for one in rounds]
         least_ms = np.min([one.ticks_ms for one in rounds], axis=0)
         p50_ms, p99_ms = np.quantile(least_ms, (0.5, 0.99)).tolist()
         per_detection_us = 1e3 * float(least_ms.sum()) / rounds[0].detections
-        ratios = [theirs / ours for theirs, ours in zip(published_ms, medians_ms, strict=False)]
+        ratios = [
+            theirs / ours
+            for theirs, ours in zip(published_ms, medians_ms, strict=False)
+        ]
         tracks = min(one.tracks for one in rounds)
-        return cls(cell, median(medians_ms), p50_ms, p99_ms, per_detection_us, tracks, ratios)
+        return cls(
+            cell, median(medians_ms), p50_ms, p99_ms, per_detection_us, tracks, ratios
+        )
 
 
 @dataclass(frozen=True)
@@ -76,11 +88,23 @@ class Promise:
         """Return yes, NO, or that it was not measured."""
         if np.isnan(self.measured):
             return "not measured"
-        return "yes" if (self.measured <= self.required if self.at_most else self.measured >= self.required) else "NO"
+        return (
+            "yes"
+            if (
+                self.measured <= self.required
+                if self.at_most
+                else self.measured >= self.required
+            )
+            else "NO"
+        )
 
     def cell(self, short: bool = False) -> str:
         """Return the measured value, its lowest and highest round unless `short`, and where missed the requirement."""
-        between = f" ({min(self.rounds):.3g} to {max(self.rounds):.3g})" if self.rounds and not short else ""
+        between = (
+            f" ({min(self.rounds):.3g} to {max(self.rounds):.3g})"
+            if self.rounds and not short
+            else ""
+        )
         return f"{_short(self.measured)}{between}{f' (target {self.required:g})' if self.verdict == 'NO' else ''}"
 
 
@@ -104,7 +128,11 @@ class Results:
     def row(self, label: str, count: int) -> Row | None:
         """Return the row with a lag of 1 s and the paper's delays; None where cars were lost."""
         wanted = (label, count, 1.0, None)
-        rows = (r for r in self.rows if (r.cell.label, r.cell.count, r.cell.lag_s, r.cell.delay_s) == wanted)
+        rows = (
+            r
+            for r in self.rows
+            if (r.cell.label, r.cell.count, r.cell.lag_s, r.cell.delay_s) == wanted
+        )
         return next((row for row in rows if row.tracks >= count), None)
 
     def ratio(self, label: str, count: int) -> Promise:
@@ -112,13 +140,20 @@ class Results:
         row, required = self.row(label, count), REQUIRED_RATIOS[count][label]
         ratios = row.ratios if row else []
         what = f"{label}, {plural(count)}: times as fast as published"
-        return Promise(what, median(ratios) if ratios else float("nan"), required, rounds=ratios)
+        return Promise(
+            what, median(ratios) if ratios else float("nan"), required, rounds=ratios
+        )
 
     def p99(self, label: str, count: int) -> Promise:
         """Return the 99 % quantile of a cell in medians."""
         row = self.row(label, count)
         measured = row.p99_ms / row.p50_ms if row else float("nan")
-        return Promise(f"{label}, {plural(count)}: 99 % quantile in medians", measured, LARGEST_P99, at_most=True)
+        return Promise(
+            f"{label}, {plural(count)}: 99 % quantile in medians",
+            measured,
+            LARGEST_P99,
+            at_most=True,
+        )
 
     def others(self) -> list[Promise]:
         """Return the promises beside those of every cell."""
@@ -126,43 +161,87 @@ class Results:
         for (label, count), largest_ms in LARGEST_MS.items():
             row = self.row(label, count)
             what = f"{label}, {plural(count)}: median tick [ms]"
-            promises.append(Promise(what, row.median_ms if row else float("nan"), largest_ms, at_most=True))
-        costs = [row.per_detection_us if (row := self.row(REPLAY, n)) else float("nan") for n in COSTED]
-        for (few, many), (first, second) in zip(pairwise(COSTED), pairwise(costs), strict=True):
+            promises.append(
+                Promise(
+                    what,
+                    row.median_ms if row else float("nan"),
+                    largest_ms,
+                    at_most=True,
+                )
+            )
+        costs = [
+            row.per_detection_us if (row := self.row(REPLAY, n)) else float("nan")
+            for n in COSTED
+        ]
+        for (few, many), (first, second) in zip(
+            pairwise(COSTED), pairwise(costs), strict=True
+        ):
             what = f"{REPLAY}: cost of an object among {many} over that among {few}"
             promises.append(Promise(what, second / first, 1.1, at_most=True))
         for name, times in self.reading.items():
-            promises.append(Promise(f"reading {name}, 10 objects: times real time", median(times), REQUIRED_READING))
+            promises.append(
+                Promise(
+                    f"reading {name}, 10 objects: times real time",
+                    median(times),
+                    REQUIRED_READING,
+                )
+            )
         for name, spent_s in self.replay_s.items():
             what = f"fgtrack replay of the demo's minute, {name}: processor time [s]"
-            promises.append(Promise(what, median(spent_s), LARGEST_REPLAY_S[name], at_most=True))
+            promises.append(
+                Promise(what, median(spent_s), LARGEST_REPLAY_S[name], at_most=True)
+            )
         return promises
 
     def promises(self) -> list[Promise]:
         """Return all."""
         cells = [(label, count) for count in REQUIRED_RATIOS for label in MAIN]
-        return [*(self.ratio(*cell) for cell in cells), *(self.p99(*cell) for cell in cells), *self.others()]
+        return [
+            *(self.ratio(*cell) for cell in cells),
+            *(self.p99(*cell) for cell in cells),
+            *self.others(),
+        ]
 
     def as_dict(self) -> dict[str, Any]:
         """Return JSON values."""
-        promises = [{**asdict(promise), "verdict": promise.verdict} for promise in self.promises()]
+        promises = [
+            {**asdict(promise), "verdict": promise.verdict}
+            for promise in self.promises()
+        ]
         return {"machine": machine(), "promises": promises, **asdict(self)}
 
 
 def machine() -> dict[str, str]:
     """Return commit, date, processor and versions that numbers belong to."""
-    describe = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
-    commit = subprocess.run(describe, capture_output=True, text=True).stdout.strip() or "unknown"
+    describe = [
+        "git",
+        "-C",
+        str(Path(__file__).parent),
+        "describe",
+        "--always",
+        "--dirty",
+    ]
+    commit = (
+        subprocess.run(describe, capture_output=True, text=True).stdout.strip()
+        or "unknown"
+    )
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    names = [
+        line.partition(":")[2].strip()
+        for line in lines
+        if line.startswith("model name")
+    ]
     return {
         "commit": f"{commit}, {date.today().isoformat()}",
         "processor": names[0] if names else platform.processor(),
         "cores": str(os.cpu_count()),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        **{name: importlib.metadata.version(name) for name in ("numpy", "scipy", "gtsam", "numba")},
+        **{
+            name: importlib.metadata.version(name)
+            for name in ("numpy", "scipy", "gtsam", "numba")
+        },
     }
 
 
@@ -174,13 +253,29 @@ def short_machine(yardsticks_us: Sequence[float]) -> str:
 
 def tables(results: Results) -> str:
     """Return all tables as Markdown."""
-    quantiles = [(str(n), *(results.p99(label, n).cell() for label in MAIN)) for n in REQUIRED_RATIOS]
+    quantiles = [
+        (str(n), *(results.p99(label, n).cell() for label in MAIN))
+        for n in REQUIRED_RATIOS
+    ]
     others = [
-        (one.what, one.cell(), f"at {'most' if one.at_most else 'least'} {one.required:g}", one.verdict)
+        (
+            one.what,
+            one.cell(),
+            f"at {'most' if one.at_most else 'least'} {one.required:g}",
+            one.verdict,
+        )
         for one in results.others()
     ]
     kept = [row for row in results.rows if row.tracks >= row.cell.count]
-    head = ["ticks with detections", "objects", "lag [s]", "delay [s]", "median [ms]", "p99 [ms]", "per detection [us]"]
+    head = [
+        "ticks with detections",
+        "objects",
+        "lag [s]",
+        "delay [s]",
+        "median [ms]",
+        "p99 [ms]",
+        "per detection [us]",
+    ]
     parts = [
         short_machine(results.yardsticks_us),
         _missed(results),
@@ -193,7 +288,9 @@ def tables(results: Results) -> str:
             for row in results.rows
             if row not in kept
         ),
-        "" if np.isnan(results.stone_soup_us) else f"Stone Soup: {results.stone_soup_us:.3g} us per detection.",
+        ""
+        if np.isnan(results.stone_soup_us)
+        else f"Stone Soup: {results.stone_soup_us:.3g} us per detection.",
     ]
     return "\n\n".join(filter(None, parts)) + "\n"
 
@@ -201,12 +298,18 @@ def tables(results: Results) -> str:
 def page_tables(results: Results) -> str:
     """Return the answer and the tables of the page, without the spread of the rounds."""
     fastest = [label for label in MAIN if label in (REPLAY, BANDED, SMOOTHER)]
-    many, few = ([results.ratio(label, n).measured for label in fastest] for n in (max(REQUIRED_RATIOS), 1))
+    many, few = (
+        [results.ratio(label, n).measured for label in fastest]
+        for n in (max(REQUIRED_RATIOS), 1)
+    )
     answer = (
-        f"With {plural(max(REQUIRED_RATIOS))}, {_times(fastest, many)} times as fast as the published implementation"
+        f"With {plural(max(REQUIRED_RATIOS))}, {_times(fastest, many)} times as fast as "
+        "the published implementation"
     )
     p99 = [results.p99(label, n) for n in REQUIRED_RATIOS for label in MAIN]
-    values = [one.measured for one in p99 if not np.isnan(one.measured)] or [float("nan")]
+    values = [one.measured for one in p99 if not np.isnan(one.measured)] or [
+        float("nan")
+    ]
     kept = sum(one.verdict == "yes" for one in p99)
     quantiles = f"{min(values):.3g} to {max(values):.3g} ({kept} of {len(p99)} at most {LARGEST_P99:g})"
     own = machine()
@@ -216,7 +319,10 @@ def page_tables(results: Results) -> str:
         _ratios(results, short=True),
         table(
             ["other requirements", "measured"],
-            [*((one.what, one.cell(short=True)) for one in results.others()), ("99 % quantile, in medians", quantiles)],
+            [
+                *((one.what, one.cell(short=True)) for one in results.others()),
+                ("99 % quantile, in medians", quantiles),
+            ],
         ),
     ]
     return "\n\n".join(parts) + "\n"
@@ -224,21 +330,32 @@ def page_tables(results: Results) -> str:
 
 def _times(labels: Sequence[str], ratios: Sequence[float]) -> str:
     return ", ".join(
-        f"`{label}` is {_short(float(f'{ratio:.2g}'))}" for label, ratio in zip(labels, ratios, strict=True)
+        f"`{label}` is {_short(float(f'{ratio:.2g}'))}"
+        for label, ratio in zip(labels, ratios, strict=True)
     )
 
 
 def _missed(results: Results) -> str:
     judged = results.promises()
-    source = "was run in turns with fgtrack" if results.is_run else "is stood for by the yardstick"
+    source = (
+        "was run in turns with fgtrack"
+        if results.is_run
+        else "is stood for by the yardstick"
+    )
     missed = sum(one.verdict == "NO" for one in judged)
     return f"{missed} of {len(judged)} requirements missed. The published implementation {source}."
 
 
 def _ratios(results: Results, short: bool = False) -> str:
-    published = {count: f"{median(ms):.3g}" for count, ms in results.published_ms.items()}
+    published = {
+        count: f"{median(ms):.3g}" for count, ms in results.published_ms.items()
+    }
     rows = [
-        (str(n), published.get(n, "-"), *(results.ratio(label, n).cell(short) for label in MAIN))
+        (
+            str(n),
+            published.get(n, "-"),
+            *(results.ratio(label, n).cell(short) for label in MAIN),
+        )
         for n in REQUIRED_RATIOS
     ]
     return table(["times as fast as published, objects", "published [ms]", *MAIN], rows)
@@ -263,11 +380,19 @@ def plural(count: float) -> str:
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a Markdown table."""
-    return "\n".join(f"| {' | '.join(line)} |" for line in (header, ["---"] * len(header), *rows))
+    return "\n".join(
+        f"| {' | '.join(line)} |" for line in (header, ["---"] * len(header), *rows)
+    )
 
 
 def _short(value: float) -> str:
-    return "-" if np.isnan(value) else f"{value:.3g}" if abs(value) < 1e3 else f"{value:.0f}"
+    return (
+        "-"
+        if np.isnan(value)
+        else f"{value:.3g}"
+        if abs(value) < 1e3
+        else f"{value:.0f}"
+    )
 
 
 def draw(results: Results, path: Path) -> None:
@@ -277,16 +402,32 @@ def draw(results: Results, path: Path) -> None:
     for label in MAIN:
         rows = [row for n in counts if (row := results.row(label, n)) is not None]
         if rows:
-            (line,) = axes.loglog([row.cell.count for row in rows], [row.median_ms for row in rows], "o-", label=label)
+            (line,) = axes.loglog(
+                [row.cell.count for row in rows],
+                [row.median_ms for row in rows],
+                "o-",
+                label=label,
+            )
             axes.loglog(
-                [row.cell.count for row in rows], [row.p99_ms for row in rows], ":", color=line.get_color(), lw=1
+                [row.cell.count for row in rows],
+                [row.p99_ms for row in rows],
+                ":",
+                color=line.get_color(),
+                lw=1,
             )
     if results.published_ms:
         medians_ms = [median(ms) for ms in results.published_ms.values()]
-        axes.loglog(list(results.published_ms), medians_ms, "ks--", label="published implementation")
+        axes.loglog(
+            list(results.published_ms),
+            medians_ms,
+            "ks--",
+            label="published implementation",
+        )
     axes.axhline(1e3 / NODE_HZ, color="0.5", lw=1)
     axes.annotate(" node period", (1.0, 1e3 / NODE_HZ), color="0.4", va="bottom")
-    axes.set(xlabel="objects", ylabel="tick with detections [ms] (dotted: 99 % quantile)")
+    axes.set(
+        xlabel="objects", ylabel="tick with detections [ms] (dotted: 99 % quantile)"
+    )
     axes.grid(alpha=0.3, which="both")
     axes.legend(fontsize=8)
     figure.savefig(path, dpi=90, pil_kwargs={"optimize": True})
@@ -305,7 +446,9 @@ def put_into(page: Path, name: str, text: str) -> None:
     _, last, after = rest.partition(end)
     if not mark or not last:
         raise ValueError(f"{page}: has no marks {begin.strip()} and {end.strip()}")
-    page.write_text(f"{before}{begin}\n{text.strip()}\n\n{end}{after}", encoding="utf-8")
+    page.write_text(
+        f"{before}{begin}\n{text.strip()}\n\n{end}{after}", encoding="utf-8"
+    )
 
 
 def finite(value: Any) -> Any:

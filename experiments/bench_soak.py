@@ -30,11 +30,17 @@ import fgtrack
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DetectionList, Disposition, EgoState, Message, TruthState
 from fgtrack.estimation.failures import Failure
-from fgtrack.io.run.rows import Row, text
-from fgtrack.io.run.sink import RunSink
 from fgtrack.pipeline.clock import clock_ticks
+from fgtrack.runs.rows import Row, text
+from fgtrack.runs.sink import RunSink
 from fgtrack.sim.clocks import ArrivalClock, DriftClock, JitterClock, OffsetClock
-from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY, ConstantDelay, LossyDelay, MarkovTimeDelay
+from fgtrack.sim.delays import (
+    LIDAR_DELAY,
+    RADAR_DELAY,
+    ConstantDelay,
+    LossyDelay,
+    MarkovTimeDelay,
+)
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.sensor import Clutter, SimulatedSensor
 from fgtrack.sim.simulate import simulate
@@ -55,10 +61,19 @@ def race(rng: np.random.Generator, lap_s: float, speed_mps: float) -> Scenario:
     ego_m = 100.0
     cars = [TrackVehicle(arc_m=ego_m + 25.0, lateral_m=3.0, speed=((0.0, speed_mps),))]
     for _ in range(int(rng.integers(0, 4))):
-        faster_mps, beside_s = rng.choice((-1.0, 1.0)) * rng.uniform(4.0, 12.0), rng.uniform(0.0, lap_s)
+        faster_mps, beside_s = (
+            rng.choice((-1.0, 1.0)) * rng.uniform(4.0, 12.0),
+            rng.uniform(0.0, lap_s),
+        )
         start_m = ego_m - faster_mps * beside_s
         lateral_m = rng.uniform(-5.0, 0.0)
-        cars.append(TrackVehicle(arc_m=start_m, lateral_m=lateral_m, speed=((0.0, speed_mps + faster_mps),)))
+        cars.append(
+            TrackVehicle(
+                arc_m=start_m,
+                lateral_m=lateral_m,
+                speed=((0.0, speed_mps + faster_mps),),
+            )
+        )
     silent_s = rng.uniform(0.0, lap_s - 3.0)
     slow = MarkovTimeDelay(LIDAR_DELAY, ConstantDelay(0.27), 0.04, 0.67)
     lidar = SimulatedSensor(
@@ -72,7 +87,11 @@ def race(rng: np.random.Generator, lap_s: float, speed_mps: float) -> Scenario:
         outlier_probability=0.01,
         drop_outs=((silent_s, silent_s + 2.0),) if rng.random() < 0.2 else (),
         delay=LossyDelay(0.03, slow),
-        clock=(OffsetClock(rng.uniform(-0.01, 0.01)), DriftClock(40.0), JitterClock(0.002)),
+        clock=(
+            OffsetClock(rng.uniform(-0.01, 0.01)),
+            DriftClock(40.0),
+            JitterClock(0.002),
+        ),
     )
     radar = SimulatedSensor(
         "radar",
@@ -82,11 +101,17 @@ def race(rng: np.random.Generator, lap_s: float, speed_mps: float) -> Scenario:
         max_range_m=105.0,
         detection_probability=0.8,
         clutter=Clutter(0.02, "track", (0.0, 5.0)),
-        delay=MarkovTimeDelay(RADAR_DELAY, ConstantDelay(0.35), to_bad_per_s=0.05, to_good_per_s=1.0),
-        clock=(ArrivalClock(), OffsetClock(-0.06)) if rng.random() < 0.2 else (JitterClock(0.002),),
+        delay=MarkovTimeDelay(
+            RADAR_DELAY, ConstantDelay(0.35), to_bad_per_s=0.05, to_good_per_s=1.0
+        ),
+        clock=(ArrivalClock(), OffsetClock(-0.06))
+        if rng.random() < 0.2
+        else (JitterClock(0.002),),
     )
     driven = TrackVehicle(arc_m=ego_m, speed=((0.0, speed_mps),))
-    return Scenario(driven, tuple(cars), (lidar, radar), duration_s=lap_s, truth_rate_hz=1.0)
+    return Scenario(
+        driven, tuple(cars), (lidar, radar), duration_s=lap_s, truth_rate_hz=1.0
+    )
 
 
 def messages(hours: float, seed: int) -> Iterator[Sent]:
@@ -100,13 +125,17 @@ def messages(hours: float, seed: int) -> Iterator[Sent]:
         return [message for message in drawn if not isinstance(message, TruthState)]
 
     ends_ns = LAPS_START_NS + nanoseconds(3600.0 * hours)
-    for message in corrupted(wrong_rng, joined(lap, lap_s, int(np.ceil(3600.0 * hours / lap_s)))):
+    for message in corrupted(
+        wrong_rng, joined(lap, lap_s, int(np.ceil(3600.0 * hours / lap_s)))
+    ):
         if message.receipt_ns > ends_ns:
             return
         yield message
 
 
-def corrupted(rng: np.random.Generator, race_messages: Iterable[Message]) -> Iterator[Sent]:
+def corrupted(
+    rng: np.random.Generator, race_messages: Iterable[Message]
+) -> Iterator[Sent]:
     """The race with wrong stamps, values that are not numbers, and lists that are repeated, some after others."""
     again: list[DetectionList] = []
     for message in race_messages:
@@ -114,16 +143,24 @@ def corrupted(rng: np.random.Generator, race_messages: Iterable[Message]) -> Ite
             yield again.pop(0)
         if isinstance(message, TruthState):
             continue
-        wrong = rng.random() < (_WRONG_EGO if isinstance(message, EgoState) else _WRONG_LIST)
+        wrong = rng.random() < (
+            _WRONG_EGO if isinstance(message, EgoState) else _WRONG_LIST
+        )
         if wrong:
-            message = replace(message, stamp_ns=message.stamp_ns + nanoseconds(float(rng.choice(_WRONG_S))))
+            message = replace(
+                message,
+                stamp_ns=message.stamp_ns + nanoseconds(float(rng.choice(_WRONG_S))),
+            )
         if isinstance(message, DetectionList):
             if message.objects and rng.random() < _NO_NUMBERS:
                 invalid = fgtrack.Detection(x_m=float("nan"), y_m=float("nan"))
                 message = replace(message, objects=(invalid, *message.objects[1:]))
             if rng.random() < _REPEATED:
                 due_ns = message.receipt_ns + nanoseconds(float(rng.uniform(0.0, 0.2)))
-                again = sorted([*again, replace(message, receipt_ns=due_ns)], key=lambda one: one.receipt_ns)
+                again = sorted(
+                    [*again, replace(message, receipt_ns=due_ns)],
+                    key=lambda one: one.receipt_ns,
+                )
         yield message
     yield from again
 
@@ -178,13 +215,23 @@ class Part:
 
 def soak(hours: float, parts: int, estimator: str, seed: int, file: Path) -> list[Part]:
     """Track the race; `file` has every part as soon as it is over."""
-    tracker = fgtrack.Tracker.from_config("smoother", map="oval", pit_map="oval", estimator=estimator)
+    tracker = fgtrack.Tracker.from_config(
+        "smoother", map="oval", pit_map="oval", estimator=estimator
+    )
     run, found = HashedRun(), list[Part]()
-    spent_us, tracked, detections = np.empty(int(3600.0 * hours * NODE_HZ / parts) + 2), 0, 0
+    spent_us, tracked, detections = (
+        np.empty(int(3600.0 * hours * NODE_HZ / parts) + 2),
+        0,
+        0,
+    )
     ticks = with_lists = 0
     began_s = time.perf_counter()
     for tick in clock_ticks(messages(hours, seed), NODE_HZ):
-        lists = sum(len(message.objects) for message in tick.messages if isinstance(message, DetectionList))
+        lists = sum(
+            len(message.objects)
+            for message in tick.messages
+            if isinstance(message, DetectionList)
+        )
         before_ns = time.thread_time_ns()
         for message in tick.messages:
             tracker.receive(message)
@@ -193,7 +240,11 @@ def soak(hours: float, parts: int, estimator: str, seed: int, file: Path) -> lis
             spent_us[with_lists] = (time.thread_time_ns() - before_ns) / 1e3
             with_lists += 1
         run.write_tick(report, 0, lists)
-        detections, tracked, ticks = detections + lists, tracked + len(report.tracks), ticks + 1
+        detections, tracked, ticks = (
+            detections + lists,
+            tracked + len(report.tracks),
+            ticks + 1,
+        )
         passed_h = (tick.now_ns - LAPS_START_NS) / 3.6e12
         if passed_h >= hours * (len(found) + 1) / parts:
             gc.collect()
@@ -215,7 +266,10 @@ def soak(hours: float, parts: int, estimator: str, seed: int, file: Path) -> lis
                     time.perf_counter() - began_s,
                 )
             )
-            file.write_text(json.dumps([asdict(part) for part in found], indent=1) + "\n", encoding="utf-8")
+            file.write_text(
+                json.dumps([asdict(part) for part in found], indent=1) + "\n",
+                encoding="utf-8",
+            )
             progress(f"{estimator}: {' '.join(row(found[-1]))}")
             tracked = ticks = with_lists = 0
     return found
@@ -244,7 +298,11 @@ def problems(runs: Sequence[Sequence[Part]]) -> list[str]:
             for part in parts
             if part.sent != sum(part.counts.values())
         ][:1]
-        failures = {kind: count for kind, count in parts[-1].failures.items() if kind not in _OF_THE_DATA}
+        failures = {
+            kind: count
+            for kind, count in parts[-1].failures.items()
+            if kind not in _OF_THE_DATA
+        }
         if failures:
             failed.append(f"run {number}: failures: {failures}")
         if growth(parts) > _MOST_GROWTH:
@@ -265,16 +323,33 @@ def growth(parts: Sequence[Part]) -> float:
 def summary(estimator: str, runs: Sequence[Sequence[Part]], rows: int = 12) -> str:
     """Return the first run as Markdown, and the comparison of all."""
     first, last = runs[0], runs[0][-1]
-    chosen = sorted({round((k + 1) * len(first) / rows) - 1 for k in range(rows)} - {-1})
-    header = ["until [h]", "memory [MB]", "tick p50 / p99 [ms]", "p50 in yardsticks", "tracks", "births", "sent"]
-    shares = {name: f"{name} {100.0 * count / max(last.sent, 1):.2g} %" for name, count in last.counts.items() if count}
+    chosen = sorted(
+        {round((k + 1) * len(first) / rows) - 1 for k in range(rows)} - {-1}
+    )
+    header = [
+        "until [h]",
+        "memory [MB]",
+        "tick p50 / p99 [ms]",
+        "p50 in yardsticks",
+        "tracks",
+        "births",
+        "sent",
+    ]
+    shares = {
+        name: f"{name} {100.0 * count / max(last.sent, 1):.2g} %"
+        for name, count in last.counts.items()
+        if count
+    }
     refused = [f"{name} {count}" for name, count in sorted(last.refused.items())]
     failures = [f"{name} {count}" for name, count in last.failures.items()]
     ticks, third = [part.in_yardsticks for part in first], max(len(first) // 3, 1)
     slowing = float(np.median(ticks[-third:]) / np.median(ticks[:third]))
     lines = [
         short_machine([part.yardstick_us for part in first]),
-        table([*header, "with a disposition", "digest of all rows"], [row(first[number]) for number in chosen]),
+        table(
+            [*header, "with a disposition", "digest of all rows"],
+            [row(first[number]) for number in chosen],
+        ),
         f"{estimator}: {len(runs)} times {last.until_h:.3g} h of race in {last.wall_s / 3600.0:.2g} h. Memory grew by "
         f"{100.0 * growth(first):.2f} % after the first sixth, the median tick changed by "
         f"{100.0 * (slowing - 1.0):.0f} % from the first third to the last. "
@@ -288,14 +363,25 @@ def summary(estimator: str, runs: Sequence[Sequence[Part]], rows: int = 12) -> s
 def draw(estimator: str, parts: Sequence[Part], path: Path) -> None:
     """Draw memory, time of a tick and tracks over the time of the race."""
     until_h = [part.until_h for part in parts]
-    figure, axes = plt.subplots(3, figsize=(7.0, 5.5), sharex=True, layout="constrained")
+    figure, axes = plt.subplots(
+        3, figsize=(7.0, 5.5), sharex=True, layout="constrained"
+    )
     axes[0].plot(until_h, [part.memory_mb for part in parts], label=estimator)
     axes[1].plot(until_h, [part.in_yardsticks for part in parts])
-    axes[1].plot(until_h, [part.tick_us[1] / part.yardstick_us for part in parts], ":", color="C0")
+    axes[1].plot(
+        until_h,
+        [part.tick_us[1] / part.yardstick_us for part in parts],
+        ":",
+        color="C0",
+    )
     axes[2].plot(until_h, [part.tracks for part in parts])
     axes[0].legend(fontsize=8, loc="lower right")
     axes[2].set_xlabel("time of the race [h]")
-    for each, label in zip(axes, ("memory [MB]", "tick [yardsticks]\n(dotted: 99 %)", "tracks, mean"), strict=True):
+    for each, label in zip(
+        axes,
+        ("memory [MB]", "tick [yardsticks]\n(dotted: 99 %)", "tracks, mean"),
+        strict=True,
+    ):
         each.set(ylabel=label, ylim=(0.0, 1.15 * each.dataLim.ymax))
         each.grid(alpha=0.3)
     figure.savefig(path, dpi=90, pil_kwargs={"optimize": True})
@@ -303,7 +389,9 @@ def draw(estimator: str, parts: Sequence[Part], path: Path) -> None:
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder for the table, figure and numbers.")] = Path("out/soak"),
+    out: Annotated[
+        Path, typer.Option("-o", help="Folder for the table, figure and numbers.")
+    ] = Path("out/soak"),
     hours: Annotated[float, typer.Option(help="Of the race.")] = 24.0,
     parts: Annotated[int, typer.Option(help="Points of the figure.")] = 48,
     estimator: str = "ekf-replay",
@@ -314,7 +402,9 @@ def main(
     """Race, print the table; write soak.md, soak.png and the parts. Exits 1 where a promise does not hold."""
     out.mkdir(parents=True, exist_ok=True)
     files = [out / f"{estimator}-{number}.json" for number in range(1, runs + 1)]
-    measured: list[Any] = Parallel(n_jobs=jobs)(delayed(soak)(hours, parts, estimator, seed, file) for file in files)
+    measured: list[Any] = Parallel(n_jobs=jobs)(
+        delayed(soak)(hours, parts, estimator, seed, file) for file in files
+    )
     said = summary(estimator, measured)
     (out / "soak.md").write_text(said, encoding="utf-8")
     draw(estimator, measured[0], out / "soak.png")

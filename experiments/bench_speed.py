@@ -48,13 +48,16 @@ from bench_report import (
 from bench_tracker import Cell, Measured, measure, scene, traffic
 
 from fgtrack.estimation.registry import ESTIMATORS
-from fgtrack.io.recording import write_recording
-from fgtrack.io.source import open_input
+from fgtrack.inputs.recording import write_recording
+from fgtrack.inputs.source import open_input
 
 ALL_OBJECTS = (1, 2, 5, 10, 20, 50, 100, 200, 300, 1000)
 LAGS_S = (0.5, 1.0, 3.0)
 DELAYS_S = (0.0, 0.06, 0.15, 0.4)
-_MANY, _SHORT_S = 50, 4.0  # with more objects the traffic is shorter, or the slow ones take minutes
+_MANY, _SHORT_S = (
+    50,
+    4.0,
+)  # with more objects the traffic is shorter, or the slow ones take minutes
 _MOST = {SMOOTHER: 100}  # objects
 
 
@@ -68,15 +71,33 @@ def cell(label: str, count: int, **settings: Any) -> Cell:
 def quick_cells() -> list[Cell]:
     """Return what the requirements need."""
     cells = [cell(label, n) for n in PUBLISHED_MS_PER_US for label in MAIN]
-    return [*cells, *(cell(*each) for each in LARGEST_MS), *(cell(REPLAY, n) for n in COSTED)]
+    return [
+        *cells,
+        *(cell(*each) for each in LARGEST_MS),
+        *(cell(REPLAY, n) for n in COSTED),
+    ]
 
 
 def full_cells() -> list[Cell]:
     """Return cells over the number of objects, the lag, the delay, and every estimator."""
-    cells = [cell(label, n) for n in ALL_OBJECTS for label in MAIN if n <= _MOST.get(label, n)]
-    cells += [cell(label, n, lag_s=lag_s) for label in (BANDED, SMOOTHER) for n in (10, 50) for lag_s in LAGS_S]
-    cells += [cell(label, 10, delay_s=delay_s) for label in MAIN for delay_s in DELAYS_S]
-    return cells + [cell(name, 10, duration_s=_SHORT_S) for name in ESTIMATORS if name not in MAIN]
+    cells = [
+        cell(label, n)
+        for n in ALL_OBJECTS
+        for label in MAIN
+        if n <= _MOST.get(label, n)
+    ]
+    cells += [
+        cell(label, n, lag_s=lag_s)
+        for label in (BANDED, SMOOTHER)
+        for n in (10, 50)
+        for lag_s in LAGS_S
+    ]
+    cells += [
+        cell(label, 10, delay_s=delay_s) for label in MAIN for delay_s in DELAYS_S
+    ]
+    return cells + [
+        cell(name, 10, duration_s=_SHORT_S) for name in ESTIMATORS if name not in MAIN
+    ]
 
 
 def shortened(cells: Iterable[Cell], duration_s: float) -> list[Cell]:
@@ -86,7 +107,9 @@ def shortened(cells: Iterable[Cell], duration_s: float) -> list[Cell]:
             one,
             duration_s=min(
                 one.duration_s,
-                _SHORT_S + one.lag_s if one.count > _MANY or (one.label, one.count) == (SMOOTHER, _MANY) else 8.0,
+                _SHORT_S + one.lag_s
+                if one.count > _MANY or (one.label, one.count) == (SMOOTHER, _MANY)
+                else 8.0,
                 duration_s,
             ),
         )
@@ -95,16 +118,25 @@ def shortened(cells: Iterable[Cell], duration_s: float) -> list[Cell]:
     return list(dict.fromkeys(short))
 
 
-def measure_round(results: Results, passes: dict[Cell, list[Measured]], streams: dict[int, Path], command: str) -> None:
+def measure_round(
+    results: Results,
+    passes: dict[Cell, list[Measured]],
+    streams: dict[int, Path],
+    command: str,
+) -> None:
     """Measure all cells once, each number of objects beside the published implementation on its stream."""
     yardsticks_us: dict[int, list[float]] = {}
     for count in sorted({one.count for one in passes}):
         if command and count in streams:
             progress(f"published implementation, {count} objects")
-            results.published_ms.setdefault(count, []).append(run_published(command, streams[count]))
+            results.published_ms.setdefault(count, []).append(
+                run_published(command, streams[count])
+            )
         for one in [each for each in passes if each.count == count]:
             progress(f"{one.label}, {count} objects, {one.lag_s:g} s lag")
-            passes[one].append(measure(one, _traffic(count, one.duration_s, one.delay_s)))
+            passes[one].append(
+                measure(one, _traffic(count, one.duration_s, one.delay_s))
+            )
             yardsticks_us.setdefault(count, []).append(passes[one][-1].yardstick_us)
     for count, times_us in yardsticks_us.items():
         results.yardsticks_us += times_us
@@ -118,11 +150,20 @@ _traffic = cache(traffic)
 
 def run_published(command: str, stream: Path) -> float:
     """Return the median tick of the published implementation in ms."""
-    run = subprocess.run([*shlex.split(command), str(stream)], stdout=subprocess.PIPE, text=True, check=True)
-    return float(json.loads(run.stdout.strip().splitlines()[-1])["receive_and_handling"][0])
+    run = subprocess.run(
+        [*shlex.split(command), str(stream)],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
+    return float(
+        json.loads(run.stdout.strip().splitlines()[-1])["receive_and_handling"][0]
+    )
 
 
-def measure_reading(results: Results, recordings: Sequence[Path], duration_s: float) -> None:
+def measure_reading(
+    results: Results, recordings: Sequence[Path], duration_s: float
+) -> None:
     """Read recordings once; processor time counts."""
     for recording in recordings:
         progress(f"reading {recording.name}")
@@ -130,7 +171,9 @@ def measure_reading(results: Results, recordings: Sequence[Path], duration_s: fl
         for _ in open_input(recording).messages():
             pass
         name = "a stream" if recording.suffix == ".jsonl" else "a bag"
-        results.reading.setdefault(name, []).append(duration_s / (time.process_time() - began_s))
+        results.reading.setdefault(name, []).append(
+            duration_s / (time.process_time() - began_s)
+        )
 
 
 def measure_replay(results: Results, demo: Path, folder: Path) -> None:
@@ -138,12 +181,26 @@ def measure_replay(results: Results, demo: Path, folder: Path) -> None:
     for name in LARGEST_REPLAY_S:
         progress(f"fgtrack replay, {name}")
         before_s = _children_s()
-        _fgtrack("replay", demo, "-c", "tuned", "-e", name, "-o", folder / "run", "--overwrite")
+        _fgtrack(
+            "replay",
+            demo,
+            "-c",
+            "tuned",
+            "-e",
+            name,
+            "-o",
+            folder / "run",
+            "--overwrite",
+        )
         results.replay_s.setdefault(name, []).append(_children_s() - before_s)
 
 
 def _fgtrack(*arguments: object) -> None:
-    subprocess.run([sys.executable, "-m", "fgtrack", *map(str, arguments)], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [sys.executable, "-m", "fgtrack", *map(str, arguments)],
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
 
 
 def _children_s() -> float:
@@ -153,19 +210,36 @@ def _children_s() -> float:
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder for speed.md, speed.json and speed.png.")] = Path("out/speed"),
-    full: Annotated[bool, typer.Option(help="Every estimator, number of objects, lag and delay.")] = False,
-    published: Annotated[str, typer.Option(help="Command that runs the published implementation on a stream.")] = "",
+    out: Annotated[
+        Path, typer.Option("-o", help="Folder for speed.md, speed.json and speed.png.")
+    ] = Path("out/speed"),
+    full: Annotated[
+        bool, typer.Option(help="Every estimator, number of objects, lag and delay.")
+    ] = False,
+    published: Annotated[
+        str,
+        typer.Option(
+            help="Command that runs the published implementation on a stream."
+        ),
+    ] = "",
     rounds: Annotated[int, typer.Option(min=1, help="Passes over every cell.")] = 3,
-    duration_s: Annotated[float, typer.Option(help="Longest traffic and replay.")] = 60.0,
-    objects: Annotated[str, typer.Option(help="Numbers of objects, with commas.")] = ",".join(map(str, ALL_OBJECTS)),
-    page: Annotated[Path | None, typer.Option(help="Put answer, tables and figure into this page.")] = None,
+    duration_s: Annotated[
+        float, typer.Option(help="Longest traffic and replay.")
+    ] = 60.0,
+    objects: Annotated[
+        str, typer.Option(help="Numbers of objects, with commas.")
+    ] = ",".join(map(str, ALL_OBJECTS)),
+    page: Annotated[
+        Path | None, typer.Option(help="Put answer, tables and figure into this page.")
+    ] = None,
 ) -> None:
     """Measure, print the tables, write speed.md, speed.json and speed.png."""
     out.mkdir(parents=True, exist_ok=True)
     counts = {int(text) for text in objects.split(",")}
     cells = shortened(full_cells() if full else quick_cells(), duration_s)
-    passes: dict[Cell, list[Measured]] = {one: [] for one in cells if one.count in counts}
+    passes: dict[Cell, list[Measured]] = {
+        one: [] for one in cells if one.count in counts
+    }
     results = Results(is_run=bool(published))
     with suppress(ImportError):
         from bench_stone_soup import per_detection_us
@@ -173,7 +247,11 @@ def main(
         results.stone_soup_us = per_detection_us()
     with tempfile.TemporaryDirectory(dir=out) as name:
         folder = Path(name).resolve()
-        streams, recordings, demo = {}, [folder / "drive.jsonl", folder / "drive"], folder / "demo"
+        streams, recordings, demo = (
+            {},
+            [folder / "drive.jsonl", folder / "drive"],
+            folder / "demo",
+        )
         short_s = min(duration_s, 8.0)
         if published:
             for count in counts & set(PUBLISHED_MS_PER_US):
@@ -181,19 +259,29 @@ def main(
                 write_recording(streams[count], scene(count, short_s))
         for recording in recordings:
             write_recording(recording, scene(10, short_s))
-        _fgtrack("simulate", "default", "--seed", 1, "--duration", duration_s, "-o", demo)
+        _fgtrack(
+            "simulate", "default", "--seed", 1, "--duration", duration_s, "-o", demo
+        )
         for number in range(rounds):
             progress(f"round {number + 1} of {rounds}")
             measure_round(results, passes, streams, published)
             measure_reading(results, recordings, short_s)
             measure_replay(results, demo, folder)
     results.rows = [
-        Row.of(one, found, results.published_ms.get(one.count, []) if one.label in MAIN and one.delay_s is None else [])
+        Row.of(
+            one,
+            found,
+            results.published_ms.get(one.count, [])
+            if one.label in MAIN and one.delay_s is None
+            else [],
+        )
         for one, found in passes.items()
     ]
     text = tables(results)
     (out / "speed.md").write_text(text, encoding="utf-8")
-    (out / "speed.json").write_text(json.dumps(finite(results.as_dict()), indent=2) + "\n", encoding="utf-8")
+    (out / "speed.json").write_text(
+        json.dumps(finite(results.as_dict()), indent=2) + "\n", encoding="utf-8"
+    )
     draw(results, out / "speed.png")
     if page is not None:
         put_into(page, "speed", page_tables(results))

@@ -36,13 +36,17 @@ def per_detection_us(count: int = 240) -> float:
     lidar = LinearGaussian(5, (0, 2), np.diag([0.09, 0.09]))
     radar = PositionSpeed(5, (0, 2), np.diag([9.0, 9.0, 0.04]))
     state = GaussianState(
-        StateVector([0.0, 65.0, 0.0, 0.0, 0.05]), np.diag([1.0, 9.0, 1.0, 9.0, 0.09]), timestamp=epoch
+        StateVector([0.0, 65.0, 0.0, 0.0, 0.05]),
+        np.diag([1.0, 9.0, 1.0, 9.0, 0.09]),
+        timestamp=epoch,
     )
     times_us = []
     for k in range(1, count + 1):
         stamp, z = epoch + timedelta(seconds=0.025 * k), [1.625 * k, 0.0, 65.0]
         detection = Detection(
-            np.array(z[: 2 + k % 2])[:, None], timestamp=stamp, measurement_model=radar if k % 2 else lidar
+            np.array(z[: 2 + k % 2])[:, None],
+            timestamp=stamp,
+            measurement_model=radar if k % 2 else lidar,
         )
         before_ns = time.perf_counter_ns()
         predicted = predictor.predict(state, timestamp=stamp)

@@ -14,11 +14,11 @@ from statistics import median
 
 import numpy as np
 
+from fgtrack.config.settings import Config
+from fgtrack.config.shipped import read_config
 from fgtrack.core.types import DetectionList, Message, TruthState
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Tick, clock_ticks
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.shipped import read_config
 from fgtrack.sim.delays import LIDAR_DELAY, RADAR_DELAY, ConstantDelay
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.sensor import SimulatedSensor
@@ -53,13 +53,29 @@ class Cell:
     @property
     def settings(self) -> Config:
         """The configuration."""
-        own: dict[str, object] = {"smoother.lag_s": self.lag_s, "smoother.lagged_s": [], "smoother.final": False}
+        own: dict[str, object] = {
+            "smoother.lag_s": self.lag_s,
+            "smoother.lagged_s": [],
+            "smoother.final": False,
+        }
         if self.count > _TWO_LANES:
-            own |= {f"map.{side}_buffer_m": _LANE_M * _num_lanes(self.count) for side in ("inner", "outer")}
+            own |= {
+                f"map.{side}_buffer_m": _LANE_M * _num_lanes(self.count)
+                for side in ("inner", "outer")
+            }
         if self.delay_s is not None:
-            own |= {f"sensors.{name}.max_delay_s": 1.0 for name in ("lidar_cluster", "radar")}
+            own |= {
+                f"sensors.{name}.max_delay_s": 1.0
+                for name in ("lidar_cluster", "radar")
+            }
         given = [f"{key}={json.dumps(value)}" for key, value in own.items()]
-        return read_config(self.config, given, track_map="oval", pit_map="oval", estimator=self.estimator)
+        return read_config(
+            self.config,
+            given,
+            track_map="oval",
+            pit_map="oval",
+            estimator=self.estimator,
+        )
 
 
 @dataclass(frozen=True)
@@ -76,7 +92,16 @@ class Measured:
 
 def traffic(count: int, duration_s: float, delay_s: float | None = None) -> list[Tick]:
     """Ticks of `scene`."""
-    return list(clock_ticks([m for m in scene(count, duration_s, delay_s) if not isinstance(m, TruthState)], NODE_HZ))
+    return list(
+        clock_ticks(
+            [
+                m
+                for m in scene(count, duration_s, delay_s)
+                if not isinstance(m, TruthState)
+            ],
+            NODE_HZ,
+        )
+    )
 
 
 def scene(count: int, duration_s: float, delay_s: float | None = None) -> list[Message]:
@@ -84,25 +109,42 @@ def scene(count: int, duration_s: float, delay_s: float | None = None) -> list[M
     return simulate(scenario(count, duration_s, delay_s), np.random.default_rng(0))
 
 
-def scenario(count: int, duration_s: float, delay_s: float | None = None, speed_mps: float = SPEED_MPS) -> Scenario:
+def scenario(
+    count: int,
+    duration_s: float,
+    delay_s: float | None = None,
+    speed_mps: float = SPEED_MPS,
+) -> Scenario:
     """Scenario of `count` cars side by side in rows 12 m apart, each detected by both sensors in every list."""
     speed, lanes = ((0.0, speed_mps), (duration_s + 4.0, speed_mps)), _num_lanes(count)
     cars = tuple(
         TrackVehicle(
-            arc_m=120.0 + 12.0 * (k // lanes), lateral_m=_LANE_M * ((lanes - 1) / 2.0 - k % lanes), speed=speed
+            arc_m=120.0 + 12.0 * (k // lanes),
+            lateral_m=_LANE_M * ((lanes - 1) / 2.0 - k % lanes),
+            speed=speed,
         )
         for k in range(count)
     )
     range_m = 400.0 if count <= 50 else 4000.0
-    lidar, radar = (LIDAR_DELAY, RADAR_DELAY) if delay_s is None else (ConstantDelay(delay_s),) * 2
+    lidar, radar = (
+        (LIDAR_DELAY, RADAR_DELAY) if delay_s is None else (ConstantDelay(delay_s),) * 2
+    )
     sensors = (
-        SimulatedSensor("lidar_cluster", {"x_m": 0.3, "y_m": 0.3}, max_range_m=range_m, delay=lidar),
         SimulatedSensor(
-            "radar", {"x_m": 0.5, "y_m": 0.5, "speed_mps": 0.2}, phase_s=0.02, max_range_m=range_m, delay=radar
+            "lidar_cluster", {"x_m": 0.3, "y_m": 0.3}, max_range_m=range_m, delay=lidar
+        ),
+        SimulatedSensor(
+            "radar",
+            {"x_m": 0.5, "y_m": 0.5, "speed_mps": 0.2},
+            phase_s=0.02,
+            max_range_m=range_m,
+            delay=radar,
         ),
     )
     ego = TrackVehicle(arc_m=100.0, speed=speed)
-    return Scenario(ego, cars, sensors, duration_s=duration_s, detection_origin_x_m=-1.74)
+    return Scenario(
+        ego, cars, sensors, duration_s=duration_s, detection_origin_x_m=-1.74
+    )
 
 
 def _num_lanes(count: int) -> int:
@@ -127,7 +169,9 @@ def measure(cell: Cell, ticks: list[Tick]) -> Measured:
     """Return one pass of `cell` over its traffic."""
     clock = time.thread_time_ns if cell.cpu else time.perf_counter_ns
     tracker = build_tracker(cell.settings)
-    steady_ns = ticks[0].now_ns + round(1e9 * min(cell.lag_s + 0.5, cell.duration_s / 2.0))
+    steady_ns = ticks[0].now_ns + round(
+        1e9 * min(cell.lag_s + 0.5, cell.duration_s / 2.0)
+    )
     yard_us, ticks_ms, tracks, detections = yardstick_us(), [], [], 0
     gc.collect()
     gc.freeze()  # a node holds no recordings, so its collections of garbage do not look through them
@@ -137,7 +181,9 @@ def measure(cell: Cell, ticks: list[Tick]) -> Measured:
             tracker.receive(message)
         report = tracker.tick(tick.now_ns)
         took_ms = (clock() - before_ns) / 1e6
-        lists = [message for message in tick.messages if isinstance(message, DetectionList)]
+        lists = [
+            message for message in tick.messages if isinstance(message, DetectionList)
+        ]
         if lists and tick.now_ns >= steady_ns:
             ticks_ms.append(took_ms)
             tracks.append(len(report.tracks))
@@ -148,4 +194,10 @@ def measure(cell: Cell, ticks: list[Tick]) -> Measured:
 
 if __name__ == "__main__":
     asked = Cell(**json.loads(sys.argv[1]))
-    print(json.dumps(asdict(measure(asked, traffic(asked.count, asked.duration_s, asked.delay_s)))))
+    print(
+        json.dumps(
+            asdict(
+                measure(asked, traffic(asked.count, asked.duration_s, asked.delay_s))
+            )
+        )
+    )

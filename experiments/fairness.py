@@ -16,10 +16,10 @@ from typing import Annotated
 import typer
 
 import fgtrack
+from fgtrack.config.yaml_file import validate
 from fgtrack.evaluation.intervals import average
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.scores.innovations import Consistency
-from fgtrack.pipeline.load import validate
 from fgtrack.sim.scenario import Scenario
 
 HERE = Path(__file__).parent
@@ -32,7 +32,10 @@ SCRIPTS: Mapping[str, tuple[str, Sequence[str]]] = {
     "attribution/attribution.py": ("what every ingredient is worth", ("--runs", "2")),
     "doppler/doppler.py": ("range, bearing and range rate", ("--runs", "2")),
     "bearing_only/bearing_only.py": ("bearings alone", ("--runs", "2")),
-    "bearing_only/cameras.py": ("bearing-only cameras beside positions", ("--runs", "2")),
+    "bearing_only/cameras.py": (
+        "bearing-only cameras beside positions",
+        ("--runs", "2"),
+    ),
 }
 
 _STILL = {
@@ -48,11 +51,38 @@ _DOPPLER_STD = {"range_m": 0.3, "bearing_rad": 0.01, "range_rate_mps": 0.1}
 
 def turning_ego(mount: tuple[float, float], duration_s: float) -> Scenario:
     """Two slow objects, seen by the RADAR of a car that turns; without an arm it sits at the reference point."""
-    exact = ("position_std_m", "yaw_std_rad", "speed_std_mps", "yaw_rate_std_radps", "accel_std_mps2")
-    ego = {"kind": "drawn", "x_m": 0.0, "y_m": 0.0, "yaw_rad": 0.0, "speed_mps": 15.0, "yaw_rate_radps": _TURN_RADPS}
+    exact = (
+        "position_std_m",
+        "yaw_std_rad",
+        "speed_std_mps",
+        "yaw_rate_std_radps",
+        "accel_std_mps2",
+    )
+    ego = {
+        "kind": "drawn",
+        "x_m": 0.0,
+        "y_m": 0.0,
+        "yaw_rad": 0.0,
+        "speed_mps": 15.0,
+        "yaw_rate_radps": _TURN_RADPS,
+    }
     opponents = [
-        {"kind": "drawn", "x_m": 50.0, "y_m": 30.0, "yaw_rad": 0.7, "speed_mps": 6.0, "yaw_rate_radps": -0.1},
-        {"kind": "drawn", "x_m": -40.0, "y_m": 45.0, "yaw_rad": 2.5, "speed_mps": 4.0, "yaw_rate_radps": 0.1},
+        {
+            "kind": "drawn",
+            "x_m": 50.0,
+            "y_m": 30.0,
+            "yaw_rad": 0.7,
+            "speed_mps": 6.0,
+            "yaw_rate_radps": -0.1,
+        },
+        {
+            "kind": "drawn",
+            "x_m": -40.0,
+            "y_m": 45.0,
+            "yaw_rad": 2.5,
+            "speed_mps": 4.0,
+            "yaw_rate_radps": 0.1,
+        },
     ]
     sensor = {
         "name": "radar",
@@ -74,47 +104,85 @@ def turning_ego(mount: tuple[float, float], duration_s: float) -> Scenario:
 
 def lever_arm(seeds: int, duration_s: float) -> str:
     """Position RMSE, NEES and NIS of the smoother with and without an arm."""
-    lines = ["| RADAR | position RMSE [m] | NEES (2) | NIS (3) |", "| --- | --- | --- | --- |"]
+    lines = [
+        "| RADAR | position RMSE [m] | NEES (2) | NIS (3) |",
+        "| --- | --- | --- | --- |",
+    ]
     for name, mount in _ARMS_M.items():
-        sensor = {"std": _DOPPLER_STD, "mount": {"x_m": mount[0], "y_m": mount[1], "yaw_rad": 0.8}}
-        settings = {"sensors": {"radar": sensor}, "birth.speed_std_mps": 20.0, "smoother.lagged_s": []}
+        sensor = {
+            "std": _DOPPLER_STD,
+            "mount": {"x_m": mount[0], "y_m": mount[1], "yaw_rad": 0.8},
+        }
+        settings = {
+            "sensors": {"radar": sensor},
+            "birth.speed_std_mps": 20.0,
+            "smoother.lagged_s": [],
+        }
         found = []
         for seed in range(seeds):
             messages = fgtrack.simulate(turning_ego(mount, duration_s), seed=seed)
             found.append(evaluate(fgtrack.replay(messages, "open_space", set=settings)))
-        rmse_m = [one.truth.overall.errors["position_m"].rmse for one in found if one.truth]
+        rmse_m = [
+            one.truth.overall.errors["position_m"].rmse for one in found if one.truth
+        ]
         nees = [one.consistency.position_nees.mean for one in found]
         nis = [one.consistency.nis["radar"].mean for one in found]
-        lines.append(f"| {name} | {' | '.join(f'{average(values):.3g}' for values in (rmse_m, nees, nis))} |")
+        lines.append(
+            f"| {name} | {' | '.join(f'{average(values):.3g}' for values in (rmse_m, nees, nis))} |"
+        )
     return "\n".join(lines) + "\n"
 
 
 def whiteness(seeds: int, duration_s: float) -> str:
     """Lag-1 correlation of the innovations on consistent noise, by estimator and sensor."""
-    lines = ["| estimator | sensor | correlation at lag 1 | inside its band |", "| --- | --- | --- | --- |"]
+    lines = [
+        "| estimator | sensor | correlation at lag 1 | inside its band |",
+        "| --- | --- | --- | --- |",
+    ]
     for estimator in ("smoother", "ekf-replay", "ekf-backward-forward"):
         runs: list[Consistency] = []
         for seed in range(seeds):
             messages = fgtrack.simulate("drawn_ctrv", seed=seed, duration_s=duration_s)
-            run = fgtrack.replay(messages, "open_space", estimator=estimator, set={"smoother.lagged_s": []})
+            run = fgtrack.replay(
+                messages,
+                "open_space",
+                estimator=estimator,
+                set={"smoother.lagged_s": []},
+            )
             runs.append(evaluate(run).consistency)
         for sensor in ("lidar_cluster", "radar"):
-            found = [one for run in runs if (one := run.autocorrelation[sensor]) is not None]
+            found = [
+                one for run in runs if (one := run.autocorrelation[sensor]) is not None
+            ]
             inside = sum(abs(one.lag1) <= one.lag1_band for one in found)
             correlation = average([one.lag1 for one in found])
-            lines.append(f"| {estimator} | {sensor} | {correlation:.3g} | {inside} of {seeds} |")
+            lines.append(
+                f"| {estimator} | {sensor} | {correlation:.3g} | {inside} of {seeds} |"
+            )
     return "\n".join(lines) + "\n"
 
 
 def printed(script: str, out: Path, jobs: int, options: Sequence[str]) -> str:
     """What an experiment prints; raises `subprocess.CalledProcessError` where it fails."""
-    command = [sys.executable, str(HERE / script), "-o", str(out), "--jobs", str(jobs), *options]
+    command = [
+        sys.executable,
+        str(HERE / script),
+        "-o",
+        str(out),
+        "--jobs",
+        str(jobs),
+        *options,
+    ]
     return subprocess.run(command, check=True, text=True, stdout=subprocess.PIPE).stdout
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder of all tables.")] = Path("out/fairness"),
-    quick: Annotated[bool, typer.Option(help="A few runs of each, to see that it works.")] = False,
+    out: Annotated[Path, typer.Option("-o", help="Folder of all tables.")] = Path(
+        "out/fairness"
+    ),
+    quick: Annotated[
+        bool, typer.Option(help="A few runs of each, to see that it works.")
+    ] = False,
     jobs: Annotated[int, typer.Option(help="Processes.")] = 1,
 ) -> None:
     """Measure everything, write fairness.md."""
@@ -129,9 +197,14 @@ def main(
             print(part, end="", flush=True)
 
         say("lever arm of a sensor on a turning ego", lever_arm(seeds, duration_s))
-        say("whiteness of innovations on consistent noise", whiteness(seeds, duration_s))
+        say(
+            "whiteness of innovations on consistent noise", whiteness(seeds, duration_s)
+        )
         for script, (question, short) in SCRIPTS.items():
-            say(question, printed(script, out / Path(script).stem, jobs, short if quick else ()))
+            say(
+                question,
+                printed(script, out / Path(script).stem, jobs, short if quick else ()),
+            )
 
 
 if __name__ == "__main__":

@@ -10,13 +10,13 @@ __version__ = "0.2.0"
 
 #: Module (or package, of a module) that each public name is loaded from on first use.
 _HOMES = {
-    "Advice": "fgtrack.calibration.page",
+    "Advice": "fgtrack.advice.page",
     "CT": "fgtrack.models.motion",
     "CTRA": "fgtrack.models.motion",
     "CTRV": "fgtrack.models.motion",
     "CV": "fgtrack.models.motion",
     "CallError": "fgtrack.core.errors",
-    "Config": "fgtrack.pipeline.config",
+    "Config": "fgtrack.config.settings",
     "DataError": "fgtrack.core.errors",
     "Detection": "fgtrack.core.types",
     "DetectionList": "fgtrack.core.types",
@@ -25,21 +25,21 @@ _HOMES = {
     "Estimator": "fgtrack.estimation.base",
     "FgtrackError": "fgtrack.core.errors",
     "Lateness": "fgtrack.pipeline.live",
-    "Ledger": "fgtrack.calibration.ledger",
+    "Ledger": "fgtrack.advice.ledger",
     "Measurement": "fgtrack.estimation.base",
     "MeasurementModel": "fgtrack.models.measurement",
     "Message": "fgtrack.core.types",
     "MotionModel": "fgtrack.models.motion",
-    "ObjectList": "fgtrack.io.adapters.common",
+    "ObjectList": "fgtrack.inputs.formats.common",
     "RobustLoss": "fgtrack.models.sensors",
-    "Run": "fgtrack.io.run",
+    "Run": "fgtrack.runs",
     "ScheduledMeasurement": "fgtrack.evaluation.bounds",
     "SensorModel": "fgtrack.models.sensors",
     "SensorPose": "fgtrack.models.measurement",
     "SmoothedReport": "fgtrack.core.types",
     "Start": "fgtrack.estimation.base",
     "StatesAt": "fgtrack.estimation.base",
-    "Study": "fgtrack.calibration.study",
+    "Study": "fgtrack.recording_study",
     "Tables": "fgtrack.evaluation.tables",
     "TickReport": "fgtrack.core.types",
     "TickTiming": "fgtrack.pipeline.live",
@@ -48,44 +48,42 @@ _HOMES = {
     "TrackState": "fgtrack.core.types",
     "Tracker": "fgtrack.pipeline.live",
     "TruthState": "fgtrack.core.types",
-    "TuneReport": "fgtrack.calibration.tune_space",
+    "TuneReport": "fgtrack.noise.parameters",
     "UpdateRecord": "fgtrack.core.types",
     "UpdateResult": "fgtrack.estimation.base",
     "UpdateStatus": "fgtrack.estimation.base",
-    "advise": "fgtrack.calibration.advise",
-    "config": "fgtrack.pipeline",
+    "advise": "fgtrack.advice.advise",
+    "config": "fgtrack",
     "bounds": "fgtrack.evaluation.bounds",
     "bounds_along": "fgtrack.evaluation.bounds",
-    "close_ups": "fgtrack.plotting.late_detection",
+    "close_ups": "fgtrack.show.figures.late_detection",
     "compare": "fgtrack.evaluation.tables.compare",
     "estimator": "fgtrack.estimation.registry",
     "evaluate": "fgtrack.evaluation.metrics",
     "initial_state": "fgtrack.estimation.birth",
-    "ledger": "fgtrack.calibration.ledger",
+    "ledger": "fgtrack.advice.ledger",
     "list_estimators": "fgtrack.estimation.registry",
-    "load_run": "fgtrack.io.run",
+    "load_run": "fgtrack.runs",
     "measurement_model": "fgtrack.models.measurement",
-    "plot": "fgtrack.plotting",
+    "plot": "fgtrack.show.figures",
     "replay": "fgtrack.pipeline.public",
     "robust_weight": "fgtrack.estimation.filters.ekf",
     "simulate": "fgtrack.pipeline.public",
-    "study": "fgtrack.calibration.study",
+    "study": "fgtrack.recording_study",
     "testing": "fgtrack",
-    "tune": "fgtrack.calibration.tune",
+    "tune": "fgtrack.noise.tune",
 }
 
 __all__ = sorted(_HOMES)
 
 if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two lists equal
+    from fgtrack import config as config
     from fgtrack import testing as testing
-    from fgtrack.calibration.advise import advise as advise
-    from fgtrack.calibration.ledger import Ledger as Ledger
-    from fgtrack.calibration.ledger import ledger as ledger
-    from fgtrack.calibration.page import Advice as Advice
-    from fgtrack.calibration.study import Study as Study
-    from fgtrack.calibration.study import study as study
-    from fgtrack.calibration.tune import tune as tune
-    from fgtrack.calibration.tune_space import TuneReport as TuneReport
+    from fgtrack.advice.advise import advise as advise
+    from fgtrack.advice.ledger import Ledger as Ledger
+    from fgtrack.advice.ledger import ledger as ledger
+    from fgtrack.advice.page import Advice as Advice
+    from fgtrack.config.settings import Config as Config
     from fgtrack.core.errors import CallError as CallError
     from fgtrack.core.errors import DataError as DataError
     from fgtrack.core.errors import FgtrackError as FgtrackError
@@ -117,9 +115,7 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.evaluation.metrics import evaluate as evaluate
     from fgtrack.evaluation.tables import Tables as Tables
     from fgtrack.evaluation.tables.compare import compare as compare
-    from fgtrack.io.adapters.common import ObjectList as ObjectList
-    from fgtrack.io.run import Run as Run
-    from fgtrack.io.run import load_run as load_run
+    from fgtrack.inputs.formats.common import ObjectList as ObjectList
     from fgtrack.models.measurement import MeasurementModel as MeasurementModel
     from fgtrack.models.measurement import SensorPose as SensorPose
     from fgtrack.models.measurement import measurement_model as measurement_model
@@ -130,22 +126,28 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.models.motion import MotionModel as MotionModel
     from fgtrack.models.sensors import RobustLoss as RobustLoss
     from fgtrack.models.sensors import SensorModel as SensorModel
-    from fgtrack.pipeline import config as config
-    from fgtrack.pipeline.config import Config as Config
+    from fgtrack.noise.parameters import TuneReport as TuneReport
+    from fgtrack.noise.tune import tune as tune
     from fgtrack.pipeline.live import Lateness as Lateness
     from fgtrack.pipeline.live import TickTiming as TickTiming
     from fgtrack.pipeline.live import Tracker as Tracker
     from fgtrack.pipeline.public import replay as replay
     from fgtrack.pipeline.public import simulate as simulate
-    from fgtrack.plotting import plot as plot
-    from fgtrack.plotting.late_detection import close_ups as close_ups
+    from fgtrack.recording_study import Study as Study
+    from fgtrack.recording_study import study as study
+    from fgtrack.runs import Run as Run
+    from fgtrack.runs import load_run as load_run
+    from fgtrack.show.figures import plot as plot
+    from fgtrack.show.figures.late_detection import close_ups as close_ups
 
 
 def __getattr__(name: str) -> object:
     if name not in _HOMES:
         raise AttributeError(f"module 'fgtrack' has no attribute {name!r}")
     members = vars(import_module(_HOMES[name]))
-    value = members[name] if name in members else import_module(f"{_HOMES[name]}.{name}")
+    value = (
+        members[name] if name in members else import_module(f"{_HOMES[name]}.{name}")
+    )
     globals()[name] = value
     return value
 

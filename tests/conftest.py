@@ -28,17 +28,37 @@ _LONG = (
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """How long `tests/fuzz` goes on, how often `tests/faults` kills, and with which random numbers."""
-    parser.addoption("--fuzz-seconds", type=float, default=10.0, help="time for each target of the fuzzing tests")
-    parser.addoption("--fuzz-seed", type=int, default=0, help="seed of the fuzzing tests")
-    parser.addoption("--changes", type=int, default=1000, help="values that tests/fuzz/test_values.py changes")
-    parser.addoption("--kills", type=int, default=3, help="kills of each command in tests/faults")
+    parser.addoption(
+        "--fuzz-seconds",
+        type=float,
+        default=10.0,
+        help="time for each target of the fuzzing tests",
+    )
+    parser.addoption(
+        "--fuzz-seed", type=int, default=0, help="seed of the fuzzing tests"
+    )
+    parser.addoption(
+        "--changes",
+        type=int,
+        default=1000,
+        help="values that tests/fuzz/test_values.py changes",
+    )
+    parser.addoption(
+        "--kills", type=int, default=3, help="kills of each command in tests/faults"
+    )
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark whole folders and the experiments as slow, for the night, and the long units."""
     for item in items:
-        if item.path.parent.name in ("faults", "statistical") or item.path.stem.endswith(_NIGHTLY):
+        if item.path.parent.name in (
+            "faults",
+            "statistical",
+        ) or item.path.stem.endswith(_NIGHTLY):
             item.add_marker(pytest.mark.slow)
-        if item.path.parent.name == "unit" and item.path.stem.removeprefix("test_") in _LONG:
+        if (
+            item.path.parent.name == "unit"
+            and item.path.stem.removeprefix("test_") in _LONG
+        ):
             item.add_marker(pytest.mark.long)

@@ -15,13 +15,13 @@ import typer
 from joblib import Parallel, delayed
 
 import fgtrack
+from fgtrack.config.shipped import read_config
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.intervals import average, paired
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.io.recording import write_recording
-from fgtrack.io.run import Run
-from fgtrack.pipeline.shipped import read_config
+from fgtrack.inputs.recording import write_recording
+from fgtrack.runs import Run
 from fgtrack.sim.redelay import restamped
 
 OFFSET_S = 0.08
@@ -79,26 +79,42 @@ def scores(run: Run) -> tuple[float, float, int]:
     assert found.truth is not None
     assert found.multi_object is not None
     overall = found.truth.overall
-    return overall.errors["position_m"].rmse, found.multi_object.gospa["rms_m"], overall.id_switches
+    return (
+        overall.errors["position_m"].rmse,
+        found.multi_object.gospa["rms_m"],
+        overall.id_switches,
+    )
 
 
-def followed(recording: Path, config: str | None, track_map: str | None, tune: bool) -> Followed:
+def followed(
+    recording: Path, config: str | None, track_map: str | None, tune: bool
+) -> Followed:
     """Scores before and after the advice is followed, and what it changes."""
     resolved = read_config(config, track_map=track_map, pit_map=track_map)
     if resolved.estimator == "smoother":  # the same numbers, sooner
         resolved = replace(resolved, estimator="smoother-banded")
     advice = fgtrack.advise(recording, resolved, tune=tune)
-    if any(one.key == "ignore_sensors" for one in advice.changes):  # without which nothing can be replayed
+    if any(
+        one.key == "ignore_sensors" for one in advice.changes
+    ):  # without which nothing can be replayed
         resolved = replace(resolved, ignore_sensors=advice.config.ignore_sensors)
-    before, after = (scores(fgtrack.replay(recording, one)) for one in (resolved, advice.config))
+    before, after = (
+        scores(fgtrack.replay(recording, one)) for one in (resolved, advice.config)
+    )
     changes = "; ".join(f"{one.key}={one.value}" for one in advice.changes) or "nothing"
-    noise = ", ".join(one.about for one in advice.findings if one.kind == "noise") or "none"
+    noise = (
+        ", ".join(one.about for one in advice.findings if one.kind == "noise") or "none"
+    )
     return Followed(*before, *after, changes, noise)
 
 
-def simulated(case: Case, seed: int, duration_s: float | None, out: Path) -> tuple[Case, int, Followed]:
+def simulated(
+    case: Case, seed: int, duration_s: float | None, out: Path
+) -> tuple[Case, int, Followed]:
     """One case with one seed."""
-    recording = out / f"{case.scenario}-{case.wrong}-{case.config}-{case.tune}-{seed}.jsonl"
+    recording = (
+        out / f"{case.scenario}-{case.wrong}-{case.config}-{case.tune}-{seed}.jsonl"
+    )
     messages = fgtrack.simulate(case.scenario, seed=seed, duration_s=duration_s)
     write_recording(recording, shifted(messages, case.wrong), overwrite=True)
     found = followed(recording, case.config, "oval", case.tune)
@@ -106,7 +122,9 @@ def simulated(case: Case, seed: int, duration_s: float | None, out: Path) -> tup
     return case, seed, found
 
 
-def recorded(autoferry: Path | None, kitti: Path | None) -> Iterator[tuple[str, Path, str | None, bool]]:
+def recorded(
+    autoferry: Path | None, kitti: Path | None
+) -> Iterator[tuple[str, Path, str | None, bool]]:
     """Names and paths of recordings, their configurations, and whether noise is fitted."""
     for number in range(6, 1, -1) if autoferry is not None else ():
         folder = Path(str(autoferry)) / f"scenario{number}"
@@ -118,18 +136,28 @@ def recorded(autoferry: Path | None, kitti: Path | None) -> Iterator[tuple[str, 
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder of the tables.")] = Path("out/advise"),
+    out: Annotated[Path, typer.Option("-o", help="Folder of the tables.")] = Path(
+        "out/advise"
+    ),
     seeds: Annotated[int, typer.Option(help="Seeds of each simulated case.")] = SEEDS,
-    duration: Annotated[float | None, typer.Option(help="Length of simulated recordings in s.")] = None,
-    autoferry: Annotated[Path | None, typer.Option(help="Folder of the Autoferry scenarios.")] = None,
-    kitti: Annotated[Path | None, typer.Option(help="Folder of the KITTI tracking data.")] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="Length of simulated recordings in s.")
+    ] = None,
+    autoferry: Annotated[
+        Path | None, typer.Option(help="Folder of the Autoferry scenarios.")
+    ] = None,
+    kitti: Annotated[
+        Path | None, typer.Option(help="Folder of the KITTI tracking data.")
+    ] = None,
     jobs: Annotated[int, typer.Option(help="Processes.")] = 1,
 ) -> None:
     """Write advise.csv: position RMSE and GOSPA before and after."""
     out.mkdir(parents=True, exist_ok=True)
     rows = list(
         Parallel(n_jobs=jobs)(
-            delayed(simulated)(case, seed, duration, out) for case in CASES for seed in range(1, seeds + 1)
+            delayed(simulated)(case, seed, duration, out)
+            for case in CASES
+            for seed in range(1, seeds + 1)
         )
     )
     names = [one.name for one in fields(Followed)]
@@ -137,7 +165,9 @@ def main(
         writer = csv.writer(file)
         writer.writerow(["recording", "seed", *names])
         for case, seed, found in rows:
-            writer.writerow([case.name, seed, *(getattr(found, name) for name in names)])
+            writer.writerow(
+                [case.name, seed, *(getattr(found, name) for name in names)]
+            )
         for name, path, config, tune in recorded(autoferry, kitti):
             found = followed(path, config, None, tune)
             writer.writerow([name, "", *(getattr(found, one) for one in names)])
@@ -150,7 +180,10 @@ def main(
     for case in CASES:
         mine = [found for one, _, found in rows if one == case]
         for what in ("rmse", "gospa") if mine else ():
-            old, new = ([getattr(one, f"{what}{side}_m") for one in mine] for side in ("", "_followed"))
+            old, new = (
+                [getattr(one, f"{what}{side}_m") for one in mine]
+                for side in ("", "_followed")
+            )
             gain = paired(new, old)
             print(
                 f"{case.name}: {what} {average(old).mean:.3f} -> {average(new).mean:.3f} m, "

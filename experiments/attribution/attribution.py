@@ -101,19 +101,32 @@ class World:
 
 
 _LIDAR = Sensor({"x_m": 0.3, "y_m": 0.3}, 0.05, delay_s=0.151)
-_RADAR = Sensor({"x_m": 1.0, "y_m": 1.0, "speed_mps": 1.0}, 0.05, phase_s=0.023, delay_s=0.062)
+_RADAR = Sensor(
+    {"x_m": 1.0, "y_m": 1.0, "speed_mps": 1.0}, 0.05, phase_s=0.023, delay_s=0.062
+)
 _URBAN = CTRV(0.01, 0.002, 1.0, 0.05)
 
 WORLDS: Mapping[str, World] = {
     "race: LiDAR and RADAR, late": World((_LIDAR, _RADAR), (50.0, 70.0), 6.0, 2.0),
     "birth: positions, heading unknown": World(
-        (Sensor({"x_m": 0.3, "y_m": 0.3}, 0.05, delay_s=0.151),), (20.0, 70.0), 2.5, 0.5, heading_known=False
+        (Sensor({"x_m": 0.3, "y_m": 0.3}, 0.05, delay_s=0.151),),
+        (20.0, 70.0),
+        2.5,
+        0.5,
+        heading_known=False,
     ),
     "outliers: 10 % of ten times the noise, late": World(
-        (Sensor(_LIDAR.std, 0.05, delay_s=0.151, outliers=0.1), _RADAR), (50.0, 70.0), 6.0, 2.0
+        (Sensor(_LIDAR.std, 0.05, delay_s=0.151, outliers=0.1), _RADAR),
+        (50.0, 70.0),
+        6.0,
+        2.0,
     ),
     "town: 2 Hz positions of turning cars": World(
-        (Sensor({"x_m": 0.5, "y_m": 0.5}, 0.5, delay_s=0.3),), (5.0, 15.0), 20.0, 5.0, motion=_URBAN
+        (Sensor({"x_m": 0.5, "y_m": 0.5}, 0.5, delay_s=0.3),),
+        (5.0, 15.0),
+        20.0,
+        5.0,
+        motion=_URBAN,
     ),
     "near: range and bearing, 6 degrees": World(
         (Sensor({"range_m": 0.2, "bearing_rad": 0.1}, 0.1, delay_s=0.15),),
@@ -145,10 +158,18 @@ def scene(world: World, rng: np.random.Generator) -> Drawn:
     plan: list[tuple[int, Sensor | None]] = []
     for sensor in world.sensors:
         count = int((world.duration_s - sensor.phase_s) / sensor.period_s)
-        plan += [(nanoseconds(sensor.phase_s + k * sensor.period_s), sensor) for k in range(1, count + 1)]
+        plan += [
+            (nanoseconds(sensor.phase_s + k * sensor.period_s), sensor)
+            for k in range(1, count + 1)
+        ]
     waits_ns = nanoseconds(WAIT_S)
-    judged = [nanoseconds(k * JUDGED_EVERY_S) for k in range(1, int(world.duration_s / JUDGED_EVERY_S) + 1)]
-    plan += [(at, None) for at in judged] + [(at - waits_ns, None) for at in judged if at > waits_ns]
+    judged = [
+        nanoseconds(k * JUDGED_EVERY_S)
+        for k in range(1, int(world.duration_s / JUDGED_EVERY_S) + 1)
+    ]
+    plan += [(at, None) for at in judged] + [
+        (at - waits_ns, None) for at in judged if at > waits_ns
+    ]
     plan.sort(key=lambda item: item[0])
     direction, heading = rng.uniform(-np.pi, np.pi, 2)
     x = np.array(
@@ -178,7 +199,9 @@ def scene(world: World, rng: np.random.Generator) -> Drawn:
 def first(world: World, x: FloatArray, rng: np.random.Generator) -> Start:
     """What a tracker would know after the first detection: where, and in some worlds whither and how fast."""
     measurement = measured(world, world.sensors[0], x, 0, rng)
-    position_m, R = measured_position(measurement.model.components, measurement.z, measurement.R, measurement.pose) or (
+    position_m, R = measured_position(
+        measurement.model.components, measurement.z, measurement.R, measurement.pose
+    ) or (
         x[:2],
         np.eye(2),
     )
@@ -191,23 +214,45 @@ def first(world: World, x: FloatArray, rng: np.random.Generator) -> Start:
         position_covariance=R,
         yaw_rad=float(x[2] + 0.1 * rng.standard_normal()) if known else None,
         speed_mps=middle_mps if known else 0.0,
-        speed_std_mps=(high_mps - low_mps) / np.sqrt(12.0) if known else high_mps / np.sqrt(2.0),
+        speed_std_mps=(high_mps - low_mps) / np.sqrt(12.0)
+        if known
+        else high_mps / np.sqrt(2.0),
         yaw_rate_std_radps=0.1,
     )
 
 
-def measured(world: World, sensor: Sensor, x: FloatArray, since_ns: int, rng: np.random.Generator) -> Measurement:
+def measured(
+    world: World, sensor: Sensor, x: FloatArray, since_ns: int, rng: np.random.Generator
+) -> Measurement:
     """What `sensor` measures of the state `x`, shape (5,); the covariance is that without outliers."""
-    pose = SensorPose(x_m=world.observer_mps * since_ns / NS_PER_S, vx_mps=world.observer_mps)
+    pose = SensorPose(
+        x_m=world.observer_mps * since_ns / NS_PER_S, vx_mps=world.observer_mps
+    )
     model = measurement_model(tuple(sensor.std), world.motion)
     std = np.array(list(sensor.std.values()))
-    noise = std * rng.standard_normal(len(std)) * (10.0 if rng.random() < sensor.outliers else 1.0)
-    return Measurement(START_NS + since_ns, model, model.predict(x, pose) + noise, np.diag(std**2), pose)
+    noise = (
+        std
+        * rng.standard_normal(len(std))
+        * (10.0 if rng.random() < sensor.outliers else 1.0)
+    )
+    return Measurement(
+        START_NS + since_ns,
+        model,
+        model.predict(x, pose) + noise,
+        np.diag(std**2),
+        pose,
+    )
 
 
 def start_of(contestant: Contestant, run: Drawn) -> Estimator:
     """A new estimator for `run`."""
-    return estimator(contestant.estimator, run.world.motion, run.start, lag_s=LAG_S, **contestant.options)
+    return estimator(
+        contestant.estimator,
+        run.world.motion,
+        run.start,
+        lag_s=LAG_S,
+        **contestant.options,
+    )
 
 
 def score(contestant: Contestant, run: Drawn) -> "Score":
@@ -222,7 +267,10 @@ def score(contestant: Contestant, run: Drawn) -> "Score":
         while waiting and waiting[0][0] <= now_ns:
             one.update(replace(waiting.pop(0)[1], loss=contestant.loss))
         one.advance(START_NS + now_ns)
-        for squares, at_ns in ((now_m2, now_ns), (ago_m2, now_ns - nanoseconds(WAIT_S))):
+        for squares, at_ns in (
+            (now_m2, now_ns),
+            (ago_m2, now_ns - nanoseconds(WAIT_S)),
+        ):
             if at_ns < nanoseconds(run.world.judged_from_s):
                 continue
             state = one.state_at(START_NS + at_ns)
@@ -232,7 +280,11 @@ def score(contestant: Contestant, run: Drawn) -> "Score":
                 nees.append(float(mahalanobis_squared(error, state.covariance[:2, :2])))
     then_m2 = [now_m2[at_ns] for at_ns in ago_m2]
     return Score(
-        *(math.sqrt(np.mean(of)) for of in (list(now_m2.values()), then_m2, list(ago_m2.values()))), np.mean(nees)
+        *(
+            math.sqrt(np.mean(of))
+            for of in (list(now_m2.values()), then_m2, list(ago_m2.values()))
+        ),
+        np.mean(nees),
     )
 
 
@@ -263,7 +315,9 @@ Scores = Mapping[str, Sequence[Mapping[str, Score]]]
 def change(of: Iterable[float], to: Iterable[float]) -> Estimate:
     """Relative change in per cent from `to` to `of`, the geometric mean over paired runs, and its 95 % interval."""
     logs = paired([math.log(value) for value in of], [math.log(value) for value in to])
-    mean, low, high = (100.0 * math.expm1(value) for value in (logs.mean, logs.low, logs.high))
+    mean, low, high = (
+        100.0 * math.expm1(value) for value in (logs.mean, logs.low, logs.high)
+    )
     return Estimate(mean, low, high, logs.count)
 
 
@@ -275,7 +329,8 @@ def table_of_errors(found: Scores) -> list[list[str]]:
             of = [run[name] for run in runs]
             kept = [one for one in of if one.rmse_m < LOST_M]
             rmse, waited, nees = (
-                f"{average([getattr(one, what) for one in kept]):.3g}" for what in ("rmse_m", "waited_rmse_m", "nees")
+                f"{average([getattr(one, what) for one in kept]):.3g}"
+                for what in ("rmse_m", "waited_rmse_m", "nees")
             )
             lost = len(of) - len(kept)
             rows.append([world, name, rmse, waited, nees, f"{lost} of {len(of)}"])
@@ -287,16 +342,28 @@ def table_of_steps(found: Scores) -> list[list[str]]:
     rows = []
     for step, (before, after) in STEPS.items():
         of_worlds = [
-            change([run[after].rmse_m for run in runs], [run[before].rmse_m for run in runs]) for runs in found.values()
+            change(
+                [run[after].rmse_m for run in runs],
+                [run[before].rmse_m for run in runs],
+            )
+            for runs in found.values()
         ]
         rows.append([step, *(marked(one) for one in of_worlds)])
     before, after = STEPS[SMOOTHING]
     waiting, smoothing = [], []
     for runs in found.values():
         waited = [run[before].waited_rmse_m for run in runs]
-        waiting.append(marked(change(waited, [run[before].then_rmse_m for run in runs])))
-        smoothing.append(marked(change([run[after].waited_rmse_m for run in runs], waited)))
-    return [*rows, [f"waiting {WAIT_S:g} s, filter", *waiting], [f"smoothing, {WAIT_S:g} s ago", *smoothing]]
+        waiting.append(
+            marked(change(waited, [run[before].then_rmse_m for run in runs]))
+        )
+        smoothing.append(
+            marked(change([run[after].waited_rmse_m for run in runs], waited))
+        )
+    return [
+        *rows,
+        [f"waiting {WAIT_S:g} s, filter", *waiting],
+        [f"smoothing, {WAIT_S:g} s ago", *smoothing],
+    ]
 
 
 def marked(value: Estimate) -> str:
@@ -312,7 +379,9 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder of the tables.")] = Path("out/attribution"),
+    out: Annotated[Path, typer.Option("-o", help="Folder of the tables.")] = Path(
+        "out/attribution"
+    ),
     runs: Annotated[int, typer.Option(help="Runs of each world.")] = 30,
     jobs: Annotated[int, typer.Option(help="Processes.")] = 1,
     seed: int = 0,
@@ -320,22 +389,39 @@ def main(
     """Write scores.csv, errors.md and steps.md."""
     out.mkdir(parents=True, exist_ok=True)
     tasks = [(world, seed + k) for world in WORLDS for k in range(runs)]
-    every = joblib.Parallel(n_jobs=jobs)(joblib.delayed(scores)(*task) for task in tasks)
-    found = {world: [one for (of, _), one in zip(tasks, every, strict=True) if of == world] for world in WORLDS}
+    every = joblib.Parallel(n_jobs=jobs)(
+        joblib.delayed(scores)(*task) for task in tasks
+    )
+    found = {
+        world: [one for (of, _), one in zip(tasks, every, strict=True) if of == world]
+        for world in WORLDS
+    }
     with (out / "scores.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["world", "seed", "contestant", *(each.name for each in fields(Score))])
+        writer.writerow(
+            ["world", "seed", "contestant", *(each.name for each in fields(Score))]
+        )
         for (world, number), one in zip(tasks, every, strict=True):
             for name, of in one.items():
                 writer.writerow([world, number, name, *astuple(of)])
     errors = markdown(
-        ["world", "contestant", "now [m]", f"{WAIT_S:g} s ago [m]", "NEES now (2)", "lost"], table_of_errors(found)
+        [
+            "world",
+            "contestant",
+            "now [m]",
+            f"{WAIT_S:g} s ago [m]",
+            "NEES now (2)",
+            "lost",
+        ],
+        table_of_errors(found),
     )
     steps = markdown(["step", *WORLDS], table_of_steps(found))
     (out / "errors.md").write_text(errors)
     (out / "steps.md").write_text(steps)
     print(f"Position error, mean over the runs that kept the object\n\n{errors}")
-    print(f"Change of the position error by each step [%], geometric mean over paired runs\n\n{steps}")
+    print(
+        f"Change of the position error by each step [%], geometric mean over paired runs\n\n{steps}"
+    )
 
 
 if __name__ == "__main__":

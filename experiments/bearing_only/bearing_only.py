@@ -59,9 +59,15 @@ class World:
     def observer(self, steps: int) -> FloatArray:
         """Positions of the observer, shape (steps, 2)."""
         times_s, courses_deg = np.array(self.courses).T
-        courses = np.deg2rad(np.interp(self.step_s * np.arange(steps), times_s, courses_deg))
-        velocity = self.observer_mps * np.stack([np.cos(courses), np.sin(courses)], axis=-1)
-        return np.concatenate([np.zeros((1, 2)), np.cumsum(self.step_s * velocity[:-1], axis=0)])
+        courses = np.deg2rad(
+            np.interp(self.step_s * np.arange(steps), times_s, courses_deg)
+        )
+        velocity = self.observer_mps * np.stack(
+            [np.cos(courses), np.sin(courses)], axis=-1
+        )
+        return np.concatenate(
+            [np.zeros((1, 2)), np.cumsum(self.step_s * velocity[:-1], axis=0)]
+        )
 
 
 WORLDS = {
@@ -119,12 +125,19 @@ class Errors(NamedTuple):
 
 def pursuit(world: World, rng: np.random.Generator, last_s: float) -> Pursuit:
     """Draw an object from the prior, its way from the motion model, and its bearings up to `last_s`."""
-    steps, model = world.steps(last_s), measurement_model(("bearing_rad",), world.motion)
+    steps, model = (
+        world.steps(last_s),
+        measurement_model(("bearing_rad",), world.motion),
+    )
     range_m = 0.0
     while range_m < NEAREST * world.range_m:
         range_m = world.range_m + world.range_std_m * rng.standard_normal()
-    position = range_m * np.array([np.cos(FIRST_BEARING_RAD), np.sin(FIRST_BEARING_RAD)])
-    truth = [np.concatenate([position, world.velocity_std_mps * rng.standard_normal(2)])]
+    position = range_m * np.array(
+        [np.cos(FIRST_BEARING_RAD), np.sin(FIRST_BEARING_RAD)]
+    )
+    truth = [
+        np.concatenate([position, world.velocity_std_mps * rng.standard_normal(2)])
+    ]
     for _ in range(steps - 1):
         truth.append(drawn(world.motion, truth[-1], world.step_s, rng))
     R = np.array([[world.bearing_std_rad**2]])
@@ -132,22 +145,33 @@ def pursuit(world: World, rng: np.random.Generator, last_s: float) -> Pursuit:
     for k, (place, state) in enumerate(zip(world.observer(steps), truth, strict=True)):
         pose = SensorPose(float(place[0]), float(place[1]))
         z = model.predict(state, pose) + world.bearing_std_rad * rng.standard_normal(1)
-        measurements.append(Measurement(START_NS + round(k * world.step_s * NS_PER_S), model, z, R, pose))
-    turn, spread_m = rotation(float(measurements[0].z[0])), [world.range_std_m, world.range_m * world.bearing_std_rad]
+        measurements.append(
+            Measurement(
+                START_NS + round(k * world.step_s * NS_PER_S), model, z, R, pose
+            )
+        )
+    turn, spread_m = (
+        rotation(float(measurements[0].z[0])),
+        [world.range_std_m, world.range_m * world.bearing_std_rad],
+    )
     start = Start(
         stamp_ns=START_NS,
         position_m=turn @ np.array([world.range_m, 0.0]),
         position_covariance=turn @ np.diag(np.square(spread_m)) @ turn.T,
         speed_std_mps=world.velocity_std_mps,
     )
-    receipts_s = world.step_s * np.arange(steps) + rng.uniform(0.0, world.latest_s, steps)
+    receipts_s = world.step_s * np.arange(steps) + rng.uniform(
+        0.0, world.latest_s, steps
+    )
     return Pursuit(np.array(truth), measurements, receipts_s, start)
 
 
 def errors(world: World, name: str, drawn: Pursuit) -> Errors:
     """Errors of the present state of the case `name`, from what has been received at every step."""
     entry, options = CASES[name]
-    one = estimator(entry, world.motion, drawn.start, lag_s=2.0 * world.last_s, **options)
+    one = estimator(
+        entry, world.motion, drawn.start, lag_s=2.0 * world.last_s, **options
+    )
     order = np.argsort(drawn.receipts_s[1:]) + 1  # the first bearing is in the start
     heard, distance_m, nees = 0, [], []
     for k in range(1, len(drawn.truth)):
@@ -169,7 +193,9 @@ def chosen(names: str | None) -> list[str]:
 
 def row(name: str, found: list[Errors], reference: list[Errors]) -> list[str]:
     """The case's errors at the last step, and in pairs those less than of the reference."""
-    last, base = (np.array([one.distance_m[-1] for one in runs]) for runs in (found, reference))
+    last, base = (
+        np.array([one.distance_m[-1] for one in runs]) for runs in (found, reference)
+    )
     nees = np.array([one.nees[-1] for one in found])
     return [
         name,
@@ -183,41 +209,77 @@ def row(name: str, found: list[Errors], reference: list[Errors]) -> list[str]:
     ]
 
 
-HEADER = ["estimator", "median_m", "q90_m", "rmse_m", "mean_less_ekf_m", "nees", "nees_median", "lost_percent"]
+HEADER = [
+    "estimator",
+    "median_m",
+    "q90_m",
+    "rmse_m",
+    "mean_less_ekf_m",
+    "nees",
+    "nees_median",
+    "lost_percent",
+]
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder for the table and the figure.")] = Path("out/bearing_only"),
+    out: Annotated[
+        Path, typer.Option("-o", help="Folder for the table and the figure.")
+    ] = Path("out/bearing_only"),
     runs: Annotated[int, typer.Option(help="Draws in each world.")] = 24,
     share: Annotated[float, typer.Option(help="Share of each world's duration.")] = 1.0,
-    cases: Annotated[str | None, typer.Option(help="Cases, separated by semicolons.")] = None,
-    worlds: Annotated[str, typer.Option(help="Worlds, separated by commas.")] = ",".join(WORLDS),
+    cases: Annotated[
+        str | None, typer.Option(help="Cases, separated by semicolons.")
+    ] = None,
+    worlds: Annotated[
+        str, typer.Option(help="Worlds, separated by commas.")
+    ] = ",".join(WORLDS),
     seed: int = 0,
     jobs: int = 1,
 ) -> None:
     """Draw the pursuits, run every case, write bearing_only.csv and bearing_only.png."""
     out.mkdir(parents=True, exist_ok=True)
     names, places = chosen(cases), worlds.split(",")
-    figure, axes = plt.subplots(1, len(places), figsize=(5.5 * len(places), 4.0), layout="constrained", squeeze=False)
+    figure, axes = plt.subplots(
+        1,
+        len(places),
+        figsize=(5.5 * len(places), 4.0),
+        layout="constrained",
+        squeeze=False,
+    )
     lines = []
     for axis, place in zip(axes[0], places, strict=True):
         world = WORLDS[place]
-        draws = [pursuit(world, np.random.default_rng([seed, run]), share * world.last_s) for run in range(runs)]
-        tasks = [delayed(errors)(world, name, drawn) for name in names for drawn in draws]
+        draws = [
+            pursuit(world, np.random.default_rng([seed, run]), share * world.last_s)
+            for run in range(runs)
+        ]
+        tasks = [
+            delayed(errors)(world, name, drawn) for name in names for drawn in draws
+        ]
         flat: list[Errors] = Parallel(n_jobs=jobs)(tasks)
-        found = {name: flat[index * runs : (index + 1) * runs] for index, name in enumerate(names)}
+        found = {
+            name: flat[index * runs : (index + 1) * runs]
+            for index, name in enumerate(names)
+        }
         lines += [[place, *row(name, found[name], found[names[0]])] for name in names]
         for name, of_case in found.items():
             rms_m = np.sqrt(np.mean([one.distance_m**2 for one in of_case], axis=0))
             axis.plot(world.step_s * np.arange(1, len(rms_m) + 1), rms_m, label=name)
-        axis.set(title=place, xlabel="time [s]", ylabel="position RMSE of the present [m]", yscale="log")
+        axis.set(
+            title=place,
+            xlabel="time [s]",
+            ylabel="position RMSE of the present [m]",
+            yscale="log",
+        )
         axis.grid(alpha=0.3, which="both")
     axes[0, -1].legend(fontsize=8)
     figure.savefig(out / "bearing_only.png", dpi=150)
     plt.close(figure)
     with (out / "bearing_only.csv").open("w", newline="") as file:
         csv.writer(file).writerows([["world", *HEADER], *lines])
-    print((out / "bearing_only.csv").read_text() + f"figure: {out / 'bearing_only.png'}")
+    print(
+        (out / "bearing_only.csv").read_text() + f"figure: {out / 'bearing_only.png'}"
+    )
 
 
 if __name__ == "__main__":

@@ -18,6 +18,8 @@ import typer
 from joblib import Parallel, delayed
 
 import fgtrack
+from fgtrack.config.settings import Config
+from fgtrack.config.shipped import read_config
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
@@ -26,13 +28,15 @@ from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.scores.lagged import lag_metrics
 from fgtrack.models.motion import CTRV
 from fgtrack.models.sensors import Correlation, Mount, SensorModel
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.shipped import read_config
 from fgtrack.sim.vehicles import drawn
 
 MOTION = CTRV(0.01, 0.001, 0.5, 0.01)
 STARTS = np.array(
-    [[30.0, 8.0, 0.1, 10.0, 0.0], [45.0, -12.0, -0.1, 9.0, 0.0], [20.0, 30.0, 0.0, 11.0, 0.0]]
+    [
+        [30.0, 8.0, 0.1, 10.0, 0.0],
+        [45.0, -12.0, -0.1, 9.0, 0.0],
+        [20.0, 30.0, 0.0, 11.0, 0.0],
+    ]
 )  # x, y, yaw, speed, yaw rate
 EGO_MPS, PERIOD_S, LIDAR_EVERY = 10.0, 0.1, 5
 LIDAR_STD_M, LIDAR_STD_RAD, BEARING_STD_RAD = 0.3, 0.1, 0.01
@@ -57,10 +61,14 @@ class Result(NamedTuple):
 
 def drive(errors: str, duration_s: float, rng: np.random.Generator) -> list[Message]:
     """Messages of one drawn scene in receipt order."""
-    return sorted(_sensed(errors, duration_s, rng), key=lambda message: message.receipt_ns)
+    return sorted(
+        _sensed(errors, duration_s, rng), key=lambda message: message.receipt_ns
+    )
 
 
-def _sensed(errors: str, duration_s: float, rng: np.random.Generator) -> Iterator[Message]:
+def _sensed(
+    errors: str, duration_s: float, rng: np.random.Generator
+) -> Iterator[Message]:
     states = STARTS.copy()
     share = LASTING.share if errors == "lasting" else 0.0
     decay = np.exp(-PERIOD_S / LASTING.time_s)
@@ -69,25 +77,57 @@ def _sensed(errors: str, duration_s: float, rng: np.random.Generator) -> Iterato
         stamp_ns = NS_PER_S + round(step * PERIOD_S * NS_PER_S)
         ego_m = np.array([EGO_MPS * step * PERIOD_S, 0.0])
         yield EgoState(stamp_ns, stamp_ns, *ego_m.tolist(), 0.0, EGO_MPS)
-        for index, (x_m, y_m, yaw_rad, speed_mps, yaw_rate_radps) in enumerate(states.tolist()):
-            yield TruthState(stamp_ns, stamp_ns, index, x_m, y_m, wrap_angle(yaw_rad), speed_mps, yaw_rate_radps)
+        for index, (x_m, y_m, yaw_rad, speed_mps, yaw_rate_radps) in enumerate(
+            states.tolist()
+        ):
+            yield TruthState(
+                stamp_ns,
+                stamp_ns,
+                index,
+                x_m,
+                y_m,
+                wrap_angle(yaw_rad),
+                speed_mps,
+                yaw_rate_radps,
+            )
         offsets = states[:, :2] - ego_m
         if step % LIDAR_EVERY == 0:
             std = [LIDAR_STD_M, LIDAR_STD_M, LIDAR_STD_RAD]
-            seen = np.column_stack([offsets, states[:, 2]]) + std * rng.standard_normal((len(states), 3))
-            boxes = [Detection(x_m=x, y_m=y, yaw_rad=wrap_angle(yaw)) for x, y, yaw in seen.tolist()]
+            seen = np.column_stack([offsets, states[:, 2]]) + std * rng.standard_normal(
+                (len(states), 3)
+            )
+            boxes = [
+                Detection(x_m=x, y_m=y, yaw_rad=wrap_angle(yaw))
+                for x, y, yaw in seen.tolist()
+            ]
             yield _list("lidar", stamp_ns, boxes, "ego")
         for name, mount in MOUNTS.items():
             rays = offsets - np.array([mount.x_m, mount.y_m])
-            lasting[name] = decay * lasting[name] + np.sqrt(1.0 - decay**2) * rng.standard_normal(len(states))
-            noise = np.sqrt(share) * lasting[name] + np.sqrt(1.0 - share) * rng.standard_normal(len(states))
+            lasting[name] = decay * lasting[name] + np.sqrt(
+                1.0 - decay**2
+            ) * rng.standard_normal(len(states))
+            noise = np.sqrt(share) * lasting[name] + np.sqrt(
+                1.0 - share
+            ) * rng.standard_normal(len(states))
             bearings = np.arctan2(rays[:, 1], rays[:, 0]) + BEARING_STD_RAD * noise
-            yield _list(name, stamp_ns, [Detection(bearing_rad=value) for value in bearings.tolist()], "sensor")
+            yield _list(
+                name,
+                stamp_ns,
+                [Detection(bearing_rad=value) for value in bearings.tolist()],
+                "sensor",
+            )
         states = drawn(MOTION, states, PERIOD_S, rng)
 
 
-def _list(sensor: str, stamp_ns: int, objects: list[Detection], frame: fgtrack.core.types.Frame) -> DetectionList:
-    return DetectionList(sensor, stamp_ns, stamp_ns + round(DELAYS_S[sensor] * NS_PER_S), objects, frame)
+def _list(
+    sensor: str,
+    stamp_ns: int,
+    objects: list[Detection],
+    frame: fgtrack.core.types.Frame,
+) -> DetectionList:
+    return DetectionList(
+        sensor, stamp_ns, stamp_ns + round(DELAYS_S[sensor] * NS_PER_S), objects, frame
+    )
 
 
 def configuration(modelled: str) -> Config:
@@ -96,17 +136,28 @@ def configuration(modelled: str) -> Config:
     correlation = LASTING if modelled == "lasting" else None
     densities = {
         name: float(np.sqrt(100.0 * getattr(MOTION, field)))
-        for name, field in zip(("position", "yaw", "speed", "yaw_rate"), CTRV.density_names(), strict=True)
+        for name, field in zip(
+            ("position", "yaw", "speed", "yaw_rate"), CTRV.density_names(), strict=True
+        )
     }
     base = read_config("open_space", ["clock.node_hz=10", "association.gate_m=15"])
-    sensors = {name: replace(camera, mount=mount, correlation=correlation) for name, mount in MOUNTS.items()}
-    lidar = SensorModel({"x_m": LIDAR_STD_M, "y_m": LIDAR_STD_M, "yaw_rad": LIDAR_STD_RAD})
+    sensors = {
+        name: replace(camera, mount=mount, correlation=correlation)
+        for name, mount in MOUNTS.items()
+    }
+    lidar = SensorModel(
+        {"x_m": LIDAR_STD_M, "y_m": LIDAR_STD_M, "yaw_rad": LIDAR_STD_RAD}
+    )
     motion = replace(base.motion, std_per_s=densities)
     birth = replace(base.birth, speed_std_mps=15.0, yaw_rate_std_radps=0.1)
-    return replace(base, sensors={"lidar": lidar, **sensors}, motion=motion, birth=birth)
+    return replace(
+        base, sensors={"lidar": lidar, **sensors}, motion=motion, birth=birth
+    )
 
 
-def result(errors: str, modelled: str, name: str, duration_s: float, seed: int) -> Result:
+def result(
+    errors: str, modelled: str, name: str, duration_s: float, seed: int
+) -> Result:
     """The estimator `name` on the scene of `seed` with such errors, modelled so."""
     messages = drive(errors, duration_s, np.random.default_rng(seed))
     run = fgtrack.replay(messages, replace(configuration(modelled), estimator=name))
@@ -121,26 +172,57 @@ def result(errors: str, modelled: str, name: str, duration_s: float, seed: int) 
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder for the table.")] = Path("out/cameras"),
+    out: Annotated[Path, typer.Option("-o", help="Folder for the table.")] = Path(
+        "out/cameras"
+    ),
     runs: Annotated[int, typer.Option(help="Seeds.")] = 20,
     duration_s: Annotated[float, typer.Option(help="Length of a scene.")] = 10.0,
     jobs: int = 1,
 ) -> None:
     """Draw the scenes, run both estimators with both models of the errors, write cameras.csv."""
     out.mkdir(parents=True, exist_ok=True)
-    cases = [(errors, modelled) for errors in ERRORS for modelled in ERRORS[: 1 + ERRORS.index(errors)]]
-    tasks = [
-        delayed(result)(*case, name, duration_s, seed) for case in cases for name in ESTIMATORS for seed in range(runs)
+    cases = [
+        (errors, modelled)
+        for errors in ERRORS
+        for modelled in ERRORS[: 1 + ERRORS.index(errors)]
     ]
-    values = np.array(Parallel(n_jobs=jobs)(tasks)).reshape(len(cases), len(ESTIMATORS), runs, -1)
+    tasks = [
+        delayed(result)(*case, name, duration_s, seed)
+        for case in cases
+        for name in ESTIMATORS
+        for seed in range(runs)
+    ]
+    values = np.array(Parallel(n_jobs=jobs)(tasks)).reshape(
+        len(cases), len(ESTIMATORS), runs, -1
+    )
     with (out / "cameras.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["errors", "modelled_as", "estimator", *Result._fields, "rmse_less_ekf_percent"])
+        writer.writerow(
+            [
+                "errors",
+                "modelled_as",
+                "estimator",
+                *Result._fields,
+                "rmse_less_ekf_percent",
+            ]
+        )
         for case, by_estimator in zip(cases, values, strict=True):
             for name, found in zip(ESTIMATORS, by_estimator, strict=True):
-                gain = paired(100.0 * np.log(found[:, 0]), 100.0 * np.log(by_estimator[0, :, 0]))
-                columns = [f"{average(column):.{3 - index % 2}f}" for index, column in enumerate(found.T)]
-                writer.writerow([*case, name, *columns, f"{gain:.2f}" if name != ESTIMATORS[0] else ""])
+                gain = paired(
+                    100.0 * np.log(found[:, 0]), 100.0 * np.log(by_estimator[0, :, 0])
+                )
+                columns = [
+                    f"{average(column):.{3 - index % 2}f}"
+                    for index, column in enumerate(found.T)
+                ]
+                writer.writerow(
+                    [
+                        *case,
+                        name,
+                        *columns,
+                        f"{gain:.2f}" if name != ESTIMATORS[0] else "",
+                    ]
+                )
     print((out / "cameras.csv").read_text())
 
 

@@ -19,19 +19,25 @@ import numpy as np
 import typer
 
 import fgtrack
+from fgtrack.config.settings import Config
+from fgtrack.config.shipped import read_config
 from fgtrack.core.geometry import rotation, wrap_angle
 from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray, TruthState
+from fgtrack.core.types import (
+    Detection,
+    DetectionList,
+    EgoState,
+    FloatArray,
+    TruthState,
+)
 from fgtrack.estimation.base import Estimator, Measurement, Start
 from fgtrack.estimation.registry import estimator
 from fgtrack.evaluation.intervals import by_stamp, within_run
 from fgtrack.evaluation.matching import Matching, match
 from fgtrack.evaluation.scores.lagged import lag_metrics
-from fgtrack.io.source import open_input
+from fgtrack.inputs.source import open_input
 from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.shipped import read_config
 
 SEQUENCES = ("0004", "0006", "0008", "0010", "0018")
 LIDAR, CAMERA = "pointrcnn_car", "rrc_car"
@@ -40,11 +46,20 @@ LAG_S = 0.3
 LIDAR_STD, BEARING_STD_RAD = np.array([0.25, 0.12, 0.06]), 0.008
 FARTHEST_M, FARTHEST_RAD = 1.5, 0.06
 WARM_UP, FEWEST = 5, 8
-MOTION = CTRV.from_std_per_step({"position": 0.3, "yaw": 0.1, "speed": 15.0, "yaw_rate": 1.0}, 100.0)
+MOTION = CTRV.from_std_per_step(
+    {"position": 0.3, "yaw": 0.1, "speed": 15.0, "yaw_rate": 1.0}, 100.0
+)
 BOX = measurement_model(("x_m", "y_m", "yaw_rad"), MOTION)
 BEARING = measurement_model(("bearing_rad",), MOTION)
-ESTIMATORS = {"ekf-replay": {"lag_s": 3.0}, "smoother": {"lag_s": 1.0}, "smoother, 20 steps": {"lag_s": 1.0}}
-STEPS = {"max_iterations": 20, "relinearise": {"x_m": 1e-3, "y_m": 1e-3, "yaw_rad": 1e-3, "speed_mps": 0.01}}
+ESTIMATORS = {
+    "ekf-replay": {"lag_s": 3.0},
+    "smoother": {"lag_s": 1.0},
+    "smoother, 20 steps": {"lag_s": 1.0},
+}
+STEPS = {
+    "max_iterations": 20,
+    "relinearise": {"x_m": 1e-3, "y_m": 1e-3, "yaw_rad": 1e-3, "speed_mps": 0.01},
+}
 
 
 class Sighting(NamedTuple):
@@ -76,15 +91,22 @@ CASES = {
     "without the mean of each car": Case(lambda errors, rng: errors - errors.mean()),
     "in random order": Case(lambda errors, rng: rng.permutation(errors)),
     "both": Case(lambda errors, rng: rng.permutation(errors) - errors.mean()),
-    "drawn, white": Case(lambda errors, rng: BEARING_STD_RAD * rng.standard_normal(len(errors))),
-    "drawn, LiDAR's as well": Case(lambda errors, rng: BEARING_STD_RAD * rng.standard_normal(len(errors)), True),
+    "drawn, white": Case(
+        lambda errors, rng: BEARING_STD_RAD * rng.standard_normal(len(errors))
+    ),
+    "drawn, LiDAR's as well": Case(
+        lambda errors, rng: BEARING_STD_RAD * rng.standard_normal(len(errors)), True
+    ),
 }
 
 
 def sightings(kitti: Path, sequence: str) -> dict[int, list[Sighting]]:
     """What was seen of every labelled car, in order of time."""
     config = read_config("kitti")
-    mount, settings = config.sensors[CAMERA].mount, replace(config.input.kitti, sequence=sequence)
+    mount, settings = (
+        config.sensors[CAMERA].mount,
+        replace(config.input.kitti, sequence=sequence),
+    )
     ego, cars, found = None, {}, {}
     for message in open_input(kitti, replace(config.input, kitti=settings)).messages():
         if isinstance(message, TruthState) and message.ignored:
@@ -96,8 +118,14 @@ def sightings(kitti: Path, sequence: str) -> dict[int, list[Sighting]]:
         elif isinstance(message, EgoState):
             ego = message
         elif ego is not None:
-            cars = {i: car for i, car in cars.items() if car.stamp_ns == message.stamp_ns}
-            offset = np.array([mount.x_m, mount.y_m]) if message.sensor == CAMERA else np.zeros(2)
+            cars = {
+                i: car for i, car in cars.items() if car.stamp_ns == message.stamp_ns
+            }
+            offset = (
+                np.array([mount.x_m, mount.y_m])
+                if message.sensor == CAMERA
+                else np.zeros(2)
+            )
             place = np.array([ego.x_m, ego.y_m]) + rotation(ego.yaw_rad) @ offset
             pose = SensorPose(float(place[0]), float(place[1]), ego.yaw_rad)
             for sighting in _of(message, pose, list(cars.values())):
@@ -105,7 +133,9 @@ def sightings(kitti: Path, sequence: str) -> dict[int, list[Sighting]]:
     return found
 
 
-def _of(message: DetectionList, pose: SensorPose, cars: Sequence[TruthState]) -> Iterator[Sighting]:
+def _of(
+    message: DetectionList, pose: SensorPose, cars: Sequence[TruthState]
+) -> Iterator[Sighting]:
     for detection in message.objects if cars else ():
         z = _in_map(detection, pose)
         misses = [_miss(z, pose, car) for car in cars]
@@ -120,7 +150,10 @@ def _in_map(detection: Detection, pose: SensorPose) -> FloatArray:
     assert detection.x_m is not None
     assert detection.y_m is not None
     assert detection.yaw_rad is not None
-    place = np.array([pose.x_m, pose.y_m]) + rotation(pose.yaw_rad) @ [detection.x_m, detection.y_m]
+    place = np.array([pose.x_m, pose.y_m]) + rotation(pose.yaw_rad) @ [
+        detection.x_m,
+        detection.y_m,
+    ]
     return np.array([*place, wrap_angle(detection.yaw_rad + pose.yaw_rad)])
 
 
@@ -130,14 +163,20 @@ def _miss(z: FloatArray, pose: SensorPose, car: TruthState) -> float:
         return abs(wrap_angle(float(z[0]) - _bearing_rad(pose, car))) / FARTHEST_RAD
     assert car.yaw_rad is not None
     turned = abs(wrap_angle(float(z[2]) - car.yaw_rad)) > 1.0
-    return np.inf if turned else float(np.hypot(z[0] - car.x_m, z[1] - car.y_m)) / FARTHEST_M
+    return (
+        np.inf
+        if turned
+        else float(np.hypot(z[0] - car.x_m, z[1] - car.y_m)) / FARTHEST_M
+    )
 
 
 def _bearing_rad(pose: SensorPose, car: TruthState) -> float:
     return wrap_angle(np.arctan2(car.y_m - pose.y_m, car.x_m - pose.x_m) - pose.yaw_rad)
 
 
-def measured(seen: Sequence[Sighting], case: Case, rng: np.random.Generator) -> list[tuple[int, Measurement]]:
+def measured(
+    seen: Sequence[Sighting], case: Case, rng: np.random.Generator
+) -> list[tuple[int, Measurement]]:
     """Receipts and measurements of one car in the order of receipt, its errors replaced as in `case`."""
     bearings = [item for item in seen if item.sensor == CAMERA]
     errors = np.array([item.error_rad for item in bearings])
@@ -149,20 +188,31 @@ def measured(seen: Sequence[Sighting], case: Case, rng: np.random.Generator) -> 
             R, model = np.array([[BEARING_STD_RAD**2]]), BEARING
         else:
             turn, z, model = np.eye(3), item.z, BOX
-            turn[:2, :2] = rotation(np.arctan2(z[1] - item.pose.y_m, z[0] - item.pose.x_m))
+            turn[:2, :2] = rotation(
+                np.arctan2(z[1] - item.pose.y_m, z[0] - item.pose.x_m)
+            )
             R = turn @ np.diag(LIDAR_STD**2) @ turn.T
             if case.white_boxes:
                 truth = np.array([item.car.x_m, item.car.y_m, item.car.yaw_rad])
                 z = truth + np.linalg.cholesky(R) @ rng.standard_normal(3)
         if case.errors is not None or item.sensor == LIDAR:
-            found.append((item.stamp_ns + DELAYS_NS[item.sensor], Measurement(item.stamp_ns, model, z, R, item.pose)))
+            found.append(
+                (
+                    item.stamp_ns + DELAYS_NS[item.sensor],
+                    Measurement(item.stamp_ns, model, z, R, item.pose),
+                )
+            )
     return sorted(found, key=lambda pair: (pair[0], pair[1].stamp_ns))
 
 
-def judged(name: str, seen: Sequence[Sighting], case: Case, rng: np.random.Generator) -> list[tuple[float, ...]]:
+def judged(
+    name: str, seen: Sequence[Sighting], case: Case, rng: np.random.Generator
+) -> list[tuple[float, ...]]:
     """Squared error and NEES of one car, of the present and 0.3 s ago, at every scan; NaN where there is none."""
     heard = measured(seen, case, rng)
-    first = next((k for k, (_, item) in enumerate(heard) if item.model is BOX), len(heard))
+    first = next(
+        (k for k, (_, item) in enumerate(heard) if item.model is BOX), len(heard)
+    )
     if len(heard) - first < FEWEST:
         return []
     start = heard[first][1]
@@ -177,17 +227,29 @@ def judged(name: str, seen: Sequence[Sighting], case: Case, rng: np.random.Gener
     )
     options = ESTIMATORS[name] | (STEPS if "20" in name else {})
     one = estimator(name.split(",")[0], MOTION, known, **options)
-    cars, rest, found, fused = {item.stamp_ns: item.car for item in seen}, heard[first + 1 :], [], 0
+    cars, rest, found, fused = (
+        {item.stamp_ns: item.car for item in seen},
+        heard[first + 1 :],
+        [],
+        0,
+    )
     for now_ns in sorted(cars):
         while rest and rest[0][0] <= now_ns:
             fused += one.update(rest.pop(0)[1]).innovation is not None
         if fused >= WARM_UP:
             one.advance(now_ns)
-            found.append((*_error(one, now_ns, cars), *_error(one, now_ns - nanoseconds(LAG_S), cars)))
+            found.append(
+                (
+                    *_error(one, now_ns, cars),
+                    *_error(one, now_ns - nanoseconds(LAG_S), cars),
+                )
+            )
     return found
 
 
-def _error(one: Estimator, stamp_ns: int, cars: dict[int, TruthState]) -> tuple[float, float]:
+def _error(
+    one: Estimator, stamp_ns: int, cars: dict[int, TruthState]
+) -> tuple[float, float]:
     if stamp_ns not in cars or stamp_ns < one.window_ns[0]:
         return np.nan, np.nan
     state, car = one.state_at(stamp_ns), cars[stamp_ns]
@@ -199,7 +261,10 @@ def cures(config: Config) -> dict[str, Config]:
     """`configs/kitti.yaml` and what it is without each part of the cure."""
     camera, lidar = config.sensors[CAMERA], config.sensors[LIDAR]
     same_std = replace(config.input, kitti=replace(config.input.kitti, box_std=None))
-    white = config.sensors | {CAMERA: replace(camera, correlation=None), LIDAR: replace(lidar, correlation=None)}
+    white = config.sensors | {
+        CAMERA: replace(camera, correlation=None),
+        LIDAR: replace(lidar, correlation=None),
+    }
     return {
         "no camera": replace(config, sensors={LIDAR: lidar}, ignore_sensors=(CAMERA,)),
         "neither": replace(config, sensors=white, input=same_std),
@@ -216,11 +281,21 @@ def track_row(config: Config, source: Path) -> list[str]:
         run = fgtrack.replay(source, replace(config, estimator=name))
         pairs.append((run, match(run, config.evaluation)))
     values = [
-        f"{found.errors['position_m'].rmse:.3f}" for run, matching in pairs for found in lag_metrics(run, matching)[:1]
+        f"{found.errors['position_m'].rmse:.3f}"
+        for run, matching in pairs
+        for found in lag_metrics(run, matching)[:1]
     ]
     lags = {found.lag_s: found for found in lag_metrics(*pairs[1])}
-    nees = [f"{lag_metrics(run, matching)[0].position_nees.mean:.2f}" for run, matching in pairs]
-    return [*values, _difference(*(matching for _, matching in pairs)), *nees, f"{lags[LAG_S].position_nees.mean:.2f}"]
+    nees = [
+        f"{lag_metrics(run, matching)[0].position_nees.mean:.2f}"
+        for run, matching in pairs
+    ]
+    return [
+        *values,
+        _difference(*(matching for _, matching in pairs)),
+        *nees,
+        f"{lags[LAG_S].position_nees.mean:.2f}",
+    ]
 
 
 def _difference(ekf: Matching | None, smoother: Matching | None) -> str:
@@ -236,39 +311,85 @@ def _difference(ekf: Matching | None, smoother: Matching | None) -> str:
 
 
 def _squares(matching: Matching) -> dict[tuple[int, int], float]:
-    tracks, truth = matching.tracks.where(matching.paired), matching.true_states[matching.paired]
+    tracks, truth = (
+        matching.tracks.where(matching.paired),
+        matching.true_states[matching.paired],
+    )
     errors = (tracks["x_m"] - truth[:, 0]) ** 2 + (tracks["y_m"] - truth[:, 1]) ** 2
-    keys = zip(tracks["now_ns"].tolist(), matching.object_index[matching.paired].tolist(), strict=True)
+    keys = zip(
+        tracks["now_ns"].tolist(),
+        matching.object_index[matching.paired].tolist(),
+        strict=True,
+    )
     return dict(zip(keys, errors.tolist(), strict=True))
 
 
 def main(
     kitti: Annotated[Path, typer.Argument(help="Folder of the data set.")],
-    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path("out/drives"),
-    sequences: Annotated[str, typer.Option(help="Sequences, separated by commas.")] = ",".join(SEQUENCES),
+    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path(
+        "out/drives"
+    ),
+    sequences: Annotated[
+        str, typer.Option(help="Sequences, separated by commas.")
+    ] = ",".join(SEQUENCES),
 ) -> None:
     """Replace the errors, run the tracker, write causes.csv and cures.csv."""
     out.mkdir(parents=True, exist_ok=True)
     with (out / "causes.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["sequence", "errors", "estimator", "rmse_m", "nees", f"nees_{LAG_S:g}s_ago"])
+        writer.writerow(
+            [
+                "sequence",
+                "errors",
+                "estimator",
+                "rmse_m",
+                "nees",
+                f"nees_{LAG_S:g}s_ago",
+            ]
+        )
         for sequence in sequences.split(","):
             cars = sightings(kitti, sequence)
             for label, case in CASES.items():
                 for name in ESTIMATORS:
                     rng = np.random.default_rng(1)
-                    rows = np.array([row for seen in cars.values() for row in judged(name, seen, case, rng)])
+                    rows = np.array(
+                        [
+                            row
+                            for seen in cars.values()
+                            for row in judged(name, seen, case, rng)
+                        ]
+                    )
                     means = np.nanmean(rows, axis=0)
                     writer.writerow(
-                        [sequence, label, name, f"{means[0] ** 0.5:.3f}", f"{means[1]:.2f}", f"{means[3]:.2f}"]
+                        [
+                            sequence,
+                            label,
+                            name,
+                            f"{means[0] ** 0.5:.3f}",
+                            f"{means[1]:.2f}",
+                            f"{means[3]:.2f}",
+                        ]
                     )
     with (out / "cures.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        header = ["rmse_ekf_m", "rmse_smoother_m", "difference_m", "nees_ekf", "nees_smoother", f"nees_{LAG_S:g}s_ago"]
+        header = [
+            "rmse_ekf_m",
+            "rmse_smoother_m",
+            "difference_m",
+            "nees_ekf",
+            "nees_smoother",
+            f"nees_{LAG_S:g}s_ago",
+        ]
         writer.writerow(["sequence", "with", *header])
         for sequence in sequences.split(","):
             for label, config in cures(read_config("kitti")).items():
-                writer.writerow([sequence, label, *track_row(config, kitti / "oxts" / f"{sequence}.txt")])
+                writer.writerow(
+                    [
+                        sequence,
+                        label,
+                        *track_row(config, kitti / "oxts" / f"{sequence}.txt"),
+                    ]
+                )
     print((out / "causes.csv").read_text() + "\n" + (out / "cures.csv").read_text())
 
 

@@ -47,7 +47,15 @@ ESTIMATORS: dict[str, tuple[str, MotionModel, dict[str, str]]] = {
 def errors(label: str, rng: np.random.Generator) -> FloatArray:
     """Errors of position and velocity after each detection of one object, shape (NUM_STEPS, 2)."""
     name, motion, options = ESTIMATORS[label]
-    x = np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi), rng.uniform(20.0, 70.0), rng.uniform(-0.1, 0.1)])
+    x = np.array(
+        [
+            0.0,
+            0.0,
+            rng.uniform(-np.pi, np.pi),
+            rng.uniform(20.0, 70.0),
+            rng.uniform(-0.1, 0.1),
+        ]
+    )
     z = x[:2] + STD_M * rng.standard_normal(2)
     R = STD_M**2 * np.eye(2)
     start = Start(
@@ -64,10 +72,14 @@ def errors(label: str, rng: np.random.Generator) -> FloatArray:
     for k in range(1, NUM_STEPS + 1):
         stamp_ns = START_NS + round(k * STEP_S * NS_PER_S)
         x = drawn(TRUTH, x, STEP_S, rng)
-        estimator.update(Measurement(stamp_ns, model, x[:2] + STD_M * rng.standard_normal(2), R))
+        estimator.update(
+            Measurement(stamp_ns, model, x[:2] + STD_M * rng.standard_normal(2), R)
+        )
         state = estimator.state_at(stamp_ns)
         mean = motion.kinematic(state.mean, state.covariance)[0]
-        found.append([np.hypot(*(mean - x)[:2]), np.hypot(*(velocity(mean) - velocity(x)))])
+        found.append(
+            [np.hypot(*(mean - x)[:2]), np.hypot(*(velocity(mean) - velocity(x)))]
+        )
     return np.array(found)
 
 
@@ -90,13 +102,29 @@ def reached_s(error: FloatArray) -> tuple[float, float]:
 def draw(results: dict[str, FloatArray], file: Path) -> None:
     """Median and 90 % quantile of both errors over the time since birth."""
     time_s = STEP_S * np.arange(1, NUM_STEPS + 1)
-    figure, axes = plt.subplots(1, 2, figsize=(9.0, 3.6), sharex=True, layout="constrained")
+    figure, axes = plt.subplots(
+        1, 2, figsize=(9.0, 3.6), sharex=True, layout="constrained"
+    )
     for axis, column, label, good in zip(
-        axes, range(2), ("position error [m]", "velocity error [m/s]"), (GOOD_M, GOOD_MPS), strict=True
+        axes,
+        range(2),
+        ("position error [m]", "velocity error [m/s]"),
+        (GOOD_M, GOOD_MPS),
+        strict=True,
     ):
         for index, (name, found) in enumerate(results.items()):
-            axis.plot(time_s, np.median(found[:, :, column], axis=0), color=f"C{index}", label=name)
-            axis.plot(time_s, np.quantile(found[:, :, column], 0.9, axis=0), color=f"C{index}", ls=":")
+            axis.plot(
+                time_s,
+                np.median(found[:, :, column], axis=0),
+                color=f"C{index}",
+                label=name,
+            )
+            axis.plot(
+                time_s,
+                np.quantile(found[:, :, column], 0.9, axis=0),
+                color=f"C{index}",
+                ls=":",
+            )
         axis.axhline(good, color="0.5", lw=0.8)
         axis.set(xlabel="time since birth [s]", ylabel=label, yscale="log")
         for which in (axis.yaxis.set_major_formatter, axis.yaxis.set_minor_formatter):
@@ -112,13 +140,19 @@ def quantile(values: FloatArray, share: float, rng: np.random.Generator) -> Esti
     resampled = rng.choice(values, (DRAWS, len(values)))
     found = np.quantile(resampled, share, axis=1, method="higher")
     low, high = np.quantile(found, [0.025, 0.975], method="nearest").tolist()
-    return Estimate(float(np.quantile(values, share, method="higher")), low, high, len(values))
+    return Estimate(
+        float(np.quantile(values, share, method="higher")), low, high, len(values)
+    )
 
 
 def root_mean(values: FloatArray, rng: np.random.Generator) -> Estimate:
     """Root of the mean of `values` (n,), which are squares, and its 95 % interval, by the same bootstrap."""
     found = np.sqrt(rng.choice(values, (DRAWS, len(values))).mean(axis=1))
-    return Estimate(float(np.sqrt(values.mean())), *np.quantile(found, [0.025, 0.975]).tolist(), len(values))
+    return Estimate(
+        float(np.sqrt(values.mean())),
+        *np.quantile(found, [0.025, 0.975]).tolist(),
+        len(values),
+    )
 
 
 def table(results: dict[str, FloatArray], rng: np.random.Generator) -> str:
@@ -130,28 +164,47 @@ def table(results: dict[str, FloatArray], rng: np.random.Generator) -> str:
     ]
     for label, found in results.items():
         first_s, settled_s = np.array([reached_s(error) for error in found]).T
-        cells = [quantile(first_s, 0.5, rng), quantile(first_s, 0.9, rng), quantile(settled_s, 0.5, rng)]
-        cells += [root_mean(found[:, round(at_s / STEP_S) - 1, 1] ** 2, rng) for at_s in (0.2, 2.0)]
-        lines.append(f"| {label} | " + " | ".join(f"{cell:.2f}" for cell in cells) + " |")
+        cells = [
+            quantile(first_s, 0.5, rng),
+            quantile(first_s, 0.9, rng),
+            quantile(settled_s, 0.5, rng),
+        ]
+        cells += [
+            root_mean(found[:, round(at_s / STEP_S) - 1, 1] ** 2, rng)
+            for at_s in (0.2, 2.0)
+        ]
+        lines.append(
+            f"| {label} | " + " | ".join(f"{cell:.2f}" for cell in cells) + " |"
+        )
     return "\n".join(lines) + "\n"
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder for the table and the figure.")] = Path("out/births"),
+    out: Annotated[
+        Path, typer.Option("-o", help="Folder for the table and the figure.")
+    ] = Path("out/births"),
     objects: Annotated[int, typer.Option(help="Number of objects.")] = 400,
     seed: int = 0,
     jobs: Annotated[int, typer.Option(help="Processes.")] = 1,
 ) -> None:
     """Draw objects, track each with every estimator, write births.csv, births.md and births.png."""
     out.mkdir(parents=True, exist_ok=True)
-    cases = [(label, np.random.default_rng([seed, i])) for label in ESTIMATORS for i in range(objects)]
+    cases = [
+        (label, np.random.default_rng([seed, i]))
+        for label in ESTIMATORS
+        for i in range(objects)
+    ]
     found = iter(Parallel(n_jobs=jobs)(delayed(errors)(*case) for case in cases))
-    results = {label: np.array([next(found) for _ in range(objects)]) for label in ESTIMATORS}
+    results = {
+        label: np.array([next(found) for _ in range(objects)]) for label in ESTIMATORS
+    }
     with (out / "births.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["estimator", "object", "first_s", "stays_s"])
         for label, each in results.items():
-            writer.writerows([label, number, *reached_s(error)] for number, error in enumerate(each))
+            writer.writerows(
+                [label, number, *reached_s(error)] for number, error in enumerate(each)
+            )
     (out / "births.md").write_text(table(results, np.random.default_rng(seed)))
     draw(results, out / "births.png")
     print((out / "births.md").read_text() + f"figure: {out / 'births.png'}")

@@ -17,14 +17,15 @@ from matplotlib.axes import Axes
 
 from fgtrack.cli.sweep import swept
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.palette import style_of
+from fgtrack.show.palette import style_of
 
 SWEEP = Path(__file__).parents[2] / "configs/sweeps/bursts.yaml"
 QUICK_SEEDS = 2
 ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward", "drop")
 RMSE = "truth.overall.errors.position_m.rmse"
 FUSED = tuple(
-    f"sensors.lidar_cluster.dispositions.{name}" for name in ("in_sequence", "out_of_sequence", "beyond_window")
+    f"sensors.lidar_cluster.dispositions.{name}"
+    for name in ("in_sequence", "out_of_sequence", "beyond_window")
 )
 BAD = ("late", "lost")
 
@@ -46,7 +47,9 @@ def values(rows: list[dict[str, str]], columns: tuple[str, ...]) -> Found:
 
 def draw(axis: Axes, found: Found, bad: str, length_s: float) -> None:
     """Position RMSE of each estimator over the share of the time, for bursts of one length."""
-    points = sorted({point[1:3] for point in found if point[1] == 0.0 or point[2] == length_s})
+    points = sorted(
+        {point[1:3] for point in found if point[1] == 0.0 or point[2] == length_s}
+    )
     for index, name in enumerate(ESTIMATORS):
         some = [found[bad, *point, name] for point in points]
         shares = np.array([share for share, _ in points])
@@ -66,8 +69,15 @@ def draw(axis: Axes, found: Found, bad: str, length_s: float) -> None:
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder of the sweep and the figure.")] = Path("out/bursts"),
-    quick: Annotated[bool, typer.Option(help=f"Run {QUICK_SEEDS} seeds only, where there is no sweep yet.")] = False,
+    out: Annotated[
+        Path, typer.Option("-o", help="Folder of the sweep and the figure.")
+    ] = Path("out/bursts"),
+    quick: Annotated[
+        bool,
+        typer.Option(
+            help=f"Run {QUICK_SEEDS} seeds only, where there is no sweep yet."
+        ),
+    ] = False,
 ) -> None:
     """Write bursts.csv and bursts.png beside sweep.csv."""
     rows = swept(SWEEP, out, QUICK_SEEDS if quick else None)
@@ -80,9 +90,28 @@ def main(
         for bad, share, length_s in dict.fromkeys(point[:3] for point in found):
             some = [found[bad, share, length_s, name] for name in ESTIMATORS]
             lists = fused[bad, share, length_s, ESTIMATORS[0]].mean()
-            line = [value for seeds in some for value in (seeds.mean(), seeds.std(ddof=1) / np.sqrt(len(seeds)))]
-            writer.writerow([bad, f"{share:g}", f"{length_s:g}", f"{lists:.0f}", *(f"{value:.3f}" for value in line)])
-    figure, axes = plt.subplots(2, len(lengths_s), figsize=(12.0, 6.0), sharex=True, sharey=True, layout="constrained")
+            line = [
+                value
+                for seeds in some
+                for value in (seeds.mean(), seeds.std(ddof=1) / np.sqrt(len(seeds)))
+            ]
+            writer.writerow(
+                [
+                    bad,
+                    f"{share:g}",
+                    f"{length_s:g}",
+                    f"{lists:.0f}",
+                    *(f"{value:.3f}" for value in line),
+                ]
+            )
+    figure, axes = plt.subplots(
+        2,
+        len(lengths_s),
+        figsize=(12.0, 6.0),
+        sharex=True,
+        sharey=True,
+        layout="constrained",
+    )
     for row, bad in enumerate(BAD):
         for column, length_s in enumerate(lengths_s):
             draw(axes[row, column], found, bad, length_s)
@@ -92,7 +121,10 @@ def main(
     axes[0, 0].legend(fontsize=8)
     figure.savefig(out / "bursts.png", dpi=150)
     plt.close(figure)
-    print((out / "bursts.csv").read_text() + f"seeds: {min(map(len, found.values()))}\nfigure: {out / 'bursts.png'}")
+    print(
+        (out / "bursts.csv").read_text()
+        + f"seeds: {min(map(len, found.values()))}\nfigure: {out / 'bursts.png'}"
+    )
 
 
 if __name__ == "__main__":

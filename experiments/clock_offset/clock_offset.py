@@ -17,11 +17,11 @@ import numpy as np
 import typer
 from joblib import Parallel, delayed
 
-from fgtrack.calibration.clock_offsets import estimate_offsets
+from fgtrack.clocks.offsets import estimate_offsets
+from fgtrack.config.settings import Config
+from fgtrack.config.shipped import read_scenario
+from fgtrack.config.yaml_file import load
 from fgtrack.core.time import nanoseconds
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import load
-from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.sim.clocks import OffsetClock
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.simulate import simulate
@@ -35,13 +35,20 @@ EGO_MPS, SLOW_MPS, GAP_M = 60.0, 30.0, 90.0
 
 def scenario(name: str, offset_s: float) -> Scenario:
     made = read_scenario("default")
-    sensors = tuple(replace(one, clock=(OffsetClock(offset_s),) if one.name == WRONG else ()) for one in made.sensors)
+    sensors = tuple(
+        replace(one, clock=(OffsetClock(offset_s),) if one.name == WRONG else ())
+        for one in made.sensors
+    )
     made = replace(made, sensors=sensors, duration_s=max(LENGTHS_S[name]))
     if name == "default":
         return made
     count = int((EGO_MPS - SLOW_MPS) * made.duration_s / GAP_M) + 1
     slow = tuple(
-        TrackVehicle(arc_m=150.0 + GAP_M * i, lateral_m=2.5 if i % 2 else 4.5, speed=((0.0, SLOW_MPS),))
+        TrackVehicle(
+            arc_m=150.0 + GAP_M * i,
+            lateral_m=2.5 if i % 2 else 4.5,
+            speed=((0.0, SLOW_MPS),),
+        )
         for i in range(count)
     )
     ego = TrackVehicle(arc_m=100.0, lateral_m=-2.0, speed=((0.0, EGO_MPS),))
@@ -50,11 +57,16 @@ def scenario(name: str, offset_s: float) -> Scenario:
 
 def configuration() -> Config:
     """The smoother's, with what the simulated sensors are really like."""
-    config = load(Config, Path("configs/smoother.yaml"), ["map.track=oval", "map.pit=oval"])
+    config = load(
+        Config, Path("configs/smoother.yaml"), ["map.track=oval", "map.pit=oval"]
+    )
     std = {one.name: one.std for one in read_scenario("default").sensors}
     return replace(
         config,
-        sensors={name: replace(sensor, std=std.get(name, sensor.std)) for name, sensor in config.sensors.items()},
+        sensors={
+            name: replace(sensor, std=std.get(name, sensor.std))
+            for name, sensor in config.sensors.items()
+        },
     )
 
 
@@ -69,25 +81,40 @@ class Row:
     known: bool
 
 
-def rows(name: str, true_s: float, seed: int, lengths_s: tuple[float, ...]) -> Iterator[Row]:
+def rows(
+    name: str, true_s: float, seed: int, lengths_s: tuple[float, ...]
+) -> Iterator[Row]:
     """An estimate for each length of one recording; NaN where there is none."""
     made = scenario(name, true_s)
     messages = simulate(made, np.random.default_rng(seed))
     for length_s in lengths_s:
         end_ns = made.start_ns + nanoseconds(length_s)
-        report = estimate_offsets([one for one in messages if one.receipt_ns <= end_ns], configuration(), REFERENCE)
+        report = estimate_offsets(
+            [one for one in messages if one.receipt_ns <= end_ns],
+            configuration(),
+            REFERENCE,
+        )
         found = next(one for one in report.sensors if one.sensor == WRONG)
-        offset_s, std_s = (np.nan if value is None else value for value in (found.offset_s, found.std_s))
+        offset_s, std_s = (
+            np.nan if value is None else value
+            for value in (found.offset_s, found.std_s)
+        )
         yield Row(name, true_s, seed, length_s, offset_s, std_s, found.is_known)
 
 
 def draw(found: list[Row], file: Path) -> None:
     """Estimates with two standard deviations over the length, one panel for each recording."""
-    figure, axes = plt.subplots(1, len(LENGTHS_S), figsize=(9.0, 3.8), sharey=True, layout="constrained")
+    figure, axes = plt.subplots(
+        1, len(LENGTHS_S), figsize=(9.0, 3.8), sharey=True, layout="constrained"
+    )
     seed = min(row.seed for row in found)
     for axis, name in zip(axes, LENGTHS_S, strict=True):
         for index, true_s in enumerate(OFFSETS_S):
-            mine = [row for row in found if (row.recording, row.true_s, row.seed) == (name, true_s, seed)]
+            mine = [
+                row
+                for row in found
+                if (row.recording, row.true_s, row.seed) == (name, true_s, seed)
+            ]
             axis.axhline(1e3 * true_s, color=f"C{index}", lw=0.8, ls="--")
             axis.errorbar(
                 [row.length_s for row in mine],
@@ -108,8 +135,13 @@ def draw(found: list[Row], file: Path) -> None:
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder for the table and the figure.")] = Path("out/clock_offset"),
-    seeds: Annotated[int, typer.Option(help="Seeds at the full length; all lengths for the first one.")] = 1,
+    out: Annotated[
+        Path, typer.Option("-o", help="Folder for the table and the figure.")
+    ] = Path("out/clock_offset"),
+    seeds: Annotated[
+        int,
+        typer.Option(help="Seeds at the full length; all lengths for the first one."),
+    ] = 1,
     jobs: Annotated[int, typer.Option(help="Processes.")] = 1,
 ) -> None:
     """Estimate all offsets, write clock_offset.csv and clock_offset.png."""
@@ -120,18 +152,37 @@ def main(
         for true_s in OFFSETS_S
         for seed in range(seeds)
     ]
-    found = [row for part in Parallel(jobs)(delayed(listed)(*call) for call in calls) for row in part]
+    found = [
+        row
+        for part in Parallel(jobs)(delayed(listed)(*call) for call in calls)
+        for row in part
+    ]
     with (out / "clock_offset.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["recording", "true_ms", "seed", "length_s", "offset_ms", "std_ms", "known"])
+        writer.writerow(
+            ["recording", "true_ms", "seed", "length_s", "offset_ms", "std_ms", "known"]
+        )
         for row in found:
             numbers = (f"{1e3 * value:.2f}" for value in (row.offset_s, row.std_s))
-            writer.writerow([row.recording, f"{1e3 * row.true_s:.0f}", row.seed, row.length_s, *numbers, row.known])
+            writer.writerow(
+                [
+                    row.recording,
+                    f"{1e3 * row.true_s:.0f}",
+                    row.seed,
+                    row.length_s,
+                    *numbers,
+                    row.known,
+                ]
+            )
     draw(found, out / "clock_offset.png")
-    print((out / "clock_offset.csv").read_text() + f"figure: {out / 'clock_offset.png'}")
+    print(
+        (out / "clock_offset.csv").read_text() + f"figure: {out / 'clock_offset.png'}"
+    )
 
 
-def listed(name: str, true_s: float, seed: int, lengths_s: tuple[float, ...]) -> list[Row]:
+def listed(
+    name: str, true_s: float, seed: int, lengths_s: tuple[float, ...]
+) -> list[Row]:
     return list(rows(name, true_s, seed, lengths_s))
 
 

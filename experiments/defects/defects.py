@@ -12,11 +12,11 @@ from typing import Annotated
 
 import typer
 
+from fgtrack.config.settings import Config
+from fgtrack.config.yaml_file import load
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.io.run import Run
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import load
 from fgtrack.pipeline.public import replay
+from fgtrack.runs import Run
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -48,7 +48,9 @@ def switched(config: Config, other: Config, defect: str) -> Config:
     for section, keys in parts.items():
         part = getattr(other, section)
         if keys:
-            part = replace(getattr(config, section), **{key: getattr(part, key) for key in keys})
+            part = replace(
+                getattr(config, section), **{key: getattr(part, key) for key in keys}
+            )
         config = replace(config, **{section: part})
     return config
 
@@ -58,7 +60,9 @@ def variants(published: Config, clean: Config) -> dict[str, Config]:
     found = {"published": published, "clean": clean}
     for defect in DEFECTS:
         if defect == HEADING:
-            circular = tuple(sorted({*published.defects, "circular_heading"} - {"heading_jump"}))
+            circular = tuple(
+                sorted({*published.defects, "circular_heading"} - {"heading_jump"})
+            )
             found[f"published without {defect}"] = replace(published, defects=circular)
             continue
         found[f"published without {defect}"] = switched(published, clean, defect)
@@ -71,13 +75,21 @@ def row(name: str, run: Run) -> str:
     metrics = evaluate(run)
     assert metrics.truth is not None, "the stream has no truth"
     errors = metrics.truth.overall.errors
-    cells = [f"{errors[part].rmse:.3f}" for part in ("position_m", "along_m", "across_m")]
+    cells = [
+        f"{errors[part].rmse:.3f}" for part in ("position_m", "along_m", "across_m")
+    ]
     cells.append(f"{errors['yaw_rad'].rmse:.4f}")
     cells.append(f"{errors['speed_mps'].rmse:.2f}")
     for sensor in ("lidar_cluster", "radar"):
         residuals = metrics.sensors[sensor].residuals
-        cells.append(" / ".join(f"{residuals[part].std:.3f}" for part in ("along_m", "across_m")))
-    cells += [str(metrics.num_tracks), str(metrics.num_confirmed), f"{100 * metrics.truth.overall.tracked_share:.1f}"]
+        cells.append(
+            " / ".join(f"{residuals[part].std:.3f}" for part in ("along_m", "across_m"))
+        )
+    cells += [
+        str(metrics.num_tracks),
+        str(metrics.num_confirmed),
+        f"{100 * metrics.truth.overall.tracked_share:.1f}",
+    ]
     return f"| {name} | " + " | ".join(cells) + " |"
 
 

@@ -18,12 +18,21 @@ from scipy.stats import t
 
 from fgtrack.cli.sweep import swept
 from fgtrack.core.types import FloatArray
-from fgtrack.plotting.style import log_axis
+from fgtrack.show.figures.style import log_axis
 
 SWEEP = Path(__file__).parents[2] / "configs/sweeps/delay.yaml"
 QUICK_SEEDS = 2
-ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward", "drop", "reorder-buffer", "as-current")
-POSITION, SPEED = (f"truth.overall.errors.{name}.rmse" for name in ("position_m", "speed_mps"))
+ESTIMATORS = (
+    "smoother",
+    "ekf-replay",
+    "ekf-backward-forward",
+    "drop",
+    "reorder-buffer",
+    "as-current",
+)
+POSITION, SPEED = (
+    f"truth.overall.errors.{name}.rmse" for name in ("position_m", "speed_mps")
+)
 SHOWN_HZ = 20.0
 RATIOS, ERRORS_M = (0.3, 5.0), (0.15, 12.0)  # of the figure
 
@@ -61,9 +70,14 @@ def draw_ratio(axis: Axes, found: Errors, what: str) -> None:
     rates_hz = sorted({rate_hz for _, rate_hz, _ in found})
     delays_s = sorted({delay_s for delay_s, _, _ in found})
     for index, rate_hz in enumerate(rates_hz):
-        points = [(found[d, rate_hz, "ekf-backward-forward"], found[d, rate_hz, "drop"]) for d in delays_s]
+        points = [
+            (found[d, rate_hz, "ekf-backward-forward"], found[d, rate_hz, "drop"])
+            for d in delays_s
+        ]
         middle, low, high = np.array([ratio(*point) for point in points]).T
-        shift_ms = 2.0 * (index - (len(rates_hz) - 1) / 2)  # so that bars do not hide each other
+        shift_ms = 2.0 * (
+            index - (len(rates_hz) - 1) / 2
+        )  # so that bars do not hide each other
         axis.errorbar(
             1e3 * np.array(delays_s) + shift_ms,
             middle,
@@ -76,9 +90,20 @@ def draw_ratio(axis: Axes, found: Errors, what: str) -> None:
             label=f"{rate_hz:g} Hz",
         )
     axis.axhline(1.0, color="black", lw=1.0)
-    axis.set(xlabel="mean delay of the LiDAR [ms]", yscale="log", ylim=RATIOS, title=f"{what}: backward-forward / drop")
+    axis.set(
+        xlabel="mean delay of the LiDAR [ms]",
+        yscale="log",
+        ylim=RATIOS,
+        title=f"{what}: backward-forward / drop",
+    )
     log_axis(axis.yaxis)
-    axis.legend(title="both sensors at", fontsize=8, title_fontsize=8, ncols=2, loc="lower right")
+    axis.legend(
+        title="both sensors at",
+        fontsize=8,
+        title_fontsize=8,
+        ncols=2,
+        loc="lower right",
+    )
 
 
 def draw_errors(axis: Axes, found: Errors) -> None:
@@ -87,7 +112,12 @@ def draw_errors(axis: Axes, found: Errors) -> None:
     for index, name in enumerate(ESTIMATORS):
         rmse_m = [found[delay_s, SHOWN_HZ, name].mean() for delay_s in delays_s]
         axis.plot(
-            1e3 * np.array(delays_s), rmse_m, marker="os^vDP"[index], ms=4, ls="--" if index == 1 else "-", label=name
+            1e3 * np.array(delays_s),
+            rmse_m,
+            marker="os^vDP"[index],
+            ms=4,
+            ls="--" if index == 1 else "-",
+            label=name,
         )
     axis.set(
         xlabel="mean delay of the LiDAR [ms]",
@@ -100,8 +130,15 @@ def draw_errors(axis: Axes, found: Errors) -> None:
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder of the sweep and the figure.")] = Path("out/delay"),
-    quick: Annotated[bool, typer.Option(help=f"Run {QUICK_SEEDS} seeds only, where there is no sweep yet.")] = False,
+    out: Annotated[
+        Path, typer.Option("-o", help="Folder of the sweep and the figure.")
+    ] = Path("out/delay"),
+    quick: Annotated[
+        bool,
+        typer.Option(
+            help=f"Run {QUICK_SEEDS} seeds only, where there is no sweep yet."
+        ),
+    ] = False,
 ) -> None:
     """Write ratios.csv and delay.png beside sweep.csv."""
     rows = swept(SWEEP, out, QUICK_SEEDS if quick else None)
@@ -112,16 +149,32 @@ def main(
     names = ("ekf-backward-forward", "ekf-replay", "smoother")
     with (out / "ratios.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        header = [f"{name}_{what}" for name in names for what in ("position", "low", "high", "speed")]
+        header = [
+            f"{name}_{what}"
+            for name in names
+            for what in ("position", "low", "high", "speed")
+        ]
         writer.writerow(["rate_hz", "delay_s", "drop_m", "drop_mps", *header])
         for rate_hz in rates_hz:
             for delay_s in delays_s:
-                to, to_speed = position[delay_s, rate_hz, "drop"], speed[delay_s, rate_hz, "drop"]
+                to, to_speed = (
+                    position[delay_s, rate_hz, "drop"],
+                    speed[delay_s, rate_hz, "drop"],
+                )
                 line = [to.mean(), to_speed.mean()]
                 for name in names:
-                    of, of_speed = position[delay_s, rate_hz, name], speed[delay_s, rate_hz, name]
+                    of, of_speed = (
+                        position[delay_s, rate_hz, name],
+                        speed[delay_s, rate_hz, name],
+                    )
                     line += [*ratio(of, to), ratio(of_speed, to_speed)[0]]
-                writer.writerow([f"{rate_hz:g}", f"{delay_s:g}", *(f"{value:.2f}" for value in line)])
+                writer.writerow(
+                    [
+                        f"{rate_hz:g}",
+                        f"{delay_s:g}",
+                        *(f"{value:.2f}" for value in line),
+                    ]
+                )
     figure, axes = plt.subplots(1, 3, figsize=(13.0, 4.2), layout="constrained")
     draw_ratio(axes[0], position, "position RMSE")
     draw_ratio(axes[1], speed, "speed RMSE")
@@ -133,7 +186,10 @@ def main(
     print((out / "ratios.csv").read_text() + f"seeds: {seeds}")
     print("position: backward-forward is worse than dropping from [ms]")
     for rate_hz in rates_hz:
-        points = [(position[d, rate_hz, "ekf-backward-forward"], position[d, rate_hz, "drop"]) for d in delays_s]
+        points = [
+            (position[d, rate_hz, "ekf-backward-forward"], position[d, rate_hz, "drop"])
+            for d in delays_s
+        ]
         found_ms = 1e3 * crossing_s(delays_s, [ratio(*point)[0] for point in points])
         print(f"{rate_hz:g} Hz: {found_ms:.0f}")
     print(f"figure: {out / 'delay.png'}")

@@ -72,23 +72,38 @@ class Hypotheses:
         fused: list[tuple[float, Estimator]] = []
         for log_weight, each in self.weighted:
             state = each.state_at(measurement.stamp_ns)
-            y, H = measurement.model.linearised(measurement.z, state.mean, measurement.pose)
+            y, H = measurement.model.linearised(
+                measurement.z, state.mean, measurement.pose
+            )
             S = congruence(H, state.covariance) + measurement.R
             result = each.update(measurement)
             if result.innovation is not None:
                 if result.innovation_covariance is not None:
                     y, S = result.innovation, result.innovation_covariance
-                density = -0.5 * float(mahalanobis_squared(y, S) + np.linalg.slogdet(S)[1])
+                density = -0.5 * float(
+                    mahalanobis_squared(y, S) + np.linalg.slogdet(S)[1]
+                )
                 fused.append((log_weight + density, each))
-        ordered, self.weighted = sorted(fused or self.weighted, key=lambda each: -each[0]), []
+        ordered, self.weighted = (
+            sorted(fused or self.weighted, key=lambda each: -each[0]),
+            [],
+        )
         for log_weight, each in ordered:
             if log_weight < ordered[0][0] + math.log(LEAST_WEIGHT):
                 break
             state = each.state_at(measurement.stamp_ns)
             for index, (other, better) in enumerate(self.weighted):
                 kept = better.state_at(measurement.stamp_ns)
-                if mahalanobis_squared(wrapped(MOTION, state.mean - kept.mean), kept.covariance) < SAME:
-                    self.weighted[index] = float(np.logaddexp(other, log_weight)), better
+                if (
+                    mahalanobis_squared(
+                        wrapped(MOTION, state.mean - kept.mean), kept.covariance
+                    )
+                    < SAME
+                ):
+                    self.weighted[index] = (
+                        float(np.logaddexp(other, log_weight)),
+                        better,
+                    )
                     break
             else:
                 self.weighted.append((log_weight, each))
@@ -129,22 +144,42 @@ def doppler(rng: np.random.Generator) -> Scene:
     """An object of unknown heading and speed, 40 to 80 m from a sensor that drives at 15 m/s."""
     away_m, direction_rad = rng.uniform(40.0, 80.0), rng.uniform(-np.pi, np.pi)
     place_m = away_m * np.array([np.cos(direction_rad), np.sin(direction_rad)])
-    x = np.array([*place_m, rng.uniform(-np.pi, np.pi), rng.uniform(8.0, 20.0), rng.uniform(-0.1, 0.1)])
+    x = np.array(
+        [
+            *place_m,
+            rng.uniform(-np.pi, np.pi),
+            rng.uniform(8.0, 20.0),
+            rng.uniform(-0.1, 0.1),
+        ]
+    )
     truth, measurements, R = [], [], np.diag(DOPPLER_STD**2)
     for stamp_ns, state in driven(x, rng):
         pose = SensorPose(15.0 * stamp_ns / 1e9, 0.0, 0.0, 15.0, 0.0)
         exact = DOPPLER.predict(state, pose)
-        measurements.append(Measurement(stamp_ns, DOPPLER, exact + DOPPLER_STD * rng.standard_normal(3), R, pose))
+        measurements.append(
+            Measurement(
+                stamp_ns, DOPPLER, exact + DOPPLER_STD * rng.standard_normal(3), R, pose
+            )
+        )
         truth.append(state)
     first = measurements.pop(0)
-    position_m, covariance = measured_position(DOPPLER.components, first.z, R, first.pose) or (first.z, R)
-    start = Start(position_m=position_m, position_covariance=covariance, speed_std_mps=20.0)
-    return Scene(start, headings(start, NUM_HEADINGS), np.array(truth[1:]), measurements)
+    position_m, covariance = measured_position(
+        DOPPLER.components, first.z, R, first.pose
+    ) or (first.z, R)
+    start = Start(
+        position_m=position_m, position_covariance=covariance, speed_std_mps=20.0
+    )
+    return Scene(
+        start, headings(start, NUM_HEADINGS), np.array(truth[1:]), measurements
+    )
 
 
 NAMES = ("ekf-replay", "iekf-replay", "ukf-replay", "smoother-banded")
 #: How the object may start.
-STARTS: dict[str, dict[str, str]] = {"one start": {"initiation": "regression"}, "8 headings": {}}
+STARTS: dict[str, dict[str, str]] = {
+    "one start": {"initiation": "regression"},
+    "8 headings": {},
+}
 
 
 def errors_m(name: str, how: str, seed: int, run: int) -> FloatArray:
@@ -154,7 +189,12 @@ def errors_m(name: str, how: str, seed: int, run: int) -> FloatArray:
     if name == NAMES[-1]:
         options |= {"lagged_s": (), "final": False}
     starts = scene.hypotheses if how == "8 headings" else [scene.start]
-    estimator = Hypotheses([fgtrack.estimator(name, MOTION, each, lag_s=WINDOW_S, **options) for each in starts])
+    estimator = Hypotheses(
+        [
+            fgtrack.estimator(name, MOTION, each, lag_s=WINDOW_S, **options)
+            for each in starts
+        ]
+    )
     found = []
     for measurement, truth in zip(scene.measurements, scene.truth, strict=True):
         estimator.update(measurement)
@@ -165,13 +205,19 @@ def errors_m(name: str, how: str, seed: int, run: int) -> FloatArray:
 
 def rmse_m(errors: FloatArray) -> FloatArray:
     """RMSE of each run from `SETTLED_S` on; `errors` (runs, num), result (runs,)."""
-    return np.asarray(np.sqrt(np.mean(errors[:, round(SETTLED_S / STEP_S) :] ** 2, axis=1)))
+    return np.asarray(
+        np.sqrt(np.mean(errors[:, round(SETTLED_S / STEP_S) :] ** 2, axis=1))
+    )
 
 
 def over_runs(values: FloatArray, rng: np.random.Generator) -> Estimate:
     """Root of the mean square of `values` (runs,), and its 95 % interval by a bootstrap over the runs."""
     resampled = np.sqrt((rng.choice(values, (2000, len(values))) ** 2).mean(axis=1))
-    return Estimate(float(np.sqrt((values**2).mean())), *np.quantile(resampled, [0.025, 0.975]).tolist(), len(values))
+    return Estimate(
+        float(np.sqrt((values**2).mean())),
+        *np.quantile(resampled, [0.025, 0.975]).tolist(),
+        len(values),
+    )
 
 
 def table(found: dict[tuple[str, str], FloatArray], rng: np.random.Generator) -> str:
@@ -182,7 +228,9 @@ def table(found: dict[tuple[str, str], FloatArray], rng: np.random.Generator) ->
         "|---|---|---|---|---|---|",
     ]
     for (name, how), values in found.items():
-        difference = "" if name == NAMES[-1] else f"{paired(values, found[NAMES[-1], how]):+.2f}"
+        difference = (
+            "" if name == NAMES[-1] else f"{paired(values, found[NAMES[-1], how]):+.2f}"
+        )
         far = f"{int((values > FAR_M).sum())} of {len(values)}"
         cells = f"{over_runs(values, rng):.2f} | {np.median(values):.2f} | {far} | {difference}"
         lines.append(f"| {name} | {how} | {cells} |")
@@ -190,7 +238,9 @@ def table(found: dict[tuple[str, str], FloatArray], rng: np.random.Generator) ->
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path("out/doppler"),
+    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path(
+        "out/doppler"
+    ),
     runs: int = 20,
     seed: int = 0,
     jobs: Annotated[int, typer.Option(help="Processes.")] = 1,
@@ -198,13 +248,21 @@ def main(
     """Run every estimator with every start, write doppler.csv and doppler.md."""
     out.mkdir(parents=True, exist_ok=True)
     cases = [(name, how) for how in STARTS for name in NAMES]
-    every = Parallel(n_jobs=jobs)(delayed(errors_m)(*case, seed, run) for case in cases for run in range(runs))
-    found = {case: rmse_m(np.array(every[k * runs : (k + 1) * runs])) for k, case in enumerate(cases)}
+    every = Parallel(n_jobs=jobs)(
+        delayed(errors_m)(*case, seed, run) for case in cases for run in range(runs)
+    )
+    found = {
+        case: rmse_m(np.array(every[k * runs : (k + 1) * runs]))
+        for k, case in enumerate(cases)
+    }
     with (out / "doppler.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["estimator", "start", "run", "rmse_m"])
         for (name, how), values in found.items():
-            writer.writerows([name, how, run, f"{value:.4f}"] for run, value in enumerate(values.tolist()))
+            writer.writerows(
+                [name, how, run, f"{value:.4f}"]
+                for run, value in enumerate(values.tolist())
+            )
     (out / "doppler.md").write_text(table(found, np.random.default_rng(seed)))
     print((out / "doppler.md").read_text())
 

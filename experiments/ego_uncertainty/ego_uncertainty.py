@@ -23,14 +23,14 @@ import numpy as np
 import typer
 from joblib import Parallel, delayed
 
+from fgtrack.config.settings import EgoConfig, MotionConfig
+from fgtrack.config.shipped import read_config
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import EgoState, Message
 from fgtrack.evaluation.intervals import average, paired
 from fgtrack.evaluation.matching import match, position_nees
 from fgtrack.models.sensors import SensorModel
-from fgtrack.pipeline.config import EgoConfig, MotionConfig
 from fgtrack.pipeline.public import replay
-from fgtrack.pipeline.shipped import read_config
 from fgtrack.sim.delays import ConstantDelay
 from fgtrack.sim.scenario import EgoMessages, Scenario
 from fgtrack.sim.sensor import SimulatedSensor
@@ -47,7 +47,9 @@ YAW_STD_RAD, POSITION_STD_M = 0.01, 0.1
 ORIGIN_M = -1.74
 """Of the detections, ahead of the ego reference point: the rear axle."""
 STD = {"x_m": 0.3, "y_m": 0.1, "yaw_rad": 0.1}
-MOTION = MotionConfig(kind="ctrv", std_per_s={"position": 0.1, "yaw": 0.05, "speed": 0.5, "yaw_rate": 0.1})
+MOTION = MotionConfig(
+    kind="ctrv", std_per_s={"position": 0.1, "yaw": 0.05, "speed": 0.5, "yaw_rate": 0.1}
+)
 SETTLED_S = 2.0
 
 
@@ -64,16 +66,30 @@ class Result:
 def scenario(count: int, duration_s: float) -> Scenario:
     """The ego and `count` objects around it; what the ego says of itself is exact."""
     motion = MOTION.model()
-    still = replace(motion, **dict.fromkeys(motion.density_names(), 0.0), resting_yaw_rad2ps=0.0)
+    still = replace(
+        motion, **dict.fromkeys(motion.density_names(), 0.0), resting_yaw_rad2ps=0.0
+    )
     angles = 2.0 * np.pi * np.arange(count) / count + 0.3
     places = RANGE_M * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     exact = dict.fromkeys(
-        ("position_std_m", "yaw_std_rad", "speed_std_mps", "yaw_rate_std_radps", "accel_std_mps2"), 0.0
+        (
+            "position_std_m",
+            "yaw_std_rad",
+            "speed_std_mps",
+            "yaw_rate_std_radps",
+            "accel_std_mps2",
+        ),
+        0.0,
     )
-    sensor = SimulatedSensor("lidar", STD, rate_hz=10.0, max_range_m=1000.0, delay=ConstantDelay(0.05))
+    sensor = SimulatedSensor(
+        "lidar", STD, rate_hz=10.0, max_range_m=1000.0, delay=ConstantDelay(0.05)
+    )
     return Scenario(
         ego=DrawnVehicle(0.0, 0.0, 0.0, SPEED_MPS, motion=still),
-        opponents=tuple(DrawnVehicle(x_m, y_m, 0.0, SPEED_MPS, motion=motion) for x_m, y_m in places.tolist()),
+        opponents=tuple(
+            DrawnVehicle(x_m, y_m, 0.0, SPEED_MPS, motion=motion)
+            for x_m, y_m in places.tolist()
+        ),
         sensors=(sensor,),
         map=None,
         duration_s=duration_s,
@@ -82,7 +98,9 @@ def scenario(count: int, duration_s: float) -> Scenario:
     )
 
 
-def erring(messages: Sequence[Message], time_s: float, rng: np.random.Generator) -> Iterator[Message]:
+def erring(
+    messages: Sequence[Message], time_s: float, rng: np.random.Generator
+) -> Iterator[Message]:
     """`messages` with errors of the ego's position and yaw that last for `time_s`, and their covariance."""
     std = np.array([POSITION_STD_M, POSITION_STD_M, YAW_STD_RAD])
     covariance = tuple(np.diag([*(std**2).tolist(), 0.0, 0.0]).ravel().tolist())
@@ -92,10 +110,14 @@ def erring(messages: Sequence[Message], time_s: float, rng: np.random.Generator)
             yield message
             continue
         if last_ns is not None:
-            kept = np.exp(-seconds(message.stamp_ns - last_ns) / time_s) if time_s else 0.0
+            kept = (
+                np.exp(-seconds(message.stamp_ns - last_ns) / time_s) if time_s else 0.0
+            )
             error = kept * error + np.sqrt(1.0 - kept**2) * std * rng.standard_normal(3)
         last_ns = message.stamp_ns
-        x_m, y_m, yaw_rad = (np.array([message.x_m, message.y_m, message.yaw_rad]) + error).tolist()
+        x_m, y_m, yaw_rad = (
+            np.array([message.x_m, message.y_m, message.yaw_rad]) + error
+        ).tolist()
         yield replace(message, x_m=x_m, y_m=y_m, yaw_rad=yaw_rad, covariance=covariance)
 
 
@@ -107,30 +129,48 @@ def result(messages: Sequence[Message], mode: str, estimator: str) -> Result:
         sensors={"lidar": SensorModel(std=STD)},
         motion=MOTION,
         ego=EgoConfig(detection_origin_x_m=ORIGIN_M, uncertainty=mode),
-        birth=Birth(ego_speed_factor=1.0, speed_std_mps=3.0, yaw_rate_std_radps=math.sqrt(0.3)),
+        birth=Birth(
+            ego_speed_factor=1.0, speed_std_mps=3.0, yaw_rate_std_radps=math.sqrt(0.3)
+        ),
     )
     matching = match(replay(iter(messages), config))
-    tracks, truth = matching.tracks.where(matching.paired), matching.true_states[matching.paired]
-    settled = tracks["stamp_ns"] >= matching.tracks["stamp_ns"].min() + nanoseconds(SETTLED_S)
+    tracks, truth = (
+        matching.tracks.where(matching.paired),
+        matching.true_states[matching.paired],
+    )
+    settled = tracks["stamp_ns"] >= matching.tracks["stamp_ns"].min() + nanoseconds(
+        SETTLED_S
+    )
     squared_m2 = (tracks["x_m"] - truth[:, 0]) ** 2 + (tracks["y_m"] - truth[:, 1]) ** 2
-    return Result(float(squared_m2[settled].mean()), float(position_nees(matching)[settled].mean()))
+    return Result(
+        float(squared_m2[settled].mean()),
+        float(position_nees(matching)[settled].mean()),
+    )
 
 
-def drive(count: int, time_s: float, seed: int, duration_s: float, estimator: str) -> dict[str, Result]:
+def drive(
+    count: int, time_s: float, seed: int, duration_s: float, estimator: str
+) -> dict[str, Result]:
     """One recording in every mode, and with an ego that has no error."""
     rng = np.random.default_rng([seed, count])
     exact = simulate(scenario(count, duration_s), rng)
     messages = list(erring(exact, time_s, rng))
-    return {mode: result(messages, mode, estimator) for mode in MODES} | {EXACT: result(exact, "none", estimator)}
+    return {mode: result(messages, mode, estimator) for mode in MODES} | {
+        EXACT: result(exact, "none", estimator)
+    }
 
 
 Row = dict[str, str | float]
 
 
-def rows(count: int, time_s: float, found: Sequence[dict[str, Result]]) -> Iterator[Row]:
+def rows(
+    count: int, time_s: float, found: Sequence[dict[str, Result]]
+) -> Iterator[Row]:
     """A row for each mode: RMSE, its change to `independent` in per cent, NEES; with 95 % intervals over the drives."""
     for mode in (*MODES, EXACT):
-        own, other = ([one[each].squared_m2 for one in found] for each in (mode, "independent"))
+        own, other = (
+            [one[each].squared_m2 for one in found] for each in (mode, "independent")
+        )
         nees = average([one[mode].nees for one in found])
         change = paired(0.5 * np.log(own), 0.5 * np.log(other))
         yield {
@@ -138,16 +178,25 @@ def rows(count: int, time_s: float, found: Sequence[dict[str, Result]]) -> Itera
             "lasts_s": time_s,
             "uncertainty": mode,
             "rmse_m": float(np.sqrt(np.mean(own))),
-            **{f"change_{name}": 100.0 * float(np.expm1(getattr(change, name))) for name in INTERVAL},
+            **{
+                f"change_{name}": 100.0 * float(np.expm1(getattr(change, name)))
+                for name in INTERVAL
+            },
             **{f"nees_{name}": getattr(nees, name) for name in INTERVAL},
         }
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the table.")] = Path("out/ego_uncertainty"),
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Folder for the table.")
+    ] = Path("out/ego_uncertainty"),
     runs: Annotated[int, typer.Option(help="Drives for each setting.")] = 20,
-    duration_s: Annotated[float, typer.Option(help="Length of a drive, above 2 s.")] = 6.0,
-    estimator: Annotated[str, typer.Option("-e", "--estimator", help="Estimator of all tracks.")] = "ekf-replay",
+    duration_s: Annotated[
+        float, typer.Option(help="Length of a drive, above 2 s.")
+    ] = 6.0,
+    estimator: Annotated[
+        str, typer.Option("-e", "--estimator", help="Estimator of all tracks.")
+    ] = "ekf-replay",
     jobs: Annotated[int, typer.Option(help="Drives at a time.")] = 1,
 ) -> None:
     """Track the same drives in every mode, write ego_uncertainty.csv."""
@@ -155,14 +204,18 @@ def main(
     for count in COUNTS:
         for time_s in TIMES_S:
             found = Parallel(n_jobs=jobs)(
-                delayed(drive)(count, time_s, seed, duration_s, estimator) for seed in range(runs)
+                delayed(drive)(count, time_s, seed, duration_s, estimator)
+                for seed in range(runs)
             )
             table += rows(count, time_s, found)
     out.mkdir(parents=True, exist_ok=True)
     with (out / "ego_uncertainty.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(table[0])
-        writer.writerows([v if isinstance(v, str) else f"{v:.4g}" for v in row.values()] for row in table)
+        writer.writerows(
+            [v if isinstance(v, str) else f"{v:.4g}" for v in row.values()]
+            for row in table
+        )
     print((out / "ego_uncertainty.csv").read_text(), end="")
 
 

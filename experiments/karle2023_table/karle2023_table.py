@@ -19,7 +19,12 @@ PUBLISHED = Path(__file__).with_name("published.csv")
 FILTER, REPLAY, SMOOTHER = "ekf-backward-forward", "ekf-replay", "smoother"
 
 #: Columns of published.csv and of sweep.csv.
-RESIDUALS = {"along [m]": "along_m", "across [m]": "across_m", "yaw [deg]": "yaw_rad", "speed [m/s]": "speed_mps"}
+RESIDUALS = {
+    "along [m]": "along_m",
+    "across [m]": "across_m",
+    "yaw [deg]": "yaw_rad",
+    "speed [m/s]": "speed_mps",
+}
 
 Row = Mapping[str, str]
 Cells = Mapping[tuple[str, str, str], Row]
@@ -43,7 +48,11 @@ def main(
 
 def beside_the_paper(rows: Iterable[Row], found: Cells) -> str:
     """Mean ± standard deviation of every residual, and the precision, in the paper and of its filter in the sweep."""
-    heads = [f"{name}: {source}" for name in (*RESIDUALS, "precision") for source in ("paper", "here")]
+    heads = [
+        f"{name}: {source}"
+        for name in (*RESIDUALS, "precision")
+        for source in ("paper", "here")
+    ]
     lines = [["row", *heads]]
     for row in rows:
         cell = found.get((row["changed"], row["to"], FILTER))
@@ -56,12 +65,33 @@ def beside_the_paper(rows: Iterable[Row], found: Cells) -> str:
 
 def beside_each_other(rows: Iterable[Row], found: Cells) -> str:
     """The paper's filter, the replaying EKF and the smoother: residual along, RMSE against truth, precision."""
-    columns = ("residual along [m]", "position RMSE [m]", "speed RMSE [m/s]", "precision")
-    lines = [["row", *(f"{name}: {estimator}" for name in columns for estimator in (FILTER, REPLAY, SMOOTHER))]]
+    columns = (
+        "residual along [m]",
+        "position RMSE [m]",
+        "speed RMSE [m/s]",
+        "precision",
+    )
+    lines = [
+        [
+            "row",
+            *(
+                f"{name}: {estimator}"
+                for name in columns
+                for estimator in (FILTER, REPLAY, SMOOTHER)
+            ),
+        ]
+    ]
     for row in rows:
-        cells = [found.get((row["changed"], row["to"], estimator)) for estimator in (FILTER, REPLAY, SMOOTHER)]
+        cells = [
+            found.get((row["changed"], row["to"], estimator))
+            for estimator in (FILTER, REPLAY, SMOOTHER)
+        ]
         entries = [residual(cell, "along_m") for cell in cells]
-        for name in ("truth.overall.errors.position_m.rmse", "truth.overall.errors.speed_mps.rmse", "precision"):
+        for name in (
+            "truth.overall.errors.position_m.rmse",
+            "truth.overall.errors.speed_mps.rmse",
+            "precision",
+        ):
             entries += [value(cell, name) for cell in cells]
         lines.append([row["row"], *entries])
     return markdown(lines)
@@ -80,7 +110,9 @@ def residual(cell: Row | None, name: str) -> str:
     if cell is None or not cell.get(f"residuals.{name}.mean"):
         return "-"
     scale = math.degrees(1.0) if name.endswith("_rad") else 1.0
-    mean, std = (scale * float(cell[f"residuals.{name}.{moment}"]) for moment in ("mean", "std"))
+    mean, std = (
+        scale * float(cell[f"residuals.{name}.{moment}"]) for moment in ("mean", "std")
+    )
     return f"{round(mean, 2) + 0.0:.2f} ± {std:.2f}"
 
 
@@ -92,7 +124,9 @@ def value(cell: Row | None, name: str) -> str:
 def markdown(lines: list[list[str]]) -> str:
     """A table of GitHub Markdown."""
     head, *rest = lines
-    return "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *rest))
+    return "\n".join(
+        f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *rest)
+    )
 
 
 if __name__ == "__main__":

@@ -19,14 +19,24 @@ import typer
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.evaluation.runs import EvaluatedRun, evaluated
-from fgtrack.evaluation.scores.innovations import LOCAL_NAMES, local_innovations, message_delays, moments_of
+from fgtrack.evaluation.scores.innovations import (
+    LOCAL_NAMES,
+    local_innovations,
+    message_delays,
+    moments_of,
+)
 from fgtrack.evaluation.scores.statistics import Distribution, Moments
 from fgtrack.evaluation.tables import MS, RUN, Column, Table, Tables, named
 from fgtrack.evaluation.truth import ego_states
-from fgtrack.io.run import Run
-from fgtrack.io.run import Table as Columns
+from fgtrack.runs import Run
+from fgtrack.runs import Table as Columns
 
-_HEADINGS = {"along_m": "along\n[m]", "across_m": "across\n[m]", "yaw_rad": "yaw\n[deg]", "speed_mps": "speed\n[m/s]"}
+_HEADINGS = {
+    "along_m": "along\n[m]",
+    "across_m": "across\n[m]",
+    "yaw_rad": "yaw\n[deg]",
+    "speed_mps": "speed\n[m/s]",
+}
 
 #: Bounds between the groups, in the quantity's unit (the published evaluation's).
 _OBSERVED_S = (1.0, 2.0, 3.0)
@@ -94,10 +104,17 @@ class ResidualSamples:
 
     def moments(self, chosen: BoolArray) -> dict[str, Moments]:
         """Mean and spread of every residual of the `chosen` samples, shape (n,)."""
-        return {name: moments_of(name, values[chosen]) for name, values in self.values.items()}
+        return {
+            name: moments_of(name, values[chosen])
+            for name, values in self.values.items()
+        }
 
 
-def main(runs: Annotated[list[Path], typer.Argument(help="Run folders, or folders of runs.")]) -> None:
+def main(
+    runs: Annotated[
+        list[Path], typer.Argument(help="Run folders, or folders of runs.")
+    ],
+) -> None:
     """Print the tables."""
     print(evaluation(evaluated(runs)))
 
@@ -107,7 +124,12 @@ def evaluation(runs: Sequence[EvaluatedRun]) -> Tables:
 
     Raises `DataError` where the map that a run names is not a map.
     """
-    makers = {"residuals": _residuals, "residuals_by": _residuals_by, "sensors": _sensors, "latency": _latency}
+    makers = {
+        "residuals": _residuals,
+        "residuals_by": _residuals_by,
+        "sensors": _sensors,
+        "latency": _latency,
+    }
     return Tables({name: make(runs) for name, make in makers.items()})
 
 
@@ -115,10 +137,18 @@ def _residuals(runs: Sequence[EvaluatedRun]) -> Table:
     """A row for each run: residuals of all sensors together, and the precision (table I)."""
     records = [
         {"run": one.label, **_moments(one.metrics.residuals)}
-        | {"precision": one.metrics.precision, "num_confirmed": one.metrics.num_confirmed}
+        | {
+            "precision": one.metrics.precision,
+            "num_confirmed": one.metrics.num_confirmed,
+        }
         for one in runs
     ]
-    columns = [RUN, *_residual_columns(), Column("preci-\nsion", "precision"), Column("con-\nfirmed", "num_confirmed")]
+    columns = [
+        RUN,
+        *_residual_columns(),
+        Column("preci-\nsion", "precision"),
+        Column("con-\nfirmed", "num_confirmed"),
+    ]
     notes = [
         "measured minus predicted, of confirmed tracks: mean ± standard deviation",
         "yaw: where no sensor measures it, against the heading of the map, as in the paper",
@@ -138,9 +168,18 @@ def _residuals_by(runs: Sequence[EvaluatedRun]) -> Table:
                 chosen = inside & (samples.sensors == sensor)
                 if chosen.any():
                     moments = samples.moments(chosen)
-                    record = {"run": one.label, "of": f"{group}, {sensor}", "num_samples": moments["along_m"].count}
+                    record = {
+                        "run": one.label,
+                        "of": f"{group}, {sensor}",
+                        "num_samples": moments["along_m"].count,
+                    }
                     records.append(record | _moments(moments))
-    columns = [RUN, Column("of", left=True), Column("samples", "num_samples"), *_residual_columns()]
+    columns = [
+        RUN,
+        Column("of", left=True),
+        Column("samples", "num_samples"),
+        *_residual_columns(),
+    ]
     notes = [
         "observed: time since the first detection of the track (its transient)",
         "speed: of the track; ahead: of the ego",
@@ -158,7 +197,9 @@ def _groups(samples: ResidualSamples) -> Iterator[tuple[str, BoolArray]]:
     for name, values, bounds, unit in quantities:
         numbers = np.digitize(values, bounds)  # NaN comes last
         middle = (f"{low:g} to {high:g}" for low, high in pairwise(bounds))
-        for k, text in enumerate((f"below {bounds[0]:g}", *middle, f"{bounds[-1]:g} and more")):
+        for k, text in enumerate(
+            (f"below {bounds[0]:g}", *middle, f"{bounds[-1]:g} and more")
+        ):
             yield f"{name} {text} {unit}", np.isfinite(values) & (numbers == k)
 
 
@@ -168,11 +209,19 @@ def _sensors(runs: Sequence[EvaluatedRun]) -> Table:
     columns = [
         RUN,
         Column("sensor", left=True),
-        Column("delay [ms]\nmean/p90/max", "delay_mean_s delay_p90_s delay_max_s", "{}/{}/{}", MS),
+        Column(
+            "delay [ms]\nmean/p90/max",
+            "delay_mean_s delay_p90_s delay_max_s",
+            "{}/{}/{}",
+            MS,
+        ),
         Column("moved [m]\nmean/max", "moved_mean_m moved_max_m", "{}/{}"),
         Column("fused", "num_fused"),
         Column("ob-\njects", "num_objects"),
-        *(Column(heading, " ".join(_ends(name, f"_{unit}")), "{}/{}/{}") for name, (unit, heading) in _SPREADS.items()),
+        *(
+            Column(heading, " ".join(_ends(name, f"_{unit}")), "{}/{}/{}")
+            for name, (unit, heading) in _SPREADS.items()
+        ),
         Column("detections\nper object", " ".join(_ends("detections")), "{}/{}/{}"),
     ]
     notes = [
@@ -186,20 +235,42 @@ def _sensors(runs: Sequence[EvaluatedRun]) -> Table:
 def _sensor_records(one: EvaluatedRun) -> Iterator[dict[str, Any]]:
     updates, samples = one.run.tables["updates"], ResidualSamples.of(one.run)
     for sensor in np.unique(updates["sensor"]).tolist():
-        receipts_ns, delay_s = message_delays(updates.where(updates["sensor"] == sensor))
-        ego = ego_states(one.run.ego, receipts_ns - np.round(delay_s * NS_PER_S).astype(np.int64))
+        receipts_ns, delay_s = message_delays(
+            updates.where(updates["sensor"] == sensor)
+        )
+        ego = ego_states(
+            one.run.ego, receipts_ns - np.round(delay_s * NS_PER_S).astype(np.int64)
+        )
         delay = Distribution.of(delay_s)
         moved_m = delay_s * ego[:, 3]
         moved = Distribution.of(moved_m[np.isfinite(moved_m)])
         mine = samples.sensors == sensor
-        detections = np.unique(samples.track_ids[mine], return_counts=True)[1].astype(np.float64)
-        record = {"run": one.label, "sensor": sensor, "delay_mean_s": delay.mean, "delay_p90_s": delay.p90}
-        record |= {"delay_max_s": delay.max, "moved_mean_m": moved.mean, "moved_max_m": moved.max}
+        detections = np.unique(samples.track_ids[mine], return_counts=True)[1].astype(
+            np.float64
+        )
+        record = {
+            "run": one.label,
+            "sensor": sensor,
+            "delay_mean_s": delay.mean,
+            "delay_p90_s": delay.p90,
+        }
+        record |= {
+            "delay_max_s": delay.max,
+            "moved_mean_m": moved.mean,
+            "moved_max_m": moved.max,
+        }
         record |= {"num_fused": int(mine.sum()), "num_objects": len(detections)}
-        spreads = {(name, f"_{unit}"): getattr(samples, f"{name}_{unit}")[mine] for name, (unit, _) in _SPREADS.items()}
+        spreads = {
+            (name, f"_{unit}"): getattr(samples, f"{name}_{unit}")[mine]
+            for name, (unit, _) in _SPREADS.items()
+        }
         for (name, unit), values in {**spreads, ("detections", ""): detections}.items():
             known = values[np.isfinite(values)]
-            quantiles = np.quantile(known, (0.0, 0.5, 1.0)).tolist() if len(known) else [math.nan] * 3
+            quantiles = (
+                np.quantile(known, (0.0, 0.5, 1.0)).tolist()
+                if len(known)
+                else [math.nan] * 3
+            )
             record |= zip(_ends(name, unit), quantiles, strict=True)
         yield record
 
@@ -220,21 +291,31 @@ def _latency(runs: Sequence[EvaluatedRun]) -> Table:
             "time_per_tick_p90_s": of.p90,
         }
         record |= {"time_per_tick_p99_s": of.p99, "time_per_tick_max_s": of.max}
-        records.append(record | {"time_per_detection_s": one.metrics.time_per_detection_s})
-    names = " ".join(f"time_per_tick_{moment}_s" for moment in ("mean", "p90", "p99", "max"))
+        records.append(
+            record | {"time_per_detection_s": one.metrics.time_per_detection_s}
+        )
+    names = " ".join(
+        f"time_per_tick_{moment}_s" for moment in ("mean", "p90", "p99", "max")
+    )
     columns = [
         RUN,
         Column("ticks", "num_ticks"),
         Column("ms/tick\nmean/p90/p99/max", names, "{}/{}/{}/{}", MS),
         Column("ms/\ndetection", "time_per_detection_s", scale=MS),
     ]
-    notes = ["of ticks with a detection, on the machine that replayed; without prediction and logging"]
+    notes = [
+        "of ticks with a detection, on the machine that replayed; without prediction and logging"
+    ]
     return Table("Latency", records, columns, notes=notes)
 
 
 def _moments(of: Mapping[str, Moments]) -> dict[str, float]:
     ends = ((named(name, "mean"), named(name, "std"), of[name]) for name in LOCAL_NAMES)
-    return {key: value for mean, std, one in ends for key, value in ((mean, one.mean), (std, one.std))}
+    return {
+        key: value
+        for mean, std, one in ends
+        for key, value in ((mean, one.mean), (std, one.std))
+    }
 
 
 def _residual_columns() -> list[Column]:
@@ -249,13 +330,17 @@ def _residual_columns() -> list[Column]:
     ]
 
 
-def _observed_s(updates: Columns, track_ids: IntArray, stamps_ns: IntArray) -> FloatArray:
+def _observed_s(
+    updates: Columns, track_ids: IntArray, stamps_ns: IntArray
+) -> FloatArray:
     """Time since the first detection of each track, shape (n,); a detection older than it counts as the first."""
     ids, numbers = np.unique(updates["track_id"], return_inverse=True)
     born_ns = np.full(len(ids), np.iinfo(np.int64).max)
     births = updates["disposition"] == "birth"
     np.minimum.at(born_ns, numbers[births], updates["stamp_ns"][births])
-    return np.asarray(np.maximum(stamps_ns - born_ns[np.searchsorted(ids, track_ids)], 0) / NS_PER_S)
+    return np.asarray(
+        np.maximum(stamps_ns - born_ns[np.searchsorted(ids, track_ids)], 0) / NS_PER_S
+    )
 
 
 if __name__ == "__main__":

@@ -35,11 +35,11 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateStatus
 from fgtrack.estimation.registry import ESTIMATORS, EXACT, OOSM_GROUP, Claims, estimator
-from fgtrack.evaluation.palette import styles
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
-from fgtrack.plotting.paper import styled
-from fgtrack.plotting.style import WRONG, log_axis, save
+from fgtrack.show.figures.paper import styled
+from fgtrack.show.figures.style import WRONG, log_axis, save
+from fgtrack.show.palette import styles
 from fgtrack.sim.vehicles import drawn
 
 MOTION = CV(velocity_density_m2ps3=5.0)
@@ -65,7 +65,10 @@ PRIOR = Start(
 #: What each method is exact for, by name; plug-ins of the group `fgtrack.oosm` included.
 METHODS: dict[str, str] = {
     "ekf-replay": EXACT,
-    **{name: Claims.of(factory).exact for name, factory in ESTIMATORS.loaded(OOSM_GROUP).items()},
+    **{
+        name: Claims.of(factory).exact
+        for name, factory in ESTIMATORS.loaded(OOSM_GROUP).items()
+    },
 }
 
 REFERENCE_RUNS = 400
@@ -95,13 +98,21 @@ def delay_s(lag: int) -> float:
 
 def starts(lag: int) -> dict[str, Callable[[], Estimator]]:
     """The estimators at `lag`; those that hold measurements back do so for as long as the late one needs."""
-    held = {"delayed-horizon": {"horizon_s": delay_s(lag)}, "reorder-buffer": {"hold_s": delay_s(lag)}}
+    held = {
+        "delayed-horizon": {"horizon_s": delay_s(lag)},
+        "reorder-buffer": {"hold_s": delay_s(lag)},
+    }
     return {
-        name: lambda name=name: estimator(name, MOTION, PRIOR, lag_s=LAG_S, **held.get(name, {})) for name in METHODS
+        name: lambda name=name: estimator(
+            name, MOTION, PRIOR, lag_s=LAG_S, **held.get(name, {})
+        )
+        for name in METHODS
     }
 
 
-def arrivals(rng: np.random.Generator, lag: int) -> tuple[list[Measurement], FloatArray]:
+def arrivals(
+    rng: np.random.Generator, lag: int
+) -> tuple[list[Measurement], FloatArray]:
     """Measurements of one run in order of arrival, and the true last state."""
     x = np.concatenate([rng.standard_normal(2), SPEED_STD_MPS * rng.standard_normal(2)])
     stamps_s = {k * STEP_S: STD_M for k in range(1, NUM_STEPS + 1)}
@@ -110,7 +121,9 @@ def arrivals(rng: np.random.Generator, lag: int) -> tuple[list[Measurement], Flo
     for stamp_s, std_m in sorted((stamps_s | {late_s: LATE_STD_M}).items()):
         x = drawn(MOTION, x, stamp_s - now_s, rng)
         z = x[:2] + std_m * rng.standard_normal(2)
-        measurement = Measurement(nanoseconds(stamp_s), POSITION, z, std_m**2 * np.eye(2))
+        measurement = Measurement(
+            nanoseconds(stamp_s), POSITION, z, std_m**2 * np.eye(2)
+        )
         if stamp_s == late_s:
             late = measurement
         else:
@@ -159,13 +172,18 @@ def measured(lag: int, num_runs: int, seed: int) -> dict[str, Samples]:
         squared, nees, fused = [], [], []
         for measurements, truth in runs:
             estimator = start()
-            statuses = [estimator.update(measurement).status for measurement in measurements]
+            statuses = [
+                estimator.update(measurement).status for measurement in measurements
+            ]
             fused.append(statuses[-1] is UpdateStatus.OUT_OF_SEQUENCE)
             state = estimator.state_at(nanoseconds(NUM_STEPS * STEP_S))
             error = state.mean - truth
             for axis in ([0, 2], [1, 3]):
                 squared.append(error[axis[0]] ** 2)
-                nees.append(error[axis] @ np.linalg.solve(state.covariance[np.ix_(axis, axis)], error[axis]))
+                nees.append(
+                    error[axis]
+                    @ np.linalg.solve(state.covariance[np.ix_(axis, axis)], error[axis])
+                )
         found[name] = Samples(np.array(squared), np.array(nees), sum(fused) / num_runs)
     return found
 
@@ -174,7 +192,17 @@ def write_csv(ladder: dict[int, dict[str, Samples]], path: Path) -> None:
     """A row per method and lag, with standard errors."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["method", "lag", "rmse_m", "rmse_error_m", "anees", "anees_error", "fused_share"])
+        writer.writerow(
+            [
+                "method",
+                "lag",
+                "rmse_m",
+                "rmse_error_m",
+                "anees",
+                "anees_error",
+                "fused_share",
+            ]
+        )
         for lag, methods in ladder.items():
             for name, s in methods.items():
                 errors = s.rmse_error_m(len(s.nees)), s.anees_error(len(s.nees))
@@ -184,11 +212,15 @@ def write_csv(ladder: dict[int, dict[str, Samples]], path: Path) -> None:
 
 def markdown(ladder: dict[int, dict[str, Samples]]) -> str:
     """RMSE / average NEES of every method at every lag, and how many standard errors the reference is away."""
-    lines = ["| method | " + " | ".join(f"l = {lag}" for lag in ladder) + " | exact for |"]
+    lines = [
+        "| method | " + " | ".join(f"l = {lag}" for lag in ladder) + " | exact for |"
+    ]
     lines.append("|---" * (len(ladder) + 2) + "|")
     for name in next(iter(ladder.values())):
         cells = [cell(name, lag, methods[name]) for lag, methods in ladder.items()]
-        lines.append(f"| {name} | " + " | ".join(cells) + f" | {METHODS[name] or '-'} |")
+        lines.append(
+            f"| {name} | " + " | ".join(cells) + f" | {METHODS[name] or '-'} |"
+        )
     return "\n".join(lines) + "\n"
 
 
@@ -226,12 +258,16 @@ def draw(ladder: dict[int, dict[str, Samples]], path: Path) -> None:
     left, right = figure.subplots(1, 2)
     lags = list(ladder)
     groups = alike(ladder)
-    for index, (names, its) in enumerate(zip(groups, styles([names[0] for names in groups]), strict=True)):
+    for index, (names, its) in enumerate(
+        zip(groups, styles([names[0] for names in groups]), strict=True)
+    ):
         curves = [ladder[lag][names[0]] for lag in lags]
         rmse_m, anees = [s.rmse_m for s in curves], [s.anees for s in curves]
         label = ", ".join(names)
         if max(rmse_m) > MAX_RMSE_M or max(anees) > MAX_ANEES:
-            label += f"\n(leaves the plot: to {max(rmse_m):.1f} m, NEES {max(anees):.0f})"
+            label += (
+                f"\n(leaves the plot: to {max(rmse_m):.1f} m, NEES {max(anees):.0f})"
+            )
         width = 1.0 + 4.0 * (1.0 - index / len(groups))
         style = {"color": its.colour, "linestyle": its.line, "linewidth": width}
         left.plot(lags, rmse_m, label=label, **style)
@@ -239,14 +275,19 @@ def draw(ladder: dict[int, dict[str, Samples]], path: Path) -> None:
     right.axhline(2.0, color=WRONG, linewidth=0.8, label="as sure as it should be")
     left.set_ylim(0.25, MAX_RMSE_M)
     right.set_ylim(1.5, MAX_ANEES)
-    for axes, quantity in ((left, "position RMSE on one axis [m]"), (right, "average NEES (2 degrees of freedom)")):
+    for axes, quantity in (
+        (left, "position RMSE on one axis [m]"),
+        (right, "average NEES (2 degrees of freedom)"),
+    ):
         axes.set_yscale("log")
         log_axis(axes.yaxis)
         axes.xaxis.set_major_locator(FixedLocator(lags))
         axes.xaxis.set_minor_locator(NullLocator())
         axes.set_xlabel("lag of the late measurement [steps of 0.1 s]")
         axes.set_ylabel(quantity)
-    left.yaxis.set_major_locator(FixedLocator([0.25, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.5, 2.0]))
+    left.yaxis.set_major_locator(
+        FixedLocator([0.25, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.5, 2.0])
+    )
     figure.legend(loc="outside lower center", ncols=3, frameon=False, handlelength=3.5)
     save(figure, path)
 
@@ -256,7 +297,10 @@ def alike(ladder: dict[int, dict[str, Samples]]) -> list[list[str]]:
     groups: list[list[str]] = []
     for name in next(iter(ladder.values())):
         for group in groups:
-            if all(np.allclose(m[name].squared_m2, m[group[0]].squared_m2, rtol=1e-6) for m in ladder.values()):
+            if all(
+                np.allclose(m[name].squared_m2, m[group[0]].squared_m2, rtol=1e-6)
+                for m in ladder.values()
+            ):
                 group.append(name)
                 break
         else:
@@ -265,12 +309,19 @@ def alike(ladder: dict[int, dict[str, Samples]]) -> list[list[str]]:
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for ladder.csv, ladder.md and ladder.png.")] = Path(
-        "out/ladder"
-    ),
-    runs: Annotated[int, typer.Option(help="Runs per lag; each counts as two samples of one axis.")] = 400,
+    out: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--out", help="Folder for ladder.csv, ladder.md and ladder.png."
+        ),
+    ] = Path("out/ladder"),
+    runs: Annotated[
+        int, typer.Option(help="Runs per lag; each counts as two samples of one axis.")
+    ] = 400,
     seed: Annotated[int, typer.Option(help="Seed of the draws.")] = 1,
-    lags: Annotated[str, typer.Option(help="Lags in steps, 1 to 40.")] = ",".join(map(str, LAGS)),
+    lags: Annotated[str, typer.Option(help="Lags in steps, 1 to 40.")] = ",".join(
+        map(str, LAGS)
+    ),
 ) -> None:
     """Write the ladder as CSV, Markdown and figure, and print it."""
     ladder = {lag: measured(lag, runs, seed) for lag in parsed(lags)}
@@ -285,7 +336,9 @@ def parsed(lags: str) -> Sequence[int]:
     """Lags from a list like `1,3,10`. Raises `CallError` for anything else."""
     found = lags.split(",")
     if not all(lag.isdecimal() and 1 <= int(lag) <= NUM_STEPS for lag in found):
-        raise CallError(f"--lags {lags}: give whole numbers from 1 to {NUM_STEPS}, as in 1,3,10")
+        raise CallError(
+            f"--lags {lags}: give whole numbers from 1 to {NUM_STEPS}, as in 1,3,10"
+        )
     return [int(lag) for lag in found]
 
 

@@ -25,7 +25,10 @@ from fgtrack.sim.vehicles import drawn
 
 START_NS = 1_790_000_000 * NS_PER_S
 STEP_S = 0.025
-SENSORS = ((0, 0.151, {"x_m": 0.3, "y_m": 0.3}), (1, 0.062, {"x_m": 3.0, "y_m": 3.0, "speed_mps": 0.5}))
+SENSORS = (
+    (0, 0.151, {"x_m": 0.3, "y_m": 0.3}),
+    (1, 0.062, {"x_m": 3.0, "y_m": 3.0, "speed_mps": 0.5}),
+)
 LAGS_S = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0, 1.5)
 WINDOWS_S = (0.2, 0.3, 0.5, 1.0, 2.0, 3.0)
 MOTION = CTRV()
@@ -45,7 +48,13 @@ class Run:
             model = measurement_model(tuple(std), MOTION)
             stds = np.array(list(std.values()))
             z = model.predict(states[-1]) + stds * rng.standard_normal(len(stds))
-            received.append((k * STEP_S + delay_s, phase, Measurement(stamp(k), model, z, np.diag(stds**2))))
+            received.append(
+                (
+                    k * STEP_S + delay_s,
+                    phase,
+                    Measurement(stamp(k), model, z, np.diag(stds**2)),
+                )
+            )
         self.truth = np.array(states)
         self.received = sorted(received, key=lambda item: item[:2])
 
@@ -93,7 +102,9 @@ def judged(run: Run, lag_s: float) -> tuple[FloatArray, FloatArray, float]:
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder for the tables and the figure.")] = Path("out/lag"),
+    out: Annotated[
+        Path, typer.Option("-o", help="Folder for the tables and the figure.")
+    ] = Path("out/lag"),
     runs: Annotated[int, typer.Option(help="Drawn objects.")] = 100,
     duration_s: float = 4.0,
     seed: int = 0,
@@ -105,11 +116,25 @@ def main(
     rmse_m = np.sqrt(np.mean([squared for squared, _, _ in found], axis=0))
     nees = np.mean([values for _, values, _ in found], axis=0)
     low, high = chi2.ppf([0.025, 0.975], 5 * runs) / runs
-    windows = [[judged(run, window_s) for run in drawn[: runs // 4]] for window_s in WINDOWS_S]
-    present_m = [np.sqrt(np.mean([squared[0] for squared, _, _ in some])) for some in windows]
-    update_ms = [1e3 * float(np.median([time_s for _, _, time_s in some])) for some in windows]
-    write(out / "lag.csv", ["lag_s", "rmse_m", "nees"], zip(LAGS_S, rmse_m, nees, strict=True))
-    write(out / "window.csv", ["window_s", "rmse_m", "update_ms"], zip(WINDOWS_S, present_m, update_ms, strict=True))
+    windows = [
+        [judged(run, window_s) for run in drawn[: runs // 4]] for window_s in WINDOWS_S
+    ]
+    present_m = [
+        np.sqrt(np.mean([squared[0] for squared, _, _ in some])) for some in windows
+    ]
+    update_ms = [
+        1e3 * float(np.median([time_s for _, _, time_s in some])) for some in windows
+    ]
+    write(
+        out / "lag.csv",
+        ["lag_s", "rmse_m", "nees"],
+        zip(LAGS_S, rmse_m, nees, strict=True),
+    )
+    write(
+        out / "window.csv",
+        ["window_s", "rmse_m", "update_ms"],
+        zip(WINDOWS_S, present_m, update_ms, strict=True),
+    )
     figure, axes = plt.subplots(1, 3, figsize=(11.0, 3.4), layout="constrained")
     axes[0].plot(LAGS_S, rmse_m, "o-")
     axes[0].set(xlabel="lag [s]", ylabel="position RMSE [m]", ylim=(0.0, None))
@@ -118,12 +143,20 @@ def main(
     axes[1].set(xlabel="lag [s]", ylabel="NEES (5 if consistent)")
     axes[1].legend()
     axes[2].plot(WINDOWS_S, update_ms, "o-")
-    axes[2].set(xlabel="length of the window [s]", ylabel="median time of an update [ms]", ylim=(0.0, None))
+    axes[2].set(
+        xlabel="length of the window [s]",
+        ylabel="median time of an update [ms]",
+        ylim=(0.0, None),
+    )
     for axis in axes:
         axis.grid(alpha=0.3)
     figure.savefig(out / "lag.png", dpi=150)
     plt.close(figure)
-    print((out / "lag.csv").read_text() + (out / "window.csv").read_text() + f"NEES band: {low:.2f} to {high:.2f}")
+    print(
+        (out / "lag.csv").read_text()
+        + (out / "window.csv").read_text()
+        + f"NEES band: {low:.2f} to {high:.2f}"
+    )
     print(f"figure: {out / 'lag.png'}")
 
 

@@ -22,22 +22,36 @@ import typer
 from joblib import Parallel, delayed
 
 import fgtrack
+from fgtrack.config.settings import Config
+from fgtrack.config.shipped import read_config
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.comparison import comparison
 from fgtrack.evaluation.intervals import within_run
 from fgtrack.evaluation.runs import EvaluatedRun
-from fgtrack.io.source import open_input
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.shipped import read_config
+from fgtrack.inputs.source import open_input
 from fgtrack.sim.delays import ConstantDelay
 from fgtrack.sim.redelay import SensorDelays, redelay
 
 REFERENCE = "ekf-backward-forward"
-GROUPS = ((REFERENCE, "rewind-forget", "ekf-replay", "smoother-banded"), (REFERENCE, "drop"))
-SENSORS = {"kitti": ("pointrcnn_car", "rrc_car"), "autoferry": ("lidar", "radar", "infrared", "daylight")}
+GROUPS = (
+    (REFERENCE, "rewind-forget", "ekf-replay", "smoother-banded"),
+    (REFERENCE, "drop"),
+)
+SENSORS = {
+    "kitti": ("pointrcnn_car", "rrc_car"),
+    "autoferry": ("lidar", "radar", "infrared", "daylight"),
+}
 CAMERAS = ("infrared", "daylight")
 SEQUENCES = ("0004", "0006", "0008", "0010", "0018")
-HEADER = ("data", "late", "delay_s", "estimator", "rmse_m", "less_backward_forward_m", "samples")
+HEADER = (
+    "data",
+    "late",
+    "delay_s",
+    "estimator",
+    "rmse_m",
+    "less_backward_forward_m",
+    "samples",
+)
 QUANTITY = "position_rmse_m"
 
 
@@ -51,12 +65,26 @@ def settings(data: str, sensor: str) -> Config:
 def sums(source: Path, config: Config, sensor: str, delay_s: float) -> list[FloatArray]:
     """Of each of `GROUPS` squared errors of every run and their count, by stamp, shape (n, runs + 1)."""
     delays = {sensor: SensorDelays(ConstantDelay(delay_s))}
-    messages = list(redelay(open_input(source, config.input).messages(), delays, np.random.default_rng(0))[0])
+    messages = list(
+        redelay(
+            open_input(source, config.input).messages(),
+            delays,
+            np.random.default_rng(0),
+        )[0]
+    )
     names = dict.fromkeys(name for group in GROUPS for name in group)
-    runs = {name: EvaluatedRun(name, fgtrack.replay(messages, replace(config, estimator=name))) for name in names}
+    runs = {
+        name: EvaluatedRun(
+            name, fgtrack.replay(messages, replace(config, estimator=name))
+        )
+        for name in names
+    }
     compared = [comparison([runs[name] for name in group]).sums for group in GROUPS]
     nothing = [np.zeros((0, len(group) + 1)) for group in GROUPS]
-    return [found.get(QUANTITY, empty) for found, empty in zip(compared, nothing, strict=True)]
+    return [
+        found.get(QUANTITY, empty)
+        for found, empty in zip(compared, nothing, strict=True)
+    ]
 
 
 def rows(recordings: Sequence[Sequence[FloatArray]]) -> Iterator[list[str]]:
@@ -69,38 +97,71 @@ def rows(recordings: Sequence[Sequence[FloatArray]]) -> Iterator[list[str]]:
             if not ticks[:, -1].any():
                 yield [name, "", "", "0"]
                 continue
-            less = within_run(ticks[:, [column, 0, -1]], lambda S: np.sqrt(S[0] / S[2]) - np.sqrt(S[1] / S[2]))
+            less = within_run(
+                ticks[:, [column, 0, -1]],
+                lambda S: np.sqrt(S[0] / S[2]) - np.sqrt(S[1] / S[2]),
+            )
             rmse_m = np.sqrt(ticks[:, column].sum() / ticks[:, -1].sum())
-            yield [name, f"{rmse_m:.3f}", f"{less:.3f}" if name != REFERENCE else "", f"{ticks[:, -1].sum():.0f}"]
+            yield [
+                name,
+                f"{rmse_m:.3f}",
+                f"{less:.3f}" if name != REFERENCE else "",
+                f"{ticks[:, -1].sum():.0f}",
+            ]
 
 
 def main(
-    kitti: Annotated[Path | None, typer.Option(help="Folder of the KITTI tracking data set.")] = None,
-    autoferry: Annotated[Path | None, typer.Option(help="Folder with a folder per scenario.")] = None,
-    out: Annotated[Path, typer.Option("-o", help="Folder for the table.")] = Path("out/late_sensors"),
-    late: Annotated[str, typer.Option(help="Sensors to delay, separated by commas, all if empty.")] = "",
-    recordings: Annotated[str, typer.Option(help="Recordings, separated by commas, all if empty.")] = "",
-    delays_s: Annotated[str, typer.Option(help="Delays, separated by commas.")] = "0.15,0.3,1",
+    kitti: Annotated[
+        Path | None, typer.Option(help="Folder of the KITTI tracking data set.")
+    ] = None,
+    autoferry: Annotated[
+        Path | None, typer.Option(help="Folder with a folder per scenario.")
+    ] = None,
+    out: Annotated[Path, typer.Option("-o", help="Folder for the table.")] = Path(
+        "out/late_sensors"
+    ),
+    late: Annotated[
+        str, typer.Option(help="Sensors to delay, separated by commas, all if empty.")
+    ] = "",
+    recordings: Annotated[
+        str, typer.Option(help="Recordings, separated by commas, all if empty.")
+    ] = "",
+    delays_s: Annotated[
+        str, typer.Option(help="Delays, separated by commas.")
+    ] = "0.15,0.3,1",
     jobs: Annotated[int, typer.Option(help="Recordings at a time.")] = 1,
 ) -> None:
     """Delay one sensor after the other, write late_sensors.csv."""
     sources: Mapping[str, list[Path]] = {
-        "kitti": [kitti / "oxts" / f"{name}.txt" for name in SEQUENCES] if kitti else [],
+        "kitti": [kitti / "oxts" / f"{name}.txt" for name in SEQUENCES]
+        if kitti
+        else [],
         "autoferry": sorted(autoferry.glob("scenario*")) if autoferry else [],
     }
     out.mkdir(parents=True, exist_ok=True)
-    with (out / "late_sensors.csv").open("w", newline="") as file, Parallel(n_jobs=jobs) as parallel:
+    with (
+        (out / "late_sensors.csv").open("w", newline="") as file,
+        Parallel(n_jobs=jobs) as parallel,
+    ):
         writer = csv.writer(file)
         writer.writerow(HEADER)
         for data, paths in sources.items():
-            chosen = [path for path in paths if not recordings or path.stem in recordings.split(",")]
+            chosen = [
+                path
+                for path in paths
+                if not recordings or path.stem in recordings.split(",")
+            ]
             for sensor in SENSORS[data] if chosen else ():
                 if late and sensor not in late.split(","):
                     continue
                 for delay_s in map(float, delays_s.split(",")):
                     config = settings(data, sensor)
-                    found = parallel(delayed(sums)(path, config, sensor, delay_s) for path in chosen)
-                    writer.writerows([data, sensor, f"{delay_s:g}", *row] for row in rows(found))
+                    found = parallel(
+                        delayed(sums)(path, config, sensor, delay_s) for path in chosen
+                    )
+                    writer.writerows(
+                        [data, sensor, f"{delay_s:g}", *row] for row in rows(found)
+                    )
                     file.flush()
     print((out / "late_sensors.csv").read_text())
 

@@ -19,12 +19,20 @@ GATE_M, SETTLE_NS, STEP_NS = 5.0, 10**9, 10**9 // 20
 
 def rms_m(folder: Path) -> float:
     """Root mean square of the distances of confirmed tracks from the truth."""
-    tracks, truth = pd.read_csv(folder / "tracks.csv"), pd.read_csv(folder / "truth.csv")
-    tracks = tracks[tracks["stamp_ns"] - tracks.groupby("track_id")["stamp_ns"].transform("min") >= SETTLE_NS]
+    tracks, truth = (
+        pd.read_csv(folder / "tracks.csv"),
+        pd.read_csv(folder / "truth.csv"),
+    )
+    tracks = tracks[
+        tracks["stamp_ns"] - tracks.groupby("track_id")["stamp_ns"].transform("min")
+        >= SETTLE_NS
+    ]
     tracks = tracks[tracks["status"] != "tentative"]
     stamps = np.unique(tracks["stamp_ns"])
     grid = np.searchsorted(stamps, np.arange(stamps[0], stamps[-1] + 1, STEP_NS))
-    tracks = tracks[tracks["stamp_ns"].isin(stamps[np.unique(grid[grid < len(stamps)])])]
+    tracks = tracks[
+        tracks["stamp_ns"].isin(stamps[np.unique(grid[grid < len(stamps)])])
+    ]
     squares = np.full(len(tracks), np.inf)
     for number, path in truth.groupby("object_id"):
         if number == -1:  # the ego

@@ -16,8 +16,8 @@ import pandas as pd
 import typer
 
 import fgtrack
+from fgtrack.config.shipped import read_config
 from fgtrack.evaluation.intervals import average, paired
-from fgtrack.pipeline.shipped import read_config
 
 REFERENCE = "ekf-replay"
 MAPS = {"track_map": "oval", "pit_map": "oval"}
@@ -35,7 +35,15 @@ def judged(seed: int, duration_s: float | None) -> list[dict[str, object]]:
         tables = result.tables.tables
 
         def add(quantity: str, what: str, value: float, noise: str = noise) -> None:
-            rows.append({"seed": seed, "quantity": quantity, "noise": noise, "name": what, "value": value})
+            rows.append(
+                {
+                    "seed": seed,
+                    "quantity": quantity,
+                    "noise": noise,
+                    "name": what,
+                    "value": value,
+                }
+            )
 
         for row in tables["policies"].records:
             add("policy", row["estimator"], row["rms_m"])
@@ -50,15 +58,23 @@ def judged(seed: int, duration_s: float | None) -> list[dict[str, object]]:
 
 def lines(results: pd.DataFrame) -> Iterable[str]:
     """Yield the table: means over the seeds with 95 % intervals, policies against the replaying filter in per cent."""
-    values = results.set_index(["quantity", "name", "noise", "seed"]).sort_index()["value"]
+    values = results.set_index(["quantity", "name", "noise", "seed"]).sort_index()[
+        "value"
+    ]
     yield f"| {' | '.join(['', *(f'{noise} noise [m] | against {REFERENCE} [%]' for noise in NOISES)])} |"
     yield "| --- " * (1 + 2 * len(NOISES)) + "|"
-    for quantity, name in results[["quantity", "name"]].drop_duplicates().itertuples(index=False):
+    for quantity, name in (
+        results[["quantity", "name"]].drop_duplicates().itertuples(index=False)
+    ):
         cells = []
         for noise in NOISES:
             own = values[quantity, name, noise].to_numpy()
             replay = values["policy", REFERENCE, noise].to_numpy()
-            against = "" if name == REFERENCE and quantity == "policy" else f"{percent(own, replay):+.1f}"
+            against = (
+                ""
+                if name == REFERENCE and quantity == "policy"
+                else f"{percent(own, replay):+.1f}"
+            )
             cells += [f"{average(own):.3f}", against if "late" not in quantity else ""]
         yield f"| {quantity}: {name} | {' | '.join(cells)} |"
 
@@ -70,14 +86,22 @@ def percent(own: Sequence[float], reference: Sequence[float]) -> object:
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder of the table.")] = Path("out/ledger"),
-    seeds: Annotated[int, typer.Option(help="Seeds 1 to this; the fit has seen none of them.")] = 10,
-    duration_s: Annotated[float | None, typer.Option(help="Length, in place of the scenario's.")] = None,
+    out: Annotated[Path, typer.Option("-o", help="Folder of the table.")] = Path(
+        "out/ledger"
+    ),
+    seeds: Annotated[
+        int, typer.Option(help="Seeds 1 to this; the fit has seen none of them.")
+    ] = 10,
+    duration_s: Annotated[
+        float | None, typer.Option(help="Length, in place of the scenario's.")
+    ] = None,
     jobs: Annotated[int, typer.Option(help="Processes.")] = 1,
 ) -> None:
     """Write rows.csv and table.md."""
     out.mkdir(parents=True, exist_ok=True)
-    every = joblib.Parallel(n_jobs=jobs)(joblib.delayed(judged)(1 + k, duration_s) for k in range(seeds))
+    every = joblib.Parallel(n_jobs=jobs)(
+        joblib.delayed(judged)(1 + k, duration_s) for k in range(seeds)
+    )
     results = pd.DataFrame([row for rows in every for row in rows])
     results.to_csv(out / "rows.csv", index=False)
     table = "\n".join(lines(results)) + "\n"

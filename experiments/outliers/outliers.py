@@ -34,7 +34,11 @@ LATEST_S = 0.3
 LOST_M = 3.0
 MOTION = CTRV()
 MODEL = measurement_model(("x_m", "y_m"), MOTION)
-HUBER, CAUCHY, TUKEY = RobustLoss("huber", 1.5), RobustLoss("cauchy", 2.0), RobustLoss("tukey", 4.7)
+HUBER, CAUCHY, TUKEY = (
+    RobustLoss("huber", 1.5),
+    RobustLoss("cauchy", 2.0),
+    RobustLoss("tukey", 4.7),
+)
 
 
 class Variant(NamedTuple):
@@ -79,7 +83,9 @@ def rmse_m(label: str, share: float, seed: int, run: int) -> float:
     """RMSE of the present position along one run: at each stamp, from what has arrived by then."""
     rng, variant = np.random.default_rng([seed, run]), VARIANTS[label]
     x = np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi), 60.0, 0.03])
-    options = {"lagged_s": (), "final": False} if variant.name == "smoother-banded" else {}
+    options = (
+        {"lagged_s": (), "final": False} if variant.name == "smoother-banded" else {}
+    )
     estimator = fgtrack.estimator(variant.name, MOTION, start(x), lag_s=1.0, **options)
     variance = STD_M**2 * (1.0 + share * (FACTOR**2 - 1.0) if variant.inflated else 1.0)
     waiting: list[tuple[int, Measurement]] = []
@@ -90,7 +96,12 @@ def rmse_m(label: str, share: float, seed: int, run: int) -> float:
         z = x[:2] + std_m * rng.standard_normal(2)
         now_ns = START_NS + round((k + 1) * STEP_S * NS_PER_S)
         receipt_ns = now_ns + round(LATEST_S * rng.random() * NS_PER_S)
-        waiting.append((receipt_ns, Measurement(now_ns, MODEL, z, variance * np.eye(2), loss=variant.loss)))
+        waiting.append(
+            (
+                receipt_ns,
+                Measurement(now_ns, MODEL, z, variance * np.eye(2), loss=variant.loss),
+            )
+        )
         waiting.sort(key=lambda each: each[0])
         while waiting and waiting[0][0] <= now_ns:
             estimator.update(waiting.pop(0)[1])
@@ -108,14 +119,24 @@ def table(rmse: dict[tuple[str, float], FloatArray]) -> str:
         for share in SHARES:
             found = rmse[label, share]
             lost = int((found > LOST_M).sum())
-            gain = "" if label == reference else f"; {paired(found, rmse[reference, share]):+.3f}"
-            cells.append(f"lost in {lost} of {len(found)}" if lost else f"{found.mean():.3f}{gain}")
+            gain = (
+                ""
+                if label == reference
+                else f"; {paired(found, rmse[reference, share]):+.3f}"
+            )
+            cells.append(
+                f"lost in {lost} of {len(found)}"
+                if lost
+                else f"{found.mean():.3f}{gain}"
+            )
         lines.append(f"| {label} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path("out/outliers"),
+    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path(
+        "out/outliers"
+    ),
     runs: Annotated[int, typer.Option(help="Runs per share of outliers.")] = 10,
     seed: int = 0,
     jobs: Annotated[int, typer.Option(help="Processes.")] = 1,
@@ -123,13 +144,18 @@ def main(
     """Run every variant over every share of outliers, write outliers.csv and outliers.md."""
     out.mkdir(parents=True, exist_ok=True)
     cases = [(label, share) for label in VARIANTS for share in SHARES]
-    found = Parallel(n_jobs=jobs)(delayed(rmse_m)(*case, seed, run) for case in cases for run in range(runs))
+    found = Parallel(n_jobs=jobs)(
+        delayed(rmse_m)(*case, seed, run) for case in cases for run in range(runs)
+    )
     rmse = dict(zip(cases, np.reshape(found, (len(cases), runs)), strict=True))
     with (out / "outliers.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["estimator", "share", "run", "rmse_m"])
         for case, values in rmse.items():
-            writer.writerows([*case, run, f"{value:.4f}"] for run, value in enumerate(values.tolist()))
+            writer.writerows(
+                [*case, run, f"{value:.4f}"]
+                for run, value in enumerate(values.tolist())
+            )
     (out / "outliers.md").write_text(table(rmse))
     print((out / "outliers.md").read_text())
 

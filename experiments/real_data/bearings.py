@@ -22,17 +22,17 @@ from joblib import Parallel, delayed
 from scores import autoferry_sources, nis_ratios, write
 
 import fgtrack
+from fgtrack.config.settings import Config
+from fgtrack.config.shipped import read_config
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import FloatArray, IntArray, Message
 from fgtrack.evaluation.comparison import comparison
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, within_run
 from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.truth import ego_states, true_paths
-from fgtrack.io.run import Run
-from fgtrack.io.source import open_input
+from fgtrack.inputs.source import open_input
 from fgtrack.models.sensors import Correlation, Filter, SensorModel
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.shipped import read_config
+from fgtrack.runs import Run
 
 CAMERAS = ("infrared", "daylight")
 FARTHEST_RAD = 0.15  # a bearing farther off is of something else
@@ -49,7 +49,16 @@ OF_BEARINGS = (
 )
 OF_GAINS = (
     *("recording", "cameras", "gospa_m", "gospa_change_m", "gospa_low", "gospa_high"),
-    *("rmse_m", "rmse_change_m", "rmse_low", "rmse_high", "mota", "idf1", "breaks", "false_tracks"),
+    *(
+        "rmse_m",
+        "rmse_change_m",
+        "rmse_low",
+        "rmse_high",
+        "mota",
+        "idf1",
+        "breaks",
+        "false_tracks",
+    ),
     *(f"nis_{camera}" for camera in CAMERAS),
 )
 
@@ -69,7 +78,11 @@ def with_cameras(config: Config, errors: str) -> Config:
     if errors == "none":
         camera = replace(camera, filters={"bearing_rad": Filter(max=-10.0)})
     ignored = tuple(name for name in config.ignore_sensors if name not in CAMERAS)
-    return replace(config, sensors={**config.sensors, **dict.fromkeys(CAMERAS, camera)}, ignore_sensors=ignored)
+    return replace(
+        config,
+        sensors={**config.sensors, **dict.fromkeys(CAMERAS, camera)},
+        ignore_sensors=ignored,
+    )
 
 
 def errors_of(run: Run, camera: str) -> list[Series]:
@@ -77,7 +90,12 @@ def errors_of(run: Run, camera: str) -> list[Series]:
     seen = run.tables["detections"].where(run.tables["detections"]["sensor"] == camera)
     stamps_ns = seen["stamp_ns"]
     poses = ego_states(run.tables["ego"], stamps_ns)
-    places_m = np.stack([path.at(stamps_ns)[:, :2] for path in true_paths(run.tables["truth"])]) - poses[:, :2]
+    places_m = (
+        np.stack(
+            [path.at(stamps_ns)[:, :2] for path in true_paths(run.tables["truth"])]
+        )
+        - poses[:, :2]
+    )
     true_rad = np.arctan2(places_m[..., 1], places_m[..., 0]) - poses[:, 2]
     found = []
     for place, own_rad in enumerate(true_rad):
@@ -96,12 +114,16 @@ def product(one: Series, other: Series, lag_s: float) -> tuple[float, int]:
     if not len(one.stamps_ns) or not len(other.stamps_ns):
         return 0.0, 0
     wanted_ns = one.stamps_ns + round(lag_s * 1e9)
-    after = np.searchsorted(other.stamps_ns, wanted_ns).clip(1, len(other.stamps_ns) - 1 or 1)
+    after = np.searchsorted(other.stamps_ns, wanted_ns).clip(
+        1, len(other.stamps_ns) - 1 or 1
+    )
     near = np.array([after - 1, np.minimum(after, len(other.stamps_ns) - 1)])
     offsets_ns = np.abs(other.stamps_ns[near] - wanted_ns)
     nearest = np.take_along_axis(near, offsets_ns.argmin(axis=0)[None], axis=0)[0]
     rows = offsets_ns.min(axis=0) <= SAME_S * 1e9
-    return float((one.errors_rad * other.errors_rad[nearest])[rows].sum()), int(rows.sum())
+    return float((one.errors_rad * other.errors_rad[nearest])[rows].sum()), int(
+        rows.sum()
+    )
 
 
 def bearings(name: str, run: Run) -> Iterator[list[str]]:
@@ -114,7 +136,13 @@ def bearings(name: str, run: Run) -> Iterator[list[str]]:
         power = float(np.square(every).mean())
         row = [math.sqrt(power), float(every.mean())]
         pairs = [[(one, one, lag_s) for one in series] for lag_s in LAGS_S]
-        pairs.append([(one, other, 0.0) for k, one in enumerate(series) for other in series[k + 1 :]])
+        pairs.append(
+            [
+                (one, other, 0.0)
+                for k, one in enumerate(series)
+                for other in series[k + 1 :]
+            ]
+        )
         for asked in pairs:
             sums, counts = zip(*(product(*each) for each in asked), strict=True)
             row.append(sum(sums) / sum(counts) / power if sum(counts) else math.nan)
@@ -124,19 +152,30 @@ def bearings(name: str, run: Run) -> Iterator[list[str]]:
 def beginning(source: Path, seconds: float) -> list[Message]:
     """The messages of the first `seconds`."""
     messages = list(open_input(source).messages())
-    return [one for one in messages if one.receipt_ns - messages[0].receipt_ns <= seconds * 1e9]
+    return [
+        one
+        for one in messages
+        if one.receipt_ns - messages[0].receipt_ns <= seconds * 1e9
+    ]
 
 
-def measured(source: Path, config: Config, seconds: float) -> tuple[list[list[str]], list[list[str]]]:
+def measured(
+    source: Path, config: Config, seconds: float
+) -> tuple[list[list[str]], list[list[str]]]:
     """Rows of both tables of one recording."""
     messages = beginning(source, seconds)
     runs = {
-        errors: EvaluatedRun(errors, fgtrack.replay(messages, with_cameras(config, errors)))
+        errors: EvaluatedRun(
+            errors, fgtrack.replay(messages, with_cameras(config, errors))
+        )
         for errors in ("none", *ERRORS)
     }
     rows = []
     for errors, run in runs.items():
-        changes = [UNKNOWN if errors == "none" else change(runs["none"], run, quantity) for quantity in QUANTITIES]
+        changes = [
+            UNKNOWN if errors == "none" else change(runs["none"], run, quantity)
+            for quantity in QUANTITIES
+        ]
         metrics = run.metrics
         assert metrics.truth is not None
         assert metrics.multi_object is not None
@@ -144,7 +183,10 @@ def measured(source: Path, config: Config, seconds: float) -> tuple[list[list[st
         values = (
             *(metrics.multi_object.gospa["in_view_rms_m"], *bounds(changes[0])),
             *(metrics.truth.overall.errors["position_m"].rmse, *bounds(changes[1])),
-            *(100.0 * metrics.multi_object.clear["mota"], 100.0 * metrics.multi_object.identity["idf1"]),
+            *(
+                100.0 * metrics.multi_object.clear["mota"],
+                100.0 * metrics.multi_object.identity["idf1"],
+            ),
             *(metrics.truth.overall.breaks, metrics.truth.false_tracks),
             *(nis.get(camera, math.nan) for camera in CAMERAS),
         )
@@ -164,17 +206,24 @@ def change(without: EvaluatedRun, run: EvaluatedRun, quantity: str) -> Estimate:
 
 
 def main(
-    autoferry: Annotated[Path, typer.Argument(help="Folder with a folder per scenario.")],
-    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path("out/bearings"),
+    autoferry: Annotated[
+        Path, typer.Argument(help="Folder with a folder per scenario.")
+    ],
+    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path(
+        "out/bearings"
+    ),
     scenarios: Annotated[str, typer.Option(help="Scenarios, all if empty.")] = "",
-    configuration: Annotated[str, typer.Option(help="Configuration without cameras.")] = "autoferry",
+    configuration: Annotated[
+        str, typer.Option(help="Configuration without cameras.")
+    ] = "autoferry",
     seconds: Annotated[float, typer.Option(help="How much of each.")] = 1e6,
     jobs: Annotated[int, typer.Option(help="Recordings at a time.")] = 1,
 ) -> None:
     """Replay all scenarios without and with cameras, print both tables."""
     config = read_config(configuration)
     found = Parallel(n_jobs=jobs)(
-        delayed(measured)(source, config, seconds) for source in autoferry_sources(autoferry, scenarios).values()
+        delayed(measured)(source, config, seconds)
+        for source in autoferry_sources(autoferry, scenarios).values()
     )
     write(out / "bearings.csv", OF_BEARINGS, [row for rows, _ in found for row in rows])
     write(out / "gains.csv", OF_GAINS, [row for _, rows in found for row in rows])

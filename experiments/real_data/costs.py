@@ -14,7 +14,14 @@ from fgtrack.sim.delays import ConstantDelay
 from fgtrack.sim.redelay import SensorDelays, redelay
 
 QUANTITIES = ("position_rmse_m", "gospa_in_view_rms_m")
-HEADER = ("quantity", "estimator", "prompt_m", "late_m", "cost_m", "less_than_last_by_m")
+HEADER = (
+    "quantity",
+    "estimator",
+    "prompt_m",
+    "late_m",
+    "cost_m",
+    "less_than_last_by_m",
+)
 
 Sums = Mapping[str, FloatArray]
 """By quantity, of one recording: sums of squares of 2 e runs, prompt and late ones of e estimators, and their count, of
@@ -27,28 +34,49 @@ def late(messages: Sequence[Message], sensor: str, delay_s: float) -> list[Messa
     return list(redelay(messages, delays, np.random.default_rng(0))[0])
 
 
-def sums(prompt: Sequence[EvaluatedRun], after: Sequence[EvaluatedRun], horizons_s: Sequence[float] = ()) -> Sums:
+def sums(
+    prompt: Sequence[EvaluatedRun],
+    after: Sequence[EvaluatedRun],
+    horizons_s: Sequence[float] = (),
+) -> Sums:
     """What runs of one recording, of the same estimators in the same order, are compared by.
 
     Positions where all runs track the same object at the same stamp, now and `horizons_s` ahead; GOSPA at all ticks.
     """
     runs = [*prompt, *after]
     found = comparison(runs).sums
-    ahead = {f"position_{horizon_s:g}_s_ahead_rmse_m": _ahead(runs, horizon_s) for horizon_s in horizons_s}
+    ahead = {
+        f"position_{horizon_s:g}_s_ahead_rmse_m": _ahead(runs, horizon_s)
+        for horizon_s in horizons_s
+    }
     return {**{name: found[name] for name in QUANTITIES if name in found}, **ahead}
 
 
 def _ahead(runs: Sequence[EvaluatedRun], horizon_s: float) -> FloatArray:
     """Squared errors of what the states predict, where all runs predict the same object from the same stamp."""
-    found = [displacements(one.run, one.matching) for one in runs if one.matching is not None]
+    found = [
+        displacements(one.run, one.matching) for one in runs if one.matching is not None
+    ]
     squares = [
-        dict(zip(zip(one.stamps_ns.tolist(), one.object_index.tolist(), strict=True), column, strict=True))
+        dict(
+            zip(
+                zip(one.stamps_ns.tolist(), one.object_index.tolist(), strict=True),
+                column,
+                strict=True,
+            )
+        )
         for one in found
-        for column in [np.square(one.values["arc"][:, round(horizon_s / STEP_S) - 1]).tolist()]
+        for column in [
+            np.square(one.values["arc"][:, round(horizon_s / STEP_S) - 1]).tolist()
+        ]
     ]
     places = sorted(functools.reduce(set.intersection, (set(each) for each in squares)))
-    values = np.array([[each[place] for each in squares] for place in places]).reshape(-1, len(runs))
-    return by_stamp(np.array([stamp_ns for stamp_ns, _ in places], dtype=np.int64), values)
+    values = np.array([[each[place] for each in squares] for place in places]).reshape(
+        -1, len(runs)
+    )
+    return by_stamp(
+        np.array([stamp_ns for stamp_ns, _ in places], dtype=np.int64), values
+    )
 
 
 def rows(found: Iterable[Sums], estimators: Sequence[str]) -> Iterator[list[str]]:

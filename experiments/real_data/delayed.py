@@ -29,11 +29,11 @@ from joblib import Parallel, delayed
 from scores import SEQUENCES, kitti_sources, write
 
 import fgtrack
+from fgtrack.config.settings import ClockConfig, Config
+from fgtrack.config.shipped import read_config
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.runs import EvaluatedRun
-from fgtrack.io.source import open_input
-from fgtrack.pipeline.config import ClockConfig, Config
-from fgtrack.pipeline.shipped import read_config
+from fgtrack.inputs.source import open_input
 
 ESTIMATORS = ("smoother", "ekf-replay", "ekf-backward-forward")
 LIDAR, CAMERA, SECOND = "pointrcnn_car", "rrc_car", "second_lidar"
@@ -41,7 +41,14 @@ LATE = {"late lidar": LIDAR, "late camera": CAMERA, "halves": SECOND}
 """The late sensor of each arrangement."""
 NODE_HZ = 20.0
 HORIZONS_S = (0.5, 1.0)
-OF_SCORES = ("arrangement", "estimator", "mota_prompt", "mota_late", "switches_prompt", "switches_late")
+OF_SCORES = (
+    "arrangement",
+    "estimator",
+    "mota_prompt",
+    "mota_late",
+    "switches_prompt",
+    "switches_late",
+)
 
 
 class Found(NamedTuple):
@@ -68,7 +75,9 @@ def arranged(arrangement: str, config: Config) -> Config:
     if arrangement != "halves":
         return config
     sensors = {**config.sensors, SECOND: config.sensors[LIDAR]}
-    return replace(config, sensors=sensors, ignore_sensors=(*config.ignore_sensors, CAMERA))
+    return replace(
+        config, sensors=sensors, ignore_sensors=(*config.ignore_sensors, CAMERA)
+    )
 
 
 def judged(arrangement: str, source: Path, config: Config, delay_s: float) -> Found:
@@ -78,21 +87,41 @@ def judged(arrangement: str, source: Path, config: Config, delay_s: float) -> Fo
     if arrangement == "halves":
         messages = list(halves(messages))
     prompt, late = (
-        [EvaluatedRun(each, fgtrack.replay(received, replace(config, estimator=each))) for each in ESTIMATORS]
+        [
+            EvaluatedRun(
+                each, fgtrack.replay(received, replace(config, estimator=each))
+            )
+            for each in ESTIMATORS
+        ]
         for received in (messages, costs.late(messages, LATE[arrangement], delay_s))
     )
     scores = []
     for pair in zip(prompt, late, strict=True):
-        clear = [one.metrics.multi_object.clear for one in pair if one.metrics.multi_object is not None]
-        scores.append([*(100.0 * one["mota"] for one in clear), *(float(one["id_switches"]) for one in clear)])
+        clear = [
+            one.metrics.multi_object.clear
+            for one in pair
+            if one.metrics.multi_object is not None
+        ]
+        scores.append(
+            [
+                *(100.0 * one["mota"] for one in clear),
+                *(float(one["id_switches"]) for one in clear),
+            ]
+        )
     return Found(costs.sums(prompt, late, HORIZONS_S), scores)
 
 
 def main(
     kitti: Annotated[Path, typer.Option(help="Folder of the KITTI tracking data set.")],
-    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path("out/delayed"),
-    sequences: Annotated[str, typer.Option(help="Sequences, separated by commas.")] = SEQUENCES,
-    arrangements: Annotated[str, typer.Option(help="Arrangements, separated by commas.")] = ",".join(LATE),
+    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path(
+        "out/delayed"
+    ),
+    sequences: Annotated[
+        str, typer.Option(help="Sequences, separated by commas.")
+    ] = SEQUENCES,
+    arrangements: Annotated[
+        str, typer.Option(help="Arrangements, separated by commas.")
+    ] = ",".join(LATE),
     delay_s: Annotated[float, typer.Option(help="Delay of the late sensor.")] = 0.15,
     config_name: Annotated[str, typer.Option("-c", help="Configuration.")] = "kitti",
     jobs: Annotated[int, typer.Option(help="Sequences at a time.")] = 1,
@@ -101,14 +130,21 @@ def main(
     config = replace(read_config(config_name), clock=ClockConfig(node_hz=NODE_HZ))
     sources, names = kitti_sources(kitti, sequences), arrangements.split(",")
     tasks = [(name, source) for name in names for source in sources.values()]
-    found = Parallel(n_jobs=jobs)(delayed(judged)(*task, config, delay_s) for task in tasks)
+    found = Parallel(n_jobs=jobs)(
+        delayed(judged)(*task, config, delay_s) for task in tasks
+    )
     cost_rows, score_rows = [], []
     for name in names:
         mine = [one for task, one in zip(tasks, found, strict=True) if task[0] == name]
-        cost_rows += [[name, *row] for row in costs.rows([one.compared for one in mine], ESTIMATORS)]
+        cost_rows += [
+            [name, *row]
+            for row in costs.rows([one.compared for one in mine], ESTIMATORS)
+        ]
         for k, estimator in enumerate(ESTIMATORS):
             columns = zip(*(one.scores[k] for one in mine), strict=True)
-            score_rows.append([name, estimator, *(f"{fmean(column):.1f}" for column in columns)])
+            score_rows.append(
+                [name, estimator, *(f"{fmean(column):.1f}" for column in columns)]
+            )
     write(out / "costs.csv", ["arrangement", *costs.HEADER], cost_rows)
     write(out / "scores.csv", OF_SCORES, score_rows)
 

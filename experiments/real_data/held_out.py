@@ -21,15 +21,19 @@ from rules import numbers, recorded, ruled
 from scores import HEADER, Found, autoferry_sources, scored, write, write_scores
 
 import fgtrack
+from fgtrack.config.settings import Config
+from fgtrack.config.shipped import read_config
 from fgtrack.evaluation.intervals import paired
 from fgtrack.evaluation.runs import EvaluatedRun
-from fgtrack.io.source import open_input
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.shipped import read_config
+from fgtrack.inputs.source import open_input
 
 
 def judged(
-    source: Path, config: Config, estimators: Sequence[str], sensor: str, delays_s: Sequence[float]
+    source: Path,
+    config: Config,
+    estimators: Sequence[str],
+    sensor: str,
+    delays_s: Sequence[float],
 ) -> tuple[list[list[Found]], list[costs.Sums]]:
     """Scores of one recording by delay and estimator, and what each delay but the first, which is 0, is compared by."""
     found, compared, prompt = [], [], list[EvaluatedRun]()
@@ -37,8 +41,16 @@ def judged(
     for delay_s in delays_s:
         messages = costs.late(recording, sensor, delay_s) if delay_s else recording
         configs = [replace(config, estimator=each) for each in estimators]
-        runs = [EvaluatedRun(one.estimator, fgtrack.replay(messages, one)) for one in configs]
-        found.append([scored(source.name, source, *each) for each in zip(configs, runs, strict=True)])
+        runs = [
+            EvaluatedRun(one.estimator, fgtrack.replay(messages, one))
+            for one in configs
+        ]
+        found.append(
+            [
+                scored(source.name, source, *each)
+                for each in zip(configs, runs, strict=True)
+            ]
+        )
         if delay_s:
             compared.append(costs.sums(prompt, runs))
         else:
@@ -53,17 +65,28 @@ def differences(scores: Sequence[Sequence[str]]) -> list[list[str]]:
     for other in others:
         for metric in ("mota", "hota", "gospa_m", "rmse_m"):
             column = HEADER.index(metric)
-            here, there = ([float(row[column]) for row in scores if row[1] == each] for each in (other, first))
+            here, there = (
+                [float(row[column]) for row in scores if row[1] == each]
+                for each in (other, first)
+            )
             rows.append([other, first, metric, f"{paired(here, there):.2f}"])
     return rows
 
 
 def main(
-    autoferry: Annotated[Path, typer.Argument(help="Folder with a folder per scenario.")],
-    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path("out/held_out"),
-    estimators: Annotated[str, typer.Option(help="Estimators, separated by commas.")] = "ekf-replay",
+    autoferry: Annotated[
+        Path, typer.Argument(help="Folder with a folder per scenario.")
+    ],
+    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path(
+        "out/held_out"
+    ),
+    estimators: Annotated[
+        str, typer.Option(help="Estimators, separated by commas.")
+    ] = "ekf-replay",
     judge: Annotated[str, typer.Option(help="Scenarios to judge, all if empty.")] = "",
-    base: Annotated[str, typer.Option(help="Configuration that the numbers go into.")] = "autoferry",
+    base: Annotated[
+        str, typer.Option(help="Configuration that the numbers go into.")
+    ] = "autoferry",
     late: Annotated[str, typer.Option(help="Sensor that is late.")] = "lidar",
     delays_s: Annotated[str, typer.Option(help="How late, separated by commas.")] = "",
     jobs: Annotated[int, typer.Option(help="Scenarios at a time.")] = 1,
@@ -75,21 +98,39 @@ def main(
     judge_names = judge.split(",") if judge else list(known)
 
     labels = [*judge_names, "none"]
-    folds = {name: ruled(config, [one for other, one in known.items() if other != name]) for name in labels}
-    rows = [[name, *(f"{value:g}" for value in numbers(fold).values())] for name, fold in folds.items()]
+    folds = {
+        name: ruled(config, [one for other, one in known.items() if other != name])
+        for name in labels
+    }
+    rows = [
+        [name, *(f"{value:g}" for value in numbers(fold).values())]
+        for name, fold in folds.items()
+    ]
     write(out / "rules.csv", ["held_out", *numbers(folds["none"])], rows)
 
-    names, lags_s = estimators.split(","), [0.0, *(float(each) for each in delays_s.split(",") if each)]
+    names, lags_s = (
+        estimators.split(","),
+        [0.0, *(float(each) for each in delays_s.split(",") if each)],
+    )
     of_scenarios = Parallel(n_jobs=jobs)(
-        delayed(judged)(sources[name], folds[name], names, late, lags_s) for name in judge_names
+        delayed(judged)(sources[name], folds[name], names, late, lags_s)
+        for name in judge_names
     )
     cost_rows = []
     for k, delay_s in enumerate(lags_s):
-        found = [one for each in zip(*(found[k] for found, _ in of_scenarios), strict=True) for one in each]
+        found = [
+            one
+            for each in zip(*(found[k] for found, _ in of_scenarios), strict=True)
+            for one in each
+        ]
         prefix = f"{delay_s:g}_s_" if delay_s else ""
         write_scores(out, found, prefix)
         header = ["estimator", "against", "metric", "difference"]
-        write(out / f"{prefix}differences.csv", header, differences([one.scores for one in found]))
+        write(
+            out / f"{prefix}differences.csv",
+            header,
+            differences([one.scores for one in found]),
+        )
         if delay_s:
             compared = [compared[k - 1] for _, compared in of_scenarios]
             cost_rows += [[f"{delay_s:g}", *row] for row in costs.rows(compared, names)]

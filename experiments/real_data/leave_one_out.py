@@ -23,22 +23,30 @@ from scipy.special import expit
 from scores import SEQUENCES, kitti_sources, raw, raw_mota, scans, write
 
 import fgtrack
+from fgtrack.config.settings import Config
+from fgtrack.config.shipped import read_config
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.evaluation.matching import match
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.io.run import NO_TRACK, Run
-from fgtrack.io.source import open_input
+from fgtrack.inputs.source import open_input
 from fgtrack.models.sensors import Score
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.shipped import read_config
-from fgtrack.tracking.existence import ExistenceRules
+from fgtrack.runs import NO_TRACK, Run
+from fgtrack.tracking.lives.existence import ExistenceRules
 
 SENSOR = "pointrcnn_car"
 SCORES = (2.0, 3.0)
 """Lowest scores with which the detections themselves are judged."""
 HEADER = (
-    *("sequence", "published", "even", "scale", "visible_share", "visible_s", "detection_probability"),
+    *(
+        "sequence",
+        "published",
+        "even",
+        "scale",
+        "visible_share",
+        "visible_s",
+        "detection_probability",
+    ),
     *(f"mota_raw_{score:g}" for score in SCORES),
     *("mota", "recall", "id_switches"),
 )
@@ -64,13 +72,17 @@ def labelled(source: Path, config: Config, run: Run) -> Labelled:
     detected, cars = matching.track_ids != NO_TRACK, []
     for has, present in zip(detected.T, matching.present.T, strict=True):
         scans_of = np.flatnonzero(present & np.logical_or.accumulate(has))
-        cars.append(np.column_stack([matching.now_ns[scans_of] / NS_PER_S, has[scans_of]]))
+        cars.append(
+            np.column_stack([matching.now_ns[scans_of] / NS_PER_S, has[scans_of]])
+        )
     return Labelled(scores[matching.tracks["track_id"]], matching.paired, tuple(cars))
 
 
 def fitted(found: Sequence[Labelled]) -> Score:
     """The score model of all of `found`: logit P(car | score) = prior log-odds + (score - even) / scale."""
-    scores, is_car = (np.concatenate(each) for each in list(zip(*found, strict=True))[:2])
+    scores, is_car = (
+        np.concatenate(each) for each in list(zip(*found, strict=True))[:2]
+    )
     signs = np.where(is_car, 1.0, -1.0)
 
     def loss(line: FloatArray) -> float:
@@ -85,74 +97,118 @@ def visibility(found: Sequence[Labelled]) -> tuple[float, float, float]:
     """Most likely share of time in which a car is visible, time constant in s and P_D if visible; see `existence`."""
 
     def loss(unbounded: FloatArray) -> float:
-        share, time_s, P_D = expit(unbounded[0]), math.exp(unbounded[1]), expit(unbounded[2])
+        share, time_s, P_D = (
+            expit(unbounded[0]),
+            math.exp(unbounded[1]),
+            expit(unbounded[2]),
+        )
         total = 0.0
         for car in (car for each in found for car in each.cars):
             v = 1.0
             for (before_s, _), (time, has) in pairwise(car.tolist()):
                 v = share + (v - share) * math.exp((before_s - time) / time_s)
                 likelihood = v * P_D if has else 1.0 - v * P_D
-                v, total = v * (P_D if has else 1.0 - P_D) / likelihood, total - math.log(likelihood)
+                v, total = (
+                    v * (P_D if has else 1.0 - P_D) / likelihood,
+                    total - math.log(likelihood),
+                )
         return total
 
     best = minimize(loss, np.array([2.0, 0.0, 3.0]), method="Nelder-Mead").x
     return float(expit(best[0])), math.exp(best[1]), float(expit(best[2]))
 
 
-def tracked(name: str, source: Path, config: Config, others: Sequence[Labelled]) -> list[str]:
+def tracked(
+    name: str, source: Path, config: Config, others: Sequence[Labelled]
+) -> list[str]:
     """The row of one sequence."""
     assert isinstance(config.lifecycle, ExistenceRules)
     score, (share, time_s, P_D) = fitted(others), visibility(others)
     sensor = replace(config.sensors[SENSOR], score=score, detection_probability=P_D)
     rules = replace(config.lifecycle, visible_share=share, visible_s=time_s)
-    run = fgtrack.replay(source, replace(config, sensors={**config.sensors, SENSOR: sensor}, lifecycle=rules))
+    run = fgtrack.replay(
+        source,
+        replace(config, sensors={**config.sensors, SENSOR: sensor}, lifecycle=rules),
+    )
     scores = evaluate(run).multi_object
     assert scores is not None
     clear = scores.clear
     motas = [100.0 * raw_mota(source, _from(config, lowest), run) for lowest in SCORES]
     recall = 100.0 * clear["pairs"] / (clear["pairs"] + clear["misses"])
-    chosen = config.lifecycle.confirm_probability, score.even, score.scale, share, time_s, P_D
+    chosen = (
+        config.lifecycle.confirm_probability,
+        score.even,
+        score.scale,
+        share,
+        time_s,
+        P_D,
+    )
     numbers = (*chosen, *motas, 100.0 * clear["mota"], recall)
-    return [name, *(f"{number:.3g}" for number in numbers), f"{clear['id_switches']:.0f}"]
+    return [
+        name,
+        *(f"{number:.3g}" for number in numbers),
+        f"{clear['id_switches']:.0f}",
+    ]
 
 
 def published_from(config: Config, probability: float) -> Config:
     """`config` with tracks published from this existence probability on."""
     assert isinstance(config.lifecycle, ExistenceRules)
-    rules = replace(config.lifecycle, confirm_probability=probability, doubt_probability=probability)
+    rules = replace(
+        config.lifecycle, confirm_probability=probability, doubt_probability=probability
+    )
     return replace(config, lifecycle=rules)
 
 
 def _from(config: Config, lowest: float) -> Config:
-    kitti = replace(config.input.kitti, min_score={**config.input.kitti.min_score, SENSOR: lowest})
+    kitti = replace(
+        config.input.kitti, min_score={**config.input.kitti.min_score, SENSOR: lowest}
+    )
     return replace(config, input=replace(config.input, kitti=kitti))
 
 
 def main(
     kitti: Annotated[Path, typer.Option(help="Folder of the KITTI tracking data set.")],
-    out: Annotated[Path, typer.Option("-o", help="Folder for the table.")] = Path("out/leave_one_out"),
-    sequences: Annotated[str, typer.Option(help="Sequences, separated by commas.")] = SEQUENCES,
+    out: Annotated[Path, typer.Option("-o", help="Folder for the table.")] = Path(
+        "out/leave_one_out"
+    ),
+    sequences: Annotated[
+        str, typer.Option(help="Sequences, separated by commas.")
+    ] = SEQUENCES,
     estimator: Annotated[str, typer.Option(help="Estimator.")] = "smoother",
-    published: Annotated[str, typer.Option(help="From which probabilities, separated by commas.")] = "0.5",
+    published: Annotated[
+        str, typer.Option(help="From which probabilities, separated by commas.")
+    ] = "0.5",
     jobs: Annotated[int, typer.Option(help="Replays at a time.")] = 1,
 ) -> None:
     """Fit to all but one, track that one; print leave_one_out.csv."""
     config = replace(read_config("kitti"), estimator=estimator)
     sources = kitti_sources(kitti, sequences)
     labels = {
-        name: labelled(source, config, fgtrack.replay(source, replace(config, estimator="drop")))
+        name: labelled(
+            source, config, fgtrack.replay(source, replace(config, estimator="drop"))
+        )
         for name, source in sources.items()
     }
     rows = Parallel(n_jobs=jobs)(
-        delayed(tracked)(name, source, one, [found for other, found in labels.items() if other != name])
-        for one in [published_from(config, float(each)) for each in published.split(",")]
+        delayed(tracked)(
+            name,
+            source,
+            one,
+            [found for other, found in labels.items() if other != name],
+        )
+        for one in [
+            published_from(config, float(each)) for each in published.split(",")
+        ]
         for name, source in sources.items()
     )
     score = fitted(list(labels.values()))
     write(out / "leave_one_out.csv", HEADER, rows)
     share, time_s, P_D = visibility(list(labels.values()))
     print(f"fitted to all: even {score.even:.2f}, scale {score.scale:.2f}")
-    print(f"visible {share:.2f} of the time, for {time_s:.2f} s, detected with {P_D:.3f}")
+    print(
+        f"visible {share:.2f} of the time, for {time_s:.2f} s, detected with {P_D:.3f}"
+    )
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ import fgtrack
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.intervals import Statistic, within_run
 from fgtrack.evaluation.matching import Matching, match
-from fgtrack.io.run import NO_TRACK
+from fgtrack.runs import NO_TRACK
 
 SHIPPED = "shipped"
 #: Visible at any time, as far as a number can say so.
@@ -31,8 +31,14 @@ PARTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
         SHIPPED: {},
         "visibility": ALWAYS,
         "claim": {"association.claim_m": 0.0},
-        "jumps": {f"sensors.{name}.correlation.jump_probability": 0.0 for name in ("lidar", "radar")},
-        "correlation": {"sensors.lidar.correlation": None, "sensors.radar.correlation": None},
+        "jumps": {
+            f"sensors.{name}.correlation.jump_probability": 0.0
+            for name in ("lidar", "radar")
+        },
+        "correlation": {
+            "sensors.lidar.correlation": None,
+            "sensors.radar.correlation": None,
+        },
         "joint": {"association.joint_from": 8},
     },
     "kitti": {
@@ -40,10 +46,22 @@ PARTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
         "visibility": ALWAYS,
         "score": {"sensors.pointrcnn_car.score": None},
         "ego": {"ego.position_std_m": 0.0, "ego.speed_std_mps": 0.0},
-        "correlation": {"sensors.pointrcnn_car.correlation": None, "sensors.rrc_car.correlation": None},
+        "correlation": {
+            "sensors.pointrcnn_car.correlation": None,
+            "sensors.rrc_car.correlation": None,
+        },
     },
 }
-HEADER = ("data", "part", "mota", "mota_difference", "rmse_m", "rmse_difference_m", "switches", "cpu_s")
+HEADER = (
+    "data",
+    "part",
+    "mota",
+    "mota_difference",
+    "rmse_m",
+    "rmse_difference_m",
+    "switches",
+    "cpu_s",
+)
 
 
 class Judged(NamedTuple):
@@ -57,15 +75,22 @@ class Judged(NamedTuple):
 def counted(matching: Matching) -> FloatArray:
     """`Judged.ticks` of a matching."""
     paired, n = matching.paired, len(matching.now_ns)
-    false, pairs = (np.bincount(matching.tick_index[rows], minlength=n) for rows in (~paired, paired))
-    distances_m = matching.distances_m[np.flatnonzero(paired), matching.object_index[paired]]
+    false, pairs = (
+        np.bincount(matching.tick_index[rows], minlength=n)
+        for rows in (~paired, paired)
+    )
+    distances_m = matching.distances_m[
+        np.flatnonzero(paired), matching.object_index[paired]
+    ]
     squared_m2 = np.bincount(matching.tick_index[paired], distances_m**2, minlength=n)
     found, switches = matching.track_ids != NO_TRACK, np.zeros(n)
     for ids, has in zip(matching.track_ids.T, found.T, strict=True):
         ticks = np.flatnonzero(has)
         switches[ticks[1:][np.diff(ids[ticks]) != 0]] += 1.0
     missed = (matching.present & ~found).sum(axis=1)
-    return np.column_stack([false, missed, switches, matching.present.sum(axis=1), squared_m2, pairs])
+    return np.column_stack(
+        [false, missed, switches, matching.present.sum(axis=1), squared_m2, pairs]
+    )
 
 
 def judged(source: Path, data: str, settings: Mapping[str, object]) -> Judged:
@@ -89,22 +114,44 @@ def rmse_m(sums: FloatArray) -> FloatArray:
 
 def row(one: Sequence[Judged], shipped: Sequence[Judged]) -> Iterator[str]:
     """Columns from `mota` on of all recordings with a setting, and as shipped."""
-    ticks = np.hstack([np.concatenate([each.ticks for each in runs]) for runs in (one, shipped)])
+    ticks = np.hstack(
+        [np.concatenate([each.ticks for each in runs]) for runs in (one, shipped)]
+    )
     sums = ticks[:, :6].sum(axis=0)
 
     def less(value: Statistic) -> str:
-        return "" if one is shipped else f"{within_run(ticks, lambda S: value(S[:6]) - value(S[6:])):+.3f}"
+        return (
+            ""
+            if one is shipped
+            else f"{within_run(ticks, lambda S: value(S[:6]) - value(S[6:])):+.3f}"
+        )
 
-    yield from (f"{mota(sums):.1f}", less(mota), f"{rmse_m(sums):.3f}", less(rmse_m), f"{sums[2]:.0f}")
+    yield from (
+        f"{mota(sums):.1f}",
+        less(mota),
+        f"{rmse_m(sums):.3f}",
+        less(rmse_m),
+        f"{sums[2]:.0f}",
+    )
     yield f"{np.mean([each.cpu_s for each in one]):.1f}"
 
 
 def main(
-    autoferry: Annotated[Path | None, typer.Option(help="Folder with a folder per scenario.")] = None,
-    kitti: Annotated[Path | None, typer.Option(help="Folder of the KITTI tracking data set.")] = None,
-    out: Annotated[Path, typer.Option("-o", help="Folder for the table.")] = Path("out/parts"),
-    scenarios: Annotated[str, typer.Option(help="Of Autoferry, separated by commas, all if empty.")] = "",
-    sequences: Annotated[str, typer.Option(help="Of KITTI, separated by commas.")] = SEQUENCES,
+    autoferry: Annotated[
+        Path | None, typer.Option(help="Folder with a folder per scenario.")
+    ] = None,
+    kitti: Annotated[
+        Path | None, typer.Option(help="Folder of the KITTI tracking data set.")
+    ] = None,
+    out: Annotated[Path, typer.Option("-o", help="Folder for the table.")] = Path(
+        "out/parts"
+    ),
+    scenarios: Annotated[
+        str, typer.Option(help="Of Autoferry, separated by commas, all if empty.")
+    ] = "",
+    sequences: Annotated[
+        str, typer.Option(help="Of KITTI, separated by commas.")
+    ] = SEQUENCES,
     jobs: Annotated[int, typer.Option(help="Recordings at a time.")] = 1,
 ) -> None:
     """Switch off one part after the other, write and print parts.csv."""
@@ -113,12 +160,17 @@ def main(
         "kitti": kitti_sources(kitti, sequences) if kitti else {},
     }
     out.mkdir(parents=True, exist_ok=True)
-    with (out / "parts.csv").open("w", newline="") as file, Parallel(n_jobs=jobs) as parallel:
+    with (
+        (out / "parts.csv").open("w", newline="") as file,
+        Parallel(n_jobs=jobs) as parallel,
+    ):
         writer, shipped = csv.writer(file), list[Judged]()
         writer.writerow(HEADER)
         for data, paths in sources.items():
             for part, settings in PARTS[data].items() if paths else ():
-                found = parallel(delayed(judged)(path, data, settings) for path in paths.values())
+                found = parallel(
+                    delayed(judged)(path, data, settings) for path in paths.values()
+                )
                 shipped = found if part == SHIPPED else shipped
                 writer.writerow([data, part, *row(found, shipped)])
                 file.flush()

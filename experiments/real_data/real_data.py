@@ -12,40 +12,72 @@ from typing import Annotated
 
 import typer
 from joblib import Parallel, delayed
-from scores import SEQUENCES, Found, autoferry_sources, kitti_sources, scored, write_scores
+from scores import (
+    SEQUENCES,
+    Found,
+    autoferry_sources,
+    kitti_sources,
+    scored,
+    write_scores,
+)
 
 import fgtrack
+from fgtrack.config.settings import Config
+from fgtrack.config.shipped import read_config
 from fgtrack.evaluation.runs import EvaluatedRun
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.shipped import read_config
 
 
 def judged(name: str, source: Path, config: Config) -> Found:
     """Scores of one recording, `name`."""
-    return scored(name, source, config, EvaluatedRun(name, fgtrack.replay(source, config)))
+    return scored(
+        name, source, config, EvaluatedRun(name, fgtrack.replay(source, config))
+    )
 
 
 def main(
-    autoferry: Annotated[Path | None, typer.Option(help="Folder with a folder per scenario.")] = None,
-    kitti: Annotated[Path | None, typer.Option(help="Folder of the KITTI tracking data set.")] = None,
-    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path("out/real_data"),
-    estimators: Annotated[str, typer.Option(help="Estimators, separated by commas.")] = "ekf-replay,smoother",
+    autoferry: Annotated[
+        Path | None, typer.Option(help="Folder with a folder per scenario.")
+    ] = None,
+    kitti: Annotated[
+        Path | None, typer.Option(help="Folder of the KITTI tracking data set.")
+    ] = None,
+    out: Annotated[Path, typer.Option("-o", help="Folder for the tables.")] = Path(
+        "out/real_data"
+    ),
+    estimators: Annotated[
+        str, typer.Option(help="Estimators, separated by commas.")
+    ] = "ekf-replay,smoother",
     sequences: Annotated[str, typer.Option(help="Sequences of KITTI.")] = SEQUENCES,
-    scenarios: Annotated[str, typer.Option(help="Scenarios of Autoferry, all if empty.")] = "",
-    autoferry_config: Annotated[str, typer.Option(help="Configuration for Autoferry.")] = "autoferry",
-    kitti_config: Annotated[str, typer.Option(help="Configuration for KITTI.")] = "kitti",
+    scenarios: Annotated[
+        str, typer.Option(help="Scenarios of Autoferry, all if empty.")
+    ] = "",
+    autoferry_config: Annotated[
+        str, typer.Option(help="Configuration for Autoferry.")
+    ] = "autoferry",
+    kitti_config: Annotated[
+        str, typer.Option(help="Configuration for KITTI.")
+    ] = "kitti",
     jobs: Annotated[int, typer.Option(help="Replays at a time.")] = 1,
 ) -> None:
     """Replay all recordings, print their scores and NIS."""
     groups: list[tuple[str, str, dict[str, Path]]] = []
     if autoferry is not None:
-        groups.append(("autoferry", autoferry_config, autoferry_sources(autoferry, scenarios)))
+        groups.append(
+            ("autoferry", autoferry_config, autoferry_sources(autoferry, scenarios))
+        )
     if kitti is not None:
         groups.append(("kitti", kitti_config, kitti_sources(kitti, sequences)))
     for group, config, sources in groups:
-        configs = [replace(read_config(config), estimator=each) for each in estimators.split(",")]
+        configs = [
+            replace(read_config(config), estimator=each)
+            for each in estimators.split(",")
+        ]
         tasks = [(*source, one) for one in configs for source in sources.items()]
-        write_scores(out, Parallel(n_jobs=jobs)(delayed(judged)(*task) for task in tasks), f"{group}_")
+        write_scores(
+            out,
+            Parallel(n_jobs=jobs)(delayed(judged)(*task) for task in tasks),
+            f"{group}_",
+        )
 
 
 if __name__ == "__main__":

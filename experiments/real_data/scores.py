@@ -8,19 +8,29 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fgtrack.config.settings import Config
 from fgtrack.core.geometry import rotation
 from fgtrack.core.types import DetectionList, EgoState, FloatArray, Message, TrackStatus
 from fgtrack.evaluation.matching import match, scenes
 from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.scores.multi_object import clear
-from fgtrack.io.run import Run, Table
-from fgtrack.io.source import open_input
-from fgtrack.pipeline.config import Config
+from fgtrack.inputs.source import open_input
+from fgtrack.runs import Run, Table
 
 SEQUENCES = "0004,0006,0008,0010,0018"
 """Of the KITTI tracking data set."""
 HEADER = (
-    *("recording", "estimator", "mota_raw", "mota", "idf1", "hota", "gospa_m", "rmse_m", "false_tracks_per_object"),
+    *(
+        "recording",
+        "estimator",
+        "mota_raw",
+        "mota",
+        "idf1",
+        "hota",
+        "gospa_m",
+        "rmse_m",
+        "false_tracks_per_object",
+    ),
     *("breaks", "id_switches"),
 )
 NIS_HEADER = ("recording", "estimator", "sensor", "nis_over_expected")
@@ -33,7 +43,11 @@ def kitti_sources(kitti: Path, sequences: str) -> dict[str, Path]:
 
 def autoferry_sources(autoferry: Path, scenarios: str) -> dict[str, Path]:
     """The inputs of `scenarios`, separated by commas, or of all, by name."""
-    names = scenarios.split(",") if scenarios else sorted(each.name for each in autoferry.glob("scenario*"))
+    names = (
+        scenarios.split(",")
+        if scenarios
+        else sorted(each.name for each in autoferry.glob("scenario*"))
+    )
     return {name: autoferry / name for name in names}
 
 
@@ -65,10 +79,14 @@ def scans(messages: Iterable[Message], config: Config) -> Iterator[Scan]:
     for message in messages:
         if isinstance(message, EgoState):
             ego = message
-        elif isinstance(message, DetectionList) and "x_m" in getattr(config.sensors.get(message.sensor), "std", {}):
+        elif isinstance(message, DetectionList) and "x_m" in getattr(
+            config.sensors.get(message.sensor), "std", {}
+        ):
             assert ego is not None
             ego_m = np.array([ego.x_m, ego.y_m])
-            points_m = np.array([(one.x_m, one.y_m) for one in message.objects], dtype=np.float64).reshape(-1, 2)
+            points_m = np.array(
+                [(one.x_m, one.y_m) for one in message.objects], dtype=np.float64
+            ).reshape(-1, 2)
             if message.frame != "map":
                 points_m = points_m @ rotation(ego.yaw_rad).T + ego_m
             scores = np.array([one.score for one in message.objects], dtype=np.float64)
@@ -81,7 +99,13 @@ def raw(run: Run, seen: Sequence[Scan]) -> Run:
     tick = np.repeat(np.arange(len(seen)), [len(scan.positions_m) for scan in seen])
     x_m, y_m = np.concatenate([scan.positions_m for scan in seen]).T
     status = np.full(len(tick), TrackStatus.CONFIRMED.value)
-    tracks = {"tick": tick, "stamp_ns": stamps_ns[tick], "track_id": np.arange(len(tick)), "x_m": x_m, "y_m": y_m}
+    tracks = {
+        "tick": tick,
+        "stamp_ns": stamps_ns[tick],
+        "track_id": np.arange(len(tick)),
+        "x_m": x_m,
+        "y_m": y_m,
+    }
     tracks |= {"num_measured": np.full(len(tick), 99), "status": status}
     timing = Table({"tick": np.arange(len(seen)), "now_ns": stamps_ns})
     return run.with_tables(tracks=Table(tracks), timing=timing)
@@ -93,13 +117,17 @@ def raw_mota(source: Path, config: Config, run: Run) -> float:
     matching = match(found, config.evaluation)
     assert matching is not None
     counts = clear(scenes(found, matching), config.evaluation.gate_m)
-    return 1.0 - (counts["misses"] + counts["false_positives"]) / (counts["pairs"] + counts["misses"])
+    return 1.0 - (counts["misses"] + counts["false_positives"]) / (
+        counts["pairs"] + counts["misses"]
+    )
 
 
 def nis_ratios(run: EvaluatedRun) -> dict[str, float]:
     """Mean NIS over its expectation, by sensor."""
     nis = run.metrics.consistency.nis
-    return {sensor: found.mean / found.dof for sensor, found in nis.items() if found.count}
+    return {
+        sensor: found.mean / found.dof for sensor, found in nis.items() if found.count
+    }
 
 
 def scored(name: str, source: Path, config: Config, run: EvaluatedRun) -> Found:
@@ -117,16 +145,31 @@ def scored(name: str, source: Path, config: Config, run: EvaluatedRun) -> Found:
         truth.false_tracks / len(truth.objects),
     )
     counts = truth.overall.breaks, truth.overall.id_switches
-    return Found([name, config.estimator, *(f"{value:.2f}" for value in values), *map(str, counts)], nis_ratios(run))
+    return Found(
+        [
+            name,
+            config.estimator,
+            *(f"{value:.2f}" for value in values),
+            *map(str, counts),
+        ],
+        nis_ratios(run),
+    )
 
 
 def summary(rows: Sequence[Sequence[str]]) -> list[list[str]]:
     """Median and mean of every column of `rows`, for each estimator."""
     found = []
     for estimator in dict.fromkeys(row[1] for row in rows):
-        columns = list(zip(*(map(float, row[2:]) for row in rows if row[1] == estimator), strict=True))
+        columns = list(
+            zip(
+                *(map(float, row[2:]) for row in rows if row[1] == estimator),
+                strict=True,
+            )
+        )
         for label, of in (("median", statistics.median), ("mean", statistics.fmean)):
-            found.append([label, estimator, *(f"{of(column):.2f}" for column in columns)])
+            found.append(
+                [label, estimator, *(f"{of(column):.2f}" for column in columns)]
+            )
     return found
 
 
@@ -142,5 +185,9 @@ def write_scores(out: Path, found: Sequence[Found], prefix: str = "") -> None:
     """`scores.csv`, with averages, and `nis.csv`."""
     rows = [one.scores for one in found]
     write(out / f"{prefix}scores.csv", HEADER, [*rows, *summary(rows)])
-    nis = [[*one.scores[:2], sensor, f"{ratio:.2f}"] for one in found for sensor, ratio in one.nis.items()]
+    nis = [
+        [*one.scores[:2], sensor, f"{ratio:.2f}"]
+        for one in found
+        for sensor, ratio in one.nis.items()
+    ]
     write(out / f"{prefix}nis.csv", NIS_HEADER, nis)

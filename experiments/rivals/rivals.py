@@ -19,12 +19,12 @@ import numpy as np
 import typer
 
 import fgtrack
+from fgtrack.config.shipped import read_scenario
 from fgtrack.core.types import Detection, DetectionList, Message
 from fgtrack.evaluation.intervals import average, paired
 from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.models.oval import OVAL
 from fgtrack.models.track_map import COLUMNS
-from fgtrack.pipeline.shipped import read_scenario
 
 Settings = Mapping[str, Any]  # Any: values of a configuration
 
@@ -40,7 +40,10 @@ WHITE = {"sensors.pointrcnn_car.correlation": None, "sensors.rrc_car.correlation
 
 def curvature(std_radpm: float) -> dict[str, float]:
     """The curvature of the map's line at the detections of both sensors."""
-    return {f"sensors.{name}.curvature_from_map_std_radpm": std_radpm for name in ("lidar_cluster", "radar")}
+    return {
+        f"sensors.{name}.curvature_from_map_std_radpm": std_radpm
+        for name in ("lidar_cluster", "radar")
+    }
 
 
 class Contestant(NamedTuple):
@@ -64,8 +67,12 @@ CURVED = {
     "smoother, curvature 0.001": Contestant(SMOOTHER, curvature(1e-3), "smoother"),
 }
 #: The filters alone, where a smoother says the same of the present.
-FILTERS = {name: one for name, one in {**MODELS, **CURVED}.items() if one.estimator != SMOOTHER}
-FILTERS_CURVED = {name: one for name, one in FILTERS.items() if name == "EKF" or "curvature" in name}
+FILTERS = {
+    name: one for name, one in {**MODELS, **CURVED}.items() if one.estimator != SMOOTHER
+}
+FILTERS_CURVED = {
+    name: one for name, one in FILTERS.items() if name == "EKF" or "curvature" in name
+}
 DOPPLER = {"range_m": 0.8, "bearing_rad": 0.01, "range_rate_mps": 0.2}
 SPREADING = {"range_m": 0.3, "bearing_rad": 0.01}
 SPREAD_ON_AVERAGE = {"x_m": 0.3, "y_m": 0.35}
@@ -97,15 +104,25 @@ SCENES: Mapping[str, Scene] = {
         {"sensors.radar.std": DOPPLER, "sensors.radar.mount": {"x_m": 3.0}},
     ),
     "race": Scene("race", "tuned", FILTERS),
-    "default, curvature 20 % too small": Scene("default", "tuned", FILTERS_CURVED, straightened=0.2),
+    "default, curvature 20 % too small": Scene(
+        "default", "tuned", FILTERS_CURVED, straightened=0.2
+    ),
     "default, LiDAR worse with distance": Scene(
         "default",
         "tuned",
         {
             "EKF": Contestant(EKF, {"sensors.lidar_cluster.std": SPREAD_ON_AVERAGE}),
-            "EKF, growth": Contestant(EKF, {"sensors.lidar_cluster.std_growth": {"y_m": 0.01}}),
-            "smoother": Contestant(SMOOTHER, {"sensors.lidar_cluster.std": SPREAD_ON_AVERAGE}),
-            "smoother, growth": Contestant(SMOOTHER, {"sensors.lidar_cluster.std_growth": {"y_m": 0.01}}, "smoother"),
+            "EKF, growth": Contestant(
+                EKF, {"sensors.lidar_cluster.std_growth": {"y_m": 0.01}}
+            ),
+            "smoother": Contestant(
+                SMOOTHER, {"sensors.lidar_cluster.std": SPREAD_ON_AVERAGE}
+            ),
+            "smoother, growth": Contestant(
+                SMOOTHER,
+                {"sensors.lidar_cluster.std_growth": {"y_m": 0.01}},
+                "smoother",
+            ),
         },
         {"lidar_cluster": {"std": SPREADING}},
         {"sensors.lidar_cluster.std": {"x_m": 0.3, "y_m": 0.03}},
@@ -114,7 +131,11 @@ SCENES: Mapping[str, Scene] = {
 #: On real cars; there is no map.
 GROWTH = {"sensors.pointrcnn_car.std": {"x_m": 0.15, "y_m": 0.08, "yaw_rad": 0.06}}
 GROWTH |= {"sensors.pointrcnn_car.std_growth": {"x_m": 0.007, "y_m": 0.003}}
-KITTI = {**MODELS, "EKF, growth": Contestant(EKF, GROWTH), "smoother, growth": Contestant(SMOOTHER, GROWTH, "smoother")}
+KITTI = {
+    **MODELS,
+    "EKF, growth": Contestant(EKF, GROWTH),
+    "smoother, growth": Contestant(SMOOTHER, GROWTH, "smoother"),
+}
 SEQUENCES = ("0004", "0006", "0008", "0010", "0018")
 
 
@@ -144,7 +165,10 @@ def in_points(messages: Iterable[Message], sensor: str) -> Iterable[Message]:
             for one in message.objects:
                 assert one.range_m is not None
                 assert one.bearing_rad is not None
-                x_m, y_m = one.range_m * np.cos(one.bearing_rad), one.range_m * np.sin(one.bearing_rad)
+                x_m, y_m = (
+                    one.range_m * np.cos(one.bearing_rad),
+                    one.range_m * np.sin(one.bearing_rad),
+                )
                 objects.append(Detection(x_m=float(x_m), y_m=float(y_m)))
             message = replace(message, objects=objects)
         yield message
@@ -179,20 +203,38 @@ def judged(scene: str, contestant: str, recording: str, run: fgtrack.Run) -> Res
     )
 
 
-def simulated(name: str, contestant: str, seed: int, duration_s: float | None) -> Result:
+def simulated(
+    name: str, contestant: str, seed: int, duration_s: float | None
+) -> Result:
     """One seed of a scene."""
     scene = SCENES[name]
     scenario = read_scenario(scene.scenario, duration_s=duration_s)
     changes = scene.sensors or {}
-    sensors = tuple(replace(one, **changes.get(one.name, {})) for one in scenario.sensors)
-    messages: Iterable[Message] = fgtrack.simulate(replace(scenario, sensors=sensors), seed=seed)
+    sensors = tuple(
+        replace(one, **changes.get(one.name, {})) for one in scenario.sensors
+    )
+    messages: Iterable[Message] = fgtrack.simulate(
+        replace(scenario, sensors=sensors), seed=seed
+    )
     if "range_m" in changes.get("lidar_cluster", {}).get("std", {}):
         messages = in_points(messages, "lidar_cluster")
     one = scene.contestants[contestant]
-    settings = {**QUIET, "evaluation.multi_object": False, **(scene.settings or {}), **one.settings}
+    settings = {
+        **QUIET,
+        "evaluation.multi_object": False,
+        **(scene.settings or {}),
+        **one.settings,
+    }
     with tempfile.TemporaryDirectory() as folder:
         track = straightened(scene.straightened, Path(folder))
-        run = fgtrack.replay(messages, scene.config, map=track, pit_map="oval", estimator=one.estimator, set=settings)
+        run = fgtrack.replay(
+            messages,
+            scene.config,
+            map=track,
+            pit_map="oval",
+            estimator=one.estimator,
+            set=settings,
+        )
         return judged(name, contestant, str(seed), run)
 
 
@@ -200,42 +242,81 @@ def recorded(kitti: Path, contestant: str, sequence: str) -> Result:
     """One sequence of KITTI."""
     one = KITTI[contestant]
     settings = {**QUIET, **WHITE, **one.settings}
-    run = fgtrack.replay(kitti / "oxts" / f"{sequence}.txt", "kitti", estimator=one.estimator, set=settings)
+    run = fgtrack.replay(
+        kitti / "oxts" / f"{sequence}.txt",
+        "kitti",
+        estimator=one.estimator,
+        set=settings,
+    )
     return judged("KITTI", contestant, sequence, run)
 
 
 def table(results: Sequence[Result], scene: str) -> str:
     """A row for each contestant: means with their intervals, and paired differences of the position and prediction."""
     contestants = KITTI if scene == "KITTI" else SCENES[scene].contestants
-    header = ["contestant", "position RMSE [m]", "less that of", "yaw [deg]", "speed [m/s]", "NEES (2)"]
-    header += ["1 s ahead, on the arc [m]", "difference [m]"] + (["MOTA [%]"] if scene == "KITTI" else [])
+    header = [
+        "contestant",
+        "position RMSE [m]",
+        "less that of",
+        "yaw [deg]",
+        "speed [m/s]",
+        "NEES (2)",
+    ]
+    header += ["1 s ahead, on the arc [m]", "difference [m]"] + (
+        ["MOTA [%]"] if scene == "KITTI" else []
+    )
     lines = [header, ["---"] * len(header)]
 
     def of(name: str, field: str) -> list[float]:
-        return [getattr(one, field) for one in results if (one.scene, one.contestant) == (scene, name)]
+        return [
+            getattr(one, field)
+            for one in results
+            if (one.scene, one.contestant) == (scene, name)
+        ]
 
     for name, one in contestants.items():
         itself = name == one.against
         line = [name, f"{average(of(name, 'position_m')):.3f}"]
         line.append(
-            "" if itself else f"{one.against}: {paired(of(name, 'position_m'), of(one.against, 'position_m')):+.3f}"
+            ""
+            if itself
+            else f"{one.against}: {paired(of(name, 'position_m'), of(one.against, 'position_m')):+.3f}"
         )
-        line += [f"{average(of(name, field)).mean:.2f}" for field in ("yaw_deg", "speed_mps", "nees")]
+        line += [
+            f"{average(of(name, field)).mean:.2f}"
+            for field in ("yaw_deg", "speed_mps", "nees")
+        ]
         line.append(f"{average(of(name, 'arc_1s_m')):.2f}")
-        line.append("" if itself else f"{paired(of(name, 'arc_1s_m'), of(one.against, 'arc_1s_m')):+.2f}")
+        line.append(
+            ""
+            if itself
+            else f"{paired(of(name, 'arc_1s_m'), of(one.against, 'arc_1s_m')):+.2f}"
+        )
         if scene == "KITTI":
             line.append(f"{average(of(name, 'mota')).mean:.1f}")
         lines.append(line)
-    return f"{scene}\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+    return (
+        f"{scene}\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+    )
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder of the tables.")] = Path("out/rivals"),
-    scenes: Annotated[str, typer.Option(help="Simulated scenes, separated by semicolons.")] = ";".join(SCENES),
-    kitti: Annotated[Path | None, typer.Option(help="Folder of the KITTI tracking data set.")] = None,
-    sequences: Annotated[str, typer.Option(help="Sequences of KITTI.")] = ",".join(SEQUENCES),
+    out: Annotated[Path, typer.Option("-o", help="Folder of the tables.")] = Path(
+        "out/rivals"
+    ),
+    scenes: Annotated[
+        str, typer.Option(help="Simulated scenes, separated by semicolons.")
+    ] = ";".join(SCENES),
+    kitti: Annotated[
+        Path | None, typer.Option(help="Folder of the KITTI tracking data set.")
+    ] = None,
+    sequences: Annotated[str, typer.Option(help="Sequences of KITTI.")] = ",".join(
+        SEQUENCES
+    ),
     seeds: Annotated[int, typer.Option(help="Seeds 1 to this.")] = 10,
-    duration_s: Annotated[float | None, typer.Option(help="Length, in place of the scenario's.")] = None,
+    duration_s: Annotated[
+        float | None, typer.Option(help="Length, in place of the scenario's.")
+    ] = None,
     jobs: Annotated[int, typer.Option(help="Processes.")] = 1,
 ) -> None:
     """Write runs.csv and tables.md."""
@@ -248,7 +329,11 @@ def main(
         for seed in range(1, seeds + 1)
     ]
     if kitti is not None:
-        tasks += [joblib.delayed(recorded)(kitti, name, each) for name in KITTI for each in sequences.split(",")]
+        tasks += [
+            joblib.delayed(recorded)(kitti, name, each)
+            for name in KITTI
+            for each in sequences.split(",")
+        ]
         names.append("KITTI")
     results = joblib.Parallel(n_jobs=jobs)(tasks)
     with (out / "runs.csv").open("w", newline="") as file:

@@ -17,8 +17,8 @@ from matplotlib.axes import Axes
 
 from fgtrack.cli.sweep import swept
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.palette import PALETTE
-from fgtrack.plotting.style import log_axis
+from fgtrack.show.figures.style import log_axis
+from fgtrack.show.palette import PALETTE
 
 SWEEP = Path(__file__).parents[2] / "configs/sweeps/wrong_stamps.yaml"
 QUICK_SEEDS = 2
@@ -30,7 +30,12 @@ RIGHT, ARRIVAL = "right", "arrival"
 EFFECTS = ("jitter", "quantised", "drift", "offset, late", "offset, early")
 
 #: Root mean square of the stamps' error over the number in the label: steps and drifts are uniform from 0 to theirs.
-RMS = {"jitter": 1.0, "quantised": 1.0 / np.sqrt(3.0), "drift": 1.0 / np.sqrt(3.0), "offset": 1.0}
+RMS = {
+    "jitter": 1.0,
+    "quantised": 1.0 / np.sqrt(3.0),
+    "drift": 1.0 / np.sqrt(3.0),
+    "offset": 1.0,
+}
 
 #: By label of the clock and estimator: a value for each seed, in their order.
 Found = Mapping[tuple[str, str], FloatArray]
@@ -39,7 +44,9 @@ Found = Mapping[tuple[str, str], FloatArray]
 def values(rows: list[dict[str, str]], column: str) -> Found:
     found: dict[tuple[str, str], list[float]] = {}
     for row in rows:
-        found.setdefault((row["clock"], row["estimator"]), []).append(float(row[column]))
+        found.setdefault((row["clock"], row["estimator"]), []).append(
+            float(row[column])
+        )
     return {key: np.array(some) for key, some in found.items()}
 
 
@@ -49,21 +56,34 @@ def effects(labels: list[str]) -> dict[str, list[tuple[float, str]]]:
     for label in labels:
         kind, _, size = label.partition(" ")
         if kind in RMS:
-            name = kind if kind != "offset" else "offset, early" if size.startswith("-") else "offset, late"
+            name = (
+                kind
+                if kind != "offset"
+                else "offset, early"
+                if size.startswith("-")
+                else "offset, late"
+            )
             found[name].append((RMS[kind] * abs(float(size)), label))
     return {name: sorted(steps) for name, steps in found.items()}
 
 
 def break_even(steps: list[tuple[float, str]], rmse: Found, estimator: str) -> str:
     """Error of the stamps from which the estimator is worse than with receipts for stamps."""
-    excess = [float(np.mean(rmse[label, estimator] - rmse[ARRIVAL, estimator])) for _, label in steps]
-    for (before_ms, _), (after_ms, _), before, after in zip(steps, steps[1:], excess, excess[1:], strict=False):
+    excess = [
+        float(np.mean(rmse[label, estimator] - rmse[ARRIVAL, estimator]))
+        for _, label in steps
+    ]
+    for (before_ms, _), (after_ms, _), before, after in zip(
+        steps, steps[1:], excess, excess[1:], strict=False
+    ):
         if before <= 0.0 < after:
             return f"{np.interp(0.0, [before, after], [before_ms, after_ms]):.0f} ms"
     return f"not up to {steps[-1][0]:.0f} ms"
 
 
-def draw(axis: Axes, found: Found, estimator: str, shown: dict[str, list[tuple[float, str]]]) -> None:
+def draw(
+    axis: Axes, found: Found, estimator: str, shown: dict[str, list[tuple[float, str]]]
+) -> None:
     for index, (name, steps) in enumerate(shown.items()):
         some = [found[label, estimator] for _, label in steps]
         axis.errorbar(
@@ -77,23 +97,46 @@ def draw(axis: Axes, found: Found, estimator: str, shown: dict[str, list[tuple[f
             elinewidth=0.8,
             label=name,
         )
-    axis.axhline(found[ARRIVAL, estimator].mean(), color="black", ls="--", lw=1.0, label="receipt as stamp")
-    axis.axhline(found[RIGHT, estimator].mean(), color="black", ls=":", lw=1.2, label="right clock")
+    axis.axhline(
+        found[ARRIVAL, estimator].mean(),
+        color="black",
+        ls="--",
+        lw=1.0,
+        label="receipt as stamp",
+    )
+    axis.axhline(
+        found[RIGHT, estimator].mean(),
+        color="black",
+        ls=":",
+        lw=1.2,
+        label="right clock",
+    )
     axis.set(xscale="log")
     log_axis(axis.xaxis)
     axis.grid(alpha=0.3)
 
 
 def main(
-    out: Annotated[Path, typer.Option("-o", help="Folder of the sweep and the figure.")] = Path("out/wrong_stamps"),
-    quick: Annotated[bool, typer.Option(help=f"Run {QUICK_SEEDS} seeds only, where there is no sweep yet.")] = False,
+    out: Annotated[
+        Path, typer.Option("-o", help="Folder of the sweep and the figure.")
+    ] = Path("out/wrong_stamps"),
+    quick: Annotated[
+        bool,
+        typer.Option(
+            help=f"Run {QUICK_SEEDS} seeds only, where there is no sweep yet."
+        ),
+    ] = False,
 ) -> None:
     """Write stamps.csv and stamps.png beside sweep.csv."""
     rows = swept(SWEEP, out, QUICK_SEEDS if quick else None)
     rmse, nis, nees = (values(rows, column) for column in (RMSE, NIS, NEES))
     labels = list(dict.fromkeys(label for label, _ in rmse))
     shown = effects(labels)
-    header = [f"{name}_{what}" for name in ESTIMATORS for what in ("m", "more_m", "error_m", "nis", "nees")]
+    header = [
+        f"{name}_{what}"
+        for name in ESTIMATORS
+        for what in ("m", "more_m", "error_m", "nis", "nees")
+    ]
     with (out / "stamps.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["clock", *header])
@@ -103,14 +146,24 @@ def main(
                 key = label, name
                 more_m = rmse[key] - rmse[RIGHT, name]
                 error_m = more_m.std(ddof=1) / np.sqrt(len(more_m))
-                line += [rmse[key].mean(), more_m.mean(), error_m, nis[key].mean(), nees[key].mean()]
+                line += [
+                    rmse[key].mean(),
+                    more_m.mean(),
+                    error_m,
+                    nis[key].mean(),
+                    nees[key].mean(),
+                ]
             writer.writerow([label, *(f"{value:.3f}" for value in line)])
-    figure, axes = plt.subplots(2, 3, figsize=(12.0, 6.4), sharex=True, sharey="row", layout="constrained")
+    figure, axes = plt.subplots(
+        2, 3, figsize=(12.0, 6.4), sharex=True, sharey="row", layout="constrained"
+    )
     for column, name in enumerate(ESTIMATORS):
         draw(axes[0, column], rmse, name, shown)
         draw(axes[1, column], nis, name, shown)
         axes[0, column].set(title=name)
-        axes[1, column].set(xlabel="root mean square error of the LiDAR's stamps [ms]", yscale="log")
+        axes[1, column].set(
+            xlabel="root mean square error of the LiDAR's stamps [ms]", yscale="log"
+        )
     axes[0, 0].set(ylabel="position RMSE [m]")
     axes[1, 0].set(ylabel="NIS of the LiDAR (2 if consistent)")
     log_axis(axes[1, 0].yaxis)
@@ -122,8 +175,13 @@ def main(
         if rmse[RIGHT, name].mean() >= rmse[ARRIVAL, name].mean():
             print(f"{name}: right clocks are worse than receipts for stamps")
             continue
-        limits = ", ".join(f"{effect} {break_even(steps, rmse, name)}" for effect, steps in shown.items())
-        print(f"{name} is worse than with receipts for stamps from (root mean square error): {limits}")
+        limits = ", ".join(
+            f"{effect} {break_even(steps, rmse, name)}"
+            for effect, steps in shown.items()
+        )
+        print(
+            f"{name} is worse than with receipts for stamps from (root mean square error): {limits}"
+        )
     print(f"figure: {out / 'stamps.png'}")
 
 

@@ -5,19 +5,54 @@ from typing import Annotated, Literal
 
 from typer import Argument, Option
 
-from fgtrack.io.recording import Storage
+from fgtrack.inputs.recording import Storage
 
-Input = Annotated[Path, Argument(metavar="INPUT", help="Recording: rosbag2, .mcap, .db3, .bag, stream, CSV, data set.")]
-ConfigFile = Annotated[str | None, Option("-c", "--config", help="Configuration: a file (YAML) or a shipped name.")]
-TrackMap = Annotated[str | None, Option("--map", help="Map of the track (CSV), or `oval` for the built-in one.")]
-PitMap = Annotated[str | None, Option("--pit-map", help="Map of the pit lane (CSV), or `oval`.")]
-Settings = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help="Override a key; repeatable.")]
-Overwrite = Annotated[bool, Option("--overwrite", help="Replace what such a command wrote there before.")]
+Input = Annotated[
+    Path,
+    Argument(
+        metavar="INPUT",
+        help="Recording: rosbag2, .mcap, .db3, .bag, stream, CSV, data set.",
+    ),
+]
+ConfigFile = Annotated[
+    str | None,
+    Option("-c", "--config", help="Configuration: a file (YAML) or a shipped name."),
+]
+TrackMap = Annotated[
+    str | None,
+    Option("--map", help="Map of the track (CSV), or `oval` for the built-in one."),
+]
+PitMap = Annotated[
+    str | None, Option("--pit-map", help="Map of the pit lane (CSV), or `oval`.")
+]
+Settings = Annotated[
+    list[str] | None,
+    Option("--set", metavar="KEY=VALUE", help="Override a key; repeatable."),
+]
+Overwrite = Annotated[
+    bool, Option("--overwrite", help="Replace what such a command wrote there before.")
+]
 Seed = Annotated[int, Option(min=0, help="Seed of the random generator.")]
-Reference = Annotated[str | None, Option("--reference", help="Sensor with the correct clock, where two do not agree.")]
-Runs = Annotated[list[Path], Argument(metavar="RUN...", help="Run folders, or folders of runs, as that of the demo.")]
+Reference = Annotated[
+    str | None,
+    Option(
+        "--reference", help="Sensor with the correct clock, where two do not agree."
+    ),
+]
+Runs = Annotated[
+    list[Path],
+    Argument(
+        metavar="RUN...", help="Run folders, or folders of runs, as that of the demo."
+    ),
+]
 Json = Annotated[bool, Option("--json", help="Print JSON instead of tables.")]
-StorageOption = Annotated[Storage, Option("--storage", help="Storage of a rosbag2 folder.")]
+StorageOption = Annotated[
+    Storage, Option("--storage", help="Storage of a rosbag2 folder.")
+]
 Form = Literal["md", "csv", "latex", "json"]
-FormOption = Annotated[Form | None, Option("--format", help="Print this instead of tables for a terminal.")]
-All = Annotated[bool, Option("--all", help="Show every table and column, not the main ones alone.")]
+FormOption = Annotated[
+    Form | None, Option("--format", help="Print this instead of tables for a terminal.")
+]
+All = Annotated[
+    bool, Option("--all", help="Show every table and column, not the main ones alone.")
+]

@@ -9,28 +9,37 @@ from typing import Annotated
 
 from typer import Option
 
-from fgtrack.calibration.advise import advise as advised
-from fgtrack.calibration.clock_offsets import OffsetReport, estimate_offsets
-from fgtrack.calibration.clocks import clock_text
-from fgtrack.calibration.page import rounded_ms
-from fgtrack.calibration.starting import starting_config
-from fgtrack.calibration.trial import TRIAL_S, beginning, passing, samples, suspicions
-from fgtrack.cli.arguments import ConfigFile, Input, Json, Overwrite, PitMap, Reference, Settings, TrackMap
+from fgtrack.advice.advise import advise as advised
+from fgtrack.advice.page import rounded_ms
+from fgtrack.advice.starting import starting_config
+from fgtrack.advice.trial import TRIAL_S, beginning, passing, samples, suspicions
+from fgtrack.cli.arguments import (
+    ConfigFile,
+    Input,
+    Json,
+    Overwrite,
+    PitMap,
+    Reference,
+    Settings,
+    TrackMap,
+)
 from fgtrack.cli.show import progress, say, sentences, show, warn
+from fgtrack.clocks.offsets import OffsetReport, estimate_offsets
+from fgtrack.clocks.stamps import clock_text
+from fgtrack.config.settings import Config
+from fgtrack.config.shipped import read_config, suited_reports
+from fgtrack.config.yaml_file import plain
 from fgtrack.core.errors import CallError, DataError, FgtrackError
+from fgtrack.core.output import check_apart, check_output, write_file
 from fgtrack.core.time import nanoseconds
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table
-from fgtrack.io.errors import UntilBreak
-from fgtrack.io.info import InputInfo, describe
-from fgtrack.io.output import check_apart, check_output, write_file
-from fgtrack.io.source import open_input
+from fgtrack.inputs.errors import UntilBreak
+from fgtrack.inputs.info import InputInfo, describe
+from fgtrack.inputs.source import open_input
 from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.pipeline.assumptions.assumption import Assumed
 from fgtrack.pipeline.build import build_road
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import plain
 from fgtrack.pipeline.replay import Feed, located
-from fgtrack.pipeline.shipped import read_config, suited_reports
 
 _DELAYS = ("mean_s", "p50_s", "p90_s", "max_s")
 
@@ -38,7 +47,10 @@ _DELAYS = ("mean_s", "p50_s", "p90_s", "max_s")
 def info(
     recording: Input,
     config_file: ConfigFile = None,
-    write: Annotated[Path | None, Option(metavar="MY.yaml", help="Write a configuration to start from.")] = None,
+    write: Annotated[
+        Path | None,
+        Option(metavar="MY.yaml", help="Write a configuration to start from."),
+    ] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
@@ -49,7 +61,9 @@ def info(
     """
     if write is not None:
         if config_file is not None:
-            raise CallError("--write, -c: a starting configuration is made from the recording alone, give one of them")
+            raise CallError(
+                "--write, -c: a starting configuration is made from the recording alone, give one of them"
+            )
         check_output(write, overwrite)
         check_apart(write, [recording])
         text = starting_config(recording)
@@ -62,16 +76,33 @@ def info(
     topics = _topics(result, NO_VALUE if config is None else "ignored")
     comes_to, problem = (config or Config()).effective, result.problem
     if as_json:
-        values = {name: getattr(result, name) for name in ("kind", "start_ns", "duration_s", "problem")}
+        values = {
+            name: getattr(result, name)
+            for name in ("kind", "start_ns", "duration_s", "problem")
+        }
         show(
-            topics, "json", {"path": str(result.path), **values, "topics": topics.plain(), "effective": plain(comes_to)}
+            topics,
+            "json",
+            {
+                "path": str(result.path),
+                **values,
+                "topics": topics.plain(),
+                "effective": plain(comes_to),
+            },
         )
     else:
         show(topics, None)
-        suited = suited_reports(topic.name for topic in result.topics) if config is None else None
+        suited = (
+            suited_reports(topic.name for topic in result.topics)
+            if config is None
+            else None
+        )
         sentences([suited or f"{config_file or 'without a configuration'}: {comes_to}"])
         if config is None and suited is None:
-            with suppress(FgtrackError), progress("detections"):  # whose topics and columns nothing names
+            with (
+                suppress(FgtrackError),
+                progress("detections"),
+            ):  # whose topics and columns nothing names
                 sentences(assumed(Config(), open_input(recording)).lines())
         elif config is not None and problem is None:
             problem = _try_out(recording, config)
@@ -102,8 +133,15 @@ def _try_out(recording: Path, config: Config) -> str | None:
 def _topics(found: InputInfo, unused: str) -> Table:
     records = []
     for item in found.topics:
-        record: dict[str, object] = {"topic": item.name, "messages": item.count, "rate_hz": item.rate_hz}
-        record |= {f"delay_{name}": None if item.delay is None else item.delay[name] for name in _DELAYS}
+        record: dict[str, object] = {
+            "topic": item.name,
+            "messages": item.count,
+            "rate_hz": item.rate_hz,
+        }
+        record |= {
+            f"delay_{name}": None if item.delay is None else item.delay[name]
+            for name in _DELAYS
+        }
         record |= {f"late_{name}": share for name, share in item.late.items()}
         records.append(record | {"taken_as": item.used_as or unused, "type": item.type})
     columns = [
@@ -117,24 +155,43 @@ def _topics(found: InputInfo, unused: str) -> Table:
             1e3,
             text=rounded_ms,
         ),
-        Column("late [%]\nstream/object", "late_stream_share late_object_share", "{}/{}", 1e2, text="{:.1f}".format),
+        Column(
+            "late [%]\nstream/object",
+            "late_stream_share late_object_share",
+            "{}/{}",
+            1e2,
+            text="{:.1f}".format,
+        ),
         Column("taken as", "taken_as", left=True),
         Column("type", left=True),
     ]
-    notes = [f"{topic.name}: {topic.note}" for topic in found.topics if topic.note is not None]
+    notes = [
+        f"{topic.name}: {topic.note}"
+        for topic in found.topics
+        if topic.note is not None
+    ]
     extent = "empty"
     if found.start_ns is not None:
         start = datetime.fromtimestamp(found.start_ns // 1_000_000_000, UTC)
         extent = f"{found.duration_s:.3f} s from {start:%Y-%m-%d %H:%M:%S} UTC ({found.start_ns} ns)"
-    return Table(f"{found.path}: {found.kind}, {extent}", records, columns, ("topic",), notes)
+    return Table(
+        f"{found.path}: {found.kind}, {extent}", records, columns, ("topic",), notes
+    )
 
 
 def advise(
     recording: Input,
     config_file: ConfigFile = None,
-    out: Annotated[Path | None, Option("-o", "--out", help="Configuration that follows the advice.")] = None,
-    tune: Annotated[bool, Option("--tune", help="Fit noise that does not fit, too.")] = False,
-    ledger: Annotated[bool, Option("--ledger", help="Compare policies for late lists, too.")] = False,
+    out: Annotated[
+        Path | None,
+        Option("-o", "--out", help="Configuration that follows the advice."),
+    ] = None,
+    tune: Annotated[
+        bool, Option("--tune", help="Fit noise that does not fit, too.")
+    ] = False,
+    ledger: Annotated[
+        bool, Option("--ledger", help="Compare policies for late lists, too.")
+    ] = False,
     reference: Reference = None,
     track_map: TrackMap = None,
     pit_map: PitMap = None,
@@ -151,9 +208,21 @@ def advise(
         check_output(out, overwrite)
         check_apart(out, [recording, config_file])
     with progress("advise") as tell:
-        advice = advised(recording, config, reference=reference, tune=tune, ledger=ledger, on_step=tell)
+        advice = advised(
+            recording,
+            config,
+            reference=reference,
+            tune=tune,
+            ledger=ledger,
+            on_step=tell,
+        )
     if out is not None:
-        head = [f"Settings for {recording} (fgtrack advise).", "", *advice.comments(), ""]
+        head = [
+            f"Settings for {recording} (fgtrack advise).",
+            "",
+            *advice.comments(),
+            "",
+        ]
         write_file(out, Assumed(advice.config, ()).to_yaml(head), overwrite)
     show(advice.tables, "json" if as_json else None, advice.as_dict())
     if out is not None and not as_json:
@@ -185,17 +254,34 @@ def offsets(
     for line in result.lines() if not as_json else ():
         say(line)
     verdicts = {item.sensor: clock_text(item, report) for item in report.others}
-    show(_offsets(report), "json" if as_json else None, asdict(report) | {"verdicts": verdicts})
+    show(
+        _offsets(report),
+        "json" if as_json else None,
+        asdict(report) | {"verdicts": verdicts},
+    )
     if not as_json:
         sentences(f"{name}: {text}" for name, text in verdicts.items())
     if readable.error is not None:
-        raise DataError(f"{located(str(readable.error), str(recording))}; used up to there")
+        raise DataError(
+            f"{located(str(readable.error), str(recording))}; used up to there"
+        )
 
 
 def _offsets(report: OffsetReport) -> Table:
     records = [
-        {"sensor": one.sensor, "offset_s": one.offset_s, "std_s": one.std_s, "num_detections": one.num_detections}
-        | {"known": "reference" if one.sensor == report.reference else "yes" if one.is_known else "no"}
+        {
+            "sensor": one.sensor,
+            "offset_s": one.offset_s,
+            "std_s": one.std_s,
+            "num_detections": one.num_detections,
+        }
+        | {
+            "known": "reference"
+            if one.sensor == report.reference
+            else "yes"
+            if one.is_known
+            else "no"
+        }
         for one in report.sensors
     ]
     columns = [
@@ -206,4 +292,10 @@ def _offsets(report: OffsetReport) -> Table:
         Column("known", left=True),
     ]
     notes = [f"{one.sensor}: {one.why}" for one in report.sensors]
-    return Table("Clock offsets (reported stamp - true time)", records, columns, ("sensor",), notes)
+    return Table(
+        "Clock offsets (reported stamp - true time)",
+        records,
+        columns,
+        ("sensor",),
+        notes,
+    )

@@ -5,12 +5,20 @@ from typing import Annotated
 
 from typer import Option
 
-from fgtrack.calibration.ledger import ledger as explained
-from fgtrack.cli.arguments import ConfigFile, Input, Json, Overwrite, PitMap, Settings, TrackMap
+from fgtrack.advice.ledger import ledger as explained
+from fgtrack.cli.arguments import (
+    ConfigFile,
+    Input,
+    Json,
+    Overwrite,
+    PitMap,
+    Settings,
+    TrackMap,
+)
 from fgtrack.cli.show import progress, say, show
-from fgtrack.io.output import check_output, new_file
-from fgtrack.plotting.ledger import waterfall
-from fgtrack.plotting.style import png
+from fgtrack.core.output import check_output, new_file
+from fgtrack.show.figures.ledger import waterfall
+from fgtrack.show.figures.style import png
 
 
 def ledger(
@@ -18,12 +26,17 @@ def ledger(
     config_file: ConfigFile = None,
     tuned: Annotated[
         str | None,
-        Option(metavar="TUNED.yaml", help="Fitted noise and clocks, as `fgtrack tune` and `advise --tune` write them."),
+        Option(
+            metavar="TUNED.yaml",
+            help="Fitted noise and clocks, as `fgtrack tune` and `advise --tune` write them.",
+        ),
     ] = None,
     track_map: TrackMap = None,
     pit_map: PitMap = None,
     settings: Settings = None,
-    figure: Annotated[Path | None, Option(metavar="FILE.png", help="Draw the waterfall there.")] = None,
+    figure: Annotated[
+        Path | None, Option(metavar="FILE.png", help="Draw the waterfall there.")
+    ] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
@@ -35,12 +48,16 @@ def ledger(
     if figure is not None:
         check_output(figure, overwrite)
     with progress("ledger"):
-        result = explained(recording, config_file, tuned, map=track_map, pit_map=pit_map, set=settings)
+        result = explained(
+            recording, config_file, tuned, map=track_map, pit_map=pit_map, set=settings
+        )
     if figure is not None:
         with new_file(figure, overwrite) as file:
             parts = [(item.cause, item.mean_square_m2) for item in result.waterfall]
             predicted = "" if result.with_truth else ", as it predicts it (no truth)"
-            title = f"Where the position error of {result.estimator} comes from{predicted}"
+            title = (
+                f"Where the position error of {result.estimator} comes from{predicted}"
+            )
             file.write(png(waterfall(parts, title)))
     show(result.tables, "json" if as_json else None)
     if not as_json:

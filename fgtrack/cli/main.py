@@ -20,7 +20,7 @@ from typer.core import TyperGroup
 import fgtrack
 from fgtrack.cli.entry import INTERRUPTED
 from fgtrack.core.errors import CallError, FgtrackError, one_line
-from fgtrack.io.output import FULL
+from fgtrack.core.output import FULL
 
 DONE, BAD_DATA, BAD_CALL = 0, 1, 2
 #: Commands in the order of the help, functions of that name, and the modules that hold them.
@@ -43,13 +43,19 @@ COMMANDS = {
     "offsets": "calibrate",
     "config": "recordings",
 }
-_STYLE: dict[str, Any] = {"add_completion": False, "rich_markup_mode": None, "pretty_exceptions_enable": False}
+_STYLE: dict[str, Any] = {
+    "add_completion": False,
+    "rich_markup_mode": None,
+    "pretty_exceptions_enable": False,
+}
 
 
 class _LazyCommands(TyperGroup):
     """Imports a command's module when the command is called; the help needs none of them."""
 
-    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+    def resolve_command(
+        self, ctx: Any, args: list[str]
+    ) -> tuple[str | None, Any, list[str]]:
         name, _, rest = super().resolve_command(ctx, args)
         return name, None if name is None else _command(name), rest
 
@@ -71,7 +77,9 @@ app = typer.Typer(
 
 def _help(name: str) -> str:
     """Docstring of a command, read from its source."""
-    source = Path(__file__).with_name(f"{COMMANDS[name]}.py").read_text(encoding="utf-8")
+    source = (
+        Path(__file__).with_name(f"{COMMANDS[name]}.py").read_text(encoding="utf-8")
+    )
     return cleandoc(source.partition(f"\ndef {name}(")[2].split('"""')[1])
 
 
@@ -87,15 +95,28 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
-    debug: Annotated[bool, Option("--debug", help="Show the traceback of an error.")] = False,
-    version: Annotated[bool, Option("--version", callback=_version, is_eager=True, help="Show the version.")] = False,
-    max_memory_gb: Annotated[float, Option("--max-memory", min=0.0, metavar="GIB", help="Most memory; 0: all.")] = 4.0,
+    debug: Annotated[
+        bool, Option("--debug", help="Show the traceback of an error.")
+    ] = False,
+    version: Annotated[
+        bool,
+        Option("--version", callback=_version, is_eager=True, help="Show the version."),
+    ] = False,
+    max_memory_gb: Annotated[
+        float,
+        Option("--max-memory", min=0.0, metavar="GIB", help="Most memory; 0: all."),
+    ] = 4.0,
 ) -> None:
     """Options before the command; `main` reads --debug itself."""
-    if max_memory_gb and sys.platform == "linux":  # elsewhere the system does not hold to it
+    if (
+        max_memory_gb and sys.platform == "linux"
+    ):  # elsewhere the system does not hold to it
         _, most = resource.getrlimit(resource.RLIMIT_AS)
         limit = int(max_memory_gb * 2**30)
-        resource.setrlimit(resource.RLIMIT_AS, (limit if most == resource.RLIM_INFINITY else min(limit, most), most))
+        resource.setrlimit(
+            resource.RLIMIT_AS,
+            (limit if most == resource.RLIM_INFINITY else min(limit, most), most),
+        )
 
 
 class _OneLine(logging.Formatter):
@@ -114,49 +135,87 @@ def run(arguments: Sequence[str]) -> int:
     logged = logging.StreamHandler()
     logged.setFormatter(_OneLine("fgtrack: %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[logged], force=True)
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # figures need nothing of what it looks for in the system
+    logging.getLogger("matplotlib").setLevel(
+        logging.ERROR
+    )  # figures need nothing of what it looks for in the system
     logging.captureWarnings(True)
     try:
         return _run(words, debug)
     finally:
         logging.captureWarnings(False)
-        resource.setrlimit(resource.RLIMIT_AS, memory)  # of whoever calls this from Python
+        resource.setrlimit(
+            resource.RLIMIT_AS, memory
+        )  # of whoever calls this from Python
 
 
 def _run(words: Sequence[str], debug: bool) -> int:
     try:
-        outcome = typer.main.get_command(app).main([*words] or ["--help"], prog_name="fgtrack", standalone_mode=False)
+        outcome = typer.main.get_command(app).main(
+            [*words] or ["--help"], prog_name="fgtrack", standalone_mode=False
+        )
         if outcome == INTERRUPTED:  # typer turns the exception into this code
-            return _failed("interrupted; what was computed so far is in the output folder", INTERRUPTED, debug)
+            return _failed(
+                "interrupted; what was computed so far is in the output folder",
+                INTERRUPTED,
+                debug,
+            )
         return BAD_CALL if not words else outcome if isinstance(outcome, int) else DONE
     except typer.TyperException as error:
         context = getattr(error, "ctx", None)
-        usage = "" if context is None else f" ({context.get_usage().replace('Usage:', 'usage:')})"
+        usage = (
+            ""
+            if context is None
+            else f" ({context.get_usage().replace('Usage:', 'usage:')})"
+        )
         return _failed(f"{error.format_message()}{usage}", BAD_CALL, debug)
     except FgtrackError as error:
-        return _failed(str(error), BAD_CALL if isinstance(error, CallError) else BAD_DATA, debug)
+        return _failed(
+            str(error), BAD_CALL if isinstance(error, CallError) else BAD_DATA, debug
+        )
     except MemoryError:
-        return _failed("more memory needed than --max-memory allows: raise it, or split the input", BAD_DATA, debug)
-    except OSError as error:  # of a path that was given, there or in a file, else of stdout
+        return _failed(
+            "more memory needed than --max-memory allows: raise it, or split the input",
+            BAD_DATA,
+            debug,
+        )
+    except (
+        OSError
+    ) as error:  # of a path that was given, there or in a file, else of stdout
         code = BAD_DATA if error.errno in FULL else BAD_CALL
         if error.filename is None:
             sys.stdout = None  # so that the end of the process does not fail on it, too
-        return _failed(f"{error.filename or 'standard output'}: cannot be used ({error.strerror})", code, debug)
-    except Exception as error:  # the last line of defence: a bug must not look like bad data
-        return _failed(f"internal error: {type(error).__name__}: {error} (run with --debug)", BAD_DATA, debug)
+        return _failed(
+            f"{error.filename or 'standard output'}: cannot be used ({error.strerror})",
+            code,
+            debug,
+        )
+    except (
+        Exception
+    ) as error:  # the last line of defence: a bug must not look like bad data
+        return _failed(
+            f"internal error: {type(error).__name__}: {error} (run with --debug)",
+            BAD_DATA,
+            debug,
+        )
 
 
 def _failed(message: str, code: int, debug: bool) -> int:
     if debug:
         traceback.print_exc()
-    with suppress(OSError):  # where that cannot be written either, the exit code is all that remains
+    with suppress(
+        OSError
+    ):  # where that cannot be written either, the exit code is all that remains
         print(f"fgtrack: error: {one_line(message)}", file=sys.stderr, flush=True)
     return code
 
 
 def main() -> int:
     """Run the command line of this process; gives the exit code."""
-    os.environ["MPLBACKEND"] = "agg"  # nothing is shown in a window, so none of the system's is needed
+    os.environ["MPLBACKEND"] = (
+        "agg"  # nothing is shown in a window, so none of the system's is needed
+    )
     if isinstance(sys.stdout, TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # for a letter that the terminal does not have
+        sys.stdout.reconfigure(
+            errors="backslashreplace"
+        )  # for a letter that the terminal does not have
     return run(sys.argv[1:])

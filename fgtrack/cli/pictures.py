@@ -8,31 +8,52 @@ from typing import Annotated, Literal, cast
 from matplotlib.figure import Figure
 from typer import Argument, Option
 
-from fgtrack.calibration.study import head_at
 from fgtrack.cli.arguments import Overwrite, Runs
 from fgtrack.cli.show import progress, say
 from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.output import check_apart, check_output, new_file, new_files
 from fgtrack.core.time import nanoseconds
 from fgtrack.evaluation.runs import evaluated, start_ns
 from fgtrack.evaluation.tables.compare import compare
 from fgtrack.evaluation.tables.seeds import SWEEP_FILE, read_sweep
-from fgtrack.io.output import check_apart, check_output, new_file, new_files
-from fgtrack.plotting.late_detection import drawn_close_up
-from fgtrack.plotting.paper import Paper, settings
-from fgtrack.plotting.plot import Planned, drawn, planned, planned_sweep, save_named
-from fgtrack.plotting.style import png, save_pages
-from fgtrack.viewers.report import write_report
+from fgtrack.recording_study import head_at
+from fgtrack.show.figures.late_detection import drawn_close_up
+from fgtrack.show.figures.paper import Paper, settings
+from fgtrack.show.figures.plot import Planned, drawn, planned, planned_sweep, save_named
+from fgtrack.show.figures.style import png, save_pages
+from fgtrack.show.report import write_report
 
 
 def figure(
-    runs: Annotated[list[Path], Argument(metavar="RUN...", help="Run folders, folders of runs, or one sweep folder.")],
-    out: Annotated[Path, Option("-o", "--out", help="Folder for the pictures, or one .pdf.")],
-    form: Annotated[Literal["png", "svg", "pdf"], Option("--format", help="Format of the pictures.")] = "png",
-    stamp: Annotated[float | None, Option(min=0.0, max=1e9, help="Close-up so many s after the first tick.")] = None,
-    width: Annotated[str | None, Option(metavar="3.4in", help="Width on paper (in, cm, mm), without title.")] = None,
-    font: Annotated[str | None, Option(metavar="NAME", help='Font, as "Times New Roman".')] = None,
-    style: Annotated[str | None, Option(metavar="FILE", help="Style of matplotlib (.mplstyle).")] = None,
-    every: Annotated[bool, Option("--all", help="Draw every object, run and metric, not the few.")] = False,
+    runs: Annotated[
+        list[Path],
+        Argument(
+            metavar="RUN...", help="Run folders, folders of runs, or one sweep folder."
+        ),
+    ],
+    out: Annotated[
+        Path, Option("-o", "--out", help="Folder for the pictures, or one .pdf.")
+    ],
+    form: Annotated[
+        Literal["png", "svg", "pdf"], Option("--format", help="Format of the pictures.")
+    ] = "png",
+    stamp: Annotated[
+        float | None,
+        Option(min=0.0, max=1e9, help="Close-up so many s after the first tick."),
+    ] = None,
+    width: Annotated[
+        str | None,
+        Option(metavar="3.4in", help="Width on paper (in, cm, mm), without title."),
+    ] = None,
+    font: Annotated[
+        str | None, Option(metavar="NAME", help='Font, as "Times New Roman".')
+    ] = None,
+    style: Annotated[
+        str | None, Option(metavar="FILE", help="Style of matplotlib (.mplstyle).")
+    ] = None,
+    every: Annotated[
+        bool, Option("--all", help="Draw every object, run and metric, not the few.")
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Draw runs or a sweep: late detections, map, errors.
@@ -46,11 +67,17 @@ def figure(
     """
     one_file = out.suffix.lower() == ".pdf" and not out.is_dir()
     if out.suffix.lower() in (".png", ".svg") and not out.is_dir():
-        raise CallError(f"{out}: one picture cannot hold all figures, name a folder or a .pdf")
+        raise CallError(
+            f"{out}: one picture cannot hold all figures, name a folder or a .pdf"
+        )
     given = {"width": width, "font": font, "style": style}
-    paper = cast(Paper, {name: value for name, value in given.items() if value is not None})
+    paper = cast(
+        Paper, {name: value for name, value in given.items() if value is not None}
+    )
     settings(paper)  # raises where one is not usable
-    picture = out if one_file else out / f"figure.{form}"  # what else is in the folder stays
+    picture = (
+        out if one_file else out / f"figure.{form}"
+    )  # what else is in the folder stays
     with progress("draw"):
         sweeps = [folder for folder in runs if (folder / SWEEP_FILE).is_file()]
         if not sweeps:
@@ -58,7 +85,9 @@ def figure(
         elif len(runs) == 1 and stamp is None:
             first, plans, missing = [], planned_sweep(read_sweep(sweeps[0])), None
         else:
-            raise CallError(f"{sweeps[0]}: is a sweep, name it alone and without --stamp")
+            raise CallError(
+                f"{sweeps[0]}: is a sweep, name it alone and without --stamp"
+            )
         named = chain(first, drawn(plans, every, **paper))
         if one_file:
             with new_file(out, overwrite) as file:
@@ -90,7 +119,9 @@ def _of_runs(
 
 
 def report(
-    runs: Runs, out: Annotated[Path, Option("-o", "--out", help="HTML file.")], overwrite: Overwrite = False
+    runs: Runs,
+    out: Annotated[Path, Option("-o", "--out", help="HTML file.")],
+    overwrite: Overwrite = False,
 ) -> None:
     """Write one HTML file: verdict, viewer, figures, tables.
 
@@ -103,6 +134,11 @@ def report(
     check_apart(out, [item.run.path for item in every])
     with progress("report"):
         close_up, late = drawn_close_up(every)
-        pictures = ((name, png(figure)) for name, figure in chain(close_up, drawn(planned(every))))
-        size = write_report(every, compare(*every), pictures, out, head_at(late), overwrite)
+        pictures = (
+            (name, png(figure))
+            for name, figure in chain(close_up, drawn(planned(every)))
+        )
+        size = write_report(
+            every, compare(*every), pictures, out, head_at(late), overwrite
+        )
     say(f"{out}: {size / 1e6:.1f} MB, open it in a browser")

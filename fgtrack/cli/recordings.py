@@ -10,25 +10,43 @@ from rich.table import Table as Grid
 from rich.text import Text
 from typer import Argument, Option
 
-from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, Seed, Settings, StorageOption
+from fgtrack.cli.arguments import (
+    ConfigFile,
+    Input,
+    Overwrite,
+    Seed,
+    Settings,
+    StorageOption,
+)
 from fgtrack.cli.show import console, progress, say
+from fgtrack.config.recorded import recorded_of
+from fgtrack.config.shipped import Kind, read_config, read_scenario, shipped, summary
+from fgtrack.config.yaml_file import dump, load
+from fgtrack.core.output import check_apart
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.diagnostics import excluded_lines
-from fgtrack.io.output import check_apart
-from fgtrack.io.recording import check_recording, write_recording
-from fgtrack.io.source import open_input
-from fgtrack.pipeline.load import dump, load
-from fgtrack.pipeline.recorded import recorded_of
-from fgtrack.pipeline.shipped import Kind, read_config, read_scenario, shipped, summary
+from fgtrack.inputs.recording import check_recording, write_recording
+from fgtrack.inputs.source import open_input
 from fgtrack.sim.redelay import SensorDelays, redelay
 from fgtrack.sim.simulate import simulate as simulated
 
 
 def simulate(
-    scenario_file: Annotated[str, Argument(metavar="SCENARIO", help="Scenario: a file (YAML) or a shipped name.")],
-    out: Annotated[Path, Option("-o", "--out", help="Stream (.jsonl, .jsonl.gz), else a rosbag2 folder.")],
+    scenario_file: Annotated[
+        str,
+        Argument(metavar="SCENARIO", help="Scenario: a file (YAML) or a shipped name."),
+    ],
+    out: Annotated[
+        Path,
+        Option(
+            "-o", "--out", help="Stream (.jsonl, .jsonl.gz), else a rosbag2 folder."
+        ),
+    ],
     seed: Seed = 0,
-    duration_s: Annotated[float | None, Option("--duration", help="Length [s], instead of the scenario's.")] = None,
+    duration_s: Annotated[
+        float | None,
+        Option("--duration", help="Length [s], instead of the scenario's."),
+    ] = None,
     storage: StorageOption = "mcap",
     overwrite: Overwrite = False,
 ) -> None:
@@ -38,15 +56,24 @@ def simulate(
     check_recording(out, overwrite)
     with progress("simulate"):
         messages = simulated(scenario, np.random.default_rng(seed))
-        count = write_recording(out, messages, storage, settings=recorded_of(scenario), overwrite=overwrite)
+        count = write_recording(
+            out, messages, storage, settings=recorded_of(scenario), overwrite=overwrite
+        )
     say(f"{out}: {count} messages")
 
 
 def convert(
     recording: Input,
-    out: Annotated[Path, Argument(metavar="OUT", help="Stream (.jsonl, .jsonl.gz), else a rosbag2 folder.")],
+    out: Annotated[
+        Path,
+        Argument(
+            metavar="OUT", help="Stream (.jsonl, .jsonl.gz), else a rosbag2 folder."
+        ),
+    ],
     config_file: ConfigFile = None,
-    delays_file: Annotated[Path | None, Option("--delays", help="Other delays, losses, clocks by sensor.")] = None,
+    delays_file: Annotated[
+        Path | None, Option("--delays", help="Other delays, losses, clocks by sensor.")
+    ] = None,
     seed: Seed = 0,
     storage: StorageOption = "mcap",
     overwrite: Overwrite = False,
@@ -63,14 +90,20 @@ def convert(
             delays = load(dict[str, SensorDelays], delays_file)
             messages, lost = redelay(messages, delays, np.random.default_rng(seed))
         kept = _with_unread(messages, unread)
-        count = write_recording(out, kept, storage, settings=source.settings(), overwrite=overwrite)
-    losses = ", ".join(f"{number} of {sensor}" for sensor, number in lost.items() if number)
+        count = write_recording(
+            out, kept, storage, settings=source.settings(), overwrite=overwrite
+        )
+    losses = ", ".join(
+        f"{number} of {sensor}" for sensor, number in lost.items() if number
+    )
     say(f"{out}: {count} messages{losses and f', lost {losses}'}")
     for line in excluded_lines({"left_out": unread}):
         say(line)
 
 
-def _with_unread(messages: Iterable[Message], unread: dict[str, Counter[str]]) -> Iterator[Message]:
+def _with_unread(
+    messages: Iterable[Message], unread: dict[str, Counter[str]]
+) -> Iterator[Message]:
     """Yield `messages`; counts of excluded detections are added to `unread`, by sensor and setting."""
     for message in messages:
         if isinstance(message, DetectionList) and message.left_out:
@@ -81,7 +114,10 @@ def _with_unread(messages: Iterable[Message], unread: dict[str, Counter[str]]) -
 def config(
     config_file: ConfigFile = None,
     settings: Settings = None,
-    listed: Annotated[bool, Option("--list", help="List the shipped configurations, scenarios and sweeps.")] = False,
+    listed: Annotated[
+        bool,
+        Option("--list", help="List the shipped configurations, scenarios and sweeps."),
+    ] = False,
 ) -> None:
     """Print the resolved configuration, or list the shipped ones."""
     if not listed:

@@ -6,24 +6,43 @@ from typing import Annotated
 
 from typer import Option
 
-from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, PitMap, Settings, TrackMap
+from fgtrack.cli.arguments import (
+    ConfigFile,
+    Input,
+    Overwrite,
+    PitMap,
+    Settings,
+    TrackMap,
+)
 from fgtrack.cli.show import progress, say, warn
+from fgtrack.config.shipped import read_config, suited_reports
 from fgtrack.core.errors import DataError
+from fgtrack.core.output import check_apart
 from fgtrack.estimation.registry import ESTIMATORS
-from fgtrack.evaluation.diagnostics import diagnostics, excluded_lines, noise_diagnostics, unused
-from fgtrack.io.output import check_apart
-from fgtrack.io.run import load_run
-from fgtrack.io.source import open_input
+from fgtrack.evaluation.diagnostics import (
+    diagnostics,
+    excluded_lines,
+    noise_diagnostics,
+    unused,
+)
+from fgtrack.inputs.source import open_input
 from fgtrack.pipeline import replay as pipeline
 from fgtrack.pipeline.assumptions.assumed import assumed
-from fgtrack.pipeline.shipped import read_config, suited_reports
+from fgtrack.runs import load_run
 
 
 def replay(
     recording: Input,
-    out: Annotated[Path, Option("-o", "--out", help="Run folder; for several estimators one below it each.")],
+    out: Annotated[
+        Path,
+        Option(
+            "-o", "--out", help="Run folder; for several estimators one below it each."
+        ),
+    ],
     config_file: ConfigFile = None,
-    estimators: Annotated[str | None, Option("-e", "--estimator", help="Names, with commas between them.")] = None,
+    estimators: Annotated[
+        str | None, Option("-e", "--estimator", help="Names, with commas between them.")
+    ] = None,
     track_map: TrackMap = None,
     pit_map: PitMap = None,
     settings: Settings = None,
@@ -33,7 +52,9 @@ def replay(
     config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
     given = (config.estimator if estimators is None else estimators).split(",")
     names = tuple(dict.fromkeys(ESTIMATORS.resolve(name.strip()) for name in given))
-    folders = {name: out / name for name in names} if len(names) > 1 else {names[0]: out}
+    folders = (
+        {name: out / name for name in names} if len(names) > 1 else {names[0]: out}
+    )
     for folder in folders.values():
         check_apart(folder, [recording, config_file])
     source = open_input(recording, config.input)
@@ -45,12 +66,19 @@ def replay(
             folders,
             origin=str(recording),
             kind=source.kind,
-            on_tick=lambda report: tell(f"tick {report.tick}, {len(report.tracks)} tracks"),
+            on_tick=lambda report: tell(
+                f"tick {report.tick}, {len(report.tracks)} tracks"
+            ),
             overwrite=overwrite,
         )
-    for line in dict.fromkeys(str(replace(result.config, estimator=name).effective) for name in names):
+    for line in dict.fromkeys(
+        str(replace(result.config, estimator=name).effective) for name in names
+    ):
         say(line)
-    if config_file is None and (suited := suited_reports(result.config.sensors)) is not None:
+    if (
+        config_file is None
+        and (suited := suited_reports(result.config.sensors)) is not None
+    ):
         warn(suited)
     runs = [load_run(folder) for folder in folders.values()]
     for line in result.lines():
@@ -61,10 +89,20 @@ def replay(
     for line in excluded_lines(runs[0].meta):  # the same of all
         say(line)
     for line in dict.fromkeys(
-        map(str, [*(item for run in runs for item in diagnostics(run)), *noise_diagnostics(runs[0])])
+        map(
+            str,
+            [
+                *(item for run in runs for item in diagnostics(run)),
+                *noise_diagnostics(runs[0]),
+            ],
+        )
     ):
         warn(line)
-    if (broken := runs[0].meta["broken_off"]) is not None:  # the others break off at the same message
-        raise DataError(f"{pipeline.located(broken, str(recording))}; replayed up to there")
+    if (
+        broken := runs[0].meta["broken_off"]
+    ) is not None:  # the others break off at the same message
+        raise DataError(
+            f"{pipeline.located(broken, str(recording))}; replayed up to there"
+        )
     if (reason := unused(runs[0])) is not None:
         raise DataError(f"{recording}: {reason}")

@@ -7,15 +7,15 @@ from typer import Option
 
 from fgtrack.cli.arguments import All, FormOption, Json, Overwrite, Runs
 from fgtrack.cli.show import progress, say, show, warn
+from fgtrack.config.shipped import shipped_folder
 from fgtrack.core.errors import CallError, FgtrackError
 from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.evaluation.kitti_result import write_kitti_result
 from fgtrack.evaluation.runs import evaluated, recordings_warning
 from fgtrack.evaluation.tables.compare import compare as tables_of
-from fgtrack.io.run import load_run, write_metrics
-from fgtrack.pipeline.shipped import shipped_folder
-from fgtrack.viewers.export import export as written
-from fgtrack.viewers.geojson import write_geojson
+from fgtrack.runs import load_run, write_metrics
+from fgtrack.show.export import export as written
+from fgtrack.show.geojson import write_geojson
 
 
 def compare(
@@ -23,12 +23,17 @@ def compare(
     as_json: Json = False,
     form: FormOption = None,
     everything: All = False,
-    streaming: Annotated[bool, Option("--streaming", help="Judge what was published when it was ready, too.")] = False,
+    streaming: Annotated[
+        bool,
+        Option("--streaming", help="Judge what was published when it was ready, too."),
+    ] = False,
 ) -> None:
     """Compare runs in tables, and write metrics.json into each."""
     form = "json" if as_json else form
     every = evaluated(runs)
-    of_each = dict.fromkeys(f"{one.label}: {line}" for one in every for line in diagnostics(one.run))
+    of_each = dict.fromkeys(
+        f"{one.label}: {line}" for one in every for line in diagnostics(one.run)
+    )
     for line in (*recordings_warning(every), *of_each):
         warn(line)
     tables = tables_of(*every, streaming=streaming)
@@ -45,22 +50,48 @@ def compare(
 
 def export(
     runs: Runs,
-    out: Annotated[Path, Option("-o", "--out", help="MCAP file; --ros2: or a rosbag2 folder; --kitti: a text file.")],
-    ros2: Annotated[bool, Option("--ros2", help="Write standard ROS 2 messages instead of Foxglove's own.")] = False,
-    geojson: Annotated[bool, Option("--geojson", help="Tracks in latitude and longitude: .geojson, .csv.")] = False,
-    kitti: Annotated[Path | None, Option(metavar="OXTS", help="Write a KITTI result of this oxts/NNNN.txt.")] = None,
+    out: Annotated[
+        Path,
+        Option(
+            "-o",
+            "--out",
+            help="MCAP file; --ros2: or a rosbag2 folder; --kitti: a text file.",
+        ),
+    ],
+    ros2: Annotated[
+        bool,
+        Option(
+            "--ros2", help="Write standard ROS 2 messages instead of Foxglove's own."
+        ),
+    ] = False,
+    geojson: Annotated[
+        bool,
+        Option("--geojson", help="Tracks in latitude and longitude: .geojson, .csv."),
+    ] = False,
+    kitti: Annotated[
+        Path | None,
+        Option(metavar="OXTS", help="Write a KITTI result of this oxts/NNNN.txt."),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Export runs for Foxglove, Lichtblick, RViz, maps, KITTI."""
     if (kitti is not None or geojson) and len(runs) != 1:
-        raise CallError(f"--{'geojson' if geojson else 'kitti'}: writes one run, these are {len(runs)}")
+        raise CallError(
+            f"--{'geojson' if geojson else 'kitti'}: writes one run, these are {len(runs)}"
+        )
     if geojson:
-        say(f"{out}: {write_geojson(load_run(runs[0]), out, overwrite=overwrite)} tracks")
+        say(
+            f"{out}: {write_geojson(load_run(runs[0]), out, overwrite=overwrite)} tracks"
+        )
         return
     if kitti is not None:
-        boxes, tracks, without_size = write_kitti_result(load_run(runs[0]), kitti, out, overwrite=overwrite)
+        boxes, tracks, without_size = write_kitti_result(
+            load_run(runs[0]), kitti, out, overwrite=overwrite
+        )
         if without_size:
-            warn(f"{without_size} tracks are left out: none of their detections has a size")
+            warn(
+                f"{without_size} tracks are left out: none of their detections has a size"
+            )
         say(f"{out}: {boxes} boxes of {tracks} tracks")
         return
     with progress("export"):

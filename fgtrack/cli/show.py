@@ -26,7 +26,11 @@ class _Output(Console):
 def console() -> Console:
     """Stdout; a file or a pipe is as wide as COLUMNS specifies, by default wide enough for nearly every table."""
     probe = _Output()
-    return probe if probe.is_terminal or os.environ.get("COLUMNS") else _Output(width=_WIDTH_WITHOUT_TERMINAL)
+    return (
+        probe
+        if probe.is_terminal or os.environ.get("COLUMNS")
+        else _Output(width=_WIDTH_WITHOUT_TERMINAL)
+    )
 
 
 def say(line: object) -> None:
@@ -45,15 +49,27 @@ def sentences(lines: Iterable[str]) -> None:
         console().print(line)
 
 
-def show(tables: Tables | Table, form: Form | None, values: Mapping[str, Any] | None = None) -> None:
+def show(
+    tables: Tables | Table, form: Form | None, values: Mapping[str, Any] | None = None
+) -> None:
     """Print tables in a form; as JSON the `values`, which are those of the tables where none are given."""
     if form is None:
         console().print(tables)
     elif form == "json":
-        result = values if values is not None else tables.to_dict() if isinstance(tables, Tables) else tables.plain()
+        result = (
+            values
+            if values is not None
+            else tables.to_dict()
+            if isinstance(tables, Tables)
+            else tables.plain()
+        )
         say(json.dumps(result, indent=2, allow_nan=False))
     else:
-        text = {"md": tables.to_markdown, "csv": tables.to_csv, "latex": tables.to_latex}[form]()
+        text = {
+            "md": tables.to_markdown,
+            "csv": tables.to_csv,
+            "latex": tables.to_latex,
+        }[form]()
         say(text.removesuffix("\n"))
 
 
@@ -66,11 +82,15 @@ def progress(what: str, total: int | None = None) -> Iterator[Callable[..., None
         return
     from rich.progress import Progress
 
-    with Progress(console=stderr, transient=True, speed_estimate_period=_SPEED_PERIOD_S) as bar:
+    with Progress(
+        console=stderr, transient=True, speed_estimate_period=_SPEED_PERIOD_S
+    ) as bar:
         task = bar.add_task(what, total=total)
 
         def moved(text: str = "", share: float | None = None) -> None:
-            at: dict[str, Any] = {"advance": 1} if share is None else {"completed": share, "total": 1.0}
+            at: dict[str, Any] = (
+                {"advance": 1} if share is None else {"completed": share, "total": 1.0}
+            )
             bar.update(task, description=f"{what} {text}".rstrip(), **at)
 
         yield moved

@@ -8,25 +8,36 @@ from typing import Annotated
 import numpy as np
 from typer import Option
 
-from fgtrack.calibration.study import Study, outputs
-from fgtrack.calibration.study import study as studied
-from fgtrack.cli.arguments import ConfigFile, Input, Overwrite, PitMap, Seed, Settings, TrackMap
+from fgtrack.cli.arguments import (
+    ConfigFile,
+    Input,
+    Overwrite,
+    PitMap,
+    Seed,
+    Settings,
+    TrackMap,
+)
 from fgtrack.cli.show import progress, say, sentences, show, warn
+from fgtrack.config.recorded import recorded_of
+from fgtrack.config.shipped import read_config, read_scenario
 from fgtrack.core.errors import DataError
+from fgtrack.core.output import check_apart, claimed
 from fgtrack.evaluation.diagnostics import diagnostics
-from fgtrack.io.output import check_apart, claimed
-from fgtrack.io.recording import check_recording, write_recording
+from fgtrack.inputs.recording import check_recording, write_recording
 from fgtrack.models.oval import OVAL
-from fgtrack.pipeline.recorded import recorded_of
 from fgtrack.pipeline.replay import located
-from fgtrack.pipeline.shipped import read_config, read_scenario
-from fgtrack.plotting.plot import error_against_delay
+from fgtrack.recording_study import Study, outputs
+from fgtrack.recording_study import study as studied
+from fgtrack.show.figures.plot import error_against_delay
 from fgtrack.sim.simulate import simulate
 
 
 def study(
     recording: Input,
-    out: Annotated[Path, Option("-o", "--out", help="Folder for report, settings, runs and figures.")],
+    out: Annotated[
+        Path,
+        Option("-o", "--out", help="Folder for report, settings, runs and figures."),
+    ],
     config_file: ConfigFile = None,
     track_map: TrackMap = None,
     pit_map: PitMap = None,
@@ -43,7 +54,9 @@ def study(
         check_apart(path, [recording, config_file])
     with progress("study") as tell:
         result = studied(recording, out, config, overwrite=overwrite, on_step=tell)
-    for line in dict.fromkeys(str(item) for run in result.runs for item in diagnostics(run)):
+    for line in dict.fromkeys(
+        str(item) for run in result.runs for item in diagnostics(run)
+    ):
         warn(line)
     show_study(result, recording)
 
@@ -55,7 +68,9 @@ def show_study(found: Study, recording: Path) -> None:
     say("")
     for assumption in found.assumptions:
         say(assumption)
-    again = shlex.join(["fgtrack", "study", str(recording), "-c", str(found.settings), "-o", "OTHER"])
+    again = shlex.join(
+        ["fgtrack", "study", str(recording), "-c", str(found.settings), "-o", "OTHER"]
+    )
     say(f"settings: {found.settings}; change them and run again by `{again}`")
     say(f"report: {found.report}, open it in a browser")
     if found.broken is not None:
@@ -63,9 +78,10 @@ def show_study(found: Study, recording: Path) -> None:
 
 
 def demo(
-    out: Annotated[Path, Option("-o", "--out", help="Folder for recording, runs, figures and report.")] = Path(
-        "fgtrack-demo"
-    ),
+    out: Annotated[
+        Path,
+        Option("-o", "--out", help="Folder for recording, runs, figures and report."),
+    ] = Path("fgtrack-demo"),
     seed: Seed = 1,
     overwrite: Overwrite = False,
 ) -> None:
@@ -76,11 +92,25 @@ def demo(
         check_recording(bag, overwrite)
         with progress("simulate"):
             messages = simulate(scenario, np.random.default_rng(seed))
-            write_recording(bag, messages, overwrite=overwrite, settings=recorded_of(scenario))
+            write_recording(
+                bag, messages, overwrite=overwrite, settings=recorded_of(scenario)
+            )
         config = read_config("tuned", track_map=OVAL, pit_map=OVAL)
     with progress("study") as tell:
         sweep = {"error_against_delay": error_against_delay()}
-        result = studied(bag, out, config, advice=False, figures=sweep, overwrite=overwrite, on_step=tell)
-    say(f"{scenario.duration_s:g} s of a simulated race ({bag}), noise fitted to other races (-c tuned):")
+        result = studied(
+            bag,
+            out,
+            config,
+            advice=False,
+            figures=sweep,
+            overwrite=overwrite,
+            on_step=tell,
+        )
+    say(
+        f"{scenario.duration_s:g} s of a simulated race ({bag}), noise fitted to other races (-c tuned):"
+    )
     show_study(result, bag)
-    say(f"error against delay, of a sweep over ten races: {out / 'figures/error_against_delay.png'}")
+    say(
+        f"error against delay, of a sweep over ten races: {out / 'figures/error_against_delay.png'}"
+    )

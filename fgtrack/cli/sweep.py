@@ -10,25 +10,51 @@ from typer import Argument, Option
 
 from fgtrack.cli.arguments import All, Form, FormOption, Overwrite, Settings
 from fgtrack.cli.show import progress, say, show
+from fgtrack.config.shipped import find_file
 from fgtrack.core.errors import DataError
+from fgtrack.core.output import check_apart, write_file
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.tables.seeds import SweepTable, difference_table, read_sweep, seed_comparisons, summary_table
-from fgtrack.io.output import check_apart, write_file
-from fgtrack.io.run import Run
-from fgtrack.pipeline.shipped import find_file
-from fgtrack.pipeline.sweep import ERROR_TABLE, PAIRED_TABLE, PRODUCTS, SUMMARY_TABLE, SWEEP_TABLE, Scalar, Sweep
+from fgtrack.evaluation.tables.seeds import (
+    SweepTable,
+    difference_table,
+    read_sweep,
+    seed_comparisons,
+    summary_table,
+)
+from fgtrack.pipeline.sweep import (
+    ERROR_TABLE,
+    PAIRED_TABLE,
+    PRODUCTS,
+    SUMMARY_TABLE,
+    SWEEP_TABLE,
+    Scalar,
+    Sweep,
+)
 from fgtrack.pipeline.sweep_plan import load_plan
+from fgtrack.runs import Run
 
 #: Wall times among the metrics, and what follows from them; they have a table of their own.
 _TIMES = "time_per_"
 
 
 def sweep(
-    sweep_name: Annotated[str, Argument(metavar="SWEEP", help="Sweep: a file (YAML) or a shipped name.")],
-    out: Annotated[Path, Option("-o", "--out", help="Folder of the tables; what is done there is kept.")],
-    jobs: Annotated[int | None, Option(min=1, help="Processes, by default one for each core.")] = None,
-    dask: Annotated[str | None, Option(metavar="ADDRESS", help="Cluster of dask to run on.")] = None,
-    recording: Annotated[Path | None, Option("--input", metavar="INPUT", help="Instead of the sweep's input.")] = None,
+    sweep_name: Annotated[
+        str, Argument(metavar="SWEEP", help="Sweep: a file (YAML) or a shipped name.")
+    ],
+    out: Annotated[
+        Path,
+        Option("-o", "--out", help="Folder of the tables; what is done there is kept."),
+    ],
+    jobs: Annotated[
+        int | None, Option(min=1, help="Processes, by default one for each core.")
+    ] = None,
+    dask: Annotated[
+        str | None, Option(metavar="ADDRESS", help="Cluster of dask to run on.")
+    ] = None,
+    recording: Annotated[
+        Path | None,
+        Option("--input", metavar="INPUT", help="Instead of the sweep's input."),
+    ] = None,
     settings: Settings = None,
     form: FormOption = None,
     everything: All = False,
@@ -44,29 +70,47 @@ def sweep(
     for name in PRODUCTS:  # what else is in the folder stays
         check_apart(out / name, plan.inputs)
     work = Sweep.open(plan, out, overwrite)
-    tell(f"jobs: {len(work.plan.jobs)}, each of {len(work.plan.estimators)} estimators; to do: {len(work.todo)}")
+    tell(
+        f"jobs: {len(work.plan.jobs)}, each of {len(work.plan.estimators)} estimators; to do: {len(work.todo)}"
+    )
     with progress("sweep", len(work.todo)) as moved:
         result = work.run(score, jobs=jobs or -1, dask=dask, on_job=moved)
-    tell(f"{out / SWEEP_TABLE}: {result.num_good} of {len(plan.jobs) * len(plan.estimators)} cells")
+    tell(
+        f"{out / SWEEP_TABLE}: {result.num_good} of {len(plan.jobs) * len(plan.estimators)} cells"
+    )
     if result.num_good:
         _summarise(read_sweep(out), out, form, everything)
     if result.errors:
-        raise DataError(f"{out / ERROR_TABLE}: {len(result.errors)} bad cells, the first: {result.errors[0]}")
-    if result.unknown_metrics and recording is None:  # the metrics were not chosen for another input
-        raise DataError(f"{sweep_file}: metrics: no column of {SWEEP_TABLE} fits {', '.join(result.unknown_metrics)}")
+        raise DataError(
+            f"{out / ERROR_TABLE}: {len(result.errors)} bad cells, the first: {result.errors[0]}"
+        )
+    if (
+        result.unknown_metrics and recording is None
+    ):  # the metrics were not chosen for another input
+        raise DataError(
+            f"{sweep_file}: metrics: no column of {SWEEP_TABLE} fits {', '.join(result.unknown_metrics)}"
+        )
 
 
-def swept(sweep_file: Path, out: Path, num_seeds: int | None = None) -> list[dict[str, str]]:
+def swept(
+    sweep_file: Path, out: Path, num_seeds: int | None = None
+) -> list[dict[str, str]]:
     """Rows of the table in `out`, for scripts; the sweep is run first (of `num_seeds` seeds) where there is none."""
     if not (out / SWEEP_TABLE).exists():
         plan = load_plan(sweep_file)
-        jobs = tuple(job for job in plan.jobs if num_seeds is None or job.seed < num_seeds)
+        jobs = tuple(
+            job for job in plan.jobs if num_seeds is None or job.seed < num_seeds
+        )
         Sweep.open(replace(plan, jobs=jobs), out).run(score)
-    rows: list[dict[str, str]] = pd.read_csv(out / SWEEP_TABLE, dtype=str, keep_default_na=False).to_dict("records")
+    rows: list[dict[str, str]] = pd.read_csv(
+        out / SWEEP_TABLE, dtype=str, keep_default_na=False
+    ).to_dict("records")
     return rows
 
 
-def _summarise(table: SweepTable, out: Path, form: Form | None, everything: bool) -> None:
+def _summarise(
+    table: SweepTable, out: Path, form: Form | None, everything: bool
+) -> None:
     """Write means and paired differences of the estimators; show the differences of one metric, and the means."""
     comparisons = seed_comparisons(table)
     differences = difference_table(comparisons, table.axes)
@@ -83,7 +127,9 @@ def _summarise(table: SweepTable, out: Path, form: Form | None, everything: bool
 def score(run: Run) -> tuple[dict[str, Scalar], dict[str, Scalar]]:
     """Return all scalars of the metrics of `run` by path, and its wall times."""
     scalars = {
-        name: value for name, value in _scalars(evaluate(run).as_dict(), "") if name not in ("name", "estimator")
+        name: value
+        for name, value in _scalars(evaluate(run).as_dict(), "")
+        if name not in ("name", "estimator")
     }
     times = {name: value for name, value in scalars.items() if name.startswith(_TIMES)}
     return {name: value for name, value in scalars.items() if name not in times}, times

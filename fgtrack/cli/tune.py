@@ -8,29 +8,48 @@ from typing import Annotated
 
 from typer import Argument, Option
 
-from fgtrack.calibration.outcome import noise_fits
-from fgtrack.calibration.tune import tuned
-from fgtrack.calibration.tune_space import HeldOut, TunedParameter, TuneReport, TuneRules
-from fgtrack.cli.arguments import ConfigFile, Json, Overwrite, PitMap, Settings, TrackMap
+from fgtrack.advice.outcome import noise_fits
+from fgtrack.cli.arguments import (
+    ConfigFile,
+    Json,
+    Overwrite,
+    PitMap,
+    Settings,
+    TrackMap,
+)
 from fgtrack.cli.show import progress, say, show
+from fgtrack.config.shipped import read_config
 from fgtrack.core.errors import DataError
+from fgtrack.core.output import check_apart, check_output, write_file
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
-from fgtrack.io.output import check_apart, check_output, write_file
-from fgtrack.io.source import open_input
+from fgtrack.inputs.source import open_input
+from fgtrack.noise.parameters import HeldOut, TunedParameter, TuneReport, TuneRules
+from fgtrack.noise.tune import tuned
 from fgtrack.pipeline.assumptions.assumption import Assumed
-from fgtrack.pipeline.shipped import read_config
 
-_KNOWN = {"yes": "yes", "roughly": "roughly", "limit": "a limit", "no": "not identifiable"}
+_KNOWN = {
+    "yes": "yes",
+    "roughly": "roughly",
+    "limit": "a limit",
+    "no": "not identifiable",
+}
 
 
 def tune(
-    recordings: Annotated[list[Path], Argument(metavar="INPUT...", help="Recordings with the same noise.")],
-    out: Annotated[Path, Option("-o", "--out", help="Tuned configuration to write (YAML).")],
+    recordings: Annotated[
+        list[Path], Argument(metavar="INPUT...", help="Recordings with the same noise.")
+    ],
+    out: Annotated[
+        Path, Option("-o", "--out", help="Tuned configuration to write (YAML).")
+    ],
     config_file: ConfigFile = None,
     track_map: TrackMap = None,
     pit_map: PitMap = None,
     settings: Settings = None,
-    keep: Annotated[list[str] | None, Option(metavar="KEY", help="Leave this key as configured; repeatable.")] = None,
+    keep: Annotated[
+        list[str] | None,
+        Option(metavar="KEY", help="Leave this key as configured; repeatable."),
+    ] = None,
     overwrite: Overwrite = False,
     as_json: Json = False,
 ) -> None:
@@ -48,7 +67,9 @@ def tune(
     if report.held_out is not None:
         shown["held_out"] = _validation(report.held_out)
     tables, result = Tables(shown), _sensors(report)
-    of_recordings = replace(report.config, map=read_config(config_file).map)  # the maps belong to these
+    of_recordings = replace(
+        report.config, map=read_config(config_file).map
+    )  # the maps belong to these
     title = f"The noise of {config_file or 'the defaults'}, fitted to {', '.join(sources)} (fgtrack tune)."
     head = [title, "", *str(tables).splitlines(), "", *result, ""]
     write_file(out, Assumed(of_recordings, ()).to_yaml(head), overwrite)
@@ -61,7 +82,12 @@ def tune(
 
 def _parameters(parameters: Sequence[TunedParameter]) -> Table:
     records = [
-        {"key": one.key, "configured": one.configured, "tuned": one.tuned, "known": _KNOWN[one.known]}
+        {
+            "key": one.key,
+            "configured": one.configured,
+            "tuned": one.tuned,
+            "known": _KNOWN[one.known],
+        }
         | {"std_error": None if one.known in ("no", "limit") else one.std_error}
         for one in parameters
     ]
@@ -82,16 +108,26 @@ def _four_digits(value: Value) -> str:
 
 def _short(key: Value) -> str:
     """A key of the configuration without what all have in common."""
-    return str(key).removeprefix("sensors.").replace(".std.", " ").replace("std_per_s.", "").replace("parameters.", "")
+    return (
+        str(key)
+        .removeprefix("sensors.")
+        .replace(".std.", " ")
+        .replace("std_per_s.", "")
+        .replace("parameters.", "")
+    )
 
 
 def _sensors(report: TuneReport) -> list[str]:
     lines = []
     for one in report.sensors:
         if one.outlier_share is not None:
-            lines.append(f"{one.sensor}: {one.count} measurements, {100.0 * one.outlier_share:.1f} % outliers")
+            lines.append(
+                f"{one.sensor}: {one.count} measurements, {100.0 * one.outlier_share:.1f} % outliers"
+            )
         if one.own_covariance:
-            lines.append(f"{one.sensor}: {one.own_covariance} measurements have a covariance of their own, which stays")
+            lines.append(
+                f"{one.sensor}: {one.own_covariance} measurements have a covariance of their own, which stays"
+            )
     lines += [
         f"{one.sensor}: innovations still correlated in time (autocorrelation {one.lag1:.2f}): so are errors, of it or "
         "of the sensor that is trusted more, and white noise is too small for them"
@@ -102,13 +138,20 @@ def _sensors(report: TuneReport) -> list[str]:
     settled = "" if report.settled else ", not settled"
     lines.append(f"{report.num_tracks} tracks, {report.rounds} associations{settled}")
     if report.num_mixed:
-        lines.append(f"{report.num_mixed} measurements left out: most around them are outliers (an exchanged object?)")
+        lines.append(
+            f"{report.num_mixed} measurements left out: most around them are outliers (an exchanged object?)"
+        )
     return lines
 
 
 def _validation(held_out: HeldOut) -> Table:
     records: list[dict[str, object]] = [
-        {"of": f"{one.sensor} {one.component}", "count": one.count, "before": one.before, "after": one.after}
+        {
+            "of": f"{one.sensor} {one.component}",
+            "count": one.count,
+            "before": one.before,
+            "after": one.after,
+        }
         | {"expected": 1.0, "band": one.band}
         for one in held_out.innovations
     ]
@@ -122,5 +165,7 @@ def _validation(held_out: HeldOut) -> Table:
     ]
     share = f"the last {100.0 * held_out.share:.0f} % of the time"
     title = f"Held out: {share}, {held_out.count} innovations, by the noise fitted to the rest"
-    notes = [f"log-likelihood per innovation: {held_out.before:.4g} before, {held_out.after:.4g} after"]
+    notes = [
+        f"log-likelihood per innovation: {held_out.before:.4g} before, {held_out.after:.4g} after"
+    ]
     return Table(title, records, columns, ("of",), notes)

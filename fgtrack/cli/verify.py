@@ -12,7 +12,12 @@ from fgtrack.evaluation.tables import Column, Table
 from fgtrack.models.correlated_errors import CorrelatedErrors
 from fgtrack.models.measurement import COMPONENTS
 from fgtrack.models.motion import CTRV
-from fgtrack.testing import BrokenPromiseError, estimator_checks, measurement_model_checks, motion_model_checks
+from fgtrack.testing import (
+    BrokenPromiseError,
+    estimator_checks,
+    measurement_model_checks,
+    motion_model_checks,
+)
 
 _COLUMNS = (
     Column("name", left=True),
@@ -23,7 +28,10 @@ _COLUMNS = (
 
 
 def verify(
-    as_json: Json = False, name: Annotated[str | None, Option("-e", "--estimator", help="This one alone.")] = None
+    as_json: Json = False,
+    name: Annotated[
+        str | None, Option("-e", "--estimator", help="This one alone.")
+    ] = None,
 ) -> None:
     """Check the contract of estimators, in any order of arrival.
 
@@ -35,14 +43,26 @@ def verify(
     broken: dict[str, dict[str, str]] = {}
     with progress("verify"):
         suites = {
-            each: (Claims.of(ESTIMATORS.load(each)).exact, estimator_checks(each, num_streams=2)) for each in names
+            each: (
+                Claims.of(ESTIMATORS.load(each)).exact,
+                estimator_checks(each, num_streams=2),
+            )
+            for each in names
         }
         if name is None:
             models = MOTION_MODELS.loaded().items()
-            suites |= {each: ("motion model", motion_model_checks(model())) for each, model in models}
-            errors = CorrelatedErrors(CTRV(), (("sensor.x_m", 1.0), ("sensor.y_m", 2.0)))
+            suites |= {
+                each: ("motion model", motion_model_checks(model()))
+                for each, model in models
+            }
+            errors = CorrelatedErrors(
+                CTRV(), (("sensor.x_m", 1.0), ("sensor.y_m", 2.0))
+            )
             suites["correlated errors"] = ("motion model", motion_model_checks(errors))
-            suites |= {each: ("measurement", measurement_model_checks(each)) for each in COMPONENTS}
+            suites |= {
+                each: ("measurement", measurement_model_checks(each))
+                for each in COMPONENTS
+            }
         for each, (_, checks) in suites.items():
             for check in checks.values():
                 try:
@@ -50,18 +70,30 @@ def verify(
                 except BrokenPromiseError as error:
                     broken.setdefault(each, {}).update(error.promises)
     records = [
-        {"name": each, "exact": claim or "-", "promises": len(checks), "broken": len(broken.get(each, ()))}
+        {
+            "name": each,
+            "exact": claim or "-",
+            "promises": len(checks),
+            "broken": len(broken.get(each, ())),
+        }
         for each, (claim, checks) in suites.items()
     ]
     table = Table("Contract of estimators and models", records, _COLUMNS, ("name",))
     promises = sum(len(checks) for _, checks in suites.values())
-    values = {"met": not broken, "promises": promises, "checked": list(suites), "broken": broken}
+    values = {
+        "met": not broken,
+        "promises": promises,
+        "checked": list(suites),
+        "broken": broken,
+    }
     show(table, "json" if as_json else None, values)
     if not as_json:
         for each, result in broken.items():
             for promise, what in result.items():
                 say(f"{each}: broken promise: it {promise}\n{what}\n")
     if broken:
-        raise DataError(f"{sum(map(len, broken.values()))} of {promises} promises broken")
+        raise DataError(
+            f"{sum(map(len, broken.values()))} of {promises} promises broken"
+        )
     if not as_json:
         say(f"all {promises} promises kept")

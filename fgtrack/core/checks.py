@@ -19,7 +19,9 @@ STAMP = f"an integer of at most {LARGEST_NS:.0g}"
 
 def is_number(value: object, least: float = -LARGEST, most: float = LARGEST) -> bool:
     """True if it is a real number between `least` and `most`; a truth value is not a number."""
-    is_real = isinstance(value, (float, int, np.floating, np.integer)) and not isinstance(value, bool)
+    is_real = isinstance(
+        value, (float, int, np.floating, np.integer)
+    ) and not isinstance(value, bool)
     return is_real and bool(least <= value <= most)  # type: ignore[operator]
 
 
@@ -43,7 +45,9 @@ def check_paths(**values: object) -> None:
     """Raise `CallError`, which names it, for an argument that is neither a text nor a path; None passes."""
     for name, value in values.items():
         if value is not None and not isinstance(value, (str, os.PathLike)):
-            raise CallError(f"{name}: must be a name or a path, is a {type(value).__name__}")
+            raise CallError(
+                f"{name}: must be a name or a path, is a {type(value).__name__}"
+            )
 
 
 def not_negative(**values: float) -> None:

@@ -51,9 +51,20 @@ _stamps = dict[str, bytes]()
 def _stamp(scope: Mapping[str, Any]) -> bytes:
     """Digest of the source of a module with these global names, of its numbers, and of the compiled modules it uses."""
     if scope["__name__"] not in _stamps:
-        numbers = [(name, value) for name, value in scope.items() if isinstance(value, (int, float))]
-        used = sorted(_stamps.keys() & {getattr(value, "__module__", None) for value in scope.values()})
-        parts = [Path(scope["__file__"]).read_bytes(), repr(numbers).encode(), *map(_stamps.__getitem__, used)]
+        numbers = [
+            (name, value)
+            for name, value in scope.items()
+            if isinstance(value, (int, float))
+        ]
+        used = sorted(
+            _stamps.keys()
+            & {getattr(value, "__module__", None) for value in scope.values()}
+        )
+        parts = [
+            Path(scope["__file__"]).read_bytes(),
+            repr(numbers).encode(),
+            *map(_stamps.__getitem__, used),
+        ]
         _stamps[scope["__name__"]] = sha256(b"".join(parts)).digest()
     return _stamps[scope["__name__"]]
 
@@ -115,14 +126,21 @@ class _Store:
             return "", {}
         except RecursionError as error:
             raise ValueError(f"{self._index_path}: is damaged") from error
-        if not isinstance(index, dict) or not isinstance(digests := index.get("digests"), dict):
+        if not isinstance(index, dict) or not isinstance(
+            digests := index.get("digests"), dict
+        ):
             raise ValueError(f"{self._index_path}: is damaged")
-        if not all(isinstance(digest, str) and digest.isalnum() for digest in digests.values()):
+        if not all(
+            isinstance(digest, str) and digest.isalnum() for digest in digests.values()
+        ):
             raise ValueError(f"{self._index_path}: is damaged")
         return str(index.get("stamp")), digests
 
     def _write(self, digests: Mapping[str, str]) -> None:
-        _replace(self._index_path, json.dumps({"stamp": self._stamp, "digests": digests}).encode())
+        _replace(
+            self._index_path,
+            json.dumps({"stamp": self._stamp, "digests": digests}).encode(),
+        )
 
 
 def _key_text(key: object) -> str:
@@ -176,7 +194,13 @@ class _Cache(FunctionCache):
             _say(_NOT_STORED)
 
 
-_SKIPPED = {"inline_closure_likes", "with_lifting", "dead_branch_prune", "inline_overloads", "nopython_rewrites"}
+_SKIPPED = {
+    "inline_closure_likes",
+    "with_lifting",
+    "dead_branch_prune",
+    "inline_overloads",
+    "nopython_rewrites",
+}
 
 
 class _LoopCompiler(Compiler):
@@ -185,7 +209,9 @@ class _LoopCompiler(Compiler):
     def define_pipelines(self) -> list[Any]:
         """See numba."""
         (full,) = super().define_pipelines()  # type: ignore[no-untyped-call]
-        full.passes[:] = [each for each in full.passes if each[0].name() not in _SKIPPED]
+        full.passes[:] = [
+            each for each in full.passes if each[0].name() not in _SKIPPED
+        ]
         return [full]
 
 
@@ -212,16 +238,24 @@ def njit(signature: str, **options: Any) -> Callable[[Callable[..., Any]], Any]:
         result.disable_compile()
         if collects:
             gc.enable()
-        if result.stats.cache_misses and isinstance(result._cache, _Cache) and not result._cache.is_damaged:
+        if (
+            result.stats.cache_misses
+            and isinstance(result._cache, _Cache)
+            and not result._cache.is_damaged
+        ):
             _say("compiling numerical loops, once: some 25 s of processor time for all")
         return result
 
     return compiled
 
 
-def _declare(function: Callable[..., Any], signatures: list[Any], lower: Callable[..., Any]) -> None:
+def _declare(
+    function: Callable[..., Any], signatures: list[Any], lower: Callable[..., Any]
+) -> None:
     """Let compiled functions call one with these signatures: `lower` writes their code."""
-    template = type(function.__name__, (ConcreteTemplate,), {"key": function, "cases": signatures})
+    template = type(
+        function.__name__, (ConcreteTemplate,), {"key": function, "cases": signatures}
+    )
     infer_global(function, numba.types.Function(template))  # type: ignore[no-untyped-call]
     for each in signatures:
         lower_builtin(function, *each.args)(lower)  # type: ignore[no-untyped-call]
@@ -233,14 +267,20 @@ def shared(signature: str) -> Callable[[_Function], _Function]:
     """
 
     def compiled(function: _Function) -> _Function:
-        (result,) = njit(signature, no_cpython_wrapper=True)(function).overloads.values()
+        (result,) = njit(signature, no_cpython_wrapper=True)(
+            function
+        ).overloads.values()
         name = f"{function.__module__}.{function.__name__} {result.signature}"
-        add_symbol(name, result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
+        add_symbol(
+            name, result.library.get_pointer_to_function(result.fndesc.llvm_func_name)
+        )
 
         def call(context: Any, builder: Any, own: Any, args: Any) -> Any:
             of = context.call_conv.get_function_type(own.return_type, own.args)
             callee = get_or_insert_function(builder.module, of, name)  # type: ignore[no-untyped-call]
-            return context.call_conv.call_function(builder, callee, own.return_type, own.args, args)[1]
+            return context.call_conv.call_function(
+                builder, callee, own.return_type, own.args, args
+            )[1]
 
         _declare(function, [result.signature], call)
         return function
@@ -250,7 +290,12 @@ def shared(signature: str) -> Callable[[_Function], _Function]:
 
 def inlined(function: _Function) -> _Function:
     """Decorate a function that only compiled ones call, which are optimised together with it."""
-    options = {**_OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": False}
+    options = {
+        **_OPTIONS,
+        "no_cpython_wrapper": True,
+        "no_cfunc_wrapper": True,
+        "_nrt": False,
+    }
     return cast(_Function, numba.njit(**options)(function))
 
 
@@ -269,17 +314,26 @@ def scratch(*shape: int) -> FloatArray:
 def _lower_scratch(context: Any, builder: Any, own: Any, shape: Any) -> Any:
     array = make_array(own.return_type)(context, builder)  # type: ignore[no-untyped-call]
     strides: list[Any] = []
-    count, size = context.get_constant(numba.types.intp, 1), context.get_constant(numba.types.intp, 8)
+    count, size = (
+        context.get_constant(numba.types.intp, 1),
+        context.get_constant(numba.types.intp, 8),
+    )
     for length in reversed(shape):
         strides.insert(0, builder.mul(count, size))
         count = builder.mul(count, length)
     data = builder.alloca(context.get_data_type(numba.types.float64), size=count)
-    populate_array(array, data=data, shape=shape, strides=strides, itemsize=size, meminfo=None)  # type: ignore[no-untyped-call]
+    populate_array(
+        array, data=data, shape=shape, strides=strides, itemsize=size, meminfo=None
+    )  # type: ignore[no-untyped-call]
     return array._getvalue()
 
 
 _SHAPES: Any = [(numba.types.int64,) * num for num in (1, 2, 3)]
-_declare(scratch, [numba.types.Array(numba.types.float64, len(each), "C")(*each) for each in _SHAPES], _lower_scratch)
+_declare(
+    scratch,
+    [numba.types.Array(numba.types.float64, len(each), "C")(*each) for each in _SHAPES],
+    _lower_scratch,
+)
 
 READ, MATRIX = "Array(float64, 2, 'C', readonly=True)", "float64[:, ::1]"
 
@@ -332,7 +386,9 @@ def add_product_transposed(A: FloatArray, B: FloatArray, out: FloatArray) -> Non
 
 
 @shared(f"void({READ}, {READ}, {MATRIX}, {MATRIX})")
-def add_congruence(A: FloatArray, P: FloatArray, AP: FloatArray, out: FloatArray) -> None:
+def add_congruence(
+    A: FloatArray, P: FloatArray, AP: FloatArray, out: FloatArray
+) -> None:
     """Add A P A' to `out`, and write A P."""
     product(A, P, AP)
     add_product_transposed(AP, A, out)

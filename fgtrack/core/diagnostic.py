@@ -44,7 +44,10 @@ _LATE_SHARE, _FEWEST_LATE = 0.01, 3  # less is chance
 
 
 def too_late(
-    sensor: str, delays_s: FloatArray, limits: Iterable[tuple[str, float | None]], refused: BoolArray | None = None
+    sensor: str,
+    delays_s: FloatArray,
+    limits: Iterable[tuple[str, float | None]],
+    refused: BoolArray | None = None,
 ) -> Diagnostic | None:
     """Return the diagnostic of a sensor whose delays, shape (n,), are longer than a configured time; None if few are.
 
@@ -54,9 +57,16 @@ def too_late(
     for key, limit_s in limits:
         if limit_s is None or not len(delays_s):
             continue
-        late = int(np.count_nonzero((delays_s > limit_s) & (True if refused is None else refused)))
+        late = int(
+            np.count_nonzero(
+                (delays_s > limit_s) & (True if refused is None else refused)
+            )
+        )
         if late >= max(_FEWEST_LATE, _LATE_SHARE * len(delays_s)):
-            share, most_s = 100.0 * late / len(delays_s), float(np.quantile(delays_s, 0.99))
+            share, most_s = (
+                100.0 * late / len(delays_s),
+                float(np.quantile(delays_s, 0.99)),
+            )
             text = (
                 f"{share:.3g} % come later than {key} {limit_s:g} s allows and are not used; 99 % come within "
                 f"{most_s:.3g} s: raise {key} above it, or correct the clock"
@@ -71,11 +81,17 @@ def late_ego(ego_delay_s: float, delays_s: Mapping[str, float]) -> Diagnostic | 
     `ego_delay_s` is the usual time from stamp to receipt of the ego's messages, `delays_s` that of the lists of each
     sensor whose lists need the ego's pose.
     """
-    sooner = {name: delay_s for name, delay_s in delays_s.items() if ego_delay_s - delay_s > _LATE_S}
+    sooner = {
+        name: delay_s
+        for name, delay_s in delays_s.items()
+        if ego_delay_s - delay_s > _LATE_S
+    }
     if not sooner:
         return None
     later_ms = 1e3 * (ego_delay_s - min(sooner.values()))
-    own = ", ".join(f"{name} {1e3 * delay_s:.0f} ms" for name, delay_s in sooner.items())
+    own = ", ".join(
+        f"{name} {1e3 * delay_s:.0f} ms" for name, delay_s in sooner.items()
+    )
     text = (
         f"its states come up to {later_ms:.0f} ms later than the lists that need them (delay {1e3 * ego_delay_s:.0f} "
         f"ms, {own}): these wait up to ego.wait_s, or are placed by an extrapolated pose and count as less certain; "

@@ -31,14 +31,19 @@ def one_line(text: str) -> str:
     """`text` on one line, escaped (it holds names from files), of a long one the beginning and the end."""
     if len(text) > _LONGEST:
         text = f"{text[: _LONGEST - _TAIL]} ... {text[-_TAIL:]}"
-    return printable(" ".join(text.split()) if any(space in text for space in "\n\r\t\v\f") else text)
+    return printable(
+        " ".join(text.split()) if any(space in text for space in "\n\r\t\v\f") else text
+    )
 
 
 def printable(text: str) -> str:
     """`text` with escapes for what is neither a letter nor a sign."""
     if text.isprintable():
         return text
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode("ascii")
+        for c in text
+    )
 
 
 def printable_lines(text: str) -> str:

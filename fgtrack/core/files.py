@@ -17,7 +17,9 @@ def open_file(path: Path) -> BinaryIO:
     return path.open("rb")
 
 
-def open_text(path: Path, encoding: str = "utf-8", newline: str | None = None) -> TextIOWrapper:
+def open_text(
+    path: Path, encoding: str = "utf-8", newline: str | None = None
+) -> TextIOWrapper:
     """`path` opened for reading text; raises as `open_file`."""
     return TextIOWrapper(open_file(path), encoding=encoding, newline=newline)
 
@@ -31,5 +33,7 @@ def read_whole(path: Path, largest_mb: float) -> bytes:
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     if len(content) > largest:
-        raise DataError(f"{path}: is larger than {largest_mb:g} MB, more than such a file holds")
+        raise DataError(
+            f"{path}: is larger than {largest_mb:g} MB, more than such a file holds"
+        )
     return content

@@ -27,12 +27,18 @@ def wrap_angle(angle_rad: float) -> float:
 
 def wrap_angles(angles_rad: FloatArray) -> FloatArray:
     """Angles in (-pi, pi], any shape; exact (unchanged to the bit) where they lie there already."""
-    largest_rad = abs(angles_rad.item()) if angles_rad.size == 1 else np.abs(angles_rad).max(initial=0.0)
+    largest_rad = (
+        abs(angles_rad.item())
+        if angles_rad.size == 1
+        else np.abs(angles_rad).max(initial=0.0)
+    )
     if largest_rad < np.pi:
         return angles_rad
     inside = (angles_rad > -np.pi) & (angles_rad <= np.pi)
     wrapped = np.pi - np.mod(np.pi - angles_rad, TWO_PI)
-    wrapped = np.where(wrapped <= -np.pi, np.pi, wrapped)  # one rounding above pi; NaN stays NaN
+    wrapped = np.where(
+        wrapped <= -np.pi, np.pi, wrapped
+    )  # one rounding above pi; NaN stays NaN
     return np.asarray(np.where(inside, angles_rad, wrapped))
 
 
@@ -73,7 +79,10 @@ def polar_gradient(vector: FloatArray, floor: float) -> FloatArray:
     x, y = vector[..., 0], vector[..., 1]
     direction, length = np.arctan2(y, x), np.maximum(np.hypot(x, y), floor)
     c, s = np.cos(direction), np.sin(direction)
-    return np.stack([np.stack([-s / length, c / length], axis=-1), np.stack([c, s], axis=-1)], axis=-2)
+    return np.stack(
+        [np.stack([-s / length, c / length], axis=-1), np.stack([c, s], axis=-1)],
+        axis=-2,
+    )
 
 
 def cartesian(direction_length: FloatArray) -> FloatArray:
@@ -86,18 +95,32 @@ def cartesian_gradient(direction_length: FloatArray) -> FloatArray:
     """Derivative of `cartesian` by direction and length, shape (..., 2, 2)."""
     direction, length = direction_length[..., 0], direction_length[..., 1]
     c, s = np.cos(direction), np.sin(direction)
-    return np.stack([np.stack([-length * s, c], axis=-1), np.stack([length * c, s], axis=-1)], axis=-2)
+    return np.stack(
+        [np.stack([-length * s, c], axis=-1), np.stack([length * c, s], axis=-1)],
+        axis=-2,
+    )
 
 
 def body_point(
-    x_m: Real, y_m: Real, yaw_rad: Real, speed_mps: Real, yaw_rate_radps: Real, ahead_m: float, left_m: float
+    x_m: Real,
+    y_m: Real,
+    yaw_rad: Real,
+    speed_mps: Real,
+    yaw_rate_radps: Real,
+    ahead_m: float,
+    left_m: float,
 ) -> tuple[Real, Real, Real, Real]:
     """Position x, y and velocity vx, vy = v + w x r, in the map, of a point fixed to a body that moves along its yaw.
     The lever arm r from the body's reference point x, y is `ahead_m` and to the `left_m`. Floats, or arrays of one
     shape.
     """
-    own = np if isinstance(yaw_rad, np.ndarray) else math  # a third of the time for floats
+    own = (
+        np if isinstance(yaw_rad, np.ndarray) else math
+    )  # a third of the time for floats
     c, s = own.cos(yaw_rad), own.sin(yaw_rad)
     arm_x_m, arm_y_m = c * ahead_m - s * left_m, s * ahead_m + c * left_m
-    vx_mps, vy_mps = speed_mps * c - yaw_rate_radps * arm_y_m, speed_mps * s + yaw_rate_radps * arm_x_m
+    vx_mps, vy_mps = (
+        speed_mps * c - yaw_rate_radps * arm_y_m,
+        speed_mps * s + yaw_rate_radps * arm_x_m,
+    )
     return x_m + arm_x_m, y_m + arm_y_m, vx_mps, vy_mps

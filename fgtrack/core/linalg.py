@@ -73,7 +73,9 @@ def congruence(F: FloatArray, P: FloatArray) -> FloatArray:
     """F P F', shapes (..., m, n) and (..., n, n)."""
     if F.ndim == P.ndim == 2:
         return np.asarray(F.dot(P).dot(F.T))
-    return F @ P @ np.ascontiguousarray(F.mT)  # with a copy of F', at half of the time that the view takes
+    return (
+        F @ P @ np.ascontiguousarray(F.mT)
+    )  # with a copy of F', at half of the time that the view takes
 
 
 def applied(A: FloatArray, x: FloatArray) -> FloatArray:
@@ -87,19 +89,28 @@ def psd_solve(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
     """
     if matrix.ndim > 2:
         return np.asarray(np.linalg.solve(matrix, rhs))
-    _, _, solution, info = _lapack().dgesv(matrix, rhs)  # the same routine at a third of the time
+    _, _, solution, info = _lapack().dgesv(
+        matrix, rhs
+    )  # the same routine at a third of the time
     if info:
         raise np.linalg.LinAlgError("singular matrix")
     return np.asarray(solution)
 
 
-def mahalanobis_squared(residual: FloatArray, covariance: FloatArray, entries: IntArray | None = None) -> FloatArray:
+def mahalanobis_squared(
+    residual: FloatArray, covariance: FloatArray, entries: IntArray | None = None
+) -> FloatArray:
     """Squared Mahalanobis distance y' S^-1 y, (..., n) and (..., n, n), of the marginal of `entries` if given."""
     if entries is not None:
-        residual, covariance = residual[..., entries], covariance[..., entries, :][..., entries]
+        residual, covariance = (
+            residual[..., entries],
+            covariance[..., entries, :][..., entries],
+        )
     if residual.ndim == 1:
         return np.asarray(residual.dot(psd_solve(covariance, residual)))
-    return np.asarray(np.vecdot(residual, psd_solve(covariance, residual[..., None])[..., 0]))
+    return np.asarray(
+        np.vecdot(residual, psd_solve(covariance, residual[..., None])[..., 0])
+    )
 
 
 def inverse_root(S: FloatArray) -> FloatArray:

@@ -21,7 +21,10 @@ class Registry:
     """
 
     def __init__(
-        self, noun: str, built_in: Mapping[str, Mapping[str, str]], aliases: Mapping[str, str] | None = None
+        self,
+        noun: str,
+        built_in: Mapping[str, Mapping[str, str]],
+        aliases: Mapping[str, str] | None = None,
     ) -> None:
         """`noun`: kind of the parts, for messages; `built_in`: `module:attribute` by name, for every entry-point group;
         `aliases`: present names by former ones."""
@@ -45,18 +48,31 @@ class Registry:
 
     def sources(self) -> dict[str, str]:
         """Names of the plug-ins, with the package of each and a hash of the code of that package or module."""
-        plugins = {name: entry for name, entry in self._entries.items() if entry.dist is not None}
-        return {name: f"{_package(entry)} {_hash_of(entry)}" for name, entry in plugins.items()}
+        plugins = {
+            name: entry
+            for name, entry in self._entries.items()
+            if entry.dist is not None
+        }
+        return {
+            name: f"{_package(entry)} {_hash_of(entry)}"
+            for name, entry in plugins.items()
+        }
 
     def resolve(self, name: str) -> str:
         """The present form of `name`. Raises `CallError` for one that does not exist."""
         name = self._aliases.get(name, name)
         if name not in self._entries:
-            hint = did_you_mean(name, [*self._entries, *self._aliases]).removesuffix("?")
-            raise CallError(f"{self._noun} {name!r} is unknown{hint}: there are {', '.join(self)}")
+            hint = did_you_mean(name, [*self._entries, *self._aliases]).removesuffix(
+                "?"
+            )
+            raise CallError(
+                f"{self._noun} {name!r} is unknown{hint}: there are {', '.join(self)}"
+            )
         return name
 
-    def load(self, name: str) -> Any:  # Any: what an entry point names is only known to its user
+    def load(
+        self, name: str
+    ) -> Any:  # Any: what an entry point names is only known to its user
         """Return the part `name`. Raises `CallError` for an unknown name and a plug-in that cannot be loaded."""
         entry = self._entries[self.resolve(name)]
         with self.blamed(name, "cannot be loaded"):
@@ -87,8 +103,13 @@ class Registry:
             for name, value in parts.items()
         }
         for group in self._built_in:
-            for entry in sorted(entry_points(group=group), key=lambda entry: (entry.name, _package(entry))):
-                holder = entries.setdefault(self._aliases.get(entry.name, entry.name), entry)
+            for entry in sorted(
+                entry_points(group=group),
+                key=lambda entry: (entry.name, _package(entry)),
+            ):
+                holder = entries.setdefault(
+                    self._aliases.get(entry.name, entry.name), entry
+                )
                 if (holder.value, _package(holder)) != (entry.value, _package(entry)):
                     _logger.warning(
                         "%s %r of %s is left out: the name belongs to %s; rename the entry point",
@@ -101,12 +122,21 @@ class Registry:
 
 
 def _package(entry: EntryPoint) -> str:
-    return "fgtrack" if entry.dist is None else f"{entry.dist.name} {entry.dist.version}"
+    return (
+        "fgtrack" if entry.dist is None else f"{entry.dist.name} {entry.dist.version}"
+    )
 
 
 def _hash_of(entry: EntryPoint) -> str:
     digest, spec = hashlib.sha256(), find_spec(entry.module.partition(".")[0])
-    paths = [] if spec is None else [Path(each) for each in spec.submodule_search_locations or [spec.origin or ""]]
+    paths = (
+        []
+        if spec is None
+        else [
+            Path(each)
+            for each in spec.submodule_search_locations or [spec.origin or ""]
+        ]
+    )
     for path in paths:
         for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
             digest.update(file.read_bytes() if file.is_file() else b"")

@@ -17,7 +17,9 @@ OpenProbability = Annotated[float, Field(gt=0.0, lt=1.0)]
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
 def settings(cls: type[T]) -> type[T]:
     """A frozen dataclass; to make one of a wrong type or range raises pydantic's `ValidationError`, a `ValueError`."""
-    return dataclass(cls, frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))  # type: ignore[return-value]  # it is `cls` itself
+    return dataclass(
+        cls, frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False)
+    )  # type: ignore[return-value]  # it is `cls` itself
 
 
 def require(condition: bool, key: str, rule: str, value: object) -> None:

@@ -84,7 +84,11 @@ class Detection:
 
 #: What a detection may measure, in the order of its covariance and of the residual columns: the fields of
 #: `Detection` before its covariance.
-MEASURABLE = tuple(takewhile(lambda name: name != "covariance", (each.name for each in fields(Detection))))
+MEASURABLE = tuple(
+    takewhile(
+        lambda name: name != "covariance", (each.name for each in fields(Detection))
+    )
+)
 #: What a detection contains of its object besides: never measurements of the state, and all may be None.
 DESCRIBING = ("z_m", "length_m", "width_m", "height_m", "score", "class_name", "id")
 
@@ -286,11 +290,17 @@ class TickReport:
 
     @classmethod
     def made_later(
-        cls, tick: int, now_ns: int, smoothed: Sequence[SmoothedReport], **makers: Callable[[], Iterable[object]]
+        cls,
+        tick: int,
+        now_ns: int,
+        smoothed: Sequence[SmoothedReport],
+        **makers: Callable[[], Iterable[object]],
     ) -> Self:
         """Return a report whose `tracks` and `updates` the `makers` of these names give when they are asked for."""
         report = object.__new__(cls)
-        report.__dict__.update(tick=tick, now_ns=now_ns, smoothed=tuple(smoothed), makers=makers)
+        report.__dict__.update(
+            tick=tick, now_ns=now_ns, smoothed=tuple(smoothed), makers=makers
+        )
         return report
 
     def __getattr__(self, name: str) -> Any:  # Any: of what is not made yet

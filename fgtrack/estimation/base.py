@@ -14,7 +14,13 @@ from fgtrack.core.checks import LARGEST, LARGEST_NS, as_stamp, is_number
 from fgtrack.core.errors import CallError
 from fgtrack.core.linalg import equal_ones, mahalanobis_squared
 from fgtrack.core.types import FloatArray, IntArray, SmoothedReport, TrackState
-from fgtrack.models.measurement import AT_ORIGIN, COMPONENTS, MeasurementModel, SensorPose, measurement_model
+from fgtrack.models.measurement import (
+    AT_ORIGIN,
+    COMPONENTS,
+    MeasurementModel,
+    SensorPose,
+    measurement_model,
+)
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.models.sensors import RobustLoss
 
@@ -40,8 +46,13 @@ class Measurement:
     """Components that are prior knowledge, as a heading from the map: fused like the others, but not measured."""
 
     def __post_init__(self) -> None:
-        if type(self.stamp_ns) is not int or not -LARGEST_NS <= self.stamp_ns <= LARGEST_NS:
-            object.__setattr__(self, "stamp_ns", as_stamp("measurement: stamp_ns", self.stamp_ns))
+        if (
+            type(self.stamp_ns) is not int
+            or not -LARGEST_NS <= self.stamp_ns <= LARGEST_NS
+        ):
+            object.__setattr__(
+                self, "stamp_ns", as_stamp("measurement: stamp_ns", self.stamp_ns)
+            )
 
     @classmethod
     def of(
@@ -62,31 +73,63 @@ class Measurement:
         """
         names = tuple(name for name in COMPONENTS if name in values)
         if not names or len(names) < len(values):
-            given = ", ".join(name for name in values if name not in COMPONENTS) or "nothing"
-            raise CallError(f"measurement of {given}: give one or more of {', '.join(COMPONENTS)}")
+            given = (
+                ", ".join(name for name in values if name not in COMPONENTS)
+                or "nothing"
+            )
+            raise CallError(
+                f"measurement of {given}: give one or more of {', '.join(COMPONENTS)}"
+            )
         if not set(assumed) < set(names):
-            raise CallError(f"measurement of {', '.join(names)}: assumed must name some of them, is {assumed!r}")
+            raise CallError(
+                f"measurement of {', '.join(names)}: assumed must name some of them, is {assumed!r}"
+            )
         if (std is None) == (covariance is None):
-            raise CallError(f"measurement of {', '.join(names)}: give either std or covariance")
+            raise CallError(
+                f"measurement of {', '.join(names)}: give either std or covariance"
+            )
         if std is not None and not isinstance(std, Mapping):
             rule = f"a mapping of {', '.join(names)} to numbers, or one number for values of one unit"
             is_one_unit = len({name.rpartition("_")[2] for name in names}) == 1
-            _check(f"measurement of {', '.join(names)}: std", std, rule, is_one_unit and is_number(std))
+            _check(
+                f"measurement of {', '.join(names)}: std",
+                std,
+                rule,
+                is_one_unit and is_number(std),
+            )
             std = dict.fromkeys(names, std)
         if std is not None and std.keys() != values.keys():
-            raise CallError(f"measurement of {', '.join(names)}: std must name the same, names {', '.join(std)}")
+            raise CallError(
+                f"measurement of {', '.join(names)}: std must name the same, names {', '.join(std)}"
+            )
         stamp_ns = as_stamp("measurement: stamp_ns", stamp_ns)
         for name, value in (*values.items(), *(std or {}).items()):
-            _check(f"measurement of {name}", value, "a number, finite and at most 1e9", is_number(value))
+            _check(
+                f"measurement of {name}",
+                value,
+                "a number, finite and at most 1e9",
+                is_number(value),
+            )
         z = np.array([values[name] for name in names], dtype=np.float64)
-        R = np.diag([std[name] ** 2 for name in names]) if std is not None else np.array(covariance, dtype=np.float64)
-        sound = R.shape == (len(z), len(z)) and np.isfinite(R).all() and (R == R.T).all() and np.isfinite(z).all()
+        R = (
+            np.diag([std[name] ** 2 for name in names])
+            if std is not None
+            else np.array(covariance, dtype=np.float64)
+        )
+        sound = (
+            R.shape == (len(z), len(z))
+            and np.isfinite(R).all()
+            and (R == R.T).all()
+            and np.isfinite(z).all()
+        )
         if not sound or np.linalg.eigvalsh(R)[0] <= 0.0:
             raise CallError(
                 f"measurement of {', '.join(names)}: values must be finite, the covariance symmetric, positive "
                 f"definite and of shape {(len(z), len(z))}, are {z.tolist()} and {R.tolist()}"
             )
-        return cls(stamp_ns, measurement_model(names, CTRV()), z, R, pose, loss, assumed)
+        return cls(
+            stamp_ns, measurement_model(names, CTRV()), z, R, pose, loss, assumed
+        )
 
     def seen_by(self, motion: MotionModel) -> "Measurement":
         """This measurement with the model for the state of `motion`: itself where that is its model already."""
@@ -106,7 +149,11 @@ class Measurement:
         numbers = [*self.z.tolist(), *self.R.ravel().tolist(), *self.pose]
         if self.loss is None:
             return self.model.components, tuple(numbers), self.assumed
-        return self.model.components, (*numbers, self.loss.width), (*self.assumed, self.loss.kind)
+        return (
+            self.model.components,
+            (*numbers, self.loss.width),
+            (*self.assumed, self.loss.kind),
+        )
 
     @property
     def order(self) -> tuple[int, Content]:
@@ -125,7 +172,10 @@ class Measurement:
 
 @cache
 def _measured(components: tuple[str, ...], assumed: tuple[str, ...]) -> IntArray:
-    return np.array([index for index, name in enumerate(components) if name not in assumed], dtype=np.int64)
+    return np.array(
+        [index for index, name in enumerate(components) if name not in assumed],
+        dtype=np.int64,
+    )
 
 
 class Lazy(Sequence[_T], Generic[_T]):
@@ -152,16 +202,31 @@ class Measurements(Lazy[Measurement]):
     def made(self, index: int) -> Measurement:
         """See `Lazy.made`."""
         own = self.stack
-        return Measurement(own.stamp_ns, own.model, own.z[index], own.R[index], own.pose, own.loss, own.assumed)
+        return Measurement(
+            own.stamp_ns,
+            own.model,
+            own.z[index],
+            own.R[index],
+            own.pose,
+            own.loss,
+            own.assumed,
+        )
 
 
-def stacks(measurements: Sequence[Measurement]) -> list[tuple[Sequence[int], Measurement]]:
+def stacks(
+    measurements: Sequence[Measurement],
+) -> list[tuple[Sequence[int], Measurement]]:
     """Return the measurements that differ in their numbers alone: their indices, and the stack of them."""
     if isinstance(measurements, Measurements):
         return [(range(len(measurements.stack.z)), measurements.stack)]
     parts = list[tuple[Sequence[int], Measurement]]()
-    for rows in equal_ones([(id(item.model), item.pose, item.assumed, item.loss) for item in measurements]):
-        z, R = (np.array([getattr(measurements[row], name) for row in rows]) for name in ("z", "R"))
+    for rows in equal_ones(
+        [(id(item.model), item.pose, item.assumed, item.loss) for item in measurements]
+    ):
+        z, R = (
+            np.array([getattr(measurements[row], name) for row in rows])
+            for name in ("z", "R")
+        )
         parts.append((rows, replace(measurements[rows[0]], z=z, R=R)))
     return parts
 
@@ -176,7 +241,9 @@ class UpdateStatus(StrEnum):
     FAILED = "failed"
 
 
-@dataclass(slots=True)  # not frozen: that takes three times as long, for every measurement
+@dataclass(
+    slots=True
+)  # not frozen: that takes three times as long, for every measurement
 class UpdateResult:
     """Outcome of one measurement."""
 
@@ -252,7 +319,11 @@ def _is_array(value: object, shape: tuple[int, ...], least: float) -> bool:
         array = np.asarray(value)
     except ValueError:  # rows of several lengths
         return False
-    return array.shape == shape and array.dtype.kind in "fiu" and bool(((least <= array) & (array <= _MOST)).all())
+    return (
+        array.shape == shape
+        and array.dtype.kind in "fiu"
+        and bool(((least <= array) & (array <= _MOST)).all())
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,14 +339,20 @@ class StatesAt:
     def of(self, track_id: int) -> "StatesAt":
         """Return the state of one track; of no track where it has none."""
         rows = [row for row, each in enumerate(self.track_ids) if each == track_id]
-        return StatesAt((track_id,) * len(rows), self.means[rows], self.covariances[rows])
+        return StatesAt(
+            (track_id,) * len(rows), self.means[rows], self.covariances[rows]
+        )
 
     def without(self, track_ids: Collection[int]) -> "StatesAt":
         """Return the states of all tracks but these; itself where no state is left out."""
         rows = [row for row, each in enumerate(self.track_ids) if each not in track_ids]
         if len(rows) == len(self.track_ids):
             return self
-        return StatesAt(tuple([self.track_ids[row] for row in rows]), self.means[rows], self.covariances[rows])
+        return StatesAt(
+            tuple([self.track_ids[row] for row in rows]),
+            self.means[rows],
+            self.covariances[rows],
+        )
 
 
 @runtime_checkable
@@ -301,7 +378,10 @@ class TrackBank(Protocol):
         """States at `stamp_ns`, in the past or the present."""
 
     def update(
-        self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+        self,
+        stamp_ns: int,
+        track_ids: Sequence[int],
+        measurements: Sequence[Measurement],
     ) -> list[UpdateResult]:
         """Fuse one measurement for each of `track_ids`, all of the same stamp."""
 

@@ -44,7 +44,9 @@ class EstimatorError(Exception):
         answers: Mapping[int, Any],  # Any: depends on the call
         unchanged: Collection[int] = (),
     ) -> None:
-        super().__init__(f"estimators of the tracks {', '.join(map(str, causes))} raised")
+        super().__init__(
+            f"estimators of the tracks {', '.join(map(str, causes))} raised"
+        )
         self.causes = causes
         """What was raised, by track."""
         self.answers = answers
@@ -73,12 +75,18 @@ class Failures:
         """Count a track that ends."""
         self.add(Failure.TRACK_ENDED)
         if len(self.ended) < 100:
-            self.ended.append({"track_id": track_id, "now_ns": now_ns, "failure": failure.value})
+            self.ended.append(
+                {"track_id": track_id, "now_ns": now_ns, "failure": failure.value}
+            )
 
     def note(self, what: str | BaseException) -> None:
         """Remember the message of a failure, or its exception."""
         if isinstance(what, BaseException):
-            name = "not enough memory" if isinstance(what, MemoryError) else type(what).__name__
+            name = (
+                "not enough memory"
+                if isinstance(what, MemoryError)
+                else type(what).__name__
+            )
             line, self.last = f"{name}: {what}", "".join(format_exception(what))
         else:
             line = self.last = what

@@ -10,7 +10,15 @@ from fgtrack.core.checks import as_stamp
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import FloatArray, SmoothedReport, TrackState
-from fgtrack.estimation.base import Estimator, Measurement, Start, StatesAt, TrackBank, UpdateResult, UpdateStatus
+from fgtrack.estimation.base import (
+    Estimator,
+    Measurement,
+    Start,
+    StatesAt,
+    TrackBank,
+    UpdateResult,
+    UpdateStatus,
+)
 from fgtrack.estimation.failures import EstimatorError
 from fgtrack.estimation.filters.ekf import predict
 from fgtrack.estimation.filters.propagation import kinematic_states, track_state
@@ -28,7 +36,9 @@ class Outcomes:
         self._causes = dict[int, Exception]()
         self._unchanged = set[int]()
 
-    def add(self, track_ids: Sequence[int], fuse: Callable[[], Sequence[UpdateResult]]) -> None:
+    def add(
+        self, track_ids: Sequence[int], fuse: Callable[[], Sequence[UpdateResult]]
+    ) -> None:
         """Note what `fuse` returns for these tracks, or what it raises; but a `DataError` propagates."""
         try:
             self._answers.update(zip(track_ids, fuse(), strict=True))
@@ -62,7 +72,9 @@ def changing_nothing(track_ids: Sequence[int]) -> Iterator[None]:
 class ObjectBank(Generic[_E]):
     """One `Estimator` per object, made by `start`. Exceptions, but `DataError`, become an `EstimatorError`."""
 
-    def __init__(self, motion: MotionModel, start: Callable[[Start], _E], lag_s: float) -> None:
+    def __init__(
+        self, motion: MotionModel, start: Callable[[Start], _E], lag_s: float
+    ) -> None:
         self._motion = motion
         self._start = start
         self._lag_ns = nanoseconds(lag_s)
@@ -87,16 +99,30 @@ class ObjectBank(Generic[_E]):
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`."""
-        states = self._ask(lambda _, item: self._state(item, stamp_ns) if item.window_ns[0] <= stamp_ns else None)
-        known = {track_id: state for track_id, state in states.items() if state is not None}
+        states = self._ask(
+            lambda _, item: (
+                self._state(item, stamp_ns) if item.window_ns[0] <= stamp_ns else None
+            )
+        )
+        known = {
+            track_id: state for track_id, state in states.items() if state is not None
+        }
         return StatesAt(tuple(known), *_stacked(known.values(), self._motion.dim))
 
     def update(
-        self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+        self,
+        stamp_ns: int,
+        track_ids: Sequence[int],
+        measurements: Sequence[Measurement],
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
         seen = dict(zip(track_ids, measurements, strict=True))
-        result = self._ask(lambda track_id, item: _checked(item.update(seen[track_id]), seen[track_id]), track_ids)
+        result = self._ask(
+            lambda track_id, item: _checked(
+                item.update(seen[track_id]), seen[track_id]
+            ),
+            track_ids,
+        )
         return [result[track_id] for track_id in track_ids]
 
     def birth(self, track_id: int, prior: Start) -> None:
@@ -109,14 +135,20 @@ class ObjectBank(Generic[_E]):
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
-        states = self._ask(lambda _, item: self._state(item, max(self.present_ns, item.window_ns[0])))
-        return kinematic_states(self._motion, self.present_ns, *_stacked(states.values(), self._motion.dim))
+        states = self._ask(
+            lambda _, item: self._state(item, max(self.present_ns, item.window_ns[0]))
+        )
+        return kinematic_states(
+            self._motion, self.present_ns, *_stacked(states.values(), self._motion.dim)
+        )
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`: none."""
         return []
 
-    def _ask(self, question: Callable[[int, _E], _T], track_ids: Sequence[int] | None = None) -> dict[int, _T]:
+    def _ask(
+        self, question: Callable[[int, _E], _T], track_ids: Sequence[int] | None = None
+    ) -> dict[int, _T]:
         """Return the answers of all estimators, or of some, by track. Raises `EstimatorError` if some raise."""
         answers, causes = dict[int, _T](), dict[int, Exception]()
         for track_id in self._estimators if track_ids is None else track_ids:
@@ -133,20 +165,32 @@ class ObjectBank(Generic[_E]):
     def _state(self, estimator: _E, stamp_ns: int) -> TrackState:
         state, n = estimator.state_at(stamp_ns), self._motion.dim
         if state.mean.shape != (n,) or state.covariance.shape != (n, n):
-            raise ValueError(f"a state has the shapes {state.mean.shape} and {state.covariance.shape}")
+            raise ValueError(
+                f"a state has the shapes {state.mean.shape} and {state.covariance.shape}"
+            )
         return state
 
 
 def _checked(result: UpdateResult, measurement: Measurement) -> UpdateResult:
     if not isinstance(result, UpdateResult):
-        raise TypeError(f"update must return an UpdateResult, returned a {type(result).__name__}")
-    if result.innovation is not None and np.shape(result.innovation) != measurement.z.shape:
-        raise ValueError(f"the innovation of {measurement.z.shape} has the shape {np.shape(result.innovation)}")
+        raise TypeError(
+            f"update must return an UpdateResult, returned a {type(result).__name__}"
+        )
+    if (
+        result.innovation is not None
+        and np.shape(result.innovation) != measurement.z.shape
+    ):
+        raise ValueError(
+            f"the innovation of {measurement.z.shape} has the shape {np.shape(result.innovation)}"
+        )
     return result
 
 
 def _stacked(states: Iterable[TrackState], n: int) -> tuple[FloatArray, FloatArray]:
-    means, covariances = [state.mean for state in states], [state.covariance for state in states]
+    means, covariances = (
+        [state.mean for state in states],
+        [state.covariance for state in states],
+    )
     return np.array(means).reshape(-1, n), np.array(covariances).reshape(-1, n, n)
 
 
@@ -191,7 +235,9 @@ class SingleObject:
             return UpdateResult(UpdateStatus.FAILED)  # before the clock moves
         self.advance(stamp_ns)
         with _own_cause():
-            result = self.bank.update(stamp_ns, [0], [measurement.seen_by(self._motion)])[0]
+            result = self.bank.update(
+                stamp_ns, [0], [measurement.seen_by(self._motion)]
+            )[0]
         if result.status is not UpdateStatus.FAILED:
             self._newest_ns = max(self._newest_ns, stamp_ns)
         return result
@@ -204,21 +250,34 @@ class SingleObject:
 
 def states_of(bank: TrackBank, motion: MotionModel, stamp_ns: int) -> StatesAt:
     """States of the tracks of `bank` whose window has begun, at any stamp, in the own form of `motion`."""
-    return ahead_of(bank.states_at(min(stamp_ns, bank.present_ns)), bank.present_ns, motion, stamp_ns)
+    return ahead_of(
+        bank.states_at(min(stamp_ns, bank.present_ns)),
+        bank.present_ns,
+        motion,
+        stamp_ns,
+    )
 
 
-def ahead_of(states: StatesAt, present_ns: int, motion: MotionModel, stamp_ns: int) -> StatesAt:
+def ahead_of(
+    states: StatesAt, present_ns: int, motion: MotionModel, stamp_ns: int
+) -> StatesAt:
     """Return `states` of the present predicted to a stamp after it; those of a stamp up to the present as they are."""
     if stamp_ns <= present_ns or not states.track_ids:
         return states
-    ahead = predict(states.means, states.covariances, motion, seconds(stamp_ns - present_ns))
+    ahead = predict(
+        states.means, states.covariances, motion, seconds(stamp_ns - present_ns)
+    )
     return StatesAt(states.track_ids, *ahead)
 
 
-def state_of(bank: TrackBank, motion: MotionModel, track_id: int, stamp_ns: int) -> TrackState:
+def state_of(
+    bank: TrackBank, motion: MotionModel, track_id: int, stamp_ns: int
+) -> TrackState:
     """State of a track of `bank` at any stamp; raises `CallError` for one before the track's window."""
     states = states_of(bank, motion, stamp_ns)
     if track_id not in states.track_ids:
-        raise CallError(f"track {track_id} has no state at {stamp_ns} ns: before its window, or not finite")
+        raise CallError(
+            f"track {track_id} has no state at {stamp_ns} ns: before its window, or not finite"
+        )
     row = states.track_ids.index(track_id)
     return track_state(motion, stamp_ns, states.means[row], states.covariances[row])

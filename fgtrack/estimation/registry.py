@@ -27,7 +27,7 @@ ESTIMATORS = Registry(
     "estimator",
     {
         "fgtrack.estimators": {
-            "ekf-backward-forward": "fgtrack.estimation.filters.backward_forward:backward_forward",
+            "ekf-backward-forward": "fgtrack.karle2023.backward_forward:backward_forward",
             "ekf-replay": "fgtrack.estimation.filters.replay:ReplayEkf",
             "iekf-replay": "fgtrack.estimation.filters.iekf:IekfReplay",
             "imm-replay": "fgtrack.estimation.filters.imm:ImmReplay",
@@ -60,7 +60,12 @@ ESTIMATORS = Registry(
 )
 MOTION_MODELS = Registry(
     "motion model",
-    {"fgtrack.motion_models": {name: f"fgtrack.models.motion:{name.upper()}" for name in ("ctrv", "ctra", "ct", "cv")}},
+    {
+        "fgtrack.motion_models": {
+            name: f"fgtrack.models.motion:{name.upper()}"
+            for name in ("ctrv", "ctra", "ct", "cv")
+        }
+    },
 )
 Factory = Callable[..., Any]  # Any: an estimator or a bank, see the module
 
@@ -104,7 +109,13 @@ class Claims:
     @classmethod
     def of(cls, factory: Factory) -> "Claims":
         """Claims of `factory`."""
-        return cls(**{f.name: getattr(factory, f.name) for f in fields(cls) if hasattr(factory, f.name)})
+        return cls(
+            **{
+                f.name: getattr(factory, f.name)
+                for f in fields(cls)
+                if hasattr(factory, f.name)
+            }
+        )
 
 
 def list_estimators() -> list[str]:
@@ -113,7 +124,9 @@ def list_estimators() -> list[str]:
 
 
 # Any: options are the estimator's own.
-def estimator(name: str, motion: MotionModel, start: Start, *, lag_s: float = 1.0, **options: Any) -> Estimator:
+def estimator(
+    name: str, motion: MotionModel, start: Start, *, lag_s: float = 1.0, **options: Any
+) -> Estimator:
     """The estimator `name` of one object.
 
     Parameters
@@ -129,16 +142,29 @@ def estimator(name: str, motion: MotionModel, start: Start, *, lag_s: float = 1.
 
     Raises `CallError` for an unknown name, and for options that the estimator does not take.
     """
-    for what, value, kind in (("name", name, str), ("motion", motion, MotionModel), ("start", start, Start)):
+    for what, value, kind in (
+        ("name", name, str),
+        ("motion", motion, MotionModel),
+        ("start", start, Start),
+    ):
         if not isinstance(value, kind):
-            raise CallError(f"{what}: must be a {kind.__name__}, is a {type(value).__name__}")
+            raise CallError(
+                f"{what}: must be a {kind.__name__}, is a {type(value).__name__}"
+            )
     if not is_number(lag_s, 0.0):
-        raise CallError(f"lag_s: must be a number, finite and not negative, is {lag_s!r}")
+        raise CallError(
+            f"lag_s: must be a number, finite and not negative, is {lag_s!r}"
+        )
     return start_estimator(name, ESTIMATORS.load(name), motion, start, lag_s, options)
 
 
 def start_estimator(
-    name: str, factory: Factory, motion: MotionModel, start: Start, lag_s: float, options: Mapping[str, Any]
+    name: str,
+    factory: Factory,
+    motion: MotionModel,
+    start: Start,
+    lag_s: float,
+    options: Mapping[str, Any],
 ) -> Estimator:
     """`estimator` of a factory that need not be registered; `name` stands in errors."""
     claims, own = Claims.of(factory), dict(options)
@@ -146,36 +172,65 @@ def start_estimator(
 
     def made(start: Start) -> Estimator:
         if claims.bank:
-            return SingleObject(motion, _made(ESTIMATORS, TrackBank, name, factory, motion, lag_s, **own), start)
-        item: Estimator = _made(ESTIMATORS, Estimator, name, factory, motion, start, lag_s, **own)
+            return SingleObject(
+                motion,
+                _made(ESTIMATORS, TrackBank, name, factory, motion, lag_s, **own),
+                start,
+            )
+        item: Estimator = _made(
+            ESTIMATORS, Estimator, name, factory, motion, start, lag_s, **own
+        )
         return item
 
     return initiated(motion, start, method, made)
 
 
 def estimator_bank(
-    name: str, motion: MotionModel, lag_s: float, options: Mapping[str, Any], factory: Factory | None = None
+    name: str,
+    motion: MotionModel,
+    lag_s: float,
+    options: Mapping[str, Any],
+    factory: Factory | None = None,
 ) -> TrackBank:
     """The estimators `name` of all objects; raises as `estimator`. A `factory` needs no entry."""
     factory = factory or ESTIMATORS.load(name)
     claims = Claims.of(factory)
-    own = {key: options[key] for key in options if claims.initiates or key != "initiation"}
+    own = {
+        key: options[key] for key in options if claims.initiates or key != "initiation"
+    }
     if claims.bank:
-        bank: TrackBank = _made(ESTIMATORS, TrackBank, name, factory, motion, lag_s, **own)
+        bank: TrackBank = _made(
+            ESTIMATORS, TrackBank, name, factory, motion, lag_s, **own
+        )
         return bank
     _check_options(name, factory, 3, own)
     if factory is ReplayEkf and isinstance(motion, WhiteNoise) and motion.is_compiled:
-        return ReplayBank(motion, lambda start: ReplayEkf(motion, start, lag_s, **own), lag_s)
-    return ObjectBank(motion, lambda start: start_estimator(name, factory, motion, start, lag_s, options), lag_s)
+        return ReplayBank(
+            motion, lambda start: ReplayEkf(motion, start, lag_s, **own), lag_s
+        )
+    return ObjectBank(
+        motion,
+        lambda start: start_estimator(name, factory, motion, start, lag_s, options),
+        lag_s,
+    )
 
 
 def motion_model(name: str, parameters: Mapping[str, Any]) -> MotionModel:
     """The motion model `name`. Raises `CallError` for an unknown name and for parameters that it does not take."""
-    model: MotionModel = _made(MOTION_MODELS, MotionModel, name, MOTION_MODELS.load(name), **parameters)
+    model: MotionModel = _made(
+        MOTION_MODELS, MotionModel, name, MOTION_MODELS.load(name), **parameters
+    )
     return model
 
 
-def _made(registry: Registry, kind: type, name: str, factory: Factory, *arguments: Any, **options: Any) -> Any:
+def _made(
+    registry: Registry,
+    kind: type,
+    name: str,
+    factory: Factory,
+    *arguments: Any,
+    **options: Any,
+) -> Any:
     """Return what the part `name` makes. Raises `CallError` where that is not of its `kind`."""
     _check_options(name, factory, len(arguments), options)
     with registry.blamed(name, "cannot be made"):
@@ -184,11 +239,15 @@ def _made(registry: Registry, kind: type, name: str, factory: Factory, *argument
         except ValueError as error:
             raise CallError(f"{name}: {error}") from error
     if not isinstance(made, kind):
-        raise CallError(f"{name!r} makes a {type(made).__name__}, which lacks a member of {kind.__name__}")
+        raise CallError(
+            f"{name!r} makes a {type(made).__name__}, which lacks a member of {kind.__name__}"
+        )
     return made
 
 
-def _check_options(name: str, factory: Factory, num_arguments: int, options: Mapping[str, Any]) -> None:
+def _check_options(
+    name: str, factory: Factory, num_arguments: int, options: Mapping[str, Any]
+) -> None:
     if not callable(factory):
         raise CallError(f"{name}: {factory!r} is no class or function of Python")
     signature = inspect.signature(factory)
@@ -196,4 +255,6 @@ def _check_options(name: str, factory: Factory, num_arguments: int, options: Map
         signature.bind(*[None] * num_arguments, **options)
     except TypeError as error:
         taken = list(signature.parameters)[num_arguments:]
-        raise CallError(f"{name}: {error}; its options are {', '.join(taken) or 'none'}") from error
+        raise CallError(
+            f"{name}: {error}; its options are {', '.join(taken) or 'none'}"
+        ) from error

@@ -16,7 +16,11 @@ Link = tuple[int, FloatArray, FloatArray, Prediction]
 
 
 def rts_step(
-    mean: FloatArray, covariance: FloatArray, predicted: Prediction, shift: FloatArray, after: FloatArray
+    mean: FloatArray,
+    covariance: FloatArray,
+    predicted: Prediction,
+    shift: FloatArray,
+    after: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return a state, or a stack of them, after the smoothing of the next one, and C = Cov(x, x_next) P_next^-1.
     x + C s and P + C (P_s - P_next) C', of `mean` (..., n) and `covariance` (..., n, n), with the prediction P_next of
@@ -32,14 +36,22 @@ def smoothed_back(
     motion: MotionModel, links: Sequence[Link], mean: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean (n,) and covariance (n, n) at the first of `links`, of those at the last, by `rts_step`."""
-    for (before_ns, x, P, _), (after_ns, _, _, predicted) in reversed(list(pairwise(links))):
+    for (before_ns, x, P, _), (after_ns, _, _, predicted) in reversed(
+        list(pairwise(links))
+    ):
         if before_ns < after_ns:  # else the same state
-            mean, covariance, _ = rts_step(x, P, predicted, wrapped(motion, mean - predicted.mean), covariance)
+            mean, covariance, _ = rts_step(
+                x, P, predicted, wrapped(motion, mean - predicted.mean), covariance
+            )
     return mean, covariance
 
 
 def between(
-    motion: MotionModel, left: FloatArray, right: FloatArray, until_s: float | FloatArray, after_s: float | FloatArray
+    motion: MotionModel,
+    left: FloatArray,
+    right: FloatArray,
+    until_s: float | FloatArray,
+    after_s: float | FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return mean, Lambda, Psi and Sigma of the state `until_s` after one and `after_s` before another one.
     x = mean + Lambda (x_l - l) + Psi (x_r - r) + N(0, Sigma), near l = `left` and r = `right`, (..., n) (Koch and

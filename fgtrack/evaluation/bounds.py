@@ -71,18 +71,29 @@ def bounds(
     truth
         True states at stamps (s,), of one or more drawn trajectories, shape (trajectories, s, n).
     """
-    stamps_ns = np.unique([start_ns, *(item.stamp_ns for item in measurements), *now_ns])
+    stamps_ns = np.unique(
+        [start_ns, *(item.stamp_ns for item in measurements), *now_ns]
+    )
     if stamps_ns[0] < start_ns:
-        raise ValueError(f"start_ns: {start_ns} is after a measurement or a time at {stamps_ns[0]}")
+        raise ValueError(
+            f"start_ns: {start_ns} is after a measurement or a time at {stamps_ns[0]}"
+        )
     states = truth(stamps_ns)
     ordered = sorted(measurements, key=lambda item: item.stamp_ns)
     receipts_ns = np.array([item.receipt_ns for item in ordered], dtype=np.int64)
     own_ns = np.array([item.stamp_ns for item in ordered], dtype=np.int64)
     later_ns = np.minimum.accumulate(receipts_ns[::-1])[::-1]
-    kept = np.append(receipts_ns[:-1] <= later_ns[1:], True)[: len(ordered)]  # before everything measured after them
+    kept = np.append(receipts_ns[:-1] <= later_ns[1:], True)[
+        : len(ordered)
+    ]  # before everything measured after them
     index = np.searchsorted(stamps_ns, own_ns)
-    gained = [_information(item, states[:, k]) for item, k in zip(ordered, index, strict=True)]
-    steps = [_step(motion, states[:, k], seconds(int(ns))) for k, ns in enumerate(np.diff(stamps_ns))]
+    gained = [
+        _information(item, states[:, k]) for item, k in zip(ordered, index, strict=True)
+    ]
+    steps = [
+        _step(motion, states[:, k], seconds(int(ns)))
+        for k, ns in enumerate(np.diff(stamps_ns))
+    ]
     start = psd_solve(prior_covariance, np.eye(motion.dim))
 
     def covariances(from_ns: IntArray) -> FloatArray:
@@ -108,7 +119,11 @@ def bounds(
         first, last = np.searchsorted(index, [k, k + 1])
         return sum((gained[i] for i in range(first, last) if counts[i]), start=J)
 
-    return Bounds(covariances(own_ns), covariances(receipts_ns), covariances(np.where(kept, receipts_ns, _NEVER_NS)))
+    return Bounds(
+        covariances(own_ns),
+        covariances(receipts_ns),
+        covariances(np.where(kept, receipts_ns, _NEVER_NS)),
+    )
 
 
 def bounds_along(
@@ -122,25 +137,44 @@ def bounds_along(
     """Mean over trajectories of the bounds along each of them; parameters and errors are those of `bounds`.
     Each is the covariance of a filter linearised at the true states: closer to what can be reached, but no bound.
     """
-    states = truth(np.unique([start_ns, *(item.stamp_ns for item in measurements), *now_ns]))
+    states = truth(
+        np.unique([start_ns, *(item.stamp_ns for item in measurements), *now_ns])
+    )
 
     def along(one: FloatArray) -> Bounds:
-        return bounds(motion, start_ns, prior_covariance, measurements, lambda _: one[None], now_ns)
+        return bounds(
+            motion,
+            start_ns,
+            prior_covariance,
+            measurements,
+            lambda _: one[None],
+            now_ns,
+        )
 
     each = map(along, states)
-    return Bounds(*(np.mean(covariances, axis=0) for covariances in zip(*each, strict=True)))
+    return Bounds(
+        *(np.mean(covariances, axis=0) for covariances in zip(*each, strict=True))
+    )
 
 
-def _step(motion: MotionModel, states: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _step(
+    motion: MotionModel, states: FloatArray, dt_s: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Expected information of one step of the chain: D11, D12 and D22 of the recursion, see `bounds`."""
     F, Q = motion.jacobian(states, dt_s), motion.process_noise(states, dt_s)
     weight = np.linalg.solve(Q, np.broadcast_to(np.eye(motion.dim), Q.shape))
     weighted, told = F.mT @ weight, []
     for shift in _DIFFERENCE * np.eye(motion.dim):
-        change = motion.process_noise(states + shift, dt_s) - motion.process_noise(states - shift, dt_s)
+        change = motion.process_noise(states + shift, dt_s) - motion.process_noise(
+            states - shift, dt_s
+        )
         told.append(weight @ change / (2.0 * _DIFFERENCE))
     noise = 0.5 * np.einsum("i...ab,j...ba->...ij", told, told)
-    return (weighted @ F + noise).mean(axis=0), -weighted.mean(axis=0), weight.mean(axis=0)
+    return (
+        (weighted @ F + noise).mean(axis=0),
+        -weighted.mean(axis=0),
+        weight.mean(axis=0),
+    )
 
 
 def _information(item: ScheduledMeasurement, states: FloatArray) -> FloatArray:

@@ -9,11 +9,17 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, within_run
-from fgtrack.evaluation.matching import TrackErrors, position_nees, recorded, scenes, track_errors
+from fgtrack.evaluation.matching import (
+    TrackErrors,
+    position_nees,
+    recorded,
+    scenes,
+    track_errors,
+)
 from fgtrack.evaluation.runs import EvaluatedRun, by_recording
 from fgtrack.evaluation.scores.multi_object import gospa
 from fgtrack.evaluation.tables import Column, Value, short, two_digits
-from fgtrack.io.run import EvaluationConfig
+from fgtrack.runs import EvaluationConfig
 
 POSITION_NEES = "position_nees"
 """The quantity that is the better the nearer it is to 2."""
@@ -22,7 +28,11 @@ STANDING_NOTE = "+: best; =: not resolved from the best, 0 is in the interval"
 """Meaning of the marks of `entry_columns`, for a table within a run."""
 
 _MARKS: Mapping[Value, str] = {"best": "+", "tie": "=", "worse": " "}
-_ERRORS = {"position_rmse_m": "position_m", "speed_rmse_mps": "speed_mps", "yaw_rmse_rad": "yaw_rad"}
+_ERRORS = {
+    "position_rmse_m": "position_m",
+    "speed_rmse_mps": "speed_mps",
+    "yaw_rmse_rad": "yaw_rad",
+}
 NEGLIGIBLE = 1e-6
 """Share of a cost that is rounding: of sums in another order."""
 
@@ -63,7 +73,9 @@ def comparisons(runs: Sequence[EvaluatedRun]) -> list[Comparison]:
 def comparable(runs: Sequence[EvaluatedRun]) -> list[list[EvaluatedRun]]:
     """The runs with truth, those of the same recording and evaluated by the same settings together."""
     groups: dict[tuple[int, EvaluationConfig], list[EvaluatedRun]] = {}
-    for number, group in enumerate(by_recording([item for item in runs if item.matching is not None])):
+    for number, group in enumerate(
+        by_recording([item for item in runs if item.matching is not None])
+    ):
         for item in group:
             groups.setdefault((number, item.run.evaluation), []).append(item)
     return list(groups.values())
@@ -81,14 +93,25 @@ def ranked(
     rounding = NEGLIGIBLE * float(np.max(costs))
     worse = {k: d.is_significant and d.high > rounding for k, d in differences.items()}
     return (
-        Entry(names[best], float(values[best]), None, "best" if all(worse.values()) else "tie"),
-        *(Entry(names[k], float(values[k]), d, "worse" if worse[k] else "tie") for k, d in differences.items()),
+        Entry(
+            names[best],
+            float(values[best]),
+            None,
+            "best" if all(worse.values()) else "tie",
+        ),
+        *(
+            Entry(names[k], float(values[k]), d, "worse" if worse[k] else "tie")
+            for k, d in differences.items()
+        ),
     )
 
 
 def entry_record(entry: Entry, name: str = "value") -> dict[str, Any]:
     """Numbers of an entry, its value as `name`, which `entry_columns` show."""
-    worse, values = entry.worse_by or UNKNOWN, {"run": entry.name, name: entry.value, "standing": entry.standing}
+    worse, values = (
+        entry.worse_by or UNKNOWN,
+        {"run": entry.name, name: entry.value, "standing": entry.standing},
+    )
     return values | {"worse_by": worse.mean, "low": worse.low, "high": worse.high}
 
 
@@ -112,13 +135,23 @@ def comparison(group: Sequence[EvaluatedRun]) -> Comparison:
     errors = []
     for matching in (item.matching for item in group if item.matching is not None):
         errors_of = track_errors(matching)
-        squares = {name: np.square(errors_of.values[error]) for name, error in _ERRORS.items()}
-        errors.append(replace(errors_of, values={**squares, POSITION_NEES: position_nees(matching)}))
+        squares = {
+            name: np.square(errors_of.values[error]) for name, error in _ERRORS.items()
+        }
+        errors.append(
+            replace(
+                errors_of, values={**squares, POSITION_NEES: position_nees(matching)}
+            )
+        )
     most, common, sums = common_sums(errors)
     if all(item.run.evaluation.multi_object for item in group):
         sums["gospa_in_view_rms_m"] = _gospa_sums(group)
     labels = tuple(item.label for item in group)
-    quantities = {name: compared(name, labels, ticks) for name, ticks in sums.items() if ticks[:, -1].any()}
+    quantities = {
+        name: compared(name, labels, ticks)
+        for name, ticks in sums.items()
+        if ticks[:, -1].any()
+    }
     return Comparison(labels, common, most, quantities, sums)
 
 
@@ -127,13 +160,19 @@ def common_sums(every: Sequence[TrackErrors]) -> tuple[int, int, dict[str, Float
     The most samples of a run, the common ones, and by name the sums of each run and, last, the counts: (n, runs + 1).
     """
     every_ns = np.unique(np.concatenate([item.stamps_ns for item in every]))
-    codes = [item.object_index * len(every_ns) + np.searchsorted(every_ns, item.stamps_ns) for item in every]
+    codes = [
+        item.object_index * len(every_ns) + np.searchsorted(every_ns, item.stamps_ns)
+        for item in every
+    ]
     samples = [np.unique(of, return_index=True) for of in codes]
     common = functools.reduce(np.intersect1d, [distinct for distinct, _ in samples])
     rows = [first[np.searchsorted(distinct, common)] for distinct, first in samples]
     sums = {}
     for name in every[0].values if len(common) else ():
-        values = np.stack([item.values[name][row] for item, row in zip(every, rows, strict=True)], axis=-1)
+        values = np.stack(
+            [item.values[name][row] for item, row in zip(every, rows, strict=True)],
+            axis=-1,
+        )
         sums[name] = by_stamp(every_ns[common % len(every_ns)], values)
     return max(len(distinct) for distinct, _ in samples), len(common), sums
 
@@ -157,11 +196,19 @@ def compared(name: str, labels: Sequence[str], ticks: FloatArray) -> tuple[Entry
 def _gospa_sums(group: Sequence[EvaluatedRun]) -> FloatArray:
     """Squared GOSPA, and 1, at the ticks that all runs have, of the objects that a sensor of any run could see."""
     matchings = [item.matching for item in group if item.matching is not None]
-    ticks_ns = [item.now_ns[recorded(each.run, item.now_ns)] for each, item in zip(group, matchings, strict=True)]
+    ticks_ns = [
+        item.now_ns[recorded(each.run, item.now_ns)]
+        for each, item in zip(group, matchings, strict=True)
+    ]
     common_ns = functools.reduce(np.intersect1d, ticks_ns)
     rows = [np.searchsorted(item, common_ns) for item in ticks_ns]
-    there = [scenes(item.run, matching) for item, matching in zip(group, matchings, strict=True)]
-    seen = np.any([scene.in_view[mine] for scene, mine in zip(there, rows, strict=True)], axis=0)
+    there = [
+        scenes(item.run, matching)
+        for item, matching in zip(group, matchings, strict=True)
+    ]
+    seen = np.any(
+        [scene.in_view[mine] for scene, mine in zip(there, rows, strict=True)], axis=0
+    )
     columns = []
     for item, scene, mine in zip(group, there, rows, strict=True):
         in_view = scene.in_view.copy()

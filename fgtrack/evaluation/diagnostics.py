@@ -14,9 +14,9 @@ from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.matching import confirmed
 from fgtrack.evaluation.scores.innovations import by_sensor, num_measured
 from fgtrack.evaluation.scores.statistics import ChiSquareMean
-from fgtrack.io.run import Run, Table
 from fgtrack.models.measurement import ANGULAR
 from fgtrack.models.road import OPEN_SPACE
+from fgtrack.runs import Run, Table
 
 USED = ("birth", "in_sequence", "out_of_sequence", "beyond_window", "merged")
 """Dispositions of detections that took part."""
@@ -28,10 +28,19 @@ CORRELATED = 0.3
 """Autocorrelation of innovations at lag 1 above which their errors are correlated in time."""
 MOST_BREAKS_PER_MINUTE = 2.0
 """More breaks per object and minute than these are bad tracking."""
-_FEWEST_BREAKS, _BREAKS_SHARE = 3, 0.25  # of all confirmed tracks; fewer are those of occlusions or of chance
+_FEWEST_BREAKS, _BREAKS_SHARE = (
+    3,
+    0.25,
+)  # of all confirmed tracks; fewer are those of occlusions or of chance
 _DEAD_SHARE = 0.5  # of the detections used, beginning a track that is never confirmed; of clutter it is below
-_GAP_S, _OVERLAP_S = 5.0, 2.0  # a track continues one that ended at most so long before, or after, it began
-_NEAR_M, _DEPARTURE = 3.0, 0.3  # from its prediction: noise, and a turn of 0.3 rad or 30 % of its speed
+_GAP_S, _OVERLAP_S = (
+    5.0,
+    2.0,
+)  # a track continues one that ended at most so long before, or after, it began
+_NEAR_M, _DEPARTURE = (
+    3.0,
+    0.3,
+)  # from its prediction: noise, and a turn of 0.3 rad or 30 % of its speed
 _YAWS_SHARE = 0.05  # of the yaws of a sensor that are half a turn off, or that misfit: fewer are outliers
 _NO_FAILURE = "step damped"  # not a failure: with bearings damped steps are usual
 #: Cause and cure of dispositions that most detections of a sensor may have.
@@ -50,7 +59,17 @@ _NAME_EGO = "name its topic in the configuration (`fgtrack info` lists the topic
 
 def diagnostics(run: Run) -> list[Diagnostic]:
     """Defects of `run`, as far as its files show them."""
-    kinds = (_angles, _ego, _map, _sensors, _latency, _failures, _fragmentation, _identities, _yaws)
+    kinds = (
+        _angles,
+        _ego,
+        _map,
+        _sensors,
+        _latency,
+        _failures,
+        _fragmentation,
+        _identities,
+        _yaws,
+    )
     return [diagnostic for kind in kinds for diagnostic in kind(run)]
 
 
@@ -63,7 +82,10 @@ def _identities(run: Run) -> Iterator[Diagnostic]:
     }
     for name, text in texts.items():
         if counts.get(name):
-            yield Diagnostic("identities", f"{counts[name]} {'tracks ' if name == 'reused' else ''}{text}")
+            yield Diagnostic(
+                "identities",
+                f"{counts[name]} {'tracks ' if name == 'reused' else ''}{text}",
+            )
 
 
 def _yaws(run: Run) -> Iterator[Diagnostic]:
@@ -76,18 +98,28 @@ def _yaws(run: Run) -> Iterator[Diagnostic]:
             yield Diagnostic(sensor, text)
         if total >= FEWEST and unused_yaws > _YAWS_SHARE * total:
             text = (
-                f"{unused_yaws} of {total} yaws misfit, only their positions were used: its yaw errors are larger than "
+                f"{unused_yaws} of {total} yaws misfit, only their positions were used: "
+                "its yaw errors are larger than "
             )
-            yield Diagnostic(sensor, f"{text}configured (sensors.{sensor}.std), or some yaws are those of another side")
+            yield Diagnostic(
+                sensor,
+                f"{text}configured (sensors.{sensor}.std), or some yaws are those of another side",
+            )
 
 
 def noise_diagnostics(run: Run) -> Iterator[Diagnostic]:
     """Sensors whose innovations are inconsistent with the noise; see also the verdict of `compare`."""
     source = (run.meta.get("input") or {}).get("path")
-    of_run = f" {source} -c {run.path / 'config.yaml'}" if run.path is not None and source else ""
+    of_run = (
+        f" {source} -c {run.path / 'config.yaml'}"
+        if run.path is not None and source
+        else ""
+    )
     for sensor, nis in misfits(run):
         size = "small" if nis.mean > nis.dof else "large"
-        factor = math.sqrt(max(nis.mean, 0.0) / nis.dof)  # below 0 by rounding, where one std is 1e9 of another
+        factor = math.sqrt(
+            max(nis.mean, 0.0) / nis.dof
+        )  # below 0 by rounding, where one std is 1e9 of another
         text = (
             f"mean NIS {nis.mean:.3g}, expected {nis.dof:.3g}: the configured noise is too {size}, as if errors were "
             f"{factor:.2g} times what is configured; `fgtrack advise{of_run} --tune -o advised.yaml` fits it, or "
@@ -101,7 +133,9 @@ def misfits(run: Run) -> Iterator[tuple[str, ChiSquareMean]]:
     for sensor, mine in by_sensor(run.tables["updates"]):
         nis = ChiSquareMean.without_band(mine["nis"], num_measured(mine))
         if nis.count >= FEWEST and is_far_off(nis):
-            from scipy.special import chdtri  # takes a quarter of a second, and a consistent run does not need it
+            from scipy.special import (
+                chdtri,
+            )  # takes a quarter of a second, and a consistent run does not need it
 
             ratio = float(np.nanmedian(mine["nis"])) / float(chdtri(nis.dof, 0.5))
             if ratio > FAR_OFF if nis.mean > nis.dof else ratio < 1.0 / FAR_OFF:
@@ -124,7 +158,10 @@ def unused(run: Run) -> str | None:
 
 def reasons(counts: Mapping[str, int]) -> str:
     """`counts` by setting in words, the most first: `40 by filters.score, 2 by max_range_m`."""
-    return ", ".join(f"{count} by {name}" for name, count in sorted(counts.items(), key=lambda item: -item[1]))
+    return ", ".join(
+        f"{count} by {name}"
+        for name, count in sorted(counts.items(), key=lambda item: -item[1])
+    )
 
 
 def excluded_lines(meta: Mapping[str, Any]) -> Iterator[str]:
@@ -138,10 +175,19 @@ def excluded_lines(meta: Mapping[str, Any]) -> Iterator[str]:
 
 def _angles(run: Run) -> Iterator[Diagnostic]:
     """Angles that were recorded in degrees and read as radians."""
-    for about, table in [(EGO, run.tables["ego"]), *by_sensor(run.tables["detections"])]:
+    for about, table in [
+        (EGO, run.tables["ego"]),
+        *by_sensor(run.tables["detections"]),
+    ]:
         for name in ANGULAR:
-            finite = [value for value in table.get(name, np.empty(0)).tolist() if math.isfinite(value)]
-            if wrong := in_degrees(about, name, min(finite, default=0.0), max(finite, default=0.0)):
+            finite = [
+                value
+                for value in table.get(name, np.empty(0)).tolist()
+                if math.isfinite(value)
+            ]
+            if wrong := in_degrees(
+                about, name, min(finite, default=0.0), max(finite, default=0.0)
+            ):
                 yield wrong
 
 
@@ -149,15 +195,23 @@ def _ego(run: Run) -> Iterator[Diagnostic]:
     """No ego where it is needed, a late one, or reasons for which more than half of its states were refused."""
     num_states = run.tables["ego"].num_rows
     if not num_states and any(name == "failed" for _, _, name, _ in _mostly(run)):
-        yield Diagnostic(EGO, f"no state was received, so nothing in its frame can be placed: {_NAME_EGO}")
+        yield Diagnostic(
+            EGO,
+            f"no state was received, so nothing in its frame can be placed: {_NAME_EGO}",
+        )
     elif not num_states and _ego_speeds_births(run):
         text = f"no state was received, so new objects are assumed to stand still: {_NAME_EGO}"
         yield Diagnostic(EGO, f"{text}, or set birth.ego_speed_factor to 0", _STANDING)
-    if num_states and (late := late_ego(_delay_s(run.tables["ego"]), _placed_delays_s(run))):
+    if num_states and (
+        late := late_ego(_delay_s(run.tables["ego"]), _placed_delays_s(run))
+    ):
         yield late
     if jumps := run.meta.get("ego_jumps"):
         times = "once" if jumps == 1 else f"{jumps} times"
-        yield Diagnostic(EGO, f"its position jumps {times}: detections are misplaced there, cut the recording in parts")
+        yield Diagnostic(
+            EGO,
+            f"its position jumps {times}: detections are misplaced there, cut the recording in parts",
+        )
     for reason, count in dict(run.meta.get("ego_refused") or {}).items():
         if 0 < num_states < 2 * count:
             text = f"{count} of {num_states} states not used, {reason}: look at the clock of its driver"
@@ -178,10 +232,17 @@ def _delay_s(table: Table) -> float:
 
 def _map(run: Run) -> Iterator[Diagnostic]:
     """No map where new objects are as fast as the ego, in its direction."""
-    if not _ego_speeds_births(run) or _section(run, "map").get("track") not in (None, OPEN_SPACE):
+    if not _ego_speeds_births(run) or _section(run, "map").get("track") not in (
+        None,
+        OPEN_SPACE,
+    ):
         return
     detections = run.tables["detections"]
-    blind = [name for name, mine in by_sensor(detections) if not np.isfinite(mine["yaw_rad"]).any()]
+    blind = [
+        name
+        for name, mine in by_sensor(detections)
+        if not np.isfinite(mine["yaw_rad"]).any()
+    ]
     if blind:
         text = f"there is none, and no heading from {', '.join(blind)}: new objects may drive in any direction"
         cure = "name it with --map (`oval` for the simulated races), or set birth.ego_speed_factor to 0 for open space"
@@ -190,7 +251,10 @@ def _map(run: Run) -> Iterator[Diagnostic]:
 
 def _ego_speeds_births(run: Run) -> bool:
     """True if new objects are assumed to be as fast as the ego, or nearly."""
-    return bool(run.tables["updates"].num_rows and _section(run, "birth").get("ego_speed_factor"))
+    return bool(
+        run.tables["updates"].num_rows
+        and _section(run, "birth").get("ego_speed_factor")
+    )
 
 
 def _mostly(run: Run) -> Iterator[tuple[str, Table, str, int]]:
@@ -203,17 +267,29 @@ def _mostly(run: Run) -> Iterator[tuple[str, Table, str, int]]:
 
 def _sensors(run: Run) -> Iterator[Diagnostic]:
     """Stamps that no driver sets, and the disposition of most detections, where no other diagnostic explains it."""
-    unset = [name for name, mine in by_sensor(run.tables["updates"]) if not mine["stamp_ns"].any()]
+    unset = [
+        name
+        for name, mine in by_sensor(run.tables["updates"])
+        if not mine["stamp_ns"].any()
+    ]
     for sensor in unset:
         text = "all stamps are 0: its driver does not set them; `stamp_from: receipt` takes the receipt for the stamp"
         yield Diagnostic(sensor, text, {f"sensors.{sensor}.stamp_from": "receipt"})
     for sensor, mine, name, count in _mostly(run):
-        if (name == "too_old" and sensor in unset) or (name == "failed" and not run.tables["ego"].num_rows):
+        if (name == "too_old" and sensor in unset) or (
+            name == "failed" and not run.tables["ego"].num_rows
+        ):
             continue
-        if name == "duplicate" and (_section(run, "sensors").get(sensor) or {}).get("copies_s"):
+        if name == "duplicate" and (_section(run, "sensors").get(sensor) or {}).get(
+            "copies_s"
+        ):
             continue  # copies of messages that several receivers heard are expected
         by = reasons((run.meta.get("out_of_bounds") or {}).get(sensor, {}))
-        cure = _too_old(run, sensor, mine) if name == "too_old" else _CURES[name].format(sensor=sensor, reasons=by)
+        cure = (
+            _too_old(run, sensor, mine)
+            if name == "too_old"
+            else _CURES[name].format(sensor=sensor, reasons=by)
+        )
         yield Diagnostic(sensor, f"{count} of {mine.num_rows} {name}: {cure}")
 
 
@@ -222,14 +298,22 @@ def _latency(run: Run) -> Iterator[Diagnostic]:
     explained = {sensor for sensor, _, _, _ in _mostly(run)}
     for sensor, mine in by_sensor(run.tables["updates"]):
         if sensor not in explained and mine["stamp_ns"].any():
-            delays_s, refused = (mine["receipt_ns"] - mine["stamp_ns"]) / NS_PER_S, mine["disposition"] == "too_old"
-            if late := too_late(sensor, delays_s, _limits(run, sensor, "reach_s"), refused):
+            delays_s, refused = (
+                (mine["receipt_ns"] - mine["stamp_ns"]) / NS_PER_S,
+                mine["disposition"] == "too_old",
+            )
+            if late := too_late(
+                sensor, delays_s, _limits(run, sensor, "reach_s"), refused
+            ):
                 yield late
 
 
 def _limits(run: Run, sensor: str, window_s: str) -> list[tuple[str, float | None]]:
     """Keys of a sensor's largest delay and of the window, with their times; `window_s` names the time of the window."""
-    window, own = run.meta.get("effective") or {}, _section(run, "sensors").get(sensor) or {}
+    window, own = (
+        run.meta.get("effective") or {},
+        _section(run, "sensors").get(sensor) or {},
+    )
     return [
         (f"sensors.{sensor}.max_delay_s", own.get("max_delay_s")),
         (str(window.get("lag_key")), window.get(window_s, window.get("lag_s"))),
@@ -246,9 +330,17 @@ def _too_old(run: Run, sensor: str, updates: Table) -> str:
 
 def _failures(run: Run) -> Iterator[Diagnostic]:
     """Failures inside the estimator."""
-    counts = {kind: n for kind, n in dict(run.meta.get("failures") or {}).items() if n and kind != _NO_FAILURE}
+    counts = {
+        kind: n
+        for kind, n in dict(run.meta.get("failures") or {}).items()
+        if n and kind != _NO_FAILURE
+    }
     if counts:
-        first = f" (the first one: {run.meta['first_failure']})" if run.meta.get("first_failure") else ""
+        first = (
+            f" (the first one: {run.meta['first_failure']})"
+            if run.meta.get("first_failure")
+            else ""
+        )
         cure = "these tracks are less accurate; look at NIS by sensor, noise, clocks and starts"
         text = f"failures: {', '.join(f'{n} {kind}' for kind, n in counts.items())}{first}: {cure}"
         yield Diagnostic("estimator", text)
@@ -256,9 +348,15 @@ def _failures(run: Run) -> Iterator[Diagnostic]:
 
 def _fragmentation(run: Run) -> Iterator[Diagnostic]:
     """Tracks that break off and restart, and births that die unconfirmed: bad tracking that needs no truth."""
-    (lifetimes_s, num_breaks), now_ns = lifetimes_and_breaks(run), run.tables["timing"]["now_ns"]
+    (lifetimes_s, num_breaks), now_ns = (
+        lifetimes_and_breaks(run),
+        run.tables["timing"]["now_ns"],
+    )
     total, minutes = len(lifetimes_s), float(lifetimes_s.sum()) / 60.0
-    if num_breaks >= max(_FEWEST_BREAKS, _BREAKS_SHARE * total) and num_breaks > MOST_BREAKS_PER_MINUTE * minutes:
+    if (
+        num_breaks >= max(_FEWEST_BREAKS, _BREAKS_SHARE * total)
+        and num_breaks > MOST_BREAKS_PER_MINUTE * minutes
+    ):
         text = (
             f"{num_breaks} of {total} confirmed tracks begin where another one has just ended: "
             f"{num_breaks / minutes:.2g} breaks per object and minute, median life {np.median(lifetimes_s):.2g} of "
@@ -280,20 +378,39 @@ def _fragmentation(run: Run) -> Iterator[Diagnostic]:
 def lifetimes_and_breaks(run: Run) -> tuple[FloatArray, int]:
     """Lifetimes [s] of the confirmed tracks, shape (tracks,), and how many begin where and when another one ends."""
     tracks = run.tables["tracks"]
-    tracks = tracks.where(np.isin(tracks["track_id"], tracks["track_id"][confirmed(tracks)]))
+    tracks = tracks.where(
+        np.isin(tracks["track_id"], tracks["track_id"][confirmed(tracks)])
+    )
     births = np.unique(tracks["track_id"], return_index=True)[1]
-    ends = tracks.num_rows - 1 - np.unique(tracks["track_id"][::-1], return_index=True)[1]
-    born_s, ended_s = ((tracks["now_ns"][each] - tracks["now_ns"][:1]) / NS_PER_S for each in (births, ends))
-    positions_m, speed_mps = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1), tracks["speed_mps"][ends]
+    ends = (
+        tracks.num_rows - 1 - np.unique(tracks["track_id"][::-1], return_index=True)[1]
+    )
+    born_s, ended_s = (
+        (tracks["now_ns"][each] - tracks["now_ns"][:1]) / NS_PER_S
+        for each in (births, ends)
+    )
+    positions_m, speed_mps = (
+        np.stack([tracks["x_m"], tracks["y_m"]], axis=-1),
+        tracks["speed_mps"][ends],
+    )
     velocities_mps = cartesian(np.stack([tracks["yaw_rad"][ends], speed_mps], axis=-1))
     free, num_breaks = np.ones(len(births), dtype=bool), 0
     for k in np.argsort(born_s, kind="stable").tolist():
         gap_s = born_s[k] - ended_s
-        late = (born_s < born_s[k]) & (ended_s < ended_s[k]) & (gap_s >= -_OVERLAP_S) & (gap_s <= _GAP_S)
+        late = (
+            (born_s < born_s[k])
+            & (ended_s < ended_s[k])
+            & (gap_s >= -_OVERLAP_S)
+            & (gap_s <= _GAP_S)
+        )
         before = np.flatnonzero(free & late)
-        expected_m = positions_m[ends[before]] + velocities_mps[before] * gap_s[before, None]
+        expected_m = (
+            positions_m[ends[before]] + velocities_mps[before] * gap_s[before, None]
+        )
         apart_m = np.linalg.norm(positions_m[births[k]] - expected_m, axis=-1)
-        near = apart_m <= _NEAR_M + _DEPARTURE * np.abs(speed_mps[before] * gap_s[before])
+        near = apart_m <= _NEAR_M + _DEPARTURE * np.abs(
+            speed_mps[before] * gap_s[before]
+        )
         if near.any():
             free[before[near][apart_m[near].argmin()]] = False
             num_breaks += 1

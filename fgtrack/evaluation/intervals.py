@@ -47,9 +47,14 @@ class Estimate:
 UNKNOWN = Estimate(math.nan, math.nan, math.nan, 0)
 
 
-def paired(values_a: Sequence[float] | FloatArray, values_b: Sequence[float] | FloatArray) -> Estimate:
+def paired(
+    values_a: Sequence[float] | FloatArray, values_b: Sequence[float] | FloatArray
+) -> Estimate:
     """Mean of `values_a` minus `values_b` and its 95 % interval, see `average`; entry k of both is of the same seed."""
-    a, b = np.asarray(values_a, dtype=np.float64), np.asarray(values_b, dtype=np.float64)
+    a, b = (
+        np.asarray(values_a, dtype=np.float64),
+        np.asarray(values_b, dtype=np.float64),
+    )
     return average((a - b)[np.isfinite(a) & np.isfinite(b)])
 
 
@@ -59,7 +64,9 @@ def average(values: Sequence[float] | FloatArray) -> Estimate:
     known = known[~np.isnan(known)]
     if not len(known):
         return UNKNOWN
-    error = float(known.std(ddof=1)) / math.sqrt(len(known)) if len(known) > 1 else math.nan
+    error = (
+        float(known.std(ddof=1)) / math.sqrt(len(known)) if len(known) > 1 else math.nan
+    )
     return _t_interval(float(known.mean()), error, len(known))
 
 
@@ -75,18 +82,32 @@ def within_run(ticks: FloatArray, statistic: Statistic) -> Estimate:
     flat over these frequencies. Of fewer than eight ticks it is unknown.
     """
     sums, size = ticks.sum(axis=0), max(1, math.ceil(len(ticks) / _MOST_PIECES))
-    pieces = np.add.reduceat(ticks, np.arange(0, len(ticks), size), axis=0) if len(ticks) else ticks
+    pieces = (
+        np.add.reduceat(ticks, np.arange(0, len(ticks), size), axis=0)
+        if len(ticks)
+        else ticks
+    )
     n = len(pieces)
     with np.errstate(divide="ignore", invalid="ignore"):  # a mean of nothing is NaN
         value = float(statistic(sums))
         if n < _FEWEST_PIECES or not math.isfinite(value):
             return Estimate(value, math.nan, math.nan, n)
         steps = np.diag(_STEP * sums)
-        change = statistic((sums + steps).T) - statistic((sums - steps).T)  # 0 for a sum of 0: nothing adds to it
-    x = pieces @ np.divide(change, 2.0 * _STEP * sums, out=np.zeros_like(sums), where=sums != 0.0)
-    freedom = min(max(int(n / (_LENGTHS * correlation_length(x))), _FEWEST_COSINES), n // 4)
-    cosines = np.cos(math.pi / n * np.outer(np.arange(1, freedom + 1), np.arange(n) + 0.5))
-    return _t_interval(value, math.sqrt(2.0 * float(np.square(cosines @ x).mean())), freedom + 1)
+        change = statistic((sums + steps).T) - statistic(
+            (sums - steps).T
+        )  # 0 for a sum of 0: nothing adds to it
+    x = pieces @ np.divide(
+        change, 2.0 * _STEP * sums, out=np.zeros_like(sums), where=sums != 0.0
+    )
+    freedom = min(
+        max(int(n / (_LENGTHS * correlation_length(x))), _FEWEST_COSINES), n // 4
+    )
+    cosines = np.cos(
+        math.pi / n * np.outer(np.arange(1, freedom + 1), np.arange(n) + 0.5)
+    )
+    return _t_interval(
+        value, math.sqrt(2.0 * float(np.square(cosines @ x).mean())), freedom + 1
+    )
 
 
 def mean_square(ticks: FloatArray) -> Estimate:
@@ -102,7 +123,10 @@ def by_stamp(stamps_ns: IntArray, samples: FloatArray) -> FloatArray:
     known = np.isfinite(samples).all(axis=1)
     distinct, index = np.unique(stamps_ns, return_inverse=True)
     columns = [*samples[known].T, np.ones(int(known.sum()))]
-    return np.stack([np.bincount(index[known], column, len(distinct)) for column in columns], axis=-1)
+    return np.stack(
+        [np.bincount(index[known], column, len(distinct)) for column in columns],
+        axis=-1,
+    )
 
 
 def correlation_length(values: FloatArray) -> float:

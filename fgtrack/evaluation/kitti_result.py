@@ -16,27 +16,31 @@ import pandas as pd
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.geometry import rotation, wrap_angle
+from fgtrack.core.output import check_apart, write_file
 from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation.matching import confirmed
 from fgtrack.evaluation.placement import update_rows
 from fgtrack.evaluation.truth import ego_states
-from fgtrack.io.adapters.kitti import CLASS_NAMES, is_sequence, view_of_sequence
-from fgtrack.io.adapters.kitti_view import PERIOD_NS, Box, View
-from fgtrack.io.output import check_apart, write_file
-from fgtrack.io.run import NO_TRACK, Run
+from fgtrack.inputs.formats.kitti import CLASS_NAMES, is_sequence, view_of_sequence
+from fgtrack.inputs.formats.kitti_view import PERIOD_NS, Box, View
+from fgtrack.runs import NO_TRACK, Run
 
 _MEANS = ["height_m", "width_m", "length_m", "score"]
 _BOX = [*_MEANS[:3], "z_m"]
 DataFrame = Any  # of pandas, which is untyped
 
 
-def write_kitti_result(run: Run, sequence: Path, out: Path, *, overwrite: bool = False) -> tuple[int, int, int]:
+def write_kitti_result(
+    run: Run, sequence: Path, out: Path, *, overwrite: bool = False
+) -> tuple[int, int, int]:
     """Write the tracks of `run` at the frames of `sequence`, its file in `oxts/` or a folder with one, to `out`.
     Returns the numbers of boxes, of tracks with a box, and of tracks of which no detection has a size. `CallError` if
     `sequence` is another file, or `out` exists or lies in an input; `DataError` if no detection has a size.
     """
     if not is_sequence(sequence):
-        raise CallError(f"{sequence}: is not a sequence of the KITTI data set, name its oxts/NNNN.txt")
+        raise CallError(
+            f"{sequence}: is not a sequence of the KITTI data set, name its oxts/NNNN.txt"
+        )
     check_apart(out, [sequence, *(() if run.path is None else (run.path,))])
     views = _located(run, view_of_sequence(sequence))
     states = _states(run, len(views))
@@ -60,37 +64,70 @@ def _located(run: Run, views: list[View]) -> list[View]:
     frames_ns = np.arange(len(views)) * PERIOD_NS
     positions = ego_states(run.tables["ego"], frames_ns)[:, :2].tolist()
     return [
-        view if math.isnan(x_m) else view._replace(ego=replace(view.ego, x_m=x_m, y_m=y_m))
+        view
+        if math.isnan(x_m)
+        else view._replace(ego=replace(view.ego, x_m=x_m, y_m=y_m))
         for view, (x_m, y_m) in zip(views, positions, strict=True)
     ]
 
 
 def _states(run: Run, num_frames: int) -> DataFrame:
     """The tracks at the newest tick of every frame, moved to it, with what is known of their boxes by then."""
-    timing = run.timing.assign(frame=-(-run.timing["now_ns"] // PERIOD_NS)).drop_duplicates("frame", keep="last")
+    timing = run.timing.assign(
+        frame=-(-run.timing["now_ns"] // PERIOD_NS)
+    ).drop_duplicates("frame", keep="last")
     timing = timing[timing["frame"].between(0, num_frames - 1)][["tick", "frame"]]
-    tracks = run.tracks[confirmed(run.tables["tracks"])] if run.evaluation.confirmed_only else run.tracks
+    tracks = (
+        run.tracks[confirmed(run.tables["tracks"])]
+        if run.evaluation.confirmed_only
+        else run.tracks
+    )
     states = (
-        tracks.fillna(0.0).assign(score=tracks["score"]).merge(timing, on="tick").sort_values("tick", kind="stable")
+        tracks.fillna(0.0)
+        .assign(score=tracks["score"])
+        .merge(timing, on="tick")
+        .sort_values("tick", kind="stable")
     )
     ahead_s = (states["frame"] * PERIOD_NS - states["now_ns"]) / NS_PER_S
-    turned_rad, way_m = ahead_s * states["yaw_rate_radps"], ahead_s * states["speed_mps"]
+    turned_rad, way_m = (
+        ahead_s * states["yaw_rate_radps"],
+        ahead_s * states["speed_mps"],
+    )
     middle_rad = states["yaw_rad"] + 0.5 * turned_rad
-    moved = {"x_m": states["x_m"] + way_m * np.cos(middle_rad), "y_m": states["y_m"] + way_m * np.sin(middle_rad)}
+    moved = {
+        "x_m": states["x_m"] + way_m * np.cos(middle_rad),
+        "y_m": states["y_m"] + way_m * np.sin(middle_rad),
+    }
     states = states.assign(**moved, yaw_rad=states["yaw_rad"] + turned_rad)
-    states = pd.merge_asof(states, _boxes(run), on="tick", by="track_id", suffixes=("", "_of_detections"))
-    return states.assign(score=states["score"].fillna(states.pop("score_of_detections")))
+    states = pd.merge_asof(
+        states, _boxes(run), on="tick", by="track_id", suffixes=("", "_of_detections")
+    )
+    return states.assign(
+        score=states["score"].fillna(states.pop("score_of_detections"))
+    )
 
 
 def _boxes(run: Run) -> DataFrame:
     """Mean size and score, most frequent class and last height of the detections that a track has fused, by tick."""
     rows = update_rows(run)
-    updates = run.updates.iloc[rows[rows >= 0]][["tick", "track_id"]].reset_index(drop=True)
-    boxes = run.detections[rows >= 0][[*_BOX, "score", "class_name"]].reset_index(drop=True).join(updates)
-    boxes = boxes[boxes["track_id"] != NO_TRACK].sort_values("tick", kind="stable").reset_index(drop=True)
+    updates = run.updates.iloc[rows[rows >= 0]][["tick", "track_id"]].reset_index(
+        drop=True
+    )
+    boxes = (
+        run.detections[rows >= 0][[*_BOX, "score", "class_name"]]
+        .reset_index(drop=True)
+        .join(updates)
+    )
+    boxes = (
+        boxes[boxes["track_id"] != NO_TRACK]
+        .sort_values("tick", kind="stable")
+        .reset_index(drop=True)
+    )
     boxes.loc[boxes[_BOX].isna().any(axis=1), [*_MEANS, "z_m"]] = np.nan
     kinds = pd.get_dummies(boxes["class_name"]).drop(columns="", errors="ignore")
-    kinds = kinds.assign(car=kinds.get("car", False)).groupby(boxes["track_id"]).cumsum()
+    kinds = (
+        kinds.assign(car=kinds.get("car", False)).groupby(boxes["track_id"]).cumsum()
+    )
     groups = boxes.groupby("track_id")
     boxes[_MEANS] = groups[_MEANS].expanding().mean().droplevel(0)
     boxes["z_m"], boxes["score"] = groups["z_m"].ffill(), boxes["score"].fillna(1.0)
@@ -100,14 +137,32 @@ def _boxes(run: Run) -> DataFrame:
 def _line(state: dict[str, Any], view: View) -> str | None:
     """The line of a track; None where camera 2 does not see it."""
     ego, height_m = view.ego, state["height_m"]
-    in_ego_m = np.array([state["x_m"] - ego.x_m, state["y_m"] - ego.y_m]) @ rotation(ego.yaw_rad)
+    in_ego_m = np.array([state["x_m"] - ego.x_m, state["y_m"] - ego.y_m]) @ rotation(
+        ego.yaw_rad
+    )
     bottom_m = np.append(in_ego_m, state["z_m"] - 0.5 * height_m)
     position_m, turned_rad = view.rectified(bottom_m, state["yaw_rad"] - ego.yaw_rad)
     right_m, down_m, forward_m = position_m.tolist()
-    box = Box(height_m, state["width_m"], state["length_m"], right_m, down_m, forward_m, turned_rad)
+    box = Box(
+        height_m,
+        state["width_m"],
+        state["length_m"],
+        right_m,
+        down_m,
+        forward_m,
+        turned_rad,
+    )
     image = box.image_px(view.projection)
     if image is None:
         return None
-    numbers = (wrap_angle(turned_rad - math.atan2(box.x_m, box.z_m)), *image, *box, state["score"])
-    name, kind = f"{state['frame']} {state['track_id']}", CLASS_NAMES.get(state["class_name"], state["class_name"])
+    numbers = (
+        wrap_angle(turned_rad - math.atan2(box.x_m, box.z_m)),
+        *image,
+        *box,
+        state["score"],
+    )
+    name, kind = (
+        f"{state['frame']} {state['track_id']}",
+        CLASS_NAMES.get(state["class_name"], state["class_name"]),
+    )
     return f"{name} {kind} -1 -1 {' '.join(f'{value:.6f}' for value in numbers)}\n"

@@ -7,8 +7,14 @@ import numpy as np
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray, TrackStatus
-from fgtrack.evaluation.truth import TRUE_STATE, TruePath, in_ignored_regions, true_paths, visible
-from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, Table
+from fgtrack.evaluation.truth import (
+    TRUE_STATE,
+    TruePath,
+    in_ignored_regions,
+    true_paths,
+    visible,
+)
+from fgtrack.runs import NO_TRACK, EvaluationConfig, Run, Table
 
 NO_OBJECT = -1
 """Object index of a track row that is paired with no true object."""
@@ -88,13 +94,17 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
         return None
     timing = run.tables["timing"]
     tracks = run.tables["tracks"]
-    kept = recorded(run, tracks["stamp_ns"]) & np.isin(tracks["tick"], timing["tick"])  # not of a tick that was killed
+    kept = recorded(run, tracks["stamp_ns"]) & np.isin(
+        tracks["tick"], timing["tick"]
+    )  # not of a tick that was killed
     tracks = tracks.where(kept & confirmed(tracks) if options.confirmed_only else kept)
     if run.tables["ignored"].num_rows:
         tracks = tracks.where(~_ignored(run, tracks, paths, options.gate_m))
     candidates, distances_m = distances(tracks, paths)
     tick_index = np.searchsorted(timing["tick"], tracks["tick"])
-    object_index = nearest_pairs(distances_m, tracks["track_id"], tick_index, timing.num_rows, options.gate_m)
+    object_index = nearest_pairs(
+        distances_m, tracks["track_id"], tick_index, timing.num_rows, options.gate_m
+    )
     paired = np.flatnonzero(object_index != NO_OBJECT)
     track_ids = np.full((timing.num_rows, len(paths)), NO_TRACK)
     track_ids[tick_index[paired], object_index[paired]] = tracks["track_id"][paired]
@@ -108,13 +118,17 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
         distances_m=distances_m,
         now_ns=timing["now_ns"],
         tick_index=tick_index,
-        present=np.stack([np.isfinite(path.at(timing["now_ns"])[:, 0]) for path in paths], axis=-1),
+        present=np.stack(
+            [np.isfinite(path.at(timing["now_ns"])[:, 0]) for path in paths], axis=-1
+        ),
         track_ids=track_ids,
         in_view=visible(run, paths, timing["now_ns"]),
     )
 
 
-def pair(scores: FloatArray, ids: IntArray, tick_index: IntArray, previous: IntArray) -> IntArray:
+def pair(
+    scores: FloatArray, ids: IntArray, tick_index: IntArray, previous: IntArray
+) -> IntArray:
     """Object of every row, shape (rows,), so that each tick has the largest sum of scores; `NO_OBJECT` without one.
     `scores`, shape (rows, objects), are 0 for pairs that are not allowed; pairs of the tick `previous`, (ticks,), stay.
     """
@@ -123,8 +137,12 @@ def pair(scores: FloatArray, ids: IntArray, tick_index: IntArray, previous: IntA
     num_ticks, inside = len(previous), scores > 0.0
     object_index = np.full(len(ids), NO_OBJECT)
     rows, columns = np.nonzero(inside)
-    ways = tick_index[rows] * scores.shape[1] + columns  # elsewhere a row has one object, and an object one row
-    ways_per_object = np.bincount(ways, minlength=num_ticks * scores.shape[1]).reshape(num_ticks, scores.shape[1])
+    ways = (
+        tick_index[rows] * scores.shape[1] + columns
+    )  # elsewhere a row has one object, and an object one row
+    ways_per_object = np.bincount(ways, minlength=num_ticks * scores.shape[1]).reshape(
+        num_ticks, scores.shape[1]
+    )
     unclear = np.asarray((ways_per_object > 1).any(axis=1))
     unclear[tick_index[inside.sum(axis=1) > 1]] = True
     clear_rows, columns = np.nonzero(inside & ~unclear[tick_index, None])
@@ -139,7 +157,9 @@ def pair(scores: FloatArray, ids: IntArray, tick_index: IntArray, previous: IntA
         track_of[object_index[before]] = ids[before]
         mine = scores[rows]
         stays = inside[rows] & (ids[rows, None] == track_of)
-        chosen, columns = linear_sum_assignment(mine + (1.0 + mine.sum()) * stays, maximize=True)
+        chosen, columns = linear_sum_assignment(
+            mine + (1.0 + mine.sum()) * stays, maximize=True
+        )
         allowed = inside[rows][chosen, columns]
         object_index[rows[chosen[allowed]]] = columns[allowed]
     return object_index
@@ -149,7 +169,12 @@ def track_errors(matching: Matching) -> TrackErrors:
     """Errors of the paired rows against the truth at their own stamps."""
     tracks = matching.tracks.where(matching.paired)
     values = state_errors(tracks, matching.true_states[matching.paired])
-    return TrackErrors(tracks["stamp_ns"], matching.object_index[matching.paired], tracks["track_id"], values)
+    return TrackErrors(
+        tracks["stamp_ns"],
+        matching.object_index[matching.paired],
+        tracks["track_id"],
+        values,
+    )
 
 
 def state_errors(states: Table, truth: FloatArray) -> dict[str, FloatArray]:
@@ -158,20 +183,30 @@ def state_errors(states: Table, truth: FloatArray) -> dict[str, FloatArray]:
     c, s = np.cos(truth[:, 2]), np.sin(truth[:, 2])
     yaw_rad = wrap_angles(states["yaw_rad"] - truth[:, 2])
     along_m, across_m = c * dx_m + s * dy_m, c * dy_m - s * dx_m
-    errors = (np.hypot(dx_m, dy_m), along_m, across_m, yaw_rad, states["speed_mps"] - truth[:, 3])
+    errors = (
+        np.hypot(dx_m, dy_m),
+        along_m,
+        across_m,
+        yaw_rad,
+        states["speed_mps"] - truth[:, 3],
+    )
     return dict(zip(ERROR_NAMES, errors, strict=True))
 
 
 def position_nees(matching: Matching) -> FloatArray:
     """Return the NEES of the position of every paired row, shape (p,); NaN where there is none."""
-    return position_squares(matching.tracks.where(matching.paired), matching.true_states[matching.paired])
+    return position_squares(
+        matching.tracks.where(matching.paired), matching.true_states[matching.paired]
+    )
 
 
 def position_squares(states: Table, truth: FloatArray) -> FloatArray:
     """Return the normalised error squared e' P^-1 e of x and y, shape (n,); NaN where P is not positive definite."""
     x, y = states["x_m"] - truth[:, 0], states["y_m"] - truth[:, 1]
     P_x, P_xy, P_y = (states[name] for name in ("p_x_x", "p_x_y", "p_y_y"))
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # of indefinite covariances
+    with np.errstate(
+        over="ignore", invalid="ignore", divide="ignore"
+    ):  # of indefinite covariances
         gain = P_xy / P_x
         rest = P_y - gain * P_xy  # variance of y given x
         squares = x**2 / P_x + (y - gain * x) ** 2 / rest
@@ -183,10 +218,21 @@ def scenes(run: Run, matching: Matching) -> Scenes:
     scored = recorded(run, matching.now_ns)
     rows = np.flatnonzero(scored[matching.tick_index])
     rows = rows[np.argsort(matching.tick_index[rows], kind="stable")]
-    tick_index, present = (np.cumsum(scored) - 1)[matching.tick_index[rows]], matching.present[scored]
+    tick_index, present = (
+        (np.cumsum(scored) - 1)[matching.tick_index[rows]],
+        matching.present[scored],
+    )
     distances_m = matching.distances_m[rows]
-    distances_m = np.where(present[tick_index] & np.isfinite(distances_m), distances_m, np.inf)
-    return Scenes(tick_index, matching.tracks["track_id"][rows], distances_m, present, matching.in_view[scored])
+    distances_m = np.where(
+        present[tick_index] & np.isfinite(distances_m), distances_m, np.inf
+    )
+    return Scenes(
+        tick_index,
+        matching.tracks["track_id"][rows],
+        distances_m,
+        present,
+        matching.in_view[scored],
+    )
 
 
 def confirmed(tracks: Table) -> BoolArray:
@@ -200,15 +246,25 @@ def published_rows(tracks: Table, ticks: IntArray, track_ids: IntArray) -> IntAr
     return np.where(before == after, before, -1)
 
 
-def neighbours(tracks: Table, name: str, values: IntArray, track_ids: IntArray) -> tuple[IntArray, IntArray]:
+def neighbours(
+    tracks: Table, name: str, values: IntArray, track_ids: IntArray
+) -> tuple[IntArray, IntArray]:
     """Rows of these tracks whose column `name` is the last up to, and the first from `values` on; -1 without one."""
     every = np.unique(np.concatenate([tracks[name], values]))
     ranks, wanted = (np.searchsorted(every, each) for each in (tracks[name], values))
-    keys, wanted = tracks["track_id"] * len(every) + ranks, track_ids * len(every) + wanted
+    keys, wanted = (
+        tracks["track_id"] * len(every) + ranks,
+        track_ids * len(every) + wanted,
+    )
     order = np.argsort(keys, kind="stable")
     keys, order = np.append(keys[order], -1), np.append(order, -1)
-    at = np.searchsorted(keys[:-1], wanted, side="right") - 1, np.searchsorted(keys[:-1], wanted)
-    before, after = (np.where(keys[k] // max(len(every), 1) == track_ids, order[k], -1) for k in at)
+    at = (
+        np.searchsorted(keys[:-1], wanted, side="right") - 1,
+        np.searchsorted(keys[:-1], wanted),
+    )
+    before, after = (
+        np.where(keys[k] // max(len(every), 1) == track_ids, order[k], -1) for k in at
+    )
     return before, after
 
 
@@ -218,19 +274,31 @@ def recorded(run: Run, stamps_ns: IntArray) -> BoolArray:
     return np.asarray((stamps_ns >= truth_ns.min()) & (stamps_ns <= truth_ns.max()))
 
 
-def _ignored(run: Run, tracks: Table, paths: list[TruePath], gate_m: float) -> BoolArray:
+def _ignored(
+    run: Run, tracks: Table, paths: list[TruePath], gate_m: float
+) -> BoolArray:
     """True for the rows of no true object that follow an ignored one or lie in an ignored region, as in KITTI."""
     objects = run.tables["ignored"].where(run.tables["ignored"]["outline_m"] == "")
-    unknown = dict.fromkeys(("yaw_rad", "speed_mps", "yaw_rate_radps"), np.full(objects.num_rows, np.nan))
-    _, distances_m = distances(tracks, [*paths, *true_paths(Table({**objects, **unknown}))])
+    unknown = dict.fromkeys(
+        ("yaw_rad", "speed_mps", "yaw_rate_radps"), np.full(objects.num_rows, np.nan)
+    )
+    _, distances_m = distances(
+        tracks, [*paths, *true_paths(Table({**objects, **unknown}))]
+    )
     timing, stamps_ns = run.tables["timing"], tracks["stamp_ns"]
     tick_index = np.searchsorted(timing["tick"], tracks["tick"])
-    index = nearest_pairs(distances_m, tracks["track_id"], tick_index, timing.num_rows, gate_m)
-    in_regions = in_ignored_regions(run, stamps_ns, np.stack([tracks["x_m"], tracks["y_m"]], axis=-1))
+    index = nearest_pairs(
+        distances_m, tracks["track_id"], tick_index, timing.num_rows, gate_m
+    )
+    in_regions = in_ignored_regions(
+        run, stamps_ns, np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
+    )
     return np.asarray((index >= len(paths)) | ((index == NO_OBJECT) & in_regions))
 
 
-def distances(tracks: Table, paths: Sequence[TruePath]) -> tuple[FloatArray, FloatArray]:
+def distances(
+    tracks: Table, paths: Sequence[TruePath]
+) -> tuple[FloatArray, FloatArray]:
     """True states at the stamps of `tracks`, shape (rows, objects, 5), and distances, shape (rows, objects), or NaN."""
     candidates = np.stack([path.at(tracks["stamp_ns"]) for path in paths], axis=1)
     xy = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
@@ -238,9 +306,15 @@ def distances(tracks: Table, paths: Sequence[TruePath]) -> tuple[FloatArray, Flo
 
 
 def nearest_pairs(
-    distances_m: FloatArray, ids: IntArray, tick_index: IntArray, num_ticks: int, gate_m: float
+    distances_m: FloatArray,
+    ids: IntArray,
+    tick_index: IntArray,
+    num_ticks: int,
+    gate_m: float,
 ) -> IntArray:
     """Object of every row: as many pairs as possible, then the least sum of distances, none beyond the gate."""
-    objects = distances_m.shape[1]  # one more pair counts for more than all distances, which are below 1 here
+    objects = distances_m.shape[
+        1
+    ]  # one more pair counts for more than all distances, which are below 1 here
     scores = np.where(distances_m <= gate_m, objects + 1.0 - distances_m / gate_m, 0.0)
     return pair(scores, ids, tick_index, np.arange(num_ticks) - 1)

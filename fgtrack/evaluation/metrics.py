@@ -12,7 +12,12 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Disposition, IntArray
 from fgtrack.evaluation.diagnostics import excluded_lines
 from fgtrack.evaluation.matching import Matching, confirmed, match, scenes, track_errors
-from fgtrack.evaluation.scores.continuity import breaks, switches, times_to_confirm, tracked_visits
+from fgtrack.evaluation.scores.continuity import (
+    breaks,
+    switches,
+    times_to_confirm,
+    tracked_visits,
+)
 from fgtrack.evaluation.scores.innovations import (
     RESIDUAL_NAMES,
     Consistency,
@@ -23,10 +28,13 @@ from fgtrack.evaluation.scores.innovations import (
     residuals,
 )
 from fgtrack.evaluation.scores.lagged import LagMetrics, lag_metrics
-from fgtrack.evaluation.scores.multi_object import MultiObjectMetrics, multi_object_metrics
+from fgtrack.evaluation.scores.multi_object import (
+    MultiObjectMetrics,
+    multi_object_metrics,
+)
 from fgtrack.evaluation.scores.prediction import PredictionErrors, prediction_errors
 from fgtrack.evaluation.scores.statistics import Distribution, Moments
-from fgtrack.io.run import NO_TRACK, EvaluationConfig, Run, Table
+from fgtrack.runs import NO_TRACK, EvaluationConfig, Run, Table
 
 FALSE_TRACK_SHARE = 0.5
 """A track that is paired with a true object in less than this share of its rows is false."""
@@ -56,12 +64,18 @@ class ObjectMetrics:
     @property
     def tracked_share(self) -> float:
         """Share of the ticks at which the object was tracked."""
-        return self.ticks_tracked / self.ticks_present if self.ticks_present else math.nan
+        return (
+            self.ticks_tracked / self.ticks_present if self.ticks_present else math.nan
+        )
 
     @property
     def tracked_share_in_view(self) -> float:
         """Share of the ticks in view at which the object was tracked."""
-        return self.ticks_tracked_in_view / self.ticks_in_view if self.ticks_in_view else math.nan
+        return (
+            self.ticks_tracked_in_view / self.ticks_in_view
+            if self.ticks_in_view
+            else math.nan
+        )
 
 
 @dataclass(frozen=True)
@@ -125,7 +139,9 @@ class Metrics:
     """Present, lagged and final states, see `lag_metrics`."""
     multi_object: MultiObjectMetrics | None = None
     """None for a run without truth, and where the options exclude it."""
-    predictions: Mapping[str, Mapping[str, PredictionErrors]] = field(default_factory=dict)
+    predictions: Mapping[str, Mapping[str, PredictionErrors]] = field(
+        default_factory=dict
+    )
     """Errors of predictions by predictor and horizon, see `prediction_errors`; empty without truth."""
     failures: Mapping[str, int] = field(default_factory=dict)
     """Failures inside the estimator by kind, zeros included; empty of runs that did not count them."""
@@ -145,25 +161,39 @@ class Metrics:
         return values
 
 
-def evaluate(run: Run, truth: Mapping[str, Any] | None = None, options: EvaluationConfig | None = None) -> Metrics:
+def evaluate(
+    run: Run,
+    truth: Mapping[str, Any] | None = None,
+    options: EvaluationConfig | None = None,
+) -> Metrics:
     """Return the metrics of `run`; without truth, those that need none.
 
     `truth` are columns of truth.csv, as of a DataFrame, by default the recording's; `options` by default the run's.
     """
     if truth is not None:
         num_rows = len(truth["stamp_ns"])
-        columns = {name: np.asarray(truth.get(name, np.full(num_rows, np.nan))) for name in run.tables["truth"]}
+        columns = {
+            name: np.asarray(truth.get(name, np.full(num_rows, np.nan)))
+            for name in run.tables["truth"]
+        }
         run = replace(run, tables={**run.tables, "truth": Table(columns)})
     options = options or run.evaluation
     return evaluate_matched(run, match(run, options), options)
 
 
-def evaluate_matched(run: Run, matching: Matching | None, options: EvaluationConfig) -> Metrics:
+def evaluate_matched(
+    run: Run, matching: Matching | None, options: EvaluationConfig
+) -> Metrics:
     """Return the metrics of `run`, whose `match` by these `options` is known."""
     tracks, timing = run.tables["tracks"], run.tables["timing"]
     busy = timing["num_detections"] > 0
-    scored = scenes(run, matching) if matching is not None and options.multi_object else None
-    time_s, detections = timing["process_ns"][busy] / NS_PER_S, timing["num_detections"][busy]
+    scored = (
+        scenes(run, matching) if matching is not None and options.multi_object else None
+    )
+    time_s, detections = (
+        timing["process_ns"][busy] / NS_PER_S,
+        timing["num_detections"][busy],
+    )
     return Metrics(
         name="" if run.path is None else run.path.resolve().name,
         estimator=str(run.meta.get("estimator", "")),
@@ -171,29 +201,45 @@ def evaluate_matched(run: Run, matching: Matching | None, options: EvaluationCon
         num_tracks=len(np.unique(tracks["track_id"])),
         num_confirmed=len(np.unique(tracks["track_id"][confirmed(tracks)])),
         sensors=_sensor_metrics(run),
-        residuals={name: moments_of(name, values) for name, values in local_innovations(run)[1].items()},
+        residuals={
+            name: moments_of(name, values)
+            for name, values in local_innovations(run)[1].items()
+        },
         time_per_tick_s=Distribution.of(time_s),
-        time_per_detection_s=float(time_s.sum() / detections.sum()) if len(time_s) else math.nan,
+        time_per_detection_s=float(time_s.sum() / detections.sum())
+        if len(time_s)
+        else math.nan,
         consistency=consistency(run, matching),
         truth=None if matching is None else _truth_metrics(run, matching, options),
         lagged=lag_metrics(run, matching),
-        multi_object=None if scored is None else multi_object_metrics(scored, options.gate_m),
+        multi_object=None
+        if scored is None
+        else multi_object_metrics(scored, options.gate_m),
         predictions=prediction_errors(run, matching),
         failures=dict(run.meta.get("failures") or {}),
         left_out=tuple(excluded_lines(run.meta)),
     )
 
 
-def _truth_metrics(run: Run, matching: Matching, options: EvaluationConfig) -> TruthMetrics:
-    errors, confirm_s = track_errors(matching), times_to_confirm(run, matching, options.gate_m)
+def _truth_metrics(
+    run: Run, matching: Matching, options: EvaluationConfig
+) -> TruthMetrics:
+    errors, confirm_s = (
+        track_errors(matching),
+        times_to_confirm(run, matching, options.gate_m),
+    )
     tracked = matching.track_ids != NO_TRACK
 
     def together(indices: Sequence[int]) -> ObjectMetrics:
         mine = np.isin(errors.object_index, indices)
         present, in_view = matching.present[:, indices], matching.in_view[:, indices]
-        sequences = [matching.track_ids[matching.present[:, index], index] for index in indices]
+        sequences = [
+            matching.track_ids[matching.present[:, index], index] for index in indices
+        ]
         return ObjectMetrics(
-            errors={name: Moments.of(values[mine]) for name, values in errors.values.items()},
+            errors={
+                name: Moments.of(values[mine]) for name, values in errors.values.items()
+            },
             ticks_present=int(present.sum()),
             ticks_tracked=int((present & tracked[:, indices]).sum()),
             breaks=sum(map(breaks, sequences)),
@@ -204,9 +250,15 @@ def _truth_metrics(run: Run, matching: Matching, options: EvaluationConfig) -> T
         )
 
     ids, inverse = np.unique(matching.tracks["track_id"], return_inverse=True)
-    life, paired_life = (np.bincount(of, minlength=len(ids)) for of in (inverse, inverse[matching.paired]))
+    life, paired_life = (
+        np.bincount(of, minlength=len(ids))
+        for of in (inverse, inverse[matching.paired])
+    )
     return TruthMetrics(
-        objects={object_id: together([index]) for index, object_id in enumerate(matching.object_ids)},
+        objects={
+            object_id: together([index])
+            for index, object_id in enumerate(matching.object_ids)
+        },
         judged_tracks=len(ids),
         false_tracks=int((paired_life < FALSE_TRACK_SHARE * life).sum()),
         tracked_visits=tracked_visits(matching),
@@ -219,11 +271,15 @@ def _sensor_metrics(run: Run) -> dict[str, SensorMetrics]:
     sensors = {}
     for sensor in np.unique(updates["sensor"]).tolist():
         mine = updates["sensor"] == sensor
-        moments = {name: moments_of(name, values[name][mine]) for name in RESIDUAL_NAMES}
+        moments = {
+            name: moments_of(name, values[name][mine]) for name in RESIDUAL_NAMES
+        }
         counts = Counter(updates["disposition"][mine].tolist())
         sensors[sensor] = SensorMetrics(
             dispositions={name.value: counts[name.value] for name in Disposition},
-            overtaken=_overtaken(updates["stamp_ns"][mine], updates["receipt_ns"][mine]),
+            overtaken=_overtaken(
+                updates["stamp_ns"][mine], updates["receipt_ns"][mine]
+            ),
             delay_s=Distribution.of(message_delays(updates.where(mine))[1]),
             residuals={name: value for name, value in moments.items() if value.count},
         )
@@ -239,8 +295,15 @@ def _overtaken(stamps_ns: IntArray, receipts_ns: IntArray) -> int:
 def _plain(value: Any) -> Any:
     """`value` as JSON: fields and properties but flags by name, NaN as None, keys as text."""
     if is_dataclass(value):
-        derived = [name for name, each in vars(type(value)).items() if isinstance(each, property) and name[:3] != "is_"]
-        value = {name: getattr(value, name) for name in (*(entry.name for entry in fields(value)), *derived)}
+        derived = [
+            name
+            for name, each in vars(type(value)).items()
+            if isinstance(each, property) and name[:3] != "is_"
+        ]
+        value = {
+            name: getattr(value, name)
+            for name in (*(entry.name for entry in fields(value)), *derived)
+        }
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, tuple):

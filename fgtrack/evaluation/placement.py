@@ -8,10 +8,10 @@ import numpy as np
 from fgtrack.core.geometry import cartesian, rotations, wrap_angles
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.truth import ego_states
-from fgtrack.io.run import Run
 from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
 from fgtrack.models.road import OPEN_SPACE
 from fgtrack.models.track_map import TrackMap
+from fgtrack.runs import Run
 
 _BOUND_STEP_M = 2.0
 _KEY = ["sensor", "stamp_ns", "receipt_ns", "index"]
@@ -37,12 +37,18 @@ def placed(run: Run) -> Placed:
     frame, stamps_ns = table["frame"], table["stamp_ns"]
     poses = ego_states(run.tables["ego"], stamps_ns)
     ego, sensors = run.config.get("ego") or {}, run.config.get("sensors") or {}
-    origin = [float(ego.get("detection_origin_x_m", 0.0)), float(ego.get("detection_origin_y_m", 0.0)), 0.0]
+    origin = [
+        float(ego.get("detection_origin_x_m", 0.0)),
+        float(ego.get("detection_origin_y_m", 0.0)),
+        0.0,
+    ]
     mounts = np.tile(origin, (len(frame), 1))  # ahead, left, yaw
     for name in np.unique(table["sensor"]).tolist():
         mount = (sensors.get(name) or {}).get("mount") or {}
         mine = (frame == "sensor") & (table["sensor"] == name)
-        mounts[mine] += [float(mount.get(key, 0.0)) for key in ("x_m", "y_m", "yaw_rad")]
+        mounts[mine] += [
+            float(mount.get(key, 0.0)) for key in ("x_m", "y_m", "yaw_rad")
+        ]
     turns, sensor_rad = rotations(poses[:, 2]), poses[:, 2] + mounts[:, 2]
     sensor_m = poses[:, :2] + np.einsum("nij,nj->ni", turns, mounts[:, :2])
     in_map, given_m = frame == "map", np.stack([table["x_m"], table["y_m"]], axis=-1)
@@ -50,10 +56,14 @@ def placed(run: Run) -> Placed:
     bearing_rad = sensor_rad + table["bearing_rad"]
     polar_m = sensor_m + cartesian(np.stack([bearing_rad, table["range_m"]], axis=-1))
     position_m = np.where(in_map[:, None], given_m, turned_m)
-    position_m = np.where(np.isfinite(given_m).all(axis=-1)[:, None], position_m, polar_m)
+    position_m = np.where(
+        np.isfinite(given_m).all(axis=-1)[:, None], position_m, polar_m
+    )
     yaw_rad = np.where(in_map, table["yaw_rad"], table["yaw_rad"] + sensor_rad)
     with np.errstate(invalid="ignore"):  # of infinite angles
-        return Placed(position_m, wrap_angles(yaw_rad), sensor_m, wrap_angles(bearing_rad))
+        return Placed(
+            position_m, wrap_angles(yaw_rad), sensor_m, wrap_angles(bearing_rad)
+        )
 
 
 def update_rows(run: Run) -> IntArray:
@@ -61,7 +71,10 @@ def update_rows(run: Run) -> IntArray:
     import pandas as pd
 
     frames = run.updates[_KEY], run.detections[_KEY]
-    keys = [pd.MultiIndex.from_frame(frame.assign(nth=frame.groupby(_KEY).cumcount())) for frame in frames]
+    keys = [
+        pd.MultiIndex.from_frame(frame.assign(nth=frame.groupby(_KEY).cumcount()))
+        for frame in frames
+    ]
     return np.asarray(keys[0].get_indexer(keys[1]), dtype=np.int64)
 
 
@@ -82,6 +95,12 @@ def roads(run: Run) -> tuple[dict[str, TrackMap], list[str]]:
 
 def road_lines(road: TrackMap) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the left bound, the right bound and the reference line of `road`, each of shape (n, 2)."""
-    s_m = np.linspace(0.0, road.length_m, max(2, round(road.length_m / _BOUND_STEP_M)) + 1)
+    s_m = np.linspace(
+        0.0, road.length_m, max(2, round(road.length_m / _BOUND_STEP_M)) + 1
+    )
     left_m, right_m = road.bounds(s_m)
-    return road.position(s_m, left_m), road.position(s_m, -right_m), road.position(s_m, np.zeros_like(s_m))
+    return (
+        road.position(s_m, left_m),
+        road.position(s_m, -right_m),
+        road.position(s_m, np.zeros_like(s_m)),
+    )

@@ -14,7 +14,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.types import MEASURABLE
 from fgtrack.evaluation.matching import Matching, match
 from fgtrack.evaluation.metrics import Metrics, evaluate_matched
-from fgtrack.io.run import Run, is_run_folder, load_run
+from fgtrack.runs import Run, is_run_folder, load_run
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +67,17 @@ def start_ns(runs: Sequence[EvaluatedRun]) -> int:
 
 def labelled(runs: Sequence[Run]) -> dict[str, Run]:
     """Runs by the shortest unique end of their path, and by the estimator; `CallError` if a run is given twice."""
-    identities = Counter(str(run.path.resolve()) if run.path else id(run) for run in runs)
+    identities = Counter(
+        str(run.path.resolve()) if run.path else id(run) for run in runs
+    )
     for identity in (identity for identity, times in identities.items() if times > 1):
-        raise CallError(f"{identity if isinstance(identity, str) else 'run'}: is given twice, name every run once")
+        raise CallError(
+            f"{identity if isinstance(identity, str) else 'run'}: is given twice, name every run once"
+        )
     paths = [run.path.resolve() for run in runs if run.path]
-    length = next(n for n in count(1) if len({path.parts[-n:] for path in paths}) == len(paths))
+    length = next(
+        n for n in count(1) if len({path.parts[-n:] for path in paths}) == len(paths)
+    )
     labels: dict[str, Run] = {}
     for run in runs:
         estimator = str(run.meta.get("estimator", "run"))
@@ -88,7 +94,9 @@ def same_recording(one: Run, other: Run) -> bool:
     """
     if not one.tables["truth"].equals(other.tables["truth"]):
         return False
-    common = np.intersect1d(one.tables["updates"]["sensor"], other.tables["updates"]["sensor"]).tolist()
+    common = np.intersect1d(
+        one.tables["updates"]["sensor"], other.tables["updates"]["sensor"]
+    ).tolist()
     if common:
         return all(_same_detections(one, other, sensor) for sensor in common)
     for name in ("truth", "ego"):
@@ -101,7 +109,9 @@ def by_recording(runs: Sequence[EvaluatedRun]) -> list[list[EvaluatedRun]]:
     """`runs` in groups, those of the same recording together."""
     groups: list[list[EvaluatedRun]] = []
     for item in runs:
-        group = next((group for group in groups if same_recording(group[0].run, item.run)), None)
+        group = next(
+            (group for group in groups if same_recording(group[0].run, item.run)), None
+        )
         if group is None:
             groups.append(group := [])
         group.append(item)
@@ -113,7 +123,9 @@ def recordings_warning(runs: Sequence[EvaluatedRun]) -> list[str]:
     groups = by_recording(runs)
     texts = []
     for group in groups:
-        source = (group[0].run.meta.get("input") or {}).get("path") or "messages in memory"
+        source = (group[0].run.meta.get("input") or {}).get(
+            "path"
+        ) or "messages in memory"
         texts.append(f"{', '.join(one.label for one in group)} ({source})")
     text = f"the runs are of {len(groups)} recordings, so their numbers cannot be compared across them"
     return [f"{text}: {'; '.join(texts)}"] if len(groups) > 1 else []
@@ -123,14 +135,23 @@ def _flat(given: Any) -> list[Run | EvaluatedRun]:  # Any: what a user gives
     if isinstance(given, Run | EvaluatedRun):
         return [given]
     if isinstance(given, Mapping):
-        return [EvaluatedRun(str(label), one_evaluated(run).run) for label, run in given.items()]
+        return [
+            EvaluatedRun(str(label), one_evaluated(run).run)
+            for label, run in given.items()
+        ]
     if not isinstance(given, Path | str):
         if not isinstance(given, Iterable):
-            raise CallError(f"runs: must be runs or paths of run folders, there is a {type(given).__name__}")
+            raise CallError(
+                f"runs: must be runs or paths of run folders, there is a {type(given).__name__}"
+            )
         return [item for entry in given for item in _flat(entry)]
     path = Path(given)
     for pattern in ("", "*", "*/*") if path.is_dir() else ():
-        if folders := [each for each in (sorted(path.glob(pattern)) if pattern else [path]) if is_run_folder(each)]:
+        if folders := [
+            each
+            for each in (sorted(path.glob(pattern)) if pattern else [path])
+            if is_run_folder(each)
+        ]:
             return [load_run(folder) for folder in folders]
     raise CallError(f"{path}: no run folder, make one with `fgtrack replay`")
 
@@ -138,12 +159,21 @@ def _flat(given: Any) -> list[Run | EvaluatedRun]:  # Any: what a user gives
 def _same_detections(one: Run, other: Run, sensor: str) -> bool:
     """True if the detections of a sensor have the same stamps or receipts, and the same values where both have any."""
     (updates, others), (values, other_values) = (
-        [run.tables[name].where(run.tables[name]["sensor"] == sensor) for run in (one, other)]
+        [
+            run.tables[name].where(run.tables[name]["sensor"] == sensor)
+            for run in (one, other)
+        ]
         for name in ("updates", "detections")
     )
-    if not any(np.array_equal(np.sort(updates[name]), np.sort(others[name])) for name in ("stamp_ns", "receipt_ns")):
+    if not any(
+        np.array_equal(np.sort(updates[name]), np.sort(others[name]))
+        for name in ("stamp_ns", "receipt_ns")
+    ):
         return False
     known = values.num_rows and other_values.num_rows
     return not known or all(
-        np.array_equal(np.sort(values[name]), np.sort(other_values[name]), equal_nan=True) for name in MEASURABLE
+        np.array_equal(
+            np.sort(values[name]), np.sort(other_values[name]), equal_nan=True
+        )
+        for name in MEASURABLE
     )

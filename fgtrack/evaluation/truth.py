@@ -10,8 +10,8 @@ from fgtrack.core.checks import LARGEST
 from fgtrack.core.geometry import cartesian, in_polygon, wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import EGO_ID, BoolArray, FloatArray, IntArray
-from fgtrack.io.run import Run, Table
 from fgtrack.models.sensors import SensorModel
+from fgtrack.runs import Run, Table
 
 #: What is interpolated, in the order of the columns of `TruePath.at`.
 TRUE_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
@@ -35,9 +35,15 @@ class TruePath:
         There is no truth outside of the stamps, and in a gap of more than a second and of more than five usual periods.
         """
         if len(self.stamps_ns) == 1:
-            return np.where((stamps_ns == self.stamps_ns[0])[:, None], self.states[0], np.nan)
+            return np.where(
+                (stamps_ns == self.stamps_ns[0])[:, None], self.states[0], np.nan
+            )
         periods_ns = np.diff(self.stamps_ns)
-        left = np.clip(np.searchsorted(self.stamps_ns, stamps_ns, side="right") - 1, 0, len(periods_ns) - 1)
+        left = np.clip(
+            np.searchsorted(self.stamps_ns, stamps_ns, side="right") - 1,
+            0,
+            len(periods_ns) - 1,
+        )
         h_ns = periods_ns[left]
         u = (stamps_ns - self.stamps_ns[left]) / h_ns
         a, b = self.states[left], self.states[left + 1]
@@ -69,7 +75,9 @@ def true_paths(truth: Table) -> list[TruePath]:
     return paths
 
 
-def true_states(truth: Table, object_index: IntArray, stamps_ns: IntArray) -> FloatArray:
+def true_states(
+    truth: Table, object_index: IntArray, stamps_ns: IntArray
+) -> FloatArray:
     """Return the true states at `stamps_ns` of these of the `true_paths`, shape (n, 5); NaN without truth."""
     states = np.full((len(stamps_ns), len(TRUE_STATE)), np.nan)
     for index, path in enumerate(true_paths(truth)):
@@ -78,15 +86,21 @@ def true_states(truth: Table, object_index: IntArray, stamps_ns: IntArray) -> Fl
     return states
 
 
-def in_ignored_regions(run: Run, stamps_ns: IntArray, points_m: FloatArray) -> BoolArray:
+def in_ignored_regions(
+    run: Run, stamps_ns: IntArray, points_m: FloatArray
+) -> BoolArray:
     """True for `points_m`, shape (n, 2), in an unlabelled region of the truth stamp that is nearest to `stamps_ns`."""
     ignored, inside = run.tables["ignored"], np.zeros(len(stamps_ns), dtype=np.bool_)
     regions = ignored.where(ignored["outline_m"] != "")
     known_ns = np.union1d(run.tables["truth"]["stamp_ns"], ignored["stamp_ns"])
-    nearest_ns = known_ns[np.searchsorted(known_ns[:-1] + np.diff(known_ns) // 2, stamps_ns)]
+    nearest_ns = known_ns[
+        np.searchsorted(known_ns[:-1] + np.diff(known_ns) // 2, stamps_ns)
+    ]
     for stamp_ns, text in zip(regions["stamp_ns"], regions["outline_m"], strict=True):
         rows = np.flatnonzero((nearest_ns == stamp_ns) & ~inside)
-        inside[rows] = in_polygon(points_m[rows], np.array(text.split(), dtype=np.float64).reshape(-1, 2))
+        inside[rows] = in_polygon(
+            points_m[rows], np.array(text.split(), dtype=np.float64).reshape(-1, 2)
+        )
     return inside
 
 
@@ -96,13 +110,21 @@ def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> BoolArray:
     """
     positions_m = np.stack([path.at(now_ns)[:, :2] for path in paths], axis=1)
     present = np.asarray(np.isfinite(positions_m).all(axis=-1))
-    sensors, poses = run.config.get("sensors") or {}, ego_states(run.tables["ego"], now_ns)[:, :3]
+    sensors, poses = (
+        run.config.get("sensors") or {},
+        ego_states(run.tables["ego"], now_ns)[:, :3],
+    )
     names = np.unique(run.tables["updates"]["sensor"]).tolist()
     if np.isnan(poses).all() or not names or not sensors.keys() >= set(names):
         return present
-    models = TypeAdapter(dict[str, SensorModel]).validate_python({name: sensors[name] for name in names})
+    models = TypeAdapter(dict[str, SensorModel]).validate_python(
+        {name: sensors[name] for name in names}
+    )
     ego = run.config.get("ego") or {}
-    origin_m = (float(ego.get("detection_origin_x_m", 0.0)), float(ego.get("detection_origin_y_m", 0.0)))
+    origin_m = (
+        float(ego.get("detection_origin_x_m", 0.0)),
+        float(ego.get("detection_origin_y_m", 0.0)),
+    )
     positions_m[~present] = 0.0
     poses = np.broadcast_to(poses[:, None], (*present.shape, 3))
     covered = [model.sees(positions_m, poses, origin_m) for model in models.values()]
@@ -111,7 +133,9 @@ def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> BoolArray:
 
 def ego_states(ego: Table, stamps_ns: IntArray) -> FloatArray:
     """x, y, yaw (not wrapped) and speed of the ego, shape (n, 4), constant beyond the ends; NaN if never known."""
-    rows = np.stack([ego[name] for name in ("x_m", "y_m", "yaw_rad", "speed_mps")], axis=-1)
+    rows = np.stack(
+        [ego[name] for name in ("x_m", "y_m", "yaw_rad", "speed_mps")], axis=-1
+    )
     known = np.flatnonzero(np.isfinite(rows[:, :3]).all(axis=1))
     if not len(known):
         return np.full((len(stamps_ns), 4), np.nan)

@@ -13,7 +13,12 @@ import numpy as np
 
 from fgtrack.core.linalg import symmetrise
 from fgtrack.core.types import FloatArray
-from fgtrack.models.measurement import AT_ORIGIN, MeasurementModel, SensorPose, position_gradient
+from fgtrack.models.measurement import (
+    AT_ORIGIN,
+    MeasurementModel,
+    SensorPose,
+    position_gradient,
+)
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.sensors import SensorModel
 
@@ -34,17 +39,24 @@ class CorrelatedErrors(MotionModel):
 
     def __post_init__(self) -> None:
         names = (*self.base.state_names, *(name for name, _ in self.times_s))
-        object.__setattr__(self, "state_names", names)  # of the object: class variables where a model has no parts
+        object.__setattr__(
+            self, "state_names", names
+        )  # of the object: class variables where a model has no parts
         object.__setattr__(self, "linear", self.base.linear)
 
     def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.predict`."""
         moved = self.base.predict(x[..., : self.base.dim], dt_s)
-        return np.concatenate([moved, x[..., self.base.dim :] * np.exp(self._exponents(dt_s))], axis=-1)
+        return np.concatenate(
+            [moved, x[..., self.base.dim :] * np.exp(self._exponents(dt_s))], axis=-1
+        )
 
     def jacobian(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.jacobian`."""
-        return self._beside(self.base.jacobian(x[..., : self.base.dim], dt_s), np.exp(self._exponents(dt_s)))
+        return self._beside(
+            self.base.jacobian(x[..., : self.base.dim], dt_s),
+            np.exp(self._exponents(dt_s)),
+        )
 
     def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.process_noise`."""
@@ -61,7 +73,9 @@ class CorrelatedErrors(MotionModel):
 
     def _exponents(self, dt_s: float | FloatArray) -> FloatArray:
         """Logarithms of the decays, shape (..., errors)."""
-        return np.minimum(-np.asarray(dt_s, dtype=np.float64)[..., None] * self._rates_hz, _MOST)
+        return np.minimum(
+            -np.asarray(dt_s, dtype=np.float64)[..., None] * self._rates_hz, _MOST
+        )
 
     def _beside(self, block: FloatArray, diagonal: FloatArray) -> FloatArray:
         """Block-diagonal matrix (..., n, n) of `block` and of `diagonal` (..., errors)."""
@@ -84,11 +98,15 @@ class ColouredNoiseMeasurement(MeasurementModel):
     def part(self, rows: Sequence[int]) -> MeasurementModel:
         """See `MeasurementModel.part`."""
         components = tuple(self.components[row] for row in rows)
-        return ColouredNoiseMeasurement(components, self.state_names, self.columns, self.gain[list(rows)])
+        return ColouredNoiseMeasurement(
+            components, self.state_names, self.columns, self.gain[list(rows)]
+        )
 
     def predict(self, x: FloatArray, pose: SensorPose = AT_ORIGIN) -> FloatArray:
         """See `MeasurementModel.predict`."""
-        return np.asarray(super().predict(x, pose) + x.take(self.columns, axis=-1) @ self.gain.T)
+        return np.asarray(
+            super().predict(x, pose) + x.take(self.columns, axis=-1) @ self.gain.T
+        )
 
     def jacobian(self, x: FloatArray, pose: SensorPose = AT_ORIGIN) -> FloatArray:
         """See `MeasurementModel.jacobian`."""
@@ -105,7 +123,9 @@ class ColouredNoiseMeasurement(MeasurementModel):
         return H
 
 
-def with_correlated_errors(motion: MotionModel, sensors: Mapping[str, SensorModel]) -> MotionModel:
+def with_correlated_errors(
+    motion: MotionModel, sensors: Mapping[str, SensorModel]
+) -> MotionModel:
     """`motion` with a state for every component of the sensors with correlated errors; itself where there is none."""
     times_s = [
         (f"{sensor}.{component}", model.correlation.time_s)
@@ -117,7 +137,11 @@ def with_correlated_errors(motion: MotionModel, sensors: Mapping[str, SensorMode
 
 
 def split_error(
-    sensor: str, model: SensorModel, measurement: MeasurementModel, R: FloatArray, state_names: Sequence[str]
+    sensor: str,
+    model: SensorModel,
+    measurement: MeasurementModel,
+    R: FloatArray,
+    state_names: Sequence[str],
 ) -> tuple[MeasurementModel, FloatArray]:
     """The measurement model with the correlated part of the error, and the covariance (k, k) of the rest.
     Of the covariance R (k, k) of the components that the sensor measures, the share s = `model.correlation.share` is
@@ -133,9 +157,15 @@ def split_error(
     white[block] -= correlated
     gain = np.zeros((len(R), len(own)))
     values, vectors = np.linalg.eigh(correlated)
-    gain[own] = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T  # turns with the axes of the covariance
-    columns = tuple(state_names.index(f"{sensor}.{measurement.components[row]}") for row in own)
-    return ColouredNoiseMeasurement(measurement.components, measurement.state_names, columns, gain), symmetrise(white)
+    gain[own] = (
+        vectors * np.sqrt(np.maximum(values, 0.0))
+    ) @ vectors.T  # turns with the axes of the covariance
+    columns = tuple(
+        state_names.index(f"{sensor}.{measurement.components[row]}") for row in own
+    )
+    return ColouredNoiseMeasurement(
+        measurement.components, measurement.state_names, columns, gain
+    ), symmetrise(white)
 
 
 def total_error(measurement: MeasurementModel, white: FloatArray) -> FloatArray:
@@ -145,7 +175,9 @@ def total_error(measurement: MeasurementModel, white: FloatArray) -> FloatArray:
     return white + measurement.gain @ measurement.gain.T
 
 
-def position_cross(measurement: MeasurementModel, z: FloatArray, pose: SensorPose) -> dict[str, tuple[float, float]]:
+def position_cross(
+    measurement: MeasurementModel, z: FloatArray, pose: SensorPose
+) -> dict[str, tuple[float, float]]:
     """Covariance of the position by z (k,) with the correlated errors, by name: -G gain, x = G (z - gain e)."""
     if not isinstance(measurement, ColouredNoiseMeasurement):
         return {}
@@ -162,7 +194,10 @@ def component_cross(measurement: MeasurementModel, component: str) -> dict[str, 
 
     The entry begins as the measured value, z - gain e, so the covariance is the negative row of the gain.
     """
-    if not isinstance(measurement, ColouredNoiseMeasurement) or component not in measurement.components:
+    if (
+        not isinstance(measurement, ColouredNoiseMeasurement)
+        or component not in measurement.components
+    ):
         return {}
     gains = measurement.gain[measurement.components.index(component)]
     names = [measurement.state_names[column] for column in measurement.columns]

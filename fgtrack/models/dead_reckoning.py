@@ -63,7 +63,9 @@ def reckoned(
         off_x_m, off_y_m = reported_m[0] - x_m, reported_m[1] - y_m
         off_m = math.hypot(off_x_m, off_y_m)
         if math.isfinite(off_m):
-            share = min(_LARGEST * math.sqrt(variance_m2) / off_m, 1.0) if off_m else 1.0
+            share = (
+                min(_LARGEST * math.sqrt(variance_m2) / off_m, 1.0) if off_m else 1.0
+            )
             x_m, y_m = x_m + (1.0 - share) * off_x_m, y_m + (1.0 - share) * off_y_m
             decay = math.exp(-dt_s / time_s)
             p, pb, b = last.covariance
@@ -80,7 +82,11 @@ def reckoned(
                 velocity_mps,
                 (x_m + gain_p * y0, y_m + gain_p * y1),
                 (error_x_m + gain_b * y0, error_y_m + gain_b * y1),
-                (p - gain_p * gain_p * S, pb - gain_p * gain_b * S, b - gain_b * gain_b * S),
+                (
+                    p - gain_p * gain_p * S,
+                    pb - gain_p * gain_b * S,
+                    b - gain_b * gain_b * S,
+                ),
             )
     start = variance_m2 + _JITTER_M2, -variance_m2, variance_m2
     return Reckoned(stamp_ns, velocity_mps, reported_m, (0.0, 0.0), start)

@@ -7,7 +7,14 @@ import numpy as np
 from fgtrack.core.compiled import check, njit, shared, wrapped
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 
-_HEADING, _CURVATURE, _LEFT, _RIGHT, _ALONG, _QUANTITIES = 4, 5, 6, 7, 9, 10  # see `fgtrack.models.track_map`
+_HEADING, _CURVATURE, _LEFT, _RIGHT, _ALONG, _QUANTITIES = (
+    4,
+    5,
+    6,
+    7,
+    9,
+    10,
+)  # see `fgtrack.models.track_map`
 
 
 @shared("int64(float64, float64, Array(float64, 2, 'C', readonly=True), float64)")
@@ -39,14 +46,23 @@ def nearest(points_m: FloatArray, rows: FloatArray, longest_m: float) -> IntArra
 
 
 @njit("(float64[:, ::1], Array(float64, 2, 'C', readonly=True), float64)")
-def feet(points_m: FloatArray, segments: FloatArray, longest_m: float) -> tuple[FloatArray, FloatArray]:
+def feet(
+    points_m: FloatArray, segments: FloatArray, longest_m: float
+) -> tuple[FloatArray, FloatArray]:
     """Quantities (m, 10) at the feet of points (m, 2) on the line, and lateral offsets (m,), left positive.
     `segments` (n, 20), at most `longest_m` long, are the rows of `TrackMap`. The foot, on a segment at the nearest
     point of the line, has the point on its normal: Re((q - t e) (B + t dB)) = 0 with q from the start of the segment to
     the point, e the segment, and B, dB the inverse of the heading and its change, as complex numbers.
     """
-    check(len(segments) > 0 and segments.shape[1] >= 2 * _QUANTITIES and points_m.shape[1] >= 2)
-    quantities, lateral = np.empty((len(points_m), _QUANTITIES)), np.empty(len(points_m))
+    check(
+        len(segments) > 0
+        and segments.shape[1] >= 2 * _QUANTITIES
+        and points_m.shape[1] >= 2
+    )
+    quantities, lateral = (
+        np.empty((len(points_m), _QUANTITIES)),
+        np.empty(len(points_m)),
+    )
     for i in range(len(points_m)):
         x, y = points_m[i, 0], points_m[i, 1]
         first = _nearest(x, y, segments, longest_m)
@@ -62,19 +78,33 @@ def feet(points_m: FloatArray, segments: FloatArray, longest_m: float) -> tuple[
         for j in range(_QUANTITIES):
             quantities[i, j] = at[j] + part * at[_QUANTITIES + j]
         right, up = right - part * at[10], up - part * at[11]
-        lateral[i] = (right * quantities[i, 3] + up * quantities[i, 2]) / math.hypot(quantities[i, 2], quantities[i, 3])
+        lateral[i] = (right * quantities[i, 3] + up * quantities[i, 2]) / math.hypot(
+            quantities[i, 2], quantities[i, 3]
+        )
     return quantities, lateral
 
 
-@njit("(float64[:, ::1], Array(float64, 2, 'C', readonly=True), float64, float64, float64)")
+@njit(
+    "(float64[:, ::1], Array(float64, 2, 'C', readonly=True), float64, float64, float64)"
+)
 def view(
-    points_m: FloatArray, segments: FloatArray, longest_m: float, left_m: float, right_m: float
+    points_m: FloatArray,
+    segments: FloatArray,
+    longest_m: float,
+    left_m: float,
+    right_m: float,
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Heading in (-pi, pi], curvature, and True beyond the bounds and so much more, of points (m, 2), shapes (m,)."""
     quantities, lateral = feet(points_m, segments, longest_m)
     m = len(points_m)
     heading, curvature, outside = np.empty(m), np.empty(m), np.empty(m, np.bool_)
     for i in range(m):
-        heading[i], curvature[i] = wrapped(quantities[i, _HEADING]), quantities[i, _CURVATURE]
-        outside[i] = lateral[i] > quantities[i, _LEFT] + left_m or -lateral[i] > quantities[i, _RIGHT] + right_m
+        heading[i], curvature[i] = (
+            wrapped(quantities[i, _HEADING]),
+            quantities[i, _CURVATURE],
+        )
+        outside[i] = (
+            lateral[i] > quantities[i, _LEFT] + left_m
+            or -lateral[i] > quantities[i, _RIGHT] + right_m
+        )
     return heading, curvature, outside

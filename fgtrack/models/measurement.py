@@ -13,7 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.geometry import cartesian, cartesian_gradient, polar, polar_gradient, wrap_angles
+from fgtrack.core.geometry import (
+    cartesian,
+    cartesian_gradient,
+    polar,
+    polar_gradient,
+    wrap_angles,
+)
 from fgtrack.core.types import MEASURABLE, STATE_NAMES, YAW_RATE, FloatArray, IntArray
 from fgtrack.models.motion import CARTESIAN, MIN_SPEED_MPS, POLAR, MotionModel
 
@@ -55,12 +61,18 @@ class MeasurementModel:
     """Names of the entries of the state: x, y and either yaw, speed or vx, vy, and what follows."""
 
     def __post_init__(self) -> None:
-        if not self.components or self.components != tuple(name for name in COMPONENTS if name in self.components):
+        if not self.components or self.components != tuple(
+            name for name in COMPONENTS if name in self.components
+        ):
             raise CallError(
                 f"measurement of {', '.join(self.components) or 'nothing'}: give one or more of "
                 f"{', '.join(COMPONENTS)}, each once and in this order"
             )
-        begins = (STATE_NAMES[:5],) if "curvature_radpm" in self.components else (POLAR, CARTESIAN)
+        begins = (
+            (STATE_NAMES[:5],)
+            if "curvature_radpm" in self.components
+            else (POLAR, CARTESIAN)
+        )
         if not any(self.state_names[: len(each)] == each for each in begins):
             raise CallError(
                 f"measurement of {', '.join(self.components)}: state of {', '.join(self.state_names)}: must begin with "
@@ -70,12 +82,16 @@ class MeasurementModel:
     @cached_property
     def angular(self) -> tuple[int, ...]:
         """Indices of the components that are angles."""
-        return tuple(index for index, name in enumerate(self.components) if name in ANGULAR)
+        return tuple(
+            index for index, name in enumerate(self.components) if name in ANGULAR
+        )
 
     @cached_property
     def relative(self) -> tuple[int, ...]:
         """Indices of the components that are relative to the sensor."""
-        return tuple(index for index, name in enumerate(self.components) if name in RELATIVE)
+        return tuple(
+            index for index, name in enumerate(self.components) if name in RELATIVE
+        )
 
     @cached_property
     def linear(self) -> bool:
@@ -145,7 +161,9 @@ class MeasurementModel:
 
     def part(self, rows: Sequence[int]) -> "MeasurementModel":
         """Return the model of the components `rows` alone, in ascending order."""
-        return _shared_model(tuple(self.components[row] for row in rows), self.state_names)
+        return _shared_model(
+            tuple(self.components[row] for row in rows), self.state_names
+        )
 
     @cached_property
     def _cartesian(self) -> bool:
@@ -161,13 +179,17 @@ class MeasurementModel:
         return np.array([self.state_names.index(name) for name in self.components])
 
 
-def measurement_model(components: tuple[str, ...], motion_model: MotionModel) -> MeasurementModel:
+def measurement_model(
+    components: tuple[str, ...], motion_model: MotionModel
+) -> MeasurementModel:
     """The measurement of `components` for the state of `motion_model`: one shared object for each."""
     return _shared_model(components, motion_model.state_names)
 
 
 @cache
-def _shared_model(components: tuple[str, ...], state_names: tuple[str, ...]) -> MeasurementModel:
+def _shared_model(
+    components: tuple[str, ...], state_names: tuple[str, ...]
+) -> MeasurementModel:
     return MeasurementModel(components, state_names)
 
 
@@ -184,7 +206,9 @@ def measured_position(
     return np.array([pose.x_m, pose.y_m]) + cartesian(direction_range), G @ R @ G.T
 
 
-def position_gradient(components: tuple[str, ...], z: FloatArray, pose: SensorPose) -> FloatArray | None:
+def position_gradient(
+    components: tuple[str, ...], z: FloatArray, pose: SensorPose
+) -> FloatArray | None:
     """Derivative of what `measured_position` gives by z, shape (2, k); None where z holds no position."""
     G = np.zeros((2, len(components)))
     if components[:2] == ("x_m", "y_m"):
@@ -210,7 +234,12 @@ def _observed(
     shape = *x.shape[:-1], len(names)
     z, G = np.empty(shape), np.zeros((*shape, 5))
     offset, motion = x[..., :2] - np.array(pose[:2]), x[..., 2:4]
-    yaw_speed, velocity, by_yaw_speed, by_velocity = motion, motion, np.eye(2), np.eye(2)
+    yaw_speed, velocity, by_yaw_speed, by_velocity = (
+        motion,
+        motion,
+        np.eye(2),
+        np.eye(2),
+    )
     if cartesian_state:
         yaw_speed, by_yaw_speed = polar(motion), polar_gradient(motion, MIN_SPEED_MPS)
     else:
@@ -223,14 +252,26 @@ def _observed(
             z[..., row], G[..., row, column] = x[..., column], 1.0
         elif name in POLAR:
             column = POLAR.index(name) - 2
-            z[..., row], G[..., row, 2:4] = yaw_speed[..., column], by_yaw_speed[..., column, :]
+            z[..., row], G[..., row, 2:4] = (
+                yaw_speed[..., column],
+                by_yaw_speed[..., column, :],
+            )
         elif name == "bearing_rad":
-            z[..., row], G[..., row, :2] = bearing_range[..., 0] - pose.yaw_rad, gradient[..., 0, :]
+            z[..., row], G[..., row, :2] = (
+                bearing_range[..., 0] - pose.yaw_rad,
+                gradient[..., 0, :],
+            )
         elif name == "range_m":
             z[..., row], G[..., row, :2] = bearing_range[..., 1], line_of_sight
         elif name == "range_rate_mps":
-            across = np.vecdot(relative, np.stack([-line_of_sight[..., 1], line_of_sight[..., 0]], axis=-1))
-            z[..., row], G[..., row, :2] = np.vecdot(relative, line_of_sight), across[..., None] * gradient[..., 0, :]
+            across = np.vecdot(
+                relative,
+                np.stack([-line_of_sight[..., 1], line_of_sight[..., 0]], axis=-1),
+            )
+            z[..., row], G[..., row, :2] = (
+                np.vecdot(relative, line_of_sight),
+                across[..., None] * gradient[..., 0, :],
+            )
             G[..., row, 2:4] = (line_of_sight[..., None, :] @ by_velocity)[..., 0, :]
         else:
             speed, turn = x[..., 3], x[..., YAW_RATE]

@@ -77,12 +77,16 @@ class MotionModel(ABC):
         """`dt_s` as an array; raises `CallError` where it is negative, because noise accumulates forwards only."""
         t = np.asarray(dt_s, dtype=np.float64)
         if (t < 0.0).any():
-            raise CallError(f"process_noise: dt_s is {t.min()} s; noise needs a duration >= 0, swap the stamps")
+            raise CallError(
+                f"process_noise: dt_s is {t.min()} s; noise needs a duration >= 0, swap the stamps"
+            )
         return t
 
     def transition(self, x: FloatArray, dt_s: float | FloatArray) -> Transition:
         """Return `predict`, `jacobian` and `process_noise` of the states `x`. Raises as `process_noise`."""
-        return Transition(self.predict(x, dt_s), self.jacobian(x, dt_s), self.process_noise(x, dt_s))
+        return Transition(
+            self.predict(x, dt_s), self.jacobian(x, dt_s), self.process_noise(x, dt_s)
+        )
 
     def start_variance(self, name: str) -> float:
         """Variance of an unobserved entry `name` of a new object; its mean is 0."""
@@ -95,7 +99,9 @@ class MotionModel(ABC):
         """
         if self._leads:
             return x, P
-        S = self._selection[: len(STATE_NAMES) if "accel_mps2" in self.state_names else ACCEL]
+        S = self._selection[
+            : len(STATE_NAMES) if "accel_mps2" in self.state_names else ACCEL
+        ]
         mean = x @ S.T
         J = np.broadcast_to(S, (*x.shape[:-1], *S.shape)).copy()
         if self.cartesian:
@@ -114,11 +120,16 @@ class MotionModel(ABC):
         if not self.cartesian:
             return mean, covariance
         slowest_mps = np.maximum(mean[..., SPEED], MIN_SPEED_MPS)
-        product = covariance[..., YAW, YAW] * covariance[..., SPEED, SPEED] + covariance[..., YAW, SPEED] ** 2
+        product = (
+            covariance[..., YAW, YAW] * covariance[..., SPEED, SPEED]
+            + covariance[..., YAW, SPEED] ** 2
+        )
         covariance[..., YAW, YAW] += product / slowest_mps**2
         return mean, covariance
 
-    def from_kinematic(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def from_kinematic(
+        self, mean: FloatArray, covariance: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """State and covariance P of this model from a kinematic state; a missing entry is 0 with `start_variance`.
         To the first-order covariance of a Cartesian velocity comes the variance of the product of speed error and yaw
         error, across the heading: without it, an object born at speed 0 could not move sideways.
@@ -129,16 +140,29 @@ class MotionModel(ABC):
         S = self._selection[: mean.shape[-1]]
         x = mean @ S
         J = np.broadcast_to(S.T, (*mean.shape[:-1], *S.T.shape)).copy()
-        unknown = [0.0 if column.any() else self.start_variance(self.state_names[k]) for k, column in enumerate(S.T)]
+        unknown = [
+            0.0 if column.any() else self.start_variance(self.state_names[k])
+            for k, column in enumerate(S.T)
+        ]
         if self.cartesian:
             unknown[2:4] = 0.0, 0.0
             yaw_speed = mean[..., YAW:YAW_RATE]
-            x[..., 2:4], J[..., 2:4, YAW:YAW_RATE] = cartesian(yaw_speed), cartesian_gradient(yaw_speed)
+            x[..., 2:4], J[..., 2:4, YAW:YAW_RATE] = (
+                cartesian(yaw_speed),
+                cartesian_gradient(yaw_speed),
+            )
         P = symmetrise(congruence(J, covariance)) + np.diag(unknown)
         if self.cartesian:
-            product = covariance[..., YAW, YAW] * covariance[..., SPEED, SPEED] + covariance[..., YAW, SPEED] ** 2
-            across = np.stack([-np.sin(mean[..., YAW]), np.cos(mean[..., YAW])], axis=-1)
-            P[..., 2:4, 2:4] += product[..., None, None] * across[..., :, None] * across[..., None, :]
+            product = (
+                covariance[..., YAW, YAW] * covariance[..., SPEED, SPEED]
+                + covariance[..., YAW, SPEED] ** 2
+            )
+            across = np.stack(
+                [-np.sin(mean[..., YAW]), np.cos(mean[..., YAW])], axis=-1
+            )
+            P[..., 2:4, 2:4] += (
+                product[..., None, None] * across[..., :, None] * across[..., None, :]
+            )
         return x, P
 
     @cached_property
@@ -149,7 +173,12 @@ class MotionModel(ABC):
     @cached_property
     def _selection(self) -> FloatArray:
         """1 where an entry of `STATE_NAMES` (rows) and one of the state (columns) have the same name, shape (6, n)."""
-        return np.array([[float(row == column) for column in self.state_names] for row in STATE_NAMES])
+        return np.array(
+            [
+                [float(row == column) for column in self.state_names]
+                for row in STATE_NAMES
+            ]
+        )
 
 
 @dataclass(frozen=True)
@@ -171,15 +200,22 @@ class WhiteNoise(MotionModel):
         not_negative(**{name: getattr(self, name) for name in self.density_names()})
 
     @classmethod
-    def from_std_per_step(cls, std: Mapping[str, float], frequency_hz: float, **others: float) -> Self:
+    def from_std_per_step(
+        cls, std: Mapping[str, float], frequency_hz: float, **others: float
+    ) -> Self:
         """Model with the noise of a filter that adds (std / frequency_hz)^2 per step: densities std^2 / frequency_hz.
         `std` is per second, as in Karle et al. 2023, by the names of all densities up to `_density_`: `position`,
         `yaw`, ... `others` are the parameters of the model that are no densities.
         """
         names = {name.partition("_density_")[0]: name for name in cls.density_names()}
         if set(std) != set(names):
-            raise ValueError(f"std of {cls.__name__}: give {', '.join(names)}, not {', '.join(std) or 'nothing'}")
-        return cls(**{names[key]: value * value / frequency_hz for key, value in std.items()}, **others)
+            raise ValueError(
+                f"std of {cls.__name__}: give {', '.join(names)}, not {', '.join(std) or 'nothing'}"
+            )
+        return cls(
+            **{names[key]: value * value / frequency_hz for key, value in std.items()},
+            **others,
+        )
 
     @classmethod
     def density_names(cls) -> tuple[str, ...]:
@@ -211,9 +247,17 @@ class WhiteNoise(MotionModel):
             x, t = np.broadcast_to(x, (*shape, n)), np.broadcast_to(t, shape)
         states = np.array(x, dtype=np.float64, order="C").reshape(-1, n)
         times_s = np.array(t, order="C").reshape(-1)
-        result = Transition(np.empty((*shape, n)), np.empty((*shape, n, n)), np.empty((*shape, n, n)))
-        flat = result.mean.reshape(-1, n), result.F.reshape(-1, n, n), result.Q.reshape(-1, n, n)
-        kernels("fgtrack.models.transitions").transitions(self.kind, states, times_s, self.noise, *flat)
+        result = Transition(
+            np.empty((*shape, n)), np.empty((*shape, n, n)), np.empty((*shape, n, n))
+        )
+        flat = (
+            result.mean.reshape(-1, n),
+            result.F.reshape(-1, n, n),
+            result.Q.reshape(-1, n, n),
+        )
+        kernels("fgtrack.models.transitions").transitions(
+            self.kind, states, times_s, self.noise, *flat
+        )
         return result
 
     @cached_property
@@ -271,7 +315,9 @@ class CTRV(WhiteNoise):
     @cached_property
     def noise(self) -> FloatArray:
         """See `WhiteNoise.noise` and `fgtrack.models.transitions`."""
-        return np.array([*self.density, self.relaxation_hz, self.slow_mps, self.resting_yaw_rad2ps])
+        return np.array(
+            [*self.density, self.relaxation_hz, self.slow_mps, self.resting_yaw_rad2ps]
+        )
 
 
 @dataclass(frozen=True)
@@ -318,7 +364,9 @@ class CT(WhiteNoise):
     @cached_property
     def density(self) -> FloatArray:
         """See `WhiteNoise.density`; vx and vy have the same."""
-        q_position, q_velocity, q_yaw_rate = (getattr(self, name) for name in self.density_names())
+        q_position, q_velocity, q_yaw_rate = (
+            getattr(self, name) for name in self.density_names()
+        )
         return np.array([q_position, q_position, q_velocity, q_velocity, q_yaw_rate])
 
     @cached_property
@@ -344,4 +392,6 @@ class CV(WhiteNoise):
     @cached_property
     def density(self) -> FloatArray:
         """See `WhiteNoise`: that of the velocity."""
-        return np.array([0.0, 0.0, self.velocity_density_m2ps3, self.velocity_density_m2ps3])
+        return np.array(
+            [0.0, 0.0, self.velocity_density_m2ps3, self.velocity_density_m2ps3]
+        )

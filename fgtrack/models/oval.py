@@ -12,7 +12,9 @@ from fgtrack.models.track_map import COLUMNS, TrackMap
 #: The name that stands for this map wherever a map file may be named.
 OVAL = "oval"
 _TURN_RADIUS_M = 220.0
-_BEND_M = 30.0  # from the start line to where the bend of the front straight begins to end
+_BEND_M = (
+    30.0  # from the start line to where the bend of the front straight begins to end
+)
 _BLEND_M = 130.0  # over which the curvature goes from one value to the next
 
 
@@ -24,7 +26,10 @@ def make_oval() -> TrackMap:
     points = _centre_line()
     path = Path.through(points)
     curvature = path.frame(np.linspace(0.0, path.length_m, len(points))).turn
-    low, high = math.radians(9.0), math.radians(20.0)  # on the straights and in the turns
+    low, high = (
+        math.radians(9.0),
+        math.radians(20.0),
+    )  # on the straights and in the turns
     banking = low + (high - low) * np.clip(curvature * _TURN_RADIUS_M, 0.0, 1.0)
     # As in the speedways' files, negative banking leans to the left.
     return _map_along(points, half_width_m=7.5, banking_rad=-banking)
@@ -36,7 +41,9 @@ def make_pit_lane() -> TrackMap:
     s = np.linspace(0.0, oval.length_m, len(oval.table))
     from_start = np.minimum(s, oval.length_m - s)
     blend = _smooth_step((from_start - 220.0) / 160.0)
-    points = oval.position(s, 24.0 - 14.0 * blend)  # the road lies 24 m to the left, the apron 10 m
+    points = oval.position(
+        s, 24.0 - 14.0 * blend
+    )  # the road lies 24 m to the left, the apron 10 m
     points[-1] = points[0]
     return _map_along(points, half_width_m=4.5, banking_rad=np.zeros(len(points)))
 
@@ -57,7 +64,9 @@ def _centre_line() -> FloatArray:
     """Points of the lap, evenly spaced from the start line, shape (n + 1, 2); the last repeats the first."""
     bend, turn = 1.0 / 600.0, 1.0 / _TURN_RADIUS_M
     bend_angle = bend * (_BEND_M + _BLEND_M / 2.0)
-    turn_m = (math.pi - bend_angle) / turn  # from the middle of one ramp to the middle of the other
+    turn_m = (
+        math.pi - bend_angle
+    ) / turn  # from the middle of one ramp to the middle of the other
     half_m = 1200.0
     straight_start = _BEND_M + _BLEND_M
 
@@ -65,7 +74,8 @@ def _centre_line() -> FloatArray:
         turn_start = straight_start + straight_m
         ramps = ((_BEND_M, -bend), (turn_start, turn), (turn_start + turn_m, -turn))
         return bend * s + sum(
-            change * _BLEND_M * _smooth_step_integral((s - start) / _BLEND_M) for start, change in ramps
+            change * _BLEND_M * _smooth_step_integral((s - start) / _BLEND_M)
+            for start, change in ramps
         )
 
     # The half lap must end above its start. A longer front straight moves its end forward by the cosine of
@@ -76,11 +86,16 @@ def _centre_line() -> FloatArray:
     x = _integrate(s, lambda u: np.cos(heading(u, straight_m)))
     y = _integrate(s, lambda u: np.sin(heading(u, straight_m)))
     x, y = np.concatenate([x, -x[-2::-1]]), np.concatenate([y, y[-2::-1]])
-    c, sn = math.cos(0.5), math.sin(0.5)  # so that no straight lies on the jump of the heading
+    c, sn = (
+        math.cos(0.5),
+        math.sin(0.5),
+    )  # so that no straight lies on the jump of the heading
     return np.stack([c * x - sn * y, sn * x + c * y], axis=1)
 
 
-def _integrate(s: FloatArray, function: Callable[[FloatArray], FloatArray]) -> FloatArray:
+def _integrate(
+    s: FloatArray, function: Callable[[FloatArray], FloatArray]
+) -> FloatArray:
     """Integral of `function` from s[0] to each s, shape (n,), by Gauss-Legendre in every cell."""
     nodes, weights = np.polynomial.legendre.leggauss(6)
     half = np.diff(s)[:, None] / 2.0
@@ -88,7 +103,9 @@ def _integrate(s: FloatArray, function: Callable[[FloatArray], FloatArray]) -> F
     return np.concatenate([[0.0], np.cumsum(cells)])
 
 
-def _map_along(points: FloatArray, *, half_width_m: float, banking_rad: FloatArray) -> TrackMap:
+def _map_along(
+    points: FloatArray, *, half_width_m: float, banking_rad: FloatArray
+) -> TrackMap:
     """Map with the reference line `points`, shape (n + 1, 2), as its raceline, driven at constant speed."""
     path = Path.through(points)
     s = path.u_m
@@ -111,6 +128,9 @@ def _map_along(points: FloatArray, *, half_width_m: float, banking_rad: FloatArr
         "s_ref_m": s,
         "psi_ref_rad": frame.heading_rad,
         "kappa_ref_radpm": curvature,
-        "dkappa_ref_radpm2": (frame.turn_rate - curvature * frame.scale_rate) / frame.scale**2,
+        "dkappa_ref_radpm2": (frame.turn_rate - curvature * frame.scale_rate)
+        / frame.scale**2,
     }
-    return TrackMap(np.stack([np.broadcast_to(columns[name], s.shape) for name in COLUMNS], axis=1))
+    return TrackMap(
+        np.stack([np.broadcast_to(columns[name], s.shape) for name in COLUMNS], axis=1)
+    )

@@ -46,10 +46,17 @@ class Path:
         # the error.
         second = total = 3.0 * (slope - np.roll(slope, 1, axis=0)) / (before + h)
         for _ in range(_STEPS):
-            neighbours = before * np.roll(second, 1, axis=0) + h * np.roll(second, -1, axis=0)
+            neighbours = before * np.roll(second, 1, axis=0) + h * np.roll(
+                second, -1, axis=0
+            )
             second = total - 0.5 * neighbours / (before + h)
         after = np.roll(second, -1, axis=0)
-        coefficients = points_m[:-1], slope - h * (2.0 * second + after) / 6.0, second, (after - second) / h
+        coefficients = (
+            points_m[:-1],
+            slope - h * (2.0 * second + after) / 6.0,
+            second,
+            (after - second) / h,
+        )
         return cls(np.concatenate([[0.0], np.cumsum(h)]), np.array(coefficients))
 
     @property
@@ -61,9 +68,16 @@ class Path:
         """Moving frame at `u_m`, shape (n,), of any lap."""
         lap_m = np.mod(u_m, self.length_m)
         piece = np.searchsorted(self.u_m[1:-1], lap_m, side="right")
-        t, (p0, p1, p2, p3) = (lap_m - self.u_m[piece])[:, None], self.coefficients[:, piece]
+        t, (p0, p1, p2, p3) = (
+            (lap_m - self.u_m[piece])[:, None],
+            self.coefficients[:, piece],
+        )
         x, y = (p0 + t * (p1 + t * (p2 / 2.0 + t * p3 / 6.0))).T
-        (x1, y1), (x2, y2), (x3, y3) = (p1 + t * (p2 + t * p3 / 2.0)).T, (p2 + t * p3).T, p3.T
+        (x1, y1), (x2, y2), (x3, y3) = (
+            (p1 + t * (p2 + t * p3 / 2.0)).T,
+            (p2 + t * p3).T,
+            p3.T,
+        )
         scale_squared = x1 * x1 + y1 * y1
         scale = np.sqrt(scale_squared)
         dot = x1 * x2 + y1 * y2

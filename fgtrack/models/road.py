@@ -2,23 +2,32 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
 from fgtrack.core.types import FloatArray
-from fgtrack.models.published_map import PublishedMap
-from fgtrack.models.track_map import RoadView, TrackMap
+from fgtrack.models.track_map import RoadView
 
 OPEN_SPACE = "none"
 """Name of open space instead of the file of a track."""
+
+
+class RoadLine(Protocol):
+    """The map of one closed road: `TrackMap`, or the map of the published implementation."""
+
+    def view(
+        self, points_m: FloatArray, inner_buffer_m: float, outer_buffer_m: float
+    ) -> RoadView:
+        """Return the map at `points_m`, shape (n, 2). Objects may lie beyond the bounds by the buffers."""
 
 
 @dataclass(frozen=True)
 class Road:
     """Maps of track and pit lane, open space without a track; objects may lie beyond the bounds by the buffers."""
 
-    track: TrackMap | PublishedMap | None = None
-    pit: TrackMap | PublishedMap | None = None
+    track: RoadLine | None = None
+    pit: RoadLine | None = None
     inner_buffer_m: float = 0.0
     outer_buffer_m: float = 0.0
     pit_buffer_m: float = 0.0
@@ -38,5 +47,7 @@ class Road:
             return track
         outside = track.outside.copy()
         strays = np.flatnonzero(outside)
-        outside[strays] = self.pit.view(points_m[strays], self.pit_buffer_m, self.pit_buffer_m).outside
+        outside[strays] = self.pit.view(
+            points_m[strays], self.pit_buffer_m, self.pit_buffer_m
+        ).outside
         return track._replace(outside=outside)

@@ -42,15 +42,22 @@ class Filter:
 
     def __post_init__(self) -> None:
         if self.min is not None and self.max is not None and not self.min <= self.max:
-            raise ValueError(f"min: must not be more than max = {self.max}, is {self.min}")
+            raise ValueError(
+                f"min: must not be more than max = {self.max}, is {self.min}"
+            )
 
     def passes(self, value: object) -> bool:
         """True if `value` passes; what is not there or not a number does not pass a bound."""
-        if (self.one_of is not None and value not in self.one_of) or value in self.none_of:
+        if (
+            self.one_of is not None and value not in self.one_of
+        ) or value in self.none_of:
             return False
         if self.min is None and self.max is None:
             return True
-        low, high = -math.inf if self.min is None else self.min, math.inf if self.max is None else self.max
+        low, high = (
+            -math.inf if self.min is None else self.min,
+            math.inf if self.max is None else self.max,
+        )
         return isinstance(value, Real) and low <= float(value) <= high
 
 
@@ -173,9 +180,13 @@ class SensorModel:
         ):
             unknown = [name for name in names if name not in known]
             if unknown:
-                raise ValueError(f"{key}: unknown {unknown[0]!r}, known are {', '.join(known)}")
+                raise ValueError(
+                    f"{key}: unknown {unknown[0]!r}, known are {', '.join(known)}"
+                )
         if not self.std or ("x_m" in self.std) != ("y_m" in self.std):
-            raise ValueError("std: name at least one measured component, and x_m and y_m together")
+            raise ValueError(
+                "std: name at least one measured component, and x_m and y_m together"
+            )
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -184,7 +195,14 @@ class SensorModel:
 
     def refusing(self, detection: Detection) -> str | None:
         """Name of the first of the filters that `detection` does not pass; None where it passes all."""
-        return next((name for name, item in self.filters.items() if not item.passes(getattr(detection, name))), None)
+        return next(
+            (
+                name
+                for name, item in self.filters.items()
+                if not item.passes(getattr(detection, name))
+            ),
+            None,
+        )
 
     @property
     def gives_position(self) -> bool:
@@ -199,10 +217,20 @@ class SensorModel:
     @property
     def is_view_given(self) -> bool:
         """True if its field of view or a range is given."""
-        limits = {self.field_of_view_rad, self.max_range_m, self.view_range_m, self.max_range_behind_m}
+        limits = {
+            self.field_of_view_rad,
+            self.max_range_m,
+            self.view_range_m,
+            self.max_range_behind_m,
+        }
         return limits != {None}
 
-    def sees(self, positions_m: FloatArray, ego_poses: FloatArray, origin_m: tuple[float, float]) -> BoolArray:
+    def sees(
+        self,
+        positions_m: FloatArray,
+        ego_poses: FloatArray,
+        origin_m: tuple[float, float],
+    ) -> BoolArray:
         """True if an object there is in range and in the field of view, shape (...); nothing hides it.
         `positions_m` (..., 2) and the `ego_poses` x, y, yaw (..., 3) at the same times are in the map, `origin_m` is
         the origin of the detection frame in that of the ego.
@@ -210,22 +238,38 @@ class SensorModel:
         x_m, y_m, yaw_rad = np.moveaxis(ego_poses, -1, 0)
         still, mount = np.zeros_like(x_m), self.placed
         at_x_m, at_y_m, _, _ = body_point(
-            x_m, y_m, yaw_rad, still, still, origin_m[0] + mount.x_m, origin_m[1] + mount.y_m
+            x_m,
+            y_m,
+            yaw_rad,
+            still,
+            still,
+            origin_m[0] + mount.x_m,
+            origin_m[1] + mount.y_m,
         )
         direction_range = polar(positions_m - np.stack([at_x_m, at_y_m], axis=-1))
         return in_view(
             direction_range[..., 1],
             direction_range[..., 0] - yaw_rad - mount.yaw_rad,
             self.field_of_view_rad or math.tau,
-            max_range_m=min((m for m in (self.max_range_m, self.view_range_m) if m is not None), default=math.inf),
+            max_range_m=min(
+                (m for m in (self.max_range_m, self.view_range_m) if m is not None),
+                default=math.inf,
+            ),
             max_range_behind_m=self.max_range_behind_m,
         )
 
     def noise(self, components: tuple[str, ...]) -> FloatArray:
         """Diagonal covariance R (k, k) of `components`, also those from the map, in the sensor's axes; read-only."""
         if components not in self._noises:
-            from_map = {"yaw_rad": self.yaw_from_map_std_rad, "curvature_radpm": self.curvature_from_map_std_radpm}
-            std = {name: value for name, value in {**from_map, **self.std}.items() if value is not None}
+            from_map = {
+                "yaw_rad": self.yaw_from_map_std_rad,
+                "curvature_radpm": self.curvature_from_map_std_radpm,
+            }
+            std = {
+                name: value
+                for name, value in {**from_map, **self.std}.items()
+                if value is not None
+            }
             R = np.diag([std[name] ** 2 for name in components])
             R.flags.writeable = False
             self._noises[components] = R
@@ -235,14 +279,20 @@ class SensorModel:
     def round(self) -> bool:
         """True if its error of the position is the same along and across the line of sight."""
         growth = self.std_growth
-        return self.std["x_m"] == self.std["y_m"] and growth.get("x_m", 0.0) == growth.get("y_m", 0.0)
+        return self.std["x_m"] == self.std["y_m"] and growth.get(
+            "x_m", 0.0
+        ) == growth.get("y_m", 0.0)
 
-    def growth(self, components: tuple[str, ...], range_m: FloatArray) -> FloatArray | None:
+    def growth(
+        self, components: tuple[str, ...], range_m: FloatArray
+    ) -> FloatArray | None:
         """Increase (m, k) of the variances in `noise` at `range_m` (m,), 0 at NaN; None where nothing grows."""
         if self.std_growth.keys().isdisjoint(components):
             return None
         rates = np.array([self.std_growth.get(name, 0.0) for name in components])
-        return np.asarray((np.where(np.isnan(range_m), 0.0, range_m)[:, None] * rates) ** 2)
+        return np.asarray(
+            (np.where(np.isnan(range_m), 0.0, range_m)[:, None] * rates) ** 2
+        )
 
     @cached_property
     def _noises(self) -> dict[tuple[str, ...], FloatArray]:
@@ -262,7 +312,11 @@ def in_view(
     `field_of_view_rad` is the full angle; `max_range_behind_m` replaces `max_range_m` in the half behind the sensor.
     """
     off_axis_rad = np.abs(wrap_angles(bearing_rad))
-    behind_m = max_range_m if max_range_behind_m is None else min(max_range_behind_m, max_range_m)
+    behind_m = (
+        max_range_m
+        if max_range_behind_m is None
+        else min(max_range_behind_m, max_range_m)
+    )
     limit_m = np.where(off_axis_rad > math.pi / 2.0, behind_m, max_range_m)
     in_range = (range_m >= min_range_m) & (range_m <= limit_m)
     return np.asarray(in_range & (off_axis_rad <= field_of_view_rad / 2.0))

@@ -37,12 +37,20 @@ COLUMNS = (
 _COLUMN = {name: index for index, name in enumerate(COLUMNS)}
 _HEADINGS = (_COLUMN["psi_racetraj_rad"], _COLUMN["psi_ref_rad"])
 _ARCS = [_COLUMN["s_racetraj_m"], _COLUMN["s_ref_m"]]
-_FILE_HEADING_OFFSET_RAD = math.pi / 2  # a file's heading is 0 along +y, REP-103 is 0 along +x
+_FILE_HEADING_OFFSET_RAD = (
+    math.pi / 2
+)  # a file's heading is 0 along +y, REP-103 is 0 along +x
 _SAME_POINT_M = 1e-3
-_MAX_HEADING_ERROR_RAD = 1.0  # coarse maps turn much in a row; a wrong convention is off by pi / 2
+_MAX_HEADING_ERROR_RAD = (
+    1.0  # coarse maps turn much in a row; a wrong convention is off by pi / 2
+)
 # A segment row holds these quantities where the segment starts, and then the changes to its end. A point is complex,
 # x + i y; times `_BACK`, exp(-i heading), a vector is along + i left. `_ALONG` is the segment's own part along.
-_POINT, _BACK, (_HEADING, _CURVATURE, _LEFT, _RIGHT, _ARC, _ALONG) = slice(0, 2), slice(2, 4), range(4, 10)
+_POINT, _BACK, (_HEADING, _CURVATURE, _LEFT, _RIGHT, _ARC, _ALONG) = (
+    slice(0, 2),
+    slice(2, 4),
+    range(4, 10),
+)
 _QUANTITIES = 10
 
 
@@ -72,8 +80,16 @@ class TrackMap:
         arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
         heading = np.unwrap(table[:, _COLUMN["psi_ref_rad"]])
         line, back = x + 1j * y, np.exp(-1j * heading)
-        others = table[:, [_COLUMN[name] for name in ("kappa_ref_radpm", "width_left_m", "width_right_m")]].T
-        knots = np.stack([x, y, back.real, back.imag, heading, *others, arc])  # in the order of a segment row
+        others = table[
+            :,
+            [
+                _COLUMN[name]
+                for name in ("kappa_ref_radpm", "width_left_m", "width_right_m")
+            ],
+        ].T
+        knots = np.stack(
+            [x, y, back.real, back.imag, heading, *others, arc]
+        )  # in the order of a segment row
         starts, changes = knots[:, :-1], np.diff(knots)
         along = (np.diff(line) * [back[:-1], np.diff(back)]).real
         segments = np.concatenate([starts, along[:1], changes, along[1:]]).T.copy()
@@ -85,7 +101,11 @@ class TrackMap:
         """Length of one lap."""
         self.counter_clockwise = bool(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1]) > 0.0)
         """True if the line is driven counter-clockwise, so that the inner bound is the left one."""
-        self._arc, self._segments, self._longest_m = arc, segments, float(np.diff(arc).max())
+        self._arc, self._segments, self._longest_m = (
+            arc,
+            segments,
+            float(np.diff(arc).max()),
+        )
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
@@ -95,14 +115,20 @@ class TrackMap:
         content = read_whole(Path(path), 20.0)  # some 100,000 rows
         try:
             lines = [
-                line for line in content.decode().splitlines() if line.strip() and not line.lstrip().startswith("#")
+                line
+                for line in content.decode().splitlines()
+                if line.strip() and not line.lstrip().startswith("#")
             ]
-            table = np.array([line.split(";") for line in lines], dtype=np.float64).reshape(-1, len(COLUMNS))
+            table = np.array(
+                [line.split(";") for line in lines], dtype=np.float64
+            ).reshape(-1, len(COLUMNS))
             table[:, _HEADINGS] += _FILE_HEADING_OFFSET_RAD
             return cls(table)
         except (ValueError, DataError) as error:
             text = str(error).removeprefix("not a map: ")
-            raise DataError(f"{path}: not a map of {len(COLUMNS)} columns separated by ';': {text}") from error
+            raise DataError(
+                f"{path}: not a map of {len(COLUMNS)} columns separated by ';': {text}"
+            ) from error
 
     def frenet(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Arc length s in [0, length) and lateral offset (left positive) of `points_m`, shape (n, 2)."""
@@ -122,7 +148,9 @@ class TrackMap:
         foot = self._at(s_m)
         return foot[:, _LEFT], foot[:, _RIGHT]
 
-    def view(self, points_m: FloatArray, inner_buffer_m: float, outer_buffer_m: float) -> RoadView:
+    def view(
+        self, points_m: FloatArray, inner_buffer_m: float, outer_buffer_m: float
+    ) -> RoadView:
         """Heading and curvature of the line beside `points_m`, shape (n, 2), and True for those outside the bounds.
         A positive buffer widens the track. The inner bound is the left one if it is driven counter-clockwise.
         """
@@ -135,7 +163,9 @@ class TrackMap:
     def _at(self, s_m: FloatArray) -> FloatArray:
         """Quantities at arc length `s_m`, shape (n, 10)."""
         s = np.mod(np.asarray(s_m, dtype=np.float64), self.length_m)
-        index: IntArray = np.minimum(np.searchsorted(self._arc, s, side="right") - 1, len(self._segments) - 1)
+        index: IntArray = np.minimum(
+            np.searchsorted(self._arc, s, side="right") - 1, len(self._segments) - 1
+        )
         at = self._segments[index]
         part = (s - at[:, _ARC]) / at[:, _QUANTITIES + _ARC]
         return np.asarray(at[:, :_QUANTITIES] + part[:, None] * at[:, _QUANTITIES:])
@@ -156,10 +186,14 @@ def _complex(vectors: FloatArray) -> npt.NDArray[np.complex128]:
 def _closed(table: FloatArray) -> FloatArray:
     """Copy of `table` that ends with its first point; raises `DataError` with the row that is wrong."""
     if table.ndim != 2 or table.shape[1] != len(COLUMNS) or len(table) < 4:
-        raise DataError(f"not a map: at least 4 rows of {len(COLUMNS)} columns are needed")
+        raise DataError(
+            f"not a map: at least 4 rows of {len(COLUMNS)} columns are needed"
+        )
     if not (np.abs(table) <= LARGEST).all():
         row, column = np.argwhere(~(np.abs(table) <= LARGEST))[0].tolist()
-        raise DataError(f"not a map: row {row + 1}: {COLUMNS[column]} is not a number up to {LARGEST:g}")
+        raise DataError(
+            f"not a map: row {row + 1}: {COLUMNS[column]} is not a number up to {LARGEST:g}"
+        )
     gap_m = float(np.hypot(*(table[0, :2] - table[-1, :2])))
     closed = table.copy() if gap_m < _SAME_POINT_M else np.vstack([table, table[:1]])
     closed[-1, :2] = table[0, :2]
@@ -171,12 +205,19 @@ def _closed(table: FloatArray) -> FloatArray:
         closed[:-1, [_COLUMN["width_left_m"], _COLUMN["width_right_m"]]].sum(axis=1),
     )
     far_m = np.append(np.full(len(steps) - 1, math.inf), 10.0 * lengths_m[:-1].max())
-    off_rad = np.abs(wrap_angles(np.arctan2(steps[:, 1], steps[:, 0]) - closed[:-1, _COLUMN["psi_ref_rad"]]))
+    off_rad = np.abs(
+        wrap_angles(
+            np.arctan2(steps[:, 1], steps[:, 0]) - closed[:-1, _COLUMN["psi_ref_rad"]]
+        )
+    )
     for wrong, text in (
         (lengths_m < _SAME_POINT_M, "the next row holds the same point"),
         (lengths_m > far_m, "the line does not close"),
         (widths_m <= 0.0, "the widths do not add up to a positive one"),
-        (off_rad > _MAX_HEADING_ERROR_RAD, "psi_ref_rad is off the way to the next row; a file counts it from +y"),
+        (
+            off_rad > _MAX_HEADING_ERROR_RAD,
+            "psi_ref_rad is off the way to the next row; a file counts it from +y",
+        ),
     ):
         if wrong.any():
             raise DataError(f"not a map: row {np.argmax(wrong) + 1}: {text}")

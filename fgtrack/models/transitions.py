@@ -12,7 +12,17 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import add_product_transposed, check, copy, inlined, merged, njit, product, scratch, shared
+from fgtrack.core.compiled import (
+    add_product_transposed,
+    check,
+    copy,
+    inlined,
+    merged,
+    njit,
+    product,
+    scratch,
+    shared,
+)
 from fgtrack.core.types import FloatArray
 
 #: Kinds of motion: constant turn rate and velocity (or acceleration), constant velocity, and constant turn rate with
@@ -50,7 +60,9 @@ _GROWTH = 1.0 / np.cumprod(np.arange(1.0, 11.0))
 _COS = np.array([(-1.0) ** k / math.factorial(2 * k) for k in range(7)])
 _SIN = np.array([(-1.0) ** k / math.factorial(2 * k + 1) for k in range(7)])
 
-_TYPES = f"float64[::1], float64, {'float64[::1], ' * 2}float64[:, ::1], float64[:, ::1]"
+_TYPES = (
+    f"float64[::1], float64, {'float64[::1], ' * 2}float64[:, ::1], float64[:, ::1]"
+)
 
 
 @inlined
@@ -106,7 +118,14 @@ def _integrated(i: int, nodes: FloatArray) -> tuple[float, float, float, float]:
 
 
 @shared(f"void({_TYPES})")
-def _short_arc(x: FloatArray, t: float, noise: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray) -> None:
+def _short_arc(
+    x: FloatArray,
+    t: float,
+    noise: FloatArray,
+    mean: FloatArray,
+    F: FloatArray,
+    Q: FloatArray,
+) -> None:
     """Write mean, F and Q after a turn of at most `MAX_TURN_RAD`.
 
     Positions are complex numbers along and left of the heading at the end. At a time r t before the end the yaw rate is
@@ -137,7 +156,11 @@ def _short_arc(x: FloatArray, t: float, noise: FloatArray, mean: FloatArray, F: 
     c, s = math.cos(mean[2]), math.sin(mean[2])
     for i in range(_NUM_NODES + 1):
         is_end = i == _NUM_NODES
-        r, g, p = (1.0, last_g, last_p) if is_end else (_NODES[i], nodes[i, 2], 1.0 + b * nodes[i, 2])
+        r, g, p = (
+            (1.0, last_g, last_p)
+            if is_end
+            else (_NODES[i], nodes[i, 2], 1.0 + b * nodes[i, 2])
+        )
         unit_x, unit_y, turned_x, turned_y = _integrated(i, nodes)
         unit_x, unit_y = t * unit_x, t * unit_y
         way_x, way_y, late_x, late_y = v * unit_x, v * unit_y, 0.0, 0.0
@@ -158,10 +181,18 @@ def _short_arc(x: FloatArray, t: float, noise: FloatArray, mean: FloatArray, F: 
             elif k == 3:
                 right, up, first, second = unit_x, unit_y, 1.0, 0.0
             elif k == 4:
-                right, up = -t * (g * way_y - turned_y) / p, t * (g * way_x - turned_x) / p
+                right, up = (
+                    -t * (g * way_y - turned_y) / p,
+                    t * (g * way_x - turned_x) / p,
+                )
                 first, second = t * g / p, 1.0 / p
             else:
-                right, up, first, second = t * (r * unit_x - late_x), t * (r * unit_y - late_y), t * r, 1.0
+                right, up, first, second = (
+                    t * (r * unit_x - late_x),
+                    t * (r * unit_y - late_y),
+                    t * r,
+                    1.0,
+                )
             own = 2 + k % 2
             if is_end:
                 F[0, k], F[1, k] = c * right - s * up, s * right + c * up
@@ -198,7 +229,14 @@ def _short_arc(x: FloatArray, t: float, noise: FloatArray, mean: FloatArray, F: 
 
 
 @shared(f"void({_TYPES})")
-def _short_turn(x: FloatArray, t: float, noise: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray) -> None:
+def _short_turn(
+    x: FloatArray,
+    t: float,
+    noise: FloatArray,
+    mean: FloatArray,
+    F: FloatArray,
+    Q: FloatArray,
+) -> None:
     """Write mean, F and Q of the state x, y, vx, vy, yaw rate after a turn of at most `MAX_TURN_RAD`.
 
     As in `_short_arc`, with complex numbers in the map. A velocity V that is added at r becomes V / U(r) at the end and
@@ -223,18 +261,32 @@ def _short_turn(x: FloatArray, t: float, noise: FloatArray, mean: FloatArray, F:
     for i in range(_NUM_NODES + 1):
         is_end = i == _NUM_NODES
         unit_x, unit_y, turned_x, turned_y = _integrated(i, nodes)
-        along, left, g = (c, -s, last_g) if is_end else (nodes[i, 0], nodes[i, 1], nodes[i, 2])
+        along, left, g = (
+            (c, -s, last_g) if is_end else (nodes[i, 0], nodes[i, 1], nodes[i, 2])
+        )
         p = 1.0 + b * g
         # By the velocity: the position moves by (way_x + i way_y) V, the final velocity is (along - i left) V.
-        way_x, way_y = t * (unit_x * along + unit_y * left), t * (unit_y * along - unit_x * left)
+        way_x, way_y = (
+            t * (unit_x * along + unit_y * left),
+            t * (unit_y * along - unit_x * left),
+        )
         # By the yaw rate.
-        late_x, late_y = t * t * (g * unit_x - turned_x) / p, t * t * (g * unit_y - turned_y) / p
+        late_x, late_y = (
+            t * t * (g * unit_x - turned_x) / p,
+            t * t * (g * unit_y - turned_y) / p,
+        )
         right, up = -(vx * late_y + vy * late_x), vx * late_x - vy * late_y
         turn_s = t * g / p
         if is_end:
             F[0, 2], F[0, 3], F[1, 2], F[1, 3] = way_x, -way_y, way_y, way_x
             F[2, 2], F[2, 3], F[3, 2], F[3, 3] = along, left, -left, along
-            F[0, 4], F[1, 4], F[2, 4], F[3, 4], F[4, 4] = right, up, -vy * turn_s, vx * turn_s, 1.0 / p
+            F[0, 4], F[1, 4], F[2, 4], F[3, 4], F[4, 4] = (
+                right,
+                up,
+                -vy * turn_s,
+                vx * turn_s,
+                1.0 / p,
+            )
             mean[0] = x[0] + way_x * x[2] - way_y * x[3]
             mean[1] = x[1] + way_y * x[2] + way_x * x[3]
             mean[2], mean[3], mean[4] = vx, vy, w
@@ -242,7 +294,10 @@ def _short_turn(x: FloatArray, t: float, noise: FloatArray, mean: FloatArray, F:
         q = noise[2] * t * _WEIGHTS[i]
         length = q * (way_x * way_x + way_y * way_y)
         # Position times conjugate velocity.
-        same, other = q * (way_x * along - way_y * left), q * (way_y * along + way_x * left)
+        same, other = (
+            q * (way_x * along - way_y * left),
+            q * (way_y * along + way_x * left),
+        )
         Q[0, 0] += length
         Q[1, 1] += length
         Q[0, 2] += same
@@ -275,7 +330,14 @@ def _short_turn(x: FloatArray, t: float, noise: FloatArray, mean: FloatArray, F:
 
 @merged
 def _arc(
-    kind: int, x: FloatArray, t: float, parts: int, noise: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
+    kind: int,
+    x: FloatArray,
+    t: float,
+    parts: int,
+    noise: FloatArray,
+    mean: FloatArray,
+    F: FloatArray,
+    Q: FloatArray,
 ) -> None:
     """Write mean, F and Q after `parts` short arcs or turns of t each."""
     n = len(x)
@@ -297,7 +359,14 @@ def _arc(
 
 
 @merged
-def _line(x: FloatArray, t: float, noise: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray) -> None:
+def _line(
+    x: FloatArray,
+    t: float,
+    noise: FloatArray,
+    mean: FloatArray,
+    F: FloatArray,
+    Q: FloatArray,
+) -> None:
     """Write mean, F and Q of constant velocity, state x, y, vx, vy: q [[t^3/3, t^2/2], [t^2/2, t]] on each axis."""
     for i in range(4):
         mean[i] = x[i]
@@ -320,13 +389,22 @@ def _num_parts(x: FloatArray, t: float, noise: FloatArray) -> float:
     if n > 5 and noise[n + 2] > 0.0:
         speed, last = x[3], x[3] + x[5] * t
         slowest = 0.0 if speed * last < 0.0 else min(abs(speed), abs(last))
-        parts = max(parts, abs(x[5] * t) / (MAX_SPEED_CHANGE * math.hypot(slowest, noise[n + 1])))
+        parts = max(
+            parts,
+            abs(x[5] * t) / (MAX_SPEED_CHANGE * math.hypot(slowest, noise[n + 1])),
+        )
     return math.ceil(parts) if parts < MAX_PARTS else math.inf
 
 
 @shared(f"void(int64, {_TYPES})")
 def transition(
-    kind: int, x: FloatArray, t: float, noise: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
+    kind: int,
+    x: FloatArray,
+    t: float,
+    noise: FloatArray,
+    mean: FloatArray,
+    F: FloatArray,
+    Q: FloatArray,
 ) -> None:
     """Write mean (n,), F and Q (n, n) of the state x (n,) after t."""
     if kind == LINE:
@@ -346,11 +424,22 @@ def transition(
     "void(int64, float64[:, ::1], float64[::1], float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, ::1])"
 )
 def transitions(
-    kind: int, x: FloatArray, dt_s: FloatArray, noise: FloatArray, mean: FloatArray, F: FloatArray, Q: FloatArray
+    kind: int,
+    x: FloatArray,
+    dt_s: FloatArray,
+    noise: FloatArray,
+    mean: FloatArray,
+    F: FloatArray,
+    Q: FloatArray,
 ) -> None:
     """Write mean (m, n), F and Q (m, n, n) of states (m, n) after `dt_s` (m,)."""
     m, n = x.shape
     check_noise(kind, noise, n)
-    check(len(dt_s) >= m and mean.shape == x.shape and F.shape == (m, n, n) and Q.shape == (m, n, n))
+    check(
+        len(dt_s) >= m
+        and mean.shape == x.shape
+        and F.shape == (m, n, n)
+        and Q.shape == (m, n, n)
+    )
     for k in range(len(x)):
         transition(kind, x[k], dt_s[k], noise, mean[k], F[k], Q[k])

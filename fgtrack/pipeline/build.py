@@ -6,52 +6,76 @@ from typing import Any
 
 import numpy as np
 
+from fgtrack.config.settings import NOISE_HZ, SMOOTHERS, Config, Defect, MapConfig
 from fgtrack.core.diagnostic import EGO
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import nanoseconds, period_ns, seconds
 from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.failures import Failures
-from fgtrack.estimation.filters.backward_forward import BackwardForwardBank
-from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator
-from fgtrack.estimation.filters.published import PublishedStorage, SaturatedEulerCtrv
+from fgtrack.estimation.filters.propagation import ExactPropagator
 from fgtrack.estimation.filters.track_initiation import initiated
 from fgtrack.estimation.object_bank import ObjectBank, SingleObject
 from fgtrack.estimation.registry import estimator_bank
+from fgtrack.karle2023.backward_forward import BackwardForwardBank
+from fgtrack.karle2023.euler import EulerCtrv
+from fgtrack.karle2023.filter_defects import PublishedStorage, SaturatedEulerCtrv
+from fgtrack.karle2023.road_map import PublishedMap
+from fgtrack.karle2023.tracker_parts import (
+    PublishedEgo,
+    PublishedLifecycle,
+    PublishedTracker,
+    SlotInbox,
+)
 from fgtrack.models.oval import OVAL, make_oval, make_pit_lane
-from fgtrack.models.published_map import PublishedMap
 from fgtrack.models.road import Road
 from fgtrack.models.track_map import TrackMap
-from fgtrack.pipeline.config import NOISE_HZ, SMOOTHERS, Config, Defect, MapConfig
 from fgtrack.tracking.association import GatedMahalanobis
-from fgtrack.tracking.ego import EgoStd, EgoTrajectory
-from fgtrack.tracking.ego_growth import EgoGrowth
-from fgtrack.tracking.existence import ExistenceLifecycle, ExistenceRules, Lifecycle
+from fgtrack.tracking.ego.growth import EgoGrowth
+from fgtrack.tracking.ego.trajectory import EgoStd, EgoTrajectory
+from fgtrack.tracking.ego.waiting import PoseWait
 from fgtrack.tracking.facing import Facing
 from fgtrack.tracking.guarded_bank import GuardedBank
 from fgtrack.tracking.inbox import Inbox
-from fgtrack.tracking.latency import Watermarks
-from fgtrack.tracking.lifecycle import CountingLifecycle
+from fgtrack.tracking.lives.counters import CountingLifecycle
+from fgtrack.tracking.lives.existence import (
+    ExistenceLifecycle,
+    ExistenceRules,
+    Lifecycle,
+)
+from fgtrack.tracking.lives.latency import Watermarks
 from fgtrack.tracking.preprocess import Preprocess
-from fgtrack.tracking.published import PublishedEgo, PublishedLifecycle, PublishedTracker, SlotInbox
 from fgtrack.tracking.tracker import Tracker, TrackerParts
-from fgtrack.tracking.waiting import PoseWait
 
 _EGO_STORAGE_TICKS = 350  # of the published implementation
 
 
-def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerParts] | None = None) -> Tracker:
+def build_tracker(
+    config: Config, observed: Callable[[TrackerParts], TrackerParts] | None = None
+) -> Tracker:
     """Return the tracker that `config` describes, of the parts that `observed` returns for the usual ones."""
     road = build_road(config.map, config.defects)
-    motion, lifecycle, failures = config.motion_model(), build_lifecycle(config), Failures()
+    motion, lifecycle, failures = (
+        config.motion_model(),
+        build_lifecycle(config),
+        Failures(),
+    )
     published_order = config.lifecycle.kind == "published"
-    joint = config.association if isinstance(config.association, GatedMahalanobis) else None
+    joint = (
+        config.association if isinstance(config.association, GatedMahalanobis) else None
+    )
     ego = _build_ego(config)
     parts = TrackerParts(
         sensors=config.sensors,
         ego=ego,
         wait=_build_wait(config, ego),
         inbox=(SlotInbox if "one_slot" in config.defects else Inbox)(config.sensors),
-        preprocess=Preprocess(road, config.merge, motion, config.ego.detection_origin_m, not published_order),
+        preprocess=Preprocess(
+            road,
+            config.merge,
+            motion,
+            config.ego.detection_origin_m,
+            not published_order,
+        ),
         association=config.association,
         joint=joint,
         bank=GuardedBank(lambda: build_bank(config, failures), failures),
@@ -67,7 +91,9 @@ def build_tracker(config: Config, observed: Callable[[TrackerParts], TrackerPart
         road=road,
         watermarks=Watermarks(config.sensors, [EGO]),
     )
-    return (PublishedTracker if published_order else Tracker)(parts if observed is None else observed(parts))
+    return (PublishedTracker if published_order else Tracker)(
+        parts if observed is None else observed(parts)
+    )
 
 
 def build_lifecycle(config: Config) -> Lifecycle:
@@ -84,14 +110,20 @@ def build_road(config: MapConfig, defects: Collection[Defect] = ()) -> Road:
     if config.track_file is None:
         if config.pit is None:
             return Road()
-        raise CallError(f"{config.pit}: a pit lane (map.pit) needs the map of its track (map.track), give --map too")
+        raise CallError(
+            f"{config.pit}: a pit lane (map.pit) needs the map of its track (map.track), give --map too"
+        )
     track = _read_map(config.track_file, make_oval)
     pit = None if config.pit is None else _read_map(config.pit, make_pit_lane)
     buffers = (config.inner_buffer_m, config.outer_buffer_m, config.pit_buffer_m)
     if not {"heading_jump", "circular_heading"} & set(defects):
         return Road(track, pit, *buffers)
     circular = "heading_jump" not in defects
-    return Road(PublishedMap(track, circular), None if pit is None else PublishedMap(pit, circular), *buffers)
+    return Road(
+        PublishedMap(track, circular),
+        None if pit is None else PublishedMap(pit, circular),
+        *buffers,
+    )
 
 
 def _read_map(name: str, built_in: Callable[[], TrackMap]) -> TrackMap:
@@ -104,21 +136,33 @@ def _read_map(name: str, built_in: Callable[[], TrackMap]) -> TrackMap:
 
 def _build_backward_forward(config: Config) -> TrackBank:
     step_ns = period_ns(config.filter.frequency_hz)
-    leads, is_stale = "leading_clock" in config.defects, "stale_present" in config.defects
+    leads, is_stale = (
+        "leading_clock" in config.defects,
+        "stale_present" in config.defects,
+    )
     steps = round(config.filter.storage_s * config.filter.frequency_hz)
 
     def bank() -> TrackBank:
         propagator = build_propagator(config, seconds(step_ns))
         if not (leads or is_stale):
             return BackwardForwardBank(propagator, step_ns, steps)
-        return PublishedStorage(propagator, step_ns, steps, leads=leads, is_stale=is_stale)
+        return PublishedStorage(
+            propagator, step_ns, steps, leads=leads, is_stale=is_stale
+        )
 
     if config.map.track_file is not None or leads or is_stale:
         return bank()
-    motion = config.motion_model()  # without a map a track may begin in any direction, each at its own time
+    motion = (
+        config.motion_model()
+    )  # without a map a track may begin in any direction, each at its own time
 
     def one(start: Start) -> Estimator:
-        return initiated(motion, start, config.initiation.method, lambda each: SingleObject(motion, bank(), each))
+        return initiated(
+            motion,
+            start,
+            config.initiation.method,
+            lambda each: SingleObject(motion, bank(), each),
+        )
 
     return ObjectBank(motion, one, config.filter.storage_s)
 
@@ -131,7 +175,10 @@ def build_bank(config: Config, failures: Failures | None = None) -> TrackBank:
         raise CallError(f"options.{name}: set the keys of smoother or filter instead")
     if is_filter:
         return _build_backward_forward(config)
-    options: dict[str, Any] = {"initiation": config.initiation.method, **given}  # Any: of the estimator's own
+    options: dict[str, Any] = {
+        "initiation": config.initiation.method,
+        **given,
+    }  # Any: of the estimator's own
     if name in SMOOTHERS:
         options |= {**vars(config.smoother), "failures": failures}
         del options["lag_s"]
@@ -143,7 +190,14 @@ def build_propagator(config: Config, step_s: float) -> ExactPropagator:
     motion, noise = config.motion_model(), config.motion
     if noise.kind != "ctrv_euler":
         return ExactPropagator(motion)
-    names = ["position", "position", "yaw", "speed", "yaw_rate", *(["accel"] if noise.is_driven else [])]
+    names = [
+        "position",
+        "position",
+        "yaw",
+        "speed",
+        "yaw_rate",
+        *(["accel"] if noise.is_driven else []),
+    ]
     density = np.array([noise.std_per_s[name] ** 2 / NOISE_HZ for name in names])
     if "noise_per_step" in config.defects:
         density *= NOISE_HZ * step_s
@@ -153,16 +207,30 @@ def build_propagator(config: Config, step_s: float) -> ExactPropagator:
 
 def _build_ego(config: Config) -> EgoTrajectory:
     ego = config.ego
-    std = EgoStd(ego.position_std_m, ego.yaw_std_rad, ego.speed_std_mps, ego.yaw_rate_std_radps)
+    std = EgoStd(
+        ego.position_std_m, ego.yaw_std_rad, ego.speed_std_mps, ego.yaw_rate_std_radps
+    )
     known = None if ego.uncertainty == "none" else std
     if "refiltered_ego" in config.defects:
         step_ns = period_ns(config.filter.frequency_hz)
-        return PublishedEgo(ego.yaw_weight, ego.yaw_rate_weight, step_ns, _EGO_STORAGE_TICKS, known)
+        return PublishedEgo(
+            ego.yaw_weight, ego.yaw_rate_weight, step_ns, _EGO_STORAGE_TICKS, known
+        )
     noise = {"speed": 15.0, **config.motion.std_per_s}  # of a plug-in as of traffic
     density_m2ps3 = noise.get("velocity", noise["speed"]) ** 2 / NOISE_HZ
-    growth = None if known is None else EgoGrowth(ego.accel_std_mps2, ego.yaw_accel_std_radps2, density_m2ps3)
+    growth = (
+        None
+        if known is None
+        else EgoGrowth(ego.accel_std_mps2, ego.yaw_accel_std_radps2, density_m2ps3)
+    )
     time_s = ego.position_time_s
-    return EgoTrajectory(ego.yaw_weight, ego.yaw_rate_weight, std=known, position_time_s=time_s, growth=growth)
+    return EgoTrajectory(
+        ego.yaw_weight,
+        ego.yaw_rate_weight,
+        std=known,
+        position_time_s=time_s,
+        growth=growth,
+    )
 
 
 def _build_wait(config: Config, ego: EgoTrajectory) -> PoseWait | None:

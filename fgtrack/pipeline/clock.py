@@ -25,7 +25,9 @@ def clock_ticks(messages: Iterable[Delivered], node_hz: float | None) -> Iterato
     """
     step_ns = 1 if node_hz is None else period_ns(node_hz)
     next_ns: int | None = None
-    for due_ns, delivered in groupby(messages, lambda message: -(-message.receipt_ns // step_ns) * step_ns):
+    for due_ns, delivered in groupby(
+        messages, lambda message: -(-message.receipt_ns // step_ns) * step_ns
+    ):
         if node_hz is not None and next_ns is not None:
             for now_ns in range(next_ns, due_ns, step_ns):
                 yield Tick(now_ns, [])
@@ -44,15 +46,24 @@ def with_last(ticks: Iterable[Tick]) -> Iterator[tuple[Tick, bool]]:
         yield before, True
 
 
-def corrected(message: DetectionList, sensors: Mapping[str, SensorModel]) -> DetectionList:
+def corrected(
+    message: DetectionList, sensors: Mapping[str, SensorModel]
+) -> DetectionList:
     """Return `message` with its receipt as the stamp, or its clock offset taken off, where `sensors` specify it."""
     sensor = sensors.get(message.sensor)
-    if sensor is None or (sensor.stamp_from != "receipt" and sensor.clock_offset_s == 0.0):
+    if sensor is None or (
+        sensor.stamp_from != "receipt" and sensor.clock_offset_s == 0.0
+    ):
         return message
     from fgtrack.sim.redelay import restamped
 
     offset_ns = nanoseconds(sensor.clock_offset_s)
     if sensor.stamp_from == "receipt":
-        objects = tuple(item if item.stamp_ns is None else replace(item, stamp_ns=None) for item in message.objects)
-        return replace(message, stamp_ns=message.receipt_ns - offset_ns, objects=objects)
+        objects = tuple(
+            item if item.stamp_ns is None else replace(item, stamp_ns=None)
+            for item in message.objects
+        )
+        return replace(
+            message, stamp_ns=message.receipt_ns - offset_ns, objects=objects
+        )
     return restamped(message, message.stamp_ns - offset_ns)

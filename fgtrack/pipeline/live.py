@@ -11,6 +11,8 @@ from typing import Self
 
 import numpy as np
 
+from fgtrack.config.settings import Config
+from fgtrack.config.shipped import read_config
 from fgtrack.core.checks import LARGEST_NS
 from fgtrack.core.diagnostic import EGO, late_ego, too_late
 from fgtrack.core.errors import CallError, DataError
@@ -25,13 +27,15 @@ from fgtrack.core.types import (
     TrackReport,
     UpdateRecord,
 )
-from fgtrack.io.run import Node
-from fgtrack.io.validation import InvalidMessageError, validated_detection, validated_head
+from fgtrack.inputs.validation import (
+    InvalidMessageError,
+    validated_detection,
+    validated_head,
+)
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import corrected
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.shipped import read_config
-from fgtrack.tracking.latency import NEWEST
+from fgtrack.runs import Node
+from fgtrack.tracking.lives.latency import NEWEST
 
 __all__ = ["Lateness", "TickTiming", "Tracker"]
 
@@ -77,11 +81,15 @@ class TickTiming:
     """Periods of the node in which the host called no tick."""
 
 
-def _spread_s(newest_ns: Sequence[int]) -> tuple[float | None, float | None, float | None]:
+def _spread_s(
+    newest_ns: Sequence[int],
+) -> tuple[float | None, float | None, float | None]:
     """Return median, 99th percentile, maximum; None where there is no duration."""
     if not newest_ns:
         return None, None, None
-    median_s, p99_s, worst_s = (np.quantile(newest_ns, (0.5, 0.99, 1.0)) / NS_PER_S).tolist()
+    median_s, p99_s, worst_s = (
+        np.quantile(newest_ns, (0.5, 0.99, 1.0)) / NS_PER_S
+    ).tolist()
     return median_s, p99_s, worst_s
 
 
@@ -112,9 +120,13 @@ class Tracker:
         estimator: str | None = None,
         set: Mapping[str, object] | None = None,  # noqa: A002 - the name of the option
     ) -> None:
-        config = read_config(config, set, track_map=map, pit_map=pit_map, estimator=estimator)
+        config = read_config(
+            config, set, track_map=map, pit_map=pit_map, estimator=estimator
+        )
         self.config = config
-        self._tracker = build_tracker(config, lambda parts: replace(parts, propagated_exceptions=(DataError,)))
+        self._tracker = build_tracker(
+            config, lambda parts: replace(parts, propagated_exceptions=(DataError,))
+        )
         self._refused: Counter[str] = Counter()
         self._unknown: dict[str, None] = {}
         self._records: list[UpdateRecord] = []
@@ -123,12 +135,18 @@ class Tracker:
         self._last = TickReport(-1, 0, (), ())
         self._first_tick_ns = 0
         self._arrivals: deque[EgoState | DetectionList] = deque()
-        self._ready: deque[EgoState | DetectionList] = deque()  # checked, for the next tick
+        self._ready: deque[EgoState | DetectionList] = (
+            deque()
+        )  # checked, for the next tick
         self._ticks_ns: deque[int] = deque(maxlen=NEWEST)
-        self._node = Node(None if config.clock.node_hz is None else period_ns(config.clock.node_hz))
+        self._node = Node(
+            None if config.clock.node_hz is None else period_ns(config.clock.node_hz)
+        )
         self._skipped = 0
         self._warnings: dict[str, str] = {}  # by sensor
-        self._placed: dict[str, None] = {}  # sensors with lists in the frame of the ego or their own
+        self._placed: dict[
+            str, None
+        ] = {}  # sensors with lists in the frame of the ego or their own
         self._turn = threading.RLock()
 
     @classmethod
@@ -161,13 +179,18 @@ class Tracker:
     def yaws(self) -> Mapping[str, Mapping[str, int]]:
         """Numbers by sensor: `yaws` of tracks, `flipped` ones by half a turn, and `unused` ones that misfit."""
         with self._turn:
-            return {sensor: dict(counts) for sensor, counts in self._tracker.yaws.items()}
+            return {
+                sensor: dict(counts) for sensor, counts in self._tracker.yaws.items()
+            }
 
     @property
     def failures(self) -> Mapping[str, int]:
         """Number of failures inside, and of their consequences; see `Failure` for the kinds."""
         with self._turn:
-            return {failure.value: count for failure, count in self._tracker.failures.counts.items()}
+            return {
+                failure.value: count
+                for failure, count in self._tracker.failures.counts.items()
+            }
 
     @property
     def last_failure(self) -> str | None:
@@ -181,9 +204,15 @@ class Tracker:
             self._take_arrivals()
             result = {}
             for name, one in self._tracker.delays.items():
-                since_ns = self._first_tick_ns if one.newest_receipt_ns is None else one.newest_receipt_ns
+                since_ns = (
+                    self._first_tick_ns
+                    if one.newest_receipt_ns is None
+                    else one.newest_receipt_ns
+                )
                 silent_s = max(seconds(self._last.now_ns - since_ns), 0.0)
-                result[name] = Lateness(one.messages, *_spread_s(one.newest_ns), silent_s)
+                result[name] = Lateness(
+                    one.messages, *_spread_s(one.newest_ns), silent_s
+                )
             return result
 
     @property
@@ -198,7 +227,10 @@ class Tracker:
             for name, sensor in self.config.used_sensors.items():
                 if name not in self._warnings:
                     delays_s = np.array(self._tracker.delays[name].newest_ns) / NS_PER_S
-                    limits = [(f"sensors.{name}.max_delay_s", sensor.max_delay_s), (window.lag_key, window.reach_s)]
+                    limits = [
+                        (f"sensors.{name}.max_delay_s", sensor.max_delay_s),
+                        (window.lag_key, window.reach_s),
+                    ]
                     late = too_late(name, delays_s, limits)
                     if late is not None:
                         self._warnings[name] = str(late)
@@ -206,8 +238,13 @@ class Tracker:
 
     def _late_ego(self) -> Iterator[str]:
         """Yield the line on an ego that is late by the newest messages."""
-        delays_s = {name: _spread_s(self._tracker.delays[name].newest_ns)[0] for name in (EGO, *self._placed)}
-        known_s = {name: delay_s for name, delay_s in delays_s.items() if delay_s is not None}
+        delays_s = {
+            name: _spread_s(self._tracker.delays[name].newest_ns)[0]
+            for name in (EGO, *self._placed)
+        }
+        known_s = {
+            name: delay_s for name, delay_s in delays_s.items() if delay_s is not None
+        }
         ego_s = known_s.pop(EGO, None)
         late = None if ego_s is None else late_ego(ego_s, known_s)
         if late is not None:
@@ -217,7 +254,12 @@ class Tracker:
     def timing(self) -> TickTiming:
         """Durations and missed deadlines of ticks."""
         with self._turn:
-            return TickTiming(self._last.tick + 1, *_spread_s(self._ticks_ns), self._node.misses, self._skipped)
+            return TickTiming(
+                self._last.tick + 1,
+                *_spread_s(self._ticks_ns),
+                self._node.misses,
+                self._skipped,
+            )
 
     def receive(self, message: EgoState | DetectionList) -> None:
         """Take a message in the order of arrival; detections of an unknown sensor are `invalid` at the next tick.
@@ -233,10 +275,14 @@ class Tracker:
             try:
                 self._take(message)
             except InvalidMessageError as error:
-                kind = "object list" if isinstance(message, DetectionList) else "ego state"
+                kind = (
+                    "object list" if isinstance(message, DetectionList) else "ego state"
+                )
                 self._refuse(message, f"{kind}: {_rule(error)}")
             except Exception as error:
-                self._refuse(message, f"message cannot be read ({type(error).__name__})")
+                self._refuse(
+                    message, f"message cannot be read ({type(error).__name__})"
+                )
             self._arrivals.popleft()
 
     def _refuse(self, message: EgoState | DetectionList, reason: str) -> None:
@@ -246,7 +292,10 @@ class Tracker:
             sensor = message.sensor if isinstance(message.sensor, str) else OTHERS
             times_ns = _recorded_ns(message.stamp_ns), _recorded_ns(message.receipt_ns)
             rows = range(len(message.objects))
-            self._records += [UpdateRecord(sensor, *times_ns, row, Disposition.INVALID) for row in rows]
+            self._records += [
+                UpdateRecord(sensor, *times_ns, row, Disposition.INVALID)
+                for row in rows
+            ]
 
     def _take(self, message: EgoState | DetectionList) -> None:
         if not isinstance(message, EgoState | DetectionList):
@@ -260,9 +309,13 @@ class Tracker:
             name = message.sensor
             if name not in self.config.sensors:
                 if name not in self.config.ignore_sensors:
-                    self._refuse(message, f"sensor {self._counted(name)!r} has no model")
+                    self._refuse(
+                        message, f"sensor {self._counted(name)!r} has no model"
+                    )
                 return
-            message = replace(message, objects=tuple(map(self._usable, message.objects)))
+            message = replace(
+                message, objects=tuple(map(self._usable, message.objects))
+            )
         self._ready.append(message)
 
     def _deliver(self, now_ns: int) -> None:
@@ -282,7 +335,9 @@ class Tracker:
                         self._placed[message.sensor] = None
                 self._tracker.receive(message)
             except Exception as error:
-                self._refuse(message, f"message cannot be read ({type(error).__name__})")
+                self._refuse(
+                    message, f"message cannot be read ({type(error).__name__})"
+                )
             self._ready.popleft()
 
     def _counted(self, sensor: str) -> str:
@@ -318,7 +373,9 @@ class Tracker:
                 self._records += self._uncounted.updates
             self._uncounted = report = self._tracker.tick(now_ns)
             report = replace(report, updates=(*self._records, *report.updates))
-            counts = Counter((update.sensor, str(update.disposition)) for update in report.updates)
+            counts = Counter(
+                (update.sensor, str(update.disposition)) for update in report.updates
+            )
             # One statement, so that an interrupt comes before or after it.
             self._counts, self._records, self._uncounted = self._with(counts), [], None
             self._ticks_ns.append(perf_counter_ns() - begun_ns)
@@ -326,7 +383,9 @@ class Tracker:
             if self._last.tick < 0:
                 self._first_tick_ns = now_ns
             elif self._node.period_ns is not None:
-                self._skipped += max(round((now_ns - self._last.now_ns) / self._node.period_ns) - 1, 0)
+                self._skipped += max(
+                    round((now_ns - self._last.now_ns) / self._node.period_ns) - 1, 0
+                )
             self._last = report
             return report
 
@@ -338,7 +397,9 @@ class Tracker:
         try:
             track_id = integer(track_id)
         except TypeError as error:
-            raise CallError(f"track_id: must be an integer, is {track_id!r:.60}") from error
+            raise CallError(
+                f"track_id: must be an integer, is {track_id!r:.60}"
+            ) from error
         stamp_ns = _stamp("stamp_ns", stamp_ns)
         with self._turn:
             return self._tracker.state_at(track_id, stamp_ns)
@@ -357,7 +418,9 @@ class Tracker:
         with self._turn:
             final = self._tracker.finish()
             updates = self._tracker.last_updates
-            self._counts = self._with(Counter((update.sensor, str(update.disposition)) for update in updates))
+            self._counts = self._with(
+                Counter((update.sensor, str(update.disposition)) for update in updates)
+            )
             return final
 
     def _with(self, counts: Mapping[tuple[str, str], int]) -> dict[str, Counter[str]]:
@@ -388,5 +451,7 @@ def _stamp(name: str, value: int) -> int:
     except TypeError:
         stamp_ns = -1
     if not 0 <= stamp_ns <= LARGEST_NS:
-        raise CallError(f"{name}: must be integer nanoseconds since 1970, is {value!r:.60}")
+        raise CallError(
+            f"{name}: must be integer nanoseconds since 1970, is {value!r:.60}"
+        )
     return stamp_ns

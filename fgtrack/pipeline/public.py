@@ -7,18 +7,18 @@ from typing import overload
 
 import numpy as np
 
+from fgtrack.config.recorded import recorded_of
+from fgtrack.config.settings import Config
+from fgtrack.config.shipped import read_config, read_scenario
 from fgtrack.core.checks import check_paths
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Message
-from fgtrack.io.recording import Storage, check_recording, write_recording
-from fgtrack.io.run import Run, load_run
-from fgtrack.io.source import open_input
-from fgtrack.io.validation import InvalidMessageError, validated_message
+from fgtrack.inputs.recording import Storage, check_recording, write_recording
+from fgtrack.inputs.source import open_input
+from fgtrack.inputs.validation import InvalidMessageError, validated_message
 from fgtrack.pipeline import replay as pipeline
 from fgtrack.pipeline.assumptions.assumed import assumed
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.recorded import recorded_of
-from fgtrack.pipeline.shipped import read_config, read_scenario
+from fgtrack.runs import Run, load_run
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.simulate import simulate as simulated
 
@@ -55,7 +55,9 @@ def replay(
     overwrite
         True to replace a run in `out`.
     """
-    resolved = read_config(config, set, track_map=map, pit_map=pit_map, estimator=estimator)
+    resolved = read_config(
+        config, set, track_map=map, pit_map=pit_map, estimator=estimator
+    )
     check_paths(out=out)
     origin, kind = "", "messages"
     if isinstance(recording, (str, Path)):
@@ -70,17 +72,23 @@ def replay(
     else:
         repeatable = pipeline.repeatable(messages, resolved)
         folders = {resolved.estimator: Path(out)}
-        pipeline.replay(repeatable, resolved, folders, origin=origin, kind=kind, overwrite=overwrite)
+        pipeline.replay(
+            repeatable, resolved, folders, origin=origin, kind=kind, overwrite=overwrite
+        )
         run = load_run(out)
     if (broken := run.meta["broken_off"]) is not None:
-        warnings.warn(f"the input broke off, replayed up to there: {broken}", stacklevel=2)
+        warnings.warn(
+            f"the input broke off, replayed up to there: {broken}", stacklevel=2
+        )
     return run
 
 
 def _messages(recording: Iterable[Message]) -> Iterator[Message]:
     """Yield the messages of `recording`. Raises `CallError` for other objects."""
     if not isinstance(recording, Iterable):
-        raise CallError(f"recording: must be a path or messages, is a {type(recording).__name__}")
+        raise CallError(
+            f"recording: must be a path or messages, is a {type(recording).__name__}"
+        )
     for count, message in enumerate(recording, 1):
         try:
             yield validated_message(message)
@@ -90,7 +98,11 @@ def _messages(recording: Iterable[Message]) -> Iterator[Message]:
 
 @overload
 def simulate(
-    scenario: str | Path | Scenario = "default", *, seed: int = 0, duration_s: float | None = None, out: None = None
+    scenario: str | Path | Scenario = "default",
+    *,
+    seed: int = 0,
+    duration_s: float | None = None,
+    out: None = None,
 ) -> Iterator[Message]: ...
 
 
@@ -141,5 +153,11 @@ def simulate(
     messages = simulated(resolved, np.random.default_rng(seed))
     if out is None:
         return iter(messages)
-    write_recording(Path(out), messages, storage, settings=recorded_of(resolved), overwrite=overwrite)
+    write_recording(
+        Path(out),
+        messages,
+        storage,
+        settings=recorded_of(resolved),
+        overwrite=overwrite,
+    )
     return Path(out)

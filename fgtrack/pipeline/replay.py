@@ -9,16 +9,16 @@ from functools import cache
 from pathlib import Path
 from time import perf_counter_ns
 
+from fgtrack.config.settings import Config
+from fgtrack.config.yaml_file import dump, plain
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S, seconds
 from fgtrack.core.types import DetectionList, EgoState, Message, TickReport, TruthState
-from fgtrack.io.errors import UntilBreak
-from fgtrack.io.run import MemoryRun, Run, RunWriter, path_from_run
+from fgtrack.inputs.errors import UntilBreak
 from fgtrack.pipeline.assumptions.assumed import assumed, is_open, source_of
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Delivered, Tick, clock_ticks, corrected, with_last
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import dump, plain
+from fgtrack.runs import MemoryRun, Run, RunWriter, path_from_run
 from fgtrack.tracking.tracker import Tracker, TrackerParts, check_sensor
 
 #: Ticks go on while nothing is received: a few messages must not make a recording of days.
@@ -59,9 +59,13 @@ class Feed:
             self.first_receipt_ns = self.last_receipt_ns = receipt_ns
         gap_s = seconds(receipt_ns - self.last_receipt_ns)
         if gap_s < 0.0:
-            raise DataError(f"receipt time goes back by {-gap_s:g} s at {receipt_ns} ns: sort the input by receipt")
+            raise DataError(
+                f"receipt time goes back by {-gap_s:g} s at {receipt_ns} ns: sort the input by receipt"
+            )
         if gap_s > _LONGEST_SILENCE_S:
-            raise DataError(f"nothing was received for {gap_s:.0f} s before {receipt_ns} ns: cut the recording there")
+            raise DataError(
+                f"nothing was received for {gap_s:.0f} s before {receipt_ns} ns: cut the recording there"
+            )
         self.last_receipt_ns = receipt_ns
 
 
@@ -89,7 +93,10 @@ def replay(
             tracker = build_tracker(chosen, (observed or {}).get(estimator))
             writer = RunWriter(folder, *_head(chosen, origin, kind, folder), overwrite)
             runs.append((chosen, tracker, claims.enter_context(writer)))
-        return [_drive(tracker, messages(), chosen, writer, origin, on_tick) for chosen, tracker, writer in runs]
+        return [
+            _drive(tracker, messages(), chosen, writer, origin, on_tick)
+            for chosen, tracker, writer in runs
+        ]
 
 
 def replay_in_memory(
@@ -109,7 +116,9 @@ def replay_in_memory(
     return memory.run
 
 
-def repeatable(messages: Iterable[Message], config: Config) -> Callable[[], Iterable[Message]]:
+def repeatable(
+    messages: Iterable[Message], config: Config
+) -> Callable[[], Iterable[Message]]:
     """Return a function that gives `messages`, which are kept if they are needed twice, as `config` is open."""
     if not is_open(config):
         return lambda: messages
@@ -153,12 +162,18 @@ def _drive(
                 writer.write_ego(tracker.located(message))
         report = tracker.tick(tick.now_ns, is_last)
         process_ns = perf_counter_ns() - before_ns
-        num_detections = sum(len(item.objects) for item in tick.messages if isinstance(item, DetectionList))
+        num_detections = sum(
+            len(item.objects)
+            for item in tick.messages
+            if isinstance(item, DetectionList)
+        )
         detections_received += num_detections
         writer.write_tick(report, process_ns, num_detections)
         on_tick(report)
     if feed.last_receipt_ns is None:
-        raise DataError(located(feed.broken or "holds neither ego states nor detections", origin))
+        raise DataError(
+            located(feed.broken or "holds neither ego states nor detections", origin)
+        )
     writer.write_smoothed(tracker.finish())
     meta = {
         "wall_s": (perf_counter_ns() - started_ns) / NS_PER_S,
@@ -170,7 +185,9 @@ def _drive(
         "ego_refused": dict(tracker.refused_ego),
         "ego_jumps": tracker.ego_jumps,
         "id_conflicts": dict(tracker.id_conflicts),
-        "yaws": {sensor: dict(counts) for sensor, counts in sorted(tracker.yaws.items())},
+        "yaws": {
+            sensor: dict(counts) for sensor, counts in sorted(tracker.yaws.items())
+        },
         **tracker.failures.as_meta(),
         "broken_off": feed.broken,
     }
@@ -184,7 +201,12 @@ def _head(
     source = {"path": origin, "kind": kind}
     if folder is not None and (relative := path_from_run(origin, folder)) is not None:
         source["path_from_run"] = relative
-    meta: dict[str, object] = {"input": source, "estimator": config.estimator, "versions": versions(), "seed": None}
+    meta: dict[str, object] = {
+        "input": source,
+        "estimator": config.estimator,
+        "versions": versions(),
+        "seed": None,
+    }
     meta["effective"] = plain(config.effective)
     if config.lifecycle.kind == "existence":
         meta["is_scored"] = True
@@ -199,11 +221,17 @@ def located(problem: str, origin: str) -> str:
 
 def delivered(messages: Iterable[Message], config: Config) -> Iterator[Tick]:
     """Return the ticks of a replay of `messages` with `config`, and the messages of each."""
-    of_tracker = (message for message in Feed(messages, config) if not isinstance(message, TruthState))
+    of_tracker = (
+        message
+        for message in Feed(messages, config)
+        if not isinstance(message, TruthState)
+    )
     return clock_ticks(of_tracker, config.clock.node_hz)
 
 
 @cache
 def versions() -> dict[str, str]:
     """Return the version of each package on which results depend."""
-    return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in _PACKAGES}
+    return {"python": platform.python_version()} | {
+        name: importlib.metadata.version(name) for name in _PACKAGES
+    }

@@ -19,16 +19,16 @@ import numpy as np
 import pandas as pd
 from pydantic import ConfigDict, TypeAdapter
 
+from fgtrack.config.settings import Config
+from fgtrack.config.yaml_file import validate
 from fgtrack.core.errors import CallError, DataError, FgtrackError
+from fgtrack.core.output import check_output, claimed, write_file
 from fgtrack.core.types import Message
-from fgtrack.io.output import check_output, claimed, write_file
-from fgtrack.io.run import Run
-from fgtrack.io.source import open_input
+from fgtrack.inputs.source import open_input
 from fgtrack.pipeline.assumptions.assumed import assumed
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import validate
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.pipeline.sweep_plan import KEY_COLUMNS, Job, Plan, Recipe, Value, compact
+from fgtrack.runs import Run
 from fgtrack.sim.redelay import SensorDelays, redelay
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.simulate import simulate
@@ -91,19 +91,37 @@ class Sweep:
         parts = {path.stem: path for path in (folder / _PARTS).glob("*.json")}
         for name in _TABLES:
             check_output(folder / name, overwrite or bool(parts))
-        cells = {key: _read_part(parts[key]) for key in parts.keys() & {job.key for job in plan.jobs}}
-        return cls(plan, folder, {key: result for key, result in cells.items() if result})
+        cells = {
+            key: _read_part(parts[key])
+            for key in parts.keys() & {job.key for job in plan.jobs}
+        }
+        return cls(
+            plan, folder, {key: result for key, result in cells.items() if result}
+        )
 
     @property
     def todo(self) -> list[Job]:
         """Jobs without a result or with a bad cell; an interrupted sweep covers the grid, as the first seed leads."""
-        good = {key for key, cells in self.done.items() if all(cell.error is None for cell in cells)}
-        left = {job.key: job for job in self.plan.jobs if job.recipe is not None and job.key not in good}
+        good = {
+            key
+            for key, cells in self.done.items()
+            if all(cell.error is None for cell in cells)
+        }
+        left = {
+            job.key: job
+            for job in self.plan.jobs
+            if job.recipe is not None and job.key not in good
+        }
         seeds = [job.seed for job in self.plan.jobs]
         return sorted(left.values(), key=lambda job: seeds.index(job.seed))
 
     def run(
-        self, score: Score, *, jobs: int = -1, dask: str | None = None, on_job: Callable[[], None] = lambda: None
+        self,
+        score: Score,
+        *,
+        jobs: int = -1,
+        dask: str | None = None,
+        on_job: Callable[[], None] = lambda: None,
     ) -> SweepResult:
         """Do the jobs that are left, keep each at once, and write the tables; also when interrupted.
         `jobs` is the number of processes, -1 is one for each core; `dask` is the address of a scheduler to use
@@ -113,8 +131,15 @@ class Sweep:
         with claimed(self.folder):
             (self.folder / _PARTS).mkdir(exist_ok=True)
             try:
-                for key, cells in _local(tasks, score, jobs) if dask is None else _on_cluster(tasks, score, dask):
-                    write_file(self.folder / _PARTS / f"{key}.json", json.dumps([asdict(cell) for cell in cells]))
+                for key, cells in (
+                    _local(tasks, score, jobs)
+                    if dask is None
+                    else _on_cluster(tasks, score, dask)
+                ):
+                    write_file(
+                        self.folder / _PARTS / f"{key}.json",
+                        json.dumps([asdict(cell) for cell in cells]),
+                    )
                     self.done[key] = cells
                     on_job()
             finally:
@@ -131,28 +156,51 @@ def _read_part(path: Path) -> tuple[Cell, ...]:
         return ()
 
 
-def write_tables(folder: Path, plan: Plan, done: Mapping[str, Sequence[Cell]]) -> SweepResult:
+def write_tables(
+    folder: Path, plan: Plan, done: Mapping[str, Sequence[Cell]]
+) -> SweepResult:
     """Write sweep.csv, timing.csv and errors.csv from the cells of the finished jobs, by key."""
     rows: list[tuple[tuple[Value, ...], Cell]] = []
     for job in plan.jobs:
-        cells = done.get(job.key, ()) if job.recipe else [Cell(name, {}, {}, job.problem) for name in plan.estimators]
+        cells = (
+            done.get(job.key, ())
+            if job.recipe
+            else [Cell(name, {}, {}, job.problem) for name in plan.estimators]
+        )
         rows += [((*job.cells, job.seed, cell.estimator), cell) for cell in cells]
     good = [(keys, cell) for keys, cell in rows if cell.error is None]
-    bad = [(keys, {"error": cell.error}) for keys, cell in rows if cell.error is not None]
+    bad = [
+        (keys, {"error": cell.error}) for keys, cell in rows if cell.error is not None
+    ]
     columns = list(dict.fromkeys(name for _, cell in good for name in cell.values))
-    matching = {pattern: fnmatch.filter(columns, pattern) for pattern in plan.metrics or ("*",)}
-    chosen = list(dict.fromkeys(column for result in matching.values() for column in result))
+    matching = {
+        pattern: fnmatch.filter(columns, pattern) for pattern in plan.metrics or ("*",)
+    }
+    chosen = list(
+        dict.fromkeys(column for result in matching.values() for column in result)
+    )
     times = list(dict.fromkeys(name for _, cell in good for name in cell.times))
     for name, wanted, values in (
         (SWEEP_TABLE, chosen, [(keys, cell.values) for keys, cell in good]),
         (TIMING_TABLE, times, [(keys, cell.times) for keys, cell in good]),
         (ERROR_TABLE, ["error"], bad),
     ):
-        texts = [[_text(value) for value in (*keys, *map(row.get, wanted))] for keys, row in values]
-        table = pd.DataFrame(texts, columns=[*plan.columns, *KEY_COLUMNS, *wanted], dtype=str)
+        texts = [
+            [_text(value) for value in (*keys, *map(row.get, wanted))]
+            for keys, row in values
+        ]
+        table = pd.DataFrame(
+            texts, columns=[*plan.columns, *KEY_COLUMNS, *wanted], dtype=str
+        )
         write_file(folder / name, table.to_csv(index=False, lineterminator="\n"))
-    unknown = tuple(pattern for pattern, result in matching.items() if good and not result)
-    return SweepResult(len(good), tuple(str(cell.error) for _, cell in rows if cell.error is not None), unknown)
+    unknown = tuple(
+        pattern for pattern, result in matching.items() if good and not result
+    )
+    return SweepResult(
+        len(good),
+        tuple(str(cell.error) for _, cell in rows if cell.error is not None),
+        unknown,
+    )
 
 
 def _text(value: Value) -> str:
@@ -165,17 +213,34 @@ def _text(value: Value) -> str:
 def run_job(key: str, recipe: Recipe, score: Score) -> tuple[str, list[Cell]]:
     """Return the cells of a job, with its key. Whatever goes wrong becomes the error of a cell."""
     try:
-        config, rng = validate(Config, recipe["config"], "config"), np.random.default_rng(recipe["seed"])
+        config, rng = (
+            validate(Config, recipe["config"], "config"),
+            np.random.default_rng(recipe["seed"]),
+        )
         if recipe["recording"] is None:
             messages = simulate(validate(Scenario, recipe["scenario"], "scenario"), rng)
         else:
             source = open_input(recipe["recording"], config.input)
             delays = validate(dict[str, SensorDelays], recipe["delays"], "delays")
-            messages = list(redelay(source.messages(), delays, rng)[0] if delays else source.messages())
-            config = assumed(config, replace(source, messages=lambda: iter(messages))).config
-    except (Exception, SystemExit) as error:  # whatever is wrong with one job out of hundreds
-        return key, [Cell(name, {}, {}, _reason(error)) for name in recipe["estimators"]]
-    return key, [_cell(messages, replace(config, estimator=name), score) for name in recipe["estimators"]]
+            messages = list(
+                redelay(source.messages(), delays, rng)[0]
+                if delays
+                else source.messages()
+            )
+            config = assumed(
+                config, replace(source, messages=lambda: iter(messages))
+            ).config
+    except (
+        Exception,
+        SystemExit,
+    ) as error:  # whatever is wrong with one job out of hundreds
+        return key, [
+            Cell(name, {}, {}, _reason(error)) for name in recipe["estimators"]
+        ]
+    return key, [
+        _cell(messages, replace(config, estimator=name), score)
+        for name in recipe["estimators"]
+    ]
 
 
 def _cell(messages: Sequence[Message], config: Config, score: Score) -> Cell:
@@ -192,7 +257,9 @@ def _cell(messages: Sequence[Message], config: Config, score: Score) -> Cell:
 def _reason(error: BaseException) -> str:
     """Return the message of an error in a line, of a bug with its type."""
     text = " ".join(str(error).split())
-    return text if isinstance(error, FgtrackError) else f"{type(error).__name__}: {text}"
+    return (
+        text if isinstance(error, FgtrackError) else f"{type(error).__name__}: {text}"
+    )
 
 
 _Result = tuple[str, Sequence[Cell]]
@@ -201,8 +268,14 @@ _Result = tuple[str, Sequence[Cell]]
 def _local(tasks: Mapping[str, Recipe], score: Score, jobs: int) -> Iterator[_Result]:
     """Yield results of processes of this machine, as they come."""
     # With several jobs at once, threads of BLAS would only wait for each other.
-    settings = {"inner_max_num_threads": 1, "initializer": _end_with_parent, "initargs": (os.getpid(),)}
-    with joblib.parallel_config("loky", n_jobs=joblib.effective_n_jobs(jobs), **settings):
+    settings = {
+        "inner_max_num_threads": 1,
+        "initializer": _end_with_parent,
+        "initargs": (os.getpid(),),
+    }
+    with joblib.parallel_config(
+        "loky", n_jobs=joblib.effective_n_jobs(jobs), **settings
+    ):
         yield from _results(tasks, score)
 
 
@@ -217,36 +290,57 @@ def _end_with_parent(parent: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _on_cluster(tasks: Mapping[str, Recipe], score: Score, address: str) -> Iterator[_Result]:
+def _on_cluster(
+    tasks: Mapping[str, Recipe], score: Score, address: str
+) -> Iterator[_Result]:
     """Yield results of the workers of a dask cluster, as they come."""
     try:
         distributed = importlib.import_module("distributed")
     except ImportError as error:
-        raise CallError("--dask needs the extra `dask`: pip install 'fgtrack[dask]'") from error
+        raise CallError(
+            "--dask needs the extra `dask`: pip install 'fgtrack[dask]'"
+        ) from error
     for name in ("distributed", "distributed.client"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # failures are raised below, in a line
+        logging.getLogger(name).setLevel(
+            logging.CRITICAL
+        )  # failures are raised below, in a line
     try:
         client = distributed.Client(address, timeout=_SCHEDULER_TIMEOUT_S)
     except (OSError, ValueError) as error:
-        raise CallError(f"--dask {address}: no scheduler is reachable, start one with `dask scheduler`") from error
-    with client, joblib.parallel_config("dask", wait_for_workers_timeout=_SCHEDULER_TIMEOUT_S):
+        raise CallError(
+            f"--dask {address}: no scheduler is reachable, start one with `dask scheduler`"
+        ) from error
+    with (
+        client,
+        joblib.parallel_config("dask", wait_for_workers_timeout=_SCHEDULER_TIMEOUT_S),
+    ):
         yield from _results(tasks, score)
 
 
 def _results(tasks: Mapping[str, Recipe], score: Score) -> Iterator[_Result]:
     """Yield results of the tasks in the backend of joblib that is set, as they come."""
-    parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch=f"{_HANDED_OUT}*n_jobs")
+    parallel = joblib.Parallel(
+        return_as="generator_unordered",
+        batch_size=1,
+        pre_dispatch=f"{_HANDED_OUT}*n_jobs",
+    )
     resource_tracker.ensure_running()  # started below, it would let interrupts through
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # Ctrl-C is for this process, not for workers
+    before = signal.pthread_sigmask(
+        signal.SIG_BLOCK, {signal.SIGINT}
+    )  # Ctrl-C is for this process, not for workers
     try:
-        results: Generator[_Result] = parallel(joblib.delayed(run_job)(*task, score) for task in tasks.items())
+        results: Generator[_Result] = parallel(
+            joblib.delayed(run_job)(*task, score) for task in tasks.items()
+        )
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     try:
         yield from results
     except Exception as error:  # of a process, a scheduler or a network; the jobs report their own errors
         what = f"the workers failed, perhaps out of memory ({_reason(error):.120})"
-        raise DataError(f"{what}: rerun the sweep to continue, or with fewer --jobs") from error
+        raise DataError(
+            f"{what}: rerun the sweep to continue, or with fewer --jobs"
+        ) from error
     finally:
         with warnings.catch_warnings():  # an interrupt is reported once, in one line
             warnings.filterwarnings("ignore", "[0-9]+ tasks (have|which)", UserWarning)

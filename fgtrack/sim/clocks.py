@@ -58,11 +58,17 @@ class ArrivalClock:
 
 
 #: Every clock model, chosen by `kind`.
-AnyClock = Annotated[OffsetClock | DriftClock | JitterClock | QuantisedClock | ArrivalClock, Discriminator("kind")]
+AnyClock = Annotated[
+    OffsetClock | DriftClock | JitterClock | QuantisedClock | ArrivalClock,
+    Discriminator("kind"),
+]
 
 
 def reported_stamps(
-    clocks: Sequence[AnyClock], rng: np.random.Generator, stamps_ns: IntArray, receipts_ns: IntArray
+    clocks: Sequence[AnyClock],
+    rng: np.random.Generator,
+    stamps_ns: IntArray,
+    receipts_ns: IntArray,
 ) -> IntArray:
     """Stamps that a sensor with `clocks` reports of messages in the order of measurement, shape (n,) as all others.
     Each entry of the list has a generator of its own: other clocks before or after one leave what it draws.
@@ -73,9 +79,13 @@ def reported_stamps(
                 stamps_ns = stamps_ns + nanoseconds(clock.offset_s)
             case DriftClock():
                 elapsed_ns = (stamps_ns - stamps_ns[:1]).astype(np.float64)
-                stamps_ns = stamps_ns + np.rint(elapsed_ns * (clock.drift_ppm * 1e-6)).astype(np.int64)
+                stamps_ns = stamps_ns + np.rint(
+                    elapsed_ns * (clock.drift_ppm * 1e-6)
+                ).astype(np.int64)
             case JitterClock():
-                errors_ns = child.standard_normal(len(stamps_ns)) * (clock.std_s * NS_PER_S)
+                errors_ns = child.standard_normal(len(stamps_ns)) * (
+                    clock.std_s * NS_PER_S
+                )
                 stamps_ns = stamps_ns + np.rint(errors_ns).astype(np.int64)
             case QuantisedClock():
                 stamps_ns = stamps_ns - stamps_ns % nanoseconds(clock.step_s)

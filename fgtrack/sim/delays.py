@@ -36,7 +36,9 @@ class UniformDelay:
     kind: Literal["uniform"] = "uniform"
 
     def __post_init__(self) -> None:
-        require(self.max_s >= self.min_s, "max_s", "must not be below min_s", self.max_s)
+        require(
+            self.max_s >= self.min_s, "max_s", "must not be below min_s", self.max_s
+        )
 
 
 @settings
@@ -68,7 +70,12 @@ class GammaDelay:
         from scipy.optimize import brentq
 
         ratio = (self.q90_s - self.min_s) / (self.mean_s - self.min_s)
-        log_shape = brentq(lambda x: _relative_q90(x) - ratio, math.log(_MIN_SHAPE), math.log(_MAX_SHAPE), xtol=1e-13)
+        log_shape = brentq(
+            lambda x: _relative_q90(x) - ratio,
+            math.log(_MIN_SHAPE),
+            math.log(_MAX_SHAPE),
+            xtol=1e-13,
+        )
         return math.exp(log_shape)
 
     @property
@@ -119,7 +126,13 @@ class MarkovTimeDelay:
 
 #: Every delay model, chosen by `kind`.
 AnyDelay = Annotated[
-    NoDelay | ConstantDelay | UniformDelay | GammaDelay | LossyDelay | MarkovDelay | MarkovTimeDelay,
+    NoDelay
+    | ConstantDelay
+    | UniformDelay
+    | GammaDelay
+    | LossyDelay
+    | MarkovDelay
+    | MarkovTimeDelay,
     Discriminator("kind"),
 ]
 _MIN_SHAPE, _MAX_SHAPE = 0.5, 1e6
@@ -133,7 +146,9 @@ def _relative_q90(log_shape: float) -> float:
     return float(gammaincinv(shape, 0.9)) / shape
 
 
-def draw_delays(model: AnyDelay, rng: np.random.Generator, stamps_s: FloatArray) -> FloatArray:
+def draw_delays(
+    model: AnyDelay, rng: np.random.Generator, stamps_s: FloatArray
+) -> FloatArray:
     """Delays in s of the messages of one sensor stamped `stamps_s` (ascending), shape (n,), NaN for a lost one."""
     n = len(stamps_s)
     match model:

@@ -32,7 +32,9 @@ class SensorDelays:
 
 
 def redelay(
-    messages: Iterable[Message], delays: Mapping[str, SensorDelays], rng: np.random.Generator
+    messages: Iterable[Message],
+    delays: Mapping[str, SensorDelays],
+    rng: np.random.Generator,
 ) -> tuple[Iterator[Message], dict[str, int]]:
     """Return `messages` with the detections of the sensors in `delays` under other delays, and the lists lost by each.
 
@@ -50,28 +52,54 @@ def redelay(
     except DataError as error:
         broken.append(error)
     receipts_ns, stamps_ns = (
-        np.array([(item.receipt_ns, item.stamp_ns) for item in read], dtype=np.int64).reshape(-1, 2).T
+        np.array([(item.receipt_ns, item.stamp_ns) for item in read], dtype=np.int64)
+        .reshape(-1, 2)
+        .T
     )
-    names = np.array([item.sensor if isinstance(item, DetectionList) else "" for item in read])
-    reported_ns, priority, lost = stamps_ns.copy(), np.zeros_like(stamps_ns), np.zeros(len(read), dtype=bool)
+    names = np.array(
+        [item.sensor if isinstance(item, DetectionList) else "" for item in read]
+    )
+    reported_ns, priority, lost = (
+        stamps_ns.copy(),
+        np.zeros_like(stamps_ns),
+        np.zeros(len(read), dtype=bool),
+    )
     known, num_lost = sorted(set(names.tolist()) - {""}), dict[str, int]()
     for sensor in delays:
         if sensor not in (*known, OTHERS):
             there, hint = ", ".join(known) or "none", did_you_mean(sensor, known)
-            raise CallError(f"sensor {sensor!r} is not in the input, whose sensors are: {there}{hint}")
-    others = {sensor: delays[OTHERS] for sensor in known if sensor not in delays} if OTHERS in delays else {}
-    chosen = {sensor: settings for sensor, settings in delays.items() if sensor != OTHERS} | others
-    for number, (sensor, child) in enumerate(zip(chosen, rng.spawn(len(chosen)), strict=True), 1):
+            raise CallError(
+                f"sensor {sensor!r} is not in the input, whose sensors are: {there}{hint}"
+            )
+    others = (
+        {sensor: delays[OTHERS] for sensor in known if sensor not in delays}
+        if OTHERS in delays
+        else {}
+    )
+    chosen = {
+        sensor: settings for sensor, settings in delays.items() if sensor != OTHERS
+    } | others
+    for number, (sensor, child) in enumerate(
+        zip(chosen, rng.spawn(len(chosen)), strict=True), 1
+    ):
         settings, (delay_rng, loss_rng, clock_rng) = chosen[sensor], child.spawn(3)
         own = np.flatnonzero(names == sensor)
         own = own[np.argsort(stamps_ns[own], kind="stable")]
         lost[own] = loss_rng.random(len(own)) < settings.loss_probability
         if settings.delay is not None:
-            delays_s = draw_delays(settings.delay, delay_rng, (stamps_ns[own] - stamps_ns[own[:1]]) / NS_PER_S)
+            delays_s = draw_delays(
+                settings.delay,
+                delay_rng,
+                (stamps_ns[own] - stamps_ns[own[:1]]) / NS_PER_S,
+            )
             lost[own] |= np.isnan(delays_s)
-            receipts_ns[own] = stamps_ns[own] + np.rint(np.nan_to_num(delays_s) * NS_PER_S).astype(np.int64)
+            receipts_ns[own] = stamps_ns[own] + np.rint(
+                np.nan_to_num(delays_s) * NS_PER_S
+            ).astype(np.int64)
             priority[own] = number
-        reported_ns[own] = reported_stamps(settings.clock, clock_rng, stamps_ns[own], receipts_ns[own])
+        reported_ns[own] = reported_stamps(
+            settings.clock, clock_rng, stamps_ns[own], receipts_ns[own]
+        )
         num_lost[sensor] = int(lost[own].sum())
     # What keeps its receipt also keeps its order among equals: no stamp in its key.
     order = np.lexsort((np.where(priority > 0, stamps_ns, 0), priority, receipts_ns))
@@ -92,6 +120,9 @@ def restamped(message: DetectionList, stamp_ns: int) -> DetectionList:
     """`message` with another stamp; detections' own stamps move as their list's does."""
     error_ns = stamp_ns - message.stamp_ns
     objects = tuple(
-        item if item.stamp_ns is None else replace(item, stamp_ns=item.stamp_ns + error_ns) for item in message.objects
+        item
+        if item.stamp_ns is None
+        else replace(item, stamp_ns=item.stamp_ns + error_ns)
+        for item in message.objects
     )
     return replace(message, stamp_ns=stamp_ns, objects=objects)

@@ -9,7 +9,17 @@ from typing import NamedTuple
 import numpy as np
 
 from fgtrack.core.geometry import body_point, cartesian, rotations, wrap_angles
-from fgtrack.core.types import SPEED, YAW, YAW_RATE, BoolArray, Detection, FloatArray, IntArray, X, Y
+from fgtrack.core.types import (
+    SPEED,
+    YAW,
+    YAW_RATE,
+    BoolArray,
+    Detection,
+    FloatArray,
+    IntArray,
+    X,
+    Y,
+)
 from fgtrack.models.measurement import ANGULAR, measurement_model
 from fgtrack.models.motion import CV
 from fgtrack.models.sensors import Mount, in_view
@@ -40,25 +50,38 @@ class Scanner:
     """Origin of the detection frame in the ego frame."""
 
     def scans(
-        self, rng: np.random.Generator, objects: Sequence[FloatArray], track: TrackMap | None
+        self,
+        rng: np.random.Generator,
+        objects: Sequence[FloatArray],
+        track: TrackMap | None,
     ) -> list[tuple[Detection, ...]]:
         """Detections of the n scans; `objects` holds the states of each object at the scans, shape (n, 6).
         Every object and the clutter have a generator of their own.
         """
         clutter_rng, objects_rng = rng.spawn(2)
         children = objects_rng.spawn(len(objects))
-        seen = [self._see(child, states) for child, states in zip(children, objects, strict=True)]
+        seen = [
+            self._see(child, states)
+            for child, states in zip(children, objects, strict=True)
+        ]
         detected = _joined([self._clutter(clutter_rng, track), *seen])
         order = np.lexsort((detected.key, detected.scan))
         rows = detected.z[order].tolist()
-        detections = [Detection(**dict(zip(self.sensor.components, row, strict=True))) for row in rows]
-        bounds = np.searchsorted(detected.scan[order], np.arange(len(self.ego) + 1)).tolist()
+        detections = [
+            Detection(**dict(zip(self.sensor.components, row, strict=True)))
+            for row in rows
+        ]
+        bounds = np.searchsorted(
+            detected.scan[order], np.arange(len(self.ego) + 1)
+        ).tolist()
         return [tuple(detections[a:b]) for a, b in pairwise(bounds)]
 
     def _see(self, rng: np.random.Generator, states: FloatArray) -> _Detected:
         """Detections of one object: none, one or two (a split) in every scan."""
         sensor, n, everything = self.sensor, len(states), np.arange(len(states))
-        seen = self._visible(everything, states) & (rng.random(n) < sensor.detection_probability)
+        seen = self._visible(everything, states) & (
+            rng.random(n) < sensor.detection_probability
+        )
         split = rng.random(n) < sensor.split_probability
         shift_m = np.where(split, rng.uniform(*sensor.split_distance_m, n) / 2.0, 0.0)
         parts = []
@@ -67,40 +90,57 @@ class Scanner:
             moved[:, X] += sign * shift_m * np.cos(states[:, YAW])
             moved[:, Y] += sign * shift_m * np.sin(states[:, YAW])
             z = self._add_noise(rng, everything, moved)
-            parts.append(_Detected(everything[present], z[present], rng.random(n)[present]))
+            parts.append(
+                _Detected(everything[present], z[present], rng.random(n)[present])
+            )
         return _joined(parts)
 
     def _clutter(self, rng: np.random.Generator, track: TrackMap | None) -> _Detected:
         """Detections of ghosts, measured without noise."""
         sensor, clutter = self.sensor, self.sensor.clutter
-        scan = np.repeat(np.arange(len(self.ego)), rng.poisson(clutter.mean_per_scan, len(self.ego)))
+        scan = np.repeat(
+            np.arange(len(self.ego)), rng.poisson(clutter.mean_per_scan, len(self.ego))
+        )
         m = len(scan)
         ghosts = np.zeros((m, self.ego.shape[1]))
         if clutter.region == "track" and track is not None:
-            s = track.frenet(self.ego[scan, :2])[0] + rng.uniform(-1.0, 1.0, m) * sensor.max_range_m
+            s = (
+                track.frenet(self.ego[scan, :2])[0]
+                + rng.uniform(-1.0, 1.0, m) * sensor.max_range_m
+            )
             left_m, right_m = track.bounds(s)
             ghosts[:, :2] = track.position(s, rng.uniform(-right_m, left_m))
             ghosts[:, YAW] = track.view(ghosts[:, :2], 0.0, 0.0).yaw_rad
         else:
             # Uniform over the area of a ring: the square of the range is uniform.
-            distance = np.sqrt(rng.uniform(sensor.min_range_m**2, sensor.max_range_m**2, m))
+            distance = np.sqrt(
+                rng.uniform(sensor.min_range_m**2, sensor.max_range_m**2, m)
+            )
             origin, _, yaw = self._carried(scan, sensor.mount)
-            direction = yaw + rng.uniform(-sensor.field_of_view_rad / 2.0, sensor.field_of_view_rad / 2.0, m)
+            direction = yaw + rng.uniform(
+                -sensor.field_of_view_rad / 2.0, sensor.field_of_view_rad / 2.0, m
+            )
             ghosts[:, X] = origin[:, X] + distance * np.cos(direction)
             ghosts[:, Y] = origin[:, Y] + distance * np.sin(direction)
             ghosts[:, YAW] = rng.uniform(-math.pi, math.pi, m)
         ghosts[:, SPEED] = rng.uniform(*clutter.speed_mps, m)
         visible = self._visible(scan, ghosts)
-        return _Detected(scan[visible], self._measure(scan, ghosts)[visible], rng.random(m)[visible])
+        return _Detected(
+            scan[visible], self._measure(scan, ghosts)[visible], rng.random(m)[visible]
+        )
 
-    def _add_noise(self, rng: np.random.Generator, scan: IntArray, states: FloatArray) -> FloatArray:
+    def _add_noise(
+        self, rng: np.random.Generator, scan: IntArray, states: FloatArray
+    ) -> FloatArray:
         """Noisy measurements of `states`, shape (m, k)."""
         sensor, components = self.sensor, self.sensor.components
         noise = rng.standard_normal((len(scan), len(components)))
         outlier = rng.random(len(scan)) < sensor.outlier_probability
         noise *= np.where(outlier, sensor.outlier_factor, 1.0)[:, None]
         noise *= [sensor.std[name] for name in components]
-        if sensor.frame == "ego":  # x_m and y_m come first: along and across the line of sight
+        if (
+            sensor.frame == "ego"
+        ):  # x_m and y_m come first: along and across the line of sight
             line_of_sight = self._relative(scan, states)[:, 1] + sensor.mount.yaw_rad
             noise[:, :2] = _rotated(noise[:, :2], line_of_sight)
         z = self._measure(scan, states) + noise
@@ -134,12 +174,17 @@ class Scanner:
         """Range, bearing and range rate of `states` from the sensor, shape (m, 3), with its own motion."""
         origin, velocity, yaw = self._carried(scan, self.sensor.mount)
         relative = np.concatenate(
-            [_rotated(states[:, :2] - origin, -yaw), _rotated(cartesian(states[:, [YAW, SPEED]]) - velocity, -yaw)],
+            [
+                _rotated(states[:, :2] - origin, -yaw),
+                _rotated(cartesian(states[:, [YAW, SPEED]]) - velocity, -yaw),
+            ],
             axis=1,
         )
         return measurement_model(POLAR, CV()).predict(relative)
 
-    def _carried(self, scan: IntArray, mount: Mount) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _carried(
+        self, scan: IntArray, mount: Mount
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Origin, its velocity, (m, 2), and yaw, (m,), in the map, of a frame mounted in the detection frame."""
         x, y, yaw, speed, yaw_rate = self.ego[scan, : YAW_RATE + 1].T
         ahead_m = self.detection_origin_x_m + mount.x_m

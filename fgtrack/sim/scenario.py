@@ -46,6 +46,13 @@ class Scenario:
     def __post_init__(self) -> None:
         names = [sensor.name for sensor in self.sensors]
         require(len(set(names)) == len(names), "sensors", "names must differ", names)
-        on_track = any(isinstance(vehicle, TrackVehicle) for vehicle in (self.ego, *self.opponents))
+        on_track = any(
+            isinstance(vehicle, TrackVehicle) for vehicle in (self.ego, *self.opponents)
+        )
         on_track |= any(sensor.clutter.region == "track" for sensor in self.sensors)
-        require(self.map is not None or not on_track, "map", "a vehicle or clutter on the track needs one", self.map)
+        require(
+            self.map is not None or not on_track,
+            "map",
+            "a vehicle or clutter on the track needs one",
+            self.map,
+        )

@@ -30,7 +30,12 @@ class Clutter:
     """Range of the speed that clutter seems to have, along the track or in any direction."""
 
     def __post_init__(self) -> None:
-        require(self.speed_mps[1] >= self.speed_mps[0], "speed_mps", "must be (smallest, largest)", self.speed_mps)
+        require(
+            self.speed_mps[1] >= self.speed_mps[0],
+            "speed_mps",
+            "must be (smallest, largest)",
+            self.speed_mps,
+        )
 
 
 @settings
@@ -71,15 +76,52 @@ class SimulatedSensor:
     def __post_init__(self) -> None:
         std, behind_m = set(self.std), self.max_range_behind_m
         seen = behind_m is None or self.min_range_m < behind_m <= self.max_range_m
-        known = bool(std) and std <= set(MEASURABLE) and ("x_m" in std) == ("y_m" in std)
-        require(known, "std", f"x_m with y_m, components out of {', '.join(MEASURABLE)}", sorted(std))
-        require("x_m" not in std or std.isdisjoint(POLAR), "std", "positions or range and bearing", sorted(std))
-        require(self.jitter_s < 1.0 / self.rate_hz, "jitter_s", "must be below a period", self.jitter_s)
-        require(self.max_range_m > self.min_range_m, "max_range_m", "must exceed min_range_m", self.max_range_m)
+        known = (
+            bool(std) and std <= set(MEASURABLE) and ("x_m" in std) == ("y_m" in std)
+        )
+        require(
+            known,
+            "std",
+            f"x_m with y_m, components out of {', '.join(MEASURABLE)}",
+            sorted(std),
+        )
+        require(
+            "x_m" not in std or std.isdisjoint(POLAR),
+            "std",
+            "positions or range and bearing",
+            sorted(std),
+        )
+        require(
+            self.jitter_s < 1.0 / self.rate_hz,
+            "jitter_s",
+            "must be below a period",
+            self.jitter_s,
+        )
+        require(
+            self.max_range_m > self.min_range_m,
+            "max_range_m",
+            "must exceed min_range_m",
+            self.max_range_m,
+        )
         apart_m = self.split_distance_m
-        require(apart_m[1] >= apart_m[0], "split_distance_m", "must be (smallest, largest)", apart_m)
-        require(seen, "max_range_behind_m", "must lie in (min_range_m, max_range_m]", behind_m)
-        require(all(a <= b for a, b in self.drop_outs), "drop_outs", "must be (start, end)", self.drop_outs)
+        require(
+            apart_m[1] >= apart_m[0],
+            "split_distance_m",
+            "must be (smallest, largest)",
+            apart_m,
+        )
+        require(
+            seen,
+            "max_range_behind_m",
+            "must lie in (min_range_m, max_range_m]",
+            behind_m,
+        )
+        require(
+            all(a <= b for a, b in self.drop_outs),
+            "drop_outs",
+            "must be (start, end)",
+            self.drop_outs,
+        )
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -93,7 +135,9 @@ class SimulatedSensor:
 
     def scan_times(self, rng: np.random.Generator, duration_s: float) -> FloatArray:
         """Times of all scans from 0 to `duration_s`, ascending, drop-outs included."""
-        num_scans = max(math.floor((duration_s - self.phase_s) * self.rate_hz + 1e-9) + 1, 0)
+        num_scans = max(
+            math.floor((duration_s - self.phase_s) * self.rate_hz + 1e-9) + 1, 0
+        )
         times = self.phase_s + np.arange(num_scans) / self.rate_hz
         times += rng.uniform(0.0, abs(self.jitter_s), num_scans)  # not -0.0
         return times[times <= duration_s]

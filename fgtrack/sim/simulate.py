@@ -50,16 +50,25 @@ def simulate(scenario: Scenario, rng: np.random.Generator) -> list[Message]:
     vehicles = (scenario.ego, *scenario.opponents)
     ego, *opponents = (
         _states_of(vehicle, path, child, scenario.duration_s)
-        for vehicle, child in zip(vehicles, vehicles_rng.spawn(len(vehicles)), strict=True)
+        for vehicle, child in zip(
+            vehicles, vehicles_rng.spawn(len(vehicles)), strict=True
+        )
     )
-    messages: list[Message] = [*_truth(scenario, [ego, *opponents]), *_ego_messages(scenario, ego, ego_rng)]
-    for sensor, child in zip(scenario.sensors, sensors_rng.spawn(len(scenario.sensors)), strict=True):
+    messages: list[Message] = [
+        *_truth(scenario, [ego, *opponents]),
+        *_ego_messages(scenario, ego, ego_rng),
+    ]
+    for sensor, child in zip(
+        scenario.sensors, sensors_rng.spawn(len(scenario.sensors)), strict=True
+    ):
         messages += _scans(scenario, sensor, ego, opponents, track, child)
     messages.sort(key=lambda message: message.receipt_ns)
     return messages
 
 
-def _states_of(vehicle: AnyVehicle, path: Path | None, rng: np.random.Generator, duration_s: float) -> States:
+def _states_of(
+    vehicle: AnyVehicle, path: Path | None, rng: np.random.Generator, duration_s: float
+) -> States:
     if isinstance(vehicle, DrawnVehicle):
         return vehicle.trajectory(rng, duration_s).states
     assert path is not None, "a scenario without a map has no vehicle on a track"
@@ -76,7 +85,9 @@ def _truth(scenario: Scenario, vehicles: Sequence[States]) -> list[Message]:
     ]
 
 
-def _ego_messages(scenario: Scenario, ego: States, rng: np.random.Generator) -> list[Message]:
+def _ego_messages(
+    scenario: Scenario, ego: States, rng: np.random.Generator
+) -> list[Message]:
     settings = scenario.ego_messages
     noise_rng, delay_rng = rng.spawn(2)
     stamps_ns, times_s = _stamps(scenario, settings.rate_hz)
@@ -88,7 +99,12 @@ def _ego_messages(scenario: Scenario, ego: States, rng: np.random.Generator) -> 
     receipts_ns, lost = _receipts(settings.delay, delay_rng, stamps_ns, times_s)
     variances = np.square(std[: len(EGO_COVARIANCE_STATES)])
     covariance = tuple(np.diag(variances).ravel().tolist()) if variances.any() else None
-    columns = zip(stamps_ns[~lost].tolist(), receipts_ns[~lost].tolist(), states[~lost].tolist(), strict=True)
+    columns = zip(
+        stamps_ns[~lost].tolist(),
+        receipts_ns[~lost].tolist(),
+        states[~lost].tolist(),
+        strict=True,
+    )
     return [
         EgoState(stamp_ns, receipt_ns, *row, in_pit=None, covariance=covariance)  # type: ignore[misc]  # six in a row
         for stamp_ns, receipt_ns, row in columns
@@ -104,12 +120,22 @@ def _scans(
     rng: np.random.Generator,
 ) -> list[Message]:
     times_rng, delay_rng, scanner_rng, clock_rng = rng.spawn(4)
-    stamps_ns, times_s = _stamps(scenario, sensor.scan_times(times_rng, scenario.duration_s))
+    stamps_ns, times_s = _stamps(
+        scenario, sensor.scan_times(times_rng, scenario.duration_s)
+    )
     scanner = Scanner(sensor, ego(times_s), scenario.detection_origin_x_m)
-    scans = scanner.scans(scanner_rng, [opponent(times_s) for opponent in opponents], track)
+    scans = scanner.scans(
+        scanner_rng, [opponent(times_s) for opponent in opponents], track
+    )
     receipts_ns, lost = _receipts(sensor.delay, delay_rng, stamps_ns, times_s)
     reported_ns = reported_stamps(sensor.clock, clock_rng, stamps_ns, receipts_ns)
-    columns = zip(reported_ns.tolist(), receipts_ns.tolist(), scans, lost | sensor.silent(times_s), strict=True)
+    columns = zip(
+        reported_ns.tolist(),
+        receipts_ns.tolist(),
+        scans,
+        lost | sensor.silent(times_s),
+        strict=True,
+    )
     return [
         DetectionList(sensor.name, stamp_ns, receipt_ns, detections, sensor.frame)
         for stamp_ns, receipt_ns, detections, is_missing in columns
@@ -117,7 +143,9 @@ def _scans(
     ]
 
 
-def _stamps(scenario: Scenario, times: FloatArray | float) -> tuple[IntArray, FloatArray]:
+def _stamps(
+    scenario: Scenario, times: FloatArray | float
+) -> tuple[IntArray, FloatArray]:
     """Stamps of times since the start, or at a rate, and the times, of whole nanoseconds."""
     if isinstance(times, float):
         times = np.arange(math.floor(scenario.duration_s * times + 1e-9) + 1) / times
@@ -130,4 +158,6 @@ def _receipts(
 ) -> tuple[IntArray, BoolArray]:
     """Receipt of each stamp, and True where the message is lost."""
     delays_s = draw_delays(delay, rng, times_s)
-    return stamps_ns + np.rint(np.nan_to_num(delays_s) * NS_PER_S).astype(np.int64), np.isnan(delays_s)
+    return stamps_ns + np.rint(np.nan_to_num(delays_s) * NS_PER_S).astype(
+        np.int64
+    ), np.isnan(delays_s)

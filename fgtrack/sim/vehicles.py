@@ -42,10 +42,17 @@ class TrackVehicle:
 
     def __post_init__(self) -> None:
         for (before_s, _), (time_s, _) in pairwise(self.speed):
-            require(time_s > before_s, "speed", "times of the knots must increase", time_s)
+            require(
+                time_s > before_s, "speed", "times of the knots must increase", time_s
+            )
         for before, change in pairwise(self.lane_changes):
             end_s = before.start_s + before.duration_s
-            require(change.start_s >= end_s, "lane_changes", "one must end before the next", change.start_s)
+            require(
+                change.start_s >= end_s,
+                "lane_changes",
+                "one must end before the next",
+                change.start_s,
+            )
 
     def states(self, path: Path, times_s: FloatArray) -> FloatArray:
         """States at `times_s`, shape (n,), from the start of the scenario: shape (n, 6), `STATE_NAMES`.
@@ -60,7 +67,9 @@ class TrackVehicle:
         frame = path.frame(u)
         stretch = frame.scale - d * frame.turn
         w = u1 * stretch
-        w1 = u2 * stretch + u1 * (u1 * (frame.scale_rate - d * frame.turn_rate) - d1 * frame.turn)
+        w1 = u2 * stretch + u1 * (
+            u1 * (frame.scale_rate - d * frame.turn_rate) - d1 * frame.turn
+        )
         speed = np.hypot(w, d1)
         return np.stack(
             [
@@ -119,7 +128,9 @@ class DrawnVehicle:
     bridge; it is exact as long as all sensors together look at most once in a step."""
     kind: Literal["drawn"] = "drawn"
 
-    def trajectory(self, rng: np.random.Generator, duration_s: float) -> "DrawnTrajectory":
+    def trajectory(
+        self, rng: np.random.Generator, duration_s: float
+    ) -> "DrawnTrajectory":
         """One draw of the motion of this vehicle over `duration_s`."""
         num_steps = math.ceil(duration_s / self.step_s) + 1
         normals = rng.standard_normal((num_steps, self.motion.dim, 2))
@@ -128,8 +139,12 @@ class DrawnVehicle:
         states[0] = [getattr(self, name) for name in STATE_NAMES[: self.motion.dim]]
         for k in range(num_steps):
             # The covariance is singular where a density is zero, so no Cholesky factor; the symmetric root is unique.
-            variances, axes = np.linalg.eigh(self.motion.process_noise(states[k], self.step_s))
-            noise[k] = (axes * np.sqrt(np.maximum(variances, 0.0))) @ axes.T @ normals[k]
+            variances, axes = np.linalg.eigh(
+                self.motion.process_noise(states[k], self.step_s)
+            )
+            noise[k] = (
+                (axes * np.sqrt(np.maximum(variances, 0.0))) @ axes.T @ normals[k]
+            )
             states[k + 1] = self.motion.predict(states[k], self.step_s) + noise[k, :, 0]
         return DrawnTrajectory(self, states, noise[:, :, 0], noise[:, :, 1])
 
@@ -166,7 +181,9 @@ class DrawnTrajectory:
 AnyVehicle = Annotated[TrackVehicle | DrawnVehicle, Discriminator("kind")]
 
 
-def drawn(motion: MotionModel, x: FloatArray, dt_s: float, rng: np.random.Generator) -> FloatArray:
+def drawn(
+    motion: MotionModel, x: FloatArray, dt_s: float, rng: np.random.Generator
+) -> FloatArray:
     """A draw of the states `dt_s` after `x`, both shape (..., n): the prediction plus N(0, Q(x, dt_s)).
     Raises `numpy.linalg.LinAlgError` where Q is singular, as with a density of zero.
     """

@@ -1,7 +1,10 @@
 """The contract suites of estimators, motion models and measurement models, as checks that name the broken promise."""
 
 from fgtrack.testing.estimators import check_estimator, estimator_checks
-from fgtrack.testing.measurement_models import check_measurement_models, measurement_model_checks
+from fgtrack.testing.measurement_models import (
+    check_measurement_models,
+    measurement_model_checks,
+)
 from fgtrack.testing.motion_models import check_motion_model, motion_model_checks
 from fgtrack.testing.promise import BrokenPromiseError
 

@@ -49,30 +49,63 @@ class Moments(NamedTuple):
 
 
 def _ctrv(model: CTRV) -> MotionEquation:
-    relaxation_hz = _relaxation_hz(model.yaw_rate_density_rad2ps3, model.yaw_rate_std_radps)
-    position, speed, yaw_rate = model.position_density_m2ps, model.speed_density_m2ps3, model.yaw_rate_density_rad2ps3
+    relaxation_hz = _relaxation_hz(
+        model.yaw_rate_density_rad2ps3, model.yaw_rate_std_radps
+    )
+    position, speed, yaw_rate = (
+        model.position_density_m2ps,
+        model.speed_density_m2ps3,
+        model.yaw_rate_density_rad2ps3,
+    )
     return MotionEquation(
-        drift=lambda x: [x[3] * np.cos(x[2]), x[3] * np.sin(x[2]), x[4], 0.0, -relaxation_hz * x[4]],
-        diffusion=lambda x: _diagonal(position, position, _yaw_density(model, x), speed, yaw_rate),
+        drift=lambda x: [
+            x[3] * np.cos(x[2]),
+            x[3] * np.sin(x[2]),
+            x[4],
+            0.0,
+            -relaxation_hz * x[4],
+        ],
+        diffusion=lambda x: _diagonal(
+            position, position, _yaw_density(model, x), speed, yaw_rate
+        ),
     )
 
 
 def _ctra(model: CTRA) -> MotionEquation:
-    relaxation_hz = _relaxation_hz(model.yaw_rate_density_rad2ps3, model.yaw_rate_std_radps)
-    position, speed, yaw_rate = model.position_density_m2ps, model.speed_density_m2ps3, model.yaw_rate_density_rad2ps3
+    relaxation_hz = _relaxation_hz(
+        model.yaw_rate_density_rad2ps3, model.yaw_rate_std_radps
+    )
+    position, speed, yaw_rate = (
+        model.position_density_m2ps,
+        model.speed_density_m2ps3,
+        model.yaw_rate_density_rad2ps3,
+    )
     accel = model.accel_density_m2ps5
     return MotionEquation(
-        drift=lambda x: [x[3] * np.cos(x[2]), x[3] * np.sin(x[2]), x[4], x[5], -relaxation_hz * x[4], 0.0],
-        diffusion=lambda x: _diagonal(position, position, _yaw_density(model, x), speed, yaw_rate, accel),
+        drift=lambda x: [
+            x[3] * np.cos(x[2]),
+            x[3] * np.sin(x[2]),
+            x[4],
+            x[5],
+            -relaxation_hz * x[4],
+            0.0,
+        ],
+        diffusion=lambda x: _diagonal(
+            position, position, _yaw_density(model, x), speed, yaw_rate, accel
+        ),
     )
 
 
 def _ct(model: CT) -> MotionEquation:
-    relaxation_hz = _relaxation_hz(model.yaw_rate_density_rad2ps3, model.yaw_rate_std_radps)
+    relaxation_hz = _relaxation_hz(
+        model.yaw_rate_density_rad2ps3, model.yaw_rate_std_radps
+    )
     position, velocity = model.position_density_m2ps, model.velocity_density_m2ps3
     return MotionEquation(
         drift=lambda x: [x[2], x[3], -x[4] * x[3], x[4] * x[2], -relaxation_hz * x[4]],
-        diffusion=lambda x: np.diag([position, position, velocity, velocity, model.yaw_rate_density_rad2ps3]),
+        diffusion=lambda x: np.diag(
+            [position, position, velocity, velocity, model.yaw_rate_density_rad2ps3]
+        ),
     )
 
 
@@ -83,7 +116,10 @@ def _relaxation_hz(density: float, std: float) -> float:
 
 def _yaw_density(model: CTRV, x: Any) -> Any:
     """Spectral density of the yaw at the states x (n, ...): a slow object has more."""
-    return model.yaw_density_rad2ps + model.resting_yaw_rad2ps / (1.0 + (x[3] / model.slow_mps) ** 2) ** 2
+    return (
+        model.yaw_density_rad2ps
+        + model.resting_yaw_rad2ps / (1.0 + (x[3] / model.slow_mps) ** 2) ** 2
+    )
 
 
 def _diagonal(*entries: Any) -> FloatArray:
@@ -95,7 +131,8 @@ def _diagonal(*entries: Any) -> FloatArray:
 def _cv(model: CV) -> MotionEquation:
     velocity = model.velocity_density_m2ps3
     return MotionEquation(
-        drift=lambda x: [x[2], x[3], 0.0, 0.0], diffusion=lambda x: np.diag([0.0, 0.0, velocity, velocity])
+        drift=lambda x: [x[2], x[3], 0.0, 0.0],
+        diffusion=lambda x: np.diag([0.0, 0.0, velocity, velocity]),
     )
 
 
@@ -110,11 +147,16 @@ def _with_errors(model: CorrelatedErrors) -> MotionEquation:
         of_object = np.asarray(base.diffusion(x[:n]))
         D = np.zeros((*of_object.shape[:-2], len(x), len(x)))
         D[..., :n, :n] = of_object
-        D[..., range(n, len(x)), range(n, len(x))] = [2.0 / time_s for time_s in times_s]
+        D[..., range(n, len(x)), range(n, len(x))] = [
+            2.0 / time_s for time_s in times_s
+        ]
         return D
 
     return MotionEquation(
-        drift=lambda x: [*base.drift(x[:n]), *(-e / time_s for e, time_s in zip(x[n:], times_s, strict=True))],
+        drift=lambda x: [
+            *base.drift(x[:n]),
+            *(-e / time_s for e, time_s in zip(x[n:], times_s, strict=True)),
+        ],
         diffusion=diffusion,
     )
 
@@ -150,24 +192,47 @@ def moments(equation: MotionEquation, x: FloatArray, dt_s: FloatArray) -> Moment
     def rates(_: float, flat: FloatArray) -> FloatArray:
         packed = flat.reshape(m, n + 2 * n * n)
         mean = packed[:, :n]
-        F, Q = packed[:, n : n + n * n].reshape(m, n, n), packed[:, n + n * n :].reshape(m, n, n)
+        F, Q = (
+            packed[:, n : n + n * n].reshape(m, n, n),
+            packed[:, n + n * n :].reshape(m, n, n),
+        )
         A = drift_jacobian(equation, mean) * scale
         AQ = A @ Q
-        D = np.broadcast_to(np.asarray(equation.diffusion(mean.T), dtype=np.float64), (m, n, n))
-        parts = _drift(equation, mean) * dt_s[:, None], A @ F, AQ + np.swapaxes(AQ, 1, 2) + D
+        D = np.broadcast_to(
+            np.asarray(equation.diffusion(mean.T), dtype=np.float64), (m, n, n)
+        )
+        parts = (
+            _drift(equation, mean) * dt_s[:, None],
+            A @ F,
+            AQ + np.swapaxes(AQ, 1, 2) + D,
+        )
         return np.concatenate([part.reshape(m, -1) for part in parts], axis=1).ravel()
 
-    start = np.concatenate([x, np.tile(np.eye(n).ravel(), (m, 1)), np.zeros((m, n * n))], axis=1)
-    result = solve_ivp(rates, (0.0, 1.0), start.ravel(), method="DOP853", rtol=_RELATIVE, atol=_ABSOLUTE)
+    start = np.concatenate(
+        [x, np.tile(np.eye(n).ravel(), (m, 1)), np.zeros((m, n * n))], axis=1
+    )
+    result = solve_ivp(
+        rates,
+        (0.0, 1.0),
+        start.ravel(),
+        method="DOP853",
+        rtol=_RELATIVE,
+        atol=_ABSOLUTE,
+    )
     packed = result.y[:, -1].reshape(m, n + 2 * n * n)
-    F, Q = packed[:, n : n + n * n].reshape(m, n, n), packed[:, n + n * n :].reshape(m, n, n)
+    F, Q = (
+        packed[:, n : n + n * n].reshape(m, n, n),
+        packed[:, n + n * n :].reshape(m, n, n),
+    )
     return Moments(packed[:, :n], F, Q * scale)
 
 
 def _drift(equation: MotionEquation, x: Any) -> Any:
     """Rates of real or complex states x (m, n), shape (m, n)."""
     states = np.swapaxes(x, 0, 1)
-    return np.stack([np.broadcast_to(rate, len(x)) for rate in equation.drift(states)], axis=1)
+    return np.stack(
+        [np.broadcast_to(rate, len(x)) for rate in equation.drift(states)], axis=1
+    )
 
 
 def drift_jacobian(equation: MotionEquation, x: FloatArray) -> FloatArray:
@@ -205,9 +270,12 @@ COMPONENTS: Mapping[str, Callable[[Seen], Any]] = {
     "range_m": lambda seen: cmath.sqrt(seen.ahead_m**2 + seen.left_m**2),
     "bearing_rad": lambda seen: direction(seen.ahead_m, seen.left_m),
     "range_rate_mps": lambda seen: (
-        (seen.ahead_m * seen.ahead_mps + seen.left_m * seen.left_mps) / cmath.sqrt(seen.ahead_m**2 + seen.left_m**2)
+        (seen.ahead_m * seen.ahead_mps + seen.left_m * seen.left_mps)
+        / cmath.sqrt(seen.ahead_m**2 + seen.left_m**2)
     ),
-    "curvature_radpm": lambda seen: seen.yaw_rate_radps * seen.speed_mps / (seen.speed_mps**2 + 1.0),
+    "curvature_radpm": lambda seen: (
+        seen.yaw_rate_radps * seen.speed_mps / (seen.speed_mps**2 + 1.0)
+    ),
 }
 #: Components that are compared modulo a full turn.
 ANGLES = ("yaw_rad", "bearing_rad")
@@ -223,14 +291,19 @@ def direction(ahead: Any, left: Any) -> Any:
 
 
 # Any: arrays of real or of complex numbers.
-def measured(components: Sequence[str], state_names: Sequence[str], x: Any, pose: Any) -> list[Any]:
+def measured(
+    components: Sequence[str], state_names: Sequence[str], x: Any, pose: Any
+) -> list[Any]:
     """Values of `components` without noise, of one state x (n,) and a sensor pose (x, y, yaw, vx, vy), both maybe
     complex. Angles are not wrapped.
     """
     own = dict(zip(state_names, x, strict=True))
     if "vx_mps" in own:
         vx_mps, vy_mps = own["vx_mps"], own["vy_mps"]
-        yaw_rad, speed_mps = direction(vx_mps, vy_mps), cmath.sqrt(vx_mps**2 + vy_mps**2)
+        yaw_rad, speed_mps = (
+            direction(vx_mps, vy_mps),
+            cmath.sqrt(vx_mps**2 + vy_mps**2),
+        )
     else:
         yaw_rad, speed_mps = own["yaw_rad"], own["speed_mps"]
         vx_mps, vy_mps = speed_mps * cmath.cos(yaw_rad), speed_mps * cmath.sin(yaw_rad)
@@ -264,18 +337,26 @@ class Linearisation(NamedTuple):
 
 
 def linearised(
-    components: Sequence[str], state_names: Sequence[str], x: FloatArray, pose: Sequence[float]
+    components: Sequence[str],
+    state_names: Sequence[str],
+    x: FloatArray,
+    pose: Sequence[float],
 ) -> Linearisation:
     """The measurement of one state x (n,), with derivatives by steps in the imaginary direction."""
     n, at = len(x), np.array([*x, *pose], dtype=np.complex128)
     values = np.real(measured(components, state_names, at[:n], at[n:]))
     steps = at + 1j * _IMAGINARY * np.eye(len(at))
-    slopes = [np.imag(measured(components, state_names, row[:n], row[n:])) / _IMAGINARY for row in steps]
+    slopes = [
+        np.imag(measured(components, state_names, row[:n], row[n:])) / _IMAGINARY
+        for row in steps
+    ]
     both = np.column_stack(slopes)
     return Linearisation(np.asarray(values, dtype=np.float64), both[:, :n], both[:, n:])
 
 
-def residual(components: Sequence[str], z: FloatArray, predicted: FloatArray) -> FloatArray:
+def residual(
+    components: Sequence[str], z: FloatArray, predicted: FloatArray
+) -> FloatArray:
     """Measured minus predicted, both (k,), with angles in [-pi, pi]."""
     y = z - predicted
     angular = [math.remainder(value, 2.0 * math.pi) for value in y]

@@ -15,8 +15,23 @@ from fgtrack.estimation.registry import ESTIMATORS, EXACT, Claims, Factory
 from fgtrack.estimation.smoothing.terms import NEAR_NS
 from fgtrack.models.motion import MotionModel
 from fgtrack.testing.banks import gives_each_of_several_objects_what_it_gives_one_alone
-from fgtrack.testing.promise import Draw, Promise, Subject, WrongError, require, run_all, sound
-from fgtrack.testing.references import dense_joint, difference, innovation, kalman_filter, predicted, rounding_bound
+from fgtrack.testing.promise import (
+    Draw,
+    Promise,
+    Subject,
+    WrongError,
+    require,
+    run_all,
+    sound,
+)
+from fgtrack.testing.references import (
+    dense_joint,
+    difference,
+    innovation,
+    kalman_filter,
+    predicted,
+    rounding_bound,
+)
 from fgtrack.testing.streams import (
     LAG_S,
     LINEAR,
@@ -31,9 +46,16 @@ from fgtrack.testing.streams import (
     with_outliers,
 )
 
-FUSED = (UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE, UpdateStatus.BEYOND_WINDOW)
+FUSED = (
+    UpdateStatus.IN_SEQUENCE,
+    UpdateStatus.OUT_OF_SEQUENCE,
+    UpdateStatus.BEYOND_WINDOW,
+)
 _LATE = (UpdateStatus.OUT_OF_SEQUENCE, UpdateStatus.BEYOND_WINDOW)
-_FIRST_LATE, _ONE_LAG = "any lag, first late measurement", "one lag, first late measurement"
+_FIRST_LATE, _ONE_LAG = (
+    "any lag, first late measurement",
+    "one lag, first late measurement",
+)
 _CONVERGED, _ORDER, _FILTERED = 1e-5, 1e-9, 1e-7
 #: Repeated reweighting under a robust loss stops at small steps, but converges slowly.
 _REWEIGHTED = 1e-2
@@ -43,7 +65,12 @@ _NEAR_SIGMA, _NEAR_COVARIANCE = 1.0, 0.05
 
 
 def _close(
-    found: TrackState, expected: TrackState, tolerance: float, stream: Stream, what: str, of_covariance: float = 0.0
+    found: TrackState,
+    expected: TrackState,
+    tolerance: float,
+    stream: Stream,
+    what: str,
+    of_covariance: float = 0.0,
 ) -> None:
     """Require that two states are as near in mean and covariance; `of_covariance` may be another tolerance."""
     mean_sigma, covariance = difference(found, expected, stream.motion)
@@ -65,12 +92,16 @@ class _Problem:
     stream: Stream = field(compare=False)
 
 
-def _joint(subject: Subject, stream: Stream, stamps_ns: Iterable[int]) -> dict[int, TrackState]:
+def _joint(
+    subject: Subject, stream: Stream, stamps_ns: Iterable[int]
+) -> dict[int, TrackState]:
     """The joint posterior at stamps. In a nonlinear model it is that of estimators that converge, else the filter's.
     A filter's posterior is given the measurements up to that stamp.
     """
     claims = Claims(
-        smooths=subject.claims.smooths, nonlinear=subject.claims.nonlinear, iterates=subject.claims.iterates
+        smooths=subject.claims.smooths,
+        nonlinear=subject.claims.nonlinear,
+        iterates=subject.claims.iterates,
     )
     return _calculated(_Problem(stream.content, claims, tuple(stamps_ns), stream))
 
@@ -80,7 +111,13 @@ def _calculated(problem: _Problem) -> dict[int, TrackState]:
     """See `_joint`."""
     stream, claims, stamps_ns = problem.stream, problem.claims, problem.stamps_ns
     if not stream.motion.linear and claims.nonlinear != "at convergence":
-        return kalman_filter(stream.motion, stream.start, stream.measurements, stamps_ns, iterated=claims.iterates)
+        return kalman_filter(
+            stream.motion,
+            stream.start,
+            stream.measurements,
+            stamps_ns,
+            iterated=claims.iterates,
+        )
     if claims.smooths:
         return dense_joint(stream.motion, stream.start, stream.measurements, stamps_ns)
     states = dict[int, TrackState]()
@@ -100,18 +137,27 @@ def _close_to_joint(
     of_covariance: float = 0.0,
 ) -> None:
     for at_ns, expected in _joint(subject, stream, stamps_ns).items():
-        _close(estimator.state_at(at_ns), expected, tolerance, stream, what, of_covariance)
+        _close(
+            estimator.state_at(at_ns), expected, tolerance, stream, what, of_covariance
+        )
 
 
 def _tolerance(subject: Subject, stream: Stream) -> float:
-    return max(subject.claims.tolerance, subject.claims.rounding * rounding_bound(stream.motion, stream.stamps_ns))
+    return max(
+        subject.claims.tolerance,
+        subject.claims.rounding * rounding_bound(stream.motion, stream.stamps_ns),
+    )
 
 
 def _probes_ns(stream: Stream, oldest_ns: int = 0) -> list[int]:
     """All stamps from `oldest_ns` on, those halfway between, and one ahead."""
     stamps = stream.stamps_ns
     middles = [(a + b) // 2 for a, b in pairwise(stamps) if b - a >= MS]
-    return [at_ns for at_ns in (*stamps, *middles, stamps[-1] + 100 * MS) if at_ns >= oldest_ns]
+    return [
+        at_ns
+        for at_ns in (*stamps, *middles, stamps[-1] + 100 * MS)
+        if at_ns >= oldest_ns
+    ]
 
 
 def _bits(estimator: Estimator, stamps_ns: list[int]) -> list[bytes]:
@@ -127,50 +173,108 @@ def _is_the_kalman_filter_in_sequence(subject: Subject, stream: Stream) -> None:
     statuses = [result.status.value for result in results]
     require(statuses == ["in_sequence"] * len(results), f"statuses are {statuses}")
     at_ns = stream.newest_ns - round(subject.claims.held_s * 1e9)
-    _close_to_joint(subject, stream, estimator, [at_ns], "the Kalman filter's", max(1e-9, subject.claims.tolerance))
+    _close_to_joint(
+        subject,
+        stream,
+        estimator,
+        [at_ns],
+        "the Kalman filter's",
+        max(1e-9, subject.claims.tolerance),
+    )
 
 
-def _gives_the_dense_joint_posterior_in_any_order(subject: Subject, stream: Stream) -> None:
+def _gives_the_dense_joint_posterior_in_any_order(
+    subject: Subject, stream: Stream
+) -> None:
     estimator, results = subject.fed(stream)
     refused = [k for k, result in enumerate(results) if result.status not in FUSED]
-    require(not refused, f"of the measurements inside the window the one at index {refused[:1]} is not fused")
+    require(
+        not refused,
+        f"of the measurements inside the window the one at index {refused[:1]} is not fused",
+    )
     tolerance = _tolerance(subject, stream)
-    _close_to_joint(subject, stream, estimator, _probes_ns(stream), "the dense joint posterior", tolerance)
+    _close_to_joint(
+        subject,
+        stream,
+        estimator,
+        _probes_ns(stream),
+        "the dense joint posterior",
+        tolerance,
+    )
 
 
-def _keeps_all_that_it_accepts_and_nothing_else(subject: Subject, stream: Stream) -> None:
+def _keeps_all_that_it_accepts_and_nothing_else(
+    subject: Subject, stream: Stream
+) -> None:
     """The clock runs ahead of the stamps, and the window is shorter than the stream."""
-    estimator, accepted, newest_ns = subject.start(stream), list[Measurement](), stream.start.stamp_ns
+    estimator, accepted, newest_ns = (
+        subject.start(stream),
+        list[Measurement](),
+        stream.start.stamp_ns,
+    )
     for place, measurement in enumerate(stream.measurements):
         oldest_ns = estimator.window_ns[0]
         status = estimator.update(measurement).status
         inside = measurement.stamp_ns >= oldest_ns
-        require((status in FUSED) == inside, f"index {place}: {status}, the window begins at {oldest_ns}")
+        require(
+            (status in FUSED) == inside,
+            f"index {place}: {status}, the window begins at {oldest_ns}",
+        )
         if inside:
             accepted.append(measurement)
             newest_ns = max(newest_ns, measurement.stamp_ns)
         estimator.advance(newest_ns + round(0.3e9 * LAG_S))
-    known, oldest_ns = replace(stream, measurements=tuple(accepted)), estimator.window_ns[0]
-    probes = [oldest_ns, *_probes_ns(known, oldest_ns)] if subject.claims.smooths else [newest_ns, newest_ns + 100 * MS]
-    _close_to_joint(subject, known, estimator, probes, "that of these", _tolerance(subject, stream))
+    known, oldest_ns = (
+        replace(stream, measurements=tuple(accepted)),
+        estimator.window_ns[0],
+    )
+    probes = (
+        [oldest_ns, *_probes_ns(known, oldest_ns)]
+        if subject.claims.smooths
+        else [newest_ns, newest_ns + 100 * MS]
+    )
+    _close_to_joint(
+        subject, known, estimator, probes, "that of these", _tolerance(subject, stream)
+    )
 
 
-def _gives_the_estimate_of_the_time_order_in_any_order(subject: Subject, stream: Stream) -> None:
+def _gives_the_estimate_of_the_time_order_in_any_order(
+    subject: Subject, stream: Stream
+) -> None:
     # Those of one stamp the other way round, because their order must not matter either.
     ordered = tuple(sorted(stream.measurements, key=lambda item: -item.stamp_ns)[::-1])
-    result, expected = (subject.fed(each)[0] for each in (stream, replace(stream, measurements=ordered)))
+    result, expected = (
+        subject.fed(each)[0] for each in (stream, replace(stream, measurements=ordered))
+    )
     tolerance = _CONVERGED if _converged(subject, result, expected) else _ORDER
     for at_ns in (stream.start.stamp_ns, stream.newest_ns, stream.newest_ns + 100 * MS):
-        _close(result.state_at(at_ns), expected.state_at(at_ns), tolerance, stream, "that of the time order")
+        _close(
+            result.state_at(at_ns),
+            expected.state_at(at_ns),
+            tolerance,
+            stream,
+            "that of the time order",
+        )
 
 
 def _fuses_a_late_measurement_exactly(subject: Subject, stream: Stream) -> None:
     estimator, results = subject.fed(stream)
-    require(results[-1].status in FUSED, f"the last measurement is {results[-1].status}")
-    _close_to_joint(subject, stream, estimator, [stream.newest_ns], "the dense joint posterior", 1e-9)
+    require(
+        results[-1].status in FUSED, f"the last measurement is {results[-1].status}"
+    )
+    _close_to_joint(
+        subject,
+        stream,
+        estimator,
+        [stream.newest_ns],
+        "the dense joint posterior",
+        1e-9,
+    )
 
 
-def _reports_the_innovation_against_all_that_it_has_fused(subject: Subject, stream: Stream) -> None:
+def _reports_the_innovation_against_all_that_it_has_fused(
+    subject: Subject, stream: Stream
+) -> None:
     """From later stamps too, where it claims so; of a nonlinear filter it is known for what comes in sequence."""
     estimator, claims = subject.start(stream), subject.claims
     fused: list[Measurement] = []
@@ -183,7 +287,11 @@ def _reports_the_innovation_against_all_that_it_has_fused(subject: Subject, stre
         result = estimator.update(measurement)
         fused.append(measurement)
         known = claims.smooths or at_ns > newest_ns
-        if not (known or claims.retrodicts if stream.motion.linear else known and not claims.spreads):
+        if not (
+            known or claims.retrodicts
+            if stream.motion.linear
+            else known and not claims.spreads
+        ):
             continue
         said = f"the innovation at {at_ns} is {result.innovation}, its NIS {result.nis}"
         if result.innovation is None or result.nis is None:
@@ -194,8 +302,13 @@ def _reports_the_innovation_against_all_that_it_has_fused(subject: Subject, stre
         off = float((np.abs(result.innovation - y) / np.sqrt(np.diag(S))).max())
         nis_off = abs(result.nis - nis) / (1.0 + nis)
         tolerance = _tolerance(subject, stream) if stream.motion.linear else 1e-6
-        require(off < tolerance, f"{said}: {off:.1e} standard deviations from that of the state before")
-        require(nis_off < max(tolerance, 1e-8), f"{said}: off by {nis_off:.1e} of 1 + NIS")
+        require(
+            off < tolerance,
+            f"{said}: {off:.1e} standard deviations from that of the state before",
+        )
+        require(
+            nis_off < max(tolerance, 1e-8), f"{said}: off by {nis_off:.1e} of 1 + NIS"
+        )
 
 
 def _counts_each_measurement_as_what_it_is(subject: Subject, stream: Stream) -> None:
@@ -212,35 +325,64 @@ def _counts_right_with(subject: Subject, stream: Stream, latency_ns: int) -> Non
     """Require the right status of each measurement of a stream with this latency."""
     estimator, newest_ns = subject.start(stream), stream.start.stamp_ns
     for place, measurement in enumerate(stream.measurements):
-        stamp_ns, what = measurement.stamp_ns, f"index {place} with a latency of {latency_ns} ns"
+        stamp_ns, what = (
+            measurement.stamp_ns,
+            f"index {place} with a latency of {latency_ns} ns",
+        )
         if latency_ns:
             estimator.advance(max(stamp_ns, newest_ns) + latency_ns)
-        may_be_too_old = stamp_ns < estimator.window_ns[0] or 0 < nanoseconds(subject.claims.held_s) < latency_ns
+        may_be_too_old = (
+            stamp_ns < estimator.window_ns[0]
+            or 0 < nanoseconds(subject.claims.held_s) < latency_ns
+        )
         result, late = estimator.update(measurement), stamp_ns < newest_ns
-        allowed = [*_LATE, UpdateStatus.TOO_OLD, UpdateStatus.FAILED] if late else [UpdateStatus.IN_SEQUENCE]
+        allowed = (
+            [*_LATE, UpdateStatus.TOO_OLD, UpdateStatus.FAILED]
+            if late
+            else [UpdateStatus.IN_SEQUENCE]
+        )
         allowed += [UpdateStatus.TOO_OLD] * may_be_too_old
-        require(result.status in allowed, f"{what}: {'late' if late else 'in sequence'}, is {result.status}")
+        require(
+            result.status in allowed,
+            f"{what}: {'late' if late else 'in sequence'}, is {result.status}",
+        )
         y, S, nis = result.innovation, result.innovation_covariance, result.nis
         complete = (result.status in FUSED) == (y is not None) == (nis is not None)
         require(complete, f"{what}: {result.status}, innovation {y}, NIS {nis}")
         if y is not None and nis is not None:
-            right = y.shape == measurement.z.shape and np.isfinite(y).all() and 0.0 <= nis < np.inf
+            right = (
+                y.shape == measurement.z.shape
+                and np.isfinite(y).all()
+                and 0.0 <= nis < np.inf
+            )
             require(right, f"{what}: the innovation is {y}, the NIS {nis}")
             if S is not None:
                 sound(y, (S + S.T) / 2.0, f"the innovation at {what}")
                 own = measurement.nis(y, S)
-                right = np.allclose(S, S.T, 1e-9) and abs(own - nis) <= 1e-6 * (1.0 + own)
-                require(right, f"{what}: the NIS is {nis}, not {own} by the covariance\n{S}")
+                right = np.allclose(S, S.T, 1e-9) and abs(own - nis) <= 1e-6 * (
+                    1.0 + own
+                )
+                require(
+                    right, f"{what}: the NIS is {nis}, not {own} by the covariance\n{S}"
+                )
             newest_ns = max(newest_ns, stamp_ns)
     end_ns = estimator.window_ns[1]
-    require(0 <= newest_ns - end_ns <= NEAR_NS, f"window_ns ends at {end_ns}, newest is {newest_ns}")
+    require(
+        0 <= newest_ns - end_ns <= NEAR_NS,
+        f"window_ns ends at {end_ns}, newest is {newest_ns}",
+    )
 
 
-def _gives_symmetric_positive_definite_covariances(subject: Subject, stream: Stream) -> None:
+def _gives_symmetric_positive_definite_covariances(
+    subject: Subject, stream: Stream
+) -> None:
     estimator, _ = subject.fed(stream)
     for at_ns in _probes_ns(stream, estimator.window_ns[0]):
         state = estimator.state_at(at_ns)
-        require(state.stamp_ns == at_ns, f"state_at({at_ns}) gives a state at {state.stamp_ns}")
+        require(
+            state.stamp_ns == at_ns,
+            f"state_at({at_ns}) gives a state at {state.stamp_ns}",
+        )
         sound(state.mean, state.covariance, f"the state at {at_ns}")
 
 
@@ -258,53 +400,92 @@ def _changes_no_input_and_no_output_later(subject: Subject, stream: Stream) -> N
     for measurement in copies:
         result = estimator.update(measurement)
         state = estimator.state_at(max(measurement.stamp_ns, estimator.window_ns[0]))
-        outputs = [state.mean, state.covariance] + ([] if result.innovation is None else [result.innovation])
+        outputs = [state.mean, state.covariance] + (
+            [] if result.innovation is None else [result.innovation]
+        )
         given += [(output, output.copy()) for output in outputs]
     for copy, measurement in zip(copies, stream.measurements, strict=True):
         same = (copy.z == measurement.z).all() and (copy.R == measurement.R).all()
         require(same, f"z or R of the measurement at {measurement.stamp_ns} is changed")
-    require(all((now == then).all() for now, then in given), "a state or innovation that was given changes later")
+    require(
+        all((now == then).all() for now, then in given),
+        "a state or innovation that was given changes later",
+    )
 
 
 def _unchanged(
-    estimator: Estimator, newest_ns: int, measurement: Measurement, allowed: tuple[UpdateStatus, ...], what: str
+    estimator: Estimator,
+    newest_ns: int,
+    measurement: Measurement,
+    allowed: tuple[UpdateStatus, ...],
+    what: str,
 ) -> None:
     """Require that an update has one of the `allowed` statuses and changes neither states nor the window."""
     probes = [newest_ns, newest_ns + 200 * MS]
     before, window_ns = _bits(estimator, probes), estimator.window_ns
     result = estimator.update(measurement)
     require(result.status in allowed, f"{what} is {result.status}")
-    require(result.nis is None and result.innovation is None, f"{what} has an innovation")
+    require(
+        result.nis is None and result.innovation is None, f"{what} has an innovation"
+    )
     require(_bits(estimator, probes) == before, f"{what} changes the state")
     require(estimator.window_ns == window_ns, f"{what} moves the window")
 
 
-def _reports_what_is_too_old_and_stays_as_it_was(subject: Subject, stream: Stream) -> None:
+def _reports_what_is_too_old_and_stays_as_it_was(
+    subject: Subject, stream: Stream
+) -> None:
     estimator, _ = subject.fed(stream)
     estimator.advance(stream.newest_ns + round(0.5e9 * LAG_S))
     rng = np.random.default_rng(0)
     for offset_ns in (-1, estimator.window_ns[0] - 1 - stream.start.stamp_ns):
-        old, what = measured(rng, stream.motion, offset_ns), f"a stamp before {estimator.window_ns[0]}"
+        old, what = (
+            measured(rng, stream.motion, offset_ns),
+            f"a stamp before {estimator.window_ns[0]}",
+        )
         _unchanged(estimator, stream.newest_ns, old, (UpdateStatus.TOO_OLD,), what)
 
 
-def _stays_as_it_was_after_a_failure_and_fuses_the_next(subject: Subject, stream: Stream) -> None:
+def _stays_as_it_was_after_a_failure_and_fuses_the_next(
+    subject: Subject, stream: Stream
+) -> None:
     estimator, _ = subject.fed(stream)
     rng, newest_ns = np.random.default_rng(1), stream.newest_ns
     for offset_ns in (-20 * MS, 0, 30 * MS):
-        good = measured(rng, stream.motion, newest_ns - stream.start.stamp_ns + offset_ns)
-        allowed = (UpdateStatus.FAILED, UpdateStatus.TOO_OLD) if offset_ns < 0 else (UpdateStatus.FAILED,)
-        for broken in (replace(good, z=good.z * np.nan), replace(good, R=good.R * np.nan)):
-            _unchanged(estimator, newest_ns, broken, allowed, "a measurement that is not a number")
+        good = measured(
+            rng, stream.motion, newest_ns - stream.start.stamp_ns + offset_ns
+        )
+        allowed = (
+            (UpdateStatus.FAILED, UpdateStatus.TOO_OLD)
+            if offset_ns < 0
+            else (UpdateStatus.FAILED,)
+        )
+        for broken in (
+            replace(good, z=good.z * np.nan),
+            replace(good, R=good.R * np.nan),
+        ):
+            _unchanged(
+                estimator,
+                newest_ns,
+                broken,
+                allowed,
+                "a measurement that is not a number",
+            )
     status = estimator.update(good).status
-    require(status is UpdateStatus.IN_SEQUENCE, f"after the failure a good measurement is {status}")
+    require(
+        status is UpdateStatus.IN_SEQUENCE,
+        f"after the failure a good measurement is {status}",
+    )
 
 
 def _moves_only_the_window_with_the_clock(subject: Subject, stream: Stream) -> None:
     estimator, _ = subject.fed(stream)
     newest_ns = stream.newest_ns
     probes = [newest_ns, newest_ns + 100 * MS]
-    before, oldest_ns = [estimator.state_at(at_ns) for at_ns in probes], estimator.window_ns[0]
+    before, oldest_ns = (
+        [estimator.state_at(at_ns) for at_ns in probes],
+        estimator.window_ns[0],
+    )
     estimator.advance(newest_ns + 300 * MS)
     moved = estimator.window_ns
     require(moved[1] == newest_ns, f"the clock moves the newest stamp to {moved[1]}")
@@ -313,17 +494,34 @@ def _moves_only_the_window_with_the_clock(subject: Subject, stream: Stream) -> N
     require(estimator.window_ns == moved, "a clock that goes back moves the window")
     if not subject.claims.held_s:
         for state, at_ns in zip(before, probes, strict=True):
-            _close(estimator.state_at(at_ns), state, _ORDER, stream, "that before the clock moved")
+            _close(
+                estimator.state_at(at_ns),
+                state,
+                _ORDER,
+                stream,
+                "that before the clock moved",
+            )
     estimator.advance(newest_ns + 20 * round(LAG_S * 1e9))
-    require(estimator.window_ns[0] > newest_ns, "the window does not leave the past behind")
+    require(
+        estimator.window_ns[0] > newest_ns, "the window does not leave the past behind"
+    )
 
 
 def _predicts_ahead_by_the_motion_model(subject: Subject, stream: Stream) -> None:
     estimator, _ = subject.fed(stream)
-    now, ahead = estimator.state_at(stream.newest_ns), estimator.state_at(stream.newest_ns + 200 * MS)
+    now, ahead = (
+        estimator.state_at(stream.newest_ns),
+        estimator.state_at(stream.newest_ns + 200 * MS),
+    )
     expected = predicted(stream.motion, now, ahead.stamp_ns)
     averaged = subject.claims.spreads and not stream.motion.linear
-    _close(ahead, expected, 0.3 if averaged else 1e-6, stream, "the prediction of the newest one")
+    _close(
+        ahead,
+        expected,
+        0.3 if averaged else 1e-6,
+        stream,
+        "the prediction of the newest one",
+    )
 
 
 def _gives_the_posterior_of_a_nonlinear_model(subject: Subject, stream: Stream) -> None:
@@ -335,13 +533,21 @@ def _gives_the_posterior_of_a_nonlinear_model(subject: Subject, stream: Stream) 
     tolerance = _CONVERGED if repeats else _FILTERED
     if repeats and any(item.loss for item in stream.measurements):
         tolerance = _REWEIGHTED
-    newest_ns = max(stream.newest_ns - nanoseconds(claims.held_s), stream.start.stamp_ns)
+    newest_ns = max(
+        stream.newest_ns - nanoseconds(claims.held_s), stream.start.stamp_ns
+    )
     probes = [newest_ns] if claims.held_s else [newest_ns, newest_ns + 100 * MS]
-    limits = (_NEAR_SIGMA, _NEAR_COVARIANCE) if claims.spreads else (tolerance, tolerance)
-    _close_to_joint(subject, stream, estimator, probes, "that of a plain calculation", *limits)
+    limits = (
+        (_NEAR_SIGMA, _NEAR_COVARIANCE) if claims.spreads else (tolerance, tolerance)
+    )
+    _close_to_joint(
+        subject, stream, estimator, probes, "that of a plain calculation", *limits
+    )
 
 
-def _converged(subject: Subject, *estimators: Any) -> bool:  # Any: the claim promises `converge`
+def _converged(
+    subject: Subject, *estimators: Any
+) -> bool:  # Any: the claim promises `converge`
     """True if the estimators have to converge first, which they do."""
     needed = subject.claims.nonlinear == "at convergence"
     for estimator in estimators if needed else ():
@@ -355,7 +561,11 @@ def _drawn(make: Callable[..., Stream], *what: MotionModel | int) -> tuple[Draw,
 
 _BOTH = (LINEAR, NONLINEAR)
 _PROMISES = (
-    Promise(_is_the_kalman_filter_in_sequence, _drawn(regular, LINEAR), lambda claims: not claims.mixes),
+    Promise(
+        _is_the_kalman_filter_in_sequence,
+        _drawn(regular, LINEAR),
+        lambda claims: not claims.mixes,
+    ),
     Promise(
         _gives_the_dense_joint_posterior_in_any_order,
         _drawn(shuffled, LINEAR),
@@ -374,8 +584,16 @@ _PROMISES = (
         lambda claims: claims.is_exact and claims.nonlinear != "never",
         repeats=True,
     ),
-    Promise(_fuses_a_late_measurement_exactly, _drawn(one_late, 1), lambda claims: claims.exact == _ONE_LAG),
-    Promise(_fuses_a_late_measurement_exactly, _drawn(one_late, 1, 2, 6), lambda claims: claims.exact == _FIRST_LATE),
+    Promise(
+        _fuses_a_late_measurement_exactly,
+        _drawn(one_late, 1),
+        lambda claims: claims.exact == _ONE_LAG,
+    ),
+    Promise(
+        _fuses_a_late_measurement_exactly,
+        _drawn(one_late, 1, 2, 6),
+        lambda claims: claims.exact == _FIRST_LATE,
+    ),
     Promise(
         _reports_the_innovation_against_all_that_it_has_fused,
         _drawn(shuffled, *_BOTH),
@@ -383,20 +601,41 @@ _PROMISES = (
         repeats=True,
     ),
     Promise(_counts_each_measurement_as_what_it_is, _drawn(shuffled, *_BOTH)),
-    Promise(_gives_symmetric_positive_definite_covariances, _drawn(shuffled, *_BOTH), repeats=True),
+    Promise(
+        _gives_symmetric_positive_definite_covariances,
+        _drawn(shuffled, *_BOTH),
+        repeats=True,
+    ),
     Promise(_gives_the_same_bits_for_the_same_input, _drawn(shuffled, *_BOTH)),
     Promise(_changes_no_input_and_no_output_later, _drawn(shuffled, *_BOTH)),
     Promise(_reports_what_is_too_old_and_stays_as_it_was, _drawn(regular, *_BOTH)),
-    Promise(_stays_as_it_was_after_a_failure_and_fuses_the_next, _drawn(regular, *_BOTH)),
+    Promise(
+        _stays_as_it_was_after_a_failure_and_fuses_the_next, _drawn(regular, *_BOTH)
+    ),
     Promise(_moves_only_the_window_with_the_clock, _drawn(regular, *_BOTH)),
-    Promise(_predicts_ahead_by_the_motion_model, _drawn(regular, *_BOTH), lambda claims: not claims.mixes),
-    Promise(_gives_the_posterior_of_a_nonlinear_model, (informative, with_outliers), lambda claims: not claims.mixes),
-    Promise(gives_each_of_several_objects_what_it_gives_one_alone, _drawn(regular, *_BOTH)),
+    Promise(
+        _predicts_ahead_by_the_motion_model,
+        _drawn(regular, *_BOTH),
+        lambda claims: not claims.mixes,
+    ),
+    Promise(
+        _gives_the_posterior_of_a_nonlinear_model,
+        (informative, with_outliers),
+        lambda claims: not claims.mixes,
+    ),
+    Promise(
+        gives_each_of_several_objects_what_it_gives_one_alone, _drawn(regular, *_BOTH)
+    ),
 )
 
 
 def check_estimator(
-    factory: str | Factory, *, exact: bool | str | None = None, seed: int = 0, num_streams: int = 10, **options: Any
+    factory: str | Factory,
+    *,
+    exact: bool | str | None = None,
+    seed: int = 0,
+    num_streams: int = 10,
+    **options: Any,
 ) -> None:
     """Raise `BrokenPromiseError` unless an estimator keeps the contract, with the measurements that show it.
 
@@ -405,22 +644,38 @@ def check_estimator(
     joint posterior of a linear model in any order of arrival, False does not, text is as in `Claims.exact`; None takes
     the claims of the factory. `num_streams` random streams are drawn for each promise that speaks of any order.
     """
-    checks = estimator_checks(factory, exact=exact, seed=seed, num_streams=num_streams, **options)
+    checks = estimator_checks(
+        factory, exact=exact, seed=seed, num_streams=num_streams, **options
+    )
     run_all(_name(factory), checks)
 
 
 def estimator_checks(
-    factory: str | Factory, *, exact: bool | str | None = None, seed: int = 0, num_streams: int = 10, **options: Any
+    factory: str | Factory,
+    *,
+    exact: bool | str | None = None,
+    seed: int = 0,
+    num_streams: int = 10,
+    **options: Any,
 ) -> dict[str, Callable[[], None]]:
     """The checks of `check_estimator` one by one, by name of the promise: for `pytest.mark.parametrize`."""
     made = ESTIMATORS.load(factory) if isinstance(factory, str) else factory
     claims = Claims.of(made)
     if exact is not None:
-        claims = replace(claims, exact=exact if isinstance(exact, str) else EXACT if exact else "")
+        claims = replace(
+            claims, exact=exact if isinstance(exact, str) else EXACT if exact else ""
+        )
     subject = Subject(_name(factory), made, claims, options)
     promised = [promise for promise in _PROMISES if promise.applies(claims)]
-    return {promise.name: partial(promise.run, subject, seed, num_streams) for promise in promised}
+    return {
+        promise.name: partial(promise.run, subject, seed, num_streams)
+        for promise in promised
+    }
 
 
 def _name(factory: str | Factory) -> str:
-    return factory if isinstance(factory, str) else getattr(factory, "__name__", repr(factory))
+    return (
+        factory
+        if isinstance(factory, str)
+        else getattr(factory, "__name__", repr(factory))
+    )

@@ -16,7 +16,12 @@ class BrokenPromiseError(AssertionError):
     """A contract is broken: `promises` holds what is wrong by name of the promise."""
 
     def __init__(self, what: str, promises: Mapping[str, str]) -> None:
-        super().__init__("\n\n".join(f"{what}: broken promise: it {name}\n{text}" for name, text in promises.items()))
+        super().__init__(
+            "\n\n".join(
+                f"{what}: broken promise: it {name}\n{text}"
+                for name, text in promises.items()
+            )
+        )
         self.promises = dict(promises)
 
 
@@ -45,10 +50,16 @@ def require(condition: object, text: str) -> None:
 def sound(mean: FloatArray, covariance: FloatArray, what: str) -> None:
     """Raise `WrongError` unless a mean is finite and a covariance symmetric and positive definite."""
     require(np.isfinite(mean).all(), f"the mean of {what} is {mean}")
-    require((covariance == covariance.T).all(), f"the covariance of {what} is not symmetric")
+    require(
+        (covariance == covariance.T).all(), f"the covariance of {what} is not symmetric"
+    )
     scale = np.sqrt(np.abs(np.diag(covariance)))
     known = np.isfinite(scale).all() and (np.diag(covariance) > 0.0).all()
-    least = np.linalg.eigvalsh(covariance / np.outer(scale, scale)).min() if known else -np.inf
+    least = (
+        np.linalg.eigvalsh(covariance / np.outer(scale, scale)).min()
+        if known
+        else -np.inf
+    )
     require(least > 0.0, f"the covariance of {what} is not positive definite")
 
 
@@ -75,12 +86,16 @@ class Subject:
 
     def start(self, stream: Stream) -> Estimator:
         """A new one for the object of `stream`."""
-        return start_estimator(self.name, self.factory, stream.motion, stream.start, LAG_S, self.options)
+        return start_estimator(
+            self.name, self.factory, stream.motion, stream.start, LAG_S, self.options
+        )
 
     def fed(self, stream: Stream) -> tuple[Estimator, list[UpdateResult]]:
         """A new one that has taken all of `stream`, and the results."""
         estimator = self.start(stream)
-        return estimator, [estimator.update(measurement) for measurement in stream.measurements]
+        return estimator, [
+            estimator.update(measurement) for measurement in stream.measurements
+        ]
 
 
 Draw = Callable[[np.random.Generator], Stream]
@@ -105,14 +120,18 @@ class Promise:
                 wrong = fault(self.check, subject, stream)
                 index = 0
                 while wrong and index < len(stream.measurements) > 1:
-                    fewer = stream.measurements[:index] + stream.measurements[index + 1 :]
+                    fewer = (
+                        stream.measurements[:index] + stream.measurements[index + 1 :]
+                    )
                     smaller = replace(stream, measurements=fewer)
                     if still := fault(self.check, subject, smaller):
                         stream, wrong = smaller, still
                     else:
                         index += 1
                 if wrong:
-                    raise BrokenPromiseError(subject.name, {self.name: f"{wrong}\n{stream}"})
+                    raise BrokenPromiseError(
+                        subject.name, {self.name: f"{wrong}\n{stream}"}
+                    )
 
     @property
     def name(self) -> str:

@@ -37,7 +37,10 @@ _STEP_TOLERANCE, _UPDATE_TOLERANCE, _QUOTIENT_STEP = 1e-9, 1e-10, 1e-6
 
 
 def dense_joint(
-    motion: MotionModel, prior: Start, measurements: Sequence[Measurement], stamps_ns: Iterable[int]
+    motion: MotionModel,
+    prior: Start,
+    measurements: Sequence[Measurement],
+    stamps_ns: Iterable[int],
 ) -> dict[int, TrackState]:
     """States at `stamps_ns` (from the prior's stamp on) given all `measurements`, by stamp.
 
@@ -52,15 +55,27 @@ def dense_joint(
     and for a motion model without an equation.
     """
     wanted = sorted(set(stamps_ns))
-    stamps = sorted({prior.stamp_ns, *wanted, *(item.stamp_ns for item in measurements)})
+    stamps = sorted(
+        {prior.stamp_ns, *wanted, *(item.stamp_ns for item in measurements)}
+    )
     if stamps[0] < prior.stamp_ns:
-        raise CallError(f"dense_joint: stamp {stamps[0]} ns lies before the prior's, {prior.stamp_ns} ns")
-    linear = motion.linear and all(item.model.linear and item.loss is None for item in measurements)
-    n, size, nodes = motion.dim, motion.dim * len(stamps), {stamp_ns: k for k, stamp_ns in enumerate(stamps)}
+        raise CallError(
+            f"dense_joint: stamp {stamps[0]} ns lies before the prior's, {prior.stamp_ns} ns"
+        )
+    linear = motion.linear and all(
+        item.model.linear and item.loss is None for item in measurements
+    )
+    n, size, nodes = (
+        motion.dim,
+        motion.dim * len(stamps),
+        {stamp_ns: k for k, stamp_ns in enumerate(stamps)},
+    )
     start, P0 = initial_state(motion, prior)
     filtered = kalman_filter(motion, prior, [] if linear else measurements, stamps)
     means = np.array([filtered[at_ns].mean for at_ns in stamps])
-    durations_s = np.array([seconds(after - before) for before, after in pairwise(stamps)])
+    durations_s = np.array(
+        [seconds(after - before) for before, after in pairwise(stamps)]
+    )
     for _ in range(1 if linear else _NEWTON_STEPS):
         d, M = np.zeros(means.shape), np.zeros((*means.shape, size))
         d[0], M[0, :, :n] = start - means[0], np.linalg.cholesky(P0)
@@ -74,15 +89,22 @@ def dense_joint(
             k = nodes[item.stamp_ns]
             y, H = innovation(motion, item, means[k])
             root = np.linalg.cholesky(item.R / _weight(item, y))
-            rows.append(np.linalg.solve(root, np.column_stack([H @ M[k], y - H @ d[k]])))
+            rows.append(
+                np.linalg.solve(root, np.column_stack([H @ M[k], y - H @ d[k]]))
+            )
         R = np.asarray(np.linalg.qr(np.vstack(rows), mode="r"))[:size]
         step = d + M @ np.linalg.solve(R[:, :size], R[:, size])
         means = means + step
         if np.abs(step).max() < _STEP_TOLERANCE:
             break
     chosen = [nodes[stamp_ns] for stamp_ns in wanted]
-    roots = np.linalg.solve(R[:, :size].T, M[chosen].reshape(-1, size).T).T.reshape(len(wanted), n, size)
-    return {at: TrackState(at, means[k], S @ S.T) for at, k, S in zip(wanted, chosen, roots, strict=True)}
+    roots = np.linalg.solve(R[:, :size].T, M[chosen].reshape(-1, size).T).T.reshape(
+        len(wanted), n, size
+    )
+    return {
+        at: TrackState(at, means[k], S @ S.T)
+        for at, k, S in zip(wanted, chosen, roots, strict=True)
+    }
 
 
 def kalman_filter(
@@ -97,9 +119,15 @@ def kalman_filter(
     filter linearises each measurement at the result of its update. Raises `CallError` for a motion model without an
     equation.
     """
-    (x, P), now_ns, wanted = initial_state(motion, prior), prior.stamp_ns, set(stamps_ns)
+    (x, P), now_ns, wanted = (
+        initial_state(motion, prior),
+        prior.stamp_ns,
+        set(stamps_ns),
+    )
     newest_ns, states = max(wanted), dict[int, TrackState]()
-    for at_ns in sorted(wanted | {item.stamp_ns for item in measurements if item.stamp_ns <= newest_ns}):
+    for at_ns in sorted(
+        wanted | {item.stamp_ns for item in measurements if item.stamp_ns <= newest_ns}
+    ):
         if at_ns > now_ns:
             state = predicted(motion, TrackState(now_ns, x, P), at_ns)
             x, P, now_ns = state.mean, state.covariance, at_ns
@@ -112,7 +140,9 @@ def kalman_filter(
 
 def predicted(motion: MotionModel, state: TrackState, stamp_ns: int) -> TrackState:
     """The state (n,) moved on to `stamp_ns`. Raises `CallError` for a motion model without an equation."""
-    ahead = _moments(motion, state.mean[None], np.array([seconds(stamp_ns - state.stamp_ns)]))
+    ahead = _moments(
+        motion, state.mean[None], np.array([seconds(stamp_ns - state.stamp_ns)])
+    )
     F = ahead.F[0]
     return TrackState(stamp_ns, ahead.mean[0], F @ state.covariance @ F.T + ahead.Q[0])
 
@@ -142,35 +172,54 @@ def _moments(motion: MotionModel, x: FloatArray, dt_s: FloatArray) -> Moments:
     """Moments of the states x (m, n) after `dt_s` (m,). Raises `CallError` for a model without an equation."""
     equation = equation_of(motion)
     if equation is None:
-        raise CallError(f"no reference for {motion!r}: fgtrack.testing.equations has no equation for it")
+        raise CallError(
+            f"no reference for {motion!r}: fgtrack.testing.equations has no equation for it"
+        )
     if not motion.linear:
         return moments(equation, x, dt_s)
     parts = [_linear_moments(equation, motion.dim, float(t)) for t in dt_s]
-    F, Q = (np.array([part[k] for part in parts]).reshape(-1, motion.dim, motion.dim) for k in range(2))
+    F, Q = (
+        np.array([part[k] for part in parts]).reshape(-1, motion.dim, motion.dim)
+        for k in range(2)
+    )
     return Moments(np.vecdot(F, x[:, None, :]), F, Q)
 
 
 @cache
-def _linear_moments(equation: MotionEquation, n: int, dt_s: float) -> tuple[FloatArray, FloatArray]:
+def _linear_moments(
+    equation: MotionEquation, n: int, dt_s: float
+) -> tuple[FloatArray, FloatArray]:
     """F and Q (n, n) of a linear equation by one matrix exponential (Van Loan, IEEE TAC 23(3), 1978)."""
     x = np.zeros((1, n))
-    A, D = drift_jacobian(equation, x)[0], np.asarray(equation.diffusion(x[0]), dtype=np.float64)
+    A, D = (
+        drift_jacobian(equation, x)[0],
+        np.asarray(equation.diffusion(x[0]), dtype=np.float64),
+    )
     exponential = expm(dt_s * np.block([[-A, D], [np.zeros((n, n)), A.T]]))
     F = exponential[n:, n:].T
     Q = F @ exponential[:n, n:]
     return F, (Q + Q.T) / 2.0
 
 
-def innovation(motion: MotionModel, item: Measurement, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+def innovation(
+    motion: MotionModel, item: Measurement, x: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Innovation y (k,) of a measurement at the state x (n,), and its Jacobian H (k, n)."""
-    known: Linearisation = linearised(item.model.components, motion.state_names, x, item.pose)
+    known: Linearisation = linearised(
+        item.model.components, motion.state_names, x, item.pose
+    )
     return residual(item.model.components, item.z, known.z), known.H
 
 
 def slope(function: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:
     """Jacobian of `function` at `x` (n,) by difference quotients, shape (k, n)."""
     steps = _QUOTIENT_STEP * (1.0 + np.abs(x)) * np.eye(len(x))
-    return np.column_stack([(function(x + step) - function(x - step)) / (2.0 * step.sum()) for step in steps])
+    return np.column_stack(
+        [
+            (function(x + step) - function(x - step)) / (2.0 * step.sum())
+            for step in steps
+        ]
+    )
 
 
 def _weight(item: Measurement, y: FloatArray) -> float:
@@ -189,7 +238,9 @@ def _huber_width(loss: RobustLoss, size: int) -> float:
     return float(stats.chi.isf(2.0 * stats.norm.sf(loss.width), size))
 
 
-def difference(found: TrackState, expected: TrackState, motion: MotionModel | None = None) -> tuple[float, float]:
+def difference(
+    found: TrackState, expected: TrackState, motion: MotionModel | None = None
+) -> tuple[float, float]:
     """Distance of `found` from `expected`: the largest difference of means and covariances, in standard deviations.
     A covariance is relative to the two standard deviations of its entry; a NaN stays one. The yaw of a state of
     `motion` goes the short way round.
@@ -200,7 +251,9 @@ def difference(found: TrackState, expected: TrackState, motion: MotionModel | No
     return float((np.abs(off) / sigma).max()), float(covariance.max())
 
 
-def rounding_bound(motion: MotionModel, stamps_ns: Iterable[int], sigma_m: float = 0.5) -> float:
+def rounding_bound(
+    motion: MotionModel, stamps_ns: Iterable[int], sigma_m: float = 0.5
+) -> float:
     """Bound of the rounding errors, in standard deviations, of a solver that divides by a linear model's process noise.
 
     Given its end, the start of a segment is known to 1 / W = sqrt(Q_xx) / 2, 3e-11 m for 1 us of CV; beside a row that

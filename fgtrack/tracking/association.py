@@ -116,13 +116,20 @@ class GatedEuclidean:
     ) -> Assignment:
         """Return the assignment with other gates; `gates_m` broadcasts to (candidates, tracks)."""
         is_one = isinstance(gates_m, float)
-        pairs = near(candidates, states.means, gates_m if is_one else float(np.max(gates_m, initial=0.0)), apart)
+        pairs = near(
+            candidates,
+            states.means,
+            gates_m if is_one else float(np.max(gates_m, initial=0.0)),
+            apart,
+        )
         if not is_one:
             limits_m = np.broadcast_to(gates_m, (len(candidates), len(states.means)))
             pairs = pairs.at(pairs.values <= limits_m[pairs.rows, pairs.columns])
         inside, readings = pairs, list[Readings]()
         if self.max_nis is not None and len(pairs.rows):
-            _, is_inside, readings = weighed(pairs, candidates, states, facings, partial(_same_limits, self.max_nis))
+            _, is_inside, readings = weighed(
+                pairs, candidates, states, facings, partial(_same_limits, self.max_nis)
+            )
             inside = pairs if all(is_inside.tolist()) else pairs.at(is_inside)
         assignment = assigned(inside, len(candidates), len(states.means))
         if readings:
@@ -173,35 +180,66 @@ class GatedMahalanobis:
         return assignment._replace(readings=tuple(readings)) if readings else assignment
 
     def gated(
-        self, candidates: Candidates, states: StatesAt, apart: Apart | None = None, facings: Facings | None = None
+        self,
+        candidates: Candidates,
+        states: StatesAt,
+        apart: Apart | None = None,
+        facings: Facings | None = None,
     ) -> Pairs:
         """Return the pairs inside the gate with their cost NIS + log det S: a vague track does not win by it."""
         return self._gated(candidates, states, apart, facings)[0]
 
     def _gated(
-        self, candidates: Candidates, states: StatesAt, apart: Apart | None, facings: Facings | None
+        self,
+        candidates: Candidates,
+        states: StatesAt,
+        apart: Apart | None,
+        facings: Facings | None,
     ) -> tuple[Pairs, list[Readings]]:
         reach_m: float | FloatArray = self.max_distance_m
         if len(candidates) * len(states.means) > MOST_NEAR:
             weight = apart.weight if isinstance(apart, Evidence) else 0.0
-            reach_m = reaches_m(candidates.groups, states, self.gate_probability, self.max_distance_m, weight)
-        pairs = near(candidates, states.means, reach_m, apart.differ if isinstance(apart, Evidence) else apart)
+            reach_m = reaches_m(
+                candidates.groups,
+                states,
+                self.gate_probability,
+                self.max_distance_m,
+                weight,
+            )
+        pairs = near(
+            candidates,
+            states.means,
+            reach_m,
+            apart.differ if isinstance(apart, Evidence) else apart,
+        )
         more = None
         if isinstance(apart, Evidence):
             more = apart.nis(pairs.rows, pairs.columns)
-            largest = max(len(group.stack.model.components) for group in candidates.groups)
+            largest = max(
+                len(group.stack.model.components) for group in candidates.groups
+            )
             likely = more <= chi_square_quantile(self.gate_probability, largest)
             pairs, more = pairs.at(likely), more[likely]
         limits = partial(_quantiles, self.gate_probability)
-        cost, inside, readings = weighed(pairs, candidates, states, facings, limits, more)
+        cost, inside, readings = weighed(
+            pairs, candidates, states, facings, limits, more
+        )
         return pairs._replace(values=cost).at(inside), readings
 
 
 def claimed(
-    assignment: Assignment, candidates: Candidates, states: StatesAt, claims_m: float | FloatArray, apart: Apart | None
+    assignment: Assignment,
+    candidates: Candidates,
+    states: StatesAt,
+    claims_m: float | FloatArray,
+    apart: Apart | None,
 ) -> Assignment:
     """Return `assignment` in which candidates at most `claims_m`, see `near`, from a track start none."""
-    rows = near(candidates, states.means, claims_m, apart).rows if assignment.new else np.zeros(0)
+    rows = (
+        near(candidates, states.means, claims_m, apart).rows
+        if assignment.new
+        else np.zeros(0)
+    )
     return _refusing(set(rows.tolist()).intersection(assignment.new), assignment)
 
 
@@ -210,7 +248,9 @@ def _refusing(suspects: set[int], assignment: Assignment) -> Assignment:
     if suspects.isdisjoint(assignment.new):
         return assignment
     refused = tuple([i for i in assignment.new if i in suspects])
-    return assignment._replace(new=[i for i in assignment.new if i not in suspects], refused=refused)
+    return assignment._replace(
+        new=[i for i in assignment.new if i not in suspects], refused=refused
+    )
 
 
 @cache
@@ -224,7 +264,15 @@ def chi_square_quantile(probability: float, freedom: int) -> float:
 @cache
 def _quantiles(probability: float, most: int) -> FloatArray:
     """`chi_square_quantile` of 0 to `most` degrees of freedom, shape (most + 1,)."""
-    return np.array([0.0, *(chi_square_quantile(probability, freedom) for freedom in range(1, most + 1))])
+    return np.array(
+        [
+            0.0,
+            *(
+                chi_square_quantile(probability, freedom)
+                for freedom in range(1, most + 1)
+            ),
+        ]
+    )
 
 
 @cache
@@ -239,12 +287,18 @@ def assigned(pairs: Pairs, num_candidates: int, num_tracks: int) -> Assignment:
     if _compete(i, j):
         pairs = pairs.at(_uncontested(pairs.rows, pairs.columns, pairs.values))
         pairs = pairs.at(_uncontested(pairs.columns, pairs.rows, pairs.values))
-        contested = (np.bincount(pairs.rows)[pairs.rows] > 1) | (np.bincount(pairs.columns)[pairs.columns] > 1)
+        contested = (np.bincount(pairs.rows)[pairs.rows] > 1) | (
+            np.bincount(pairs.columns)[pairs.columns] > 1
+        )
         chosen = ~contested
         if contested.any():
             chosen[contested.nonzero()[0][_least_cost(pairs.at(contested))]] = True
         i, j = pairs.rows[chosen].tolist(), pairs.columns[chosen].tolist()
-    new = sorted(set(range(num_candidates)).difference(i)) if len(i) < num_candidates else []
+    new = (
+        sorted(set(range(num_candidates)).difference(i))
+        if len(i) < num_candidates
+        else []
+    )
     missed = sorted(set(range(num_tracks)).difference(j)) if len(j) < num_tracks else []
     return Assignment(list(zip(i, j, strict=True)), new, missed)
 
@@ -266,20 +320,29 @@ def _least_cost(pairs: Pairs) -> IntArray:
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
-    (rows, i), (columns, j) = (np.unique(each, return_inverse=True) for each in pairs[:2])
+    (rows, i), (columns, j) = (
+        np.unique(each, return_inverse=True) for each in pairs[:2]
+    )
     if len(rows) > len(columns):
         rows, i, columns, j = columns, j, rows, i
     own, shape = np.arange(len(rows)), (len(rows), len(columns) + len(rows))
-    shifted = pairs.values + (1.0 - pairs.values.min())  # a sparse graph has no edges of weight 0
+    shifted = pairs.values + (
+        1.0 - pairs.values.min()
+    )  # a sparse graph has no edges of weight 0
     costs = np.concatenate([shifted, np.full(len(rows), _OUTSIDE)])
     edges = np.concatenate([i, own]), np.concatenate([j, len(columns) + own])
     of, taken = min_weight_full_bipartite_matching(csr_array((costs, edges), shape))
     inside, width, order = taken < len(columns), len(columns), np.lexsort((j, i))
-    return order[(i * width + j)[order].searchsorted(of[inside] * width + taken[inside])]
+    return order[
+        (i * width + j)[order].searchsorted(of[inside] * width + taken[inside])
+    ]
 
 
 def near(
-    candidates: Candidates, means: FloatArray, reach_m: float | FloatArray, excluded: Apart | None = None
+    candidates: Candidates,
+    means: FloatArray,
+    reach_m: float | FloatArray,
+    excluded: Apart | None = None,
 ) -> Pairs:
     """Return the pairs, with distances, at most `reach_m` (a number or one for each track) apart and not `excluded`.
     Of a candidate with more than `MOST_NEAR` tracks so near, the nearest of them. Distances are in the map; that of a
@@ -288,7 +351,11 @@ def near(
     limits_m = np.empty(len(means))
     limits_m[:] = reach_m
     tracks = np.ascontiguousarray(means), means[:, 0].argsort()
-    pairs = Pairs(*kernels("fgtrack.tracking.kernels").near(candidates.lines, *tracks, limits_m, MOST_NEAR))
+    pairs = Pairs(
+        *kernels("fgtrack.tracking.kernels").near(
+            candidates.lines, *tracks, limits_m, MOST_NEAR
+        )
+    )
     return pairs if excluded is None else pairs.at(~excluded(pairs.rows, pairs.columns))
 
 
@@ -300,7 +367,9 @@ def _innovations_of(
     x = states.means.take(columns, axis=0)
     y, H = own.model.linearised(own.z.take(members, axis=0), x, own.pose)
     R, every = group.noise(members, x, P, columns), np.arange(y.shape[1])
-    _, nis, logdet = kernels("fgtrack.estimation.kernels.kalman").innovations(y, stacked(H), P, columns, R, every)
+    _, nis, logdet = kernels("fgtrack.estimation.kernels.kalman").innovations(
+        y, stacked(H), P, columns, R, every
+    )
     return nis, logdet
 
 
@@ -316,7 +385,11 @@ def weighed(
     `limits` gives the largest NIS of 0 to k components, shape (k + 1,); `more` (m,) is added to the NIS. With `facings`
     the cost is that of the likeliest reading of a yaw, see `fgtrack.tracking.facing`, and one reading has to be inside.
     """
-    cost, inside, readings = np.empty(len(pairs.rows)), np.empty(len(pairs.rows), dtype=bool), list[Readings]()
+    cost, inside, readings = (
+        np.empty(len(pairs.rows)),
+        np.empty(len(pairs.rows), dtype=bool),
+        list[Readings](),
+    )
     for group, members, chosen in candidates.split(pairs.rows) if len(cost) else ():
         columns = pairs.columns.take(chosen)
         own_more = None if more is None else more[chosen]
@@ -334,7 +407,11 @@ def weighed(
 
 
 def reaches_m(
-    groups: Sequence[Group], states: StatesAt, probability: float, limit_m: float, more_nis: float = 0.0
+    groups: Sequence[Group],
+    states: StatesAt,
+    probability: float,
+    limit_m: float,
+    more_nis: float = 0.0,
 ) -> FloatArray:
     """Largest distance from each track of a candidate with a NIS up to the quantile of `probability` and `more_nis`.
     Shape (tracks,).
@@ -345,21 +422,30 @@ def reaches_m(
     for group in groups:
         model, pose = group.stack.model, group.stack.pose
         plain = model.components[:2] == ("x_m", "y_m")
-        if not plain or not np.array_equal(model.predict(states.means, pose)[:, :2], states.means[:, :2]):
+        if not plain or not np.array_equal(
+            model.predict(states.means, pose)[:, :2], states.means[:, :2]
+        ):
             return np.full(len(states.means), limit_m)
         own_m2, quantile = (
             _largest_variances(group.stack.R).max(),
             chi_square_quantile(probability, len(model.components)) + more_nis,
         )
         if group.stamp_error is not None:
-            late = group.stamp_error.noise(model, pose, states.means, states.covariances)
+            late = group.stamp_error.noise(
+                model, pose, states.means, states.covariances
+            )
             own_m2 = own_m2 + late[:, :2, :2].trace(axis1=1, axis2=2)
-        squared_m2 = np.maximum(squared_m2, quantile * (_largest_variances(states.covariances) + own_m2))
+        squared_m2 = np.maximum(
+            squared_m2, quantile * (_largest_variances(states.covariances) + own_m2)
+        )
     return np.minimum(np.sqrt(squared_m2) * _MARGIN, limit_m)
 
 
 def _largest_variances(covariances: FloatArray) -> FloatArray:
     """Larger eigenvalues, shape (m,), of the position blocks of (m, n, n)."""
     blocks = symmetrise(covariances[:, :2, :2])
-    middle, half = 0.5 * (blocks[:, 0, 0] + blocks[:, 1, 1]), 0.5 * (blocks[:, 0, 0] - blocks[:, 1, 1])
+    middle, half = (
+        0.5 * (blocks[:, 0, 0] + blocks[:, 1, 1]),
+        0.5 * (blocks[:, 0, 0] - blocks[:, 1, 1]),
+    )
     return np.asarray(middle + np.hypot(half, blocks[:, 0, 1]))

@@ -13,7 +13,11 @@ from fgtrack.core.settings import settings
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, EgoState, FloatArray
 from fgtrack.estimation.base import Measurement, Start, StatesAt
-from fgtrack.models.correlated_errors import component_cross, position_cross, total_error
+from fgtrack.models.correlated_errors import (
+    component_cross,
+    position_cross,
+    total_error,
+)
 from fgtrack.models.measurement import position_gradient
 from fgtrack.models.road import Road
 from fgtrack.tracking.preprocess import Candidate
@@ -44,7 +48,9 @@ class Birth:
     across_std_m: PositiveFloat = 0.1
     """Standard deviation of the position across the heading (`kind: fixed`)."""
 
-    def prior(self, candidate: Candidate, road: Road, ego: EgoState | None, ego_in_pit: bool) -> Start | None:
+    def prior(
+        self, candidate: Candidate, road: Road, ego: EgoState | None, ego_in_pit: bool
+    ) -> Start | None:
         """First state at the candidate's stamp; None where it has no position to start from.
         Measured components come first, then map heading, road curvature and a share of the ego speed.
         """
@@ -57,26 +63,40 @@ class Birth:
             curvature_radpm = float(view.curvature_radpm[0])
             if yaw_rad is None:
                 yaw_rad = float(view.yaw_rad[0])
-        assumed_mps = 0.0 if ego is None or ego_in_pit else self.ego_speed_factor * ego.speed_mps
+        assumed_mps = (
+            0.0 if ego is None or ego_in_pit else self.ego_speed_factor * ego.speed_mps
+        )
         speed_mps = values.get("speed_mps", assumed_mps)
         slow = ego is not None and ego.speed_mps < self.slow_ego_mps
         if self.kind == "measured":
             R = total_error(measurement.model, measurement.R)
             stds = dict(zip(values, np.sqrt(np.diag(R)).tolist(), strict=True))
             crosses = _crosses(measurement, R)
-            position = np.zeros((2, 2)) if candidate.position_covariance is None else candidate.position_covariance
-            speed_variance = speed_mps**2 + stds.get("speed_mps", self.speed_std_mps) ** 2
-            position = position + candidate.stamp_std_s**2 * speed_variance * np.eye(2)  # in an unknown direction
+            position = (
+                np.zeros((2, 2))
+                if candidate.position_covariance is None
+                else candidate.position_covariance
+            )
+            speed_variance = (
+                speed_mps**2 + stds.get("speed_mps", self.speed_std_mps) ** 2
+            )
+            position = position + candidate.stamp_std_s**2 * speed_variance * np.eye(
+                2
+            )  # in an unknown direction
         else:
             stds, crosses, turn = {}, {}, rotation(yaw_rad or 0.0)
-            position = turn @ np.diag([self.along_std_m**2, self.across_std_m**2]) @ turn.T
+            position = (
+                turn @ np.diag([self.along_std_m**2, self.across_std_m**2]) @ turn.T
+            )
         return Start(
             stamp_ns=measurement.stamp_ns,
             position_m=candidate.position_m,
             position_covariance=position,
             **crosses,
             yaw_rad=yaw_rad,
-            yaw_std_rad=stds.get("yaw_rad", self.yaw_std_rad) if yaw_rad is not None else None,
+            yaw_std_rad=stds.get("yaw_rad", self.yaw_std_rad)
+            if yaw_rad is not None
+            else None,
             speed_mps=speed_mps,
             speed_std_mps=stds.get("speed_mps", self.speed_std_mps),
             yaw_rate_radps=speed_mps * curvature_radpm,
@@ -101,7 +121,9 @@ def _crosses(measurement: Measurement, R: FloatArray) -> dict[str, Any]:
             x_m, y_m = (G @ R[:, components.index(name)]).tolist()
             position[name] = x_m, y_m
     if len(measured) == 2:
-        yaw["speed_mps"] = float(R[components.index("yaw_rad"), components.index("speed_mps")])
+        yaw["speed_mps"] = float(
+            R[components.index("yaw_rad"), components.index("speed_mps")]
+        )
     return {"position_cross": position, "yaw_cross": yaw, "speed_cross": speed}
 
 
@@ -127,8 +149,16 @@ def in_any_direction(
                 continue
         yaw_rad = float(states.means[row, YAW])
         std_m = start.speed_std_mps * seconds(stamp_ns - start.stamp_ns)
-        along, across = np.array([[math.cos(yaw_rad), math.sin(yaw_rad)], [-math.sin(yaw_rad), math.cos(yaw_rad)]])
-        if until_ns > stamp_ns and along @ covariances[row, :2, :2] @ along < (0.5 * std_m) ** 2:
+        along, across = np.array(
+            [
+                [math.cos(yaw_rad), math.sin(yaw_rad)],
+                [-math.sin(yaw_rad), math.cos(yaw_rad)],
+            ]
+        )
+        if (
+            until_ns > stamp_ns
+            and along @ covariances[row, :2, :2] @ along < (0.5 * std_m) ** 2
+        ):
             continue
         covariances[row, :2, :2] += np.outer(std_m * across, std_m * across)
     return replace(states, covariances=covariances)

@@ -13,9 +13,15 @@ import numpy as np
 from fgtrack.core.geometry import circular_mean, rotations
 from fgtrack.core.linalg import congruence, kernels
 from fgtrack.core.types import BoolArray, Detection, FloatArray, IntArray
-from fgtrack.models.measurement import ANGULAR, COMPONENTS, MIN_RANGE_M, MeasurementModel, SensorPose
+from fgtrack.models.measurement import (
+    ANGULAR,
+    COMPONENTS,
+    MIN_RANGE_M,
+    MeasurementModel,
+    SensorPose,
+)
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.ego import EgoPose
+from fgtrack.tracking.ego.trajectory import EgoPose
 from fgtrack.tracking.inbox import Batch, own_covariance
 
 X, YAW, RANGE, BEARING, CURVATURE = map(
@@ -78,14 +84,20 @@ def in_map_frame(batches: Sequence[PosedBatch]) -> MapDetections:
     indices: list[int] = []
     for batch, sensor, _, _ in batches:
         read, own = _reading(tuple(sensor.std))
-        numbers += chain.from_iterable(map(read, map(batch.message.objects.__getitem__, batch.indices)))
+        numbers += chain.from_iterable(
+            map(read, map(batch.message.objects.__getitem__, batch.indices))
+        )
         columns.append(own)
         indices += batch.indices
     poses, first_rows = np.array([each.pose for each in batches]), np.array(starts)
     moves = np.array([each.batch.message.frame != "map" for each in batches])
     read_values = np.array(numbers, dtype=np.float64), np.array(columns)
-    arrays = kernels("fgtrack.tracking.kernels").to_map(*read_values, first_rows, poses, moves)
-    return MapDetections(batches, poses, first_rows, np.array(indices, dtype=np.int64), *arrays)
+    arrays = kernels("fgtrack.tracking.kernels").to_map(
+        *read_values, first_rows, poses, moves
+    )
+    return MapDetections(
+        batches, poses, first_rows, np.array(indices, dtype=np.int64), *arrays
+    )
 
 
 def move_back(items: MapDetections, by_m: FloatArray) -> None:
@@ -103,20 +115,30 @@ def merged(items: MapDetections, merge: "Merge") -> MapDetections:
     """Return `items` with those of one object averaged, in the order of the merge; bearings alone are last.
     Averaged are the components that all have; where none of these gives a position, the leading one stands for all.
     """
-    bearing, apart = np.isnan(items.points_m[:, 0]), merge.apart(items.points_m, items.starts)
+    bearing, apart = (
+        np.isnan(items.points_m[:, 0]),
+        merge.apart(items.points_m, items.starts),
+    )
     if all(apart) and not len(bearing.nonzero()[0]):
         return items
     rows, members_of = list[int](), dict[int, list[int]]()  # by the row that leads
     for k, (first, end) in enumerate(pairwise(items.starts.tolist())):
         placed = (first + np.flatnonzero(~bearing[first:end])).tolist()
-        groups = {row: (row,) for row in range(len(placed))} if apart[k] else merge.groups(items.points_m[placed])
+        groups = (
+            {row: (row,) for row in range(len(placed))}
+            if apart[k]
+            else merge.groups(items.points_m[placed])
+        )
         for row, group in groups.items():
             if len(group) > 1:
                 members_of[len(rows)] = [placed[member] for member in group]
             rows.append(placed[row])
         rows += (first + np.flatnonzero(bearing[first:end])).tolist()
     result, claimed, of = items.at(np.array(rows, dtype=np.int64)), set(rows), items.of
-    others, averaged = dict[tuple[int, int], tuple[int, ...]](), dict[tuple[int, int], MapDetections]()
+    others, averaged = (
+        dict[tuple[int, int], tuple[int, ...]](),
+        dict[tuple[int, int], MapDetections](),
+    )
     for row, members in members_of.items():
         key = int(of[rows[row]]), int(result.indices[row])
         new = [member for member in members if member not in claimed]
@@ -127,24 +149,38 @@ def merged(items: MapDetections, merge: "Merge") -> MapDetections:
         if X in columns or (RANGE in columns and BEARING in columns):
             averaged[key] = parts
             result.values[row] = np.nan
-            result.values[row, columns] = [merge.mean(COMPONENTS[k], parts.values[:, k]) for k in columns]
+            result.values[row, columns] = [
+                merge.mean(COMPONENTS[k], parts.values[:, k]) for k in columns
+            ]
             result.points_m[row] = parts.points_m.mean(axis=0)
             result.map_yaw[row] = parts.map_yaw.any()
     return result._replace(merged=others, averaged=averaged)
 
 
-def covariances(items: MapDetections, k: int, rows: IntArray | slice, names: tuple[str, ...]) -> FloatArray:
+def covariances(
+    items: MapDetections, k: int, rows: IntArray | slice, names: tuple[str, ...]
+) -> FloatArray:
     """Covariances of `names` in the map, shape (m, k, k), of the `rows` of `items`, which are of batch k.
     A detection's own where it has one, else the sensor's R. What the map gave has the sensor's standard deviation for
     it and is not correlated with the rest. The covariance of an average is the mean of those of its detections.
     """
-    (batch, sensor, _, pose), indices, points_m = items.batches[k], items.indices[rows].tolist(), items.points_m[rows]
+    (batch, sensor, _, pose), indices, points_m = (
+        items.batches[k],
+        items.indices[rows].tolist(),
+        items.points_m[rows],
+    )
     m = len(indices)
     R = np.empty((m, len(names), len(names)))
     R[:] = sensor.noise(names)
     turns = "x_m" in names and not sensor.round
-    offsets_m = points_m - np.array(pose[:2]) if turns or sensor.std_growth else points_m
-    more = sensor.growth(names, np.hypot(offsets_m[:, 0], offsets_m[:, 1])) if sensor.std_growth else None
+    offsets_m = (
+        points_m - np.array(pose[:2]) if turns or sensor.std_growth else points_m
+    )
+    more = (
+        sensor.growth(names, np.hypot(offsets_m[:, 0], offsets_m[:, 1]))
+        if sensor.std_growth
+        else None
+    )
     if more is not None:
         R.reshape(m, -1)[:, :: len(names) + 1] += more
     carrying = []
@@ -152,7 +188,11 @@ def covariances(items: MapDetections, k: int, rows: IntArray | slice, names: tup
         detection = batch.message.objects[index]
         if detection.covariance is not None:
             carrying.append(row)
-            carried = [name for name in names if name in detection.measured and name in sensor.std]
+            carried = [
+                name
+                for name in names
+                if name in detection.measured and name in sensor.std
+            ]
             here = [names.index(name) for name in carried]
             R[row][np.ix_(here, here)] = own_covariance(detection, carried)
     if carrying and "x_m" in names and batch.message.frame != "map":
@@ -162,16 +202,22 @@ def covariances(items: MapDetections, k: int, rows: IntArray | slice, names: tup
         R[rest] = _turned(R[rest], np.arctan2(offsets_m[rest, 1], offsets_m[rest, 0]))
     for row, index in enumerate(indices if items.averaged else ()):
         if (k, index) in items.averaged:
-            R[row] = covariances(items.averaged[k, index], k, slice(None), names).mean(axis=0)
+            R[row] = covariances(items.averaged[k, index], k, slice(None), names).mean(
+                axis=0
+            )
     return R
 
 
 @cache
-def _reading(names: tuple[str, ...]) -> tuple[Callable[[Detection], Any], tuple[int, ...]]:
+def _reading(
+    names: tuple[str, ...],
+) -> tuple[Callable[[Detection], Any], tuple[int, ...]]:
     """Return what reads the components `names` of a detection, a tuple, and their columns, followed by -1."""
     columns = [*map(COMPONENTS.index, names), *[-1] * (len(COMPONENTS) - len(names))]
     read = attrgetter(*names)
-    return read if len(names) > 1 else lambda detection: (read(detection),), tuple(columns)
+    return read if len(names) > 1 else lambda detection: (read(detection),), tuple(
+        columns
+    )
 
 
 def _turned(R: FloatArray, yaws_rad: FloatArray) -> FloatArray:
@@ -200,7 +246,9 @@ class PoseError(NamedTuple):
         """Return that of some detections."""
         return PoseError(self.covariance, self.placement[rows], self.R[rows])
 
-    def noise(self, model: MeasurementModel, pose: SensorPose, x: FloatArray) -> FloatArray:
+    def noise(
+        self, model: MeasurementModel, pose: SensorPose, x: FloatArray
+    ) -> FloatArray:
         """R + G P_e G' at the states `x` (m, n), shape (m, k, k)."""
         R, G = self.R.copy(), self.placement
         if model.relative:
@@ -222,7 +270,11 @@ class Merge:
 
     def mean(self, name: str, values: FloatArray) -> float:
         """Average of component `name`; of angles on the circle."""
-        return circular_mean(values) if name in ANGULAR else float(values.sum() / len(values))
+        return (
+            circular_mean(values)
+            if name in ANGULAR
+            else float(values.sum() / len(values))
+        )
 
 
 @dataclass(frozen=True)
@@ -247,7 +299,9 @@ class ConnectedMerge(Merge):
         apart: list[bool] = self._linked(points_m, starts, 1.0 + 1e-9)[1].tolist()
         return apart
 
-    def _linked(self, points_m: FloatArray, starts: IntArray, margin: float = 1.0) -> tuple[IntArray, BoolArray]:
+    def _linked(
+        self, points_m: FloatArray, starts: IntArray, margin: float = 1.0
+    ) -> tuple[IntArray, BoolArray]:
         by_x = points_m[:, 0].argsort()
         if len(starts) > 2:
             by_x = by_x[starts.searchsorted(by_x, side="right").argsort(kind="stable")]

@@ -29,7 +29,17 @@ import numpy as np
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.linalg import kernels, stacked
-from fgtrack.core.types import ACCEL, SPEED, YAW, BoolArray, FloatArray, IntArray, SmoothedReport, TrackState, YawWord
+from fgtrack.core.types import (
+    ACCEL,
+    SPEED,
+    YAW,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    SmoothedReport,
+    TrackState,
+    YawWord,
+)
 from fgtrack.estimation.base import Measurement, Start, StatesAt
 from fgtrack.estimation.filters.propagation import States
 from fgtrack.tracking.preprocess import Candidates, Group
@@ -51,7 +61,10 @@ _RIGHT = np.array([1.0, 0.0, 0.0])
 _KERNELS = "fgtrack.tracking.facing_kernels"
 #: Bits of a reading; 0 takes the detection as it was measured.
 HALF_TURN, WITHOUT_YAW, REVERSED = 1, 2, 4
-_WORDS: "dict[int, YawWord]" = {1: "flipped", 2: "unused"}  # by the defect that the kernels number
+_WORDS: "dict[int, YawWord]" = {
+    1: "flipped",
+    2: "unused",
+}  # by the defect that the kernels number
 
 
 class Facings(NamedTuple):
@@ -152,11 +165,17 @@ def read(
     return Readings(group, members, columns, *found)
 
 
-def as_read(measurements: Measurement, readings: IntArray) -> list[tuple[IntArray | slice, Measurement]]:
+def as_read(
+    measurements: Measurement, readings: IntArray
+) -> list[tuple[IntArray | slice, Measurement]]:
     """Return the stack `measurements` as read by its `readings` (m,), and the rows of each part."""
     if not readings.any():
         return [(slice(None), measurements)]
-    names, z, R = measurements.model.components, measurements.z.copy(), measurements.R.copy()
+    names, z, R = (
+        measurements.model.components,
+        measurements.z.copy(),
+        measurements.R.copy(),
+    )
     turned = (readings & HALF_TURN) > 0
     if turned.any():
         yaw = names.index("yaw_rad")
@@ -170,12 +189,21 @@ def as_read(measurements: Measurement, readings: IntArray) -> list[tuple[IntArra
     parts = list[tuple[IntArray | slice, Measurement]]()
     for rows, columns in (
         ((~without).nonzero()[0], list(range(len(names)))),
-        (without.nonzero()[0], [k for k, name in enumerate(names) if name != "yaw_rad"]),
+        (
+            without.nonzero()[0],
+            [k for k, name in enumerate(names) if name != "yaw_rad"],
+        ),
     ):
         if len(rows):
-            model = measurements.model if len(columns) == len(names) else measurements.model.part(columns)
+            model = (
+                measurements.model
+                if len(columns) == len(names)
+                else measurements.model.part(columns)
+            )
             own = R[rows][:, columns][:, :, columns]
-            parts.append((rows, replace(measurements, model=model, z=z[rows][:, columns], R=own)))
+            parts.append(
+                (rows, replace(measurements, model=model, z=z[rows][:, columns], R=own))
+            )
     return parts
 
 
@@ -194,21 +222,31 @@ class Facing:
         self._stamps_ns = np.zeros(0, dtype=np.int64)
         self._turned = np.zeros(0, dtype=bool)
         self._is_any_turned = False
-        self._ended = set[int]()  # tracks that were published turned, until their last states are published
-        self._seen: dict[str, FloatArray] = {}  # by sensor: numbers of yaws that were right, flipped, anything
+        self._ended = set[
+            int
+        ]()  # tracks that were published turned, until their last states are published
+        self._seen: dict[
+            str, FloatArray
+        ] = {}  # by sensor: numbers of yaws that were right, flipped, anything
         self._shares: dict[str, FloatArray] = {}  # of the numbers, until they change
         self.counts: dict[str, Counter[str]] = {}
         """Numbers of yaws by sensor: all `yaws` of detections that tracks used, `flipped` yaws and `unused` yaws."""
 
     def at(self, sensor: str, track_ids: tuple[int, ...]) -> Facings:
         """Return the belief about some tracks for the detections of `sensor`."""
-        return Facings(self._log_odds[self._rows_of(track_ids)], self._shares_of(sensor), self._cartesian)
+        return Facings(
+            self._log_odds[self._rows_of(track_ids)],
+            self._shares_of(sensor),
+            self._cartesian,
+        )
 
     def _rows_of(self, track_ids: tuple[int, ...]) -> IntArray:
         """Return rows of the arrays, shape (m,). The rows of the last call are kept for the same tracks."""
         if track_ids != self._last_ids:
             self._last_ids = track_ids
-            self._last_rows = np.array([self._rows[track_id] for track_id in track_ids], dtype=np.int64)
+            self._last_rows = np.array(
+                [self._rows[track_id] for track_id in track_ids], dtype=np.int64
+            )
         return self._last_rows
 
     def _shares_of(self, sensor: str) -> FloatArray:
@@ -218,7 +256,9 @@ class Facing:
             shares = self._shares[sensor] = counts / counts.sum()
         return shares
 
-    def born(self, track_id: int, sensor: str, start: Start, first: Measurement) -> None:
+    def born(
+        self, track_id: int, sensor: str, start: Start, first: Measurement
+    ) -> None:
         """Begin the belief about a track with this `start` of its `first` measurement, by `sensor`."""
         log_odds = 0.0 if start.yaw_rad is None else MOST_EVIDENCE
         if "yaw_rad" in first.model.components and "yaw_rad" not in first.assumed:
@@ -228,11 +268,17 @@ class Facing:
             present = len(self._log_odds)
             more = max(present, 8)
             self._log_odds = np.concatenate([self._log_odds, np.zeros(more)])
-            self._stamps_ns = np.concatenate([self._stamps_ns, np.zeros(more, dtype=np.int64)])
+            self._stamps_ns = np.concatenate(
+                [self._stamps_ns, np.zeros(more, dtype=np.int64)]
+            )
             self._turned = np.concatenate([self._turned, np.zeros(more, dtype=bool)])
             self._free = list(range(present, present + more))
         row = self._rows[track_id] = self._free.pop()
-        self._log_odds[row], self._stamps_ns[row], self._turned[row] = log_odds, start.stamp_ns, False
+        self._log_odds[row], self._stamps_ns[row], self._turned[row] = (
+            log_odds,
+            start.stamp_ns,
+            False,
+        )
         self._last_ids = ()
 
     def read(
@@ -250,13 +296,20 @@ class Facing:
         """
         if not any(map(is_read, candidates.groups)):
             return None
-        useful = [each for each in found if _learns(each.group) or each.codes.max(initial=0) > 0]
+        useful = [
+            each
+            for each in found
+            if _learns(each.group) or each.codes.max(initial=0) > 0
+        ]
         if found and not useful:
             return None
         rows, columns = np.array(pairs).T
         keys = rows * len(states.means) + columns
         useful = useful or self._read(sensor, candidates, rows, columns, states)
-        readings, words = np.zeros(len(pairs), dtype=np.int64), list[YawWord | None]([None] * len(pairs))
+        readings, words = (
+            np.zeros(len(pairs), dtype=np.int64),
+            list[YawWord | None]([None] * len(pairs)),
+        )
         for each in useful:
             own = each.group.rows.take(each.members) * len(states.means) + each.columns
             at = own.searchsorted(keys)
@@ -266,28 +319,45 @@ class Facing:
             if _learns(each.group) and len(here):
                 has_yaw = _kind(each.group.stack.model.components).yaw >= 0
                 of = self._rows_of(states.track_ids)[columns[here]]
-                for k, word in self._learn(sensor, stamp_ns, of, codes, each.evidence[at], has_yaw):
+                for k, word in self._learn(
+                    sensor, stamp_ns, of, codes, each.evidence[at], has_yaw
+                ):
                     words[here[k]] = word
         return YawsRead(readings, words) if readings.any() or any(words) else None
 
     def _read(
-        self, sensor: str, candidates: Candidates, rows: IntArray, columns: IntArray, states: StatesAt
+        self,
+        sensor: str,
+        candidates: Candidates,
+        rows: IntArray,
+        columns: IntArray,
+        states: StatesAt,
     ) -> list[Readings]:
         """Return the readings of candidates `rows` as those of the tracks `columns`, both (m,), without a gate."""
         facings, result = self.at(sensor, states.track_ids), list[Readings]()
         for group, members, here in candidates.split(rows):
             if is_read(group):
                 limits = np.full(len(group.stack.model.components) + 1, np.inf)
-                result.append(read(group, members, columns[here], states, facings, limits))
+                result.append(
+                    read(group, members, columns[here], states, facings, limits)
+                )
         return result
 
     def _learn(
-        self, sensor: str, stamp_ns: int, rows: IntArray, codes: IntArray, evidence: FloatArray, has_yaw: bool
+        self,
+        sensor: str,
+        stamp_ns: int,
+        rows: IntArray,
+        codes: IntArray,
+        evidence: FloatArray,
+        has_yaw: bool,
     ) -> list[tuple[int, YawWord]]:
         """Learn from readings (m,) of detections of the tracks in `rows`; return the yaws with a defect, and which."""
         seen = self._seen.setdefault(sensor, np.zeros(3)) if has_yaw else np.zeros(3)
         arrays = self._log_odds, self._stamps_ns, seen
-        defects = kernels(_KERNELS).learn(rows, stamp_ns, codes, evidence, has_yaw, self._switch_hz, *arrays)
+        defects = kernels(_KERNELS).learn(
+            rows, stamp_ns, codes, evidence, has_yaw, self._switch_hz, *arrays
+        )
         if not has_yaw:
             return []
         self._shares.pop(sensor, None)
@@ -297,35 +367,52 @@ class Facing:
         counts.update([word for _, word in words])
         return words
 
-    def published(self, track_ids: tuple[int, ...], states: Sequence[TrackState]) -> Sequence[TrackState]:
+    def published(
+        self, track_ids: tuple[int, ...], states: Sequence[TrackState]
+    ) -> Sequence[TrackState]:
         """Return the kinematic present `states` of tracks, with the yaw of the front; the belief is decided here."""
         if not track_ids:
             return states
         if isinstance(states, States) and not self._is_any_turned:
-            may_turn = states.means[:, SPEED].min() < 0.0 or self._log_odds.min() < -_SURE
+            may_turn = (
+                states.means[:, SPEED].min() < 0.0 or self._log_odds.min() < -_SURE
+            )
             if not may_turn:
                 return states
         rows = self._rows_of(track_ids)
         before = self._turned[rows]
-        after = kernels(_KERNELS).turned(*_arrays(states), self._log_odds[rows], before, _SURE)
+        after = kernels(_KERNELS).turned(
+            *_arrays(states), self._log_odds[rows], before, _SURE
+        )
         if not (self._is_any_turned or after.any()):
             return states
         self._turned[rows] = after
         self._is_any_turned = bool(after.any())
         return turned(states, after) if self._is_any_turned else states
 
-    def seen(self, track_ids: tuple[int, ...], states: Sequence[TrackState]) -> Sequence[TrackState]:
+    def seen(
+        self, track_ids: tuple[int, ...], states: Sequence[TrackState]
+    ) -> Sequence[TrackState]:
         """Return kinematic `states` of tracks at any stamp, with the yaw of what is published as their front."""
-        return turned(states, self._turned[self._rows_of(track_ids)]) if self._is_any_turned else states
+        return (
+            turned(states, self._turned[self._rows_of(track_ids)])
+            if self._is_any_turned
+            else states
+        )
 
     def smoothed(self, reports: Sequence[SmoothedReport]) -> Sequence[SmoothedReport]:
         """Return all smoothed `reports` of a tick, with the yaw of what is published as the front of their tracks."""
         ended, self._ended = self._ended, set()
         if not (self._is_any_turned or ended):
             return reports
-        backwards = ended.union(track_id for track_id, row in self._rows.items() if self._turned[row])
+        backwards = ended.union(
+            track_id for track_id, row in self._rows.items() if self._turned[row]
+        )
         return [
-            replace(each, state=_turned_one(each.state)) if each.track_id in backwards else each for each in reports
+            replace(each, state=_turned_one(each.state))
+            if each.track_id in backwards
+            else each
+            for each in reports
         ]
 
     def forget(self, track_id: int) -> None:
@@ -348,8 +435,13 @@ def _arrays(states: Sequence[TrackState]) -> tuple[FloatArray, FloatArray]:
     if isinstance(states, States):
         x, P = states.means, states.covariances
     else:
-        x, P = np.array([each.mean for each in states]), np.array([each.covariance for each in states])
-    return np.ascontiguousarray(x, dtype=np.float64), np.ascontiguousarray(P, dtype=np.float64)
+        x, P = (
+            np.array([each.mean for each in states]),
+            np.array([each.covariance for each in states]),
+        )
+    return np.ascontiguousarray(x, dtype=np.float64), np.ascontiguousarray(
+        P, dtype=np.float64
+    )
 
 
 def turned(states: Sequence[TrackState], rows: BoolArray) -> States:

@@ -4,10 +4,24 @@ import math
 
 import numpy as np
 
-from fgtrack.core.compiled import add_congruence, check, check_rows, copy, inlined, njit, whiten
+from fgtrack.core.compiled import (
+    add_congruence,
+    check,
+    check_rows,
+    copy,
+    inlined,
+    njit,
+    whiten,
+)
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.tracking.facing import HALF_TURN, MEMORY, MOST_EVIDENCE, REVERSED, WITHOUT_YAW
+from fgtrack.tracking.facing import (
+    HALF_TURN,
+    MEMORY,
+    MOST_EVIDENCE,
+    REVERSED,
+    WITHOUT_YAW,
+)
 
 #: No reading of the pair lies inside the gate.
 OUTSIDE = -1
@@ -49,13 +63,29 @@ def _weigh(shares: FloatArray, is_signed: bool, weights: FloatArray) -> None:
         weights[1, 0], weights[1, 1], weights[1, 2] = flip, right, other
         return
     half = 0.5 * flip
-    weights[0, 0], weights[0, 1], weights[0, 2], weights[0, 4] = right, half, other, half
-    weights[1, 4], weights[1, 3], weights[1, 5], weights[1, 0] = right, half, other, half
+    weights[0, 0], weights[0, 1], weights[0, 2], weights[0, 4] = (
+        right,
+        half,
+        other,
+        half,
+    )
+    weights[1, 4], weights[1, 3], weights[1, 5], weights[1, 0] = (
+        right,
+        half,
+        other,
+        half,
+    )
 
 
 @inlined
 def _compare(
-    logs: FloatArray, weights: FloatArray, front: float, rear: float, has_yaw: bool, signs: int, evidence: FloatArray
+    logs: FloatArray,
+    weights: FloatArray,
+    front: float,
+    rear: float,
+    has_yaw: bool,
+    signs: int,
+    evidence: FloatArray,
 ) -> None:
     """Write the log-likelihood ratio of the facing, and the probabilities that the yaw is half a turn off, or anything.
     `logs` are the log-likelihoods of the readings, in the columns of `weights`.
@@ -69,7 +99,10 @@ def _compare(
         if weights[0, entry] + weights[1, entry] <= 0.0:
             continue
         likelihood = math.exp(logs[entry] - highest)
-        by_front, by_rear = likelihood * weights[0, entry], likelihood * weights[1, entry]
+        by_front, by_rear = (
+            likelihood * weights[0, entry],
+            likelihood * weights[1, entry],
+        )
         ahead += by_front
         behind += by_rear
         way = entry % _NUM_YAW
@@ -85,7 +118,11 @@ def _compare(
 
 @njit("b1[::1](float64[:, ::1], float64[:, :, ::1], float64[::1], b1[::1], float64)")
 def turned(
-    means: FloatArray, covariances: FloatArray, log_odds: FloatArray, before: BoolArray, sure: float
+    means: FloatArray,
+    covariances: FloatArray,
+    log_odds: FloatArray,
+    before: BoolArray,
+    sure: float,
 ) -> BoolArray:
     """Return which kinematic states (m, n) and (m, n, n) have the yaw of the rear, shape (m,).
     The belief of `log_odds` (m,) and of the speed changes what was true `before` where it is beyond `sure`.
@@ -135,13 +172,30 @@ def read(
     """
     m, k = y.shape
     check_rows(tracks, 0, min(len(x), len(P), len(log_odds)))
-    check(min(len(z), len(tracks), len(R), len(more)) >= m and (len(H) == 1 or len(H) >= m))
-    check(z.shape[1] >= k and H.shape[1] == k and H.shape[2] == P.shape[1] and P.shape[2] == P.shape[1])
+    check(
+        min(len(z), len(tracks), len(R), len(more)) >= m
+        and (len(H) == 1 or len(H) >= m)
+    )
+    check(
+        z.shape[1] >= k
+        and H.shape[1] == k
+        and H.shape[2] == P.shape[1]
+        and P.shape[2] == P.shape[1]
+    )
     check(R.shape[1] == k and R.shape[2] == k and x.shape[1] > 3 and P.shape[1] > 3)
     check(-1 <= yaw < k and len(signed) >= k and len(shares) >= 3 and len(limits) > k)
-    readings, costs, evidence = np.full(m, OUTSIDE), np.full(m, np.inf), np.zeros((m, 3))
+    readings, costs, evidence = (
+        np.full(m, OUTSIDE),
+        np.full(m, np.inf),
+        np.zeros((m, 3)),
+    )
     order, S, root = np.empty(k, np.int64), np.empty((k, k)), np.empty((k, k))
-    HP, white, weights, logs = np.empty((k, P.shape[1])), np.empty(k), np.zeros((2, 2 * _NUM_YAW)), np.empty(6)
+    HP, white, weights, logs = (
+        np.empty((k, P.shape[1])),
+        np.empty(k),
+        np.zeros((2, 2 * _NUM_YAW)),
+        np.empty(6),
+    )
     count, signs, usual = 0, 1, 1.0
     for a in range(k):
         if signed[a]:
@@ -163,18 +217,34 @@ def read(
         if cartesian:
             speed = math.sqrt(x[t, 2] ** 2 + x[t, 3] ** 2)
             cos, sin = (x[t, 2] / speed, x[t, 3] / speed) if speed > 0.0 else (1.0, 0.0)
-            variance = cos * cos * P[t, 2, 2] + 2.0 * cos * sin * P[t, 2, 3] + sin * sin * P[t, 3, 3]
-        belief = min(max(log_odds[t] + _forwards(speed, variance), -_LARGEST_LOG_ODDS), _LARGEST_LOG_ODDS)
+            variance = (
+                cos * cos * P[t, 2, 2]
+                + 2.0 * cos * sin * P[t, 2, 3]
+                + sin * sin * P[t, 3, 3]
+            )
+        belief = min(
+            max(log_odds[t] + _forwards(speed, variance), -_LARGEST_LOG_ODDS),
+            _LARGEST_LOG_ODDS,
+        )
         front = 1.0 / (1.0 + math.exp(-belief))
         rear = 1.0 / (1.0 + math.exp(belief))
         copy(R[i], S)
         add_congruence(H[min(i, len(H) - 1)], P[t], HP, S)
         for sign in range(signs):
-            if sign == 1 and inside and not learns and least < least_logdet + SURE - 2.0 * math.log(rear / usual):
+            if (
+                sign == 1
+                and inside
+                and not learns
+                and least < least_logdet + SURE - 2.0 * math.log(rear / usual)
+            ):
                 break  # no NIS is small enough
             for a in range(k):
                 own = order[a]
-                white[a] = y[i, own] - 2.0 * z[i, own] if sign == 1 and signed[own] else y[i, own]
+                white[a] = (
+                    y[i, own] - 2.0 * z[i, own]
+                    if sign == 1 and signed[own]
+                    else y[i, own]
+                )
                 for b in range(a + 1):
                     other = order[b]
                     root[a, b] = S[own, other]
@@ -191,7 +261,13 @@ def read(
                     logs[sign * _NUM_YAW + way] = -np.inf
                 continue
             for way in range(_NUM_YAW if yaw >= 0 else 1):
-                entry, code, own_nis, own_logdet, limit = sign * _NUM_YAW + way, sign * REVERSED, nis, logdet, limits[k]
+                entry, code, own_nis, own_logdet, limit = (
+                    sign * _NUM_YAW + way,
+                    sign * REVERSED,
+                    nis,
+                    logdet,
+                    limits[k],
+                )
                 if yaw >= 0 and way < 2:
                     own_logdet += 2.0 * math.log(root[k - 1, k - 1])
                 if entry == 0:
@@ -200,7 +276,12 @@ def read(
                     turn = last - math.copysign(math.pi, y[i, yaw]) / root[k - 1, k - 1]
                     code, own_nis = code + HALF_TURN, rest + turn * turn
                 elif way == 2:
-                    code, own_nis, own_logdet, limit = code + WITHOUT_YAW, rest, logdet + _LOG_TURN, limits[k - 1]
+                    code, own_nis, own_logdet, limit = (
+                        code + WITHOUT_YAW,
+                        rest,
+                        logdet + _LOG_TURN,
+                        limits[k - 1],
+                    )
                 weight = front * weights[0, entry] + rear * weights[1, entry]
                 logs[entry] = -0.5 * (own_nis + own_logdet)
                 if not (weight > 0.0 and own_nis < np.inf):
@@ -219,7 +300,9 @@ def read(
     return readings, costs, evidence
 
 
-@njit("int64[::1](int64[::1], int64, int64[::1], float64[:, ::1], b1, float64, float64[::1], int64[::1], float64[::1])")
+@njit(
+    "int64[::1](int64[::1], int64, int64[::1], float64[:, ::1], b1, float64, float64[::1], int64[::1], float64[::1])"
+)
 def learn(
     rows: IntArray,
     stamp_ns: int,
@@ -236,7 +319,11 @@ def learn(
     flipped and other yaws that were `seen` (3,) are updated. Returns the defects of the yaws (m,).
     """
     check_rows(rows, 0, min(len(log_odds), len(stamps_ns)))
-    check(min(len(codes), len(evidence)) >= len(rows) and evidence.shape[1] >= 3 and len(seen) >= 3)
+    check(
+        min(len(codes), len(evidence)) >= len(rows)
+        and evidence.shape[1] >= 3
+        and len(seen) >= 3
+    )
     defects = np.zeros(len(rows), np.int64)
     for i in range(len(rows)):
         row = rows[i]
@@ -244,9 +331,13 @@ def learn(
         if dt_s > 0.0:
             changed = -0.5 * math.expm1(-2.0 * switch_hz * dt_s)
             odds = math.exp(log_odds[row])
-            log_odds[row] = math.log((odds * (1.0 - changed) + changed) / (odds * changed + 1.0 - changed))
+            log_odds[row] = math.log(
+                (odds * (1.0 - changed) + changed) / (odds * changed + 1.0 - changed)
+            )
             stamps_ns[row] = stamp_ns
-        belief = log_odds[row] + min(max(evidence[i, LOG_RATIO], -MOST_EVIDENCE), MOST_EVIDENCE)
+        belief = log_odds[row] + min(
+            max(evidence[i, LOG_RATIO], -MOST_EVIDENCE), MOST_EVIDENCE
+        )
         log_odds[row] = min(max(belief, -_LARGEST_LOG_ODDS), _LARGEST_LOG_ODDS)
         if not has_yaw:
             continue

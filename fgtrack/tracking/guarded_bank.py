@@ -10,7 +10,14 @@ import numpy as np
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.linalg import kernels
 from fgtrack.core.types import SmoothedReport, TrackState
-from fgtrack.estimation.base import Measurement, Start, StatesAt, TrackBank, UpdateResult, UpdateStatus
+from fgtrack.estimation.base import (
+    Measurement,
+    Start,
+    StatesAt,
+    TrackBank,
+    UpdateResult,
+    UpdateStatus,
+)
 from fgtrack.estimation.failures import EstimatorError, Failure, Failures
 from fgtrack.estimation.filters.propagation import States
 
@@ -25,7 +32,9 @@ class GuardedBank:
     empty bank.
     """
 
-    def __init__(self, make: Callable[[], TrackBank], failures: Failures | None = None) -> None:
+    def __init__(
+        self, make: Callable[[], TrackBank], failures: Failures | None = None
+    ) -> None:
         self._make, self._bank = make, make()
         self._now_ns = 0
         self._alive: dict[int, None] = {}  # track ids in order of birth
@@ -60,28 +69,44 @@ class GuardedBank:
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`; states that are not finite are left out."""
         states = self._ask(lambda bank: bank.states_at(stamp_ns))
-        if math.isfinite(np.vdot(states.means, states.means) + np.vdot(states.covariances, states.covariances)):
+        if math.isfinite(
+            np.vdot(states.means, states.means)
+            + np.vdot(states.covariances, states.covariances)
+        ):
             return states
-        finite = np.isfinite(states.means.sum(axis=1) + states.covariances.sum(axis=(1, 2)))
-        return StatesAt(tuple(compress(states.track_ids, finite)), states.means[finite], states.covariances[finite])
+        finite = np.isfinite(
+            states.means.sum(axis=1) + states.covariances.sum(axis=(1, 2))
+        )
+        return StatesAt(
+            tuple(compress(states.track_ids, finite)),
+            states.means[finite],
+            states.covariances[finite],
+        )
 
     def state_of(self, track_id: int, stamp_ns: int) -> StatesAt:
         """Return the state of one track at `stamp_ns`, see `states_at`; of no track where it has none.
         A bank with `states_of` is asked for it alone.
         """
         if hasattr(self._bank, "states_of"):
-            states: StatesAt = self._ask(lambda bank: getattr(bank, "states_of")(stamp_ns, track_id))  # noqa: B009
+            states: StatesAt = self._ask(
+                lambda bank: bank.states_of(stamp_ns, track_id)  # type: ignore[attr-defined]
+            )
             return states
         return self.states_at(stamp_ns).of(track_id)
 
     def update(
-        self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+        self,
+        stamp_ns: int,
+        track_ids: Sequence[int],
+        measurements: Sequence[Measurement],
     ) -> list[UpdateResult]:
         """See `TrackBank.update`; a measurement whose update raises has failed, and so has one of an ended track.
         What propagates, and an interrupt, leaves states unknown, so it ends the tracks of the call as well.
         """
         results = [UpdateResult(UpdateStatus.FAILED) for _ in track_ids]
-        alive = [row for row, track_id in enumerate(track_ids) if track_id in self._alive]
+        alive = [
+            row for row, track_id in enumerate(track_ids) if track_id in self._alive
+        ]
         ids = [track_ids[row] for row in alive]
         given = set(ids)
         if len(ids) < len(results):
@@ -99,21 +124,32 @@ class GuardedBank:
             if result.nis is None and result.status is UpdateStatus.FAILED:
                 self.failures.add(Failure.UPDATE_FAILED)
                 if track_id in answers or track_id not in given:
-                    self.failures.note(f"a measurement of track {track_id} could not be fused")
+                    self.failures.note(
+                        f"a measurement of track {track_id} could not be fused"
+                    )
         return results
 
     def _updated(
-        self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+        self,
+        stamp_ns: int,
+        track_ids: Sequence[int],
+        measurements: Sequence[Measurement],
     ) -> Mapping[int, UpdateResult]:
         """Return the results by track; tracks that raise end, unless their states are as before, and have none."""
         try:
             results = self._bank.update(stamp_ns, track_ids, measurements)
         except EstimatorError as error:
-            ended = {each: cause for each, cause in error.causes.items() if each not in error.unchanged}
+            ended = {
+                each: cause
+                for each, cause in error.causes.items()
+                if each not in error.unchanged
+            }
             for each in error.unchanged:
                 self.failures.note(error.causes[each])
             self._end(ended, Failure.UPDATE_FAILED)
-            return {each: error.answers[each] for each in track_ids if each in error.answers}
+            return {
+                each: error.answers[each] for each in track_ids if each in error.answers
+            }
         if not {*map(type, results)} <= {UpdateResult}:
             raise TypeError(f"update must return results, returned {results!r:.200}")
         return dict(zip(track_ids, results, strict=True))
@@ -127,7 +163,9 @@ class GuardedBank:
             if track_id in self._bank.track_ids:
                 self.remove(track_id)
             self._alive.pop(track_id, None)
-            if not isinstance(error, Exception) or (isinstance(error, CallError) and not self._can_start):
+            if not isinstance(error, Exception) or (
+                isinstance(error, CallError) and not self._can_start
+            ):
                 raise
             self.failures.note(error)
             self.failures.add(Failure.BIRTH_FAILED)
@@ -142,7 +180,10 @@ class GuardedBank:
             self._bank.remove(track_id)
         except Exception as error:
             self.failures.add(Failure.ESTIMATOR_RAISED)
-            if isinstance(error, EstimatorError) and track_id not in self._bank.track_ids:
+            if (
+                isinstance(error, EstimatorError)
+                and track_id not in self._bank.track_ids
+            ):
                 self.failures.note(error)
             else:
                 self._alive.pop(track_id)
@@ -155,21 +196,33 @@ class GuardedBank:
             states, unsound = self._ask(lambda bank: self._checked(bank.present()))
             if not unsound:
                 return states
-            for track_id, fault in [(self.track_ids[row], fault) for row, fault in unsound.items()]:
+            for track_id, fault in [
+                (self.track_ids[row], fault) for row, fault in unsound.items()
+            ]:
                 self.failures.add(fault)
-                self._end({track_id: f"the state of track {track_id} is {fault.value}"}, fault)
+                self._end(
+                    {track_id: f"the state of track {track_id} is {fault.value}"}, fault
+                )
 
     def smoothed(self) -> list[SmoothedReport]:
         """See `TrackBank.smoothed`; those that are not sound are left out."""
         reports, unsound = self._ask(lambda bank: _smoothed(bank.smoothed()))
         for fault in unsound.values():
             self.failures.add(fault)
-        return [report for row, report in enumerate(reports) if row not in unsound] if unsound else reports
+        return (
+            [report for row, report in enumerate(reports) if row not in unsound]
+            if unsound
+            else reports
+        )
 
-    def _checked(self, states: Sequence[TrackState]) -> tuple[Sequence[TrackState], dict[int, Failure]]:
+    def _checked(
+        self, states: Sequence[TrackState]
+    ) -> tuple[Sequence[TrackState], dict[int, Failure]]:
         """Return present states and their faults. Raises `ValueError` for another number of states than of tracks."""
         if len(states) != len(self._alive):
-            raise ValueError(f"present gives {len(states)} states of {len(self._alive)} tracks")
+            raise ValueError(
+                f"present gives {len(states)} states of {len(self._alive)} tracks"
+            )
         return states, faults(states)
 
     def _ask(self, question: Callable[[TrackBank], _T], *, changes: bool = False) -> _T:
@@ -185,7 +238,10 @@ class GuardedBank:
                 if isinstance(error, MemoryError) and not changes:
                     raise
                 self.failures.add(Failure.ESTIMATOR_RAISED)
-                if isinstance(error, EstimatorError) and error.causes.keys() & self._alive.keys():
+                if (
+                    isinstance(error, EstimatorError)
+                    and error.causes.keys() & self._alive.keys()
+                ):
                     self._end(error.causes, Failure.ESTIMATOR_RAISED)
                 elif self._alive:
                     self._start_over(error)
@@ -210,7 +266,9 @@ class GuardedBank:
         self.advance(self._now_ns)
 
 
-def _smoothed(reports: list[SmoothedReport]) -> tuple[list[SmoothedReport], dict[int, Failure]]:
+def _smoothed(
+    reports: list[SmoothedReport],
+) -> tuple[list[SmoothedReport], dict[int, Failure]]:
     """Return smoothed states and their faults."""
     return reports, faults([report.state for report in reports]) if reports else {}
 
@@ -228,7 +286,13 @@ def faults(states: Sequence[TrackState]) -> dict[int, Failure]:
     if isinstance(states, States):
         x, P = states.means, states.covariances
     else:
-        x, P = np.array([state.mean for state in states]), np.array([state.covariance for state in states])
-    x, P = np.ascontiguousarray(x, dtype=np.float64), np.ascontiguousarray(P, dtype=np.float64)
+        x, P = (
+            np.array([state.mean for state in states]),
+            np.array([state.covariance for state in states]),
+        )
+    x, P = (
+        np.ascontiguousarray(x, dtype=np.float64),
+        np.ascontiguousarray(P, dtype=np.float64),
+    )
     codes = kernels("fgtrack.tracking.kernels").faults(x, P)
     return {row: _KINDS[codes[row] - 1] for row in codes.nonzero()[0].tolist()}

@@ -11,14 +11,24 @@ import numpy as np
 from fgtrack.core.checks import LARGEST
 from fgtrack.core.linalg import is_covariance
 from fgtrack.core.time import NS_PER_S, nanoseconds
-from fgtrack.core.types import Detection, DetectionList, Disposition, FloatArray, Frame, UpdateRecord, YawWord
+from fgtrack.core.types import (
+    Detection,
+    DetectionList,
+    Disposition,
+    FloatArray,
+    Frame,
+    UpdateRecord,
+    YawWord,
+)
 from fgtrack.estimation.base import Measurement, UpdateResult, UpdateStatus
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.latency import FOREVER
+from fgtrack.tracking.lives.latency import FOREVER
 
 #: In any unit: no sensor is better than this.
 SMALLEST_STD = 1e-6
-_MAX_FUTURE_NS = NS_PER_S  # a detection stamped further ahead of its receipt has a wrong stamp
+_MAX_FUTURE_NS = (
+    NS_PER_S  # a detection stamped further ahead of its receipt has a wrong stamp
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +58,9 @@ def record(
     """Return the record of detection `index` of `message`; the innovation is that of `measurement`, or one like it."""
     stamp_ns, named = message.objects[index].stamp_ns, dict[str, float]()
     if measurement is not None and innovation is not None:
-        named = dict(zip(measurement.model.components, innovation.tolist(), strict=True))
+        named = dict(
+            zip(measurement.model.components, innovation.tolist(), strict=True)
+        )
         for name in measurement.assumed:
             del named[name]
     return UpdateRecord(
@@ -56,7 +68,9 @@ def record(
         message.stamp_ns if stamp_ns is None else stamp_ns,
         message.receipt_ns,
         index,
-        disposition if isinstance(disposition, Disposition) else Disposition(disposition.value),
+        disposition
+        if isinstance(disposition, Disposition)
+        else Disposition(disposition.value),
         track_id,
         nis,
         named,
@@ -66,10 +80,14 @@ def record(
 
 def records(message: DetectionList, disposition: Disposition) -> list[UpdateRecord]:
     """The same disposition for every detection of `message`."""
-    return [record(message, index, disposition) for index in range(len(message.objects))]
+    return [
+        record(message, index, disposition) for index in range(len(message.objects))
+    ]
 
 
-def merged_records(message: DetectionList, indices: Iterable[int], track_id: int | None) -> list[UpdateRecord]:
+def merged_records(
+    message: DetectionList, indices: Iterable[int], track_id: int | None
+) -> list[UpdateRecord]:
     """The records of the detections `indices` that were merged into another one, of a track if there is one."""
     return [record(message, index, Disposition.MERGED, track_id) for index in indices]
 
@@ -87,12 +105,27 @@ class FusedRecords:
     """Words on the yaws of the matched ones."""
 
     def __iter__(self) -> Iterator[UpdateRecord]:
-        for (index, track_id, measurement, result), yaw in zip(self.matched, self.yaws, strict=True):
-            yield record(self.message, index, result.status, track_id, result.nis, measurement, result.innovation, yaw)
-            yield from merged_records(self.message, self.merged.get(index, ()), track_id)
+        for (index, track_id, measurement, result), yaw in zip(
+            self.matched, self.yaws, strict=True
+        ):
+            yield record(
+                self.message,
+                index,
+                result.status,
+                track_id,
+                result.nis,
+                measurement,
+                result.innovation,
+                yaw,
+            )
+            yield from merged_records(
+                self.message, self.merged.get(index, ()), track_id
+            )
 
 
-def is_usable(detection: Detection, sensor: SensorModel, at_origin: bool = False) -> bool:
+def is_usable(
+    detection: Detection, sensor: SensorModel, at_origin: bool = False
+) -> bool:
     """True if `detection` has valid values and a position or bearing, and is not an empty slot (x = y = 0).
     With `at_origin` there are no empty slots: the first position of many recordings is the origin of the map.
     """
@@ -114,7 +147,9 @@ def own_covariance(detection: Detection, names: Sequence[str]) -> FloatArray:
     """Covariance of the components `names` that `detection` carries, shape (k, k)."""
     measured = detection.measured
     rows = [measured.index(name) for name in names]
-    return np.array(detection.covariance).reshape(len(measured), len(measured))[np.ix_(rows, rows)]
+    return np.array(detection.covariance).reshape(len(measured), len(measured))[
+        np.ix_(rows, rows)
+    ]
 
 
 def is_valid_covariance(detection: Detection, sensor: SensorModel) -> bool:
@@ -137,7 +172,10 @@ def stamps(message: DetectionList, sensor: SensorModel) -> list[int]:
         return [message.stamp_ns] * len(message.objects)
     if sensor.stamp_from == "objects_mean":
         return [sum(own) // len(own)] * len(message.objects)
-    return [message.stamp_ns if each.stamp_ns is None else each.stamp_ns for each in message.objects]
+    return [
+        message.stamp_ns if each.stamp_ns is None else each.stamp_ns
+        for each in message.objects
+    ]
 
 
 _Origin = tuple[str, str | None, float | None, float | None]
@@ -154,14 +192,20 @@ _values = attrgetter(*(each.name for each in fields(Detection)))
 class Inbox:
     """Keeps every message. Refuses repeated, too late and future ones, and single detections that are no detections."""
 
-    def __init__(self, sensors: Mapping[str, SensorModel], memory_s: float = 10.0) -> None:
+    def __init__(
+        self, sensors: Mapping[str, SensorModel], memory_s: float = 10.0
+    ) -> None:
         """`memory_s`: how long a list is remembered; at least as long as a sensor's list may take."""
         self._sensors = sensors
         self._max_delay_ns = {
-            name: nanoseconds(sensor.max_delay_s) for name, sensor in sensors.items() if sensor.max_delay_s is not None
+            name: nanoseconds(sensor.max_delay_s)
+            for name, sensor in sensors.items()
+            if sensor.max_delay_s is not None
         }
         self._memory_ns = max([nanoseconds(memory_s), *self._max_delay_ns.values()])
-        self._receipts_ns: dict[tuple[str, int, Frame, int], int] = {}  # of lists, in order of receipt
+        self._receipts_ns: dict[
+            tuple[str, int, Frame, int], int
+        ] = {}  # of lists, in order of receipt
         self._pending: list[Batch] = []
         self._originals: dict[_Origin, DetectionList] = {}
 
@@ -171,7 +215,9 @@ class Inbox:
         """
         sensor = self._sensors[message.sensor]
         at_origin = message.origin_deg is not None
-        usable = [is_usable(detection, sensor, at_origin) for detection in message.objects]
+        usable = [
+            is_usable(detection, sensor, at_origin) for detection in message.objects
+        ]
         if self._is_copy(message, usable):
             return records(message, Disposition.DUPLICATE)
         ended: list[UpdateRecord] = []
@@ -180,7 +226,11 @@ class Inbox:
         fates = {stamp_ns: self._fate(message, stamp_ns) for stamp_ns in set(own_ns)}
         for index, (stamp_ns, is_sound) in enumerate(zip(own_ns, usable, strict=True)):
             fate = fates[stamp_ns] if is_sound else Disposition.INVALID
-            if fate is None and sensor.copies_s and self._is_heard(message, index, stamp_ns, sensor.copies_s):
+            if (
+                fate is None
+                and sensor.copies_s
+                and self._is_heard(message, index, stamp_ns, sensor.copies_s)
+            ):
                 fate = Disposition.DUPLICATE
             if fate is None:
                 kept.setdefault(stamp_ns, []).append(index)
@@ -188,7 +238,9 @@ class Inbox:
                 ended.append(record(message, index, fate))
         newest_ns = max(kept, default=0)
         for stamp_ns, indices in kept.items():
-            self._pending.append(Batch(message, stamp_ns, tuple(indices), last=stamp_ns == newest_ns))
+            self._pending.append(
+                Batch(message, stamp_ns, tuple(indices), last=stamp_ns == newest_ns)
+            )
         return ended
 
     def _fate(self, message: DetectionList, stamp_ns: int) -> Disposition | None:
@@ -196,15 +248,25 @@ class Inbox:
         delay_ns = message.receipt_ns - stamp_ns
         if delay_ns < -_MAX_FUTURE_NS:
             return Disposition.INVALID
-        return Disposition.TOO_OLD if delay_ns > self._max_delay_ns.get(message.sensor, delay_ns) else None
+        return (
+            Disposition.TOO_OLD
+            if delay_ns > self._max_delay_ns.get(message.sensor, delay_ns)
+            else None
+        )
 
-    def _is_heard(self, message: DetectionList, index: int, stamp_ns: int, copies_s: float) -> bool:
+    def _is_heard(
+        self, message: DetectionList, index: int, stamp_ns: int, copies_s: float
+    ) -> bool:
         """True if another receiver has heard the message of detection `index`; the earliest stamp in a tick counts."""
         item = message.objects[index]
         if item.id is None:
             return False
         oldest_ns = message.receipt_ns - nanoseconds(copies_s)
-        while self._originals and self._originals[first := next(iter(self._originals))].receipt_ns < oldest_ns:
+        while (
+            self._originals
+            and self._originals[first := next(iter(self._originals))].receipt_ns
+            < oldest_ns
+        ):
             del self._originals[first]
         key = _origin(message.sensor, item)
         original = self._originals.setdefault(key, message)
@@ -213,9 +275,17 @@ class Inbox:
         for row, batch in enumerate(self._pending):
             if batch.message is not original or stamp_ns >= batch.stamp_ns:
                 continue
-            alike = tuple(i for i in batch.indices if _origin(message.sensor, original.objects[i]) == key)
+            alike = tuple(
+                i
+                for i in batch.indices
+                if _origin(message.sensor, original.objects[i]) == key
+            )
             rest = tuple(i for i in batch.indices if i not in alike)
-            self._pending[row] = replace(batch, indices=rest) if rest else replace(batch, stamp_ns=stamp_ns)
+            self._pending[row] = (
+                replace(batch, indices=rest)
+                if rest
+                else replace(batch, stamp_ns=stamp_ns)
+            )
             if rest and alike:
                 self._pending.append(Batch(original, stamp_ns, alike, last=False))
         return True
@@ -227,14 +297,24 @@ class Inbox:
         if message.objects and not any(usable):
             return False
         oldest_ns = message.receipt_ns - self._memory_ns
-        while self._receipts_ns and self._receipts_ns[first := next(iter(self._receipts_ns))] < oldest_ns:
+        while (
+            self._receipts_ns
+            and self._receipts_ns[first := next(iter(self._receipts_ns))] < oldest_ns
+        ):
             del self._receipts_ns[first]
         values = list(map(_values, compress(message.objects, usable)))
         try:
-            contents = list(map(marshal.dumps, values, repeat(2)))  # 2: without references to what is shared
+            contents = list(
+                map(marshal.dumps, values, repeat(2))
+            )  # 2: without references to what is shared
         except ValueError:  # numbers of other libraries
             contents = [repr(each).encode() for each in values]
-        key = (message.sensor, message.stamp_ns, message.frame, hash((len(contents), *sorted(contents))))
+        key = (
+            message.sensor,
+            message.stamp_ns,
+            message.frame,
+            hash((len(contents), *sorted(contents))),
+        )
         if key in self._receipts_ns:
             return True
         self._receipts_ns[key] = message.receipt_ns
@@ -245,13 +325,19 @@ class Inbox:
         """Oldest stamp of what `collect` has not returned; `FOREVER` where there is nothing."""
         return min((batch.stamp_ns for batch in self._pending), default=FOREVER)
 
-    def collect(self, now_ns: int = 0, waits: Callable[[Batch, int], bool] | None = None) -> list[Batch]:
+    def collect(
+        self, now_ns: int = 0, waits: Callable[[Batch, int], bool] | None = None
+    ) -> list[Batch]:
         """Return everything received and not yet returned, oldest stamp first.
 
         `waits` is asked about batches at the tick `now_ns`. A batch that waits stays here until the next call. With it
         stay all batches of its message, by which together tracks are missed, and what its sensor has stamped later.
         """
-        pending, held, first_ns = sorted(self._pending, key=attrgetter("stamp_ns")), set[int](), dict[str, int]()
+        pending, held, first_ns = (
+            sorted(self._pending, key=attrgetter("stamp_ns")),
+            set[int](),
+            dict[str, int](),
+        )
         if waits is None:
             self._pending = []
             return pending

@@ -5,7 +5,15 @@ import math
 import numpy as np
 
 from fgtrack.core.checks import LARGEST
-from fgtrack.core.compiled import add_congruence, check, check_rows, cholesky, inlined, njit, wrapped
+from fgtrack.core.compiled import (
+    add_congruence,
+    check,
+    check_rows,
+    cholesky,
+    inlined,
+    njit,
+    wrapped,
+)
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.models.measurement import COMPONENTS
 
@@ -14,7 +22,8 @@ _ROUNDING = 1e-9
 """Tolerance of an eigenvalue of a correlation matrix below 0: rounding, where an entry is known for certain."""
 
 X, Y, YAW, RANGE, BEARING, CURVATURE = (
-    COMPONENTS.index(name) for name in ("x_m", "y_m", "yaw_rad", "range_m", "bearing_rad", "curvature_radpm")
+    COMPONENTS.index(name)
+    for name in ("x_m", "y_m", "yaw_rad", "range_m", "bearing_rad", "curvature_radpm")
 )
 
 
@@ -32,7 +41,11 @@ def _checked_starts(starts: IntArray, num_lists: int, num_rows: int) -> int:
 
 @njit("(float64[::1], int64[:, ::1], int64[::1], float64[:, ::1], b1[::1])")
 def to_map(
-    numbers: FloatArray, columns: IntArray, starts: IntArray, poses: FloatArray, moves: BoolArray
+    numbers: FloatArray,
+    columns: IntArray,
+    starts: IntArray,
+    poses: FloatArray,
+    moves: BoolArray,
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return components (m, 8) and positions (m, 2) in the map of detections, NaN for none, and m times False.
     The rows from `starts[k]` up to the next start are of list k. Of each of them `numbers` has the components
@@ -40,7 +53,9 @@ def to_map(
     and bearing always are.
     """
     m, at, needed = _checked_starts(starts, len(poses), -1), 0, 0
-    check(len(columns) >= len(poses) and len(moves) >= len(poses) and poses.shape[1] >= 3)
+    check(
+        len(columns) >= len(poses) and len(moves) >= len(poses) and poses.shape[1] >= 3
+    )
     for k in range(len(poses)):
         check_rows(columns[k], -1, len(COMPONENTS))
         for column in columns[k]:
@@ -57,16 +72,27 @@ def to_map(
                     row[column] = numbers[at]
                     at += 1
             if moves[k]:
-                row[X], row[Y] = x_m + c * row[X] - s * row[Y], y_m + s * row[X] + c * row[Y]
+                row[X], row[Y] = (
+                    x_m + c * row[X] - s * row[Y],
+                    y_m + s * row[X] + c * row[Y],
+                )
                 row[YAW] = wrapped(row[YAW] + yaw_rad)
             points[i, 0], points[i, 1] = row[X], row[Y]
             if math.isnan(row[X]):
-                right, up = row[RANGE] * math.cos(row[BEARING]), row[RANGE] * math.sin(row[BEARING])
-                points[i, 0], points[i, 1] = x_m + c * right - s * up, y_m + s * right + c * up
+                right, up = (
+                    row[RANGE] * math.cos(row[BEARING]),
+                    row[RANGE] * math.sin(row[BEARING]),
+                )
+                points[i, 0], points[i, 1] = (
+                    x_m + c * right - s * up,
+                    y_m + s * right + c * up,
+                )
     return values, points, np.zeros(m, np.bool_)
 
 
-@njit("(float64[:, ::1], float64[:, ::1], b1[::1], int64[::1], b1[:, ::1], float64[:], float64[:], b1[:])")
+@njit(
+    "(float64[:, ::1], float64[:, ::1], b1[::1], int64[::1], b1[:, ::1], float64[:], float64[:], b1[:])"
+)
 def on_road(
     values: FloatArray,
     points: FloatArray,
@@ -81,7 +107,13 @@ def on_road(
     Returns which are `outside` (m,), of those with a position.
     """
     m = _checked_starts(starts, len(takes), len(values))
-    check(len(points) >= m and len(map_yaw) >= m and len(heading) >= m and len(curvature) >= m and len(outside) >= m)
+    check(
+        len(points) >= m
+        and len(map_yaw) >= m
+        and len(heading) >= m
+        and len(curvature) >= m
+        and len(outside) >= m
+    )
     beyond = np.zeros(len(values), np.bool_)
     for k in range(len(takes)):
         for i in range(starts[k], starts[k + 1]):
@@ -97,13 +129,20 @@ def on_road(
 
 @njit("(float64[:, ::1], float64[:, ::1], b1[::1], int64[::1], float64[:, ::1])")
 def described(
-    values: FloatArray, points: FloatArray, map_yaw: BoolArray, starts: IntArray, poses: FloatArray
+    values: FloatArray,
+    points: FloatArray,
+    map_yaw: BoolArray,
+    starts: IntArray,
+    poses: FloatArray,
 ) -> tuple[IntArray, FloatArray]:
     """Return which components detections have, as the bits of a number (m,), and their positions and NaN (m, 3).
     The highest bit is `map_yaw`. Of a bearing alone the position of the sensor, and the direction.
     """
     m, num = values.shape
-    check(_checked_starts(starts, len(poses), m) <= min(len(points), len(map_yaw)) and poses.shape[1] >= 3)
+    check(
+        _checked_starts(starts, len(poses), m) <= min(len(points), len(map_yaw))
+        and poses.shape[1] >= 3
+    )
     codes, lines = np.zeros(m, np.int64), np.empty((m, 3))
     for k in range(len(poses)):
         for i in range(starts[k], starts[k + 1]):
@@ -113,7 +152,11 @@ def described(
                 codes[i] |= 1 << num
             lines[i, 0], lines[i, 1], lines[i, 2] = points[i, 0], points[i, 1], np.nan
             if math.isnan(points[i, 0]):
-                lines[i, 0], lines[i, 1], lines[i, 2] = poses[k, 0], poses[k, 1], poses[k, 2] + values[i, BEARING]
+                lines[i, 0], lines[i, 1], lines[i, 2] = (
+                    poses[k, 0],
+                    poses[k, 1],
+                    poses[k, 2] + values[i, BEARING],
+                )
     return codes, lines
 
 
@@ -136,9 +179,20 @@ def pose_error(
     P is of x, y, yaw, speed and yaw rate of the body, which is at `x_m`, `y_m` (`core.geometry.body_point`). G is that
     of detections at `points` (m, 2), placed in the map by the pose; of the `components` (k,) x, y and yaw depend on it.
     """
-    check(len(pose) >= 5 and len(P) == 5 and P.shape[1] == 5 and covariance.shape[0] == 5 and covariance.shape[1] == 5)
+    check(
+        len(pose) >= 5
+        and len(P) == 5
+        and P.shape[1] == 5
+        and covariance.shape[0] == 5
+        and covariance.shape[1] == 5
+    )
     check(len(G) >= len(points) and G.shape[1] >= len(components) and G.shape[2] >= 5)
-    J, JP, c, s = np.zeros((5, 5)), np.empty((5, 5)), math.cos(yaw_rad), math.sin(yaw_rad)
+    J, JP, c, s = (
+        np.zeros((5, 5)),
+        np.empty((5, 5)),
+        math.cos(yaw_rad),
+        math.sin(yaw_rad),
+    )
     right, up = pose[0] - x_m, pose[1] - y_m
     J[0, 0] = J[1, 1] = J[2, 2] = 1.0
     J[0, 2], J[1, 2], J[3, 2], J[4, 2] = -up, right, -pose[4], pose[3]
@@ -166,7 +220,11 @@ def add_pose_error(G: FloatArray, P: FloatArray, R: FloatArray) -> None:
 
 @njit("(float64[:, ::1], float64[:, ::1], int64[::1], float64[::1], int64)")
 def near(
-    points: FloatArray, means: FloatArray, by_x: IntArray, reach_m: FloatArray, most: int
+    points: FloatArray,
+    means: FloatArray,
+    by_x: IntArray,
+    reach_m: FloatArray,
+    most: int,
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Return rows, columns and distances of the pairs of `points` and tracks that are at most `reach_m` (n,) apart.
     Of a point in (m, 3) the third entry is NaN, of a line of sight from there its direction. At most so many tracks of
@@ -176,7 +234,11 @@ def near(
     check(len(by_x) >= n and len(reach_m) >= n and most > 0 and points.shape[1] >= 3)
     check_rows(by_x, 0, n)
     largest, count, longest = m * min(n, most), 0, 0.0
-    rows, columns, distances = np.empty(largest, np.int64), np.empty(largest, np.int64), np.empty(largest)
+    rows, columns, distances = (
+        np.empty(largest, np.int64),
+        np.empty(largest, np.int64),
+        np.empty(largest),
+    )
     for j in range(n):
         longest = max(longest, reach_m[j] * (1.0 + 1e-9))
     for i in range(m):
@@ -194,7 +256,9 @@ def near(
             distance = math.sqrt(dx * dx + dy * dy)
             if not math.isnan(angle):
                 off = math.atan2(dy, dx) - angle
-                distance = abs(distance * math.sin(off)) if math.cos(off) > 0.0 else distance
+                distance = (
+                    abs(distance * math.sin(off)) if math.cos(off) > 0.0 else distance
+                )
             elif dx > longest:
                 break
             if distance > reach_m[j]:
@@ -206,7 +270,10 @@ def near(
                 if distances[k] <= distance:
                     continue
                 for other in range(k, count - 1):
-                    columns[other], distances[other] = columns[other + 1], distances[other + 1]
+                    columns[other], distances[other] = (
+                        columns[other + 1],
+                        distances[other + 1],
+                    )
                 count -= 1
             k = count
             while k > first and columns[k - 1] > j:  # in the order of the tracks
@@ -218,7 +285,9 @@ def near(
 
 
 @njit("(float64[:, ::1], int64[:], int64[::1], float64)")
-def linked(points: FloatArray, by_x: IntArray, starts: IntArray, distance: float) -> tuple[IntArray, BoolArray]:
+def linked(
+    points: FloatArray, by_x: IntArray, starts: IntArray, distance: float
+) -> tuple[IntArray, BoolArray]:
     """First of the `points` (n, 2) that each one is linked to by steps of at most `distance` in its list, shape (n,).
     With True for each list without links. `by_x` (n,) has the points of a list from `starts[k]` up to the next start,
     in the order of x.
@@ -249,11 +318,17 @@ def linked(points: FloatArray, by_x: IntArray, starts: IntArray, distance: float
 def faults(means: FloatArray, covariances: FloatArray) -> IntArray:
     """Fault of each state (m, n) and (m, n, n), shape (m,): not finite or beyond any vehicle, invalid covariance."""
     m, n = means.shape
-    check(len(covariances) >= m and covariances.shape[1] == n and covariances.shape[2] == n)
+    check(
+        len(covariances) >= m
+        and covariances.shape[1] == n
+        and covariances.shape[2] == n
+    )
     result, C, std = np.full(m, SOUND), np.empty((n, n)), np.empty(n)
     for i in range(m):
         P, size, total = covariances[i], 0.0, 0.0
-        sound = P[0, 0] > 0.0 and P[1, 1] > 0.0  # every model has a position; other entries may be 0 for certain
+        sound = (
+            P[0, 0] > 0.0 and P[1, 1] > 0.0
+        )  # every model has a position; other entries may be 0 for certain
         for a in range(n):
             std[a] = math.sqrt(max(P[a, a], 1e-300))
         for a in range(n):

@@ -43,10 +43,18 @@ class _Seen:
 class Evidence:
     """Evidence of class and identity on pairs of detections and tracks."""
 
-    def __init__(self, classes: Apart | None, theirs: IntArray, own: IntArray, wrong_id_probability: float) -> None:
+    def __init__(
+        self,
+        classes: Apart | None,
+        theirs: IntArray,
+        own: IntArray,
+        wrong_id_probability: float,
+    ) -> None:
         """`theirs` and `own` number the identities of the detections and of the tracks, 0 of none."""
         self._classes, self._theirs, self._own = classes, theirs, own
-        self.weight = 2.0 * math.log((1.0 - wrong_id_probability) / wrong_id_probability)
+        self.weight = 2.0 * math.log(
+            (1.0 - wrong_id_probability) / wrong_id_probability
+        )
         """Twice the log-likelihood ratio of equal against different identities."""
 
     def __call__(self, rows: IntArray, columns: IntArray) -> BoolArray:
@@ -55,12 +63,20 @@ class Evidence:
 
     def differ(self, rows: IntArray, columns: IntArray) -> BoolArray:
         """True of pairs that differ in class."""
-        return np.zeros(len(rows), dtype=bool) if self._classes is None else self._classes(rows, columns)
+        return (
+            np.zeros(len(rows), dtype=bool)
+            if self._classes is None
+            else self._classes(rows, columns)
+        )
 
     def nis(self, rows: IntArray, columns: IntArray) -> FloatArray:
         """Addition to the NIS of the pairs, shape (m,): `weight` of different identities, minus it of equal ones."""
         a, b = self._theirs[rows], self._own[columns]
-        return np.where((a == _UNKNOWN) | (b == _UNKNOWN), 0.0, np.where(a == b, -self.weight, self.weight))
+        return np.where(
+            (a == _UNKNOWN) | (b == _UNKNOWN),
+            0.0,
+            np.where(a == b, -self.weight, self.weight),
+        )
 
 
 class Objects:
@@ -72,9 +88,13 @@ class Objects:
     def __init__(self) -> None:
         self._seen: dict[int, _Seen] = {}
         self._ids: dict[int, str] = {}  # of most detections, by track
-        self._owners: dict[str, set[int]] = {}  # tracks of an identity, of most of their detections
+        self._owners: dict[
+            str, set[int]
+        ] = {}  # tracks of an identity, of most of their detections
         self._former: dict[str, int] = {}  # tracks that have ended, by identity
-        self._strays: dict[str, tuple[int, Hashable]] = {}  # by identity, see `is_stray`: their number, newest list
+        self._strays: dict[
+            str, tuple[int, Hashable]
+        ] = {}  # by identity, see `is_stray`: their number, newest list
         self.id_conflicts: Counter[str] = Counter()
         """Identities that were `reused`: a track began with that of another one; or `changed`: a track fused another
         identity than most of its detections have."""
@@ -99,7 +119,9 @@ class Objects:
                     self.id_conflicts["changed"] += 1
                 seen.ids[detection.id] += 1
                 self._strays.pop(detection.id, None)
-                if detection.id != known and seen.ids[detection.id] > seen.ids.get(known or "", 0):
+                if detection.id != known and seen.ids[detection.id] > seen.ids.get(
+                    known or "", 0
+                ):
                     self._disown(track_id)
                     self._ids[track_id] = detection.id
                     self._owners.setdefault(detection.id, set()).add(track_id)
@@ -107,7 +129,9 @@ class Objects:
                 if value is not None:
                     seen.num_sizes[name] += 1
                     mean = seen.sizes_m.get(name, 0.0)
-                    seen.sizes_m[name] = mean + 1.0 / seen.num_sizes[name] * (value - mean)
+                    seen.sizes_m[name] = mean + 1.0 / seen.num_sizes[name] * (
+                        value - mean
+                    )
 
     def owner(self, detection: Detection) -> int | None:
         """Return the one track with the identity of `detection`; None without any, and where its class decides."""
@@ -117,18 +141,31 @@ class Objects:
         return next(iter(tracks)) if len(tracks) == 1 else None
 
     def evidence(
-        self, detections: Iterable[Detection], track_ids: Sequence[int], wrong_id_probability: float
+        self,
+        detections: Iterable[Detection],
+        track_ids: Sequence[int],
+        wrong_id_probability: float,
     ) -> Apart | None:
         """Return the evidence of classes and identities on pairs of detections and tracks; None without any."""
         if not self._seen:
             return None
         detections = list(detections)
-        classes, ids = self.apart(detections, track_ids), [each.id for each in detections]
+        classes, ids = (
+            self.apart(detections, track_ids),
+            [each.id for each in detections],
+        )
         if not any(ids):
             return classes
-        numbers: dict[str | None, int] = {name: number for number, name in enumerate(dict.fromkeys(ids), 1) if name}
+        numbers: dict[str | None, int] = {
+            name: number for number, name in enumerate(dict.fromkeys(ids), 1) if name
+        }
         theirs = np.array([numbers.get(name, _UNKNOWN) for name in ids])
-        own = np.array([numbers.get(self._ids[i], _OTHER) if i in self._ids else _UNKNOWN for i in track_ids])
+        own = np.array(
+            [
+                numbers.get(self._ids[i], _OTHER) if i in self._ids else _UNKNOWN
+                for i in track_ids
+            ]
+        )
         return Evidence(classes, theirs, own, wrong_id_probability)
 
     def is_stray(self, detection: Detection, of: Hashable) -> bool:
@@ -151,17 +188,28 @@ class Objects:
         lost = min(self._owners.get(detection.id or "", ()), default=None)
         return self._former.pop(detection.id or "", None) if lost is None else lost
 
-    def apart(self, detections: Iterable[Detection], track_ids: Sequence[int]) -> Apart | None:
+    def apart(
+        self, detections: Iterable[Detection], track_ids: Sequence[int]
+    ) -> Apart | None:
         """Return a test of pairs of detections and tracks for different classes; None if no pair is excluded."""
         named = [each.class_name for each in detections]
         if not any(named):
             return None
-        classes = [_most(self._seen[i].classes) if i in self._seen else None for i in track_ids]
+        classes = [
+            _most(self._seen[i].classes) if i in self._seen else None for i in track_ids
+        ]
         if not any(classes):
             return None
         numbers = dict(_GROUPS)
         theirs, own = (
-            np.array([numbers.setdefault(name.lower(), len(numbers) + 1) if name else _UNKNOWN for name in names])
+            np.array(
+                [
+                    numbers.setdefault(name.lower(), len(numbers) + 1)
+                    if name
+                    else _UNKNOWN
+                    for name in names
+                ]
+            )
             for names in (named, classes)
         )
 
@@ -173,7 +221,9 @@ class Objects:
 
     def reports(self, track_ids: Iterable[int]) -> list[ObjectReport | None]:
         """Class and size of the object of each track; None if no detection has reported any."""
-        return [self._report(self._seen[i]) if i in self._seen else None for i in track_ids]
+        return [
+            self._report(self._seen[i]) if i in self._seen else None for i in track_ids
+        ]
 
     def forget(self, track_id: int) -> None:
         """Forget a track that has ended."""

@@ -11,10 +11,22 @@ import numpy as np
 
 from fgtrack.core.geometry import body_point
 from fgtrack.core.linalg import congruence, kernels, symmetrise
-from fgtrack.core.types import BoolArray, Disposition, FloatArray, IntArray, UpdateRecord
+from fgtrack.core.types import (
+    BoolArray,
+    Disposition,
+    FloatArray,
+    IntArray,
+    UpdateRecord,
+)
 from fgtrack.estimation.base import Lazy, Measurement, Measurements
 from fgtrack.models.correlated_errors import split_error
-from fgtrack.models.measurement import COMPONENTS, MeasurementModel, SensorPose, measured_position, measurement_model
+from fgtrack.models.measurement import (
+    COMPONENTS,
+    MeasurementModel,
+    SensorPose,
+    measured_position,
+    measurement_model,
+)
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
@@ -28,7 +40,7 @@ from fgtrack.tracking.detections import (
     merged,
     move_back,
 )
-from fgtrack.tracking.ego import EgoPose
+from fgtrack.tracking.ego.trajectory import EgoPose
 from fgtrack.tracking.inbox import Batch, record
 
 _FAR_M = 1e6
@@ -53,7 +65,13 @@ class Candidate(NamedTuple):
     @property
     def values(self) -> dict[str, float]:
         """Measured components by name, in the map frame."""
-        return dict(zip(self.measurement.model.components, self.measurement.z.tolist(), strict=True))
+        return dict(
+            zip(
+                self.measurement.model.components,
+                self.measurement.z.tolist(),
+                strict=True,
+            )
+        )
 
 
 class StampError(NamedTuple):
@@ -62,19 +80,25 @@ class StampError(NamedTuple):
     motion: MotionModel
     std_s: float
 
-    def rate(self, model: MeasurementModel, pose: SensorPose, x: FloatArray) -> FloatArray:
+    def rate(
+        self, model: MeasurementModel, pose: SensorPose, x: FloatArray
+    ) -> FloatArray:
         """Derivative v of h(x) by the stamp at the states `x` (..., n), shape (..., k)."""
         moved = model.predict(self.motion.predict(x, _STEP_S), pose)
         return model.residual(moved, model.predict(x, pose)) / _STEP_S
 
-    def noise(self, model: MeasurementModel, pose: SensorPose, x: FloatArray, P: FloatArray) -> FloatArray:
+    def noise(
+        self, model: MeasurementModel, pose: SensorPose, x: FloatArray, P: FloatArray
+    ) -> FloatArray:
         """Covariance sigma_t^2 E[v v'], shape (m, k, k), at the states `x` (m, n) with covariances `P`.
         E[v v'] = v v' + D P D' with D = dv/dx, which is the derivative of H F by time: the velocity of a new track is
         its uncertainty.
         """
         v, (moved, F, _) = self.rate(model, pose, x), self.motion.transition(x, _STEP_S)
         D = (model.jacobian(moved, pose) @ F - model.jacobian(x, pose)) / _STEP_S
-        return self.std_s**2 * (v[..., :, None] * v[..., None, :] + symmetrise(congruence(D, P)))
+        return self.std_s**2 * (
+            v[..., :, None] * v[..., None, :] + symmetrise(congruence(D, P))
+        )
 
 
 class Group(NamedTuple):
@@ -91,7 +115,9 @@ class Group(NamedTuple):
     stamp_error: StampError | None = None
     """Error of the stamp, of which nothing is in `stack` and `spread`; None where it is not considered."""
 
-    def noise(self, members: IntArray, x: FloatArray, P: FloatArray, of: IntArray) -> FloatArray:
+    def noise(
+        self, members: IntArray, x: FloatArray, P: FloatArray, of: IntArray
+    ) -> FloatArray:
         """R of some `members` (p,), of objects at the states `x` (p, n) with covariances P[of] (p, n, n)."""
         own = self.stack
         R = own.R.take(members, axis=0)
@@ -101,13 +127,21 @@ class Group(NamedTuple):
             R = R + self.stamp_error.noise(own.model, own.pose, x, P[of])
         return R
 
-    def seen_at(self, members: IntArray, x: FloatArray, P: FloatArray, of: IntArray) -> Measurement:
+    def seen_at(
+        self, members: IntArray, x: FloatArray, P: FloatArray, of: IntArray
+    ) -> Measurement:
         """The stack of some `members`, ascending, see `noise`."""
-        own, varies = self.stack, self.stamp_error is not None or (self.error is not None and self.stack.model.relative)
+        own, varies = (
+            self.stack,
+            self.stamp_error is not None
+            or (self.error is not None and self.stack.model.relative),
+        )
         if len(members) == len(own.z) and not varies:
             return own
         z, R = own.z.take(members, axis=0), self.noise(members, x, P, of)
-        return Measurement(own.stamp_ns, own.model, z, R, own.pose, own.loss, own.assumed)
+        return Measurement(
+            own.stamp_ns, own.model, z, R, own.pose, own.loss, own.assumed
+        )
 
     def position_covariances(self, members: IntArray) -> FloatArray:
         """Covariances of the positions in the map of some `members` (p,), which have one, shape (p, 2, 2)."""
@@ -115,7 +149,8 @@ class Group(NamedTuple):
         if own.model.components[:2] == ("x_m", "y_m"):
             return R[:, :2, :2]
         positions = [
-            measured_position(own.model.components, z, C, own.pose) for z, C in zip(own.z[members], R, strict=True)
+            measured_position(own.model.components, z, C, own.pose)
+            for z, C in zip(own.z[members], R, strict=True)
         ]
         return np.array([each[1] for each in positions if each is not None])
 
@@ -124,7 +159,11 @@ class Candidates(Lazy[Candidate]):
     """The candidates of a batch, in the order of the merge."""
 
     def __init__(
-        self, leaders: list[int], merged: Mapping[int, tuple[int, ...]], lines: FloatArray, groups: list[Group]
+        self,
+        leaders: list[int],
+        merged: Mapping[int, tuple[int, ...]],
+        lines: FloatArray,
+        groups: list[Group],
     ) -> None:
         self.leaders, self.merged = leaders, merged
         """See `Candidate`; by leader."""
@@ -142,7 +181,9 @@ class Candidates(Lazy[Candidate]):
         leader, point = self.leaders[index], self.lines[index]
         [(group, members, _)] = self.split(np.array([index]))
         own = Measurements(group.stack)[members[0]]
-        position = measured_position(own.model.components, own.z, group.spread[members[0]], own.pose)
+        position = measured_position(
+            own.model.components, own.z, group.spread[members[0]], own.pose
+        )
         return Candidate(
             leader,
             self.merged.get(leader, ()),
@@ -167,16 +208,30 @@ class Candidates(Lazy[Candidate]):
     def renew(self, chosen: set[int]) -> None:
         """Take the whole errors of the `chosen` ones as new, whatever the correlated parts are."""
         for k, group in enumerate(self.groups):
-            if not chosen.isdisjoint(group.rows.tolist()):  # with correlated errors each is a group
-                self.groups[k] = group._replace(stack=replace(group.stack, R=group.spread), error=None)
+            if not chosen.isdisjoint(
+                group.rows.tolist()
+            ):  # with correlated errors each is a group
+                self.groups[k] = group._replace(
+                    stack=replace(group.stack, R=group.spread), error=None
+                )
 
     def at(self, indices: Sequence[int]) -> "Candidates":
         """Return the candidates at `indices`."""
         groups = [
-            Group(here, replace(own, z=own.z[m], R=own.R[m]), spread[m], error and error.at(m), stamp_error)
-            for (_, own, spread, error, stamp_error), m, here in self.split(np.array(indices))
+            Group(
+                here,
+                replace(own, z=own.z[m], R=own.R[m]),
+                spread[m],
+                error and error.at(m),
+                stamp_error,
+            )
+            for (_, own, spread, error, stamp_error), m, here in self.split(
+                np.array(indices)
+            )
         ]
-        return Candidates([self.leaders[i] for i in indices], self.merged, self.lines[indices], groups)
+        return Candidates(
+            [self.leaders[i] for i in indices], self.merged, self.lines[indices], groups
+        )
 
 
 Preprocessed = tuple[Candidates, list[UpdateRecord]]
@@ -204,13 +259,17 @@ class Preprocess:
         self._origin_m = detection_origin_m
         self._assumes_map_yaw = assumes_map_yaw
 
-    def __call__(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> Preprocessed:
+    def __call__(
+        self, batch: Batch, sensor: SensorModel, ego: EgoPose | None
+    ) -> Preprocessed:
         """Return the candidates of a batch, and the records of the rejected detections.
         `ego` is the pose at the batch's stamp; it may be None for detections in the map frame.
         """
         return self.together([self.posed(batch, sensor, ego)])[0]
 
-    def posed(self, batch: Batch, sensor: SensorModel, ego: EgoPose | None) -> PosedBatch:
+    def posed(
+        self, batch: Batch, sensor: SensorModel, ego: EgoPose | None
+    ) -> PosedBatch:
         """Return `batch` with the pose of the frame that its detections are given in, and the velocity of its origin.
         Of detections in the map the pose that they are seen from: that of the ego, without one the map's origin.
         """
@@ -222,30 +281,50 @@ class Preprocess:
             x_m, y_m = x_m + sensor.placed.x_m, y_m + sensor.placed.y_m
             yaw_rad += sensor.placed.yaw_rad
         x_m, y_m, vx_mps, vy_mps = body_point(*ego[:5], x_m, y_m)
-        return PosedBatch(batch, sensor, ego, SensorPose(x_m, y_m, yaw_rad, vx_mps, vy_mps))
+        return PosedBatch(
+            batch, sensor, ego, SensorPose(x_m, y_m, yaw_rad, vx_mps, vy_mps)
+        )
 
     def together(self, batches: Sequence[PosedBatch]) -> list[Preprocessed]:
         """Return for each of `batches` what `__call__` returns, in one pass over the arrays of all."""
         lost: list[dict[int, str]] = [{} for _ in batches]
         items = in_map_frame(batches)
-        if any(s.filters or s.near_side_m or s.max_range_m is not None for _, s, _, _ in batches):
+        if any(
+            s.filters or s.near_side_m or s.max_range_m is not None
+            for _, s, _, _ in batches
+        ):
             items = _restricted(items, lost)
         items = merged(self._on_road(items, lost), self._merge)
         return [
             (candidates, [_out_of_bounds(each.batch, *one) for one in out.items()])
-            for each, candidates, out in zip(batches, self._candidates(items), lost, strict=True)
+            for each, candidates, out in zip(
+                batches, self._candidates(items), lost, strict=True
+            )
         ]
 
-    def _on_road(self, items: MapDetections, lost: Sequence[dict[int, str]]) -> MapDetections:
+    def _on_road(
+        self, items: MapDetections, lost: Sequence[dict[int, str]]
+    ) -> MapDetections:
         """Return the detections inside the bounds, with yaw and curvature of the map; `lost` gets the rest."""
         if not self._road.known:
             return items
         takes = [
-            (sensor.yaw_from_map_std_rad is not None, sensor.curvature_from_map_std_radpm is not None)
+            (
+                sensor.yaw_from_map_std_rad is not None,
+                sensor.curvature_from_map_std_radpm is not None,
+            )
             for _, sensor, _, _ in items.batches
         ]
-        arrays = items.values, items.points_m, items.map_yaw, items.starts, np.array(takes)
-        outside = kernels("fgtrack.tracking.kernels").on_road(*arrays, *self._road.view(items.points_m))
+        arrays = (
+            items.values,
+            items.points_m,
+            items.map_yaw,
+            items.starts,
+            np.array(takes),
+        )
+        outside = kernels("fgtrack.tracking.kernels").on_road(
+            *arrays, *self._road.view(items.points_m)
+        )
         return _without(items, outside, "map.track", lost)
 
     def _candidates(self, items: MapDetections) -> Iterator[Candidates]:
@@ -256,54 +335,111 @@ class Preprocess:
             own = codes[first:end]
             kinds, groups = dict.fromkeys(own.tolist()), []
             for code in kinds:
-                rows = np.arange(end - first) if len(kinds) == 1 else (own == code).nonzero()[0]
+                rows = (
+                    np.arange(end - first)
+                    if len(kinds) == 1
+                    else (own == code).nonzero()[0]
+                )
                 groups += self._groups(items, k, first, rows, code)
-            others = {index: others for (batch, index), others in items.merged.items() if batch == k}
-            yield Candidates(items.indices[first:end].tolist(), others, lines[first:end], groups)
+            others = {
+                index: others
+                for (batch, index), others in items.merged.items()
+                if batch == k
+            }
+            yield Candidates(
+                items.indices[first:end].tolist(), others, lines[first:end], groups
+            )
 
-    def _groups(self, items: MapDetections, k: int, first: int, rows: IntArray, code: int) -> list[Group]:
+    def _groups(
+        self, items: MapDetections, k: int, first: int, rows: IntArray, code: int
+    ) -> list[Group]:
         """Return the candidates `rows` of batch k, which begins at `first`, and which all measure the same.
         One by one where errors are correlated in time.
         """
         here = slice(first, first + len(rows)) if rows[-1] < len(rows) else first + rows
         (batch, sensor, ego, pose), points_m = items.batches[k], items.points_m[here]
         names, columns, assumed, placed = _components(code, self._assumes_map_yaw)
-        z, R = items.values[here].take(columns, axis=1), covariances(items, k, here, names)
+        z, R = (
+            items.values[here].take(columns, axis=1),
+            covariances(items, k, here, names),
+        )
         model = measurement_model(names, self._motion)
         models, white = [model], R
         if sensor.correlation is not None:
-            split = [split_error(batch.message.sensor, sensor, model, item, self._motion.state_names) for item in R]
-            models, white = [each for each, _ in split], np.array([noise for _, noise in split])
+            split = [
+                split_error(
+                    batch.message.sensor, sensor, model, item, self._motion.state_names
+                )
+                for item in R
+            ]
+            models, white = (
+                [each for each, _ in split],
+                np.array([noise for _, noise in split]),
+            )
         total, error, is_moved = white, None, batch.message.frame != "map"
-        if ego is not None and ego.covariance is not None and (is_moved or model.relative):
+        if (
+            ego is not None
+            and ego.covariance is not None
+            and (is_moved or model.relative)
+        ):
             P, G, components = (
                 np.zeros((5, 5)),
                 np.zeros((*z.shape, 5)),
                 placed if is_moved else np.full(len(names), -1),
             )
             body = ego.yaw_rad, ego.x_m, ego.y_m, ego.covariance
-            kernels("fgtrack.tracking.kernels").pose_error(points_m, components, items.poses[k], *body, P, G)
+            kernels("fgtrack.tracking.kernels").pose_error(
+                points_m, components, items.poses[k], *body, P, G
+            )
             x, error = points_m, PoseError(P, G, white)
             if model.relative:
-                x, is_placed = np.zeros((len(z), self._motion.dim)), not math.isnan(points_m[0, 0])  # all or none
-                x[:, :2] = points_m if is_placed else _far_along(z[:, names.index("bearing_rad")], pose)
+                x, is_placed = (
+                    np.zeros((len(z), self._motion.dim)),
+                    not math.isnan(points_m[0, 0]),
+                )  # all or none
+                x[:, :2] = (
+                    points_m
+                    if is_placed
+                    else _far_along(z[:, names.index("bearing_rad")], pose)
+                )
             total = error.noise(models[0], pose, x)
             R = total if white is R else R + (total - white)
-        late = StampError(self._motion, sensor.stamp_std_s) if sensor.stamp_std_s else None
+        late = (
+            StampError(self._motion, sensor.stamp_std_s) if sensor.stamp_std_s else None
+        )
         whole = Group(
-            rows, Measurement(batch.stamp_ns, models[0], z, total, pose, sensor.loss, assumed), R, error, late
+            rows,
+            Measurement(
+                batch.stamp_ns, models[0], z, total, pose, sensor.loss, assumed
+            ),
+            R,
+            error,
+            late,
         )
         if sensor.correlation is None:
             return [whole]
         groups = []
         for i, each in enumerate(models):
-            item, m = Measurement(batch.stamp_ns, each, z[i : i + 1], total[i : i + 1], pose, sensor.loss, assumed), [i]
+            item, m = (
+                Measurement(
+                    batch.stamp_ns,
+                    each,
+                    z[i : i + 1],
+                    total[i : i + 1],
+                    pose,
+                    sensor.loss,
+                    assumed,
+                ),
+                [i],
+            )
             groups.append(Group(rows[m], item, R[m], error and error.at(m), late))
         return groups
 
 
 def _out_of_bounds(batch: Batch, index: int, reason: str) -> UpdateRecord:
-    return replace(record(batch.message, index, Disposition.OUT_OF_BOUNDS), reason=reason)
+    return replace(
+        record(batch.message, index, Disposition.OUT_OF_BOUNDS), reason=reason
+    )
 
 
 def _restricted(items: MapDetections, lost: Sequence[dict[int, str]]) -> MapDetections:
@@ -316,38 +452,69 @@ def _restricted(items: MapDetections, lost: Sequence[dict[int, str]]) -> MapDete
         if name is not None:
             lost[k][index] = f"filters.{name}"
     items = items.at(np.array(passes, dtype=bool))
-    ranges_m = [each.sensor.max_range_m if each.ego is not None else None for each in batches]
-    of, most_m = items.of, np.array([math.inf if range_m is None else range_m for range_m in ranges_m])
+    ranges_m = [
+        each.sensor.max_range_m if each.ego is not None else None for each in batches
+    ]
+    of, most_m = (
+        items.of,
+        np.array([math.inf if range_m is None else range_m for range_m in ranges_m]),
+    )
     offsets_m = items.points_m - items.poses[of, :2]
     far = np.hypot(offsets_m[:, 0], offsets_m[:, 1]) > most_m[of]
     items = _without(items, far, "max_range_m", lost)
-    move_back(items, np.array([0.0 if each.ego is None else each.sensor.near_side_m for each in batches]))
+    move_back(
+        items,
+        np.array(
+            [0.0 if each.ego is None else each.sensor.near_side_m for each in batches]
+        ),
+    )
     return items
 
 
-def _without(items: MapDetections, outside: BoolArray, reason: str, lost: Sequence[dict[int, str]]) -> MapDetections:
+def _without(
+    items: MapDetections,
+    outside: BoolArray,
+    reason: str,
+    lost: Sequence[dict[int, str]],
+) -> MapDetections:
     """`items` without those `outside`, shape (m,), whose indices `lost` of their batch gets with the `reason`."""
     rows = outside.nonzero()[0]
     if not len(rows):
         return items
-    for k, index in zip(items.of[rows].tolist(), items.indices[rows].tolist(), strict=True):
+    for k, index in zip(
+        items.of[rows].tolist(), items.indices[rows].tolist(), strict=True
+    ):
         lost[k][index] = reason
     return items.at(~outside)
 
 
 @cache
-def _components(code: int, map_yaw_is_assumed: bool) -> tuple[tuple[str, ...], IntArray, tuple[str, ...], IntArray]:
+def _components(
+    code: int, map_yaw_is_assumed: bool
+) -> tuple[tuple[str, ...], IntArray, tuple[str, ...], IntArray]:
     """Names and columns of the measured `COMPONENTS`, see the kernel `described`; names that are assumed; columns.
     Of the last, -1 of what is assumed.
     """
     columns = np.array([k for k in range(len(COMPONENTS)) if code >> k & 1])
     names = tuple(COMPONENTS[k] for k in columns)
-    known = {"curvature_radpm", "yaw_rad"} if map_yaw_is_assumed and code >> len(COMPONENTS) else {"curvature_radpm"}
+    known = (
+        {"curvature_radpm", "yaw_rad"}
+        if map_yaw_is_assumed and code >> len(COMPONENTS)
+        else {"curvature_radpm"}
+    )
     assumed = tuple(name for name in names if name in known)
-    return names, columns, assumed, np.where([name in assumed for name in names], -1, columns)
+    return (
+        names,
+        columns,
+        assumed,
+        np.where([name in assumed for name in names], -1, columns),
+    )
 
 
 def _far_along(bearings_rad: FloatArray, pose: SensorPose) -> list[tuple[float, float]]:
     """Points so far along lines of sight (m,) that the position of the sensor no longer matters."""
     angles_rad = [pose.yaw_rad + bearing_rad for bearing_rad in bearings_rad.tolist()]
-    return [(pose.x_m + _FAR_M * math.cos(angle), pose.y_m + _FAR_M * math.sin(angle)) for angle in angles_rad]
+    return [
+        (pose.x_m + _FAR_M * math.cos(angle), pose.y_m + _FAR_M * math.sin(angle))
+        for angle in angles_rad
+    ]

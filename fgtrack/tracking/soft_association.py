@@ -22,8 +22,8 @@ from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, StatesAt
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.association import Pairs
-from fgtrack.tracking.existence import position_densities
 from fgtrack.tracking.facing import REVERSED, SIGNED
+from fgtrack.tracking.lives.existence import position_densities
 from fgtrack.tracking.preprocess import Candidates, Group
 
 LEAST_INFORMATION = 0.05
@@ -31,11 +31,15 @@ LEAST_INFORMATION = 0.05
 _ITERATIONS = 30
 
 
-def joint_probabilities(pairs: Pairs, candidates: Candidates, states: StatesAt, sensor: SensorModel) -> Pairs:
+def joint_probabilities(
+    pairs: Pairs, candidates: Candidates, states: StatesAt, sensor: SensorModel
+) -> Pairs:
     """Return those of `pairs` whose candidates have a position, with the probability that they belong together."""
     pairs = pairs.at(np.array(candidates.placed, dtype=bool)[pairs.rows])
     rows, columns, _ = pairs
-    densities = position_densities(candidates, rows, states.means[columns], states.covariances[columns])
+    densities = position_densities(
+        candidates, rows, states.means[columns], states.covariances[columns]
+    )
     odds = sensor.detection_probability / (1.0 - sensor.detection_probability)
     weights = np.zeros((len(states.means), len(candidates)))
     weights[columns, rows] = odds * np.nan_to_num(densities) / sensor.clutter_per_m2
@@ -57,7 +61,12 @@ def marginals(weights: FloatArray) -> FloatArray:
 
 
 def equivalent(
-    seen: Measurement, tracks: IntArray, group: Group, joint: Pairs, states: StatesAt, readings: IntArray | None = None
+    seen: Measurement,
+    tracks: IntArray,
+    group: Group,
+    joint: Pairs,
+    states: StatesAt,
+    readings: IntArray | None = None,
 ) -> Measurement:
     """Return `seen`, the detections of `group` assigned to `tracks`, as the equivalent measurements; see the module.
     Tracks that are not in `joint` keep theirs. `seen` has its `readings` (m,), see `fgtrack.tracking.facing`. Of
@@ -66,7 +75,9 @@ def equivalent(
     z, R = seen.z.copy(), seen.R.copy()
     names = seen.model.components
     columns = [group.stack.model.components.index(name) for name in names]
-    yaw = names.index("yaw_rad") if "yaw_rad" in names and readings is not None else None
+    yaw = (
+        names.index("yaw_rad") if "yaw_rad" in names and readings is not None else None
+    )
     signed = [row for row, name in enumerate(names) if name in SIGNED]
     members = np.searchsorted(group.rows, joint.rows)
     in_group = group.rows.take(members, mode="clip") == joint.rows
@@ -78,13 +89,21 @@ def equivalent(
         every = np.concatenate([z[k : k + 1], group.stack.z[members[own]][:, columns]])
         if readings is not None and readings[k] & REVERSED:
             every[1:, signed] *= -1.0
-        y, H = seen.model.linearised(every, np.broadcast_to(x, (len(every), x.shape[1])), seen.pose)
+        y, H = seen.model.linearised(
+            every, np.broadcast_to(x, (len(every), x.shape[1])), seen.pose
+        )
         if yaw is not None:
             y[1:, yaw] -= math.pi * np.round(y[1:, yaw] / math.pi)
-        L = np.linalg.cholesky(congruence(H if H.ndim == 2 else H[0], states.covariances[track]) + R[k])
+        L = np.linalg.cholesky(
+            congruence(H if H.ndim == 2 else H[0], states.covariances[track]) + R[k]
+        )
         white = np.linalg.solve(L, y.T)
         mean = white[:, 1:] @ b
-        D = b.sum() * np.eye(len(mean)) - (b * white[:, 1:]) @ white[:, 1:].T + np.outer(mean, mean)
+        D = (
+            b.sum() * np.eye(len(mean))
+            - (b * white[:, 1:]) @ white[:, 1:].T
+            + np.outer(mean, mean)
+        )
         information, axes = np.linalg.eigh(D)
         inverse = (axes / np.maximum(information, LEAST_INFORMATION)) @ axes.T
         z[k] += L @ (inverse @ mean - white[:, 0])

@@ -28,7 +28,14 @@ from fgtrack.core.types import (
     TrackStatus,
     UpdateRecord,
 )
-from fgtrack.estimation.base import Measurement, Measurements, Start, StatesAt, UpdateResult, UpdateStatus
+from fgtrack.estimation.base import (
+    Measurement,
+    Measurements,
+    Start,
+    StatesAt,
+    UpdateResult,
+    UpdateStatus,
+)
 from fgtrack.estimation.failures import Failure, Failures
 from fgtrack.estimation.filters.ekf import correct_one, propagated
 from fgtrack.estimation.filters.propagation import kinematic_states
@@ -37,20 +44,34 @@ from fgtrack.models.measurement import AT_ORIGIN
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.association import Assignment, Association, GatedMahalanobis, Likely, Pairs, claimed
+from fgtrack.tracking.association import (
+    Assignment,
+    Association,
+    GatedMahalanobis,
+    Likely,
+    Pairs,
+    claimed,
+)
 from fgtrack.tracking.birth import Birth, in_any_direction
 from fgtrack.tracking.detections import PosedBatch
-from fgtrack.tracking.ego import EgoPose, EgoTrajectory
-from fgtrack.tracking.existence import Lifecycle, after_jumps, explained
+from fgtrack.tracking.ego.trajectory import EgoPose, EgoTrajectory
+from fgtrack.tracking.ego.waiting import PoseWait, places, range_of
 from fgtrack.tracking.facing import Facing, Facings, YawsRead, as_read
 from fgtrack.tracking.guarded_bank import GuardedBank, faults
-from fgtrack.tracking.inbox import Batch, FusedRecords, Inbox, merged_records, record, stamps
-from fgtrack.tracking.latency import FOREVER, NEVER, Delays, Watermarks
-from fgtrack.tracking.lifecycle import Scan
+from fgtrack.tracking.inbox import (
+    Batch,
+    FusedRecords,
+    Inbox,
+    merged_records,
+    record,
+    stamps,
+)
+from fgtrack.tracking.lives.counters import Scan
+from fgtrack.tracking.lives.existence import Lifecycle, after_jumps, explained
+from fgtrack.tracking.lives.latency import FOREVER, NEVER, Delays, Watermarks
 from fgtrack.tracking.objects import Apart, Evidence, Objects
 from fgtrack.tracking.preprocess import Candidates, Group, Preprocess, Preprocessed
 from fgtrack.tracking.soft_association import equivalent, joint_probabilities
-from fgtrack.tracking.waiting import PoseWait, places, range_of
 
 _SELDOM = 1e-3  # probability with which a true pair misses the usual gate
 
@@ -110,14 +131,28 @@ class Tracker:
         self._parts = parts
         self._tick = -1
         self._next_id = 0
-        self._records: list[Iterable[UpdateRecord]] = []  # some are made when they are asked for
+        self._records: list[
+            Iterable[UpdateRecord]
+        ] = []  # some are made when they are asked for
         self._waiting: list[Batch] = []  # collected, and not processed to the end
-        self._begun: tuple[int, Batch] | None = None  # the first of them, and the index of its first record
-        self._num_measured = Counter[int]()  # detections that have changed the state, by track
-        self._undirected: dict[int, Start] = {}  # of tracks with one position and an unknown heading, by id
-        self._directed: dict[int, tuple[Start, int]] = {}  # of those that have a second position since, and its stamp
-        self._newborn: dict[int, tuple[str, int]] = {}  # sensors of first positions, and stamps of second ones, by id
-        self._seen: dict[int, set[int]] = {}  # in this tick, by message: tracks that it has matched or started
+        self._begun: tuple[int, Batch] | None = (
+            None  # the first of them, and the index of its first record
+        )
+        self._num_measured = Counter[
+            int
+        ]()  # detections that have changed the state, by track
+        self._undirected: dict[
+            int, Start
+        ] = {}  # of tracks with one position and an unknown heading, by id
+        self._directed: dict[
+            int, tuple[Start, int]
+        ] = {}  # of those that have a second position since, and its stamp
+        self._newborn: dict[
+            int, tuple[str, int]
+        ] = {}  # sensors of first positions, and stamps of second ones, by id
+        self._seen: dict[
+            int, set[int]
+        ] = {}  # in this tick, by message: tracks that it has matched or started
         self.failures = parts.failures
         """Counts of internal failures and of the tracks that they have ended."""
         self.refused_ego: Counter[str] = Counter()
@@ -160,8 +195,12 @@ class Tracker:
         if message.sensor not in self._parts.sensors:
             check_sensor(message.sensor, self._parts.sensors)
         if message.frame not in FRAMES:
-            raise DataError(f"{message.sensor}: frame: one of {', '.join(FRAMES)} expected, not {message.frame!r}")
-        own_ns = stamps(message, self._parts.sensors[message.sensor]) or [message.stamp_ns]
+            raise DataError(
+                f"{message.sensor}: frame: one of {', '.join(FRAMES)} expected, not {message.frame!r}"
+            )
+        own_ns = stamps(message, self._parts.sensors[message.sensor]) or [
+            message.stamp_ns
+        ]
         self.delays[message.sensor].add(min(own_ns), message.receipt_ns, max(own_ns))
         self._records.append(self._parts.inbox.put(message))
 
@@ -175,7 +214,9 @@ class Tracker:
         self._fail_rest()  # of a tick that was interrupted
         self._waiting += parts.inbox.collect(now_ns, None if is_last else parts.wait)
         held_ns = parts.inbox.held_ns
-        self._expire(now_ns, min([held_ns, *(batch.stamp_ns for batch in self._waiting)]))
+        self._expire(
+            now_ns, min([held_ns, *(batch.stamp_ns for batch in self._waiting)])
+        )
         bank.advance(now_ns)
         with self._contained(Failure.STEP_FAILED):
             parts.ego.start_tick()
@@ -188,7 +229,9 @@ class Tracker:
             states = parts.facing.published(bank.track_ids, states)
         tracks = self._reports(*self._published(bank.track_ids, states))
         updates = partial(chain.from_iterable, self._records)
-        report = TickReport.made_later(self._tick, now_ns, smoothed, tracks=tracks, updates=updates)
+        report = TickReport.made_later(
+            self._tick, now_ns, smoothed, tracks=tracks, updates=updates
+        )
         self._records = []  # last: until here an interrupt leaves them for the next tick
         return report
 
@@ -213,25 +256,37 @@ class Tracker:
         Raises `CallError` for a track that does not exist, a stamp before its window, and a state that is not sound.
         """
         suspended = self._parts.lifecycle.suspended()
-        track_ids = [each for each in self._parts.bank.track_ids if each not in suspended]
+        track_ids = [
+            each for each in self._parts.bank.track_ids if each not in suspended
+        ]
         if track_id not in track_ids:
-            raise CallError(f"track {track_id} does not exist: there are {', '.join(map(str, track_ids)) or 'none'}")
+            raise CallError(
+                f"track {track_id} does not exist: there are {', '.join(map(str, track_ids)) or 'none'}"
+            )
         bank, motion = self._parts.bank, self._parts.motion
         known = bank.state_of(track_id, min(stamp_ns, bank.present_ns))
-        for track in self._reports_of(ahead_of(known, bank.present_ns, motion, stamp_ns), stamp_ns):
+        for track in self._reports_of(
+            ahead_of(known, bank.present_ns, motion, stamp_ns), stamp_ns
+        ):
             return track
-        raise CallError(f"track {track_id} has no state at {stamp_ns} ns: before its window, or not finite")
+        raise CallError(
+            f"track {track_id} has no state at {stamp_ns} ns: before its window, or not finite"
+        )
 
     def tracks_at(self, stamp_ns: int) -> tuple[TrackReport, ...]:
         """All tracks that have a state at a stamp, see `state_at`, in order of birth."""
-        return self._reports_of(states_of(self._parts.bank, self._parts.motion, stamp_ns), stamp_ns)
+        return self._reports_of(
+            states_of(self._parts.bank, self._parts.motion, stamp_ns), stamp_ns
+        )
 
     def _reports_of(self, states: StatesAt, stamp_ns: int) -> tuple[TrackReport, ...]:
         """Tracks with these states at a stamp, those that are not suspended and whose states are sound."""
         states = states.without(self._parts.lifecycle.suspended())
         if not states.track_ids:
             return ()
-        present: Sequence[TrackState] = kinematic_states(self._parts.motion, stamp_ns, states.means, states.covariances)
+        present: Sequence[TrackState] = kinematic_states(
+            self._parts.motion, stamp_ns, states.means, states.covariances
+        )
         if self._parts.facing is not None:
             present = self._parts.facing.seen(states.track_ids, present)
         unsound, reports = faults(present), self._reports(states.track_ids, present)()
@@ -255,7 +310,9 @@ class Tracker:
         suspended = self._parts.lifecycle.suspended()
         if not suspended:
             return track_ids, states
-        rows = [row for row, track_id in enumerate(track_ids) if track_id not in suspended]
+        rows = [
+            row for row, track_id in enumerate(track_ids) if track_id not in suspended
+        ]
         return [track_ids[row] for row in rows], [states[row] for row in rows]
 
     def _expire(self, now_ns: int, processed_ns: int) -> None:
@@ -277,22 +334,30 @@ class Tracker:
     def _forget_first(self, oldest_ns: int) -> None:
         """Forget the first positions of tracks whose second one no late list can precede."""
         if self._newborn:
-            self._newborn = {i: each for i, each in self._newborn.items() if each[1] >= oldest_ns}
+            self._newborn = {
+                i: each for i, each in self._newborn.items() if each[1] >= oldest_ns
+            }
         if self._directed:
-            self._directed = {i: each for i, each in self._directed.items() if each[1] >= oldest_ns}
+            self._directed = {
+                i: each for i, each in self._directed.items() if each[1] >= oldest_ns
+            }
 
     def _posed(self, batch: Batch) -> PosedBatch:
         """Return `batch` with the pose that it is seen from; detections in the map need none."""
         parts, sensor = self._parts, self._parts.sensors[batch.message.sensor]
         with self._contained(Failure.STEP_FAILED):
             if places(batch, sensor):
-                ego = parts.ego.placed(batch.stamp_ns, parts.bank.present_ns, partial(range_of, batch))
+                ego = parts.ego.placed(
+                    batch.stamp_ns, parts.bank.present_ns, partial(range_of, batch)
+                )
             else:
                 ego = parts.ego.pose_at(batch.stamp_ns, parts.bank.present_ns)
             return parts.preprocess.posed(batch, sensor, ego)
         return PosedBatch(batch, sensor, None, AT_ORIGIN)
 
-    def _preprocessed(self, batches: Sequence[PosedBatch]) -> Sequence[Preprocessed | None]:
+    def _preprocessed(
+        self, batches: Sequence[PosedBatch]
+    ) -> Sequence[Preprocessed | None]:
         """Candidates of `batches` in one pass; of a pass that fails nothing, so that one batch does not fail others."""
         try:
             return self._parts.preprocess.together(batches) if batches else ()
@@ -301,7 +366,9 @@ class Tracker:
                 raise
             return [None] * len(batches)
 
-    def _process_if_possible(self, posed: PosedBatch, preprocessed: Preprocessed | None) -> None:
+    def _process_if_possible(
+        self, posed: PosedBatch, preprocessed: Preprocessed | None
+    ) -> None:
         """Process a batch, the first that waits; after an exception or an interrupt, the rest of it ends as failed."""
         self._begun = len(self._records), posed.batch
         with self._contained(Failure.LIST_FAILED):
@@ -320,7 +387,9 @@ class Tracker:
             first, batch = self._begun
             ended = {each.index for each in chain.from_iterable(self._records[first:])}
             rest = [index for index in batch.indices if index not in ended]
-            self._records.append([record(batch.message, index, Disposition.FAILED) for index in rest])
+            self._records.append(
+                [record(batch.message, index, Disposition.FAILED) for index in rest]
+            )
             self._close()
 
     def _close(self) -> None:
@@ -335,15 +404,25 @@ class Tracker:
         parts, batch, ego = self._parts, posed.batch, posed.ego
         message = batch.message
         if ego is None and message.frame != "map":
-            self._records.append([record(message, index, Disposition.FAILED) for index in batch.indices])
+            self._records.append(
+                [record(message, index, Disposition.FAILED) for index in batch.indices]
+            )
             return
-        scan = Scan(message.sensor, batch.stamp_ns, parts.bank.present_ns, ego, message.objects)
-        candidates, out_of_bounds = preprocessed or parts.preprocess.together([posed])[0]
+        scan = Scan(
+            message.sensor, batch.stamp_ns, parts.bank.present_ns, ego, message.objects
+        )
+        candidates, out_of_bounds = (
+            preprocessed or parts.preprocess.together([posed])[0]
+        )
         self._records.append(out_of_bounds)
         if self._is_too_old(batch):
-            self._conclude(batch, candidates, range(len(candidates)), Disposition.TOO_OLD)
+            self._conclude(
+                batch, candidates, range(len(candidates)), Disposition.TOO_OLD
+            )
             return
-        states, assignment = self._identified(batch, candidates) or self._associated(batch, candidates)
+        states, assignment = self._identified(batch, candidates) or self._associated(
+            batch, candidates
+        )
         with self._contained(Failure.STEP_FAILED):
             self._match(batch, candidates, assignment, states, scan)
         if assignment.pairs:
@@ -357,7 +436,9 @@ class Tracker:
         for position in new:
             self._give_birth(batch, candidates, position, scan)
 
-    def _identified(self, batch: Batch, candidates: Candidates) -> tuple[StatesAt, Assignment] | None:
+    def _identified(
+        self, batch: Batch, candidates: Candidates
+    ) -> tuple[StatesAt, Assignment] | None:
         """Return the track with the identity of the only candidate, its state and the pair; None outside its gate.
         Identities that are seldom wrong need no other track: the cost does not depend on the number of tracks.
         """
@@ -371,34 +452,66 @@ class Tracker:
         if owner is None or owner in self._undirected:
             return None
         states = parts.bank.state_of(owner, batch.stamp_ns)
-        assignment = parts.association(candidates, states, facings=self._facings(batch, states))
+        assignment = parts.association(
+            candidates, states, facings=self._facings(batch, states)
+        )
         return (states, assignment) if assignment.pairs else None
 
-    def _associated(self, batch: Batch, candidates: Candidates) -> tuple[StatesAt, Assignment]:
+    def _associated(
+        self, batch: Batch, candidates: Candidates
+    ) -> tuple[StatesAt, Assignment]:
         """Return the states of the tracks that `batch` may be associated with, and the assignment."""
         states = self._offered(batch)
         return states, self._assigned(batch, candidates, states)
 
-    def _assigned(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Assignment:
+    def _assigned(
+        self, batch: Batch, candidates: Candidates, states: StatesAt
+    ) -> Assignment:
         """Return the assignment of candidates to tracks of the same class, and by their identities."""
         parts, evidence = self._parts, self._evidence(batch, candidates, states)
         likely = self._likely(batch, candidates, states, evidence)
-        result = parts.association(candidates, states, evidence, likely, self._facings(batch, states))
+        result = parts.association(
+            candidates, states, evidence, likely, self._facings(batch, states)
+        )
         if parts.joint is None or not (parts.joint.claim_m and result.new):
             return result
-        tentative = [parts.lifecycle.status(each) is TrackStatus.TENTATIVE for each in states.track_ids]
-        result = claimed(result, candidates, states, np.where(tentative, -1.0, parts.joint.claim_m), evidence)
+        tentative = [
+            parts.lifecycle.status(each) is TrackStatus.TENTATIVE
+            for each in states.track_ids
+        ]
+        result = claimed(
+            result,
+            candidates,
+            states,
+            np.where(tentative, -1.0, parts.joint.claim_m),
+            evidence,
+        )
         reaches_m = np.where(tentative, -1.0, parts.joint.max_distance_m)
-        return after_jumps(result, candidates, states, reaches_m, parts.sensors[batch.message.sensor])
+        return after_jumps(
+            result, candidates, states, reaches_m, parts.sensors[batch.message.sensor]
+        )
 
-    def _likely(self, batch: Batch, candidates: Candidates, states: StatesAt, evidence: Apart | None) -> Likely | None:
+    def _likely(
+        self,
+        batch: Batch,
+        candidates: Candidates,
+        states: StatesAt,
+        evidence: Apart | None,
+    ) -> Likely | None:
         """Return the test of pairs against clutter and new objects; None where no pair is tested."""
         weigh, tests = self._parts.weigh_births, list[Likely]()
-        if weigh is not None and all(group.stack.model.components == ("x_m", "y_m") for group in candidates.groups):
-            tests.append(partial(weigh, batch.message.sensor, batch.stamp_ns, states.track_ids))
+        if weigh is not None and all(
+            group.stack.model.components == ("x_m", "y_m")
+            for group in candidates.groups
+        ):
+            tests.append(
+                partial(weigh, batch.message.sensor, batch.stamp_ns, states.track_ids)
+            )
         newborn = self._newborn_of_others(batch, states)
         if newborn.any():
-            tests.append(partial(self._explained, newborn, batch, candidates, states, evidence))
+            tests.append(
+                partial(self._explained, newborn, batch, candidates, states, evidence)
+            )
         if not tests:
             return None
         return lambda pairs: np.all([test(pairs) for test in tests], axis=0)
@@ -410,8 +523,13 @@ class Tracker:
         if not self._newborn:
             return np.zeros(len(states.track_ids), dtype=bool)
         sensors, own = self._parts.sensors, batch.message.sensor
-        first = [self._newborn.get(track_id, (own, NEVER)) for track_id in states.track_ids]
-        others = [name != own and sensors[name].scan and batch.stamp_ns < until_ns for name, until_ns in first]
+        first = [
+            self._newborn.get(track_id, (own, NEVER)) for track_id in states.track_ids
+        ]
+        others = [
+            name != own and sensors[name].scan and batch.stamp_ns < until_ns
+            for name, until_ns in first
+        ]
         return np.array(others, dtype=bool)
 
     def _explained(
@@ -425,22 +543,30 @@ class Tracker:
     ) -> BoolArray:
         """True of pairs, but of those of `newborn` tracks that clutter or a new object explains better, shape (m,)."""
         result = np.ones(len(pairs.rows), dtype=bool)
-        placed = np.array([candidates.placed[row] for row in pairs.rows.tolist()], dtype=bool)
+        placed = np.array(
+            [candidates.placed[row] for row in pairs.rows.tolist()], dtype=bool
+        )
         chosen = (newborn[pairs.columns] & placed).nonzero()[0]
         if len(chosen):
             tested, lifecycle = pairs.at(chosen), self._parts.lifecycle
             sensor = self._parts.sensors[batch.message.sensor]
             ids = [states.track_ids[column] for column in tested.columns.tolist()]
-            detected = sensor.detection_probability * lifecycle.existing(ids, batch.stamp_ns)
+            detected = sensor.detection_probability * lifecycle.existing(
+                ids, batch.stamp_ns
+            )
             odds = detected / (1.0 - detected) if sensor.scan else detected
             others_per_m2 = sensor.clutter_per_m2 / (1.0 - lifecycle.birth_probability)
             more_nis = np.zeros(len(chosen))
             if isinstance(evidence, Evidence):
                 more_nis = evidence.nis(tested.rows, tested.columns)
-            result[chosen] = explained(tested, candidates, states, odds, others_per_m2, more_nis)
+            result[chosen] = explained(
+                tested, candidates, states, odds, others_per_m2, more_nis
+            )
         return result
 
-    def _evidence(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Apart | None:
+    def _evidence(
+        self, batch: Batch, candidates: Candidates, states: StatesAt
+    ) -> Apart | None:
         described = map(batch.message.objects.__getitem__, candidates.leaders)
         wrong = self._parts.sensors[batch.message.sensor].wrong_id_probability
         return self._parts.objects.evidence(described, states.track_ids, wrong)
@@ -448,38 +574,72 @@ class Tracker:
     def _facings(self, batch: Batch, states: StatesAt) -> Facings | None:
         """Return the belief about the fronts of the tracks; None where every yaw is taken as it is."""
         facing = self._parts.facing
-        return None if facing is None else facing.at(batch.message.sensor, states.track_ids)
+        return (
+            None
+            if facing is None
+            else facing.at(batch.message.sensor, states.track_ids)
+        )
 
-    def _joint(self, batch: Batch, candidates: Candidates, states: StatesAt) -> Pairs | None:
+    def _joint(
+        self, batch: Batch, candidates: Candidates, states: StatesAt
+    ) -> Pairs | None:
         """Probabilities that candidates belong to tracks with enough detections; None where they are not considered."""
         rule = self._parts.joint
         if rule is None or rule.joint_from is None:
             return None
         evidence = self._evidence(batch, candidates, states)
         pairs = rule.gated(candidates, states, evidence, self._facings(batch, states))
-        known = np.array([self._num_measured[track_id] >= rule.joint_from for track_id in states.track_ids])
+        known = np.array(
+            [
+                self._num_measured[track_id] >= rule.joint_from
+                for track_id in states.track_ids
+            ]
+        )
         sensor = self._parts.sensors[batch.message.sensor]
-        return joint_probabilities(pairs.at(known[pairs.columns]), candidates, states, sensor)
+        return joint_probabilities(
+            pairs.at(known[pairs.columns]), candidates, states, sensor
+        )
 
-    def _unclaimed(self, batch: Batch, candidates: Candidates, new: Sequence[int], states: StatesAt) -> list[int]:
+    def _unclaimed(
+        self, batch: Batch, candidates: Candidates, new: Sequence[int], states: StatesAt
+    ) -> list[int]:
         """Return those of `new` that belong to no track which began after the batch's stamp.
         The detection that started it has overtaken them. They are too old for it, and not another object. Compared are
         the present states of these tracks, moved back to the stamp.
         """
         bank, motion = self._parts.bank, self._parts.motion
-        now, back_s = bank.states_at(bank.present_ns), seconds(bank.present_ns - batch.stamp_ns)
+        now, back_s = (
+            bank.states_at(bank.present_ns),
+            seconds(bank.present_ns - batch.stamp_ns),
+        )
         now = now.without(self._parts.lifecycle.suspended())
-        rows = [row for row, track_id in enumerate(now.track_ids) if track_id not in states.track_ids]
+        rows = [
+            row
+            for row, track_id in enumerate(now.track_ids)
+            if track_id not in states.track_ids
+        ]
         if not rows:
             return list(new)
         x, F = now.means[rows], motion.jacobian(now.means[rows], -back_s)
         P = propagated(F, now.covariances[rows], motion.process_noise(x, back_s))
-        moved = StatesAt(tuple(now.track_ids[row] for row in rows), motion.predict(x, -back_s), P)
-        younger = in_any_direction(moved, batch.stamp_ns, self._undirected, self._directed)
+        moved = StatesAt(
+            tuple(now.track_ids[row] for row in rows), motion.predict(x, -back_s), P
+        )
+        younger = in_any_direction(
+            moved, batch.stamp_ns, self._undirected, self._directed
+        )
         claims = self._assigned(batch, candidates.at(new), younger)
         for k, track in claims.pairs:
-            self._conclude(batch, candidates, [new[k]], Disposition.TOO_OLD, younger.track_ids[track])
-        self._conclude(batch, candidates, [new[k] for k in claims.refused], Disposition.GATED)
+            self._conclude(
+                batch,
+                candidates,
+                [new[k]],
+                Disposition.TOO_OLD,
+                younger.track_ids[track],
+            )
+        self._conclude(
+            batch, candidates, [new[k] for k in claims.refused], Disposition.GATED
+        )
         return [new[k] for k in claims.new]
 
     def _is_too_old(self, batch: Batch) -> bool:
@@ -492,16 +652,27 @@ class Tracker:
         states = self._parts.bank.states_at(batch.stamp_ns).without(ended)
         if not (self._undirected or self._directed):
             return states
-        return in_any_direction(states, batch.stamp_ns, self._undirected, self._directed)
+        return in_any_direction(
+            states, batch.stamp_ns, self._undirected, self._directed
+        )
 
-    def _ranges_m(self, track_ids: Sequence[int], positions_m: FloatArray, ego: EgoPose | None) -> FloatArray:
+    def _ranges_m(
+        self, track_ids: Sequence[int], positions_m: FloatArray, ego: EgoPose | None
+    ) -> FloatArray:
         """Distances from the ego to tracks at `positions_m` (n, 2), both at the stamp of the batch."""
         if ego is None:
             return np.zeros(len(track_ids))
-        return np.asarray(np.hypot(positions_m[:, 0] - ego.x_m, positions_m[:, 1] - ego.y_m))
+        return np.asarray(
+            np.hypot(positions_m[:, 0] - ego.x_m, positions_m[:, 1] - ego.y_m)
+        )
 
     def _match(
-        self, batch: Batch, candidates: Candidates, assignment: Assignment, states: StatesAt, scan: Scan
+        self,
+        batch: Batch,
+        candidates: Candidates,
+        assignment: Assignment,
+        states: StatesAt,
+        scan: Scan,
     ) -> None:
         """Lives of matched tracks, where it is positions that are seen, and the objects that detections describe."""
         seen = self._seen.setdefault(id(batch.message), set())
@@ -511,25 +682,54 @@ class Tracker:
             for position, track in assignment.pairs:
                 self._describe(batch, candidates, position, states.track_ids[track])
 
-    def _miss(self, batch: Batch, assignment: Assignment, states: StatesAt, scan: Scan) -> None:
+    def _miss(
+        self, batch: Batch, assignment: Assignment, states: StatesAt, scan: Scan
+    ) -> None:
         """Lives of missed tracks, where it is positions that are seen; tracks that run out end here.
         A track is missed by a message as a whole, so only its last batch counts. The list may end a track that it has
         matched, where clutter explains the match better. So tracks end after the list has been fused.
         """
-        lifecycle, sensor = self._parts.lifecycle, self._parts.sensors[batch.message.sensor]
-        if not assignment.missed or not batch.last or not (sensor.gives_position and sensor.scan):
+        lifecycle, sensor = (
+            self._parts.lifecycle,
+            self._parts.sensors[batch.message.sensor],
+        )
+        if (
+            not assignment.missed
+            or not batch.last
+            or not (sensor.gives_position and sensor.scan)
+        ):
             return
         seen = self._seen[id(batch.message)]
-        rows = [track for track in assignment.missed if states.track_ids[track] not in seen]
+        rows = [
+            track for track in assignment.missed if states.track_ids[track] not in seen
+        ]
         if rows:
-            missed, positions_m = [states.track_ids[track] for track in rows], states.means[rows, :2]
-            self._end(lifecycle.missed(scan, missed, positions_m, self._ranges_m(missed, positions_m, scan.ego)))
+            missed, positions_m = (
+                [states.track_ids[track] for track in rows],
+                states.means[rows, :2],
+            )
+            self._end(
+                lifecycle.missed(
+                    scan,
+                    missed,
+                    positions_m,
+                    self._ranges_m(missed, positions_m, scan.ego),
+                )
+            )
 
-    def _estimate(self, batch: Batch, candidates: Candidates, assignment: Assignment, states: StatesAt) -> None:
+    def _estimate(
+        self,
+        batch: Batch,
+        candidates: Candidates,
+        assignment: Assignment,
+        states: StatesAt,
+    ) -> None:
         """Fuse the matched candidates, group by group; the records are in the order of the candidates.
         A group that raises has failed, and what others have fused is recorded whatever happens afterwards.
         """
-        outcomes: dict[int, tuple[Measurement, UpdateResult]] = {}  # by index of the pair
+        outcomes: dict[
+            int, tuple[Measurement, UpdateResult]
+        ] = {}  # by index of the pair
         chosen, tracks = np.array(assignment.pairs).T
         read: YawsRead | None = None
         try:
@@ -537,29 +737,50 @@ class Tracker:
             read = self._read(batch, candidates, assignment, states)
             for group, members, here in candidates.split(chosen):
                 with self._contained(Failure.LIST_FAILED):
-                    for pairs, of, each, ways in _seen(group, members, here, tracks, states, read):
-                        stack = each if joint is None else equivalent(each, of, group, joint, states, ways)
+                    for pairs, of, each, ways in _seen(
+                        group, members, here, tracks, states, read
+                    ):
+                        stack = (
+                            each
+                            if joint is None
+                            else equivalent(each, of, group, joint, states, ways)
+                        )
                         own = Measurements(stack), of, states
-                        results = self._fused(batch.stamp_ns, *own, outcomes, pairs.tolist())
+                        results = self._fused(
+                            batch.stamp_ns, *own, outcomes, pairs.tolist()
+                        )
                         if candidates.placed[chosen[here[0]]]:  # as all others
                             with self._contained(Failure.STEP_FAILED):
                                 self._placed(*own, results)
         finally:
-            failed, leaders = (None, UpdateResult(UpdateStatus.FAILED)), candidates.leaders
+            failed, leaders = (
+                (None, UpdateResult(UpdateStatus.FAILED)),
+                candidates.leaders,
+            )
             matched = [
                 (leaders[position], states.track_ids[track], *outcomes.get(k, failed))
                 for k, (position, track) in enumerate(assignment.pairs)
             ]
             words = [None] * len(matched) if read is None else read.words
-            self._records.append(FusedRecords(batch.message, matched, candidates.merged, words))
+            self._records.append(
+                FusedRecords(batch.message, matched, candidates.merged, words)
+            )
 
-    def _read(self, batch: Batch, candidates: Candidates, assignment: Assignment, states: StatesAt) -> YawsRead | None:
+    def _read(
+        self,
+        batch: Batch,
+        candidates: Candidates,
+        assignment: Assignment,
+        states: StatesAt,
+    ) -> YawsRead | None:
         """Return the readings of the matched candidates; None where every yaw is taken as it is."""
         facing = self._parts.facing
         if facing is None:
             return None
         pairs, readings = assignment.pairs, assignment.readings
-        return facing.read(batch.message.sensor, batch.stamp_ns, candidates, pairs, readings, states)
+        return facing.read(
+            batch.message.sensor, batch.stamp_ns, candidates, pairs, readings, states
+        )
 
     def _fused(
         self,
@@ -573,18 +794,26 @@ class Tracker:
         """Fuse measurements of the tracks whose states have the indices `of` (m,); note the outcomes of `pairs`."""
         ids = list(map(states.track_ids.__getitem__, of.tolist()))
         results = self._parts.bank.update(stamp_ns, ids, measurements)
-        outcomes.update(zip(pairs, zip(repeat(measurements.stack), results), strict=True))
+        outcomes.update(
+            zip(pairs, zip(repeat(measurements.stack), results), strict=True)
+        )
         for track_id, result in zip(ids, results, strict=True):
             if result.innovation is not None:
                 self._num_measured[track_id] += 1
         return results
 
     def _placed(
-        self, measurements: Measurements, of: IntArray, states: StatesAt, results: Sequence[UpdateResult]
+        self,
+        measurements: Measurements,
+        of: IntArray,
+        states: StatesAt,
+        results: Sequence[UpdateResult],
     ) -> None:
         """Count the fused ones of these measurements, which give positions, for the lives of their tracks."""
         ids = list(map(states.track_ids.__getitem__, of.tolist()))
-        fused = [row for row, result in enumerate(results) if result.innovation is not None]
+        fused = [
+            row for row, result in enumerate(results) if result.innovation is not None
+        ]
         self._parts.lifecycle.fused([ids[row] for row in fused])
         for row in fused:
             track_id, stamp_ns = ids[row], measurements.stack.stamp_ns
@@ -599,9 +828,13 @@ class Tracker:
                 # The estimator's prior, linearised along an unknown direction, spreads along it alone.
                 seen, track = measurements[row].seen_by(self._parts.motion), of[row]
                 with suppress(np.linalg.LinAlgError):
-                    results[row].nis = correct_one(states.means[track], states.covariances[track], seen).nis
+                    results[row].nis = correct_one(
+                        states.means[track], states.covariances[track], seen
+                    ).nis
 
-    def _give_birth(self, batch: Batch, candidates: Candidates, position: int, scan: Scan) -> None:
+    def _give_birth(
+        self, batch: Batch, candidates: Candidates, position: int, scan: Scan
+    ) -> None:
         """Start a track, if the sensor and the birth rules want one; a track whose start fails leaves nothing."""
         first, track_id = len(self._records), None
         try:
@@ -614,7 +847,9 @@ class Tracker:
                 self._parts.bank.birth(track_id, prior)
                 if self._parts.bank.holds(track_id):
                     self._begin(track_id, batch, candidates, position, scan, prior)
-                    self._conclude(batch, candidates, [position], Disposition.BIRTH, track_id)
+                    self._conclude(
+                        batch, candidates, [position], Disposition.BIRTH, track_id
+                    )
         finally:
             if len(self._records) == first:
                 self._conclude(batch, candidates, [position], Disposition.FAILED)
@@ -625,9 +860,13 @@ class Tracker:
         parts, candidate = self._parts, candidates[position]
         if not parts.sensors[scan.sensor].births:
             return None
-        if parts.objects.is_stray(scan.objects[candidate.leader], (scan.sensor, scan.stamp_ns)):
+        if parts.objects.is_stray(
+            scan.objects[candidate.leader], (scan.sensor, scan.stamp_ns)
+        ):
             return None
-        return parts.birth.prior(candidate, parts.road, parts.ego.current, parts.ego.in_pit)
+        return parts.birth.prior(
+            candidate, parts.road, parts.ego.current, parts.ego.in_pit
+        )
 
     def _number(self, detection: Detection) -> int:
         """Return the number of a new track. A former track with the identity of `detection` passes on its number."""
@@ -641,7 +880,13 @@ class Tracker:
         return track_id
 
     def _begin(
-        self, track_id: int, batch: Batch, candidates: Candidates, position: int, scan: Scan, prior: Start
+        self,
+        track_id: int,
+        batch: Batch,
+        candidates: Candidates,
+        position: int,
+        scan: Scan,
+        prior: Start,
     ) -> None:
         """Note what the tracker keeps of a track that the bank has started."""
         if prior.yaw_rad is None and not self._parts.motion.cartesian:
@@ -650,14 +895,20 @@ class Tracker:
         self._num_measured[track_id] = 1
         self._newborn[track_id] = scan.sensor, FOREVER
         if self._parts.facing is not None:
-            self._parts.facing.born(track_id, scan.sensor, prior, candidates[position].measurement)
+            self._parts.facing.born(
+                track_id, scan.sensor, prior, candidates[position].measurement
+            )
         self._parts.lifecycle.born(track_id, scan, candidates[position])
         self._describe(batch, candidates, position, track_id)
 
-    def _describe(self, batch: Batch, candidates: Candidates, position: int, track_id: int) -> None:
+    def _describe(
+        self, batch: Batch, candidates: Candidates, position: int, track_id: int
+    ) -> None:
         leader = candidates.leaders[position]
         indices = leader, *candidates.merged.get(leader, ())
-        self._parts.objects.learn(track_id, map(batch.message.objects.__getitem__, indices))
+        self._parts.objects.learn(
+            track_id, map(batch.message.objects.__getitem__, indices)
+        )
 
     def _conclude(
         self,
@@ -670,7 +921,14 @@ class Tracker:
         """Record the outcome of candidates, and of the detections that were merged into them."""
         for leader in map(candidates.leaders.__getitem__, positions):
             own = record(batch.message, leader, disposition, track_id)
-            self._records.append((own, *merged_records(batch.message, candidates.merged.get(leader, ()), track_id)))
+            self._records.append(
+                (
+                    own,
+                    *merged_records(
+                        batch.message, candidates.merged.get(leader, ()), track_id
+                    ),
+                )
+            )
 
     def _end(self, track_ids: Sequence[int]) -> None:
         """End tracks. A track whose end raises is forgotten as well, and the remaining tracks still end."""
@@ -681,22 +939,43 @@ class Tracker:
             self._num_measured.pop(track_id, None)
             parts = self._parts
             facing = () if parts.facing is None else (parts.facing.forget,)
-            for forget in (parts.bank.remove, parts.objects.forget, *facing, parts.lifecycle.forget):
+            for forget in (
+                parts.bank.remove,
+                parts.objects.forget,
+                *facing,
+                parts.lifecycle.forget,
+            ):
                 with self._contained(Failure.STEP_FAILED):
                     forget(track_id)
 
-    def _reports(self, track_ids: Sequence[int], states: Sequence[TrackState]) -> Callable[[], Iterable[TrackReport]]:
+    def _reports(
+        self, track_ids: Sequence[int], states: Sequence[TrackState]
+    ) -> Callable[[], Iterable[TrackReport]]:
         """Return what makes the reports of tracks in these `states`, with all else as it is now."""
         parts = self._parts
         statuses = list(map(parts.lifecycle.status, track_ids))
         probabilities = list(map(parts.lifecycle.probability, track_ids))
         num_measured = list(map(self._num_measured.__getitem__, track_ids))
         objects = parts.objects.reports(track_ids)
-        return partial(map, TrackReport, track_ids, statuses, states, num_measured, objects, probabilities)
+        return partial(
+            map,
+            TrackReport,
+            track_ids,
+            statuses,
+            states,
+            num_measured,
+            objects,
+            probabilities,
+        )
 
 
 def _seen(
-    group: Group, members: IntArray, here: IntArray, tracks: IntArray, states: StatesAt, read: YawsRead | None
+    group: Group,
+    members: IntArray,
+    here: IntArray,
+    tracks: IntArray,
+    states: StatesAt,
+    read: YawsRead | None,
 ) -> Iterator[tuple[IntArray, IntArray, Measurement, IntArray | None]]:
     """Yield the measurements of the `members` of a group, whose pairs have the indices `here`, as they are `read`.
     `tracks` are those of all pairs. Each stack comes with the indices of its pairs, their tracks and readings.

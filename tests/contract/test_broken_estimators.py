@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from fgtrack.core.types import FloatArray, TrackState
-from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus
+from fgtrack.estimation.base import (
+    Measurement,
+    Start,
+    StatesAt,
+    UpdateResult,
+    UpdateStatus,
+)
 from fgtrack.estimation.filters.ekf import correct_one
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.object_bank import ObjectBank
@@ -23,14 +29,21 @@ SEVERAL = "gives each of several objects what it gives one alone"
 class DropsLateData(ReplayEkf):
     def update(self, measurement: Measurement) -> UpdateResult:
         if self.window_ns[0] <= measurement.stamp_ns < self.window_ns[1]:
-            return UpdateResult(UpdateStatus.OUT_OF_SEQUENCE, np.zeros(len(measurement.z)), 0.0)
+            return UpdateResult(
+                UpdateStatus.OUT_OF_SEQUENCE, np.zeros(len(measurement.z)), 0.0
+            )
         return super().update(measurement)
 
 
 class ForgetsEqualStamps(ReplayEkf):
     def update(self, measurement: Measurement) -> UpdateResult:
-        if measurement.stamp_ns == self.window_ns[1] > self.window_ns[0] and np.isfinite(measurement.z).all():
-            return UpdateResult(UpdateStatus.IN_SEQUENCE, np.zeros(len(measurement.z)), 0.0)
+        if (
+            measurement.stamp_ns == self.window_ns[1] > self.window_ns[0]
+            and np.isfinite(measurement.z).all()
+        ):
+            return UpdateResult(
+                UpdateStatus.IN_SEQUENCE, np.zeros(len(measurement.z)), 0.0
+            )
         return super().update(measurement)
 
 
@@ -42,7 +55,11 @@ class DoublesTheNoise(ReplayEkf):
 class SaysInSequence(ReplayEkf):
     def update(self, measurement: Measurement) -> UpdateResult:
         result = super().update(measurement)
-        return result if result.nis is None else replace(result, status=UpdateStatus.IN_SEQUENCE)
+        return (
+            result
+            if result.nis is None
+            else replace(result, status=UpdateStatus.IN_SEQUENCE)
+        )
 
 
 class TakesLatencyForDisorder(ReplayEkf):
@@ -65,13 +82,17 @@ class TakesLatencyForDisorder(ReplayEkf):
 class Lopsided(ReplayEkf):
     def state_at(self, stamp_ns: int) -> TrackState:
         state = super().state_at(stamp_ns)
-        return replace(state, covariance=state.covariance + 1e-9 * np.eye(len(state.mean), k=1))
+        return replace(
+            state, covariance=state.covariance + 1e-9 * np.eye(len(state.mean), k=1)
+        )
 
 
 class Random(ReplayEkf):
     def state_at(self, stamp_ns: int) -> TrackState:
         state = super().state_at(stamp_ns)
-        return replace(state, mean=state.mean + 1e-14 * np.random.default_rng().standard_normal())
+        return replace(
+            state, mean=state.mean + 1e-14 * np.random.default_rng().standard_normal()
+        )
 
 
 class SharesItsState(ReplayEkf):
@@ -108,21 +129,35 @@ class ForgetsWithTheClock(ReplayEkf):
 
 class StandsStill(ReplayEkf):
     def state_at(self, stamp_ns: int) -> TrackState:
-        return replace(super().state_at(min(stamp_ns, self.window_ns[1])), stamp_ns=stamp_ns)
+        return replace(
+            super().state_at(min(stamp_ns, self.window_ns[1])), stamp_ns=stamp_ns
+        )
 
 
 class Sees(ReplayEkf):
     """Fuses another measurement in a nonlinear model; linear ones it takes as they are."""
 
     def update(self, measurement: Measurement) -> UpdateResult:
-        known = self.window_ns[0] <= measurement.stamp_ns and np.isfinite(measurement.z).all()
+        known = (
+            self.window_ns[0] <= measurement.stamp_ns
+            and np.isfinite(measurement.z).all()
+        )
         before = self.state_at(measurement.stamp_ns) if known else None
         late = measurement.stamp_ns <= self.window_ns[1]
-        result = super().update(measurement if self._motion.linear else self.seen(measurement))
+        result = super().update(
+            measurement if self._motion.linear else self.seen(measurement)
+        )
         if result.nis is None or before is None or late:
             return result
-        said = correct_one(before.mean, before.covariance, measurement.seen_by(self._motion))
-        return replace(result, innovation=said.innovation, nis=said.nis, innovation_covariance=said.S)
+        said = correct_one(
+            before.mean, before.covariance, measurement.seen_by(self._motion)
+        )
+        return replace(
+            result,
+            innovation=said.innovation,
+            nis=said.nis,
+            innovation_covariance=said.S,
+        )
 
     def seen(self, measurement: Measurement) -> Measurement:
         return measurement
@@ -172,30 +207,72 @@ class ShowsAnother(FilterBank):
 class GivesOneForAll(FilterBank):
     def states_at(self, stamp_ns: int) -> StatesAt:
         states = super().states_at(stamp_ns)
-        return replace(states, means=np.repeat(states.means[:1], len(states.means), axis=0))
+        return replace(
+            states, means=np.repeat(states.means[:1], len(states.means), axis=0)
+        )
 
 
 #: Each broken estimator, the promise that it breaks, and the fault that the promise must name.
 BROKEN = (
     (DropsLateData, ANY_ORDER, "differs from the dense joint posterior"),
-    (DropsLateData, "gives the estimate of the time order in any order", "differs from that of the time order"),
-    (DropsLateData, "keeps all that it accepts and nothing else", "differs from that of these"),
+    (
+        DropsLateData,
+        "gives the estimate of the time order in any order",
+        "differs from that of the time order",
+    ),
+    (
+        DropsLateData,
+        "keeps all that it accepts and nothing else",
+        "differs from that of these",
+    ),
     (ForgetsEqualStamps, ANY_ORDER, "differs from the dense joint posterior"),
-    (DoublesTheNoise, "is the kalman filter in sequence", "differs from the Kalman filter's"),
-    (DoublesTheNoise, "reports the innovation against all that it has fused", r"the innovation .* off by"),
+    (
+        DoublesTheNoise,
+        "is the kalman filter in sequence",
+        "differs from the Kalman filter's",
+    ),
+    (
+        DoublesTheNoise,
+        "reports the innovation against all that it has fused",
+        r"the innovation .* off by",
+    ),
     (SaysInSequence, "counts each measurement as what it is", "late, is in_sequence"),
-    (TakesLatencyForDisorder, "counts each measurement as what it is", "in sequence, is out_of_sequence"),
+    (
+        TakesLatencyForDisorder,
+        "counts each measurement as what it is",
+        "in sequence, is out_of_sequence",
+    ),
     (Lopsided, "gives symmetric positive definite covariances", "is not symmetric"),
     (Random, "gives the same bits for the same input", "states differ"),
     (SharesItsState, "changes no input and no output later", "changes later"),
-    (FusesWhatIsTooOld, "reports what is too old and stays as it was", "a stamp before .* changes the state"),
-    (FusesWhatIsNoNumber, "stays as it was after a failure and fuses the next", "that is not a number is "),
-    (ForgetsWithTheClock, "moves only the window with the clock", "differs from that before the clock moved"),
-    (StandsStill, "predicts ahead by the motion model", "differs from the prediction of the newest one"),
+    (
+        FusesWhatIsTooOld,
+        "reports what is too old and stays as it was",
+        "a stamp before .* changes the state",
+    ),
+    (
+        FusesWhatIsNoNumber,
+        "stays as it was after a failure and fuses the next",
+        "that is not a number is ",
+    ),
+    (
+        ForgetsWithTheClock,
+        "moves only the window with the clock",
+        "differs from that before the clock moved",
+    ),
+    (
+        StandsStill,
+        "predicts ahead by the motion model",
+        "differs from the prediction of the newest one",
+    ),
     (WithQuadrupleNoise, NEAR, "differs from that of a plain calculation"),
     (WithoutPose, NEAR, "differs from that of a plain calculation"),
     (WithoutLoss, NEAR, "differs from that of a plain calculation"),
-    (SaysAnotherCovariance, "counts each measurement as what it is", "the NIS is .* by the covariance"),
+    (
+        SaysAnotherCovariance,
+        "counts each measurement as what it is",
+        "the NIS is .* by the covariance",
+    ),
     (RemovesTheNext, SEVERAL, r"its objects are \(0, 1, 2, 4"),
     (ShowsAnother, SEVERAL, "the present state of object 0 is "),
     (GivesOneForAll, SEVERAL, "the state of object 1 .* differs from what it is alone"),
@@ -203,9 +280,13 @@ BROKEN = (
 
 
 @pytest.mark.parametrize(("broken", "promise", "fault"), BROKEN)
-def test_a_broken_estimator_is_found_out_by_the_promise_that_it_breaks(broken: type, promise: str, fault: str) -> None:
+def test_a_broken_estimator_is_found_out_by_the_promise_that_it_breaks(
+    broken: type, promise: str, fault: str
+) -> None:
     """An exception of the broken estimator would be a fault of this test: its text begins with the exception's name."""
-    with pytest.raises(BrokenPromiseError, match="measurements in the order of arrival") as error:
+    with pytest.raises(
+        BrokenPromiseError, match="measurements in the order of arrival"
+    ) as error:
         estimator_checks(broken)[promise]()
     assert list(error.value.promises) == [promise]
     said = error.value.promises[promise]
@@ -215,12 +296,24 @@ def test_a_broken_estimator_is_found_out_by_the_promise_that_it_breaks(broken: t
 
 def test_every_broken_estimator_of_this_file_is_tested() -> None:
     bases = {Sees, FilterBank}
-    broken = {each for each in globals().values() if isinstance(each, type) and each.__module__ == __name__} - bases
+    broken = {
+        each
+        for each in globals().values()
+        if isinstance(each, type) and each.__module__ == __name__
+    } - bases
     assert broken == {each for each, _, _ in BROKEN}
 
 
 #: Components of which the derivative is negated.
-ROWS = ("range_m", "bearing_rad", "range_rate_mps", "x_m", "y_m", "yaw_rad", "speed_mps")
+ROWS = (
+    "range_m",
+    "bearing_rad",
+    "range_rate_mps",
+    "x_m",
+    "y_m",
+    "yaw_rad",
+    "speed_mps",
+)
 
 
 @pytest.mark.parametrize("row", ROWS)
@@ -236,10 +329,13 @@ def test_a_wrong_sign_in_a_row_of_the_measurement_jacobian_breaks_the_nonlinear_
         check()
     assert list(error.value.promises) == [NEAR]
     off = re.match(
-        r"the state at .* differs from that of a plain calculation by (\S+) standard", error.value.promises[NEAR]
+        r"the state at .* differs from that of a plain calculation by (\S+) standard",
+        error.value.promises[NEAR],
     )
     assert off is not None
-    assert float(off[1]) > 0.01  # a thousand times the tolerance, which is 1e-7, or 1e-5 of the filter that iterates
+    assert (
+        float(off[1]) > 0.01
+    )  # a thousand times the tolerance, which is 1e-7, or 1e-5 of the filter that iterates
 
 
 def negate_row(monkeypatch: pytest.MonkeyPatch, row: str) -> None:
@@ -249,9 +345,13 @@ def negate_row(monkeypatch: pytest.MonkeyPatch, row: str) -> None:
     def sign(model: MeasurementModel) -> FloatArray:
         return np.where([name == row for name in model.components], -1.0, 1.0)[:, None]
 
-    monkeypatch.setattr(MeasurementModel, "selection", lambda model, n: sign(model) * linear(model, n))
     monkeypatch.setattr(
-        MeasurementModel, "jacobian", lambda model, x, pose=AT_ORIGIN: sign(model) * nonlinear(model, x, pose)
+        MeasurementModel, "selection", lambda model, n: sign(model) * linear(model, n)
+    )
+    monkeypatch.setattr(
+        MeasurementModel,
+        "jacobian",
+        lambda model, x, pose=AT_ORIGIN: sign(model) * nonlinear(model, x, pose),
     )
 
 
@@ -281,4 +381,7 @@ def test_all_that_is_broken_is_said_at_once() -> None:
     with pytest.raises(BrokenPromiseError) as error:
         check_estimator(DropsLateData)
     assert len(error.value.promises) >= 3
-    assert "DropsLateData: broken promise: it keeps all that it accepts and nothing else\n" in str(error.value)
+    assert (
+        "DropsLateData: broken promise: it keeps all that it accepts and nothing else\n"
+        in str(error.value)
+    )

@@ -32,6 +32,8 @@ def test_so_it_does_with_other_options(name: str, options: dict[str, Any]) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in ESTIMATORS if Claims.of(ESTIMATORS.load(name)).is_exact])
+@pytest.mark.parametrize(
+    "name", [name for name in ESTIMATORS if Claims.of(ESTIMATORS.load(name)).is_exact]
+)
 def test_exact_estimators_keep_it_on_many_streams(name: str) -> None:
     check_estimator(name, seed=2, num_streams=100 if name == "smoother-batch" else 500)

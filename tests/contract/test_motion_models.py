@@ -52,7 +52,9 @@ class _Whirls(CV):
 
 
 class _NegativeBirth(CV):
-    def from_kinematic(self, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def from_kinematic(
+        self, mean: FloatArray, covariance: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         x, P = super().from_kinematic(mean, covariance)
         return x, -P
 
@@ -79,7 +81,9 @@ class _OtherTransitionOfMany(CTRV):
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, MotionModel) else "",
 )
-def test_a_broken_model_is_found_out_by_the_promise_that_it_breaks(model: MotionModel, promise: str) -> None:
+def test_a_broken_model_is_found_out_by_the_promise_that_it_breaks(
+    model: MotionModel, promise: str
+) -> None:
     with pytest.raises(BrokenPromiseError, match=r"(?s)x = \[.*dt_s = \d") as error:
         motion_model_checks(model)[promise]()
     assert list(error.value.promises) == [promise]
@@ -88,4 +92,7 @@ def test_a_broken_model_is_found_out_by_the_promise_that_it_breaks(model: Motion
 def test_all_that_is_broken_is_said_at_once() -> None:
     with pytest.raises(BrokenPromiseError) as error:
         check_motion_model(_WrongJacobian())
-    assert set(error.value.promises) >= {"has the jacobian of its prediction", "has the transition of its functions"}
+    assert set(error.value.promises) >= {
+        "has the jacobian of its prediction",
+        "has the transition of its functions",
+    }

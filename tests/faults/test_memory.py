@@ -11,24 +11,24 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fgtrack.config.shipped import read_config
 from fgtrack.core.types import Detection, DetectionList
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.live import Tracker
-from fgtrack.pipeline.shipped import read_config
 
 START_NS = 1_600_000_000_000_000_000
 MS = 1_000_000
 ESTIMATORS = ("ekf-replay", "smoother", "smoother-banded", "ekf-backward-forward")
 GROWING = (
-    "fgtrack.estimation.filters.backward_forward",
+    "fgtrack.karle2023.backward_forward",
     "fgtrack.estimation.filters.replay_bank",
     "fgtrack.estimation.smoothing.bank",
     "fgtrack.estimation.smoothing.nodes",
     "fgtrack.estimation.smoothing.solver",
-    "fgtrack.tracking.existence",
+    "fgtrack.tracking.lives.existence",
     "fgtrack.tracking.guarded_bank",
     "fgtrack.tracking.tracker",
-    "fgtrack.tracking.visibility",
+    "fgtrack.tracking.lives.visibility",
 )
 ALLOCATING = ("array", "concatenate", "empty", "full", "tile", "vstack", "zeros")
 NUM_OBJECTS = 11
@@ -61,9 +61,14 @@ def numpy(monkeypatch: pytest.MonkeyPatch) -> Numpy:
     for name in GROWING:
         monkeypatch.setattr(import_module(name), "np", made)
     nodes = import_module("fgtrack.estimation.smoothing.nodes")
-    for name, few in (("_FEW_TRACKS", 1), ("_FEW_NODES", 16), ("_FEW_VALUES", 1), ("_FEW_COMPONENTS", 1)):
+    for name, few in (
+        ("_FEW_TRACKS", 1),
+        ("_FEW_NODES", 16),
+        ("_FEW_VALUES", 1),
+        ("_FEW_COMPONENTS", 1),
+    ):
         monkeypatch.setattr(nodes, name, few)
-    visibility = import_module("fgtrack.tracking.visibility")
+    visibility = import_module("fgtrack.tracking.lives.visibility")
     monkeypatch.setattr(visibility, "_FEWEST_TRACKS", 1)
     monkeypatch.setattr(visibility, "_FEWEST_ENTRIES", 2)
     return made
@@ -71,7 +76,9 @@ def numpy(monkeypatch: pytest.MonkeyPatch) -> Numpy:
 
 def tracker(estimator: str) -> Tracker:
     config = read_config(None, {"estimator": estimator})
-    sensor = SensorModel(std={"x_m": 0.3, "y_m": 0.3, "speed_mps": 0.5}, clutter_per_m2=1e-6)
+    sensor = SensorModel(
+        std={"x_m": 0.3, "y_m": 0.3, "speed_mps": 0.5}, clutter_per_m2=1e-6
+    )
     return Tracker(config.__class__(**{**vars(config), "sensors": {"lidar": sensor}}))
 
 
@@ -80,7 +87,9 @@ def run(one: Tracker, num_ticks: int = 10) -> tuple[list[int], int, Counter[str]
     rows, raised, places = Counter[str](), 0, list[int]()
     for k in range(num_ticks):
         now_ns = START_NS + 100 * k * MS
-        places_m = [(2.0 * k, 100.0 * number) for number in range(NUM_OBJECTS if k > 2 else 3)]
+        places_m = [
+            (2.0 * k, 100.0 * number) for number in range(NUM_OBJECTS if k > 2 else 3)
+        ]
         items = tuple(Detection(x, y, speed_mps=20.0) for x, y in places_m)
         one.receive(DetectionList("lidar", now_ns, now_ns, items, "map"))
         try:
@@ -95,7 +104,9 @@ def run(one: Tracker, num_ticks: int = 10) -> tuple[list[int], int, Counter[str]
 
 @pytest.mark.long
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_each_allocation_may_fail_and_no_detection_is_lost(estimator: str, numpy: Numpy) -> None:
+def test_each_allocation_may_fail_and_no_detection_is_lost(
+    estimator: str, numpy: Numpy
+) -> None:
     every = run(tracker(estimator))
     assert every[0] == list(range(NUM_OBJECTS))
     numpy.count = 0
@@ -104,7 +115,11 @@ def test_each_allocation_may_fail_and_no_detection_is_lost(estimator: str, numpy
     made = tracker(estimator)
     first = numpy.count - last
     rng = np.random.default_rng(7)
-    chosen = sorted(rng.choice(np.arange(first + 1, last + 1), min(last - first, 120), replace=False).tolist())
+    chosen = sorted(
+        rng.choice(
+            np.arange(first + 1, last + 1), min(last - first, 120), replace=False
+        ).tolist()
+    )
     for at in chosen:
         made = tracker(estimator)
         numpy.count, numpy.at = first, at
@@ -113,7 +128,10 @@ def test_each_allocation_may_fail_and_no_detection_is_lost(estimator: str, numpy
         assert raised <= 1, at
         assert rows == every[2], at
         assert places == every[0], at
-        assert not {"not finite", "not positive definite"} & (+Counter(made.failures)).keys(), at
+        assert (
+            not {"not finite", "not positive definite"}
+            & (+Counter(made.failures)).keys()
+        ), at
         if any(made.failures.values()):
             assert made._tracker.failures.first is not None
             assert made._tracker.failures.first.startswith("not enough memory"), at
@@ -152,11 +170,17 @@ print(json.dumps([sent, counts, len(report.tracks), failures, one._tracker.failu
 @pytest.mark.long
 @pytest.mark.parametrize("spare_mb", [4, 40])
 @pytest.mark.parametrize("estimator", ["ekf-replay", "smoother", "smoother-banded"])
-def test_a_crowd_that_does_not_fit_into_memory_ends_no_process(estimator: str, spare_mb: int) -> None:
+def test_a_crowd_that_does_not_fit_into_memory_ends_no_process(
+    estimator: str, spare_mb: int
+) -> None:
     words = [sys.executable, "-c", _CROWD, estimator, "3000", str(spare_mb)]
-    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=300)
+    done = subprocess.run(
+        words, capture_output=True, text=True, check=False, timeout=300
+    )
     assert done.returncode == 0, done.stderr[-2000:]
-    sent, counted, num_tracks, failures, first = json.loads(done.stdout.splitlines()[-1])
+    sent, counted, num_tracks, failures, first = json.loads(
+        done.stdout.splitlines()[-1]
+    )
     assert counted == sent
     assert num_tracks >= 1  # the car that was there before, or its successor
     assert not {"not finite", "not positive definite"} & failures.keys()

@@ -24,11 +24,16 @@ class Form(NamedTuple):
     write: Callable[[Any], bytes]
 
 
-def changed(rng: np.random.Generator, name: str, content: bytes, count: int) -> tuple[bytes, list[str]]:
+def changed(
+    rng: np.random.Generator, name: str, content: bytes, count: int
+) -> tuple[bytes, list[str]]:
     """Return the file `name` with `count` values changed, and what was changed.
     A change that the format cannot hold, as a text where a message of ROS has a number, is drawn again.
     """
-    form, said = next(form for suffix, form in FORMS.items() if name.endswith(suffix)), list[str]()
+    form, said = (
+        next(form for suffix, form in FORMS.items() if name.endswith(suffix)),
+        list[str](),
+    )
     document = form.read(content)
     for _ in range(_ATTEMPTS * count):
         if len(said) == count:
@@ -73,7 +78,10 @@ def _read_cells(content: bytes) -> Any:
     """Rows of cells, numbers and JSON as values; the first entry is what separates the cells."""
     lines = content.decode().splitlines()
     mark = next((mark for mark in _MARKS if mark in (lines or [""])[0]), " ")
-    return {"mark": mark, "rows": [[_cell(text) for text in line.split(mark)] for line in lines]}
+    return {
+        "mark": mark,
+        "rows": [[_cell(text) for text in line.split(mark)] for line in lines],
+    }
 
 
 def _cell(text: str) -> Any:
@@ -84,13 +92,15 @@ def _cell(text: str) -> Any:
 
 def _write_cells(document: Any) -> bytes:
     mark, rows = document["mark"], document["rows"]
-    return "\n".join(mark.join(map(_text, row if isinstance(row, list) else [row])) for row in rows).encode(
-        "utf-8", "surrogatepass"
-    )
+    return "\n".join(
+        mark.join(map(_text, row if isinstance(row, list) else [row])) for row in rows
+    ).encode("utf-8", "surrogatepass")
 
 
 def _text(value: Any) -> str:
-    return "" if value is None else value if isinstance(value, str) else json.dumps(value)
+    return (
+        "" if value is None else value if isinstance(value, str) else json.dumps(value)
+    )
 
 
 def _read_bag2(storage: str) -> Callable[[bytes], Any]:
@@ -110,7 +120,9 @@ def _read_bag2(storage: str) -> Callable[[bytes], Any]:
                     {
                         "topic": connection.topic,
                         "log_ns": log_ns,
-                        "message": _tree(store.deserialize_cdr(data, connection.msgtype)),
+                        "message": _tree(
+                            store.deserialize_cdr(data, connection.msgtype)
+                        ),
                     }
                     for connection, log_ns, data in reader.messages()
                 ]
@@ -125,12 +137,18 @@ def _write_bag2(storage: str) -> Callable[[Any], bytes]:
         store = _store(ros1=False)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "bag"
-            with Writer(path, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin[storage.upper()]) as bag:
+            with Writer(
+                path,
+                version=Writer.VERSION_LATEST,
+                storage_plugin=StoragePlugin[storage.upper()],
+            ) as bag:
                 topics: dict[str, Any] = {}
                 for each in document:
                     message = _message(store, each["message"])
                     if each["topic"] not in topics:
-                        topics[each["topic"]] = bag.add_connection(each["topic"], message.__msgtype__, typestore=store)
+                        topics[each["topic"]] = bag.add_connection(
+                            each["topic"], message.__msgtype__, typestore=store
+                        )
                     data = store.serialize_cdr(message, message.__msgtype__)
                     bag.write(topics[each["topic"]], each["log_ns"], data)
             (file,) = (file for file in path.iterdir() if file.suffix != ".yaml")
@@ -168,7 +186,9 @@ def _write_bag1(document: Any) -> bytes:
             for each in document:
                 message = _message(store, each["message"])
                 if each["topic"] not in topics:
-                    topics[each["topic"]] = bag.add_connection(each["topic"], message.__msgtype__, typestore=store)
+                    topics[each["topic"]] = bag.add_connection(
+                        each["topic"], message.__msgtype__, typestore=store
+                    )
                 data = store.serialize_ros1(message, message.__msgtype__)
                 bag.write(topics[each["topic"]], each["log_ns"], data)
         return path.read_bytes()
@@ -179,7 +199,7 @@ def _store(ros1: bool) -> Any:
         from rosbags.typesys import Stores, get_typestore
 
         return get_typestore(Stores.ROS1_NOETIC)
-    from fgtrack.io.ros.messages import MessageFactory
+    from fgtrack.inputs.ros.messages import MessageFactory
 
     return MessageFactory().typestore
 
@@ -189,7 +209,11 @@ _TYPE = "__msgtype__"
 
 def _tree(value: Any) -> Any:
     if is_dataclass(value):
-        own = {each.name: _tree(getattr(value, each.name)) for each in fields(value) if each.name != _TYPE}
+        own = {
+            each.name: _tree(getattr(value, each.name))
+            for each in fields(value)
+            if each.name != _TYPE
+        }
         return {_TYPE: value.__msgtype__, **own}  # type: ignore[attr-defined]  # of all messages of ROS
     if isinstance(value, np.ndarray):
         return value.tolist()
@@ -198,11 +222,17 @@ def _tree(value: Any) -> Any:
 
 def _message(store: Any, tree: Any) -> Any:
     if isinstance(tree, dict) and _TYPE in tree:
-        given = {key: _message(store, value) for key, value in tree.items() if key != _TYPE}
+        given = {
+            key: _message(store, value) for key, value in tree.items() if key != _TYPE
+        }
         return store.types[tree[_TYPE]](**given)
     if isinstance(tree, list):
         items = [_message(store, each) for each in tree]
-        return np.array(items, dtype=np.float64) if all(isinstance(each, float | int) for each in items) else items
+        return (
+            np.array(items, dtype=np.float64)
+            if all(isinstance(each, float | int) for each in items)
+            else items
+        )
     return tree
 
 
@@ -216,7 +246,10 @@ _CELLS = Form(_read_cells, _write_cells)
 #: By the end of the name of a file.
 FORMS: dict[str, Form] = {
     ".jsonl": _LINES,
-    ".gz": Form(lambda content: _read_lines(gzip.decompress(content)), lambda doc: gzip.compress(_write_lines(doc))),
+    ".gz": Form(
+        lambda content: _read_lines(gzip.decompress(content)),
+        lambda doc: gzip.compress(_write_lines(doc)),
+    ),
     ".json": Form(json.loads, lambda document: json.dumps(document).encode()),
     ".yaml": Form(_read_yaml, _write_yaml),
     ".csv": _CELLS,

@@ -16,9 +16,9 @@ from ruamel.yaml import YAML
 from support import kitti
 
 import fgtrack
-from fgtrack.io.ros.bag_writer import write_bag
-from fgtrack.io.stream import STREAM_FORMAT, write_stream
-from fgtrack.pipeline.shipped import shipped_folder
+from fgtrack.config.shipped import shipped_folder
+from fgtrack.inputs.ros.bag_writer import write_bag
+from fgtrack.inputs.stream import STREAM_FORMAT, write_stream
 from fuzz import scene
 
 Files = Mapping[str, bytes]
@@ -68,7 +68,10 @@ def all_fields() -> Files:
                 }
             )
     text = "".join(f"{json.dumps(line)}\n" for line in lines)
-    return {"x.jsonl": text.encode(), "x.yaml": json.dumps({"sensors": scene.SENSORS}).encode()}
+    return {
+        "x.jsonl": text.encode(),
+        "x.yaml": json.dumps({"sensors": scene.SENSORS}).encode(),
+    }
 
 
 def latitudes() -> bytes:
@@ -84,7 +87,9 @@ def latitudes() -> bytes:
             "id": "4CA911",
         }
         times = {"stamp_ns": now_ns, "receipt_ns": now_ns + 10**7}
-        lines.append({"type": "detections", "sensor": "gnss", **times, "objects": [item]})
+        lines.append(
+            {"type": "detections", "sensor": "gnss", **times, "objects": [item]}
+        )
     return "".join(f"{json.dumps(line)}\n" for line in lines).encode()
 
 
@@ -113,8 +118,15 @@ def asterix(records: Sequence[Mapping[str, Any]]) -> bytes:
 
     blocks = []
     for each in records:
-        position = (("LAT", (each["latitude_deg"], "°")), ("LON", (each["longitude_deg"], "°")))
-        motion = (("RE", 0), ("GS", (each["speed_nmps"], "NM/s")), ("TA", (each["course_deg"], "°")))
+        position = (
+            ("LAT", (each["latitude_deg"], "°")),
+            ("LON", (each["longitude_deg"], "°")),
+        )
+        motion = (
+            ("RE", 0),
+            ("GS", (each["speed_nmps"], "NM/s")),
+            ("TA", (each["course_deg"], "°")),
+        )
         items = {
             "010": (("SAC", 0), ("SIC", each["sic"])),
             "080": each["address"],
@@ -158,7 +170,10 @@ def nmea(records: Sequence[Mapping[str, Any]]) -> bytes:
         check = 0
         for byte in time.encode():
             check ^= byte
-        lines += [f"\\{time}*{check:02X}\\{line}" for line in pyais.encode_dict(given, sentence_type="VDM")]
+        lines += [
+            f"\\{time}*{check:02X}\\{line}"
+            for line in pyais.encode_dict(given, sentence_type="VDM")
+        ]
     return ("\n".join(lines) + "\n").encode()
 
 
@@ -172,7 +187,9 @@ def straight() -> bytes:
         for name in ("lidar", "radar") if k % 3 == 0 else ("lidar",):
             x_m, y_m = rng.normal((at_m, 5.0), 0.3).tolist()
             seen = fgtrack.Detection(x_m=x_m, y_m=y_m)
-            messages.append(fgtrack.DetectionList(name, now_ns, now_ns + 10**7, (seen,), "map"))
+            messages.append(
+                fgtrack.DetectionList(name, now_ns, now_ns + 10**7, (seen,), "map")
+            )
     return stream(sorted(messages, key=lambda message: message.receipt_ns))
 
 
@@ -182,8 +199,17 @@ def autoferry() -> Files:
         sensor, time = k % 4 + 1, round(1000.0 + 0.1 * k, 3)
         points = [[10.0 + 0.1 * k, -20.0], [5.0, 30.0 - 0.1 * k]]
         measurement = points if sensor < 3 else [0.3, -1.2]
-        records.append({"sensorID": sensor, "time": time, "ownshipPosition": [1.0, 2.0], "measurement": measurement})
-        truth.append([{"targetID": 1, "position": [11.0 + 0.1 * k, -18.0, 0.0], "time": time}])
+        records.append(
+            {
+                "sensorID": sensor,
+                "time": time,
+                "ownshipPosition": [1.0, 2.0],
+                "measurement": measurement,
+            }
+        )
+        truth.append(
+            [{"targetID": 1, "position": [11.0 + 0.1 * k, -18.0, 0.0], "time": time}]
+        )
     return {
         "in/scenario9_detections.json": json.dumps(records).encode(),
         "in/scenario9_groundTruth.json": json.dumps(truth).encode(),
@@ -195,9 +221,32 @@ def log_folder() -> Files:
     rows = [f"{columns};cycle_time_ns"]
     for k in range(30):
         now_ns = 10**12 + k * 20_000_000
-        ego = {"is_updated": True, "in_pit": False, "t": now_ns - 10**7, "state": [1.0 * k, 2.0, 3.0, 40.0, 0.1, -1.0]}
-        lidar = [[{"state": [20.0, 1.0, 0.1], "t": now_ns - 5 * 10**7, "keys": ["x", "y", "yaw"]}], now_ns - 5 * 10**7]
-        radar = [[{"state": [20.0, 1.0, 9.0], "t": now_ns - 3 * 10**7, "keys": ["x", "y", "v"]}], now_ns - 3 * 10**7]
+        ego = {
+            "is_updated": True,
+            "in_pit": False,
+            "t": now_ns - 10**7,
+            "state": [1.0 * k, 2.0, 3.0, 40.0, 0.1, -1.0],
+        }
+        lidar = [
+            [
+                {
+                    "state": [20.0, 1.0, 0.1],
+                    "t": now_ns - 5 * 10**7,
+                    "keys": ["x", "y", "yaw"],
+                }
+            ],
+            now_ns - 5 * 10**7,
+        ]
+        radar = [
+            [
+                {
+                    "state": [20.0, 1.0, 9.0],
+                    "t": now_ns - 3 * 10**7,
+                    "keys": ["x", "y", "v"],
+                }
+            ],
+            now_ns - 3 * 10**7,
+        ]
         cells = (now_ns, {"lidar": lidar, "radar": radar}, ego, [], {}, {}, {}, {}, 5)
         rows.append(";".join(map(json.dumps, cells)))
     return {"in/data_logs.csv": "\n".join(rows).encode()}
@@ -208,47 +257,90 @@ def kitti_sequence() -> Files:
         kitti.folder(
             Path(at) / "in",
             oxts=[kitti.oxts(1e-5 * k, yaw_rad=0.1, speed_mps=10.0) for k in range(20)],
-            label_02=[kitti.label(k, 1, "Car", 20.0 + 0.1 * k, 2.0, 0.0) for k in range(20)],
+            label_02=[
+                kitti.label(k, 1, "Car", 20.0 + 0.1 * k, 2.0, 0.0) for k in range(20)
+            ],
             pointrcnn_car=[kitti.pose(k, 20.0 + 0.1 * k, 2.0, 0.0) for k in range(20)],
         )
-        return {str(file.relative_to(at)): file.read_bytes() for file in Path(at).rglob("*.txt")}
+        return {
+            str(file.relative_to(at)): file.read_bytes()
+            for file in Path(at).rglob("*.txt")
+        }
 
 
 def tables() -> Files:
     """CSV in three files, with a mapping of their columns."""
-    ego, seen, cars = ["t;east;north;heading;kmh"], ["ms\tgot\trange\tazimuth\tkind\tsnr\tid"], ["t,id,x,y"]
+    ego, seen, cars = (
+        ["t;east;north;heading;kmh"],
+        ["ms\tgot\trange\tazimuth\tkind\tsnr\tid"],
+        ["t,id,x,y"],
+    )
     for k in range(40):
         t = f"{1000.0 + 0.05 * k:.2f}"
         ego.append(f"{t};{k}.5;2;90.0;72")
-        seen.append(f"{1_000_000 + 50 * k}\t{1_000_090 + 50 * k}\t{20 + 0.1 * k}\t-1.5\tcar\t9\tcar_a")
+        seen.append(
+            f"{1_000_000 + 50 * k}\t{1_000_090 + 50 * k}\t{20 + 0.1 * k}\t-1.5\tcar\t9\tcar_a"
+        )
         cars.append(f'{t},"car_a",{k + 20},3')
     texts = {"ego.csv": ego, "radar.tsv": seen, "cars.csv": cars}
-    return {"x.yaml": MAPPING} | {f"in/{name}": "\n".join(lines).encode() for name, lines in texts.items()}
+    return {"x.yaml": MAPPING} | {
+        f"in/{name}": "\n".join(lines).encode() for name, lines in texts.items()
+    }
 
 
 def nuscenes() -> Files:
     boxes: dict[str, object] = {}
-    tables: dict[str, list[dict[str, object]]] = {"scene": [{"token": "a", "name": "scene-0001"}]}
+    tables: dict[str, list[dict[str, object]]] = {
+        "scene": [{"token": "a", "name": "scene-0001"}]
+    }
     for k in range(10):
-        stamp_us, token, turned = 10**15 + 500_000 * k, f"s{k}", [math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
-        box = {"sample_token": token, "translation": [110.0, 2.0 + k, 1.0], "size": [1.9, 4.5, 1.6], "rotation": turned}
+        stamp_us, token, turned = (
+            10**15 + 500_000 * k,
+            f"s{k}",
+            [math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)],
+        )
+        box = {
+            "sample_token": token,
+            "translation": [110.0, 2.0 + k, 1.0],
+            "size": [1.9, 4.5, 1.6],
+            "rotation": turned,
+        }
         boxes[token] = [
-            {**box, "velocity": [0.0, 2.0], "tracking_name": "car", "tracking_id": "7", "tracking_score": 1}
+            {
+                **box,
+                "velocity": [0.0, 2.0],
+                "tracking_name": "car",
+                "tracking_id": "7",
+                "tracking_score": 1,
+            }
         ]
         for name, entry in {
             "sample": {"token": token, "timestamp": stamp_us, "scene_token": "a"},
             "sample_data": {"sample_token": token, "ego_pose_token": f"p{k}"},
-            "ego_pose": {"token": f"p{k}", "timestamp": stamp_us, "translation": [100.0, k, 0.0], "rotation": turned},
+            "ego_pose": {
+                "token": f"p{k}",
+                "timestamp": stamp_us,
+                "translation": [100.0, k, 0.0],
+                "rotation": turned,
+            },
         }.items():
             tables.setdefault(name, []).append(entry)
-    files = {f"in/v1.0-mini/{name}.json": json.dumps(entries).encode() for name, entries in tables.items()}
-    return {"in/results.json": json.dumps({"meta": {}, "results": boxes}).encode(), **files}
+    files = {
+        f"in/v1.0-mini/{name}.json": json.dumps(entries).encode()
+        for name, entries in tables.items()
+    }
+    return {
+        "in/results.json": json.dumps({"meta": {}, "results": boxes}).encode(),
+        **files,
+    }
 
 
 def bag(storage: str, messages: Sequence[fgtrack.Message] = ()) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         write_bag(Path(folder) / "bag", messages or drive(), storage)
-        (file,) = (file for file in (Path(folder) / "bag").iterdir() if file.suffix != ".yaml")
+        (file,) = (
+            file for file in (Path(folder) / "bag").iterdir() if file.suffix != ".yaml"
+        )
         return file.read_bytes()
 
 
@@ -258,9 +350,13 @@ def ros1() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.bag"
         with Rosbag1Writer(path) as writer:
-            topic = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=store)
+            topic = writer.add_connection(
+                "/odom", "nav_msgs/msg/Odometry", typestore=store
+            )
             for k in range(40):
-                time = types["builtin_interfaces/msg/Time"](1000 + k // 20, (k % 20) * 50_000_000)
+                time = types["builtin_interfaces/msg/Time"](
+                    1000 + k // 20, (k % 20) * 50_000_000
+                )
                 header = types["std_msgs/msg/Header"](k, time, "map")
                 pose = types["geometry_msgs/msg/Pose"](
                     types["geometry_msgs/msg/Point"](1.0 * k, 0.0, 0.0),
@@ -276,7 +372,11 @@ def ros1() -> bytes:
                     ),
                 )
                 receipt_ns = 1_000_000_000_000 + k * 50_000_000
-                writer.write(topic, receipt_ns, store.serialize_ros1(message, "nav_msgs/msg/Odometry"))
+                writer.write(
+                    topic,
+                    receipt_ns,
+                    store.serialize_ros1(message, "nav_msgs/msg/Odometry"),
+                )
         return path.read_bytes()
 
 
@@ -295,14 +395,23 @@ def configurations() -> list[Files]:
     """Each shipped one, beside a stream of lists of its sensors that measure places."""
     found = []
     for content in shipped("."):
-        ours = [message.sensor for message in drive() if isinstance(message, fgtrack.DetectionList)]
+        ours = [
+            message.sensor
+            for message in drive()
+            if isinstance(message, fgtrack.DetectionList)
+        ]
         sensors = YAML(typ="safe").load(content)["sensors"]
         theirs = [name for name, sensor in sensors.items() if "x_m" in sensor["std"]]
         if not theirs:
             continue
-        names = {name: name if name in theirs else theirs[k % len(theirs)] for k, name in enumerate(sorted({*ours}))}
+        names = {
+            name: name if name in theirs else theirs[k % len(theirs)]
+            for k, name in enumerate(sorted({*ours}))
+        }
         messages = [
-            replace(message, sensor=names[message.sensor]) if isinstance(message, fgtrack.DetectionList) else message
+            replace(message, sensor=names[message.sensor])
+            if isinstance(message, fgtrack.DetectionList)
+            else message
             for message in drive()
         ]
         found.append({"x.yaml": content, "x.jsonl": stream(messages)})
@@ -310,7 +419,9 @@ def configurations() -> list[Files]:
 
 
 def shipped(kind: str) -> list[bytes]:
-    return [file.read_bytes() for file in sorted((shipped_folder() / kind).glob("*.yaml"))]
+    return [
+        file.read_bytes() for file in sorted((shipped_folder() / kind).glob("*.yaml"))
+    ]
 
 
 SWEEP = b"""format: fgtrack-sweep/1

@@ -23,7 +23,14 @@ from fgtrack.estimation.failures import Failure
 from fuzz import scene, values
 from fuzz.scene import Record
 
-ESTIMATORS = ("ekf-replay", "smoother-banded", "smoother", "imm-replay", "ekf-backward-forward", "larsen")
+ESTIMATORS = (
+    "ekf-replay",
+    "smoother-banded",
+    "smoother",
+    "imm-replay",
+    "ekf-backward-forward",
+    "larsen",
+)
 #: What a healthy drive is changed in: after its tracks have begun, and long before its end.
 CHANGED_S = (0.4, 0.7)
 _TICK_NS = 10**8
@@ -32,11 +39,40 @@ _COUNTS = (1, 1, 2, 3, 4)
 _NEAR_M = 4.0
 #: Times that no clock gives; the integers among them are before the drive.
 _ODD_NS: tuple[Any, ...] = (
-    *(None, math.nan, math.inf, "1", 1.5, 1e18, -1, 2**63, 2**70, -(2**63), True, [], np.array([1, 2]), b"1"),
-    *(0, 1, np.uint64(5), np.int32(7), scene.START_NS - 3600 * 10**9, np.float64(1e18), np.array(5), object()),
+    *(
+        None,
+        math.nan,
+        math.inf,
+        "1",
+        1.5,
+        1e18,
+        -1,
+        2**63,
+        2**70,
+        -(2**63),
+        True,
+        [],
+        np.array([1, 2]),
+        b"1",
+    ),
+    *(
+        0,
+        1,
+        np.uint64(5),
+        np.int32(7),
+        scene.START_NS - 3600 * 10**9,
+        np.float64(1e18),
+        np.array(5),
+        object(),
+    ),
 )
 _LONGEST_S, _LONGEST_LINE = 20.0, 300
-_HIDDEN = (Failure.LIST_FAILED, Failure.ESTIMATOR_RAISED, Failure.NOT_FINITE, Failure.NOT_DEFINITE)
+_HIDDEN = (
+    Failure.LIST_FAILED,
+    Failure.ESTIMATOR_RAISED,
+    Failure.NOT_FINITE,
+    Failure.NOT_DEFINITE,
+)
 
 
 @dataclass(frozen=True)
@@ -51,7 +87,9 @@ class Case:
     """Cars that must keep their tracks: neither their sensor nor the ego was changed."""
 
 
-def case_of(name: str, seed: int, number: int, only: Sequence[int] | None = None) -> Case:
+def case_of(
+    name: str, seed: int, number: int, only: Sequence[int] | None = None
+) -> Case:
     """Return case `number` of an estimator; `only` some of its changes, to find the ones that matter."""
     key = [seed, zlib.crc32(name.encode()), number]
     rng = np.random.default_rng(key)
@@ -60,16 +98,30 @@ def case_of(name: str, seed: int, number: int, only: Sequence[int] | None = None
     begin_ns, end_ns = (scene.START_NS + round(s * 1e9) for s in CHANGED_S)
     chosen, rest = list[Any](), list[Record]()
     for record in scene.drive(sensors):
-        is_chosen = begin_ns <= record["at_ns"] < end_ns and record.get("sensor", "ego") == source
+        is_chosen = (
+            begin_ns <= record["at_ns"] < end_ns
+            and record.get("sensor", "ego") == source
+        )
         (chosen if is_chosen else rest).append(record)
     said = []
     for k in range(int(_COUNTS[rng.integers(len(_COUNTS))])):
         if only is None or k in only:
-            said.append(values.change(np.random.default_rng([*key, k]), chosen, of_programs=True))
-    changed = [{"at_ns": begin_ns, **(each if isinstance(each, dict) else {"message": each})} for each in chosen]
+            said.append(
+                values.change(
+                    np.random.default_rng([*key, k]), chosen, of_programs=True
+                )
+            )
+    changed = [
+        {"at_ns": begin_ns, **(each if isinstance(each, dict) else {"message": each})}
+        for each in chosen
+    ]
     arrivals = sorted([*rest, *changed], key=lambda each: each["at_ns"])
     seen = {car: by for car, by in scene.SEEN_BY.items() if by in sensors}
-    kept = {car for car, by in seen.items() if by == "lidar" and source not in ("ego", "lidar")}
+    kept = {
+        car
+        for car, by in seen.items()
+        if by == "lidar" and source not in ("ego", "lidar")
+    }
     return Case(arrivals, tuple(said), tuple(seen), frozenset(kept))
 
 
@@ -77,14 +129,24 @@ def message_of(record: Record) -> Any:
     """Return the message of a record, as a program makes it. Raises what the constructors raise."""
     if "message" in record:
         return record["message"]
-    given = {key: value for key, value in record.items() if key not in ("type", values.ARRIVAL)}
+    given = {
+        key: value
+        for key, value in record.items()
+        if key not in ("type", values.ARRIVAL)
+    }
     if record.get("type") == "ego":
         if _are_floats(given.get("covariance")):
             given["covariance"] = tuple(given["covariance"])
-        return fgtrack.EgoState(**_required(given, "stamp_ns", "receipt_ns", "x_m", "y_m", "yaw_rad", "speed_mps"))
+        return fgtrack.EgoState(
+            **_required(
+                given, "stamp_ns", "receipt_ns", "x_m", "y_m", "yaw_rad", "speed_mps"
+            )
+        )
     if isinstance(given.get("objects"), list):
         given["objects"] = [_detection_of(item) for item in given["objects"]]
-    return fgtrack.DetectionList(**_required(given, "sensor", "stamp_ns", "receipt_ns", "objects"))
+    return fgtrack.DetectionList(
+        **_required(given, "sensor", "stamp_ns", "receipt_ns", "objects")
+    )
 
 
 def _detection_of(item: Any) -> Any:
@@ -92,7 +154,11 @@ def _detection_of(item: Any) -> Any:
 
 
 def _are_floats(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 25 and all(isinstance(each, float) for each in value)
+    return (
+        isinstance(value, list)
+        and len(value) == 25
+        and all(isinstance(each, float) for each in value)
+    )
 
 
 def _required(given: Record, *names: str) -> Record:
@@ -102,7 +168,9 @@ def _required(given: Record, *names: str) -> Record:
 
 def tracker_of(name: str) -> fgtrack.Tracker:
     """Return a tracker of the sensors of the drive."""
-    return fgtrack.Tracker(fgtrack.Config().replace(sensors=scene.SENSORS), estimator=name)
+    return fgtrack.Tracker(
+        fgtrack.Config().replace(sensors=scene.SENSORS), estimator=name
+    )
 
 
 class Told(logging.Handler):
@@ -127,11 +195,18 @@ def problems_of(name: str, case: Case) -> Iterator[str]:
             yield from _problems(name, case)
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
-        place = next(each for each in reversed(traceback.extract_tb(error.__traceback__)) if "/fuzz/" in each.filename)
+        place = next(
+            each
+            for each in reversed(traceback.extract_tb(error.__traceback__))
+            if "/fuzz/" in each.filename
+        )
         yield f"{place.line}: raises {type(error).__name__}: {error!s:.200} ({where.filename}:{where.lineno})"
     finally:
         logging.getLogger().removeHandler(told)
-    yield from {f"warns {each.category.__name__}: {each.message} ({each.filename}:{each.lineno})" for each in warned}
+    yield from {
+        f"warns {each.category.__name__}: {each.message} ({each.filename}:{each.lineno})"
+        for each in warned
+    }
     yield from (f"logs {line!r:.300}" for line in told.lines if not _is_line(line))
 
 
@@ -143,7 +218,10 @@ def _problems(name: str, case: Case) -> Iterator[str]:
     tracker, began_s = tracker_of(name), time.process_time()
     received, kept = 0, {}
     arrivals = list(case.arrivals)
-    begin_ns, last_ns = scene.START_NS + round(CHANGED_S[0] * 1e9), arrivals[-1]["at_ns"]
+    begin_ns, last_ns = (
+        scene.START_NS + round(CHANGED_S[0] * 1e9),
+        arrivals[-1]["at_ns"],
+    )
     for now_ns in range(scene.START_NS, last_ns + _TICK_NS, _TICK_NS):
         while arrivals and arrivals[0]["at_ns"] <= now_ns:
             try:
@@ -175,8 +253,16 @@ def _problems(name: str, case: Case) -> Iterator[str]:
     counted = sum(sum(counts.values()) for counts in tracker.counts.values())
     if counted != received:
         yield f"{received} detections, {counted} counted: {tracker.counts}"
-    yield from (f"refuses with {reason!r:.400}" for reason in tracker.refused if not _is_line(reason))
-    if failed := {kind: count for kind, count in tracker.failures.items() if Failure(kind) in _HIDDEN}:
+    yield from (
+        f"refuses with {reason!r:.400}"
+        for reason in tracker.refused
+        if not _is_line(reason)
+    )
+    if failed := {
+        kind: count
+        for kind, count in tracker.failures.items()
+        if Failure(kind) in _HIDDEN
+    }:
         yield f"fails inside: {failed}, {str(tracker.last_failure)[-400:]}"
     if time.process_time() - began_s > _LONGEST_S:
         yield f"takes {time.process_time() - began_s:.0f} s"
@@ -189,7 +275,11 @@ def _ask(tracker: fgtrack.Tracker, report: fgtrack.TickReport) -> None:
         for track in report.tracks[:3]:
             with suppress(fgtrack.CallError):
                 tracker.state_at(track.track_id, stamp_ns)
-    delays_s = [each.delay_worst_s for each in tracker.lateness.values() if each.delay_worst_s is not None]
+    delays_s = [
+        each.delay_worst_s
+        for each in tracker.lateness.values()
+        if each.delay_worst_s is not None
+    ]
     assert all(map(math.isfinite, delays_s))
     assert tracker.timing.ticks > 0
 
@@ -214,7 +304,10 @@ def _unsound(report: fgtrack.TickReport) -> Iterator[str]:
             yield f"tick {report.tick}: the state of track {track.track_id} is not finite"
             return
         scale[scale == 0.0] = 1.0
-        if not np.array_equal(P, P.T) or np.linalg.eigvalsh(P / np.outer(scale, scale)).min() < -1e-8:
+        if (
+            not np.array_equal(P, P.T)
+            or np.linalg.eigvalsh(P / np.outer(scale, scale)).min() < -1e-8
+        ):
             yield f"tick {report.tick}: the covariance of track {track.track_id} is not positive definite"
             return
     for update in report.updates:
@@ -225,7 +318,11 @@ def _unsound(report: fgtrack.TickReport) -> Iterator[str]:
 
 def _tracks_near(report: fgtrack.TickReport, car: str) -> set[int]:
     x_m, y_m = scene.place_m(car, report.now_ns)
-    return {each.track_id for each in report.tracks if math.hypot(each.x_m - x_m, each.y_m - y_m) < _NEAR_M}
+    return {
+        each.track_id
+        for each in report.tracks
+        if math.hypot(each.x_m - x_m, each.y_m - y_m) < _NEAR_M
+    }
 
 
 def healthy() -> Case:

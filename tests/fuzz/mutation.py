@@ -15,9 +15,54 @@ from fuzz import values
 
 #: What numbers and texts are replaced by.
 ODD: tuple[Any, ...] = (
-    *(0, -1, 1, 3, 10**6, 10**18, -(2**31) - 1, 2**63 - 1, 2**63, 10**30, 0.0, -0.0, 0.5, 1e-300, 1e-9, 1e9, -1e19),
-    *(1e200, -1e308, math.nan, math.inf, -math.inf, None, True, "", "x", "1", "nan", "[bold]", "\x1b[31m"),
-    *("\u202eabc", "ä", "\x00", "x" * 5000, "a.b.c", "../x", [], {}, [[]], [0], {"x": 0}, [None, None]),
+    *(
+        0,
+        -1,
+        1,
+        3,
+        10**6,
+        10**18,
+        -(2**31) - 1,
+        2**63 - 1,
+        2**63,
+        10**30,
+        0.0,
+        -0.0,
+        0.5,
+        1e-300,
+        1e-9,
+        1e9,
+        -1e19,
+    ),
+    *(
+        1e200,
+        -1e308,
+        math.nan,
+        math.inf,
+        -math.inf,
+        None,
+        True,
+        "",
+        "x",
+        "1",
+        "nan",
+        "[bold]",
+        "\x1b[31m",
+    ),
+    *(
+        "\u202eabc",
+        "ä",
+        "\x00",
+        "x" * 5000,
+        "a.b.c",
+        "../x",
+        [],
+        {},
+        [[]],
+        [0],
+        {"x": 0},
+        [None, None],
+    ),
 )
 _NUMBER = rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"
 _FACTORS = (0.0, -1.0, 1e-12, 1e-9, 1e-3, 1.0, 2.0, 57.3, 1e3, 1e6, 1e9, 1e20)
@@ -27,11 +72,16 @@ Mutation = Callable[[np.random.Generator, bytes], bytes]
 def mutated(rng: np.random.Generator, name: str, content: bytes) -> bytes:
     """`content` of the file `name` with one to four things corrupted."""
     for _ in range(int(rng.integers(1, 5))):
-        known = next((ways for suffix, ways in _BY_SUFFIX.items() if name.endswith(suffix)), (_number, _lines))
+        known = next(
+            (ways for suffix, ways in _BY_SUFFIX.items() if name.endswith(suffix)),
+            (_number, _lines),
+        )
         ways = [_bytes, _bytes, *known]
         try:
             content = ways[rng.integers(len(ways))](rng, content)
-        except Exception:  # of the libraries that read what an earlier mutation has left
+        except (
+            Exception
+        ):  # of the libraries that read what an earlier mutation has left
             content = _bytes(rng, content)
     return content
 
@@ -41,7 +91,11 @@ def _bytes(rng: np.random.Generator, content: bytes) -> bytes:
     if not content:
         return bytes(rng.integers(0, 256, 20, dtype=np.uint8))
     place, length = int(rng.integers(len(content))), int(2 ** rng.uniform(0, 12))
-    head, part, tail = content[:place], content[place : place + length], content[place + length :]
+    head, part, tail = (
+        content[:place],
+        content[place : place + length],
+        content[place + length :],
+    )
     noise = bytes(rng.integers(0, 256, len(part), dtype=np.uint8))
     flipped = bytes([part[0] ^ 1 << int(rng.integers(8))]) + part[1:]
     middle = (b"", part + part, bytes(len(part)), noise, flipped)
@@ -57,7 +111,10 @@ def _packed(rng: np.random.Generator, content: bytes) -> bytes:
         ("<q", (0, -1, 1, 100_000, 2**62, 2**63 - 1, -(2**63))),
         ("<i", (0, -1, 1, 100_000, 2**30, 2**31 - 1, -(2**31))),
     )[rng.integers(4)]
-    new, place = struct.pack(form, values[rng.integers(len(values))]), 4 * int(rng.integers(len(content) // 4 + 1))
+    new, place = (
+        struct.pack(form, values[rng.integers(len(values))]),
+        4 * int(rng.integers(len(content) // 4 + 1)),
+    )
     return (content[:place] + new + content[place + len(new) :])[: len(content)]
 
 
@@ -65,20 +122,31 @@ def _number(rng: np.random.Generator, content: bytes) -> bytes:
     """A number somewhere in a text replaced by something odd."""
     found = list(re.finditer(_NUMBER, content))
     one = found[rng.integers(len(found))]
-    return content[: one.start()] + str(_odd(rng)).encode("utf-8", "replace") + content[one.end() :]
+    return (
+        content[: one.start()]
+        + str(_odd(rng)).encode("utf-8", "replace")
+        + content[one.end() :]
+    )
 
 
 def _field(rng: np.random.Generator, content: bytes) -> bytes:
     """All numbers behind one name scaled, moved, noisy or replaced by one thing that is odd."""
     names = sorted(set(re.findall(rb'(\w+)"?: *(?=-?\d)', content)))
     name = names[rng.integers(len(names))]
-    factor, size = float(rng.choice(_FACTORS)), 10.0 ** float(rng.uniform(-9.0, 19.0)) * float(rng.integers(2))
+    factor, size = (
+        float(rng.choice(_FACTORS)),
+        10.0 ** float(rng.uniform(-9.0, 19.0)) * float(rng.integers(2)),
+    )
     odd, is_noisy = None if rng.integers(4) else str(_odd(rng)), bool(rng.integers(2))
 
     def change(match: re.Match[bytes]) -> bytes:
-        value = float(match[2]) * factor + size * (rng.standard_normal() if is_noisy else 1.0)
+        value = float(match[2]) * factor + size * (
+            rng.standard_normal() if is_noisy else 1.0
+        )
         is_whole = match[2].lstrip(b"-").isdigit() and math.isfinite(value)
-        return match[1] + (odd or str(round(value) if is_whole else value)).encode("utf-8", "replace")
+        return match[1] + (odd or str(round(value) if is_whole else value)).encode(
+            "utf-8", "replace"
+        )
 
     return re.sub(rb'(\b%s"?: *)(%s)' % (name, _NUMBER), change, content)
 
@@ -87,7 +155,9 @@ def _lines(rng: np.random.Generator, content: bytes) -> bytes:
     """Lines left out, doubled, exchanged or moved."""
     lines = content.splitlines(keepends=True)
     one, other = sorted(rng.integers(len(lines), size=2).tolist())
-    changed = (lines[:one], [lines[one]] * 2, [lines[other]], lines[one:other][::-1])[rng.integers(4)]
+    changed = (lines[:one], [lines[one]] * 2, [lines[other]], lines[one:other][::-1])[
+        rng.integers(4)
+    ]
     return b"".join(lines[:one] + changed + lines[other:])
 
 
@@ -97,14 +167,22 @@ def _columns(rng: np.random.Generator, content: bytes) -> bytes:
     lines = content.splitlines(keepends=True)
     row = int(rng.integers(len(lines)))
     cells = lines[row].split(mark)
-    cells[rng.integers(len(cells))] = (b"", b"1" + mark + b"1", str(_odd(rng)).encode())[rng.integers(3)]
+    cells[rng.integers(len(cells))] = (
+        b"",
+        b"1" + mark + b"1",
+        str(_odd(rng)).encode(),
+    )[rng.integers(3)]
     lines[row] = mark.join(cells)
     return b"".join(lines)
 
 
 def _json(rng: np.random.Generator, content: bytes) -> bytes:
     """A value anywhere in a document of JSON, or in one of its lines."""
-    lines = [content] if content[:1] not in b"{[" or b"\n{" not in content else content.splitlines()
+    lines = (
+        [content]
+        if content[:1] not in b"{[" or b"\n{" not in content
+        else content.splitlines()
+    )
     place = int(rng.integers(len(lines)))
     document = {"": json.loads(lines[place])}
     values.change(rng, document)
@@ -132,19 +210,25 @@ def _mcap(rng: np.random.Generator, content: bytes) -> bytes:
 
     found = list(make_reader(io.BytesIO(content)).iter_messages(log_time_order=False))
     out, chosen = io.BytesIO(), int(rng.integers(len(found)))
-    writer = Writer(out, chunk_size=int(rng.choice([100, 10_000])), compression=CompressionType.ZSTD)
+    writer = Writer(
+        out, chunk_size=int(rng.choice([100, 10_000])), compression=CompressionType.ZSTD
+    )
     writer.start(profile="ros2", library="")
     channels: dict[int, int] = {}
     for place, (schema, channel, message) in enumerate(found):
         if channel.id not in channels:
             data = _bytes(rng, schema.data) if not rng.integers(20) else schema.data
             number = writer.register_schema(schema.name, schema.encoding, data)
-            channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, number)
+            channels[channel.id] = writer.register_channel(
+                channel.topic, channel.message_encoding, number
+            )
         data, log_ns = message.data, message.log_time
         if place == chosen:
             data = (_packed if rng.integers(2) else _bytes)(rng, data)
             log_ns = int(rng.choice([log_ns, 0, 2**63 - 1, log_ns + 10**10]))
-        writer.add_message(channels[channel.id], log_ns, data, message.publish_time, message.sequence)
+        writer.add_message(
+            channels[channel.id], log_ns, data, message.publish_time, message.sequence
+        )
     writer.finish()
     return out.getvalue()
 

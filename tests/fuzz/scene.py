@@ -19,7 +19,11 @@ DURATION_S, RATE_HZ = 1.4, 10
 _WHOLE_CIRCLE = 6.28
 #: The sensors of the drive, as in a configuration. Each sees its own cars alone.
 SENSORS: dict[str, Any] = {
-    "lidar": {"std": {"x_m": 0.3, "y_m": 0.3}, "field_of_view_rad": 1.2, "max_range_m": 120.0},
+    "lidar": {
+        "std": {"x_m": 0.3, "y_m": 0.3},
+        "field_of_view_rad": 1.2,
+        "max_range_m": 120.0,
+    },
     "boxes": {
         "std": {"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.1},
         "mount": {"yaw_rad": 1.57},
@@ -74,7 +78,11 @@ def place_m(car: str, stamp_ns: int) -> tuple[float, float]:
 
 def drive(sensors: Sequence[str] = tuple(SENSORS)) -> list[Record]:
     """Return the records of the ego and of some sensors in the order of their arrival, for the caller to change."""
-    return [deepcopy(record) for record in _drive() if record.get("sensor") in (None, *sensors)]
+    return [
+        deepcopy(record)
+        for record in _drive()
+        if record.get("sensor") in (None, *sensors)
+    ]
 
 
 @cache
@@ -106,8 +114,14 @@ def _ego(stamp_ns: int) -> Record:
     }
 
 
-def _list(rng: np.random.Generator, sensor: str, stamp_ns: int, delay_ms: int) -> Record:
-    seen = [car for car, by in SEEN_BY.items() if by == sensor or (sensor == "camera" and by == "boxes")]
+def _list(
+    rng: np.random.Generator, sensor: str, stamp_ns: int, delay_ms: int
+) -> Record:
+    seen = [
+        car
+        for car, by in SEEN_BY.items()
+        if by == sensor or (sensor == "camera" and by == "boxes")
+    ]
     receipt_ns = stamp_ns + delay_ms * 10**6
     return {
         "type": "detections",
@@ -120,12 +134,21 @@ def _list(rng: np.random.Generator, sensor: str, stamp_ns: int, delay_ms: int) -
     }
 
 
-def _detection(rng: np.random.Generator, sensor: str, car: str, stamp_ns: int) -> Record:
+def _detection(
+    rng: np.random.Generator, sensor: str, car: str, stamp_ns: int
+) -> Record:
     x_m, y_m = place_m(car, stamp_ns)
     ahead_m, left_m = x_m - _EGO_MPS * (stamp_ns - START_NS) / 1e9, y_m
     noise = rng.standard_normal(4).tolist()
     number = list(CARS).index(car)
-    described = {"length_m": 4.5, "width_m": 1.8, "height_m": 1.5, "class_name": "car", "score": 0.9, "z_m": 0.7}
+    described = {
+        "length_m": 4.5,
+        "width_m": 1.8,
+        "height_m": 1.5,
+        "class_name": "car",
+        "score": 0.9,
+        "z_m": 0.7,
+    }
     if sensor == "lidar":
         return {"x_m": x_m + 0.3 * noise[0], "y_m": y_m + 0.3 * noise[1]}
     if sensor == "boxes":
@@ -138,7 +161,11 @@ def _detection(rng: np.random.Generator, sensor: str, car: str, stamp_ns: int) -
             **described,
         }
     if sensor == "camera":
-        return {"bearing_rad": math.atan2(left_m, ahead_m) + 0.01 * noise[0], "class_name": "car", "score": 0.8}
+        return {
+            "bearing_rad": math.atan2(left_m, ahead_m) + 0.01 * noise[0],
+            "class_name": "car",
+            "score": 0.8,
+        }
     if sensor == "radar":
         back_m = -1.0 - ahead_m  # the sensor looks back
         range_m = math.hypot(back_m, left_m)
@@ -163,4 +190,6 @@ def _detection(rng: np.random.Generator, sensor: str, car: str, stamp_ns: int) -
 
 def numbers_of(records: Sequence[Record]) -> int:
     """Return the number of detections."""
-    return sum(len(record["objects"]) for record in records if record["type"] == "detections")
+    return sum(
+        len(record["objects"]) for record in records if record["type"] == "detections"
+    )

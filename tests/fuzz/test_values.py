@@ -31,19 +31,29 @@ def case_of(name: str, seed: int, number: int) -> tuple[dict[str, bytes], list[s
     right = healthy(target)
     files = dict(right[rng.integers(len(right))])
     names = sorted(
-        one for one in files if one.endswith(tuple(documents.FORMS)) and one.endswith(target.corrupted or "")
+        one
+        for one in files
+        if one.endswith(tuple(documents.FORMS)) and one.endswith(target.corrupted or "")
     )
     one = str(rng.choice(names))
-    files[one], changes = documents.changed(rng, one, files[one], int(rng.choice(_COUNTS)))
+    files[one], changes = documents.changed(
+        rng, one, files[one], int(rng.choice(_COUNTS))
+    )
     return files, changes
 
 
-def findings_in_files(server: Server, name: str, seed: int, changes: int, keep: Path) -> Iterator[str]:
+def findings_in_files(
+    server: Server, name: str, seed: int, changes: int, keep: Path
+) -> Iterator[str]:
     """Yield what is wrong with the cases of a target, until so many values were changed; their files stay in `keep`."""
     number = 0
     while changes > 0:
         files, said = case_of(name, seed, number)
-        target = SHORT[name] if number % 4 == 0 else replace(SHORT[name], commands=_without_info(SHORT[name]))
+        target = (
+            SHORT[name]
+            if number % 4 == 0
+            else replace(SHORT[name], commands=_without_info(SHORT[name]))
+        )
         problem = problem_of(server, target, files, keep / f"{name}-{number}")
         if problem is not None:
             yield f"{name} {number}: {problem}  [{'; '.join(said)}]"
@@ -55,11 +65,15 @@ def _without_info(target: Target) -> list[Sequence[str]]:
     return [command for command in target.commands if command[0] != "info"]
 
 
-def findings_in_messages(server: Server, name: str, seed: int, changes: int, folder: Path) -> Iterator[str]:
+def findings_in_messages(
+    server: Server, name: str, seed: int, changes: int, folder: Path
+) -> Iterator[str]:
     """Yield what is wrong with live cases of an estimator, until so many values were changed."""
     number = 0
     while changes > 0:
-        done = server([name, str(seed), str(number), str(changes)], folder, call="fuzz.live:main")
+        done = server(
+            [name, str(seed), str(number), str(changes)], folder, call="fuzz.live:main"
+        )
         lines = done.said.splitlines()
         for line in lines:
             if line.startswith("case "):
@@ -74,13 +88,17 @@ def findings_in_messages(server: Server, name: str, seed: int, changes: int, fol
 
 
 @pytest.mark.parametrize("name", live.ESTIMATORS)
-def test_a_few_wrong_values_in_live_messages(server: Server, name: str, tmp_path: Path) -> None:
+def test_a_few_wrong_values_in_live_messages(
+    server: Server, name: str, tmp_path: Path
+) -> None:
     assert live.case_of(name, _SEED, 1).changes == live.case_of(name, _SEED, 1).changes
     assert list(findings_in_messages(server, name, _SEED, 40, tmp_path)) == []
 
 
 @pytest.mark.parametrize("name", SHORT)
-def test_a_few_wrong_values_in_files_of_every_kind(server: Server, name: str, tmp_path: Path) -> None:
+def test_a_few_wrong_values_in_files_of_every_kind(
+    server: Server, name: str, tmp_path: Path
+) -> None:
     assert case_of(name, _SEED, 1) == case_of(name, _SEED, 1)
     assert list(findings_in_files(server, name, _SEED, 2, tmp_path)) == []
 
@@ -93,24 +111,41 @@ def test_a_drive_without_wrong_values_is_tracked(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SHORT)
-def test_files_without_wrong_values_are_read(server: Server, name: str, tmp_path: Path) -> None:
+def test_files_without_wrong_values_are_read(
+    server: Server, name: str, tmp_path: Path
+) -> None:
     for k, files in enumerate(healthy(SHORT[name])):
-        assert problem_of(server, SHORT[name], files, tmp_path / f"right-{k}", right=True) is None
+        assert (
+            problem_of(server, SHORT[name], files, tmp_path / f"right-{k}", right=True)
+            is None
+        )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", live.ESTIMATORS)
-def test_many_wrong_values_in_live_messages(server: Server, name: str, request: pytest.FixtureRequest) -> None:
-    changes, seed = request.config.getoption("--changes"), request.config.getoption("--fuzz-seed")
+def test_many_wrong_values_in_live_messages(
+    server: Server, name: str, request: pytest.FixtureRequest
+) -> None:
+    changes, seed = (
+        request.config.getoption("--changes"),
+        request.config.getoption("--fuzz-seed"),
+    )
     keep = _folder()
-    found = findings_in_messages(server, name, seed, -(-_LIVE_SHARE * changes // _SHARES), keep)
+    found = findings_in_messages(
+        server, name, seed, -(-_LIVE_SHARE * changes // _SHARES), keep
+    )
     assert _kept(keep / f"live-{name}.txt", found) == 0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SHORT)
-def test_many_wrong_values_in_files(server: Server, name: str, request: pytest.FixtureRequest) -> None:
-    changes, seed = request.config.getoption("--changes"), request.config.getoption("--fuzz-seed")
+def test_many_wrong_values_in_files(
+    server: Server, name: str, request: pytest.FixtureRequest
+) -> None:
+    changes, seed = (
+        request.config.getoption("--changes"),
+        request.config.getoption("--fuzz-seed"),
+    )
     keep = _folder()
     found = findings_in_files(server, name, seed, -(-changes // _SHARES), keep)
     assert _kept(keep / f"{name}.txt", found) == 0

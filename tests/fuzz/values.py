@@ -64,7 +64,11 @@ def _times(*factors: float) -> Change:
         factor = factors[rng.integers(len(factors))]
         if not _is_number(value):
             return factor
-        return round(value * factor) if isinstance(value, int) and math.isfinite(value * factor) else value * factor
+        return (
+            round(value * factor)
+            if isinstance(value, int) and math.isfinite(value * factor)
+            else value * factor
+        )
 
     return scaled
 
@@ -100,17 +104,73 @@ PLAIN: dict[str, Change] = {
     "missing": _pick(_MISSING),
     "empty": _pick("", [], {}),
     "text": _as_text,
-    "other text": _pick("x", "nan", "inf", "1e5", "0x10", "1_000", "true", "[bold]", "=HYPERLINK(1)", "../x", "a.b.c"),
-    "text of other letters": _pick("ä", "車", "\u202eabc", "\x00", "\x1b[31m", "a\nb", "\ud800", "🚗", _LONG, "ＡＢ"),
+    "other text": _pick(
+        "x",
+        "nan",
+        "inf",
+        "1e5",
+        "0x10",
+        "1_000",
+        "true",
+        "[bold]",
+        "=HYPERLINK(1)",
+        "../x",
+        "a.b.c",
+    ),
+    "text of other letters": _pick(
+        "ä",
+        "車",
+        "\u202eabc",
+        "\x00",
+        "\x1b[31m",
+        "a\nb",
+        "\ud800",
+        "🚗",
+        _LONG,
+        "ＡＢ",
+    ),
     "number": _pick(0, 1, -1, 3, 0.5, 1e6),
     "list": _as_list,
     "boolean": _pick(True, False),
-    "huge": _pick(1e308, -1e308, 1e200, 1e19, 10**30, 2**63, 2**63 - 1, -(2**63) - 1, 2**64, 2**70, 10**400),
+    "huge": _pick(
+        1e308,
+        -1e308,
+        1e200,
+        1e19,
+        10**30,
+        2**63,
+        2**63 - 1,
+        -(2**63) - 1,
+        2**64,
+        2**70,
+        10**400,
+    ),
     "tiny": _pick(5e-324, 1e-300, -1e-308, 1e-12),
     "zero": _pick(0, 0.0, -0.0),
-    "unit": _times(1e3, 1e-3, 1e6, 1e-6, 1e9, 1e-9, 57.29577951308232, 0.017453292519943295, 3.6, 1.852),
+    "unit": _times(
+        1e3,
+        1e-3,
+        1e6,
+        1e-6,
+        1e9,
+        1e-9,
+        57.29577951308232,
+        0.017453292519943295,
+        3.6,
+        1.852,
+    ),
     "sign": _negated,
-    "time": _plus(_HOUR_NS, -_HOUR_NS, 10**9, -(10**9), 24 * _HOUR_NS, 3 * 10**8, -3 * 10**8, 1, 315_964_800 * 10**9),
+    "time": _plus(
+        _HOUR_NS,
+        -_HOUR_NS,
+        10**9,
+        -(10**9),
+        24 * _HOUR_NS,
+        3 * 10**8,
+        -3 * 10**8,
+        1,
+        315_964_800 * 10**9,
+    ),
 }
 
 
@@ -130,14 +190,29 @@ def _numpy(*kinds: Callable[[Any], Any]) -> Change:
 OF_PROGRAMS: dict[str, Change] = {
     "numpy float": _numpy(np.float16, np.float32, np.float64, np.longdouble),
     "numpy integer": _numpy(np.uint64, np.int64, np.int32, np.uint8, np.int8),
-    "numpy wraps": _pick(np.uint64(2**63 + 5), np.uint64(0), np.int32(-1), np.int8(-128), np.float16(6e4)),
-    "numpy array": _numpy(np.array, np.atleast_1d, lambda value: np.array([value, value]), lambda _: np.zeros(0)),
+    "numpy wraps": _pick(
+        np.uint64(2**63 + 5), np.uint64(0), np.int32(-1), np.int8(-128), np.float16(6e4)
+    ),
+    "numpy array": _numpy(
+        np.array,
+        np.atleast_1d,
+        lambda value: np.array([value, value]),
+        lambda _: np.zeros(0),
+    ),
     "numpy text": _pick(
-        np.str_("car"), np.bytes_(b"car"), np.bool_(True), np.datetime64(0, "ns"), np.timedelta64(1, "s")
+        np.str_("car"),
+        np.bytes_(b"car"),
+        np.bool_(True),
+        np.datetime64(0, "ns"),
+        np.timedelta64(1, "s"),
     ),
     "other number": _numpy(Decimal, Fraction, complex),
-    "object": _pick(b"abc", (), (1.0,), frozenset({1}), object, Ellipsis, range(3), bytearray(b"1")),
-    "masked": _pick(np.ma.masked, np.void(b"1"), np.array(None), np.array("x"), np.float64(math.nan)),
+    "object": _pick(
+        b"abc", (), (1.0,), frozenset({1}), object, Ellipsis, range(3), bytearray(b"1")
+    ),
+    "masked": _pick(
+        np.ma.masked, np.void(b"1"), np.array(None), np.array("x"), np.float64(math.nan)
+    ),
 }
 
 
@@ -150,11 +225,44 @@ def _covariance(rng: np.random.Generator, value: Any) -> Any:
     asymmetric, indefinite, broken = list(flat), list(flat), list[Any](flat)
     asymmetric[-2 if n > 1 else 0] += 1.0
     indefinite[1 if n > 1 else 0] = indefinite[n if n > 1 else 0] = -1e3
-    broken[int(rng.integers(len(flat)))] = (None, math.nan, math.inf, "1", 1e308, -1.0, 0.0, [1.0])[rng.integers(8)]
+    broken[int(rng.integers(len(flat)))] = (
+        None,
+        math.nan,
+        math.inf,
+        "1",
+        1e308,
+        -1.0,
+        0.0,
+        [1.0],
+    )[rng.integers(8)]
     choices: tuple[Any, ...] = (
-        *(flat[:-1], [*flat, 1.0], flat[:n], flat[:1], [], [flat], square, asymmetric, indefinite, broken, broken),
-        *([0.0] * len(flat), [-each for each in flat], [1e18 * each for each in flat], [1e-18 * each for each in flat]),
-        *([1.0] * len(flat), [[each] for each in flat], {"x_m": 1.0}, 1.0, "0.1 0 0 0.1", [1] * len(flat)),
+        *(
+            flat[:-1],
+            [*flat, 1.0],
+            flat[:n],
+            flat[:1],
+            [],
+            [flat],
+            square,
+            asymmetric,
+            indefinite,
+            broken,
+            broken,
+        ),
+        *(
+            [0.0] * len(flat),
+            [-each for each in flat],
+            [1e18 * each for each in flat],
+            [1e-18 * each for each in flat],
+        ),
+        *(
+            [1.0] * len(flat),
+            [[each] for each in flat],
+            {"x_m": 1.0},
+            1.0,
+            "0.1 0 0 0.1",
+            [1] * len(flat),
+        ),
         *([0.0] * 36, [1.0] * 36, [str(each) for each in flat], [True] * len(flat)),
     )
     return choices[rng.integers(len(choices))]
@@ -162,7 +270,13 @@ def _covariance(rng: np.random.Generator, value: Any) -> Any:
 
 def _covariance_of_programs(rng: np.random.Generator, value: Any) -> Any:
     changed = _covariance(rng, value)
-    forms = (tuple, np.array, lambda each: np.array(each, dtype=np.float32), lambda each: np.asmatrix(each), list)
+    forms = (
+        tuple,
+        np.array,
+        lambda each: np.array(each, dtype=np.float32),
+        lambda each: np.asmatrix(each),
+        list,
+    )
     try:
         with np.errstate(all="ignore"):
             return forms[rng.integers(len(forms))](changed)
@@ -190,7 +304,11 @@ def _shuffled(rng: np.random.Generator, value: list[Any]) -> None:
 
 def _grown(rng: np.random.Generator, value: list[Any]) -> None:
     one, count = value[int(rng.integers(len(value)))], _MANY[rng.integers(len(_MANY))]
-    value += [deepcopy(one) for _ in range(count)] if rng.integers(2) else [_moved(rng, one) for _ in range(count)]
+    value += (
+        [deepcopy(one) for _ in range(count)]
+        if rng.integers(2)
+        else [_moved(rng, one) for _ in range(count)]
+    )
 
 
 def _moved(rng: np.random.Generator, value: Any) -> Any:
@@ -199,7 +317,9 @@ def _moved(rng: np.random.Generator, value: Any) -> Any:
     if isinstance(value, dict):
         for key in ("x_m", "y_m", "bearing_rad", "latitude_deg", "longitude_deg"):
             if key in value and _is_number(value[key]):
-                value[key] += float(rng.normal(0.0, 1.0 if key.endswith(("rad", "deg")) else 100.0))
+                value[key] += float(
+                    rng.normal(0.0, 1.0 if key.endswith(("rad", "deg")) else 100.0)
+                )
     return value
 
 
@@ -212,7 +332,9 @@ OF_LISTS: dict[str, Callable[[np.random.Generator, list[Any]], None]] = {
 }
 
 
-def places(document: Any, hidden: Sequence[str] = (ARRIVAL,), path: str = "") -> list[Place]:
+def places(
+    document: Any, hidden: Sequence[str] = (ARRIVAL,), path: str = ""
+) -> list[Place]:
     """Return all values in a document, those that contain others too, without keys that are `hidden`."""
     found = []
     for key in _keys(document):
@@ -230,7 +352,9 @@ def change(rng: np.random.Generator, document: Any, of_programs: bool = False) -
     if not everywhere:
         return "nothing to change"
     kinds = [_value, _value, _value, _value, _everywhere, _list, _added, _covariances]
-    if isinstance(document, list) and any(isinstance(each, dict) and "stamp_ns" in each for each in document):
+    if isinstance(document, list) and any(
+        isinstance(each, dict) and "stamp_ns" in each for each in document
+    ):
         kinds += [_messages, _messages]
     if rng.integers(200) == 0:
         kinds = [_many]
@@ -245,7 +369,9 @@ def _chosen(rng: np.random.Generator, items: Sequence[Any]) -> Any:
     return items[rng.integers(len(items))]
 
 
-def _value(rng: np.random.Generator, document: Any, everywhere: list[Place], of_programs: bool) -> str:
+def _value(
+    rng: np.random.Generator, document: Any, everywhere: list[Place], of_programs: bool
+) -> str:
     """Change one value. Each name of a field is as likely as any other."""
     names = sorted({str(each.key) for each in everywhere})
     name = _chosen(rng, names)
@@ -256,23 +382,33 @@ def _value(rng: np.random.Generator, document: Any, everywhere: list[Place], of_
     return f"{place.path}: {old!r:.60} -> {_shown(new)} ({kind})"
 
 
-def _everywhere(rng: np.random.Generator, document: Any, everywhere: list[Place], of_programs: bool) -> str:
+def _everywhere(
+    rng: np.random.Generator, document: Any, everywhere: list[Place], of_programs: bool
+) -> str:
     """Change a field in every message of one sensor, or in all rows, in the same way."""
-    leaves = [each for each in everywhere if not isinstance(each.value, list | dict)] or everywhere
+    leaves = [
+        each for each in everywhere if not isinstance(each.value, list | dict)
+    ] or everywhere
     place = _chosen(rng, leaves)
     sensor = _sensor(document, place)
     kind = _chosen(rng, list(_changes(of_programs)))
     seed, count = int(rng.integers(2**32)), 0
     for each in leaves:
         if each.key == place.key and _sensor(document, each) == sensor:
-            each.put(_changes(of_programs)[kind](np.random.default_rng(seed), each.value))
+            each.put(
+                _changes(of_programs)[kind](np.random.default_rng(seed), each.value)
+            )
             count += 1
     return f"all {count} {place.key} of {sensor}: {kind} (seed {seed})"
 
 
 def _sensor(document: Any, place: Place) -> Any:
     number = place.path[1:].partition("]")[0]
-    if isinstance(document, list) and number.isdigit() and isinstance(document[int(number)], dict):
+    if (
+        isinstance(document, list)
+        and number.isdigit()
+        and isinstance(document[int(number)], dict)
+    ):
         return source(document[int(number)])
     return None
 
@@ -282,7 +418,9 @@ def source(record: dict[str, Any]) -> str:
     return repr(record.get("sensor", record.get("type")))
 
 
-def _list(rng: np.random.Generator, document: Any, everywhere: list[Place], of_programs: bool) -> str:
+def _list(
+    rng: np.random.Generator, document: Any, everywhere: list[Place], of_programs: bool
+) -> str:
     lists = [each for each in everywhere if isinstance(each.value, list) and each.value]
     if not lists:
         return _value(rng, document, everywhere, of_programs)
@@ -291,14 +429,20 @@ def _list(rng: np.random.Generator, document: Any, everywhere: list[Place], of_p
     return f"{place.path}: {kind}"
 
 
-def _added(rng: np.random.Generator, document: Any, everywhere: list[Place], of_programs: bool) -> str:
+def _added(
+    rng: np.random.Generator, document: Any, everywhere: list[Place], of_programs: bool
+) -> str:
     """Add a field that nobody knows, or rename one. Constructors of messages take no such field."""
-    mappings = [each for each in everywhere if isinstance(each.value, dict) and each.value]
+    mappings = [
+        each for each in everywhere if isinstance(each.value, dict) and each.value
+    ]
     if of_programs or not mappings:
         return _value(rng, document, everywhere, of_programs)
     place = _chosen(rng, mappings)
     name, value = (
-        _chosen(rng, ["unknown", "", "ä", "x_mm", "stamp", "covariances", "\x1b[31m", _LONG]),
+        _chosen(
+            rng, ["unknown", "", "ä", "x_mm", "stamp", "covariances", "\x1b[31m", _LONG]
+        ),
         PLAIN["list"](rng, 1.0),
     )
     if rng.integers(2):
@@ -308,7 +452,9 @@ def _added(rng: np.random.Generator, document: Any, everywhere: list[Place], of_
     return f"{place.path}: field {name!r:.30} = {_shown(value)}"
 
 
-def _covariances(rng: np.random.Generator, document: Any, everywhere: list[Place], of_programs: bool) -> str:
+def _covariances(
+    rng: np.random.Generator, document: Any, everywhere: list[Place], of_programs: bool
+) -> str:
     found = [each for each in everywhere if each.key == "covariance"]
     if not found:
         return _value(rng, document, everywhere, of_programs)
@@ -318,7 +464,9 @@ def _covariances(rng: np.random.Generator, document: Any, everywhere: list[Place
     return f"{place.path}: {_shown(new)} (covariance)"
 
 
-def _many(rng: np.random.Generator, document: Any, everywhere: list[Place], of_programs: bool) -> str:
+def _many(
+    rng: np.random.Generator, document: Any, everywhere: list[Place], of_programs: bool
+) -> str:
     lists = [each for each in everywhere if isinstance(each.value, list) and each.value]
     if not lists:
         return _value(rng, document, everywhere, of_programs)
@@ -333,19 +481,55 @@ _KINDS_OF_ORDER = (
 )
 
 
-def _messages(rng: np.random.Generator, document: list[Any], everywhere: list[Place], of_programs: bool) -> str:
+def _messages(
+    rng: np.random.Generator,
+    document: list[Any],
+    everywhere: list[Place],
+    of_programs: bool,
+) -> str:
     """Change the order of messages, their clocks and how often they come."""
-    rows = [k for k, each in enumerate(document) if isinstance(each, dict) and "stamp_ns" in each]
+    rows = [
+        k
+        for k, each in enumerate(document)
+        if isinstance(each, dict) and "stamp_ns" in each
+    ]
     row = int(_chosen(rng, rows))
-    one, arrivals_ns = document[row], [each.get(ARRIVAL) if isinstance(each, dict) else None for each in document]
+    one, arrivals_ns = (
+        document[row],
+        [each.get(ARRIVAL) if isinstance(each, dict) else None for each in document],
+    )
     sensor = source(one)
     same = [k for k in rows if source(document[k]) == sensor]
-    step_ns = int(_chosen(rng, [_HOUR_NS, -_HOUR_NS, 10**9, -(10**9), 4 * 10**8, -4 * 10**8, 10**18, -(10**18)]))
+    step_ns = int(
+        _chosen(
+            rng,
+            [
+                _HOUR_NS,
+                -_HOUR_NS,
+                10**9,
+                -(10**9),
+                4 * 10**8,
+                -4 * 10**8,
+                10**18,
+                -(10**18),
+            ],
+        )
+    )
     key = str(_chosen(rng, ["stamp_ns", "receipt_ns"]))
     kind = str(
         _chosen(
             rng,
-            ["again", "other contents", "shuffled", "reversed", "jump", "one ahead", "lost", "swapped", "same stamp"],
+            [
+                "again",
+                "other contents",
+                "shuffled",
+                "reversed",
+                "jump",
+                "one ahead",
+                "lost",
+                "swapped",
+                "same stamp",
+            ],
         )
     )
     match kind:
@@ -371,7 +555,9 @@ def _messages(rng: np.random.Generator, document: list[Any], everywhere: list[Pl
         case "one ahead":
             one[key] = _moved_by(one.get(key), step_ns)
         case "lost":
-            for k in reversed(same[same.index(row) :][: int(_chosen(rng, [1, 5, 1000]))]):
+            for k in reversed(
+                same[same.index(row) :][: int(_chosen(rng, [1, 5, 1000]))]
+            ):
                 del document[k]
         case "swapped":
             other_row = int(_chosen(rng, rows))
@@ -403,4 +589,10 @@ def _is_number(value: Any) -> bool:
 
 
 def _keys(value: Any) -> list[Any]:
-    return list(value) if isinstance(value, dict) else list(range(len(value))) if isinstance(value, list) else []
+    return (
+        list(value)
+        if isinstance(value, dict)
+        else list(range(len(value)))
+        if isinstance(value, list)
+        else []
+    )

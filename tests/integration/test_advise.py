@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 import fgtrack
-from fgtrack.calibration.arrivals import Arrivals, window_findings
 from fgtrack.cli.main import run as run_command
+from fgtrack.clocks.arrivals import Arrivals, window_findings
+from fgtrack.config.shipped import read_config
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.io.run import load_run
-from fgtrack.io.source import open_input
-from fgtrack.io.stream import write_stream
+from fgtrack.inputs.source import open_input
+from fgtrack.inputs.stream import write_stream
 from fgtrack.pipeline.assumptions.assumed import assumed
-from fgtrack.pipeline.shipped import read_config
+from fgtrack.runs import load_run
 from fgtrack.sim.redelay import restamped
 
 MS = 1_000_000
@@ -39,7 +39,9 @@ Call = Callable[..., tuple[int, str]]
 
 
 @pytest.fixture
-def call(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call:
+def call(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Call:
     """Runs a command in an empty folder; gives its exit code and what it prints, its lines joined."""
     monkeypatch.chdir(tmp_path)
 
@@ -53,7 +55,11 @@ def call(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest
 
 
 def drive(
-    count: int = 150, *, truth: bool = True, late_ms: Callable[[int], float] = lambda k: 100.0, wave_mps: float = 6.0
+    count: int = 150,
+    *,
+    truth: bool = True,
+    late_ms: Callable[[int], float] = lambda k: 100.0,
+    wave_mps: float = 6.0,
 ) -> list[Message]:
     """The ego at 20 m/s far from the origin of the map; a car ahead that is faster and slower than it by turns."""
     rng = np.random.default_rng(1)
@@ -65,18 +71,41 @@ def drive(
         messages.append(EgoState(now_ns, now_ns, ego_m, 500.0, 0.0, 20.0))
         ahead_m = 30.0 + wave_mps * (1.0 - np.cos(now_s))
         if truth:
-            messages.append(TruthState(now_ns, now_ns, 1, ego_m + ahead_m, 501.0, 0.0, 20.0 + wave_mps * np.sin(now_s)))
-        for sensor, std_m, delay_ms in (("lidar", 0.3, late_ms(k)), ("radar", 1.0, 40.0)):
+            messages.append(
+                TruthState(
+                    now_ns,
+                    now_ns,
+                    1,
+                    ego_m + ahead_m,
+                    501.0,
+                    0.0,
+                    20.0 + wave_mps * np.sin(now_s),
+                )
+            )
+        for sensor, std_m, delay_ms in (
+            ("lidar", 0.3, late_ms(k)),
+            ("radar", 1.0, 40.0),
+        ):
             x_m, y_m = rng.normal((ahead_m, 1.0), std_m).tolist()
             receipt_ns = now_ns + round(delay_ms * MS)
             messages.append(
-                DetectionList(sensor, now_ns, receipt_ns, (Detection(x_m=x_m, y_m=y_m, yaw_rad=0.0),), "ego")
+                DetectionList(
+                    sensor,
+                    now_ns,
+                    receipt_ns,
+                    (Detection(x_m=x_m, y_m=y_m, yaw_rad=0.0),),
+                    "ego",
+                )
             )
     return sorted(messages, key=lambda message: message.receipt_ns)
 
 
-def changed(change: Callable[[DetectionList], DetectionList], messages: Iterable[Message]) -> list[Message]:
-    return [change(item) if isinstance(item, DetectionList) else item for item in messages]
+def changed(
+    change: Callable[[DetectionList], DetectionList], messages: Iterable[Message]
+) -> list[Message]:
+    return [
+        change(item) if isinstance(item, DetectionList) else item for item in messages
+    ]
 
 
 def write(messages: Sequence[Message]) -> str:
@@ -95,18 +124,34 @@ def test_a_healthy_recording_is_fine_and_nothing_is_changed(call: Call) -> None:
     code, text = advised(call, "drive.jsonl", "-o", "a.yaml")
     assert code == 0
     assert "Fine: the ego (20 Hz" in text
-    assert "stamps of lidar, radar, clock of lidar, noise of lidar, radar, frames, angles and fields" in text
+    assert (
+        "stamps of lidar, radar, clock of lidar, noise of lidar, radar, frames, angles and fields"
+        in text
+    )
     assert "tracks (2 beginnings, 99 % tracked where a sensor could see)" in text
-    assert "radar: its clock offset from the truth of the recording is not known: +25 ms ±" in text  # too short a drive
+    assert (
+        "radar: its clock offset from the truth of the recording is not known: +25 ms ±"
+        in text
+    )  # too short a drive
     assert "# Nothing is changed." in Path("a.yaml").read_text()
     for name in ("c", "a"):
-        assert call("replay", "drive.jsonl", "-c", f"{name}.yaml", "-o", f"runs/{name}")[0] == 0
+        assert (
+            call("replay", "drive.jsonl", "-c", f"{name}.yaml", "-o", f"runs/{name}")[0]
+            == 0
+        )
     assert load_run("runs/a").meta["digest"] == load_run("runs/c").meta["digest"]
 
 
 @pytest.mark.parametrize("command", ["advise", "offsets"])
-def test_without_a_configuration_the_sensors_are_those_of_the_recording(call: Call, command: str) -> None:
-    bare = changed(lambda item: replace(item, objects=[replace(one, yaw_rad=None) for one in item.objects]), drive(100))
+def test_without_a_configuration_the_sensors_are_those_of_the_recording(
+    call: Call, command: str
+) -> None:
+    bare = changed(
+        lambda item: replace(
+            item, objects=[replace(one, yaw_rad=None) for one in item.objects]
+        ),
+        drive(100),
+    )
     write(bare)
     out = () if command == "offsets" else ("-o", "a.yaml")
     code, text = call(command, "drive.jsonl", *out)
@@ -120,11 +165,22 @@ def test_without_a_configuration_the_sensors_are_those_of_the_recording(call: Ca
 def test_a_track_outlives_the_silence_of_the_slowest_sensor() -> None:
     every_ms = {"camera": 50, "lidar": 3000, "radar": 1000}
     stamps_ns = {
-        name: START_NS + np.arange(0, 60_000, period, dtype=np.int64) * MS for name, period in every_ms.items()
+        name: START_NS + np.arange(0, 60_000, period, dtype=np.int64) * MS
+        for name, period in every_ms.items()
     }
-    arrivals = [Arrivals(name, each, each, np.ones_like(each)) for name, each in stamps_ns.items()]
+    arrivals = [
+        Arrivals(name, each, each, np.ones_like(each))
+        for name, each in stamps_ns.items()
+    ]
     sensors = ", ".join(f"{name}: {{std: {{x_m: 1.0, y_m: 1.0}}}}" for name in every_ms)
-    config = read_config(None, [f"sensors={{{sensors}}}", "lifecycle.out_of_view_s=0.5", "filter.storage_s=10.0"])
+    config = read_config(
+        None,
+        [
+            f"sensors={{{sensors}}}",
+            "lifecycle.out_of_view_s=0.5",
+            "filter.storage_s=10.0",
+        ],
+    )
     (found,) = window_findings(arrivals, config)
     assert (found.about, found.settings) == ("lidar", {"lifecycle.out_of_view_s": 10.0})
     short = replace(config, filter=replace(config.filter, storage_s=1.0))
@@ -136,38 +192,64 @@ def test_a_track_outlives_the_silence_of_the_slowest_sensor() -> None:
     assert not list(window_findings(arrivals[1:2], alone))
     settings = ["lifecycle.kind=counting", "lifecycle.forget_s=0.5"]
     counted = replace(alone, lifecycle=read_config(None, settings).lifecycle)
-    assert [one.settings for one in window_findings(arrivals[1:2], counted)] == [{"lifecycle.forget_s": 10.0}]
+    assert [one.settings for one in window_findings(arrivals[1:2], counted)] == [
+        {"lifecycle.forget_s": 10.0}
+    ]
 
 
 def test_stamps_of_zero(call: Call) -> None:
-    zero = changed(lambda item: replace(item, stamp_ns=0) if item.sensor == "radar" else item, drive(45))
+    zero = changed(
+        lambda item: replace(item, stamp_ns=0) if item.sensor == "radar" else item,
+        drive(45),
+    )
     recording = write(zero)
     _, shown = call("info", recording, "-c", "c.yaml")
     assert "radar: all stamps are 0: set `stamp_from: receipt`" in shown
     code, text = advised(call, recording, "-o", "a.yaml")
     assert code == 0
-    assert "its driver sets none, so its delay stays unknown. Set sensors.radar.stamp_from: receipt" in text
+    assert (
+        "its driver sets none, so its delay stays unknown. Set sensors.radar.stamp_from: receipt"
+        in text
+    )
     assert call("replay", recording, "-c", "a.yaml", "-o", "run")[0] == 0
     fates = load_run("run").meta["counts"]["radar"]
-    assert sum(fates.get(fate, 0) for fate in ("birth", "in_sequence", "out_of_sequence")) > 40
+    assert (
+        sum(fates.get(fate, 0) for fate in ("birth", "in_sequence", "out_of_sequence"))
+        > 40
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sensor", ["lidar", "radar"])
-def test_a_wrong_clock_is_found_by_the_truth_and_mended(call: Call, sensor: str) -> None:
-    off = changed(lambda item: restamped(item, item.stamp_ns + 80 * MS) if item.sensor == sensor else item, drive(600))
+def test_a_wrong_clock_is_found_by_the_truth_and_mended(
+    call: Call, sensor: str
+) -> None:
+    off = changed(
+        lambda item: (
+            restamped(item, item.stamp_ns + 80 * MS) if item.sensor == sensor else item
+        ),
+        drive(600),
+    )
     write(off)
     code, text = advised(call, "drive.jsonl", "-o", "a.yaml")
     assert code == 0
-    assert f"later than the truth of the recording. Set sensors.{sensor}.clock_offset_s" in text
+    assert (
+        f"later than the truth of the recording. Set sensors.{sensor}.clock_offset_s"
+        in text
+    )
     changes = {
         line.split()[2]: float(line.split()[4].rstrip(":"))
         for line in Path("a.yaml").read_text().splitlines()
         if line.startswith("# - sensors.")
     }
-    assert changes == {f"sensors.{sensor}.clock_offset_s": pytest.approx(0.08, abs=0.02)}
+    assert changes == {
+        f"sensors.{sensor}.clock_offset_s": pytest.approx(0.08, abs=0.02)
+    }
     for name in ("c", "a"):
-        assert call("replay", "drive.jsonl", "-c", f"{name}.yaml", "-o", f"runs/{name}")[0] == 0
+        assert (
+            call("replay", "drive.jsonl", "-c", f"{name}.yaml", "-o", f"runs/{name}")[0]
+            == 0
+        )
     before, after = (rmse_m(f"runs/{name}") for name in ("c", "a"))
     assert after < before
 
@@ -181,26 +263,42 @@ def rmse_m(path: str) -> float:
 @pytest.mark.slow
 def test_without_truth_only_the_difference_of_two_clocks_is_known(call: Call) -> None:
     off = changed(
-        lambda item: restamped(item, item.stamp_ns + 80 * MS) if item.sensor == "lidar" else item,
+        lambda item: (
+            restamped(item, item.stamp_ns + 80 * MS) if item.sensor == "lidar" else item
+        ),
         drive(250, truth=False, wave_mps=12.0),
     )
     write(off)
     advice = fgtrack.advise("drive.jsonl", "c.yaml", reference="radar")
     (clock,) = [one for one in advice.findings if one.kind == "clock"]
-    assert "later than those of radar. radar is received 40 ms after its stamps at least" in clock.text
-    assert "of it is the clock of lidar. To identify the wrong one of the two clocks takes truth" in clock.text
-    code, text = call("offsets", "drive.jsonl", "-c", "c.yaml", "--reference", "radar", "--json")
+    assert (
+        "later than those of radar. radar is received 40 ms after its stamps at least"
+        in clock.text
+    )
+    assert (
+        "of it is the clock of lidar. To identify the wrong one of the two clocks takes truth"
+        in clock.text
+    )
+    code, text = call(
+        "offsets", "drive.jsonl", "-c", "c.yaml", "--reference", "radar", "--json"
+    )
     assert code == 0
     offsets = json.loads(text)
     assert offsets["verdicts"] == {"lidar": clock.text}
     (lidar,) = [one for one in offsets["sensors"] if one["sensor"] == "lidar"]
-    assert lidar["offset_s"] == pytest.approx(advice.config.sensors["lidar"].clock_offset_s, abs=1e-4)
-    assert advice.config.sensors["lidar"].clock_offset_s == pytest.approx(0.08, abs=0.02)
+    assert lidar["offset_s"] == pytest.approx(
+        advice.config.sensors["lidar"].clock_offset_s, abs=1e-4
+    )
+    assert advice.config.sensors["lidar"].clock_offset_s == pytest.approx(
+        0.08, abs=0.02
+    )
 
 
 def test_a_limit_that_refuses_bursts(call: Call) -> None:
     def late_ms(k: int) -> float:
-        return 600.0 + 5.0 * (k % 7) if k % 100 in range(40, 60) else 100.0 + 3.0 * (k % 7)
+        return (
+            600.0 + 5.0 * (k % 7) if k % 100 in range(40, 60) else 100.0 + 3.0 * (k % 7)
+        )
 
     write(drive(200, late_ms=late_ms))
     Path("c.yaml").write_text(CONFIG.replace("lidar: {", "lidar: {max_delay_s: 0.3, "))
@@ -210,35 +308,53 @@ def test_a_limit_that_refuses_bursts(call: Call) -> None:
     assert advice.after is not None
     assert advice.before.used["lidar"] == pytest.approx(0.8, abs=0.02)
     assert advice.after.used["lidar"] == pytest.approx(1.0, abs=0.01)
-    assert "20 % of its detections come later than max_delay_s 0.3 s allows" in " ".join(advice.sentences)
+    assert (
+        "20 % of its detections come later than max_delay_s 0.3 s allows"
+        in " ".join(advice.sentences)
+    )
 
 
 def test_a_window_shorter_than_the_delays(call: Call) -> None:
     write(drive(100))
     Path("c.yaml").write_text(CONFIG + "filter: {storage_s: 0.05}\n")
-    assert fgtrack.advise("drive.jsonl", "c.yaml").config.filter.storage_s == pytest.approx(0.2)
+    assert fgtrack.advise(
+        "drive.jsonl", "c.yaml"
+    ).config.filter.storage_s == pytest.approx(0.2)
 
 
 def test_negative_delays_a_jump_and_a_drift(call: Call) -> None:
     def ahead(item: DetectionList) -> DetectionList:
-        return restamped(item, item.stamp_ns + 70 * MS) if item.sensor == "radar" else item
+        return (
+            restamped(item, item.stamp_ns + 70 * MS) if item.sensor == "radar" else item
+        )
 
     write(changed(ahead, drive(300)))
-    assert "radar: 100 % of its stamps lie after their receipt, by up to 30 ms" in " ".join(told())
+    assert (
+        "radar: 100 % of its stamps lie after their receipt, by up to 30 ms"
+        in " ".join(told())
+    )
 
     def jump(item: DetectionList) -> DetectionList:
         later = item.sensor == "radar" and item.stamp_ns > START_NS + 10_000 * MS
         return restamped(item, item.stamp_ns - 500 * MS) if later else item
 
     write(changed(jump, drive(400)))
-    assert "radar: its delay is 40 ms until about 10 s and 540 ms after that" in " ".join(told())
+    assert (
+        "radar: its delay is 40 ms until about 10 s and 540 ms after that"
+        in " ".join(told())
+    )
 
     def drift(item: DetectionList) -> DetectionList:
         slow_ns = (item.stamp_ns - START_NS) * 2 // 1000
-        return restamped(item, item.stamp_ns - slow_ns) if item.sensor == "radar" else item
+        return (
+            restamped(item, item.stamp_ns - slow_ns) if item.sensor == "radar" else item
+        )
 
     write(changed(drift, drive(400)))
-    assert "radar: its delay is 50 ms until about 10 s and 70 ms after that" in " ".join(told())
+    assert (
+        "radar: its delay is 50 ms until about 10 s and 70 ms after that"
+        in " ".join(told())
+    )
 
 
 def told() -> tuple[str, ...]:
@@ -248,10 +364,15 @@ def told() -> tuple[str, ...]:
 
 def test_a_sensor_without_a_model_is_left_out(call: Call) -> None:
     write(drive())
-    Path("c.yaml").write_text("\n".join(line for line in CONFIG.splitlines() if "radar" not in line))
+    Path("c.yaml").write_text(
+        "\n".join(line for line in CONFIG.splitlines() if "radar" not in line)
+    )
     code, text = advised(call, "drive.jsonl", "-o", "a.yaml")
     assert code == 0
-    assert "no model of radar (radar: x_m, y_m, yaw_rad): give sensors.NAME.std, or leave them out" in text
+    assert (
+        "no model of radar (radar: x_m, y_m, yaw_rad): give sensors.NAME.std, or leave them out"
+        in text
+    )
     assert call("replay", "drive.jsonl", "-c", "a.yaml", "-o", "run")[0] == 0
 
 
@@ -270,9 +391,13 @@ def test_an_estimator_that_forgets_and_noise_that_does_not_fit(call: Call) -> No
     assert told["sensors.radar.std.x_m"] == advice.config.sensors["radar"].std["x_m"]
     assert set(told) <= {"estimator", *(key for key in told if ".std" in key)}
     (tuned,) = [str(one) for one in advice.findings if one.about == "tune"]
-    assert tuned.startswith("tune: fitted to the recording by maximum likelihood. As configured stay ")
+    assert tuned.startswith(
+        "tune: fitted to the recording by maximum likelihood. As configured stay "
+    )
     assert f"sensors.radar.std.x_m: {told['sensors.radar.std.x_m']}" in tuned
-    assert any(line.startswith("- sensors.radar.std.x_m = ") for line in advice.comments())
+    assert any(
+        line.startswith("- sensors.radar.std.x_m = ") for line in advice.comments()
+    )
     assert "Nothing is changed." not in advice.comments()
 
 
@@ -288,17 +413,25 @@ def test_white_noise_is_not_fitted_to_errors_that_last(call: Call) -> None:
         of = item.objects[0]
         assert of.x_m is not None
         assert of.y_m is not None
-        return replace(item, objects=(replace(of, x_m=of.x_m + error_m[0], y_m=of.y_m + error_m[1]),))
+        return replace(
+            item,
+            objects=(replace(of, x_m=of.x_m + error_m[0], y_m=of.y_m + error_m[1]),),
+        )
 
     write_stream("drive.jsonl", changed(erring, drive(350)))
     Path("c.yaml").write_text(CONFIG)
     advice = fgtrack.advise("drive.jsonl", "c.yaml", tune=True)
     assert any(one.kind == "noise" and one.about == "lidar" for one in advice.findings)
     (tuned,) = [one for one in advice.findings if one.about == "tune"]
-    assert tuned.text.startswith("no noise is changed. With what is fitted, innovations of ")
+    assert tuned.text.startswith(
+        "no noise is changed. With what is fitted, innovations of "
+    )
     assert "still correlated in time (autocorrelation 0." in tuned.text
     assert not advice.changes
-    assert advice.config == assumed(read_config("c.yaml"), open_input("drive.jsonl")).config
+    assert (
+        advice.config
+        == assumed(read_config("c.yaml"), open_input("drive.jsonl")).config
+    )
     code, text = call("tune", "drive.jsonl", "-c", "c.yaml", "-o", "t.yaml")
     assert code == 0
     assert "innovations still correlated in time (autocorrelation 0." in text
@@ -308,7 +441,14 @@ def test_white_noise_is_not_fitted_to_errors_that_last(call: Call) -> None:
 @pytest.mark.slow
 def test_an_origin_that_is_wrong_is_found_by_the_truth(call: Call) -> None:
     def moved(item: DetectionList) -> DetectionList:
-        return replace(item, objects=[replace(of, x_m=of.x_m + 1.5) for of in item.objects if of.x_m is not None])
+        return replace(
+            item,
+            objects=[
+                replace(of, x_m=of.x_m + 1.5)
+                for of in item.objects
+                if of.x_m is not None
+            ],
+        )
 
     write(changed(moved, drive(600)))
     advice = fgtrack.advise("drive.jsonl", "c.yaml")
@@ -318,7 +458,11 @@ def test_an_origin_that_is_wrong_is_found_by_the_truth(call: Call) -> None:
     assert advice.config.ego.detection_origin_x_m == pytest.approx(-1.5, abs=0.1)
     assert advice.before is not None
     assert advice.after is not None
-    rmse_m = [one.truth.errors["position_m"].rmse for one in (advice.before, advice.after) if one.truth is not None]
+    rmse_m = [
+        one.truth.errors["position_m"].rmse
+        for one in (advice.before, advice.after)
+        if one.truth is not None
+    ]
     assert rmse_m[1] < 0.5 < rmse_m[0]
 
 
@@ -328,7 +472,9 @@ def test_bad_calls(call: Call) -> None:
     Path("mine.yaml").write_text("estimator: smoother\n")
     assert advised(call, "drive.jsonl", "-o", "mine.yaml")[0] == 2
     assert advised(call, "nothing.jsonl")[0] == 2
-    Path("cut.jsonl").write_text("\n".join(Path("drive.jsonl").read_text().splitlines()[:300]) + '\n{"type": "eg')
+    Path("cut.jsonl").write_text(
+        "\n".join(Path("drive.jsonl").read_text().splitlines()[:300]) + '\n{"type": "eg'
+    )
     code, text = call("advise", "cut.jsonl", "-c", "c.yaml")
     assert code == 1
     assert "Fine: " in text

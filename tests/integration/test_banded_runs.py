@@ -6,7 +6,7 @@ from support.examples import slow
 from support.messages import shared
 
 import fgtrack
-from fgtrack.io.run.schema import COVARIANCE_STATES
+from fgtrack.runs.schema import COVARIANCE_STATES
 
 STATES = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
 TOLERANCE = 1e-3  # standard deviations
@@ -17,12 +17,22 @@ def recording(name: str) -> dict[str, object]:
     if name == "default":
         messages = list(fgtrack.simulate("default", seed=1))
         until_ns = messages[0].receipt_ns + 8_000_000_000
-        return {"recording": [message for message in messages if message.receipt_ns < until_ns], "map": "oval"}
-    maps = {key: shared(f"data/maps/lvms_{file}.csv") for key, file in (("map", "track"), ("pit_map", "pitlane"))}
+        return {
+            "recording": [
+                message for message in messages if message.receipt_ns < until_ns
+            ],
+            "map": "oval",
+        }
+    maps = {
+        key: shared(f"data/maps/lvms_{file}.csv")
+        for key, file in (("map", "track"), ("pit_map", "pitlane"))
+    }
     return {"recording": shared(f"reference/{name}/stream.jsonl.gz"), **maps}
 
 
-@pytest.mark.parametrize("name", ["default", *slow("short10", "lidar3_10", "jitter10", "full60")])
+@pytest.mark.parametrize(
+    "name", ["default", *slow("short10", "lidar3_10", "jitter10", "full60")]
+)
 def test_whole_runs_are_those_of_the_smoother(name: str) -> None:
     given = recording(name)
     expected, found = (
@@ -38,4 +48,7 @@ def test_whole_runs_are_those_of_the_smoother(name: str) -> None:
         variance = expected.tracks[f"p_{short}_{short}"]
         apart = np.abs(found.tracks[state] - expected.tracks[state]) / np.sqrt(variance)
         assert np.nanmax(apart) < TOLERANCE
-        assert np.nanmax(np.abs(found.tracks[f"p_{short}_{short}"] / variance - 1.0)) < TOLERANCE
+        assert (
+            np.nanmax(np.abs(found.tracks[f"p_{short}_{short}"] / variance - 1.0))
+            < TOLERANCE
+        )

@@ -10,13 +10,13 @@ import pytest
 from support.messages import START_NS, standing
 
 from fgtrack.cli.main import run
+from fgtrack.config.settings import Config
+from fgtrack.config.yaml_file import load
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import Detection, DetectionList
-from fgtrack.io.ros.bag_writer import write_bag
-from fgtrack.io.run import load_run
-from fgtrack.io.stream import read_stream, write_stream
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import load
+from fgtrack.inputs.ros.bag_writer import write_bag
+from fgtrack.inputs.stream import read_stream, write_stream
+from fgtrack.runs import load_run
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,11 @@ class Outcome:
     @property
     def error(self) -> str:
         """The one line on stderr."""
-        lines = [line for line in self.err.splitlines() if not line.startswith("fgtrack: warning: ")]
+        lines = [
+            line
+            for line in self.err.splitlines()
+            if not line.startswith("fgtrack: warning: ")
+        ]
         assert len(lines) == 1, self.err
         assert lines[0].startswith("fgtrack: error: "), self.err
         assert "Traceback" not in self.out + self.err
@@ -42,7 +46,9 @@ Command = Callable[..., Outcome]
 
 
 @pytest.fixture
-def fgtrack(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
+def fgtrack(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Command:
     """Runs a command in an empty folder."""
     monkeypatch.chdir(tmp_path)
 
@@ -70,19 +76,54 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """One simulated scenario, written in every way."""
     folder = tmp_path_factory.mktemp("recordings")
     made = {}
-    for name, extra in [("s.jsonl", ()), ("s.jsonl.gz", ()), ("mcap", ()), ("sqlite3", ("--storage", "sqlite3"))]:
+    for name, extra in [
+        ("s.jsonl", ()),
+        ("s.jsonl.gz", ()),
+        ("mcap", ()),
+        ("sqlite3", ("--storage", "sqlite3")),
+    ]:
         made[name] = folder / name
-        assert run(["simulate", "default", "-o", str(made[name]), "--duration", "2", "--seed", "3", *extra]) == 0
+        assert (
+            run(
+                [
+                    "simulate",
+                    "default",
+                    "-o",
+                    str(made[name]),
+                    "--duration",
+                    "2",
+                    "--seed",
+                    "3",
+                    *extra,
+                ]
+            )
+            == 0
+        )
     return made
 
 
 @pytest.fixture(scope="module")
-def runs(recordings: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def runs(
+    recordings: dict[str, Path], tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Path]:
     """A replay of each of them."""
     folder = tmp_path_factory.mktemp("runs")
     maps = ["--map", "oval", "--pit-map", "oval"]
     for name, path in recordings.items():
-        assert run(["replay", str(path), "-c", "karle2023", "-o", str(folder / name), *maps]) == 0
+        assert (
+            run(
+                [
+                    "replay",
+                    str(path),
+                    "-c",
+                    "karle2023",
+                    "-o",
+                    str(folder / name),
+                    *maps,
+                ]
+            )
+            == 0
+        )
     return {name: folder / name for name in recordings}
 
 
@@ -93,34 +134,68 @@ def test_every_storage_gives_the_same_run_to_the_byte(runs: dict[str, Path]) -> 
     assert len(load_run(runs["mcap"]).tracks) > 50
 
 
-def test_runs_are_compared_as_tables_and_as_json(fgtrack: Command, runs: dict[str, Path]) -> None:
+def test_runs_are_compared_as_tables_and_as_json(
+    fgtrack: Command, runs: dict[str, Path]
+) -> None:
     assert fgtrack("compare", runs["mcap"], runs["sqlite3"]).code == 0
     told = fgtrack("compare", runs["mcap"], runs["sqlite3"], "--json")
     assert told.code == 0
     assert json.loads(told.out)
     assert json.loads((runs["mcap"] / "metrics.json").read_text())
-    for form, start in (("md", "### Tracking"), ("latex", r"\begin{table}"), ("csv", "table,run,"), ("json", "{")):
+    for form, start in (
+        ("md", "### Tracking"),
+        ("latex", r"\begin{table}"),
+        ("csv", "table,run,"),
+        ("json", "{"),
+    ):
         told = fgtrack("compare", runs["mcap"], "--format", form)
         assert (told.code, told.err) == (0, "")
         assert start in told.out
-        assert told.out.startswith({"md": "- The configured noise", "latex": "% The configured noise"}.get(form, start))
+        assert told.out.startswith(
+            {"md": "- The configured noise", "latex": "% The configured noise"}.get(
+                form, start
+            )
+        )
 
 
-def test_a_recording_of_which_nothing_was_used_fails_and_says_why(fgtrack: Command, stream: Path) -> None:
-    told = fgtrack("replay", stream, "-c", "karle2023", "--set", "sensors.lidar.max_delay_s=0.01", "-o", "late")
+def test_a_recording_of_which_nothing_was_used_fails_and_says_why(
+    fgtrack: Command, stream: Path
+) -> None:
+    told = fgtrack(
+        "replay",
+        stream,
+        "-c",
+        "karle2023",
+        "--set",
+        "sensors.lidar.max_delay_s=0.01",
+        "-o",
+        "late",
+    )
     assert told.code == 1
     assert told.error == f"{stream}: none of the 60 detections was used (60 too_old)"
     warning = "fgtrack: warning: lidar: 60 of 60 too_old: median delay 0.05 s, allowed 0.01 s: raise sensors.lidar."
     assert told.err.startswith(warning)
     assert load_run("late").meta["complete"]
-    assert "late (ekf-backward-forward): lidar: 60 of 60 too_old" in fgtrack("compare", "late").err
+    assert (
+        "late (ekf-backward-forward): lidar: 60 of 60 too_old"
+        in fgtrack("compare", "late").err
+    )
 
 
-def test_streaming_is_compared_when_it_is_asked_for(fgtrack: Command, runs: dict[str, Path]) -> None:
-    plain, told = (fgtrack("compare", runs["mcap"], "--json", *more) for more in ((), ("--streaming",)))
+def test_streaming_is_compared_when_it_is_asked_for(
+    fgtrack: Command, runs: dict[str, Path]
+) -> None:
+    plain, told = (
+        fgtrack("compare", runs["mcap"], "--json", *more)
+        for more in ((), ("--streaming",))
+    )
     assert (told.code, told.err) == (0, "")
     tables = json.loads(told.out)["tables"]
-    assert [row["judged"] for row in tables["streaming"]] == ["asked", "ready", "predicted"]
+    assert [row["judged"] for row in tables["streaming"]] == [
+        "asked",
+        "ready",
+        "predicted",
+    ]
     assert tables["load"][0]["load"] > 0.0
     assert "streaming" not in json.loads(plain.out)["tables"]
 
@@ -132,8 +207,12 @@ def test_the_printed_configuration_is_one(fgtrack: Command, stream: Path) -> Non
     assert fgtrack("config", "-c", "c.yaml").out == printed.out
     assert fgtrack("replay", stream, "-c", "c.yaml", "-o", "run").code == 0
     asked, ran = load(Config, Path("c.yaml")), load(Config, Path("run/config.yaml"))
-    assert {name: sensor.std for name, sensor in ran.sensors.items()} == {n: s.std for n, s in asked.sensors.items()}
-    assert replace(ran, sensors=asked.sensors, ego=asked.ego) == asked  # with what the recording carries
+    assert {name: sensor.std for name, sensor in ran.sensors.items()} == {
+        n: s.std for n, s in asked.sensors.items()
+    }
+    assert (
+        replace(ran, sensors=asked.sensors, ego=asked.ego) == asked
+    )  # with what the recording carries
 
 
 # --- the call is bad: 2
@@ -144,20 +223,45 @@ def test_the_printed_configuration_is_one(fgtrack: Command, stream: Path) -> Non
     [
         (("replay", "missing", "-o", "run"), "missing: there is no such file"),
         (("compare", "missing"), "missing: no run folder"),
-        (("simulate", "missing.yaml", "-o", "x.jsonl"), "missing.yaml: there is no such scenario file"),
-        (("simulate", "default", "-o", "x.jsonl", "--duration", "0"), "duration_s: Input should be greater than 0"),
+        (
+            ("simulate", "missing.yaml", "-o", "x.jsonl"),
+            "missing.yaml: there is no such scenario file",
+        ),
+        (
+            ("simulate", "default", "-o", "x.jsonl", "--duration", "0"),
+            "duration_s: Input should be greater than 0",
+        ),
         (("simulate", "default", "-o", "x.jsonl", "--seed", "-1"), "--seed"),
-        (("replay", "drive.jsonl", "-o", "foreign"), "foreign: exists and is not a run folder"),
-        (("replay", "drive.jsonl", "-o", "run", "-e", "magic"), "estimator 'magic' is unknown"),
-        (("replay", "drive.jsonl", "-o", "run", "--map", "missing.csv"), "missing.csv: there is no such map"),
-        (("convert", "drive.jsonl", "drive.html"), "drive.html: is written as .jsonl, as .jsonl.gz, or as a rosbag2"),
-        (("replay", "drive.jsonl", "b", "-o", "run"), "usage: fgtrack replay [OPTIONS] {INPUT})"),
+        (
+            ("replay", "drive.jsonl", "-o", "foreign"),
+            "foreign: exists and is not a run folder",
+        ),
+        (
+            ("replay", "drive.jsonl", "-o", "run", "-e", "magic"),
+            "estimator 'magic' is unknown",
+        ),
+        (
+            ("replay", "drive.jsonl", "-o", "run", "--map", "missing.csv"),
+            "missing.csv: there is no such map",
+        ),
+        (
+            ("convert", "drive.jsonl", "drive.html"),
+            "drive.html: is written as .jsonl, as .jsonl.gz, or as a rosbag2",
+        ),
+        (
+            ("replay", "drive.jsonl", "b", "-o", "run"),
+            "usage: fgtrack replay [OPTIONS] {INPUT})",
+        ),
         (("replya", "drive.jsonl"), "Did you mean 'replay'?"),
     ],
     ids=" ".join,
 )
 def test_a_bad_call_is_one_line_and_exit_code_2(
-    fgtrack: Command, stream: Path, tmp_path: Path, arguments: Sequence[str], message: str
+    fgtrack: Command,
+    stream: Path,
+    tmp_path: Path,
+    arguments: Sequence[str],
+    message: str,
 ) -> None:
     (tmp_path / "foreign").mkdir()
     (tmp_path / "foreign/thesis.tex").write_text("years of work")
@@ -186,14 +290,21 @@ def test_no_command_shows_the_help_and_is_a_bad_call(fgtrack: Command) -> None:
         (b"", "is empty"),
         (b"hello\n", "is not an input"),
         (b'{"type": "ego"}\n', "starts with a header"),
-        (b'{"type": "header", "format": "fgtrack-stream/2"}\n', "of format 'fgtrack-stream/1'"),
+        (
+            b'{"type": "header", "format": "fgtrack-stream/2"}\n',
+            "of format 'fgtrack-stream/1'",
+        ),
     ],
 )
 def test_a_file_that_is_no_input_is_one_line_and_exit_code_1(
     fgtrack: Command, tmp_path: Path, content: bytes, message: str
 ) -> None:
     (tmp_path / "input").write_bytes(content)
-    for arguments in [("replay", "input", "-o", "run"), ("info", "input"), ("convert", "input", "out.jsonl")]:
+    for arguments in [
+        ("replay", "input", "-o", "run"),
+        ("info", "input"),
+        ("convert", "input", "out.jsonl"),
+    ]:
         called = fgtrack(*arguments)
         assert message in called.error
         assert "input" in called.error
@@ -201,7 +312,9 @@ def test_a_file_that_is_no_input_is_one_line_and_exit_code_1(
 
 
 @pytest.mark.parametrize("name", ["empty.jsonl", "empty"])
-def test_a_recording_without_anything_to_track_is_exit_code_1(fgtrack: Command, tmp_path: Path, name: str) -> None:
+def test_a_recording_without_anything_to_track_is_exit_code_1(
+    fgtrack: Command, tmp_path: Path, name: str
+) -> None:
     if name.endswith("jsonl"):
         write_stream(tmp_path / name, [])
     else:
@@ -211,7 +324,9 @@ def test_a_recording_without_anything_to_track_is_exit_code_1(fgtrack: Command, 
     assert called.code == 1
 
 
-def test_a_truncated_stream_is_replayed_up_to_the_break(fgtrack: Command, stream: Path) -> None:
+def test_a_truncated_stream_is_replayed_up_to_the_break(
+    fgtrack: Command, stream: Path
+) -> None:
     whole = stream.read_bytes()
     cut = whole[: len(whole) // 2]
     stream.write_bytes(cut)
@@ -222,12 +337,17 @@ def test_a_truncated_stream_is_replayed_up_to_the_break(fgtrack: Command, stream
     found = load_run("run")
     assert found.meta["complete"] is True
     assert "breaks off" in found.meta["broken_off"]
-    assert len(found.updates) == found.meta["detections_received"] == cut.count(b'"lidar"', 0, cut.rindex(b"\n"))
+    assert (
+        len(found.updates)
+        == found.meta["detections_received"]
+        == cut.count(b'"lidar"', 0, cut.rindex(b"\n"))
+    )
     assert fgtrack("compare", "run").code == 0
 
 
 @pytest.mark.parametrize(
-    ("receipt_ns", "message"), [(START_NS, "receipt"), (START_NS + 10**13, "nothing was received for")]
+    ("receipt_ns", "message"),
+    [(START_NS, "receipt"), (START_NS + 10**13, "nothing was received for")],
 )
 def test_a_recording_with_broken_time_is_replayed_up_to_there(
     fgtrack: Command, tmp_path: Path, receipt_ns: int, message: str
@@ -252,7 +372,9 @@ def test_an_unknown_sensor_says_what_to_do(fgtrack: Command, tmp_path: Path) -> 
     assert "ignore_sensors" in called.error
     assert called.code == 1
     assert not Path("run").exists()
-    ignored = fgtrack("replay", "sonar.jsonl", "-o", "run", "--set", "ignore_sensors=[sonar]")
+    ignored = fgtrack(
+        "replay", "sonar.jsonl", "-o", "run", "--set", "ignore_sensors=[sonar]"
+    )
     assert "holds neither ego states nor detections" in ignored.error
     assert ignored.code == 1
 
@@ -260,15 +382,36 @@ def test_an_unknown_sensor_says_what_to_do(fgtrack: Command, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("error", "code", "message"),
     [
-        (ZeroDivisionError("oh"), 1, "internal error: ZeroDivisionError: oh (run with --debug)"),
-        (PermissionError(13, "Permission denied", "x.csv"), 2, "x.csv: cannot be used (Permission denied)"),
-        (OSError(28, "No space left on device", "x.csv"), 1, "x.csv: cannot be used (No space left on device)"),
-        (KeyboardInterrupt(), 130, "interrupted; what was computed so far is in the output folder"),
+        (
+            ZeroDivisionError("oh"),
+            1,
+            "internal error: ZeroDivisionError: oh (run with --debug)",
+        ),
+        (
+            PermissionError(13, "Permission denied", "x.csv"),
+            2,
+            "x.csv: cannot be used (Permission denied)",
+        ),
+        (
+            OSError(28, "No space left on device", "x.csv"),
+            1,
+            "x.csv: cannot be used (No space left on device)",
+        ),
+        (
+            KeyboardInterrupt(),
+            130,
+            "interrupted; what was computed so far is in the output folder",
+        ),
     ],
     ids=repr,
 )
 def test_whatever_is_raised_is_one_line_and_shows_its_traceback_on_demand(
-    fgtrack: Command, stream: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int, message: str
+    fgtrack: Command,
+    stream: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    error: BaseException,
+    code: int,
+    message: str,
 ) -> None:
     def broken(*_: object, **__: object) -> None:
         raise error
@@ -276,10 +419,15 @@ def test_whatever_is_raised_is_one_line_and_shows_its_traceback_on_demand(
     monkeypatch.setattr("fgtrack.pipeline.replay.replay", broken)
     called = fgtrack("replay", stream, "-o", "run")
     assert (called.code, called.err) == (code, f"fgtrack: error: {message}\n")
-    assert code == 130 or "Traceback" in fgtrack("--debug", "replay", stream, "-o", "run").err
+    assert (
+        code == 130
+        or "Traceback" in fgtrack("--debug", "replay", stream, "-o", "run").err
+    )
 
 
-def test_a_warning_of_a_plug_in_is_a_line(fgtrack: Command, stream: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_warning_of_a_plug_in_is_a_line(
+    fgtrack: Command, stream: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def warns(*_: object, **__: object) -> None:
         warnings.simplefilter("always")
         warnings.warn("\x1b[31mdivide\nby zero", RuntimeWarning, stacklevel=1)
@@ -292,18 +440,34 @@ def test_a_warning_of_a_plug_in_is_a_line(fgtrack: Command, stream: Path, monkey
     assert "test_cli.py:" in warned
 
 
-def test_whatever_a_recording_says_every_command_prints_lines_for_a_terminal(fgtrack: Command, tmp_path: Path) -> None:
+def test_whatever_a_recording_says_every_command_prints_lines_for_a_terminal(
+    fgtrack: Command, tmp_path: Path
+) -> None:
     """As the name of a sensor, and of a key that is not known."""
     odd = "\u202e[bold]\u96f7\u9054[/bold][/]\x1b[31m $\\frac{"
-    named = [replace(one, sensor=odd) if isinstance(one, DetectionList) else one for one in standing(100)]
+    named = [
+        replace(one, sensor=odd) if isinstance(one, DetectionList) else one
+        for one in standing(100)
+    ]
     write_stream(tmp_path / "odd.jsonl", named)
     lines = (tmp_path / "odd.jsonl").read_text(encoding="utf-8").splitlines()
     lines[1] = json.dumps({**json.loads(lines[1]), odd: 1})
     (tmp_path / "odd.jsonl").write_text("\n".join(lines), encoding="utf-8")
-    called = [fgtrack("info", "odd.jsonl"), fgtrack("replay", "odd.jsonl", "-o", "run"), fgtrack("compare", "run")]
-    called += [fgtrack("compare", "run", "--all"), fgtrack("advise", "odd.jsonl"), fgtrack("offsets", "odd.jsonl")]
+    called = [
+        fgtrack("info", "odd.jsonl"),
+        fgtrack("replay", "odd.jsonl", "-o", "run"),
+        fgtrack("compare", "run"),
+    ]
+    called += [
+        fgtrack("compare", "run", "--all"),
+        fgtrack("advise", "odd.jsonl"),
+        fgtrack("offsets", "odd.jsonl"),
+    ]
     called += [fgtrack("convert", "odd.jsonl", "odd.mcap"), fgtrack("info", "odd.mcap")]
-    called += [fgtrack("report", "run", "-o", "run.html"), fgtrack("export", "run", "-o", "run.mcap")]
+    called += [
+        fgtrack("report", "run", "-o", "run.html"),
+        fgtrack("export", "run", "-o", "run.mcap"),
+    ]
     for one in called:
         assert "internal error" not in one.err
         for line in (one.out + one.err).splitlines():

@@ -9,10 +9,10 @@ from support.pictures import faults
 
 import fgtrack
 from fgtrack.cli.main import run as command
-from fgtrack.evaluation.palette import style_of
 from fgtrack.evaluation.placement import placed
-from fgtrack.plotting.close_up import Arrival, CloseUp
-from fgtrack.plotting.late_detection import close_up_of
+from fgtrack.show.figures.close_up import Arrival, CloseUp
+from fgtrack.show.figures.late_detection import close_up_of
+from fgtrack.show.palette import style_of
 
 NAMES = ("ekf-replay", "ekf-backward-forward")
 
@@ -24,7 +24,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     fgtrack.simulate("default", seed=3, duration_s=6.0, out=folder / "drive.jsonl")
     for name in NAMES:
         fgtrack.replay(
-            folder / "drive.jsonl", "tuned", map="oval", pit_map="oval", estimator=name, out=folder / "runs" / name
+            folder / "drive.jsonl",
+            "tuned",
+            map="oval",
+            pit_map="oval",
+            estimator=name,
+            out=folder / "runs" / name,
         )
     return folder
 
@@ -40,24 +45,36 @@ def test_it_is_one_detection_that_came_late_and_the_rule_says_how_typical_it_is(
     (arrival,) = {one.arrival for one in found}
     for name in NAMES:
         updates = fgtrack.load_run(folder / "runs" / name).tables["updates"]
-        row = (updates["stamp_ns"] == arrival.stamp_ns) & (updates["index"] == arrival.index)
-        assert updates["disposition"][row & (updates["sensor"] == arrival.sensor)].tolist() == ["out_of_sequence"]
+        row = (updates["stamp_ns"] == arrival.stamp_ns) & (
+            updates["index"] == arrival.index
+        )
+        assert updates["disposition"][
+            row & (updates["sensor"] == arrival.sensor)
+        ].tolist() == ["out_of_sequence"]
     rule = r"\d+ % of \d+ late detections lower the error of the present.* (\d+\.\d+) to (\d+\.\d+) m"
     errors_m = re.match(rule, found[0].rule)
     assert errors_m is not None
     assert float(errors_m[1]) > float(errors_m[2])
 
 
-def test_it_draws_the_past_towards_the_detection_and_is_fused_once(folder: Path, found: list[CloseUp]) -> None:
+def test_it_draws_the_past_towards_the_detection_and_is_fused_once(
+    folder: Path, found: list[CloseUp]
+) -> None:
     for name, one in zip(NAMES, found, strict=True):
         run = fgtrack.load_run(folder / "runs" / name)
         table, stamp_ns = run.tables["detections"], one.arrival.stamp_ns
         row = np.logical_and.reduce(
-            [table[key] == getattr(one.arrival, key) for key in ("sensor", "stamp_ns", "receipt_ns", "index")]
+            [
+                table[key] == getattr(one.arrival, key)
+                for key in ("sensor", "stamp_ns", "receipt_ns", "index")
+            ]
         )
         (position_m,) = placed(run).position_m[row]
         k = one.after.stamps_ns.tolist().index(stamp_ns)
-        off_m = [np.linalg.norm(each.means[k, :2] - position_m) for each in (one.before, one.after)]
+        off_m = [
+            np.linalg.norm(each.means[k, :2] - position_m)
+            for each in (one.before, one.after)
+        ]
         assert off_m[1] < off_m[0]
         assert stamp_ns not in one.fused_ns
         assert one.fused_ns.max() > stamp_ns
@@ -68,27 +85,42 @@ def test_what_is_not_there_is_said(folder: Path) -> None:
     with pytest.raises(fgtrack.DataError, match="there is no such list"):
         close_up_of(run, Arrival("lidar_cluster", 1, 2, 0))
     gated = np.flatnonzero(run.tables["updates"]["disposition"] == "birth")[0]
-    values = (int(run.tables["updates"][name][gated]) for name in ("stamp_ns", "receipt_ns", "index"))
+    values = (
+        int(run.tables["updates"][name][gated])
+        for name in ("stamp_ns", "receipt_ns", "index")
+    )
     with pytest.raises(fgtrack.DataError, match="no track has fused it"):
         close_up_of(run, Arrival(str(run.tables["updates"]["sensor"][gated]), *values))
-    in_memory = fgtrack.replay(fgtrack.simulate("default", seed=3, duration_s=3.0), "tuned", estimator="ekf-replay")
+    in_memory = fgtrack.replay(
+        fgtrack.simulate("default", seed=3, duration_s=3.0),
+        "tuned",
+        estimator="ekf-replay",
+    )
     with pytest.raises(fgtrack.DataError, match="recording of the run is not there"):
         fgtrack.close_ups([in_memory])
 
 
-def test_the_picture_shows_errors_before_and_after_and_what_was_forgotten(folder: Path, found: list[CloseUp]) -> None:
+def test_the_picture_shows_errors_before_and_after_and_what_was_forgotten(
+    folder: Path, found: list[CloseUp]
+) -> None:
     runs = [folder / "runs" / name for name in NAMES]
     figure = fgtrack.plot.close_up(runs, found)
     assert faults(figure) == []
     assert figure.get_supxlabel().replace("\n", " ") == found[0].rule
     for column, (name, one) in enumerate(zip(NAMES, found, strict=True)):
         present, errors = figure.axes[column], figure.axes[len(NAMES) + column]
-        before, after = (line for line in errors.lines if line.get_label() in ("before it arrives", "after"))
+        before, after = (
+            line
+            for line in errors.lines
+            if line.get_label() in ("before it arrives", "after")
+        )
         assert after.get_color() == style_of(name).colour
         text = f"{before.get_ydata()[-1]:.2f} m before, {after.get_ydata()[-1]:.2f} m after"
         assert present.get_title(loc="left") == f"{name}\n{text}"
         labels = errors.get_legend_handles_labels()[1]
-        assert ("fused meanwhile, now forgotten" in labels) == (name == "ekf-backward-forward")
+        assert ("fused meanwhile, now forgotten" in labels) == (
+            name == "ekf-backward-forward"
+        )
         assert after.get_xdata()[-1] == 0.0
         assert one.after.stamps_ns[-1] == one.now_ns
     with pytest.raises(fgtrack.CallError, match="of one detection"):
@@ -100,7 +132,10 @@ def test_the_command_refuses_times_that_are_not_and_goes_on_without_a_recording(
 ) -> None:
     runs = [str(folder / "runs" / NAMES[0])]
     for odd in ("-inf", "1e300"):
-        assert command(["figure", runs[0], "-o", str(tmp_path / "odd"), f"--stamp={odd}"]) == 2
+        assert (
+            command(["figure", runs[0], "-o", str(tmp_path / "odd"), f"--stamp={odd}"])
+            == 2
+        )
         assert "--stamp" in capsys.readouterr().err
     (folder / "drive.jsonl").rename(tmp_path / "drive.jsonl")
     try:
@@ -108,7 +143,10 @@ def test_the_command_refuses_times_that_are_not_and_goes_on_without_a_recording(
         assert "no close-up:" in capsys.readouterr().out
         assert not (tmp_path / "rest/close_up.png").exists()
         assert (tmp_path / "rest/arrivals.png").exists()
-        assert command(["figure", runs[0], "-o", str(tmp_path / "none"), "--stamp", "4"]) == 1
+        assert (
+            command(["figure", runs[0], "-o", str(tmp_path / "none"), "--stamp", "4"])
+            == 1
+        )
         assert "recording of the run is not there" in capsys.readouterr().err
     finally:
         (tmp_path / "drive.jsonl").rename(folder / "drive.jsonl")

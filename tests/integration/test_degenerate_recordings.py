@@ -12,7 +12,7 @@ from support.examples import slow
 
 from fgtrack.cli.main import run
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
-from fgtrack.io.stream import write_stream
+from fgtrack.inputs.stream import write_stream
 
 Capture = pytest.CaptureFixture[str]
 MS = 1_000_000
@@ -42,14 +42,18 @@ def drive(
         for sensor in ("lidar", "radar"):
             x, y = (20.0, 5.0) if alike else rng.normal((x_m, 5.0), std_m).tolist()
             seen = Detection(x_m=x, y_m=y, yaw_rad=yaw_rad)
-            messages.append(DetectionList(sensor, now_ns, now_ns + 20 * MS, (seen,), "map"))
+            messages.append(
+                DetectionList(sensor, now_ns, now_ns + 20 * MS, (seen,), "map")
+            )
     return sorted(messages, key=lambda message: message.receipt_ns)
 
 
 def one_detection() -> list[Message]:
     messages = drive()
     first = next(one for one in messages if isinstance(one, DetectionList))
-    return [one for one in messages if not isinstance(one, DetectionList) or one is first]
+    return [
+        one for one in messages if not isinstance(one, DetectionList) or one is first
+    ]
 
 
 def boundless_truth() -> list[Message]:
@@ -74,7 +78,9 @@ KINDS = {
     "one stamp": (lambda: drive(stamps=1), FEW),
 }
 _FAST = ("constant yaw", "one detection")
-each_kind = pytest.mark.parametrize("kind", [*_FAST, *slow(*(kind for kind in KINDS if kind not in _FAST))])
+each_kind = pytest.mark.parametrize(
+    "kind", [*_FAST, *slow(*(kind for kind in KINDS if kind not in _FAST))]
+)
 
 
 def called(words: Sequence[str], capsys: Capture) -> tuple[int, str, str]:
@@ -85,30 +91,40 @@ def called(words: Sequence[str], capsys: Capture) -> tuple[int, str, str]:
 
 
 @each_kind
-def test_tune_fits_what_can_be_or_says_what_is_wrong(kind: str, tmp_path: Path, capsys: Capture) -> None:
+def test_tune_fits_what_can_be_or_says_what_is_wrong(
+    kind: str, tmp_path: Path, capsys: Capture
+) -> None:
     messages, wrong = KINDS[kind]
     drive_path, out = tmp_path / "drive.jsonl", tmp_path / "tuned.yaml"
     lidar = [one for one in messages() if getattr(one, "sensor", "lidar") == "lidar"]
     write_stream(drive_path, lidar)
-    code, text, err = called(["tune", str(drive_path), "-o", str(out), "--json"], capsys)
+    code, text, err = called(
+        ["tune", str(drive_path), "-o", str(out), "--json"], capsys
+    )
     if wrong is None:
         assert code == 0, err
         found = {one["key"]: one for one in json.loads(text)["parameters"]}
         assert found["sensors.lidar.std.x_m"]["tuned"] == pytest.approx(0.3, rel=0.5)
         yaw = found.get("sensors.lidar.std.yaw_rad")
         # The model gives the yaw some noise, so the likelihood bounds a standard deviation of zero from above alone.
-        assert yaw is None or yaw["why"].startswith(("no maximum", "only bounded: below"))
+        assert yaw is None or yaw["why"].startswith(
+            ("no maximum", "only bounded: below")
+        )
     else:
         assert code == 1
         line = err.splitlines()[-1]
-        assert line.startswith(f"fgtrack: error: {drive_path}: nothing to fit noise to: ")
+        assert line.startswith(
+            f"fgtrack: error: {drive_path}: nothing to fit noise to: "
+        )
         assert wrong in line
         assert not out.exists()
 
 
 @each_kind
 @pytest.mark.parametrize("command", ["offsets", "advise"])
-def test_offsets_and_advice_say_what_can_be_known(kind: str, command: str, tmp_path: Path, capsys: Capture) -> None:
+def test_offsets_and_advice_say_what_can_be_known(
+    kind: str, command: str, tmp_path: Path, capsys: Capture
+) -> None:
     path = tmp_path / "drive.jsonl"
     write_stream(path, KINDS[kind][0]())
     code, out, err = called([command, str(path)], capsys)

@@ -13,7 +13,7 @@ from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from fgtrack.core.types import EgoState
-from fgtrack.io.ros.messages import ODOMETRY, MessageFactory
+from fgtrack.inputs.ros.messages import ODOMETRY, MessageFactory
 
 pytestmark = pytest.mark.slow
 
@@ -53,7 +53,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("extending") / "example"
     shutil.copytree(ROOT / "docs/example", folder)
     (folder / "sweep.yaml").write_text(SWEEP)
-    options = {"TARGET": str(folder / "site"), "NO_DEPS": "1", "NO_BUILD_ISOLATION": "0", "NO_INDEX": "1"}
+    options = {
+        "TARGET": str(folder / "site"),
+        "NO_DEPS": "1",
+        "NO_BUILD_ISOLATION": "0",
+        "NO_INDEX": "1",
+    }
     env = {f"PIP_{name}": value for name, value in options.items()}
     [line] = [line for line in commands() if line.startswith("pip ")]
     followed(folder, ["-m", *line.split()], env=env)
@@ -66,7 +71,11 @@ def commands() -> list[str]:
 
 
 def followed(
-    folder: Path, arguments: list[str], given: str = "", env: dict[str, str] | None = None, code: int = 0
+    folder: Path,
+    arguments: list[str],
+    given: str = "",
+    env: dict[str, str] | None = None,
+    code: int = 0,
 ) -> str:
     """Output of a Python that knows the package and fgtrack, started in `folder`."""
     paths = os.pathsep.join(map(str, (folder / "site", ROOT)))
@@ -82,13 +91,18 @@ def followed(
     return done.stdout + done.stderr
 
 
-def test_the_commands_of_the_page_run_and_workers_load_the_package(folder: Path) -> None:
+def test_the_commands_of_the_page_run_and_workers_load_the_package(
+    folder: Path,
+) -> None:
     lines = [line for line in commands() if line.startswith("fgtrack ")]
     lines.append("fgtrack sweep sweep.yaml -o sweep --jobs 4")
     said = followed(folder, ["-c", DRIVER], "\n".join(lines) + "\n")
     for name in ("refilter", "drop-bank", "smoother-dogleg", "ekf-replay"):
         assert (folder / "runs" / name / "tracks.csv").stat().st_size > 2000
-    tracks = [(folder / "runs" / name / "tracks.csv").read_text() for name in ("refilter", "ekf-replay")]
+    tracks = [
+        (folder / "runs" / name / "tracks.csv").read_text()
+        for name in ("refilter", "ekf-replay")
+    ]
     # the same filter, which is only made again where the other one finds the direction of a new object itself
     assert abs(last_x_m(tracks[0]) - last_x_m(tracks[1])) < 0.02
     assert re.search(r"all \d+ promises kept", said)
@@ -104,12 +118,28 @@ def last_x_m(tracks: str) -> float:
 
 
 def test_the_page_shows_the_entry_points_of_the_example() -> None:
-    [shown] = [text.split("\n", 1)[1] for language, text in BLOCKS if language == "toml"]
+    [shown] = [
+        text.split("\n", 1)[1] for language, text in BLOCKS if language == "toml"
+    ]
     assert shown in (ROOT / "docs/example/pyproject.toml").read_text(encoding="utf-8")
 
 
 def test_the_tests_of_the_page_pass(folder: Path) -> None:
-    said = followed(folder, ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", "/dev/null", "--rootdir", ".", "."])
+    said = followed(
+        folder,
+        [
+            "-m",
+            "pytest",
+            "-q",
+            "-p",
+            "no:cacheprovider",
+            "-c",
+            "/dev/null",
+            "--rootdir",
+            ".",
+            ".",
+        ],
+    )
     assert re.search(r"\d\d passed", said)
 
 
@@ -125,7 +155,9 @@ def test_a_recording_with_the_message_type_is_replayed(folder: Path) -> None:
             now_ns = 10**9 + k * 50_000_000
             message = make.odometry(EgoState(now_ns, now_ns, 0.0, 0.0, 0.0, 0.0))
             bag.write(ego, now_ns, make.serialize(message))
-            blip = store.types[BLIPS](now_ns - 20_000_000, np.array([20.0 + 0.5 * k]), np.array([0.1]))
+            blip = store.types[BLIPS](
+                now_ns - 20_000_000, np.array([20.0 + 0.5 * k]), np.array([0.1])
+            )
             bag.write(blips, now_ns + 1, store.serialize_cdr(blip, BLIPS))
     (folder / "bag.yaml").write_text(CONFIG)
     lines = ["fgtrack info bag -c bag.yaml", "fgtrack replay bag -c bag.yaml -o blips"]
@@ -155,8 +187,8 @@ import numpy as np
 import fgtrack
 from dataclasses import replace
 from fgtrack.core.types import MEASURABLE
-from fgtrack.io.ros.bag_writer import write_bag
-from fgtrack.io.source import open_input
+from fgtrack.inputs.ros.bag_writer import write_bag
+from fgtrack.inputs.source import open_input
 
 assert "inverse_range_pm" in MEASURABLE
 model = fgtrack.measurement_model(("bearing_rad", "inverse_range_pm"), fgtrack.CTRV())

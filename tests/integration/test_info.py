@@ -3,10 +3,10 @@ from support.messages import START_NS, drive, shared
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import DetectionList, EgoState
-from fgtrack.io.config import InputConfig, TopicInput
-from fgtrack.io.info import describe
-from fgtrack.io.ros.bag_writer import write_bag
-from fgtrack.io.stream import write_stream
+from fgtrack.inputs.info import describe
+from fgtrack.inputs.ros.bag_writer import write_bag
+from fgtrack.inputs.settings import InputConfig, TopicInput
+from fgtrack.inputs.stream import write_stream
 
 
 def by_name(info):
@@ -28,11 +28,18 @@ def test_a_recording_is_described_by_its_topics_with_rates_and_delays(tmp_path):
 
 def test_a_configuration_says_which_topic_is_which_sensor(tmp_path):
     write_bag(tmp_path / "bag", drive())
-    config = InputConfig(TopicInput("/ego/odometry"), {"front": TopicInput("/detections/lidar")})
+    config = InputConfig(
+        TopicInput("/ego/odometry"), {"front": TopicInput("/detections/lidar")}
+    )
     info = describe(tmp_path / "bag", config)
-    used = {name: topic.used_as for name, topic in by_name(info).items() if topic.used_as}
+    used = {
+        name: topic.used_as for name, topic in by_name(info).items() if topic.used_as
+    }
     assert used == {"/ego/odometry": "ego", "/detections/lidar": "detections front"}
-    info = describe(tmp_path / "bag", InputConfig(TopicInput("/ego/odometry"), {"x": TopicInput("/nothing")}))
+    info = describe(
+        tmp_path / "bag",
+        InputConfig(TopicInput("/ego/odometry"), {"x": TopicInput("/nothing")}),
+    )
     assert "no topic /nothing" in info.problem
 
 
@@ -49,18 +56,33 @@ def test_a_stream_is_described_by_its_sensors_up_to_the_break(tmp_path):
 
 
 def test_times_in_another_unit_are_a_problem(tmp_path):
-    seconds = [EgoState(1_700_000_000 + k // 100, 1_700_000_000 + k // 100, k, 0.0, 0.0, 1.0) for k in range(900)]
+    seconds = [
+        EgoState(1_700_000_000 + k // 100, 1_700_000_000 + k // 100, k, 0.0, 0.0, 1.0)
+        for k in range(900)
+    ]
     write_stream(tmp_path / "s.jsonl", seconds)
     problem = describe(tmp_path / "s.jsonl").problem
-    assert problem.startswith("900 times within 8e-09 s, which no sensor sends: they are not in ns, they look like s")
-    clocks = [EgoState(0, 0, 0.0, 0.0, 0.0, 0.0), DetectionList("radar", START_NS, START_NS, ())]
+    assert problem.startswith(
+        "900 times within 8e-09 s, which no sensor sends: they are not in ns, they look like s"
+    )
+    clocks = [
+        EgoState(0, 0, 0.0, 0.0, 0.0, 0.0),
+        DetectionList("radar", START_NS, START_NS, ()),
+    ]
     write_stream(tmp_path / "clocks.jsonl", clocks)
-    assert "years long: its times are of several units or clocks" in describe(tmp_path / "clocks.jsonl").problem
+    assert (
+        "years long: its times are of several units or clocks"
+        in describe(tmp_path / "clocks.jsonl").problem
+    )
 
 
 def test_every_shared_recording_is_described_or_refused_in_one_line():
     root = shared("data/bags")
-    paths = [*root.rglob("*.mcap"), *root.rglob("*.db3"), *(file.parent for file in root.rglob("metadata.yaml"))]
+    paths = [
+        *root.rglob("*.mcap"),
+        *root.rglob("*.db3"),
+        *(file.parent for file in root.rglob("metadata.yaml")),
+    ]
     assert len(paths) > 30
     refused = []
     for path in paths:

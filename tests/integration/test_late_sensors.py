@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from fgtrack.config.settings import Config
 from fgtrack.core.types import Detection, DetectionList, EgoState, TrackStatus
-from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.live import Tracker
 from fgtrack.pipeline.replay import replay_in_memory
 
@@ -33,7 +33,13 @@ class Watched(NamedTuple):
     """Advance of its stamps."""
 
 
-def config(watched: int, estimator: str, noise_m: float = 0.3, reach_s: float = 4.0, **settings: object) -> Config:
+def config(
+    watched: int,
+    estimator: str,
+    noise_m: float = 0.3,
+    reach_s: float = 4.0,
+    **settings: object,
+) -> Config:
     """A sensor for each sector around the ego."""
     sensors = {
         f"s{k}": {
@@ -44,9 +50,21 @@ def config(watched: int, estimator: str, noise_m: float = 0.3, reach_s: float = 
         }
         for k in range(watched)
     }
-    times = {"smoother.lag_s": reach_s} if "smoother" in estimator else {"filter.storage_s": reach_s}
+    times = (
+        {"smoother.lag_s": reach_s}
+        if "smoother" in estimator
+        else {"filter.storage_s": reach_s}
+    )
     keys = {key.replace("__", "."): value for key, value in settings.items()}
-    return Config().replace({"estimator": estimator, "clock.node_hz": NODE_HZ, "sensors": sensors, **times, **keys})
+    return Config().replace(
+        {
+            "estimator": estimator,
+            "clock.node_hz": NODE_HZ,
+            "sensors": sensors,
+            **times,
+            **keys,
+        }
+    )
 
 
 def place_m(k: int, watched: int, time_s: float) -> tuple[float, float]:
@@ -61,16 +79,24 @@ def messages(
     """The lists of all sensors in order of receipt, and an ego that stands."""
     watched, generator = list(watched), np.random.default_rng(seed)
     made: list[EgoState | DetectionList] = [
-        EgoState(ns(0.05 * k), ns(0.05 * k), 0.0, 0.0, 0.0, 0.0) for k in range(round(20 * duration_s) + 1)
+        EgoState(ns(0.05 * k), ns(0.05 * k), 0.0, 0.0, 0.0, 0.0)
+        for k in range(round(20 * duration_s) + 1)
     ]
     for k, one in enumerate(watched):
         for i in range(math.ceil(duration_s * one.rate_hz)):
             at_s = (i + 0.3 * k / len(watched)) / one.rate_hz
             late_s = one.delay_s(at_s) if callable(one.delay_s) else one.delay_s
-            x_m, y_m = place_m(k, len(watched), at_s) + generator.normal(0.0, noise_m, 2)
+            x_m, y_m = place_m(k, len(watched), at_s) + generator.normal(
+                0.0, noise_m, 2
+            )
             stamps_ns = ns(at_s + one.ahead_s), ns(at_s + late_s)
-            made.append(DetectionList(f"s{k}", *stamps_ns, [Detection(x_m=x_m, y_m=y_m)], "map"))
-    return sorted((one for one in made if one.receipt_ns <= ns(duration_s)), key=lambda one: one.receipt_ns)
+            made.append(
+                DetectionList(f"s{k}", *stamps_ns, [Detection(x_m=x_m, y_m=y_m)], "map")
+            )
+    return sorted(
+        (one for one in made if one.receipt_ns <= ns(duration_s)),
+        key=lambda one: one.receipt_ns,
+    )
 
 
 class Found(NamedTuple):
@@ -82,7 +108,13 @@ class Found(NamedTuple):
     """Number of tracks that it had."""
 
 
-def tracked(tracker: Tracker, watched: list[Watched], duration_s: float, noise_m: float = 0.3, seed: int = 0) -> Found:
+def tracked(
+    tracker: Tracker,
+    watched: list[Watched],
+    duration_s: float,
+    noise_m: float = 0.3,
+    seed: int = 0,
+) -> Found:
     """Objects as published at every tick from `CONFIRMED_S` after the first list of their sensor came."""
     pending = messages(watched, duration_s, noise_m, seed)[::-1]
     hits: list[list[bool]] = [[] for _ in watched]
@@ -93,7 +125,11 @@ def tracked(tracker: Tracker, watched: list[Watched], duration_s: float, noise_m
             tracker.receive(pending.pop())
         report = tracker.tick(ns(at_s))
         for k, one in enumerate(watched):
-            latest_s = one.delay_s if not callable(one.delay_s) else max(map(one.delay_s, np.arange(0.0, 30.0, 0.05)))
+            latest_s = (
+                one.delay_s
+                if not callable(one.delay_s)
+                else max(map(one.delay_s, np.arange(0.0, 30.0, 0.05)))
+            )
             if at_s < CONFIRMED_S + latest_s:
                 continue
             x_m, y_m = place_m(k, len(watched), at_s)
@@ -109,10 +145,17 @@ def tracked(tracker: Tracker, watched: list[Watched], duration_s: float, noise_m
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("estimator", ["ekf-replay", "imm-replay", "smoother-banded", "smoother"])
+@pytest.mark.parametrize(
+    "estimator", ["ekf-replay", "imm-replay", "smoother-banded", "smoother"]
+)
 @pytest.mark.parametrize(
     ("rates_hz", "delay_s", "noise_m"),
-    [((10.0, 10.0), 0.1, 2.0), ((25.0, 2.0), 0.6, 0.1), ((2.0, 25.0), 1.2, 0.3), ((12.0, 5.0), 3.0, 0.3)],
+    [
+        ((10.0, 10.0), 0.1, 2.0),
+        ((25.0, 2.0), 0.6, 0.1),
+        ((2.0, 25.0), 1.2, 0.3),
+        ((12.0, 5.0), 3.0, 0.3),
+    ],
 )
 def test_an_object_that_only_a_late_sensor_sees_is_one_confirmed_track(
     estimator: str, rates_hz: tuple[float, float], delay_s: float, noise_m: float
@@ -126,7 +169,9 @@ def test_an_object_that_only_a_late_sensor_sees_is_one_confirmed_track(
 
 @pytest.mark.long
 @pytest.mark.parametrize("estimator", ["ekf-replay", "smoother-banded"])
-def test_so_is_each_object_of_four_sensors_with_their_own_delays(estimator: str) -> None:
+def test_so_is_each_object_of_four_sensors_with_their_own_delays(
+    estimator: str,
+) -> None:
     watched = [Watched(10.0), Watched(5.0, 0.7), Watched(2.0, 2.5), Watched(25.0, 0.2)]
     found = tracked(Tracker(config(4, estimator)), watched, 8.0, seed=3)
     assert min(found.shares) >= SHARE
@@ -142,7 +187,13 @@ def test_so_is_each_object_of_four_sensors_with_their_own_delays(estimator: str)
         {"lifecycle__lifetime_s": 2.0},
         {"lifecycle__memory_s": 0.3},
         {"lifecycle": {"kind": "counting", "forget_s": 0.3}},
-        {"lifecycle": {"kind": "counting", "forget_s": 1.0, "suppress_births_near_newer_tracks": True}},
+        {
+            "lifecycle": {
+                "kind": "counting",
+                "forget_s": 1.0,
+                "suppress_births_near_newer_tracks": True,
+            }
+        },
     ],
     ids=str,
 )
@@ -166,14 +217,21 @@ def test_a_single_slow_sensor_keeps_its_tracks(kind: str, estimator: str) -> Non
 
 @pytest.mark.parametrize(
     "delay_s",
-    [lambda at_s: 0.15 + 1.4 * (at_s % 3.0 < 0.4), lambda at_s: math.ceil((at_s + 0.01) / 1.3) * 1.3 - at_s],
+    [
+        lambda at_s: 0.15 + 1.4 * (at_s % 3.0 < 0.4),
+        lambda at_s: math.ceil((at_s + 0.01) / 1.3) * 1.3 - at_s,
+    ],
     ids=["stalls", "queue"],
 )
 @pytest.mark.parametrize("rate_hz", [4.0, 20.0])
 def test_a_sensor_whose_lists_come_in_bursts_keeps_its_tracks(
     delay_s: Callable[[float], float], rate_hz: float
 ) -> None:
-    found = tracked(Tracker(config(2, "ekf-replay")), [Watched(10.0), Watched(rate_hz, delay_s)], 10.0)
+    found = tracked(
+        Tracker(config(2, "ekf-replay")),
+        [Watched(10.0), Watched(rate_hz, delay_s)],
+        10.0,
+    )
     assert min(found.shares) >= SHARE
     assert found.ids == [1, 1]
 
@@ -189,7 +247,11 @@ def test_one_list_that_is_an_hour_late_keeps_no_track() -> None:
     for late_s in (0.2, 3600.0):
         tracker = Tracker(config(2, "ekf-replay"))
         pending = messages([Watched(10.0), Watched(10.0, 0.2)], 8.0)
-        pending = [one for one in pending if getattr(one, "sensor", "s0") == "s0" or one.stamp_ns < ns(4.0)]
+        pending = [
+            one
+            for one in pending
+            if getattr(one, "sensor", "s0") == "s0" or one.stamp_ns < ns(4.0)
+        ]
         stale = DetectionList("s1", ns(2.2 - late_s), ns(2.2), [], "map")
         pending = sorted([*pending, stale], key=lambda one: one.receipt_ns)[::-1]
         for tick in range(round(8.0 * NODE_HZ)):
@@ -206,7 +268,9 @@ def test_one_list_that_is_an_hour_late_keeps_no_track() -> None:
 
 @pytest.mark.parametrize("estimator", ["ekf-replay", "smoother-banded"])
 @pytest.mark.parametrize("delay_s", [0.3, 2.2])
-def test_an_object_that_is_gone_leaves_no_track_after_the_usual_delay(estimator: str, delay_s: float) -> None:
+def test_an_object_that_is_gone_leaves_no_track_after_the_usual_delay(
+    estimator: str, delay_s: float
+) -> None:
     """The sensors go on, and show nothing."""
     tracker, gone_s = Tracker(config(2, estimator)), 3.0
     pending = messages([Watched(10.0), Watched(10.0, delay_s)], 12.0)
@@ -228,7 +292,9 @@ def test_an_object_that_is_gone_leaves_no_track_after_the_usual_delay(estimator:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("estimator", ["ekf-replay", "imm-replay", "smoother-banded", "smoother"])
+@pytest.mark.parametrize(
+    "estimator", ["ekf-replay", "imm-replay", "smoother-banded", "smoother"]
+)
 @pytest.mark.parametrize(
     ("rates_hz", "ahead_s", "noise_m"),
     [
@@ -239,11 +305,19 @@ def test_an_object_that_is_gone_leaves_no_track_after_the_usual_delay(estimator:
     ],
 )
 def test_a_clock_that_is_ahead_swaps_no_objects(
-    estimator: str, rates_hz: tuple[float, ...], ahead_s: tuple[float, ...], noise_m: float
+    estimator: str,
+    rates_hz: tuple[float, ...],
+    ahead_s: tuple[float, ...],
+    noise_m: float,
 ) -> None:
     """A first detection of one object, with an unknown velocity, does not take those of another, 60 m away."""
-    watched = [Watched(rate_hz, 0.06, ahead) for rate_hz, ahead in zip(rates_hz, ahead_s, strict=True)]
-    found = tracked(Tracker(config(len(watched), estimator, noise_m)), watched, 6.0, noise_m, seed=2)
+    watched = [
+        Watched(rate_hz, 0.06, ahead)
+        for rate_hz, ahead in zip(rates_hz, ahead_s, strict=True)
+    ]
+    found = tracked(
+        Tracker(config(len(watched), estimator, noise_m)), watched, 6.0, noise_m, seed=2
+    )
     assert min(found.shares) >= SHARE
     assert found.ids == [1] * len(watched)
 
@@ -256,19 +330,33 @@ def test_nor_do_sensors_that_take_turns(estimator: str) -> None:
     assert found == Found([1.0, 1.0], [1, 1])
 
 
-@pytest.mark.parametrize(("estimator", "key"), [("ekf-replay", "filter.storage_s"), ("smoother", "smoother.lag_s")])
-def test_an_estimator_with_a_shorter_memory_than_a_delay_warns_once(estimator: str, key: str) -> None:
+@pytest.mark.parametrize(
+    ("estimator", "key"),
+    [("ekf-replay", "filter.storage_s"), ("smoother", "smoother.lag_s")],
+)
+def test_an_estimator_with_a_shorter_memory_than_a_delay_warns_once(
+    estimator: str, key: str
+) -> None:
     watched = [Watched(10.0), Watched(10.0, lambda at_s: 0.1 if at_s < 2.0 else 2.6)]
     for reach_s, is_warned in ((1.5, True), (3.0, False)):
-        tracker = Tracker(config(2, estimator, reach_s=reach_s, smoother__ring_s=0.0, smoother__late="drop"))
+        tracker = Tracker(
+            config(
+                2,
+                estimator,
+                reach_s=reach_s,
+                smoother__ring_s=0.0,
+                smoother__late="drop",
+            )
+        )
         for message in messages(watched, 6.0):
             tracker.receive(message)
             tracker.tick(message.receipt_ns)
         found = tracker.warnings
         assert found == tracker.warnings
-        assert [(f"{key} {reach_s:g} s" in one, "s1: " in one, "2.6 s" in one) for one in found] == (
-            [(True,) * 3] * is_warned
-        )
+        assert [
+            (f"{key} {reach_s:g} s" in one, "s1: " in one, "2.6 s" in one)
+            for one in found
+        ] == ([(True,) * 3] * is_warned)
         assert bool(tracker.counts["s1"].get("too_old")) is is_warned
 
 
@@ -280,7 +368,15 @@ def test_a_live_tracker_and_a_replay_await_the_same_lists() -> None:
     for now_ns in run.tables["timing"]["now_ns"].tolist():
         while pending and pending[-1].receipt_ns <= now_ns:
             tracker.receive(pending.pop())
-        rows += [(now_ns, one.track_id, one.x_m, one.score) for one in tracker.tick(now_ns).tracks]
+        rows += [
+            (now_ns, one.track_id, one.x_m, one.score)
+            for one in tracker.tick(now_ns).tracks
+        ]
     tracks = run.tables["tracks"]
     assert len(rows) > 100
-    assert rows == list(zip(*(tracks[name].tolist() for name in ("now_ns", "track_id", "x_m", "score")), strict=True))
+    assert rows == list(
+        zip(
+            *(tracks[name].tolist() for name in ("now_ns", "track_id", "x_m", "score")),
+            strict=True,
+        )
+    )

@@ -23,7 +23,11 @@ def test_the_loop_publishes_a_drive_and_accounts_for_every_detection() -> None:
     """By a clock that stands until the loop has done what is due: no verdict depends on the machine."""
     loop = load_file(LOOP, "live")
     tracker = fgtrack.Tracker.from_config("smoother", map="oval")
-    sent = [m for m in fgtrack.simulate("single_opponent", seed=1, duration_s=1.5) if not isinstance(m, TruthState)]
+    sent = [
+        m
+        for m in fgtrack.simulate("single_opponent", seed=1, duration_s=1.5)
+        if not isinstance(m, TruthState)
+    ]
     clock_ns, polls = sent[0].receipt_ns, 0
     published: dict[int, tuple[fgtrack.TrackReport, ...]] = {}
 
@@ -46,16 +50,29 @@ def test_the_loop_publishes_a_drive_and_accounts_for_every_detection() -> None:
     passed = len(stamps_ns) - 1 + tracker.timing.skipped
     assert stamps_ns[-1] - stamps_ns[0] == passed * loop.PERIOD_NS > 1_300_000_000
     assert [track.stamp_ns for track in published[stamps_ns[-1]]] == [stamps_ns[-1]]
-    received = Counter(m.sensor for m in sent if isinstance(m, fgtrack.DetectionList) for _ in m.objects)
-    assert {sensor: sum(counts.values()) for sensor, counts in tracker.counts.items()} == received
+    received = Counter(
+        m.sensor
+        for m in sent
+        if isinstance(m, fgtrack.DetectionList)
+        for _ in m.objects
+    )
+    assert {
+        sensor: sum(counts.values()) for sensor, counts in tracker.counts.items()
+    } == received
     assert tracker.lateness["radar"].delay_median_s == pytest.approx(0.06, abs=0.01)
     assert tracker.refused == tracker.failures == {}
 
 
 def test_the_drive_of_the_loop_keeps_the_stamps_of_the_simulation() -> None:
     drive = list(load_file(LOOP, "live").drive(duration_s=0.2))
-    sent = [m for m in fgtrack.simulate("single_opponent", seed=1, duration_s=0.2) if not isinstance(m, TruthState)]
-    assert [m.stamp_ns - drive[0].stamp_ns for m in drive] == [m.stamp_ns - sent[0].stamp_ns for m in sent]
+    sent = [
+        m
+        for m in fgtrack.simulate("single_opponent", seed=1, duration_s=0.2)
+        if not isinstance(m, TruthState)
+    ]
+    assert [m.stamp_ns - drive[0].stamp_ns for m in drive] == [
+        m.stamp_ns - sent[0].stamp_ns for m in sent
+    ]
     assert all(m.receipt_ns >= m.stamp_ns for m in drive)
 
 
@@ -63,7 +80,9 @@ def test_the_drive_of_the_loop_keeps_the_stamps_of_the_simulation() -> None:
 def test_a_soak_of_some_seconds_accounts_for_every_detection(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bench_live.main(tmp_path, duration_s=3.0, objects=2, estimator="ekf-replay", parts=3)
+    bench_live.main(
+        tmp_path, duration_s=3.0, objects=2, estimator="ekf-replay", parts=3
+    )
     text = capsys.readouterr().out
     assert (tmp_path / "live.md").read_text(encoding="utf-8") == text
     rows = [line.split("|") for line in text.splitlines() if line.startswith("| ")][2:]
@@ -72,11 +91,18 @@ def test_a_soak_of_some_seconds_accounts_for_every_detection(
     assert (len(rows), until_min[-1] >= 2.9 / 60) == (3, True)
     assert all(float(row[2]) > 10.0 for row in rows)
     result = json.loads((tmp_path / "live.json").read_text(encoding="utf-8"))
-    counted = {sensor: sum(counts.values()) for sensor, counts in result["counts"].items()}
+    counted = {
+        sensor: sum(counts.values()) for sensor, counts in result["counts"].items()
+    }
     assert counted == result["sent"]
     assert sum(counted.values()) > 100
     assert result["refused"] == result["failures"] == {}
     assert result["timing"]["ticks"] == sum(part["ticks"] for part in result["parts"])
-    assert all(part["tick_ms"] == sorted(part["tick_ms"]) and len(part["tick_ms"]) == 3 for part in result["parts"])
-    ticks = sum(int(row[5].split()[2]) + int(row[6]) for row in rows)  # done and skipped
+    assert all(
+        part["tick_ms"] == sorted(part["tick_ms"]) and len(part["tick_ms"]) == 3
+        for part in result["parts"]
+    )
+    ticks = sum(
+        int(row[5].split()[2]) + int(row[6]) for row in rows
+    )  # done and skipped
     assert ticks == pytest.approx(50 * 60 * until_min[-1], abs=5)

@@ -13,7 +13,7 @@ import pytest
 from rosbags.interfaces import Nodetype
 from support.scripts import LIVE, load_file
 
-from fgtrack.io.ros.typestore import typestore_of
+from fgtrack.inputs.ros.typestore import typestore_of
 
 MS = 1_000_000
 NOW_NS = 1_700_000_000_000_000_000
@@ -22,8 +22,16 @@ SPEED_MPS = 20.0  # of the ego, along x, turning
 
 
 TYPES = (
-    *("vision_msgs/msg/Detection3DArray", "vision_msgs/msg/Detection3D", "vision_msgs/msg/ObjectHypothesisWithPose"),
-    *("nav_msgs/msg/Odometry", "geometry_msgs/msg/TransformStamped", "builtin_interfaces/msg/Time"),
+    *(
+        "vision_msgs/msg/Detection3DArray",
+        "vision_msgs/msg/Detection3D",
+        "vision_msgs/msg/ObjectHypothesisWithPose",
+    ),
+    *(
+        "nav_msgs/msg/Odometry",
+        "geometry_msgs/msg/TransformStamped",
+        "builtin_interfaces/msg/Time",
+    ),
 )
 STORE = typestore_of(TYPES)
 
@@ -48,10 +56,18 @@ def message_class(name: str) -> type:
 
     def make(self: Any, **values: Any) -> None:
         for field_name, (kind, what) in fields.items():
-            setattr(self, field_name, values.pop(field_name) if field_name in values else _default(kind, what))
+            setattr(
+                self,
+                field_name,
+                values.pop(field_name)
+                if field_name in values
+                else _default(kind, what),
+            )
         assert not values, f"{name} has no {values}"
 
-    return type(name.rpartition("/")[2], (), {"__slots__": tuple(fields), "__init__": make})
+    return type(
+        name.rpartition("/")[2], (), {"__slots__": tuple(fields), "__init__": make}
+    )
 
 
 @dataclass(frozen=True)
@@ -64,7 +80,9 @@ class Time:
 
     def to_msg(self) -> Any:
         seconds, nanoseconds = divmod(self.nanoseconds, 10**9)
-        return message_class("builtin_interfaces/msg/Time")(sec=seconds, nanosec=nanoseconds)
+        return message_class("builtin_interfaces/msg/Time")(
+            sec=seconds, nanosec=nanoseconds
+        )
 
 
 class TransformException(Exception):  # noqa: N818 - its name
@@ -85,15 +103,25 @@ class Buffer:
         stamps = sorted(self.known)
         stamp_ns = time.nanoseconds or max(stamps, default=0)
         if not stamps or not stamps[0] <= stamp_ns <= stamps[-1]:
-            raise TransformException("Lookup would require extrapolation into the future")
+            raise TransformException(
+                "Lookup would require extrapolation into the future"
+            )
         since = [stamp - stamps[0] for stamp in stamps]
         x, y, yaw = (
-            float(np.interp(stamp_ns - stamps[0], since, [self.known[s][k] for s in stamps])) for k in range(3)
+            float(
+                np.interp(
+                    stamp_ns - stamps[0], since, [self.known[s][k] for s in stamps]
+                )
+            )
+            for k in range(3)
         )
         found = message_class("geometry_msgs/msg/TransformStamped")()
         found.header.stamp = Time(stamp_ns).to_msg()
         found.transform.translation.x, found.transform.translation.y = x, y
-        found.transform.rotation.z, found.transform.rotation.w = np.sin(yaw / 2.0), np.cos(yaw / 2.0)
+        found.transform.rotation.z, found.transform.rotation.w = (
+            np.sin(yaw / 2.0),
+            np.cos(yaw / 2.0),
+        )
         return found
 
 
@@ -118,26 +146,38 @@ class Node:
         return SimpleNamespace(value=self.given.get(name, value))
 
     def get_clock(self) -> Any:
-        return SimpleNamespace(now=lambda: Time(self.time_ns), create_jump_callback=self._on_jumps)
+        return SimpleNamespace(
+            now=lambda: Time(self.time_ns), create_jump_callback=self._on_jumps
+        )
 
-    def _on_jumps(self, threshold: Any, *, post_callback: Callable[[Any], None]) -> None:
+    def _on_jumps(
+        self, threshold: Any, *, post_callback: Callable[[Any], None]
+    ) -> None:
         self.jumps.append((threshold, post_callback))
 
     def get_logger(self) -> Any:
         return SimpleNamespace(warning=lambda line: None)
 
-    def create_subscription(self, kind: type, topic: str, callback: Callable[[Any], None], qos_profile: Any) -> None:
+    def create_subscription(
+        self, kind: type, topic: str, callback: Callable[[Any], None], qos_profile: Any
+    ) -> None:
         self.subscriptions[topic] = callback
 
     def create_publisher(self, kind: type, topic: str, qos_profile: Any) -> Any:
         return SimpleNamespace(publish=self.published.setdefault(topic, []).append)
 
-    def create_timer(self, timer_period_sec: float, callback: Callable[[], None]) -> None:
+    def create_timer(
+        self, timer_period_sec: float, callback: Callable[[], None]
+    ) -> None:
         self.timers.append(callback)
 
 
 def messages_of(package: str) -> dict[str, type]:
-    return {name.rpartition("/")[2]: message_class(name) for name in TYPES if name.startswith(package)}
+    return {
+        name.rpartition("/")[2]: message_class(name)
+        for name in TYPES
+        if name.startswith(package)
+    }
 
 
 STAND_INS: Mapping[str, Mapping[str, Any]] = {
@@ -152,7 +192,11 @@ STAND_INS: Mapping[str, Mapping[str, Any]] = {
         "QoSReliabilityPolicy": SimpleNamespace(BEST_EFFORT=2),
     },
     "rclpy.time": {"Time": Time},
-    "tf2_ros": {"Buffer": Buffer, "TransformException": TransformException, "TransformListener": listener},
+    "tf2_ros": {
+        "Buffer": Buffer,
+        "TransformException": TransformException,
+        "TransformListener": listener,
+    },
     "nav_msgs": {},
     "nav_msgs.msg": messages_of("nav_msgs"),
     "vision_msgs": {},
@@ -170,7 +214,11 @@ def script() -> Iterator[ModuleType]:
 
 
 def made(script: ModuleType, **parameters: Any) -> Any:
-    Node.given = {"sensors": ["lidar_cluster", "radar"], "config": "smoother", **parameters}
+    Node.given = {
+        "sensors": ["lidar_cluster", "radar"],
+        "config": "smoother",
+        **parameters,
+    }
     node = script.TrackerNode()
     node.time_ns = NOW_NS
     return node
@@ -210,10 +258,14 @@ def tick(node: Any, now_ns: int) -> Any:
 
 
 def counts(node: Any) -> dict[str, dict[str, int]]:
-    return {sensor: dict(of_sensor) for sensor, of_sensor in node.tracker.counts.items()}
+    return {
+        sensor: dict(of_sensor) for sensor, of_sensor in node.tracker.counts.items()
+    }
 
 
-def test_a_standing_car_is_tracked_from_a_turning_ego_with_late_lists_and_late_poses(script: ModuleType) -> None:
+def test_a_standing_car_is_tracked_from_a_turning_ego_with_late_lists_and_late_poses(
+    script: ModuleType,
+) -> None:
     node = made(script, published_ago_s=0.1)
     for k in range(1, 60):
         now_ns = NOW_NS + 20 * MS * k
@@ -222,22 +274,41 @@ def test_a_standing_car_is_tracked_from_a_turning_ego_with_late_lists_and_late_p
         odometry.twist.twist.linear.x, odometry.twist.twist.angular.z = SPEED_MPS, 0.3
         send(node, "odometry", odometry, now_ns - 5 * MS)
         if k > 10:
-            send(node, "radar/detections", detections(now_ns - 17 * MS), now_ns - 3 * MS)  # between two poses
-            send(node, "lidar_cluster/detections", detections(now_ns - 111 * MS), now_ns - 2 * MS)
+            send(
+                node, "radar/detections", detections(now_ns - 17 * MS), now_ns - 3 * MS
+            )  # between two poses
+            send(
+                node,
+                "lidar_cluster/detections",
+                detections(now_ns - 111 * MS),
+                now_ns - 2 * MS,
+            )
         published = tick(node, now_ns)
     [track] = published.detections
     assert Time.from_msg(published.header.stamp).nanoseconds == now_ns - 100 * MS
-    assert (published.header.frame_id, track.header.frame_id, track.id) == ("map", "map", "0")
+    assert (published.header.frame_id, track.header.frame_id, track.id) == (
+        "map",
+        "map",
+        "0",
+    )
     at_m = (track.bbox.center.position.x, track.bbox.center.position.y)
-    assert at_m == pytest.approx(CAR_M, abs=2.2)  # the middle of the car is not where detections are taken
+    assert at_m == pytest.approx(
+        CAR_M, abs=2.2
+    )  # the middle of the car is not where detections are taken
     P = np.reshape(track.results[0].pose.covariance, (6, 6))
     np.testing.assert_allclose(P, P.T)
     assert np.linalg.eigvalsh(P[np.ix_((0, 1, 5), (0, 1, 5))])[0] > 0.0
     assert (P[2:5] == 0.0).all()
     found = counts(node)
-    assert sum(map(sum, (one.values() for one in found.values()))) == 2 * 49 - 1  # the newest one waits for its pose
+    assert (
+        sum(map(sum, (one.values() for one in found.values()))) == 2 * 49 - 1
+    )  # the newest one waits for its pose
     assert found["lidar_cluster"]["out_of_sequence"] > 40
-    assert (node.without_pose, node.tracker.refused, node.tracker.failures) == (0, {}, {})
+    assert (node.without_pose, node.tracker.refused, node.tracker.failures) == (
+        0,
+        {},
+        {},
+    )
     assert node.tracker.lateness["radar"].delay_median_s == pytest.approx(0.014)
     assert node.tracker.lateness["lidar_cluster"].delay_median_s == pytest.approx(0.109)
 
@@ -268,5 +339,8 @@ def test_where_time_begins_again_the_tracker_does(script: ModuleType) -> None:
     assert threshold.min_backward.nanoseconds < 0
     on_jump(None)
     published = tick(node, NOW_NS - 5_000 * MS)
-    assert (published.detections, Time.from_msg(published.header.stamp).nanoseconds) == ([], NOW_NS - 5_000 * MS)
+    assert (
+        published.detections,
+        Time.from_msg(published.header.stamp).nanoseconds,
+    ) == ([], NOW_NS - 5_000 * MS)
     assert (counts(node), node.tracker.refused, node.buffer.known) == ({}, {}, {})

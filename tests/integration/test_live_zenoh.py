@@ -40,19 +40,36 @@ def tracker_script(messages: ModuleType) -> ModuleType:
 
 def test_an_object_list_is_the_same_after_its_journey(messages: ModuleType) -> None:
     stamp_ns = 1_700_000_000_123_456_789
-    data = messages.objects_to_cdr(stamp_ns, "base_link", [("0", 1.25, -2.0, 0.0), ("1", 1e3, 0.1, 3.0)])
+    data = messages.objects_to_cdr(
+        stamp_ns, "base_link", [("0", 1.25, -2.0, 0.0), ("1", 1e3, 0.1, 3.0)]
+    )
     found = messages.cdr_to_list(data, "radar", stamp_ns + 5)
-    assert (found.sensor, found.stamp_ns, found.receipt_ns, found.frame) == ("radar", stamp_ns, stamp_ns + 5, "ego")
+    assert (found.sensor, found.stamp_ns, found.receipt_ns, found.frame) == (
+        "radar",
+        stamp_ns,
+        stamp_ns + 5,
+        "ego",
+    )
     assert [(one.x_m, one.y_m) for one in found.objects] == [(1.25, -2.0), (1e3, 0.1)]
     assert messages.stamp_of(data) == stamp_ns
-    assert messages.cdr_to_list(messages.objects_to_cdr(0, "map", []), "radar", 1).frame == "map"
+    assert (
+        messages.cdr_to_list(messages.objects_to_cdr(0, "map", []), "radar", 1).frame
+        == "map"
+    )
 
 
 def test_an_ego_state_is_the_same_after_its_journey(messages: ModuleType) -> None:
     ego = fgtrack.EgoState(1_700_000_000_000_000_001, 7, 10.0, -20.0, -3.0, 30.0, 0.25)
     found = messages.cdr_to_ego(messages.odometry_to_cdr(ego), 7)
-    assert (found.stamp_ns, found.receipt_ns, found.x_m, found.y_m) == (ego.stamp_ns, 7, 10.0, -20.0)
-    assert (found.yaw_rad, found.speed_mps, found.yaw_rate_radps) == pytest.approx((-3.0, 30.0, 0.25))
+    assert (found.stamp_ns, found.receipt_ns, found.x_m, found.y_m) == (
+        ego.stamp_ns,
+        7,
+        10.0,
+        -20.0,
+    )
+    assert (found.yaw_rad, found.speed_mps, found.yaw_rate_radps) == pytest.approx(
+        (-3.0, 30.0, 0.25)
+    )
 
 
 # Numbers
@@ -68,7 +85,10 @@ def test_every_number_is_received_or_missing_and_a_second_time_repeated(
     found.expect(sent)
     expected = set(range(max([sent, *(number + 1 for number in numbers)])))
     assert found.missing == expected - set(numbers)
-    assert (found.received, found.repeated) == (len(numbers), len(numbers) - len(set(numbers)))
+    assert (found.received, found.repeated) == (
+        len(numbers),
+        len(numbers) - len(set(numbers)),
+    )
 
 
 # What comes in
@@ -79,11 +99,15 @@ def sample(topic: str, data: bytes, attachment: bytes | None) -> Any:
         return SimpleNamespace(to_bytes=lambda: value)
 
     return SimpleNamespace(
-        key_expr=topic, payload=as_bytes(data), attachment=None if attachment is None else as_bytes(attachment)
+        key_expr=topic,
+        payload=as_bytes(data),
+        attachment=None if attachment is None else as_bytes(attachment),
     )
 
 
-def test_what_cannot_be_read_is_counted_and_not_lost(messages: ModuleType, tracker_script: ModuleType) -> None:
+def test_what_cannot_be_read_is_counted_and_not_lost(
+    messages: ModuleType, tracker_script: ModuleType
+) -> None:
     inlet = tracker_script.Inlet(sim_time=True)
     good = messages.objects_to_cdr(5, "base_link", [])
     topic = "vehicle/lists/radar"
@@ -93,14 +117,24 @@ def test_what_cannot_be_read_is_counted_and_not_lost(messages: ModuleType, track
         sample(topic, good, b"short"),
         sample(topic, good, None),
         sample("vehicle/odometry", b"", messages.attachment(0, 150)),
-        sample("vehicle/sent", json.dumps({topic: 5, "vehicle/lists/lidar": 3}).encode(), None),
+        sample(
+            "vehicle/sent",
+            json.dumps({topic: 5, "vehicle/lists/lidar": 3}).encode(),
+            None,
+        ),
         sample(topic, good, messages.attachment(4, 300)),  # after the end
     ]
     [only] = inlet.messages(samples)
     assert (only.sensor, only.stamp_ns, only.receipt_ns) == ("radar", 5, 100)
     assert inlet.unreadable == {topic: 3, "vehicle/odometry": 1}
-    missing = {of_topic: sorted(numbers.missing) for of_topic, numbers in inlet.numbers.items()}
-    assert missing == {topic: [2, 3, 4], "vehicle/odometry": [], "vehicle/lists/lidar": [0, 1, 2]}
+    missing = {
+        of_topic: sorted(numbers.missing) for of_topic, numbers in inlet.numbers.items()
+    }
+    assert missing == {
+        topic: [2, 3, 4],
+        "vehicle/odometry": [],
+        "vehicle/lists/lidar": [0, 1, 2],
+    }
     assert inlet.now_ns() == 200
 
 
@@ -117,14 +151,23 @@ def driven(*options: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """What vehicle and tracker say at the end of a drive."""
     pytest.importorskip("zenoh", reason="eclipse-zenoh is not installed (extra `live`)")
     address = f"tcp/127.0.0.1:{free_port()}"
-    tracker_command = ["zenoh_tracker.py", "--listen", address, "--sim-time", "--estimator", "ekf-replay"]
+    tracker_command = [
+        "zenoh_tracker.py",
+        "--listen",
+        address,
+        "--sim-time",
+        "--estimator",
+        "ekf-replay",
+    ]
     tracker = start(tracker_command)
     try:
         assert tracker.stdout is not None
         assert tracker.stdout.readline() == "ready\n"
         vehicle = start(["zenoh_vehicle.py", "--connect", address, *options])
         try:
-            said = [process.communicate(timeout=TIMEOUT_S) for process in (vehicle, tracker)]
+            said = [
+                process.communicate(timeout=TIMEOUT_S) for process in (vehicle, tracker)
+            ]
         finally:
             vehicle.kill()
     finally:
@@ -165,12 +208,20 @@ def simulated(max_lists: int) -> Counter[str]:
 @pytest.mark.slow
 def test_of_ten_thousand_late_messages_none_is_lost_without_a_word() -> None:
     vehicle, tracker = driven("--duration-s", "300", "--max-lists", "10000")
-    lists = {topic: count for topic, count in vehicle["sent"].items() if topic.startswith("vehicle/lists/")}
+    lists = {
+        topic: count
+        for topic, count in vehicle["sent"].items()
+        if topic.startswith("vehicle/lists/")
+    }
     assert sum(lists.values()) == 10_000
     assert tracker["received"] == vehicle["sent"]
     assert set(tracker["lost"].values()) == set(tracker["repeated"].values()) == {0}
     assert total(tracker["counts"]) == simulated(10_000)
-    assert (tracker["unreadable"], tracker["refused"], tracker["failures"]) == ({}, {}, {})
+    assert (tracker["unreadable"], tracker["refused"], tracker["failures"]) == (
+        {},
+        {},
+        {},
+    )
     fused = sum(
         of_sensor.get(name, 0)
         for of_sensor in tracker["counts"].values()

@@ -29,7 +29,10 @@ def parked(
     """States (m, 5) and covariances (m, 5, 5), from 5 s on, of an object that stands at the origin with yaw 0."""
     rng = np.random.default_rng(seed)
     start = fgtrack.Start(
-        position_m=tuple(rng.normal(0.0, std_m, 2)), position_std_m=std_m, speed_std_mps=10.0, yaw_rate_std_radps=0.5
+        position_m=tuple(rng.normal(0.0, std_m, 2)),
+        position_std_m=std_m,
+        speed_std_mps=10.0,
+        yaw_rate_std_radps=0.5,
     )
     one, means, covariances = fgtrack.estimator(name, motion, start), [], []
     for k in range(1, round(duration_s * rate_hz) + 1):
@@ -55,20 +58,30 @@ def assert_within(means: FloatArray, covariances: FloatArray) -> None:
     assert np.median(np.abs(means[:, 4])) < 0.3
     assert np.quantile(np.abs(means[:, 4]) / stds[:, 4], 0.95) < 2.5
     assert np.quantile(yaw_errors / stds[:, 2], 0.95) < 3.0
-    nees = np.einsum("ki,kij,kj->k", means[:, :2], np.linalg.inv(covariances[:, :2, :2]), means[:, :2])
+    nees = np.einsum(
+        "ki,kij,kj->k",
+        means[:, :2],
+        np.linalg.inv(covariances[:, :2, :2]),
+        means[:, :2],
+    )
     assert np.mean(nees) < 3.0
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("motion", [POLAR, CARTESIAN], ids=["ctrv", "ct"])
 @pytest.mark.parametrize("name", FAST)
-def test_a_parked_object_seen_by_positions_does_not_turn(name: str, motion: fgtrack.MotionModel) -> None:
+def test_a_parked_object_seen_by_positions_does_not_turn(
+    name: str, motion: fgtrack.MotionModel
+) -> None:
     runs = [parked(name, motion, 60.0, 10.0, 0.3, seed) for seed in range(2)]
     assert_within(*map(np.concatenate, zip(*runs, strict=True)))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("rate_hz", "std_m"), [(10.0, 0.3), (2.0, 0.1), (25.0, 0.1), (25.0, 2.0), (2.0, 2.0)])
+@pytest.mark.parametrize(
+    ("rate_hz", "std_m"),
+    [(10.0, 0.3), (2.0, 0.1), (25.0, 0.1), (25.0, 2.0), (2.0, 2.0)],
+)
 @pytest.mark.parametrize("motion", [POLAR, CARTESIAN], ids=["ctrv", "ct"])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_parked_object_does_not_turn_for_ten_minutes(
@@ -85,18 +98,25 @@ def test_a_parked_object_with_a_measured_yaw_keeps_it(name: str) -> None:
     assert np.sqrt(np.mean(np.square(means[:, 2]))) < 0.1
 
 
-def tracks_of_car(estimator: str, sensor: dict[str, object], rests_s: float, seed: int) -> tuple[set[int], set[int]]:
+def tracks_of_car(
+    estimator: str, sensor: dict[str, object], rests_s: float, seed: int
+) -> tuple[set[int], set[int]]:
     """Track ids before and after a car drives off at 3 m/s^2 in any direction, which confirmed tracks near it have."""
     rng = np.random.default_rng(seed)
     components = list(sensor["std"])  # type: ignore[call-overload]
-    tracker = fgtrack.Tracker(fgtrack.Config().replace({"estimator": estimator, "sensors": {"radar": sensor}}))
+    tracker = fgtrack.Tracker(
+        fgtrack.Config().replace({"estimator": estimator, "sensors": {"radar": sensor}})
+    )
     heading = rng.uniform(-math.pi, math.pi)
     before, after = set[int](), set[int]()
     for k in range(round((rests_s + 3.0) * 10.0)):
         stamp_ns = (1000 * 10 + k) * NS_PER_S // 10
         driven_m = 1.5 * max(0.1 * k - rests_s, 0.0) ** 2
         speed_mps = 3.0 * max(0.1 * k - rests_s, 0.0)
-        x_m, y_m = 30.0 + driven_m * math.cos(heading), 20.0 + driven_m * math.sin(heading)
+        x_m, y_m = (
+            30.0 + driven_m * math.cos(heading),
+            20.0 + driven_m * math.sin(heading),
+        )
         range_m, bearing_rad = math.hypot(x_m, y_m), math.atan2(y_m, x_m)
         exact = {
             "x_m": x_m,
@@ -106,15 +126,23 @@ def tracks_of_car(estimator: str, sensor: dict[str, object], rests_s: float, see
             "bearing_rad": bearing_rad,
             "range_rate_mps": speed_mps * math.cos(heading - bearing_rad),
         }
-        values = {name: exact[name] + rng.normal(0.0, sensor["std"][name]) for name in components}  # type: ignore[index]
+        values = {
+            name: exact[name] + rng.normal(0.0, sensor["std"][name])
+            for name in components
+        }  # type: ignore[index]
         tracker.receive(fgtrack.EgoState(stamp_ns, stamp_ns, 0.0, 0.0, 0.0, 0.0))
         objects = [fgtrack.Detection(**values)]
-        tracker.receive(fgtrack.DetectionList("radar", stamp_ns, stamp_ns + 20_000_000, objects, frame="ego"))
+        tracker.receive(
+            fgtrack.DetectionList(
+                "radar", stamp_ns, stamp_ns + 20_000_000, objects, frame="ego"
+            )
+        )
         report = tracker.tick(stamp_ns + 20_000_000)
         near = [
             track.track_id
             for track in report.tracks
-            if track.status != "tentative" and math.hypot(track.x_m - x_m, track.y_m - y_m) < 3.0
+            if track.status != "tentative"
+            and math.hypot(track.x_m - x_m, track.y_m - y_m) < 3.0
         ]
         if 0.1 * k > rests_s - 2.0:
             (before if driven_m == 0.0 else after).update(near)
@@ -142,7 +170,9 @@ def test_a_car_that_drives_off_keeps_its_identity(estimator: str, sensor: str) -
 @pytest.mark.parametrize("rests_s", [5.0, 120.0, 600.0])
 @pytest.mark.parametrize("sensor", SENSORS)
 @pytest.mark.parametrize("estimator", ["ekf-replay", "smoother-banded", "imm-replay"])
-def test_a_car_that_stood_for_long_keeps_its_identity(estimator: str, sensor: str, rests_s: float) -> None:
+def test_a_car_that_stood_for_long_keeps_its_identity(
+    estimator: str, sensor: str, rests_s: float
+) -> None:
     for seed in range(20 if rests_s < 60.0 else 5):
         before, after = tracks_of_car(estimator, SENSORS[sensor], rests_s, seed)
         assert before == after
@@ -152,7 +182,13 @@ def test_a_car_that_stood_for_long_keeps_its_identity(estimator: str, sensor: st
 def test_the_motion_has_a_heading_where_a_sensor_measures_one() -> None:
     config = fgtrack.Config().replace({"sensors": {"radar": SENSORS["positions"]}})
     assert isinstance(config.motion_model(), fgtrack.CT)
-    both = config.replace({"sensors": {"radar": SENSORS["positions"], "lidar": SENSORS["yaw"]}})
+    both = config.replace(
+        {"sensors": {"radar": SENSORS["positions"], "lidar": SENSORS["yaw"]}}
+    )
     assert isinstance(both.motion_model(), fgtrack.CTRV)
-    assert isinstance(both.replace({"ignore_sensors": ["lidar"]}).motion_model(), fgtrack.CT)
-    assert isinstance(config.replace({"motion.kind": "ctrv"}).motion_model(), fgtrack.CTRV)
+    assert isinstance(
+        both.replace({"ignore_sensors": ["lidar"]}).motion_model(), fgtrack.CT
+    )
+    assert isinstance(
+        config.replace({"motion.kind": "ctrv"}).motion_model(), fgtrack.CTRV
+    )

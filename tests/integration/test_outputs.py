@@ -14,17 +14,19 @@ from support.paper import paper
 
 from fgtrack.cli import study
 from fgtrack.cli.main import COMMANDS, _command, run
+from fgtrack.config.shipped import shipped_folder
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
-from fgtrack.io.ros.bag_writer import write_bag
-from fgtrack.io.run import RunWriter, load_run
-from fgtrack.io.source import open_input
-from fgtrack.io.stream import write_stream
+from fgtrack.inputs.ros.bag_writer import write_bag
+from fgtrack.inputs.source import open_input
+from fgtrack.inputs.stream import write_stream
 from fgtrack.pipeline.replay import replay
-from fgtrack.pipeline.shipped import shipped_folder
+from fgtrack.runs import RunWriter, load_run
 
 MS = 1_000_000
-SWEEP = "format: fgtrack-sweep/1\nscenario: default\nestimators: [ekf-replay]\nseeds: 1\n"
+SWEEP = (
+    "format: fgtrack-sweep/1\nscenario: default\nestimators: [ekf-replay]\nseeds: 1\n"
+)
 
 SCENARIOS = shipped_folder() / "scenarios"
 
@@ -37,14 +39,20 @@ def noisy(count: int = 120) -> list[Message]:
     for k in range(count):
         now_ns, (x_m, y_m) = START_NS + k * 50 * MS, rng.normal((20.0, 1.0), 0.5)
         messages.append(EgoState(now_ns, now_ns, 0.0, 0.0, 0.0, 0.0))
-        messages.append(DetectionList("lidar", now_ns, now_ns, (Detection(x_m=x_m, y_m=y_m),)))
+        messages.append(
+            DetectionList("lidar", now_ns, now_ns, (Detection(x_m=x_m, y_m=y_m),))
+        )
     return messages
 
 
 def content(path: Path) -> dict[str, bytes | None]:
     """Every file below `path` with its bytes, and every folder."""
     below = [path, *sorted(path.rglob("*"))]
-    return {str(item): item.read_bytes() if item.is_file() else None for item in below if os.path.lexists(item)}
+    return {
+        str(item): item.read_bytes() if item.is_file() else None
+        for item in below
+        if os.path.lexists(item)
+    }
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +67,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_stream("other.jsonl", standing(10))
         write_bag("bag", standing(10))
         seen = [kitti.pose(frame, 20.0, 3.0, 0.0) for frame in range(30)]
-        kitti.folder(folder / "kitti", oxts=[kitti.oxts(speed_mps=10.0)] * 30, pointrcnn_car=seen)
+        kitti.folder(
+            folder / "kitti", oxts=[kitti.oxts(speed_mps=10.0)] * 30, pointrcnn_car=seen
+        )
         Path("sweep.yaml").write_text(SWEEP)
         for words in (
             ("replay", "other.jsonl", "-o", "run"),
@@ -68,7 +78,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
             *(
                 words
                 for words, _ in WRITERS
-                if words[0] in ("figure", "report", "export", "tune", "advise", "info", "ledger")
+                if words[0]
+                in ("figure", "report", "export", "tune", "advise", "info", "ledger")
             ),
         ):
             assert run(list(words)) == 0
@@ -83,17 +94,23 @@ def here(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(study, "simulate", lambda scenario, rng: standing(30))
 
     def redraw(named: object, folder: Path, form: str) -> list[Path]:
-        return [Path(shutil.copy(picture, folder)) for picture in sorted((made / "figures").iterdir())]
+        return [
+            Path(shutil.copy(picture, folder))
+            for picture in sorted((made / "figures").iterdir())
+        ]
 
     monkeypatch.setattr("fgtrack.cli.pictures.save_named", redraw)
     monkeypatch.setattr(
-        "fgtrack.cli.pictures.save_pages", lambda figures, file: file.write((made / "figures.pdf").read_bytes())
+        "fgtrack.cli.pictures.save_pages",
+        lambda figures, file: file.write((made / "figures.pdf").read_bytes()),
     )
     return folder
 
 
 @pytest.fixture
-def call(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Call]:
+def call(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Call]:
     """Runs a command; gives its exit code and the line on stderr."""
 
     def called(*words: str) -> tuple[int, str]:
@@ -114,7 +131,10 @@ WRITERS = [
     (("convert", "drive.jsonl", "bag"), "bag"),
     (("convert", "drive.jsonl", "bag", "--storage", "sqlite3"), "bag"),
     (("replay", "drive.jsonl", "-o", "run"), "run"),
-    (("replay", "drive.jsonl", "-o", "demo/runs", "-e", "ekf-replay,smoother"), "demo/runs/smoother"),
+    (
+        ("replay", "drive.jsonl", "-o", "demo/runs", "-e", "ekf-replay,smoother"),
+        "demo/runs/smoother",
+    ),
     (("demo", "-o", "demo"), "demo/recording"),
     (("study", "drive.jsonl", "-o", "demo"), "demo/settings.yaml"),
     (("figure", "run", "-o", "figures"), "figures/arrivals.png"),
@@ -123,7 +143,10 @@ WRITERS = [
     (("export", "run", "-o", "run.mcap"), "run.mcap"),
     (("export", "run", "-o", "ros2.mcap", "--ros2"), "ros2.mcap"),
     (("export", "run", "-o", "ros2", "--ros2"), "ros2"),
-    (("export", "kitti_run", "-o", "0001.txt", "--kitti", "kitti/oxts/0001.txt"), "0001.txt"),
+    (
+        ("export", "kitti_run", "-o", "0001.txt", "--kitti", "kitti/oxts/0001.txt"),
+        "0001.txt",
+    ),
     (("tune", "noisy.jsonl", "-o", "tuned.yaml"), "tuned.yaml"),
     (("advise", "drive.jsonl", "-o", "advised.yaml"), "advised.yaml"),
     (("info", "drive.jsonl", "--write", "my.yaml"), "my.yaml"),
@@ -143,10 +166,18 @@ def test_every_command_with_an_output_is_in_the_table() -> None:
     for name in COMMANDS:
         parameters = _command(name).params
         writes = {"out", "output", "overwrite"} & {each.name for each in parameters}
-        writes |= {"-o", "--out", "--output"} & {option for each in parameters for option in each.opts}
+        writes |= {"-o", "--out", "--output"} & {
+            option for each in parameters for option in each.opts
+        }
         assert bool(writes) == (name in tried), name
-        kinds = [each for each in parameters if (getattr(each, "help", None) or "").startswith("Write ")]
-        assert not [each for each in kinds if not set(each.opts) & tried.get(name, set())], name
+        kinds = [
+            each
+            for each in parameters
+            if (getattr(each, "help", None) or "").startswith("Write ")
+        ]
+        assert not [
+            each for each in kinds if not set(each.opts) & tried.get(name, set())
+        ], name
 
 
 @pytest.mark.parametrize(("words", "place"), WRITERS, ids=str)
@@ -169,13 +200,21 @@ def test_what_exists_is_refused_at_once_and_replaced_with_overwrite(
     assert call(*words, "--overwrite")[0] == 0
     after = content(here)
     assert after.get(str(own)) != before.get(str(own), b"")
-    assert {name: data for name, data in after.items() if not name.startswith(str(here / out))} == {
-        name: data for name, data in before.items() if not name.startswith(str(here / out))
+    assert {
+        name: data
+        for name, data in after.items()
+        if not name.startswith(str(here / out))
+    } == {
+        name: data
+        for name, data in before.items()
+        if not name.startswith(str(here / out))
     }
     assert not [name for name in after if "part" in name]
 
 
-def test_a_recording_with_something_else_in_its_folder_is_not_replaced(here: Path, call: Call) -> None:
+def test_a_recording_with_something_else_in_its_folder_is_not_replaced(
+    here: Path, call: Call
+) -> None:
     (here / "bag/notes.txt").write_text("why")
     before = content(here)
     assert call("convert", "drive.jsonl", "bag", "--overwrite")[0] == 2
@@ -186,15 +225,24 @@ def test_other_files_beside_a_run_stay(here: Path, call: Call) -> None:
     (here / "run/notes.txt").write_text("why")
     assert call("replay", "drive.jsonl", "-o", "run", "--overwrite")[0] == 0
     assert (here / "run/notes.txt").read_text() == "why"
-    assert load_run("run").meta["input"] == {"path": "drive.jsonl", "kind": "stream", "path_from_run": "../drive.jsonl"}
+    assert load_run("run").meta["input"] == {
+        "path": "drive.jsonl",
+        "kind": "stream",
+        "path_from_run": "../drive.jsonl",
+    }
 
 
 HEADER = '{"type": "header", "format": "fgtrack-stream/1"}\n'
 TRUTH = '{"type": "truth", "stamp_ns": 1, "receipt_ns": 1, "object_id": 1, "x_m": 0, "y_m": 0}\n'
 
 
-@pytest.mark.parametrize("text", ['{"type": "ego"}\n', "", HEADER + '{"ty', HEADER + TRUTH, HEADER + TRUTH + "{}\n"])
-def test_an_input_that_gives_nothing_leaves_the_old_run(here: Path, call: Call, text: str) -> None:
+@pytest.mark.parametrize(
+    "text",
+    ['{"type": "ego"}\n', "", HEADER + '{"ty', HEADER + TRUTH, HEADER + TRUTH + "{}\n"],
+)
+def test_an_input_that_gives_nothing_leaves_the_old_run(
+    here: Path, call: Call, text: str
+) -> None:
     Path("bad.jsonl").write_text(text)
     before = content(here / "run")
     code, error = call("replay", "bad.jsonl", "-o", "run", "--overwrite")
@@ -205,10 +253,14 @@ def test_an_input_that_gives_nothing_leaves_the_old_run(here: Path, call: Call, 
     assert not (here / "new").exists()
 
 
-def test_nothing_is_replayed_where_one_of_several_folders_is_in_use(here: Path, call: Call) -> None:
+def test_nothing_is_replayed_where_one_of_several_folders_is_in_use(
+    here: Path, call: Call
+) -> None:
     Path("runs/smoother").mkdir(parents=True)
     Path("runs/smoother/thesis").write_text("x")
-    assert call("replay", "drive.jsonl", "-o", "runs", "-e", "ekf-replay,smoother")[0] == 2
+    assert (
+        call("replay", "drive.jsonl", "-o", "runs", "-e", "ekf-replay,smoother")[0] == 2
+    )
     assert os.listdir("runs") == ["smoother"]
 
 
@@ -230,20 +282,38 @@ TANGLED = [
     (("convert", "drive.jsonl", "./drive.jsonl"), "drive.jsonl"),
     (("convert", "bag/bag.mcap", "bag"), "bag/bag.mcap"),
     (("simulate", "more/scenario.yaml", "-o", "more"), "more/scenario.yaml"),
-    (("replay", "drive.jsonl", "-c", "run/config.yaml", "-o", "run"), "run/config.yaml"),
+    (
+        ("replay", "drive.jsonl", "-c", "run/config.yaml", "-o", "run"),
+        "run/config.yaml",
+    ),
     (("replay", "bag", "-o", "bag/run"), "bag"),
     (("figure", "run", "-o", "run/figures"), "run"),
     (("report", "run", "-o", "run/report.html"), "run"),
-    (("study", "demo/recording", "-c", "demo/settings.yaml", "-o", "demo"), "demo/settings.yaml"),
+    (
+        ("study", "demo/recording", "-c", "demo/settings.yaml", "-o", "demo"),
+        "demo/settings.yaml",
+    ),
     (("export", "run", "-o", "run/run.mcap"), "run"),
-    (("export", "kitti_run", "-o", "kitti/oxts/0001.txt", "--kitti", "kitti/oxts/0001.txt"), "kitti/oxts/0001.txt"),
+    (
+        (
+            "export",
+            "kitti_run",
+            "-o",
+            "kitti/oxts/0001.txt",
+            "--kitti",
+            "kitti/oxts/0001.txt",
+        ),
+        "kitti/oxts/0001.txt",
+    ),
     (("tune", "noisy.jsonl", "-c", "tuned.yaml", "-o", "tuned.yaml"), "tuned.yaml"),
     (("sweep", "sweep.yaml", "--input", "bag", "-o", "bag"), "bag"),
 ]
 
 
 @pytest.mark.parametrize(("words", "which"), TANGLED, ids=str)
-def test_an_input_is_never_the_output(here: Path, call: Call, words: tuple[str, ...], which: str) -> None:
+def test_an_input_is_never_the_output(
+    here: Path, call: Call, words: tuple[str, ...], which: str
+) -> None:
     Path("more").mkdir()
     shutil.copy(SCENARIOS / "single_opponent.yaml", "more/scenario.yaml")
     before = content(here)
@@ -297,7 +367,9 @@ def test_figures_are_replaced_all_or_none(here: Path, call: Call) -> None:
     assert sorted(Path("figures").iterdir()) == figures
 
 
-def test_an_output_that_cannot_be_written_is_a_bad_call_everywhere(here: Path, call: Call) -> None:
+def test_an_output_that_cannot_be_written_is_a_bad_call_everywhere(
+    here: Path, call: Call
+) -> None:
     Path("file").write_text("")
     Path("sweep.yaml").write_text(SWEEP)
     for words, _ in [*WRITERS, *ONGOING[:1]]:
@@ -315,7 +387,9 @@ def test_a_run_that_cannot_be_written_to_is_compared_with_a_warning(
     assert run(["compare", "run", "--json"]) == 0
     tables = json.loads(capfd.readouterr().out)
     Path("run/metrics.json").unlink()
-    Path("run/metrics.json").mkdir()  # as in a folder that may only be read, for root too
+    Path(
+        "run/metrics.json"
+    ).mkdir()  # as in a folder that may only be read, for root too
     before = content(here)
     assert run(["compare", "run", "--json"]) == 0
     said = capfd.readouterr()
@@ -325,7 +399,9 @@ def test_a_run_that_cannot_be_written_to_is_compared_with_a_warning(
     assert content(here) == before
 
 
-@pytest.mark.parametrize(("write", "out"), [(write_stream, "other.jsonl"), (write_bag, "bag")])
+@pytest.mark.parametrize(
+    ("write", "out"), [(write_stream, "other.jsonl"), (write_bag, "bag")]
+)
 def test_what_fails_while_it_is_written_keeps_the_old_recording(
     here: Path, write: Callable[..., int], out: str
 ) -> None:
@@ -334,7 +410,11 @@ def test_what_fails_while_it_is_written_keeps_the_old_recording(
         raise error
 
     before = content(here)
-    for error, count in ((RuntimeError("broken"), 5), (DataError("broken"), 5), (DataError("broken"), 0)):
+    for error, count in (
+        (RuntimeError("broken"), 5),
+        (DataError("broken"), 5),
+        (DataError("broken"), 0),
+    ):
         with pytest.raises((DataError, RuntimeError), match="broken"):
             write(out, failing(error, count), overwrite=True)
         assert content(here) == before

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
+from fgtrack.config.shipped import read_config
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import DetectionList, EgoState, TruthState
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.io.config import Filter, InputConfig, TopicInput
-from fgtrack.io.ros.messages import ODOMETRY, MessageFactory
-from fgtrack.io.ros.typestore import typestore_of
-from fgtrack.io.source import open_input
+from fgtrack.inputs.ros.messages import ODOMETRY, MessageFactory
+from fgtrack.inputs.ros.typestore import typestore_of
+from fgtrack.inputs.settings import Filter, InputConfig, TopicInput
+from fgtrack.inputs.source import open_input
 from fgtrack.pipeline.public import replay
-from fgtrack.pipeline.shipped import read_config
 
 ESR = "delphi_esr_msgs/msg/EsrTrack"
 START_NS = 1_640_000_000_000_000_000
@@ -38,7 +38,9 @@ def recording(tmp_path_factory) -> Path:
     rng = np.random.default_rng(4)
 
     def header(stamp_ns: int, frame_id: str):
-        time = store.types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        time = store.types["builtin_interfaces/msg/Time"](
+            sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9
+        )
         return store.types["std_msgs/msg/Header"](stamp=time, frame_id=frame_id)
 
     def odometry(car: int, stamp_ns: int, t_s: float):
@@ -65,20 +67,31 @@ def recording(tmp_path_factory) -> Path:
             width=1.5,
             range_accel=0.0,
             med_range_mode=0,
-            range_rate=(speed_mps - SPEED_MPS) * ahead_m / range_m + rng.normal(0.0, 0.1),
+            range_rate=(speed_mps - SPEED_MPS) * ahead_m / range_m
+            + rng.normal(0.0, 0.1),
         )
 
     sent = []
     for tick in range(400):  # 100 Hz
         stamp_ns, t_s = START_NS + tick * 10_000_000, 0.01 * tick
         for car in (1, *OPPONENTS):
-            sent.append((stamp_ns + car, f"/vehicle_{car}/local_odometry", odometry(car, stamp_ns, t_s)))
+            sent.append(
+                (
+                    stamp_ns + car,
+                    f"/vehicle_{car}/local_odometry",
+                    odometry(car, stamp_ns, t_s),
+                )
+            )
         if tick % 5 == 0:
             for slot, car in enumerate((2, 0, 3, 0)):
                 late_ns = DELAY_NS + slot * 1_000_000
                 message = track(slot, car, stamp_ns + slot * 100_000, t_s)
-                sent.append((stamp_ns + late_ns, "/vehicle_1/radar_front/esr_track", message))
-    with Writer(path, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.SQLITE3) as bag:
+                sent.append(
+                    (stamp_ns + late_ns, "/vehicle_1/radar_front/esr_track", message)
+                )
+    with Writer(
+        path, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.SQLITE3
+    ) as bag:
         connections = {}
         for log_ns, topic, message in sorted(sent, key=lambda item: item[0]):
             kind = message.__msgtype__
@@ -89,7 +102,11 @@ def recording(tmp_path_factory) -> Path:
 
 
 def lists(recording: Path, config: InputConfig) -> list[DetectionList]:
-    return [item for item in open_input(recording, config).messages() if isinstance(item, DetectionList)]
+    return [
+        item
+        for item in open_input(recording, config).messages()
+        if isinstance(item, DetectionList)
+    ]
 
 
 def test_the_shipped_configuration_tracks_both_opponents(recording):
@@ -99,7 +116,9 @@ def test_the_shipped_configuration_tracks_both_opponents(recording):
     assert found.clear["mota"] > 0.8
     assert found.clear["id_switches"] == 0
     assert set(np.unique(run.truth["object_id"]).tolist()) == {2, 3}
-    assert np.median(run.updates["receipt_ns"] - run.updates["stamp_ns"]) == pytest.approx(DELAY_NS, abs=3e6)
+    assert np.median(
+        run.updates["receipt_ns"] - run.updates["stamp_ns"]
+    ) == pytest.approx(DELAY_NS, abs=3e6)
 
 
 def test_the_tracks_of_a_cycle_are_one_scan(recording):
@@ -114,10 +133,13 @@ def test_the_tracks_of_a_cycle_are_one_scan(recording):
 
 def test_topics_of_truth_are_an_object_each(recording):
     topics = tuple(
-        TopicInput(f"/vehicle_{car}/local_odometry", object_id=name) for car, name in ((2, None), (3, "poli"))
+        TopicInput(f"/vehicle_{car}/local_odometry", object_id=name)
+        for car, name in ((2, None), (3, "poli"))
     )
     truth = [
-        item for item in open_input(recording, InputConfig(truth=topics)).messages() if isinstance(item, TruthState)
+        item
+        for item in open_input(recording, InputConfig(truth=topics)).messages()
+        if isinstance(item, TruthState)
     ]
     ids = [item.object_id for item in truth]
     assert ids[:2] == [0, ids[1]]
@@ -128,12 +150,26 @@ def test_topics_of_truth_are_an_object_each(recording):
 @pytest.mark.parametrize(
     ("item", "error", "complaint"),
     [
-        ({"filters": {"rcs": Filter(min=0.0)}}, CallError, "without fields, filters go by .*score.*, not by 'rcs'"),
-        ({"fields": {"range_m": "rangee"}}, DataError, "there is no 'rangee', but header, canmsg, id"),
-        ({"fields": {"range_m": "range"}, "filters": {"snr": Filter(min=0.0)}}, DataError, "there is no 'snr'"),
+        (
+            {"filters": {"rcs": Filter(min=0.0)}},
+            CallError,
+            "without fields, filters go by .*score.*, not by 'rcs'",
+        ),
+        (
+            {"fields": {"range_m": "rangee"}},
+            DataError,
+            "there is no 'rangee', but header, canmsg, id",
+        ),
+        (
+            {"fields": {"range_m": "range"}, "filters": {"snr": Filter(min=0.0)}},
+            DataError,
+            "there is no 'snr'",
+        ),
     ],
 )
-def test_what_does_not_fit_is_one_line_with_what_there_is(recording, item, error, complaint):
+def test_what_does_not_fit_is_one_line_with_what_there_is(
+    recording, item, error, complaint
+):
     topic = TopicInput("/vehicle_1/radar_front/esr_track", **item)
     with pytest.raises(error, match=complaint) as caught:
         lists(recording, InputConfig(detections={"radar": topic}))

@@ -18,16 +18,29 @@ def test_the_judge_fits_all_reports_but_the_last_one_that_had_been_received():
     times_s = np.arange(20.0)
     x_m = 3.0 + 2.0 * times_s + 0.5 * times_s**2
     lists = [
-        DetectionList("adsb", round(t * S), round((t + 0.5) * S), (Detection(x, -x, id="A"),), "map")
+        DetectionList(
+            "adsb",
+            round(t * S),
+            round((t + 0.5) * S),
+            (Detection(x, -x, id="A"),),
+            "map",
+        )
         for t, x in zip(times_s.tolist(), x_m.tolist(), strict=True)
     ]
-    copy = replace(lists[10], stamp_ns=lists[10].stamp_ns + S, receipt_ns=lists[10].receipt_ns + S)
+    copy = replace(
+        lists[10], stamp_ns=lists[10].stamp_ns + S, receipt_ns=lists[10].receipt_ns + S
+    )
     far = replace(lists[9], objects=(Detection(1e4, 1e4, id="A"),))
-    standing = [replace(each, objects=(Detection(7.0, 0.02 * k, id="B"),)) for k, each in enumerate(lists)]
+    standing = [
+        replace(each, objects=(Detection(7.0, 0.02 * k, id="B"),))
+        for k, each in enumerate(lists)
+    ]
     judge = experiment.Judge([*lists[:9], far, *lists[10:], copy, *standing], 5.0)
     assert len(judge.reports["A"]) == 20
     exact = pytest.approx([76.03125, -76.03125], abs=1e-6)
-    assert judge.position_m("A", 10.25, 9.7) == exact  # without what was received at 9.5
+    assert (
+        judge.position_m("A", 10.25, 9.7) == exact
+    )  # without what was received at 9.5
     assert judge.position_m("A", 10.25, 8.7) != exact
     assert judge.position_m("A", 0.0, 30.0) is None
     assert judge.position_m("B", 10.25, 9.7) is None

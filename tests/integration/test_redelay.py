@@ -7,8 +7,8 @@ import pytest
 
 from fgtrack.cli.main import run
 from fgtrack.core.types import DetectionList, Message
-from fgtrack.io.run import load_run
-from fgtrack.io.source import open_input
+from fgtrack.inputs.source import open_input
+from fgtrack.runs import load_run
 
 Command = Callable[..., tuple[int, str, str]]
 
@@ -41,10 +41,17 @@ radar: {loss_probability: 0.5, clock: [{kind: arrival}, {kind: offset, offset_s:
 
 
 @pytest.fixture
-def fgtrack(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
+def fgtrack(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Command:
     """Runs a command in a folder with a recording and files of delays; exit code, stdout, stderr."""
     monkeypatch.chdir(tmp_path)
-    for name, text in {"scenario": SCENARIO, "bursts": BURSTS, "back": BACK, "loss": LOSS}.items():
+    for name, text in {
+        "scenario": SCENARIO,
+        "bursts": BURSTS,
+        "back": BACK,
+        "loss": LOSS,
+    }.items():
         Path(f"{name}.yaml").write_text(text)
 
     def call(*arguments: object) -> tuple[int, str, str]:
@@ -61,12 +68,37 @@ def read(path: str) -> list[Message]:
 
 
 def digest(fgtrack: Command, recording: str) -> object:
-    assert fgtrack("replay", recording, "-o", f"runs/{recording}", "--map", "oval", "-e", "ekf-replay")[0] == 0
+    assert (
+        fgtrack(
+            "replay",
+            recording,
+            "-o",
+            f"runs/{recording}",
+            "--map",
+            "oval",
+            "-e",
+            "ekf-replay",
+        )[0]
+        == 0
+    )
     return load_run(Path(f"runs/{recording}")).meta["digest"]
 
 
-def test_constant_delays_restore_a_stream_that_went_through_bursts_and_a_bag(fgtrack: Command) -> None:
-    assert fgtrack("convert", "original.jsonl", "bursts", "--delays", "bursts.yaml", "--seed", 7)[0] == 0
+def test_constant_delays_restore_a_stream_that_went_through_bursts_and_a_bag(
+    fgtrack: Command,
+) -> None:
+    assert (
+        fgtrack(
+            "convert",
+            "original.jsonl",
+            "bursts",
+            "--delays",
+            "bursts.yaml",
+            "--seed",
+            7,
+        )[0]
+        == 0
+    )
     assert read("bursts") != read("original.jsonl")
     assert len(read("bursts")) == len(read("original.jsonl"))
     assert fgtrack("convert", "bursts", "back.jsonl", "--delays", "back.yaml")[0] == 0
@@ -74,22 +106,50 @@ def test_constant_delays_restore_a_stream_that_went_through_bursts_and_a_bag(fgt
     assert digest(fgtrack, "back.jsonl") == digest(fgtrack, "original.jsonl")
 
 
-def test_the_seed_decides_the_digest_of_the_run_whatever_the_storage(fgtrack: Command) -> None:
+def test_the_seed_decides_the_digest_of_the_run_whatever_the_storage(
+    fgtrack: Command,
+) -> None:
     for out, seed in {"a.jsonl": 7, "b.jsonl.gz": 7, "c": 7, "d.jsonl": 8}.items():
-        assert fgtrack("convert", "original.jsonl", out, "--delays", "bursts.yaml", "--seed", seed)[0] == 0
-    assert fgtrack("convert", "original.jsonl", "e.jsonl", "--delays", "bursts.yaml")[0] == 0
-    digests = [digest(fgtrack, name) for name in ("a.jsonl", "b.jsonl.gz", "c", "d.jsonl", "e.jsonl")]
+        assert (
+            fgtrack(
+                "convert",
+                "original.jsonl",
+                out,
+                "--delays",
+                "bursts.yaml",
+                "--seed",
+                seed,
+            )[0]
+            == 0
+        )
+    assert (
+        fgtrack("convert", "original.jsonl", "e.jsonl", "--delays", "bursts.yaml")[0]
+        == 0
+    )
+    digests = [
+        digest(fgtrack, name)
+        for name in ("a.jsonl", "b.jsonl.gz", "c", "d.jsonl", "e.jsonl")
+    ]
     assert digests[0] == digests[1] == digests[2]
     assert len(set(digests)) == 3
 
 
 def test_what_is_lost_is_said(fgtrack: Command) -> None:
-    code, out, err = fgtrack("convert", "original.jsonl", "loss.jsonl", "--delays", "loss.yaml")
+    code, out, err = fgtrack(
+        "convert", "original.jsonl", "loss.jsonl", "--delays", "loss.yaml"
+    )
     lost = len(read("original.jsonl")) - len(read("loss.jsonl"))
-    assert (code, out, err) == (0, f"loss.jsonl: {len(read('loss.jsonl'))} messages, lost {lost} of radar\n", "")
+    assert (code, out, err) == (
+        0,
+        f"loss.jsonl: {len(read('loss.jsonl'))} messages, lost {lost} of radar\n",
+        "",
+    )
     assert 15 < lost < 45
     lists = [m for m in read("loss.jsonl") if isinstance(m, DetectionList)]
-    assert {(m.sensor, m.receipt_ns - m.stamp_ns) for m in lists} == {("lidar_cluster", 0), ("radar", 50_000_000)}
+    assert {(m.sensor, m.receipt_ns - m.stamp_ns) for m in lists} == {
+        ("lidar_cluster", 0),
+        ("radar", 50_000_000),
+    }
 
 
 @pytest.mark.parametrize(
@@ -99,12 +159,19 @@ def test_what_is_lost_is_said(fgtrack: Command) -> None:
             "radar: {dely: {kind: none}}",
             "bad.yaml: radar.dely: unknown key, did you mean 'delay', known here: delay, clock",
         ),
-        ("sonar: {delay: {kind: none}}", "sensor 'sonar' is not in the input, whose sensors are: lidar"),
+        (
+            "sonar: {delay: {kind: none}}",
+            "sensor 'sonar' is not in the input, whose sensors are: lidar",
+        ),
     ],
 )
-def test_a_bad_file_of_delays_is_one_line_that_names_the_key(fgtrack: Command, text: str, message: str) -> None:
+def test_a_bad_file_of_delays_is_one_line_that_names_the_key(
+    fgtrack: Command, text: str, message: str
+) -> None:
     Path("bad.yaml").write_text(text)
-    code, _, err = fgtrack("convert", "original.jsonl", "out.jsonl", "--delays", "bad.yaml")
+    code, _, err = fgtrack(
+        "convert", "original.jsonl", "out.jsonl", "--delays", "bad.yaml"
+    )
     assert code == 2
     assert message in err
     assert len(err.splitlines()) == 1

@@ -12,10 +12,15 @@ import pytest
 import fgtrack
 from fgtrack.cli.main import run as command
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))),
+    None,
+)
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed (apt-get install chromium)"),
+    pytest.mark.skipif(
+        CHROMIUM is None, reason="no Chromium is installed (apt-get install chromium)"
+    ),
 ]
 
 NAMES = ("ekf-replay", "smoother")
@@ -45,21 +50,46 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     fgtrack.simulate("default", seed=3, duration_s=4.0, out=folder / "drive.jsonl")
     for name in NAMES:
         fgtrack.replay(
-            folder / "drive.jsonl", "tuned", map="oval", pit_map="oval", estimator=name, out=folder / "runs" / name
+            folder / "drive.jsonl",
+            "tuned",
+            map="oval",
+            pit_map="oval",
+            estimator=name,
+            out=folder / "runs" / name,
         )
-    assert command(["report", str(folder / "runs"), "-o", str(folder / "report.html")]) == 0
+    assert (
+        command(["report", str(folder / "runs"), "-o", str(folder / "report.html")])
+        == 0
+    )
     return folder
 
 
-def probed(folder: Path, code: str, link: str = "", width: int = 1280, *switches: str) -> object:
+def probed(
+    folder: Path, code: str, link: str = "", width: int = 1280, *switches: str
+) -> object:
     """Value that `code` returns in the loaded page, which must complain of nothing and load nothing."""
     page = (folder / "report.html").read_text(encoding="utf-8")
-    page = page.replace("<head>", f"<head>{LISTENER}", 1).replace("</body>", PROBE.replace("CODE", code) + "</body>", 1)
+    page = page.replace("<head>", f"<head>{LISTENER}", 1).replace(
+        "</body>", PROBE.replace("CODE", code) + "</body>", 1
+    )
     (folder / "probe.html").write_text(page, encoding="utf-8")
-    words = [str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu", f"--window-size={width},900", *switches]
-    words += [f"--user-data-dir={folder}/profile", "--virtual-time-budget=20000", "--dump-dom"]
+    words = [
+        str(CHROMIUM),
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        f"--window-size={width},900",
+        *switches,
+    ]
+    words += [
+        f"--user-data-dir={folder}/profile",
+        "--virtual-time-budget=20000",
+        "--dump-dom",
+    ]
     words.append((folder / "probe.html").as_uri() + link)
-    done = subprocess.run(words, capture_output=True, text=True, timeout=300, check=True)
+    done = subprocess.run(
+        words, capture_output=True, text=True, timeout=300, check=True
+    )
     shown = re.search(r'<pre id="probe">(.*?)</pre>', done.stdout, re.DOTALL)
     assert shown is not None, done.stderr
     answer = json.loads(unescape(shown[1]))
@@ -69,7 +99,10 @@ def probed(folder: Path, code: str, link: str = "", width: int = 1280, *switches
 
 @pytest.mark.parametrize(
     ("width", "switches", "background"),
-    [(1280, (), "rgb(255, 255, 255)"), (500, ("--blink-settings=preferredColorScheme=0",), "rgb(20, 23, 27)")],
+    [
+        (1280, (), "rgb(255, 255, 255)"),
+        (500, ("--blink-settings=preferredColorScheme=0",), "rgb(20, 23, 27)"),
+    ],
     ids=["wide and light", "narrow and dark"],
 )
 def test_every_screen_shows_it_without_scrolling_sideways(
@@ -109,7 +142,10 @@ def test_a_link_opens_the_same_picture(folder: Path) -> None:
     return [viewer.view, viewer.link()];"""
     view, link = probed(folder, code)  # type: ignore[misc]
     assert "t=1.2345&" in link
-    opened = [probed(folder, "return [viewer.view, viewer.link(), drawn()];", link) for _ in range(2)]
+    opened = [
+        probed(folder, "return [viewer.view, viewer.link(), drawn()];", link)
+        for _ in range(2)
+    ]
     assert opened[0] == opened[1]
     assert opened[0][:2] == [pytest.approx(view, abs=0.006), link]  # type: ignore[index]
     code = "location.hash = '#t=3'; await new Promise((ready) => setTimeout(ready, 500)); return viewer.time;"

@@ -20,9 +20,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_half_a_minute_of_race_is_accounted_for_and_the_same_twice(folder: Path) -> None:
+def test_half_a_minute_of_race_is_accounted_for_and_the_same_twice(
+    folder: Path,
+) -> None:
     first, second = (
-        [bench_soak.Part(**part) for part in json.loads((folder / f"ekf-replay-{number}.json").read_text())]
+        [
+            bench_soak.Part(**part)
+            for part in json.loads((folder / f"ekf-replay-{number}.json").read_text())
+        ]
         for number in (1, 2)
     )
     assert len(first) == len(second) == 3
@@ -30,7 +35,13 @@ def test_half_a_minute_of_race_is_accounted_for_and_the_same_twice(folder: Path)
     assert [part.digest for part in first] == [part.digest for part in second]
     assert len({part.digest for part in first}) == 3
     assert first[-1].counts["birth"] > 5
-    for disposition in ("in_sequence", "out_of_sequence", "too_old", "duplicate", "merged"):
+    for disposition in (
+        "in_sequence",
+        "out_of_sequence",
+        "too_old",
+        "duplicate",
+        "merged",
+    ):
         assert first[-1].counts[disposition] > 0
     assert first[-1].failures == {}
 

@@ -5,19 +5,28 @@ from pathlib import Path
 import pytest
 
 import fgtrack
-from fgtrack.calibration.study import ESTIMATORS, Study
 from fgtrack.cli.main import run as command
+from fgtrack.recording_study import ESTIMATORS, Study
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return Path(fgtrack.simulate("default", seed=3, duration_s=3.0, out=tmp_path_factory.mktemp("in") / "drive.jsonl"))
+    return Path(
+        fgtrack.simulate(
+            "default",
+            seed=3,
+            duration_s=3.0,
+            out=tmp_path_factory.mktemp("in") / "drive.jsonl",
+        )
+    )
 
 
 @pytest.fixture(scope="module")
 def found(recording: Path) -> Study:
     steps: list[tuple[str, float]] = []
-    found = fgtrack.study(recording, recording.parent / "out", on_step=lambda *step: steps.append(step))
+    found = fgtrack.study(
+        recording, recording.parent / "out", on_step=lambda *step: steps.append(step)
+    )
     shares = [share for _, share in steps]
     assert shares == sorted(shares)
     assert shares[0] == 0.0
@@ -29,8 +38,15 @@ def found(recording: Path) -> Study:
 def test_a_recording_becomes_a_page_without_a_configuration(found: Study) -> None:
     assert [run.meta["estimator"] for run in found.runs] == list(ESTIMATORS)
     page = found.report.read_text(encoding="utf-8")
-    assert page.index("lidar_cluster (") < page.index('id="viewer"') < page.index('id="part-tables"')
-    assert {path.name for path in (found.path / "figures").iterdir()} >= {"errors_object_0.png", "map_smoother.png"}
+    assert (
+        page.index("lidar_cluster (")
+        < page.index('id="viewer"')
+        < page.index('id="part-tables"')
+    )
+    assert {path.name for path in (found.path / "figures").iterdir()} >= {
+        "errors_object_0.png",
+        "map_smoother.png",
+    }
     assert (found.path / "runs/smoother/metrics.json").exists()
 
 
@@ -47,7 +63,9 @@ def test_the_summary_is_short_and_says_what_to_do(found: Study) -> None:
     assert found.summary[-1].startswith(("Take ", "First: "))
 
 
-def test_the_settings_name_what_was_assumed_and_give_the_same_runs(found: Study, recording: Path) -> None:
+def test_the_settings_name_what_was_assumed_and_give_the_same_runs(
+    found: Study, recording: Path
+) -> None:
     text = found.settings.read_text(encoding="utf-8")
     assert found.assumptions
     assert "# assumed: " in text
@@ -57,14 +75,20 @@ def test_the_settings_name_what_was_assumed_and_give_the_same_runs(found: Study,
     assert again.meta["digest"] == found.runs[1].meta["digest"]
 
 
-def test_a_study_is_replaced_only_when_told(found: Study, recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_study_is_replaced_only_when_told(
+    found: Study, recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert command(["study", str(recording), "-o", str(found.path)]) == 2
     assert "--overwrite" in capsys.readouterr().err
 
 
 @pytest.mark.slow
 def test_without_truth_it_says_so(recording: Path, tmp_path: Path) -> None:
-    lines = [line for line in recording.read_text().splitlines(keepends=True) if '"truth"' not in line[:60]]
+    lines = [
+        line
+        for line in recording.read_text().splitlines(keepends=True)
+        if '"truth"' not in line[:60]
+    ]
     (tmp_path / "drive.jsonl").write_text("".join(lines))
     found = fgtrack.study(tmp_path / "drive.jsonl", tmp_path / "out", advice=False)
     assert "half of them for" in found.summary[1]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from fgtrack.io.run import load_run
+from fgtrack.runs import load_run
 
 pytestmark = pytest.mark.slow
 
@@ -25,7 +25,11 @@ raise SystemExit(main.main())
 #: A program in a pseudo-terminal of 80 columns whose output goes to a pipe.
 IN_TERMINAL = (
     *(sys.executable, "-c", "import pty, sys; sys.exit(pty.spawn(sys.argv[1:]) >> 8)"),
-    *("sh", "-c", 'unset COLUMNS LINES NO_COLOR; stty cols 80 rows 50 && exec "$0" "$@"'),
+    *(
+        "sh",
+        "-c",
+        'unset COLUMNS LINES NO_COLOR; stty cols 80 rows 50 && exec "$0" "$@"',
+    ),
 )
 
 
@@ -51,13 +55,20 @@ def test_the_demo_goes_from_scenario_to_report(demo: Path) -> None:
     assert {path.name for path in (demo / "runs").iterdir()} == set(ESTIMATORS)
     found = {name: load_run(demo / "runs" / name) for name in ESTIMATORS}
     assert [one.meta["estimator"] for one in found.values()] == list(ESTIMATORS)
-    assert {one.config["sensors"]["radar"]["std"]["speed_mps"] for one in found.values()} == {1.006}  # fitted
+    assert {
+        one.config["sensors"]["radar"]["std"]["speed_mps"] for one in found.values()
+    } == {1.006}  # fitted
     shown = (demo / "shown.txt").read_text(encoding="utf-8")
     summary, tables = shown.split("\nTracking\n")
     assert "at the newest stamp" in " ".join(summary.split())
     for text in tables.split("Error against lag"):
-        assert sorted(ESTIMATORS, key=lambda name: text.index(f" {name} ")) == list(ESTIMATORS)
+        assert sorted(ESTIMATORS, key=lambda name: text.index(f" {name} ")) == list(
+            ESTIMATORS
+        )
     assert set(found["smoother"].tables["lagged"]["lag_s"].tolist()) == {0.3}
     assert "final" in found["smoother"].tables["smoothed"]["kind"]
-    assert {path.name for path in (demo / "figures").iterdir()} >= {"error_against_lag.png", "arrivals.png"}
+    assert {path.name for path in (demo / "figures").iterdir()} >= {
+        "error_against_lag.png",
+        "arrivals.png",
+    }
     assert "report.html" in shown

@@ -7,25 +7,32 @@ from pathlib import Path
 from support.messages import drive
 from typer.testing import CliRunner
 
-from fgtrack.calibration.trial import samples, suspicions
+from fgtrack.advice.trial import samples, suspicions
 from fgtrack.cli.main import app
+from fgtrack.config.settings import Config
+from fgtrack.config.yaml_file import dump, validate
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
-from fgtrack.io.stream import write_stream
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import dump, validate
+from fgtrack.inputs.stream import write_stream
 
 CONFIG = validate(
     Config,
     {
-        "sensors": {"lidar": {"std": {"x_m": 0.3, "y_m": 0.3}}, "radar": {"std": {"x_m": 1.0, "y_m": 1.0}}},
+        "sensors": {
+            "lidar": {"std": {"x_m": 0.3, "y_m": 0.3}},
+            "radar": {"std": {"x_m": 1.0, "y_m": 1.0}},
+        },
         "ego": {"detection_origin_x_m": 0.0},
     },
     "test",
 )
 
 
-def changed(change: Callable[[DetectionList], DetectionList], messages: Iterable[Message]) -> list[Message]:
-    return [change(item) if isinstance(item, DetectionList) else item for item in messages]
+def changed(
+    change: Callable[[DetectionList], DetectionList], messages: Iterable[Message]
+) -> list[Message]:
+    return [
+        change(item) if isinstance(item, DetectionList) else item for item in messages
+    ]
 
 
 def with_objects(item: DetectionList, **fields: object) -> DetectionList:
@@ -41,7 +48,12 @@ def test_nothing_is_said_of_a_healthy_drive():
     shown = samples(drive())
     assert shown["radar (in the frame ego)"] == "x_m 31, y_m 1.5, speed_mps -4"
     assert shown["ego"].startswith("x_m 0, y_m 0, yaw_rad 0.25, speed_mps 50")
-    assert set(shown) == {"ego", "truth", "lidar (in the frame ego)", "radar (in the frame ego)"}
+    assert set(shown) == {
+        "ego",
+        "truth",
+        "lidar (in the frame ego)",
+        "radar (in the frame ego)",
+    }
 
 
 def test_stamps_of_zero_are_found():
@@ -49,14 +61,20 @@ def test_stamps_of_zero_are_found():
     (lidar, radar) = found(zero)
     assert lidar.startswith("lidar: all stamps are 0: set `stamp_from: receipt`")
     assert radar.startswith("radar: all stamps are 0")
-    egos = [replace(item, stamp_ns=0) if isinstance(item, EgoState) else item for item in drive()]
+    egos = [
+        replace(item, stamp_ns=0) if isinstance(item, EgoState) else item
+        for item in drive()
+    ]
     assert any(line.startswith("ego: all stamps are 0") for line in found(egos))
 
 
 def test_a_missing_ego_is_found():
     without = [item for item in drive() if not isinstance(item, EgoState)]
     (line,) = found(without)
-    assert line == "ego: no state is read, but lidar is relative to it: name its topic (input.ego)"
+    assert (
+        line
+        == "ego: no state is read, but lidar is relative to it: name its topic (input.ego)"
+    )
     in_map = changed(lambda item: replace(item, frame="map"), without)
     assert found(in_map) == []
 
@@ -65,15 +83,25 @@ def test_degrees_for_radians_are_found():
     turned = changed(lambda item: with_objects(item, yaw_rad=45.0), drive())
     lines = found(turned)
     assert [line.partition(":")[0] for line in lines] == ["lidar", "radar"]
-    assert "yaw_rad goes up to 45: degrees? Convert it by `{path: ..., degrees: true}`" in lines[0]
-    egos = [replace(item, yaw_rad=180.0) if isinstance(item, EgoState) else item for item in drive()]
-    assert found(egos) == ["ego: yaw_rad goes up to 180: degrees? Convert it by `{path: ..., degrees: true}`"]
+    assert (
+        "yaw_rad goes up to 45: degrees? Convert it by `{path: ..., degrees: true}`"
+        in lines[0]
+    )
+    egos = [
+        replace(item, yaw_rad=180.0) if isinstance(item, EgoState) else item
+        for item in drive()
+    ]
+    assert found(egos) == [
+        "ego: yaw_rad goes up to 180: degrees? Convert it by `{path: ..., degrees: true}`"
+    ]
 
 
 def far(messages: Iterable[Message]) -> Iterator[Message]:
     """The same drive a kilometre from the origin of the map."""
     for item in messages:
-        yield replace(item, x_m=item.x_m + 1000.0) if isinstance(item, EgoState) else item
+        yield (
+            replace(item, x_m=item.x_m + 1000.0) if isinstance(item, EgoState) else item
+        )
 
 
 def test_a_wrong_frame_is_found():
@@ -81,7 +109,10 @@ def test_a_wrong_frame_is_found():
     lines = found(as_map)
     assert lines[0].startswith("lidar: is read as in the map, 98")
     assert lines[0].endswith("set `frame: ego` (or sensor)")
-    moved = changed(lambda item: replace(item, objects=[Detection(x_m=1030.0, y_m=1.0)]), far(drive()))
+    moved = changed(
+        lambda item: replace(item, objects=[Detection(x_m=1030.0, y_m=1.0)]),
+        far(drive()),
+    )
     lines = found(moved)
     assert lines[0].startswith("lidar: is read as relative to the ego, 1030 m away")
     assert lines[0].endswith("set `frame: map`")
@@ -100,7 +131,9 @@ def test_components_that_are_never_measured_are_found():
         "x",
     )
     (line,) = found(drive(), config)
-    assert line.startswith("radar: never measures range_m, bearing_rad of its std, but x_m, y_m, speed_mps")
+    assert line.startswith(
+        "radar: never measures range_m, bearing_rad of its std, but x_m, y_m, speed_mps"
+    )
 
 
 def info(recording: Path, config: Path) -> tuple[int, str]:

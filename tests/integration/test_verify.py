@@ -19,7 +19,9 @@ class Careless(ReplayEkf):
 
     def update(self, measurement: Measurement) -> UpdateResult:
         if self.window_ns[0] <= measurement.stamp_ns < self.window_ns[1]:
-            return UpdateResult(UpdateStatus.OUT_OF_SEQUENCE, np.zeros(len(measurement.z)), 0.0)
+            return UpdateResult(
+                UpdateStatus.OUT_OF_SEQUENCE, np.zeros(len(measurement.z)), 0.0
+            )
         return super().update(measurement)
 
 
@@ -45,7 +47,10 @@ def test_a_broken_promise_is_shown_with_its_measurements_and_fails_the_command(
     monkeypatch.setattr(ESTIMATORS, "load", lambda name: Careless)
     assert run(["verify", "-e", "ekf-replay"]) == 1
     out, err = capsys.readouterr()
-    assert "ekf-replay: broken promise: it gives the dense joint posterior in any order" in out
+    assert (
+        "ekf-replay: broken promise: it gives the dense joint posterior in any order"
+        in out
+    )
     assert "measurements in the order of arrival" in out
     assert re.fullmatch(r"fgtrack: error: [1-9]\d* of \d+ promises broken\n", err)
     assert run(["verify", "-e", "ekf-replay", "--json"]) == 1

@@ -7,10 +7,10 @@ import pytest
 from support.examples import slow
 
 import fgtrack
-from fgtrack.calibration.outcome import Outcome
+from fgtrack.advice.outcome import Outcome
+from fgtrack.config.shipped import read_scenario
 from fgtrack.core.types import DetectionList, Message, TruthState
-from fgtrack.io.run import Run
-from fgtrack.pipeline.shipped import read_scenario
+from fgtrack.runs import Run
 from fgtrack.sim.simulate import simulate
 from fgtrack.sim.vehicles import TrackVehicle
 
@@ -21,7 +21,10 @@ LEFT_M = (2.5, -2.5, -2.5, 2.5, 2.5, -2.5, 3.5, -2.5)
 
 
 def scene(
-    num_opponents: int, speed_mps: float, ego_mps: float | None = None, ahead_m: tuple[float, ...] = AHEAD_M
+    num_opponents: int,
+    speed_mps: float,
+    ego_mps: float | None = None,
+    ahead_m: tuple[float, ...] = AHEAD_M,
 ) -> list[Message]:
     """Messages of opponents around an ego on the oval, which speed up by a tenth."""
     scenario = read_scenario("default")
@@ -51,7 +54,10 @@ def check_tracked(run: Run) -> None:
     assert found.breaks_per_minute <= 2.0
 
 
-@pytest.mark.parametrize(("num_opponents", "speed_mps"), [(2, 30.0), *slow((1, 10.0), (1, 65.0), (8, 10.0), (8, 65.0))])
+@pytest.mark.parametrize(
+    ("num_opponents", "speed_mps"),
+    [(2, 30.0), *slow((1, 10.0), (1, 65.0), (8, 10.0), (8, 65.0))],
+)
 def test_cars_around_a_driving_ego(num_opponents: int, speed_mps: float) -> None:
     check_tracked(fgtrack.replay(scene(num_opponents, speed_mps)))
 
@@ -66,7 +72,11 @@ def test_a_forward_sensor_misses_no_car_behind() -> None:
     messages = scene(2, 30.0, ahead_m=(30.0, -25.0))
     run = fgtrack.replay(messages)
     lidar = run.config["sensors"]["lidar_cluster"]
-    assert run.config["sensors"]["radar"]["field_of_view_rad"] < 3.0 < lidar["field_of_view_rad"]
+    assert (
+        run.config["sensors"]["radar"]["field_of_view_rad"]
+        < 3.0
+        < lidar["field_of_view_rad"]
+    )
     check_tracked(run)
 
 

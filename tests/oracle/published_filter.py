@@ -39,7 +39,9 @@ def predict(state: Array, P: Array) -> tuple[Array, Array]:
     F[0, 2], F[0, 3] = -v * DT * c, -DT * s
     F[1, 2], F[1, 3] = -v * DT * s, DT * c
     F[2, 4] = DT
-    predicted = np.array([x - v * DT * s, y + v * DT * c, min(yaw + r * DT, math.pi), v + a * DT, r, a])
+    predicted = np.array(
+        [x - v * DT * s, y + v * DT * c, min(yaw + r * DT, math.pi), v + a * DT, r, a]
+    )
     return predicted, (F @ P) @ F.T + rotated(Q0, yaw)
 
 
@@ -52,7 +54,9 @@ def line_of_sight(offset: Array) -> float:
     return wrap(-bearing if offset[0] > 0 else bearing)
 
 
-def correct(x: Array, P: Array, z: Array, std: tuple[float, ...], ego_xy: Array) -> tuple[Array, Array]:
+def correct(
+    x: Array, P: Array, z: Array, std: tuple[float, ...], ego_xy: Array
+) -> tuple[Array, Array]:
     """Measurement update (section 13)."""
     R = rotated(np.diag(np.square(std)), line_of_sight(x[:2] - ego_xy))
     H = np.eye(len(std), 6)

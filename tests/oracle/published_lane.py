@@ -44,7 +44,9 @@ class PublishedLane:
         offsets = self.centre - point
         k = int(np.argmin(offsets[:, 0] ** 2 + offsets[:, 1] ** 2))
         segment = self.centre[(k + 1) % len(self.centre)] - self.centre[k]
-        along = np.dot(segment, point - self.centre[k]) / np.dot(segment, segment) * segment
+        along = (
+            np.dot(segment, point - self.centre[k]) / np.dot(segment, segment) * segment
+        )
         return float((self.arcs[k] + np.hypot(*along)) % self.lap)
 
     def at(self, point: Array) -> Place:
@@ -55,7 +57,9 @@ class PublishedLane:
         lo = hi - 1
 
         def value(column: Array) -> Array:
-            return (column[hi] - column[lo]) / (self.arcs[hi] - self.arcs[lo]) * (arc - self.arcs[lo]) + column[lo]
+            return (column[hi] - column[lo]) / (self.arcs[hi] - self.arcs[lo]) * (
+                arc - self.arcs[lo]
+            ) + column[lo]
 
         return Place(
             heading=float(value(self.headings)),
@@ -68,4 +72,7 @@ class PublishedLane:
     def outside(self, point: Array) -> bool:
         """Whether `point` is off the lane."""
         place = self.at(point)
-        return place.to_right - place.width > self.inner_buffer or place.to_left - place.width > self.outer_buffer
+        return (
+            place.to_right - place.width > self.inner_buffer
+            or place.to_left - place.width > self.outer_buffer
+        )

@@ -38,9 +38,13 @@ class PublishedReception:
 
     def __init__(self) -> None:
         self.ego: tuple[int, list[float]] | None = None  # the current ego
-        self.ego_storage: deque[tuple[int, list[float]]] = deque(maxlen=STORAGE)  # newest first
+        self.ego_storage: deque[tuple[int, list[float]]] = deque(
+            maxlen=STORAGE
+        )  # newest first
         self.in_pit = False
-        self.slots: dict[str, tuple[list[list[float]], int] | None] = dict.fromkeys(SENSORS)
+        self.slots: dict[str, tuple[list[list[float]], int] | None] = dict.fromkeys(
+            SENSORS
+        )
         self.accepted_ns: dict[str, int | None] = dict.fromkeys(SENSORS)
 
     def receive(self, message: Message) -> None:
@@ -57,14 +61,24 @@ class PublishedReception:
         if repeated or math.isnan(ego.x_m) or math.isnan(ego.y_m):
             return
         yaw = wrap(wrap(ego.yaw_rad) - math.pi / 2)
-        state = [ego.x_m, ego.y_m, yaw, ego.speed_mps, ego.yaw_rate_radps, ego.accel_mps2]
+        state = [
+            ego.x_m,
+            ego.y_m,
+            yaw,
+            ego.speed_mps,
+            ego.yaw_rate_radps,
+            ego.accel_mps2,
+        ]
         self.ego = (ego.stamp_ns, state)
 
     def _receive_detections(self, message: DetectionList) -> None:
         name, sensor = message.sensor, SENSORS[message.sensor]
         stamp_ns = message.stamp_ns
         if sensor.stamps_of_objects and message.objects:
-            own = [stamp_ns if item.stamp_ns is None else item.stamp_ns for item in message.objects]
+            own = [
+                stamp_ns if item.stamp_ns is None else item.stamp_ns
+                for item in message.objects
+            ]
             stamp_ns = int(np.mean(own))
         if stamp_ns == self.accepted_ns[name]:
             self.slots[name] = None
@@ -90,14 +104,20 @@ class PublishedReception:
     def _entry(item: Detection, sensor: Sensor) -> list[float]:
         values: list[Any] = [item.x_m, item.y_m]
         if sensor.measures_yaw:
-            values.append(item.yaw_rad)  # relative to the ego: the same number in both conventions
+            values.append(
+                item.yaw_rad
+            )  # relative to the ego: the same number in both conventions
         if sensor.measures_speed:
             values.append(item.speed_mps)
         return values
 
     def collect(self) -> list[tuple[int, str, list[list[float]]]]:
         """Stamp, sensor and objects of the full slots, oldest first; the slots are empty afterwards (section 6)."""
-        batches = [(slot[1], name, slot[0]) for name, slot in self.slots.items() if slot is not None]
+        batches = [
+            (slot[1], name, slot[0])
+            for name, slot in self.slots.items()
+            if slot is not None
+        ]
         self.slots = dict.fromkeys(SENSORS)
         return sorted(batches, key=lambda batch: batch[0])
 
@@ -116,7 +136,9 @@ class PublishedReception:
         before = self.ego_storage[i][1]
         yaw = wrap(before[2] + 0.9 * wrap(state[2] - before[2]))
         yaw_rate = (1 - 0.4) * before[4] + 0.4 * state[4]
-        target = self.ego_storage[0][1] if overwrite else state  # the same list, unless an old stamp came back
+        target = (
+            self.ego_storage[0][1] if overwrite else state
+        )  # the same list, unless an old stamp came back
         target[2], target[4] = yaw, yaw_rate
         if not overwrite:
             self.ego_storage.appendleft(self.ego)

@@ -22,7 +22,9 @@ class Situation:
 
     ego_speed_mps: tuple[float, ...] = (40.0, 70.0)  # one of these ...
     ego_speed_changes_mps: float = 0.0  # ... plus what a sine adds
-    ego_exact_speeds_mps: tuple[float, ...] = ()  # reported instead of the true one, by chance
+    ego_exact_speeds_mps: tuple[
+        float, ...
+    ] = ()  # reported instead of the true one, by chance
     ego_noise: float = 1.0
     ego_bias: float = 0.0  # of speed, yaw rate and acceleration: reported motion and poses contradict each other
     ego_hz: float = 100.0
@@ -63,9 +65,15 @@ SITUATIONS = {
     "usual": Situation(),
     "stalled_ego": Situation(duration_s=2.6, ego_silent_s=(0.4, 2.3), ego_bias=0.3),
     "pit_lane": Situation(in_pit_p=0.6, pit_toggle_p=0.02, start="closing"),
-    "vanishing_objects": Situation(duration_s=4.0, objects_gone_s=(1.2, 3.7), clutter=0.05),
-    "only_lidar": Situation(duration_s=3.5, sensors=("lidar",), objects_gone_s=(0.8, 3.2)),
-    "clock_with_gaps": Situation(duration_s=16.0, clock="gaps", sensors_hz=5.0, ego_hz=20.0),
+    "vanishing_objects": Situation(
+        duration_s=4.0, objects_gone_s=(1.2, 3.7), clutter=0.05
+    ),
+    "only_lidar": Situation(
+        duration_s=3.5, sensors=("lidar",), objects_gone_s=(0.8, 3.2)
+    ),
+    "clock_with_gaps": Situation(
+        duration_s=16.0, clock="gaps", sensors_hz=5.0, ego_hz=20.0
+    ),
     "wound_up_yaw": Situation(
         duration_s=9.0,
         sensors_silent_s=(0.8, 8.5),
@@ -106,7 +114,9 @@ def anything(rng: np.random.Generator) -> Situation:
         ego_resent_p=sometimes(0.1, 0.0),
         ego_nan_p=sometimes(0.2, 0.0),
         pit_toggle_p=sometimes(0.02, 0.0),
-        sensors=tuple(str(name) for name in rng.permutation(SENSORS)[: rng.integers(1, 4)]),
+        sensors=tuple(
+            str(name) for name in rng.permutation(SENSORS)[: rng.integers(1, 4)]
+        ),
         sensors_silent_s=sometimes(silence(), NEVER),
         sensors_hz=float(rng.choice([5.0, 20.0, 33.0])),
         delay=str(rng.choice(["usual", "none", "mixed", "tiny", "future", "huge"])),

@@ -16,7 +16,11 @@ Messages = list[EgoState | DetectionList]
 
 NODE_NS = 20_000_000
 REAR_AXLE_M = 1.74
-DELAYS_S = {"lidar": (0.10, 0.02), "lidar_cluster": (0.151, 0.03), "radar": (0.062, 0.02)}  # mean, std
+DELAYS_S = {
+    "lidar": (0.10, 0.02),
+    "lidar_cluster": (0.151, 0.03),
+    "radar": (0.062, 0.02),
+}  # mean, std
 
 
 class Line:
@@ -25,7 +29,9 @@ class Line:
     def __init__(self, path: Path) -> None:
         table = np.loadtxt(path, delimiter=";", comments="#")
         self.points, heading = table[:, :2], table[:, 14]
-        self.arcs = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self.points, axis=0).T))])
+        self.arcs = np.concatenate(
+            [[0.0], np.cumsum(np.hypot(*np.diff(self.points, axis=0).T))]
+        )
         self.lap_m = float(self.arcs[-1])
         self.jump_m = float(self.arcs[np.argmax(np.abs(np.diff(heading)))])
         self.jump_rep103_m = float(self.arcs[np.argmin(np.abs(heading - math.pi / 2))])
@@ -33,17 +39,26 @@ class Line:
     def pose(self, arc: float, left: float) -> tuple[Array, float]:
         """Position, shape (2,), `left` of the line, and yaw (REP-103)."""
         before, after = (
-            np.array([np.interp((arc + step) % self.lap_m, self.arcs, column) for column in self.points.T])
+            np.array(
+                [
+                    np.interp((arc + step) % self.lap_m, self.arcs, column)
+                    for column in self.points.T
+                ]
+            )
             for step in (-2.0, 2.0)
         )
         yaw = math.atan2(after[1] - before[1], after[0] - before[0])
-        return (before + after) / 2 + left * np.array([-math.sin(yaw), math.cos(yaw)]), yaw
+        return (before + after) / 2 + left * np.array(
+            [-math.sin(yaw), math.cos(yaw)]
+        ), yaw
 
 
 class World:
     """The ego and the objects, driving along the lines."""
 
-    def __init__(self, situation: Situation, rng: np.random.Generator, track: Line, pit: Line) -> None:
+    def __init__(
+        self, situation: Situation, rng: np.random.Generator, track: Line, pit: Line
+    ) -> None:
         self.situation, self.rng, self.track = situation, rng, track
         begin = {
             "anywhere": rng.uniform(0.0, track.lap_m),
@@ -52,7 +67,11 @@ class World:
             "jump_rep103": track.jump_rep103_m,
         }
         self.speed = float(rng.choice(situation.ego_speed_mps))
-        ahead_m = 0.0 if situation.start == "anywhere" else rng.uniform(0.2, 0.8) * situation.duration_s * self.speed
+        ahead_m = (
+            0.0
+            if situation.start == "anywhere"
+            else rng.uniform(0.2, 0.8) * situation.duration_s * self.speed
+        )
         self.begin_m = float(begin[situation.start] - ahead_m)
         low, high = situation.num_objects
         spread = situation.spread_m
@@ -82,14 +101,28 @@ class World:
             gone = situation.objects_gone_s[0] <= time_s < situation.objects_gone_s[1]
             if rng.random() < situation.seen_p and not gone:
                 share = line.lap_m / self.track.lap_m  # beside the ego on both lines
-                arc = (self.begin_m + (self.speed + relative_mps) * time_s + offset_m) * share
+                arc = (
+                    self.begin_m + (self.speed + relative_mps) * time_s + offset_m
+                ) * share
                 places.append((*line.pose(arc, left_m), self.speed + relative_mps))
         origin, ego_yaw, _ = self.ego(time_s)
         for _ in range(rng.poisson(situation.clutter)):
-            places.append((origin + rng.uniform(-70.0, 70.0, 2), rng.uniform(-math.pi, math.pi), 30.0))
+            places.append(
+                (
+                    origin + rng.uniform(-70.0, 70.0, 2),
+                    rng.uniform(-math.pi, math.pi),
+                    30.0,
+                )
+            )
         return [self._detection(place, origin, ego_yaw, sensor) for place in places]
 
-    def _detection(self, place: tuple[Array, float, float], origin: Array, ego_yaw: float, sensor: str) -> Detection:
+    def _detection(
+        self,
+        place: tuple[Array, float, float],
+        origin: Array,
+        ego_yaw: float,
+        sensor: str,
+    ) -> Detection:
         rng = self.rng
         position, yaw, speed = place
         dx, dy = position - origin + rng.normal(0.0, 1.0, 2) * self.situation.noise_m
@@ -98,7 +131,9 @@ class World:
         values = [
             float(x),
             float(y),
-            math.remainder(yaw - ego_yaw + rng.normal(0.0, self.situation.noise_rad), math.tau),
+            math.remainder(
+                yaw - ego_yaw + rng.normal(0.0, self.situation.noise_rad), math.tau
+            ),
         ]
         values.append(float(abs(speed + rng.normal(0.0, self.situation.noise_mps))))
         if rng.random() < self.situation.zero_p:
@@ -106,10 +141,17 @@ class World:
         if rng.random() < self.situation.nan_p:
             values[rng.integers(4)] = float(rng.choice([math.nan, math.inf]))
         x, y, yaw, speed = values
-        return Detection(x, y, yaw if sensor == "lidar" else None, speed if sensor == "radar" else None)
+        return Detection(
+            x,
+            y,
+            yaw if sensor == "lidar" else None,
+            speed if sensor == "radar" else None,
+        )
 
 
-def generate(situation: Situation, seed: int, track: Path, pit: Path) -> tuple[Messages, list[int]]:
+def generate(
+    situation: Situation, seed: int, track: Path, pit: Path
+) -> tuple[Messages, list[int]]:
     """Messages in receipt order, and the ticks of the node."""
     rng = np.random.default_rng(seed)
     world = World(situation, rng, Line(track), Line(pit))
@@ -120,7 +162,9 @@ def generate(situation: Situation, seed: int, track: Path, pit: Path) -> tuple[M
     return messages, _ticks(situation, rng, messages)
 
 
-def _times(situation: Situation, rng: np.random.Generator, hz: float, silent_s: Interval) -> list[float]:
+def _times(
+    situation: Situation, rng: np.random.Generator, hz: float, silent_s: Interval
+) -> list[float]:
     times = np.arange(rng.uniform(0.0, 1.0 / hz), situation.duration_s, 1.0 / hz)
     return [float(time) for time in times if not silent_s[0] <= time < silent_s[1]]
 
@@ -130,12 +174,18 @@ def _stamp_ns(situation: Situation, time_s: float) -> int:
     return stamp_ns // situation.stamp_grid_ns * situation.stamp_grid_ns
 
 
-def _ego_messages(situation: Situation, world: World, rng: np.random.Generator) -> Messages:
+def _ego_messages(
+    situation: Situation, world: World, rng: np.random.Generator
+) -> Messages:
     messages: list[EgoState] = []
     in_pit = False
     for time_s in _times(situation, rng, situation.ego_hz, situation.ego_silent_s):
         position, yaw, speed = world.ego(time_s)
-        noise = rng.normal(0.0, 1.0, 6) * situation.ego_noise * [0.05, 0.05, 0.01, 0.2, 0.03, 0.5]
+        noise = (
+            rng.normal(0.0, 1.0, 6)
+            * situation.ego_noise
+            * [0.05, 0.05, 0.01, 0.2, 0.03, 0.5]
+        )
         noise[3:] += situation.ego_bias * np.array([4.0, 0.5, 2.0])
         values = np.array([*position, yaw, speed, 0.0, 0.0]) + noise
         values[2] = math.remainder(values[2], math.tau)
@@ -159,17 +209,24 @@ def _ego_messages(situation: Situation, world: World, rng: np.random.Generator) 
     return list(messages)
 
 
-def _detection_lists(situation: Situation, world: World, rng: np.random.Generator, sensor: str) -> Messages:
+def _detection_lists(
+    situation: Situation, world: World, rng: np.random.Generator, sensor: str
+) -> Messages:
     messages: Messages = []
     newest_ns = 0
-    for time_s in _times(situation, rng, situation.sensors_hz, situation.sensors_silent_s):
+    for time_s in _times(
+        situation, rng, situation.sensors_hz, situation.sensors_silent_s
+    ):
         objects = world.seen(time_s, sensor)
         stamp_ns = _stamp_ns(situation, time_s)
         receipt_ns = stamp_ns + _delay_ns(situation, rng, sensor)
         newest_ns = receipt_ns = max(receipt_ns, newest_ns, situation.epoch_ns)
         if situation.object_stamps:
             spread_ns = rng.integers(-20_000_000, 1_000_000, len(objects))
-            objects = [_stamped(item, stamp_ns + int(own)) for item, own in zip(objects, spread_ns, strict=True)]
+            objects = [
+                _stamped(item, stamp_ns + int(own))
+                for item, own in zip(objects, spread_ns, strict=True)
+            ]
         messages.append(DetectionList(sensor, stamp_ns, receipt_ns, tuple(objects)))
         if rng.random() < situation.duplicate_p:
             objects = world.seen(time_s, sensor) if rng.random() < 0.5 else objects
@@ -179,14 +236,19 @@ def _detection_lists(situation: Situation, world: World, rng: np.random.Generato
             objects = world.seen(time_s, sensor)
             messages.append(
                 DetectionList(
-                    sensor, stamp_ns + int(rng.integers(-5_000_000, 9_000_000)), receipt_ns + 1, tuple(objects)
+                    sensor,
+                    stamp_ns + int(rng.integers(-5_000_000, 9_000_000)),
+                    receipt_ns + 1,
+                    tuple(objects),
                 )
             )
     return messages
 
 
 def _stamped(item: Detection, stamp_ns: int) -> Detection:
-    return Detection(item.x_m, item.y_m, item.yaw_rad, item.speed_mps, stamp_ns=stamp_ns)
+    return Detection(
+        item.x_m, item.y_m, item.yaw_rad, item.speed_mps, stamp_ns=stamp_ns
+    )
 
 
 def _delay_ns(situation: Situation, rng: np.random.Generator, sensor: str) -> int:
@@ -202,7 +264,9 @@ def _delay_ns(situation: Situation, rng: np.random.Generator, sensor: str) -> in
     return round(float(delay_s) * 1e9)
 
 
-def _ticks(situation: Situation, rng: np.random.Generator, messages: Messages) -> list[int]:
+def _ticks(
+    situation: Situation, rng: np.random.Generator, messages: Messages
+) -> list[int]:
     first_ns = -(-messages[0].receipt_ns // NODE_NS) * NODE_NS
     num_ticks = max(round(situation.duration_s * 1e9) // NODE_NS, 1)
     steps_ns = np.full(num_ticks, NODE_NS)
@@ -210,13 +274,17 @@ def _ticks(situation: Situation, rng: np.random.Generator, messages: Messages) -
         kinds = [
             rng.integers(1, 10_000_000, num_ticks),
             rng.integers(15_000_000, 25_000_000, num_ticks),
-            rng.choice([10_000_000, 20_000_000, 30_000_000, 10_000_001, 9_999_999], num_ticks),
+            rng.choice(
+                [10_000_000, 20_000_000, 30_000_000, 10_000_001, 9_999_999], num_ticks
+            ),
             rng.integers(20_000_000, 200_000_000, num_ticks),
         ]
         steps_ns = np.choose(rng.choice(4, num_ticks, p=[0.3, 0.4, 0.2, 0.1]), kinds)
     if situation.clock == "gaps":
         long = rng.random(num_ticks) < 0.05
-        steps_ns = np.where(long, rng.integers(500_000_000, 6_000_000_000, num_ticks), steps_ns)
+        steps_ns = np.where(
+            long, rng.integers(500_000_000, 6_000_000_000, num_ticks), steps_ns
+        )
     last_ns = messages[-1].receipt_ns + 500_000_000
     ticks = accumulate((int(step) for step in steps_ns), initial=first_ns)
     return [now_ns for now_ns in ticks if now_ns <= last_ns]

@@ -45,7 +45,9 @@ class Object:
     counter: int
     last_seen_ns: int
     num_measured: int = 1
-    states: deque[Array] = field(default_factory=lambda: deque(maxlen=STORAGE))  # newest first
+    states: deque[Array] = field(
+        default_factory=lambda: deque(maxlen=STORAGE)
+    )  # newest first
     stamps: deque[int] = field(default_factory=lambda: deque(maxlen=STORAGE))
     covariances: deque[Array] = field(default_factory=lambda: deque(maxlen=STORAGE))
     estimate: Array = None  # for matching
@@ -125,7 +127,13 @@ class PublishedTracker:
     def _result(self) -> TickResult:
         to_rep103 = np.array([0.0, 0.0, math.pi / 2, 0.0, 0.0, 0.0])
         objects = {
-            name: ObjectResult(thing.x + to_rep103, thing.P, thing.counter, thing.num_measured, thing.last_seen_ns)
+            name: ObjectResult(
+                thing.x + to_rep103,
+                thing.P,
+                thing.counter,
+                thing.num_measured,
+                thing.last_seen_ns,
+            )
             for name, thing in self.objects.items()
         }
         return TickResult(self.track_ns, objects, self.deaths)
@@ -139,9 +147,15 @@ class PublishedTracker:
         if entries:
             ego_ns, ego = self._ego()
             if self.track_ns - stamp_ns > STEP_NS / 2:
-                ego_ns, ego = min(self.input.ego_storage, key=lambda entry: abs(entry[0] - stamp_ns))
-                offered = [number for number in offered if self._look_up(number, stamp_ns, ego)]
-            detections = self._preprocess(entries, sensor, (stamp_ns - ego_ns) / 1e9, ego)
+                ego_ns, ego = min(
+                    self.input.ego_storage, key=lambda entry: abs(entry[0] - stamp_ns)
+                )
+                offered = [
+                    number for number in offered if self._look_up(number, stamp_ns, ego)
+                ]
+            detections = self._preprocess(
+                entries, sensor, (stamp_ns - ego_ns) / 1e9, ego
+            )
         matches, new, unmatched = self._match(detections, offered, sensor)
         self._age(unmatched, name)
         for index, number in matches:
@@ -160,16 +174,22 @@ class PublishedTracker:
             return False
         h = min(range(len(thing.stamps)), key=lambda i: abs(thing.stamps[i] - stamp_ns))
         thing.estimate = thing.states[h]
-        thing.history = History(h, thing.states[h], thing.covariances[h], np.array(ego[:2]))
+        thing.history = History(
+            h, thing.states[h], thing.covariances[h], np.array(ego[:2])
+        )
         return True
 
-    def _preprocess(self, entries: list[list[float]], sensor: Sensor, dt: float, ego: list[float]) -> list[Array]:
+    def _preprocess(
+        self, entries: list[list[float]], sensor: Sensor, dt: float, ego: list[float]
+    ) -> list[Array]:
         x, y, yaw, v, r, _ = ego
         origin = np.array([x - v * dt * math.sin(yaw), y + v * dt * math.cos(yaw)])
         ego_yaw = yaw + r * dt
         kept = []
         for entry in entries:
-            position = rot(ego_yaw) @ np.array([entry[0] - REAR_AXLE, entry[1]]) + origin
+            position = (
+                rot(ego_yaw) @ np.array([entry[0] - REAR_AXLE, entry[1]]) + origin
+            )
             if sensor.measures_yaw:
                 z = [*position, wrap(entry[2] + ego_yaw), *entry[3:]]
             else:
@@ -187,7 +207,9 @@ class PublishedTracker:
         for i, z in enumerate(detections):
             for j, number in enumerate(offered):
                 cost[i, j] = math.hypot(*(z[:2] - self.objects[number].estimate[:2]))
-        pairs = sorted(zip(*(side.tolist() for side in linear_sum_assignment(cost)), strict=True))
+        pairs = sorted(
+            zip(*(side.tolist() for side in linear_sum_assignment(cost)), strict=True)
+        )
         paired = {i for i, _ in pairs}
         births = [i for i in range(len(detections)) if i not in paired]
         births += [i for i, j in pairs if cost[i, j] > MATCH_DISTANCE]
@@ -219,7 +241,9 @@ class PublishedTracker:
     def _update(self, thing: Object, z: Array, sensor: Sensor, stamp_ns: int) -> None:
         past = thing.history
         x, P, ego_xy = (
-            (thing.x, thing.P, np.array(self._ego()[1][:2])) if past is None else (past.x, past.P, past.ego_xy)
+            (thing.x, thing.P, np.array(self._ego()[1][:2]))
+            if past is None
+            else (past.x, past.P, past.ego_xy)
         )
         thing.x, thing.P = correct(x, P, z, sensor.std, ego_xy)
         thing.num_measured += 1
@@ -241,7 +265,12 @@ class PublishedTracker:
         r = v * self.track.at(z[:2]).curvature
         a = a_ego if v_ego < 10.0 else 0.0
         # The shared P_init of quirk Q1 is not imitated: turning a multiple of the identity changes nothing.
-        thing = Object(np.array([z[0], z[1], yaw, v, r, a]), rotated(P_INIT, yaw), sensor.counter_init, self.track_ns)
+        thing = Object(
+            np.array([z[0], z[1], yaw, v, r, a]),
+            rotated(P_INIT, yaw),
+            sensor.counter_init,
+            self.track_ns,
+        )
         n = max(round((self.track_ns - stamp_ns) / STEP_NS), 0)
         thing.store(self.track_ns - n * STEP_NS)
         for step in reversed(range(n)):
@@ -254,14 +283,23 @@ def merge(detections: list[Array]) -> list[Array]:
     """Overlap merge (section 10.6), in the order of the reference: that of a set of index tuples."""
     indices = range(len(detections))
     near = [
-        tuple(j for j in indices if math.hypot(*(detections[i] - detections[j])[:2]) <= MERGE_DISTANCE) for i in indices
+        tuple(
+            j
+            for j in indices
+            if math.hypot(*(detections[i] - detections[j])[:2]) <= MERGE_DISTANCE
+        )
+        for i in indices
     ]
     groups = {members for members in near if len(members) >= 2}
     merged = [sum(detections[j] for j in members) / len(members) for members in groups]
-    return merged + [detections[i] for i in indices if not any(i in members for members in groups)]
+    return merged + [
+        detections[i] for i in indices if not any(i in members for members in groups)
+    ]
 
 
-def run(messages: Iterable[Message], ticks_ns: Iterable[int], track_csv: Path, pit_csv: Path) -> Iterator[TickResult]:
+def run(
+    messages: Iterable[Message], ticks_ns: Iterable[int], track_csv: Path, pit_csv: Path
+) -> Iterator[TickResult]:
     """The results at `ticks_ns`; what was received at or before a tick is delivered before it."""
     tracker = PublishedTracker(track_csv, pit_csv)
     waiting = deque(messages)

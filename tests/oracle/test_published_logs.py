@@ -14,7 +14,7 @@ from support.messages import shared
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import STATE_NAMES
-from fgtrack.io.stream import read_stream
+from fgtrack.inputs.stream import read_stream
 from fgtrack.pipeline.public import replay
 
 RUNS = ("short10", "lidar3_10", "jitter10", "full60")
@@ -42,7 +42,13 @@ def log_rows(name: str, ticks_ns: list[int]) -> Iterator[tuple[Any, ...]]:
         while messages and messages[0].receipt_ns <= now_ns:
             reception.receive(messages.pop(0))
         found = {
-            sensor: [[{"state": state, "t": slot[1], "keys": keys(sensor)} for state in slot[0]], slot[1]]
+            sensor: [
+                [
+                    {"state": state, "t": slot[1], "keys": keys(sensor)}
+                    for state in slot[0]
+                ],
+                slot[1],
+            ]
             for sensor, slot in reception.slots.items()
             if slot is not None
         }
@@ -50,26 +56,42 @@ def log_rows(name: str, ticks_ns: list[int]) -> Iterator[tuple[Any, ...]]:
         reception.store_ego()
         if reception.ego is not None:
             stamp_ns, state = reception.ego
-            ego = {"is_updated": True, "in_pit": reception.in_pit, "t": stamp_ns, "state": state}
+            ego = {
+                "is_updated": True,
+                "in_pit": reception.in_pit,
+                "t": stamp_ns,
+                "state": state,
+            }
             yield (now_ns, found or None, ego, [], {}, {}, {}, {}, 1)
 
 
 def keys(sensor: str) -> list[str]:
     """What the node says that the objects of a sensor hold; the yaw comes from the map after logging."""
-    return ["x", "y", "yaw", "v"] if SENSORS[sensor].measures_speed else ["x", "y", "yaw"]
+    return (
+        ["x", "y", "yaw", "v"] if SENSORS[sensor].measures_speed else ["x", "y", "yaw"]
+    )
 
 
 @pytest.mark.parametrize("name", [RUNS[0], *slow(*RUNS[1:])])
-def test_a_log_folder_replays_to_the_tracks_of_the_stream(name: str, tmp_path: Path) -> None:
+def test_a_log_folder_replays_to_the_tracks_of_the_stream(
+    name: str, tmp_path: Path
+) -> None:
     with gzip.open(shared(f"reference/{name}/expected.jsonl.gz")) as file:
         expected = [json.loads(line) for line in file]
     rows = list(log_rows(name, [tick["now_ns"] for tick in expected]))
     lines = [";".join(COLUMNS), *(";".join(map(json.dumps, row)) for row in rows)]
     (tmp_path / "data_logs.csv").write_text("\n".join(lines))
-    maps = {lane: shared(f"data/maps/lvms_{file}.csv") for lane, file in (("map", "track"), ("pit_map", "pitlane"))}
+    maps = {
+        lane: shared(f"data/maps/lvms_{file}.csv")
+        for lane, file in (("map", "track"), ("pit_map", "pitlane"))
+    }
     run = replay(tmp_path, "karle2023_reference", set=AS_LOGGED, **maps)
     egos_ns = [0, *(ego["t"] for _, _, ego, *_ in rows)]
-    ticks = [row[0] for row, before_ns in zip(rows, egos_ns, strict=False) if row[1] or row[2]["t"] != before_ns]
+    ticks = [
+        row[0]
+        for row, before_ns in zip(rows, egos_ns, strict=False)
+        if row[1] or row[2]["t"] != before_ns
+    ]
     assert run.timing["now_ns"].tolist() == ticks
     assert len(expected) - len(ticks) <= 2  # nothing came in some
     wanted = [
@@ -81,7 +103,9 @@ def test_a_log_folder_replays_to_the_tracks_of_the_stream(name: str, tmp_path: P
     names = ("now_ns", "track_id", "num_measured", *STATE_NAMES)
     given = np.stack([run.tracks[name].astype(np.float64) for name in names], axis=-1)
     assert given.shape == (len(wanted), len(names))
-    order, wanted_order = (np.lexsort(table[:, :2].T[::-1]) for table in (given, np.array(wanted)))
+    order, wanted_order = (
+        np.lexsort(table[:, :2].T[::-1]) for table in (given, np.array(wanted))
+    )
     errors = given[order] - np.array(wanted)[wanted_order]
     errors[:, 5] = wrap_angles(errors[:, 5])
     assert np.abs(errors).max() < 1e-9

@@ -19,12 +19,14 @@ from support.examples import slow
 from support.messages import SHARED
 from support.ticks import listed_ticks
 
+from fgtrack.config.settings import Config
+from fgtrack.config.yaml_file import load
 from fgtrack.pipeline.build import build_propagator, build_tracker
 from fgtrack.pipeline.clock import Delivered
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import load
 
-REFERENCE_CONFIG = Path(__file__).resolve().parents[2] / "configs/karle2023_reference.yaml"
+REFERENCE_CONFIG = (
+    Path(__file__).resolve().parents[2] / "configs/karle2023_reference.yaml"
+)
 SHARED_MAPS = ("lvms", "ims")
 TOLERANCE = 1e-9
 # After seconds of prediction an update leaves a ten millionth of the covariance: rounding loses as many digits.
@@ -47,7 +49,9 @@ def maps() -> dict[str, Maps]:
     folder = Path(__file__).parents[2] / "configs/maps"
     found = {"oval": (folder / "oval_track.csv", folder / "oval_pitlane.csv")}
     for name in SHARED_MAPS:
-        track, pit = (SHARED / f"data/maps/{name}_{lane}.csv" for lane in ("track", "pitlane"))
+        track, pit = (
+            SHARED / f"data/maps/{name}_{lane}.csv" for lane in ("track", "pitlane")
+        )
         if track.exists() and pit.exists():
             found[name] = (track, pit)
     return found
@@ -55,11 +59,16 @@ def maps() -> dict[str, Maps]:
 
 @cache
 def reference_config(track: Path, pit: Path) -> Config:
-    settings = [f"map.track={json.dumps(str(track))}", f"map.pit={json.dumps(str(pit))}"]
+    settings = [
+        f"map.track={json.dumps(str(track))}",
+        f"map.pit={json.dumps(str(pit))}",
+    ]
     return load(Config, REFERENCE_CONFIG, settings)
 
 
-def fgtrack_run(messages: Sequence[Delivered], ticks_ns: list[int], track: Path, pit: Path) -> Iterator[Snapshot]:
+def fgtrack_run(
+    messages: Sequence[Delivered], ticks_ns: list[int], track: Path, pit: Path
+) -> Iterator[Snapshot]:
     """What fgtrack makes of it; counters and last sights are read off its lifecycle."""
     tracker = build_tracker(reference_config(track, pit))
     for tick in islice(listed_ticks(messages, ticks_ns), len(ticks_ns)):
@@ -89,14 +98,20 @@ def difference(x: Array, expected: Array) -> Array:
     return d
 
 
-def assert_same_object(got: ObjectResult, expected: ObjectResult, tolerance: float) -> None:
+def assert_same_object(
+    got: ObjectResult, expected: ObjectResult, tolerance: float
+) -> None:
     assert (got.counter, got.num_measured, got.last_seen_ns) == (
         expected.counter,
         expected.num_measured,
         expected.last_seen_ns,
     )
-    assert np.abs(difference(got.x, expected.x)).max() <= tolerance, "the state is another"
-    assert np.abs(got.P - expected.P).max() <= tolerance * (1.0 + np.abs(expected.P).max()), "its covariance is another"
+    assert np.abs(difference(got.x, expected.x)).max() <= tolerance, (
+        "the state is another"
+    )
+    assert np.abs(got.P - expected.P).max() <= tolerance * (
+        1.0 + np.abs(expected.P).max()
+    ), "its covariance is another"
 
 
 class Relabelling:
@@ -110,9 +125,16 @@ class Relabelling:
             self.ours.pop(theirs, None)
         for theirs in sorted(set(expected.objects) - set(self.ours)):
             free = set(got.objects) - set(self.ours.values())
-            assert free, f"a birth is missing: {sorted(expected.objects)} against {sorted(got.objects)}"
+            assert free, (
+                f"a birth is missing: {sorted(expected.objects)} against {sorted(got.objects)}"
+            )
             x = expected.objects[theirs].x
-            self.ours[theirs] = min(free, key=lambda ours: float(np.abs(difference(got.objects[ours].x, x)).max()))
+            self.ours[theirs] = min(
+                free,
+                key=lambda ours: float(
+                    np.abs(difference(got.objects[ours].x, x)).max()
+                ),
+            )
         assert set(self.ours.values()) == set(got.objects)
 
 
@@ -122,7 +144,9 @@ def assert_same_run(situation: Situation, seed: int, track: Path, pit: Path) -> 
     tolerance = TOLERANCE_AFTER_GAPS if situation.clock == "gaps" else TOLERANCE
     relabelling = Relabelling()
     expectations = run(messages, ticks_ns, track, pit)
-    for expected, got in zip(expectations, fgtrack_run(messages, ticks_ns, track, pit), strict=True):
+    for expected, got in zip(
+        expectations, fgtrack_run(messages, ticks_ns, track, pit), strict=True
+    ):
         assert got.track_ns == expected.track_ns
         relabelling.update(got, expected)
         for theirs, state in expected.objects.items():
@@ -137,27 +161,41 @@ def test_fgtrack_does_what_the_oracle_does(name: str, maps: dict[str, Maps]) -> 
 
 
 @pytest.mark.parametrize("seed", [*range(8), *slow(*range(8, 100))])
-def test_fgtrack_does_what_the_oracle_does_whatever_comes(seed: int, maps: dict[str, Maps]) -> None:
+def test_fgtrack_does_what_the_oracle_does_whatever_comes(
+    seed: int, maps: dict[str, Maps]
+) -> None:
     situation = anything(np.random.default_rng(seed))
     assert_same_run(situation, seed, *maps[list(maps)[seed % len(maps)]])
 
 
 @pytest.mark.parametrize("num_steps", [1, 15, 350])
-@pytest.mark.parametrize("yaw_range_rad", [(-np.pi, np.pi), (-40.0, -np.pi), (np.pi, 40.0)])
-def test_fgtrack_predicts_as_the_oracle_does(yaw_range_rad: tuple[float, float], num_steps: int) -> None:
+@pytest.mark.parametrize(
+    "yaw_range_rad", [(-np.pi, np.pi), (-40.0, -np.pi), (np.pi, 40.0)]
+)
+def test_fgtrack_predicts_as_the_oracle_does(
+    yaw_range_rad: tuple[float, float], num_steps: int
+) -> None:
     rng = np.random.default_rng(num_steps)
     yaws = rng.uniform(*yaw_range_rad, 20)
     states = np.stack(
-        [*rng.normal(0.0, 300.0, (2, 20)), yaws, *(rng.normal(0.0, 1.0, (3, 20)) * [[40.0], [1.0], [2.0]])]
+        [
+            *rng.normal(0.0, 300.0, (2, 20)),
+            yaws,
+            *(rng.normal(0.0, 1.0, (3, 20)) * [[40.0], [1.0], [2.0]]),
+        ]
     )
     roots = rng.normal(0.0, 1.0, (20, 6, 6))
     covariances = roots @ roots.transpose(0, 2, 1)
     propagator = build_propagator(load(Config, REFERENCE_CONFIG), DT)
     to_rep103 = np.array([0.0, 0.0, np.pi / 2.0, 0.0, 0.0, 0.0])
-    means, spreads = propagator.propagate(states.T + to_rep103, covariances, np.full(20, num_steps), DT)
+    means, spreads = propagator.propagate(
+        states.T + to_rep103, covariances, np.full(20, num_steps), DT
+    )
     for i in range(20):
         x, P = states[:, i], covariances[i]
         for _ in range(num_steps):
             x, P = predict(x, P)
         np.testing.assert_allclose(means[i], x + to_rep103, rtol=1e-11, atol=TOLERANCE)
-        np.testing.assert_allclose(spreads[i], P, rtol=1e-11, atol=TOLERANCE * (1.0 + np.abs(P).max()))
+        np.testing.assert_allclose(
+            spreads[i], P, rtol=1e-11, atol=TOLERANCE * (1.0 + np.abs(P).max())
+        )

@@ -30,7 +30,12 @@ SMOOTHED: dict[Draw, float] = {
 #: A window that keeps everything, and thresholds at which a smoother relinearises at every move.
 CONVERGED = {
     "ring_s": 10.0,
-    "relinearise": {"yaw_rad": 1e-7, "speed_mps": 1e-7, "yaw_rate_radps": 1e-7, "accel_mps2": 1e-7},
+    "relinearise": {
+        "yaw_rad": 1e-7,
+        "speed_mps": 1e-7,
+        "yaw_rate_radps": 1e-7,
+        "accel_mps2": 1e-7,
+    },
 }
 OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "smoother": {**CONVERGED, "max_iterations": 20},
@@ -47,7 +52,9 @@ def drawn(draw: Draw) -> Stream:
 def start(name: str, stream: Stream) -> Estimator:
     """The estimator `name`, with settings by which it solves its equations to rounding."""
     factory = ESTIMATORS.load(name)
-    return start_estimator(name, factory, stream.motion, stream.prior, stream.lag_s, OPTIONS.get(name, {}))
+    return start_estimator(
+        name, factory, stream.motion, stream.prior, stream.lag_s, OPTIONS.get(name, {})
+    )
 
 
 def fed(estimator: Estimator, stream: Stream) -> Estimator:
@@ -67,11 +74,19 @@ def largest(differences: list[tuple[float, float]]) -> float:
 
 def apart(name: str, draw: Draw) -> float:
     stream = drawn(draw)
-    found, expected = fed(start(name, stream), stream), filtered(stream.problem).state_at
+    found, expected = (
+        fed(start(name, stream), stream),
+        filtered(stream.problem).state_at,
+    )
     stamps = [stream.newest_ns, stream.newest_ns + AHEAD_NS]
     if name in SMOOTHERS:
         expected, stamps = stream.solution.state_at, [*stream.probes_ns(), *stamps]
-    return largest([difference(found.state_at(at), TrackState(at, *expected(at)), stream.motion) for at in stamps])
+    return largest(
+        [
+            difference(found.state_at(at), TrackState(at, *expected(at)), stream.motion)
+            for at in stamps
+        ]
+    )
 
 
 def test_the_dense_joint_of_a_linear_model_is_that_of_scipy() -> None:
@@ -79,11 +94,18 @@ def test_the_dense_joint_of_a_linear_model_is_that_of_scipy() -> None:
     stamps = [*stream.probes_ns(), stream.newest_ns, stream.newest_ns + AHEAD_NS]
     joint = dense_joint(stream.motion, stream.prior, stream.measurements, stamps)
     expected = stream.solution.state_at
-    assert largest([difference(joint[at], TrackState(at, *expected(at))) for at in stamps]) < 1e-7
+    assert (
+        largest([difference(joint[at], TrackState(at, *expected(at))) for at in stamps])
+        < 1e-7
+    )
 
 
 @pytest.mark.parametrize(
-    ("name", "draw"), [*product(SMOOTHERS[:2], SMOOTHED), *product(SMOOTHERS[2:], (streams.observed, streams.robust))]
+    ("name", "draw"),
+    [
+        *product(SMOOTHERS[:2], SMOOTHED),
+        *product(SMOOTHERS[2:], (streams.observed, streams.robust)),
+    ],
 )
 def test_a_converged_smoother_solves_least_squares(name: str, draw: Draw) -> None:
     assert apart(name, draw) < SMOOTHED[draw]

@@ -21,14 +21,18 @@ def _tolerance(estimator: str) -> float:
     return ROUNDING if Claims.of(ESTIMATORS.load(estimator)).smooths else 0.0
 
 
-def _with_fault(estimator: str, name: str, at: int, error: type[BaseException]) -> tuple[Outcome, Fault]:
+def _with_fault(
+    estimator: str, name: str, at: int, error: type[BaseException]
+) -> tuple[Outcome, Fault]:
     tracker = make(estimator)
     point = next(each for each in points(tracker) if str(each) == name)
     with Fault(point, at, error) as fault:
         return run(tracker, fault), fault
 
 
-def _findings(estimator: str, chosen: Callable[[list[str]], list[str]], seed: int) -> list[str]:
+def _findings(
+    estimator: str, chosen: Callable[[list[str]], list[str]], seed: int
+) -> list[str]:
     """Let each of the `chosen` methods raise once, at a random call, and return what is wrong."""
     rng, reference = random.Random(f"{estimator} {seed}"), run(make(estimator))
     assert not reference.lies
@@ -40,7 +44,10 @@ def _findings(estimator: str, chosen: Callable[[list[str]], list[str]], seed: in
             at, error = rng.randint(1, calls), rng.choice((*ERRORS, KeyboardInterrupt))
             faulty, fault = _with_fault(estimator, name, at, error)
             wrong = problems(reference, faulty, fault, _tolerance(estimator))
-            findings += [f"{name}, call {at} of {calls}, {error.__name__}: {each}" for each in wrong]
+            findings += [
+                f"{name}, call {at} of {calls}, {error.__name__}: {each}"
+                for each in wrong
+            ]
     return findings
 
 
@@ -49,7 +56,9 @@ def _findings(estimator: str, chosen: Callable[[list[str]], list[str]], seed: in
 def test_a_call_that_raises_ends_its_own_update_alone(estimator: str) -> None:
     def chosen(names: list[str]) -> list[str]:
         rest = [name for name in names if ".update" not in name and "Bank" not in name]
-        return [name for name in names if name not in rest] + random.Random(estimator).sample(rest, 8)
+        return [name for name in names if name not in rest] + random.Random(
+            estimator
+        ).sample(rest, 8)
 
     assert not _findings(estimator, chosen, 0)
 
@@ -57,11 +66,15 @@ def test_a_call_that_raises_ends_its_own_update_alone(estimator: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("estimator", list(ESTIMATORS))
-def test_a_call_of_any_method_of_any_estimator_may_raise(estimator: str, seed: int) -> None:
+def test_a_call_of_any_method_of_any_estimator_may_raise(
+    estimator: str, seed: int
+) -> None:
     assert not _findings(estimator, lambda names: names, seed)
 
 
-def _stubborn(estimator: str, error: type[Exception], monkeypatch: pytest.MonkeyPatch) -> Outcome:
+def _stubborn(
+    estimator: str, error: type[Exception], monkeypatch: pytest.MonkeyPatch
+) -> Outcome:
     """Run a tracker whose measurement models raise in every update of the object at y = -300 m."""
     tracker = make(estimator)
     bank, is_active = tracker._tracker._parts.bank._bank, [False]
@@ -86,7 +99,9 @@ def _stubborn(estimator: str, error: type[Exception], monkeypatch: pytest.Monkey
 
 @pytest.mark.long
 @pytest.mark.parametrize("error", [ValueError, MemoryError, np.linalg.LinAlgError])
-@pytest.mark.parametrize("estimator", ["smoother-banded", "smoother", "iekf-replay", "ukf-replay"])
+@pytest.mark.parametrize(
+    "estimator", ["smoother-banded", "smoother", "iekf-replay", "ukf-replay"]
+)
 def test_a_model_that_always_raises_for_one_object_disturbs_no_other(
     estimator: str, error: type[Exception], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -103,12 +118,19 @@ def test_a_model_that_always_raises_for_one_object_disturbs_no_other(
             assert other is not None
             if number in own:
                 for a, b in zip(own[number], other[number], strict=True):
-                    np.testing.assert_allclose(b, a, rtol=_tolerance(estimator), atol=_tolerance(estimator))
+                    np.testing.assert_allclose(
+                        b, a, rtol=_tolerance(estimator), atol=_tolerance(estimator)
+                    )
 
 
 def test_an_interrupt_loses_no_detection_and_the_next_tick_goes_on() -> None:
     reference = run(make("ekf-replay"))
-    for name in ("Preprocess.together", "GatedMahalanobis.__call__", "ExistenceLifecycle.born", "ReplayBank.present"):
+    for name in (
+        "Preprocess.together",
+        "GatedMahalanobis.__call__",
+        "ExistenceLifecycle.born",
+        "ReplayBank.present",
+    ):
         faulty, fault = _with_fault("ekf-replay", name, 3, KeyboardInterrupt)
         assert fault.raised
         assert [each.split()[1] for each in faulty.raised] == ["KeyboardInterrupt:"]
@@ -120,6 +142,9 @@ def test_a_point_is_restored_after_its_fault() -> None:
     tracker = make("ekf-replay")
     bank = tracker._tracker._parts.bank._bank
     before = dict(vars(bank))
-    with Fault(Point(bank, "advance"), 1, ValueError), pytest.raises(ValueError, match="injected"):
+    with (
+        Fault(Point(bank, "advance"), 1, ValueError),
+        pytest.raises(ValueError, match="injected"),
+    ):
         bank.advance(0)
     assert vars(bank) == before

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgtrack.calibration.tune import tuned
-from fgtrack.calibration.tune_space import TuneReport
+from fgtrack.config.settings import Config
+from fgtrack.config.shipped import read_config, read_scenario
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Message
 from fgtrack.models.motion import CTRV
+from fgtrack.noise.parameters import TuneReport
+from fgtrack.noise.tune import tuned
 from fgtrack.pipeline.assumptions.assumed import source_of
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.shipped import read_config, read_scenario
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.sensor import Clutter
 from fgtrack.sim.simulate import simulate
@@ -29,20 +29,40 @@ def by_model(**changes: float) -> Scenario:
     std = {"position": 0.2, "yaw": 0.3, "speed": 1.0, "yaw_rate": 0.5} | changes
     scenario = read_scenario("drawn_ctrv")
     motion = CTRV.from_std_per_step(std, 100.0)
-    return replace(scenario, opponents=tuple(replace(one, motion=motion) for one in scenario.opponents))
+    return replace(
+        scenario,
+        opponents=tuple(replace(one, motion=motion) for one in scenario.opponents),
+    )
 
 
 def ctrv(seed: int) -> tuple[Iterator[Message], Config, Truth]:
     """Late positions with outliers, lost detections and clutter; LiDAR and RADAR differ along and across."""
     scenario = by_model(speed=3.0, yaw_rate=1.0, yaw=0.1)
     lidar, radar = scenario.sensors
-    lidar = replace(lidar, std={"x_m": 0.5, "y_m": 0.2}, outlier_probability=0.02, outlier_factor=5.0)
-    radar = replace(radar, std={"x_m": 1.5, "y_m": 0.6, "speed_mps": 0.5}, outlier_probability=0.01)
+    lidar = replace(
+        lidar,
+        std={"x_m": 0.5, "y_m": 0.2},
+        outlier_probability=0.02,
+        outlier_factor=5.0,
+    )
+    radar = replace(
+        radar, std={"x_m": 1.5, "y_m": 0.6, "speed_mps": 0.5}, outlier_probability=0.01
+    )
     radar = replace(radar, detection_probability=0.8, clutter=Clutter(0.5))
-    truth = {f"sensors.{one.name}.std.{name}": value for one in (lidar, radar) for name, value in one.std.items()}
-    truth |= {"motion.std_per_s.speed": 3.0, "motion.std_per_s.yaw_rate": 1.0, "motion.std_per_s.yaw": 0.1}
+    truth = {
+        f"sensors.{one.name}.std.{name}": value
+        for one in (lidar, radar)
+        for name, value in one.std.items()
+    }
+    truth |= {
+        "motion.std_per_s.speed": 3.0,
+        "motion.std_per_s.yaw_rate": 1.0,
+        "motion.std_per_s.yaw": 0.1,
+    }
     truth["motion.std_per_s.position"] = 0.2
-    messages = simulate(replace(scenario, sensors=(lidar, radar)), np.random.default_rng(seed))
+    messages = simulate(
+        replace(scenario, sensors=(lidar, radar)), np.random.default_rng(seed)
+    )
     return iter(messages), read_config("open_space"), truth
 
 
@@ -53,7 +73,13 @@ def urban(seed: int) -> tuple[Iterator[Message], Config, Truth]:
     motion = CTRV.from_std_per_step(motion_std, 100.0)
     cars = tuple(
         replace(
-            scenario.opponents[0], x_m=x_m, y_m=y_m, yaw_rad=yaw_rad, speed_mps=6.0, yaw_rate_radps=0.0, motion=motion
+            scenario.opponents[0],
+            x_m=x_m,
+            y_m=y_m,
+            yaw_rad=yaw_rad,
+            speed_mps=6.0,
+            yaw_rate_radps=0.0,
+            motion=motion,
         )
         for x_m, y_m, yaw_rad in (
             (60.0, 0.0, 3.0),
@@ -68,7 +94,10 @@ def urban(seed: int) -> tuple[Iterator[Message], Config, Truth]:
         "lidar_cluster": {"x_m": 0.2, "y_m": 0.1},
         "radar": {"range_m": 0.4, "bearing_rad": 0.01, "range_rate_mps": 0.2},
     }
-    wrong_std = "sensors.lidar_cluster.std={x_m: 0.5, y_m: 0.5}", "sensors.radar.births=false"
+    wrong_std = (
+        "sensors.lidar_cluster.std={x_m: 0.5, y_m: 0.5}",
+        "sensors.radar.births=false",
+    )
     sensors = tuple(
         replace(
             one,
@@ -91,7 +120,11 @@ def urban(seed: int) -> tuple[Iterator[Message], Config, Truth]:
             "birth.speed_std_mps=10.0",
         ],
     )
-    truth = {f"sensors.{sensor}.std.{name}": value for sensor, parts in std.items() for name, value in parts.items()}
+    truth = {
+        f"sensors.{sensor}.std.{name}": value
+        for sensor, parts in std.items()
+        for name, value in parts.items()
+    }
     truth |= {f"motion.std_per_s.{name}": value for name, value in motion_std.items()}
     drawn = replace(scenario, ego=ego, opponents=cars, sensors=sensors)
     return iter(simulate(drawn, np.random.default_rng(seed))), config, truth
@@ -104,24 +137,38 @@ def wrong(report: TuneReport, truth: Truth) -> list[str]:
         if one.known in ("yes", "roughly"):
             assert one.std_error is not None
             error = math.log(one.tuned / truth[one.key])
-            if abs(error) > min(math.log(1.15) if one.known == "yes" else math.inf, 3.0 * one.std_error):
-                found.append(f"{one.key}: {one.tuned}, true is {truth[one.key]}, standard error {one.std_error:.3f}")
+            if abs(error) > min(
+                math.log(1.15) if one.known == "yes" else math.inf, 3.0 * one.std_error
+            ):
+                found.append(
+                    f"{one.key}: {one.tuned}, true is {truth[one.key]}, standard error {one.std_error:.3f}"
+                )
     return found
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("scene", "seed"), [(ctrv, 11), (ctrv, 12), (urban, 12), (urban, 13)])
+@pytest.mark.parametrize(
+    ("scene", "seed"), [(ctrv, 11), (ctrv, 12), (urban, 12), (urban, 13)]
+)
 def test_every_identifiable_standard_deviation_is_found(
     scene: Callable[[int], tuple[Iterator[Message], Config, Truth]], seed: int
 ) -> None:
     messages, config, truth = scene(seed)
     kept = list(messages)
-    kept = [one for one in kept if one.receipt_ns < kept[0].receipt_ns + nanoseconds(SECONDS)]
+    kept = [
+        one
+        for one in kept
+        if one.receipt_ns < kept[0].receipt_ns + nanoseconds(SECONDS)
+    ]
     report = tuned({"scene": source_of(lambda: kept)}, config)
     assert wrong(report, truth) == []
     measured = [one for one in report.parameters if one.key.startswith("sensors")]
-    assert all(one.known == "yes" for one in measured), [one.key for one in measured if one.known != "yes"]
+    assert all(one.known == "yes" for one in measured), [
+        one.key for one in measured if one.known != "yes"
+    ]
     assert report.held_out is not None
     assert report.held_out.after > report.held_out.before
     for one in report.held_out.innovations:
-        assert 0.8 < one.after < 2.3  # outliers count: 3 % that are 5 times as large add 0.72
+        assert (
+            0.8 < one.after < 2.3
+        )  # outliers count: 3 % that are 5 times as large add 0.72

@@ -40,14 +40,20 @@ def make(name: str, motion: MotionModel) -> Estimator:
     return estimator("smoother", motion, PRIOR, lag_s=1.0)
 
 
-def late_positions(motion: MotionModel, start_ns: int, num_steps: int) -> list[ScheduledMeasurement]:
+def late_positions(
+    motion: MotionModel, start_ns: int, num_steps: int
+) -> list[ScheduledMeasurement]:
     """Good positions 151 ms late at every other step, bad ones 62 ms late in between, in order of receipt."""
     position = measurement_model(("x_m", "y_m"), motion)
     found = []
     for k in range(1, num_steps + 1):
         stamp_ns = start_ns + k * STEP_NS
         late_ns, std_m = (151_000_000, 0.3) if k % 2 else (62_000_000, 1.0)
-        found.append(ScheduledMeasurement(stamp_ns, stamp_ns + late_ns, position, std_m**2 * np.eye(2)))
+        found.append(
+            ScheduledMeasurement(
+                stamp_ns, stamp_ns + late_ns, position, std_m**2 * np.eye(2)
+            )
+        )
     return sorted(found, key=lambda item: item.receipt_ns)
 
 
@@ -72,16 +78,25 @@ def tried(motion: MotionModel) -> Trial:
         return chain[:, np.searchsorted(stamps_ns, wanted_ns)]
 
     z = truth(np.array([item.stamp_ns for item in items]))[..., :2]
-    z = z + np.sqrt([item.R[0, 0] for item in items])[:, None] * rng.standard_normal(z.shape)
-    errors = {name: np.array([errors_of(name, motion, items, values) for values in z]) for name in NAMES}
+    z = z + np.sqrt([item.R[0, 0] for item in items])[:, None] * rng.standard_normal(
+        z.shape
+    )
+    errors = {
+        name: np.array([errors_of(name, motion, items, values) for values in z])
+        for name in NAMES
+    }
     true_now = truth(np.array(NOWS_NS))
     about = motion, START_NS, P0, items, truth, NOWS_NS
     return Trial(
-        {name: wrapped(found - true_now) for name, found in errors.items()}, bounds(*about), bounds_along(*about)
+        {name: wrapped(found - true_now) for name, found in errors.items()},
+        bounds(*about),
+        bounds_along(*about),
     )
 
 
-def errors_of(name: str, motion: MotionModel, items: list[ScheduledMeasurement], z: FloatArray) -> list[FloatArray]:
+def errors_of(
+    name: str, motion: MotionModel, items: list[ScheduledMeasurement], z: FloatArray
+) -> list[FloatArray]:
     """States at NOWS_NS, from what has arrived by then."""
     estimator, place, found = make(name, motion), 0, []
     for now_ns in NOWS_NS:
@@ -104,33 +119,49 @@ def paper() -> Trial:
     return tried(CTRV())
 
 
-def position_ratio(trial: Trial, name: str, covariances: FloatArray) -> tuple[float, float]:
+def position_ratio(
+    trial: Trial, name: str, covariances: FloatArray
+) -> tuple[float, float]:
     """Mean squared error of the position over its bound, averaged over the times, and the standard error."""
     squared = np.sum(trial.errors[name][..., :2] ** 2, axis=-1)
-    ratio = np.mean(squared / np.trace(covariances[:, :2, :2], axis1=1, axis2=2), axis=1)
+    ratio = np.mean(
+        squared / np.trace(covariances[:, :2, :2], axis1=1, axis2=2), axis=1
+    )
     return float(ratio.mean()), float(ratio.std(ddof=1) / np.sqrt(NUM_RUNS))
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_mean_of_the_bounds_along_the_trajectories_is_reached(paper: Trial, name: str) -> None:
+def test_the_mean_of_the_bounds_along_the_trajectories_is_reached(
+    paper: Trial, name: str
+) -> None:
     ratio, error = position_ratio(paper, name, paper.along.arrived)
     assert abs(ratio - 1.0) < 3.0 * error
     assert error < 0.12
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_estimator_is_better_than_the_posterior_bound(paper: Trial, name: str) -> None:
+def test_no_estimator_is_better_than_the_posterior_bound(
+    paper: Trial, name: str
+) -> None:
     """The trace of B^-1 E[e e'] is at least n, with the bound B and the errors e of all n entries."""
-    for covariance, errors in zip(paper.posterior.arrived, np.moveaxis(paper.errors[name], 1, 0), strict=True):
+    for covariance, errors in zip(
+        paper.posterior.arrived, np.moveaxis(paper.errors[name], 1, 0), strict=True
+    ):
         weighed = np.vecdot(errors, np.linalg.solve(covariance, errors.T).T)
         assert weighed.mean() > 5.0 - 3.0 * weighed.std(ddof=1) / np.sqrt(NUM_RUNS)
 
 
 def test_the_posterior_bound_is_far_off_where_it_matters_much(paper: Trial) -> None:
-    posterior_m2, along_m2 = (np.trace(one.arrived[-1][:2, :2]) for one in (paper.posterior, paper.along))
+    posterior_m2, along_m2 = (
+        np.trace(one.arrived[-1][:2, :2]) for one in (paper.posterior, paper.along)
+    )
     assert posterior_m2 < 0.5 * along_m2
 
 
-def test_who_takes_all_in_time_would_be_below_the_bound_of_what_has_arrived(paper: Trial) -> None:
-    in_time_m2, arrived_m2, dropped_m2 = (np.trace(one[-1][:2, :2]) for one in paper.along)
+def test_who_takes_all_in_time_would_be_below_the_bound_of_what_has_arrived(
+    paper: Trial,
+) -> None:
+    in_time_m2, arrived_m2, dropped_m2 = (
+        np.trace(one[-1][:2, :2]) for one in paper.along
+    )
     assert in_time_m2 < 0.8 * arrived_m2 < 0.8 * 0.8 * dropped_m2

@@ -17,6 +17,8 @@ def positions(yaw_rad: float, num: int, speed_mps: float = 30.0) -> list[Measure
     """Of an object that drives straight on; the same but for the direction."""
     rng, found = np.random.default_rng(0), []
     for k in range(1, num + 1):
-        offset = np.array([speed_mps * k * PERIOD_NS / 1e9, 0.0]) + STD_M * rng.standard_normal(2)
+        offset = np.array(
+            [speed_mps * k * PERIOD_NS / 1e9, 0.0]
+        ) + STD_M * rng.standard_normal(2)
         found.append(position(k, *(rotation(yaw_rad) @ offset).tolist()))
     return found

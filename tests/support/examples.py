@@ -10,4 +10,9 @@ few = settings(max_examples=settings().max_examples // 3)
 
 def slow(*values: Any) -> list[Any]:
     """Parameters that are marked slow; a tuple holds several arguments."""
-    return [pytest.param(*(one if isinstance(one, tuple) else (one,)), marks=pytest.mark.slow) for one in values]
+    return [
+        pytest.param(
+            *(one if isinstance(one, tuple) else (one,)), marks=pytest.mark.slow
+        )
+        for one in values
+    ]

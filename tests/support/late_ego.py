@@ -6,11 +6,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from fgtrack.config.settings import Config
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import clock_ticks, with_last
-from fgtrack.pipeline.config import Config
 
 START_NS = 1_000_000_000_000
 _STEP_S = 0.005
@@ -56,15 +56,24 @@ def drive(given: Drive, seed: int) -> Heard:
     w, phase = 2.0 * math.pi / given.period_s, rng.uniform(0.0, 2.0 * math.pi)
     yaws = given.yaw_rate_radps / w * np.sin(w * t + phase)
     rates = given.yaw_rate_radps * np.cos(w * t + phase)
-    xs, ys = (np.cumsum(given.speed_mps * turn(yaws)) * _STEP_S for turn in (np.cos, np.sin))
+    xs, ys = (
+        np.cumsum(given.speed_mps * turn(yaws)) * _STEP_S for turn in (np.cos, np.sin)
+    )
 
     def ego_at(time_s: float) -> tuple[float, float, float, float]:
-        x_m, y_m, yaw_rad, rate_radps = (float(np.interp(time_s, t, each)) for each in (xs, ys, yaws, rates))
+        x_m, y_m, yaw_rad, rate_radps = (
+            float(np.interp(time_s, t, each)) for each in (xs, ys, yaws, rates)
+        )
         return x_m, y_m, yaw_rad, rate_radps
 
     x_m, y_m, yaw_rad, _ = ego_at(0.0)
     speed_mps, turn_radps, bearing_rad = given.speed_mps, 0.0, rng.uniform(-0.5, 0.5)
-    at = np.array([x_m + given.range_m * math.cos(bearing_rad), y_m + given.range_m * math.sin(bearing_rad)])
+    at = np.array(
+        [
+            x_m + given.range_m * math.cos(bearing_rad),
+            y_m + given.range_m * math.sin(bearing_rad),
+        ]
+    )
     times, positions = np.arange(0.0, given.duration_s + 1.0, _STEP_S), []
     for _ in times:
         positions.append(at.copy())
@@ -81,16 +90,40 @@ def drive(given: Drive, seed: int) -> Heard:
     for k in range(math.ceil((given.duration_s + 1.0) * given.ego_hz)):
         time_s = k / given.ego_hz - 1.0
         if given.ego_from_s <= time_s <= given.ego_until_s:
-            receipt_s = time_s + given.late_s + (rng.uniform(0.0, given.jitter_s) if given.jitter_s else 0.0)
+            receipt_s = (
+                time_s
+                + given.late_s
+                + (rng.uniform(0.0, given.jitter_s) if given.jitter_s else 0.0)
+            )
             x_m, y_m, yaw_rad, rate_radps = ego_at(time_s)
-            heard.append(EgoState(_ns(time_s), _ns(receipt_s), x_m, y_m, yaw_rad, given.speed_mps, rate_radps))
+            heard.append(
+                EgoState(
+                    _ns(time_s),
+                    _ns(receipt_s),
+                    x_m,
+                    y_m,
+                    yaw_rad,
+                    given.speed_mps,
+                    rate_radps,
+                )
+            )
     for k in range(math.ceil(given.duration_s * given.list_hz)):
         time_s = k / given.list_hz
         x_m, y_m, yaw_rad, _ = ego_at(time_s)
-        (dx, dy), c, s = position_m(time_s) - (x_m, y_m), math.cos(yaw_rad), math.sin(yaw_rad)
+        (dx, dy), c, s = (
+            position_m(time_s) - (x_m, y_m),
+            math.cos(yaw_rad),
+            math.sin(yaw_rad),
+        )
         noise_m = given.noise_m * rng.normal(size=2)
-        seen = Detection(x_m=c * dx + s * dy + noise_m[0], y_m=c * dy - s * dx + noise_m[1])
-        heard.append(DetectionList("lidar", _ns(time_s), _ns(time_s + given.delay_s), (seen,), "ego"))
+        seen = Detection(
+            x_m=c * dx + s * dy + noise_m[0], y_m=c * dy - s * dx + noise_m[1]
+        )
+        heard.append(
+            DetectionList(
+                "lidar", _ns(time_s), _ns(time_s + given.delay_s), (seen,), "ego"
+            )
+        )
     return Heard(sorted(heard, key=lambda message: message.receipt_ns), position_m)
 
 
@@ -110,13 +143,19 @@ class Outcome:
     dispositions: list[str] = field(default_factory=list)
 
 
-def followed(given: Drive, seed: int, estimator: str = "ekf-replay", **settings: object) -> Outcome:
+def followed(
+    given: Drive, seed: int, estimator: str = "ekf-replay", **settings: object
+) -> Outcome:
     """Track a drive with the noise that it has; `settings` are those of the ego."""
     sensors = {"lidar": SensorModel(std={"x_m": given.noise_m, "y_m": given.noise_m})}
     config = replace(Config(sensors=sensors), estimator=estimator)
     config = config.replace({"motion.kind": "ctrv"})  # as the object moves
     config = config.replace({f"ego.{name}": value for name, value in settings.items()})
-    tracker, heard, outcome = build_tracker(config), drive(given, seed), Outcome(math.nan, math.nan, 0.0)
+    tracker, heard, outcome = (
+        build_tracker(config),
+        drive(given, seed),
+        Outcome(math.nan, math.nan, 0.0),
+    )
     squares, nees, ticks = list[float](), list[float](), 0
     for tick, is_last in with_last(clock_ticks(heard.messages, config.clock.node_hz)):
         for message in tick.messages:
@@ -133,7 +172,12 @@ def followed(given: Drive, seed: int, estimator: str = "ekf-replay", **settings:
             errors = [np.array([each.x_m, each.y_m]) - truth_m for each in confirmed]
             k = int(np.argmin(np.linalg.norm(errors, axis=1)))
             squares.append(float(errors[k] @ errors[k]))
-            nees.append(float(errors[k] @ np.linalg.solve(confirmed[k].covariance[:2, :2], errors[k])))
+            nees.append(
+                float(
+                    errors[k]
+                    @ np.linalg.solve(confirmed[k].covariance[:2, :2], errors[k])
+                )
+            )
     if nees:
         outcome.nees, outcome.rmse_m = float(np.mean(nees)), math.sqrt(np.mean(squares))
         outcome.tracked = len(nees) / ticks

@@ -4,7 +4,7 @@ import struct
 
 import zstandard
 
-from fgtrack.io.ros.mcap_file import MCAP_MAGIC
+from fgtrack.inputs.ros.mcap_file import MCAP_MAGIC
 
 SEPARATOR = "=" * 80 + "\n"
 
@@ -18,11 +18,19 @@ def text(value: str) -> bytes:
 
 
 def schema(number: int, name: str, definition: str, encoding: str = "ros2msg") -> bytes:
-    return record(0x03, struct.pack("<H", number) + text(name) + text(encoding) + text(definition))
+    return record(
+        0x03, struct.pack("<H", number) + text(name) + text(encoding) + text(definition)
+    )
 
 
 def channel(number: int, schema_number: int, topic: str) -> bytes:
-    return record(0x04, struct.pack("<HH", number, schema_number) + text(topic) + text("cdr") + text(""))
+    return record(
+        0x04,
+        struct.pack("<HH", number, schema_number)
+        + text(topic)
+        + text("cdr")
+        + text(""),
+    )
 
 
 def message(number: int, log_ns: int, data: bytes) -> bytes:
@@ -40,9 +48,17 @@ END = record(0x0F, bytes(4)) + record(0x02, bytes(20)) + MCAP_MAGIC
 CDR = b"\0\1\0\0"
 
 
-def mcap_of_type(definition: str, encoding: str = "ros2msg", data: bytes = bytes(8)) -> bytes:
+def mcap_of_type(
+    definition: str, encoding: str = "ros2msg", data: bytes = bytes(8)
+) -> bytes:
     """A file with one message on `/x`, of the type `a/msg/B` of this definition."""
-    return HEADER + schema(1, "a/msg/B", definition, encoding) + channel(1, 1, "/x") + message(1, 10, CDR + data) + END
+    return (
+        HEADER
+        + schema(1, "a/msg/B", definition, encoding)
+        + channel(1, 1, "/x")
+        + message(1, 10, CDR + data)
+        + END
+    )
 
 
 def poses(count: int) -> bytes:

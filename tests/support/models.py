@@ -3,5 +3,7 @@
 from fgtrack.estimation.registry import MOTION_MODELS
 from fgtrack.models.motion import MotionModel
 
-MOTIONS: dict[str, MotionModel] = {kind: MOTION_MODELS.load(kind)() for kind in MOTION_MODELS}
+MOTIONS: dict[str, MotionModel] = {
+    kind: MOTION_MODELS.load(kind)() for kind in MOTION_MODELS
+}
 MODELS = tuple(MOTIONS.values())

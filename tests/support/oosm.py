@@ -51,19 +51,35 @@ def started(name: str, motion: MotionModel = LINEAR, lag_s: float = LAG_S) -> Es
 
 
 def measured(
-    rng: np.random.Generator, at_s: float, motion: MotionModel = LINEAR, std: float = 1.0, speed: bool = False
+    rng: np.random.Generator,
+    at_s: float,
+    motion: MotionModel = LINEAR,
+    std: float = 1.0,
+    speed: bool = False,
 ) -> Measurement:
-    truth = {"x_m": 3.0 + 20.0 * at_s * np.cos(0.4), "y_m": -2.0 + 20.0 * at_s * np.sin(0.4), "speed_mps": 20.0}
+    truth = {
+        "x_m": 3.0 + 20.0 * at_s * np.cos(0.4),
+        "y_m": -2.0 + 20.0 * at_s * np.sin(0.4),
+        "speed_mps": 20.0,
+    }
     names = tuple(truth) if speed else ("x_m", "y_m")
-    z = np.array([truth[name] for name in names]) + std * rng.standard_normal(len(names))
-    return Measurement(stamp(at_s), measurement_model(names, motion), z, std**2 * np.eye(len(names)))
+    z = np.array([truth[name] for name in names]) + std * rng.standard_normal(
+        len(names)
+    )
+    return Measurement(
+        stamp(at_s), measurement_model(names, motion), z, std**2 * np.eye(len(names))
+    )
 
 
-def in_sequence(rng: np.random.Generator, motion: MotionModel = LINEAR) -> list[Measurement]:
+def in_sequence(
+    rng: np.random.Generator, motion: MotionModel = LINEAR
+) -> list[Measurement]:
     return [measured(rng, k * STEP_S, motion) for k in range(1, NUM_STEPS + 1)]
 
 
-def late(rng: np.random.Generator, lag: int, part: float = 0.3, motion: MotionModel = LINEAR) -> Measurement:
+def late(
+    rng: np.random.Generator, lag: int, part: float = 0.3, motion: MotionModel = LINEAR
+) -> Measurement:
     """Between the steps `lag` and `lag - 1` before the last one."""
     return measured(rng, (NUM_STEPS - lag + part) * STEP_S, motion, 0.3)
 
@@ -74,13 +90,19 @@ def fed(estimator: Estimator, measurements: Sequence[Measurement]) -> Estimator:
     return estimator
 
 
-def replayed(measurements: Sequence[Measurement], motion: MotionModel = LINEAR) -> Estimator:
+def replayed(
+    measurements: Sequence[Measurement], motion: MotionModel = LINEAR
+) -> Estimator:
     return fed(ReplayEkf(motion, prior(), LAG_S), measurements)
 
 
-def assert_same(found: TrackState, expected: TrackState, tolerance: float = 1e-9) -> None:
+def assert_same(
+    found: TrackState, expected: TrackState, tolerance: float = 1e-9
+) -> None:
     scale = np.sqrt(np.diag(expected.covariance))
-    np.testing.assert_allclose((found.mean - expected.mean) / scale, 0.0, atol=tolerance)
+    np.testing.assert_allclose(
+        (found.mean - expected.mean) / scale, 0.0, atol=tolerance
+    )
     difference = (found.covariance - expected.covariance) / np.outer(scale, scale)
     np.testing.assert_allclose(difference, 0.0, atol=tolerance)
 

@@ -51,7 +51,12 @@ class Dynamics:
     @classmethod
     def of(cls, names: tuple[str, ...], density: Mapping[str, float]) -> "Dynamics":
         """From densities by what they drive: position, yaw, speed, yaw_rate, accel or velocity."""
-        drives = {"x_m": "position", "y_m": "position", "vx_mps": "velocity", "vy_mps": "velocity"}
+        drives = {
+            "x_m": "position",
+            "y_m": "position",
+            "vx_mps": "velocity",
+            "vy_mps": "velocity",
+        }
         keys = [drives.get(name, name.rpartition("_")[0]) for name in names]
         return cls(names, tuple(density.get(key, 0.0) for key in keys))
 
@@ -60,7 +65,9 @@ class Dynamics:
         D = np.tile(np.diag(self.densities), (len(x), 1, 1))
         if "yaw_rad" in self.names:
             yaw, speed = self._column["yaw_rad"], x[:, self._column["speed_mps"]]
-            D[:, yaw, yaw] += self.resting_yaw / (1.0 + (speed / self.slow_mps) ** 2) ** 2
+            D[:, yaw, yaw] += (
+                self.resting_yaw / (1.0 + (speed / self.slow_mps) ** 2) ** 2
+            )
         return D
 
     @property
@@ -88,8 +95,14 @@ class Dynamics:
             A[:, 0, at["vx_mps"]] = A[:, 1, at["vy_mps"]] = 1.0
             return A
         yaw, speed = x[:, at["yaw_rad"]], x[:, at["speed_mps"]]
-        A[:, 0, at["yaw_rad"]], A[:, 0, at["speed_mps"]] = -speed * np.sin(yaw), np.cos(yaw)
-        A[:, 1, at["yaw_rad"]], A[:, 1, at["speed_mps"]] = speed * np.cos(yaw), np.sin(yaw)
+        A[:, 0, at["yaw_rad"]], A[:, 0, at["speed_mps"]] = (
+            -speed * np.sin(yaw),
+            np.cos(yaw),
+        )
+        A[:, 1, at["yaw_rad"]], A[:, 1, at["speed_mps"]] = (
+            speed * np.cos(yaw),
+            np.sin(yaw),
+        )
         A[:, at["yaw_rad"], at["yaw_rate_radps"]] = 1.0
         A[:, at["yaw_rate_radps"], at["yaw_rate_radps"]] = -self.relaxation_hz
         if "accel_mps2" in at:
@@ -103,21 +116,41 @@ class Dynamics:
         durations keep their digits.
         """
         m, n = x.shape
-        start = np.concatenate([x, np.tile(np.eye(n).ravel(), (m, 1)), np.zeros((m, n * n))], axis=1)
+        start = np.concatenate(
+            [x, np.tile(np.eye(n).ravel(), (m, 1)), np.zeros((m, n * n))], axis=1
+        )
 
         def derivative(_: float, flat: FloatArray) -> FloatArray:
             packed = flat.reshape(m, -1)
-            F, Q = packed[:, n : n + n * n].reshape(m, n, n), packed[:, n + n * n :].reshape(m, n, n)
+            F, Q = (
+                packed[:, n : n + n * n].reshape(m, n, n),
+                packed[:, n + n * n :].reshape(m, n, n),
+            )
             A = self.slopes(packed[:, :n]) * t[:, None, None]
             AQ, D = A @ Q, self.diffusion(packed[:, :n])
             rates = self.rates(packed[:, :n]) * t[:, None]
             return np.concatenate(
-                [rates, (A @ F).reshape(m, -1), (AQ + np.swapaxes(AQ, 1, 2) + D).reshape(m, -1)], axis=1
+                [
+                    rates,
+                    (A @ F).reshape(m, -1),
+                    (AQ + np.swapaxes(AQ, 1, 2) + D).reshape(m, -1),
+                ],
+                axis=1,
             ).ravel()
 
-        found = solve_ivp(derivative, (0.0, 1.0), start.ravel(), method="DOP853", rtol=_ACCURACY, atol=_SMALLEST)
+        found = solve_ivp(
+            derivative,
+            (0.0, 1.0),
+            start.ravel(),
+            method="DOP853",
+            rtol=_ACCURACY,
+            atol=_SMALLEST,
+        )
         packed = found.y[:, -1].reshape(m, -1)
-        F, Q = packed[:, n : n + n * n].reshape(m, n, n), packed[:, n + n * n :].reshape(m, n, n)
+        F, Q = (
+            packed[:, n : n + n * n].reshape(m, n, n),
+            packed[:, n + n * n :].reshape(m, n, n),
+        )
         return Flow(packed[:, :n], F, Q * t[:, None, None])
 
     def move(self, x: FloatArray, t: float) -> Flow:
@@ -168,7 +201,10 @@ def mounted(vehicle: Vehicle, forward_m: float, left_m: float, yaw_rad: float) -
 def slopes(function: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:
     """Derivative of `function`, (n,) -> (k,), at `x` (n,): difference quotients, shape (k, n)."""
     steps = _STEP * np.eye(len(x))
-    return np.stack([(function(x + step) - function(x - step)) / (2.0 * _STEP) for step in steps], axis=-1)
+    return np.stack(
+        [(function(x + step) - function(x - step)) / (2.0 * _STEP) for step in steps],
+        axis=-1,
+    )
 
 
 @dataclass(frozen=True)
@@ -189,7 +225,9 @@ class Sighting:
         for k, name in enumerate(self.names):
             if name in _ANGLES:
                 y[k] = math.remainder(y[k], 2.0 * math.pi)
-        return np.asarray(linalg.solve_triangular(linalg.cholesky(self.R, lower=True), y, lower=True))
+        return np.asarray(
+            linalg.solve_triangular(linalg.cholesky(self.R, lower=True), y, lower=True)
+        )
 
     def slope(self, x: FloatArray, state_names: tuple[str, ...]) -> FloatArray:
         """Derivative of h by x, whitened, shape (k, n): difference quotients."""
@@ -199,11 +237,17 @@ class Sighting:
         """What the sighting counts at the whitened residual `y`."""
         if self.loss is None:
             return 1.0
-        beyond = 2.0 * stats.norm.sf(self.loss)  # the same share of good measurements, whatever is measured
-        return 1.0 / max(float(np.linalg.norm(y)) / float(stats.chi.isf(beyond, len(y))), 1.0)
+        beyond = 2.0 * stats.norm.sf(
+            self.loss
+        )  # the same share of good measurements, whatever is measured
+        return 1.0 / max(
+            float(np.linalg.norm(y)) / float(stats.chi.isf(beyond, len(y))), 1.0
+        )
 
 
-def seen(names: tuple[str, ...], x: FloatArray, state_names: tuple[str, ...], eye: Eye) -> FloatArray:
+def seen(
+    names: tuple[str, ...], x: FloatArray, state_names: tuple[str, ...], eye: Eye
+) -> FloatArray:
     """What `eye` sees of the state `x` (n,), without noise, shape (k,); angles are not wrapped."""
     state = dict(zip(state_names, x.tolist(), strict=True))
     if "vx_mps" in state:
@@ -254,7 +298,9 @@ class Problem:
         return np.asarray(np.diff(np.array(self.stamps_ns)) / NS_PER_S)
 
 
-def conditioned(P: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
+def conditioned(
+    P: FloatArray, H: FloatArray, R: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Gain K (n, k) of H x + N(0, R) on x of covariance P (n, n), and the covariance that it leaves."""
     K = linalg.solve(H @ P @ H.T + R, H @ P, assume_a="pos").T
     A = np.eye(len(P)) - K @ H
@@ -264,20 +310,29 @@ def conditioned(P: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray
 def whitening(covariance: FloatArray) -> FloatArray:
     """W with W' W the inverse of `covariance`."""
     return np.asarray(
-        linalg.solve_triangular(linalg.cholesky(covariance, lower=True), np.eye(len(covariance)), lower=True)
+        linalg.solve_triangular(
+            linalg.cholesky(covariance, lower=True), np.eye(len(covariance)), lower=True
+        )
     )
 
 
 _NAMES = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2")
 
 
-def kinematic_start(names: tuple[str, ...], values: Sequence[float], std: Sequence[float]) -> Estimate:
+def kinematic_start(
+    names: tuple[str, ...], values: Sequence[float], std: Sequence[float]
+) -> Estimate:
     """The start of a state `names` from x, y, yaw, speed, yaw rate and acceleration that are not correlated.
 
     A velocity (vx, vy) is linearised; across the heading it has the product of the errors of yaw and speed as well.
     """
     own = dict(zip(_NAMES, values, strict=False))
-    P, c, s, speed = np.diag(np.square(std)), math.cos(own["yaw_rad"]), math.sin(own["yaw_rad"]), own["speed_mps"]
+    P, c, s, speed = (
+        np.diag(np.square(std)),
+        math.cos(own["yaw_rad"]),
+        math.sin(own["yaw_rad"]),
+        own["speed_mps"],
+    )
     own.update(vx_mps=speed * c, vy_mps=speed * s)
     J = np.array([[float(name == shown) for shown in _NAMES] for name in names])
     covariance = np.zeros((len(names), len(names)))
@@ -331,7 +386,9 @@ def _with(prior: Estimate, one: Sighting, names: tuple[str, ...]) -> Estimate:
     """The state after a sighting, by tangents at `prior`, weighed by the loss of the residual that is left."""
     y, H, weight = one.residual(prior.mean, names), one.slope(prior.mean, names), 1.0
     for _ in range(_MAX_STEPS):
-        K, P = conditioned(prior.covariance, H, np.eye(len(y)) / max(weight, _LEAST_WEIGHT))
+        K, P = conditioned(
+            prior.covariance, H, np.eye(len(y)) / max(weight, _LEAST_WEIGHT)
+        )
         step = K @ y
         last, weight = weight, one.weight(y - H @ step)
         if abs(weight - last) < _WEIGHT_AT_REST:
@@ -363,15 +420,24 @@ class Solution:
         if place + 1 == len(stamps) or stamps[place] == stamp_ns:
             return moved(self.problem, Estimate(mean, P), stamp_ns - stamps[place])
         until = self.problem.dynamics.move(mean, (stamp_ns - stamps[place]) / NS_PER_S)
-        after = self.problem.dynamics.move(until.mean, (stamps[place + 1] - stamp_ns) / NS_PER_S)
-        return self._between(slice(place * n, (place + 2) * n), until, after, self.means[place + 1])
+        after = self.problem.dynamics.move(
+            until.mean, (stamps[place + 1] - stamp_ns) / NS_PER_S
+        )
+        return self._between(
+            slice(place * n, (place + 2) * n), until, after, self.means[place + 1]
+        )
 
-    def _between(self, both: slice, until: Flow, after: Flow, right: FloatArray) -> Estimate:
+    def _between(
+        self, both: slice, until: Flow, after: Flow, right: FloatArray
+    ) -> Estimate:
         """Condition N(until.mean, until.Q), given the left state, on the right one."""
         by_right, C = conditioned(until.Q, after.F, after.Q)
         by_left = until.F - by_right @ after.F @ until.F
         T = np.hstack([by_left, by_right])
-        return Estimate(until.mean + by_right @ (right - after.mean), C + T @ self.covariance[both, both] @ T.T)
+        return Estimate(
+            until.mean + by_right @ (right - after.mean),
+            C + T @ self.covariance[both, both] @ T.T,
+        )
 
 
 def smoothed(problem: Problem) -> Solution:
@@ -380,7 +446,9 @@ def smoothed(problem: Problem) -> Solution:
     Gauss-Newton on the normal equations' orthogonal factor, from the filter's states; a step that comes no closer is
     halved.
     """
-    means = np.array([estimate.mean for estimate in filtered(problem).estimates.values()])
+    means = np.array(
+        [estimate.mean for estimate in filtered(problem).estimates.values()]
+    )
     last, share = np.inf, 1.0
     for _ in range(_MAX_STEPS):
         A, b = _rows(problem, means)
@@ -392,7 +460,9 @@ def smoothed(problem: Problem) -> Solution:
         if longest < _AT_REST:
             break
     else:
-        raise ArithmeticError(f"the oracle's least squares do not converge: the last step is {last:g}")
+        raise ArithmeticError(
+            f"the oracle's least squares do not converge: the last step is {last:g}"
+        )
     A, _ = _rows(problem, means)
     return Solution(problem, means, _covariance(np.asarray(np.linalg.qr(A, mode="r"))))
 
@@ -406,7 +476,10 @@ def _covariance(R: FloatArray) -> FloatArray:
 def _rows(problem: Problem, means: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Whitened equations A step = b at `means`: of the start, of the segments, of the sightings."""
     count, n = means.shape
-    dynamics, place = problem.dynamics, {stamp_ns: k for k, stamp_ns in enumerate(problem.stamps_ns)}
+    dynamics, place = (
+        problem.dynamics,
+        {stamp_ns: k for k, stamp_ns in enumerate(problem.stamps_ns)},
+    )
     rows, rhs = [], []
 
     def add(blocks: Iterable[tuple[int, FloatArray]], b: FloatArray) -> None:
@@ -424,7 +497,10 @@ def _rows(problem: Problem, means: FloatArray) -> tuple[FloatArray, FloatArray]:
         add([(k, -W @ flow.F[k]), (k + 1, W)], W @ (flow.mean[k] - means[k + 1]))
     for one in problem.sightings:
         k = place[one.stamp_ns]
-        y, H = one.residual(means[k], dynamics.names), one.slope(means[k], dynamics.names)
+        y, H = (
+            one.residual(means[k], dynamics.names),
+            one.slope(means[k], dynamics.names),
+        )
         root = np.sqrt(one.weight(y))
         add([(k, root * H)], root * y)
     return np.vstack(rows), np.concatenate(rhs)

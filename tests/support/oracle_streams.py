@@ -7,7 +7,18 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from support.oracle import Dynamics, Eye, Problem, Sighting, Solution, Vehicle, kinematic_start, mounted, seen, smoothed
+from support.oracle import (
+    Dynamics,
+    Eye,
+    Problem,
+    Sighting,
+    Solution,
+    Vehicle,
+    kinematic_start,
+    mounted,
+    seen,
+    smoothed,
+)
 
 from fgtrack.core.time import NS_PER_S, nanoseconds
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray, Frame
@@ -17,7 +28,7 @@ from fgtrack.models.motion import CTRA, CTRV, CV, MotionModel
 from fgtrack.models.road import Road
 from fgtrack.models.sensors import Mount, RobustLoss, SensorModel
 from fgtrack.tracking.detections import NoMerge
-from fgtrack.tracking.ego import EgoTrajectory
+from fgtrack.tracking.ego.trajectory import EgoTrajectory
 from fgtrack.tracking.inbox import Batch
 from fgtrack.tracking.preprocess import Preprocess
 
@@ -37,7 +48,14 @@ FAST = Start(
     yaw_rate_radps=0.1,
     yaw_rate_std_radps=0.1,
 )
-_TURNING = replace(FAST, position_m=(30.0, 12.0), yaw_rad=3.0, yaw_std_rad=0.2, speed_mps=12.0, yaw_rate_radps=0.5)
+_TURNING = replace(
+    FAST,
+    position_m=(30.0, 12.0),
+    yaw_rad=3.0,
+    yaw_std_rad=0.2,
+    speed_mps=12.0,
+    yaw_rate_radps=0.5,
+)
 
 
 #: Seen from the observer: its detections' frame, and the pose of its RADAR in that frame. The object is behind it.
@@ -49,7 +67,9 @@ _PAPER = {
 }
 _ONBOARD: Mapping[str, SensorModel] = {
     "lidar_cluster": SensorModel(std={"x_m": 0.5, "y_m": 0.2, "yaw_rad": 0.15}),
-    "radar": SensorModel(std={"range_m": 0.5, "bearing_rad": 0.02, "range_rate_mps": 0.1}, mount=_ARM),
+    "radar": SensorModel(
+        std={"range_m": 0.5, "bearing_rad": 0.02, "range_rate_mps": 0.1}, mount=_ARM
+    ),
 }
 
 
@@ -75,7 +95,9 @@ class Stream:
         """Stamps of nodes inside the window and one between them."""
         oldest_ns = self.newest_ns - nanoseconds(0.9 * self.lag_s)
         past = [m.stamp_ns for m in self.measurements if m.stamp_ns >= oldest_ns]
-        return sorted({*past[:: max(len(past) // 5, 1)], (past[0] + self.newest_ns) // 2})
+        return sorted(
+            {*past[:: max(len(past) // 5, 1)], (past[0] + self.newest_ns) // 2}
+        )
 
     @cached_property
     def problem(self) -> Problem:
@@ -88,24 +110,48 @@ class Stream:
         return smoothed(self.problem)
 
 
-def problem_of(motion: MotionModel, prior: Start, sightings: Sequence[Sighting]) -> Problem:
+def problem_of(
+    motion: MotionModel, prior: Start, sightings: Sequence[Sighting]
+) -> Problem:
     """What the oracle is given: a model of fgtrack, a start whose entries are not correlated, sightings."""
-    values = *prior.position_m, prior.yaw_rad or 0.0, prior.speed_mps, prior.yaw_rate_radps, prior.accel_mps2
-    std = prior.position_std_m, prior.position_std_m, prior.yaw_std_rad or 0.0, prior.speed_std_mps
-    start = kinematic_start(motion.state_names, values, (*std, prior.yaw_rate_std_radps, prior.accel_std_mps2))
+    values = (
+        *prior.position_m,
+        prior.yaw_rad or 0.0,
+        prior.speed_mps,
+        prior.yaw_rate_radps,
+        prior.accel_mps2,
+    )
+    std = (
+        prior.position_std_m,
+        prior.position_std_m,
+        prior.yaw_std_rad or 0.0,
+        prior.speed_std_mps,
+    )
+    start = kinematic_start(
+        motion.state_names,
+        values,
+        (*std, prior.yaw_rate_std_radps, prior.accel_std_mps2),
+    )
     names = motion.density_names() if isinstance(motion, CTRV | CV) else ()
     density = {name.partition("_density_")[0]: getattr(motion, name) for name in names}
     dynamics = Dynamics.of(motion.state_names, density)
     if isinstance(motion, CTRV):
-        relaxation_hz = 0.5 * motion.yaw_rate_density_rad2ps3 / motion.yaw_rate_std_radps**2
+        relaxation_hz = (
+            0.5 * motion.yaw_rate_density_rad2ps3 / motion.yaw_rate_std_radps**2
+        )
         dynamics = replace(
-            dynamics, relaxation_hz=relaxation_hz, slow_mps=motion.slow_mps, resting_yaw=motion.resting_yaw_rad2ps
+            dynamics,
+            relaxation_hz=relaxation_hz,
+            slow_mps=motion.slow_mps,
+            resting_yaw=motion.resting_yaw_rad2ps,
         )
     return Problem(dynamics, prior.stamp_ns, start, tuple(sightings))
 
 
 # A sensor measures the state x at a stamp.
-Sense = Callable[[np.random.Generator, FloatArray, int, str], tuple[Measurement, Sighting]]
+Sense = Callable[
+    [np.random.Generator, FloatArray, int, str], tuple[Measurement, Sighting]
+]
 Plan = tuple[FloatArray, npt.NDArray[np.str_]]
 
 
@@ -127,12 +173,22 @@ def observed(rng: np.random.Generator) -> Stream:
     stamps_s, sensors = paper_stamps(0.6)
     stamps_s = np.where(stamps_s > 0.3, stamps_s + 0.7, stamps_s)  # nothing for a while
     plan = stamps_s, sensors
-    return drawn(rng, CTRV(), plan, lag_s=2.0, reach_s=1.9, start=_TURNING, sense=_Onboard(stamps_s))
+    return drawn(
+        rng,
+        CTRV(),
+        plan,
+        lag_s=2.0,
+        reach_s=1.9,
+        start=_TURNING,
+        sense=_Onboard(stamps_s),
+    )
 
 
 def robust(rng: np.random.Generator) -> Stream:
     """Outliers among the positions, and a Huber loss."""
-    return drawn(rng, CTRV(), paper_stamps(0.45), lag_s=2.0, reach_s=1.9, sense=_with_outliers)
+    return drawn(
+        rng, CTRV(), paper_stamps(0.45), lag_s=2.0, reach_s=1.9, sense=_with_outliers
+    )
 
 
 def accelerated(rng: np.random.Generator) -> Stream:
@@ -152,17 +208,28 @@ def paper_stamps(duration_s: float) -> Plan:
     return stamps_s, np.tile(["lidar_cluster", "radar"], len(rounds))
 
 
-def paper(rng: np.random.Generator, x: FloatArray, stamp_ns: int, sensor: str) -> tuple[Measurement, Sighting]:
+def paper(
+    rng: np.random.Generator, x: FloatArray, stamp_ns: int, sensor: str
+) -> tuple[Measurement, Sighting]:
     """What the paper's `sensor` measures of `x`; in a linear model its position only."""
-    noise, motion = _PAPER[sensor], next(m for m in (CV(), CTRV(), CTRA()) if m.dim == len(x))
+    noise, motion = (
+        _PAPER[sensor],
+        next(m for m in (CV(), CTRV(), CTRA()) if m.dim == len(x)),
+    )
     names = _POSITION if motion.linear else tuple(noise.std)
     std = np.array([noise.std[name] for name in names])
-    z = seen(names, x, motion.state_names, Eye()) + std * rng.standard_normal(len(names))
-    measurement = Measurement(stamp_ns, measurement_model(names, motion), z, noise.noise(names))
+    z = seen(names, x, motion.state_names, Eye()) + std * rng.standard_normal(
+        len(names)
+    )
+    measurement = Measurement(
+        stamp_ns, measurement_model(names, motion), z, noise.noise(names)
+    )
     return measurement, Sighting(stamp_ns, names, z, np.diag(std**2))
 
 
-def _with_outliers(rng: np.random.Generator, x: FloatArray, stamp_ns: int, sensor: str) -> tuple[Measurement, Sighting]:
+def _with_outliers(
+    rng: np.random.Generator, x: FloatArray, stamp_ns: int, sensor: str
+) -> tuple[Measurement, Sighting]:
     measurement, sighting = paper(rng, x, stamp_ns, sensor)
     outlier = np.sqrt(np.diag(sighting.R)) * rng.normal(0.0, 8.0, len(sighting.z))
     z = sighting.z + outlier * (rng.random() < 0.2)
@@ -188,28 +255,47 @@ class _Onboard:
         names, std = tuple(model.std), np.array(list(model.std.values()))
         noise, state_names = std * rng.standard_normal(len(std)), CTRV.state_names
         if sensor == "radar":
-            eye = mounted(vehicle, _FRAME_M[0] + _ARM.x_m, _FRAME_M[1] + _ARM.y_m, _ARM.yaw_rad)
+            eye = mounted(
+                vehicle, _FRAME_M[0] + _ARM.x_m, _FRAME_M[1] + _ARM.y_m, _ARM.yaw_rad
+            )
             z = seen(names, x, state_names, eye) + noise
             values = dict(zip(names, z.tolist(), strict=True))
             values["bearing_rad"] = math.remainder(values["bearing_rad"], 2.0 * math.pi)
-            measurement = self._prepared(Detection(**values), stamp_ns, sensor, "sensor")
+            measurement = self._prepared(
+                Detection(**values), stamp_ns, sensor, "sensor"
+            )
             return measurement, Sighting(stamp_ns, names, z, np.diag(std**2), eye)
         eye = mounted(vehicle, *_FRAME_M, 0.0)
         c, s = math.cos(eye.yaw_rad), math.sin(eye.yaw_rad)
-        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])  # map from the frame of detections
+        turn = np.array(
+            [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
+        )  # map from the frame of detections
         there = turn.T @ (x[:3] - np.array([eye.x_m, eye.y_m, eye.yaw_rad])) + noise
         z = turn @ there + np.array([eye.x_m, eye.y_m, eye.yaw_rad])
         z[2] = math.remainder(z[2], 2.0 * math.pi)
-        measurement = self._prepared(Detection(*there.tolist()), stamp_ns, sensor, "ego")
+        measurement = self._prepared(
+            Detection(*there.tolist()), stamp_ns, sensor, "ego"
+        )
         sight = np.eye(3)
         sight[:2, 0] = there[:2] / np.hypot(*there[:2])
-        sight[:2, 1] = -sight[1, 0], sight[0, 0]  # deviations lie along and across the line of sight
+        sight[:2, 1] = (
+            -sight[1, 0],
+            sight[0, 0],
+        )  # deviations lie along and across the line of sight
         R = turn @ sight @ np.diag(std**2) @ sight.T @ turn.T
         return measurement, Sighting(stamp_ns, names, z, R)
 
-    def _prepared(self, detection: Detection, stamp_ns: int, sensor: str, frame: Frame) -> Measurement:
-        batch = Batch(DetectionList(sensor, stamp_ns, stamp_ns, [detection], frame), stamp_ns, (0,))
-        [candidate], _ = self._prepare(batch, _ONBOARD[sensor], self._ego.pose_at(stamp_ns, stamp_ns))
+    def _prepared(
+        self, detection: Detection, stamp_ns: int, sensor: str, frame: Frame
+    ) -> Measurement:
+        batch = Batch(
+            DetectionList(sensor, stamp_ns, stamp_ns, [detection], frame),
+            stamp_ns,
+            (0,),
+        )
+        [candidate], _ = self._prepare(
+            batch, _ONBOARD[sensor], self._ego.pose_at(stamp_ns, stamp_ns)
+        )
         return candidate.measurement
 
 
@@ -218,7 +304,13 @@ def _observer(stamp_ns: int) -> Vehicle:
     yaw_rate, speed_mps = 0.4, 20.0
     yaw_rad = -0.3 + yaw_rate * (stamp_ns - _START_NS) / NS_PER_S
     radius_m = speed_mps / yaw_rate
-    return Vehicle(radius_m * math.sin(yaw_rad), -radius_m * math.cos(yaw_rad), yaw_rad, speed_mps, yaw_rate)
+    return Vehicle(
+        radius_m * math.sin(yaw_rad),
+        -radius_m * math.cos(yaw_rad),
+        yaw_rad,
+        speed_mps,
+        yaw_rate,
+    )
 
 
 def drawn(
@@ -238,10 +330,14 @@ def drawn(
     for stamp_s, sensor in zip(stamps_s.tolist(), sensors.tolist(), strict=True):
         if stamp_s > last_s:
             moved = dynamics.move(x, stamp_s - last_s)
-            x = moved.mean + np.linalg.cholesky(moved.Q) @ rng.standard_normal(motion.dim)
+            x = moved.mean + np.linalg.cholesky(moved.Q) @ rng.standard_normal(
+                motion.dim
+            )
             last_s = stamp_s
         measurement, sighting = sense(rng, x, _START_NS + nanoseconds(stamp_s), sensor)
         measurements.append(measurement)
         sightings.append(sighting)
-    order = np.argsort(stamps_s + rng.uniform(0.0, reach_s, len(stamps_s)), kind="stable").tolist()
+    order = np.argsort(
+        stamps_s + rng.uniform(0.0, reach_s, len(stamps_s)), kind="stable"
+    ).tolist()
     return Stream(motion, start, tuple(measurements), tuple(sightings), order, lag_s)

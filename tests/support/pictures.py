@@ -26,7 +26,10 @@ def faults(figure: Figure) -> list[str]:
         or box.y1 > canvas.y1 + _TOUCH_PX
     ]
     for (name, box), (other, its) in combinations(boxes, 2):
-        wide, high = min(box.x1, its.x1) - max(box.x0, its.x0), min(box.y1, its.y1) - max(box.y0, its.y0)
+        wide, high = (
+            min(box.x1, its.x1) - max(box.x0, its.x0),
+            min(box.y1, its.y1) - max(box.y0, its.y0),
+        )
         if wide > _TOUCH_PX and high > _TOUCH_PX:
             found.append(f"overlap: {name!r} and {other!r}")
     return found
@@ -35,14 +38,26 @@ def faults(figure: Figure) -> list[str]:
 def _boxes(figure: Figure) -> Iterator[tuple[str, Bbox]]:
     """Every text that is seen, and its place in pixels."""
     renderer = FigureCanvasAgg(figure).get_renderer()
-    seen = [text for text in figure.findobj(Text) if text.get_visible() and text.get_text().strip()]
+    seen = [
+        text
+        for text in figure.findobj(Text)
+        if text.get_visible() and text.get_text().strip()
+    ]
     ticks = {id(label) for axes in figure.axes for label in _all_tick_labels(axes)}
     drawn = {id(label) for axes in figure.axes for label in _drawn_tick_labels(axes)}
-    hidden = {id(text) for axes in figure.axes if not axes.get_visible() for text in axes.findobj(Text)}
+    hidden = {
+        id(text)
+        for axes in figure.axes
+        if not axes.get_visible()
+        for text in axes.findobj(Text)
+    }
     for text in seen:
         if id(text) in hidden or (id(text) in ticks and id(text) not in drawn):
             continue
-        yield text.get_text(), Text.get_window_extent(text, renderer)  # of an annotation without its arrow
+        yield (
+            text.get_text(),
+            Text.get_window_extent(text, renderer),
+        )  # of an annotation without its arrow
 
 
 def _all_tick_labels(axes: Axes) -> Iterator[Text]:
@@ -57,4 +72,6 @@ def _drawn_tick_labels(axes: Axes) -> Iterator[Text]:
         low, high = sorted(axis.get_view_interval())
         for tick in (*axis.majorTicks, *axis.minorTicks):
             if low <= tick.get_loc() <= high:
-                yield from (label for label in (tick.label1, tick.label2) if label.get_visible())
+                yield from (
+                    label for label in (tick.label1, tick.label2) if label.get_visible()
+                )

@@ -7,24 +7,41 @@ from typing import Any
 
 import numpy as np
 
+from fgtrack.config.shipped import read_config
 from fgtrack.core.types import Detection, DetectionList, FloatArray
 from fgtrack.estimation.base import Measurement, UpdateResult, UpdateStatus
 from fgtrack.estimation.registry import ESTIMATORS, Claims
 from fgtrack.models.measurement import MeasurementModel
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.live import Tracker
-from fgtrack.pipeline.shipped import read_config
 
 START_NS = 1_600_000_000_000_000_000
 MS = 1_000_000
-ERRORS = (ValueError, KeyError, MemoryError, FloatingPointError, np.linalg.LinAlgError, ZeroDivisionError)
+ERRORS = (
+    ValueError,
+    KeyError,
+    MemoryError,
+    FloatingPointError,
+    np.linalg.LinAlgError,
+    ZeroDivisionError,
+)
 SENSORS = {
     "lidar": SensorModel(std={"x_m": 0.3, "y_m": 0.3}, clutter_per_m2=1e-4),
-    "radar": SensorModel(std={"range_m": 0.5, "bearing_rad": 0.01, "range_rate_mps": 0.3}, clutter_per_m2=1e-4),
-    "mixed": SensorModel(std={"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.1, "speed_mps": 0.5}, clutter_per_m2=1e-4),
+    "radar": SensorModel(
+        std={"range_m": 0.5, "bearing_rad": 0.01, "range_rate_mps": 0.3},
+        clutter_per_m2=1e-4,
+    ),
+    "mixed": SensorModel(
+        std={"x_m": 0.3, "y_m": 0.3, "yaw_rad": 0.1, "speed_mps": 0.5},
+        clutter_per_m2=1e-4,
+    ),
 }
 NUM_OBJECTS = 4
-FUSED = (UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE, UpdateStatus.BEYOND_WINDOW)
+FUSED = (
+    UpdateStatus.IN_SEQUENCE,
+    UpdateStatus.OUT_OF_SEQUENCE,
+    UpdateStatus.BEYOND_WINDOW,
+)
 
 
 def place_m(number: int, time_s: float) -> tuple[float, float]:
@@ -47,15 +64,31 @@ def lists(num_ticks: int) -> list[list[DetectionList]]:
                     continue
                 x_m, y_m = place_m(number, time_s)
                 if sensor == "radar":
-                    polar = {"range_m": float(np.hypot(x_m, y_m)), "bearing_rad": float(np.arctan2(y_m, x_m))}
-                    items.append(Detection(**polar, range_rate_mps=10.0 * x_m / polar["range_m"]))
+                    polar = {
+                        "range_m": float(np.hypot(x_m, y_m)),
+                        "bearing_rad": float(np.arctan2(y_m, x_m)),
+                    }
+                    items.append(
+                        Detection(**polar, range_rate_mps=10.0 * x_m / polar["range_m"])
+                    )
                 elif sensor == "mixed":
                     yaw_rad = 0.0 if number % 2 else None
-                    items.append(Detection(x_m, y_m, yaw_rad, 10.0, class_name="car", id=f"object {number}"))
+                    items.append(
+                        Detection(
+                            x_m,
+                            y_m,
+                            yaw_rad,
+                            10.0,
+                            class_name="car",
+                            id=f"object {number}",
+                        )
+                    )
                 else:
                     items.append(Detection(x_m, y_m))
             stamp_ns = now_ns - late_ms * MS
-            messages.append(DetectionList(sensor, stamp_ns, now_ns, tuple(items), "map"))
+            messages.append(
+                DetectionList(sensor, stamp_ns, now_ns, tuple(items), "map")
+            )
         ticks.append(messages)
     return ticks
 
@@ -96,17 +129,31 @@ def points(tracker: Tracker) -> list[Point]:
     if not getattr(factory, "bank", False):
         owners.append((factory, "update state_at advance"))
     if hasattr(bank, "solver"):
-        owners.append((type(bank.solver), "fuse solve states_at damp iterate relinearise begin"))
-        owners.append((type(bank.solver.nodes), "linearise linearise_factors note windows transition begin_window"))
+        owners.append(
+            (type(bank.solver), "fuse solve states_at damp iterate relinearise begin")
+        )
+        owners.append(
+            (
+                type(bank.solver.nodes),
+                "linearise linearise_factors note windows transition begin_window",
+            )
+        )
     if hasattr(bank, "_rows") and hasattr(bank, "_allocate"):
         owners.append((bank, "_put_in _take_out _allocate _fused _alone"))
-    return [Point(owner, name) for owner, names in owners for name in names.split() if hasattr(owner, name)]
+    return [
+        Point(owner, name)
+        for owner, names in owners
+        for name in names.split()
+        if hasattr(owner, name)
+    ]
 
 
 class Fault:
     """The call number `at` of a method raises what `error` makes; 0 for none."""
 
-    def __init__(self, point: Point, at: int, error: type[BaseException] = ValueError) -> None:
+    def __init__(
+        self, point: Point, at: int, error: type[BaseException] = ValueError
+    ) -> None:
         self.point, self.at, self.error = point, at, error
         self.calls = 0
         """Number of calls so far."""
@@ -138,7 +185,11 @@ class Fault:
             self._set(self._kept)
 
     def _set(self, value: Any) -> None:
-        set_ = type.__setattr__ if isinstance(self.point.owner, type) else object.__setattr__
+        set_ = (
+            type.__setattr__
+            if isinstance(self.point.owner, type)
+            else object.__setattr__
+        )
         set_(self.point.owner, self.point.name, value)
 
 
@@ -172,7 +223,11 @@ def numbers(key: Key) -> list[int]:
     sensor, stamp_ns, _ = key
     late_ms = {"lidar": 150, "radar": 90, "mixed": 0}[sensor]
     k = round((stamp_ns - START_NS) / MS + late_ms) // 100
-    return [each for each in range(NUM_OBJECTS) if not ((each == 2 and k < 4) or (each == 3 and k > 6))]
+    return [
+        each
+        for each in range(NUM_OBJECTS)
+        if not ((each == 2 and k < 4) or (each == 3 and k > 6))
+    ]
 
 
 def object_at(y_m: float) -> int:
@@ -185,15 +240,24 @@ def run(tracker: Tracker, fault: Fault | None = None, num_ticks: int = 12) -> Ou
     outcome, guard = Outcome(), tracker._tracker._parts.bank
     update, claims = guard.update, Claims.of(ESTIMATORS.load(tracker.config.estimator))
 
-    def asked(track_ids: Sequence[int], stamp_ns: int) -> dict[int, tuple[FloatArray, FloatArray]]:
+    def asked(
+        track_ids: Sequence[int], stamp_ns: int
+    ) -> dict[int, tuple[FloatArray, FloatArray]]:
         known: dict[int, tuple[FloatArray, FloatArray]] = {}
         for at_ns in (guard.present_ns, stamp_ns):
             states = guard._bank.states_at(at_ns)
             for row, each in enumerate(states.track_ids):
-                known[each if at_ns == stamp_ns else -1 - each] = states.means[row], states.covariances[row]
-        return {each: known[each] for each in known if max(each, -1 - each) in track_ids}
+                known[each if at_ns == stamp_ns else -1 - each] = (
+                    states.means[row],
+                    states.covariances[row],
+                )
+        return {
+            each: known[each] for each in known if max(each, -1 - each) in track_ids
+        }
 
-    def watched(stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]) -> list[UpdateResult]:
+    def watched(
+        stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+    ) -> list[UpdateResult]:
         if fault is not None:
             fault.paused = True
         before = asked(track_ids, stamp_ns)
@@ -209,10 +273,16 @@ def run(tracker: Tracker, fault: Fault | None = None, num_ticks: int = 12) -> Ou
                 for each in (track_id, -1 - track_id)
                 for a, b in zip(before.get(each, ()), after.get(each, ()), strict=False)
             )
-            if result.status in FUSED and (track_id not in after or (same and not claims.held_s)):
-                outcome.lies.append(f"track {track_id} is {result.status}, but its state is as before, or gone")
+            if result.status in FUSED and (
+                track_id not in after or (same and not claims.held_s)
+            ):
+                outcome.lies.append(
+                    f"track {track_id} is {result.status}, but its state is as before, or gone"
+                )
             if result.status not in FUSED and track_id in after and not same:
-                outcome.lies.append(f"track {track_id} is {result.status}, but its state has changed")
+                outcome.lies.append(
+                    f"track {track_id} is {result.status}, but its state has changed"
+                )
         if fault is not None:
             fault.paused = False
         return results
@@ -229,43 +299,80 @@ def run(tracker: Tracker, fault: Fault | None = None, num_ticks: int = 12) -> Ou
             outcome.raised.append(f"{k}: {type(error).__name__}: {error}")
             outcome.states.append(None)
             continue
-        outcome.rows += [((row.sensor, row.stamp_ns, row.index), row.disposition.value) for row in report.updates]
-        outcome.states.append({object_at(each.y_m): (each.state.mean, each.state.covariance) for each in report.tracks})
-    outcome.failures = {name: count for name, count in tracker.failures.items() if count}
+        outcome.rows += [
+            ((row.sensor, row.stamp_ns, row.index), row.disposition.value)
+            for row in report.updates
+        ]
+        outcome.states.append(
+            {
+                object_at(each.y_m): (each.state.mean, each.state.covariance)
+                for each in report.tracks
+            }
+        )
+    outcome.failures = {
+        name: count for name, count in tracker.failures.items() if count
+    }
     outcome.first_failure = tracker._tracker.failures.first
     del guard.update
     return outcome
 
 
-def problems(reference: Outcome, faulty: Outcome, fault: Fault, tolerance: float) -> list[str]:
+def problems(
+    reference: Outcome, faulty: Outcome, fault: Fault, tolerance: float
+) -> list[str]:
     """What is wrong with a run in which something was raised."""
     result = list(faulty.lies)
-    twice = [each for each, count in Counter(each for each, _ in faulty.rows).items() if count > 1]
+    twice = [
+        each
+        for each, count in Counter(each for each, _ in faulty.rows).items()
+        if count > 1
+    ]
     missing = {each for each, _ in reference.rows} - {each for each, _ in faulty.rows}
     result += [f"twice: {twice}"] if twice else []
     result += [f"missing: {sorted(missing)}"] if missing else []
     may_raise = fault.error in (MemoryError, KeyboardInterrupt)
     result += [f"raised {faulty.raised}"] if len(faulty.raised) > may_raise else []
-    if fault.raised and faulty.rows != reference.rows and not faulty.failures and not faulty.raised:
+    if (
+        fault.raised
+        and faulty.rows != reference.rows
+        and not faulty.failures
+        and not faulty.raised
+    ):
         result.append("something failed, and no failure is counted")
     first = str(faulty.first_failure)
     if faulty.failures and not ("injected" in first or "could not be fused" in first):
-        result.append(f"the first failure is {faulty.first_failure}, of {faulty.failures}")
-    if faulty.failures.keys() & {"not finite", "not positive definite"} and fault.error is not KeyboardInterrupt:
+        result.append(
+            f"the first failure is {faulty.first_failure}, of {faulty.failures}"
+        )
+    if (
+        faulty.failures.keys() & {"not finite", "not positive definite"}
+        and fault.error is not KeyboardInterrupt
+    ):
         result.append(f"{faulty.failures}")
     for number in range(NUM_OBJECTS):
         if faulty.of(number) != reference.of(number):
             continue
-        for k, (own, other) in enumerate(zip(reference.states, faulty.states, strict=True)):
+        for k, (own, other) in enumerate(
+            zip(reference.states, faulty.states, strict=True)
+        ):
             if other is None or number not in own or number not in other:
                 continue
             equal = all(
-                a.tobytes() == b.tobytes() if tolerance == 0.0 else np.allclose(a, b, tolerance, tolerance)
+                a.tobytes() == b.tobytes()
+                if tolerance == 0.0
+                else np.allclose(a, b, tolerance, tolerance)
                 for a, b in zip(own[number], other[number], strict=True)
             )
             if not equal:
-                result.append(f"object {number} differs at tick {k}, though its detections are as in the other run")
+                result.append(
+                    f"object {number} differs at tick {k}, though its detections are as in the other run"
+                )
                 break
-    if faulty.states[-1] is None or faulty.states[-1].keys() != reference.states[-1].keys():  # type: ignore[union-attr]
-        result.append(f"at the end there are {faulty.states[-1] and sorted(faulty.states[-1])}")
+    if (
+        faulty.states[-1] is None
+        or faulty.states[-1].keys() != reference.states[-1].keys()
+    ):  # type: ignore[union-attr]
+        result.append(
+            f"at the end there are {faulty.states[-1] and sorted(faulty.states[-1])}"
+        )
     return result

@@ -18,7 +18,16 @@ from importlib import import_module
 from pathlib import Path
 
 #: What a process does to files, as Python's audit events; writing into an open file is none.
-_CHANGES = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.truncate", "sqlite3.connect")
+_CHANGES = (
+    "open",
+    "os.rename",
+    "os.remove",
+    "os.mkdir",
+    "os.rmdir",
+    "os.link",
+    "os.truncate",
+    "sqlite3.connect",
+)
 
 
 @dataclass(frozen=True)
@@ -62,11 +71,16 @@ class Server:
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [sys.executable, __file__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
         )
         assert self._read() == "ready"
 
-    def __call__(self, words: Sequence[str], folder: Path, **disturbed: object) -> Outcome:
+    def __call__(
+        self, words: Sequence[str], folder: Path, **disturbed: object
+    ) -> Outcome:
         """Run a command in `folder`; `disturbed` are fields of `Order`."""
         assert self._process.stdin is not None
         order = Order(list(words), str(folder), **disturbed)  # type: ignore[arg-type]  # as the caller names them
@@ -105,11 +119,30 @@ def _warm_up() -> None:
     with tempfile.TemporaryDirectory() as folder, open(os.devnull, "w") as nowhere:
         standard, sys.stdout = sys.stdout, nowhere
         stream = f"{folder}/x.jsonl"
-        assert run(["simulate", "single_opponent", "--duration", "1", "-o", stream]) == 0
+        assert (
+            run(["simulate", "single_opponent", "--duration", "1", "-o", stream]) == 0
+        )
         for storage in ("mcap", "sqlite3"):
-            assert run(["convert", stream, f"{folder}/{storage}", "--storage", storage]) == 0
+            assert (
+                run(["convert", stream, f"{folder}/{storage}", "--storage", storage])
+                == 0
+            )
         assert run(["convert", f"{folder}/mcap", f"{folder}/y.jsonl.gz"]) == 0
-        assert run(["replay", stream, "-c", "smoother", "--map", "oval", "-o", f"{folder}/run"]) == 0
+        assert (
+            run(
+                [
+                    "replay",
+                    stream,
+                    "-c",
+                    "smoother",
+                    "--map",
+                    "oval",
+                    "-o",
+                    f"{folder}/run",
+                ]
+            )
+            == 0
+        )
         assert run(["compare", f"{folder}/run"]) == 0
         sys.stdout = standard
 
@@ -122,7 +155,9 @@ def _outcome(order: Order) -> Outcome:
             _child(order, said.fileno(), counted.fileno())
         watched = select.poll()
         watched.register(os.pidfd_open(pid), select.POLLIN)
-        if not watched.poll(None if order.kill_after_s is None else 1e3 * order.kill_after_s):
+        if not watched.poll(
+            None if order.kill_after_s is None else 1e3 * order.kill_after_s
+        ):
             os.kill(pid, signal.SIGKILL)
         _, status, used = os.wait4(pid, 0)
         code = os.waitstatus_to_exitcode(status)
@@ -132,7 +167,12 @@ def _outcome(order: Order) -> Outcome:
         text = said.read().decode(errors="replace")
         changes = int(counted.read() or b"-1")
     return Outcome(
-        code, took_s, text, None if changes < 0 else changes, used.ru_maxrss / 1000.0, used.ru_utime + used.ru_stime
+        code,
+        took_s,
+        text,
+        None if changes < 0 else changes,
+        used.ru_maxrss / 1000.0,
+        used.ru_utime + used.ru_stime,
     )
 
 
@@ -145,14 +185,20 @@ def _child(order: Order, said: int, counted: int) -> None:
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
         os.dup2(said if order.out is None else os.open(order.out, os.O_WRONLY), 1)
         os.dup2(said, 2)
-        sys.stdout, sys.stderr = (os.fdopen(number, "w", closefd=False) for number in (1, 2))
+        sys.stdout, sys.stderr = (
+            os.fdopen(number, "w", closefd=False) for number in (1, 2)
+        )
         if order.largest_file is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (order.largest_file,) * 2)
         if order.user is not None:
             os.setgroups([])
             os.setgid(order.user)
             os.setuid(order.user)
-        changes = (lambda: -1) if order.kill_at_change is None else _kill_at(order.kill_at_change)
+        changes = (
+            (lambda: -1)
+            if order.kill_at_change is None
+            else _kill_at(order.kill_at_change)
+        )
         code = run(order.words)
         os.write(counted, str(changes()).encode())
         sys.stderr.flush()
@@ -179,9 +225,13 @@ def _kill_at(number: int) -> Callable[[], int]:
 
 def _writes(arguments: tuple[object, ...]) -> bool:
     flags = arguments[2]
-    return isinstance(flags, int) and bool(flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT))
+    return isinstance(flags, int) and bool(
+        flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
+    )
 
 
 if __name__ == "__main__":
-    sys.path[0] = str(Path(__file__).parents[1])  # beside this file lies a module `mcap`
+    sys.path[0] = str(
+        Path(__file__).parents[1]
+    )  # beside this file lies a module `mcap`
     serve()

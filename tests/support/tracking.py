@@ -11,9 +11,9 @@ from fgtrack.models.measurement import SensorPose, measurement_model
 from fgtrack.models.motion import CTRV
 from fgtrack.models.road import Road
 from fgtrack.models.track_map import RoadView
-from fgtrack.tracking.existence import Lifecycle
 from fgtrack.tracking.inbox import Batch
-from fgtrack.tracking.lifecycle import Scan
+from fgtrack.tracking.lives.counters import Scan
+from fgtrack.tracking.lives.existence import Lifecycle
 from fgtrack.tracking.preprocess import Candidate, Candidates, Group
 
 ZEROS, UNIT = np.zeros(5), np.eye(5)
@@ -26,7 +26,11 @@ def ms(value: float) -> int:
 
 
 def message(
-    *objects: Detection, sensor: str = "lidar", stamp_ms: float = 0.0, delay_ms: float = 0.0, frame: Frame = "ego"
+    *objects: Detection,
+    sensor: str = "lidar",
+    stamp_ms: float = 0.0,
+    delay_ms: float = 0.0,
+    frame: Frame = "ego",
 ) -> DetectionList:
     """A message that is received `delay_ms` after its stamp."""
     stamp_ns = START_NS + ms(stamp_ms)
@@ -42,14 +46,18 @@ def candidate(x_m: float, y_m: float, variance_m2: float = 0.09) -> Candidate:
     """A position in the map."""
     R = variance_m2 * np.eye(2)
     position = np.array([x_m, y_m])
-    measurement = Measurement(START_NS, measurement_model(("x_m", "y_m"), CTRV()), position, R)
+    measurement = Measurement(
+        START_NS, measurement_model(("x_m", "y_m"), CTRV()), position, R
+    )
     return Candidate(0, (), measurement, position, R)
 
 
 def bearing(bearing_rad: float, pose: SensorPose, std_rad: float = 0.02) -> Candidate:
     """A line of sight."""
     model = measurement_model(("bearing_rad",), CTRV())
-    measurement = Measurement(START_NS, model, np.array([bearing_rad]), np.array([[std_rad**2]]), pose)
+    measurement = Measurement(
+        START_NS, model, np.array([bearing_rad]), np.array([[std_rad**2]]), pose
+    )
     return Candidate(0, (), measurement, None, None)
 
 
@@ -62,18 +70,37 @@ def candidates_of(items: Sequence[Candidate]) -> Candidates:
         if one.position_m is not None:
             lines[i] = *one.position_m, np.nan
         spread = own.R if one.position_covariance is None else one.position_covariance
-        groups.append(Group(np.array([i]), replace(own, z=own.z[None], R=own.R[None]), spread[None], None))
+        groups.append(
+            Group(
+                np.array([i]),
+                replace(own, z=own.z[None], R=own.R[None]),
+                spread[None],
+                None,
+            )
+        )
     return Candidates(list(range(len(items))), {}, lines, groups)
 
 
 def match(
-    life: Lifecycle, track_id: int, scan: Scan, item: Candidate, mean: FloatArray = ZEROS, P: FloatArray = UNIT
+    life: Lifecycle,
+    track_id: int,
+    scan: Scan,
+    item: Candidate,
+    mean: FloatArray = ZEROS,
+    P: FloatArray = UNIT,
 ) -> None:
     """`item` is matched with a track of this state."""
-    life.matched(scan, candidates_of([item]), [(0, 0)], StatesAt((track_id,), mean[None], P[None]))
+    life.matched(
+        scan,
+        candidates_of([item]),
+        [(0, 0)],
+        StatesAt((track_id,), mean[None], P[None]),
+    )
 
 
-def states(positions_m: Sequence[tuple[float, float]], variance_m2: float = 0.09) -> StatesAt:
+def states(
+    positions_m: Sequence[tuple[float, float]], variance_m2: float = 0.09
+) -> StatesAt:
     """Tracks 10, 11, ... at these positions."""
     means = np.zeros((len(positions_m), 5))
     means[:, :2] = np.array(positions_m).reshape(-1, 2)
@@ -86,12 +113,25 @@ class StraightRoad(Road):
 
     known = True
 
-    def __init__(self, yaw_rad: float = 0.4, curvature_radpm: float = 0.01, half_width_m: float = np.inf) -> None:
+    def __init__(
+        self,
+        yaw_rad: float = 0.4,
+        curvature_radpm: float = 0.01,
+        half_width_m: float = np.inf,
+    ) -> None:
         super().__init__()
-        self.__dict__.update(_yaw_rad=yaw_rad, _curvature_radpm=curvature_radpm, _half_width_m=half_width_m)
+        self.__dict__.update(
+            _yaw_rad=yaw_rad,
+            _curvature_radpm=curvature_radpm,
+            _half_width_m=half_width_m,
+        )
 
     def view(self, points_m: FloatArray) -> RoadView:
         """See `fgtrack.models.road.Road.view`."""
         count = len(points_m)
         outside = np.abs(points_m[:, 1]) > self._half_width_m
-        return RoadView(np.full(count, self._yaw_rad), np.full(count, self._curvature_radpm), outside)
+        return RoadView(
+            np.full(count, self._yaw_rad),
+            np.full(count, self._curvature_radpm),
+            outside,
+        )

@@ -19,7 +19,7 @@ from fgtrack.core.types import (
     TruthState,
     UpdateRecord,
 )
-from fgtrack.io.run import Run, RunWriter, load_run
+from fgtrack.runs import Run, RunWriter, load_run
 
 START_NS = 1_700_000_000_000_000_000
 TICK_NS = 20_000_000
@@ -42,7 +42,12 @@ class Car:
         yaw = self.yaw_rad + turned / 2
         chord = self.speed_mps * t_s * float(np.sinc(turned / (2 * math.pi)))
         heading = math.remainder(self.yaw_rad + turned, 2 * math.pi)
-        return self.x_m + chord * math.cos(yaw), self.y_m + chord * math.sin(yaw), heading, self.speed_mps
+        return (
+            self.x_m + chord * math.cos(yaw),
+            self.y_m + chord * math.sin(yaw),
+            heading,
+            self.speed_mps,
+        )
 
     def truth(self, ticks: Iterable[int], *, pose: bool = True) -> list[TruthState]:
         """Truth at `ticks`; without `pose` only its position."""
@@ -51,7 +56,9 @@ class Car:
             stamp_ns = START_NS + tick * TICK_NS
             x_m, y_m, yaw_rad, speed_mps = self.state(tick * TICK_NS / 1e9)
             motion = (yaw_rad, speed_mps) if pose else (None, None)
-            rows.append(TruthState(stamp_ns, stamp_ns, self.object_id, x_m, y_m, *motion))
+            rows.append(
+                TruthState(stamp_ns, stamp_ns, self.object_id, x_m, y_m, *motion)
+            )
         return rows
 
     def track(
@@ -81,9 +88,13 @@ class Car:
         status = TrackStatus.TENTATIVE if num_measured < 3 else TrackStatus.CONFIRMED
         return TrackReport(track_id, status, state, num_measured)
 
-    def later(self, tick: float, track_id: int, lag_s: float | None = None, **errors: float) -> SmoothedReport:
+    def later(
+        self, tick: float, track_id: int, lag_s: float | None = None, **errors: float
+    ) -> SmoothedReport:
         """What is known later of this car at `tick`; finally, without `lag_s`."""
-        return SmoothedReport(track_id, self.track(tick, track_id, **errors).state, lag_s)
+        return SmoothedReport(
+            track_id, self.track(tick, track_id, **errors).state, lag_s
+        )
 
 
 #: A car that drives west, where the heading jumps, and one that drives round and round.
@@ -119,7 +130,13 @@ def write_run(
         for tick in range(ticks):
             rows = tuple(tracks[tick]) if tick < len(tracks) else ()
             records = tuple(updates.get(tick, ()))
-            report = TickReport(tick, START_NS + tick * TICK_NS, rows, records, tuple(smoothed.get(tick, ())))
+            report = TickReport(
+                tick,
+                START_NS + tick * TICK_NS,
+                rows,
+                records,
+                tuple(smoothed.get(tick, ())),
+            )
             duration = process_ns[tick] if tick < len(process_ns) else 1_000_000
             count = num_detections[tick] if tick < len(num_detections) else len(records)
             writer.write_tick(report, duration, count)
@@ -140,7 +157,16 @@ def update(
 ) -> UpdateRecord:
     """An update of the detection sensed at `tick`."""
     stamp_ns = START_NS + tick * TICK_NS
-    return UpdateRecord(sensor, stamp_ns, stamp_ns + delay_ns, index, disposition, track_id, nis, dict(innovation))
+    return UpdateRecord(
+        sensor,
+        stamp_ns,
+        stamp_ns + delay_ns,
+        index,
+        disposition,
+        track_id,
+        nis,
+        dict(innovation),
+    )
 
 
 def run_beside(path: Path) -> Run:
@@ -148,7 +174,17 @@ def run_beside(path: Path) -> Run:
     tracks = [[WEST.track(k, 1, along_m=2.0)] for k in range(150)]
     updates = {k: [update("lidar", tick=k, x_m=0.3, y_m=0.1)] for k in range(1, 150)}
     updates |= {
-        k: [*updates[k], update("radar", tick=k - 5, delay_ns=100_000_000, x_m=-1.0, y_m=0.0, speed_mps=2.0)]
+        k: [
+            *updates[k],
+            update(
+                "radar",
+                tick=k - 5,
+                delay_ns=100_000_000,
+                x_m=-1.0,
+                y_m=0.0,
+                speed_mps=2.0,
+            ),
+        ]
         for k in (100, 120)
     }
     updates[0] = [update("lidar", tick=0, disposition=Disposition.BIRTH)]
@@ -158,7 +194,13 @@ def run_beside(path: Path) -> Run:
         for tick in range(150):
             x_m, y_m, yaw_rad, _ = WEST.state(tick * TICK_NS / 1e9)
             now_ns = START_NS + tick * TICK_NS
-            writer.write_ego(EgoState(now_ns, now_ns, x_m + 30.0, y_m + 3.0, yaw_rad, 30.0))
-            writer.write_tick(TickReport(tick, now_ns, tuple(tracks[tick]), tuple(updates[tick])), 2_000_000, 1)
+            writer.write_ego(
+                EgoState(now_ns, now_ns, x_m + 30.0, y_m + 3.0, yaw_rad, 30.0)
+            )
+            writer.write_tick(
+                TickReport(tick, now_ns, tuple(tracks[tick]), tuple(updates[tick])),
+                2_000_000,
+                1,
+            )
         writer.finish({"estimator": "ekf-replay"})
     return load_run(path)

@@ -25,7 +25,9 @@ def random_scenes(seed: int, side_m: float) -> tuple[Positions, Positions, Scene
     """
     rng = np.random.default_rng(seed)
     ticks, count = int(rng.integers(1, 40)), int(rng.integers(1, 6))
-    xy = rng.uniform(0.0, side_m, (count, 2)) + np.cumsum(rng.normal(0.0, 0.5, (ticks, count, 2)), axis=0)
+    xy = rng.uniform(0.0, side_m, (count, 2)) + np.cumsum(
+        rng.normal(0.0, 0.5, (ticks, count, 2)), axis=0
+    )
     present = rng.random((ticks, count)) > 0.15
     followers = np.arange(count)
     objects, tracks = Positions([], []), Positions([], [])
@@ -41,7 +43,9 @@ def random_scenes(seed: int, side_m: float) -> tuple[Positions, Positions, Scene
         objects.xy.append(xy[tick, present[tick]])
         tracks.ids.append(np.concatenate([followers[seen], 1000 + clutter]))
         around = xy[tick, seen] + rng.normal(0.0, 2.0, (seen.sum(), 2))
-        tracks.xy.append(np.concatenate([around, rng.uniform(0.0, side_m, (len(clutter), 2))]))
+        tracks.xy.append(
+            np.concatenate([around, rng.uniform(0.0, side_m, (len(clutter), 2))])
+        )
     return objects, tracks, as_scenes(objects, tracks, count)
 
 
@@ -55,4 +59,6 @@ def as_scenes(objects: Positions, tracks: Positions, count: int) -> Scenes:
         block[:, ids] = np.linalg.norm(tracks.xy[tick][:, None] - xy, axis=-1)
         blocks.append(block)
     tick_index = np.repeat(np.arange(len(blocks)), [len(block) for block in blocks])
-    return Scenes(tick_index, np.concatenate(tracks.ids), np.concatenate(blocks), present, present)
+    return Scenes(
+        tick_index, np.concatenate(tracks.ids), np.concatenate(blocks), present, present
+    )

@@ -4,15 +4,22 @@ import numpy as np
 import pytest
 from support.tracking import START_NS, ms
 
-from fgtrack.core.types import Detection, DetectionList, Disposition, EgoState, TickReport, TrackStatus
+from fgtrack.config.settings import Config, MotionConfig
+from fgtrack.core.types import (
+    Detection,
+    DetectionList,
+    Disposition,
+    EgoState,
+    TickReport,
+    TrackStatus,
+)
 from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.models.sensors import Correlation, SensorModel
 from fgtrack.pipeline.build import build_tracker
-from fgtrack.pipeline.config import Config, MotionConfig
 from fgtrack.tracking.association import GatedEuclidean
 from fgtrack.tracking.birth import Birth
-from fgtrack.tracking.existence import ExistenceRules
-from fgtrack.tracking.lifecycle import LifecycleRules
+from fgtrack.tracking.lives.counters import LifecycleRules
+from fgtrack.tracking.lives.existence import ExistenceRules
 from fgtrack.tracking.tracker import Tracker
 
 AT_M = np.array([40.0, 10.0])
@@ -21,11 +28,20 @@ LIVES: list[LifecycleRules | ExistenceRules] = [
     LifecycleRules(kind="published", forget_s=2.0, confirm_count=3),
     ExistenceRules(lifetime_s=2.0, out_of_view_s=1e6),
 ]
-SENSORS = {"lidar": SensorModel(std={"x_m": 0.3, "y_m": 0.3}), "camera": SensorModel(std={"bearing_rad": 0.01})}
+SENSORS = {
+    "lidar": SensorModel(std={"x_m": 0.3, "y_m": 0.3}),
+    "camera": SensorModel(std={"bearing_rad": 0.01}),
+}
 
 
-def tracker(lifecycle, estimator: str = "ekf-replay", camera: SensorModel = SENSORS["camera"]) -> Tracker:
-    motion = Config().motion if estimator == "ekf-backward-forward" else MotionConfig("cv", {"velocity": 1.0})
+def tracker(
+    lifecycle, estimator: str = "ekf-replay", camera: SensorModel = SENSORS["camera"]
+) -> Tracker:
+    motion = (
+        Config().motion
+        if estimator == "ekf-backward-forward"
+        else MotionConfig("cv", {"velocity": 1.0})
+    )
     config = Config(
         estimator,
         sensors={**SENSORS, "camera": camera},
@@ -42,8 +58,16 @@ def look(tracker: Tracker, sensor: str, at_ms: float) -> TickReport:
     now_ns = START_NS + ms(at_ms)
     tracker.receive(EgoState(now_ns, now_ns, 0.0, 0.0, 0.0, 0.0))
     bearing_rad = float(np.arctan2(AT_M[1], AT_M[0]))
-    seen = Detection(x_m=AT_M[0], y_m=AT_M[1]) if sensor == "lidar" else Detection(bearing_rad=bearing_rad)
-    tracker.receive(DetectionList(sensor, now_ns, now_ns, [seen], "map" if sensor == "lidar" else "ego"))
+    seen = (
+        Detection(x_m=AT_M[0], y_m=AT_M[1])
+        if sensor == "lidar"
+        else Detection(bearing_rad=bearing_rad)
+    )
+    tracker.receive(
+        DetectionList(
+            sensor, now_ns, now_ns, [seen], "map" if sensor == "lidar" else "ego"
+        )
+    )
     return tracker.tick(now_ns)
 
 
@@ -69,13 +93,17 @@ def test_bearings_alone_do_not_confirm_a_track(lifecycle) -> None:
     assert track.status is TrackStatus.CONFIRMED
 
 
-@pytest.mark.parametrize("lifecycle", [LIVES[0], LIVES[2]], ids=["counting", "existence"])
+@pytest.mark.parametrize(
+    "lifecycle", [LIVES[0], LIVES[2]], ids=["counting", "existence"]
+)
 def test_bearings_alone_do_not_keep_a_track_for_ever(lifecycle) -> None:
     one = tracker(lifecycle)
     for k in range(10):
         (track,) = look(one, "lidar", 100.0 * k).tracks
     assert track.status is TrackStatus.CONFIRMED
-    lived_s = next(0.1 * k for k in range(10, 1000) if not look(one, "camera", 100.0 * k).tracks)
+    lived_s = next(
+        0.1 * k for k in range(10, 1000) if not look(one, "camera", 100.0 * k).tracks
+    )
     assert 2.0 < lived_s < 40.0
 
 
@@ -91,12 +119,20 @@ def test_a_camera_that_does_not_see_a_track_does_not_end_it(lifecycle) -> None:
 
 
 @pytest.mark.parametrize("estimator", ["ekf-replay", "smoother-banded"])
-def test_a_bias_that_is_a_state_pulls_no_track_and_is_found_whatever_arrives_first(estimator: str) -> None:
+def test_a_bias_that_is_a_state_pulls_no_track_and_is_found_whatever_arrives_first(
+    estimator: str,
+) -> None:
     """Bearings that are wrong by 2 m at the object, for good; half of them overtake the positions."""
     bias_rad, std_rad, errors_m, innovations = 0.05, 0.05, {}, []
-    for name, correlation in (("white", None), ("lasting", Correlation(share=0.99, time_s=100.0))):
+    for name, correlation in (
+        ("white", None),
+        ("lasting", Correlation(share=0.99, time_s=100.0)),
+    ):
         white_rad = std_rad * 0.1  # what of the error is new in every detection
-        camera = SensorModel(std={"bearing_rad": std_rad if correlation else white_rad}, correlation=correlation)
+        camera = SensorModel(
+            std={"bearing_rad": std_rad if correlation else white_rad},
+            correlation=correlation,
+        )
         one = tracker(LIVES[0], estimator, camera)
         rng = np.random.default_rng(3)
         for k in range(100):
@@ -105,11 +141,31 @@ def test_a_bias_that_is_a_state_pulls_no_track_and_is_found_whatever_arrives_fir
             if k % 5 == 2:  # 150 ms late
                 x_m, y_m = AT_M + 0.3 * rng.standard_normal(2)
                 late_ns = now_ns - ms(150.0)
-                one.receive(DetectionList("lidar", late_ns, now_ns, [Detection(x_m=x_m, y_m=y_m)], "map"))
-            bearing_rad = float(np.arctan2(AT_M[1], AT_M[0])) + bias_rad + white_rad * rng.standard_normal()
-            one.receive(DetectionList("camera", now_ns, now_ns, [Detection(bearing_rad=bearing_rad)], "ego"))
+                one.receive(
+                    DetectionList(
+                        "lidar", late_ns, now_ns, [Detection(x_m=x_m, y_m=y_m)], "map"
+                    )
+                )
+            bearing_rad = (
+                float(np.arctan2(AT_M[1], AT_M[0]))
+                + bias_rad
+                + white_rad * rng.standard_normal()
+            )
+            one.receive(
+                DetectionList(
+                    "camera",
+                    now_ns,
+                    now_ns,
+                    [Detection(bearing_rad=bearing_rad)],
+                    "ego",
+                )
+            )
             report = one.tick(now_ns)
-            innovations += [each.innovation for each in report.updates if correlation and each.sensor == "camera"]
+            innovations += [
+                each.innovation
+                for each in report.updates
+                if correlation and each.sensor == "camera"
+            ]
         (track,) = report.tracks
         errors_m[name] = float(np.hypot(track.x_m - AT_M[0], track.y_m - AT_M[1]))
     assert errors_m["white"] > 0.8

@@ -8,7 +8,13 @@ from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.replay import ReplayEkf
-from fgtrack.evaluation.bounds import Bounds, ScheduledMeasurement, _step, bounds, bounds_along
+from fgtrack.evaluation.bounds import (
+    Bounds,
+    ScheduledMeasurement,
+    _step,
+    bounds,
+    bounds_along,
+)
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRV, CV, MotionModel
 
@@ -32,8 +38,14 @@ def planned(motion: MotionModel, seed: int = 0) -> list[ScheduledMeasurement]:
     for k in range(1, 20):
         late_ns = int(rng.uniform(0.3, 0.4) * NS_PER_S)
         stamp_ns = START_NS + k * 100_000_000
-        found.append(ScheduledMeasurement(stamp_ns, stamp_ns + late_ns, model, 0.04 * np.eye(2)))
-        found.append(ScheduledMeasurement(stamp_ns + 40_000_000, stamp_ns + 45_000_000, model, 2.0 * np.eye(2)))
+        found.append(
+            ScheduledMeasurement(stamp_ns, stamp_ns + late_ns, model, 0.04 * np.eye(2))
+        )
+        found.append(
+            ScheduledMeasurement(
+                stamp_ns + 40_000_000, stamp_ns + 45_000_000, model, 2.0 * np.eye(2)
+            )
+        )
     return found
 
 
@@ -45,7 +57,9 @@ def straight(motion: MotionModel, x: FloatArray, trajectories: int = 1):
     return truth
 
 
-def replayed(motion: MotionModel, items: Sequence[ScheduledMeasurement], now_ns: int) -> FloatArray:
+def replayed(
+    motion: MotionModel, items: Sequence[ScheduledMeasurement], now_ns: int
+) -> FloatArray:
     """Covariance of the exact filter, given `items` with any values."""
     estimator = ReplayEkf(motion, PRIOR, 100.0)
     for item in items:
@@ -71,16 +85,32 @@ def test_in_a_linear_model_the_bounds_are_the_covariances_of_the_exact_filter() 
                 kept.append(item)
             newest_ns = max(newest_ns, item.stamp_ns)
         for covariance, expected in zip(
-            (found.in_time[i], found.arrived[i], found.dropped[i]), (sensed, arrived, kept), strict=True
+            (found.in_time[i], found.arrived[i], found.dropped[i]),
+            (sensed, arrived, kept),
+            strict=True,
         ):
-            np.testing.assert_allclose(covariance, replayed(motion, expected, now_ns), rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(
+                covariance, replayed(motion, expected, now_ns), rtol=1e-9, atol=1e-12
+            )
 
 
 @pytest.mark.parametrize("motion", [CV(5.0), CTRV()])
-def test_what_has_arrived_lies_between_all_and_what_came_in_time(motion: MotionModel) -> None:
+def test_what_has_arrived_lies_between_all_and_what_came_in_time(
+    motion: MotionModel,
+) -> None:
     x, P = initial_state(motion, PRIOR)
-    found = bounds(motion, START_NS, P, planned(motion), straight(motion, x, trajectories=3), NOW_NS)
-    for smaller, larger in ((found.in_time, found.arrived), (found.arrived, found.dropped)):
+    found = bounds(
+        motion,
+        START_NS,
+        P,
+        planned(motion),
+        straight(motion, x, trajectories=3),
+        NOW_NS,
+    )
+    for smaller, larger in (
+        (found.in_time, found.arrived),
+        (found.arrived, found.dropped),
+    ):
         least = np.linalg.eigvalsh(larger - smaller).min(axis=-1)
         assert (least > -1e-9).all()
     assert np.trace(found.dropped[-1] - found.arrived[-1]) > 1e-3
@@ -89,22 +119,31 @@ def test_what_has_arrived_lies_between_all_and_what_came_in_time(motion: MotionM
 def test_the_bounds_along_trajectories_are_the_mean_of_those_of_each() -> None:
     motion = CTRV()
     x, P = initial_state(motion, PRIOR)
-    starts = x + np.random.default_rng(1).standard_normal((3, 5)) @ np.linalg.cholesky(P).T
+    starts = (
+        x + np.random.default_rng(1).standard_normal((3, 5)) @ np.linalg.cholesky(P).T
+    )
 
     def truth(stamps_ns: IntArray) -> FloatArray:
         return motion.predict(starts[:, None], (stamps_ns - START_NS) / NS_PER_S)
 
     found = bounds_along(motion, START_NS, P, planned(motion), truth, NOW_NS)
-    each = [bounds(motion, START_NS, P, planned(motion), straight(motion, start), NOW_NS) for start in starts]
+    each = [
+        bounds(motion, START_NS, P, planned(motion), straight(motion, start), NOW_NS)
+        for start in starts
+    ]
     for mean, single in zip(found, zip(*each, strict=True), strict=True):
         np.testing.assert_allclose(mean, np.mean(single, axis=0), rtol=1e-12)
 
 
 @pytest.mark.parametrize("function", [bounds, bounds_along])
-def test_a_measurement_before_the_start_is_refused(function: Callable[..., Bounds]) -> None:
+def test_a_measurement_before_the_start_is_refused(
+    function: Callable[..., Bounds],
+) -> None:
     motion = CV(5.0)
     x, P = initial_state(motion, PRIOR)
-    early = ScheduledMeasurement(START_NS - 1, START_NS, measurement_model(("x_m", "y_m"), motion), np.eye(2))
+    early = ScheduledMeasurement(
+        START_NS - 1, START_NS, measurement_model(("x_m", "y_m"), motion), np.eye(2)
+    )
     with pytest.raises(ValueError, match="start_ns"):
         function(motion, START_NS, P, [early], straight(motion, x), NOW_NS)
 
@@ -123,11 +162,18 @@ def test_noise_that_depends_on_the_state_tells_of_it() -> None:
     J = np.empty((5, 5))
     for i, a in enumerate(h * np.eye(5)):
         for j, b in enumerate(h * np.eye(5)):
-            corners = divergence(a + b) - divergence(a - b) - divergence(b - a) + divergence(-a - b)
+            corners = (
+                divergence(a + b)
+                - divergence(a - b)
+                - divergence(b - a)
+                + divergence(-a - b)
+            )
             J[i, j] = corners / (4.0 * h * h)
     F, weight = motion.jacobian(x, dt_s), np.linalg.inv(motion.process_noise(x, dt_s))
     D11, D12, D22 = _step(motion, x[None], dt_s)
-    np.testing.assert_allclose(D11 - F.T @ weight @ F, J, rtol=1e-3, atol=1e-3 * J.max())
+    np.testing.assert_allclose(
+        D11 - F.T @ weight @ F, J, rtol=1e-3, atol=1e-3 * J.max()
+    )
     np.testing.assert_allclose(D22, weight, rtol=1e-9)
     np.testing.assert_allclose(D12, -F.T @ weight, rtol=1e-9)
     assert J[2, 2] > 1.0  # the heading shows in the direction of the noise

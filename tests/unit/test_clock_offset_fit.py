@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.special import stdtrit
 
-from fgtrack.calibration.clock_offsets import _Fit, _solved
-from fgtrack.calibration.paths import EgoPath
+from fgtrack.clocks.offsets import _Fit, _solved
+from fgtrack.clocks.paths import EgoPath
 from fgtrack.core.geometry import rotations
 from fgtrack.core.types import EgoState, FloatArray, IntArray
 
@@ -14,11 +14,17 @@ STRETCH = 100
 """Samples in a stretch of 5 s."""
 
 
-def solved(r: FloatArray, g: FloatArray, yaws_rad: FloatArray, stamps_ns: IntArray) -> _Fit:
-    return _solved(r, np.concatenate([g[:, :, None], rotations(yaws_rad)], axis=2), stamps_ns)
+def solved(
+    r: FloatArray, g: FloatArray, yaws_rad: FloatArray, stamps_ns: IntArray
+) -> _Fit:
+    return _solved(
+        r, np.concatenate([g[:, :, None], rotations(yaws_rad)], axis=2), stamps_ns
+    )
 
 
-def recording(rng: np.random.Generator, offset_s: float = 0.0) -> tuple[float, float, float]:
+def recording(
+    rng: np.random.Generator, offset_s: float = 0.0
+) -> tuple[float, float, float]:
     """A minute of an object that drives ahead, overtaken in four stretches; errors of positions last for a second."""
     count = 12 * STRETCH
     overtaking = np.zeros(count)
@@ -67,13 +73,24 @@ def test_the_path_of_the_ego_does_not_move_with_the_noise_of_its_states() -> Non
     yaws_rad = 2.5 + 0.25 * times_s
     positions_m = 200.0 * np.stack([np.sin(yaws_rad), -np.cos(yaws_rad)], axis=-1)
     states = [
-        EgoState(k * 10_000_000, k * 10_000_000, x, y, float(np.arctan2(np.sin(yaw), np.cos(yaw))), 50.0)
-        for k, ((x, y), yaw) in enumerate(zip(positions_m + rng.normal(0.0, 0.02, (1000, 2)), yaws_rad, strict=True))
+        EgoState(
+            k * 10_000_000,
+            k * 10_000_000,
+            x,
+            y,
+            float(np.arctan2(np.sin(yaw), np.cos(yaw))),
+            50.0,
+        )
+        for k, ((x, y), yaw) in enumerate(
+            zip(positions_m + rng.normal(0.0, 0.02, (1000, 2)), yaws_rad, strict=True)
+        )
     ]
     ego = EgoPath(reversed(states))
     poses = ego(np.array([1_234_000_000, 5_000_000_000, 20_000_000_000]))
     yaw_rad = 2.5 + 0.25 * 1.234
-    assert poses[0] == pytest.approx([200.0 * np.sin(yaw_rad), -200.0 * np.cos(yaw_rad), yaw_rad], abs=0.02)
+    assert poses[0] == pytest.approx(
+        [200.0 * np.sin(yaw_rad), -200.0 * np.cos(yaw_rad), yaw_rad], abs=0.02
+    )
     assert np.isnan(poses[2]).all()
     steps_m = np.diff(ego(np.arange(100, 900) * 10_000_000)[:, :2], axis=0)
     assert np.hypot(*steps_m.T) / 0.01 == pytest.approx(50.0, abs=0.5)

@@ -30,7 +30,9 @@ def loaded(path: Path, source: str) -> Any:
 
 
 @pytest.fixture
-def stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str], Any]:
+def stored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[str, str], Any]:
     """Function that loads the modules `callee` and `caller`, whose loops are stored in a folder of this test."""
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr(compiled, "_said", set())
@@ -40,7 +42,10 @@ def stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, st
     def load(callee: str, caller: str) -> Any:
         head = "from fgtrack.core.compiled import inlined, njit, shared\nOFFSET = 1\n"
         loaded(tmp_path / "callee.py", head + callee)
-        return loaded(tmp_path / "caller.py", "from callee import OFFSET, twice\n" + head.split("OFFSET")[0] + caller)
+        return loaded(
+            tmp_path / "caller.py",
+            "from callee import OFFSET, twice\n" + head.split("OFFSET")[0] + caller,
+        )
 
     yield load
     for name in ("callee", "caller"):
@@ -52,7 +57,9 @@ CALLER = "@njit('float64(int64)')\ndef call(x):\n    return twice(x) + OFFSET\n"
 SHARED = "@shared('int64(int64)')\ndef twice(x):\n    return 2 * x\n"
 
 
-def test_loops_are_compiled_once_and_stored(stored, caplog: pytest.LogCaptureFixture) -> None:
+def test_loops_are_compiled_once_and_stored(
+    stored, caplog: pytest.LogCaptureFixture
+) -> None:
     assert stored(SHARED, CALLER).call(3) == 7.0
     [line] = caplog.messages
     assert "compiling numerical loops, once" in line
@@ -70,7 +77,9 @@ def test_loops_are_compiled_once_and_stored(stored, caplog: pytest.LogCaptureFix
         SHARED + "OFFSET = 1.5\n",
     ],
 )
-def test_what_is_stored_of_a_caller_is_not_used_after_another_module_changed(stored, changed: str) -> None:
+def test_what_is_stored_of_a_caller_is_not_used_after_another_module_changed(
+    stored, changed: str
+) -> None:
     assert stored(SHARED, CALLER).call(3) == 7.0
     after = stored(changed, CALLER).call
     assert after(3) == (7.5 if "OFFSET" in changed else 8.5)
@@ -78,10 +87,15 @@ def test_what_is_stored_of_a_caller_is_not_used_after_another_module_changed(sto
 
 
 def test_loops_that_cannot_be_stored_are_compiled_with_one_line(
-    stored, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    stored,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     for name in ("cache", "__pycache__", "home"):
-        (tmp_path / name).write_text("a file, in which root cannot make a folder either")
+        (tmp_path / name).write_text(
+            "a file, in which root cannot make a folder either"
+        )
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
     assert stored(SHARED, CALLER).call(3) == 7.0
     [line] = caplog.messages
@@ -137,7 +151,9 @@ def files(tmp_path: Path, pattern: str) -> list[Path]:
 
 
 @pytest.mark.parametrize("damage", DAMAGES, ids=lambda name: name.replace(" ", "-"))
-@pytest.mark.parametrize("pattern", ["caller*.nbc", "caller*.nbi", "callee*.nbc", "callee*.nbi", "*.nb[ci]"])
+@pytest.mark.parametrize(
+    "pattern", ["caller*.nbc", "caller*.nbi", "callee*.nbc", "callee*.nbi", "*.nb[ci]"]
+)
 def test_damaged_files_are_replaced_with_one_line(
     stored, tmp_path: Path, caplog: pytest.LogCaptureFixture, pattern: str, damage: str
 ) -> None:
@@ -164,7 +180,10 @@ def test_the_code_of_another_function_is_not_run(stored, tmp_path: Path) -> None
     module = stored(SHARED, CALLER + body)
     assert (module.call(3), module.other(3)) == (7.0, 30.0)
     for suffix in ("nbc", "nbi"):
-        [call], [other] = files(tmp_path, f"caller.call*.{suffix}"), files(tmp_path, f"caller.other*.{suffix}")
+        [call], [other] = (
+            files(tmp_path, f"caller.call*.{suffix}"),
+            files(tmp_path, f"caller.other*.{suffix}"),
+        )
         call.write_bytes(other.read_bytes())
         module = stored(SHARED, CALLER + body)
         assert (module.call(3), module.other(3)) == (7.0, 30.0)
@@ -172,7 +191,11 @@ def test_the_code_of_another_function_is_not_run(stored, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("pattern", ["caller*.nbc", "caller*.nbi"])
 def test_a_file_that_cannot_be_read_is_replaced(
-    stored, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, pattern: str
+    stored,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    pattern: str,
 ) -> None:
     """Permissions mean nothing to root, so the reading itself is refused."""
     assert stored(SHARED, CALLER).call(3) == 7.0
@@ -206,7 +229,11 @@ def test_a_folder_instead_of_a_file_is_no_error(
 
 @pytest.mark.parametrize("part", [".nbc.", ".nbi."])
 def test_a_disk_that_is_full_in_the_middle_leaves_no_part_and_no_damage(
-    stored, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, part: str
+    stored,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    part: str,
 ) -> None:
     write = Path.write_bytes
 
@@ -228,24 +255,51 @@ def test_a_disk_that_is_full_in_the_middle_leaves_no_part_and_no_damage(
     assert not [line for line in caplog.messages if "damaged" in line]
 
 
-def test_what_was_stored_of_an_earlier_source_does_not_pile_up(stored, tmp_path: Path) -> None:
+def test_what_was_stored_of_an_earlier_source_does_not_pile_up(
+    stored, tmp_path: Path
+) -> None:
     for factor in (2, 3, 4):
-        assert stored(SHARED.replace("2 *", f"{factor} *"), CALLER).call(3) == 3.0 * factor + 1.0
-        assert len(files(tmp_path, "callee*.nbc")) == len(files(tmp_path, "caller*.nbc")) == 1
+        assert (
+            stored(SHARED.replace("2 *", f"{factor} *"), CALLER).call(3)
+            == 3.0 * factor + 1.0
+        )
+        assert (
+            len(files(tmp_path, "callee*.nbc"))
+            == len(files(tmp_path, "caller*.nbc"))
+            == 1
+        )
     again = stored(SHARED.replace("2 *", "4 *"), CALLER).call
     assert again.stats.cache_hits
 
 
 @pytest.mark.long
-def test_other_processes_find_what_is_stored_even_if_two_write_at_once(tmp_path: Path) -> None:
-    (tmp_path / "callee.py").write_text(f"from fgtrack.core.compiled import shared\n{SHARED}")
-    head = "from fgtrack.core.compiled import njit\nfrom callee import twice\nOFFSET = 1\n"
-    (tmp_path / "caller.py").write_text(f"{head}{CALLER}print(call(3), sum(call.stats.cache_hits.values()))\n")
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path)}
+def test_other_processes_find_what_is_stored_even_if_two_write_at_once(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "callee.py").write_text(
+        f"from fgtrack.core.compiled import shared\n{SHARED}"
+    )
+    head = (
+        "from fgtrack.core.compiled import njit\nfrom callee import twice\nOFFSET = 1\n"
+    )
+    (tmp_path / "caller.py").write_text(
+        f"{head}{CALLER}print(call(3), sum(call.stats.cache_hits.values()))\n"
+    )
+    environment = {
+        **os.environ,
+        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+        "PYTHONPATH": str(tmp_path),
+    }
     command = sys.executable, str(tmp_path / "caller.py")
 
     def start() -> subprocess.Popen[str]:
-        return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        return subprocess.Popen(
+            command,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
 
     for process in [start(), start()]:
         out, error = process.communicate(timeout=120.0)
@@ -267,10 +321,18 @@ def test_scratch_arrays_do_not_overlap(stored) -> None:
     head = "from fgtrack.core.compiled import scratch\n"
     body = "    a, b, c = scratch(n), scratch(n, 2), scratch(2, 3, n)\n    a[:], b[:], c[:] = 1.0, 2.0, 3.0\n"
     total = "    return a.sum() + b.sum() + c.sum() + c[1, 2, n - 1]\n"
-    call = stored(SHARED, head + "@njit('float64(int64)')\ndef call(n):\n" + body + total).call
-    assert [call(n) for n in (1, 6)] == [1.0 + 4.0 + 18.0 + 3.0, 6.0 + 24.0 + 108.0 + 3.0]
+    call = stored(
+        SHARED, head + "@njit('float64(int64)')\ndef call(n):\n" + body + total
+    ).call
+    assert [call(n) for n in (1, 6)] == [
+        1.0 + 4.0 + 18.0 + 3.0,
+        6.0 + 24.0 + 108.0 + 3.0,
+    ]
 
 
 def test_a_loop_that_gives_a_number_allocates_nothing(stored) -> None:
     with pytest.raises(numba.core.errors.TypingError, match="empty"):
-        stored(SHARED, "import numpy as np\n@njit('float64(int64)')\ndef call(n):\n    return np.empty(n)[0]\n")
+        stored(
+            SHARED,
+            "import numpy as np\n@njit('float64(int64)')\ndef call(n):\n    return np.empty(n)[0]\n",
+        )

@@ -21,15 +21,27 @@ MODEL = measurement_model(("bearing_rad",), MOTION)
 
 def heard(rng: np.random.Generator) -> tuple[list[Measurement], FloatArray]:
     """Bearings of an object 100 m away, give or take 60 m, from an observer that turns after 5 s; where it is last."""
-    x = np.array([max(100.0 + RANGE_STD_M * rng.standard_normal(), 10.0), 0.0, *(10.0 * rng.standard_normal(2))])
+    x = np.array(
+        [
+            max(100.0 + RANGE_STD_M * rng.standard_normal(), 10.0),
+            0.0,
+            *(10.0 * rng.standard_normal(2)),
+        ]
+    )
     place, found = np.zeros(2), []
     for k in range(51):
         pose = SensorPose(float(place[0]), float(place[1]))
         z = MODEL.predict(x, pose) + STD_RAD * rng.standard_normal(1)
-        found.append(Measurement(round(k * STEP_S * NS_PER_S), MODEL, z, np.array([[STD_RAD**2]]), pose))
+        found.append(
+            Measurement(
+                round(k * STEP_S * NS_PER_S), MODEL, z, np.array([[STD_RAD**2]]), pose
+            )
+        )
         last, x = x, MOTION.predict(x, STEP_S)
         course_rad = np.interp(k * STEP_S, [5.0, 7.0], [0.0, 0.5 * np.pi])
-        place = place + 20.0 * STEP_S * np.array([np.cos(course_rad), np.sin(course_rad)])
+        place = place + 20.0 * STEP_S * np.array(
+            [np.cos(course_rad), np.sin(course_rad)]
+        )
     return found, last
 
 
@@ -51,19 +63,29 @@ def tracked(streams: list[list[Measurement]], make: type[SmootherBank]) -> Smoot
 def test_bearings_alone_lead_where_levenberg_marquardt_does() -> None:
     found = [heard(np.random.default_rng(seed)) for seed in (2,)]
     streams = [stream for stream, _ in found]
-    slow, *banks = (tracked(streams, each) for each in (BatchBank, SmootherBank, IncrementalBank))
+    slow, *banks = (
+        tracked(streams, each) for each in (BatchBank, SmootherBank, IncrementalBank)
+    )
     assert not slow.failures.counts
     for bank in banks:
         assert bank.failures.counts[Failure.STEP_DAMPED] > 0
         for track_id, (measurements, truth) in enumerate(found):
-            state, expected = (state_of(each, MOTION, track_id, measurements[-1].stamp_ns) for each in (bank, slow))
+            state, expected = (
+                state_of(each, MOTION, track_id, measurements[-1].stamp_ns)
+                for each in (bank, slow)
+            )
             std = np.sqrt(np.diag(expected.covariance))
             assert np.abs((state.mean - expected.mean) / std).max() < 0.1
             d = state.mean - truth
-            assert d @ np.linalg.solve(state.covariance, d) < 23.5  # one in ten thousand
+            assert (
+                d @ np.linalg.solve(state.covariance, d) < 23.5
+            )  # one in ten thousand
 
 
 def test_positions_need_none() -> None:
     model = measurement_model(("x_m", "y_m"), MOTION)
-    fixes = [Measurement(k * NS_PER_S, model, np.array([5.0 * k, 1.0]), np.eye(2)) for k in range(5)]
+    fixes = [
+        Measurement(k * NS_PER_S, model, np.array([5.0 * k, 1.0]), np.eye(2))
+        for k in range(5)
+    ]
     assert not tracked([fixes], SmootherBank).failures.counts

@@ -10,7 +10,13 @@ from fgtrack.models.motion import CV
 from fgtrack.testing.references import dense_joint
 
 NS = 10**9
-START = Start(position_m=(1.0, 2.0), position_std_m=0.7, yaw_rad=0.3, yaw_std_rad=0.2, speed_mps=10.0)
+START = Start(
+    position_m=(1.0, 2.0),
+    position_std_m=0.7,
+    yaw_rad=0.3,
+    yaw_std_rad=0.2,
+    speed_mps=10.0,
+)
 STD = {"x_m": 0.3, "y_m": 0.5}
 
 
@@ -33,7 +39,9 @@ def test_two_nodes_are_a_prediction_a_correction_and_a_smoothing_step() -> None:
     for stamp_ns, (mean, covariance) in expected.items():
         assert found[stamp_ns].stamp_ns == stamp_ns
         np.testing.assert_allclose(found[stamp_ns].mean, mean, rtol=1e-10)
-        np.testing.assert_allclose(found[stamp_ns].covariance, covariance, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(
+            found[stamp_ns].covariance, covariance, rtol=1e-9, atol=1e-12
+        )
 
 
 def test_what_is_before_the_start_is_refused() -> None:

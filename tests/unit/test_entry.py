@@ -23,13 +23,22 @@ entry.main()
 
 
 def run(program: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=50.0)
+    return subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=50.0
+    )
 
 
 @pytest.mark.parametrize(
-    ("module", "words"), [("fgtrack.cli.main", []), ("fgtrack.cli.calibrate", ["info", "x"]), ("numpy", ["info", "x"])]
+    ("module", "words"),
+    [
+        ("fgtrack.cli.main", []),
+        ("fgtrack.cli.calibrate", ["info", "x"]),
+        ("numpy", ["info", "x"]),
+    ],
 )
-def test_an_interrupt_while_something_loads_is_one_line(module: str, words: list[str]) -> None:
+def test_an_interrupt_while_something_loads_is_one_line(
+    module: str, words: list[str]
+) -> None:
     done = run(INTERRUPTED.format(module=module, words=words))
     assert done.returncode == 130
     assert done.stderr.startswith("fgtrack: error: interrupted")

@@ -4,9 +4,15 @@ from fgtrack.core.errors import CallError, DataError, FgtrackError, one_line
 
 
 @pytest.mark.parametrize("kind", [CallError, DataError, FgtrackError])
-def test_an_error_is_one_line_that_a_terminal_can_show(kind: type[FgtrackError]) -> None:
-    told = str(kind("drive.bag: sensor '\x1b[31mred\x1b]0;title\x07'\nis\t\u202eno\r sensor"))
-    assert told == "drive.bag: sensor '\\x1b[31mred\\x1b]0;title\\x07' is \\u202eno sensor"
+def test_an_error_is_one_line_that_a_terminal_can_show(
+    kind: type[FgtrackError],
+) -> None:
+    told = str(
+        kind("drive.bag: sensor '\x1b[31mred\x1b]0;title\x07'\nis\t\u202eno\r sensor")
+    )
+    assert (
+        told == "drive.bag: sensor '\\x1b[31mred\\x1b]0;title\\x07' is \\u202eno sensor"
+    )
     assert told.isprintable()
 
 
@@ -18,7 +24,10 @@ def test_of_a_long_error_the_beginning_and_the_end_are_kept() -> None:
 
 
 def test_a_line_of_any_script_stays_as_it_is() -> None:
-    assert one_line("Fähre.mcap: 船 is no [bold]sensor[/bold]") == "Fähre.mcap: 船 is no [bold]sensor[/bold]"
+    assert (
+        one_line("Fähre.mcap: 船 is no [bold]sensor[/bold]")
+        == "Fähre.mcap: 船 is no [bold]sensor[/bold]"
+    )
 
 
 def test_half_a_surrogate_can_be_printed() -> None:

@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import Disposition
 from fgtrack.evaluation.runs import evaluated
-from fgtrack.io.run import Run
 from fgtrack.models.track_map import COLUMNS
-from fgtrack.plotting import plot
-from fgtrack.plotting.style import WRONG, broken_line
+from fgtrack.runs import Run
+from fgtrack.show.figures import plot
+from fgtrack.show.figures.style import WRONG, broken_line
 
 TICKS = range(60)
 
@@ -38,15 +38,30 @@ EXPECTED: dict[str, tuple[bool, set[str], list[str]]] = {
     ),
     "residuals": (
         False,
-        {"time [s]", "along track [m]", "across track [m]", "speed [m/s]", "density [1/m]", "density [s/m]"},
+        {
+            "time [s]",
+            "along track [m]",
+            "across track [m]",
+            "speed [m/s]",
+            "density [1/m]",
+            "density [s/m]",
+        },
         ["lidar: mean -0.200, std 0.141, n 60"],
     ),
     "consistency": (
         False,
         {"time [s]", "NEES of\nthe position", "NIS of\nlidar", "NIS of\nradar"},
-        ["position: mean 0.073, expected 2; 77 % of the ticks in their band", "95 % band", "expected"],
+        [
+            "position: mean 0.073, expected 2; 77 % of the ticks in their band",
+            "95 % band",
+            "expected",
+        ],
     ),
-    "arrivals": (False, {"time [s]", "time of receipt [s]", "delay [ms]"}, ["fused in sequence: 120 of 120"]),
+    "arrivals": (
+        False,
+        {"time [s]", "time of receipt [s]", "delay [ms]"},
+        ["fused in sequence: 120 of 120"],
+    ),
     "errors": (
         True,
         {*("position error [m]", "speed error [m/s]", "yaw error [deg]", "time [s]")},
@@ -69,16 +84,35 @@ def a_run(folder: Path, *, along_m: float = 0.3, config_text: str = "") -> Run:
     ]
     updates = {
         k: [
-            update("lidar", tick=k, delay_ns=150_000_000 + k, nis=2.0, x_m=0.1 * (k % 5), y_m=0.3),
-            update("radar", tick=k, delay_ns=60_000_000, nis=1.0, speed_mps=0.2 * (k % 3)),
+            update(
+                "lidar",
+                tick=k,
+                delay_ns=150_000_000 + k,
+                nis=2.0,
+                x_m=0.1 * (k % 5),
+                y_m=0.3,
+            ),
+            update(
+                "radar", tick=k, delay_ns=60_000_000, nis=1.0, speed_mps=0.2 * (k % 3)
+            ),
         ]
         for k in TICKS
     }
     truth = [*WEST.truth(TICKS), *ROUND.truth(TICKS)]
-    smoothed = {k: [WEST.later(k - 5, 1, 0.1)] for k in TICKS[5:]} if folder.name == "smoother" else {}
+    smoothed = (
+        {k: [WEST.later(k - 5, 1, 0.1)] for k in TICKS[5:]}
+        if folder.name == "smoother"
+        else {}
+    )
     meta = {"estimator": folder.name}
     return write_run(
-        folder, tracks, truth=truth, updates=updates, smoothed=smoothed, meta=meta, config_text=config_text
+        folder,
+        tracks,
+        truth=truth,
+        updates=updates,
+        smoothed=smoothed,
+        meta=meta,
+        config_text=config_text,
     )
 
 
@@ -103,7 +137,9 @@ def legend(axes: Axes) -> list[str]:
 
 
 def labels(figure: Figure) -> set[str]:
-    return {text for axes in figure.axes for text in (axes.get_xlabel(), axes.get_ylabel())} - {""}
+    return {
+        text for axes in figure.axes for text in (axes.get_xlabel(), axes.get_ylabel())
+    } - {""}
 
 
 # --- every figure
@@ -114,7 +150,9 @@ def test_a_figure_says_what_it_shows(name: str, runs: list[Run]) -> None:
     """Of runs in memory, read, or named by their folder."""
     several, text, lines = EXPECTED[name]
     first, second = runs
-    figure = getattr(plot, name)([replace(first, path=None), second.path] if several else str(first.path))
+    figure = getattr(plot, name)(
+        [replace(first, path=None), second.path] if several else str(first.path)
+    )
     assert labels(figure) == text
     assert legend(figure.axes[0]) == lines
     assert figure.get_suptitle()
@@ -125,45 +163,86 @@ def test_there_is_a_figure_of_what_runs_have_data_for(
     names: Callable[[Sequence[Run]], list[str]], runs: list[Run], tmp_path: Path
 ) -> None:
     assert names(runs) == [
-        *("map_smoother", "map_ekf-replay", "residuals_smoother", "residuals_ekf-replay"),
+        *(
+            "map_smoother",
+            "map_ekf-replay",
+            "residuals_smoother",
+            "residuals_ekf-replay",
+        ),
         *("consistency_smoother", "consistency_ekf-replay"),
         "arrivals",
         *("errors_object_7", "errors_object_8", "error_against_lag"),
     ]
-    assert names(runs[1:]) == [name for name in names(runs) if "smoother" not in name and "lag" not in name]
+    assert names(runs[1:]) == [
+        name for name in names(runs) if "smoother" not in name and "lag" not in name
+    ]
     plain = runs[0].with_tables(
-        truth=runs[0].tables["truth"].where(np.zeros(len(runs[0].tables["truth"]["stamp_ns"]), dtype=bool))
+        truth=runs[0]
+        .tables["truth"]
+        .where(np.zeros(len(runs[0].tables["truth"]["stamp_ns"]), dtype=bool))
     )
-    assert names([plain]) == [*("map_smoother", "residuals_smoother", "consistency_smoother", "arrivals")]
+    assert names([plain]) == [
+        *("map_smoother", "residuals_smoother", "consistency_smoother", "arrivals")
+    ]
     other = write_run(tmp_path / "other", updates={0: [update(delay_ns=1_000_000)]})
     assert [name for name in names([*runs, other]) if "arrivals" in name] == [
         "arrivals_smoother",
         "arrivals_other (smoother)",
     ]
     assert names([write_run(tmp_path / "empty", [[]])]) == []
-    lidar, radar = update("lidar", tick=0, delay_ns=7), update("radar", tick=1, delay_ns=9)
+    lidar, radar = (
+        update("lidar", tick=0, delay_ns=7),
+        update("radar", tick=1, delay_ns=9),
+    )
     gated = replace(radar, disposition=Disposition.GATED)
-    order = {"as received": [lidar, radar], "the other way": [radar, lidar], "gated": [lidar, gated]}  # one figure
-    alike = [write_run(tmp_path / name, updates={0: rows}) for name, rows in order.items()]
-    assert [name for name in names(alike) if name.startswith("arrivals")] == ["arrivals"]
+    order = {
+        "as received": [lidar, radar],
+        "the other way": [radar, lidar],
+        "gated": [lidar, gated],
+    }  # one figure
+    alike = [
+        write_run(tmp_path / name, updates={0: rows}) for name, rows in order.items()
+    ]
+    assert [name for name in names(alike) if name.startswith("arrivals")] == [
+        "arrivals"
+    ]
 
 
 def test_arrivals_show_the_part_with_the_most_late_detections(tmp_path: Path) -> None:
     late = {
-        k: [update("lidar", tick=k, delay_ns=150_000_000, disposition=Disposition.OUT_OF_SEQUENCE)]
+        k: [
+            update(
+                "lidar",
+                tick=k,
+                delay_ns=150_000_000,
+                disposition=Disposition.OUT_OF_SEQUENCE,
+            )
+        ]
         for k in range(200, 220)
     }
-    early = {k: [update("radar", tick=k, delay_ns=20_000_000)] for k in range(0, 400, 5)}
+    early = {
+        k: [update("radar", tick=k, delay_ns=20_000_000)] for k in range(0, 400, 5)
+    }
     updates = {k: [*early.get(k, []), *late.get(k, [])] for k in {*early, *late}}
-    flow, *delays = plot.arrivals(write_run(tmp_path / "run", [[]] * 400, updates=updates)).axes
-    assert legend(flow) == ["fused in sequence: 80 of 100", "fused out of sequence: 20 of 100"]
+    flow, *delays = plot.arrivals(
+        write_run(tmp_path / "run", [[]] * 400, updates=updates)
+    ).axes
+    assert legend(flow) == [
+        "fused in sequence: 80 of 100",
+        "fused out of sequence: 20 of 100",
+    ]
     low_s, high_s = flow.get_xlim()
     assert low_s == pytest.approx(200 * TICK_NS / 1e9, abs=0.2)
-    assert high_s - low_s == pytest.approx(20 * 0.02)  # twenty lists of the fastest sensor
+    assert high_s - low_s == pytest.approx(
+        20 * 0.02
+    )  # twenty lists of the fastest sensor
     lines = [segment for lines in flow.collections for segment in lines.get_segments()]
     lengths_s = {round(float(end[0] - start[0]), 3) for start, end in lines}
     assert lengths_s == {0.15, 0.02}
-    assert [axes.get_title(loc="left") for axes in delays] == ["lidar", "radar"]  # a row for each
+    assert [axes.get_title(loc="left") for axes in delays] == [
+        "lidar",
+        "radar",
+    ]  # a row for each
     for axes, delay_ms in zip(delays, (150.0, 20.0), strict=True):
         assert {y for line in axes.lines for y in line.get_ydata()} == {delay_ms}
 
@@ -189,9 +268,14 @@ def circle_map(path: Path) -> Path:
 
 
 def test_the_map_shows_the_bounds_of_the_track(tmp_path: Path) -> None:
-    run = a_run(tmp_path / "run", config_text=f"map:\n  track: {circle_map(tmp_path / 'map.csv')}\n")
+    run = a_run(
+        tmp_path / "run",
+        config_text=f"map:\n  track: {circle_map(tmp_path / 'map.csv')}\n",
+    )
     axes, _ = plot.map(run).axes
-    radii = [float(np.hypot(*np.asarray(line.get_data())).mean()) for line in axes.lines[:2]]
+    radii = [
+        float(np.hypot(*np.asarray(line.get_data())).mean()) for line in axes.lines[:2]
+    ]
     assert radii == pytest.approx([292.5, 307.5], abs=0.5)
     west, west_track, *_, wrong, _ = [line.get_color() for line in axes.lines[2:]]
     assert west == west_track != wrong == WRONG
@@ -199,7 +283,9 @@ def test_the_map_shows_the_bounds_of_the_track(tmp_path: Path) -> None:
 
 def test_a_line_is_not_drawn_across_a_pause() -> None:
     stamps_ns = START_NS + TICK_NS * np.array([1, 0, 40, 41])
-    x, y = broken_line(stamps_ns, np.array([1.0, 0.0, 2.0, 3.0]), np.arange(4.0), TICK_NS)
+    x, y = broken_line(
+        stamps_ns, np.array([1.0, 0.0, 2.0, 3.0]), np.arange(4.0), TICK_NS
+    )
     np.testing.assert_array_equal(x, [0.0, 1.0, np.nan, 2.0, 3.0])
     np.testing.assert_array_equal(y, [1.0, 0.0, np.nan, 2.0, 3.0])
 
@@ -214,12 +300,18 @@ def short_run(tmp_path: Path) -> Run:
 
 @pytest.mark.parametrize(
     ("form", "start", "varying"),
-    [("png", b"\x89PNG", b"Software"), ("svg", b"<?xml", b"dc:date"), ("pdf", b"%PDF", b"CreationDate")],
+    [
+        ("png", b"\x89PNG", b"Software"),
+        ("svg", b"<?xml", b"dc:date"),
+        ("pdf", b"%PDF", b"CreationDate"),
+    ],
 )
 def test_files_hold_no_date_and_no_version(
     form: str, start: bytes, varying: bytes, short_run: Run, tmp_path: Path
 ) -> None:
-    (file,) = plot.save_named(plot.drawn(plot.planned(evaluated(short_run))), tmp_path, form)
+    (file,) = plot.save_named(
+        plot.drawn(plot.planned(evaluated(short_run))), tmp_path, form
+    )
     assert file.name == f"arrivals.{form}"
     content = file.read_bytes()
     assert content.startswith(start)
@@ -233,11 +325,20 @@ def test_a_figure_has_its_style_whenever_it_is_drawn_and_saved(short_run: Run) -
         return file.getvalue()
 
     expected, drawn_before = picture(plot.arrivals(short_run)), plot.arrivals(short_run)
-    with mpl.rc_context({"lines.linewidth": 9.0, "axes.facecolor": "red", "xtick.labelsize": 30}):
+    with mpl.rc_context(
+        {"lines.linewidth": 9.0, "axes.facecolor": "red", "xtick.labelsize": 30}
+    ):
         before = dict(mpl.rcParams)
-        assert picture(drawn_before) == expected  # it keeps the settings with which it was made
+        assert (
+            picture(drawn_before) == expected
+        )  # it keeps the settings with which it was made
         mine = plot.arrivals(short_run)
-        assert mine.axes[0].get_facecolor() == (1.0, 0.0, 0.0, 1.0)  # those of the user win
+        assert mine.axes[0].get_facecolor() == (
+            1.0,
+            0.0,
+            0.0,
+            1.0,
+        )  # those of the user win
         assert dict(mpl.rcParams) == before
     assert picture(mine) != expected
     assert picture(plot.arrivals(short_run)) == expected

@@ -13,23 +13,34 @@ from fgtrack.core.types import Disposition, EgoState, TickReport
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.runs import evaluated
 from fgtrack.evaluation.scores.innovations import local_innovations
-from fgtrack.io.run import Run, RunWriter, load_run
 from fgtrack.models.oval import make_oval
+from fgtrack.runs import Run, RunWriter, load_run
 
 paper = load("karle2023_table", "paper_tables")
 
 
 def test_innovations_are_local_and_of_confirmed_tracks(tmp_path: Path) -> None:
-    tracks = [[WEST.track(k, 1), WEST.track(k, 2, across_m=50.0, num_measured=2)] for k in range(6)]
+    tracks = [
+        [WEST.track(k, 1), WEST.track(k, 2, across_m=50.0, num_measured=2)]
+        for k in range(6)
+    ]
     updates = {
         0: [update(tick=0, disposition=Disposition.BIRTH)],
         3: [update("radar", tick=3, x_m=-0.5, y_m=0.25, speed_mps=2.0)],
-        4: [update(tick=1, x_m=1.0, y_m=2.0), update(tick=4, index=1, track_id=2, x_m=9.0, y_m=9.0)],
+        4: [
+            update(tick=1, x_m=1.0, y_m=2.0),
+            update(tick=4, index=1, track_id=2, x_m=9.0, y_m=9.0),
+        ],
     }
     run = write_run(tmp_path / "run", tracks, updates=updates)
     rows, values, states = local_innovations(run)
-    assert run.tables["updates"]["sensor"][rows].tolist() == ["radar", "lidar"]  # not the birth, not track 2
-    np.testing.assert_allclose(values["along_m"], [0.5, -1.0], atol=1e-9)  # WEST drives along -x
+    assert run.tables["updates"]["sensor"][rows].tolist() == [
+        "radar",
+        "lidar",
+    ]  # not the birth, not track 2
+    np.testing.assert_allclose(
+        values["along_m"], [0.5, -1.0], atol=1e-9
+    )  # WEST drives along -x
     np.testing.assert_allclose(values["across_m"], [-0.25, -2.0], atol=1e-9)
     np.testing.assert_allclose(values["speed_mps"], [2.0, np.nan])
     assert np.isnan(values["yaw_rad"]).all()  # neither measured nor on a map
@@ -53,8 +64,16 @@ def on_the_oval(tmp_path: Path) -> Run:
     with RunWriter(tmp_path / "run", json.dumps({"map": {"track": "oval"}})) as writer:
         writer.write_ego(EgoState(START_NS, START_NS, *ego))
         for tick in range(3):
-            records = (update(tick=0, x_m=0.0, y_m=0.0), update(tick=0, index=1, x_m=0.0, y_m=0.0, yaw_rad=0.3))
-            report = TickReport(tick, START_NS + tick * TICK_NS, (car.track(tick, 1),), records if tick == 2 else ())
+            records = (
+                update(tick=0, x_m=0.0, y_m=0.0),
+                update(tick=0, index=1, x_m=0.0, y_m=0.0, yaw_rad=0.3),
+            )
+            report = TickReport(
+                tick,
+                START_NS + tick * TICK_NS,
+                (car.track(tick, 1),),
+                records if tick == 2 else (),
+            )
             writer.write_tick(report, 1, 2)
         writer.finish({})
     return load_run(tmp_path / "run")
@@ -77,7 +96,11 @@ def test_the_tables_of_the_paper(tmp_path: Path) -> None:
     tables = paper.evaluation(evaluated(run))
     (row,) = tables.tables["residuals"].plain()
     assert row["along_mean_m"] == pytest.approx((149 * -0.3 + 2 * 1.0) / 151)
-    assert (row["speed_mean_mps"], row["speed_std_mps"], row["yaw_mean_rad"]) == (2.0, 0.0, None)
+    assert (row["speed_mean_mps"], row["speed_std_mps"], row["yaw_mean_rad"]) == (
+        2.0,
+        0.0,
+        None,
+    )
     assert (row["precision"], row["num_confirmed"]) == (1.0, 1)
     groups = tables["residuals_by"].set_index("of")
     assert groups["num_samples"].to_dict() == {
@@ -95,8 +118,17 @@ def test_the_tables_of_the_paper(tmp_path: Path) -> None:
     sensors = tables["sensors"].set_index("sensor")
     radar = sensors.loc["radar"]
     assert (radar["delay_mean_s"], radar["moved_max_m"]) == pytest.approx((0.1, 3.0))
-    assert (radar["num_fused"], radar["num_objects"], radar["detections_median"]) == (2, 1, 2.0)
-    assert (radar["relative_speed_median_mps"], radar["ahead_median_m"]) == pytest.approx((-10.0, 32.0))
+    assert (radar["num_fused"], radar["num_objects"], radar["detections_median"]) == (
+        2,
+        1,
+        2.0,
+    )
+    assert (
+        radar["relative_speed_median_mps"],
+        radar["ahead_median_m"],
+    ) == pytest.approx((-10.0, 32.0))
     assert radar["distance_median_m"] == pytest.approx(math.hypot(32.0, 3.0))
     assert sensors["detections_median"]["lidar"] == 149.0
-    assert tables["latency"][["num_ticks", "time_per_tick_mean_s"]].values.tolist() == [[150, pytest.approx(0.002)]]
+    assert tables["latency"][["num_ticks", "time_per_tick_mean_s"]].values.tolist() == [
+        [150, pytest.approx(0.002)]
+    ]

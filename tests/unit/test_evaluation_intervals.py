@@ -8,7 +8,13 @@ from scipy.signal import lfilter
 from scipy.stats import ttest_rel
 
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.intervals import by_stamp, correlation_length, mean_square, paired, within_run
+from fgtrack.evaluation.intervals import (
+    by_stamp,
+    correlation_length,
+    mean_square,
+    paired,
+    within_run,
+)
 
 
 def mean(sums: FloatArray) -> FloatArray:
@@ -23,7 +29,9 @@ def correlated(rng: np.random.Generator, n: int, correlation: float) -> FloatArr
     """A first-order autoregressive series with variance 1, shape (n,)."""
     start = 20 * math.ceil(1.0 / (1.0 - correlation))
     noise = rng.standard_normal(n + start)
-    return np.asarray(lfilter([math.sqrt(1.0 - correlation**2)], [1.0, -correlation], noise)[start:])
+    return np.asarray(
+        lfilter([math.sqrt(1.0 - correlation**2)], [1.0, -correlation], noise)[start:]
+    )
 
 
 def test_over_seeds_it_is_the_paired_t_interval() -> None:
@@ -31,12 +39,16 @@ def test_over_seeds_it_is_the_paired_t_interval() -> None:
     a, b = rng.normal(0.5, 0.1, 8), rng.normal(0.4, 0.1, 8)
     found = paired(a, b)
     expected = ttest_rel(a, b).confidence_interval(0.95)
-    np.testing.assert_allclose((found.mean, found.low, found.high), ((a - b).mean(), *expected), rtol=1e-12)
+    np.testing.assert_allclose(
+        (found.mean, found.low, found.high), ((a - b).mean(), *expected), rtol=1e-12
+    )
     assert found.count == 8
 
 
 def test_pairs_with_a_missing_value_are_left_out() -> None:
-    assert paired([1.0, math.nan, 3.0, 5.0], [0.0, 2.0, 1.0, math.nan]) == paired([1.0, 3.0], [0.0, 1.0])
+    assert paired([1.0, math.nan, 3.0, 5.0], [0.0, 2.0, 1.0, math.nan]) == paired(
+        [1.0, 3.0], [0.0, 1.0]
+    )
 
 
 def test_one_pair_has_no_interval_and_none_no_mean() -> None:
@@ -50,13 +62,17 @@ def test_one_pair_has_no_interval_and_none_no_mean() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("correlation", [0.0, 0.8])
-def test_the_interval_within_a_run_covers_the_truth_as_often_as_it_says(correlation: float) -> None:
+def test_the_interval_within_a_run_covers_the_truth_as_often_as_it_says(
+    correlation: float,
+) -> None:
     rng = np.random.default_rng(2)
     true_difference = math.sqrt(1.25) - math.sqrt(1.49)
     runs, hits, naive = 120, 0, 0
     for _ in range(runs):
         common = correlated(rng, 400, correlation)
-        a, b = (common + scale * correlated(rng, 400, correlation) for scale in (0.5, 0.7))
+        a, b = (
+            common + scale * correlated(rng, 400, correlation) for scale in (0.5, 0.7)
+        )
         ticks = np.stack([a**2, b**2, np.ones(400)], axis=-1)
         found = within_run(ticks, rmse_difference)
         hits += found.low <= true_difference <= found.high
@@ -71,12 +87,17 @@ def test_without_correlation_the_standard_error_is_the_textbook_one() -> None:
     values = np.random.default_rng(3).standard_normal(400)
     found = within_run(np.stack([values, np.ones(400)], axis=-1), mean)
     assert found.mean == pytest.approx(values.mean())
-    assert (found.high - found.low) / 2.0 == pytest.approx(1.97 * values.std() / 20.0, rel=0.15)
+    assert (found.high - found.low) / 2.0 == pytest.approx(
+        1.97 * values.std() / 20.0, rel=0.15
+    )
 
 
 def test_sums_are_those_of_each_stamp_without_what_is_not_known() -> None:
     samples = np.array([[1.0, 10.0], [2.0, np.nan], [4.0, 40.0], [8.0, 80.0]])
-    assert by_stamp(np.array([7, 7, 3, 7]), samples).tolist() == [[4.0, 40.0, 1.0], [9.0, 90.0, 2.0]]
+    assert by_stamp(np.array([7, 7, 3, 7]), samples).tolist() == [
+        [4.0, 40.0, 1.0],
+        [9.0, 90.0, 2.0],
+    ]
 
 
 def test_the_correlation_length_is_that_of_a_first_order_autoregression() -> None:
@@ -94,12 +115,21 @@ def test_the_correlation_of_a_trend_is_as_long_as_the_run() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("times", [30, 120, 400])
 @pytest.mark.parametrize("samples", [15, 60, 200])
-def test_of_twenty_true_ties_one_is_called_a_difference(samples: int, times: int) -> None:
+def test_of_twenty_true_ties_one_is_called_a_difference(
+    samples: int, times: int
+) -> None:
     """At so many samples per correlation time, in a run of so many of these times."""
     rng, n = np.random.default_rng(1), samples * times
     series = (correlated(rng, n, math.exp(-1.0 / samples)) for _ in range(1000))
-    share = np.mean([within_run(np.stack([x, np.ones(n)], axis=-1), mean).is_significant for x in series])
-    assert 0.03 < share < 0.075  # 5 % within three standard errors, and a bias of half a per cent
+    share = np.mean(
+        [
+            within_run(np.stack([x, np.ones(n)], axis=-1), mean).is_significant
+            for x in series
+        ]
+    )
+    assert (
+        0.03 < share < 0.075
+    )  # 5 % within three standard errors, and a bias of half a per cent
 
 
 def test_a_sum_of_zeros_and_a_short_run_do_no_harm() -> None:

@@ -13,16 +13,25 @@ from hypothesis.extra import numpy as hnp
 from fgtrack.core.types import Disposition, TrackReport
 from fgtrack.evaluation.metrics import Metrics, ObjectMetrics, evaluate
 from fgtrack.evaluation.scores.statistics import Moments
-from fgtrack.io.run import Run
+from fgtrack.runs import Run
 
 
 @settings(deadline=None)
-@given(hnp.arrays(np.float64, st.integers(1, 20), elements=st.floats(-1.0, 1.0)), st.floats(-3.0, 3.0))
-def test_the_spread_of_angles_does_not_depend_on_where_they_point(angles: np.ndarray, turn: float) -> None:
+@given(
+    hnp.arrays(np.float64, st.integers(1, 20), elements=st.floats(-1.0, 1.0)),
+    st.floats(-3.0, 3.0),
+)
+def test_the_spread_of_angles_does_not_depend_on_where_they_point(
+    angles: np.ndarray, turn: float
+) -> None:
     here = Moments.of(angles)
-    there = Moments.of_angles(np.array([math.remainder(a + turn, 2 * math.pi) for a in angles]))
+    there = Moments.of_angles(
+        np.array([math.remainder(a + turn, 2 * math.pi) for a in angles])
+    )
     assert there.std == pytest.approx(here.std, abs=1e-7)
-    assert math.remainder(there.mean - here.mean - turn, 2 * math.pi) == pytest.approx(0.0, abs=1e-9)
+    assert math.remainder(there.mean - here.mean - turn, 2 * math.pi) == pytest.approx(
+        0.0, abs=1e-9
+    )
 
 
 @pytest.fixture
@@ -34,9 +43,15 @@ def story(tmp_path: Path) -> Run:
     for k in range(10):
         rows = []
         if k < 3 or 5 <= k < 7:
-            rows.append(WEST.track(k, 1, along_m=1.5, across_m=2.0, yaw_rad=-0.2, speed_mps=-1.0))
+            rows.append(
+                WEST.track(
+                    k, 1, along_m=1.5, across_m=2.0, yaw_rad=-0.2, speed_mps=-1.0
+                )
+            )
         if k >= 7:
-            rows.append(WEST.track(k, 2, along_m=-1.5, across_m=2.0, yaw_rad=0.2, speed_mps=1.0))
+            rows.append(
+                WEST.track(k, 2, along_m=-1.5, across_m=2.0, yaw_rad=0.2, speed_mps=1.0)
+            )
         if k < 8:
             rows.append(ROUND.track(k, 3, along_m=1.0))
         rows.append(WEST.track(k, 4, across_m=60.0))
@@ -55,8 +70,18 @@ def objects_of(metrics: Metrics) -> dict[int, ObjectMetrics]:
 def test_time_tracked_breaks_and_switches_are_counted(story: Run) -> None:
     objects = objects_of(evaluate(story))
     west, round_ = objects[7], objects[8]
-    assert (west.ticks_present, west.ticks_tracked, west.breaks, west.id_switches) == (10, 8, 2, 1)
-    assert (round_.ticks_present, round_.ticks_tracked, round_.breaks, round_.id_switches) == (9, 8, 0, 0)
+    assert (west.ticks_present, west.ticks_tracked, west.breaks, west.id_switches) == (
+        10,
+        8,
+        2,
+        1,
+    )
+    assert (
+        round_.ticks_present,
+        round_.ticks_tracked,
+        round_.breaks,
+        round_.id_switches,
+    ) == (9, 8, 0, 0)
     assert west.tracked_share == pytest.approx(0.8)
 
 
@@ -88,17 +113,29 @@ def test_truth_without_heading_gives_position_errors_only(tmp_path: Path) -> Non
     run = write_run(tmp_path / "run", tracks, truth=WEST.truth(range(3), pose=False))
     errors = objects_of(evaluate(run))[7].errors
     assert errors["position_m"].rmse == pytest.approx(0.5)
-    assert [errors[name].count for name in ("along_m", "across_m", "yaw_rad", "speed_mps")] == [0] * 4
+    assert [
+        errors[name].count for name in ("along_m", "across_m", "yaw_rad", "speed_mps")
+    ] == [0] * 4
 
 
-@pytest.mark.parametrize("start_yaw_rad", [0.3, math.pi - 0.005], ids=["anywhere", "over the jump"])
-def test_residuals_turn_into_the_direction_of_the_track(tmp_path: Path, start_yaw_rad: float) -> None:
+@pytest.mark.parametrize(
+    "start_yaw_rad", [0.3, math.pi - 0.005], ids=["anywhere", "over the jump"]
+)
+def test_residuals_turn_into_the_direction_of_the_track(
+    tmp_path: Path, start_yaw_rad: float
+) -> None:
     car = dataclasses.replace(ROUND, yaw_rad=start_yaw_rad)
     yaw_rad = car.state(0.01)[2]  # half a tick after the first
     forward = {"x_m": 2.0 * math.cos(yaw_rad), "y_m": 2.0 * math.sin(yaw_rad)}
     record = update(nis=1.5, **forward)
     between = dataclasses.replace(record, stamp_ns=record.stamp_ns + 10_000_000)
-    metrics = evaluate(write_run(tmp_path / "run", [[car.track(k, 1)] for k in range(3)], updates={1: [between]}))
+    metrics = evaluate(
+        write_run(
+            tmp_path / "run",
+            [[car.track(k, 1)] for k in range(3)],
+            updates={1: [between]},
+        )
+    )
     residuals = metrics.sensors["lidar"].residuals
     assert residuals["along_m"].mean == pytest.approx(2.0)
     assert residuals["across_m"].mean == pytest.approx(0.0, abs=1e-9)
@@ -126,10 +163,14 @@ def test_residuals_and_nis_are_summed_by_sensor(tmp_path: Path) -> None:
 
 
 def test_dispositions_sum_to_the_detections_received(tmp_path: Path) -> None:
-    updates = {k: [update(index=k, disposition=name)] for k, name in enumerate(Disposition)}
+    updates = {
+        k: [update(index=k, disposition=name)] for k, name in enumerate(Disposition)
+    }
     updates[0].append(update("radar", disposition=Disposition.GATED))
     metrics = evaluate(write_run(tmp_path / "run", updates=updates))
-    assert dict(metrics.sensors["lidar"].dispositions) == {name.value: 1 for name in Disposition}
+    assert dict(metrics.sensors["lidar"].dispositions) == {
+        name.value: 1 for name in Disposition
+    }
     assert metrics.sensors["lidar"].detections == len(Disposition)
     assert metrics.sensors["radar"].dispositions["gated"] == 1
     assert sum(sensor.detections for sensor in metrics.sensors.values()) == 13
@@ -137,8 +178,13 @@ def test_dispositions_sum_to_the_detections_received(tmp_path: Path) -> None:
 
 def test_the_delay_of_a_message_counts_once(tmp_path: Path) -> None:
     late, soon = 200_000_000, 100_000_000
-    updates = {0: [update(index=k, delay_ns=late) for k in range(8)], 5: [update(tick=5, delay_ns=soon)]}
-    delay_s = evaluate(write_run(tmp_path / "run", updates=updates)).sensors["lidar"].delay_s
+    updates = {
+        0: [update(index=k, delay_ns=late) for k in range(8)],
+        5: [update(tick=5, delay_ns=soon)],
+    }
+    delay_s = (
+        evaluate(write_run(tmp_path / "run", updates=updates)).sensors["lidar"].delay_s
+    )
     assert (delay_s.count, delay_s.max) == (2, 0.2)
     assert delay_s.mean == pytest.approx(0.15)
     assert delay_s.p90 == pytest.approx(0.19)
@@ -148,9 +194,27 @@ def test_metrics_are_strict_json(story: Run) -> None:
     plain = evaluate(story).as_dict()
     again = json.loads(json.dumps(plain, allow_nan=False))
     assert again == plain
-    assert again["truth"]["objects"]["7"]["errors"]["position_m"]["rmse"] == pytest.approx(2.5)
+    assert again["truth"]["objects"]["7"]["errors"]["position_m"][
+        "rmse"
+    ] == pytest.approx(2.5)
     assert again["truth"]["overall"]["tracked_share"] == pytest.approx(16 / 19)
     assert again["precision"] == 0.5
-    assert list(again["truth"]["overall"]["errors"]["position_m"]) == ["count", "mean", "std", "rmse"]
-    assert list(again["consistency"]["position_nees"]) == ["count", "mean", "dof", "band_low", "band_high"]
-    assert list(again["consistency"]["position_nees_interval"]) == ["mean", "low", "high", "count"]
+    assert list(again["truth"]["overall"]["errors"]["position_m"]) == [
+        "count",
+        "mean",
+        "std",
+        "rmse",
+    ]
+    assert list(again["consistency"]["position_nees"]) == [
+        "count",
+        "mean",
+        "dof",
+        "band_low",
+        "band_high",
+    ]
+    assert list(again["consistency"]["position_nees_interval"]) == [
+        "mean",
+        "low",
+        "high",
+        "count",
+    ]

@@ -14,8 +14,12 @@ from evaluation_scenes import Positions, random_scenes
 from fgtrack.core.types import TrackReport
 from fgtrack.evaluation.matching import Scenes, match, scenes
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.evaluation.scores.multi_object import MultiObjectMetrics, gospa, multi_object_metrics
-from fgtrack.io.run import EvaluationConfig, Run
+from fgtrack.evaluation.scores.multi_object import (
+    MultiObjectMetrics,
+    gospa,
+    multi_object_metrics,
+)
+from fgtrack.runs import EvaluationConfig, Run
 
 C_M, GATE_M = 5.0, 4.0
 
@@ -23,7 +27,9 @@ C_M, GATE_M = 5.0, 4.0
 SCENES = [(seed, side_m) for seed in range(3) for side_m in (3.0, 15.0, 200.0)]
 
 
-def multi_object(run: Run, options: EvaluationConfig | None = None) -> MultiObjectMetrics:
+def multi_object(
+    run: Run, options: EvaluationConfig | None = None
+) -> MultiObjectMetrics:
     found = evaluate(run, options=options).multi_object
     assert found is not None
     return found
@@ -35,7 +41,8 @@ def multi_object(run: Run, options: EvaluationConfig | None = None) -> MultiObje
 @pytest.mark.parametrize(("seed", "side_m"), SCENES)
 def test_gospa_and_its_parts_are_those_of_stone_soup(seed: int, side_m: float) -> None:
     ospametric = pytest.importorskip(
-        "stonesoup.metricgenerator.ospametric", reason="stonesoup is not installed (extra `rivals`)"
+        "stonesoup.metricgenerator.ospametric",
+        reason="stonesoup is not installed (extra `rivals`)",
     )
     from stonesoup.measures import Euclidean
     from stonesoup.types.state import State
@@ -49,9 +56,14 @@ def test_gospa_and_its_parts_are_those_of_stone_soup(seed: int, side_m: float) -
             assert found["total_m2"][tick] == 0.0
             continue
         stamp = start + timedelta(seconds=tick)
-        states = [[State(xy[:, None], timestamp=stamp) for xy in one.xy[tick]] for one in (tracks, objects)]
+        states = [
+            [State(xy[:, None], timestamp=stamp) for xy in one.xy[tick]]
+            for one in (tracks, objects)
+        ]
         expected = generator.compute_gospa_metric(*states)[0].value
-        assert math.sqrt(found["total_m2"][tick]) == pytest.approx(expected["distance"], abs=1e-9)
+        assert math.sqrt(found["total_m2"][tick]) == pytest.approx(
+            expected["distance"], abs=1e-9
+        )
         for name in ("localisation", "missed", "false"):
             assert found[f"{name}_m2"][tick] == pytest.approx(expected[name], abs=1e-9)
 
@@ -65,7 +77,11 @@ def story(tmp_path: Path) -> Run:
     for k in range(12):
         rows = [] if k == 5 else [WEST.track(k, 1 if k < 5 else 2, along_m=0.8)]
         tracks.append([*rows, WEST.track(k, 3, across_m=60.0)] if k < 2 else rows)
-    return write_run(tmp_path / "story", tracks, truth=[*WEST.truth(range(10)), *ROUND.truth(range(8))])
+    return write_run(
+        tmp_path / "story",
+        tracks,
+        truth=[*WEST.truth(range(10)), *ROUND.truth(range(8))],
+    )
 
 
 def test_gospa_of_a_run_is_what_can_be_counted(story: Run) -> None:
@@ -75,13 +91,25 @@ def test_gospa_of_a_run_is_what_can_be_counted(story: Run) -> None:
     assert found["localisation_m2"] == pytest.approx(0.9 * 0.64)
     assert found["missed_m2"] == pytest.approx(9 * 12.5 / 10)
     assert found["false_m2"] == pytest.approx(2 * 12.5 / 10)
-    missed_one, with_false, missed_two = math.sqrt(13.14), math.sqrt(25.64), math.sqrt(25.0)
+    missed_one, with_false, missed_two = (
+        math.sqrt(13.14),
+        math.sqrt(25.64),
+        math.sqrt(25.0),
+    )
     # ticks 0, 1; then 2, 3, 4, 6, 7; then 5; and 8, 9 with WEST alone
-    assert found["mean_m"] == pytest.approx((2 * with_false + 5 * missed_one + missed_two + 2 * 0.8) / 10)
+    assert found["mean_m"] == pytest.approx(
+        (2 * with_false + 5 * missed_one + missed_two + 2 * 0.8) / 10
+    )
 
 
 def test_a_pair_at_the_cut_off_is_a_miss_and_a_false_track() -> None:
-    there = Scenes(np.array([0]), np.array([1]), np.array([[2.0]]), np.array([[True]]), np.array([[True]]))
+    there = Scenes(
+        np.array([0]),
+        np.array([1]),
+        np.array([[2.0]]),
+        np.array([[True]]),
+        np.array([[True]]),
+    )
     at, inside = gospa(there, 2.0), gospa(there, 2.0 + 1e-9)
     names = ("localisation_m2", "missed_m2", "false_m2", "total_m2", "in_view_m2")
     assert [at[name][0] for name in names] == [0.0, 2.0, 2.0, 4.0, 4.0]
@@ -91,23 +119,35 @@ def test_a_pair_at_the_cut_off_is_a_miss_and_a_false_track() -> None:
 # --- CLEAR, IDF1, HOTA
 
 
-def trackeval_data(trackeval: Any, objects: Positions, tracks: Positions) -> dict[str, Any]:  # Any: has no types
+def trackeval_data(
+    trackeval: Any, objects: Positions, tracks: Positions
+) -> dict[str, Any]:  # Any: has no types
     """What TrackEval takes, with its own similarity of positions."""
-    similarity = trackeval.datasets._base_dataset._BaseDataset._calculate_euclidean_similarity
+    similarity = (
+        trackeval.datasets._base_dataset._BaseDataset._calculate_euclidean_similarity
+    )
     data: dict[str, Any] = {"num_timesteps": len(objects.ids)}
-    for name, det, one in (("gt_ids", "gt_dets", objects), ("tracker_ids", "tracker_dets", tracks)):
+    for name, det, one in (
+        ("gt_ids", "gt_dets", objects),
+        ("tracker_ids", "tracker_dets", tracks),
+    ):
         every, dense = np.unique(np.concatenate(one.ids), return_inverse=True)
         data[name] = np.split(dense, np.cumsum([len(ids) for ids in one.ids])[:-1])
         data[f"num_{name}"], data[f"num_{det}"] = len(every), len(dense)
     data["similarity_scores"] = [
-        similarity(a, b, zero_distance=2.0 * GATE_M) for a, b in zip(objects.xy, tracks.xy, strict=True)
+        similarity(a, b, zero_distance=2.0 * GATE_M)
+        for a, b in zip(objects.xy, tracks.xy, strict=True)
     ]
     return data
 
 
 @pytest.mark.parametrize(("seed", "side_m"), SCENES)
-def test_clear_identity_and_hota_are_those_of_trackeval(seed: int, side_m: float) -> None:
-    trackeval = pytest.importorskip("trackeval", reason="trackeval is not installed (extra `rivals`)")
+def test_clear_identity_and_hota_are_those_of_trackeval(
+    seed: int, side_m: float
+) -> None:
+    trackeval = pytest.importorskip(
+        "trackeval", reason="trackeval is not installed (extra `rivals`)"
+    )
     objects, tracks, there = random_scenes(seed, side_m)
     data = trackeval_data(trackeval, objects, tracks)
     quiet = {"PRINT_CONFIG": False}
@@ -115,11 +155,20 @@ def test_clear_identity_and_hota_are_those_of_trackeval(seed: int, side_m: float
 
     expected = trackeval.metrics.CLEAR(quiet).eval_sequence(data)
     clear = found.clear
-    counts = (clear["pairs"], clear["misses"], clear["false_positives"], clear["id_switches"])
-    assert counts == tuple(expected[name] for name in ("CLR_TP", "CLR_FN", "CLR_FP", "IDSW"))
+    counts = (
+        clear["pairs"],
+        clear["misses"],
+        clear["false_positives"],
+        clear["id_switches"],
+    )
+    assert counts == tuple(
+        expected[name] for name in ("CLR_TP", "CLR_FN", "CLR_FP", "IDSW")
+    )
     assert clear["mota"] == pytest.approx(expected["MOTA"], abs=1e-6)
     if clear["pairs"]:
-        assert clear["motp_m"] == pytest.approx((1.0 - expected["MOTP"]) * 2.0 * GATE_M, abs=1e-6)
+        assert clear["motp_m"] == pytest.approx(
+            (1.0 - expected["MOTP"]) * 2.0 * GATE_M, abs=1e-6
+        )
 
     expected = trackeval.metrics.Identity(quiet).eval_sequence(data)
     for name in ("IDF1", "IDP", "IDR"):
@@ -127,12 +176,20 @@ def test_clear_identity_and_hota_are_those_of_trackeval(seed: int, side_m: float
 
     expected = trackeval.metrics.HOTA().eval_sequence(data)
     for name in ("HOTA", "DetA", "AssA"):
-        assert found.hota[name.lower()] == pytest.approx(np.mean(expected[name]), abs=1e-6)
+        assert found.hota[name.lower()] == pytest.approx(
+            np.mean(expected[name]), abs=1e-6
+        )
 
 
 def test_a_pair_at_the_gate_counts_and_one_beyond_it_does_not() -> None:
     for distance_m, pairs in ((GATE_M, 1), (GATE_M + 1e-6, 0)):
-        there = Scenes(np.array([0]), np.array([1]), np.array([[distance_m]]), np.array([[True]]), np.array([[True]]))
+        there = Scenes(
+            np.array([0]),
+            np.array([1]),
+            np.array([[distance_m]]),
+            np.array([[True]]),
+            np.array([[True]]),
+        )
         found = multi_object_metrics(there, GATE_M)
         assert (found.clear["pairs"], found.identity["idf1"]) == (pairs, pairs)
 
@@ -149,7 +206,9 @@ def test_ticks_without_recorded_truth_are_not_judged(story: Run) -> None:
     assert np.isinf(there.distances_m[there.tick_index >= 8, 1]).all()
 
 
-def test_an_object_that_has_left_has_no_pair_though_a_row_has_an_earlier_stamp(tmp_path: Path) -> None:
+def test_an_object_that_has_left_has_no_pair_though_a_row_has_an_earlier_stamp(
+    tmp_path: Path,
+) -> None:
     truth = [*WEST.truth(range(3)), *ROUND.truth(range(5))]
     run = write_run(tmp_path / "run", [[], [], [], [WEST.track(2, 1)], []], truth=truth)
     matching = match(run)
@@ -162,7 +221,9 @@ def test_an_object_that_has_left_has_no_pair_though_a_row_has_an_earlier_stamp(t
 def test_the_configuration_of_the_run_says_how_it_is_judged(story: Run) -> None:
     without = replace(story, config_text="evaluation: {multi_object: false}")
     assert evaluate(without).multi_object is None
-    assert str(evaluate(without).truth) == str(evaluate(story).truth)  # NaN equals no NaN
+    assert str(evaluate(without).truth) == str(
+        evaluate(story).truth
+    )  # NaN equals no NaN
     options = "evaluation: {gate_m: 3, multi_object: true}"
     one = evaluate(replace(story, config_text=options))
     assert one.options == EvaluationConfig(3.0)

@@ -32,7 +32,9 @@ LOSSES = ("huber", "cauchy", "tukey", "geman_mcclure", "dcs")
 
 def state(motion: MotionModel, seed: int) -> FloatArray:
     rng = np.random.default_rng(seed)
-    kinematic = np.array([12.0, 7.0, 0.4, 20.0, 0.3, 1.5]) + 0.2 * rng.standard_normal(6)
+    kinematic = np.array([12.0, 7.0, 0.4, 20.0, 0.3, 1.5]) + 0.2 * rng.standard_normal(
+        6
+    )
     return motion.from_kinematic(kinematic, np.eye(6))[0]
 
 
@@ -43,13 +45,17 @@ def values(**states: FloatArray) -> gtsam.Values:
     return found
 
 
-def linear_parts(factor: gtsam.NonlinearFactor, at: gtsam.Values) -> tuple[FloatArray, FloatArray]:
+def linear_parts(
+    factor: gtsam.NonlinearFactor, at: gtsam.Values
+) -> tuple[FloatArray, FloatArray]:
     """A and b of A dx = b, with the weight of a loss."""
     A, b = factor.linearize(at).jacobian()
     return A, b
 
 
-def numeric_jacobian(function: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:
+def numeric_jacobian(
+    function: Callable[[FloatArray], FloatArray], x: FloatArray
+) -> FloatArray:
     """Central differences, with steps that suit metres, radians and metres per second alike."""
     columns = []
     for k in range(len(x)):
@@ -66,7 +72,9 @@ def test_a_motion_factor_is_the_whitened_gap_and_its_derivative_under_the_noise_
     """The derivative of the noise itself is left out on purpose, so L stays as it is at the linearisation point."""
     motion = MOTIONS[kind]
     left, at = state(motion, 0), state(motion, 9)
-    right = motion.predict(left, dt_s) + 0.1 * np.random.default_rng(1).standard_normal(motion.dim)
+    right = motion.predict(left, dt_s) + 0.1 * np.random.default_rng(1).standard_normal(
+        motion.dim
+    )
     L = np.linalg.cholesky(motion.process_noise(at, dt_s))
 
     def residual(both: FloatArray) -> FloatArray:
@@ -74,15 +82,22 @@ def test_a_motion_factor_is_the_whitened_gap_and_its_derivative_under_the_noise_
         return np.linalg.solve(L, x_right - motion.predict(x_left, dt_s))
 
     A, b = linear_parts(
-        motion_factor(motion, LEFT, RIGHT, dt_s, motion.process_noise(at, dt_s)), values(left=left, right=right)
+        motion_factor(motion, LEFT, RIGHT, dt_s, motion.process_noise(at, dt_s)),
+        values(left=left, right=right),
     )
     both = np.concatenate([left, right])
     expected = numeric_jacobian(residual, both)
-    np.testing.assert_allclose(A, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
-    np.testing.assert_allclose(b, -residual(both), rtol=1e-9, atol=1e-9 * np.abs(b).max())
+    np.testing.assert_allclose(
+        A, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max()
+    )
+    np.testing.assert_allclose(
+        b, -residual(both), rtol=1e-9, atol=1e-9 * np.abs(b).max()
+    )
 
 
-def measurement(kind: str, what: str, loss: RobustLoss | None, off: float = 1.0) -> tuple[Measurement, FloatArray]:
+def measurement(
+    kind: str, what: str, loss: RobustLoss | None, off: float = 1.0
+) -> tuple[Measurement, FloatArray]:
     """A measurement of a state, and a state that is `off` away from it."""
     motion = MOTIONS[kind]
     model = measurement_model(COMPONENTS[what], motion)
@@ -90,13 +105,17 @@ def measurement(kind: str, what: str, loss: RobustLoss | None, off: float = 1.0)
     k = len(COMPONENTS[what])
     root = np.eye(k) + 0.3 * rng.standard_normal((k, k))
     R = 0.04 * root @ root.T
-    z = model.predict(x, POSE) + off * np.linalg.cholesky(R) @ np.full(k, 1.0 / math.sqrt(k))
+    z = model.predict(x, POSE) + off * np.linalg.cholesky(R) @ np.full(
+        k, 1.0 / math.sqrt(k)
+    )
     return Measurement(0, model, z, R, POSE, loss), x
 
 
 def whitened(item: Measurement, x: FloatArray) -> FloatArray:
     L = np.linalg.cholesky(item.R)
-    return np.linalg.solve(L, -item.model.residual(item.z, item.model.predict(x, item.pose)))
+    return np.linalg.solve(
+        L, -item.model.residual(item.z, item.model.predict(x, item.pose))
+    )
 
 
 def loss_and_weight(kind: str, width: float, e: float) -> tuple[float, float]:
@@ -119,37 +138,69 @@ def loss_and_weight(kind: str, width: float, e: float) -> tuple[float, float]:
 
 @pytest.mark.parametrize("loss", [None, *LOSSES], ids=str)
 @pytest.mark.parametrize(("kind", "what"), list(product(MOTIONS, COMPONENTS)))
-def test_a_measurement_factor_is_the_whitened_weighted_residual(kind: str, what: str, loss: str | None) -> None:
+def test_a_measurement_factor_is_the_whitened_weighted_residual(
+    kind: str, what: str, loss: str | None
+) -> None:
     for off in (0.4, 2.0, 5.0):
-        item, x = measurement(kind, what, None if loss is None else RobustLoss(loss, 1.5), off)
+        item, x = measurement(
+            kind, what, None if loss is None else RobustLoss(loss, 1.5), off
+        )
         own = item.loss and width(item.loss, len(item.R))
-        root_weight = 1.0 if loss is None else math.sqrt(loss_and_weight(loss, own or 0.0, off)[1])
-        A, b = linear_parts(measurement_factor(LEFT, (item, 0.0), x, MOTIONS[kind]), values(left=x))
+        root_weight = (
+            1.0
+            if loss is None
+            else math.sqrt(loss_and_weight(loss, own or 0.0, off)[1])
+        )
+        A, b = linear_parts(
+            measurement_factor(LEFT, (item, 0.0), x, MOTIONS[kind]), values(left=x)
+        )
         expected = numeric_jacobian(lambda at, item=item: whitened(item, at), x)
-        np.testing.assert_allclose(A, root_weight * expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
-        np.testing.assert_allclose(b, -root_weight * whitened(item, x), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(
+            A, root_weight * expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max()
+        )
+        np.testing.assert_allclose(
+            b, -root_weight * whitened(item, x), rtol=1e-9, atol=1e-9
+        )
 
 
-@pytest.mark.parametrize(("c", "off"), [(1.5, 0.3), (1.5, 1.4), (1.5, 1.6), (1.5, 8.0), (2.5, 2.4), (2.5, 2.6)])
+@pytest.mark.parametrize(
+    ("c", "off"),
+    [(1.5, 0.3), (1.5, 1.4), (1.5, 1.6), (1.5, 8.0), (2.5, 2.4), (2.5, 2.6)],
+)
 @pytest.mark.parametrize("kind", LOSSES)
 def test_a_robust_loss_is_its_formula(kind: str, c: float, off: float) -> None:
     item, x = measurement("ctrv", "position", RobustLoss(kind, c), off)
     factor = measurement_factor(LEFT, (item, 0.0), x, CTRV())
     of_two = width(RobustLoss(kind, c), 2)
-    assert factor.error(values(left=x)) == pytest.approx(loss_and_weight(kind, of_two, off)[0], rel=1e-9)
+    assert factor.error(values(left=x)) == pytest.approx(
+        loss_and_weight(kind, of_two, off)[0], rel=1e-9
+    )
     loss, expected_weight = loss_and_weight(kind, c, off)
     assert penalty(RobustLoss(kind, c), off, 1) == pytest.approx(loss, rel=1e-12)
-    assert weight(RobustLoss(kind, c), off, 1) == pytest.approx(expected_weight, rel=1e-12, abs=1e-12)
+    assert weight(RobustLoss(kind, c), off, 1) == pytest.approx(
+        expected_weight, rel=1e-12, abs=1e-12
+    )
     step = 1e-6
-    slope = (loss_and_weight(kind, c, off + step)[0] - loss_and_weight(kind, c, off - step)[0]) / (2 * step)
+    slope = (
+        loss_and_weight(kind, c, off + step)[0]
+        - loss_and_weight(kind, c, off - step)[0]
+    ) / (2 * step)
     assert slope == pytest.approx(expected_weight * off, rel=1e-5, abs=1e-6)
 
 
-@pytest.mark.parametrize("loss", [None, RobustLoss("huber", 2.0)], ids=["gaussian", "huber"])
+@pytest.mark.parametrize(
+    "loss", [None, RobustLoss("huber", 2.0)], ids=["gaussian", "huber"]
+)
 @pytest.mark.parametrize("turns", [-1, 0, 2])
-def test_a_yaw_is_taken_on_the_branch_next_to_the_state(loss: RobustLoss | None, turns: int) -> None:
+def test_a_yaw_is_taken_on_the_branch_next_to_the_state(
+    loss: RobustLoss | None, turns: int
+) -> None:
     model = measurement_model(("yaw_rad",), CTRV())
-    item = Measurement(0, model, np.array([-math.pi + 0.1]), np.array([[0.01]]), loss=loss)
+    item = Measurement(
+        0, model, np.array([-math.pi + 0.1]), np.array([[0.01]]), loss=loss
+    )
     x = np.array([0.0, 0.0, math.pi - 0.05 + 2.0 * math.pi * turns, 10.0, 0.0])
-    _, b = linear_parts(measurement_factor(LEFT, (item, 0.0), x, CTRV()), values(left=x))
+    _, b = linear_parts(
+        measurement_factor(LEFT, (item, 0.0), x, CTRV()), values(left=x)
+    )
     assert b == pytest.approx([1.5])

@@ -8,13 +8,18 @@ from test_figure_texts import a_run
 
 from fgtrack.core.errors import CallError
 from fgtrack.evaluation.runs import EvaluatedRun, evaluated
-from fgtrack.plotting import plot
+from fgtrack.show.figures import plot
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> list[EvaluatedRun]:
     folder = tmp_path_factory.mktemp("paper")
-    return evaluated([a_run(folder / name) for name in ("smoother", "ekf-replay", "ekf-backward-forward")])
+    return evaluated(
+        [
+            a_run(folder / name)
+            for name in ("smoother", "ekf-replay", "ekf-backward-forward")
+        ]
+    )
 
 
 @pytest.mark.parametrize("name", ["errors", "lag"])
@@ -29,8 +34,15 @@ def test_a_figure_in_a_column_is_readable(name: str, runs: list[EvaluatedRun]) -
 
 def test_a_style_is_a_file_or_a_name(runs: list[EvaluatedRun], tmp_path: Path) -> None:
     (tmp_path / "mine.mplstyle").write_text("axes.facecolor: black\n")
-    assert plot.arrivals(runs[0], style=tmp_path / "mine.mplstyle").axes[0].get_facecolor() == (0.0, 0.0, 0.0, 1.0)
-    assert plot.arrivals(runs[0], style="dark_background").axes[0].get_facecolor() == (0.0, 0.0, 0.0, 1.0)
+    assert plot.arrivals(runs[0], style=tmp_path / "mine.mplstyle").axes[
+        0
+    ].get_facecolor() == (0.0, 0.0, 0.0, 1.0)
+    assert plot.arrivals(runs[0], style="dark_background").axes[0].get_facecolor() == (
+        0.0,
+        0.0,
+        0.0,
+        1.0,
+    )
 
 
 @pytest.mark.parametrize(
@@ -43,6 +55,8 @@ def test_a_style_is_a_file_or_a_name(runs: list[EvaluatedRun], tmp_path: Path) -
         ({"style": "nowhere.mplstyle"}, "cannot be used"),
     ],
 )
-def test_what_is_not_usable_is_one_clear_error(paper: dict[str, str], message: str, runs: list[EvaluatedRun]) -> None:
+def test_what_is_not_usable_is_one_clear_error(
+    paper: dict[str, str], message: str, runs: list[EvaluatedRun]
+) -> None:
     with pytest.raises(CallError, match=message):
         plot.arrivals(runs[0], **paper)

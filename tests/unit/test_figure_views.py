@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray
-from fgtrack.evaluation.palette import style_of
 from fgtrack.evaluation.runs import evaluated
-from fgtrack.plotting import plot
+from fgtrack.show.figures import plot
+from fgtrack.show.palette import style_of
 
 TICKS = range(60)
 
@@ -36,8 +36,13 @@ def stamp_ns(tick: int) -> int:
 # --- the map
 
 
-def test_one_stray_track_does_not_stretch_the_map_but_is_counted(tmp_path: Path) -> None:
-    tracks = [[WEST.track(k, 1), *([WEST.track(k, 2, across_m=90_000.0)] if k < 3 else [])] for k in TICKS]
+def test_one_stray_track_does_not_stretch_the_map_but_is_counted(
+    tmp_path: Path,
+) -> None:
+    tracks = [
+        [WEST.track(k, 1), *([WEST.track(k, 2, across_m=90_000.0)] if k < 3 else [])]
+        for k in TICKS
+    ]
     figure = plot.map(write_run(tmp_path / "run", tracks, truth=WEST.truth(TICKS)))
     (axes,) = figure.axes
     figure.canvas.draw()  # an equal aspect is made then
@@ -47,9 +52,21 @@ def test_one_stray_track_does_not_stretch_the_map_but_is_counted(tmp_path: Path)
 
 def test_ego_and_detections_are_on_the_map(tmp_path: Path) -> None:
     """The ego stands at (10, 20), turned to +y; what it sees 5 m ahead is at (10, 25)."""
-    ego = [EgoState(stamp_ns(k), stamp_ns(k), 10.0, 20.0, np.pi / 2, 0.0) for k in TICKS]
-    seen = [DetectionList("lidar", stamp_ns(k), stamp_ns(k), [Detection(x_m=5.0, y_m=0.0)]) for k in TICKS[1:-1]]
-    (axes,) = plot.map(write_run(tmp_path / "run", [[WEST.track(k, 1)] for k in TICKS], ego=ego, detections=seen)).axes
+    ego = [
+        EgoState(stamp_ns(k), stamp_ns(k), 10.0, 20.0, np.pi / 2, 0.0) for k in TICKS
+    ]
+    seen = [
+        DetectionList("lidar", stamp_ns(k), stamp_ns(k), [Detection(x_m=5.0, y_m=0.0)])
+        for k in TICKS[1:-1]
+    ]
+    (axes,) = plot.map(
+        write_run(
+            tmp_path / "run",
+            [[WEST.track(k, 1)] for k in TICKS],
+            ego=ego,
+            detections=seen,
+        )
+    ).axes
     own, found = labelled(axes, "ego"), labelled(axes, "detections (58)")
     assert (x_of(own)[0], y_of(own)[0]) == (10.0, 20.0)
     assert (x_of(found)[0], y_of(found)[0]) == pytest.approx((10.0, 25.0))
@@ -58,10 +75,15 @@ def test_ego_and_detections_are_on_the_map(tmp_path: Path) -> None:
 # --- NEES and NIS
 
 
-def test_consistent_values_are_inside_their_bands_and_others_outside(tmp_path: Path) -> None:
+def test_consistent_values_are_inside_their_bands_and_others_outside(
+    tmp_path: Path,
+) -> None:
     rng = np.random.default_rng(1)
     updates = {
-        k: [update("lidar", tick=k, nis=nis, x_m=0.0, y_m=0.0), update("radar", tick=k, nis=9.0 * nis, speed_mps=0.0)]
+        k: [
+            update("lidar", tick=k, nis=nis, x_m=0.0, y_m=0.0),
+            update("radar", tick=k, nis=9.0 * nis, speed_mps=0.0),
+        ]
         for k, nis in enumerate(rng.chisquare(2, 400))
     }
     figure = plot.consistency(write_run(tmp_path / "run", updates=updates))
@@ -85,33 +107,64 @@ def test_curves_that_coincide_are_both_seen_for_one_is_dashed(tmp_path: Path) ->
     runs = []
     for name in ("smoother", "ekf-replay"):
         tracks = [[WEST.track(k, 1, along_m=0.5)] for k in TICKS]
-        later = {k: [WEST.later(k - 5, 1, along_m=0.1)] for k in TICKS[5:]} if name == "smoother" else {}
+        later = (
+            {k: [WEST.later(k - 5, 1, along_m=0.1)] for k in TICKS[5:]}
+            if name == "smoother"
+            else {}
+        )
         meta = {"estimator": name}
-        runs.append(write_run(tmp_path / name, tracks, truth=WEST.truth(TICKS), meta=meta, smoothed=later))
+        runs.append(
+            write_run(
+                tmp_path / name,
+                tracks,
+                truth=WEST.truth(TICKS),
+                meta=meta,
+                smoothed=later,
+            )
+        )
     position, *_ = plot.errors(runs).axes
     smoother, replay, final = position.lines
     np.testing.assert_allclose(y_of(smoother), y_of(replay))
     assert (smoother.get_linestyle(), replay.get_linestyle()) == ("-", "--")
-    assert final.get_color() == smoother.get_color() == style_of("smoother").colour != replay.get_color()
+    assert (
+        final.get_color()
+        == smoother.get_color()
+        == style_of("smoother").colour
+        != replay.get_color()
+    )
     assert str(final.get_label()).startswith("smoother, final state: RMSE 0.1")
 
 
 # --- few
 
 
-def test_of_many_objects_the_worst_are_drawn_and_the_rest_on_request(tmp_path: Path) -> None:
+def test_of_many_objects_the_worst_are_drawn_and_the_rest_on_request(
+    tmp_path: Path,
+) -> None:
     cars = [Car(k, 100.0, 30.0 * k, 0.0, 20.0) for k in range(6)]
-    tracks = [[car.track(k, car.object_id, along_m=0.1 * car.object_id) for car in cars] for k in TICKS]
-    run = write_run(tmp_path / "run", tracks, truth=[row for car in cars for row in car.truth(TICKS)])
-    plans = [plan for plan in plot.planned(evaluated(run)) if plan.name.startswith("errors")]
+    tracks = [
+        [car.track(k, car.object_id, along_m=0.1 * car.object_id) for car in cars]
+        for k in TICKS
+    ]
+    run = write_run(
+        tmp_path / "run",
+        tracks,
+        truth=[row for car in cars for row in car.truth(TICKS)],
+    )
+    plans = [
+        plan for plan in plot.planned(evaluated(run)) if plan.name.startswith("errors")
+    ]
     assert [plan.name for plan in plans if not plan.is_extra] == [
         *("errors_all_objects", "errors_object_3", "errors_object_4", "errors_object_5")
     ]
     assert len(plans) == 7
-    few, every = ([name for name, _ in plot.drawn(plans, each)] for each in (False, True))
+    few, every = (
+        [name for name, _ in plot.drawn(plans, each)] for each in (False, True)
+    )
     assert len(every) == len(few) + 3
     many = evaluated(
-        [replace(run, path=None)] * 1 + [write_run(tmp_path / f"r{k}", [[cars[0].track(0, 1)]]) for k in range(7)]
+        [replace(run, path=None)] * 1
+        + [write_run(tmp_path / f"r{k}", [[cars[0].track(0, 1)]]) for k in range(7)]
     )
     maps = [plan for plan in plot.planned(many) if plan.name.startswith("map")]
     assert (len(maps), sum(not plan.is_extra for plan in maps)) == (8, 3)

@@ -11,7 +11,10 @@ from fgtrack.estimation.base import Measurement, SensorPose, Start, UpdateStatus
 from fgtrack.estimation.object_bank import SingleObject
 from fgtrack.estimation.smoothing.bank import SmootherBank
 from fgtrack.estimation.smoothing.gtsam.batch import BatchBank
-from fgtrack.estimation.smoothing.gtsam.incremental import IncrementalBank, IncrementalSolver
+from fgtrack.estimation.smoothing.gtsam.incremental import (
+    IncrementalBank,
+    IncrementalSolver,
+)
 from fgtrack.models.motion import CTRV, CV, MotionModel, Transition
 
 MS = 1_000_000
@@ -22,7 +25,12 @@ def at(ms: int, x_m: float, y_m: float = 0.0) -> Measurement:
     return Measurement.of(ms * MS, x_m=x_m, y_m=y_m, std=STD)
 
 
-def one_of(motion: MotionModel, start: Start, make: type[SmootherBank] = SmootherBank, **options: Any) -> SingleObject:
+def one_of(
+    motion: MotionModel,
+    start: Start,
+    make: type[SmootherBank] = SmootherBank,
+    **options: Any,
+) -> SingleObject:
     return SingleObject(motion, make(motion, **{"lag_s": 1.0, **options}), start)
 
 
@@ -31,17 +39,29 @@ def largest_step_to_convergence(smoother: SingleObject, ms: int) -> float:
     found = smoother.state_at(ms * MS)
     assert isinstance(smoother.bank, SmootherBank)
     smoother.bank.converge()
-    return float((np.abs(found.mean - smoother.state_at(ms * MS).mean) / np.sqrt(np.diag(found.covariance))).max())
+    return float(
+        (
+            np.abs(found.mean - smoother.state_at(ms * MS).mean)
+            / np.sqrt(np.diag(found.covariance))
+        ).max()
+    )
 
 
 @pytest.mark.parametrize("make", [SmootherBank, IncrementalBank, BatchBank])
-def test_the_process_noise_follows_the_states_that_move(make: type[SmootherBank]) -> None:
+def test_the_process_noise_follows_the_states_that_move(
+    make: type[SmootherBank],
+) -> None:
     """The speed starts far off, and with it the noise across the direction of travel."""
-    names, start = CTRV().state_names, Start(yaw_rad=0.4, yaw_std_rad=0.5, speed_mps=5.0, speed_std_mps=50.0)
+    names, start = (
+        CTRV().state_names,
+        Start(yaw_rad=0.4, yaw_std_rad=0.5, speed_mps=5.0, speed_std_mps=50.0),
+    )
     apart = {}
     for threshold in (1e-7, 1e9):
         thresholds = dict.fromkeys(names, threshold)
-        smoother = one_of(CTRV(), start, make, lag_s=9.0, relinearise=thresholds, max_iterations=50)
+        smoother = one_of(
+            CTRV(), start, make, lag_s=9.0, relinearise=thresholds, max_iterations=50
+        )
         for k in range(1, 6):
             smoother.update(at(500 * k, 15.0 * k, 0.8 * k * k))
         apart[threshold] = largest_step_to_convergence(smoother, 2500)
@@ -51,12 +71,19 @@ def test_the_process_noise_follows_the_states_that_move(make: type[SmootherBank]
 
 def test_a_sensor_that_is_not_linear_brings_the_thresholds_of_the_position() -> None:
     """Bearings from the side, of an object that starts far from where it is."""
-    pose, start = SensorPose(0.0, -20.0), Start(position_m=(8.0, 6.0), position_std_m=10.0, speed_std_mps=1.0)
+    pose, start = (
+        SensorPose(0.0, -20.0),
+        Start(position_m=(8.0, 6.0), position_std_m=10.0, speed_std_mps=1.0),
+    )
     smoother = one_of(CV(), start, lag_s=9.0)
     smoother.update(at(100, 7.0, 6.0))
     for k in range(2, 8):
         std = {"range_m": 0.2, "bearing_rad": 0.02}
-        smoother.update(Measurement.of(100 * k * MS, range_m=20.0, bearing_rad=np.pi / 2, std=std, pose=pose))
+        smoother.update(
+            Measurement.of(
+                100 * k * MS, range_m=20.0, bearing_rad=np.pi / 2, std=std, pose=pose
+            )
+        )
     assert largest_step_to_convergence(smoother, 700) < 0.1
 
 
@@ -82,7 +109,13 @@ def test_further_iterations_are_taken_only_while_a_state_moves() -> None:
     smoother.update(at(100, 3.0))
     assert Counted.num_updates == 1
     exact = dict.fromkeys(CTRV().state_names, 1e-9)
-    smoother = one_of(CTRV(), Start(yaw_rad=0.5, speed_mps=20.0), CountedBank, max_iterations=5, relinearise=exact)
+    smoother = one_of(
+        CTRV(),
+        Start(yaw_rad=0.5, speed_mps=20.0),
+        CountedBank,
+        max_iterations=5,
+        relinearise=exact,
+    )
     Counted.num_updates = 0
     smoother.update(at(100, 3.0))
     assert Counted.num_updates == 5
@@ -93,7 +126,10 @@ def test_covariances_are_read_from_the_graph_once_until_something_is_fused() -> 
     for k in (1, 2):
         smoother.update(at(100 * k, 3.0 * k))
         before = Counted.num_covariances
-        states = [smoother.state_at(stamp_ms * MS) for stamp_ms in (100 * k + 10, 100 * k + 30, 100 * k)]
+        states = [
+            smoother.state_at(stamp_ms * MS)
+            for stamp_ms in (100 * k + 10, 100 * k + 30, 100 * k)
+        ]
         assert Counted.num_covariances == before + 1
         assert states[0].covariance[0, 0] > states[2].covariance[0, 0]
 
@@ -105,10 +141,16 @@ def test_an_object_that_is_never_seen_again_has_no_graph() -> None:
     states = [one_of(CTRV(), start, CountedBank).state_at(k * MS) for k in (0, 100)]
     assert Counted.num_updates == 0
     smoother = one_of(CTRV(), start, IncrementalBank)
-    smoother.update(Measurement.of(200 * MS, x_m=4.0, y_m=0.0, std={"x_m": 1e7, "y_m": 1e7}))
-    for state, seen in zip(states, [smoother.state_at(state.stamp_ns) for state in states], strict=True):
+    smoother.update(
+        Measurement.of(200 * MS, x_m=4.0, y_m=0.0, std={"x_m": 1e7, "y_m": 1e7})
+    )
+    for state, seen in zip(
+        states, [smoother.state_at(state.stamp_ns) for state in states], strict=True
+    ):
         np.testing.assert_allclose(state.mean, seen.mean, atol=1e-9)
-        np.testing.assert_allclose(state.covariance, seen.covariance, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(
+            state.covariance, seen.covariance, rtol=1e-6, atol=1e-9
+        )
 
 
 def test_the_window_is_as_long_as_it_says() -> None:
@@ -139,8 +181,12 @@ def test_what_lies_behind_the_ring_is_forgotten(make: type[SmootherBank]) -> Non
     assert smoother.update(at(29_499, 295.0)).status is UpdateStatus.TOO_OLD
 
 
-@pytest.mark.parametrize(("final", "left", "rest"), [(True, [1], [2, 3, 4, 5]), (False, [], [])])
-def test_a_bank_reports_lagged_states_and_final_ones_once(final: bool, left: list[int], rest: list[int]) -> None:
+@pytest.mark.parametrize(
+    ("final", "left", "rest"), [(True, [1], [2, 3, 4, 5]), (False, [], [])]
+)
+def test_a_bank_reports_lagged_states_and_final_ones_once(
+    final: bool, left: list[int], rest: list[int]
+) -> None:
     bank = SmootherBank(CV(), 0.25, ring_s=0.5, lagged_s=(0.2,), final=final)
     bank.advance(100 * MS)
     bank.birth(7, Start(stamp_ns=100 * MS))
@@ -152,9 +198,13 @@ def test_a_bank_reports_lagged_states_and_final_ones_once(final: bool, left: lis
     reports = bank.smoothed()
     [lagged] = [report for report in reports if report.lag_s is not None]
     assert (lagged.track_id, lagged.state.stamp_ns, lagged.lag_s) == (7, 300 * MS, 0.2)
-    assert [report.state.stamp_ns for report in reports if report.lag_s is None] == [100 * k * MS for k in left]
+    assert [report.state.stamp_ns for report in reports if report.lag_s is None] == [
+        100 * k * MS for k in left
+    ]
     bank.remove(7)
-    assert [report.state.stamp_ns for report in bank.smoothed()] == [100 * k * MS for k in rest]
+    assert [report.state.stamp_ns for report in bank.smoothed()] == [
+        100 * k * MS for k in rest
+    ]
     assert bank.smoothed() == []
 
 
@@ -168,18 +218,27 @@ class OwnTransition(CTRV):
 def test_a_motion_model_in_numpy_gives_what_the_same_one_compiled_gives() -> None:
     """With detections ahead, late, on a node and beyond the window, and at stamps between nodes."""
     start = Start(yaw_rad=0.4, yaw_std_rad=0.5, speed_mps=12.0)
-    compiled, numpy = (one_of(model, start, lag_s=0.3, ring_s=1.0) for model in (CTRV(), OwnTransition()))
+    compiled, numpy = (
+        one_of(model, start, lag_s=0.3, ring_s=1.0)
+        for model in (CTRV(), OwnTransition())
+    )
     for k, ms in enumerate((100, 300, 200, 200, 500, 400, 700, 150, 650)):
         for each in (compiled, numpy):
             each.update(at(ms, 0.012 * ms, 0.2 * (k % 3)))
     for ms in (150, 450, 700, 900):
         states = [each.state_at(ms * MS) for each in (compiled, numpy)]
-        np.testing.assert_allclose(states[1].mean, states[0].mean, rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(states[1].covariance, states[0].covariance, rtol=1e-10, atol=1e-14)
+        np.testing.assert_allclose(
+            states[1].mean, states[0].mean, rtol=1e-12, atol=1e-12
+        )
+        np.testing.assert_allclose(
+            states[1].covariance, states[0].covariance, rtol=1e-10, atol=1e-14
+        )
 
 
 @pytest.mark.parametrize("make", [SmootherBank, IncrementalBank, BatchBank])
-def test_noise_that_is_no_covariance_fails_updates_and_leaves_the_states(make: type[SmootherBank]) -> None:
+def test_noise_that_is_no_covariance_fails_updates_and_leaves_the_states(
+    make: type[SmootherBank],
+) -> None:
     class Faulty(CV):
         sign = 1.0
 
@@ -193,17 +252,26 @@ def test_noise_that_is_no_covariance_fails_updates_and_leaves_the_states(make: t
     for k in range(1, 10):
         Faulty.sign = 1.0 if k < 4 else -1e3
         stamp_ns = k * 100_000_000
-        status = estimator.update(Measurement.of(stamp_ns, x_m=float(k), y_m=0.0, std=0.3)).status
+        status = estimator.update(
+            Measurement.of(stamp_ns, x_m=float(k), y_m=0.0, std=0.3)
+        ).status
         assert status is (UpdateStatus.IN_SEQUENCE if k < 4 else UpdateStatus.FAILED)
         assert 0.0 < estimator.state_at(stamp_ns).covariance[0, 0] < np.inf
 
 
 def test_a_copy_converges_as_its_original() -> None:
-    estimator = SingleObject(CTRV(), SmootherBank(CTRV(), lag_s=1.0), Start(yaw_rad=0.0, speed_mps=10.0))
+    estimator = SingleObject(
+        CTRV(), SmootherBank(CTRV(), lag_s=1.0), Start(yaw_rad=0.0, speed_mps=10.0)
+    )
     for k in range(1, 6):
-        estimator.update(Measurement.of(k * 100_000_000, x_m=float(k), y_m=0.3 * k * k, std=0.1))
+        estimator.update(
+            Measurement.of(k * 100_000_000, x_m=float(k), y_m=0.3 * k * k, std=0.1)
+        )
     clone = copy.deepcopy(estimator)
     for each in (estimator, clone):
         each.bank.converge()
     for k in (1, 3, 5):
-        np.testing.assert_array_equal(clone.state_at(k * 100_000_000).mean, estimator.state_at(k * 100_000_000).mean)
+        np.testing.assert_array_equal(
+            clone.state_at(k * 100_000_000).mean,
+            estimator.state_at(k * 100_000_000).mean,
+        )

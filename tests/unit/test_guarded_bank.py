@@ -7,7 +7,13 @@ import pytest
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import TrackState
-from fgtrack.estimation.base import Estimator, Measurement, Start, UpdateResult, UpdateStatus
+from fgtrack.estimation.base import (
+    Estimator,
+    Measurement,
+    Start,
+    UpdateResult,
+    UpdateStatus,
+)
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.estimation.object_bank import ObjectBank, changing_nothing
 from fgtrack.models.motion import CTRV, MotionModel
@@ -38,25 +44,45 @@ class Moody(ReplayEkf):
         state = super().state_at(stamp_ns)
         if self.mood == 4000.0:
             raise RuntimeError("no state")
-        return TrackState(stamp_ns, state.mean * np.nan, state.covariance) if self.mood == 2000.0 else state
+        return (
+            TrackState(stamp_ns, state.mean * np.nan, state.covariance)
+            if self.mood == 2000.0
+            else state
+        )
 
 
 def bank_of(*x_m: float, motion: MotionModel = MOTION) -> GuardedBank:
     """A bank of cars that drive east at 10 m/s from these places, seen five times."""
-    bank = GuardedBank(lambda: ObjectBank(motion, lambda start: Moody(start, motion), 1.0))
+    bank = GuardedBank(
+        lambda: ObjectBank(motion, lambda start: Moody(start, motion), 1.0)
+    )
     bank.advance(0)
     for track_id, x in enumerate(x_m):
-        bank.birth(track_id, Start(stamp_ns=0, position_m=(x, 0.0), yaw_rad=0.0, speed_mps=10.0, speed_std_mps=1.0))
+        bank.birth(
+            track_id,
+            Start(
+                stamp_ns=0,
+                position_m=(x, 0.0),
+                yaw_rad=0.0,
+                speed_mps=10.0,
+                speed_std_mps=1.0,
+            ),
+        )
     for k in range(1, 6):
         step(bank, 100 * MS * k, [x + 1.0 * k for x in x_m])
     assert counted(bank) == {}
     return bank
 
 
-def step(bank: GuardedBank, stamp_ns: int, x_m: Sequence[float]) -> tuple[list[UpdateResult], list[TrackState]]:
+def step(
+    bank: GuardedBank, stamp_ns: int, x_m: Sequence[float]
+) -> tuple[list[UpdateResult], list[TrackState]]:
     """A tick with a measurement of every track."""
     bank.advance(stamp_ns)
-    measured = [Measurement.of(stamp_ns, x_m=x, y_m=0.0, std={"x_m": 0.3, "y_m": 0.3}) for x in x_m]
+    measured = [
+        Measurement.of(stamp_ns, x_m=x, y_m=0.0, std={"x_m": 0.3, "y_m": 0.3})
+        for x in x_m
+    ]
     return bank.update(stamp_ns, bank.track_ids, measured), bank.present()
 
 
@@ -77,7 +103,9 @@ def test_a_track_whose_update_raises_ends_and_the_others_go_on() -> None:
     assert [result.status for result in results] == [fused, failed, fused]
     assert counted(bank) == {"update failed": 1, "track ended": 1}
     assert "singular" in str(bank.failures.last)
-    assert bank.failures.ended == [{"track_id": 1, "now_ns": 600 * MS, "failure": "update failed"}]
+    assert bank.failures.ended == [
+        {"track_id": 1, "now_ns": 600 * MS, "failure": "update failed"}
+    ]
     assert bank.track_ids == (0, 2)
     for track_id, state in states(bank).items():
         assert state.mean.tobytes() == states(calm)[track_id].mean.tobytes()
@@ -87,7 +115,10 @@ def test_a_track_whose_update_raises_ends_and_the_others_go_on() -> None:
 def test_of_tracks_that_are_updated_together_all_of_the_call_end() -> None:
     class Together(ObjectBank[Moody]):
         def update(
-            self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+            self,
+            stamp_ns: int,
+            track_ids: Sequence[int],
+            measurements: Sequence[Measurement],
         ) -> list[UpdateResult]:
             raise RuntimeError("together")
 
@@ -96,7 +127,9 @@ def test_of_tracks_that_are_updated_together_all_of_the_call_end() -> None:
     for track_id in range(3):
         bank.birth(track_id, Start(yaw_rad=0.0))
     seen = [Measurement.of(0, x_m=0.0, y_m=0.0, std=0.3)] * 2
-    assert [result.status for result in bank.update(0, [0, 2], seen)] == [UpdateStatus.FAILED] * 2
+    assert [result.status for result in bank.update(0, [0, 2], seen)] == [
+        UpdateStatus.FAILED
+    ] * 2
     assert (bank.track_ids, len(bank.present())) == ((1,), 1)
     assert counted(bank) == {"update failed": 2, "track ended": 2}
 
@@ -113,7 +146,11 @@ def test_a_track_whose_state_is_not_finite_ends() -> None:
 def test_states_that_are_not_finite_are_not_offered() -> None:
     bank = bank_of(0.0, 100.0)
     bank.advance(600 * MS)
-    bank.update(600 * MS, [1], [Measurement.of(600 * MS, x_m=2000.0, y_m=0.0, std={"x_m": 0.3, "y_m": 0.3})])
+    bank.update(
+        600 * MS,
+        [1],
+        [Measurement.of(600 * MS, x_m=2000.0, y_m=0.0, std={"x_m": 0.3, "y_m": 0.3})],
+    )
     assert bank.states_at(600 * MS).track_ids == (0,)
 
 
@@ -152,7 +189,10 @@ def test_a_bank_that_cannot_remove_a_track_is_replaced() -> None:
 def test_a_track_whose_state_is_as_before_goes_on() -> None:
     class Full(ObjectBank[Moody]):
         def update(
-            self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+            self,
+            stamp_ns: int,
+            track_ids: Sequence[int],
+            measurements: Sequence[Measurement],
         ) -> list[UpdateResult]:
             with changing_nothing(track_ids):
                 raise MemoryError("no array of 8 GB")
@@ -162,7 +202,9 @@ def test_a_track_whose_state_is_as_before_goes_on() -> None:
     for track_id in range(2):
         bank.birth(track_id, Start(yaw_rad=0.0))
     seen = [Measurement.of(0, x_m=0.0, y_m=0.0, std=0.3)] * 2
-    assert [result.status for result in bank.update(0, [0, 1], seen)] == [UpdateStatus.FAILED] * 2
+    assert [result.status for result in bank.update(0, [0, 1], seen)] == [
+        UpdateStatus.FAILED
+    ] * 2
     assert bank.track_ids == (0, 1)
     assert counted(bank) == {"update failed": 2}
     assert bank.failures.first == "not enough memory: no array of 8 GB"
@@ -174,24 +216,37 @@ def test_a_track_that_has_ended_is_not_updated_and_the_others_are() -> None:
     bank.advance(600 * MS)
     seen = [Measurement.of(600 * MS, x_m=x, y_m=0.0, std=0.3) for x in (6.0, 106.0)]
     results = bank.update(600 * MS, [0, 1], seen)
-    assert [result.status for result in results] == [UpdateStatus.IN_SEQUENCE, UpdateStatus.FAILED]
+    assert [result.status for result in results] == [
+        UpdateStatus.IN_SEQUENCE,
+        UpdateStatus.FAILED,
+    ]
     assert counted(bank) == {"update failed": 1}
     assert bank.failures.first == "a measurement of track 1 could not be fused"
     assert bank.track_ids == (0,)
 
 
-@pytest.mark.parametrize("answer", [[], [None], [UpdateResult(UpdateStatus.IN_SEQUENCE)] * 2])
-def test_tracks_of_an_update_without_a_result_each_end(answer: list[UpdateResult]) -> None:
+@pytest.mark.parametrize(
+    "answer", [[], [None], [UpdateResult(UpdateStatus.IN_SEQUENCE)] * 2]
+)
+def test_tracks_of_an_update_without_a_result_each_end(
+    answer: list[UpdateResult],
+) -> None:
     class Careless(ObjectBank[Moody]):
         def update(
-            self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+            self,
+            stamp_ns: int,
+            track_ids: Sequence[int],
+            measurements: Sequence[Measurement],
         ) -> list[UpdateResult]:
             return answer
 
     bank = GuardedBank(lambda: Careless(MOTION, Moody, 1.0))
     bank.advance(0)
     bank.birth(0, Start(yaw_rad=0.0))
-    assert bank.update(0, [0], [Measurement.of(0, x_m=0.0, y_m=0.0, std=0.3)])[0].status is UpdateStatus.FAILED
+    assert (
+        bank.update(0, [0], [Measurement.of(0, x_m=0.0, y_m=0.0, std=0.3)])[0].status
+        is UpdateStatus.FAILED
+    )
     assert counted(bank) == {"update failed": 1, "track ended": 1}
     assert bank.track_ids == ()
 

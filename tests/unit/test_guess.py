@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from fgtrack.io.config import Field
-from fgtrack.io.guess import agreeing_with_motion, guesses, time_unit
+from fgtrack.inputs.guess import agreeing_with_motion, guesses, time_unit
+from fgtrack.inputs.settings import Field
 
 
 @pytest.mark.parametrize(
@@ -34,13 +34,17 @@ from fgtrack.io.guess import agreeing_with_motion, guesses, time_unit
         ("temperature", [4.0], None, None),
     ],
 )
-def test_a_field_is_taken_by_its_name_and_its_unit_by_name_and_values(name, samples, component, path):
+def test_a_field_is_taken_by_its_name_and_its_unit_by_name_and_values(
+    name, samples, component, path
+):
     found = {key: one.path for key, one in guesses({name: samples}).items()}
     assert found == ({} if component is None else {component: path})
 
 
 def test_two_velocities_are_a_speed_and_of_two_names_the_first_is_taken():
-    found = guesses({"velocity.x": [1.0], "velocity.y": [1.0], "range": [1.0], "distance": [1.0]})
+    found = guesses(
+        {"velocity.x": [1.0], "velocity.y": [1.0], "range": [1.0], "distance": [1.0]}
+    )
     assert {key: one.path for key, one in found.items()} == {
         "range_m": "range",
         "speed_mps": ["velocity.x", "velocity.y"],
@@ -65,18 +69,34 @@ def test_the_unit_of_times_is_that_of_their_size_name_or_period(name, samples, u
 
 @pytest.mark.parametrize("compass", [True, False])
 @pytest.mark.parametrize("degrees", [True, False])
-def test_a_heading_and_a_speed_are_those_with_which_the_positions_move(compass, degrees):
+def test_a_heading_and_a_speed_are_those_with_which_the_positions_move(
+    compass, degrees
+):
     t_s = np.arange(200) * 0.1
     yaw_rad = 0.3 + 0.02 * t_s
     x_m, y_m = np.cumsum(1.5 * np.cos(yaw_rad)), np.cumsum(1.5 * np.sin(yaw_rad))
     heading = (0.5 * math.pi - yaw_rad if compass else yaw_rad) % (2.0 * math.pi)
     heading = np.degrees(heading) if degrees else heading
-    values = {"ms": 1e3 * t_s, "x": x_m, "y": y_m, "heading": heading, "speed": np.full(200, 15.0 * 3.6)}
-    found = agreeing_with_motion(guesses({name: one.tolist() for name, one in values.items()}), values, "ms")
+    values = {
+        "ms": 1e3 * t_s,
+        "x": x_m,
+        "y": y_m,
+        "heading": heading,
+        "speed": np.full(200, 15.0 * 3.6),
+    }
+    found = agreeing_with_motion(
+        guesses({name: one.tolist() for name, one in values.items()}), values, "ms"
+    )
     path = found["yaw_rad"].path
-    read = [path.value(one) for one in heading] if isinstance(path, Field) else heading.tolist()
+    read = (
+        [path.value(one) for one in heading]
+        if isinstance(path, Field)
+        else heading.tolist()
+    )
     np.testing.assert_allclose(np.cos(read - yaw_rad), 1.0, atol=1e-9)
     assert found["speed_mps"].path == Field("speed", 1.0 / 3.6)
-    assert "3.6 times the distance travelled per second: kmh" in found["speed_mps"].reason
+    assert (
+        "3.6 times the distance travelled per second: kmh" in found["speed_mps"].reason
+    )
     strange = agreeing_with_motion(found, {**values, "heading": -2.0 * heading}, "ms")
     assert "check it" in strange["yaw_rad"].reason

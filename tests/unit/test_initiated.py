@@ -8,18 +8,20 @@ from support.directions import PERIOD_NS, START, positions
 from support.examples import slow
 
 import fgtrack
+from fgtrack.config.settings import Config, InitiationConfig, MapConfig, MotionConfig
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.types import YAW
 from fgtrack.estimation.base import Estimator, Measurement, Start
-from fgtrack.estimation.filters.backward_forward import BackwardForwardBank
 from fgtrack.estimation.filters.track_initiation import MOST_MEASUREMENTS, Initiated
 from fgtrack.estimation.registry import ESTIMATORS, Claims, start_estimator
+from fgtrack.karle2023.backward_forward import BackwardForwardBank
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.pipeline.build import build_bank
-from fgtrack.pipeline.config import Config, InitiationConfig, MapConfig, MotionConfig
 from fgtrack.testing import estimator_checks
 
-NAMES = [name for name in ESTIMATORS if name not in ("smoother-batch", "as-current", "drop")]
+NAMES = [
+    name for name in ESTIMATORS if name not in ("smoother-batch", "as-current", "drop")
+]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -32,7 +34,9 @@ def test_every_estimator_finds_the_direction(name: str) -> None:
         estimator = fgtrack.estimator(name, CTRV(), START, initiation=method)
         for measurement in measurements:
             estimator.update(measurement)
-        off_rad[method] = abs(wrap_angle(estimator.state_at(12 * PERIOD_NS).mean[YAW] - 3.0))
+        off_rad[method] = abs(
+            wrap_angle(estimator.state_at(12 * PERIOD_NS).mean[YAW] - 3.0)
+        )
     assert max(off_rad["two-point"], off_rad["regression"]) < 0.15, off_rad
 
 
@@ -46,11 +50,17 @@ def test_it_begins_again_until_the_direction_is_certain_and_then_no_more() -> No
     start_estimator_of(make, positions(2.0, 20))
     assert starts[0].yaw_rad is None
     assert 2 < len(starts) < 15
-    assert all(abs(wrap_angle((start.yaw_rad or 0.0) - 2.0)) < 0.5 for start in starts[1:])
-    assert starts[-1].yaw_std_rad == pytest.approx(np.pi / np.sqrt(3.0))  # the measurements say it once more
+    assert all(
+        abs(wrap_angle((start.yaw_rad or 0.0) - 2.0)) < 0.5 for start in starts[1:]
+    )
+    assert starts[-1].yaw_std_rad == pytest.approx(
+        np.pi / np.sqrt(3.0)
+    )  # the measurements say it once more
     starts.clear()
     start_estimator_of(make, positions(2.0, 60, speed_mps=0.0))
-    assert len(starts) == MOST_MEASUREMENTS + 2  # the first one, and after the last that takes part
+    assert (
+        len(starts) == MOST_MEASUREMENTS + 2
+    )  # the first one, and after the last that takes part
 
 
 def start_estimator_of(make: object, measurements: list[Measurement]) -> None:
@@ -71,7 +81,9 @@ def test_a_window_that_moves_on_ends_it() -> None:
     assert np.isfinite(state.mean).all()
 
 
-@pytest.mark.parametrize("name", ["ekf-replay", *slow("smoother", "reorder-buffer", "al1")])
+@pytest.mark.parametrize(
+    "name", ["ekf-replay", *slow("smoother", "reorder-buffer", "al1")]
+)
 def test_the_contract_holds_with_an_unknown_direction(name: str) -> None:
     made = ESTIMATORS.load(name)
 
@@ -82,16 +94,26 @@ def test_the_contract_holds_with_an_unknown_direction(name: str) -> None:
 
     vars(unknown).update({**vars(Claims.of(made)), "bank": False, "initiates": True})
     checks = estimator_checks(unknown, seed=3, num_streams=3)
-    del checks["gives the posterior of a nonlinear model"]  # of which the heading is known at the start
+    del checks[
+        "gives the posterior of a nonlinear model"
+    ]  # of which the heading is known at the start
     for check in checks.values():
         check()
 
 
-@pytest.mark.parametrize("name", ["ekf-replay", "smoother", "rts", "ekf-backward-forward"])
+@pytest.mark.parametrize(
+    "name", ["ekf-replay", "smoother", "rts", "ekf-backward-forward"]
+)
 def test_the_configuration_says_it_for_all_tracks(name: str) -> None:
-    config = Config(name, motion=MotionConfig(kind="ctrv"), initiation=InitiationConfig(method="two-point"))
+    config = Config(
+        name,
+        motion=MotionConfig(kind="ctrv"),
+        initiation=InitiationConfig(method="two-point"),
+    )
     bank = build_bank(config)
-    one = fgtrack.estimator(name, config.motion.model(), START, lag_s=3.5, initiation="two-point")
+    one = fgtrack.estimator(
+        name, config.motion.model(), START, lag_s=3.5, initiation="two-point"
+    )
     bank.birth(1, START)
     for measurement in positions(2.0, 4):
         bank.advance(measurement.stamp_ns)
@@ -103,5 +125,7 @@ def test_the_configuration_says_it_for_all_tracks(name: str) -> None:
 
 
 def test_on_a_map_backward_forward_stays_one_bank_for_all_objects() -> None:
-    bank = build_bank(Config(estimator="ekf-backward-forward", map=MapConfig(track="oval")))
+    bank = build_bank(
+        Config(estimator="ekf-backward-forward", map=MapConfig(track="oval"))
+    )
     assert isinstance(bank, BackwardForwardBank)

@@ -3,13 +3,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.kitti import CENTRE_PX, FOCAL_PX, RECTIFIED_FROM_IMU, box, calibration, folder, label, oxts, pose
+from support.kitti import (
+    CENTRE_PX,
+    FOCAL_PX,
+    RECTIFIED_FROM_IMU,
+    box,
+    calibration,
+    folder,
+    label,
+    oxts,
+    pose,
+)
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
-from fgtrack.io.adapters.kitti_view import Box
-from fgtrack.io.config import InputConfig, KittiInput
-from fgtrack.io.source import open_input
+from fgtrack.inputs.formats.kitti_view import Box
+from fgtrack.inputs.settings import InputConfig, KittiInput
+from fgtrack.inputs.source import open_input
 
 
 def messages(path: Path, **settings: object) -> list[Message]:
@@ -17,7 +27,9 @@ def messages(path: Path, **settings: object) -> list[Message]:
 
 
 def lists(path: Path, **settings: object) -> list[DetectionList]:
-    return [item for item in messages(path, **settings) if isinstance(item, DetectionList)]
+    return [
+        item for item in messages(path, **settings) if isinstance(item, DetectionList)
+    ]
 
 
 def test_a_frame_gives_truth_ego_and_the_detections_of_every_folder(tmp_path):
@@ -28,7 +40,10 @@ def test_a_frame_gives_truth_ego_and_the_detections_of_every_folder(tmp_path):
         camera=[box(1, 590.0, 610.0)],
         laser=[pose(0, 10.0, 0.0, 0.0)],
     )
-    found = [(type(item).__name__, item.stamp_ns, getattr(item, "sensor", "")) for item in messages(drive)]
+    found = [
+        (type(item).__name__, item.stamp_ns, getattr(item, "sensor", ""))
+        for item in messages(drive)
+    ]
     assert found == [
         ("EgoState", 0, ""),
         ("DetectionList", 0, "camera"),
@@ -51,31 +66,48 @@ def test_a_box_in_space_is_a_position_and_a_yaw_in_the_ego_frame(tmp_path):
     (found,) = lists(folder(tmp_path, laser=[pose(0, 20.0, 3.0, 0.4)]))
     (detection,) = found.objects
     assert detection.measured == ("x_m", "y_m", "yaw_rad")
-    assert (detection.x_m, detection.y_m, detection.yaw_rad) == pytest.approx((20.0, 3.0, 0.4))
-    assert (detection.length_m, detection.width_m, detection.height_m) == (4.0, 1.6, 1.5)
+    assert (detection.x_m, detection.y_m, detection.yaw_rad) == pytest.approx(
+        (20.0, 3.0, 0.4)
+    )
+    assert (detection.length_m, detection.width_m, detection.height_m) == (
+        4.0,
+        1.6,
+        1.5,
+    )
     assert detection.z_m == pytest.approx(-1.5 + 0.5 * 1.5)
     assert (detection.score, detection.class_name) == (9.0, "car")
 
 
 def test_a_box_in_the_image_is_the_bearing_of_its_middle_from_the_camera(tmp_path):
     (found,) = lists(folder(tmp_path, camera=[box(0, 400.0, 460.0)]))
-    assert found.objects == (Detection(bearing_rad=pytest.approx(math.atan2(170.0, FOCAL_PX)), score=1.0),)
+    assert found.objects == (
+        Detection(bearing_rad=pytest.approx(math.atan2(170.0, FOCAL_PX)), score=1.0),
+    )
 
 
 def test_the_bearing_of_a_wide_box_is_less_certain(tmp_path):
     drive = folder(tmp_path, camera=[box(0, 590.0, 610.0), box(0, 550.0, 650.0)])
     (found,) = lists(drive, box_std=0.1)
     far, near = (math.sqrt(item.covariance[0]) for item in found.objects)
-    assert (far, near) == pytest.approx((0.1 * 2.0 * math.atan(10 / FOCAL_PX), 0.1 * 2.0 * math.atan(50 / FOCAL_PX)))
+    assert (far, near) == pytest.approx(
+        (0.1 * 2.0 * math.atan(10 / FOCAL_PX), 0.1 * 2.0 * math.atan(50 / FOCAL_PX))
+    )
 
 
 def test_roll_and_pitch_are_taken_out(tmp_path):
     """A point 10 m ahead of a unit that looks down by 0.1 rad is nearer; one to the left of a rolled unit too."""
-    tilted, laser = [oxts(pitch_rad=0.1), oxts(roll_rad=0.1)], [pose(0, 10.0, 0.0, 0.0), pose(1, 10.0, 4.0, 0.0)]
+    tilted, laser = (
+        [oxts(pitch_rad=0.1), oxts(roll_rad=0.1)],
+        [pose(0, 10.0, 0.0, 0.0), pose(1, 10.0, 4.0, 0.0)],
+    )
     drive = folder(tmp_path, oxts=tilted, laser=laser)
     (pitched,), (rolled,) = (item.objects for item in lists(drive))
-    assert (pitched.x_m, pitched.y_m) == pytest.approx((10.0 * math.cos(0.1) - 1.5 * math.sin(0.1), 0.0))
-    assert (rolled.x_m, rolled.y_m) == pytest.approx((10.0, 4.0 * math.cos(0.1) + 1.5 * math.sin(0.1)))
+    assert (pitched.x_m, pitched.y_m) == pytest.approx(
+        (10.0 * math.cos(0.1) - 1.5 * math.sin(0.1), 0.0)
+    )
+    assert (rolled.x_m, rolled.y_m) == pytest.approx(
+        (10.0, 4.0 * math.cos(0.1) + 1.5 * math.sin(0.1))
+    )
 
 
 def test_the_map_begins_at_the_first_frame_with_x_to_the_east(tmp_path):
@@ -84,19 +116,37 @@ def test_the_map_begins_at_the_first_frame_with_x_to_the_east(tmp_path):
         tmp_path,
         oxts=[
             oxts(yaw_rad=3.0),
-            oxts(100.0 * metre_deg, 50.0 * metre_deg / math.cos(math.radians(49.0)), 0.0, 0.0, 3.5, 8.0, 0.2, -1.0),
+            oxts(
+                100.0 * metre_deg,
+                50.0 * metre_deg / math.cos(math.radians(49.0)),
+                0.0,
+                0.0,
+                3.5,
+                8.0,
+                0.2,
+                -1.0,
+            ),
         ],
-        label_02=[label(0, 3, "Car", 10.0, 0.0, 0.3), label(0, 4, "Tram", 10.0, 0.0, 0.3)],
+        label_02=[
+            label(0, 3, "Car", 10.0, 0.0, 0.3),
+            label(0, 4, "Tram", 10.0, 0.0, 0.3),
+        ],
     )
     truth, first, second = messages(drive)
     assert first == EgoState(0, 0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0)
     assert isinstance(second, EgoState)
     assert (second.x_m, second.y_m) == pytest.approx((50.0, 100.0), abs=0.01)
     assert second.yaw_rad == pytest.approx(3.5 - 2.0 * math.pi)
-    assert (second.speed_mps, second.yaw_rate_radps, second.accel_mps2) == (8.0, 0.2, -1.0)
+    assert (second.speed_mps, second.yaw_rate_radps, second.accel_mps2) == (
+        8.0,
+        0.2,
+        -1.0,
+    )
     assert isinstance(truth, TruthState)
     assert truth.object_id == 3
-    assert (truth.x_m, truth.y_m) == pytest.approx((10.0 * math.cos(3.0), 10.0 * math.sin(3.0)))
+    assert (truth.x_m, truth.y_m) == pytest.approx(
+        (10.0 * math.cos(3.0), 10.0 * math.sin(3.0))
+    )
     assert truth.yaw_rad == pytest.approx(3.3 - 2.0 * math.pi)
 
 
@@ -105,7 +155,10 @@ def test_truth_does_not_step_with_the_reported_position(tmp_path):
     metre_deg = math.degrees(1.0 / 6_378_137.0)
     at_m = [1.036 * k for k in range(20)]
     reported_m = [x_m + 0.58 * (k >= 10) for k, x_m in enumerate(at_m)]
-    egos = [oxts(x_m * metre_deg, yaw_rad=0.5 * math.pi, speed_mps=10.0) for x_m in reported_m]
+    egos = [
+        oxts(x_m * metre_deg, yaw_rad=0.5 * math.pi, speed_mps=10.0)
+        for x_m in reported_m
+    ]
     labels = [label(k, 1, "Car", 50.0 - x_m, 0.0, 0.0) for k, x_m in enumerate(at_m)]
     received = messages(folder(tmp_path, oxts=egos, label_02=labels))
     states = [item for item in received if isinstance(item, EgoState)]
@@ -117,7 +170,11 @@ def test_truth_does_not_step_with_the_reported_position(tmp_path):
 def test_a_neighbouring_class_and_regions_are_ignored(tmp_path):
     """The region spans 20 px around the middle and 14 px high: a car of 1.5 m is half inside it from 37.5 m on."""
     region = f"0 -1 DontCare -1 -1 -10 {CENTRE_PX[0] - 10} 180 {CENTRE_PX[0] + 10} 194 -1 -1 -1 -1000 -1000 -1000 -10"
-    labels = [label(0, 3, "Car", 10.0, 0.0, 0.3), label(0, 4, "Van", 20.0, 0.0, 0.3), region]
+    labels = [
+        label(0, 3, "Car", 10.0, 0.0, 0.3),
+        label(0, 4, "Van", 20.0, 0.0, 0.3),
+        region,
+    ]
     car, van, dont_care, _ = messages(folder(tmp_path, label_02=labels))
     assert [item.ignored for item in (car, van, dont_care)] == [False, True, True]
     assert (van.object_id, van.outline_m) == (4, None)
@@ -130,7 +187,9 @@ def test_a_neighbouring_class_and_regions_are_ignored(tmp_path):
     assert corners == pytest.approx(np.column_stack([ahead, aside]))
 
 
-def test_a_region_too_flat_to_hold_a_car_near_by_begins_at_half_of_the_distance_where_it_ends(tmp_path):
+def test_a_region_too_flat_to_hold_a_car_near_by_begins_at_half_of_the_distance_where_it_ends(
+    tmp_path,
+):
     """1 px high a car of 1.5 m is half inside it at 525 m, behind its end at 150 m."""
     region = f"0 -1 DontCare -1 -1 -10 {CENTRE_PX[0]} 180 {CENTRE_PX[0] + 10} 181 -1 -1 -1 -1000 -1000 -1000 -10"
     dont_care, *_ = messages(folder(tmp_path, label_02=[region]))
@@ -167,7 +226,10 @@ def test_results_without_a_place_in_space_are_bearings(tmp_path, line, score):
         "sensor",
         (Detection(bearing_rad=bearing_rad, score=score, class_name="car"),),
     )
-    with pytest.raises(DataError, match=r"camera: some boxes have a position, others are in the image alone"):
+    with pytest.raises(
+        DataError,
+        match=r"camera: some boxes have a position, others are in the image alone",
+    ):
         lists(folder(tmp_path, camera=[pose(0, 10.0, 0.0, 0.0), line]))
 
 
@@ -175,22 +237,40 @@ def test_classes_are_named(tmp_path):
     drive = folder(
         tmp_path,
         laser=[pose(0, 10.0, 0.0, 0.0, kind=1), pose(0, 20.0, 0.0, 0.0)],
-        label_02=[label(0, 3, "Car", 10.0, 0.0, 0.3), label(0, 4, "Pedestrian", 20.0, 0.0, 0.3)],
+        label_02=[
+            label(0, 3, "Car", 10.0, 0.0, 0.3),
+            label(0, 4, "Pedestrian", 20.0, 0.0, 0.3),
+        ],
     )
     truth, _, found = messages(drive, classes=("Pedestrian",))
-    assert (truth.object_id, [item.class_name for item in found.objects]) == (4, ["pedestrian"])
+    assert (truth.object_id, [item.class_name for item in found.objects]) == (
+        4,
+        ["pedestrian"],
+    )
 
 
 def test_other_classes_low_scores_and_boxes_cut_off_are_left_out(tmp_path):
     drive = folder(
         tmp_path,
-        laser=[pose(0, 10.0, 0.0, 0.0, kind=1), pose(0, 20.0, 0.0, 0.0, 1.0), pose(0, 30.0, 0.0, 0.0, 5.0)],
-        camera=[box(0, 0.5, 60.0), box(0, 1100.0, 1240.5), box(0, 300.0, 360.0, 0.5), box(0, 300.0, 360.0, 0.9)],
+        laser=[
+            pose(0, 10.0, 0.0, 0.0, kind=1),
+            pose(0, 20.0, 0.0, 0.0, 1.0),
+            pose(0, 30.0, 0.0, 0.0, 5.0),
+        ],
+        camera=[
+            box(0, 0.5, 60.0),
+            box(0, 1100.0, 1240.5),
+            box(0, 300.0, 360.0, 0.5),
+            box(0, 300.0, 360.0, 0.9),
+        ],
     )
     camera, laser = lists(drive, min_score={"laser": 3.0, "camera": 0.9})
     assert [round(item.x_m) for item in laser.objects] == [30]
     assert laser.left_out == ("input.kitti.classes", "input.kitti.min_score")
-    assert camera.left_out == (*["input.kitti.image_width_px"] * 2, "input.kitti.min_score")
+    assert camera.left_out == (
+        *["input.kitti.image_width_px"] * 2,
+        "input.kitti.min_score",
+    )
     assert len(camera.objects) == 1
     camera, laser = lists(drive, image_width_px=1300.0)
     assert (len(camera.objects), len(laser.objects)) == (3, 2)
@@ -200,13 +280,21 @@ def test_other_classes_low_scores_and_boxes_cut_off_are_left_out(tmp_path):
     ("turned_rad", "expected"),
     [
         (0.0, (600 + 700 / 20.8, 180, 600 + 700 * 5 / 19.2, 180 + 700 * 1.5 / 19.2)),
-        (0.5 * math.pi, (600 + 700 * 2.2 / 22, 180, 600 + 700 * 3.8 / 18, 180 + 700 * 1.5 / 18)),
-        (math.pi, (600 + 700 / 20.8, 180, 600 + 700 * 5 / 19.2, 180 + 700 * 1.5 / 19.2)),
+        (
+            0.5 * math.pi,
+            (600 + 700 * 2.2 / 22, 180, 600 + 700 * 3.8 / 18, 180 + 700 * 1.5 / 18),
+        ),
+        (
+            math.pi,
+            (600 + 700 / 20.8, 180, 600 + 700 * 5 / 19.2, 180 + 700 * 1.5 / 19.2),
+        ),
     ],
 )
 def test_a_box_in_the_image_is_the_hull_of_its_corners(turned_rad, expected):
     """1.5 m high, 1.6 m wide and 4 m long, 3 m to the right, 20 m ahead, with its roof at the height of the camera."""
-    projection = np.array([[700.0, 0.0, 600.0, 0.0], [0.0, 700.0, 180.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
+    projection = np.array(
+        [[700.0, 0.0, 600.0, 0.0], [0.0, 700.0, 180.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
+    )
     found = Box(1.5, 1.6, 4.0, 3.0, 1.5, 20.0, turned_rad)
     assert found.image_px(projection) == pytest.approx(expected)
     cut = found._replace(x_m=17.0).image_px(projection)
@@ -226,10 +314,18 @@ def test_an_input_is_a_folder_of_one_sequence_a_file_or_a_sequence_by_name(tmp_p
     folder(tmp_path, "0001", laser=[pose(0, 10.0, 0.0, 0.0)])
     assert len(lists(tmp_path)) == 1
     folder(tmp_path, "0012", laser=[pose(0, 30.0, 0.0, 0.0)])
-    assert lists(tmp_path / "oxts/0012.txt") == lists(tmp_path, sequence=12) == lists(tmp_path, sequence="0012")
-    with pytest.raises(CallError, match=r"holds the sequences 0001, 0012, name one .*oxts/0001\.txt"):
+    assert (
+        lists(tmp_path / "oxts/0012.txt")
+        == lists(tmp_path, sequence=12)
+        == lists(tmp_path, sequence="0012")
+    )
+    with pytest.raises(
+        CallError, match=r"holds the sequences 0001, 0012, name one .*oxts/0001\.txt"
+    ):
         open_input(tmp_path)
-    with pytest.raises(CallError, match="holds the sequences 0001, 0012, name one of them"):
+    with pytest.raises(
+        CallError, match="holds the sequences 0001, 0012, name one of them"
+    ):
         messages(tmp_path, sequence=7)
 
 
@@ -237,7 +333,10 @@ def _with_zeros(name):
     """A calibration in which all numbers of a matrix are 0."""
     lines = calibration().splitlines()
     return "\n".join(
-        f"{name}: {' '.join(['0'] * (len(line.split()) - 1))}" if line.startswith(name) else line for line in lines
+        f"{name}: {' '.join(['0'] * (len(line.split()) - 1))}"
+        if line.startswith(name)
+        else line
+        for line in lines
     )
 
 
@@ -248,11 +347,26 @@ def _with_zeros(name):
         ({"oxts": [oxts(yaw_rad=math.inf)]}, r"oxts/0001\.txt:1: "),
         ({"calib": ["P2: 1 2 x"]}, r"calib/0001\.txt:1: "),
         ({"calib": ["P2: 1 2 3"]}, r"calib/0001\.txt: "),
-        ({"calib": [calibration().replace("P2: ", "P2: nan ", 1)]}, r"calib/0001\.txt:3: .*not finite"),
-        ({"calib": [calibration().replace("P2: ", "P2: 1e300 ", 1)]}, r"calib/0001\.txt:3: .*too large"),
-        ({"calib": [_with_zeros("P2")]}, r"calib/0001\.txt: is not a calibration .*P2 cannot be inverted"),
-        ({"calib": [_with_zeros("R_rect")]}, r"calib/0001\.txt: is not a calibration .*Tr cannot be inverted"),
-        ({"laser": [pose(0, 1.0, 2.0, 0.0), "0,2,3"]}, r"laser/0001\.txt:2: .*3 fields"),
+        (
+            {"calib": [calibration().replace("P2: ", "P2: nan ", 1)]},
+            r"calib/0001\.txt:3: .*not finite",
+        ),
+        (
+            {"calib": [calibration().replace("P2: ", "P2: 1e300 ", 1)]},
+            r"calib/0001\.txt:3: .*too large",
+        ),
+        (
+            {"calib": [_with_zeros("P2")]},
+            r"calib/0001\.txt: is not a calibration .*P2 cannot be inverted",
+        ),
+        (
+            {"calib": [_with_zeros("R_rect")]},
+            r"calib/0001\.txt: is not a calibration .*Tr cannot be inverted",
+        ),
+        (
+            {"laser": [pose(0, 1.0, 2.0, 0.0), "0,2,3"]},
+            r"laser/0001\.txt:2: .*3 fields",
+        ),
         ({"laser": ["car"]}, r"laser/0001\.txt:1: "),
         ({"laser": [pose(7, 1.0, 2.0, 0.0)]}, r"laser/0001\.txt:1: .*of frame 7"),
         ({"label_02": ["0 1 Car 0 0"]}, r"label_02/0001\.txt:1: "),
@@ -269,13 +383,20 @@ def test_a_damaged_file_is_one_line_that_names_it(tmp_path, files, where):
     ("file", "line", "broken", "end"),
     [
         ("laser", 3, pose(2, 11.0, 0.0, 0.0)[:20], 2),
-        ("laser", 3, "", 1),  # a line without a frame may belong to that of the line above
+        (
+            "laser",
+            3,
+            "",
+            1,
+        ),  # a line without a frame may belong to that of the line above
         ("laser", 1, "", 0),
         ("label_02", 3, "2 5 Car 0", 2),
         ("oxts", 3, oxts()[:40], 2),
     ],
 )
-def test_a_sequence_is_read_up_to_the_frame_of_a_damaged_line(tmp_path, file, line, broken, end):
+def test_a_sequence_is_read_up_to_the_frame_of_a_damaged_line(
+    tmp_path, file, line, broken, end
+):
     files = {
         "oxts": [oxts()] * 4,
         "label_02": [label(frame, 5, "Car", 10.0, 0.0, 0.0) for frame in range(4)],
@@ -289,9 +410,17 @@ def test_a_sequence_is_read_up_to_the_frame_of_a_damaged_line(tmp_path, file, li
     assert received == [item for item in intact if item.stamp_ns < end * 103_600_000]
 
 
-def test_what_is_not_finite_in_a_detection_is_left_to_the_tracker_without_a_warning(tmp_path):
+def test_what_is_not_finite_in_a_detection_is_left_to_the_tracker_without_a_warning(
+    tmp_path,
+):
     whole = pose(0, 10.0, 0.0, 0.0)
     cells = whole.split(",")
-    lines = [",".join([*cells[:10], bad, *cells[11:]]) for bad in ("inf", "nan")] + [whole]
+    lines = [",".join([*cells[:10], bad, *cells[11:]]) for bad in ("inf", "nan")] + [
+        whole
+    ]
     (found,) = lists(folder(tmp_path, laser=lines))
-    assert [math.isfinite(item.x_m + item.y_m) for item in found.objects] == [False, False, True]
+    assert [math.isfinite(item.x_m + item.y_m) for item in found.objects] == [
+        False,
+        False,
+        True,
+    ]

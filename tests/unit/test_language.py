@@ -31,13 +31,23 @@ def texts(module: Path) -> Iterator[tuple[int, str]]:
         for token in tokenize.tokenize(file.readline):
             if token.type in (tokenize.COMMENT, tokenize.STRING):
                 is_format = re.match("[rR]?[fF]", token.string)
-                text = re.sub(r"\{[^{}]*\}", "", token.string) if is_format else token.string
+                text = (
+                    re.sub(r"\{[^{}]*\}", "", token.string)
+                    if is_format
+                    else token.string
+                )
                 yield token.start[0], re.sub("`[^`]*`", "", text)
 
 
-@pytest.mark.parametrize("folder", sorted({each.relative_to(ROOT / "fgtrack").parts[0] for each in MODULES}))
+@pytest.mark.parametrize(
+    "folder", sorted({each.relative_to(ROOT / "fgtrack").parts[0] for each in MODULES})
+)
 def test_no_docstring_begins_with_a_question_word(folder: str) -> None:
-    modules = [each for each in MODULES if each.relative_to(ROOT / "fgtrack").parts[0] == folder]
+    modules = [
+        each
+        for each in MODULES
+        if each.relative_to(ROOT / "fgtrack").parts[0] == folder
+    ]
     documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
     for module in modules:
         for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
@@ -49,14 +59,25 @@ def test_no_docstring_begins_with_a_question_word(folder: str) -> None:
 def test_package_and_tutorials_use_the_words_of_the_field() -> None:
     modules = [
         *MODULES,
-        *(file for name in ("_ext", "example", "live", "tutorials") for file in (ROOT / "docs" / name).rglob("*.py")),
+        *(
+            file
+            for name in ("_ext", "example", "live", "tutorials")
+            for file in (ROOT / "docs" / name).rglob("*.py")
+        ),
     ]
-    banned = [f"{module}:{line}: {text}" for module in modules for line, text in texts(module) if BANNED.search(text)]
+    banned = [
+        f"{module}:{line}: {text}"
+        for module in modules
+        for line, text in texts(module)
+        if BANNED.search(text)
+    ]
     assert not banned, "\n".join(banned)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_a_page_uses_the_words_of_the_field(page: Path) -> None:
-    text = re.sub("```.*?```|`[^`]*`", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    text = re.sub(
+        "```.*?```|`[^`]*`", "", page.read_text(encoding="utf-8"), flags=re.DOTALL
+    )
     banned = BANNED.search(text)
     assert banned is None, f"{page.name}: {banned}"

@@ -8,18 +8,31 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fgtrack.models.sensors import Mount, SensorModel
-from fgtrack.tracking.ego import EgoPose
-from fgtrack.tracking.latency import FOREVER, NEVER, Delays, Views, Watermarks, decided_ns, usual_ns
+from fgtrack.tracking.ego.trajectory import EgoPose
+from fgtrack.tracking.lives.latency import (
+    FOREVER,
+    NEVER,
+    Delays,
+    Views,
+    Watermarks,
+    decided_ns,
+    usual_ns,
+)
 
 MS, S = 1_000_000, 1_000_000_000
 START_NS = 1_600_000_000 * S
 POSITION = SensorModel(std={"x_m": 0.3, "y_m": 0.3})
 
 
-def learned(delays_ms: list[float], period_ms: float = 100.0, first_ms: float = 0.0) -> Delays:
+def learned(
+    delays_ms: list[float], period_ms: float = 100.0, first_ms: float = 0.0
+) -> Delays:
     """Delays of a sensor with this period, in order of receipt."""
     delays = Delays()
-    messages = [(first_ms + k * period_ms, first_ms + k * period_ms + late) for k, late in enumerate(delays_ms)]
+    messages = [
+        (first_ms + k * period_ms, first_ms + k * period_ms + late)
+        for k, late in enumerate(delays_ms)
+    ]
     for stamp_ms, receipt_ms in sorted(messages, key=lambda each: each[1]):
         delays.add(START_NS + round(stamp_ms * MS), START_NS + round(receipt_ms * MS))
         delays.processed(START_NS + round(stamp_ms * MS))
@@ -27,7 +40,10 @@ def learned(delays_ms: list[float], period_ms: float = 100.0, first_ms: float = 
 
 
 def watermark_ms(delays: Delays, now_ms: float, most_ms: float = 60_000.0) -> float:
-    return (delays.watermark_ns(START_NS + round(now_ms * MS), round(most_ms * MS)) - START_NS) / MS
+    return (
+        delays.watermark_ns(START_NS + round(now_ms * MS), round(most_ms * MS))
+        - START_NS
+    ) / MS
 
 
 def test_nothing_is_awaited_of_a_sensor_that_never_sent_anything() -> None:
@@ -36,7 +52,11 @@ def test_nothing_is_awaited_of_a_sensor_that_never_sent_anything() -> None:
 
 def test_the_watermark_is_the_newest_stamp_until_the_next_list_is_overdue() -> None:
     delays = learned([700.0] * 5)  # the newest stamp is 400 ms, received at 1,100 ms
-    assert [watermark_ms(delays, now_ms) for now_ms in (1100.0, 1150.0, 1200.0)] == [400.0, 400.0, 400.0]
+    assert [watermark_ms(delays, now_ms) for now_ms in (1100.0, 1150.0, 1200.0)] == [
+        400.0,
+        400.0,
+        400.0,
+    ]
     assert watermark_ms(delays, 1200.001) == pytest.approx(500.001)
     assert watermark_ms(delays, 5000.0) == 4300.0
 
@@ -50,13 +70,17 @@ def test_a_list_that_has_come_counts_once_it_is_processed() -> None:
 
 
 def test_lists_in_disorder_are_awaited_for_their_usual_delay() -> None:
-    delays = learned([100.0, 100.0, 900.0, 100.0, 100.0, 100.0])  # that of 200 ms comes last, at 1,100 ms
+    delays = learned(
+        [100.0, 100.0, 900.0, 100.0, 100.0, 100.0]
+    )  # that of 200 ms comes last, at 1,100 ms
     assert watermark_ms(delays, 1100.0) == 200.0
 
 
 @pytest.mark.parametrize("period_ms", [40.0, 500.0])
 @pytest.mark.parametrize("rank", [0, 7, 59])
-def test_one_delay_of_an_hour_does_not_keep_tracks_for_an_hour(period_ms: float, rank: int) -> None:
+def test_one_delay_of_an_hour_does_not_keep_tracks_for_an_hour(
+    period_ms: float, rank: int
+) -> None:
     """Neither an early one, which no track could use, nor the newest one."""
     delays = learned([100.0] * 60, period_ms)
     late_ns = START_NS + round(60 * period_ms * MS) + 100 * MS
@@ -72,7 +96,9 @@ def test_a_delay_that_has_changed_is_followed_at_once_and_forgotten_later() -> N
     delays.add(START_NS + 10 * S, START_NS + 12 * S)
     assert delays.usual_ns() == 2 * S
     for k in range(200):
-        delays.add(START_NS + 10 * S + k * 100 * MS, START_NS + 10 * S + (k + 1) * 100 * MS)
+        delays.add(
+            START_NS + 10 * S + k * 100 * MS, START_NS + 10 * S + (k + 1) * 100 * MS
+        )
     assert delays.usual_ns() == 100 * MS
 
 
@@ -80,15 +106,26 @@ def test_what_comes_too_late_for_every_track_is_not_awaited() -> None:
     delays = learned([5000.0] * 10)
     assert delays.usual_ns(3 * S) == 3 * S
     assert watermark_ms(delays, 5900.0, most_ms=3000.0) == 2900.0
-    sensors = {"refused": SensorModel(std=POSITION.std, max_delay_s=0.2), "taken": POSITION}
+    sensors = {
+        "refused": SensorModel(std=POSITION.std, max_delay_s=0.2),
+        "taken": POSITION,
+    }
     watermarks = Watermarks(sensors, ["ego"])
     for name in ("refused", "taken"):
         for k in range(10):
-            watermarks.delays[name].add(START_NS + k * 100 * MS, START_NS + k * 100 * MS + 500 * MS)
+            watermarks.delays[name].add(
+                START_NS + k * 100 * MS, START_NS + k * 100 * MS + 500 * MS
+            )
             watermarks.delays[name].processed(START_NS + k * 100 * MS)
     now_ns = START_NS + 5 * S
-    assert (now_ns - watermarks.at(now_ns, now_ns - 3 * S)).tolist() == [200 * MS, 500 * MS]
-    assert (now_ns - watermarks.at(now_ns, now_ns - 300 * MS)).tolist() == [200 * MS, 300 * MS]
+    assert (now_ns - watermarks.at(now_ns, now_ns - 3 * S)).tolist() == [
+        200 * MS,
+        500 * MS,
+    ]
+    assert (now_ns - watermarks.at(now_ns, now_ns - 300 * MS)).tolist() == [
+        200 * MS,
+        300 * MS,
+    ]
 
 
 def test_a_clock_that_is_ahead_has_a_watermark_ahead_of_now() -> None:
@@ -106,7 +143,10 @@ def test_a_stamp_far_ahead_teaches_nothing() -> None:
 @given(st.lists(st.integers(0, 100_000), min_size=1, max_size=100))
 def test_of_fifty_delays_the_longest_one_is_unusual(durations_ns: list[int]) -> None:
     durations_ns.sort()
-    assert sum(each > usual_ns(durations_ns) for each in durations_ns) <= len(durations_ns) // 50
+    assert (
+        sum(each > usual_ns(durations_ns) for each in durations_ns)
+        <= len(durations_ns) // 50
+    )
 
 
 @given(
@@ -121,7 +161,10 @@ def test_every_list_up_to_the_watermark_has_come_by_the_delays_known_so_far(
     delays = learned(delays_ms, period_ms)
     last_ms = max(k * period_ms + late for k, late in enumerate(delays_ms))
     mark_ms = watermark_ms(delays, last_ms + after_ms)
-    due_ms, newest_ms = last_ms + after_ms - max(delays_ms), (len(delays_ms) - 1) * period_ms
+    due_ms, newest_ms = (
+        last_ms + after_ms - max(delays_ms),
+        (len(delays_ms) - 1) * period_ms,
+    )
     assert min(due_ms, newest_ms) - 1e-3 <= mark_ms <= due_ms + 1e-3
 
 
@@ -131,30 +174,55 @@ def test_watermarks_never_depend_on_anything_but_stamps_and_receipts() -> None:
     one, other = learned(delays_ms), learned(delays_ms)
     for now_ms in range(100, 10_000, 37):  # asked often, and once
         one.watermark_ns(START_NS + now_ms * MS, 3 * S)
-    assert one.watermark_ns(START_NS + 10 * S, 3 * S) == other.watermark_ns(START_NS + 10 * S, 3 * S)
-    marks = [one.watermark_ns(START_NS + now_ms * MS, 3 * S) for now_ms in range(9000, 20_000, 50)]
+    assert one.watermark_ns(START_NS + 10 * S, 3 * S) == other.watermark_ns(
+        START_NS + 10 * S, 3 * S
+    )
+    marks = [
+        one.watermark_ns(START_NS + now_ms * MS, 3 * S)
+        for now_ms in range(9000, 20_000, 50)
+    ]
     assert all(later >= earlier for earlier, later in pairwise(marks))
 
 
 def test_only_sensors_that_could_show_an_object_are_awaited() -> None:
     watermarks_ns = np.array([START_NS, START_NS - S, FOREVER])
-    could_show = np.array([[True, False, True], [False, True, True], [False, False, False], [False, False, True]])
+    could_show = np.array(
+        [
+            [True, False, True],
+            [False, True, True],
+            [False, False, False],
+            [False, False, True],
+        ]
+    )
     expected_ns = np.full((4, 3), NEVER)
-    expected_ns[2, 1], expected_ns[3, 1] = START_NS - S, START_NS - S + 1  # the list of the last one has not come
+    expected_ns[2, 1], expected_ns[3, 1] = (
+        START_NS - S,
+        START_NS - S + 1,
+    )  # the list of the last one has not come
     found = decided_ns(watermarks_ns, could_show, expected_ns)
     assert found.tolist() == [START_NS, START_NS - S, FOREVER, START_NS - S]
 
 
-def test_a_sensor_could_show_what_is_in_its_view_and_a_camera_shows_no_position() -> None:
+def test_a_sensor_could_show_what_is_in_its_view_and_a_camera_shows_no_position() -> (
+    None
+):
     sensors = {
-        "ahead": SensorModel(std=POSITION.std, field_of_view_rad=2.0, view_range_m=50.0),
-        "behind": SensorModel(std=POSITION.std, field_of_view_rad=2.0, mount=Mount(yaw_rad=np.pi)),
+        "ahead": SensorModel(
+            std=POSITION.std, field_of_view_rad=2.0, view_range_m=50.0
+        ),
+        "behind": SensorModel(
+            std=POSITION.std, field_of_view_rad=2.0, mount=Mount(yaw_rad=np.pi)
+        ),
         "around": POSITION,
         "camera": SensorModel(std={"bearing_rad": 0.01}),
     }
     views, places_m = Views(sensors), np.array([[20.0, 0.0], [-20.0, 0.0], [60.0, 0.0]])
     ego = EgoPose(0.0, 0.0, 0.0, 0.0, 0.0)
-    seen = [[True, False, True, False], [False, True, True, False], [False, False, True, False]]
+    seen = [
+        [True, False, True, False],
+        [False, True, True, False],
+        [False, False, True, False],
+    ]
     assert views.of(places_m, ego).tolist() == seen
     assert views.of(places_m, None).tolist() == [[True, True, True, False]] * 3
     assert views.at_birth(places_m[2], ego, 0).tolist() == [True, False, True, False]

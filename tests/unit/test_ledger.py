@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import fgtrack
-from fgtrack.calibration.ledger import Ledger, Part, _sentence, ledger
+from fgtrack.advice.ledger import Ledger, Part, _sentence, ledger
+from fgtrack.config.shipped import read_config, read_scenario
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import DetectionList, Message, TruthState
-from fgtrack.io.stream import write_stream
-from fgtrack.pipeline.shipped import read_config, read_scenario
-from fgtrack.plotting.ledger import waterfall
+from fgtrack.inputs.stream import write_stream
+from fgtrack.show.figures.ledger import waterfall
 from fgtrack.sim.simulate import simulate
 
 MAPS = {"track_map": "oval", "pit_map": "oval"}
@@ -23,24 +23,38 @@ MAPS = {"track_map": "oval", "pit_map": "oval"}
 
 @pytest.fixture(scope="module")
 def messages() -> list[Message]:
-    return simulate(replace(read_scenario("default"), duration_s=12.0), np.random.default_rng(2))
+    return simulate(
+        replace(read_scenario("default"), duration_s=12.0), np.random.default_rng(2)
+    )
 
 
 @pytest.fixture(scope="module")
 def karle(messages: list[Message]) -> Ledger:
-    return ledger(messages, read_config("karle2023", **MAPS), read_config("tuned", **MAPS))
+    return ledger(
+        messages, read_config("karle2023", **MAPS), read_config("tuned", **MAPS)
+    )
 
 
 def rms(result: Ledger, estimator: str) -> float:
     return float(
-        next(row["rms_m"] for row in result.tables.tables["policies"].records if row["estimator"] == estimator)
+        next(
+            row["rms_m"]
+            for row in result.tables.tables["policies"].records
+            if row["estimator"] == estimator
+        )
     )
 
 
 def prompt(messages: Sequence[Message]) -> list[Message]:
-    moved = [replace(m, receipt_ns=m.stamp_ns) if isinstance(m, DetectionList) else m for m in messages]
+    moved = [
+        replace(m, receipt_ns=m.stamp_ns) if isinstance(m, DetectionList) else m
+        for m in messages
+    ]
     return sorted(
-        moved, key=lambda message: message.stamp_ns if isinstance(message, TruthState) else message.receipt_ns
+        moved,
+        key=lambda message: (
+            message.stamp_ns if isinstance(message, TruthState) else message.receipt_ns
+        ),
     )
 
 
@@ -54,7 +68,9 @@ def test_the_parts_add_up_to_the_difference_of_the_ends(karle: Ledger) -> None:
         "late arrival, everything kept",
     ]
     total = sum(part.share_m2.mean for part in rest)
-    assert total == pytest.approx(first.mean_square_m2 - rest[-1].mean_square_m2, abs=1e-12)
+    assert total == pytest.approx(
+        first.mean_square_m2 - rest[-1].mean_square_m2, abs=1e-12
+    )
     assert rest[-1].share_m2.mean > 0.0  # lateness costs
     assert str(pickle.loads(pickle.dumps(karle))) == str(karle)
 
@@ -74,38 +90,68 @@ def test_a_wrong_clock_has_a_part(messages: list[Message]) -> None:
     assert clock.cause == "clock offsets"
     assert clock.share_m2.mean > 0.1 * first.mean_square_m2
     total = clock.share_m2.mean + sum(part.share_m2.mean for part in rest)
-    assert total == pytest.approx(first.mean_square_m2 - rest[-1].mean_square_m2, abs=1e-12)
+    assert total == pytest.approx(
+        first.mean_square_m2 - rest[-1].mean_square_m2, abs=1e-12
+    )
     without = ledger(messages, config)  # the same of the clock that is right
-    assert clock.mean_square_m2 == pytest.approx(without.waterfall[0].mean_square_m2, rel=0.02)
+    assert clock.mean_square_m2 == pytest.approx(
+        without.waterfall[0].mean_square_m2, rel=0.02
+    )
 
 
 def test_settings_and_maps_are_those_of_replay(messages: list[Message]) -> None:
-    given = ledger(messages, "tuned", map="oval", pit_map="oval", set={"estimator": "ekf-replay"})
-    assert str(given) == str(ledger(messages, read_config("tuned", estimator="ekf-replay", **MAPS)))
+    given = ledger(
+        messages, "tuned", map="oval", pit_map="oval", set={"estimator": "ekf-replay"}
+    )
+    assert str(given) == str(
+        ledger(messages, read_config("tuned", estimator="ekf-replay", **MAPS))
+    )
 
 
-def test_advice_has_the_table_where_it_is_asked_for(messages: list[Message], tmp_path: Path) -> None:
+def test_advice_has_the_table_where_it_is_asked_for(
+    messages: list[Message], tmp_path: Path
+) -> None:
     write_stream(tmp_path / "drive.jsonl", messages)
     config = read_config("tuned", estimator="ekf-replay", **MAPS)
     advice = fgtrack.advise(tmp_path / "drive.jsonl", config, ledger=True)
     names = [row["estimator"] for row in advice.tables.tables["ledger"].records]
-    assert names == ["drop", "ekf-backward-forward", "rewind-forget", "ekf-replay", "smoother-banded", names[-1]]
+    assert names == [
+        "drop",
+        "ekf-backward-forward",
+        "rewind-forget",
+        "ekf-replay",
+        "smoother-banded",
+        names[-1],
+    ]
     assert names[-1] == "ekf-replay, if no list were late"
-    assert "ledger" not in fgtrack.advise(tmp_path / "drive.jsonl", config).tables.tables
+    assert (
+        "ledger" not in fgtrack.advise(tmp_path / "drive.jsonl", config).tables.tables
+    )
 
 
-def test_the_replaying_filter_has_the_error_of_its_own_run(messages: list[Message]) -> None:
+def test_the_replaying_filter_has_the_error_of_its_own_run(
+    messages: list[Message],
+) -> None:
     """By the run's files alone: tracks against the truth at the same ticks."""
     config = read_config("smoother", estimator="ekf-replay", **MAPS)
     result = ledger(messages, config)
-    assert result.waterfall[0].mean_square_m2 == pytest.approx(rms(result, "ekf-replay") ** 2, rel=1e-9)
-    assert [part.cause for part in result.waterfall[1:]] == ["late arrival, everything kept"]
+    assert result.waterfall[0].mean_square_m2 == pytest.approx(
+        rms(result, "ekf-replay") ** 2, rel=1e-9
+    )
+    assert [part.cause for part in result.waterfall[1:]] == [
+        "late arrival, everything kept"
+    ]
 
 
 def test_nobody_late_means_no_part_of_lateness(messages: list[Message]) -> None:
-    result = ledger(prompt(messages), read_config("smoother", estimator="ekf-replay", **MAPS))
+    result = ledger(
+        prompt(messages), read_config("smoother", estimator="ekf-replay", **MAPS)
+    )
     assert result.waterfall[-1].share_m2.mean == pytest.approx(0.0, abs=1e-12)
-    assert all(row["cost"] == pytest.approx(0.0, abs=1e-9) for row in result.tables.tables["sensors"].records)
+    assert all(
+        row["cost"] == pytest.approx(0.0, abs=1e-9)
+        for row in result.tables.tables["sensors"].records
+    )
     assert rms(result, "drop") == pytest.approx(rms(result, "ekf-replay"), rel=1e-9)
 
 
@@ -115,8 +161,14 @@ def test_a_tie_has_no_minus(karle: Ledger) -> None:
     assert ": tie +0.00 m; " in _sentence([first, tie], karle.tables.tables)
 
 
-def test_a_late_sensor_costs_and_its_late_lists_are_worth_something(karle: Ledger) -> None:
-    lidar = next(row for row in karle.tables.tables["sensors"].records if row["sensor"] == "lidar_cluster")
+def test_a_late_sensor_costs_and_its_late_lists_are_worth_something(
+    karle: Ledger,
+) -> None:
+    lidar = next(
+        row
+        for row in karle.tables.tables["sensors"].records
+        if row["sensor"] == "lidar_cluster"
+    )
     assert lidar["delay_s"] == pytest.approx(0.15, abs=0.03)
     assert lidar["late"] > 0.4
     assert lidar["too_old"] == 0.0
@@ -128,10 +180,14 @@ def test_a_late_sensor_costs_and_its_late_lists_are_worth_something(karle: Ledge
 def test_waiting_buys_more_than_smoothing(karle: Ledger) -> None:
     now, *_, longest = karle.tables.tables["waiting"].records
     assert longest["smoother_m"] < longest["filter_m"] < now["filter_m"]
-    assert now["gain"] == pytest.approx(0.0, abs=0.02)  # at the newest stamp both nearly tie
+    assert now["gain"] == pytest.approx(
+        0.0, abs=0.02
+    )  # at the newest stamp both nearly tie
 
 
-def test_without_truth_predicted_variances_stand_for_errors(messages: list[Message]) -> None:
+def test_without_truth_predicted_variances_stand_for_errors(
+    messages: list[Message],
+) -> None:
     config = read_config("smoother", estimator="ekf-replay", **MAPS)
     result = ledger([m for m in messages if not isinstance(m, TruthState)], config)
     assert not result.with_truth
@@ -146,15 +202,25 @@ def test_a_recording_without_tracks_has_no_ledger() -> None:
 
 
 def test_a_run_folder_stands_for_its_recording(tmp_path: Path) -> None:
-    recording = fgtrack.simulate("default", duration_s=6.0, seed=1, out=tmp_path / "drive.jsonl")
+    recording = fgtrack.simulate(
+        "default", duration_s=6.0, seed=1, out=tmp_path / "drive.jsonl"
+    )
     fgtrack.replay(recording, "smoother", estimator="ekf-replay", out=tmp_path / "run")
-    assert str(ledger(tmp_path / "run")) == str(ledger(recording, read_config(str(tmp_path / "run" / "config.yaml"))))
+    assert str(ledger(tmp_path / "run")) == str(
+        ledger(recording, read_config(str(tmp_path / "run" / "config.yaml")))
+    )
 
 
 def test_the_figure_names_every_part(karle: Ledger) -> None:
-    [axes] = waterfall([(part.cause, part.mean_square_m2) for part in karle.waterfall], "title").axes
+    [axes] = waterfall(
+        [(part.cause, part.mean_square_m2) for part in karle.waterfall], "title"
+    ).axes
     labels = [label.get_text() for label in axes.get_yticklabels()]
-    assert labels == ["error now", *(part.cause for part in karle.waterfall[1:]), "if nothing were late"]
+    assert labels == [
+        "error now",
+        *(part.cause for part in karle.waterfall[1:]),
+        "if nothing were late",
+    ]
 
 
 def test_sensors_need_no_configuration(messages: list[Message]) -> None:
@@ -162,8 +228,13 @@ def test_sensors_need_no_configuration(messages: list[Message]) -> None:
 
 
 def test_a_run_folder_without_its_recording_says_so(tmp_path: Path) -> None:
-    recording = fgtrack.simulate("default", duration_s=2.0, seed=1, out=tmp_path / "drive.jsonl")
+    recording = fgtrack.simulate(
+        "default", duration_s=2.0, seed=1, out=tmp_path / "drive.jsonl"
+    )
     fgtrack.replay(recording, "smoother", estimator="ekf-replay", out=tmp_path / "run")
     Path(recording).unlink()
-    with pytest.raises(DataError, match=r"run: its recording is not at .*drive.jsonl, give the recording with -c"):
+    with pytest.raises(
+        DataError,
+        match=r"run: its recording is not at .*drive.jsonl, give the recording with -c",
+    ):
         ledger(tmp_path / "run")

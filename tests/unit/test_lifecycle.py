@@ -5,9 +5,14 @@ import pytest
 from support.tracking import START_NS, candidate, match, ms
 
 from fgtrack.core.types import TrackStatus
+from fgtrack.karle2023.tracker_parts import PublishedLifecycle
 from fgtrack.models.sensors import SensorModel
-from fgtrack.tracking.lifecycle import CountingLifecycle, Life, LifecycleRules, Scan
-from fgtrack.tracking.published import PublishedLifecycle
+from fgtrack.tracking.lives.counters import (
+    CountingLifecycle,
+    Life,
+    LifecycleRules,
+    Scan,
+)
 
 STD = {"x_m": 0.3, "y_m": 0.3}
 SENSORS = {
@@ -42,11 +47,20 @@ def test_a_track_starts_with_the_counter_of_the_sensor_that_found_it(kind) -> No
         ("long_range", False, False, True),
     ],
 )
-def test_a_sensor_ages_only_what_it_is_responsible_for(ages, near: bool, at_limit: bool, far: bool) -> None:
-    life = CountingLifecycle(LifecycleRules(short_range_m=60.0), {"one": SensorModel(std=STD, ages=ages)})
+def test_a_sensor_ages_only_what_it_is_responsible_for(
+    ages, near: bool, at_limit: bool, far: bool
+) -> None:
+    life = CountingLifecycle(
+        LifecycleRules(short_range_m=60.0), {"one": SensorModel(std=STD, ages=ages)}
+    )
     for track_id in range(3):
         life.born(track_id, Scan("one", START_NS, START_NS), HERE)
-    life.missed(Scan("one", START_NS, START_NS), [0, 1, 2], NOWHERE, np.array([10.0, 60.0, 60.1]))
+    life.missed(
+        Scan("one", START_NS, START_NS),
+        [0, 1, 2],
+        NOWHERE,
+        np.array([10.0, 60.0, 60.1]),
+    )
     assert [life.lives[i].misses == 1 for i in range(3)] == [near, at_limit, far]
 
 
@@ -56,11 +70,17 @@ def test_a_missed_track_counts_down_and_ends_at_zero(kind) -> None:
     life.born(0, Scan("near", START_NS, START_NS), HERE)
     life.born(1, Scan("near", START_NS, START_NS), HERE)
     ranges_m = np.array([10.0, 61.0])
-    assert life.missed(Scan("near", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == []
+    assert (
+        life.missed(Scan("near", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == []
+    )
     assert life.missed(Scan("far", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == []
     assert [life.lives[i].counter for i in (0, 1)] == [2, 2]
-    assert life.missed(Scan("near", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == []
-    assert life.missed(Scan("near", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == [0]
+    assert (
+        life.missed(Scan("near", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == []
+    )
+    assert life.missed(Scan("near", START_NS, START_NS), [0, 1], NOWHERE, ranges_m) == [
+        0
+    ]
     life.forget(0)
     assert list(life.lives) == [1]
 
@@ -74,7 +94,10 @@ def test_only_the_clean_life_cycle_knows_sensors_that_age_always() -> None:
 
 
 def test_the_counter_stops_at_its_cap_but_the_published_one_may_pass_it() -> None:
-    clean, published = lifecycle(counter_cap=6), lifecycle(PublishedLifecycle, counter_cap=6)
+    clean, published = (
+        lifecycle(counter_cap=6),
+        lifecycle(PublishedLifecycle, counter_cap=6),
+    )
     for life in (clean, published):
         life.born(0, Scan("far", START_NS, START_NS), HERE)
         for _ in range(3):
@@ -96,19 +119,31 @@ def test_the_last_sight_is_the_newest_stamp_and_in_the_published_one_the_last() 
 
 
 def test_time_alone_ends_a_track_but_the_published_one_needs_a_list() -> None:
-    clean, published = lifecycle(forget_s=2.0), lifecycle(PublishedLifecycle, forget_s=2.0)
+    clean, published = (
+        lifecycle(forget_s=2.0),
+        lifecycle(PublishedLifecycle, forget_s=2.0),
+    )
     late_ns = START_NS + ms(2000) + 1
     for life in (clean, published):
         life.born(0, Scan("blind", START_NS, START_NS), HERE)
         assert life.expired(late_ns - 1) == []
     assert clean.expired(late_ns) == [0]
     assert published.expired(late_ns) == []
-    assert published.missed(Scan("blind", late_ns - 1, late_ns - 1), [0], NOWHERE, np.array([10.0])) == []
-    assert published.missed(Scan("blind", late_ns, late_ns), [0], NOWHERE, np.array([10.0])) == [0]
+    assert (
+        published.missed(
+            Scan("blind", late_ns - 1, late_ns - 1), [0], NOWHERE, np.array([10.0])
+        )
+        == []
+    )
+    assert published.missed(
+        Scan("blind", late_ns, late_ns), [0], NOWHERE, np.array([10.0])
+    ) == [0]
 
 
 @pytest.mark.parametrize("order", list(permutations(range(4))))
-def test_matches_and_misses_count_in_order_of_their_stamps(order: tuple[int, ...]) -> None:
+def test_matches_and_misses_count_in_order_of_their_stamps(
+    order: tuple[int, ...],
+) -> None:
     """With a cap of 6: 5 + 2 -> 6, then 5, 4, and + 2 -> 6."""
     life = lifecycle(counter_cap=6)
     life.born(0, Scan("far", START_NS, START_NS), HERE)
@@ -148,15 +183,26 @@ def test_a_track_waits_for_the_lists_that_could_show_it(comes: bool) -> None:
 
     assert life.expired(START_NS + late_ns, watermarks(2500.0)) == []
     for k in range(1, 4):  # at 2.51, 2.52 and 2.53 s
-        scan = Scan("near", START_NS + late_ns + ms(10 * k), START_NS + late_ns + ms(10 * k))
+        scan = Scan(
+            "near", START_NS + late_ns + ms(10 * k), START_NS + late_ns + ms(10 * k)
+        )
         assert life.missed(scan, [0], NOWHERE, np.array([10.0])) == []
     assert life.lives[0].counter == 0
     if comes:
         for k in range(1, 4):
-            match(life, 0, Scan("both", START_NS + ms(700 * k), START_NS + late_ns + ms(700 * k)), HERE)
+            match(
+                life,
+                0,
+                Scan("both", START_NS + ms(700 * k), START_NS + late_ns + ms(700 * k)),
+                HERE,
+            )
         assert life.lives[0].counter == 2 + 3 * 2 - 3
     assert life.expired(START_NS + ms(3500), watermarks(3500.0)) == []
-    ended = [at_ms for at_ms in range(3500, 7000, 10) if life.expired(START_NS + ms(at_ms), watermarks(at_ms))]
+    ended = [
+        at_ms
+        for at_ms in range(3500, 7000, 10)
+        if life.expired(START_NS + ms(at_ms), watermarks(at_ms))
+    ]
     assert ended[0] == (2100 + 2500 + 1000 + 10 if comes else 2500 + 1000 + 10)
 
 
@@ -180,6 +226,11 @@ def test_the_status_tells_unconfirmed_from_seen_from_missed() -> None:
     status.append(life.status(0))
     match(life, 0, Scan("both", START_NS, START_NS), HERE)
     status.append(life.status(0))
-    assert status == [TrackStatus.TENTATIVE, TrackStatus.CONFIRMED, TrackStatus.COASTING, TrackStatus.CONFIRMED]
+    assert status == [
+        TrackStatus.TENTATIVE,
+        TrackStatus.CONFIRMED,
+        TrackStatus.COASTING,
+        TrackStatus.CONFIRMED,
+    ]
     life.lives[0] = Life(1, START_NS, num_placed=2, misses=1)
     assert life.status(0) is TrackStatus.TENTATIVE

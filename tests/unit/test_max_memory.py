@@ -16,7 +16,9 @@ def test_a_command_runs_within_the_limit_and_the_caller_keeps_its_own(
 ) -> None:
     seen = []
     monkeypatch.setattr(
-        fgtrack.cli.recordings, "config", lambda: seen.append(resource.getrlimit(resource.RLIMIT_AS)[0])
+        fgtrack.cli.recordings,
+        "config",
+        lambda: seen.append(resource.getrlimit(resource.RLIMIT_AS)[0]),
     )
     before = resource.getrlimit(resource.RLIMIT_AS)
     assert run([*words, "config"]) == 0
@@ -24,7 +26,9 @@ def test_a_command_runs_within_the_limit_and_the_caller_keeps_its_own(
     assert resource.getrlimit(resource.RLIMIT_AS) == before
 
 
-def test_too_little_memory_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_too_little_memory_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def exhausted() -> None:
         raise MemoryError
 

@@ -6,7 +6,7 @@ from rosbags.typesys import Stores, get_typestore
 from support.mcap import poses
 
 from fgtrack.core.errors import DataError
-from fgtrack.io.ros.typestore import MessageTypes, checked, typestore_of
+from fgtrack.inputs.ros.typestore import MessageTypes, checked, typestore_of
 
 NUMBER = (Nodetype.BASE, ("float64", 0))
 NAME = "a_msgs/msg/B"
@@ -29,27 +29,44 @@ def test_every_definition_of_ros_passes(store: Stores) -> None:
         (NAME, ([("X", "int8", [1])], []), "not a plain value"),
         (NAME, ([("X", "int8, y", 1)], []), "not a plain value"),
         (NAME, ([], [("x", (Nodetype.BASE, ("os.system", 0)))]), "unknown type"),
-        (NAME, ([], [("x", (Nodetype.NAME, "a/msg/B()"))]), "not a name of a message type"),
+        (
+            NAME,
+            ([], [("x", (Nodetype.NAME, "a/msg/B()"))]),
+            "not a name of a message type",
+        ),
         (NAME, ([], [("x", (Nodetype.ARRAY, (NUMBER, 10**9)))]), "longer than"),
-        (NAME, ([], [("x", (Nodetype.SEQUENCE, ((Nodetype.NAME, "x;y"), 0)))]), "not a name of a message type"),
+        (
+            NAME,
+            ([], [("x", (Nodetype.SEQUENCE, ((Nodetype.NAME, "x;y"), 0)))]),
+            "not a name of a message type",
+        ),
         (NAME, ([("A", "float64", float("inf"))], []), "not a plain value"),
         (NAME, ([("A", "int64", 1 << 64)], []), "not a plain value"),
-        (NAME, ([], [("class", NUMBER), ("class_", NUMBER)]), "two members of one name"),
+        (
+            NAME,
+            ([], [("class", NUMBER), ("class_", NUMBER)]),
+            "two members of one name",
+        ),
         (NAME, ([("x", "int8", 1)], [("x", NUMBER)]), "two members of one name"),
         (NAME, ([], [("__class__", NUMBER)]), "not a name of a member"),
         ("a/" + "b" * 300, ([], []), "not a name of a message type"),
     ],
 )
-def test_what_is_no_name_and_no_number_is_refused(name: str, definition, problem: str) -> None:
+def test_what_is_no_name_and_no_number_is_refused(
+    name: str, definition, problem: str
+) -> None:
     with pytest.raises(ValueError, match=problem):
         checked({name: definition})
 
 
-def test_a_definition_that_is_refused_is_a_problem_of_its_type_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_definition_that_is_refused_is_a_problem_of_its_type_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Whatever the parser makes of a text."""
     typestore_of(("nav_msgs/msg/Odometry",))  # reads the shipped definitions once
     monkeypatch.setattr(
-        "fgtrack.io.ros.typestore.get_types_from_msg", lambda *of: {NAME: ([], [("x);import os;(", NUMBER)])}
+        "fgtrack.inputs.ros.typestore.get_types_from_msg",
+        lambda *of: {NAME: ([], [("x);import os;(", NUMBER)])},
     )
     evil = (NAME, MessageDefinition(MessageDefinitionFormat.MSG, "float64 x"))
     types = MessageTypes([evil, ("nav_msgs/msg/Odometry", None)], ros1=False)
@@ -94,18 +111,48 @@ PART_OF_IDL = "module a_msgs { module msg { struct C { long x; }; }; };"
 def test_what_ros_generates_in_idl_is_read() -> None:
     key = (NAME, MessageDefinition(MessageDefinitionFormat.IDL, f"{IDL}{PART_OF_IDL}"))
     constants, members = MessageTypes([key], ros1=False).types[key][NAME]
-    assert [(name, value) for name, _, value in constants][:3] == [("CAR", 1), ("NONE", -1), ("SMALL", -1.5e-3)]
-    assert [name for name, _ in members] == ["stamp", "x", "covariance", "names", "parts"]
+    assert [(name, value) for name, _, value in constants][:3] == [
+        ("CAR", 1),
+        ("NONE", -1),
+        ("SMALL", -1.5e-3),
+    ]
+    assert [name for name, _ in members] == [
+        "stamp",
+        "x",
+        "covariance",
+        "names",
+        "parts",
+    ]
     assert dict(members)["covariance"] == (Nodetype.ARRAY, (NUMBER, 36))
     assert dict(members)["names"][0] == Nodetype.SEQUENCE
 
 
 @pytest.mark.parametrize(
-    "text", ["=", "/*x", '"', '\\"', "@", "@ ", "@(", "@a ", "//", "#\n", "=(", "sequence<", "sequence ", "= ", "a=1 "]
+    "text",
+    [
+        "=",
+        "/*x",
+        '"',
+        '\\"',
+        "@",
+        "@ ",
+        "@(",
+        "@a ",
+        "//",
+        "#\n",
+        "=(",
+        "sequence<",
+        "sequence ",
+        "= ",
+        "a=1 ",
+    ],
 )
 def test_a_hostile_definition_in_idl_is_refused_in_a_moment(text: str) -> None:
     """Expressions that look for an end from each beginning would take minutes for these 150,000 characters."""
-    key = (NAME, MessageDefinition(MessageDefinitionFormat.IDL, text * (150_000 // len(text))))
+    key = (
+        NAME,
+        MessageDefinition(MessageDefinitionFormat.IDL, text * (150_000 // len(text))),
+    )
     assert NAME in "".join(name for name, _ in MessageTypes([key], ros1=False).problems)
 
 
@@ -126,13 +173,18 @@ def test_every_type_of_ros_is_small_enough() -> None:
 
 
 def embedded(**texts: str) -> list[tuple[str, MessageDefinition]]:
-    return [(f"a/msg/{name}", MessageDefinition(MessageDefinitionFormat.MSG, text)) for name, text in texts.items()]
+    return [
+        (f"a/msg/{name}", MessageDefinition(MessageDefinitionFormat.MSG, text))
+        for name, text in texts.items()
+    ]
 
 
 PART = "a/C c\n" + "=" * 80 + "\nMSG: a/C\n"
 
 
-def test_topics_that_contradict_each_other_are_each_read_by_their_own_definition() -> None:
+def test_topics_that_contradict_each_other_are_each_read_by_their_own_definition() -> (
+    None
+):
     keys = embedded(A=f"{PART}uint8 x\n", B=f"{PART}uint16 y\n")
     types = MessageTypes(keys, ros1=False)
     assert not types.problems
@@ -147,7 +199,10 @@ def test_one_name_for_two_types_is_read_by_what_each_topic_says() -> None:
     assert types.decode(keys[1], b"\0\1\0\0\0\1", "it").y == 256
 
 
-@pytest.mark.parametrize("evil", ["float64 A=1e999\n", "int32 class\nint32 class_\n", f"int64 A=0x{'f' * 6000}\n"])
+@pytest.mark.parametrize(
+    "evil",
+    ["float64 A=1e999\n", "int32 class\nint32 class_\n", f"int64 A=0x{'f' * 6000}\n"],
+)
 def test_a_definition_that_nobody_needs_leaves_the_others_readable(evil: str) -> None:
     keys = [*embedded(A=f"{evil}int32 x\n"), ("nav_msgs/msg/Odometry", None)]
     types = MessageTypes(keys, ros1=False)
@@ -162,6 +217,6 @@ def test_a_message_may_be_large_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -
         MessageTypes([("geometry_msgs/msg/PoseArray", None)], ros1=False),
     )
     assert len(types.decode(key, poses(3), "it").poses) == 3
-    monkeypatch.setattr("fgtrack.io.ros.typestore._LARGEST_BYTES", 100)
+    monkeypatch.setattr("fgtrack.inputs.ros.typestore._LARGEST_BYTES", 100)
     with pytest.raises(DataError, match=r"it: has \d+ bytes, at most 100 are decoded"):
         types.decode(key, poses(3), "it")

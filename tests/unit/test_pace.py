@@ -2,7 +2,7 @@
 
 import pytest
 
-from fgtrack.io.run import Node
+from fgtrack.runs import Node
 
 MS = 1_000_000
 
@@ -18,7 +18,8 @@ def test_a_tick_begins_when_the_one_before_is_done(
     due_ms: list[int], took_ms: list[int], done_ms: list[int], misses: int
 ) -> None:
     node = Node(20 * MS)
-    assert [node.done_ns(due * MS, took * MS) for due, took in zip(due_ms, took_ms, strict=True)] == [
-        done * MS for done in done_ms
-    ]
+    assert [
+        node.done_ns(due * MS, took * MS)
+        for due, took in zip(due_ms, took_ms, strict=True)
+    ] == [done * MS for done in done_ms]
     assert node.misses == misses

@@ -2,13 +2,15 @@
 
 import pytest
 
-from fgtrack.evaluation.palette import PALETTE, SENSORS, style_of, styles
+from fgtrack.show.palette import PALETTE, SENSORS, style_of, styles
 
 
 def luminance(colour: str) -> float:
     """Relative luminance as WCAG 2.1 defines it."""
     shares = [int(colour[k : k + 2], 16) / 255.0 for k in (1, 3, 5)]
-    r, g, b = (c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in shares)
+    r, g, b = (
+        c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in shares
+    )
     return 0.2126 * r + 0.7152 * g + 0.0722 * b
 
 

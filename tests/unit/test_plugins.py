@@ -8,14 +8,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from fgtrack.config.shipped import read_scenario
+from fgtrack.config.yaml_file import plain
 from fgtrack.core.errors import CallError
 from fgtrack.core.plugins import Registry
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
-from fgtrack.estimation.registry import ESTIMATORS, MOTION_MODELS, estimator, estimator_bank, motion_model
+from fgtrack.estimation.registry import (
+    ESTIMATORS,
+    MOTION_MODELS,
+    estimator,
+    estimator_bank,
+    motion_model,
+)
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CV
-from fgtrack.pipeline.load import plain
-from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.pipeline.sweep import run_job
 
 GROUP = "fgtrack.tests"
@@ -24,7 +30,9 @@ GROUP = "fgtrack.tests"
 def installed(folder: Path, package: str, **entries: str) -> None:
     info = folder / f"{package}-1.0.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n"
+    )
     lines = [f"{name} = {value}" for name, value in entries.items()]
     (info / "entry_points.txt").write_text("\n".join([f"[{GROUP}]", *lines, ""]))
 
@@ -34,13 +42,27 @@ def registry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Registry:
     (tmp_path / "sound_plugin.py").write_text("class Part:\n    pass\n")
     (tmp_path / "leaving_plugin.py").write_text("raise SystemExit(0)\n")
     (tmp_path / "broken_plugin.py").write_text("import no_such_module\n")
-    installed(tmp_path, "sound", part="sound_plugin:Part", ours="sound_plugin:Part", old="sound_plugin:Part")
-    installed(tmp_path, "wrecked", wrong="broken_plugin:Part", part="broken_plugin:Part", zero="leaving_plugin:Part")
+    installed(
+        tmp_path,
+        "sound",
+        part="sound_plugin:Part",
+        ours="sound_plugin:Part",
+        old="sound_plugin:Part",
+    )
+    installed(
+        tmp_path,
+        "wrecked",
+        wrong="broken_plugin:Part",
+        part="broken_plugin:Part",
+        zero="leaving_plugin:Part",
+    )
     monkeypatch.syspath_prepend(tmp_path)
     return Registry("part", {GROUP: {"ours": "pathlib:Path"}}, aliases={"old": "ours"})
 
 
-def test_built_in_parts_come_first_and_plug_ins_are_loaded_by_name(registry: Registry) -> None:
+def test_built_in_parts_come_first_and_plug_ins_are_loaded_by_name(
+    registry: Registry,
+) -> None:
     assert list(registry) == ["ours", "part", "wrong", "zero"]
     assert registry.load("ours") is Path
     assert registry.load("part").__module__ == "sound_plugin"
@@ -59,9 +81,15 @@ def test_the_source_of_a_plug_in_follows_its_code(
     assert after["wrong"].startswith("wrecked 1.0 ")
 
 
-def test_a_name_that_is_taken_is_left_out_with_a_line(registry: Registry, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_name_that_is_taken_is_left_out_with_a_line(
+    registry: Registry, caplog: pytest.LogCaptureFixture
+) -> None:
     assert registry.load("old") is Path
-    assert [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING] == [
+    assert [
+        record.getMessage()
+        for record in caplog.records
+        if record.levelno == logging.WARNING
+    ] == [
         "part 'old' of sound 1.0 is left out: the name belongs to fgtrack; rename the entry point",
         "part 'ours' of sound 1.0 is left out: the name belongs to fgtrack; rename the entry point",
         "part 'part' of wrecked 1.0 is left out: the name belongs to sound 1.0; rename the entry point",
@@ -71,7 +99,10 @@ def test_a_name_that_is_taken_is_left_out_with_a_line(registry: Registry, caplog
 def test_a_broken_plug_in_is_named_and_does_not_disturb_the_others(
     registry: Registry, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with pytest.raises(CallError, match=r"^part 'wrong': plug-in broken_plugin:Part of wrecked 1\.0 cannot") as error:
+    with pytest.raises(
+        CallError,
+        match=r"^part 'wrong': plug-in broken_plugin:Part of wrecked 1\.0 cannot",
+    ) as error:
         registry.load("wrong")
     assert "No module named 'no_such_module'" in str(error.value)
     assert "\n" not in str(error.value)
@@ -81,7 +112,10 @@ def test_a_broken_plug_in_is_named_and_does_not_disturb_the_others(
 
 
 def test_an_unknown_name_gives_the_nearest_and_all(registry: Registry) -> None:
-    with pytest.raises(CallError, match=r"^part 'prt' is unknown, did you mean 'part': there are ours, part, wrong"):
+    with pytest.raises(
+        CallError,
+        match=r"^part 'prt' is unknown, did you mean 'part': there are ours, part, wrong",
+    ):
         registry.resolve("prt")
     assert registry.resolve("old") == "ours"
 
@@ -92,20 +126,28 @@ def test_every_estimator_is_made_by_name(name: str) -> None:
     one = estimator(name, motion, Start(position_m=(1.0, 2.0)), lag_s=1.0)
     z = one.state_at(0).mean[:2]
     assert z.tolist() == [1.0, 2.0]
-    measurement = Measurement(10**9 // 2, measurement_model(("x_m", "y_m"), motion), z, np.eye(2))
+    measurement = Measurement(
+        10**9 // 2, measurement_model(("x_m", "y_m"), motion), z, np.eye(2)
+    )
     assert one.update(measurement).status is UpdateStatus.IN_SEQUENCE
     assert one.window_ns[1] == 10**9 // 2
 
 
 def test_options_that_an_estimator_does_not_take_are_refused() -> None:
     start = Start()
-    with pytest.raises(CallError, match=r"^ekf-replay: .*'hold_s'; its options are initiation$"):
+    with pytest.raises(
+        CallError, match=r"^ekf-replay: .*'hold_s'; its options are initiation$"
+    ):
         estimator("ekf-replay", CV(), start, hold_s=0.1)
-    with pytest.raises(CallError, match="unknown option 'ring'; its options are late, ring_s"):
+    with pytest.raises(
+        CallError, match="unknown option 'ring'; its options are late, ring_s"
+    ):
         estimator("smoother", CV(), start, ring=0.1)
     with pytest.raises(CallError, match="smoother: max_iterations: must lie between"):
         estimator("smoother", CV(), start, max_iterations=0)
-    with pytest.raises(CallError, match=r"cv: .*'drag'; its options are velocity_density_m2ps3"):
+    with pytest.raises(
+        CallError, match=r"cv: .*'drag'; its options are velocity_density_m2ps3"
+    ):
         motion_model("cv", {"drag": 0.1})
 
 
@@ -142,9 +184,13 @@ class LackingBank:
     ],
     ids=["raises", "leaves", "number", "bank"],
 )
-def test_a_part_that_cannot_be_made_is_one_line(monkeypatch: pytest.MonkeyPatch, part: object, message: str) -> None:
+def test_a_part_that_cannot_be_made_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, part: object, message: str
+) -> None:
     package = SimpleNamespace(name="odd", version="1.0")
-    entry = SimpleNamespace(dist=package, load=lambda: part, group="fgtrack.estimators", value="x:Y")
+    entry = SimpleNamespace(
+        dist=package, load=lambda: part, group="fgtrack.estimators", value="x:Y"
+    )
     for registry in (ESTIMATORS, MOTION_MODELS):
         monkeypatch.setitem(registry._entries, "odd", entry)
     with pytest.raises(CallError, match=message):
@@ -156,11 +202,21 @@ def test_a_part_that_cannot_be_made_is_one_line(monkeypatch: pytest.MonkeyPatch,
             motion_model("odd", {})
 
 
-def test_what_a_job_raises_is_the_error_of_a_cell(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_job_raises_is_the_error_of_a_cell(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def leaves(*_: object) -> None:
         raise SystemExit(0)
 
     scenario = {**plain(read_scenario("single_opponent")), "duration_s": 0.1}
-    recipe = {"config": {}, "recording": None, "scenario": scenario, "seed": 0, "estimators": ("ekf-replay",)}
+    recipe = {
+        "config": {},
+        "recording": None,
+        "scenario": scenario,
+        "seed": 0,
+        "estimators": ("ekf-replay",),
+    }
     monkeypatch.setattr("fgtrack.pipeline.sweep.replay_in_memory", leaves)
-    assert [cell.error for cell in run_job("key", recipe, leaves)[1]] == ["SystemExit: 0"]
+    assert [cell.error for cell in run_job("key", recipe, leaves)[1]] == [
+        "SystemExit: 0"
+    ]

@@ -7,8 +7,13 @@ from hypothesis import strategies as st
 from support.models import MODELS
 
 from fgtrack.core.types import FloatArray
-from fgtrack.estimation.filters.propagation import EulerCtrv, ExactPropagator
-from fgtrack.estimation.filters.published import YAW_LIMIT_RAD, SaturatedEulerCtrv, published_yaw
+from fgtrack.estimation.filters.propagation import ExactPropagator
+from fgtrack.karle2023.euler import EulerCtrv
+from fgtrack.karle2023.filter_defects import (
+    YAW_LIMIT_RAD,
+    SaturatedEulerCtrv,
+    published_yaw,
+)
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRA, CTRV, MotionModel
 
@@ -17,14 +22,26 @@ ANISOTROPIC = np.array([4e-3, 1e-5, 9e-4, 1e-2, 2.5e-3])
 seeds = st.integers(0, 2**32 - 1)
 
 
-def random_states(rng: np.random.Generator, count: int, n: int) -> tuple[FloatArray, FloatArray]:
-    mean = rng.normal(size=(count, n)) * np.array([500.0, 500.0, 1.5, 40.0, 0.3, 2.0])[:n]
-    root = rng.normal(size=(count, n, n)) * np.array([1.0, 1.0, 0.1, 1.0, 0.1, 1.0])[:n, None]
+def random_states(
+    rng: np.random.Generator, count: int, n: int
+) -> tuple[FloatArray, FloatArray]:
+    mean = (
+        rng.normal(size=(count, n)) * np.array([500.0, 500.0, 1.5, 40.0, 0.3, 2.0])[:n]
+    )
+    root = (
+        rng.normal(size=(count, n, n))
+        * np.array([1.0, 1.0, 0.1, 1.0, 0.1, 1.0])[:n, None]
+    )
     return mean, root @ np.swapaxes(root, -1, -2)
 
 
 def naive_step(
-    x: FloatArray, P: FloatArray, density: FloatArray, dt: float, driving: bool, limit: float
+    x: FloatArray,
+    P: FloatArray,
+    density: FloatArray,
+    dt: float,
+    driving: bool,
+    limit: float,
 ) -> tuple[FloatArray, FloatArray]:
     """One Euler step of one object, written down entry by entry (Karle et al. 2023, eqs. 3, 4 and 10)."""
     n = len(x)
@@ -54,7 +71,9 @@ PROPAGATORS = {
 
 
 @pytest.mark.parametrize("kind", PROPAGATORS)
-@pytest.mark.parametrize("density", [ISOTROPIC, ANISOTROPIC], ids=["isotropic", "anisotropic"])
+@pytest.mark.parametrize(
+    "density", [ISOTROPIC, ANISOTROPIC], ids=["isotropic", "anisotropic"]
+)
 @settings(deadline=None, max_examples=10)
 @given(seed=seeds, steps=st.lists(st.integers(0, 400), min_size=1, max_size=4))
 def test_all_euler_steps_at_once_are_the_steps_one_by_one(
@@ -74,7 +93,9 @@ def test_all_euler_steps_at_once_are_the_steps_one_by_one(
     for i, count in enumerate(steps):
         mean, covariance = x[i], P[i]
         for _ in range(count):
-            mean, covariance = naive_step(mean, covariance, density, 0.01, driving, limit)
+            mean, covariance = naive_step(
+                mean, covariance, density, 0.01, driving, limit
+            )
         np.testing.assert_allclose(means[i], mean, rtol=0.0, atol=1e-9)
         scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
         assert np.abs((covariances[i] - covariance) / scale).max() < 1e-11
@@ -83,7 +104,9 @@ def test_all_euler_steps_at_once_are_the_steps_one_by_one(
 @pytest.mark.parametrize("motion", MODELS, ids=lambda motion: type(motion).__name__)
 @settings(deadline=None, max_examples=10)
 @given(seed=seeds, steps=st.lists(st.integers(0, 60), min_size=1, max_size=3))
-def test_exact_steps_at_once_are_the_exact_steps_one_by_one(motion: MotionModel, seed: int, steps: list[int]) -> None:
+def test_exact_steps_at_once_are_the_exact_steps_one_by_one(
+    motion: MotionModel, seed: int, steps: list[int]
+) -> None:
     """Means, Jacobians and noise compose, so k steps from the start are one step k times."""
     propagator = ExactPropagator(motion)
     x, P = random_states(np.random.default_rng(seed), len(steps), motion.dim)
@@ -91,15 +114,24 @@ def test_exact_steps_at_once_are_the_exact_steps_one_by_one(motion: MotionModel,
     for i, count in enumerate(steps):
         mean, covariance = x[i, None], P[i, None]
         for _ in range(count):
-            mean, covariance = propagator.propagate(mean, covariance, np.array([1]), 0.02)
+            mean, covariance = propagator.propagate(
+                mean, covariance, np.array([1]), 0.02
+            )
         np.testing.assert_allclose(means[i], mean[0], rtol=0.0, atol=1e-9)
         deviations = np.sqrt(np.diag(covariance[0]))
-        assert np.abs((covariances[i] - covariance[0]) / np.outer(deviations, deviations)).max() < 1e-9
+        assert (
+            np.abs(
+                (covariances[i] - covariance[0]) / np.outer(deviations, deviations)
+            ).max()
+            < 1e-9
+        )
 
 
 def test_an_acceleration_is_carried_along_where_it_does_not_drive() -> None:
     x, P = np.array([[0.0, 0.0, 0.0, 10.0, 0.0, 3.0]]), np.eye(6)[None]
-    means, _ = EulerCtrv(CTRA(), np.append(ISOTROPIC, 0.1)).propagate(x, P, np.array([50]), 0.01)
+    means, _ = EulerCtrv(CTRA(), np.append(ISOTROPIC, 0.1)).propagate(
+        x, P, np.array([50]), 0.01
+    )
     assert means[0, 3] == 10.0
     assert means[0, 5] == 3.0
 
@@ -112,7 +144,9 @@ def test_an_acceleration_is_carried_along_where_it_does_not_drive() -> None:
         (SaturatedEulerCtrv(CTRV(), ISOTROPIC).wrap, math.pi + 0.5),
     ],
 )
-def test_settling_wraps_a_copy_to_the_propagators_own_range(wrap, wrapped: float) -> None:
+def test_settling_wraps_a_copy_to_the_propagators_own_range(
+    wrap, wrapped: float
+) -> None:
     mean = np.array([[1.0, 2.0, math.pi + 0.5, 4.0, 5.0]])
     assert wrap(mean)[0] == pytest.approx([1.0, 2.0, wrapped, 4.0, 5.0])
     assert mean[0, 2] == math.pi + 0.5
@@ -128,6 +162,9 @@ def test_the_published_yaw_range_ends_where_the_published_yaw_is_pi() -> None:
 
 def test_a_published_residual_wraps_by_one_turn_alone() -> None:
     model = measurement_model(("x_m", "yaw_rad", "bearing_rad"), CTRV())
-    z, predicted = np.array([3.0, -2.0, -3.0]), np.array([1.0, -2.0 - 2.0 * math.pi, 3.0])
+    z, predicted = (
+        np.array([3.0, -2.0, -3.0]),
+        np.array([1.0, -2.0 - 2.0 * math.pi, 3.0]),
+    )
     found = SaturatedEulerCtrv(CTRV(), ISOTROPIC).residual(model, z, predicted)
     assert found == pytest.approx([2.0, 2.0 * math.pi, 2.0 * math.pi - 6.0])

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from fgtrack.io.errors import cause
+from fgtrack.inputs.errors import cause
 
 
 def named(value: Any) -> Any:
@@ -31,18 +31,36 @@ def raised(action: Callable[[Any], Any], value: Any) -> Exception:
         (named, [1], "a list where the format has something else"),
         (named, True, "true or false where the format has something else"),
         (float, {}, "an object with names where the format has something else"),
-        (lambda value: value.items(), "x", "a text where the format has something else"),
-        (lambda value: value + 1, object(), "a value where the format has something else"),
-        (lambda value: [a + b for a, b in value], [3], "a number where the format has something else"),
+        (
+            lambda value: value.items(),
+            "x",
+            "a text where the format has something else",
+        ),
+        (
+            lambda value: value + 1,
+            object(),
+            "a value where the format has something else",
+        ),
+        (
+            lambda value: [a + b for a, b in value],
+            [3],
+            "a number where the format has something else",
+        ),
         (lambda value: value[0], [], "a list has another length"),
-        (lambda value: dict(zip(value, [], strict=True)), [1], "a list has another length"),
+        (
+            lambda value: dict(zip(value, [], strict=True)),
+            [1],
+            "a list has another length",
+        ),
         (lambda value: [a + b for a, b in value], [[1]], "a list has another length"),
         (int, float("inf"), "a number is out of range"),
         (float, "abc", "could not convert string to float: 'abc'"),
         (json.loads, "[" * 100_000, "values are nested too deeply"),
     ],
 )
-def test_the_cause_is_told_in_words(action: Callable[[Any], Any], value: Any, said: str) -> None:
+def test_the_cause_is_told_in_words(
+    action: Callable[[Any], Any], value: Any, said: str
+) -> None:
     assert cause(raised(action, value)) == said
 
 

@@ -12,12 +12,12 @@ from support.raising import MS, START_NS, lists, make
 MODULES = (
     "fgtrack.estimation.kernels.kalman",
     "fgtrack.estimation.kernels.replay",
-    "fgtrack.estimation.kernels.storage",
+    "fgtrack.karle2023.storage_kernels",
     "fgtrack.estimation.smoothing.kernels",
     "fgtrack.estimation.smoothing.node_kernels",
     "fgtrack.tracking.facing_kernels",
     "fgtrack.tracking.kernels",
-    "fgtrack.tracking.visibility_kernels",
+    "fgtrack.tracking.lives.visibility_kernels",
 )
 #: Names of arguments that are row numbers, or indices of what a row has.
 ROW_NUMBERS = {"tracks", "rows", "indices", "anchors", "by_x", "sensors", "entries"}
@@ -32,7 +32,11 @@ Calls = dict[str, list[Any]]
 
 def _compiled(module: Any) -> Iterator[str]:
     for name, value in vars(module).items():
-        if hasattr(value, "py_func") and value.signatures and value.py_func.__module__ == module.__name__:
+        if (
+            hasattr(value, "py_func")
+            and value.signatures
+            and value.py_func.__module__ == module.__name__
+        ):
             yield name
 
 
@@ -51,17 +55,29 @@ def calls() -> Calls:
         for name in _compiled(module):
             own = getattr(module, name)
 
-            def called(*arguments: Any, _own: Any = own, _key: str = f"{path}.{name}") -> Any:
-                sized = [len(each) for each in arguments if isinstance(each, np.ndarray)]
+            def called(
+                *arguments: Any, _own: Any = own, _key: str = f"{path}.{name}"
+            ) -> Any:
+                sized = [
+                    len(each) for each in arguments if isinstance(each, np.ndarray)
+                ]
                 if min(sized, default=0) > 1 or _key not in recorded:
                     recorded[_key] = [_own, *map(_copied, arguments)]
                 return _own(*arguments)
 
             patch.setattr(module, name, called)
-            for user in ("fgtrack.estimation.smoothing.bank", "fgtrack.tracking.association"):
+            for user in (
+                "fgtrack.estimation.smoothing.bank",
+                "fgtrack.tracking.association",
+            ):
                 if getattr(import_module(user), name, None) is own:
                     patch.setattr(import_module(user), name, called)
-    for estimator in ("ekf-replay", "smoother", "smoother-banded", "ekf-backward-forward"):
+    for estimator in (
+        "ekf-replay",
+        "smoother",
+        "smoother-banded",
+        "ekf-backward-forward",
+    ):
         tracker = make(estimator)
         for k, messages in enumerate(lists(9)):
             for message in messages:
@@ -82,14 +98,20 @@ def test_a_row_number_beyond_an_end_is_refused(calls: Calls) -> None:
     for key, (function, *arguments) in calls.items():
         names = list(inspect.signature(function.py_func).parameters)
         for place, (name, value) in enumerate(zip(names, arguments, strict=True)):
-            is_row = isinstance(value, np.ndarray) and value.dtype == np.int64 and value.ndim == 1
+            is_row = (
+                isinstance(value, np.ndarray)
+                and value.dtype == np.int64
+                and value.ndim == 1
+            )
             if name not in ROW_NUMBERS or not is_row or not len(value):
                 continue
             for wrong in (-3, 10**6, 2**40):
                 broken = value.copy()
                 broken[-1] = wrong
                 tried += 1
-                if name == "indices" and key.endswith(("locate", "move_far")):  # written, not read
+                if name == "indices" and key.endswith(
+                    ("locate", "move_far")
+                ):  # written, not read
                     continue
                 try:
                     function(*_with(arguments, place, broken))
@@ -107,16 +129,26 @@ def test_an_array_that_is_too_small_is_refused(calls: Calls) -> None:
         for place, (name, value) in enumerate(zip(names, arguments, strict=True)):
             parts = value if isinstance(value, tuple) else (value,)
             for row, part in enumerate(parts):
-                is_array = isinstance(part, np.ndarray) and len(part) > 0 and part.flags.writeable
+                is_array = (
+                    isinstance(part, np.ndarray)
+                    and len(part) > 0
+                    and part.flags.writeable
+                )
                 if not is_array or name in LENGTHS:
                     continue
                 less = np.ascontiguousarray(part[: len(part) // 2])
-                given = (*parts[:row], less, *parts[row + 1 :]) if isinstance(value, tuple) else less
+                given = (
+                    (*parts[:row], less, *parts[row + 1 :])
+                    if isinstance(value, tuple)
+                    else less
+                )
                 tried += 1
                 try:
                     function(*_with(arguments, place, given))
                 except IndexError:
                     continue
-                accepted.add(f"{key.rpartition('.')[2]}.{name}{row if isinstance(value, tuple) else ''}")
+                accepted.add(
+                    f"{key.rpartition('.')[2]}.{name}{row if isinstance(value, tuple) else ''}"
+                )
     assert tried > 80
     assert accepted <= FURTHER_LENGTHS, " ".join(sorted(accepted - FURTHER_LENGTHS))

@@ -22,7 +22,16 @@ from fgtrack.core.types import (
     TruthState,
     UpdateRecord,
 )
-from fgtrack.io.run import COLUMNS, NO_TRACK, MemoryRun, RunWriter, digest, load_run, sink, write_metrics
+from fgtrack.runs import (
+    COLUMNS,
+    NO_TRACK,
+    MemoryRun,
+    RunWriter,
+    digest,
+    load_run,
+    sink,
+    write_metrics,
+)
 
 
 def track(track_id: int = 1, size: int = 5, stamp_ns: int = 990) -> TrackReport:
@@ -37,7 +46,16 @@ def report(tick: int = 0, size: int = 5) -> TickReport:
         1000 + tick,
         (track(1, size), track(2, size)),
         (
-            UpdateRecord("lidar", 900, 950, 0, Disposition.IN_SEQUENCE, 1, 0.1, {"x_m": 0.3, "y_m": -0.1}),
+            UpdateRecord(
+                "lidar",
+                900,
+                950,
+                0,
+                Disposition.IN_SEQUENCE,
+                1,
+                0.1,
+                {"x_m": 0.3, "y_m": -0.1},
+            ),
             UpdateRecord('a",b', 901, 951, 1, Disposition.INVALID),
         ),
     )
@@ -72,7 +90,9 @@ def test_the_ego_is_in_the_files_with_the_next_tick_and_not_in_the_digest(tmp_pa
         assert not path.exists() or not (path / "ego.csv").exists()
         writer.write_tick(report(), 5, 2)
         assert load_run(path).tables["ego"]["receipt_ns"].tolist() == [2]
-        writer.write_ego(EgoState(3, 4, 1.1, 0.2, 0.3, 0.4, yaw_rate_radps=0.5, accel_mps2=0.6))
+        writer.write_ego(
+            EgoState(3, 4, 1.1, 0.2, 0.3, 0.4, yaw_rate_radps=0.5, accel_mps2=0.6)
+        )
         finished = writer.finish({})
     ego = load_run(path).tables["ego"]
     assert ego["stamp_ns"].tolist() == [1, 3]
@@ -80,16 +100,26 @@ def test_the_ego_is_in_the_files_with_the_next_tick_and_not_in_the_digest(tmp_pa
     assert ego["accel_mps2"].tolist() == [0.0, 0.6]
     write(tmp_path / "without", report())
     assert finished["digest"] == digest(tmp_path / "without")
-    assert load_run(tmp_path / "without").tables["ego"].num_rows == 0  # as a run folder of an older version
+    assert (
+        load_run(tmp_path / "without").tables["ego"].num_rows == 0
+    )  # as a run folder of an older version
 
 
 def test_what_the_sensors_said_comes_back_and_is_not_in_the_digest(tmp_path):
     path = tmp_path / "run"
-    box = Detection(x_m=np.float32(0.1), y_m=-2, covariance=(1.0, 0.0, 0.0, 1.0), object_id=7)
+    box = Detection(
+        x_m=np.float32(0.1), y_m=-2, covariance=(1.0, 0.0, 0.0, 1.0), object_id=7
+    )
     with RunWriter(path) as writer:
-        writer.write_detections(DetectionList('a",b', 5, 9, [box, Detection(bearing_rad=0.3, stamp_ns=6)], "sensor"))
+        writer.write_detections(
+            DetectionList(
+                'a",b', 5, 9, [box, Detection(bearing_rad=0.3, stamp_ns=6)], "sensor"
+            )
+        )
         writer.write_tick(report(), 5, 2)
-        writer.write_detections(DetectionList("radar", 7, 10, [Detection(x_m=math.nan, y_m=1.0)], "map"))
+        writer.write_detections(
+            DetectionList("radar", 7, 10, [Detection(x_m=math.nan, y_m=1.0)], "map")
+        )
         writer.write_detections(DetectionList("radar", 8, 11, []))
         finished = writer.finish({})
     found = load_run(path).tables["detections"]
@@ -98,7 +128,9 @@ def test_what_the_sensors_said_comes_back_and_is_not_in_the_digest(tmp_path):
     assert found["stamp_ns"].tolist() == [5, 6, 7]
     assert found["receipt_ns"].tolist() == [9, 9, 10]
     assert found["index"].tolist() == [0, 1, 0]
-    np.testing.assert_array_equal(found["x_m"], [float(np.float32(0.1)), math.nan, math.nan])
+    np.testing.assert_array_equal(
+        found["x_m"], [float(np.float32(0.1)), math.nan, math.nan]
+    )
     np.testing.assert_array_equal(found["y_m"], [-2.0, math.nan, 1.0])
     np.testing.assert_array_equal(found["bearing_rad"], [math.nan, 0.3, math.nan])
     write(tmp_path / "without", report())
@@ -108,7 +140,9 @@ def test_what_the_sensors_said_comes_back_and_is_not_in_the_digest(tmp_path):
 def test_updates_truth_smoothed_and_timing_come_back(tmp_path):
     with RunWriter(tmp_path / "run", config_text="seed: 1\n") as writer:
         writer.write_tick(report(), 5, 2)
-        writer.write_tick(TickReport(1, 2000, (), (), (SmoothedReport(4, track().state),)), 6, 0)
+        writer.write_tick(
+            TickReport(1, 2000, (), (), (SmoothedReport(4, track().state),)), 6, 0
+        )
         writer.write_truth(TruthState(3, 3, -1, 1.0, 2.0, speed_mps=0.1))
         writer.finish({})
     run = load_run(tmp_path / "run")
@@ -125,16 +159,23 @@ def test_updates_truth_smoothed_and_timing_come_back(tmp_path):
     assert run.tables["smoothed"]["kind"].tolist() == ["final"]
     assert run.tables["timing"]["process_ns"].tolist() == [5, 6]
     assert run.tables["timing"]["num_tracks"].tolist() == [2, 0]
-    assert run.tables["tracks"].where(run.tables["tracks"]["track_id"] == 2).num_rows == 1
+    assert (
+        run.tables["tracks"].where(run.tables["tracks"]["track_id"] == 2).num_rows == 1
+    )
 
 
 @pytest.mark.parametrize("size", [4, 5, 6])
 def test_lagged_states_of_every_lag_come_back_to_the_bit(tmp_path, size):
     lags_s = (0.3, 0.1, 2 / 3)
     states = [track(5 + index, size, stamp_ns=100 + index).state for index in range(3)]
-    smoothed = tuple(SmoothedReport(2, state, lag_s) for state, lag_s in zip(states, lags_s, strict=True))
+    smoothed = tuple(
+        SmoothedReport(2, state, lag_s)
+        for state, lag_s in zip(states, lags_s, strict=True)
+    )
     with RunWriter(tmp_path / "run", smoothed_lag_s=0.3) as writer:
-        writer.write_tick(TickReport(7, 1007, report(size=size).tracks, (), smoothed), 5, 0)
+        writer.write_tick(
+            TickReport(7, 1007, report(size=size).tracks, (), smoothed), 5, 0
+        )
         writer.finish({})
     lagged = load_run(tmp_path / "run").tables["lagged"]
     assert lagged["lag_s"].tolist() == list(lags_s)
@@ -143,7 +184,9 @@ def test_lagged_states_of_every_lag_come_back_to_the_bit(tmp_path, size):
     assert lagged["track_id"].tolist() == [2, 2, 2]
     assert lagged["stamp_ns"].tolist() == [100, 101, 102]
     names = ["x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2"]
-    assert [[lagged[name][k] for name in names[:size]] for k in range(3)] == [state.mean.tolist() for state in states]
+    assert [[lagged[name][k] for name in names[:size]] for k in range(3)] == [
+        state.mean.tolist() for state in states
+    ]
     assert lagged["p_x_y"].tolist() == [state.covariance[0, 1] for state in states]
     assert np.isnan(lagged["accel_mps2"]).all() == (size < 6)
 
@@ -166,7 +209,12 @@ def test_there_is_no_smoothed_lagged_or_truth_file_without_a_row(tmp_path):
     assert not (tmp_path / "run/smoothed.csv").exists()
     assert not (tmp_path / "run/lagged.csv").exists()
     run = load_run(tmp_path / "run")
-    assert run.tables["smoothed"].num_rows == run.tables["lagged"].num_rows == run.tables["truth"].num_rows == 0
+    assert (
+        run.tables["smoothed"].num_rows
+        == run.tables["lagged"].num_rows
+        == run.tables["truth"].num_rows
+        == 0
+    )
     assert run.tables["truth"]["object_id"].dtype == np.int64
 
 
@@ -175,7 +223,9 @@ def test_a_killed_run_is_readable_up_to_its_last_whole_row(tmp_path, monkeypatch
     writer = RunWriter(path)
     for tick in range(4):
         monkeypatch.setattr(sink, "monotonic", lambda now_s=5.0 + 0.1 * tick: now_s)
-        writer.write_tick(report(tick), 5, 2)  # the last one within 0.2 s of the one before it
+        writer.write_tick(
+            report(tick), 5, 2
+        )  # the last one within 0.2 s of the one before it
     data = (path / "tracks.csv").read_bytes()
     (path / "tracks.csv").write_bytes(data[:-30])
     run = load_run(path)
@@ -189,7 +239,9 @@ def test_ticks_that_do_not_increase_are_refused(tmp_path):
     write(tmp_path / "run", report())
     with (tmp_path / "run/timing.csv").open("a") as file:
         file.write("0,1000,1,1,1\n")
-    with pytest.raises(DataError, match=r"timing\.csv: its ticks do not increase, repeat the run"):
+    with pytest.raises(
+        DataError, match=r"timing\.csv: its ticks do not increase, repeat the run"
+    ):
         load_run(tmp_path / "run")
 
 
@@ -227,7 +279,10 @@ def test_a_missing_or_damaged_file_is_one_line_that_names_it(tmp_path, file, dam
     text = (path / file).read_text()
     (path / file).unlink()
     if damage is not None:
-        (path / file).write_text(damage if isinstance(damage, str) else damage(text), errors="surrogateescape")
+        (path / file).write_text(
+            damage if isinstance(damage, str) else damage(text),
+            errors="surrogateescape",
+        )
     with pytest.raises(DataError) as caught:
         load_run(path)
     assert file in str(caught.value)
@@ -252,7 +307,9 @@ def test_tables_are_data_frames_with_typed_columns(tmp_path):
     for table, names in COLUMNS.items():
         assert list(getattr(run, table).columns) == list(names)
     tracks = run.tracks
-    assert tracks.dtypes.astype(str)[["tick", "stamp_ns", "x_m", "status"]].tolist() == [
+    assert tracks.dtypes.astype(str)[
+        ["tick", "stamp_ns", "x_m", "status"]
+    ].tolist() == [
         "int64",
         "int64",
         "float64",
@@ -276,13 +333,17 @@ def test_a_run_in_memory_or_of_a_folder_is_saved_as_it_is(tmp_path):
     for name, run in (("a", load_run(tmp_path / "run")), ("b", memory.run)):
         run.save(tmp_path / name)
         for file in (tmp_path / "run").iterdir():
-            assert (tmp_path / name / file.name).read_text() == file.read_text(), file.name
+            assert (tmp_path / name / file.name).read_text() == file.read_text(), (
+                file.name
+            )
         with pytest.raises(CallError, match="already exists"):
             run.save(tmp_path / name)
     assert (memory.run.estimator, memory.run.path) == ("test", None)
 
 
-def test_existence_probabilities_are_a_column_of_runs_that_have_them_and_of_no_others(tmp_path):
+def test_existence_probabilities_are_a_column_of_runs_that_have_them_and_of_no_others(
+    tmp_path,
+):
     tracks = tuple(dataclasses.replace(each, score=0.75) for each in report().tracks)
     scored = dataclasses.replace(report(), tracks=tracks)
     for name, item in (("scored", scored), ("counted", report())):
@@ -297,9 +358,15 @@ def test_existence_probabilities_are_a_column_of_runs_that_have_them_and_of_no_o
     assert load_run(tmp_path / "counted").tracks["score"].isna().all()
 
 
-def test_smoothed_holds_final_states_and_those_of_the_first_lag_of_tracks_that_are_there(tmp_path):
+def test_smoothed_holds_final_states_and_those_of_the_first_lag_of_tracks_that_are_there(
+    tmp_path,
+):
     lags_s = (None, 0.1, 0.3)
-    smoothed = tuple(SmoothedReport(number, track(number).state, lag_s) for number in (1, 9) for lag_s in lags_s)
+    smoothed = tuple(
+        SmoothedReport(number, track(number).state, lag_s)
+        for number in (1, 9)
+        for lag_s in lags_s
+    )
     with RunWriter(tmp_path / "run", smoothed_lag_s=0.3) as writer:
         writer.write_tick(TickReport(0, 1000, (track(1),), (), smoothed), 5, 0)
         finished = writer.finish({})
@@ -307,7 +374,10 @@ def test_smoothed_holds_final_states_and_those_of_the_first_lag_of_tracks_that_a
     assert run.lagged["lag_s"].tolist() == [0.1, 0.3]
     rows = zip(run.smoothed["track_id"], run.smoothed["kind"], strict=True)
     assert list(rows) == [(1, "final"), (1, "lagged"), (9, "final")]
-    assert finished["digest"] == write(tmp_path / "plain", TickReport(0, 1000, (track(1),), ()))["digest"]
+    assert (
+        finished["digest"]
+        == write(tmp_path / "plain", TickReport(0, 1000, (track(1),), ()))["digest"]
+    )
 
 
 def test_an_older_run_stays_until_the_new_one_is_whole(tmp_path):
@@ -337,11 +407,20 @@ def test_an_older_run_stays_until_the_new_one_is_whole(tmp_path):
         writer.finish({})
     assert load_run(path).estimator == "new"
     assert {file.name for file in path.iterdir()} == {
-        *("meta.json", "config.yaml", "tracks.csv", "updates.csv", "timing.csv", "notes.txt")
+        *(
+            "meta.json",
+            "config.yaml",
+            "tracks.csv",
+            "updates.csv",
+            "timing.csv",
+            "notes.txt",
+        )
     }
 
 
-def test_a_kill_while_an_older_run_is_replaced_leaves_what_overwrite_replaces(tmp_path, monkeypatch):
+def test_a_kill_while_an_older_run_is_replaced_leaves_what_overwrite_replaces(
+    tmp_path, monkeypatch
+):
     write(tmp_path / "run", report())
     moved = []
 
@@ -352,7 +431,10 @@ def test_a_kill_while_an_older_run_is_replaced_leaves_what_overwrite_replaces(tm
         replace(source, target)
 
     monkeypatch.setattr(os, "replace", killed)
-    with suppress(KeyboardInterrupt), RunWriter(tmp_path / "run", overwrite=True) as writer:
+    with (
+        suppress(KeyboardInterrupt),
+        RunWriter(tmp_path / "run", overwrite=True) as writer,
+    ):
         writer.write_tick(report(), 5, 2)
         writer.finish({})
     monkeypatch.undo()

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fgtrack.config.settings import Config, MapConfig, MotionConfig
+from fgtrack.config.shipped import read_scenario
 from fgtrack.core.types import EgoState, Message
 from fgtrack.evaluation.metrics import evaluate
-from fgtrack.io.run import COLUMNS, Run, load_run
-from fgtrack.pipeline.config import Config, MapConfig, MotionConfig
 from fgtrack.pipeline.replay import replay, replay_in_memory
-from fgtrack.pipeline.shipped import read_scenario
+from fgtrack.runs import COLUMNS, Run, load_run
 from fgtrack.sim.simulate import simulate
 
 #: Columns and entries that no two runs share: wall times.
@@ -40,11 +40,15 @@ def without(meta: Mapping[str, Any]) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def messages() -> list[Message]:
-    return simulate(replace(read_scenario("default"), duration_s=3.0), np.random.default_rng(4))
+    return simulate(
+        replace(read_scenario("default"), duration_s=3.0), np.random.default_rng(4)
+    )
 
 
 @pytest.mark.parametrize("estimator", ["smoother", "ekf-replay"])
-def test_replays_are_the_same_in_memory_and_written(estimator: str, messages: list[Message], tmp_path: Path) -> None:
+def test_replays_are_the_same_in_memory_and_written(
+    estimator: str, messages: list[Message], tmp_path: Path
+) -> None:
     config = Config(estimator=estimator, map=MapConfig(track="oval"))
     config = replace(config, smoother=replace(config.smoother, lagged_s=(0.3, 0.1)))
     if estimator == "smoother":
@@ -54,9 +58,19 @@ def test_replays_are_the_same_in_memory_and_written(estimator: str, messages: li
     memory = replay_in_memory(messages, config)
     assert memory.meta["broken_off"] is None
     assert memory.tables["tracks"].num_rows > 100
-    assert memory.tables["ego"].num_rows == sum(isinstance(message, EgoState) for message in messages)
+    assert memory.tables["ego"].num_rows == sum(
+        isinstance(message, EgoState) for message in messages
+    )
     said, ended = (
-        sorted(zip(*(table[name].tolist() for name in ("sensor", "stamp_ns", "receipt_ns", "index")), strict=True))
+        sorted(
+            zip(
+                *(
+                    table[name].tolist()
+                    for name in ("sensor", "stamp_ns", "receipt_ns", "index")
+                ),
+                strict=True,
+            )
+        )
         for table in (memory.tables["detections"], memory.tables["updates"])
     )
     assert said == ended
@@ -67,6 +81,6 @@ def test_replays_are_the_same_in_memory_and_written(estimator: str, messages: li
     )
     assert_same(memory, written)
     kept, read = (evaluate(run).as_dict() for run in (memory, written))
-    assert {name: kept[name] for name in kept if not name.startswith(NAMES_AND_TIMES)} == {
-        name: read[name] for name in read if not name.startswith(NAMES_AND_TIMES)
-    }
+    assert {
+        name: kept[name] for name in kept if not name.startswith(NAMES_AND_TIMES)
+    } == {name: read[name] for name in read if not name.startswith(NAMES_AND_TIMES)}

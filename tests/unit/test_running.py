@@ -9,10 +9,16 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from fgtrack.config.shipped import read_config
 from fgtrack.core.diagnostic import EGO
-from fgtrack.core.types import Detection, DetectionList, EgoState, TrackReport, TruthState
+from fgtrack.core.types import (
+    Detection,
+    DetectionList,
+    EgoState,
+    TrackReport,
+    TruthState,
+)
 from fgtrack.pipeline.live import TickTiming, Tracker
-from fgtrack.pipeline.shipped import read_config
 from fgtrack.tracking.detections import PosedBatch
 from fgtrack.tracking.preprocess import Preprocess, Preprocessed
 
@@ -26,7 +32,9 @@ def tracker_of(estimator: str = "ekf-replay") -> Tracker:
     return Tracker.from_config("smoother", estimator=estimator, set=SETTINGS)
 
 
-def messages(count: int, sensor: str = "lidar_cluster") -> Iterator[EgoState | DetectionList]:
+def messages(
+    count: int, sensor: str = "lidar_cluster"
+) -> Iterator[EgoState | DetectionList]:
     """Two standing cars, seen every 50 ms from a standing ego."""
     for k in range(count):
         at_ns = NOW_NS + 50 * MS * k
@@ -56,7 +64,9 @@ def test_all_tracks_can_be_asked_for_at_any_time_as_one_can(estimator: str) -> N
     now_ns = tracks[0].stamp_ns
     for stamp_ns in (now_ns - 300 * MS, now_ns, now_ns + 1, now_ns + 500 * MS):
         found = tracker.tracks_at(stamp_ns)
-        assert [track.track_id for track in found] == [track.track_id for track in tracks]
+        assert [track.track_id for track in found] == [
+            track.track_id for track in tracks
+        ]
         for track in found:
             one = tracker.state_at(track.track_id, stamp_ns)
             assert track.stamp_ns == stamp_ns
@@ -78,8 +88,12 @@ def test_what_is_no_message_and_what_cannot_be_read_is_counted() -> None:
     before = detections_of(tracker)
     tracker.receive(TruthState(NOW_NS, NOW_NS, 1, 0.0, 0.0))  # type: ignore[arg-type]
     tracker.receive(EgoState(float("nan"), NOW_NS, 0.0, 0.0, 0.0, 0.0))  # type: ignore[arg-type]
-    tracker.receive(DetectionList("radar", NOW_NS, NOW_NS, [Detection(x_m="near", y_m=1.0)]))  # type: ignore[arg-type]
-    tracker.receive(DetectionList("radar", -(2**70), NOW_NS, [Detection(x_m=1.0, y_m=1.0)] * 3))
+    tracker.receive(
+        DetectionList("radar", NOW_NS, NOW_NS, [Detection(x_m="near", y_m=1.0)])
+    )  # type: ignore[arg-type]
+    tracker.receive(
+        DetectionList("radar", -(2**70), NOW_NS, [Detection(x_m=1.0, y_m=1.0)] * 3)
+    )
     tracker.receive(DetectionList("radar", NOW_NS, NOW_NS, [{"x_m": 1.0}]))  # type: ignore[list-item]
     assert sum(tracker.refused.values()) == 5
     assert tracker.refused["neither ego state nor object list"] == 1
@@ -91,7 +105,9 @@ def test_what_is_no_message_and_what_cannot_be_read_is_counted() -> None:
 # Failures
 
 
-def test_a_list_whose_processing_raises_ends_as_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_list_whose_processing_raises_ends_as_failed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     tracker = tracker_of()
     run(tracker)
 
@@ -101,7 +117,11 @@ def test_a_list_whose_processing_raises_ends_as_failed(monkeypatch: pytest.Monke
     with monkeypatch.context() as patch:
         patch.setattr("fgtrack.tracking.tracker.Tracker._estimate", broken)
         late_ns = NOW_NS + 1_000 * MS
-        tracker.receive(DetectionList("lidar_cluster", late_ns, late_ns, [Detection(x_m=30.0, y_m=1.0)] * 3))
+        tracker.receive(
+            DetectionList(
+                "lidar_cluster", late_ns, late_ns, [Detection(x_m=30.0, y_m=1.0)] * 3
+            )
+        )
         report = tracker.tick(late_ns)
     assert sorted(row.disposition for row in report.updates) == ["failed"] * 3
     assert tracker.failures == {"list failed": 1}
@@ -109,7 +129,9 @@ def test_a_list_whose_processing_raises_ends_as_failed(monkeypatch: pytest.Monke
     assert len(report.tracks) == 2
 
 
-def test_a_batch_whose_preprocessing_raises_fails_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_batch_whose_preprocessing_raises_fails_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     tracker = tracker_of()
     run(tracker)
     together = Preprocess.together
@@ -124,9 +146,13 @@ def test_a_batch_whose_preprocessing_raises_fails_alone(monkeypatch: pytest.Monk
         late_ns = NOW_NS + 1_000 * MS
         for num in (3, 2):
             objects = [Detection(x_m=30.0 * k, y_m=1.0) for k in range(1, num + 1)]
-            tracker.receive(DetectionList("lidar_cluster", late_ns + num, late_ns + num, objects))
+            tracker.receive(
+                DetectionList("lidar_cluster", late_ns + num, late_ns + num, objects)
+            )
         report = tracker.tick(late_ns + MS)
-    assert [row.disposition == "failed" for row in report.updates] == [False] * 2 + [True] * 3
+    assert [row.disposition == "failed" for row in report.updates] == [False] * 2 + [
+        True
+    ] * 3
     assert tracker.failures == {"list failed": 1}
 
 
@@ -149,7 +175,11 @@ def test_messages_may_be_received_by_many_threads_while_others_tick_and_ask() ->
     counts = {"lidar_cluster": 50, "radar": 50, "stranger": 5000, "unknown": 5000}
 
     def receive(sensor: str) -> None:
-        lists = [message for message in messages(counts[sensor], sensor) if isinstance(message, DetectionList)]
+        lists = [
+            message
+            for message in messages(counts[sensor], sensor)
+            if isinstance(message, DetectionList)
+        ]
         for number, message in enumerate(lists):
             tracker.receive(message)
             if number % 300 == 0:
@@ -157,7 +187,15 @@ def test_messages_may_be_received_by_many_threads_while_others_tick_and_ask() ->
 
     def ask() -> None:
         while not over.is_set():
-            assert len({track.stamp_ns for track in tracker.tracks_at(NOW_NS + time.monotonic_ns())}) <= 1
+            assert (
+                len(
+                    {
+                        track.stamp_ns
+                        for track in tracker.tracks_at(NOW_NS + time.monotonic_ns())
+                    }
+                )
+                <= 1
+            )
             assert tracker.lateness["radar"].messages <= counts["radar"]
             assert tracker.timing.ticks >= 0
             assert sum(tracker.refused.values()) <= 10_000
@@ -176,16 +214,22 @@ def test_messages_may_be_received_by_many_threads_while_others_tick_and_ask() ->
     for one in (*receivers, asker):
         one.result()
     assert ticks > 10
-    found = {sensor: sum(of_sensor.values()) for sensor, of_sensor in tracker.counts.items()}
+    found = {
+        sensor: sum(of_sensor.values()) for sensor, of_sensor in tracker.counts.items()
+    }
     assert found == {sensor: 2 * count for sensor, count in counts.items()}
-    assert [tracker.lateness[sensor].messages for sensor in ("lidar_cluster", "radar")] == [50, 50]
+    assert [
+        tracker.lateness[sensor].messages for sensor in ("lidar_cluster", "radar")
+    ] == [50, 50]
     assert sum(tracker.refused.values()) == 10_000
 
 
 def test_receiving_never_waits_for_a_tick() -> None:
     tracker = tracker_of()
     with tracker._turn:  # as a tick that takes long
-        thread = threading.Thread(target=lambda: [tracker.receive(message) for message in messages(5)])
+        thread = threading.Thread(
+            target=lambda: [tracker.receive(message) for message in messages(5)]
+        )
         thread.start()
         thread.join(10.0)
         assert not thread.is_alive()
@@ -202,15 +246,26 @@ def test_it_says_how_late_every_sensor_is() -> None:
     np.random.default_rng(1).shuffle(delays_ms)
     for k, delay_ms in enumerate(delays_ms.tolist()):
         stamp_ns = NOW_NS + 10 * MS * k
-        tracker.receive(DetectionList("radar", stamp_ns, stamp_ns + delay_ms * MS, [Detection(x_m=9.0, y_m=0.0)] * 2))
+        tracker.receive(
+            DetectionList(
+                "radar",
+                stamp_ns,
+                stamp_ns + delay_ms * MS,
+                [Detection(x_m=9.0, y_m=0.0)] * 2,
+            )
+        )
     tracker.tick(NOW_NS)
     tracker.tick(NOW_NS + 20_000 * MS)
     late = tracker.lateness["radar"]
     spread_s = np.quantile(delays_ms[-1000:] / 1e3, (0.5, 0.99, 1.0))
     assert late.messages == 1100
-    assert (late.delay_median_s, late.delay_p99_s, late.delay_worst_s) == pytest.approx(tuple(spread_s))
+    assert (late.delay_median_s, late.delay_p99_s, late.delay_worst_s) == pytest.approx(
+        tuple(spread_s)
+    )
     receipts_ns = NOW_NS + MS * (10 * np.arange(1100) + delays_ms)
-    assert late.silent_s == pytest.approx((NOW_NS + 20_000 * MS - receipts_ns.max()) / 1e9)
+    assert late.silent_s == pytest.approx(
+        (NOW_NS + 20_000 * MS - receipts_ns.max()) / 1e9
+    )
 
 
 def test_a_sensor_that_has_said_nothing_is_silent_since_the_first_tick() -> None:
@@ -230,7 +285,10 @@ class Clock:
     def __init__(self, durations_ms: Sequence[int]) -> None:
         self._times_ns = [0]
         for duration_ms in durations_ms:
-            self._times_ns += [self._times_ns[-1], self._times_ns[-1] + duration_ms * MS]
+            self._times_ns += [
+                self._times_ns[-1],
+                self._times_ns[-1] + duration_ms * MS,
+            ]
         self._times_ns.pop(0)
 
     def __call__(self) -> int:
@@ -247,7 +305,11 @@ class Clock:
     ],
 )
 def test_it_counts_missed_deadlines_and_skipped_ticks(
-    monkeypatch: pytest.MonkeyPatch, period_ms: int, durations_ms: list[int], misses: int, skipped: int
+    monkeypatch: pytest.MonkeyPatch,
+    period_ms: int,
+    durations_ms: list[int],
+    misses: int,
+    skipped: int,
 ) -> None:
     config = read_config("smoother", ["clock.node_hz=50"])
     tracker = Tracker(config)
@@ -256,7 +318,11 @@ def test_it_counts_missed_deadlines_and_skipped_ticks(
     for k in range(4):
         tracker.tick(NOW_NS + k * period_ms * MS)
     timing = tracker.timing
-    assert (timing.ticks, timing.deadline_misses, timing.skipped) == (4, misses, skipped)
+    assert (timing.ticks, timing.deadline_misses, timing.skipped) == (
+        4,
+        misses,
+        skipped,
+    )
     assert timing.worst_s == max(durations_ms) / 1e3
     assert timing.median_s == pytest.approx(np.median(durations_ms) / 1e3)
 
@@ -269,12 +335,20 @@ def far_ahead(kind: str, ahead_ns: int, at_ns: int) -> EgoState | DetectionList:
     stamp_ns = at_ns if kind.endswith("receipt") else at_ns + ahead_ns
     if kind.startswith("ego"):
         return EgoState(stamp_ns, at_ns + ahead_ns, 10.0, 0.0, 0.0, 20.0)
-    return DetectionList("lidar_cluster", stamp_ns, at_ns + ahead_ns, [Detection(x_m=31.0, y_m=1.0)], frame="ego")
+    return DetectionList(
+        "lidar_cluster",
+        stamp_ns,
+        at_ns + ahead_ns,
+        [Detection(x_m=31.0, y_m=1.0)],
+        frame="ego",
+    )
 
 
 @pytest.mark.parametrize("ahead_s", [62, 3600, 10 * 365 * 86_400])
 @pytest.mark.parametrize("kind", ["ego", "ego receipt", "list", "list receipt"])
-def test_one_message_of_a_clock_that_is_ahead_hides_no_later_one(kind: str, ahead_s: float) -> None:
+def test_one_message_of_a_clock_that_is_ahead_hides_no_later_one(
+    kind: str, ahead_s: float
+) -> None:
     """All later lists are fused, and a silent sensor is silent."""
     tracker = Tracker("open_space", estimator="ekf-replay")
     for k in range(40):
@@ -283,11 +357,17 @@ def test_one_message_of_a_clock_that_is_ahead_hides_no_later_one(kind: str, ahea
             tracker.receive(far_ahead(kind, round(ahead_s * 1e9), at_ns + 10 * MS))
         tracker.receive(EgoState(at_ns, at_ns, 1.0 * k, 0.0, 0.0, 20.0))
         position = Detection(x_m=30.0 - 0.5 * k + 0.01 * (k % 3), y_m=1.0)
-        tracker.receive(DetectionList("lidar_cluster", at_ns, at_ns + 30 * MS, [position], frame="ego"))
+        tracker.receive(
+            DetectionList(
+                "lidar_cluster", at_ns, at_ns + 30 * MS, [position], frame="ego"
+            )
+        )
         report = tracker.tick(at_ns + 30 * MS)
     assert len(report.tracks) == 1
     counts = tracker.counts["lidar_cluster"]
-    fused = sum(counts.get(name, 0) for name in ("birth", "in_sequence", "out_of_sequence"))
+    fused = sum(
+        counts.get(name, 0) for name in ("birth", "in_sequence", "out_of_sequence")
+    )
     assert fused >= 40
     assert sum(counts.values()) == 40 + kind.startswith("list")
     assert sum(tracker.refused.values()) <= 1

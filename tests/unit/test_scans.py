@@ -4,14 +4,22 @@ import pytest
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message
-from fgtrack.io.adapters.scans import grouped
-from fgtrack.io.errors import UntilBreak
+from fgtrack.inputs.errors import UntilBreak
+from fgtrack.inputs.formats.scans import grouped
 
 MS = 1_000_000
 
 
-def one(stamp_ms: float, receipt_ms: float, x_m: float, sensor: str = "radar") -> DetectionList:
-    return DetectionList(sensor, round(stamp_ms * MS), round(receipt_ms * MS), (Detection(x_m=x_m, y_m=0.0),), "sensor")
+def one(
+    stamp_ms: float, receipt_ms: float, x_m: float, sensor: str = "radar"
+) -> DetectionList:
+    return DetectionList(
+        sensor,
+        round(stamp_ms * MS),
+        round(receipt_ms * MS),
+        (Detection(x_m=x_m, y_m=0.0),),
+        "sensor",
+    )
 
 
 def ego(receipt_ms: float) -> EgoState:
@@ -21,16 +29,35 @@ def ego(receipt_ms: float) -> EgoState:
 def told(messages: list[Message]) -> list[tuple[int, int, list[float]]]:
     """Stamp, receipt in ms, and what is in the lists."""
     return [
-        (item.stamp_ns // MS, item.receipt_ns // MS, [each.x_m for each in getattr(item, "objects", ())])
+        (
+            item.stamp_ns // MS,
+            item.receipt_ns // MS,
+            [each.x_m for each in getattr(item, "objects", ())],
+        )
         for item in messages
     ]
 
 
 def test_equal_stamps_are_one_scan_received_with_its_last_detection() -> None:
-    messages = [one(0, 5, 1.0), ego(6), one(0, 7, 2.0), ego(8), one(50, 55, 3.0), ego(60)]
+    messages = [
+        one(0, 5, 1.0),
+        ego(6),
+        one(0, 7, 2.0),
+        ego(8),
+        one(50, 55, 3.0),
+        ego(60),
+    ]
     found = list(grouped(messages, {"radar": 0}))
-    assert told(found) == [(6, 6, []), (0, 7, [1.0, 2.0]), (8, 8, []), (50, 55, [3.0]), (60, 60, [])]
-    assert [item.receipt_ns for item in found] == sorted(item.receipt_ns for item in found)
+    assert told(found) == [
+        (6, 6, []),
+        (0, 7, [1.0, 2.0]),
+        (8, 8, []),
+        (50, 55, [3.0]),
+        (60, 60, []),
+    ]
+    assert [item.receipt_ns for item in found] == sorted(
+        item.receipt_ns for item in found
+    )
 
 
 def test_stamps_within_the_window_are_one_scan_with_stamps_of_their_own() -> None:
@@ -42,7 +69,13 @@ def test_stamps_within_the_window_are_one_scan_with_stamps_of_their_own() -> Non
 
 
 def test_other_sensors_are_left_alone_and_scans_of_two_sensors_do_not_mix() -> None:
-    messages = [one(0, 5, 1.0), one(0, 6, 9.0, "lidar"), one(0, 7, 5.0, "rear"), one(0, 8, 2.0), one(0, 9, 6.0, "rear")]
+    messages = [
+        one(0, 5, 1.0),
+        one(0, 6, 9.0, "lidar"),
+        one(0, 7, 5.0, "rear"),
+        one(0, 8, 2.0),
+        one(0, 9, 6.0, "rear"),
+    ]
     found = list(grouped(messages, {"radar": 0, "rear": 0}))
     assert [(item.sensor, [each.x_m for each in item.objects]) for item in found] == [
         ("lidar", [9.0]),

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from fgtrack.config.shipped import read_scenario
 from fgtrack.core.types import DetectionList, FloatArray, Message, TruthState
-from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.sim.simulate import simulate
 
 EGO_ID = -1
@@ -19,7 +19,10 @@ def messages() -> list[Message]:
 def detections(messages: list[Message]) -> dict[str, FloatArray]:
     """x and y in the ego frame of all detections, shape (n, 2), by sensor."""
     scans = [message for message in messages if isinstance(message, DetectionList)]
-    points = {name: [(d.x_m, d.y_m) for s in scans if s.sensor == name for d in s.objects] for name in NAMES}
+    points = {
+        name: [(d.x_m, d.y_m) for s in scans if s.sensor == name for d in s.objects]
+        for name in NAMES
+    }
     return {name: np.array(values, dtype=float) for name, values in points.items()}
 
 
@@ -28,19 +31,27 @@ def cars(messages: list[Message]) -> dict[int, FloatArray]:
     """x, y, speed, shape (n, 3), of every car at the same n stamps."""
     truth = [message for message in messages if isinstance(message, TruthState)]
     ids = {state.object_id for state in truth}
-    states = {i: [(s.x_m, s.y_m, s.speed_mps) for s in truth if s.object_id == i] for i in ids}
+    states = {
+        i: [(s.x_m, s.y_m, s.speed_mps) for s in truth if s.object_id == i] for i in ids
+    }
     return {i: np.array(values, dtype=float) for i, values in states.items()}
 
 
 NAMES = ("lidar_cluster", "radar")
 
 
-def test_the_sensors_of_the_default_see_where_those_of_the_paper_did(detections: dict[str, FloatArray]) -> None:
+def test_the_sensors_of_the_default_see_where_those_of_the_paper_did(
+    detections: dict[str, FloatArray],
+) -> None:
     lidar, radar = detections["lidar_cluster"], detections["radar"]
-    assert -57.0 - 3.0 < lidar[:, 0].min() < -50.0  # an outlier may lie a little beyond the range
+    assert (
+        -57.0 - 3.0 < lidar[:, 0].min() < -50.0
+    )  # an outlier may lie a little beyond the range
     assert radar[:, 0].min() > 0.0
     assert np.hypot(*lidar.T).max() < 98.0 + 3.0
-    assert np.hypot(*radar.T).max() < 105.0 + 3.0 + 3.0  # its range counts from the nose
+    assert (
+        np.hypot(*radar.T).max() < 105.0 + 3.0 + 3.0
+    )  # its range counts from the nose
 
 
 def test_cars_of_the_default_follow_each_other_and_overtake_at_the_speeds_of_the_paper(
@@ -49,9 +60,13 @@ def test_cars_of_the_default_follow_each_other_and_overtake_at_the_speeds_of_the
     ego = cars[EGO_ID]
     others = [states for i, states in cars.items() if i != EGO_ID]
     near = [np.hypot(*(car - ego)[:, :2].T) < 105.0 for car in others]
-    speed = np.concatenate([car[mask, 2] for car, mask in zip(others, near, strict=True)])
+    speed = np.concatenate(
+        [car[mask, 2] for car, mask in zip(others, near, strict=True)]
+    )
     assert 35.0 < speed.min() < speed.max() < 75.0
-    relative = np.concatenate([(car - ego)[mask, 2] for car, mask in zip(others, near, strict=True)])
+    relative = np.concatenate(
+        [(car - ego)[mask, 2] for car, mask in zip(others, near, strict=True)]
+    )
     counts, edges = np.histogram(relative, bins=np.arange(-12.5, 13.0))
     assert edges[counts.argmax()] == -0.5  # the peak of the distribution is at 0
     assert relative.min() < -5.0

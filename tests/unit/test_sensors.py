@@ -13,7 +13,12 @@ POSITION = {"x_m": 0.3, "y_m": 0.4}
 
 
 ORIGIN_M = (-1.74, 0.0)
-AHEAD = SensorModel(std=POSITION, mount=Mount(3.74, 1.0, 0.0), max_range_m=50.0, field_of_view_rad=math.pi / 2.0)
+AHEAD = SensorModel(
+    std=POSITION,
+    mount=Mount(3.74, 1.0, 0.0),
+    max_range_m=50.0,
+    field_of_view_rad=math.pi / 2.0,
+)
 
 
 @pytest.mark.parametrize(
@@ -27,8 +32,16 @@ AHEAD = SensorModel(std=POSITION, mount=Mount(3.74, 1.0, 0.0), max_range_m=50.0,
         (replace(AHEAD, mount=Mount(3.74, 1.0, math.pi)), (-5.0, 1.0), True),
         (replace(AHEAD, mount=Mount(3.74, 1.0, math.pi / 2.0)), (2.0, 21.0), True),
         (replace(AHEAD, field_of_view_rad=math.tau), (-5.0, 1.0), True),
-        (replace(AHEAD, field_of_view_rad=math.tau, max_range_behind_m=6.0), (-5.0, 1.0), False),
-        (replace(AHEAD, field_of_view_rad=math.tau, max_range_behind_m=80.0), (-68.0, 1.0), False),
+        (
+            replace(AHEAD, field_of_view_rad=math.tau, max_range_behind_m=6.0),
+            (-5.0, 1.0),
+            False,
+        ),
+        (
+            replace(AHEAD, field_of_view_rad=math.tau, max_range_behind_m=80.0),
+            (-68.0, 1.0),
+            False,
+        ),
         (SensorModel(std=POSITION), (-5e6, 1.0), True),
     ],
 )
@@ -48,6 +61,9 @@ def test_what_grows_with_range_is_measured_and_does_not_shrink() -> None:
     found = sensor.growth(("x_m", "y_m"), np.array([0.0, 10.0, np.nan]))
     assert found is not None
     np.testing.assert_allclose(found, [[0.0, 0.0], [0.0, 0.01], [0.0, 0.0]])
-    for growth, said in (({"speed_mps": 0.1}, "known are x_m, y_m"), ({"x_m": -0.1}, "greater than or equal to 0")):
+    for growth, said in (
+        ({"speed_mps": 0.1}, "known are x_m, y_m"),
+        ({"x_m": -0.1}, "greater than or equal to 0"),
+    ):
         with pytest.raises(ValueError, match=said):
             SensorModel(std=POSITION, std_growth=growth)

@@ -24,10 +24,16 @@ def pit_lane() -> TrackMap:
     return make_pit_lane()
 
 
-@pytest.mark.parametrize(("name", "lane"), [("oval_track", "oval"), ("oval_pitlane", "pit_lane")])
-def test_the_committed_maps_are_what_the_functions_make(request: pytest.FixtureRequest, name: str, lane: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "lane"), [("oval_track", "oval"), ("oval_pitlane", "pit_lane")]
+)
+def test_the_committed_maps_are_what_the_functions_make(
+    request: pytest.FixtureRequest, name: str, lane: str
+) -> None:
     track: TrackMap = request.getfixturevalue(lane)
-    np.testing.assert_allclose(TrackMap.read(MAPS / f"{name}.csv").table, track.table, atol=1e-7)
+    np.testing.assert_allclose(
+        TrackMap.read(MAPS / f"{name}.csv").table, track.table, atol=1e-7
+    )
 
 
 def test_the_oval_has_the_proportions_of_a_speedway(oval: TrackMap) -> None:
@@ -49,16 +55,28 @@ COARSE = np.stack([300.0 * np.cos(ANGLES), 200.0 * np.sin(ANGLES)], axis=1)
 
 @pytest.mark.parametrize("fine", [True, False])
 def test_a_path_frame_holds_the_exact_derivatives(oval: TrackMap, fine: bool) -> None:
-    path = DrivenPath.through(oval.table[:, :2]) if fine else DrivenPath.through(np.vstack([COARSE, COARSE[:1]]))
+    path = (
+        DrivenPath.through(oval.table[:, :2])
+        if fine
+        else DrivenPath.through(np.vstack([COARSE, COARSE[:1]]))
+    )
     u, h = np.linspace(-50.0, 2500.0, 997), 1e-4
     frame, ahead, behind = path.frame(u), path.frame(u + h), path.frame(u - h)
 
-    def assert_derivative(value: FloatArray, difference: FloatArray, atol: float) -> None:
+    def assert_derivative(
+        value: FloatArray, difference: FloatArray, atol: float
+    ) -> None:
         np.testing.assert_allclose(value, difference / (2.0 * h), atol=atol)
 
-    assert_derivative(frame.scale * np.cos(frame.heading_rad), ahead.x_m - behind.x_m, 1e-7)
-    assert_derivative(frame.scale * np.sin(frame.heading_rad), ahead.y_m - behind.y_m, 1e-7)
-    assert_derivative(frame.turn, wrap_angles(ahead.heading_rad - behind.heading_rad), 1e-8)
+    assert_derivative(
+        frame.scale * np.cos(frame.heading_rad), ahead.x_m - behind.x_m, 1e-7
+    )
+    assert_derivative(
+        frame.scale * np.sin(frame.heading_rad), ahead.y_m - behind.y_m, 1e-7
+    )
+    assert_derivative(
+        frame.turn, wrap_angles(ahead.heading_rad - behind.heading_rad), 1e-8
+    )
     assert_derivative(frame.turn_rate, ahead.turn - behind.turn, 2e-6)
     assert_derivative(frame.scale_rate, ahead.scale - behind.scale, 1e-8)
 
@@ -67,6 +85,13 @@ def test_a_path_is_the_periodic_cubic_spline() -> None:
     points = np.vstack([COARSE, COARSE[:1]])
     path = DrivenPath.through(points)
     spline = CubicSpline(path.u_m, points, bc_type="periodic")
-    frame, u = path.frame(path.length_m + path.u_m), np.linspace(0.0, path.length_m, 500)
-    np.testing.assert_allclose(np.stack([frame.x_m, frame.y_m], axis=1), points, atol=1e-9)
-    np.testing.assert_allclose(np.stack([path.frame(u).x_m, path.frame(u).y_m], axis=1), spline(u), atol=1e-9)
+    frame, u = (
+        path.frame(path.length_m + path.u_m),
+        np.linspace(0.0, path.length_m, 500),
+    )
+    np.testing.assert_allclose(
+        np.stack([frame.x_m, frame.y_m], axis=1), points, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        np.stack([path.frame(u).x_m, path.frame(u).y_m], axis=1), spline(u), atol=1e-9
+    )

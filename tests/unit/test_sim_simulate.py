@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from fgtrack.config.shipped import read_scenario
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
-from fgtrack.pipeline.shipped import read_scenario
 from fgtrack.sim.delays import NoDelay
 from fgtrack.sim.scenario import EgoMessages, Scenario
 from fgtrack.sim.sensor import Clutter, SimulatedSensor
@@ -30,14 +30,20 @@ def scans_of(messages: list[Message], sensor: str) -> list[DetectionList]:
 
 
 def test_settings_of_a_scenario_that_make_no_sense_are_named() -> None:
-    drawn, driven = DrawnVehicle(0.0, 0.0, 0.0, 9.0), TrackVehicle(0.0, speed=((0.0, 9.0),))
+    drawn, driven = (
+        DrawnVehicle(0.0, 0.0, 0.0, 9.0),
+        TrackVehicle(0.0, speed=((0.0, 9.0),)),
+    )
     lidar = SimulatedSensor("lidar", {"x_m": 1.0, "y_m": 1.0})
     on_track = replace(lidar, clutter=Clutter(1.0, region="track"))
     for make, message in (
         (lambda: Scenario(drawn, sensors=(lidar, lidar)), "sensors: names must differ"),
         (lambda: Scenario(driven, map=None), "map: a vehicle"),
         (lambda: Scenario(drawn, opponents=(driven,), map=None), "map: a vehicle"),
-        (lambda: Scenario(drawn, sensors=(on_track,), map=None), "map: a vehicle or clutter"),
+        (
+            lambda: Scenario(drawn, sensors=(on_track,), map=None),
+            "map: a vehicle or clutter",
+        ),
         (lambda: EgoMessages(speed_std_mps=-1.0), "speed_std_mps"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -53,15 +59,22 @@ def test_messages_come_in_order_of_receipt_and_scans_overtake_each_other() -> No
     assert receipts == sorted(receipts)
     detection_stamps = [m.stamp_ns for m in messages if isinstance(m, DetectionList)]
     assert detection_stamps != sorted(detection_stamps)
-    assert all(message.receipt_ns >= message.stamp_ns >= SHORT.start_ns for message in messages)
-    assert all(type(message.stamp_ns) is int and type(message.receipt_ns) is int for message in messages)
+    assert all(
+        message.receipt_ns >= message.stamp_ns >= SHORT.start_ns for message in messages
+    )
+    assert all(
+        type(message.stamp_ns) is int and type(message.receipt_ns) is int
+        for message in messages
+    )
 
 
 def test_truth_holds_every_object_at_every_stamp() -> None:
     truth = [message for message in run(SHORT) if isinstance(message, TruthState)]
     stamps = [SHORT.start_ns + k * NS_PER_S // 100 for k in range(501)]
     for object_id in (-1, 0, 1):
-        assert [state.stamp_ns for state in truth if state.object_id == object_id] == stamps
+        assert [
+            state.stamp_ns for state in truth if state.object_id == object_id
+        ] == stamps
     assert len(truth) == 3 * len(stamps)
     assert all(state.receipt_ns == state.stamp_ns for state in truth)
 
@@ -69,7 +82,11 @@ def test_truth_holds_every_object_at_every_stamp() -> None:
 def test_ego_messages_are_truth_with_noise_and_delay() -> None:
     messages = run(DEFAULT)
     ego = [m for m in messages if isinstance(m, EgoState)]
-    truth = {m.stamp_ns: m for m in messages if isinstance(m, TruthState) and m.object_id == -1}
+    truth = {
+        m.stamp_ns: m
+        for m in messages
+        if isinstance(m, TruthState) and m.object_id == -1
+    }
     settings = DEFAULT.ego_messages
     for name, std in (
         ("x_m", settings.position_std_m),
@@ -78,27 +95,44 @@ def test_ego_messages_are_truth_with_noise_and_delay() -> None:
         ("yaw_rate_radps", settings.yaw_rate_std_radps),
         ("accel_mps2", settings.accel_std_mps2),
     ):
-        error = np.array([getattr(m, name) - getattr(truth[m.stamp_ns], name) for m in ego])
+        error = np.array(
+            [getattr(m, name) - getattr(truth[m.stamp_ns], name) for m in ego]
+        )
         chi2 = stats.chi2(len(error))
         assert chi2.ppf(1e-4) < np.sum(error**2) / std**2 < chi2.ppf(1.0 - 1e-4)
     assert {m.receipt_ns - m.stamp_ns for m in ego} == {2_000_000}
     variances = [0.02**2, 0.02**2, 0.001**2, 0.05**2, 0.002**2]
     assert {m.covariance for m in ego} == {tuple(np.diag(variances).ravel().tolist())}
-    exact = replace(settings, **dict.fromkeys([name for name in vars(settings) if "_std_" in name], 0.0))
+    exact = replace(
+        settings,
+        **dict.fromkeys([name for name in vars(settings) if "_std_" in name], 0.0),
+    )
     silent = run(replace(DEFAULT, ego_messages=exact, duration_s=0.1))
     assert {m.covariance for m in silent if isinstance(m, EgoState)} == {None}
 
 
 def test_delays_of_the_default_scenario_are_those_of_the_paper() -> None:
     messages = run(replace(DEFAULT, duration_s=300.0, truth_rate_hz=0.1, opponents=()))
-    for name, mean_s, q90_s in (("lidar_cluster", 0.151, 0.191), ("radar", 0.062, 0.089)):
-        delays = np.array([(s.receipt_ns - s.stamp_ns) / NS_PER_S for s in scans_of(messages, name)])
+    for name, mean_s, q90_s in (
+        ("lidar_cluster", 0.151, 0.191),
+        ("radar", 0.062, 0.089),
+    ):
+        delays = np.array(
+            [(s.receipt_ns - s.stamp_ns) / NS_PER_S for s in scans_of(messages, name)]
+        )
         assert abs(delays.mean() - mean_s) < 4.0 * delays.std() / np.sqrt(len(delays))
-        assert stats.binomtest(int(np.count_nonzero(delays <= q90_s)), len(delays), 0.9).pvalue > 1e-4
+        assert (
+            stats.binomtest(
+                int(np.count_nonzero(delays <= q90_s)), len(delays), 0.9
+            ).pvalue
+            > 1e-4
+        )
 
 
 def test_a_scan_that_saw_nothing_is_sent_and_a_silent_sensor_sends_nothing() -> None:
-    lidar = SimulatedSensor("lidar", {"x_m": 1.0, "y_m": 1.0}, rate_hz=10.0, drop_outs=((1.0, 2.0),))
+    lidar = SimulatedSensor(
+        "lidar", {"x_m": 1.0, "y_m": 1.0}, rate_hz=10.0, drop_outs=((1.0, 2.0),)
+    )
     scans = scans_of(run(replace(SHORT, opponents=(), sensors=(lidar,))), "lidar")
     assert all(scan.objects == () for scan in scans)
     times = [(scan.stamp_ns - SHORT.start_ns) / NS_PER_S for scan in scans]
@@ -109,7 +143,16 @@ def test_equal_receipts_are_ordered_truth_ego_sensors() -> None:
     lidar = SimulatedSensor("lidar", {"x_m": 1.0, "y_m": 1.0}, rate_hz=10.0)
     radar = replace(lidar, name="radar")
     scenario = replace(
-        SHORT, sensors=(radar, lidar), opponents=SHORT.opponents[:1], ego_messages=EgoMessages(delay=NoDelay())
+        SHORT,
+        sensors=(radar, lidar),
+        opponents=SHORT.opponents[:1],
+        ego_messages=EgoMessages(delay=NoDelay()),
     )
     first = [m for m in run(scenario) if m.receipt_ns == SHORT.start_ns]
-    assert [getattr(m, "sensor", type(m)) for m in first] == [TruthState, TruthState, EgoState, "radar", "lidar"]
+    assert [getattr(m, "sensor", type(m)) for m in first] == [
+        TruthState,
+        TruthState,
+        EgoState,
+        "radar",
+        "lidar",
+    ]

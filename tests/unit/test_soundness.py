@@ -19,11 +19,18 @@ def present(motion: MotionModel, count: int = 3) -> list[TrackState]:
     rng = np.random.default_rng(1)
     means = rng.normal(size=(count, motion.dim)) * 10.0 + 5.0
     roots = rng.normal(size=(count, motion.dim, motion.dim))
-    return kinematic_states(motion, 0, means, roots @ roots.mT + 0.1 * np.eye(motion.dim))
+    return kinematic_states(
+        motion, 0, means, roots @ roots.mT + 0.1 * np.eye(motion.dim)
+    )
 
 
-def spoilt(states: Sequence[TrackState], place: int, mean: FloatArray, covariance: FloatArray) -> list[TrackState]:
-    return [TrackState(0, mean, covariance) if k == place else state for k, state in enumerate(states)]
+def spoilt(
+    states: Sequence[TrackState], place: int, mean: FloatArray, covariance: FloatArray
+) -> list[TrackState]:
+    return [
+        TrackState(0, mean, covariance) if k == place else state
+        for k, state in enumerate(states)
+    ]
 
 
 @pytest.mark.parametrize("motion", MOTIONS, ids=lambda motion: type(motion).__name__)

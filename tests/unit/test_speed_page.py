@@ -19,11 +19,26 @@ def test_a_quantile_is_of_the_least_time_of_every_tick() -> None:
     ticks_ms = [1.0] * 98 + [2.0, 2.0]
     busy, late = [9.0, *ticks_ms[1:]], [*ticks_ms[:-3], 8.0, 2.0, 2.0]
     cell = Cell(REPLAY, "smoother", 50)
-    row = Row.of(cell, [Measured(1.0, each, 5000, 50.0) for each in (busy, late)], [30.0, 20.0])
-    assert (row.median_ms, row.p50_ms, row.p99_ms, row.ratios) == (1.0, 1.0, 2.0, [30.0, 20.0])
+    row = Row.of(
+        cell, [Measured(1.0, each, 5000, 50.0) for each in (busy, late)], [30.0, 20.0]
+    )
+    assert (row.median_ms, row.p50_ms, row.p99_ms, row.ratios) == (
+        1.0,
+        1.0,
+        2.0,
+        [30.0, 20.0],
+    )
     results = Results([row])
-    assert (results.p99(REPLAY, 50).verdict, results.ratio(REPLAY, 50).cell()) == ("yes", "25 (20 to 30)")
-    assert "(target 25)" in Results([Row.of(cell, [Measured(1.0, busy, 5000, 50.0)], [24.0])]).ratio(REPLAY, 50).cell()
+    assert (results.p99(REPLAY, 50).verdict, results.ratio(REPLAY, 50).cell()) == (
+        "yes",
+        "25 (20 to 30)",
+    )
+    assert (
+        "(target 25)"
+        in Results([Row.of(cell, [Measured(1.0, busy, 5000, 50.0)], [24.0])])
+        .ratio(REPLAY, 50)
+        .cell()
+    )
 
 
 def test_a_tracker_that_lost_cars_has_no_times_in_the_table() -> None:
@@ -40,9 +55,15 @@ def test_the_page_is_at_most_a_month_older_than_the_code_that_it_times() -> None
     assert measured is not None
     folders = [f"fgtrack/{name}" for name in TIMED]
     log = subprocess.run(
-        ["git", "log", "-1", "--format=%cs", "--", *folders], cwd=ROOT, text=True, capture_output=True, check=False
+        ["git", "log", "-1", "--format=%cs", "--", *folders],
+        cwd=ROOT,
+        text=True,
+        capture_output=True,
+        check=False,
     )
     if not log.stdout.strip():
         pytest.skip("not a checkout")
     changed = date.fromisoformat(log.stdout.strip())
-    assert changed <= date.fromisoformat(measured[1]) + timedelta(days=31), "run `make bench PAGE=docs/speed.md`"
+    assert changed <= date.fromisoformat(measured[1]) + timedelta(days=31), (
+        "run `make bench PAGE=docs/speed.md`"
+    )

@@ -12,10 +12,18 @@ from fgtrack.models.motion import CTRA, CTRV, CV
 
 
 def test_the_values_and_their_standard_deviations_become_the_state() -> None:
-    start = Start(position_m=(1.0, 2.0), position_std_m=0.5, yaw_rad=0.4, yaw_std_rad=0.2, speed_mps=30.0)
+    start = Start(
+        position_m=(1.0, 2.0),
+        position_std_m=0.5,
+        yaw_rad=0.4,
+        yaw_std_rad=0.2,
+        speed_mps=30.0,
+    )
     mean, P = initial_state(CTRA(), start)
     assert mean.tolist() == [1.0, 2.0, 0.4, 30.0, 0.0, 0.0]
-    assert np.sqrt(np.diag(P)).tolist() == pytest.approx([0.5, 0.5, 0.2, 10.0, 0.3, 1.0])
+    assert np.sqrt(np.diag(P)).tolist() == pytest.approx(
+        [0.5, 0.5, 0.2, 10.0, 0.3, 1.0]
+    )
 
 
 def test_every_value_is_named() -> None:
@@ -31,7 +39,9 @@ def test_a_position_covariance_takes_the_place_of_the_standard_deviation() -> No
             assert P[:2, :2].tolist() == R.tolist()
 
 
-def test_of_an_unknown_direction_the_yaw_is_uniform_and_the_velocity_isotropic() -> None:
+def test_of_an_unknown_direction_the_yaw_is_uniform_and_the_velocity_isotropic() -> (
+    None
+):
     start = Start(speed_mps=3.0, speed_std_mps=4.0)
     mean, P = initial_state(CTRV(), start)
     assert (mean[2], P[2, 2]) == (0.0, pytest.approx(math.pi**2 / 3.0))

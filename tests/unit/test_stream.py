@@ -12,12 +12,27 @@ from support.messages import drive, exact, message_lists, shared
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState
-from fgtrack.io.errors import TruncatedInput, UntilBreak
-from fgtrack.io.stream import read_header, read_stream, write_stream
+from fgtrack.inputs.errors import TruncatedInput, UntilBreak
+from fgtrack.inputs.stream import read_header, read_stream, write_stream
 
 HEADER = {"type": "header", "format": "fgtrack-stream/1"}
-EGO = {"type": "ego", "stamp_ns": 1, "receipt_ns": 2, "x_m": 0, "y_m": 0, "yaw_rad": 0.0, "speed_mps": 1.5}
-LIST = {"type": "detections", "sensor": "lidar", "stamp_ns": 1, "receipt_ns": 2, "frame": "ego", "objects": []}
+EGO = {
+    "type": "ego",
+    "stamp_ns": 1,
+    "receipt_ns": 2,
+    "x_m": 0,
+    "y_m": 0,
+    "yaw_rad": 0.0,
+    "speed_mps": 1.5,
+}
+LIST = {
+    "type": "detections",
+    "sensor": "lidar",
+    "stamp_ns": 1,
+    "receipt_ns": 2,
+    "frame": "ego",
+    "objects": [],
+}
 
 
 def write_records(path: Path, *records: object) -> Path:
@@ -36,7 +51,9 @@ def test_what_is_written_is_read_to_the_bit(tmp_path_factory, messages, suffix):
 def test_the_same_messages_give_the_same_bytes(tmp_path):
     for name in ("a.jsonl.gz", "b.jsonl.gz"):
         write_stream(tmp_path / name, drive())
-    assert (tmp_path / "a.jsonl.gz").read_bytes() == (tmp_path / "b.jsonl.gz").read_bytes()
+    assert (tmp_path / "a.jsonl.gz").read_bytes() == (
+        tmp_path / "b.jsonl.gz"
+    ).read_bytes()
 
 
 def test_gzip_is_recognised_by_content_and_not_by_name(tmp_path):
@@ -54,13 +71,19 @@ def test_what_is_none_is_not_written(tmp_path):
 
 
 def test_numpy_scalars_are_written_as_numbers(tmp_path):
-    write_stream(tmp_path / "a.jsonl", [EgoState(np.int64(1), 2, np.float64(0.1), 0.0, 0.0, 1.0)])
-    assert list(read_stream(tmp_path / "a.jsonl")) == [EgoState(1, 2, 0.1, 0.0, 0.0, 1.0)]
+    write_stream(
+        tmp_path / "a.jsonl", [EgoState(np.int64(1), 2, np.float64(0.1), 0.0, 0.0, 1.0)]
+    )
+    assert list(read_stream(tmp_path / "a.jsonl")) == [
+        EgoState(1, 2, 0.1, 0.0, 0.0, 1.0)
+    ]
 
 
 def test_a_reference_stream_survives_a_round_trip_to_the_byte(tmp_path):
     source = shared("reference/short10/stream.jsonl.gz")
-    header = {key: value for key, value in read_header(source).items() if key not in HEADER}
+    header = {
+        key: value for key, value in read_header(source).items() if key not in HEADER
+    }
     write_stream(tmp_path / "a.jsonl", read_stream(source), header)
     assert (tmp_path / "a.jsonl").read_bytes() == gzip.decompress(source.read_bytes())
 
@@ -106,7 +129,14 @@ def test_a_bad_record_is_one_line_with_file_and_line(tmp_path, record, complaint
 
 @pytest.mark.parametrize(
     "text",
-    ["", "{", "nonsense\n", json.dumps(EGO) + "\n", '{"type": "header", "format": "fgtrack-stream/2"}\n', "[" * 10**5],
+    [
+        "",
+        "{",
+        "nonsense\n",
+        json.dumps(EGO) + "\n",
+        '{"type": "header", "format": "fgtrack-stream/2"}\n',
+        "[" * 10**5,
+    ],
 )
 def test_what_does_not_start_with_the_header_is_no_stream(tmp_path, text):
     (tmp_path / "a.jsonl").write_text(text)
@@ -116,7 +146,9 @@ def test_what_does_not_start_with_the_header_is_no_stream(tmp_path, text):
 
 @pytest.mark.parametrize("name", ["a.jsonl", "a.jsonl.gz"])
 @pytest.mark.parametrize("kept", [0.3, 0.7, 0.999])
-def test_a_truncated_stream_gives_all_before_the_break_and_says_where_it_is(tmp_path, name, kept):
+def test_a_truncated_stream_gives_all_before_the_break_and_says_where_it_is(
+    tmp_path, name, kept
+):
     messages = drive()
     path = tmp_path / name
     write_stream(path, messages)

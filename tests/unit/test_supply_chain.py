@@ -13,7 +13,9 @@ from packaging.requirements import Requirement
 from packaging.version import Version
 
 ROOT = Path(__file__).parents[2]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))[
+    "project"
+]
 EXTRAS = PROJECT["optional-dependencies"]
 REQUIRED = [Requirement(line) for line in PROJECT["dependencies"]]
 ABSENT = {
@@ -41,7 +43,10 @@ def _packages(lock: str) -> dict[str, tuple[set[Version], int]]:
     packages: dict[str, tuple[set[Version], int]] = {}
     for name, version, hashes in blocks:
         versions, count = packages.get(_name(name), (set(), len(hashes.splitlines())))
-        packages[_name(name)] = versions | {Version(version)}, min(count, len(hashes.splitlines()))
+        packages[_name(name)] = (
+            versions | {Version(version)},
+            min(count, len(hashes.splitlines())),
+        )
     return packages
 
 
@@ -54,7 +59,9 @@ def test_what_is_imported_is_asked_for() -> None:
     """Not only by another package, whose next or last version may do without it."""
     asked = {_name(one.name) for one in REQUIRED}
     asked |= {
-        _name(Requirement(line).name) for extra in ("dask", "foxglove", "ais", "asterix") for line in EXTRAS[extra]
+        _name(Requirement(line).name)
+        for extra in ("dask", "foxglove", "ais", "asterix")
+        for line in EXTRAS[extra]
     }
     installed = packages_distributions()
     imported = {
@@ -63,23 +70,42 @@ def test_what_is_imported_is_asked_for() -> None:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         for name in _imported(node)
     }
-    others = sorted(imported - sys.stdlib_module_names - {"fgtrack", "compression"})  # the latter of Python 3.14
+    others = sorted(
+        imported - sys.stdlib_module_names - {"fgtrack", "compression"}
+    )  # the latter of Python 3.14
     assert len(others) > 10
-    assert [name for name in others if not asked & {_name(one) for one in installed.get(name) or [ABSENT[name]]}] == []
+    assert [
+        name
+        for name in others
+        if not asked & {_name(one) for one in installed.get(name) or [ABSENT[name]]}
+    ] == []
 
 
 def _imported(node: ast.AST) -> list[str]:
     if isinstance(node, ast.Import):
         return [alias.name for alias in node.names]
-    return [node.module] if isinstance(node, ast.ImportFrom) and node.module and not node.level else []
+    return (
+        [node.module]
+        if isinstance(node, ast.ImportFrom) and node.module and not node.level
+        else []
+    )
 
 
 @pytest.mark.parametrize("lock", LOCKS[1:])
-def test_a_lock_file_holds_what_the_project_asks_for(lock: str, locked: dict[str, Any]) -> None:
+def test_a_lock_file_holds_what_the_project_asks_for(
+    lock: str, locked: dict[str, Any]
+) -> None:
     extras = ("test", "rivals", "foxglove", "live") if lock == "test" else (lock,)
-    lines = [*REQUIRED, *(Requirement(line) for extra in extras for line in EXTRAS.get(extra, []))]
+    lines = [
+        *REQUIRED,
+        *(Requirement(line) for extra in extras for line in EXTRAS.get(extra, [])),
+    ]
     assert [one.name for one in lines if _name(one.name) not in locked[lock]] == []
-    outside = [one for one in lines if not all(v in one.specifier for v in locked[lock][_name(one.name)][0])]
+    outside = [
+        one
+        for one in lines
+        if not all(v in one.specifier for v in locked[lock][_name(one.name)][0])
+    ]
     assert outside == []
 
 
@@ -100,10 +126,19 @@ def test_lock_files_agree_on_versions(locked: dict[str, Any]) -> None:
 
 def test_the_makefile_installs_what_is_locked() -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    recipes = makefile.split("$(BIN)/uv: requirements/install.txt\n")[1].split("$(TOOLS):")[0]
+    recipes = makefile.split("$(BIN)/uv: requirements/install.txt\n")[1].split(
+        "$(TOOLS):"
+    )[0]
     installs = [
-        part for line in recipes.splitlines() for part in line.split("||") if re.search(r"pip install|PIP", part)
+        part
+        for line in recipes.splitlines()
+        for part in line.split("||")
+        if re.search(r"pip install|PIP", part)
     ]
     assert len(installs) == 5
-    assert [part for part in installs if "--require-hashes -r $<" not in part and "--no-deps" not in part] == []
+    assert [
+        part
+        for part in installs
+        if "--require-hashes -r $<" not in part and "--no-deps" not in part
+    ] == []
     assert re.search(r"^demo: \$\(RUN\)\n", makefile, re.MULTILINE)

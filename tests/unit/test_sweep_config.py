@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fgtrack.config.shipped import read_scenario
+from fgtrack.config.yaml_file import dump, plain
 from fgtrack.core.errors import CallError
-from fgtrack.io.stream import write_stream
-from fgtrack.pipeline.load import dump, plain
-from fgtrack.pipeline.shipped import read_scenario
+from fgtrack.inputs.stream import write_stream
 from fgtrack.pipeline.sweep import Cell, Sweep, write_tables
 from fgtrack.pipeline.sweep_plan import Job, Plan, load_plan
 from fgtrack.sim.simulate import simulate
@@ -38,13 +38,22 @@ def plan(tmp_path: Path) -> Any:
 # --- the grid
 
 
-def test_the_grid_is_the_product_with_the_last_axis_fastest_and_then_the_seed(plan: Any) -> None:
-    made = plan("seeds: [7, 3]\nvary: {association.gate_m: [5.0, 3.0], clock.node_hz: [20.0, null]}")
+def test_the_grid_is_the_product_with_the_last_axis_fastest_and_then_the_seed(
+    plan: Any,
+) -> None:
+    made = plan(
+        "seeds: [7, 3]\nvary: {association.gate_m: [5.0, 3.0], clock.node_hz: [20.0, null]}"
+    )
     assert made.columns == ("association.gate_m", "clock.node_hz")
     points = [(5.0, 20.0), (5.0, None), (3.0, 20.0), (3.0, None)]
-    assert [(job.cells, job.seed) for job in made.jobs] == [(point, seed) for point in points for seed in (7, 3)]
+    assert [(job.cells, job.seed) for job in made.jobs] == [
+        (point, seed) for point in points for seed in (7, 3)
+    ]
     for job in made.jobs:
-        assert (job.recipe["config"]["association"]["gate_m"], job.recipe["config"]["clock"]["node_hz"]) == job.cells
+        assert (
+            job.recipe["config"]["association"]["gate_m"],
+            job.recipe["config"]["clock"]["node_hz"],
+        ) == job.cells
         assert job.recipe["seed"] == job.seed
 
 
@@ -56,19 +65,37 @@ vary:
     scenario.sensors.radar.delay: [{kind: none}, {kind: constant, delay_s: 0.2}]
     sensors.radar.max_delay_s: [0.1, 0.3]
 """)
-    assert made.columns == ("delay", "scenario.sensors.radar.delay", "sensors.radar.max_delay_s")
+    assert made.columns == (
+        "delay",
+        "scenario.sensors.radar.delay",
+        "sensors.radar.max_delay_s",
+    )
     assert [job.cells[0] for job in made.jobs] == ["short", "long"]
-    assert [job.recipe["config"]["sensors"]["radar"]["max_delay_s"] for job in made.jobs] == [0.1, 0.3]
-    assert [job.recipe["scenario"]["sensors"][1]["delay"]["kind"] for job in made.jobs] == ["none", "constant"]
+    assert [
+        job.recipe["config"]["sensors"]["radar"]["max_delay_s"] for job in made.jobs
+    ] == [0.1, 0.3]
+    assert [
+        job.recipe["scenario"]["sensors"][1]["delay"]["kind"] for job in made.jobs
+    ] == ["none", "constant"]
 
 
 def test_scenario_lists_are_addressed_by_name_or_index(plan: Any) -> None:
-    keys = ["scenario.sensors.radar.delay.mean_s", "scenario.sensors.1.rate_hz", "scenario.opponents.0.lateral_m"]
-    made = plan(f"vary:\n  all:\n    {keys[0]}: [0.07]\n    {keys[1]}: [10.0]\n    {keys[2]}: [1.5]")
+    keys = [
+        "scenario.sensors.radar.delay.mean_s",
+        "scenario.sensors.1.rate_hz",
+        "scenario.opponents.0.lateral_m",
+    ]
+    made = plan(
+        f"vary:\n  all:\n    {keys[0]}: [0.07]\n    {keys[1]}: [10.0]\n    {keys[2]}: [1.5]"
+    )
     scenario = made.jobs[0].recipe["scenario"]
     base = plain(read_scenario("default"))
     lidar, radar = scenario["sensors"]
-    assert (radar["delay"]["mean_s"], radar["rate_hz"], scenario["opponents"][0]["lateral_m"]) == (0.07, 10.0, 1.5)
+    assert (
+        radar["delay"]["mean_s"],
+        radar["rate_hz"],
+        scenario["opponents"][0]["lateral_m"],
+    ) == (0.07, 10.0, 1.5)
     assert lidar == base["sensors"][0]
     assert scenario["opponents"][1:] == base["opponents"][1:]
 
@@ -92,10 +119,16 @@ one_at_a_time:
         ("modality", "LiDAR", 5.0, 50.0, ["radar"]),
         ("both", [3.0, None], 3.0, None, []),
     ]
-    assert [(*job.cells, job.seed) for job in made.jobs] == [(*row[:2], seed) for row in rows for seed in (4, 2)]
+    assert [(*job.cells, job.seed) for job in made.jobs] == [
+        (*row[:2], seed) for row in rows for seed in (4, 2)
+    ]
     for job, row in zip(made.jobs[::2], rows, strict=True):
         config = job.recipe["config"]
-        found = (config["association"]["gate_m"], config["clock"]["node_hz"], config["ignore_sensors"])
+        found = (
+            config["association"]["gate_m"],
+            config["clock"]["node_hz"],
+            config["ignore_sensors"],
+        )
         assert found == row[2:]
 
 
@@ -106,17 +139,38 @@ one_at_a_time:
     ("text", "said"),
     [
         ("seed: 3", "seed: unknown key, did you mean 'seeds'"),
-        ("seeds: 100001", "vary: 100001 combinations of values and seeds, at most 100000"),
+        (
+            "seeds: 100001",
+            "vary: 100001 combinations of values and seeds, at most 100000",
+        ),
         ("seeds: [1, 1]", "seeds: name at least one, and each once"),
         ("seeds: [-1]", "seeds.0: Input should be greater than or equal to 0"),
-        ("vary: {association.gate_m: 5.0}", "vary.association.gate_m: a list of values is needed"),
-        ("vary: {a: {clock.node_hz: [5.0, 9.0], association.gate_m: [3.0]}}", "mapping of keys to equally long lists"),
-        ("set: {estimator: smoother}", "set.estimator: is not a key of the runs of this sweep"),
-        ("vary: {delays.radar.delay: [null]}", "vary.delays.radar.delay: is not a key of the runs of this sweep"),
+        (
+            "vary: {association.gate_m: 5.0}",
+            "vary.association.gate_m: a list of values is needed",
+        ),
+        (
+            "vary: {a: {clock.node_hz: [5.0, 9.0], association.gate_m: [3.0]}}",
+            "mapping of keys to equally long lists",
+        ),
+        (
+            "set: {estimator: smoother}",
+            "set.estimator: is not a key of the runs of this sweep",
+        ),
+        (
+            "vary: {delays.radar.delay: [null]}",
+            "vary.delays.radar.delay: is not a key of the runs of this sweep",
+        ),
         ("delays: d.yaml", "delays: a scenario has its own"),
         ("input: x", "scenario, input: name one of them"),
-        ("vary: {clok.node_hz: [5.0, 7.0]}", "clok.node_hz=5.0: config: clok: unknown key"),
-        ("vary: {scenario.sensors.lidr.rate_hz: [5.0]}", "lidr.rate_hz: there is no 'lidr' among 2 entries"),
+        (
+            "vary: {clok.node_hz: [5.0, 7.0]}",
+            "clok.node_hz=5.0: config: clok: unknown key",
+        ),
+        (
+            "vary: {scenario.sensors.lidr.rate_hz: [5.0]}",
+            "lidr.rate_hz: there is no 'lidr' among 2 entries",
+        ),
     ],
 )
 def test_an_error_names_the_path_of_the_key(plan: Any, text: str, said: str) -> None:
@@ -128,10 +182,19 @@ def test_an_error_names_the_path_of_the_key(plan: Any, text: str, said: str) -> 
 @pytest.mark.parametrize(
     ("head", "said"),
     [
-        (HEAD.replace("karle2023", "missing.yaml"), "missing.yaml: there is no such configuration file"),
+        (
+            HEAD.replace("karle2023", "missing.yaml"),
+            "missing.yaml: there is no such configuration file",
+        ),
         ("scenario: default\nestimators: [ekf-replay]", "format: Field required"),
-        ("format: fgtrack-sweep/1\nscenario: default\nestimators: []", "estimators: name at least one"),
-        ("format: fgtrack-sweep/1\ninput: nothing.mcap\nestimators: [ekf-replay]", "nothing.mcap: there is no such"),
+        (
+            "format: fgtrack-sweep/1\nscenario: default\nestimators: []",
+            "estimators: name at least one",
+        ),
+        (
+            "format: fgtrack-sweep/1\ninput: nothing.mcap\nestimators: [ekf-replay]",
+            "nothing.mcap: there is no such",
+        ),
     ],
 )
 def test_what_every_sweep_needs_is_missed(plan: Any, head: str, said: str) -> None:
@@ -155,19 +218,29 @@ def test_a_point_that_cannot_be_run_is_a_problem_of_its_own_cells(plan: Any) -> 
 
 @pytest.fixture
 def recording(tmp_path: Path) -> str:
-    write_stream(tmp_path / "drive.jsonl", simulate(read_scenario("default"), np.random.default_rng(0))[:200])
+    write_stream(
+        tmp_path / "drive.jsonl",
+        simulate(read_scenario("default"), np.random.default_rng(0))[:200],
+    )
     return "format: fgtrack-sweep/1\ninput: drive.jsonl\nestimators: [ekf-replay]\n"
 
 
-def test_a_recording_with_its_own_delays_has_one_seed(plan: Any, recording: str) -> None:
+def test_a_recording_with_its_own_delays_has_one_seed(
+    plan: Any, recording: str
+) -> None:
     (job,) = plan("", recording).jobs
     assert (job.recipe["delays"], "scenario" in job.recipe) == ({}, False)
-    with pytest.raises(CallError, match="seeds: a recording with its own delays has one"):
+    with pytest.raises(
+        CallError, match="seeds: a recording with its own delays has one"
+    ):
         plan("seeds: 2", recording)
 
 
 def test_the_delays_of_a_recording_may_be_varied(plan: Any, recording: str) -> None:
-    made = plan("seeds: 2\nvary: {delays.radar.delay: [null, {kind: constant, delay_s: 0.3}]}", recording)
+    made = plan(
+        "seeds: 2\nvary: {delays.radar.delay: [null, {kind: constant, delay_s: 0.3}]}",
+        recording,
+    )
     kinds = [job.recipe["delays"]["radar"]["delay"] for job in made.jobs]
     assert [kind and kind["delay_s"] for kind in kinds] == [None, None, 0.3, 0.3]
     made = plan("seeds: 2\nset: {delays.radar.loss_probability: 0.1}", recording)
@@ -181,29 +254,56 @@ def keys(made: Plan) -> list[str]:
     return [job.key for job in made.jobs]
 
 
-def test_the_key_of_a_job_is_that_of_its_content_however_it_is_written(plan: Any, tmp_path: Path) -> None:
+def test_the_key_of_a_job_is_that_of_its_content_however_it_is_written(
+    plan: Any, tmp_path: Path
+) -> None:
     (tmp_path / "scenario.yaml").write_text(dump(read_scenario("default")))
     reference = keys(plan("seeds: 3\nset: {association.gate_m: 3.0}"))
     assert keys(plan("set: {association.gate_m: 3.0}\nseeds: [0, 1, 2]")) == reference
-    assert keys(plan("seeds: 3\nvary: {association.gate_m: [3.0]}\nmetrics: [num_tracks]")) == reference
-    assert keys(plan("seeds: 3\nset: {association.gate_m: 3.0}", HEAD.replace("default", "scenario.yaml"))) == reference
+    assert (
+        keys(plan("seeds: 3\nvary: {association.gate_m: [3.0]}\nmetrics: [num_tracks]"))
+        == reference
+    )
+    assert (
+        keys(
+            plan(
+                "seeds: 3\nset: {association.gate_m: 3.0}",
+                HEAD.replace("default", "scenario.yaml"),
+            )
+        )
+        == reference
+    )
     assert keys(plan("seeds: [1]\nset: {association.gate_m: 3.0}")) == reference[1:2]
 
 
 @pytest.mark.parametrize(
-    "text", ["seeds: [1]", "set: {association.gate_m: 4.9}", "duration_s: 59.9", "set: {ego.yaw_weight: 0.5}"]
+    "text",
+    [
+        "seeds: [1]",
+        "set: {association.gate_m: 4.9}",
+        "duration_s: 59.9",
+        "set: {ego.yaw_weight: 0.5}",
+    ],
 )
 def test_whatever_decides_the_result_changes_the_key(plan: Any, text: str) -> None:
     assert keys(plan(text)) != keys(plan(""))
 
 
-def test_versions_and_the_code_of_plug_ins_change_the_key(plan: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_versions_and_the_code_of_plug_ins_change_the_key(
+    plan: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A plug-in may change without a new version."""
     found = [keys(plan(""))]
     for target, value in (
         ("fgtrack.pipeline.sweep_plan.versions", {"fgtrack": "another"}),
-        ("fgtrack.estimation.registry.ESTIMATORS.sources", {"mine": "package 1.0 of other code"}),
-        ("fgtrack.estimation.registry.MOTION_MODELS.sources", {"mine": "package 1.0 of other code"}),
+        (
+            "fgtrack.estimation.registry.ESTIMATORS.sources",
+            {"mine": "package 1.0 of other code"},
+        ),
+        (
+            "fgtrack.estimation.registry.MOTION_MODELS.sources",
+            {"mine": "package 1.0 of other code"},
+        ),
     ):
         with monkeypatch.context() as patch:
             patch.setattr(target, lambda value=value: value)
@@ -216,10 +316,17 @@ def test_the_content_of_every_file_changes_the_key_whatever_its_size_and_time(
 ) -> None:
     track, drive = tmp_path / "track.csv", tmp_path / "drive.jsonl"
     track.write_text("abc")
-    for text, head, file in ((f"set: {{map.track: {track}}}", HEAD, track), ("", recording, drive)):
+    for text, head, file in (
+        (f"set: {{map.track: {track}}}", HEAD, track),
+        ("", recording, drive),
+    ):
         before, time_ns = keys(plan(text, head)), file.stat().st_mtime_ns
         assert keys(plan(text, head)) == before
-        file.write_text(file.read_text().replace("c", "d", 1) if file != drive else file.read_text()[:-300] + "\n")
+        file.write_text(
+            file.read_text().replace("c", "d", 1)
+            if file != drive
+            else file.read_text()[:-300] + "\n"
+        )
         os.utime(file, ns=(time_ns, time_ns))
         assert keys(plan(text, head)) != before
 
@@ -270,7 +377,11 @@ FILE = "input.csv.detections.radar.file"
         (f"vary: {{{FILE}: [radar.csv, other.csv]}}", "radar.csv", [True, False]),
         (f"vary: {{{FILE}: [radar.csv, other.csv]}}", "ego.csv", [True, True]),
         (f"one_at_a_time: {{{FILE}: [other.csv]}}", "other.csv", [False, True]),
-        (f"vary: {{{FILE}: [other.csv], clock.node_hz: [20.0, 50.0]}}", "other.csv", [True, True]),
+        (
+            f"vary: {{{FILE}: [other.csv], clock.node_hz: [20.0, 50.0]}}",
+            "other.csv",
+            [True, True],
+        ),
         (f"vary: {{{FILE}: [other.csv]}}", "radar.csv", [False]),
         ("vary: {clock.node_hz: [20.0, 50.0]}", "other.csv", [False, False]),
     ],
@@ -285,7 +396,9 @@ def test_the_files_that_a_point_reads_decide_its_key(
     assert [a != b for a, b in zip(before, after, strict=True)] == stale
 
 
-def test_a_file_that_is_set_for_all_points_decides_their_keys(plan: Any, drive: Path) -> None:
+def test_a_file_that_is_set_for_all_points_decides_their_keys(
+    plan: Any, drive: Path
+) -> None:
     head = TABLES_HEAD.replace("set: {", f"set: {{{FILE}: other.csv, ")
     before = keys(plan("", head))
     moved(drive / "radar.csv")
@@ -336,18 +449,24 @@ def test_a_recording_that_breaks_off_is_a_bad_cell_and_not_a_bad_call(
     assert "breaks off in the middle of record" in str(job.problem)
 
 
-def test_a_map_that_the_recording_carries_decides_the_key(plan: Any, tmp_path: Path) -> None:
+def test_a_map_that_the_recording_carries_decides_the_key(
+    plan: Any, tmp_path: Path
+) -> None:
     track = tmp_path / "track.csv"
     track.write_text("abc")
     messages = simulate(read_scenario("default"), np.random.default_rng(0))[:50]
-    write_stream(tmp_path / "drive.jsonl", messages, {"settings": {"map": {"track": str(track)}}})
+    write_stream(
+        tmp_path / "drive.jsonl", messages, {"settings": {"map": {"track": str(track)}}}
+    )
     head = "format: fgtrack-sweep/1\ninput: drive.jsonl\nestimators: [ekf-replay]\n"
     before = keys(plan("", head))
     track.write_text("abd")
     assert keys(plan("", head)) != before
 
 
-def test_a_map_that_cannot_be_read_is_a_problem_in_a_line(plan: Any, tmp_path: Path, monkeypatch: Any) -> None:
+def test_a_map_that_cannot_be_read_is_a_problem_in_a_line(
+    plan: Any, tmp_path: Path, monkeypatch: Any
+) -> None:
     track = tmp_path / "track.csv"
     track.write_text("abc")
 
@@ -369,11 +488,19 @@ def test_a_recording_takes_the_place_of_the_scenario(tmp_path: Path) -> None:
     scenario = read_scenario("single_opponent", duration_s=0.2)
     recording = tmp_path / "drive.jsonl"
     write_stream(recording, simulate(scenario, np.random.default_rng(0)))
-    made = load_plan(tmp_path / "sweep.yaml", recording, ["map.track=null", "association.gate_m=3.5"])
+    made = load_plan(
+        tmp_path / "sweep.yaml", recording, ["map.track=null", "association.gate_m=3.5"]
+    )
     assert [(job.cells, job.seed) for job in made.jobs] == [((20.0,), 0), ((50.0,), 0)]
     for job in made.jobs:
-        assert ("scenario" in job.recipe, job.recipe["recording"]) == (False, str(recording.resolve()))
-        assert (job.recipe["config"]["map"]["track"], job.recipe["config"]["association"]["gate_m"]) == (None, 3.5)
+        assert ("scenario" in job.recipe, job.recipe["recording"]) == (
+            False,
+            str(recording.resolve()),
+        )
+        assert (
+            job.recipe["config"]["map"]["track"],
+            job.recipe["config"]["association"]["gate_m"],
+        ) == (None, 3.5)
 
 
 # --- parts and tables
@@ -393,7 +520,9 @@ TABLES = Plan(
 
 
 def cell(name: str, error: str | None = None, **values: float | None) -> Cell:
-    return Cell(name, {} if error else values, {} if error else {"replay_s": 0.25}, error)
+    return Cell(
+        name, {} if error else values, {} if error else {"replay_s": 0.25}, error
+    )
 
 
 DONE = {
@@ -425,8 +554,15 @@ def test_tables_are_in_the_order_of_the_grid_with_all_digits(tmp_path: Path) -> 
     assert result.errors == ("it, broke", *["rate_hz=-1: must be positive"] * 2)
 
 
-def test_metrics_are_chosen_by_name_or_pattern_and_unknown_ones_reported(tmp_path: Path) -> None:
-    plan = Plan(TABLES.columns, TABLES.jobs, TABLES.estimators, ("n", "[xz]", "n*", "missing", "m.*"))
+def test_metrics_are_chosen_by_name_or_pattern_and_unknown_ones_reported(
+    tmp_path: Path,
+) -> None:
+    plan = Plan(
+        TABLES.columns,
+        TABLES.jobs,
+        TABLES.estimators,
+        ("n", "[xz]", "n*", "missing", "m.*"),
+    )
     result = write_tables(tmp_path, plan, DONE)
     assert lines(tmp_path / "sweep.csv")[0] == "rate_hz,delay,seed,estimator,n,x"
     assert result.unknown_metrics == ("missing", "m.*")
@@ -438,8 +574,24 @@ def part(folder: Path, key: str, text: str) -> None:
 
 
 def test_a_part_gives_back_its_cells_to_the_last_bit(tmp_path: Path) -> None:
-    values = {"window": "window", "on": True, "none": None, "nan": math.nan, "n": 2**62, "x": 0.1 + 0.2}
-    part(tmp_path, "k0", json.dumps([{"estimator": name, "values": values, "times": {"s": 0.5}} for name in "ab"]))
+    values = {
+        "window": "window",
+        "on": True,
+        "none": None,
+        "nan": math.nan,
+        "n": 2**62,
+        "x": 0.1 + 0.2,
+    }
+    part(
+        tmp_path,
+        "k0",
+        json.dumps(
+            [
+                {"estimator": name, "values": values, "times": {"s": 0.5}}
+                for name in "ab"
+            ]
+        ),
+    )
     part(tmp_path, "k2", "[]")  # of another sweep
     sweep = Sweep.open(TABLES, tmp_path)
     assert list(sweep.done) == ["k0"]
@@ -448,15 +600,25 @@ def test_a_part_gives_back_its_cells_to_the_last_bit(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ['[{"estimator": "a", "val', '{"format": "x"}'])
-def test_the_job_of_a_damaged_part_is_repeated(tmp_path: Path, caplog: pytest.LogCaptureFixture, text: str) -> None:
-    part(tmp_path, "k1", json.dumps([{"estimator": name, "values": {"x": 1}, "times": {}} for name in "ab"]))
+def test_the_job_of_a_damaged_part_is_repeated(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, text: str
+) -> None:
+    part(
+        tmp_path,
+        "k1",
+        json.dumps(
+            [{"estimator": name, "values": {"x": 1}, "times": {}} for name in "ab"]
+        ),
+    )
     part(tmp_path, "k0", text)
     assert [job.key for job in Sweep.open(TABLES, tmp_path).todo] == ["k0"]
     assert "k0.json: is damaged, its job is repeated" in caplog.text
 
 
 @pytest.mark.parametrize("name", ["sweep.csv", "paired.csv"])
-def test_tables_without_parts_are_replaced_with_overwrite_only(tmp_path: Path, name: str) -> None:
+def test_tables_without_parts_are_replaced_with_overwrite_only(
+    tmp_path: Path, name: str
+) -> None:
     (tmp_path / name).write_text("yield\n1\n")
     with pytest.raises(CallError, match=rf"{name}: already exists"):
         Sweep.open(TABLES, tmp_path)

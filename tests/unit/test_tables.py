@@ -7,17 +7,20 @@ from pathlib import Path
 
 import pytest
 
+from fgtrack.config.settings import Config
+from fgtrack.config.yaml_file import validate
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
-from fgtrack.io.adapters.common import object_id
-from fgtrack.io.config import CsvInput, CsvTable, Field, Filter, InputConfig
-from fgtrack.io.errors import UntilBreak
-from fgtrack.io.source import input_kind, open_input
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import validate
+from fgtrack.inputs.errors import UntilBreak
+from fgtrack.inputs.formats.common import object_id
+from fgtrack.inputs.settings import CsvInput, CsvTable, Field, Filter, InputConfig
+from fgtrack.inputs.source import input_kind, open_input
 from fgtrack.pipeline.replay import replay_in_memory
 
-EGO = CsvTable({"stamp": "t", "x_m": "x", "y_m": "y", "yaw_rad": "yaw", "speed_mps": "v"}, "ego.csv")
+EGO = CsvTable(
+    {"stamp": "t", "x_m": "x", "y_m": "y", "yaw_rad": "yaw", "speed_mps": "v"},
+    "ego.csv",
+)
 RADAR = CsvTable({"stamp": "t", "receipt": "seen", "x_m": "x", "y_m": "y"}, "radar.csv")
 RADAR_TEXT = "t,seen,x,y\n1.0,1.1,30,2\n1.0,1.1,40,-2\n1.05,1.15,31,2\n"
 
@@ -36,15 +39,22 @@ def test_rows_become_messages_in_the_order_of_receipt(tmp_path):
     ego = "t,x,y,yaw,v\n1.0,0,0,0.5,10\n1.12,1,0,0.5,10\n"
     truth = "t;id;px;py\n1.1;car_a;30.5;2\n"
     write(tmp_path, ego=ego, radar=RADAR_TEXT, truth=truth)
-    cars = CsvTable({"stamp": "t", "object_id": "id", "x_m": "px", "y_m": "py"}, "truth.csv")
+    cars = CsvTable(
+        {"stamp": "t", "object_id": "id", "x_m": "px", "y_m": "py"}, "truth.csv"
+    )
     assert messages(tmp_path, ego=EGO, detections={"radar": RADAR}, truth=cars) == [
         EgoState(1_000_000_000, 1_000_000_000, 0.0, 0.0, 0.5, 10.0),
         TruthState(1_100_000_000, 1_100_000_000, object_id("car_a"), 30.5, 2.0),
         DetectionList(
-            "radar", 1_000_000_000, 1_100_000_000, (Detection(x_m=30.0, y_m=2.0), Detection(x_m=40.0, y_m=-2.0))
+            "radar",
+            1_000_000_000,
+            1_100_000_000,
+            (Detection(x_m=30.0, y_m=2.0), Detection(x_m=40.0, y_m=-2.0)),
         ),
         EgoState(1_120_000_000, 1_120_000_000, 1.0, 0.0, 0.5, 10.0),
-        DetectionList("radar", 1_050_000_000, 1_150_000_000, (Detection(x_m=31.0, y_m=2.0),)),
+        DetectionList(
+            "radar", 1_050_000_000, 1_150_000_000, (Detection(x_m=31.0, y_m=2.0),)
+        ),
     ]
     assert input_kind(tmp_path) == input_kind(tmp_path / "radar.csv") == "csv"
 
@@ -59,8 +69,18 @@ def test_one_file_may_hold_everything(tmp_path):
         "radar\t1500.5\t20\t\t5\t\t3\n"
     )
     heading = Field("heading", scale=-1.0, offset=90.0, degrees=True)
-    ego = {"stamp": "ms", "x_m": "a", "y_m": "b", "yaw_rad": heading, "speed_mps": Field("kmh", scale=1 / 3.6)}
-    radar = {"stamp": "ms", "range_m": "a", "bearing_rad": Field("heading", scale=-1.0, degrees=True)}
+    ego = {
+        "stamp": "ms",
+        "x_m": "a",
+        "y_m": "b",
+        "yaw_rad": heading,
+        "speed_mps": Field("kmh", scale=1 / 3.6),
+    }
+    radar = {
+        "stamp": "ms",
+        "range_m": "a",
+        "bearing_rad": Field("heading", scale=-1.0, degrees=True),
+    }
     found = messages(
         path,
         ego=CsvTable(ego, time_unit="ms", filters={"kind": Filter(one_of=("ego",))}),
@@ -74,27 +94,46 @@ def test_one_file_may_hold_everything(tmp_path):
         },
     )
     assert found[0] == EgoState(
-        1_500_250_000, 1_500_250_000, 1.0, 2.0, pytest.approx(math.radians(100.0)), pytest.approx(10.0)
+        1_500_250_000,
+        1_500_250_000,
+        1.0,
+        2.0,
+        pytest.approx(math.radians(100.0)),
+        pytest.approx(10.0),
     )
     assert sorted(found[1].left_out) == ["filters.kind", "filters.snr"]
     bearing_rad = pytest.approx(math.radians(10.0))
     assert found[1:] == [
         DetectionList(
-            "radar", 1_500_500_000, 1_500_500_000, (Detection(range_m=10.0, bearing_rad=bearing_rad),), "sensor"
+            "radar",
+            1_500_500_000,
+            1_500_500_000,
+            (Detection(range_m=10.0, bearing_rad=bearing_rad),),
+            "sensor",
         )
     ]
 
 
 def test_where_no_row_passes_an_empty_list_says_what_was_left_out(tmp_path):
     write(tmp_path, radar=RADAR_TEXT)
-    (found,) = messages(tmp_path, detections={"radar": replace(RADAR, filters={"x": Filter(min=50.0)})})
-    assert (found.stamp_ns, found.objects, found.left_out) == (1_000_000_000, (), ("filters.x",) * 3)
+    (found,) = messages(
+        tmp_path, detections={"radar": replace(RADAR, filters={"x": Filter(min=50.0)})}
+    )
+    assert (found.stamp_ns, found.objects, found.left_out) == (
+        1_000_000_000,
+        (),
+        ("filters.x",) * 3,
+    )
 
 
-def test_an_empty_cell_is_not_given_and_a_row_without_a_measurement_is_a_scan_that_saw_nothing(tmp_path):
+def test_an_empty_cell_is_not_given_and_a_row_without_a_measurement_is_a_scan_that_saw_nothing(
+    tmp_path,
+):
     write(tmp_path, radar="t,seen,x,y,v,name\n1,1,30,2,,car\n2,2,,,,\n3,3,nan,2,5,\n")
     columns = {**RADAR.columns, "speed_mps": "v", "class_name": "name"}
-    first, second, third = messages(tmp_path, detections={"radar": CsvTable(columns, "radar.csv")})
+    first, second, third = messages(
+        tmp_path, detections={"radar": CsvTable(columns, "radar.csv")}
+    )
     assert first.objects == (Detection(x_m=30.0, y_m=2.0, class_name="car"),)
     assert second.objects == ()
     assert math.isnan(third.objects[0].x_m)
@@ -104,11 +143,16 @@ def test_an_empty_cell_is_not_given_and_a_row_without_a_measurement_is_a_scan_th
 def test_times_keep_all_their_digits(tmp_path):
     write(tmp_path, radar="t,seen,x,y\n1700000000.123456789,1700000000.2,1,2\n")
     (found,) = messages(tmp_path, detections={"radar": RADAR})
-    assert (found.stamp_ns, found.receipt_ns) == (1_700_000_000_123_456_789, 1_700_000_000_200_000_000)
+    assert (found.stamp_ns, found.receipt_ns) == (
+        1_700_000_000_123_456_789,
+        1_700_000_000_200_000_000,
+    )
     late = CsvTable(RADAR.columns, "radar.csv", stamp_from="receipt")
     (found,) = messages(tmp_path, detections={"radar": late})
     assert found.stamp_ns == found.receipt_ns == 1_700_000_000_200_000_000
-    assert messages(tmp_path, truth=late) == [TruthState(found.stamp_ns, found.stamp_ns, 0, 1.0, 2.0)]
+    assert messages(tmp_path, truth=late) == [
+        TruthState(found.stamp_ns, found.stamp_ns, 0, 1.0, 2.0)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -118,16 +162,31 @@ def test_times_keep_all_their_digits(tmp_path):
         ("t,seen,x,y,x\n", r"radar\.csv:1: has a column twice: t, seen, x, y, x"),
         (RADAR_TEXT + "2,2,far,1\n", r"radar\.csv:5: x: 'far' is not a number"),
         (RADAR_TEXT + "noon,2,1,1\n", r"radar\.csv:5: t: 'noon' is not a time"),
-        (RADAR_TEXT + "1e999999999,2,1,1\n", r"radar\.csv:5: t: '1e999999999' is not a time"),
-        (RADAR_TEXT + "1e15,2,1,1\n", r"radar\.csv:5: t: '1e15' is not a time in s, or change `time_unit`"),
+        (
+            RADAR_TEXT + "1e999999999,2,1,1\n",
+            r"radar\.csv:5: t: '1e999999999' is not a time",
+        ),
+        (
+            RADAR_TEXT + "1e15,2,1,1\n",
+            r"radar\.csv:5: t: '1e15' is not a time in s, or change `time_unit`",
+        ),
         (RADAR_TEXT + "2,2,1\n", r"radar\.csv:5: has 3 cells, the header has 4"),
-        (RADAR_TEXT + '2,2,"' + "1" * 200_000 + '",1\n', r"radar\.csv:4: cannot be read any further \(field larger"),
+        (
+            RADAR_TEXT + '2,2,"' + "1" * 200_000 + '",1\n',
+            r"radar\.csv:4: cannot be read any further \(field larger",
+        ),
         (RADAR_TEXT + "2,2,\udcff,1\n", r"radar\.csv:5: x: '.' is not a number"),
         ("", r"radar\.csv:1: has no column 't'"),
     ],
 )
-def test_a_damaged_file_is_one_line_and_what_is_before_it_is_replayed(tmp_path, text, complaint):
-    write(tmp_path, ego="t,x,y,yaw,v\n" + "".join(f"{k / 10},0,0,0,1\n" for k in range(30)), radar=text)
+def test_a_damaged_file_is_one_line_and_what_is_before_it_is_replayed(
+    tmp_path, text, complaint
+):
+    write(
+        tmp_path,
+        ego="t,x,y,yaw,v\n" + "".join(f"{k / 10},0,0,0,1\n" for k in range(30)),
+        radar=text,
+    )
     config = InputConfig(csv=CsvInput(EGO, {"radar": RADAR}))
     readable = UntilBreak(open_input(tmp_path, config).messages())
     with pytest.raises(DataError, match=complaint) as caught:  # noqa: PT012 - wrong from the start, or at a row
@@ -149,7 +208,11 @@ def test_a_damaged_file_is_one_line_and_what_is_before_it_is_replayed(tmp_path, 
             [f"{1_700_000_000 + 0.05 * k:.2f}" for k in range(30)],
             r"radar\.csv: .*look like s since 1970: change `time_unit`",
         ),
-        ("ns", [f"{0.05 * k:.2f}" for k in range(100)], r"radar\.csv: .*change `time_unit` \(input\.csv\.detec"),
+        (
+            "ns",
+            [f"{0.05 * k:.2f}" for k in range(100)],
+            r"radar\.csv: .*change `time_unit` \(input\.csv\.detec",
+        ),
         (
             "s",
             [f"{1_700_000_000_000 + 50 * k}" for k in range(30)],
@@ -160,13 +223,26 @@ def test_a_damaged_file_is_one_line_and_what_is_before_it_is_replayed(tmp_path, 
 def test_times_in_another_unit_name_file_and_key(tmp_path, unit, times, complaint):
     write(tmp_path, radar="t,x,y\n" + "".join(f"{time},1,2\n" for time in times))
     with pytest.raises(DataError, match=complaint):
-        messages(tmp_path, detections={"radar": CsvTable({"stamp": "t", "x_m": "x", "y_m": "y"}, "radar.csv", unit)})
+        messages(
+            tmp_path,
+            detections={
+                "radar": CsvTable(
+                    {"stamp": "t", "x_m": "x", "y_m": "y"}, "radar.csv", unit
+                )
+            },
+        )
 
 
-@pytest.mark.parametrize(("unit", "factor"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+@pytest.mark.parametrize(
+    ("unit", "factor"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)]
+)
 def test_times_in_their_unit_are_read(tmp_path, unit, factor):
     for start_s in (0.0, 1.7, 1_700_000_000.0):
-        write(tmp_path, radar="t,x,y\n" + "".join(f"{(start_s + 0.05 * k) * factor!r},1,2\n" for k in range(30)))
+        write(
+            tmp_path,
+            radar="t,x,y\n"
+            + "".join(f"{(start_s + 0.05 * k) * factor!r},1,2\n" for k in range(30)),
+        )
         table = CsvTable({"stamp": "t", "x_m": "x", "y_m": "y"}, "radar.csv", unit)
         assert len(messages(tmp_path, detections={"radar": table})) == 30
 
@@ -175,20 +251,44 @@ def test_an_angle_of_many_turns_is_not_wrapped_as_it_may_be_in_degrees(tmp_path)
     write(tmp_path, radar="t,a\n1,10\n2,290\n")
     compass = Field("a", scale=-1.0, offset=90.0)
     table = CsvTable({"stamp": "t", "bearing_rad": compass}, "radar.csv")
-    assert [item.objects[0].bearing_rad for item in messages(tmp_path, detections={"radar": table})] == [80.0, -200.0]
-    table = replace(table, columns={"stamp": "t", "bearing_rad": replace(compass, degrees=True)})
-    (north, south) = [item.objects[0].bearing_rad for item in messages(tmp_path, detections={"radar": table})]
+    assert [
+        item.objects[0].bearing_rad
+        for item in messages(tmp_path, detections={"radar": table})
+    ] == [80.0, -200.0]
+    table = replace(
+        table, columns={"stamp": "t", "bearing_rad": replace(compass, degrees=True)}
+    )
+    (north, south) = [
+        item.objects[0].bearing_rad
+        for item in messages(tmp_path, detections={"radar": table})
+    ]
     assert (north, south) == pytest.approx((math.radians(80.0), math.radians(160.0)))
 
 
 @pytest.mark.parametrize(
     ("role", "columns", "complaint"),
     [
-        ("ego", {"stamp": "t"}, r"input\.csv\.ego\.columns: must name speed_mps, stamp, x_m, y_m, yaw_rad$"),
-        ("truth", {"stamp": "t"}, r"input\.csv\.truth\.columns: must name stamp, x_m, y_m$"),
-        ("radar", {"x_m": "x"}, r"input\.csv\.detections\.radar\.columns: must name stamp"),
+        (
+            "ego",
+            {"stamp": "t"},
+            r"input\.csv\.ego\.columns: must name speed_mps, stamp, x_m, y_m, yaw_rad$",
+        ),
+        (
+            "truth",
+            {"stamp": "t"},
+            r"input\.csv\.truth\.columns: must name stamp, x_m, y_m$",
+        ),
+        (
+            "radar",
+            {"x_m": "x"},
+            r"input\.csv\.detections\.radar\.columns: must name stamp",
+        ),
         ("radar", {"stamp": "t", "speed": "v"}, "unknown column 'speed', known"),
-        ("radar", {"stamp": "t", "score": "x"}, "stamp and what is measured, one of x_m"),
+        (
+            "radar",
+            {"stamp": "t", "score": "x"},
+            "stamp and what is measured, one of x_m",
+        ),
     ],
 )
 def test_a_mapping_that_does_not_fit_is_one_line(tmp_path, role, columns, complaint):
@@ -201,14 +301,20 @@ def test_a_mapping_that_does_not_fit_is_one_line(tmp_path, role, columns, compla
         messages(tmp_path, **tables(CsvTable(columns, "radar.csv")))
     with pytest.raises(CallError, match=r"is a folder, so .* must name its file"):
         messages(tmp_path, detections={"radar": CsvTable({"stamp": "t", "x_m": "x"})})
-    with pytest.raises(CallError, match=r"name its columns in input\.csv: radar\.csv has t, seen, x, y"):
+    with pytest.raises(
+        CallError, match=r"name its columns in input\.csv: radar\.csv has t, seen, x, y"
+    ):
         messages(tmp_path)
 
 
 def test_the_mapping_is_written_in_the_configuration(tmp_path):
     write(tmp_path, radar=RADAR_TEXT)
     columns = {"stamp": "t", "x_m": "x", "y_m": {"path": "y", "scale": -1}}
-    raw = {"input": {"csv": {"detections": {"radar": {"file": "radar.csv", "columns": columns}}}}}
+    raw = {
+        "input": {
+            "csv": {"detections": {"radar": {"file": "radar.csv", "columns": columns}}}
+        }
+    }
     (first, _) = open_input(tmp_path, validate(Config, raw, "test").input).messages()
     assert [item.y_m for item in first.objects] == [-2.0, 2.0]
 
@@ -222,7 +328,12 @@ REPORTS = {
 
 @pytest.mark.parametrize(
     ("name", "sensor", "delay_s"),
-    [(n, s, d) for n, s, d in zip(REPORTS, ("adsb", "ais", "reports"), (2.0, 0.0, 0.1), strict=True)],
+    [
+        (n, s, d)
+        for n, s, d in zip(
+            REPORTS, ("adsb", "ais", "reports"), (2.0, 0.0, 0.1), strict=True
+        )
+    ],
 )
 def test_position_reports_need_no_mapping(tmp_path, name, sensor, delay_s):
     text = REPORTS[name].encode()
@@ -266,5 +377,7 @@ def test_rows_that_repeat_a_position_are_left_out_and_unnamed_columns_ignored(tm
 
 def test_one_wrong_clock_among_many_does_not_make_a_table_years_long(tmp_path):
     rows = "".join(f"2024-01-02 07:41:{k % 60:02}.{k},41.3,2.08\n" for k in range(120))
-    (tmp_path / "a.csv").write_text(f"time,lat,lon\n1970-01-01 00:00:00,41.3,2.08\n{rows}")
+    (tmp_path / "a.csv").write_text(
+        f"time,lat,lon\n1970-01-01 00:00:00,41.3,2.08\n{rows}"
+    )
     assert len(list(open_input(tmp_path).messages())) == 121

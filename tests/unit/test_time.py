@@ -8,8 +8,13 @@ YEAR_NS = 31_557_600 * NS_PER_S
 NOW_S = 1_790_000_000
 
 
-@pytest.mark.parametrize(("value", "unit"), [(NOW_S, "s"), (NOW_S * 1e3, "ms"), (NOW_S * 1e9, "ns"), (9e8, None)])
-def test_the_unit_is_that_in_which_a_time_is_of_this_century(value: float, unit: str | None) -> None:
+@pytest.mark.parametrize(
+    ("value", "unit"),
+    [(NOW_S, "s"), (NOW_S * 1e3, "ms"), (NOW_S * 1e9, "ns"), (9e8, None)],
+)
+def test_the_unit_is_that_in_which_a_time_is_of_this_century(
+    value: float, unit: str | None
+) -> None:
     assert epoch_unit(value) == unit
 
 

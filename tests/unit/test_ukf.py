@@ -6,7 +6,12 @@ import pytest
 from fgtrack.core.geometry import rotation
 from fgtrack.core.time import NS_PER_S
 from fgtrack.estimation.base import Measurement, Start
-from fgtrack.estimation.filters.ukf import DenseRule, UkfReplay, measurement_regression, regression
+from fgtrack.estimation.filters.ukf import (
+    DenseRule,
+    UkfReplay,
+    measurement_regression,
+    regression,
+)
 from fgtrack.estimation.registry import estimator
 from fgtrack.models.measurement import measurement_model
 from fgtrack.models.motion import CTRA, CTRV, MotionModel
@@ -44,7 +49,9 @@ def test_the_noise_is_that_of_the_cubature_points() -> None:
 
 def test_a_narrow_spread_gives_the_derivative() -> None:
     motion, x = CTRV(), np.array([3.0, 1.0, 0.4, 20.0, 0.3])
-    mean, slope, _ = regression(lambda each: motion.predict(each, 0.2), x, 1e-8 * np.eye(5))
+    mean, slope, _ = regression(
+        lambda each: motion.predict(each, 0.2), x, 1e-8 * np.eye(5)
+    )
     np.testing.assert_allclose(slope, motion.jacobian(x, 0.2), atol=1e-6)
     np.testing.assert_allclose(mean, motion.predict(x, 0.2), atol=1e-6)
 
@@ -59,18 +66,30 @@ def test_bearings_are_averaged_across_half_a_turn() -> None:
 
 
 def test_a_yaw_is_an_entry_of_the_state_however_wide_it_is() -> None:
-    measurement = Measurement.of(0, yaw_rad=3.0, range_m=9.0, std={"yaw_rad": 0.1, "range_m": 1.0})
+    measurement = Measurement.of(
+        0, yaw_rad=3.0, range_m=9.0, std={"yaw_rad": 0.1, "range_m": 1.0}
+    )
     wide = np.diag([1.0, 1.0, 4.0, 1.0, 1.0])
-    mean, slope, _ = measurement_regression(measurement, np.array([10.0, 0.0, 1.0, 1.0, 0.0]), wide)
+    mean, slope, _ = measurement_regression(
+        measurement, np.array([10.0, 0.0, 1.0, 1.0, 0.0]), wide
+    )
     np.testing.assert_allclose(slope[0], [0.0, 0.0, 1.0, 0.0, 0.0], atol=1e-12)
     assert mean[0] == pytest.approx(1.0)
 
 
 def test_a_semidefinite_covariance_is_taken() -> None:
     motion = CTRV()
-    assert np.isfinite(regression(lambda x: motion.predict(x, 0.1), np.zeros(5), np.diag([1.0, 1, 0, 1, 0]))[1]).all()
+    assert np.isfinite(
+        regression(
+            lambda x: motion.predict(x, 0.1), np.zeros(5), np.diag([1.0, 1, 0, 1, 0])
+        )[1]
+    ).all()
     with pytest.raises(np.linalg.LinAlgError):
-        regression(lambda x: motion.predict(x, 0.1), np.zeros(5), np.diag([1.0, 1.0, -1.0, 1.0, 1.0]))
+        regression(
+            lambda x: motion.predict(x, 0.1),
+            np.zeros(5),
+            np.diag([1.0, 1.0, -1.0, 1.0, 1.0]),
+        )
 
 
 SAMPLES = 200_000
@@ -86,7 +105,9 @@ def spread(yaw_std_rad: float, n: int = 5) -> np.ndarray:
     return P
 
 
-def turned(covariance: np.ndarray, mean: np.ndarray, angle_rad: float) -> tuple[np.ndarray, np.ndarray]:
+def turned(
+    covariance: np.ndarray, mean: np.ndarray, angle_rad: float
+) -> tuple[np.ndarray, np.ndarray]:
     """The same state in a world that is turned round the origin."""
     J = np.eye(len(mean))
     J[:2, :2] = rotation(angle_rad)
@@ -97,27 +118,44 @@ def turned(covariance: np.ndarray, mean: np.ndarray, angle_rad: float) -> tuple[
 
 @pytest.mark.parametrize("motion", [CTRV(), CTRA()], ids=["ctrv", "ctra"])
 @pytest.mark.parametrize("dt_s", [0.1, 1.0, 3.0])
-@pytest.mark.parametrize("yaw_std_rad", [0.1, 0.3, 0.7, 1.0, np.pi / 2, np.pi / np.sqrt(3.0), 3.0, 7.0])
+@pytest.mark.parametrize(
+    "yaw_std_rad", [0.1, 0.3, 0.7, 1.0, np.pi / 2, np.pi / np.sqrt(3.0), 3.0, 7.0]
+)
 def test_a_prediction_has_the_moments_of_the_model_however_wide_the_yaw(
     motion: MotionModel, dt_s: float, yaw_std_rad: float
 ) -> None:
-    mean, P = np.array([3.0, 4.0, 3.0, 10.0, 0.2, 0.5])[: motion.dim], spread(yaw_std_rad, motion.dim)
+    mean, P = (
+        np.array([3.0, 4.0, 3.0, 10.0, 0.2, 0.5])[: motion.dim],
+        spread(yaw_std_rad, motion.dim),
+    )
     found = UkfReplay(motion, Start(), 1.0).predict(mean, P, dt_s)
     x = np.random.default_rng(2).multivariate_normal(mean, P, SAMPLES)
     y = motion.predict(x, dt_s)
     apart = y - y.mean(axis=0)
-    covariance = apart.T @ apart / SAMPLES + motion.process_noise(x[:5000], dt_s).mean(axis=0)
+    covariance = apart.T @ apart / SAMPLES + motion.process_noise(x[:5000], dt_s).mean(
+        axis=0
+    )
     std, before = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(P))
     np.testing.assert_allclose((found.mean - y.mean(axis=0)) / std, 0.0, atol=NEAR)
-    np.testing.assert_allclose((found.covariance - covariance) / np.outer(std, std), 0.0, atol=NEAR)
+    np.testing.assert_allclose(
+        (found.covariance - covariance) / np.outer(std, std), 0.0, atol=NEAR
+    )
     cross = apart.T @ (x - x.mean(axis=0)) / SAMPLES
-    np.testing.assert_allclose((found.cross - cross) / np.outer(std, before), 0.0, atol=NEAR)
+    np.testing.assert_allclose(
+        (found.cross - cross) / np.outer(std, before), 0.0, atol=NEAR
+    )
 
 
 @pytest.mark.parametrize("name", ["ukf-replay", "iplf-replay"])
 def test_an_object_of_unknown_heading_spreads_round_its_place(name: str) -> None:
     """At 10 m/s after 1 s it lies on a ring of 10 m: the same in every direction."""
-    start = Start(yaw_rad=3.0, yaw_std_rad=4.0, speed_mps=10.0, speed_std_mps=1.0, position_std_m=1.0)
+    start = Start(
+        yaw_rad=3.0,
+        yaw_std_rad=4.0,
+        speed_mps=10.0,
+        speed_std_mps=1.0,
+        position_std_m=1.0,
+    )
     state = estimator(name, CTRV(), start).state_at(NS_PER_S)
     np.testing.assert_allclose(state.mean[:2], 0.0, atol=0.1)
     expected = (10.0**2 + 1.0) / 2.0 + 1.0
@@ -125,17 +163,30 @@ def test_an_object_of_unknown_heading_spreads_round_its_place(name: str) -> None
     assert abs(state.covariance[0, 1]) < 0.01 * expected
 
 
-SEEN = (("bearing_rad",), ("range_m", "bearing_rad"), ("range_m", "bearing_rad", "range_rate_mps"))
+SEEN = (
+    ("bearing_rad",),
+    ("range_m", "bearing_rad"),
+    ("range_m", "bearing_rad", "range_rate_mps"),
+)
 
 
 @pytest.mark.parametrize("seen", SEEN, ids=",".join)
-@pytest.mark.parametrize("position_m", [(-30.0, 0.2), (-30.0, -0.2), (-30.0, 0.0), (10.0, 0.0)], ids=str)
-@pytest.mark.parametrize(("along_m", "yaw_std_rad"), [(1.0, 0.2), (1.0, 1.8), (30.0, 0.2), (30.0, 1.8)])
+@pytest.mark.parametrize(
+    "position_m", [(-30.0, 0.2), (-30.0, -0.2), (-30.0, 0.0), (10.0, 0.0)], ids=str
+)
+@pytest.mark.parametrize(
+    ("along_m", "yaw_std_rad"), [(1.0, 0.2), (1.0, 1.8), (30.0, 0.2), (30.0, 1.8)]
+)
 def test_a_measurement_has_the_moments_of_its_model_across_half_a_turn(
-    seen: tuple[str, ...], position_m: tuple[float, float], along_m: float, yaw_std_rad: float
+    seen: tuple[str, ...],
+    position_m: tuple[float, float],
+    along_m: float,
+    yaw_std_rad: float,
 ) -> None:
     """Where the sensor may lie in the middle of the object's spread, the bearing has a jump: the errors are larger."""
-    measurement = Measurement.of(0, std=dict.fromkeys(seen, 1.0), **dict.fromkeys(seen, 1.0))
+    measurement = Measurement.of(
+        0, std=dict.fromkeys(seen, 1.0), **dict.fromkeys(seen, 1.0)
+    )
     mean, P = (
         np.array([*position_m, 0.5, 10.0, 0.0]),
         np.diag([along_m**2, 0.25 * along_m**2, yaw_std_rad**2, 4.0, 0.1]),
@@ -147,23 +198,42 @@ def test_a_measurement_has_the_moments_of_its_model_across_half_a_turn(
     std, before = np.sqrt(np.diag(S)), np.sqrt(np.diag(P))
     tolerance = 0.05 if along_m < 10.0 else 0.08
     np.testing.assert_allclose(y.mean(axis=0) / std, 0.0, atol=tolerance)
-    np.testing.assert_allclose((A @ P @ A.T + noise - S) / np.outer(std, std), 0.0, atol=tolerance)
-    np.testing.assert_allclose((A @ P - y.T @ (x - mean) / SAMPLES) / np.outer(std, before), 0.0, atol=tolerance)
+    np.testing.assert_allclose(
+        (A @ P @ A.T + noise - S) / np.outer(std, std), 0.0, atol=tolerance
+    )
+    np.testing.assert_allclose(
+        (A @ P - y.T @ (x - mean) / SAMPLES) / np.outer(std, before),
+        0.0,
+        atol=tolerance,
+    )
 
 
 @pytest.mark.parametrize("name", ["ukf-replay", "iplf-replay"])
 @pytest.mark.parametrize("angle_rad", [0.3, 1.7, np.pi, -2.0])
 @pytest.mark.parametrize("spread_m", [5.0, 30.0])
-def test_a_turned_world_gives_the_turned_estimate(name: str, angle_rad: float, spread_m: float) -> None:
+def test_a_turned_world_gives_the_turned_estimate(
+    name: str, angle_rad: float, spread_m: float
+) -> None:
     """With a spread that is the same in all directions, and a bearing that lies beyond half a turn."""
     found = []
     for turn_rad in (0.0, angle_rad):
         at = rotation(turn_rad) @ [-30.0, 0.2]
-        start = Start(position_m=at, position_std_m=spread_m, yaw_rad=turn_rad, yaw_std_rad=1.8, speed_mps=10.0)
+        start = Start(
+            position_m=at,
+            position_std_m=spread_m,
+            yaw_rad=turn_rad,
+            yaw_std_rad=1.8,
+            speed_mps=10.0,
+        )
         one = estimator(name, CTRV(), start)
         one.advance(NS_PER_S // 2)
         bearing_rad = float(np.angle(np.exp(1j * (np.pi + 0.02 + turn_rad))))
-        assert one.update(Measurement.of(NS_PER_S // 2, bearing_rad=bearing_rad, std=0.05)).nis is not None
+        assert (
+            one.update(
+                Measurement.of(NS_PER_S // 2, bearing_rad=bearing_rad, std=0.05)
+            ).nis
+            is not None
+        )
         state = one.state_at(NS_PER_S // 2)
         P, mean = turned(state.covariance, state.mean, -turn_rad)
         found.append((mean[:2], P[:2, :2]))
@@ -195,11 +265,21 @@ def test_a_wide_heading_and_doppler_track_a_car() -> None:
         velocity = 10.0 * np.array([np.cos(heading_rad), np.sin(heading_rad)])
         start_m = np.array([60.0, 20.0]) + rng.normal(0.0, 1.0, 2)
         start = Start(
-            position_m=start_m, position_std_m=1.0, yaw_rad=0.0, yaw_std_rad=4.0, speed_mps=10.0, speed_std_mps=1.0
+            position_m=start_m,
+            position_std_m=1.0,
+            yaw_rad=0.0,
+            yaw_std_rad=4.0,
+            speed_mps=10.0,
+            speed_std_mps=1.0,
         )
-        one, model = estimator("ukf-replay", CTRV(), start), measurement_model(SEEN[2], CTRV())
+        one, model = (
+            estimator("ukf-replay", CTRV(), start),
+            measurement_model(SEEN[2], CTRV()),
+        )
         for k in range(1, 9):
-            truth = np.array([*(np.array([60.0, 20.0]) + velocity * 0.1 * k), heading_rad, 10.0, 0.0])
+            truth = np.array(
+                [*(np.array([60.0, 20.0]) + velocity * 0.1 * k), heading_rad, 10.0, 0.0]
+            )
             std = np.array([0.5, 0.01, 0.2])
             z = model.predict(truth) + std * rng.standard_normal(3)
             one.update(Measurement(k * NS_PER_S // 10, model, z, np.diag(std**2)))

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from support.tracking import START_NS, message, ms
 
+from fgtrack.config.settings import Config
 from fgtrack.core.types import Detection, DetectionList, EgoState
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.build import build_tracker
-from fgtrack.pipeline.config import Config
 from fgtrack.pipeline.live import Tracker as LiveTracker
 from fgtrack.tracking.tracker import Tracker
 
@@ -24,18 +24,24 @@ CONFIG = Config(sensors=SENSORS)
 
 def ego(stamp_ms: float, receipt_ms: float | None = None) -> EgoState:
     receipt_ns = START_NS + ms(stamp_ms if receipt_ms is None else receipt_ms)
-    return EgoState(START_NS + ms(stamp_ms), receipt_ns, 0.01 * stamp_ms, 0.0, 0.0, 10.0)
+    return EgoState(
+        START_NS + ms(stamp_ms), receipt_ns, 0.01 * stamp_ms, 0.0, 0.0, 10.0
+    )
 
 
 def tracker(**settings: object) -> Tracker:
-    return build_tracker(CONFIG.replace({f"ego.{name}": value for name, value in settings.items()}))
+    return build_tracker(
+        CONFIG.replace({f"ego.{name}": value for name, value in settings.items()})
+    )
 
 
 def seen(one: Tracker, now_ms: float, *messages: EgoState | DetectionList) -> list[str]:
     """Dispositions of a tick that takes `messages`."""
     for each in messages:
         one.receive(each)
-    return [str(update.disposition) for update in one.tick(START_NS + ms(now_ms)).updates]
+    return [
+        str(update.disposition) for update in one.tick(START_NS + ms(now_ms)).updates
+    ]
 
 
 def test_a_list_waits_until_the_ego_has_come_to_its_stamp() -> None:
@@ -65,7 +71,9 @@ def test_nothing_waits_longer_than_the_limit() -> None:
 
 
 def test_without_waiting_every_list_is_placed_at_once() -> None:
-    assert seen(tracker(wait_s=0.0), 500.0, ego(0.0), message(FAR, stamp_ms=450.0)) == ["birth"]
+    assert seen(tracker(wait_s=0.0), 500.0, ego(0.0), message(FAR, stamp_ms=450.0)) == [
+        "birth"
+    ]
 
 
 def test_no_list_waits_until_the_estimator_could_not_fuse_it() -> None:
@@ -88,14 +96,28 @@ def test_an_ego_that_starts_late_places_what_waits_for_it() -> None:
 
 
 def test_positions_in_the_map_wait_for_nothing() -> None:
-    assert seen(tracker(), 500.0, ego(0.0), message(FAR, stamp_ms=450.0, frame="map")) == ["birth"]
+    assert seen(
+        tracker(), 500.0, ego(0.0), message(FAR, stamp_ms=450.0, frame="map")
+    ) == ["birth"]
 
 
-def test_ranges_to_objects_in_the_map_wait_for_an_ego_that_is_late_but_for_none_that_is_lost() -> None:
+def test_ranges_to_objects_in_the_map_wait_for_an_ego_that_is_late_but_for_none_that_is_lost() -> (
+    None
+):
     far = Detection(range_m=100.0, bearing_rad=0.1)
     late = message(far, sensor="radar", stamp_ms=700.0, frame="map")
     assert seen(tracker(), 700.0, ego(0.0), late) == []
-    assert len(seen(tracker(), 1500.0, ego(0.0), replace(late, stamp_ns=START_NS + ms(1400.0)))) == 1
+    assert (
+        len(
+            seen(
+                tracker(),
+                1500.0,
+                ego(0.0),
+                replace(late, stamp_ns=START_NS + ms(1400.0)),
+            )
+        )
+        == 1
+    )
     assert len(seen(tracker(), 700.0, late)) == 1
 
 
@@ -112,7 +134,11 @@ def test_the_order_of_ego_and_list_in_a_tick_does_not_matter(is_first: bool) -> 
 def test_the_lists_of_a_sensor_stay_in_order() -> None:
     one = tracker()
     seen(one, 0.0, ego(0.0))
-    lists = [message(FAR, stamp_ms=450.0), message(NEAR, stamp_ms=451.0), message(stamp_ms=452.0)]
+    lists = [
+        message(FAR, stamp_ms=450.0),
+        message(NEAR, stamp_ms=451.0),
+        message(stamp_ms=452.0),
+    ]
     assert seen(one, 500.0, *lists) == []
     assert seen(one, 600.0, ego(460.0)) == ["birth", "birth"]
 
@@ -120,8 +146,14 @@ def test_the_lists_of_a_sensor_stay_in_order() -> None:
 def test_the_batches_of_a_message_wait_together() -> None:
     sensors = {"lidar": replace(SENSORS["lidar"], stamp_from="object")}
     one = build_tracker(replace(CONFIG, sensors=sensors))
-    early, late = (replace(FAR, y_m=y_m, stamp_ns=START_NS + ms(at)) for y_m, at in ((3.0, 100.0), (30.0, 450.0)))
-    assert seen(one, 500.0, ego(0.0), ego(120.0), message(early, late, stamp_ms=450.0)) == []
+    early, late = (
+        replace(FAR, y_m=y_m, stamp_ns=START_NS + ms(at))
+        for y_m, at in ((3.0, 100.0), (30.0, 450.0))
+    )
+    assert (
+        seen(one, 500.0, ego(0.0), ego(120.0), message(early, late, stamp_ms=450.0))
+        == []
+    )
     assert len(seen(one, 600.0, ego(460.0))) == 2
 
 

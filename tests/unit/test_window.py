@@ -32,9 +32,13 @@ START = Start(
 )
 
 
-def position(offset_ns: int, x_m: float, y_m: float, loss: RobustLoss | None = None) -> Measurement:
+def position(
+    offset_ns: int, x_m: float, y_m: float, loss: RobustLoss | None = None
+) -> Measurement:
     model = measurement_model(("x_m", "y_m"), CV())
-    return Measurement(START_NS + offset_ns, model, np.array([x_m, y_m]), 0.09 * np.eye(2), loss=loss)
+    return Measurement(
+        START_NS + offset_ns, model, np.array([x_m, y_m]), 0.09 * np.eye(2), loss=loss
+    )
 
 
 def smoother(make: type[SmootherBank], *measurements: Measurement) -> SingleObject:
@@ -50,10 +54,21 @@ def test_detections_close_together_behind_the_window_are_exact_in_any_order(
     gap_ns: int, make: type[SmootherBank]
 ) -> None:
     """A velocity between two positions 1 us apart magnifies their rounding a million times; nothing else does."""
-    inside = [position(ms * MS, 3.0 + 0.018 * ms, -2.0 + 0.008 * ms) for ms in (300, 700, 1200)]
+    inside = [
+        position(ms * MS, 3.0 + 0.018 * ms, -2.0 + 0.008 * ms)
+        for ms in (300, 700, 1200)
+    ]
     offsets = (500 * MS, 500 * MS + gap_ns, 500 * MS + 2 * gap_ns, 700 * MS - gap_ns)
-    late = [position(offset, 12.4 + 0.3 * k, 2.0 - 0.4 * k) for k, offset in enumerate(offsets)]
-    stamps_ns = [START_NS + 1200 * MS, START_NS, *(item.stamp_ns for item in late), START_NS + 420 * MS]
+    late = [
+        position(offset, 12.4 + 0.3 * k, 2.0 - 0.4 * k)
+        for k, offset in enumerate(offsets)
+    ]
+    stamps_ns = [
+        START_NS + 1200 * MS,
+        START_NS,
+        *(item.stamp_ns for item in late),
+        START_NS + 420 * MS,
+    ]
     joint = dense_joint(CV(), START, [*inside, *late], stamps_ns)
     for order in list(permutations(late))[::5]:
         one = smoother(make, *inside)
@@ -65,11 +80,16 @@ def test_detections_close_together_behind_the_window_are_exact_in_any_order(
 
 
 @pytest.mark.parametrize("kind", ["cauchy", "tukey"])
-def test_an_outlier_weighs_as_little_behind_the_window_as_its_loss_says(kind: str) -> None:
+def test_an_outlier_weighs_as_little_behind_the_window_as_its_loss_says(
+    kind: str,
+) -> None:
     """Both when its node leaves, and when it comes too late for it."""
     outlier = position(300 * MS, 58.0, 0.6, RobustLoss(kind, 2.0))
     newest = position(700 * MS, 15.6, 3.6)
-    plain, left, late = (smoother(SmootherBank, *each) for each in ([newest], [outlier, newest], [newest, outlier]))
+    plain, left, late = (
+        smoother(SmootherBank, *each)
+        for each in ([newest], [outlier, newest], [newest, outlier])
+    )
     expected = plain.state_at(START_NS + 700 * MS)
     for one in (left, late):
         off = one.state_at(START_NS + 700 * MS).mean - expected.mean
@@ -78,8 +98,13 @@ def test_an_outlier_weighs_as_little_behind_the_window_as_its_loss_says(kind: st
 
 @pytest.mark.parametrize("offset_ns", [-US, US, 1])
 @pytest.mark.parametrize("make", [SmootherBank, IncrementalBank])
-def test_a_stamp_up_to_a_microsecond_from_a_node_shares_it(offset_ns: int, make: type[SmootherBank]) -> None:
-    near, apart = position(300 * MS + offset_ns, 8.5, 0.5), position(300 * MS + 3 * offset_ns, 8.5, 0.5)
+def test_a_stamp_up_to_a_microsecond_from_a_node_shares_it(
+    offset_ns: int, make: type[SmootherBank]
+) -> None:
+    near, apart = (
+        position(300 * MS + offset_ns, 8.5, 0.5),
+        position(300 * MS + 3 * offset_ns, 8.5, 0.5),
+    )
     for last, num in ((near, 2), (apart, 3 if abs(offset_ns) == US else 2)):
         one = smoother(make, position(300 * MS, 8.4, 0.4), near, last)
         one.bank.remove(0)
@@ -115,14 +140,18 @@ def test_the_state_between_two_nodes_is_the_conditional_of_the_joint(
     np.testing.assert_allclose(np.hstack([Lambda, Psi]), gain, atol=1e-6 * scale)
     np.testing.assert_allclose(Sigma, M - gain @ cross.T, atol=1e-7 * np.abs(M).max())
     moved = gain @ np.concatenate([np.zeros(n), right - kind.predict(middle, after_s)])
-    np.testing.assert_allclose(mean, middle + moved, atol=1e-6 * max(1.0, np.abs(moved).max()))
+    np.testing.assert_allclose(
+        mean, middle + moved, atol=1e-6 * max(1.0, np.abs(moved).max())
+    )
 
 
 @pytest.mark.parametrize("kind", MODELS, ids=MOTIONS)
 def test_at_its_ends_the_state_between_two_nodes_is_theirs(kind: MotionModel) -> None:
     left = np.array([12.0, 7.0, 0.4, 20.0, 0.3, 1.5])[: kind.dim]
     right = kind.predict(left, 0.3) + 0.1
-    at_left, at_right = (between(kind, left, right, *times) for times in ((0.0, 0.3), (0.3, 0.0)))
+    at_left, at_right = (
+        between(kind, left, right, *times) for times in ((0.0, 0.3), (0.3, 0.0))
+    )
     np.testing.assert_allclose(at_left[0], left, atol=1e-9)
     np.testing.assert_allclose(at_left[1], np.eye(kind.dim), atol=1e-9)
     np.testing.assert_allclose(at_right[0], right, atol=1e-9)

@@ -3,7 +3,7 @@
 import pytest
 from ruamel.yaml.error import YAMLError
 
-from fgtrack.io.yaml_text import safe_yaml
+from fgtrack.core.yaml_text import safe_yaml
 
 
 @pytest.mark.parametrize(

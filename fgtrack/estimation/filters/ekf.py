@@ -6,7 +6,14 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from fgtrack.core.linalg import congruence, identity, kernels, psd_solve, stacked, symmetrise
+from fgtrack.core.linalg import (
+    congruence,
+    identity,
+    kernels,
+    psd_solve,
+    stacked,
+    symmetrise,
+)
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.models.motion import MotionModel
@@ -25,7 +32,9 @@ def propagated(F: FloatArray, P: FloatArray, Q: FloatArray) -> FloatArray:
     return symmetrise(congruence(F, P) + Q)
 
 
-def kalman_gain(P: FloatArray, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
+def kalman_gain(
+    P: FloatArray, H: FloatArray, R: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Gain K = P H' S^-1 (..., n, k), and innovation covariance S = H P H' + R (..., k, k), which must be regular."""
     HP = H @ P
     S = HP @ H.mT + R
@@ -38,7 +47,9 @@ def joseph(P: FloatArray, K: FloatArray, H: FloatArray, R: FloatArray) -> FloatA
     return symmetrise(congruence(A, P) + congruence(K, R))
 
 
-def robust_weight(loss: RobustLoss | None, y: FloatArray, spread: FloatArray, R: FloatArray) -> float:
+def robust_weight(
+    loss: RobustLoss | None, y: FloatArray, spread: FloatArray, R: FloatArray
+) -> float:
     """Weight w of an innovation y (k,) with covariance `spread` + R, both (k, k), under a robust loss; 1 without.
 
     At w the correction with R / w minimises prior plus loss of the post-fit residual r = R / w S^-1 y, S = `spread` + R
@@ -50,7 +61,9 @@ def robust_weight(loss: RobustLoss | None, y: FloatArray, spread: FloatArray, R:
         return w
     for _ in range(_MAX_REWEIGHTINGS):
         solved = psd_solve(spread + R / w, y)
-        new = weight(loss, math.sqrt(max(float(solved.dot(R.dot(solved))), 0.0)) / w, len(y))
+        new = weight(
+            loss, math.sqrt(max(float(solved.dot(R.dot(solved))), 0.0)) / w, len(y)
+        )
         if not new < w * (1.0 - _REWEIGHTING_TOLERANCE):
             break
         w = new
@@ -91,19 +104,27 @@ class Prediction(NamedTuple):
 
 
 def predict(
-    mean: FloatArray, covariance: FloatArray, motion: MotionModel, dt_s: FloatArray | float
+    mean: FloatArray,
+    covariance: FloatArray,
+    motion: MotionModel,
+    dt_s: FloatArray | float,
 ) -> tuple[FloatArray, FloatArray]:
     """Mean (..., n) and covariance (..., n, n) after `dt_s` (...): f(x), F P F' + Q (Karle et al. 2023, eqs. 3, 4)."""
     return predict_across(mean, covariance, motion, dt_s)[:2]
 
 
 def predict_across(
-    mean: FloatArray, covariance: FloatArray, motion: MotionModel, dt_s: FloatArray | float
+    mean: FloatArray,
+    covariance: FloatArray,
+    motion: MotionModel,
+    dt_s: FloatArray | float,
 ) -> Prediction:
     """`predict`, and the cross-covariance of both states, which is half way to the covariance."""
     after, F, Q = motion.transition(mean, dt_s)
     shape, n = Q.shape, Q.shape[-1]
-    F, P, Q = (np.array(each, order="C") for each in (F, np.broadcast_to(covariance, shape), Q))
+    F, P, Q = (
+        np.array(each, order="C") for each in (F, np.broadcast_to(covariance, shape), Q)
+    )
     _, cross = kernels(_KALMAN).predict(*(each.reshape(-1, n, n) for each in (F, P, Q)))
     return Prediction(after, Q, cross.reshape(shape))
 
@@ -121,16 +142,39 @@ def correct(
     `measured` is `Measurement.measured`, for the NIS, `loss` the robust loss of all (see `robust_weight`).
     """
     rows = np.arange(y.shape[-1]) if measured is None else measured
-    m, x, P, H, R = len(mean), _copied(mean), _copied(covariance), stacked(H), np.ascontiguousarray(R)
-    S, nis, w, fused = np.empty(R.shape), np.empty(m), np.ones(m), np.empty(m, dtype=bool)
+    m, x, P, H, R = (
+        len(mean),
+        _copied(mean),
+        _copied(covariance),
+        stacked(H),
+        np.ascontiguousarray(R),
+    )
+    S, nis, w, fused = (
+        np.empty(R.shape),
+        np.empty(m),
+        np.ones(m),
+        np.empty(m, dtype=bool),
+    )
     fuse = kernels(_KALMAN).correct
     fuse(x, P, y, H, R, rows, S, nis, fused)
     if loss is not None:
         x, P = _copied(mean), _copied(covariance)
         spread = congruence(H, P)
         for row in range(len(x)):
-            w[row] = robust_weight(loss, y[row], spread[row], R[row]) if fused[row] else 1.0
-        fuse(x, P, y, H, R / w[:, None, None], rows, np.empty(R.shape), np.empty(len(x)), fused)
+            w[row] = (
+                robust_weight(loss, y[row], spread[row], R[row]) if fused[row] else 1.0
+            )
+        fuse(
+            x,
+            P,
+            y,
+            H,
+            R / w[:, None, None],
+            rows,
+            np.empty(R.shape),
+            np.empty(len(x)),
+            fused,
+        )
     return Correction(x, P, y, nis, w, S, fused)
 
 
@@ -146,13 +190,21 @@ def updated_one(
     """One state, (n,) and (n, n), after the innovation y (k,) of a measurement with H (k, n) and R (k, k).
     Raises `numpy.linalg.LinAlgError` for one that cannot be fused.
     """
-    x, P, y, nis, w, S, fused = correct(mean[None], covariance[None], y[None], H, R[None], measured, loss)
+    x, P, y, nis, w, S, fused = correct(
+        mean[None], covariance[None], y[None], H, R[None], measured, loss
+    )
     if not fused[0]:
-        raise np.linalg.LinAlgError("innovation covariance not positive definite, or posterior not finite")
+        raise np.linalg.LinAlgError(
+            "innovation covariance not positive definite, or posterior not finite"
+        )
     return Correction(x[0], P[0], y[0], float(nis[0]), float(w[0]), S[0])
 
 
-def correct_one(mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
+def correct_one(
+    mean: FloatArray, covariance: FloatArray, measurement: Measurement
+) -> OneCorrection:
     """`correct` of one state, shapes (n,) and (n, n). Raises as `updated_one`."""
     y, H = measurement.model.linearised(measurement.z, mean, measurement.pose)
-    return updated_one(mean, covariance, y, H, measurement.R, measurement.loss, measurement.measured)
+    return updated_one(
+        mean, covariance, y, H, measurement.R, measurement.loss, measurement.measured
+    )

@@ -28,29 +28,46 @@ class IekfReplay(ReplayEkf):
     iterates = True
     _max_iterations, _tolerance = 10, 1e-6
 
-    def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
+    def correct(
+        self, mean: FloatArray, covariance: FloatArray, measurement: Measurement
+    ) -> OneCorrection:
         """See `ReplayEkf.correct`."""
         if measurement.model.linear:
             return super().correct(mean, covariance, measurement)
 
         def cost(x: FloatArray) -> float:
-            y = measurement.model.residual(measurement.z, measurement.model.predict(x, measurement.pose))
-            return negative_log_posterior(x - mean, covariance, y, measurement.R, measurement.loss)
+            y = measurement.model.residual(
+                measurement.z, measurement.model.predict(x, measurement.pose)
+            )
+            return negative_log_posterior(
+                x - mean, covariance, y, measurement.R, measurement.loss
+            )
 
         x = mean
         for _ in range(self._max_iterations):
             last = x
             y, H = measurement.model.linearised(measurement.z, x, measurement.pose)
-            update = reweighted(mean, covariance, y, H, measurement.R, measurement.loss, x - mean)
-            limit = negative_log_posterior(x - mean, covariance, y, measurement.R, measurement.loss)
+            update = reweighted(
+                mean, covariance, y, H, measurement.R, measurement.loss, x - mean
+            )
+            limit = negative_log_posterior(
+                x - mean, covariance, y, measurement.R, measurement.loss
+            )
             x = descended(cost, limit, last, update.mean)
             if largest_move(x - last, covariance) < self._tolerance:
                 break
         first = super().correct(mean, covariance, measurement)
-        return first._replace(mean=x, covariance=update.covariance, weight=update.weight)
+        return first._replace(
+            mean=x, covariance=update.covariance, weight=update.weight
+        )
 
 
-def descended(cost: Callable[[FloatArray], float], limit: float, start: FloatArray, end: FloatArray) -> FloatArray:
+def descended(
+    cost: Callable[[FloatArray], float],
+    limit: float,
+    start: FloatArray,
+    end: FloatArray,
+) -> FloatArray:
     """Farthest point from `start` (n,) to `end` (n,), by halving, with a `cost` of at most `limit`; else `start`."""
     step = end - start
     for _ in range(_MAX_HALVINGS):
@@ -63,16 +80,24 @@ def descended(cost: Callable[[FloatArray], float], limit: float, start: FloatArr
 def largest_move(step: FloatArray, covariance: FloatArray) -> float:
     """Largest entry of `step` (n,) in standard deviations of `covariance` (n, n)."""
     sigma = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
-    return float(np.divide(np.abs(step), sigma, out=np.zeros(len(step)), where=sigma > 0.0).max())
+    return float(
+        np.divide(np.abs(step), sigma, out=np.zeros(len(step)), where=sigma > 0.0).max()
+    )
 
 
 def negative_log_posterior(
-    off: FloatArray, P: FloatArray, residual: FloatArray, R: FloatArray, loss: RobustLoss | None
+    off: FloatArray,
+    P: FloatArray,
+    residual: FloatArray,
+    R: FloatArray,
+    loss: RobustLoss | None,
 ) -> float:
     """Cost that an update minimises: half of off' P^-1 off, and the loss of the residual (k,) in R (k, k).
     `off` (n,) is the step from the prior with covariance P (n, n).
     """
-    return 0.5 * float(off.dot(psd_solve(P, off))) + penalty(loss, _length(residual, R), len(R))
+    return 0.5 * float(off.dot(psd_solve(P, off))) + penalty(
+        loss, _length(residual, R), len(R)
+    )
 
 
 def reweighted(

@@ -11,7 +11,12 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.filters.ekf import OneCorrection, Prediction, correct_one, predict
+from fgtrack.estimation.filters.ekf import (
+    OneCorrection,
+    Prediction,
+    correct_one,
+    predict,
+)
 from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.filters.propagation import wrapped
 from fgtrack.estimation.filters.replay import Mixture, ReplayEkf, Step
@@ -55,9 +60,16 @@ class ImmReplay(ReplayEkf):
         beside = _beside(motion, other)
         self._models = (motion,) if beside is None else (motion, beside)
         self._rate_hz = len(self._models) / stay_s
-        means, covariances = zip(*(initial_state(model, prior) for model in self._models), strict=True)
+        means, covariances = zip(
+            *(initial_state(model, prior) for model in self._models), strict=True
+        )
         self.steps = [
-            replace(self.steps[0], mixture=Mixture(means, covariances, np.full(len(means), 1.0 / len(means))))
+            replace(
+                self.steps[0],
+                mixture=Mixture(
+                    means, covariances, np.full(len(means), 1.0 / len(means))
+                ),
+            )
         ]
 
     def transition(self, dt_s: float) -> FloatArray:
@@ -73,27 +85,43 @@ class ImmReplay(ReplayEkf):
         mean, covariance = self._moments(mixture, mixture.probabilities, self._motion)
         return Prediction(mean, covariance, covariance)
 
-    def _step(self, before: Step, measurement: Measurement) -> tuple[Step, OneCorrection]:
+    def _step(
+        self, before: Step, measurement: Measurement
+    ) -> tuple[Step, OneCorrection]:
         prior = self._mixed(before, measurement.stamp_ns)
         mean, covariance = self._moments(prior, prior.probabilities, self._motion)
         corrected = [
             correct_one(mean, covariance, measurement.seen_by(model))
-            for model, mean, covariance in zip(self._models, prior.means, prior.covariances, strict=True)
+            for model, mean, covariance in zip(
+                self._models, prior.means, prior.covariances, strict=True
+            )
         ]
         logs = np.log(np.maximum(prior.probabilities, _LEAST))
         logs += [_log_likelihood(each, measurement) for each in corrected]
         likelihoods = np.maximum(np.exp(logs - logs.max()), _LEAST)
         posterior = Mixture(
-            tuple(wrapped(model, each.mean) for model, each in zip(self._models, corrected, strict=True)),
+            tuple(
+                wrapped(model, each.mean)
+                for model, each in zip(self._models, corrected, strict=True)
+            ),
             tuple(each.covariance for each in corrected),
             likelihoods / likelihoods.sum(),
         )
         x, P = self._moments(posterior, posterior.probabilities, self._motion)
         weight = float(posterior.probabilities @ [each.weight for each in corrected])
-        correction = correct_one(mean, covariance, measurement)._replace(mean=x, covariance=P, weight=weight)
-        step = self._concluded(before, measurement, Prediction(mean, covariance, covariance), correction)
-        if step.search is not None and step.search.line is not None:  # the state comes from the line, by `motion`
-            alike = [_converted(self._motion, model, step.mean, step.covariance) for model in self._models]
+        correction = correct_one(mean, covariance, measurement)._replace(
+            mean=x, covariance=P, weight=weight
+        )
+        step = self._concluded(
+            before, measurement, Prediction(mean, covariance, covariance), correction
+        )
+        if (
+            step.search is not None and step.search.line is not None
+        ):  # the state comes from the line, by `motion`
+            alike = [
+                _converted(self._motion, model, step.mean, step.covariance)
+                for model in self._models
+            ]
             means, covariances = zip(*alike, strict=True)
             posterior = posterior._replace(means=means, covariances=covariances)
         return replace(step, mixture=posterior), correction
@@ -109,24 +137,35 @@ class ImmReplay(ReplayEkf):
         probabilities = joint.sum(axis=0)
         states = [
             predict(*self._moments(old, shares / total, model), model, dt_s)
-            for model, shares, total in zip(self._models, joint.T, probabilities, strict=True)
+            for model, shares, total in zip(
+                self._models, joint.T, probabilities, strict=True
+            )
         ]
         means, covariances = zip(*states, strict=True)
         return Mixture(means, covariances, probabilities)
 
-    def _moments(self, mixture: Mixture, weights: FloatArray, model: MotionModel) -> tuple[FloatArray, FloatArray]:
+    def _moments(
+        self, mixture: Mixture, weights: FloatArray, model: MotionModel
+    ) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance of the Gaussians of `mixture` with other `weights`, in the state of `model`."""
         states = [
             _converted(each, model, mean, covariance)
-            for each, mean, covariance in zip(self._models, mixture.means, mixture.covariances, strict=True)
+            for each, mean, covariance in zip(
+                self._models, mixture.means, mixture.covariances, strict=True
+            )
         ]
         if len(states) == 1:
             return states[0]
         reference = states[int(weights.argmax())][0]
         apart = [wrapped(model, mean - reference) for mean, _ in states]
         offset = weights @ np.array(apart)
-        spread = [P + np.outer(d - offset, d - offset) for d, (_, P) in zip(apart, states, strict=True)]
-        return reference + offset, symmetrise(np.tensordot(weights, np.array(spread), axes=1))
+        spread = [
+            P + np.outer(d - offset, d - offset)
+            for d, (_, P) in zip(apart, states, strict=True)
+        ]
+        return reference + offset, symmetrise(
+            np.tensordot(weights, np.array(spread), axes=1)
+        )
 
 
 def _converted(
@@ -136,9 +175,12 @@ def _converted(
     if model.state_names == wanted.state_names:
         return mean, covariance
     if model.cartesian and wanted.cartesian:
-        selection = np.array([[float(a == b) for b in model.state_names] for a in wanted.state_names])
+        selection = np.array(
+            [[float(a == b) for b in model.state_names] for a in wanted.state_names]
+        )
         missing = [
-            0.0 if row.any() else wanted.start_variance(wanted.state_names[k]) for k, row in enumerate(selection)
+            0.0 if row.any() else wanted.start_variance(wanted.state_names[k])
+            for k, row in enumerate(selection)
         ]
         return selection @ mean, congruence(selection, covariance) + np.diag(missing)
     return wanted.from_kinematic(*model.kinematic(mean, covariance))
@@ -152,15 +194,29 @@ def _beside(motion: MotionModel, other: str | MotionModel) -> MotionModel | None
         return other
     if isinstance(motion, CT) and not other:
         return CV(motion.velocity_density_m2ps3)
-    default = "ctrv" if isinstance(motion, CTRA) else "ctra" if isinstance(motion, CTRV) else ""
+    default = (
+        "ctrv"
+        if isinstance(motion, CTRA)
+        else "ctra"
+        if isinstance(motion, CTRV)
+        else ""
+    )
     if not (other or default):
         return None
     alike = isinstance(motion, CTRV) and other in ("", default)
-    same = {each.name: getattr(motion, each.name) for each in fields(CTRV)} if alike else {}
+    same = (
+        {each.name: getattr(motion, each.name) for each in fields(CTRV)}
+        if alike
+        else {}
+    )
     return motion_model(other or default, same)
 
 
 def _log_likelihood(corrected: OneCorrection, measurement: Measurement) -> float:
     """Log-likelihood of the innovation by one model, under the loss of the measurement, without common terms."""
-    distance = math.sqrt(max(float(mahalanobis_squared(corrected.innovation, corrected.S)), 0.0))
-    return -penalty(measurement.loss, distance, len(measurement.R)) - 0.5 * float(np.linalg.slogdet(corrected.S)[1])
+    distance = math.sqrt(
+        max(float(mahalanobis_squared(corrected.innovation, corrected.S)), 0.0)
+    )
+    return -penalty(measurement.loss, distance, len(measurement.R)) - 0.5 * float(
+        np.linalg.slogdet(corrected.S)[1]
+    )

@@ -33,7 +33,9 @@ CERTAIN_TO_SMOOTHER, SMOOTHER_ITERATIONS = 3.0, 10
 def checked_initiation(method: str) -> Initiation:
     """`method`; raises `CallError` for one that does not exist."""
     if method not in get_args(Initiation):
-        raise CallError(f"initiation: must be {', '.join(get_args(Initiation))}, is {method!r}")
+        raise CallError(
+            f"initiation: must be {', '.join(get_args(Initiation))}, is {method!r}"
+        )
     return cast(Initiation, method)
 
 
@@ -58,21 +60,31 @@ class Line(NamedTuple):
 
 def fix_of(measurement: Measurement, time_s: float) -> Fix | None:
     """The position that `measurement` gives; None where it gives none: a bearing alone, a range alone."""
-    position = measured_position(measurement.model.components, measurement.z, measurement.R, measurement.pose)
+    position = measured_position(
+        measurement.model.components, measurement.z, measurement.R, measurement.pose
+    )
     return None if position is None else Fix(time_s, *position)
 
 
-def fixes_of(mean: FloatArray, covariance: FloatArray, later: Iterable[tuple[float, Measurement]]) -> list[Fix]:
+def fixes_of(
+    mean: FloatArray, covariance: FloatArray, later: Iterable[tuple[float, Measurement]]
+) -> list[Fix]:
     """The position of a first state, (n,) and (n, n), at time 0, and those of the measurements `later` with times."""
     fixes = [fix_of(measurement, time_s) for time_s, measurement in later]
-    return [Fix(0.0, mean[:2], covariance[:2, :2]), *(fix for fix in fixes if fix is not None)]
+    return [
+        Fix(0.0, mean[:2], covariance[:2, :2]),
+        *(fix for fix in fixes if fix is not None),
+    ]
 
 
 def straight_lines(fixes: Sequence[Fix], least: int) -> Iterator[Line]:
     """Least-squares lines at constant velocity through the first `least` fixes, and through each one more.
     Raises `numpy.linalg.LinAlgError` where all are of one time, or one has no uncertainty.
     """
-    information, vector = np.zeros((4, 4)), np.zeros(4)  # of the position at time 0 and the velocity
+    information, vector = (
+        np.zeros((4, 4)),
+        np.zeros(4),
+    )  # of the position at time 0 and the velocity
     for count, fix in enumerate(fixes, start=1):
         H = np.hstack([np.eye(2), fix.time_s * np.eye(2)])
         weighted = psd_solve(fix.covariance, H).T
@@ -102,7 +114,9 @@ class Search:
         checked = checked_initiation(method)
         return cls(start.stamp_ns, checked) if sought(motion, start, checked) else None
 
-    def next_line(self, fixes: Callable[[], Iterable[Fix]], oldest_ns: int) -> "tuple[Line, Search] | None":
+    def next_line(
+        self, fixes: Callable[[], Iterable[Fix]], oldest_ns: int
+    ) -> "tuple[Line, Search] | None":
         """The line to restart along, and another search, after measurements from the stamp `oldest_ns` on.
         Through as many of the first `fixes` as the method asks for, whatever the order of arrival. None where the last
         line stays, where all fixes are of one time, and where one has no uncertainty.
@@ -110,10 +124,21 @@ class Search:
         if self.until_ns is not None and oldest_ns > self.until_ns:
             return None
         line, until_ns = None, None
-        ordered = sorted(fixes(), key=lambda fix: (fix.time_s, *fix.position_m.tolist(), *fix.covariance.flat))
+        ordered = sorted(
+            fixes(),
+            key=lambda fix: (
+                fix.time_s,
+                *fix.position_m.tolist(),
+                *fix.covariance.flat,
+            ),
+        )
         simultaneous = sum(fix.time_s == ordered[0].time_s for fix in ordered)
         try:
-            for fix, line in zip(ordered[simultaneous:], straight_lines(ordered, simultaneous + 1), strict=True):
+            for fix, line in zip(
+                ordered[simultaneous:],
+                straight_lines(ordered, simultaneous + 1),
+                strict=True,
+            ):
                 if over(line, self.method, CERTAIN_TO_SMOOTHER):
                     until_ns = self.first_ns + nanoseconds(fix.time_s)
                     break
@@ -127,7 +152,14 @@ def along(line: Line, time_s: float, state_names: Sequence[str]) -> FloatArray:
     yaw_rad, speed_mps = polar(line.velocity_mps).tolist()
     vx_mps, vy_mps = line.velocity_mps.tolist()
     x_m, y_m = (line.position_m + time_s * line.velocity_mps).tolist()
-    values = {"x_m": x_m, "y_m": y_m, "yaw_rad": yaw_rad, "speed_mps": speed_mps, "vx_mps": vx_mps, "vy_mps": vy_mps}
+    values = {
+        "x_m": x_m,
+        "y_m": y_m,
+        "yaw_rad": yaw_rad,
+        "speed_mps": speed_mps,
+        "vx_mps": vx_mps,
+        "vy_mps": vy_mps,
+    }
     return np.array([values.get(name, 0.0) for name in state_names])
 
 
@@ -138,5 +170,7 @@ def sought(motion: MotionModel, start: Start, method: Initiation) -> bool:
 
 def over(line: Line, method: Initiation, certain: float) -> bool:
     """True if `line` is the last one for `method`: its velocity is `certain` standard deviations from zero."""
-    sigmas = math.sqrt(line.velocity_mps @ psd_solve(line.covariance, line.velocity_mps))
+    sigmas = math.sqrt(
+        line.velocity_mps @ psd_solve(line.covariance, line.velocity_mps)
+    )
     return method == "two-point" or sigmas > certain

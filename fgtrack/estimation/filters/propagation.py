@@ -1,6 +1,5 @@
 """Propagators of many objects through equal time steps, and the kinematic states that a bank gives."""
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -27,43 +26,25 @@ class ExactPropagator:
         if not (isinstance(self.motion, WhiteNoise) and self.motion.is_compiled):
             return predict(mean, covariance, self.motion, steps * np.float64(dt_s))
         x, P = mean.copy(), covariance.copy()
-        kernels("fgtrack.estimation.kernels.kalman").propagate(self.motion.kind, self.motion.noise, x, P, steps, dt_s)
+        kernels("fgtrack.estimation.kernels.kalman").propagate(
+            self.motion.kind, self.motion.noise, x, P, steps, dt_s
+        )
         return x, P
 
     def wrap(self, mean: FloatArray) -> FloatArray:
         """Means, shape (..., n), with the angles brought back to their range after a correction."""
         return wrapped(self.motion, mean)
 
-    def residual(self, model: MeasurementModel, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
+    def residual(
+        self, model: MeasurementModel, z: FloatArray, z_predicted: FloatArray
+    ) -> FloatArray:
         """Measured minus predicted, shape (..., k), in the angles' range: the model's own."""
         return model.residual(z, z_predicted)
 
 
-class EulerCtrv(ExactPropagator):
-    """CTRV in Euler steps (Karle et al. 2023, eq. 10); states beyond the yaw rate and their noise are carried along."""
-
-    yaw_limit_rad = math.inf
-    """Largest yaw that a step gives."""
-
-    def __init__(self, motion: MotionModel, density: FloatArray, *, accelerates: bool = False) -> None:
-        """`density`: diagonal of Q per second, shape (n,), along and across the heading first.
-        `accelerates`: the acceleration drives the speed but is absent from the transition matrix (defect Q5).
-        """
-        super().__init__(motion)
-        self._density = np.array(density, dtype=np.float64)
-        self._accelerates = accelerates
-
-    def propagate(
-        self, mean: FloatArray, covariance: FloatArray, steps: IntArray, dt_s: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """See `ExactPropagator.propagate`."""
-        x, P = mean.copy(), covariance.copy()
-        euler = kernels("fgtrack.estimation.kernels.euler")
-        euler.propagate(x, P, steps, dt_s, self._density, self._accelerates, self.yaw_limit_rad)
-        return x, P
-
-
-def track_state(motion: MotionModel, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> TrackState:
+def track_state(
+    motion: MotionModel, stamp_ns: int, mean: FloatArray, covariance: FloatArray
+) -> TrackState:
     """A state of `motion` as it is handed out, with the yaw in (-pi, pi]."""
     return TrackState(stamp_ns, wrapped(motion, mean), covariance)
 
@@ -87,7 +68,9 @@ def wrapped_yaw(mean: FloatArray) -> FloatArray:
 class States(Lazy[TrackState]):
     """States of several objects."""
 
-    def __init__(self, stamps_ns: Sequence[int], means: FloatArray, covariances: FloatArray) -> None:
+    def __init__(
+        self, stamps_ns: Sequence[int], means: FloatArray, covariances: FloatArray
+    ) -> None:
         self.stamps_ns, self.means, self.covariances = stamps_ns, means, covariances
         """Shapes (m,), (m, n) and (m, n, n)."""
 
@@ -96,11 +79,16 @@ class States(Lazy[TrackState]):
 
     def made(self, index: int) -> TrackState:
         """See `Lazy.made`."""
-        return TrackState(self.stamps_ns[index], self.means[index], self.covariances[index])
+        return TrackState(
+            self.stamps_ns[index], self.means[index], self.covariances[index]
+        )
 
 
 def kinematic_states(
-    motion: MotionModel, stamps_ns: int | Sequence[int], means: FloatArray, covariances: FloatArray
+    motion: MotionModel,
+    stamps_ns: int | Sequence[int],
+    means: FloatArray,
+    covariances: FloatArray,
 ) -> States:
     """Published kinematic states of m states of `motion`, shapes (m, n) and (m, n, n), at these stamps, or at one."""
     means, covariances = motion.published(means, covariances)

@@ -11,7 +11,12 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.filters.ekf import OneCorrection, Prediction, correct_one, predict_across
+from fgtrack.estimation.filters.ekf import (
+    OneCorrection,
+    Prediction,
+    correct_one,
+    predict_across,
+)
 from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.filters.propagation import track_state, wrapped
 from fgtrack.estimation.filters.track_initiation import TrackInitiation
@@ -59,7 +64,9 @@ class ReplayEkf(WindowedFilter):
     retrodicts = True
     initiates = True
 
-    def __init__(self, motion: MotionModel, prior: Start, lag_s: float, initiation: str = DEFAULT) -> None:
+    def __init__(
+        self, motion: MotionModel, prior: Start, lag_s: float, initiation: str = DEFAULT
+    ) -> None:
         super().__init__(motion, prior, lag_s)
         x, P = initial_state(motion, prior)
         search = TrackInitiation.of(motion, prior, initiation)
@@ -69,7 +76,9 @@ class ReplayEkf(WindowedFilter):
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: the filter's state, from the measurements up to that stamp."""
         stamp_ns = as_stamp("stamp_ns", stamp_ns)
-        before = self.steps[max(bisect.bisect_right(self.steps, stamp_ns, key=_stamp) - 1, 0)]
+        before = self.steps[
+            max(bisect.bisect_right(self.steps, stamp_ns, key=_stamp) - 1, 0)
+        ]
         mean, covariance, _ = self._ahead(before, stamp_ns)
         return track_state(self._motion, stamp_ns, mean, covariance)
 
@@ -79,20 +88,29 @@ class ReplayEkf(WindowedFilter):
 
     def _forget_before(self, stamp_ns: int) -> None:
         # what is measured at that very stamp may still come, and belongs behind the first step
-        del self.steps[: max(bisect.bisect_left(self.steps, stamp_ns, key=_stamp) - 1, 0)]
+        del self.steps[
+            : max(bisect.bisect_left(self.steps, stamp_ns, key=_stamp) - 1, 0)
+        ]
 
     def _fuse(self, measurement: Measurement) -> OneCorrection:
-        stamp_ns = measurement.stamp_ns  # it comes by stamp and, at one stamp, by content; never before the first
+        stamp_ns = (
+            measurement.stamp_ns
+        )  # it comes by stamp and, at one stamp, by content; never before the first
         index = max(bisect.bisect_right(self.steps, stamp_ns, key=_stamp), 1)
         while index > 1 and self.steps[index - 1].stamp_ns == stamp_ns:
             last = self.steps[index - 1].measurement
             if last is None or last.content <= measurement.content:
                 break
             index -= 1
-        later, (step, correction) = self.steps[index:], self._step(self.steps[index - 1], measurement)
+        later, (step, correction) = (
+            self.steps[index:],
+            self._step(self.steps[index - 1], measurement),
+        )
         if later and self.retrodicts:
             expected = self.correct(*self._retrodicted(step, later), measurement)
-            correction = correction._replace(innovation=expected.innovation, nis=expected.nis, S=expected.S)
+            correction = correction._replace(
+                innovation=expected.innovation, nis=expected.nis, S=expected.S
+            )
         chain = [step]
         for each in later:
             if each.measurement is not None:
@@ -100,11 +118,15 @@ class ReplayEkf(WindowedFilter):
         self.steps[index:] = chain
         return correction
 
-    def predict(self, mean: FloatArray, covariance: FloatArray, dt_s: float) -> Prediction:
+    def predict(
+        self, mean: FloatArray, covariance: FloatArray, dt_s: float
+    ) -> Prediction:
         """State `mean` (n,), `covariance` (n, n) after `dt_s` >= 0."""
         return predict_across(mean, covariance, self._motion, dt_s)
 
-    def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
+    def correct(
+        self, mean: FloatArray, covariance: FloatArray, measurement: Measurement
+    ) -> OneCorrection:
         """State after `measurement` at the stamp of `mean` (n,) and `covariance` (n, n), with the innovation before it.
         Raises `numpy.linalg.LinAlgError` for a measurement that cannot be fused.
         """
@@ -114,32 +136,58 @@ class ReplayEkf(WindowedFilter):
         """State at `stamp_ns`, predicted from a step."""
         if stamp_ns == before.stamp_ns:
             return Prediction(before.mean, before.covariance, before.covariance)
-        return self.predict(before.mean, before.covariance, seconds(stamp_ns - before.stamp_ns))
+        return self.predict(
+            before.mean, before.covariance, seconds(stamp_ns - before.stamp_ns)
+        )
 
-    def _step(self, before: Step, measurement: Measurement) -> tuple[Step, OneCorrection]:
+    def _step(
+        self, before: Step, measurement: Measurement
+    ) -> tuple[Step, OneCorrection]:
         """The step of `measurement` after the step before it. Raises as `correct`."""
         predicted = self._ahead(before, measurement.stamp_ns)
         corrected = self.correct(predicted.mean, predicted.covariance, measurement)
         return self._concluded(before, measurement, predicted, corrected), corrected
 
     def _concluded(
-        self, before: Step, measurement: Measurement, predicted: Prediction, corrected: OneCorrection
+        self,
+        before: Step,
+        measurement: Measurement,
+        predicted: Prediction,
+        corrected: OneCorrection,
     ) -> Step:
         """The step of a corrected state; while the direction of travel is sought, that along the line instead."""
         mean, covariance = corrected.mean, corrected.covariance
-        search = None if before.search is None else before.search.with_measurement(measurement)
+        search = (
+            None
+            if before.search is None
+            else before.search.with_measurement(measurement)
+        )
         if search is not None and search.line is not None:
             mean, covariance = search.state()
-        return Step(measurement.stamp_ns, measurement, wrapped(self._motion, mean), covariance, predicted, search)
+        return Step(
+            measurement.stamp_ns,
+            measurement,
+            wrapped(self._motion, mean),
+            covariance,
+            predicted,
+            search,
+        )
 
-    def _retrodicted(self, new: Step, later: Sequence[Step]) -> tuple[FloatArray, FloatArray]:
+    def _retrodicted(
+        self, new: Step, later: Sequence[Step]
+    ) -> tuple[FloatArray, FloatArray]:
         """State (n,), (n, n) at the `new` measurement, given all that was fused before, the `later` steps included."""
-        links: list[Link] = [(each.stamp_ns, each.mean, each.covariance, each.predicted) for each in later]
+        links: list[Link] = [
+            (each.stamp_ns, each.mean, each.covariance, each.predicted)
+            for each in later
+        ]
         mean, covariance = later[-1].mean, later[-1].covariance
         for index in range(len(later) - 1, -1, -1):
             search = later[index].search
             if search is not None and search.line is not None:
-                mean, covariance = smoothed_back(self._motion, links[index:], mean, covariance)
+                mean, covariance = smoothed_back(
+                    self._motion, links[index:], mean, covariance
+                )
                 return search.retrodicted(new.stamp_ns, mean, covariance)
         without = Step(new.stamp_ns, None, *new.predicted[:2], new.predicted)
         stamp_ns, x, P, _ = links[0]

@@ -32,7 +32,12 @@ from fgtrack.models.motion import WhiteNoise
 
 _KERNELS = "fgtrack.estimation.kernels.replay"
 #: In the order of the numbers that the kernels give.
-_STATUS = UpdateStatus.FAILED, UpdateStatus.TOO_OLD, UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE
+_STATUS = (
+    UpdateStatus.FAILED,
+    UpdateStatus.TOO_OLD,
+    UpdateStatus.IN_SEQUENCE,
+    UpdateStatus.OUT_OF_SEQUENCE,
+)
 _FUSED, _NO_ROOM = _STATUS[2:], len(_STATUS)
 
 
@@ -44,15 +49,23 @@ class ReplayBank(ObjectBank[ReplayEkf]):
     motion model is one of the shipped ones.
     """
 
-    def __init__(self, motion: WhiteNoise, start: Callable[[Start], ReplayEkf], lag_s: float) -> None:
+    def __init__(
+        self, motion: WhiteNoise, start: Callable[[Start], ReplayEkf], lag_s: float
+    ) -> None:
         super().__init__(motion, start, lag_s)
         self._kind, self._noise = motion.kind, motion.noise
         self._start_ns = -int(LARGEST_NS)  # of all windows, by the clock
         self._rows: dict[int, int] = {}  # of tracks in the arrays
-        self._order: IntArray | None = None  # of all tracks by birth, until one comes, goes or moves
+        self._order: IntArray | None = (
+            None  # of all tracks by birth, until one comes, goes or moves
+        )
         self._free: list[int] = []
         self._arrays = list[Any]()
-        self._shape: tuple[int, ...] = 0, 0, 0  # numbers of tracks, steps and components
+        self._shape: tuple[int, ...] = (
+            0,
+            0,
+            0,
+        )  # numbers of tracks, steps and components
         self._allocate(8, 64, 4)
 
     def _allocate(self, *least: int) -> None:
@@ -71,7 +84,10 @@ class ReplayBank(ObjectBank[ReplayEkf]):
             track, place = np.nonzero(np.arange(order.shape[1]) < windows[:, :1])
             used = track, order[track, place]  # only the pages of used slots are made
             arrays[0][:present, : order.shape[1]], arrays[3][:present] = order, windows
-            arrays[1][*used, : labels.shape[2]], arrays[2][used] = labels[used], steps[used]
+            arrays[1][*used, : labels.shape[2]], arrays[2][used] = (
+                labels[used],
+                steps[used],
+            )
             arrays[4][*used, : measured.shape[2], : measured.shape[3]] = measured[used]
         free = [*self._free, *range(present, rows)]
         self._arrays, self._shape, self._free = arrays, shape, free
@@ -81,14 +97,20 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         self.present_ns = now_ns
         self._start_ns = max(self._start_ns, now_ns - self._lag_ns)
         if len(self._rows) < len(self._estimators):
-            self._ask(lambda _, item: item.advance(now_ns), [i for i in self._estimators if i not in self._rows])
+            self._ask(
+                lambda _, item: item.advance(now_ns),
+                [i for i in self._estimators if i not in self._rows],
+            )
 
     def states_at(self, stamp_ns: int) -> StatesAt:
         """See `TrackBank.states_at`."""
         known, *states = self._states(stamp_ns)
         if known is None:
             return StatesAt(self.track_ids, *states)
-        return StatesAt(tuple(compress(self.track_ids, known.tolist())), *(each[known] for each in states))
+        return StatesAt(
+            tuple(compress(self.track_ids, known.tolist())),
+            *(each[known] for each in states),
+        )
 
     def states_of(self, stamp_ns: int, track_id: int) -> StatesAt:
         """Return `states_at` of one track, at a cost that does not depend on the number of the others."""
@@ -99,10 +121,17 @@ class ReplayBank(ObjectBank[ReplayEkf]):
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
-        return kinematic_states(self._motion, self.present_ns, *self._states(self.present_ns, is_present=True)[1:])
+        return kinematic_states(
+            self._motion,
+            self.present_ns,
+            *self._states(self.present_ns, is_present=True)[1:],
+        )
 
     def update(
-        self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+        self,
+        stamp_ns: int,
+        track_ids: Sequence[int],
+        measurements: Sequence[Measurement],
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
         outcomes = Outcomes()
@@ -111,16 +140,25 @@ class ReplayBank(ObjectBank[ReplayEkf]):
             outcomes.add(ids, partial(self._update, stamp_ns, ids, alike))
         return outcomes.results(track_ids)
 
-    def _update(self, stamp_ns: int, track_ids: Sequence[int], one: Measurement) -> list[UpdateResult]:
+    def _update(
+        self, stamp_ns: int, track_ids: Sequence[int], one: Measurement
+    ) -> list[UpdateResult]:
         """Return the outcomes of a stack of measurements."""
         with changing_nothing(track_ids):
             seen = one.seen_by(self._motion)
-            is_held = list(map(self._rows.__contains__, track_ids)) if _is_plain(seen) else [False] * len(track_ids)
+            is_held = (
+                list(map(self._rows.__contains__, track_ids))
+                if _is_plain(seen)
+                else [False] * len(track_ids)
+            )
         outcomes = Outcomes()
         for chosen in equal_ones(is_held):
             part, ids = seen, track_ids
             if len(chosen) < len(track_ids):
-                part, ids = replace(seen, z=seen.z[chosen], R=seen.R[chosen]), [track_ids[k] for k in chosen]
+                part, ids = (
+                    replace(seen, z=seen.z[chosen], R=seen.R[chosen]),
+                    [track_ids[k] for k in chosen],
+                )
             fuse = self._fused if is_held[chosen[0]] else self._alone
             outcomes.add(ids, partial(fuse, stamp_ns, ids, part))
         return outcomes.results(track_ids)
@@ -138,7 +176,9 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         if track_id in self._rows:
             self._free.append(self._rows.pop(track_id))
 
-    def _alone(self, stamp_ns: int, track_ids: Sequence[int], one: Measurement) -> list[UpdateResult]:
+    def _alone(
+        self, stamp_ns: int, track_ids: Sequence[int], one: Measurement
+    ) -> list[UpdateResult]:
         """Outcomes of a stack of measurements that need the filters of their objects."""
         with changing_nothing(track_ids):
             for track_id in track_ids:
@@ -151,16 +191,38 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         self._put_in(track_ids)
         return results
 
-    def _fused(self, stamp_ns: int, track_ids: Sequence[int], one: Measurement) -> list[UpdateResult]:
+    def _fused(
+        self, stamp_ns: int, track_ids: Sequence[int], one: Measurement
+    ) -> list[UpdateResult]:
         """Outcomes of a stack of measurements of entries of the state."""
         with changing_nothing(track_ids):
-            rows, (m, k) = np.array(list(map(self._rows.__getitem__, track_ids))), one.z.shape
+            rows, (m, k) = (
+                np.array(list(map(self._rows.__getitem__, track_ids))),
+                one.z.shape,
+            )
             if k > self._shape[2]:
                 self._allocate(0, 0, k)
-            z, R = np.ascontiguousarray(one.z, dtype=np.float64), np.ascontiguousarray(one.R, dtype=np.float64)
-            y, S, nis, status = np.empty((m, k)), np.empty((m, k, k)), np.empty(m), np.empty(m, dtype=np.int64)
+            z, R = (
+                np.ascontiguousarray(one.z, dtype=np.float64),
+                np.ascontiguousarray(one.R, dtype=np.float64),
+            )
+            y, S, nis, status = (
+                np.empty((m, k)),
+                np.empty((m, k, k)),
+                np.empty(m),
+                np.empty(m, dtype=np.int64),
+            )
             now = self._lag_ns, self._start_ns, stamp_ns, one.model.selected
-            fuse = partial(kernels(_KERNELS).fuse, self._kind, self._noise, *self._arrays, rows, *now, z, R)
+            fuse = partial(
+                kernels(_KERNELS).fuse,
+                self._kind,
+                self._noise,
+                *self._arrays,
+                rows,
+                *now,
+                z,
+                R,
+            )
         if not fuse(one.measured, y, S, nis, status):
             return _results(y, S, nis, status)
         outcomes = Outcomes()
@@ -169,47 +231,82 @@ class ReplayBank(ObjectBank[ReplayEkf]):
             ids = [track_ids[k] for k in chosen.tolist()]
             if is_full:
                 part = replace(one, z=z[chosen], R=R[chosen])
-                outcomes.add(ids, partial(self._fused_in_more_room, stamp_ns, ids, part))
+                outcomes.add(
+                    ids, partial(self._fused_in_more_room, stamp_ns, ids, part)
+                )
             else:
-                outcomes.add(ids, partial(_results, y[chosen], S[chosen], nis[chosen], status[chosen]))
+                outcomes.add(
+                    ids,
+                    partial(
+                        _results, y[chosen], S[chosen], nis[chosen], status[chosen]
+                    ),
+                )
         return outcomes.results(track_ids)
 
-    def _fused_in_more_room(self, stamp_ns: int, track_ids: Sequence[int], one: Measurement) -> list[UpdateResult]:
+    def _fused_in_more_room(
+        self, stamp_ns: int, track_ids: Sequence[int], one: Measurement
+    ) -> list[UpdateResult]:
         """Return `_fused` of tracks whose slots are all in use, after the slots have doubled."""
         with changing_nothing(track_ids):
             self._allocate(0, 2 * self._shape[1], 0)
         return self._fused(stamp_ns, track_ids, one)
 
-    def _states(self, stamp_ns: int, is_present: bool = False) -> tuple[BoolArray | None, FloatArray, FloatArray]:
+    def _states(
+        self, stamp_ns: int, is_present: bool = False
+    ) -> tuple[BoolArray | None, FloatArray, FloatArray]:
         """True of the tracks that are known (m,), None if all are, means (m, n) and covariances (m, n, n) of all."""
         if self._order is None:
-            self._order = np.array([self._rows.get(i, -1) for i in self._estimators], dtype=np.int64)
-        count, known, means, covariances = self._ahead(self._order, stamp_ns, is_present)
+            self._order = np.array(
+                [self._rows.get(i, -1) for i in self._estimators], dtype=np.int64
+            )
+        count, known, means, covariances = self._ahead(
+            self._order, stamp_ns, is_present
+        )
         if len(self._rows) < len(known):
-            apart = [track_id for track_id in self._estimators if track_id not in self._rows]
-            states = self._ask(lambda _, item: self._state_of(item, stamp_ns, is_present), apart)
+            apart = [
+                track_id for track_id in self._estimators if track_id not in self._rows
+            ]
+            states = self._ask(
+                lambda _, item: self._state_of(item, stamp_ns, is_present), apart
+            )
             for k, track_id in enumerate(self._estimators):
                 state = states.get(track_id)
                 if state is not None:
-                    known[k], means[k], covariances[k] = True, state.mean, state.covariance
+                    known[k], means[k], covariances[k] = (
+                        True,
+                        state.mean,
+                        state.covariance,
+                    )
                     count += 1
                 elif track_id in states:
                     known[k] = False
         return None if count == len(known) else known, means, covariances
 
-    def _state_of(self, item: ReplayEkf, stamp_ns: int, is_present: bool) -> TrackState | None:
+    def _state_of(
+        self, item: ReplayEkf, stamp_ns: int, is_present: bool
+    ) -> TrackState | None:
         """Return the state of a filter; at the present its first one instead of none."""
         start_ns = item.window_ns[0]
-        return self._state(item, max(stamp_ns, start_ns)) if is_present or start_ns <= stamp_ns else None
+        return (
+            self._state(item, max(stamp_ns, start_ns))
+            if is_present or start_ns <= stamp_ns
+            else None
+        )
 
     def _ahead(
         self, rows: IntArray, stamp_ns: int, is_present: bool = False
     ) -> tuple[int, BoolArray, FloatArray, FloatArray]:
         """Return `kernels.replay.ahead` of rows of the arrays: how many and which are known, means and covariances."""
         m, n = len(rows), self._motion.dim
-        known, means, covariances = np.empty(m, dtype=bool), np.empty((m, n)), np.empty((m, n, n))
+        known, means, covariances = (
+            np.empty(m, dtype=bool),
+            np.empty((m, n)),
+            np.empty((m, n, n)),
+        )
         at = rows, self._start_ns, stamp_ns, is_present
-        count = kernels(_KERNELS).ahead(self._kind, self._noise, *self._arrays[:4], *at, means, covariances, known)
+        count = kernels(_KERNELS).ahead(
+            self._kind, self._noise, *self._arrays[:4], *at, means, covariances, known
+        )
         return count, known, means, covariances
 
     def _put_in(self, track_ids: Iterable[int]) -> None:
@@ -217,12 +314,22 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         with suppress(MemoryError):
             for track_id in track_ids:
                 item = self._estimators[track_id]
-                if all(each.search is None and _is_plain(each.measurement) for each in item.steps):
+                if all(
+                    each.search is None and _is_plain(each.measurement)
+                    for each in item.steps
+                ):
                     self._put(track_id, item)
 
     def _put(self, track_id: int, item: ReplayEkf) -> None:
         """Move the steps of a filter into the arrays."""
-        k = max((len(each.measurement.z) for each in item.steps if each.measurement is not None), default=0)
+        k = max(
+            (
+                len(each.measurement.z)
+                for each in item.steps
+                if each.measurement is not None
+            ),
+            default=0,
+        )
         rows, slots, largest = self._shape
         if not self._free or len(item.steps) >= slots or k > largest:
             self._allocate(rows * (1 + (not self._free)), 2 * len(item.steps), k)
@@ -246,11 +353,20 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         order, labels, steps, windows, measured = (array[row] for array in self._arrays)
         chain = list[Step]()
         for slot in order[: windows[0]].tolist():
-            own, (stamp_ns, d, *entries), measurement = steps[slot].copy(), labels[slot].tolist(), None
+            own, (stamp_ns, d, *entries), measurement = (
+                steps[slot].copy(),
+                labels[slot].tolist(),
+                None,
+            )
             if d:
                 names = tuple(self._motion.state_names[entry] for entry in entries[:d])
-                z, R = measured[slot, 0, :d].copy(), measured[slot, 1 : d + 1, :d].copy()
-                measurement = Measurement(stamp_ns, measurement_model(names, self._motion), z, R)
+                z, R = (
+                    measured[slot, 0, :d].copy(),
+                    measured[slot, 1 : d + 1, :d].copy(),
+                )
+                measurement = Measurement(
+                    stamp_ns, measurement_model(names, self._motion), z, R
+                )
             predicted = Prediction(own[n + 1], own[n + 2 : 2 * n + 2], own[2 * n + 2 :])
             chain.append(Step(stamp_ns, measurement, own[0], own[1 : n + 1], predicted))
         item = self._estimators[track_id]
@@ -260,12 +376,17 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         self._order = None
 
 
-def _results(y: FloatArray, S: FloatArray, nis: FloatArray, status: IntArray) -> list[UpdateResult]:
+def _results(
+    y: FloatArray, S: FloatArray, nis: FloatArray, status: IntArray
+) -> list[UpdateResult]:
     """Return the outcomes of innovations (m, k), covariances (m, k, k), NIS and status as the kernels write them."""
     statuses = list(map(_STATUS.__getitem__, status.tolist()))
     results = list(map(UpdateResult, statuses, y, nis.tolist(), S))
     if UpdateStatus.FAILED in statuses or UpdateStatus.TOO_OLD in statuses:
-        results = [each if each.status in _FUSED else UpdateResult(each.status) for each in results]
+        results = [
+            each if each.status in _FUSED else UpdateResult(each.status)
+            for each in results
+        ]
     return results
 
 
@@ -273,4 +394,8 @@ def _is_plain(measurement: Measurement | None) -> bool:
     """True if a measurement, or None, is of entries of the state, without a loss."""
     if measurement is None:
         return True
-    return measurement.loss is None and type(measurement.model) is MeasurementModel and measurement.model.linear
+    return (
+        measurement.loss is None
+        and type(measurement.model) is MeasurementModel
+        and measurement.model.linear
+    )

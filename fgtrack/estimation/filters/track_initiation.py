@@ -12,7 +12,14 @@ from fgtrack.core.checks import as_stamp
 from fgtrack.core.geometry import cartesian, polar
 from fgtrack.core.time import seconds
 from fgtrack.core.types import YAW, FloatArray, TrackState
-from fgtrack.estimation.base import KNOWN_YAW_STD_RAD, UNKNOWN_YAW_STD_RAD, Estimator, Measurement, Start, UpdateResult
+from fgtrack.estimation.base import (
+    KNOWN_YAW_STD_RAD,
+    UNKNOWN_YAW_STD_RAD,
+    Estimator,
+    Measurement,
+    Start,
+    UpdateResult,
+)
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import Prediction, correct_one, propagated
 from fgtrack.estimation.filters.initiation import (
@@ -49,7 +56,9 @@ class TrackInitiation:
     """Through the fixes; None where they are of one time."""
 
     @classmethod
-    def of(cls, motion: MotionModel, start: Start, method: str) -> "TrackInitiation | None":
+    def of(
+        cls, motion: MotionModel, start: Start, method: str
+    ) -> "TrackInitiation | None":
         """Before the first measurement; None where no direction is sought. Raises `CallError` for another `method`."""
         checked = checked_initiation(method)
         if not sought(motion, start, checked):
@@ -60,7 +69,11 @@ class TrackInitiation:
     def with_measurement(self, measurement: Measurement) -> "TrackInitiation | None":
         """With one more measurement, the newest; None where the direction is known, or sought no more."""
         time_s = seconds(measurement.stamp_ns - self.start.stamp_ns)
-        if self.over or time_s > LONGEST_S or len(self.measurements) == MOST_MEASUREMENTS:
+        if (
+            self.over
+            or time_s > LONGEST_S
+            or len(self.measurements) == MOST_MEASUREMENTS
+        ):
             return None
         fix = fix_of(measurement, time_s)
         fixes = self.fixes if fix is None else (*self.fixes, fix)
@@ -68,9 +81,13 @@ class TrackInitiation:
         if fix is not None and time_s > 0.0:
             try:
                 [line] = straight_lines(fixes, len(fixes))
-            except np.linalg.LinAlgError:  # of a position that is known without error, no line can be weighted
+            except (
+                np.linalg.LinAlgError
+            ):  # of a position that is known without error, no line can be weighted
                 line = None
-        return replace(self, measurements=(*self.measurements, measurement), fixes=fixes, line=line)
+        return replace(
+            self, measurements=(*self.measurements, measurement), fixes=fixes, line=line
+        )
 
     @property
     def over(self) -> bool:
@@ -99,12 +116,22 @@ class TrackInitiation:
         `state`.
         """
         yaw_rad, speed_mps = self._course()
-        std_rad = UNKNOWN_YAW_STD_RAD if self.start.yaw_std_rad is None else self.start.yaw_std_rad
-        return replace(self.start, yaw_rad=yaw_rad, yaw_std_rad=std_rad, speed_mps=speed_mps)
+        std_rad = (
+            UNKNOWN_YAW_STD_RAD
+            if self.start.yaw_std_rad is None
+            else self.start.yaw_std_rad
+        )
+        return replace(
+            self.start, yaw_rad=yaw_rad, yaw_std_rad=std_rad, speed_mps=speed_mps
+        )
 
-    def retrodicted(self, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def retrodicted(
+        self, stamp_ns: int, mean: FloatArray, covariance: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """The state at `stamp_ns` given all measurements, of `mean` (n,) and `covariance` (n, n) at the newest one."""
-        links = [link for link in self._filtered((stamp_ns, None)) if link[0] >= stamp_ns]
+        links = [
+            link for link in self._filtered((stamp_ns, None)) if link[0] >= stamp_ns
+        ]
         return smoothed_back(self.motion, links, mean, covariance)
 
     def _filtered(self, *others: tuple[int, None]) -> list[Link]:
@@ -121,7 +148,9 @@ class TrackInitiation:
             predicted = Prediction(x, P, P)
             if stamp_ns > at_ns:
                 moved, F, Q = self.motion.transition(nominal, seconds(stamp_ns - at_ns))
-                predicted = Prediction(moved + F @ (x - nominal), propagated(F, P, Q), F @ P)
+                predicted = Prediction(
+                    moved + F @ (x - nominal), propagated(F, P, Q), F @ P
+                )
                 nominal, at_ns = moved, stamp_ns
             x, P = predicted.mean, predicted.covariance
             if measurement is not None:
@@ -132,7 +161,11 @@ class TrackInitiation:
     def nominal(self, x: FloatArray) -> FloatArray:
         """State (n,) on the line at the start, other entries as in x (n,); raises as `state` without a line."""
         yaw_rad, speed_mps = self._course()
-        motion = cartesian(np.array([yaw_rad, speed_mps])) if self.motion.cartesian else (yaw_rad, speed_mps)
+        motion = (
+            cartesian(np.array([yaw_rad, speed_mps]))
+            if self.motion.cartesian
+            else (yaw_rad, speed_mps)
+        )
         nominal = x.copy()
         if self.line is not None:
             nominal[:2] = self.line.position_m
@@ -146,10 +179,14 @@ class TrackInitiation:
         yaw_rad, speed_mps = polar(self.line.velocity_mps).tolist()
         along = np.array([math.cos(yaw_rad), math.sin(yaw_rad)])
         P, R = self.start.speed_std_mps**2, float(along @ self.line.covariance @ along)
-        return yaw_rad, self.start.speed_mps + P / (P + R) * (speed_mps - self.start.speed_mps)
+        return yaw_rad, self.start.speed_mps + P / (P + R) * (
+            speed_mps - self.start.speed_mps
+        )
 
 
-def initiated(motion: MotionModel, start: Start, method: str, make: Callable[[Start], Estimator]) -> Estimator:
+def initiated(
+    motion: MotionModel, start: Start, method: str, make: Callable[[Start], Estimator]
+) -> Estimator:
     """Return what `make` gives for `start`, by itself or as `Initiated`. Raises `CallError` for an unknown `method`."""
     search = TrackInitiation.of(motion, start, method)
     return make(start) if search is None else Initiated(search, make)
@@ -161,7 +198,9 @@ class Initiated:
     stamps.
     """
 
-    def __init__(self, search: TrackInitiation, make: Callable[[Start], Estimator]) -> None:
+    def __init__(
+        self, search: TrackInitiation, make: Callable[[Start], Estimator]
+    ) -> None:
         self._make = make
         self._search: TrackInitiation | None = search
         self._fused: list[Measurement] = []
@@ -177,7 +216,11 @@ class Initiated:
         """See `Estimator.update`; the innovation is that before it is reinitialised."""
         result = self._inner.update(measurement)
         if self._search is not None and result.innovation is not None:
-            bisect.insort(self._fused, measurement.seen_by(self._search.motion), key=lambda each: each.order)
+            bisect.insort(
+                self._fused,
+                measurement.seen_by(self._search.motion),
+                key=lambda each: each.order,
+            )
             self._begin_again(self._search)
         return result
 
@@ -201,7 +244,10 @@ class Initiated:
         ended = search.over or count < len(self._fused)
         if search.line is not None:
             inner = self._make(search.turned())
-            fused = all(inner.update(measurement).innovation is not None for measurement in self._fused)
+            fused = all(
+                inner.update(measurement).innovation is not None
+                for measurement in self._fused
+            )
             if fused:
                 inner.advance(self._clock_ns)
                 self._inner = inner

@@ -22,7 +22,12 @@ from fgtrack.core.linalg import identity, symmetrise
 from fgtrack.core.types import YAW, FloatArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.estimation.filters.ekf import OneCorrection, Prediction, updated_one
-from fgtrack.estimation.filters.iekf import descended, largest_move, negative_log_posterior, reweighted
+from fgtrack.estimation.filters.iekf import (
+    descended,
+    largest_move,
+    negative_log_posterior,
+    reweighted,
+)
 from fgtrack.estimation.filters.replay import ReplayEkf
 from fgtrack.models.measurement import MIN_RANGE_M, MeasurementModel
 from fgtrack.models.motion import MIN_SPEED_MPS
@@ -60,7 +65,11 @@ def regression(
     bends, slopes = 0.5 * (ahead + behind), (ahead - behind) / (2.0 * n**0.5)
     shift = bends.sum(axis=-2) / n
     noise = bends.mT @ bends / n - shift[..., :, None] * shift[..., None, :]
-    return values[..., 0, :] + shift, np.linalg.solve(L.mT, slopes).mT, symmetrise(noise)
+    return (
+        values[..., 0, :] + shift,
+        np.linalg.solve(L.mT, slopes).mT,
+        symmetrise(noise),
+    )
 
 
 class DenseRule(NamedTuple):
@@ -76,7 +85,13 @@ class DenseRule(NamedTuple):
     """Shape (n, n)."""
 
     @classmethod
-    def of(cls, mean: FloatArray, covariance: FloatArray, turns: FloatArray, sights: FloatArray) -> "DenseRule | None":
+    def of(
+        cls,
+        mean: FloatArray,
+        covariance: FloatArray,
+        turns: FloatArray,
+        sights: FloatArray,
+    ) -> "DenseRule | None":
         """Return the rule of N(mean, covariance), (n,) and (n, n); None where no direction is wide.
 
         The rows of `turns`, shape (a, n), are gradients of angles whose sines and cosines count. The rows of `sights`,
@@ -92,19 +107,36 @@ class DenseRule(NamedTuple):
         n, root, gradients = len(mean), _root(covariance), np.vstack([sights, turns])
         # Directions on which the angles depend come first, the others leave them alone: few directions are wide, and a
         # turned world has turned points.
-        root = root @ np.linalg.qr((gradients[gradients.any(axis=1)] @ root).T, mode="complete")[0]
+        root = (
+            root
+            @ np.linalg.qr(
+                (gradients[gradients.any(axis=1)] @ root).T, mode="complete"
+            )[0]
+        )
         spreads_rad = np.abs(turns @ root).max(axis=0, initial=0.0)
-        seen_rad = np.minimum(np.abs(sights @ root).max(axis=0, initial=0.0), _SIGHT_RAD)
-        if seen_rad.max() > WIDE_SIGHT_RAD:  # a line of sight needs both of its directions
+        seen_rad = np.minimum(
+            np.abs(sights @ root).max(axis=0, initial=0.0), _SIGHT_RAD
+        )
+        if (
+            seen_rad.max() > WIDE_SIGHT_RAD
+        ):  # a line of sight needs both of its directions
             is_seen = seen_rad > _ROUNDING * seen_rad.max()
-            spreads_rad = np.where(is_seen, np.maximum(spreads_rad, np.maximum(seen_rad, 1.0)), spreads_rad)
-        wide, narrow = (spreads_rad > WIDE_RAD).nonzero()[0], (spreads_rad <= WIDE_RAD).nonzero()[0]
+            spreads_rad = np.where(
+                is_seen, np.maximum(spreads_rad, np.maximum(seen_rad, 1.0)), spreads_rad
+            )
+        wide, narrow = (
+            (spreads_rad > WIDE_RAD).nonzero()[0],
+            (spreads_rad <= WIDE_RAD).nonzero()[0],
+        )
         if not len(wide):
             return None
         xi, weights = np.zeros((1, n)), np.ones(1)
         for row in wide.tolist():
             at, share = _equidistant(min(float(spreads_rad[row]), _MOST_RAD))
-            xi, weights = np.repeat(xi, len(at), axis=0), np.outer(weights, share).ravel()
+            xi, weights = (
+                np.repeat(xi, len(at), axis=0),
+                np.outer(weights, share).ravel(),
+            )
             xi[:, row] = np.tile(at, len(xi) // len(at))
         if len(narrow):
             unit = len(narrow) ** 0.5 * identity(n)[narrow]
@@ -112,7 +144,9 @@ class DenseRule(NamedTuple):
             weights = np.repeat(weights, 2 * len(narrow)) / (2 * len(narrow))
         return cls(mean + xi @ root.T, weights, xi, root)
 
-    def regression(self, values: FloatArray, centre: FloatArray, circular: Sequence[int] = ()) -> Regression:
+    def regression(
+        self, values: FloatArray, centre: FloatArray, circular: Sequence[int] = ()
+    ) -> Regression:
         """Return the regression of `values` (m, k) of a function at the points; `centre` (k,) is near its mean.
 
         The `circular` components are angles: their mean is the one from which the wrapped differences cancel.
@@ -149,20 +183,34 @@ def _root(covariance: FloatArray) -> FloatArray:
     except np.linalg.LinAlgError:
         n = covariance.shape[-1]
         scale = np.maximum(np.trace(covariance, axis1=-2, axis2=-1) / n, _JITTER)
-        return np.asarray(np.linalg.cholesky(covariance + _JITTER * scale[..., None, None] * identity(n)))
+        return np.asarray(
+            np.linalg.cholesky(
+                covariance + _JITTER * scale[..., None, None] * identity(n)
+            )
+        )
 
 
-def measurement_regression(measurement: Measurement, mean: FloatArray, covariance: FloatArray) -> Regression:
+def measurement_regression(
+    measurement: Measurement, mean: FloatArray, covariance: FloatArray
+) -> Regression:
     """Regression of what `measurement` measures. Angles are averaged on the circle, but for entries of the state."""
     model, pose = measurement.model, measurement.pose
     rule = _rule_of(measurement, mean, covariance)
     if rule is None:
-        return regression(lambda x: model.predict(x, pose), mean, covariance, _difference(model))
-    circular = [k for k in model.angular if model.components[k] not in model.state_names]
-    return rule.regression(model.predict(rule.points, pose), model.predict(mean, pose), circular)
+        return regression(
+            lambda x: model.predict(x, pose), mean, covariance, _difference(model)
+        )
+    circular = [
+        k for k in model.angular if model.components[k] not in model.state_names
+    ]
+    return rule.regression(
+        model.predict(rule.points, pose), model.predict(mean, pose), circular
+    )
 
 
-def _rule_of(measurement: Measurement, mean: FloatArray, covariance: FloatArray) -> DenseRule | None:
+def _rule_of(
+    measurement: Measurement, mean: FloatArray, covariance: FloatArray
+) -> DenseRule | None:
     """Return the dense rule for a measurement, where its line of sight or a heading in it is uncertain."""
     model, n = measurement.model, len(mean)
     turns, sights = np.zeros((1, n)), np.zeros((4, n))
@@ -180,9 +228,14 @@ def _rule_of(measurement: Measurement, mean: FloatArray, covariance: FloatArray)
 
 
 @cache
-def _difference(model: MeasurementModel) -> Callable[[FloatArray, FloatArray], FloatArray]:
+def _difference(
+    model: MeasurementModel,
+) -> Callable[[FloatArray, FloatArray], FloatArray]:
     """Difference of measurements, angles in their range, but for entries of the state."""
-    direct = np.array([k for k, name in enumerate(model.components) if name in model.state_names], dtype=np.int64)
+    direct = np.array(
+        [k for k, name in enumerate(model.components) if name in model.state_names],
+        dtype=np.int64,
+    )
 
     def difference(z: FloatArray, centre: FloatArray) -> FloatArray:
         y = model.residual(z, centre)
@@ -202,22 +255,32 @@ class UkfReplay(ReplayEkf):
 
     spreads = True
 
-    def predict(self, mean: FloatArray, covariance: FloatArray, dt_s: float) -> Prediction:
+    def predict(
+        self, mean: FloatArray, covariance: FloatArray, dt_s: float
+    ) -> Prediction:
         """See `ReplayEkf.predict`."""
         if self._motion.linear:
             return super().predict(mean, covariance, dt_s)
         rule = self._turning_rule(mean, covariance, dt_s)
         if rule is None:
-            after, A, noise = regression(lambda x: self._motion.predict(x, dt_s), mean, covariance)
+            after, A, noise = regression(
+                lambda x: self._motion.predict(x, dt_s), mean, covariance
+            )
             Q = self._motion.process_noise(mean, dt_s)
         else:
             centre = self._motion.predict(mean, dt_s)
-            after, A, noise = rule.regression(self._motion.predict(rule.points, dt_s), centre)
-            Q = np.tensordot(rule.weights, self._motion.process_noise(rule.points, dt_s), axes=1)
+            after, A, noise = rule.regression(
+                self._motion.predict(rule.points, dt_s), centre
+            )
+            Q = np.tensordot(
+                rule.weights, self._motion.process_noise(rule.points, dt_s), axes=1
+            )
         AP = A @ covariance
         return Prediction(after, symmetrise(AP @ A.mT + noise + Q), AP)
 
-    def _turning_rule(self, mean: FloatArray, covariance: FloatArray, dt_s: float) -> DenseRule | None:
+    def _turning_rule(
+        self, mean: FloatArray, covariance: FloatArray, dt_s: float
+    ) -> DenseRule | None:
         """Return the dense rule for a prediction, where the yaw before or after it is uncertain."""
         names = self._motion.state_names[: len(mean)]
         if "yaw_rad" not in names:
@@ -228,13 +291,17 @@ class UkfReplay(ReplayEkf):
             turns[1, names.index("yaw_rate_radps")] = dt_s
         return DenseRule.of(mean, covariance, turns, np.zeros((0, len(mean))))
 
-    def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
+    def correct(
+        self, mean: FloatArray, covariance: FloatArray, measurement: Measurement
+    ) -> OneCorrection:
         """See `ReplayEkf.correct`."""
         if measurement.model.linear:
             return super().correct(mean, covariance, measurement)
         z, A, noise = measurement_regression(measurement, mean, covariance)
         y, R = measurement.model.residual(measurement.z, z), measurement.R + noise
-        return updated_one(mean, covariance, y, A, R, measurement.loss, measurement.measured)
+        return updated_one(
+            mean, covariance, y, A, R, measurement.loss, measurement.measured
+        )
 
 
 class IplfReplay(UkfReplay):
@@ -251,7 +318,9 @@ class IplfReplay(UkfReplay):
     iterates = True
     _max_iterations, _tolerance = 10, 1e-2
 
-    def correct(self, mean: FloatArray, covariance: FloatArray, measurement: Measurement) -> OneCorrection:
+    def correct(
+        self, mean: FloatArray, covariance: FloatArray, measurement: Measurement
+    ) -> OneCorrection:
         """See `ReplayEkf.correct`."""
         first = super().correct(mean, covariance, measurement)
         if measurement.model.linear:
@@ -264,12 +333,18 @@ class IplfReplay(UkfReplay):
             update = reweighted(mean, covariance, y, A, R, measurement.loss, x - mean)
             x, P = update.mean, update.covariance
 
-            def cost(x: FloatArray, spread: FloatArray = spread, R: FloatArray = R) -> float:
+            def cost(
+                x: FloatArray, spread: FloatArray = spread, R: FloatArray = R
+            ) -> float:
                 z, _, _ = measurement_regression(measurement, x, spread)
                 residual = measurement.model.residual(measurement.z, z)
-                return negative_log_posterior(x - mean, covariance, residual, R, measurement.loss)
+                return negative_log_posterior(
+                    x - mean, covariance, residual, R, measurement.loss
+                )
 
-            limit = negative_log_posterior(last - mean, covariance, y, R, measurement.loss)
+            limit = negative_log_posterior(
+                last - mean, covariance, y, R, measurement.loss
+            )
             x = descended(cost, limit, last, x)
             narrowed = np.abs(1.0 - spread.diagonal() / P.diagonal()).max()
             if max(largest_move(x - last, P), narrowed) < self._tolerance:

@@ -43,7 +43,9 @@ class WindowedFilter(ABC):
             return UpdateResult(UpdateStatus.FAILED)
         if result is None:
             return UpdateResult(UpdateStatus.TOO_OLD)
-        return UpdateResult(self.moved_on(measurement.stamp_ns), result.innovation, result.nis, result.S)
+        return UpdateResult(
+            self.moved_on(measurement.stamp_ns), result.innovation, result.nis, result.S
+        )
 
     def moved_on(self, stamp_ns: int) -> UpdateStatus:
         """Status of a measurement that was fused; the window moves on."""

@@ -23,11 +23,17 @@ from fgtrack.core.compiled import (
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.models.transitions import check_noise, transition
 
-_VECTORS, _MATRICES, _READ = "float64[:, ::1]", "float64[:, :, ::1]", "Array(float64, 3, 'C', readonly=True)"
+_VECTORS, _MATRICES, _READ = (
+    "float64[:, ::1]",
+    "float64[:, :, ::1]",
+    "Array(float64, 3, 'C', readonly=True)",
+)
 
 
 @shared(f"float64({MATRIX}, float64[::1], int64[::1], {MATRIX}, float64[::1])")
-def marginal_nis(S: FloatArray, y: FloatArray, rows: IntArray, root: FloatArray, white: FloatArray) -> float:
+def marginal_nis(
+    S: FloatArray, y: FloatArray, rows: IntArray, root: FloatArray, white: FloatArray
+) -> float:
     """Return the NIS of the `rows` of y (k,) with covariance S; NaN where that of the rows has no root."""
     for a in range(len(rows)):
         white[a] = y[rows[a]]
@@ -36,7 +42,9 @@ def marginal_nis(S: FloatArray, y: FloatArray, rows: IntArray, root: FloatArray,
     return whiten(root, white[: len(rows)])
 
 
-@shared(f"b1(float64[::1], {f'{MATRIX}, ' * 3}{READ}, float64[::1], {MATRIX}, {MATRIX})")
+@shared(
+    f"b1(float64[::1], {f'{MATRIX}, ' * 3}{READ}, float64[::1], {MATRIX}, {MATRIX})"
+)
 def conclude(
     mean: FloatArray,
     P: FloatArray,
@@ -66,7 +74,12 @@ def conclude(
 
 @njit(f"({_VECTORS}, {_READ}, {_READ}, int64[:], {_READ}, int64[::1])")
 def innovations(
-    y: FloatArray, H: FloatArray, P: FloatArray, tracks: IntArray, R: FloatArray, rows: IntArray
+    y: FloatArray,
+    H: FloatArray,
+    P: FloatArray,
+    tracks: IntArray,
+    R: FloatArray,
+    rows: IntArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return S = H P H' + R (m, k, k) of innovations y (m, k), and of their `rows` the NIS and log det S, shapes (m,).
     NaN where S has no root. Jacobians H (m, k, n) or (1, k, n), covariances P (tracks, n, n), R (m, k, k).
@@ -89,7 +102,9 @@ def innovations(
 
 
 @njit(f"({_MATRICES}, {_MATRICES}, {_MATRICES})")
-def predict(F: FloatArray, P: FloatArray, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
+def predict(
+    F: FloatArray, P: FloatArray, Q: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return covariances F P F' + Q, written over Q, and cross-covariances F P, shapes (m, n, n)."""
     check(F.shape == P.shape and Q.shape == P.shape)
     cross = np.empty(P.shape)
@@ -99,10 +114,22 @@ def predict(F: FloatArray, P: FloatArray, Q: FloatArray) -> tuple[FloatArray, Fl
 
 
 @njit(f"void(int64, float64[::1], {_VECTORS}, {_MATRICES}, int64[::1], float64)")
-def propagate(motion: int, noise: FloatArray, mean: FloatArray, P: FloatArray, steps: IntArray, dt_s: float) -> None:
+def propagate(
+    motion: int,
+    noise: FloatArray,
+    mean: FloatArray,
+    P: FloatArray,
+    steps: IntArray,
+    dt_s: float,
+) -> None:
     """Move states (m, n) and (m, n, n), each by its own number of `steps` (m,) of `dt_s`: f(x) and F P F' + Q."""
     n = mean.shape[1]
-    check(len(P) >= len(mean) and len(steps) >= len(mean) and P.shape[1] == n and P.shape[2] == n)
+    check(
+        len(P) >= len(mean)
+        and len(steps) >= len(mean)
+        and P.shape[1] == n
+        and P.shape[2] == n
+    )
     check_noise(motion, noise, n)
     F, FP, Q, x = scratch(n, n), scratch(n, n), scratch(n, n), scratch(n)
     for i in range(len(mean)):
@@ -113,7 +140,9 @@ def propagate(motion: int, noise: FloatArray, mean: FloatArray, P: FloatArray, s
         copy(Q, P[i])
 
 
-@njit(f"void({_VECTORS}, {_MATRICES}, {_VECTORS}, {_READ}, {_READ}, int64[::1], {_MATRICES}, float64[::1], b1[::1])")
+@njit(
+    f"void({_VECTORS}, {_MATRICES}, {_VECTORS}, {_READ}, {_READ}, int64[::1], {_MATRICES}, float64[::1], b1[::1])"
+)
 def correct(
     mean: FloatArray,
     P: FloatArray,
@@ -131,11 +160,25 @@ def correct(
     """
     m, k, n = len(y), y.shape[1], mean.shape[1]
     check_rows(rows, 0, k)
-    check(len(mean) >= m and len(P) >= m and len(R) >= m and len(S) >= m and len(nis) >= m and len(fused) >= m)
+    check(
+        len(mean) >= m
+        and len(P) >= m
+        and len(R) >= m
+        and len(S) >= m
+        and len(nis) >= m
+        and len(fused) >= m
+    )
     check(len(H) == 1 or len(H) >= m)
     check(P.shape[1] == n and P.shape[2] == n and H.shape[1] == k and H.shape[2] == n)
     check(R.shape[1] == k and R.shape[2] == k and S.shape[1] == k and S.shape[2] == k)
-    K, root, white, A, AP, KR = scratch(k, n), scratch(k, k), scratch(k), scratch(n, n), scratch(n, n), scratch(n, k)
+    K, root, white, A, AP, KR = (
+        scratch(k, n),
+        scratch(k, k),
+        scratch(k),
+        scratch(n, n),
+        scratch(n, n),
+        scratch(n, k),
+    )
     for i in range(m):
         h = H[min(i, len(H) - 1)]
         copy(R[i], S[i])

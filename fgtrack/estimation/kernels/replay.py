@@ -54,7 +54,12 @@ def _ahead(
 
 @shared(f"void({MATRIX}, int64[::1], {MATRIX}, b1, float64[::1], {MATRIX})")
 def _innovation(
-    state: FloatArray, label: IntArray, measured: FloatArray, wraps: bool, y: FloatArray, S: FloatArray
+    state: FloatArray,
+    label: IntArray,
+    measured: FloatArray,
+    wraps: bool,
+    y: FloatArray,
+    S: FloatArray,
 ) -> None:
     """Write y = z - H x and S = H P H' + R, of an H that selects entries."""
     k = label[1]
@@ -70,9 +75,17 @@ def _innovation(
 _SPACE = f"Tuple(({f'{MATRIX}, ' * 4}float64[::1], {f'{MATRIX}, ' * 3}float64[::1]))"
 
 
-@shared(f"b1(int64, float64[::1], int64[::1], int64[:, ::1], float64[:, :, ::1], {_SPACE}, {MATRIX})")
+@shared(
+    f"b1(int64, float64[::1], int64[::1], int64[:, ::1], float64[:, :, ::1], {_SPACE}, {MATRIX})"
+)
 def _retrodict(
-    motion: int, noise: FloatArray, slots: IntArray, labels: IntArray, steps: FloatArray, space: _Space, now: FloatArray
+    motion: int,
+    noise: FloatArray,
+    slots: IntArray,
+    labels: IntArray,
+    steps: FloatArray,
+    space: _Space,
+    now: FloatArray,
 ) -> bool:
     """Smooth `now`, the state after the last of `slots`, back to the prediction of the first, which is new.
     From step to step (Rauch, Tung and Striebel), x_j + C s and P_j + C (P - P_-) C' with the prediction x_-, P_- of the
@@ -126,7 +139,16 @@ def _step(
     k, n = label[1], before.shape[1]
     F, A, AP, _, _, S, K, KR, y = space
     y, K, predicted = y[:k], K[:k], after[n + 1 :]
-    _ahead(motion, noise, before[: n + 1], late_ns, F, predicted[0], predicted[1 : n + 1], predicted[n + 1 :])
+    _ahead(
+        motion,
+        noise,
+        before[: n + 1],
+        late_ns,
+        F,
+        predicted[0],
+        predicted[1 : n + 1],
+        predicted[n + 1 :],
+    )
     copy(predicted, after[: n + 1])
     _innovation(after, label, measured, motion == ARC, y, S)
     for c in range(k):
@@ -147,7 +169,9 @@ def _step(
 
 
 @merged
-def _comes_after(label: IntArray, measured: FloatArray, new_label: IntArray, new: FloatArray) -> bool:
+def _comes_after(
+    label: IntArray, measured: FloatArray, new_label: IntArray, new: FloatArray
+) -> bool:
     """True if a step comes after a new one: by stamp, and at one stamp by content, whatever came first."""
     k = label[1]
     if label[0] != new_label[0] or k == 0:
@@ -163,7 +187,9 @@ def _comes_after(label: IntArray, measured: FloatArray, new_label: IntArray, new
 
 
 @merged
-def _forget(oldest_ns: int, slots: IntArray, labels: IntArray, window: IntArray) -> None:
+def _forget(
+    oldest_ns: int, slots: IntArray, labels: IntArray, window: IntArray
+) -> None:
     """Free the slots of steps before the newest one that is older than `oldest_ns`."""
     gone = 0
     while gone + 1 < window[0] and labels[slots[gone + 1], 0] < oldest_ns:
@@ -178,13 +204,23 @@ _STEPS = "int64, float64[::1], int64[:, ::1], int64[:, :, ::1], float64[:, :, :,
 
 @inlined
 def _check(
-    tracks: IntArray, least: int, order: IntArray, labels: IntArray, steps: FloatArray, windows: IntArray, n: int
+    tracks: IntArray,
+    least: int,
+    order: IntArray,
+    labels: IntArray,
+    steps: FloatArray,
+    windows: IntArray,
+    n: int,
 ) -> None:
     """Raise `IndexError` for tracks, or numbers of steps, beyond the ends of the arrays of states of dimension n."""
     size, slots = order.shape
     check_rows(tracks, least, size)
-    check(labels.shape[0] == size and steps.shape[0] == size and windows.shape[0] == size)
-    check(labels.shape[1] == slots and steps.shape[1] == slots and windows.shape[1] >= 3)
+    check(
+        labels.shape[0] == size and steps.shape[0] == size and windows.shape[0] == size
+    )
+    check(
+        labels.shape[1] == slots and steps.shape[1] == slots and windows.shape[1] >= 3
+    )
     check(steps.shape[2] == 3 * n + 2 and steps.shape[3] == n)
     for i in range(len(tracks)):
         if tracks[i] >= 0:
@@ -225,15 +261,42 @@ def fuse(
     m, k, n, num_without_room = len(tracks), y.shape[1], steps.shape[3], 0
     check_noise(motion, noise, n)
     _check(tracks, 0, order, labels, steps, windows, n)
-    check(measured.shape[0] == order.shape[0] and measured.shape[1] == order.shape[1] and measured.shape[2] > k)
-    check(measured.shape[3] >= k and labels.shape[2] >= k + 2 and len(entries) >= k and z.shape[1] >= k)
-    check(len(y) == m and len(z) == m and len(R) == m and len(S) == m and len(nis) == m and len(status) == m)
+    check(
+        measured.shape[0] == order.shape[0]
+        and measured.shape[1] == order.shape[1]
+        and measured.shape[2] > k
+    )
+    check(
+        measured.shape[3] >= k
+        and labels.shape[2] >= k + 2
+        and len(entries) >= k
+        and z.shape[1] >= k
+    )
+    check(
+        len(y) == m
+        and len(z) == m
+        and len(R) == m
+        and len(S) == m
+        and len(nis) == m
+        and len(status) == m
+    )
     check(R.shape[1] >= k and R.shape[2] >= k and S.shape[1] >= k and S.shape[2] >= k)
     check_rows(entries, 0, n)
     check_rows(rows, 0, k)
     now, most = scratch(n + 1, n), measured.shape[3]
-    F, A, AP, ahead, mean = scratch(n, n), scratch(n, n), scratch(n, n), scratch(2 * n + 1, n), scratch(n)
-    root, K, KR, white = scratch(most, most), scratch(most, n), scratch(n, most), scratch(most)
+    F, A, AP, ahead, mean = (
+        scratch(n, n),
+        scratch(n, n),
+        scratch(n, n),
+        scratch(2 * n + 1, n),
+        scratch(n),
+    )
+    root, K, KR, white = (
+        scratch(most, most),
+        scratch(most, n),
+        scratch(n, most),
+        scratch(most),
+    )
     space = F, A, AP, ahead, mean, root, K, KR, white
     for i in range(len(tracks)):
         t = tracks[i]
@@ -254,7 +317,9 @@ def fuse(
             label[2 + a], new[0, a] = entries[a], z[i, a]
             for b in range(k):
                 new[1 + a, b] = R[i, a, b]
-        while index > 1 and _comes_after(labels[t, slots[index - 1]], measured[t, slots[index - 1]], label, new):
+        while index > 1 and _comes_after(
+            labels[t, slots[index - 1]], measured[t, slots[index - 1]], label, new
+        ):
             slots[index] = slots[index - 1]
             index -= 1
         slots[index] = own
@@ -262,11 +327,28 @@ def fuse(
         while j <= last:
             s, left = slots[j], slots[j - 1]
             late_ns = labels[t, s, 0] - labels[t, left, 0]
-            ok = _step(motion, noise, steps[t, left], steps[t, s], late_ns, labels[t, s], measured[t, s], space)
+            ok = _step(
+                motion,
+                noise,
+                steps[t, left],
+                steps[t, s],
+                late_ns,
+                labels[t, s],
+                measured[t, s],
+                space,
+            )
             if ok and s == own:
                 newest = slots[count]
                 copy(steps[t, newest, n + 1 if index == count else 0 :], now)
-                ok = _retrodict(motion, noise, slots[index : count + 1], labels[t], steps[t], space, now)
+                ok = _retrodict(
+                    motion,
+                    noise,
+                    slots[index : count + 1],
+                    labels[t],
+                    steps[t],
+                    space,
+                    now,
+                )
                 _innovation(now, label, new, motion == ARC, y[i], S[i])
                 nis[i] = marginal_nis(S[i], y[i], rows, root, white)
                 ok = ok and not math.isnan(nis[i])
@@ -284,7 +366,9 @@ def fuse(
     return num_without_room
 
 
-@njit(f"int64({_STEPS}, int64[::1], int64, int64, b1, float64[:, ::1], float64[:, :, ::1], b1[::1])")
+@njit(
+    f"int64({_STEPS}, int64[::1], int64, int64, b1, float64[:, ::1], float64[:, :, ::1], b1[::1])"
+)
 def ahead(
     motion: int,
     noise: FloatArray,
@@ -306,7 +390,11 @@ def ahead(
     n, count = steps.shape[3], 0
     check_noise(motion, noise, n)
     _check(tracks, -1, order, labels, steps, windows, n)
-    check(len(means) == len(tracks) and len(covariances) == len(tracks) and len(known) == len(tracks))
+    check(
+        len(means) == len(tracks)
+        and len(covariances) == len(tracks)
+        and len(known) == len(tracks)
+    )
     F, FP = scratch(n, n), scratch(n, n)
     for i in range(len(tracks)):
         t, at_ns = tracks[i], stamp_ns
@@ -323,7 +411,16 @@ def ahead(
         while j > 0 and labels[t, order[t, j], 0] > at_ns:
             j -= 1
         s = order[t, j]
-        _ahead(motion, noise, steps[t, s, : n + 1], at_ns - labels[t, s, 0], F, means[i], covariances[i], FP)
+        _ahead(
+            motion,
+            noise,
+            steps[t, s, : n + 1],
+            at_ns - labels[t, s, 0],
+            F,
+            means[i],
+            covariances[i],
+            FP,
+        )
         if motion == ARC:
             means[i, _YAW] = wrapped(means[i, _YAW])
     return count

@@ -47,7 +47,9 @@ class AccumulatedStateDensity(WindowedFilter):
         """See `Estimator.state_at`: smoothed, from all measurements."""
         stamp_ns = as_stamp("stamp_ns", stamp_ns)
         (_, mean, covariance), block = self._with_state(stamp_ns)
-        return track_state(self._motion, stamp_ns, mean[block].copy(), covariance[block, block].copy())
+        return track_state(
+            self._motion, stamp_ns, mean[block].copy(), covariance[block, block].copy()
+        )
 
     def _forget_before(self, stamp_ns: int) -> None:
         stamps_ns, mean, covariance = self._stack
@@ -69,12 +71,20 @@ class AccumulatedStateDensity(WindowedFilter):
         index = max(bisect.bisect_right(stamps_ns, stamp_ns) - 1, 0)
         if stamps_ns[index] == stamp_ns:
             return self._stack, slice(index * n, index * n + n)
-        left, until_s = mean[index * n : index * n + n], seconds(stamp_ns - stamps_ns[index])
+        left, until_s = (
+            mean[index * n : index * n + n],
+            seconds(stamp_ns - stamps_ns[index]),
+        )
         if index + 1 == len(stamps_ns):
             own, A, noise = self._motion.transition(left, until_s)
         else:
-            right, after_s = mean[index * n + n : index * n + 2 * n], seconds(stamps_ns[index + 1] - stamp_ns)
-            own, Lambda, Psi, noise = between(self._motion, left, right, until_s, after_s)
+            right, after_s = (
+                mean[index * n + n : index * n + 2 * n],
+                seconds(stamps_ns[index + 1] - stamp_ns),
+            )
+            own, Lambda, Psi, noise = between(
+                self._motion, left, right, until_s, after_s
+            )
             A = np.hstack((Lambda, Psi))
         neighbours, at = slice(index * n, index * n + A.shape[1]), index * n + n
         cross = A @ covariance[neighbours]
@@ -83,6 +93,8 @@ class AccumulatedStateDensity(WindowedFilter):
         grown[np.ix_(others, others)] = covariance
         grown[at : at + n, others] = cross
         grown[others, at : at + n] = cross.T
-        grown[at : at + n, at : at + n] = propagated(A, covariance[neighbours, neighbours], noise)
+        grown[at : at + n, at : at + n] = propagated(
+            A, covariance[neighbours, neighbours], noise
+        )
         stamps_ns = (*stamps_ns[: index + 1], stamp_ns, *stamps_ns[index + 1 :])
         return (stamps_ns, np.insert(mean, at, own), grown), slice(at, at + n)

@@ -28,10 +28,17 @@ class DelayedHorizon:
     initiates = True
 
     def __init__(
-        self, motion: MotionModel, prior: Start, lag_s: float, horizon_s: float = 0.2, initiation: str = DEFAULT
+        self,
+        motion: MotionModel,
+        prior: Start,
+        lag_s: float,
+        horizon_s: float = 0.2,
+        initiation: str = DEFAULT,
     ) -> None:
         if not 0.0 <= horizon_s <= lag_s:
-            raise CallError(f"measurements held for {horizon_s} s: give a time from 0 to the window's {lag_s} s")
+            raise CallError(
+                f"measurements held for {horizon_s} s: give a time from 0 to the window's {lag_s} s"
+            )
         self._motion = motion
         self._hold_ns = nanoseconds(horizon_s)
         self._now_ns = prior.stamp_ns
@@ -70,7 +77,11 @@ class DelayedHorizon:
             return self._ordered.state_at(stamp_ns)
         front = self._ordered.state_at(front_ns)
         dt_s = seconds(stamp_ns - front_ns)
-        return track_state(self._motion, stamp_ns, *predict(front.mean, front.covariance, self._motion, dt_s))
+        return track_state(
+            self._motion,
+            stamp_ns,
+            *predict(front.mean, front.covariance, self._motion, dt_s),
+        )
 
 
 class ReorderBuffer(DelayedHorizon):
@@ -87,7 +98,12 @@ class ReorderBuffer(DelayedHorizon):
     held_s = 0.1
 
     def __init__(
-        self, motion: MotionModel, prior: Start, lag_s: float, hold_s: float = 0.1, initiation: str = DEFAULT
+        self,
+        motion: MotionModel,
+        prior: Start,
+        lag_s: float,
+        hold_s: float = 0.1,
+        initiation: str = DEFAULT,
     ) -> None:
         super().__init__(motion, prior, lag_s, hold_s, initiation)
 

@@ -8,7 +8,13 @@ from fgtrack.core.linalg import congruence, identity, psd_solve, symmetrise
 from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray
 from fgtrack.estimation.base import Measurement
-from fgtrack.estimation.filters.ekf import Correction, OneCorrection, Prediction, propagated, robust_weight
+from fgtrack.estimation.filters.ekf import (
+    Correction,
+    OneCorrection,
+    Prediction,
+    propagated,
+    robust_weight,
+)
 from fgtrack.estimation.oosm.late import FilterStep, RewindForget
 from fgtrack.estimation.rts import rts_step
 
@@ -17,7 +23,9 @@ Past = tuple[FloatArray, FloatArray, FloatArray]
 (m, n) of the state to be corrected with the state at tau."""
 
 
-def fuse_across(mean: FloatArray, covariance: FloatArray, past: Past, measurement: Measurement) -> OneCorrection:
+def fuse_across(
+    mean: FloatArray, covariance: FloatArray, past: Past, measurement: Measurement
+) -> OneCorrection:
     """The state x, `mean` (m,) and `covariance` (m, m), after a measurement of the state `past`.
     S = H P_tau H' + R, x+ = x + C H' S^-1 (z - h(x_tau)), P+ = P - C H' S^-1 H C' with C = Cov(x, x_tau) (Bar-Shalom
     2002, see `A1`), with the weight that a robust loss gives R (see `robust_weight`). Raises
@@ -33,7 +41,9 @@ def fuse_across(mean: FloatArray, covariance: FloatArray, past: Past, measuremen
         S = propagated(H, P_tau, measurement.R / w)
     across = cross @ H.T
     gain = psd_solve(S, across.T).T
-    result = Correction(mean + gain @ y, symmetrise(covariance - gain @ across.T), y, nis, w, expected)
+    result = Correction(
+        mean + gain @ y, symmetrise(covariance - gain @ across.T), y, nis, w, expected
+    )
     if not (np.isfinite(result.mean).all() and np.isfinite(result.covariance).all()):
         raise np.linalg.LinAlgError("the measurement gives a state that is not finite")
     return result
@@ -49,7 +59,9 @@ class CrossingEkf(RewindForget):
         now = self._steps[-1]
         past = self._past(measurement.stamp_ns)
         result = fuse_across(now.mean, now.covariance, past, measurement)
-        np.linalg.cholesky(result.covariance)  # an approximate cross-covariance may take away more than there is
+        np.linalg.cholesky(
+            result.covariance
+        )  # an approximate cross-covariance may take away more than there is
         self._absorb(result.mean, result.covariance)
         return result
 
@@ -57,13 +69,17 @@ class CrossingEkf(RewindForget):
     def _past(self, stamp_ns: int) -> Past:
         """Estimate of the state at `stamp_ns`, and its cross-covariance with the present."""
 
-    def _since(self, stamp_ns: int) -> tuple[FloatArray, FloatArray, list[tuple[FilterStep, FloatArray]]]:
+    def _since(
+        self, stamp_ns: int
+    ) -> tuple[FloatArray, FloatArray, list[tuple[FilterStep, FloatArray]]]:
         """Return x_{tau|m}, P_{tau|m}, and each step after `stamp_ns` with F (n, n) to it."""
         left = self._left(stamp_ns)
         mean, covariance = self._predicted(left, stamp_ns)
         since, x, at_ns = [], mean, stamp_ns
         for step in self._steps[left + 1 :]:
-            since.append((step, self._motion.jacobian(x, seconds(step.stamp_ns - at_ns))))
+            since.append(
+                (step, self._motion.jacobian(x, seconds(step.stamp_ns - at_ns)))
+            )
             x, at_ns = step.mean, step.stamp_ns
         return mean, covariance, since
 
@@ -103,7 +119,10 @@ class A1(CrossingEkf):
         gained = (covariance - now.covariance) @ weighted  # P H' S^-1 H Q
         P_vv, P_xv, end = Q, Q - gained, now.mean
         if self.noise_in_state:
-            P_vv, end = Q - weighted.T @ gained, now.mean - weighted.T @ (now.mean - mean)
+            P_vv, end = (
+                Q - weighted.T @ gained,
+                now.mean - weighted.T @ (now.mean - mean),
+            )
         start, back = motion.predict(end, -back_s), motion.jacobian(end, -back_s)
         spread = back @ (now.covariance + P_vv - P_xv - P_xv.T) @ back.T
         return start, symmetrise(spread), (now.covariance - P_xv) @ back.T
@@ -137,7 +156,10 @@ class C(CrossingEkf):
     def _past(self, stamp_ns: int) -> Past:
         now = self._steps[-1]
         dt_s = seconds(stamp_ns - now.stamp_ns)
-        mean, back = self._motion.predict(now.mean, dt_s), self._motion.jacobian(now.mean, dt_s)
+        mean, back = (
+            self._motion.predict(now.mean, dt_s),
+            self._motion.jacobian(now.mean, dt_s),
+        )
         cross = now.covariance @ back.T
         return mean, symmetrise(back @ cross), cross
 
@@ -187,10 +209,20 @@ class RtsCrossCovariance(CrossingEkf):
     def _past(self, stamp_ns: int) -> Past:
         x, P_x, since = self._since(stamp_ns)
         before = [(x, P_x), *((step.mean, step.covariance) for step, _ in since)]
-        smoothed, P, path = self._steps[-1].mean, self._steps[-1].covariance, self._steps[-1].covariance
-        for (x, P_x), (after, F) in zip(reversed(before[:-1]), reversed(since), strict=True):
-            predicted = Prediction(after.predicted_mean, after.predicted_covariance, F @ P_x)
-            smoothed, P, gain = rts_step(x, P_x, predicted, smoothed - after.predicted_mean, P)
+        smoothed, P, path = (
+            self._steps[-1].mean,
+            self._steps[-1].covariance,
+            self._steps[-1].covariance,
+        )
+        for (x, P_x), (after, F) in zip(
+            reversed(before[:-1]), reversed(since), strict=True
+        ):
+            predicted = Prediction(
+                after.predicted_mean, after.predicted_covariance, F @ P_x
+            )
+            smoothed, P, gain = rts_step(
+                x, P_x, predicted, smoothed - after.predicted_mean, P
+            )
             path = gain @ path
         return smoothed, P, path.T
 

@@ -12,7 +12,13 @@ from fgtrack.core.time import seconds
 from fgtrack.core.types import FloatArray, TrackState
 from fgtrack.estimation.base import Measurement, Start
 from fgtrack.estimation.birth import initial_state
-from fgtrack.estimation.filters.ekf import Correction, OneCorrection, correct_one, predict, propagated
+from fgtrack.estimation.filters.ekf import (
+    Correction,
+    OneCorrection,
+    correct_one,
+    predict,
+    propagated,
+)
 from fgtrack.estimation.filters.propagation import track_state, wrapped
 from fgtrack.estimation.filters.windowed import WindowedFilter
 from fgtrack.models.motion import MotionModel
@@ -45,7 +51,7 @@ class RewindForget(WindowedFilter):
 
     Karle, Fent, Huch, Sauerbeck and Lienkamp, Multi-modal sensor fusion and object tracking for autonomous racing, IEEE
     Transactions on Intelligent Vehicles, 2023, section III-G: x_1 = f(x_{tau|tau}), P_1 = F P_{tau|tau} F' + Q from tau
-    to now. Here at the stamp itself; `fgtrack.estimation.filters.backward_forward` has the paper's time grid. The other
+    to now. Here at the stamp itself; `fgtrack.karle2023.backward_forward` has the paper's time grid. The other
     methods override `_fuse_late`; all are linearised at the stored means.
 
     Exact for: nothing; consistent, but all measurements between the late stamp and the present are lost.
@@ -54,14 +60,18 @@ class RewindForget(WindowedFilter):
     def __init__(self, motion: MotionModel, prior: Start, lag_s: float) -> None:
         super().__init__(motion, prior, lag_s)
         x, P = initial_state(motion, prior)
-        self._steps = [FilterStep(prior.stamp_ns, x, P, x, P, np.zeros_like(x), np.zeros_like(P))]
+        self._steps = [
+            FilterStep(prior.stamp_ns, x, P, x, P, np.zeros_like(x), np.zeros_like(P))
+        ]
         """In order of their stamps, the first of them the prior."""
 
     def state_at(self, stamp_ns: int) -> TrackState:
         """See `Estimator.state_at`: predicted from the last stored step before that stamp."""
         stamp_ns = as_stamp("stamp_ns", stamp_ns)
         step = self._steps[self._left(stamp_ns)]
-        moved = self._moved(wrapped(self._motion, step.mean), step.covariance, step.stamp_ns, stamp_ns)
+        moved = self._moved(
+            wrapped(self._motion, step.mean), step.covariance, step.stamp_ns, stamp_ns
+        )
         return track_state(self._motion, stamp_ns, *moved)
 
     def _forget_before(self, stamp_ns: int) -> None:
@@ -77,9 +87,19 @@ class RewindForget(WindowedFilter):
         mean, covariance = self._predicted(index, measurement.stamp_ns)
         result = correct_one(mean, covariance, measurement)
         y, H = measurement.model.linearised(measurement.z, mean, measurement.pose)
-        weighted = psd_solve(propagated(H, covariance, measurement.R / result.weight), np.column_stack((y, H)))
+        weighted = psd_solve(
+            propagated(H, covariance, measurement.R / result.weight),
+            np.column_stack((y, H)),
+        )
         information = H.T @ weighted[:, 0], symmetrise(H.T @ weighted[:, 1:])
-        step = FilterStep(measurement.stamp_ns, result.mean, result.covariance, mean, covariance, *information)
+        step = FilterStep(
+            measurement.stamp_ns,
+            result.mean,
+            result.covariance,
+            mean,
+            covariance,
+            *information,
+        )
         self._steps[index + 1 :] = [step]
         return result
 
@@ -89,7 +109,11 @@ class RewindForget(WindowedFilter):
 
     def _left(self, stamp_ns: int) -> int:
         """Return the index of the last step that is not after `stamp_ns`, or of the first step, where all are."""
-        return max(bisect.bisect_right(self._steps, stamp_ns, key=lambda step: step.stamp_ns) - 1, 0)
+        return max(
+            bisect.bisect_right(self._steps, stamp_ns, key=lambda step: step.stamp_ns)
+            - 1,
+            0,
+        )
 
     def _predicted(self, index: int, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
         """Return mean (n,) and covariance (n, n) at `stamp_ns` from the step at `index`."""
@@ -113,7 +137,11 @@ class RewindForget(WindowedFilter):
         gained = psd_solve(now.covariance, now.covariance - covariance)
         score = psd_solve(now.covariance, mean - now.mean)
         weight = symmetrise(psd_solve(now.covariance, gained.T))
-        self._steps.append(FilterStep(now.stamp_ns, mean, covariance, now.mean, now.covariance, score, weight))
+        self._steps.append(
+            FilterStep(
+                now.stamp_ns, mean, covariance, now.mean, now.covariance, score, weight
+            )
+        )
 
 
 class Drop(RewindForget):

@@ -10,10 +10,22 @@ import numpy as np
 
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray, IntArray, SmoothedReport, TrackState
-from fgtrack.estimation.base import Measurement, Start, StatesAt, UpdateResult, UpdateStatus, stacks
+from fgtrack.estimation.base import (
+    Measurement,
+    Start,
+    StatesAt,
+    UpdateResult,
+    UpdateStatus,
+    stacks,
+)
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.failures import EstimatorError, Failure, Failures
-from fgtrack.estimation.filters.initiation import DEFAULT, SMOOTHER_ITERATIONS, Search, checked_initiation
+from fgtrack.estimation.filters.initiation import (
+    DEFAULT,
+    SMOOTHER_ITERATIONS,
+    Search,
+    checked_initiation,
+)
 from fgtrack.estimation.filters.propagation import kinematic_states
 from fgtrack.estimation.kernels.kalman import innovations
 from fgtrack.estimation.object_bank import Outcomes, changing_nothing
@@ -45,7 +57,13 @@ class SmootherBank:
     """
 
     make_solver: ClassVar[type[Solver]] = Solver
-    bank, exact, nonlinear, smooths, initiates = (True, "any lag, any number", "at convergence", True, True)
+    bank, exact, nonlinear, smooths, initiates = (
+        True,
+        "any lag, any number",
+        "at convergence",
+        True,
+        True,
+    )
 
     def __init__(
         self,
@@ -57,7 +75,10 @@ class SmootherBank:
     ) -> None:
         self._motion = motion
         self._settings = settings = SmootherSettings.of_options(lag_s, options)
-        self._lag_ns, self._behind_ns = (nanoseconds(settings.lag_s), nanoseconds(settings.behind_s))
+        self._lag_ns, self._behind_ns = (
+            nanoseconds(settings.lag_s),
+            nanoseconds(settings.behind_s),
+        )
         self._lagged = [(lag_s, nanoseconds(lag_s)) for lag_s in settings.lagged_s]
         self.solver = self.make_solver(motion, settings)
         self.failures = failures or Failures()
@@ -103,12 +124,17 @@ class SmootherBank:
             tracks, track_ids = self._all()
             is_known = self._windows(tracks)[2] <= stamp_ns
             if not is_known.all():
-                track_ids, tracks = (tuple(compress(track_ids, is_known.tolist())), tracks[is_known])
+                track_ids, tracks = (
+                    tuple(compress(track_ids, is_known.tolist())),
+                    tracks[is_known],
+                )
             states = self._states(tracks, np.full(len(tracks), stamp_ns))
             known = self._known[stamp_ns] = StatesAt(track_ids, *states)
         return known
 
-    def _states(self, tracks: IntArray, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray]:
+    def _states(
+        self, tracks: IntArray, stamps_ns: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Return `Solver.states_at`. Raises `EstimatorError` for the tracks of which the solver raises."""
         try:
             return self.solver.states_at(tracks, stamps_ns)
@@ -118,7 +144,9 @@ class SmootherBank:
             causes = dict[int, Exception]()
             for row, track in enumerate(tracks.tolist()):
                 try:
-                    self.solver.states_at(tracks[row : row + 1], stamps_ns[row : row + 1])
+                    self.solver.states_at(
+                        tracks[row : row + 1], stamps_ns[row : row + 1]
+                    )
                 except Exception as error:
                     causes[self._ids[track]] = error
             if causes:
@@ -126,25 +154,44 @@ class SmootherBank:
             raise
 
     def update(
-        self, stamp_ns: int, track_ids: Sequence[int], measurements: Sequence[Measurement]
+        self,
+        stamp_ns: int,
+        track_ids: Sequence[int],
+        measurements: Sequence[Measurement],
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
         with changing_nothing(track_ids):
             states = self.states_at(stamp_ns)
-            row_of = dict(zip(states.track_ids, range(len(states.track_ids)), strict=True))
+            row_of = dict(
+                zip(states.track_ids, range(len(states.track_ids)), strict=True)
+            )
             inside = [k for k, track_id in enumerate(track_ids) if track_id in row_of]
             if len(inside) < len(track_ids):
                 measurements = [measurements[k] for k in inside]
             parts = stacks(measurements)
-        outcomes, outside = Outcomes(), [track_id for track_id in track_ids if track_id not in row_of]
-        outcomes.add(outside, lambda: [UpdateResult(UpdateStatus.TOO_OLD) for _ in outside])
+        outcomes, outside = (
+            Outcomes(),
+            [track_id for track_id in track_ids if track_id not in row_of],
+        )
+        outcomes.add(
+            outside, lambda: [UpdateResult(UpdateStatus.TOO_OLD) for _ in outside]
+        )
         for indices, stack in parts:
             ids = [track_ids[inside[k]] for k in indices]
-            outcomes.add(ids, partial(self._update, ids, stack, states, [row_of[each] for each in ids]))
+            outcomes.add(
+                ids,
+                partial(
+                    self._update, ids, stack, states, [row_of[each] for each in ids]
+                ),
+            )
         return outcomes.results(track_ids)
 
     def _update(
-        self, track_ids: Sequence[int], stack: Measurement, states: StatesAt, of: Sequence[int]
+        self,
+        track_ids: Sequence[int],
+        stack: Measurement,
+        states: StatesAt,
+        of: Sequence[int],
     ) -> list[UpdateResult]:
         """Return the outcomes of a stack of measurements of tracks, whose `states` are in the rows `of`.
         Of a stack that raises, the measurements of the tracks whose states are as before are fused alone.
@@ -155,30 +202,56 @@ class SmootherBank:
             if len(track_ids) == 1:
                 raise
             outcomes = Outcomes()
-            alone = [k for k, track_id in enumerate(track_ids) if track_id in error.unchanged]
-            others = [track_id for track_id in track_ids if track_id not in error.unchanged]
+            alone = [
+                k for k, track_id in enumerate(track_ids) if track_id in error.unchanged
+            ]
+            others = [
+                track_id for track_id in track_ids if track_id not in error.unchanged
+            ]
             outcomes.add(others, partial(_raised, error, others))
             for k in alone:
                 one = replace(stack, z=stack.z[k : k + 1], R=stack.R[k : k + 1])
-                outcomes.add([track_ids[k]], partial(self._update, [track_ids[k]], one, states, [of[k]]))
+                outcomes.add(
+                    [track_ids[k]],
+                    partial(self._update, [track_ids[k]], one, states, [of[k]]),
+                )
             return outcomes.results(track_ids)
 
     def _fused(
-        self, track_ids: Sequence[int], stack: Measurement, states: StatesAt, of: Sequence[int]
+        self,
+        track_ids: Sequence[int],
+        stack: Measurement,
+        states: StatesAt,
+        of: Sequence[int],
     ) -> list[UpdateResult]:
         """Return the outcomes of `_update` of all tracks together. Raises `EstimatorError` for those that raise."""
         with changing_nothing(track_ids):
-            alike, tracks = stack.seen_by(self._motion), np.array([self._tracks[each] for each in track_ids])
+            alike, tracks = (
+                stack.seen_by(self._motion),
+                np.array([self._tracks[each] for each in track_ids]),
+            )
             rows = np.array(of)
             means = states.means[rows]
             y, H = alike.model.linearised(alike.z, means, alike.pose)
             H = np.array(H, dtype=np.float64, order="C", ndmin=3)
             R = np.array(alike.R, dtype=np.float64, order="C", ndmin=3)
-            (S, nis, _), times = innovations(y, H, states.covariances, rows, R, alike.measured), self._windows(tracks)
+            (S, nis, _), times = (
+                innovations(y, H, states.covariances, rows, R, alike.measured),
+                self._windows(tracks),
+            )
             usable, given = np.isfinite(nis).nonzero()[0], (y, H, means, R, times[3])
             if len(usable) < len(tracks):
-                alike, tracks = replace(alike, z=alike.z[usable], R=alike.R[usable]), tracks[usable]
-                given = y[usable], H if len(H) == 1 else H[usable], means[usable], R[usable], times[3, usable]
+                alike, tracks = (
+                    replace(alike, z=alike.z[usable], R=alike.R[usable]),
+                    tracks[usable],
+                )
+                given = (
+                    y[usable],
+                    H if len(H) == 1 else H[usable],
+                    means[usable],
+                    R[usable],
+                    times[3, usable],
+                )
         results = [UpdateResult(UpdateStatus.FAILED) for _ in track_ids]
         if not usable.size:
             return results
@@ -187,22 +260,40 @@ class SmootherBank:
         try:
             left = self.solver.fuse(tracks, alike, *given)
         except NotFusedError as error:
-            if len(own) == 1 and not error.lost and isinstance(error.cause, np.linalg.LinAlgError):
+            if (
+                len(own) == 1
+                and not error.lost
+                and isinstance(error.cause, np.linalg.LinAlgError)
+            ):
                 self.failures.add(Failure.GRAPH_REBUILT)
                 return results
-            lost, causes = {self._ids[track] for track in error.lost}, dict.fromkeys(own, error.cause)
-            answers = {each: result for each, result in zip(track_ids, results, strict=True) if each not in causes}
+            lost, causes = (
+                {self._ids[track] for track in error.lost},
+                dict.fromkeys(own, error.cause),
+            )
+            answers = {
+                each: result
+                for each, result in zip(track_ids, results, strict=True)
+                if each not in causes
+            }
             raise EstimatorError(causes, answers, causes.keys() - lost) from error
         made = list(zip(y, nis.tolist(), S, *times[:2].tolist(), strict=True))
         for index in usable.tolist():
             *outcome, newest_ns, start_ns = made[index]
-            results[index] = UpdateResult(_status(alike.stamp_ns, newest_ns, start_ns), *outcome)
+            results[index] = UpdateResult(
+                _status(alike.stamp_ns, newest_ns, start_ns), *outcome
+            )
         if left is not None:
-            self._final += self._reports(map(self._ids.__getitem__, left[0].tolist()), *left[1:])
+            self._final += self._reports(
+                map(self._ids.__getitem__, left[0].tolist()), *left[1:]
+            )
         causes = self._improved(tracks, alike.stamp_ns)
         if causes:
             answers = dict(zip(track_ids, results, strict=True))
-            raise EstimatorError(causes, {each: answers[each] for each in track_ids if each not in causes})
+            raise EstimatorError(
+                causes,
+                {each: answers[each] for each in track_ids if each not in causes},
+            )
         return results
 
     def birth(self, track_id: int, prior: Start) -> None:
@@ -229,15 +320,21 @@ class SmootherBank:
         if self._settings.final:
             try:
                 stamps_ns = self.solver.nodes.window_stamps_ns(track)
-                states = self.solver.states_at(np.full(len(stamps_ns), track), stamps_ns)
-                self._final += self._reports(repeat(track_id), stamps_ns.tolist(), *states)
+                states = self.solver.states_at(
+                    np.full(len(stamps_ns), track), stamps_ns
+                )
+                self._final += self._reports(
+                    repeat(track_id), stamps_ns.tolist(), *states
+                )
             except Exception as error:
                 raise EstimatorError({track_id: error}, {}) from error
 
     def present(self) -> Sequence[TrackState]:
         """See `TrackBank.present`; of an object whose first stamp lies ahead of the clock, that first state."""
         tracks, _ = self._all()
-        states = self._states(tracks, np.maximum(self.present_ns, self._windows(tracks)[2]))
+        states = self._states(
+            tracks, np.maximum(self.present_ns, self._windows(tracks)[2])
+        )
         return kinematic_states(self._motion, self.present_ns, *states)
 
     def smoothed(self) -> list[SmoothedReport]:
@@ -246,7 +343,9 @@ class SmootherBank:
         for lag_s, lag_ns in self._lagged:
             stamp_ns = self.present_ns - lag_ns
             states = self.states_at(stamp_ns)
-            reports += self._reports(states.track_ids, stamp_ns, states.means, states.covariances, lag_s)
+            reports += self._reports(
+                states.track_ids, stamp_ns, states.means, states.covariances, lag_s
+            )
         final, self._final = self._final, []
         return final + reports
 
@@ -283,7 +382,9 @@ class SmootherBank:
 
     def _improve(self, tracks: IntArray, stamp_ns: int) -> None:
         """Initiate, damp and iterate windows with a new measurement at `stamp_ns`."""
-        for track in self._searches.keys() & set(tracks.tolist()) if self._searches else ():
+        for track in (
+            self._searches.keys() & set(tracks.tolist()) if self._searches else ()
+        ):
             self._initiate(track, stamp_ns)
         if damped := self.solver.damp(tracks):
             self.failures.add(Failure.STEP_DAMPED, damped)
@@ -295,10 +396,14 @@ class SmootherBank:
 
     def _initiate(self, track: int, oldest_ns: int) -> None:
         """Reinitialise from a straight line, where the oldest new stamp asks for it, as long as nothing has left."""
-        if self.solver.nodes.first[track] > 0:  # a node that left stays behind the window
+        if (
+            self.solver.nodes.first[track] > 0
+        ):  # a node that left stays behind the window
             del self._searches[track]
             return
-        following = self._searches[track].next_line(partial(self.solver.fixes, track), oldest_ns)
+        following = self._searches[track].next_line(
+            partial(self.solver.fixes, track), oldest_ns
+        )
         if following is not None:
             line, self._searches[track] = following
             self.solver.restart(track, line)
@@ -307,14 +412,19 @@ class SmootherBank:
     def _all(self) -> tuple[IntArray, tuple[int, ...]]:
         """Return rows and ids of all tracks in order of birth."""
         if self._order is None:
-            self._order = (np.array([*self._tracks.values()], dtype=np.int64), tuple(self._tracks))
+            self._order = (
+                np.array([*self._tracks.values()], dtype=np.int64),
+                tuple(self._tracks),
+            )
         return self._order
 
     def _windows(self, tracks: IntArray) -> IntArray:
         """Return the newest stamps of `tracks`, the starts of their windows, the oldest stamps that are fused, and the
         indices of the nodes where the windows will begin, shape (4, m).
         """
-        return self.solver.nodes.windows(tracks, self._clock_ns, self._lag_ns, self._behind_ns)
+        return self.solver.nodes.windows(
+            tracks, self._clock_ns, self._lag_ns, self._behind_ns
+        )
 
 
 def _status(stamp_ns: int, newest_ns: int, start_ns: int) -> UpdateStatus:
@@ -325,12 +435,23 @@ def _status(stamp_ns: int, newest_ns: int, start_ns: int) -> UpdateStatus:
     """
     if stamp_ns >= newest_ns:
         return UpdateStatus.IN_SEQUENCE
-    return UpdateStatus.OUT_OF_SEQUENCE if stamp_ns >= start_ns else UpdateStatus.BEYOND_WINDOW
+    return (
+        UpdateStatus.OUT_OF_SEQUENCE
+        if stamp_ns >= start_ns
+        else UpdateStatus.BEYOND_WINDOW
+    )
 
 
 def _raised(error: EstimatorError, track_ids: Sequence[int]) -> list[UpdateResult]:
     """Return the answers of `error` for these tracks. Raises an `EstimatorError` of those that have none."""
-    causes = {track_id: error.causes[track_id] for track_id in track_ids if track_id in error.causes}
+    causes = {
+        track_id: error.causes[track_id]
+        for track_id in track_ids
+        if track_id in error.causes
+    }
     if causes:
-        raise EstimatorError(causes, {each: error.answers[each] for each in track_ids if each not in causes})
+        raise EstimatorError(
+            causes,
+            {each: error.answers[each] for each in track_ids if each not in causes},
+        )
     return [error.answers[track_id] for track_id in track_ids]

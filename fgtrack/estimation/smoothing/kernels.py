@@ -43,10 +43,24 @@ NUM_ROWS, CHANGED, STALE = range(3)
 ORIGIN, REFERENCE = range(2)
 C, FILTERED, PREDICTED, P, F, Q = range(6)
 #: Types of arguments.
-INDICES, TIMES, VECTORS, MATRICES = ("int64[::1]", "float64[::1]", "float64[:, ::1]", "float64[:, :, ::1]")
+INDICES, TIMES, VECTORS, MATRICES = (
+    "int64[::1]",
+    "float64[::1]",
+    "float64[:, ::1]",
+    "float64[:, :, ::1]",
+)
 BLOCKS = "float64[:, :, :, ::1]"
 NODES = f"Tuple(({'int64[:, ::1], ' * 4}{MATRICES}, {MATRICES}, {BLOCKS}, {MATRICES}))"
-Arrays = tuple[IntArray, IntArray, IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]
+Arrays = tuple[
+    IntArray,
+    IntArray,
+    IntArray,
+    IntArray,
+    FloatArray,
+    FloatArray,
+    FloatArray,
+    FloatArray,
+]
 """See `Nodes.arrays`."""
 
 
@@ -58,12 +72,29 @@ def check_track(track: int, nodes: Arrays, spare: int) -> None:
     info, all_ns, numbers, labels, backs, points, blocks, rows = nodes
     size, n = len(labels), points.shape[2]
     check(0 <= track < len(info))
-    check(len(all_ns) == len(info) and len(numbers) == len(info) and all_ns.shape[1] == numbers.shape[1])
-    check(len(backs) == size and len(points) == size and len(blocks) == size and len(rows) == size)
-    check(backs.shape[1] == n + 1 and backs.shape[2] == n + 1 and blocks.shape[2] == n and blocks.shape[3] == n + 1)
+    check(
+        len(all_ns) == len(info)
+        and len(numbers) == len(info)
+        and all_ns.shape[1] == numbers.shape[1]
+    )
+    check(
+        len(backs) == size
+        and len(points) == size
+        and len(blocks) == size
+        and len(rows) == size
+    )
+    check(
+        backs.shape[1] == n + 1
+        and backs.shape[2] == n + 1
+        and blocks.shape[2] == n
+        and blocks.shape[3] == n + 1
+    )
     check(rows.shape[2] == n + 1)
     own = info[track]
-    check(0 <= own[FIRST] < own[COUNT] <= all_ns.shape[1] - spare and 0 <= own[KNOWN] <= own[COUNT])
+    check(
+        0 <= own[FIRST] < own[COUNT] <= all_ns.shape[1] - spare
+        and 0 <= own[KNOWN] <= own[COUNT]
+    )
     check_rows(numbers[track, : own[COUNT] + spare], 0, size)
 
 
@@ -99,10 +130,16 @@ def _complement(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
 
 
 @merged
-def _predict(points: FloatArray, blocks: FloatArray, before: int, at: int, moved: FloatArray) -> None:
+def _predict(
+    points: FloatArray, blocks: FloatArray, before: int, at: int, moved: FloatArray
+) -> None:
     """Write the prediction [F P F' + Q | F x + f - x0], and F P to `moved`."""
     n = len(moved)
-    left, motion, noise = (blocks[before, FILTERED], blocks[before, F], blocks[before, Q])
+    left, motion, noise = (
+        blocks[before, FILTERED],
+        blocks[before, F],
+        blocks[before, Q],
+    )
     ahead = blocks[at, PREDICTED]
     copy(noise, ahead)
     add_congruence(motion, left, moved, ahead)
@@ -114,11 +151,21 @@ def _predict(points: FloatArray, blocks: FloatArray, before: int, at: int, moved
 
 @shared(f"b1({BLOCKS}, {VECTORS}, int64, int64, {VECTORS}, {VECTORS}, {VECTORS})")
 def _condition(
-    blocks: FloatArray, back: FloatArray, before: int, at: int, gain: FloatArray, E: FloatArray, work: FloatArray
+    blocks: FloatArray,
+    back: FloatArray,
+    before: int,
+    at: int,
+    gain: FloatArray,
+    E: FloatArray,
+    work: FloatArray,
 ) -> bool:
     """A = P F' (F P F' + Q)^-1, b, C = E P E' + A Q A', E = I - A F; `gain` holds F P. False if there is no A."""
     n = len(gain)
-    left, motion, ahead = (blocks[before, FILTERED], blocks[before, F], blocks[at, PREDICTED])
+    left, motion, ahead = (
+        blocks[before, FILTERED],
+        blocks[before, F],
+        blocks[at, PREDICTED],
+    )
     rest = blocks[before, C]
     copy(ahead, E)
     if not solve(E, gain):
@@ -136,7 +183,13 @@ def _condition(
 
 @shared(f"void({VECTORS}, {VECTORS}, int64, {TIMES}, {VECTORS}, {VECTORS}, {VECTORS})")
 def _correct(
-    state: FloatArray, rows: FloatArray, k: int, gain: FloatArray, E: FloatArray, P: FloatArray, work: FloatArray
+    state: FloatArray,
+    rows: FloatArray,
+    k: int,
+    gain: FloatArray,
+    E: FloatArray,
+    P: FloatArray,
+    work: FloatArray,
 ) -> None:
     """Fuse y = G x + N(0, 1), [G | y] being row k, into `state` [P | x]; precise ones in Joseph's form."""
     n = len(gain)
@@ -175,7 +228,13 @@ def _given(back: FloatArray, later: FloatArray, out: FloatArray) -> None:
 
 
 @njit(f"b1({INDICES}, {INDICES}, {INDICES}, b1, {NODES})")
-def solve_windows(tracks: IntArray, starts: IntArray, anchors: IntArray, is_partial: bool, nodes: Arrays) -> bool:
+def solve_windows(
+    tracks: IntArray,
+    starts: IntArray,
+    anchors: IntArray,
+    is_partial: bool,
+    nodes: Arrays,
+) -> bool:
     """Eliminate from `starts` on, let the windows begin at `anchors`, and write steps: A (step of the next node) + b.
     If `is_partial`, only eliminate up to the nodes at `anchors`. True if all is finite.
     """
@@ -186,7 +245,13 @@ def solve_windows(tracks: IntArray, starts: IntArray, anchors: IntArray, is_part
     check(len(starts) >= len(tracks))
     for t in range(len(tracks)):
         check(starts[t] >= 0)
-    A, E, D, work, gain = scratch(n, n), scratch(n, n), scratch(n, n), scratch(n, n), scratch(n)
+    A, E, D, work, gain = (
+        scratch(n, n),
+        scratch(n, n),
+        scratch(n, n),
+        scratch(n, n),
+        scratch(n),
+    )
     for t in range(len(tracks)):
         of, track, count = numbers[tracks[t]], tracks[t], info[tracks[t], COUNT]
         for index in range(starts[t], anchors[t] + 1 if is_partial else count):
@@ -224,7 +289,12 @@ def last_before(all_ns: IntArray, count: int, stamp_ns: int) -> int:
 
 @njit(f"int64({INDICES}, {INDICES}, {NODES}, {INDICES}, {TIMES}, {TIMES})")
 def locate(
-    tracks: IntArray, stamps_ns: IntArray, nodes: Arrays, indices: IntArray, until_s: FloatArray, after_s: FloatArray
+    tracks: IntArray,
+    stamps_ns: IntArray,
+    nodes: Arrays,
+    indices: IntArray,
+    until_s: FloatArray,
+    after_s: FloatArray,
 ) -> int:
     """Write the indices of the nodes after `stamps_ns`, or of the last ones, and the times around the stamps.
     Return how many are after them.
@@ -247,7 +317,13 @@ def locate(
 
 
 @njit(f"void({INDICES}, {INDICES}, {TIMES}, {NODES}, {VECTORS})")
-def smooth(tracks: IntArray, indices: IntArray, after_s: FloatArray, nodes: Arrays, means: FloatArray) -> None:
+def smooth(
+    tracks: IntArray,
+    indices: IntArray,
+    after_s: FloatArray,
+    nodes: Arrays,
+    means: FloatArray,
+) -> None:
     """Make the covariances of the nodes at `indices` known, and behind the window the steps; those on the way stay.
     Write the states that motion starts from: of these nodes, or where `after_s` the conditional one of those before.
     """
@@ -284,7 +360,9 @@ def smooth(tracks: IntArray, indices: IntArray, after_s: FloatArray, nodes: Arra
 _STATE = f"{TIMES}, {VECTORS}, {VECTORS}"
 
 
-@shared(f"b1({MATRICES}, {BLOCKS}, {MATRICES}, int64, int64, {_STATE}, {_STATE}, {MATRICES})")
+@shared(
+    f"b1({MATRICES}, {BLOCKS}, {MATRICES}, int64, int64, {_STATE}, {_STATE}, {MATRICES})"
+)
 def _interpolate(
     points: FloatArray,
     blocks: FloatArray,
@@ -303,7 +381,15 @@ def _interpolate(
     See `rts.between` for Psi, Lambda and Sigma, which is E Q1 E' + Psi Q2 Psi'.
     """
     n = len(mean)
-    S, gain, Psi, E, Lambda, by_right, half = (work[0], work[1], work[2], work[3], work[4], work[5], work[6])
+    S, gain, Psi, E, Lambda, by_right, half = (
+        work[0],
+        work[1],
+        work[2],
+        work[3],
+        work[4],
+        work[5],
+        work[6],
+    )
     for attempt in range(2):
         copy(Q2, S)
         add_congruence(F2, Q1, gain, S)
@@ -336,7 +422,9 @@ def _interpolate(
     return True
 
 
-@njit(f"b1({INDICES}, {INDICES}, {TIMES}, {NODES}, {', '.join([VECTORS, MATRICES, MATRICES] * 2)})")
+@njit(
+    f"b1({INDICES}, {INDICES}, {TIMES}, {NODES}, {', '.join([VECTORS, MATRICES, MATRICES] * 2)})"
+)
 def arrive(
     tracks: IntArray,
     indices: IntArray,
@@ -357,8 +445,18 @@ def arrive(
     n = mean.shape[1]
     check_nodes(tracks, nodes, 0)
     check_indices(indices, tracks, nodes)
-    check(len(mean) <= min(len(tracks), len(after_s), len(F1), len(Q1), len(ahead), len(F2), len(Q2)))
-    check(n == points.shape[2] and ahead.shape[1] == n and F1.shape[1:] == (n, n) and Q1.shape[1:] == (n, n))
+    check(
+        len(mean)
+        <= min(
+            len(tracks), len(after_s), len(F1), len(Q1), len(ahead), len(F2), len(Q2)
+        )
+    )
+    check(
+        n == points.shape[2]
+        and ahead.shape[1] == n
+        and F1.shape[1:] == (n, n)
+        and Q1.shape[1:] == (n, n)
+    )
     check(F2.shape[1:] == (n, n) and Q2.shape[1:] == (n, n))
     work = scratch(7, n, n)
     for t in range(len(mean)):
@@ -366,7 +464,20 @@ def arrive(
         check(indices[t] > 0 or not after_s[t] > 0.0)
         if after_s[t] > 0.0:
             before = numbers[tracks[t], indices[t] - 1]
-            if not _interpolate(points, blocks, backs, before, at, mean[t], F1[t], Q1[t], ahead[t], F2[t], Q2[t], work):
+            if not _interpolate(
+                points,
+                blocks,
+                backs,
+                before,
+                at,
+                mean[t],
+                F1[t],
+                Q1[t],
+                ahead[t],
+                F2[t],
+                Q2[t],
+                work,
+            ):
                 return False
         else:
             add_congruence(F1[t], blocks[at, P], work[0], Q1[t])

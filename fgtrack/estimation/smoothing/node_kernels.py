@@ -1,6 +1,15 @@
 """Compiled loops that insert, move, linearise and forget nodes; `nodes` are the `arrays` of `Nodes`, in that order."""
 
-from fgtrack.core.compiled import check, cholesky, copy, forward, merged, njit, scratch, shared
+from fgtrack.core.compiled import (
+    check,
+    cholesky,
+    copy,
+    forward,
+    merged,
+    njit,
+    scratch,
+    shared,
+)
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.estimation.smoothing.kernels import (
@@ -48,7 +57,11 @@ def _forget(track: int, reach_ns: int, nodes: Arrays) -> None:
     """Forget nodes behind the window that are older than one at or before `reach_ns`, if they are many."""
     info, stamps_ns, numbers, _, _, _, _, _ = nodes
     count, all_ns, of = info[track, COUNT], stamps_ns[track], numbers[track]
-    many = 0 if all_ns[_MANY - 1] > reach_ns else min(last_before(all_ns, count, reach_ns), info[track, FIRST] - 1)
+    many = (
+        0
+        if all_ns[_MANY - 1] > reach_ns
+        else min(last_before(all_ns, count, reach_ns), info[track, FIRST] - 1)
+    )
     if many < _MANY:
         return
     for index in range(count):
@@ -61,7 +74,14 @@ def _forget(track: int, reach_ns: int, nodes: Arrays) -> None:
 
 
 @njit(f"int64({INDICES}, int64, int64, int64, {NODES}, int64[:, ::1])")
-def windows(tracks: IntArray, clock_ns: int, lag_ns: int, behind_ns: int, nodes: Arrays, out: IntArray) -> int:
+def windows(
+    tracks: IntArray,
+    clock_ns: int,
+    lag_ns: int,
+    behind_ns: int,
+    nodes: Arrays,
+    out: IntArray,
+) -> int:
     """Write the newest stamps of `tracks`, the starts of their windows, the oldest stamps that are fused, and the
     indices of the nodes where the windows will begin; older nodes are kept as far as those stamps need them. Return the
     largest number of nodes.
@@ -72,11 +92,20 @@ def windows(tracks: IntArray, clock_ns: int, lag_ns: int, behind_ns: int, nodes:
     check(len(out) >= 4 and out.shape[1] >= len(tracks) and all_ns.shape[1] >= _MANY)
     for t in range(len(tracks)):
         track = tracks[t]
-        newest_ns, begin_ns = (all_ns[track, info[track, COUNT] - 1], info[track, BEGIN_NS])
+        newest_ns, begin_ns = (
+            all_ns[track, info[track, COUNT] - 1],
+            info[track, BEGIN_NS],
+        )
         start_ns = max(max(newest_ns, clock_ns) - lag_ns, begin_ns)
-        out[0, t], out[1, t], out[2, t] = (newest_ns, start_ns, max(start_ns - behind_ns, begin_ns))
+        out[0, t], out[1, t], out[2, t] = (
+            newest_ns,
+            start_ns,
+            max(start_ns - behind_ns, begin_ns),
+        )
         _forget(track, out[2, t], nodes)
-        out[3, t] = max(info[track, FIRST], last_before(all_ns[track], info[track, COUNT], start_ns))
+        out[3, t] = max(
+            info[track, FIRST], last_before(all_ns[track], info[track, COUNT], start_ns)
+        )
         most = max(most, info[track, COUNT])
     return most
 
@@ -107,7 +136,13 @@ _MOVE_FAR = f"int64(int64, int64, int64, {VECTORS}, {NODES}, b1, {INDICES})"
 
 @shared(_MOVE_FAR)
 def _move_far(
-    track: int, anchor: int, start: int, thresholds: FloatArray, nodes: Arrays, moves: bool, indices: IntArray
+    track: int,
+    anchor: int,
+    start: int,
+    thresholds: FloatArray,
+    nodes: Arrays,
+    moves: bool,
+    indices: IntArray,
 ) -> int:
     """Move linearisation points, if it `moves`, where the step is longer than the thresholds; return their number.
     Of their `indices` so many are written as there is room for. `thresholds` are those of linear and nonlinear tracks,
@@ -115,10 +150,20 @@ def _move_far(
     that is too far.
     """
     info, _, numbers, _, backs, _, _, _ = nodes
-    limits, num, moved = thresholds[info[track, NONLINEAR]], 0, scratch(thresholds.shape[1])
+    limits, num, moved = (
+        thresholds[info[track, NONLINEAR]],
+        0,
+        scratch(thresholds.shape[1]),
+    )
     for index in range(info[track, FIRST], info[track, COUNT]):
         steps, too_long = backs[numbers[track, index], len(limits)], False
-        share = SOLVED_SHARE if num or index >= start else LEAVING_SHARE if index < anchor else 1.0
+        share = (
+            SOLVED_SHARE
+            if num or index >= start
+            else LEAVING_SHARE
+            if index < anchor
+            else 1.0
+        )
         for i in range(len(limits)):
             moved[i] = steps[i]
             if abs(steps[i]) > share * limits[i]:
@@ -134,23 +179,37 @@ def _move_far(
 
 @njit(_MOVE_FAR)
 def move_far(
-    track: int, anchor: int, start: int, thresholds: FloatArray, nodes: Arrays, moves: bool, indices: IntArray
+    track: int,
+    anchor: int,
+    start: int,
+    thresholds: FloatArray,
+    nodes: Arrays,
+    moves: bool,
+    indices: IntArray,
 ) -> int:
     """See `_move_far`."""
     info, _, _, _, _, points, _, _ = nodes
     check_track(track, nodes, 0)
-    check(thresholds.shape[1] == points.shape[2] and 0 <= info[track, NONLINEAR] < len(thresholds))
+    check(
+        thresholds.shape[1] == points.shape[2]
+        and 0 <= info[track, NONLINEAR] < len(thresholds)
+    )
     return _move_far(track, anchor, start, thresholds, nodes, moves, indices)
 
 
 @merged
-def _insert(track: int, index: int, stamp_ns: int, mean: FloatArray, nodes: Arrays) -> None:
+def _insert(
+    track: int, index: int, stamp_ns: int, mean: FloatArray, nodes: Arrays
+) -> None:
     """Insert a node at `index`, linearised at `mean`; later nodes move up."""
     info, all_ns, numbers, labels, _, points, _, _ = nodes
     count = info[track, COUNT]
     at = numbers[track, count]
     for k in range(count, index, -1):
-        all_ns[track, k], numbers[track, k] = (all_ns[track, k - 1], numbers[track, k - 1])
+        all_ns[track, k], numbers[track, k] = (
+            all_ns[track, k - 1],
+            numbers[track, k - 1],
+        )
     all_ns[track, index], numbers[track, index] = stamp_ns, at
     info[track, COUNT] = count + 1
     labels[at, NUM_ROWS], labels[numbers[track, index - 1], STALE] = 0, 1
@@ -160,7 +219,13 @@ def _insert(track: int, index: int, stamp_ns: int, mean: FloatArray, nodes: Arra
 
 @merged
 def _observe(
-    at: int, y: FloatArray, H: FloatArray, R: FloatArray, mean: FloatArray, nodes: Arrays, L: FloatArray
+    at: int,
+    y: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+    mean: FloatArray,
+    nodes: Arrays,
+    L: FloatArray,
 ) -> bool:
     """Append L^-1 [H | y + H (mean - x0)], R = L L', to the rows of a node; False if R is not positive definite."""
     _, _, _, labels, _, points, _, rows = nodes
@@ -205,8 +270,17 @@ def place(
     m, n, k, flags = len(tracks), points.shape[2], y.shape[1], 0
     check_nodes(tracks, nodes, 1)
     check_indices(anchors, tracks, nodes)
-    check(min(len(y), len(R), len(means), len(ahead_s)) >= m and (len(H) == 1 or len(H) >= m))
-    check(H.shape[1] == k and H.shape[2] == n and R.shape[1] == k and R.shape[2] == k and means.shape[1] == n)
+    check(
+        min(len(y), len(R), len(means), len(ahead_s)) >= m
+        and (len(H) == 1 or len(H) >= m)
+    )
+    check(
+        H.shape[1] == k
+        and H.shape[2] == n
+        and R.shape[1] == k
+        and R.shape[2] == k
+        and means.shape[1] == n
+    )
     check(len(out) >= 8 and out.shape[1] >= m and thresholds.shape[1] == n)
     for t in range(m):
         check(0 <= info[tracks[t], NONLINEAR] < len(thresholds))
@@ -222,19 +296,36 @@ def place(
             _insert(track, index, stamp_ns, means[t], nodes)
         at = numbers[track, index]
         ahead_s[t] = (stamp_ns - all_ns[track, index]) / NS_PER_S
-        is_plain = is_linear and ahead_s[t] == 0.0 and labels[at, NUM_ROWS] + k <= rows.shape[1]
-        if is_plain and not _observe(at, y[t], H[min(t, len(H) - 1)], R[t], means[t], nodes, L):
+        is_plain = (
+            is_linear
+            and ahead_s[t] == 0.0
+            and labels[at, NUM_ROWS] + k <= rows.shape[1]
+        )
+        if is_plain and not _observe(
+            at, y[t], H[min(t, len(H) - 1)], R[t], means[t], nodes, L
+        ):
             flags |= NOT_DEFINITE
         flags |= (BEHIND if is_behind else 0) | (0 if is_plain else NOT_PLAIN)
         labels[at, STALE] = 1
         start = far[0] + (is_new and far[0] >= index) if num else index
-        out[0, t], out[1, t], out[2, t], out[3, t] = (at, index, is_new, min(index, start))
-        out[4, t], out[5, t], out[6, t] = (anchors[t] + (is_behind and is_new), is_behind, info[track, FIRST])
+        out[0, t], out[1, t], out[2, t], out[3, t] = (
+            at,
+            index,
+            is_new,
+            min(index, start),
+        )
+        out[4, t], out[5, t], out[6, t] = (
+            anchors[t] + (is_behind and is_new),
+            is_behind,
+            info[track, FIRST],
+        )
     return flags
 
 
 @njit(f"void(int64, {TIMES}, {INDICES}, {INDICES}, {NODES})")
-def linearise_motion(kind: int, noise: FloatArray, tracks: IntArray, starts: IntArray, nodes: Arrays) -> None:
+def linearise_motion(
+    kind: int, noise: FloatArray, tracks: IntArray, starts: IntArray, nodes: Arrays
+) -> None:
     """Linearise the motion from nodes that are stale, the one before `starts` and later ones, to the next ones."""
     info, all_ns, numbers, labels, _, points, blocks, _ = nodes
     n = points.shape[2]
@@ -249,7 +340,9 @@ def linearise_motion(kind: int, noise: FloatArray, tracks: IntArray, starts: Int
             if labels[at, STALE] and index < info[track, COUNT] - 1:
                 dt_s = (all_ns[track, index + 1] - all_ns[track, index]) / NS_PER_S
                 motion = blocks[at, F]
-                transition(kind, points[at, ORIGIN], dt_s, noise, mean, motion, blocks[at, Q])
+                transition(
+                    kind, points[at, ORIGIN], dt_s, noise, mean, motion, blocks[at, Q]
+                )
                 for i in range(n):
                     motion[i, n] = mean[i]
                 labels[at, CHANGED] = 1
@@ -257,7 +350,9 @@ def linearise_motion(kind: int, noise: FloatArray, tracks: IntArray, starts: Int
 
 
 @njit(f"int64(int64, int64, {NODES}, int64[:, ::1], {MATRICES})")
-def changed_factors(track: int, start: int, nodes: Arrays, owners: IntArray, factors: FloatArray) -> int:
+def changed_factors(
+    track: int, start: int, nodes: Arrays, owners: IntArray, factors: FloatArray
+) -> int:
     """Write the factors of a track from index `start` on that have changed. Return their number; -1 for an invalid Q.
 
     A factor is that of the measurements of a node, in its first rows, and of its motion to the next one, if there is
@@ -274,8 +369,14 @@ def changed_factors(track: int, start: int, nodes: Arrays, owners: IntArray, fac
     check(min(len(owners), len(factors)) >= last + 1 - start and owners.shape[1] >= 3)
     check(factors.shape[1] >= n + rows.shape[1] and factors.shape[2] >= 2 * n + 1)
     for index in range(start, last + 1):
-        left, right = (numbers[track, index], -1 if index == last else numbers[track, index + 1])
-        used, size = (labels[left, NUM_ROWS], labels[left, NUM_ROWS] + (0 if index == last else n))
+        left, right = (
+            numbers[track, index],
+            -1 if index == last else numbers[track, index + 1],
+        )
+        used, size = (
+            labels[left, NUM_ROWS],
+            labels[left, NUM_ROWS] + (0 if index == last else n),
+        )
         if not labels[left, CHANGED] or not size:
             continue
         labels[left, CHANGED] = 0

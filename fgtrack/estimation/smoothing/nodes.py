@@ -43,7 +43,9 @@ class Nodes:
 
     def __init__(self, motion: MotionModel) -> None:
         self._motion, n, size = motion, motion.dim, _FEW_VALUES
-        self._compiled = motion if isinstance(motion, WhiteNoise) and motion.is_compiled else None
+        self._compiled = (
+            motion if isinstance(motion, WhiteNoise) and motion.is_compiled else None
+        )
         self.tracks: IntArray = np.zeros((_FEW_TRACKS, 5), dtype=np.int64)
         """Number of nodes; index of the oldest one of the window; index from which on `P` is known; stamp of the first
         state; 1 if there was a measurement that is not linear."""
@@ -75,14 +77,26 @@ class Nodes:
         kept = (self.tracks, self.stamps_ns, self.numbers, self.labels, self.backs)
         self.arrays = (*kept, self.points, self.blocks, self.rows)
         """Arguments of all loops."""
-        self.count, self.first, self.step = (self.tracks[:, COUNT], self.tracks[:, FIRST], self.backs[:, n, :n])
-        self.origin, self.reference = (self.points[:, ORIGIN], self.points[:, REFERENCE])
+        self.count, self.first, self.step = (
+            self.tracks[:, COUNT],
+            self.tracks[:, FIRST],
+            self.backs[:, n, :n],
+        )
+        self.origin, self.reference = (
+            self.points[:, ORIGIN],
+            self.points[:, REFERENCE],
+        )
         """x0; the first x0, which the variables of a factor graph are relative to."""
-        self.filtered, self.predicted = (self.blocks[:, FILTERED], self.blocks[:, PREDICTED])
+        self.filtered, self.predicted = (
+            self.blocks[:, FILTERED],
+            self.blocks[:, PREDICTED],
+        )
         self.ahead = self.blocks[:, F, :, n]
         """Covariances and means relative to x0 after and before the node's own measurements; f(x0), f being the motion
         to the next node."""
-        self.C, self.P, self.F, self.Q = (self.blocks[:, k, :, :n] for k in (C, P, F, Q))
+        self.C, self.P, self.F, self.Q = (
+            self.blocks[:, k, :, :n] for k in (C, P, F, Q)
+        )
         """C; covariance given everything; derivative of f at x0; noise of the motion."""
 
     def window(self, track: int) -> IntArray:
@@ -97,7 +111,9 @@ class Nodes:
         """Return the measurements of a node."""
         return [(stack[row], ahead_s) for stack, row, ahead_s in self._factors[number]]
 
-    def begin_window(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
+    def begin_window(
+        self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray
+    ) -> None:
         """Make the first node of a new track."""
         while track >= len(self.tracks):
             self._grow(axis=0)
@@ -109,12 +125,26 @@ class Nodes:
         number = int(self.numbers[track, 0])
         self._factors[number], self.labels[number] = [], 0
         self.origin[number], self.step[number], self.P[number] = mean, 0.0, covariance
-        self.predicted[number] = self.filtered[number] = np.column_stack([covariance, np.zeros(len(mean))])
+        self.predicted[number] = self.filtered[number] = np.column_stack(
+            [covariance, np.zeros(len(mean))]
+        )
 
-    def note(self, stack: Measurements, numbers: IntArray, is_new: IntArray, ahead_s: FloatArray) -> None:
+    def note(
+        self,
+        stack: Measurements,
+        numbers: IntArray,
+        is_new: IntArray,
+        ahead_s: FloatArray,
+    ) -> None:
         """Keep a stack of measurements, one for each of the nodes `numbers`: all or none."""
         kept = dict[int, list[tuple[Measurements, int, float]]]()
-        rows = zip(numbers.tolist(), is_new.tolist(), range(len(numbers)), ahead_s.tolist(), strict=True)
+        rows = zip(
+            numbers.tolist(),
+            is_new.tolist(),
+            range(len(numbers)),
+            ahead_s.tolist(),
+            strict=True,
+        )
         for number, new, *factor in rows:
             kept[number] = [*([] if new else self._factors[number]), (stack, *factor)]
         self._factors.update(kept)
@@ -125,7 +155,10 @@ class Nodes:
         if is_noted:
             self._factors[int(number)].pop()
         if is_new:
-            for each, free in ((self.stamps_ns[track], NEVER), (self.numbers[track], number)):
+            for each, free in (
+                (self.stamps_ns[track], NEVER),
+                (self.numbers[track], number),
+            ):
                 each[index:last] = each[index + 1 : last + 1]
                 each[last] = free
             self.count[track] = last
@@ -134,7 +167,10 @@ class Nodes:
     def windows(self, tracks: IntArray, *limits_ns: int) -> IntArray:
         """Return `node_kernels.windows` of `tracks`, shape (4, m), with room for another node in each."""
         out = np.empty((4, len(tracks)), dtype=np.int64)
-        if node_kernels.windows(tracks, *limits_ns, self.arrays, out) >= self.stamps_ns.shape[1]:
+        if (
+            node_kernels.windows(tracks, *limits_ns, self.arrays, out)
+            >= self.stamps_ns.shape[1]
+        ):
             self._grow(axis=1)
         counts = self.count[tracks]
         lacking = self.numbers[tracks, counts] == NONE
@@ -144,7 +180,10 @@ class Nodes:
 
     def linearise_factors(self, number: int) -> None:
         """Linearise all measurements of a node at its linearisation point."""
-        rows = [whitened(factor, self.origin[number], self._motion) for factor in self.factors(number)]
+        rows = [
+            whitened(factor, self.origin[number], self._motion)
+            for factor in self.factors(number)
+        ]
         used = sum(map(len, rows))
         if used > self.rows.shape[1]:
             self._resize(len(self.labels), used)
@@ -157,22 +196,32 @@ class Nodes:
         compiled = self._compiled
         if is_nonlinear or compiled is None:
             is_node = np.arange(self.numbers.shape[1]) < self.count[tracks, None]
-            rows, indices = np.nonzero(is_node & (self.labels[self.numbers[tracks], STALE] > 0))
+            rows, indices = np.nonzero(
+                is_node & (self.labels[self.numbers[tracks], STALE] > 0)
+            )
             rows = tracks[rows]
             stale = self.numbers[rows, indices]
             for number in stale.tolist() if is_nonlinear else ():
                 self.linearise_factors(number)
         if compiled is not None:
-            node_kernels.linearise_motion(compiled.kind, compiled.noise, tracks, starts, self.arrays)
+            node_kernels.linearise_motion(
+                compiled.kind, compiled.noise, tracks, starts, self.arrays
+            )
             return
         self.labels[stale, STALE] = 0
         inner = indices < self.count[rows] - 1
         rows, indices, stale = rows[inner], indices[inner], stale[inner]
-        dt_s = (self.stamps_ns[rows, indices + 1] - self.stamps_ns[rows, indices]) / NS_PER_S
-        self.ahead[stale], self.F[stale], self.Q[stale] = self.transition(self.origin[stale], dt_s)
+        dt_s = (
+            self.stamps_ns[rows, indices + 1] - self.stamps_ns[rows, indices]
+        ) / NS_PER_S
+        self.ahead[stale], self.F[stale], self.Q[stale] = self.transition(
+            self.origin[stale], dt_s
+        )
         self.labels[stale, CHANGED] = 1
 
-    def transition(self, x: FloatArray, dt_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def transition(
+        self, x: FloatArray, dt_s: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return `MotionModel.transition` of states (m, n) after times (m,)."""
         if self._compiled is None:
             return self._motion.transition(x, dt_s)
@@ -188,7 +237,11 @@ class Nodes:
         stamps_ns, numbers = np.full(shape, NEVER), np.full(shape, NONE)
         tracks = np.zeros((shape[0], self.tracks.shape[1]), dtype=np.int64)
         rows, columns = self.stamps_ns.shape
-        stamps_ns[:rows, :columns], numbers[:rows, :columns], tracks[:rows] = self.stamps_ns, self.numbers, self.tracks
+        stamps_ns[:rows, :columns], numbers[:rows, :columns], tracks[:rows] = (
+            self.stamps_ns,
+            self.numbers,
+            self.tracks,
+        )
         self.stamps_ns, self.numbers, self.tracks = stamps_ns, numbers, tracks
         self._share()
 
@@ -210,7 +263,9 @@ class Nodes:
             shape = size, *values.shape[1:]
             if name == "rows":
                 shape = size, width, values.shape[2]
-            larger.append(np.zeros(shape, values.dtype))  # only pages of used numbers are made
+            larger.append(
+                np.zeros(shape, values.dtype)
+            )  # only pages of used numbers are made
             larger[-1][:used, : values.shape[1]] = values[:used]
         for name, values in zip(names, larger, strict=True):
             setattr(self, name, values)

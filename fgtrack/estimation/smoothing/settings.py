@@ -12,7 +12,12 @@ from fgtrack.core.types import FloatArray
 from fgtrack.models.motion import MotionModel
 
 _NEVER = 1e9
-_RELINEARISE = {"yaw_rad": 0.02, "speed_mps": 1.0, "yaw_rate_radps": 0.05, "accel_mps2": 1.0}
+_RELINEARISE = {
+    "yaw_rad": 0.02,
+    "speed_mps": 1.0,
+    "yaw_rate_radps": 0.05,
+    "accel_mps2": 1.0,
+}
 _NONLINEAR = {"x_m": 0.05, "y_m": 0.05, "vx_mps": 0.2, "vy_mps": 0.2}
 
 
@@ -41,10 +46,16 @@ class SmootherSettings:
     def __post_init__(self) -> None:
         not_negative(lag_s=self.lag_s, ring_s=self.ring_s)
         if not 1 <= self.max_iterations <= 100:
-            raise ValueError(f"max_iterations: must lie between 1 and 100, is {self.max_iterations}")
-        not_negative(**{f"relinearise.{name}": value for name, value in self.relinearise.items()})
+            raise ValueError(
+                f"max_iterations: must lie between 1 and 100, is {self.max_iterations}"
+            )
+        not_negative(
+            **{f"relinearise.{name}": value for name, value in self.relinearise.items()}
+        )
         if any(not 0.0 <= lag_s <= self.lag_s for lag_s in self.lagged_s):
-            raise ValueError(f"lagged_s: must lie between 0 and lag_s = {self.lag_s}, is {list(self.lagged_s)}")
+            raise ValueError(
+                f"lagged_s: must lie between 0 and lag_s = {self.lag_s}, is {list(self.lagged_s)}"
+            )
         if len(set(self.lagged_s)) < len(self.lagged_s):
             raise ValueError(f"lagged_s: names a lag twice, is {list(self.lagged_s)}")
 
@@ -60,7 +71,9 @@ class SmootherSettings:
         """
         taken = [each.name for each in fields(cls)]
         if unknown := set(options).difference(taken):
-            raise CallError(f"unknown option {min(unknown)!r}; its options are {', '.join(taken[1:])}, initiation")
+            raise CallError(
+                f"unknown option {min(unknown)!r}; its options are {', '.join(taken[1:])}, initiation"
+            )
         return cls(lag_s=lag_s, **{"lagged_s": (), "final": False, **options})
 
     def thresholds(self, motion: MotionModel, nonlinear: bool) -> FloatArray:
@@ -68,5 +81,11 @@ class SmootherSettings:
         Motion models are linear in the position. If some measurement is `nonlinear`, or has a robust loss, the position
         has a threshold as well. Where all is linear, nothing has one.
         """
-        named = {**_NONLINEAR, **self.relinearise} if nonlinear else {} if motion.linear else self.relinearise
+        named = (
+            {**_NONLINEAR, **self.relinearise}
+            if nonlinear
+            else {}
+            if motion.linear
+            else self.relinearise
+        )
         return np.array([named.get(name, _NEVER) for name in motion.state_names])

@@ -55,10 +55,14 @@ class Solver:
         self.nodes = Nodes(motion)
         self._has_final = settings.final
         self._is_nonlinear = False  # of all tracks
-        linear, nonlinear = (settings.thresholds(motion, nonlinear) for nonlinear in (False, True))
+        linear, nonlinear = (
+            settings.thresholds(motion, nonlinear) for nonlinear in (False, True)
+        )
         self._thresholds = np.array([linear, nonlinear, _ROBUST_SHARE * nonlinear])
 
-    def begin(self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray) -> None:
+    def begin(
+        self, track: int, stamp_ns: int, mean: FloatArray, covariance: FloatArray
+    ) -> None:
         """Start the window of a track with its first node."""
         self.nodes.begin_window(track, stamp_ns, mean, covariance)
         self.forget(track)
@@ -74,12 +78,18 @@ class Solver:
         """
         self._solve(tracks, starts, anchors, is_partial=False)
 
-    def _solve(self, tracks: IntArray, starts: IntArray, anchors: IntArray, is_partial: bool) -> None:
+    def _solve(
+        self, tracks: IntArray, starts: IntArray, anchors: IntArray, is_partial: bool
+    ) -> None:
         """Solve windows, see `kernels.solve_windows`."""
-        if not kernels.solve_windows(tracks, starts, anchors, is_partial, self.nodes.arrays):
+        if not kernels.solve_windows(
+            tracks, starts, anchors, is_partial, self.nodes.arrays
+        ):
             raise np.linalg.LinAlgError("a state is not finite")
 
-    def smoothed(self, tracks: IntArray, indices: IntArray, after_s: FloatArray) -> FloatArray:
+    def smoothed(
+        self, tracks: IntArray, indices: IntArray, after_s: FloatArray
+    ) -> FloatArray:
         """Make `P` of the nodes at `indices` known, and where `after_s` what the states of those before depend on.
         Return the means of these nodes, or where `after_s` those before, shape (m, n).
         """
@@ -89,16 +99,22 @@ class Solver:
 
     # --- states
 
-    def states_at(self, tracks: IntArray, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray]:
+    def states_at(
+        self, tracks: IntArray, stamps_ns: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Return means (m, n) and covariances (m, n, n) of `tracks` at `stamps_ns`, not older than the oldest node.
         They are interpolated, or predicted ahead.
         """
         nodes, indices = self.nodes, np.empty(len(tracks), dtype=np.int64)
         until_s, after_s = np.empty((2, len(tracks)))
-        num_between = kernels.locate(tracks, stamps_ns, nodes.arrays, indices, until_s, after_s)
+        num_between = kernels.locate(
+            tracks, stamps_ns, nodes.arrays, indices, until_s, after_s
+        )
         mean, F, Q = nodes.transition(self.smoothed(tracks, indices, after_s), until_s)
         ahead = nodes.transition(mean, after_s) if num_between else (mean, F, Q)
-        if not kernels.arrive(tracks, indices, after_s, nodes.arrays, mean, F, Q, *ahead):
+        if not kernels.arrive(
+            tracks, indices, after_s, nodes.arrays, mean, F, Q, *ahead
+        ):
             raise np.linalg.LinAlgError("process noise is not positive definite")
         return mean, Q
 
@@ -115,7 +131,11 @@ class Solver:
             return None
         rows, columns = np.nonzero(np.arange(int(num.max())) < num[:, None])
         stamps_ns = nodes.stamps_ns[tracks[rows], nodes.first[tracks[rows]] + columns]
-        return (tracks[rows], stamps_ns.tolist(), *self.states_at(tracks[rows], stamps_ns))
+        return (
+            tracks[rows],
+            stamps_ns.tolist(),
+            *self.states_at(tracks[rows], stamps_ns),
+        )
 
     # --- updates
 
@@ -138,11 +158,25 @@ class Solver:
         nodes, stamp_ns = self.nodes, stack.stamp_ns
         ahead_s, out = np.empty(len(tracks)), np.empty((8, len(tracks)), dtype=np.int64)
         try:
-            guesses = self._marked_nonlinear(tracks, stack, guesses) if stack.is_nonlinear else guesses
+            guesses = (
+                self._marked_nonlinear(tracks, stack, guesses)
+                if stack.is_nonlinear
+                else guesses
+            )
             leaving = self._leaving(tracks, anchors) if self._has_final else None
         except Exception as error:
             raise NotFusedError(error, self._not_restored(tracks)) from error
-        given = (tracks, stamp_ns, y, H, R, guesses, not stack.is_nonlinear, self._thresholds, anchors)
+        given = (
+            tracks,
+            stamp_ns,
+            y,
+            H,
+            R,
+            guesses,
+            not stack.is_nonlinear,
+            self._thresholds,
+            anchors,
+        )
         flags = node_kernels.place(*given, nodes.arrays, out, ahead_s)
         numbers, indices, is_new, starts, anchors, is_behind, _, _ = out
         is_noted = False
@@ -151,7 +185,9 @@ class Solver:
             is_noted = True
             if flags & NOT_DEFINITE:
                 raise np.linalg.LinAlgError("a covariance is not positive definite")
-            nodes.linearise(tracks, starts, self._is_nonlinear or bool(flags & NOT_PLAIN))
+            nodes.linearise(
+                tracks, starts, self._is_nonlinear or bool(flags & NOT_PLAIN)
+            )
             if flags & BEHIND:
                 rows = is_behind.nonzero()[0]
                 self._refilter(tracks[rows], starts[rows], anchors[rows])
@@ -159,19 +195,27 @@ class Solver:
             self.solve(tracks, starts, anchors)
         except Exception as error:
             nodes.first[tracks] = out[6]
-            for track, index, new in zip(tracks.tolist(), indices.tolist(), is_new.tolist(), strict=True):
+            for track, index, new in zip(
+                tracks.tolist(), indices.tolist(), is_new.tolist(), strict=True
+            ):
                 nodes.withdraw(track, index, is_new=bool(new), is_noted=is_noted)
-            raise NotFusedError(error, self._not_restored(tracks, indices - is_new)) from error
+            raise NotFusedError(
+                error, self._not_restored(tracks, indices - is_new)
+            ) from error
         return leaving
 
-    def _not_restored(self, tracks: IntArray, starts: IntArray | None = None) -> list[int]:
+    def _not_restored(
+        self, tracks: IntArray, starts: IntArray | None = None
+    ) -> list[int]:
         """Solve windows without a measurement that was withdrawn, see `relinearise`; return those that raise.
         A window that cannot be solved without it either keeps its last states.
         """
         lost = list[int]()
         for row, track in enumerate(tracks.tolist()):
             try:
-                self.relinearise(track, start=NEVER if starts is None else int(starts[row]))
+                self.relinearise(
+                    track, start=NEVER if starts is None else int(starts[row])
+                )
             except np.linalg.LinAlgError:
                 pass
             except Exception:
@@ -187,26 +231,38 @@ class Solver:
         for track in tracks.tolist():
             self.forget(track)
 
-    def _marked_nonlinear(self, tracks: IntArray, stack: Measurement, guesses: FloatArray) -> FloatArray:
+    def _marked_nonlinear(
+        self, tracks: IntArray, stack: Measurement, guesses: FloatArray
+    ) -> FloatArray:
         """States at its stamp after the relinearisation of tracks whose first nonlinear or robust measurement comes.
         From now on, these have other thresholds.
         """
         level, stamp_ns = 1 if stack.loss is None else _ROBUST, stack.stamp_ns
         first = (self.nodes.tracks[tracks, NONLINEAR] < level).nonzero()[0]
         if first.size:
-            self.nodes.tracks[tracks[first], NONLINEAR], self._is_nonlinear = level, True
+            self.nodes.tracks[tracks[first], NONLINEAR], self._is_nonlinear = (
+                level,
+                True,
+            )
             for track in tracks[first].tolist():
                 self.relinearise(track, self.estimates(track))
             guesses = guesses.copy()
-            guesses[first] = self.states_at(tracks[first], np.full(len(first), stamp_ns))[0]
+            guesses[first] = self.states_at(
+                tracks[first], np.full(len(first), stamp_ns)
+            )[0]
         return guesses
 
     # --- relinearisation
 
     def _move_far(self, track: int, moves: bool) -> IntArray:
         """Move the linearisation points of nodes of a window that are far from them, if it `moves`; return indices."""
-        nodes, indices = (self.nodes, np.empty(self.nodes.stamps_ns.shape[1], dtype=np.int64))
-        num = node_kernels.move_far(track, 0, NEVER, self._thresholds, nodes.arrays, moves, indices)
+        nodes, indices = (
+            self.nodes,
+            np.empty(self.nodes.stamps_ns.shape[1], dtype=np.int64),
+        )
+        num = node_kernels.move_far(
+            track, 0, NEVER, self._thresholds, nodes.arrays, moves, indices
+        )
         return indices[:num]
 
     def iterate(self, tracks: IntArray, max_iterations: int) -> None:
@@ -223,9 +279,13 @@ class Solver:
     def reweight(self, tracks: IntArray) -> None:
         """Take steps of tracks with a robust loss, whose weights follow the states."""
         if self._is_nonlinear:
-            self.iterate(tracks[self.nodes.tracks[tracks, NONLINEAR] == _ROBUST], _ROBUST_STEPS)
+            self.iterate(
+                tracks[self.nodes.tracks[tracks, NONLINEAR] == _ROBUST], _ROBUST_STEPS
+            )
 
-    def relinearise(self, track: int, means: FloatArray | None = None, start: int = NEVER) -> None:
+    def relinearise(
+        self, track: int, means: FloatArray | None = None, start: int = NEVER
+    ) -> None:
         """Linearise a window at `means`, shape (m, n), or where its linearisation points are, and solve it.
         From index `start` on, if that lies behind the window.
         """
@@ -257,7 +317,9 @@ class Solver:
                 1.0 if longest < 0.5 * last else 0.5,
                 self._cost(track, means) * (1.0 + _ROUNDING) + _ROUNDING,
             )
-            while share > _LEAST_SHARE and self._cost(track, means + share * steps) > most:
+            while (
+                share > _LEAST_SHARE and self._cost(track, means + share * steps) > most
+            ):
                 share *= 0.5
             means, last = means + share * steps, longest
 
@@ -268,13 +330,22 @@ class Solver:
         nodes, n, numbers = self.nodes, self.motion.dim, self.nodes.window(track)
         prior, Q = nodes.predicted[numbers[0]], nodes.Q[numbers[:-1]]
         dt_s = np.diff(nodes.window_stamps_ns(track)) / NS_PER_S
-        total = mahalanobis_squared(means[0] - nodes.origin[numbers[0]] - prior[:, n], prior[:, :n])
-        gaps = means[1:] - self.motion.predict(means[:-1], dt_s)
-        total += sum(((noise_root(each) @ gap) ** 2).sum() for each, gap in zip(Q, gaps, strict=True))
-        factors = (
-            (factor, x) for number, x in zip(numbers.tolist(), means, strict=True) for factor in nodes.factors(number)
+        total = mahalanobis_squared(
+            means[0] - nodes.origin[numbers[0]] - prior[:, n], prior[:, :n]
         )
-        return 0.5 * float(total) + sum(cost(factor, x, self.motion) for factor, x in factors)
+        gaps = means[1:] - self.motion.predict(means[:-1], dt_s)
+        total += sum(
+            ((noise_root(each) @ gap) ** 2).sum()
+            for each, gap in zip(Q, gaps, strict=True)
+        )
+        factors = (
+            (factor, x)
+            for number, x in zip(numbers.tolist(), means, strict=True)
+            for factor in nodes.factors(number)
+        )
+        return 0.5 * float(total) + sum(
+            cost(factor, x, self.motion) for factor, x in factors
+        )
 
     def damp(self, tracks: IntArray) -> int:
         """Converge in damped steps where the last one left the range of its linearisation; return how many tracks."""
@@ -285,7 +356,15 @@ class Solver:
             numbers = nodes.window(track)
             means, steps = nodes.origin[numbers], nodes.step[numbers]
             far = (self._move_far(track, moves=False) - nodes.first[track]).tolist()
-            if any(overshot(nodes.factors(numbers[k]), means[k], means[k] + steps[k], self.motion) for k in far):
+            if any(
+                overshot(
+                    nodes.factors(numbers[k]),
+                    means[k],
+                    means[k] + steps[k],
+                    self.motion,
+                )
+                for k in far
+            ):
                 num += 1
                 try:
                     self.converge(track)
@@ -298,16 +377,30 @@ class Solver:
     def fixes(self, track: int) -> list[Fix]:
         """Positions measured at the nodes, after that of the prior, of a window that nothing has left yet."""
         nodes, numbers = self.nodes, self.nodes.window(track)
-        prior, begin_ns = (nodes.predicted[numbers[0]], int(nodes.tracks[track, BEGIN_NS]))
-        factors = (factor for number in numbers.tolist() for factor, _ in nodes.factors(number))
+        prior, begin_ns = (
+            nodes.predicted[numbers[0]],
+            int(nodes.tracks[track, BEGIN_NS]),
+        )
+        factors = (
+            factor for number in numbers.tolist() for factor, _ in nodes.factors(number)
+        )
         later = ((seconds(factor.stamp_ns - begin_ns), factor) for factor in factors)
-        return fixes_of(nodes.origin[numbers[0]] + prior[:, -1], prior[:, :-1].copy(), later)
+        return fixes_of(
+            nodes.origin[numbers[0]] + prior[:, -1], prior[:, :-1].copy(), later
+        )
 
     def restart(self, track: int, line: Line) -> None:
         """Re-solve from states along `line`, with the prior's heading, which must be vague, turned there."""
         nodes, oldest = self.nodes, self.nodes.window(track)[0]
-        times_s = (nodes.window_stamps_ns(track) - nodes.tracks[track, BEGIN_NS]) / NS_PER_S
-        means = np.array([along(line, time_s, self.motion.state_names) for time_s in times_s.tolist()])
+        times_s = (
+            nodes.window_stamps_ns(track) - nodes.tracks[track, BEGIN_NS]
+        ) / NS_PER_S
+        means = np.array(
+            [
+                along(line, time_s, self.motion.state_names)
+                for time_s in times_s.tolist()
+            ]
+        )
         if not self.motion.cartesian:
             nodes.predicted[oldest, YAW, -1] = means[0, YAW] - nodes.origin[oldest, YAW]
         self.relinearise(track, means)

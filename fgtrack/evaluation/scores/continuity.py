@@ -6,7 +6,7 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FUSED, FloatArray, IntArray
 from fgtrack.evaluation.matching import Matching, confirmed, distances, published_rows
 from fgtrack.evaluation.truth import true_paths
-from fgtrack.io.run import NO_TRACK, Run
+from fgtrack.runs import NO_TRACK, Run
 
 _SHORTEST_ABSENCE_NS = NS_PER_S
 
@@ -32,17 +32,28 @@ def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
     import pandas as pd
 
     tracks, updates = run.tables["tracks"], run.tables["updates"]
-    updates = updates.where(np.isin(updates["disposition"], list(FUSED)) & (updates["track_id"] != NO_TRACK))
+    updates = updates.where(
+        np.isin(updates["disposition"], list(FUSED)) & (updates["track_id"] != NO_TRACK)
+    )
     rows = published_rows(tracks, updates["tick"], updates["track_id"])
-    _, distances_m = distances(tracks.where(rows[rows >= 0]), true_paths(run.tables["truth"]))
+    _, distances_m = distances(
+        tracks.where(rows[rows >= 0]), true_paths(run.tables["truth"])
+    )
     distances_m = np.where(distances_m <= gate_m, distances_m, np.inf)
-    near, first_ns = np.isfinite(distances_m).any(axis=1), run.tables["truth"]["stamp_ns"].min()
+    near, first_ns = (
+        np.isfinite(distances_m).any(axis=1),
+        run.tables["truth"]["stamp_ns"].min(),
+    )
     paired = matching.paired & confirmed(matching.tracks)
     detected_ns = pd.Series(updates["stamp_ns"][rows >= 0][near] - first_ns)
     confirmed_ns = pd.Series(matching.now_ns[matching.tick_index[paired]] - first_ns)
     begin_ns = detected_ns.groupby(distances_m[near].argmin(axis=1)).min()
-    times_s = (confirmed_ns.groupby(matching.object_index[paired]).min() - begin_ns) / NS_PER_S
-    return np.asarray(times_s.reindex(range(len(matching.object_ids))), dtype=np.float64)
+    times_s = (
+        confirmed_ns.groupby(matching.object_index[paired]).min() - begin_ns
+    ) / NS_PER_S
+    return np.asarray(
+        times_s.reindex(range(len(matching.object_ids))), dtype=np.float64
+    )
 
 
 def tracked_visits(matching: Matching) -> int:
@@ -55,6 +66,9 @@ def tracked_visits(matching: Matching) -> int:
     count = 0
     for in_view, has_track in zip(matching.in_view.T, tracked.T, strict=True):
         ticks = np.flatnonzero(in_view)
-        comes = np.diff(matching.now_ns[ticks], prepend=-_SHORTEST_ABSENCE_NS) >= _SHORTEST_ABSENCE_NS
+        comes = (
+            np.diff(matching.now_ns[ticks], prepend=-_SHORTEST_ABSENCE_NS)
+            >= _SHORTEST_ABSENCE_NS
+        )
         count += len(np.unique(np.cumsum(comes)[has_track[ticks]]))
     return count

@@ -13,8 +13,8 @@ from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, mean_squar
 from fgtrack.evaluation.matching import Matching, confirmed, neighbours, position_nees
 from fgtrack.evaluation.placement import roads
 from fgtrack.evaluation.scores.statistics import NORMAL_95, ChiSquareMean, Moments
-from fgtrack.io.run import NO_TRACK, Run, Table
 from fgtrack.models.measurement import ANGULAR
+from fgtrack.runs import NO_TRACK, Run, Table
 
 #: Every residual, in the order in which it is shown.
 RESIDUAL_NAMES = ("along_m", "across_m", *MEASURABLE)
@@ -52,9 +52,13 @@ def local_innovations(run: Run) -> tuple[IntArray, dict[str, FloatArray], FloatA
     rows, states = np.flatnonzero(known), track_states(run, known)[known]
     values = {name: every[name][rows] for name in LOCAL_NAMES}
     road = roads(run)[0].get("track")
-    missing = np.flatnonzero(np.isnan(values["yaw_rad"]) & np.isfinite(states).all(axis=1))
+    missing = np.flatnonzero(
+        np.isnan(values["yaw_rad"]) & np.isfinite(states).all(axis=1)
+    )
     if road is not None and len(missing):
-        values["yaw_rad"][missing] = wrap_angles(road.view(states[missing, :2], 0.0, 0.0).yaw_rad - states[missing, 2])
+        values["yaw_rad"][missing] = wrap_angles(
+            road.view(states[missing, :2], 0.0, 0.0).yaw_rad - states[missing, 2]
+        )
     return rows, values, states
 
 
@@ -62,7 +66,9 @@ def residuals(run: Run) -> Mapping[str, FloatArray]:
     """Innovations by name of `RESIDUAL_NAMES`, each of shape (rows of updates.csv,), NaN where not measured.
     `along_m` and `across_m` (left positive) are in the direction of the track: x_loc and y_loc of Karle et al. 2023.
     """
-    values: dict[str, FloatArray] = {name: run.tables["updates"][f"res_{name}"] for name in MEASURABLE}
+    values: dict[str, FloatArray] = {
+        name: run.tables["updates"][f"res_{name}"] for name in MEASURABLE
+    }
     yaw_rad = track_states(run, np.isfinite(values["x_m"]))[:, 2]
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     along_m = c * values["x_m"] + s * values["y_m"]
@@ -78,12 +84,16 @@ def by_sensor(table: Table) -> Iterator[tuple[str, Table]]:
 
 def num_measured(updates: Table) -> IntArray:
     """Number of components of each innovation, the degrees of freedom of its NIS, shape (rows,)."""
-    return np.asarray(np.sum([np.isfinite(updates[f"res_{name}"]) for name in MEASURABLE], axis=0))
+    return np.asarray(
+        np.sum([np.isfinite(updates[f"res_{name}"]) for name in MEASURABLE], axis=0)
+    )
 
 
 def message_delays(updates: Table) -> tuple[IntArray, FloatArray]:
     """Receipt in ns and delay in s of the messages with a detection in `updates` of one sensor, by receipt."""
-    messages = np.unique(np.stack([updates["receipt_ns"], updates["stamp_ns"]], axis=-1), axis=0)
+    messages = np.unique(
+        np.stack([updates["receipt_ns"], updates["stamp_ns"]], axis=-1), axis=0
+    )
     return messages[:, 0], (messages[:, 0] - messages[:, 1]) / NS_PER_S
 
 
@@ -96,14 +106,22 @@ def autocorrelation(updates: Table) -> Autocorrelation | None:
     1.96 sqrt(sum_k (nu(k)' nu(k + 1))^2) / sum_k nu(k)' nu(k): for a constant variance the 1.96 / sqrt(n) of
     Bar-Shalom, Li, Kirubarajan 2001, section 5.4.
     """
-    for names in (("x_m", "y_m"), *((name,) for name in MEASURABLE if name not in ("x_m", "y_m"))):
+    for names in (
+        ("x_m", "y_m"),
+        *((name,) for name in MEASURABLE if name not in ("x_m", "y_m")),
+    ):
         innovations = np.stack([updates[f"res_{name}"] for name in names], axis=-1)
         known = np.isfinite(innovations).all(axis=1) & (updates["track_id"] != NO_TRACK)
         ids, counts = np.unique(updates["track_id"][known], return_counts=True)
         known &= np.isin(updates["track_id"], ids[counts >= FEWEST])
-        order = np.flatnonzero(known)[np.argsort(updates["track_id"][known], kind="stable")]
+        order = np.flatnonzero(known)[
+            np.argsort(updates["track_id"][known], kind="stable")
+        ]
         nu, ids = innovations[order], updates["track_id"][order]
-        products, energy = np.einsum("ni,ni->n", nu[:-1], nu[1:])[ids[:-1] == ids[1:]], float(np.square(nu).sum())
+        products, energy = (
+            np.einsum("ni,ni->n", nu[:-1], nu[1:])[ids[:-1] == ids[1:]],
+            float(np.square(nu).sum()),
+        )
         if energy > 0.0:
             band = NORMAL_95 * math.sqrt(float(np.square(products).sum())) / energy
             return Autocorrelation(float(products.sum()) / energy, band)
@@ -115,13 +133,26 @@ def track_states(run: Run, wanted: BoolArray) -> FloatArray:
     Linear between published rows, constant outside; NaN elsewhere.
     """
     tracks, updates = run.tables["tracks"], run.tables["updates"]
-    before, after = neighbours(tracks, "stamp_ns", updates["stamp_ns"], updates["track_id"])
-    before, after = np.where(before < 0, after, before), np.where(after < 0, before, after)
+    before, after = neighbours(
+        tracks, "stamp_ns", updates["stamp_ns"], updates["track_id"]
+    )
+    before, after = (
+        np.where(before < 0, after, before),
+        np.where(after < 0, before, after),
+    )
     there = wanted & (before >= 0)
     states = np.full((updates.num_rows, len(_TRACK_STATE)), np.nan)
-    a, b = (np.stack([tracks[name][rows[there]] for name in _TRACK_STATE], axis=-1) for rows in (before, after))
-    from_ns, until_ns = tracks["stamp_ns"][before[there]], tracks["stamp_ns"][after[there]]
-    share = (updates["stamp_ns"][there] - from_ns).clip(0) / np.maximum(until_ns - from_ns, 1)
+    a, b = (
+        np.stack([tracks[name][rows[there]] for name in _TRACK_STATE], axis=-1)
+        for rows in (before, after)
+    )
+    from_ns, until_ns = (
+        tracks["stamp_ns"][before[there]],
+        tracks["stamp_ns"][after[there]],
+    )
+    share = (updates["stamp_ns"][there] - from_ns).clip(0) / np.maximum(
+        until_ns - from_ns, 1
+    )
     change = b - a
     change[:, 2] = wrap_angles(change[:, 2])
     states[there] = a + share[:, None] * change
@@ -148,11 +179,16 @@ class Consistency:
 def consistency(run: Run, matching: Matching | None) -> Consistency:
     """NEES of the evaluated rows of `run`, NIS and whiteness of its innovations."""
     sensors = dict(by_sensor(run.tables["updates"]))
-    nis = {name: ChiSquareMean.of(mine["nis"], num_measured(mine)) for name, mine in sensors.items()}
+    nis = {
+        name: ChiSquareMean.of(mine["nis"], num_measured(mine))
+        for name, mine in sensors.items()
+    }
     white = {name: autocorrelation(mine) for name, mine in sensors.items()}
     if matching is None or not matching.paired.any():
         return Consistency(ChiSquareMean(), nis, white)
     squares = position_nees(matching)
     ticks = by_stamp(matching.tracks["stamp_ns"][matching.paired], squares[:, None])
     interval = mean_square(ticks)
-    return Consistency(ChiSquareMean.of(squares, np.full(len(squares), 2)), nis, white, interval)
+    return Consistency(
+        ChiSquareMean.of(squares, np.full(len(squares), 2)), nis, white, interval
+    )

@@ -9,10 +9,16 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, by_stamp, within_run
-from fgtrack.evaluation.matching import Matching, TrackErrors, neighbours, position_squares, state_errors
+from fgtrack.evaluation.matching import (
+    Matching,
+    TrackErrors,
+    neighbours,
+    position_squares,
+    state_errors,
+)
 from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.evaluation.truth import true_states
-from fgtrack.io.run import Run, Table
+from fgtrack.runs import Run, Table
 
 WINDOW: Literal["window"] = "window"
 """The lag of a final state: the window's length, or less where the track ended before."""
@@ -36,7 +42,11 @@ class LagMetrics:
     @property
     def is_lagged(self) -> bool:
         """True for states of one lag behind the present that have truth."""
-        return isinstance(self.lag_s, float) and self.lag_s > 0.0 and self.errors["position_m"].count > 0
+        return (
+            isinstance(self.lag_s, float)
+            and self.lag_s > 0.0
+            and self.errors["position_m"].count > 0
+        )
 
     def gain(self, name: str) -> float:
         """Relative reduction of the RMSE of `name` against the present states; NaN where that is 0."""
@@ -52,39 +62,67 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
         return ()
     lagged, smoothed = run.tables["lagged"], run.tables["smoothed"]
     parts: dict[float | Literal["window"], Table] = {
-        lag_s: lagged.where(lagged["lag_s"] == lag_s) for lag_s in np.unique(lagged["lag_s"]).tolist() if lag_s > 0.0
+        lag_s: lagged.where(lagged["lag_s"] == lag_s)
+        for lag_s in np.unique(lagged["lag_s"]).tolist()
+        if lag_s > 0.0
     }
     if (smoothed["kind"] == "final").any():
         parts[WINDOW] = smoothed.where(smoothed["kind"] == "final")
-    present, truth = matching.tracks.where(matching.paired), matching.true_states[matching.paired]
+    present, truth = (
+        matching.tracks.where(matching.paired),
+        matching.true_states[matching.paired],
+    )
     errors = _moments(state_errors(present, truth))
-    result = [LagMetrics(0.0, errors, Moments.of(position_squares(present, truth)), errors)]
+    result = [
+        LagMetrics(0.0, errors, Moments.of(position_squares(present, truth)), errors)
+    ]
     for lag_s, every in parts.items():
         states, truth, rows = _with_truth(run, matching, every)
         present = matching.tracks.where(rows)
-        of_states, of_present = state_errors(states, truth), state_errors(present, matching.true_states[rows])
-        squares = np.square(np.stack([of_states["position_m"], of_present["position_m"]], axis=-1))
-        reduction = within_run(by_stamp(states["stamp_ns"], squares), lambda S: 1.0 - np.sqrt(S[0] / S[1]))
+        of_states, of_present = (
+            state_errors(states, truth),
+            state_errors(present, matching.true_states[rows]),
+        )
+        squares = np.square(
+            np.stack([of_states["position_m"], of_present["position_m"]], axis=-1)
+        )
+        reduction = within_run(
+            by_stamp(states["stamp_ns"], squares), lambda S: 1.0 - np.sqrt(S[0] / S[1])
+        )
         nees = Moments.of(position_squares(states, truth))
-        result.append(LagMetrics(lag_s, _moments(of_states), nees, _moments(of_present), reduction))
+        result.append(
+            LagMetrics(
+                lag_s, _moments(of_states), nees, _moments(of_present), reduction
+            )
+        )
     return tuple(result)
 
 
 def final_errors(run: Run, matching: Matching) -> TrackErrors:
     """Errors of the final states, each against the object that its track was paired with at that stamp."""
     smoothed = run.tables["smoothed"]
-    states, truth, rows = _with_truth(run, matching, smoothed.where(smoothed["kind"] == "final"))
+    states, truth, rows = _with_truth(
+        run, matching, smoothed.where(smoothed["kind"] == "final")
+    )
     errors = state_errors(states, truth)
-    return TrackErrors(states["stamp_ns"], matching.object_index[rows], states["track_id"], errors)
+    return TrackErrors(
+        states["stamp_ns"], matching.object_index[rows], states["track_id"], errors
+    )
 
 
-def _with_truth(run: Run, matching: Matching, states: Table) -> tuple[Table, FloatArray, IntArray]:
+def _with_truth(
+    run: Run, matching: Matching, states: Table
+) -> tuple[Table, FloatArray, IntArray]:
     """Return those of `states` that belong to an object, its true states there, shape (n, 5), and their track rows."""
-    before, after = neighbours(matching.tracks, "stamp_ns", states["stamp_ns"], states["track_id"])
+    before, after = neighbours(
+        matching.tracks, "stamp_ns", states["stamp_ns"], states["track_id"]
+    )
     alive = (before >= 0) & (after >= 0)
     states, before, after = states.where(alive), before[alive], after[alive]
     tracks_ns, stamps_ns = matching.tracks["stamp_ns"], states["stamp_ns"]
-    rows = np.where(stamps_ns - tracks_ns[before] < tracks_ns[after] - stamps_ns, before, after)
+    rows = np.where(
+        stamps_ns - tracks_ns[before] < tracks_ns[after] - stamps_ns, before, after
+    )
     truth = true_states(run.tables["truth"], matching.object_index[rows], stamps_ns)
     known = np.isfinite(truth[:, 0]) & np.isfinite(states["x_m"])
     return states.where(known), truth[known], rows[known]

@@ -16,7 +16,7 @@ from motrics import compute_hota_from_similarity, compute_identity_from_similari
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.matching import NO_OBJECT, Scenes, pair
 from fgtrack.evaluation.scores.continuity import switches
-from fgtrack.io.run import NO_TRACK
+from fgtrack.runs import NO_TRACK
 
 AT_GATE = 0.5
 """Similarity of a pair that is as far apart as the gate, from which on it counts."""
@@ -42,21 +42,43 @@ def multi_object_metrics(scenes: Scenes, gate_m: float) -> MultiObjectMetrics:
     """Scores of `scenes`; a pair is not farther apart than `gate_m`."""
     squares_m2 = gospa(scenes, gate_m)
     means_m2 = {name: _mean(values) for name, values in squares_m2.items()}
-    roots = {"mean_m": _mean(np.sqrt(squares_m2["total_m2"])), "rms_m": math.sqrt(means_m2.pop("total_m2"))}
+    roots = {
+        "mean_m": _mean(np.sqrt(squares_m2["total_m2"])),
+        "rms_m": math.sqrt(means_m2.pop("total_m2")),
+    }
     roots["in_view_rms_m"] = math.sqrt(means_m2.pop("in_view_m2"))
     similarity = np.maximum(0.0, 1.0 - scenes.distances_m / (2.0 * gate_m))
     edges = np.searchsorted(scenes.tick_index, np.arange(1, len(scenes.present)))
     frames = (
         [np.flatnonzero(here).tolist() for here in scenes.present],
-        [ids.tolist() for _, ids in zip(scenes.present, np.split(scenes.track_ids, edges), strict=False)],
-        [of.T[here].tolist() for here, of in zip(scenes.present, np.split(similarity, edges), strict=False)],
+        [
+            ids.tolist()
+            for _, ids in zip(
+                scenes.present, np.split(scenes.track_ids, edges), strict=False
+            )
+        ],
+        [
+            of.T[here].tolist()
+            for here, of in zip(
+                scenes.present, np.split(similarity, edges), strict=False
+            )
+        ],
     )
-    identity, hota = compute_identity_from_similarity(*frames, AT_GATE), compute_hota_from_similarity(*frames)
+    identity, hota = (
+        compute_identity_from_similarity(*frames, AT_GATE),
+        compute_hota_from_similarity(*frames),
+    )
     return MultiObjectMetrics(
         {"c_m": gate_m, "ticks": len(scenes.present), **roots, **means_m2},
         clear(scenes, gate_m),
-        {name: getattr(identity, name) if identity.num_gt else math.nan for name in ("idf1", "idp", "idr")},
-        {name: getattr(hota, name) if hota.num_gt else math.nan for name in ("hota", "deta", "assa")},
+        {
+            name: getattr(identity, name) if identity.num_gt else math.nan
+            for name in ("idf1", "idp", "idr")
+        },
+        {
+            name: getattr(hota, name) if hota.num_gt else math.nan
+            for name in ("hota", "deta", "assa")
+        },
     )
 
 
@@ -64,10 +86,15 @@ def clear(scenes: Scenes, gate_m: float) -> dict[str, float]:
     """CLEAR of `scenes`: pairs of the last tick stay, the rest has the largest sum of similarities within `gate_m`."""
     similarity = np.maximum(0.0, 1.0 - scenes.distances_m / (2.0 * gate_m))
     scores = np.where(similarity >= AT_GATE - np.finfo(np.float64).eps, similarity, 0.0)
-    num_ticks, num_rows = len(scenes.present), np.bincount(scenes.tick_index, minlength=len(scenes.present))
+    num_ticks, num_rows = (
+        len(scenes.present),
+        np.bincount(scenes.tick_index, minlength=len(scenes.present)),
+    )
     used = scenes.present.any(axis=1) & (num_rows > 0)
     last = np.maximum.accumulate(np.where(used, np.arange(num_ticks), 0))
-    columns = pair(scores, scenes.track_ids, scenes.tick_index, np.concatenate([[-1], last])[:-1])
+    columns = pair(
+        scores, scenes.track_ids, scenes.tick_index, np.concatenate([[-1], last])[:-1]
+    )
     paired = np.flatnonzero(columns != NO_OBJECT)
     track_ids = np.full(scenes.present.shape, NO_TRACK)
     track_ids[scenes.tick_index[paired], columns[paired]] = scenes.track_ids[paired]
@@ -75,7 +102,9 @@ def clear(scenes: Scenes, gate_m: float) -> dict[str, float]:
     pairs, objects = len(paired), int(scenes.present.sum())
     misses, false_positives = objects - pairs, len(columns) - pairs
     return {
-        "mota": 1.0 - (misses + false_positives + switched) / objects if objects else math.nan,
+        "mota": 1.0 - (misses + false_positives + switched) / objects
+        if objects
+        else math.nan,
         "motp_m": _mean(scenes.distances_m[paired, columns[paired]]),
         "pairs": pairs,
         "misses": misses,
@@ -93,15 +122,33 @@ def gospa(scenes: Scenes, c_m: float) -> dict[str, FloatArray]:
     columns = pair(gains_m2, scenes.track_ids, tick_index, np.full(num_ticks, -1))
     rows = np.flatnonzero(columns != NO_OBJECT)
     columns, ticks = columns[rows], tick_index[rows]
-    squares_m2, paired = np.square(scenes.distances_m[rows, columns]), np.zeros_like(scenes.present)
+    squares_m2, paired = (
+        np.square(scenes.distances_m[rows, columns]),
+        np.zeros_like(scenes.present),
+    )
     paired[ticks, columns] = True
     single_m2, missed = c_m**2 / 2.0, scenes.present & ~paired
-    localisation_m2 = np.asarray(np.bincount(ticks, squares_m2, num_ticks), dtype=np.float64)
+    localisation_m2 = np.asarray(
+        np.bincount(ticks, squares_m2, num_ticks), dtype=np.float64
+    )
     missed_m2 = single_m2 * missed.sum(axis=1)
-    false_m2 = single_m2 * (np.bincount(tick_index, minlength=num_ticks) - paired.sum(axis=1))
-    unseen_m2, total_m2 = single_m2 * (missed & ~scenes.in_view).sum(axis=1), localisation_m2 + missed_m2 + false_m2
-    parts = {"localisation_m2": localisation_m2, "missed_m2": missed_m2, "false_m2": false_m2}
-    return parts | {"out_of_view_m2": unseen_m2, "total_m2": total_m2, "in_view_m2": total_m2 - unseen_m2}
+    false_m2 = single_m2 * (
+        np.bincount(tick_index, minlength=num_ticks) - paired.sum(axis=1)
+    )
+    unseen_m2, total_m2 = (
+        single_m2 * (missed & ~scenes.in_view).sum(axis=1),
+        localisation_m2 + missed_m2 + false_m2,
+    )
+    parts = {
+        "localisation_m2": localisation_m2,
+        "missed_m2": missed_m2,
+        "false_m2": false_m2,
+    }
+    return parts | {
+        "out_of_view_m2": unseen_m2,
+        "total_m2": total_m2,
+        "in_view_m2": total_m2 - unseen_m2,
+    }
 
 
 def _mean(values: FloatArray) -> float:

@@ -22,7 +22,9 @@ def arc_positions(states: FloatArray, ahead_s: FloatArray) -> FloatArray:
     return np.asarray(_ARC.predict(states[:, None], ahead_s)[..., :2])
 
 
-def rail_positions(track: TrackMap, states: FloatArray, ahead_s: FloatArray) -> FloatArray:
+def rail_positions(
+    track: TrackMap, states: FloatArray, ahead_s: FloatArray
+) -> FloatArray:
     """As `arc_positions` for `ARC_S`, then along `track`; the times rise by some 0.1 s.
     An object beyond a bound goes on along that bound, one with a negative speed stops.
     """
@@ -41,7 +43,9 @@ def rail_positions(track: TrackMap, states: FloatArray, ahead_s: FloatArray) -> 
         way_m = speed_mps * (float(ahead_s[column]) - at_s)
         chord_m = np.linalg.norm(at(s_m + way_m) - here, axis=1)
         # The way beside the line is longer or shorter than along it, where it turns.
-        s_m = s_m + way_m * np.divide(way_m, chord_m, out=np.ones_like(way_m), where=chord_m > 0.0)
+        s_m = s_m + way_m * np.divide(
+            way_m, chord_m, out=np.ones_like(way_m), where=chord_m > 0.0
+        )
         here, at_s = at(s_m), float(ahead_s[column])
         positions[:, column] = here
     return positions

@@ -26,7 +26,11 @@ class Moments:
     def of(cls, values: FloatArray) -> Self:
         """Moments of `values`, shape (n,), ignoring NaN."""
         values = values[~np.isnan(values)]
-        return cls(len(values), float(values.mean()), float(values.std())) if len(values) else cls()
+        return (
+            cls(len(values), float(values.mean()), float(values.std()))
+            if len(values)
+            else cls()
+        )
 
     @classmethod
     def of_angles(cls, values_rad: FloatArray) -> Self:
@@ -82,7 +86,9 @@ class ChiSquareMean:
         mean = cls.without_band(values, dof)
         if not mean.count:
             return mean
-        low, high = chi_square_band(np.array([mean.dof * mean.count]), np.array([mean.count]))
+        low, high = chi_square_band(
+            np.array([mean.dof * mean.count]), np.array([mean.count])
+        )
         return replace(mean, band_low=low.item(), band_high=high.item())
 
     @classmethod
@@ -91,12 +97,16 @@ class ChiSquareMean:
         known = ~np.isnan(values)
         if not known.any():
             return cls()
-        return cls(int(known.sum()), float(values[known].mean()), float(dof[known].mean()))
+        return cls(
+            int(known.sum()), float(values[known].mean()), float(dof[known].mean())
+        )
 
 
 def chi_square_band(dof: FloatArray, count: IntArray) -> tuple[FloatArray, FloatArray]:
     """Two-sided 95 % band of the mean of `count` squares with `dof` degrees of freedom in all, shape (n,) each."""
     from scipy.special import gammaincinv
 
-    low, high = (2.0 * gammaincinv(dof / 2.0, share) / count for share in (0.025, 0.975))
+    low, high = (
+        2.0 * gammaincinv(dof / 2.0, share) / count for share in (0.025, 0.975)
+    )
     return low, high

@@ -81,12 +81,19 @@ class Column:
     def cell(self, record: Record) -> str:
         """Text of the numbers of `record`; a dash without any."""
         names = self.names or self.heading
-        values = [record.get(name) for name in (names.split() if isinstance(names, str) else names)]
+        values = [
+            record.get(name)
+            for name in (names.split() if isinstance(names, str) else names)
+        ]
         texts = [
-            NO_VALUE if value is None else self.text(value * self.scale if isinstance(value, float) else value)
+            NO_VALUE
+            if value is None
+            else self.text(value * self.scale if isinstance(value, float) else value)
             for value in values
         ]
-        return printable(self.form.format(*texts) if set(texts) - {NO_VALUE} else NO_VALUE)
+        return printable(
+            self.form.format(*texts) if set(texts) - {NO_VALUE} else NO_VALUE
+        )
 
     @property
     def line(self) -> str:
@@ -104,7 +111,9 @@ def named(name: str, moment: str) -> str:
 
 
 def _text(shown: object) -> str:
-    console = Console(file=io.StringIO(), width=_WIDTH, color_system=None, force_terminal=False)
+    console = Console(
+        file=io.StringIO(), width=_WIDTH, color_system=None, force_terminal=False
+    )
     with console.capture() as capture:
         console.print(shown)
     return capture.get().removesuffix("\n")
@@ -144,7 +153,10 @@ class Table:
     def plain(self) -> list[dict[str, Value | None]]:
         """Return the records as JSON values: None where there is no value."""
         names = dict.fromkeys(name for record in self.records for name in record)
-        return [{name: _plain(record.get(name)) for name in names} for record in self.records]
+        return [
+            {name: _plain(record.get(name)) for name in names}
+            for record in self.records
+        ]
 
     def to_csv(self) -> str:
         """Return all numbers with all digits; an empty cell where there is no value."""
@@ -154,14 +166,24 @@ class Table:
     def shown(self) -> list[Column]:
         """Columns shown: those with a value, unless extra."""
         shown = [column for column in self.columns if not column.is_extra]
-        return [column for column in shown if any(column.cell(record) != NO_VALUE for record in self.records)]
+        return [
+            column
+            for column in shown
+            if any(column.cell(record) != NO_VALUE for record in self.records)
+        ]
 
-    def rows(self, text: Callable[[str], str] = str, bold: str = "{}") -> list[list[str]]:
+    def rows(
+        self, text: Callable[[str], str] = str, bold: str = "{}"
+    ) -> list[list[str]]:
         """Return a row of cells for each record shown, `bold` ones in that format; a repeated first cell is empty."""
         rows, shown = [], self.shown
         for record in filter(self.is_main, self.records):
-            cells = [(text(column.cell(record)), column.bold(record)) for column in shown]
-            rows.append([bold.format(cell) if is_bold else cell for cell, is_bold in cells])
+            cells = [
+                (text(column.cell(record)), column.bold(record)) for column in shown
+            ]
+            rows.append(
+                [bold.format(cell) if is_bold else cell for cell, is_bold in cells]
+            )
         for row, before in zip(rows[:0:-1], rows[-2::-1], strict=True):
             if row[0] == before[0]:
                 row[0] = ""
@@ -171,18 +193,40 @@ class Table:
         """Return the columns and records shown as a table of GitHub Markdown under a heading, the notes below."""
         head = [_markdown(column.line) for column in self.shown]
         rule = [":---" if column.left else "---:" for column in self.shown]
-        rows = [f"| {' | '.join(row)} |" for row in (head, rule, *self.rows(_markdown, "**{}**"))]
+        rows = [
+            f"| {' | '.join(row)} |"
+            for row in (head, rule, *self.rows(_markdown, "**{}**"))
+        ]
         notes = [f"- {_markdown(note)}" for note in self.notes]
-        return "\n".join([f"### {_markdown(self.title)}", "", *rows, "", *notes, *([""] if notes else [])])
+        return "\n".join(
+            [
+                f"### {_markdown(self.title)}",
+                "",
+                *rows,
+                "",
+                *notes,
+                *([""] if notes else []),
+            ]
+        )
 
     def to_latex(self) -> str:
         """Return a table environment with the rules of package booktabs; notes as comments."""
-        rows = [f"{' & '.join(row)} \\\\" for row in self.rows(_latex, r"\textbf{{{}}}")]
+        rows = [
+            f"{' & '.join(row)} \\\\" for row in self.rows(_latex, r"\textbf{{{}}}")
+        ]
         return "\n".join(
             [
-                *(r"\begin{table}", r"\centering", f"\\caption{{{_latex(self.title)}}}"),
+                *(
+                    r"\begin{table}",
+                    r"\centering",
+                    f"\\caption{{{_latex(self.title)}}}",
+                ),
                 f"\\begin{{tabular}}{{{''.join('l' if column.left else 'r' for column in self.shown)}}}",
-                *(r"\toprule", f"{' & '.join(_latex(column.line) for column in self.shown)} \\\\", r"\midrule"),
+                *(
+                    r"\toprule",
+                    f"{' & '.join(_latex(column.line) for column in self.shown)} \\\\",
+                    r"\midrule",
+                ),
                 *(*rows, r"\bottomrule", r"\end{tabular}"),
                 *(*(f"% {printable(note)}" for note in self.notes), r"\end{table}", ""),
             ]
@@ -190,33 +234,59 @@ class Table:
 
     def to_html(self) -> str:
         """Return head and body of an HTML table of the columns and records shown."""
-        head = [html_cell("th", escape(printable_lines(column.heading)), column.left) for column in self.shown]
+        head = [
+            html_cell("th", escape(printable_lines(column.heading)), column.left)
+            for column in self.shown
+        ]
         rows = [
-            "".join(html_cell("td", cell, column.left) for column, cell in zip(self.shown, row, strict=True))
+            "".join(
+                html_cell("td", cell, column.left)
+                for column, cell in zip(self.shown, row, strict=True)
+            )
             for row in self.rows(escape, "<b>{}</b>")
         ]
         body = "".join(f"<tr>{row}</tr>\n" for row in rows)
         return f"<thead><tr>{''.join(head)}</tr></thead>\n<tbody>\n{body}</tbody>\n"
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+    def __rich_console__(
+        self, console: Console, options: ConsoleOptions
+    ) -> RenderResult:
         """Grids in the width: columns without room stand in further ones below, with the names of the rows."""
         yield Text(f"\n{printable(self.title)}")
         shown = self.shown
-        rows = [[Text.from_markup(cell, emoji=False) for cell in row] for row in self.rows(rich_escape, "[bold]{}[/]")]
+        rows = [
+            [Text.from_markup(cell, emoji=False) for cell in row]
+            for row in self.rows(rich_escape, "[bold]{}[/]")
+        ]
 
         def grid(indices: Sequence[int]) -> Grid:
-            result = Grid(box=SIMPLE_HEAD, show_edge=False, padding=(0, 0, 0, 1), header_style="")
+            result = Grid(
+                box=SIMPLE_HEAD, show_edge=False, padding=(0, 0, 0, 1), header_style=""
+            )
             for k in indices:
                 left, heading = shown[k].left, Text(printable_lines(shown[k].heading))
                 justify: Any = "left" if left else "right"  # Any: rich has a Literal
-                result.add_column(heading, justify=justify, vertical="bottom", no_wrap=not left, overflow="fold")
+                result.add_column(
+                    heading,
+                    justify=justify,
+                    vertical="bottom",
+                    no_wrap=not left,
+                    overflow="fold",
+                )
             for row in rows:
                 result.add_row(*(row[k] for k in indices))
             return result
 
-        sizes = [1 + console.measure(grid([k]), options=options.update_width(_ANY)).maximum for k in range(len(shown))]
-        num_names = next((k for k, column in enumerate(shown) if not column.left), len(shown))
-        free = options.max_width + 1 - min(sum(sizes[:num_names]), options.max_width // 2)  # longer names are broken
+        sizes = [
+            1 + console.measure(grid([k]), options=options.update_width(_ANY)).maximum
+            for k in range(len(shown))
+        ]
+        num_names = next(
+            (k for k, column in enumerate(shown) if not column.left), len(shown)
+        )
+        free = (
+            options.max_width + 1 - min(sum(sizes[:num_names]), options.max_width // 2)
+        )  # longer names are broken
         parts: list[list[int]] = [[]]
         for k in range(num_names, len(shown)):
             if parts[-1] and sum(sizes[each] for each in (*parts[-1], k)) > free:
@@ -241,7 +311,9 @@ class Tables:
 
     def in_full(self) -> "Tables":
         """Return the tables, all of them shown with all columns and records."""
-        return replace(self, tables={name: table.in_full() for name, table in self.tables.items()})
+        return replace(
+            self, tables={name: table.in_full() for name, table in self.tables.items()}
+        )
 
     def __getitem__(self, name: str | list[str]) -> DataFrame:
         if isinstance(name, list):
@@ -253,20 +325,25 @@ class Tables:
     def __repr__(self) -> str:
         return "\n  ".join(["Tables", *self.verdict, ", ".join(self.tables)])
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+    def __rich_console__(
+        self, console: Console, options: ConsoleOptions
+    ) -> RenderResult:
         yield from bulleted(self.verdict, options.max_width)
         yield from self._filled()
 
     def _repr_html_(self) -> str:
         tables = (
-            f"<table><caption>{escape(table.title)}</caption>{table.to_html()}</table>" for table in self._filled()
+            f"<table><caption>{escape(table.title)}</caption>{table.to_html()}</table>"
+            for table in self._filled()
         )
         return f"<pre>{escape(printable_lines(repr(self)))}</pre>{''.join(tables)}"
 
     def to_markdown(self) -> str:
         """Return verdict and tables, as far as they are shown."""
         verdict = "".join(f"- {_markdown(line)}\n" for line in self.verdict)
-        return f"{verdict}\n" * bool(verdict) + "\n".join(table.to_markdown() for table in self._filled())
+        return f"{verdict}\n" * bool(verdict) + "\n".join(
+            table.to_markdown() for table in self._filled()
+        )
 
     def to_latex(self) -> str:
         """Return the tables, as far as they are shown, the verdict as comments."""
@@ -280,7 +357,10 @@ class Tables:
             for record in table.plain():
                 run, part = (*(record.pop(key) for key in table.keys), "")[:2]
                 head = {"table": name, "run": run, "part": part}
-                rows += [{**head, "quantity": quantity, "value": value} for quantity, value in record.items()]
+                rows += [
+                    {**head, "quantity": quantity, "value": value}
+                    for quantity, value in record.items()
+                ]
         return _csv(rows)
 
     def to_dict(self) -> dict[str, Any]:
@@ -289,14 +369,22 @@ class Tables:
         return {"verdict": list(self.verdict), **self.details, "tables": tables}
 
     def _filled(self) -> list[Table]:
-        return [table for table in self.tables.values() if table.records and not table.is_detail]
+        return [
+            table
+            for table in self.tables.values()
+            if table.records and not table.is_detail
+        ]
 
 
 def bulleted(sentences: Iterable[str], width: int) -> Iterator[Text]:
     """Return the lines of sentences, each behind a dash, wrapped between words."""
     for sentence in sentences:
         lines = textwrap.wrap(
-            printable(sentence), width, initial_indent="- ", subsequent_indent="  ", break_on_hyphens=False
+            printable(sentence),
+            width,
+            initial_indent="- ",
+            subsequent_indent="  ",
+            break_on_hyphens=False,
         )
         yield from map(Text, lines)
 
@@ -305,13 +393,17 @@ def html_cell(tag: str, content: str, is_left: bool) -> str:
     """Return a cell of an HTML table with escaped `content`; of class `long` where it may be broken."""
     kind = " ".join(["left"] * is_left + ["long"] * (len(content) > _LONG))
     lines = content.replace("\n", "<br>")
-    return f'<{tag} class="{kind}">{lines}</{tag}>' if kind else f"<{tag}>{lines}</{tag}>"
+    return (
+        f'<{tag} class="{kind}">{lines}</{tag}>' if kind else f"<{tag}>{lines}</{tag}>"
+    )
 
 
 def _csv(records: Sequence[Record]) -> str:
     import pandas as pd
 
-    text: str = pd.DataFrame(records, dtype=object).to_csv(index=False, lineterminator="\n")
+    text: str = pd.DataFrame(records, dtype=object).to_csv(
+        index=False, lineterminator="\n"
+    )
     return text
 
 

@@ -41,10 +41,14 @@ _QUANTITIES = {
 }
 _CONTINUITY = ("tracked_share", "tracked_share_in_view", "breaks", "id_switches")
 _UNITS = {"m": "m", "rad": "rad", "mps": "m/s"}
-_COMMON_SHARE = 0.9  # of the samples that all runs have in common; below it a note counts them
+_COMMON_SHARE = (
+    0.9  # of the samples that all runs have in common; below it a note counts them
+)
 
 
-def compare(*runs: OneRun | Iterable[OneRun] | Mapping[str, OneRun], streaming: bool = False) -> Tables:
+def compare(
+    *runs: OneRun | Iterable[OneRun] | Mapping[str, OneRun], streaming: bool = False
+) -> Tables:
     """Return the metrics of `runs` in comparison: the `verdict`, and tables `differences`, `tracking`, `multi_object`,
     `lag`, `consistency`, `dispositions`, and `residuals_SENSOR` of every sensor.
 
@@ -62,7 +66,11 @@ def compare(*runs: OneRun | Iterable[OneRun] | Mapping[str, OneRun], streaming: 
         "multi_object": _multi_object(metrics),
         "lag": _lag(metrics),
         "consistency": _consistency(metrics),
-        **{f"residuals_{name}": _residuals(name, metrics) for item in metrics.values() for name in item.sensors},
+        **{
+            f"residuals_{name}": _residuals(name, metrics)
+            for item in metrics.values()
+            for name in item.sensors
+        },
         "dispositions": _dispositions(metrics),
     }
     more, sentences = streaming_tables(every) if streaming else ({}, [])
@@ -73,21 +81,38 @@ def compare(*runs: OneRun | Iterable[OneRun] | Mapping[str, OneRun], streaming: 
 def _differences(compared: Sequence[Comparison]) -> Table:
     """A row for each recording, quantity and run: its value, and how much worse than the best it is."""
     records = [
-        {"quantity": name, **entry_record(entry), "blocks": (entry.worse_by or UNKNOWN).count}
+        {
+            "quantity": name,
+            **entry_record(entry),
+            "blocks": (entry.worse_by or UNKNOWN).count,
+        }
         for one in compared
         for name, entries in one.quantities.items()
         for entry in entries
     ]
     quantity = Column("quantity", text=lambda name: _QUANTITIES[str(name)], left=True)
-    notes = ["RMSE where all runs track the object; NEES: worse is farther from 2", STANDING_NOTE]
+    notes = [
+        "RMSE where all runs track the object; NEES: worse is farther from 2",
+        STANDING_NOTE,
+    ]
     notes += [
         f"{', '.join(one.runs)}: {one.samples} samples in common, of up to {one.most_samples}"
         for one in compared
         if one.samples < _COMMON_SHARE * one.most_samples
     ]
-    title, columns = "Differences of runs of the same recording", [quantity, RUN, *entry_columns("value")]
+    title, columns = (
+        "Differences of runs of the same recording",
+        [quantity, RUN, *entry_columns("value")],
+    )
     main = ("position_rmse_m", _GOSPA)
-    return Table(title, records, columns, ("run", "quantity"), notes, is_main=lambda row: row["quantity"] in main)
+    return Table(
+        title,
+        records,
+        columns,
+        ("run", "quantity"),
+        notes,
+        is_main=lambda row: row["quantity"] in main,
+    )
 
 
 def _tracking(metrics: Mapping[str, Metrics]) -> Table:
@@ -97,30 +122,48 @@ def _tracking(metrics: Mapping[str, Metrics]) -> Table:
         record: dict[str, Any] = {"run": label, "estimator": item.estimator}
         if item.truth is not None:
             overall = item.truth.overall
-            record |= {named(name, "rmse"): overall.errors[name].rmse for name in _ERRORS}
+            record |= {
+                named(name, "rmse"): overall.errors[name].rmse for name in _ERRORS
+            }
             record |= {"position_nees": item.consistency.position_nees.mean}
             record |= {name: getattr(overall, name) for name in _CONTINUITY}
-            record |= {"false_tracks": item.truth.false_tracks, "precision": item.precision}
+            record |= {
+                "false_tracks": item.truth.false_tracks,
+                "precision": item.precision,
+            }
         time_s = item.time_per_tick_s
         record |= {"num_tracks": item.num_tracks, "num_confirmed": item.num_confirmed}
-        records.append(record | {"time_per_tick_p50_s": time_s.p50, "time_per_tick_p99_s": time_s.p99})
+        records.append(
+            record
+            | {"time_per_tick_p50_s": time_s.p50, "time_per_tick_p99_s": time_s.p99}
+        )
     columns = [
         RUN,
-        *(Column(heading, named(name, "rmse"), is_extra=name != "position_m") for name, heading in _ERRORS.items()),
+        *(
+            Column(heading, named(name, "rmse"), is_extra=name != "position_m")
+            for name, heading in _ERRORS.items()
+        ),
         Column("NEES\npos.", "position_nees"),
         Column("tracked\n[%]", "tracked_share_in_view", scale=PERCENT),
         Column("breaks/\nswitches", "breaks id_switches", "{}/{}"),
         Column("false\ntracks", "false_tracks"),
         Column("preci-\nsion", "precision", is_extra=True),
         Column("tracks all/\nconfirmed", "num_tracks num_confirmed", "{}/{}"),
-        Column("ms/tick\np50/p99", "time_per_tick_p50_s time_per_tick_p99_s", "{}/{}", MS),
+        Column(
+            "ms/tick\np50/p99", "time_per_tick_p50_s time_per_tick_p99_s", "{}/{}", MS
+        ),
     ]
     notes = [
         "errors: RMSE against truth; NEES: mean of the position's; 2 if consistent; tracked: of the ticks in view",
         "breaks: resumed after a loss or with another track; switches: the latter",
         f"false: paired with a true object in less than {FALSE_TRACK_SHARE:.0%} of its life",
     ]
-    return Table("Tracking", records, columns, notes=notes if any(item.truth for item in metrics.values()) else ())
+    return Table(
+        "Tracking",
+        records,
+        columns,
+        notes=notes if any(item.truth for item in metrics.values()) else (),
+    )
 
 
 def _multi_object(metrics: Mapping[str, Metrics]) -> Table:
@@ -128,14 +171,29 @@ def _multi_object(metrics: Mapping[str, Metrics]) -> Table:
     records = []
     for label, item in metrics.items():
         if item.multi_object is not None and item.truth is not None:
-            of, m2, overall = item.multi_object, item.multi_object.gospa, item.truth.overall
-            parts = {part: m2[f"{part}_m2"] for part in ("localisation", "false", "out_of_view", "missed")}
+            of, m2, overall = (
+                item.multi_object,
+                item.multi_object.gospa,
+                item.truth.overall,
+            )
+            parts = {
+                part: m2[f"{part}_m2"]
+                for part in ("localisation", "false", "out_of_view", "missed")
+            }
             parts["missed_in_view"] = max(parts["missed"] - parts["out_of_view"], 0.0)
-            record = {"run": label, _GOSPA: m2["in_view_rms_m"], "gospa_rms_m": m2["rms_m"]}
-            record |= {f"gospa_{part}_m": math.sqrt(square) for part, square in parts.items()}
+            record = {
+                "run": label,
+                _GOSPA: m2["in_view_rms_m"],
+                "gospa_rms_m": m2["rms_m"],
+            }
+            record |= {
+                f"gospa_{part}_m": math.sqrt(square) for part, square in parts.items()
+            }
             record |= {"mota": of.clear["mota"], "idf1": of.identity["idf1"], **of.hota}
             switches, confirm_s = overall.id_switches, overall.time_to_confirm_s.mean
-            records.append(record | {"id_switches": switches, "time_to_confirm_s": confirm_s})
+            records.append(
+                record | {"id_switches": switches, "time_to_confirm_s": confirm_s}
+            )
     columns = [
         RUN,
         Column("GOSPA\n[m]", _GOSPA),
@@ -144,7 +202,10 @@ def _multi_object(metrics: Mapping[str, Metrics]) -> Table:
         Column("false\n[m]", "gospa_false_m"),
         Column("unseen\n[m]", "gospa_out_of_view_m"),
         Column("with\nunseen", "gospa_rms_m"),
-        *(Column(f"{name}\n[%]", name.lower(), scale=PERCENT) for name in ("MOTA", "IDF1", "HOTA", "DetA", "AssA")),
+        *(
+            Column(f"{name}\n[%]", name.lower(), scale=PERCENT)
+            for name in ("MOTA", "IDF1", "HOTA", "DetA", "AssA")
+        ),
         Column("switches", "id_switches"),
         Column("confirm\n[s]", "time_to_confirm_s"),
     ]
@@ -159,16 +220,30 @@ def _multi_object(metrics: Mapping[str, Metrics]) -> Table:
 def _lag(metrics: Mapping[str, Metrics]) -> Table:
     """A row for each run and lag, where any run has lagged or final states: errors, and how waiting lowers them."""
     records = []
-    for label, item in metrics.items() if any(len(item.lagged) > 1 for item in metrics.values()) else ():
+    for label, item in (
+        metrics.items()
+        if any(len(item.lagged) > 1 for item in metrics.values())
+        else ()
+    ):
         for lag in item.lagged:
             at_s = lag.lag_s if isinstance(lag.lag_s, float) else None
-            record: dict[str, Any] = {"run": label, "lag": WINDOW if at_s is None else f"{at_s:g}", "lag_s": at_s}
+            record: dict[str, Any] = {
+                "run": label,
+                "lag": WINDOW if at_s is None else f"{at_s:g}",
+                "lag_s": at_s,
+            }
             record |= {"num_states": lag.errors["position_m"].count}
             for name in ("position_m", "speed_mps", "yaw_rad"):
                 gain = lag.gain(name) if lag.lag_s else math.nan
-                record |= {named(name, "rmse"): lag.errors[name].rmse, f"{name.rpartition('_')[0]}_reduction": gain}
+                record |= {
+                    named(name, "rmse"): lag.errors[name].rmse,
+                    f"{name.rpartition('_')[0]}_reduction": gain,
+                }
             of = lag.position_reduction
-            record |= {"position_reduction_low": of.low, "position_reduction_high": of.high}
+            record |= {
+                "position_reduction_low": of.low,
+                "position_reduction_high": of.high,
+            }
             records.append(record | {"position_nees": lag.position_nees.mean})
     columns = [
         RUN,
@@ -176,7 +251,12 @@ def _lag(metrics: Mapping[str, Metrics]) -> Table:
         Column("states", "num_states", is_extra=True),
         Column(_ERRORS["position_m"], "position_rmse_m"),
         Column("below\n[%]", "position_reduction", scale=PERCENT),
-        Column("95 %\ninterval", "position_reduction_low position_reduction_high", "{} to {}", PERCENT),
+        Column(
+            "95 %\ninterval",
+            "position_reduction_low position_reduction_high",
+            "{} to {}",
+            PERCENT,
+        ),
         Column(_ERRORS["speed_mps"], "speed_rmse_mps", is_extra=True),
         Column("below\n[%]", "speed_reduction", scale=PERCENT, is_extra=True),
         Column(_ERRORS["yaw_rad"], "yaw_rmse_rad", is_extra=True),
@@ -187,7 +267,13 @@ def _lag(metrics: Mapping[str, Metrics]) -> Table:
         "lag 0: states as published; window: final states, as they leave the window; NEES: 2 if consistent",
         "below: reduction against the present states of the same tracks and stamps",
     ]
-    return Table("Error against lag (RMSE against truth)", records, columns, ("run", "lag"), notes)
+    return Table(
+        "Error against lag (RMSE against truth)",
+        records,
+        columns,
+        ("run", "lag"),
+        notes,
+    )
 
 
 def _consistency(metrics: Mapping[str, Metrics]) -> Table:
@@ -195,15 +281,36 @@ def _consistency(metrics: Mapping[str, Metrics]) -> Table:
     records = []
     for label, item in metrics.items():
         of = item.consistency
-        squares = {"NEES position": of.position_nees} | {f"NIS {sensor}": nis for sensor, nis in of.nis.items()}
+        squares = {"NEES position": of.position_nees} | {
+            f"NIS {sensor}": nis for sensor, nis in of.nis.items()
+        }
         for name, square in squares.items():
-            record: dict[str, Any] = {"run": label, "of": name, "num_samples": square.count, "mean": square.mean}
-            record |= {"expected": square.dof, "band_low": square.band_low, "band_high": square.band_high}
+            record: dict[str, Any] = {
+                "run": label,
+                "of": name,
+                "num_samples": square.count,
+                "mean": square.mean,
+            }
+            record |= {
+                "expected": square.dof,
+                "band_low": square.band_low,
+                "band_high": square.band_high,
+            }
             white = of.autocorrelation.get(name.removeprefix("NIS "))
-            record |= {} if white is None else {"lag1_correlation": white.lag1, "lag1_band": white.lag1_band}
+            record |= (
+                {}
+                if white is None
+                else {"lag1_correlation": white.lag1, "lag1_band": white.lag1_band}
+            )
             records += [record] if square.count else []
     columns = [
-        *(RUN, Column("of", left=True), Column("samples", "num_samples"), Column("mean"), Column("expected")),
+        *(
+            RUN,
+            Column("of", left=True),
+            Column("samples", "num_samples"),
+            Column("mean"),
+            Column("expected"),
+        ),
         Column("95 % band", "band_low band_high", "{} to {}"),
         Column("correlation\nat lag 1", "lag1_correlation lag1_band", "{} ± {}"),
     ]
@@ -223,20 +330,30 @@ def _residuals(sensor: str, metrics: Mapping[str, Metrics]) -> Table:
             mine, nis = item.sensors[sensor], item.consistency.nis[sensor]
             record: dict[str, Any] = {"run": label}
             for name, moments in mine.residuals.items():
-                record |= {named(name, "mean"): moments.mean, named(name, "std"): moments.std}
+                record |= {
+                    named(name, "mean"): moments.mean,
+                    named(name, "std"): moments.std,
+                }
             record |= {"nis_mean": nis.mean, "nis_expected": nis.dof}
-            records.append(record | {"delay_mean_s": mine.delay_s.mean, "delay_p90_s": mine.delay_s.p90})
+            records.append(
+                record
+                | {"delay_mean_s": mine.delay_s.mean, "delay_p90_s": mine.delay_s.p90}
+            )
     columns = [RUN]
     for name in (name for name in RESIDUAL_NAMES if name not in ("x_m", "y_m")):
         quantity, _, unit = name.rpartition("_")
         heading = f"{quantity.replace('_', ' ')}\n[{_UNITS[unit]}]"
-        columns.append(Column(heading, f"{named(name, 'mean')} {named(name, 'std')}", "{} ± {}"))
+        columns.append(
+            Column(heading, f"{named(name, 'mean')} {named(name, 'std')}", "{} ± {}")
+        )
     columns += [
         Column("NIS", "nis_mean"),
         Column("NIS\nexpected", "nis_expected"),
         Column("delay [ms]\nmean/p90", "delay_mean_s delay_p90_s", "{}/{}", MS),
     ]
-    title = f"Residuals of {sensor} (measured minus predicted: mean ± standard deviation)"
+    title = (
+        f"Residuals of {sensor} (measured minus predicted: mean ± standard deviation)"
+    )
     return Table(title, records, columns, is_detail=True)
 
 
@@ -247,11 +364,20 @@ def _dispositions(metrics: Mapping[str, Metrics]) -> Table:
         for name, sensor in item.sensors.items():
             counts = sensor.dispositions
             refused = sum(count for kind, count in counts.items() if kind not in USED)
-            groups = {"fused": sum(counts[k] for k in FUSED), "late": sum(counts[k] for k in LATE), "refused": refused}
+            groups = {
+                "fused": sum(counts[k] for k in FUSED),
+                "late": sum(counts[k] for k in LATE),
+                "refused": refused,
+            }
             late = {"overtaken": sensor.overtaken, "detections": sensor.detections}
             records.append({"run": label, "sensor": name, **counts, **late, **groups})
-    occur = [kind.value for kind in Disposition if any(record[kind] for record in records)]
-    kinds = [Column(kind.replace("_", "\n"), kind, is_extra=kind != Disposition.MERGED) for kind in occur]
+    occur = [
+        kind.value for kind in Disposition if any(record[kind] for record in records)
+    ]
+    kinds = [
+        Column(kind.replace("_", "\n"), kind, is_extra=kind != Disposition.MERGED)
+        for kind in occur
+    ]
     columns = [
         *(
             RUN,

@@ -13,7 +13,13 @@ import pandas as pd
 from fgtrack.core.errors import CallError, DataError, did_you_mean
 from fgtrack.core.files import open_text
 from fgtrack.core.types import FloatArray
-from fgtrack.evaluation.comparison import STANDING_NOTE, Entry, entry_columns, entry_record, ranked
+from fgtrack.evaluation.comparison import (
+    STANDING_NOTE,
+    Entry,
+    entry_columns,
+    entry_record,
+    ranked,
+)
 from fgtrack.evaluation.intervals import paired
 from fgtrack.evaluation.tables import PERCENT, Column, DataFrame, Table
 
@@ -59,17 +65,26 @@ class SweepTable:
     @property
     def shown_axes(self) -> list[str]:
         """Axes that vary and distinguish the points, without those of whole mappings where labels do it."""
-        return distinguishing(self.rows[[axis for axis in self.axes if self.rows[axis].nunique() > 1]])
+        return distinguishing(
+            self.rows[[axis for axis in self.axes if self.rows[axis].nunique() > 1]]
+        )
 
     def means(self, metric: str) -> DataFrame:
         """Return the mean over the seeds at every point and of every estimator; `CallError` if there is no such metric.
         Columns are `shown_axes`, `estimator`, `mean`, `standard_error` (NaN of one seed) and `seeds` with a value.
         """
         if metric not in self.metrics:
-            hint = did_you_mean(metric, self.metrics) or f", there are {', '.join(self.metrics[:5])} ..."
+            hint = (
+                did_you_mean(metric, self.metrics)
+                or f", there are {', '.join(self.metrics[:5])} ..."
+            )
             raise CallError(f"{metric}: the sweep has no such metric{hint}")
-        groups = self.rows.dropna(subset=[metric]).groupby([*self.shown_axes, "estimator"], sort=False)[metric]
-        return groups.agg(mean="mean", standard_error="sem", seeds="count").reset_index()
+        groups = self.rows.dropna(subset=[metric]).groupby(
+            [*self.shown_axes, "estimator"], sort=False
+        )[metric]
+        return groups.agg(
+            mean="mean", standard_error="sem", seeds="count"
+        ).reset_index()
 
 
 @dataclass(frozen=True)
@@ -92,21 +107,36 @@ def read_sweep(folder: Path | str) -> SweepTable:
         with open_text(path) as file:
             rows = pd.read_csv(file, dtype=str, keep_default_na=False, index_col=False)
     except OSError as error:
-        raise CallError(f"{path}: cannot be read ({error.strerror}), make one with `fgtrack sweep`") from error
+        raise CallError(
+            f"{path}: cannot be read ({error.strerror}), make one with `fgtrack sweep`"
+        ) from error
     except ValueError as error:
-        raise DataError(f"{path}: is not a table ({' '.join(str(error).split())}), repeat the sweep") from error
-    if not {"seed", "estimator"} <= set(rows) or rows.empty or rows.isna().any(axis=None):
+        raise DataError(
+            f"{path}: is not a table ({' '.join(str(error).split())}), repeat the sweep"
+        ) from error
+    if (
+        not {"seed", "estimator"} <= set(rows)
+        or rows.empty
+        or rows.isna().any(axis=None)
+    ):
         raise DataError(f"{path}: holds no rows of a sweep, repeat it")
     seed = rows.columns.get_loc("seed")
-    cells, values = rows.iloc[:, : seed + 2], rows.iloc[:, seed + 2 :].apply(pd.to_numeric, errors="coerce")
+    cells, values = (
+        rows.iloc[:, : seed + 2],
+        rows.iloc[:, seed + 2 :].apply(pd.to_numeric, errors="coerce"),
+    )
     numbers = values.astype(float).replace([np.inf, -np.inf], np.nan)
-    return SweepTable(tuple(rows.columns[:seed]), tuple(numbers), pd.concat([cells, numbers], axis=1))
+    return SweepTable(
+        tuple(rows.columns[:seed]), tuple(numbers), pd.concat([cells, numbers], axis=1)
+    )
 
 
 def distinguishing(points: DataFrame) -> list[str]:
     """Columns that distinguish `points`, without those of whole mappings where labels do it."""
     distinct = points.drop_duplicates()
-    plain = [axis for axis in points if not distinct[axis].str.startswith(("{", "[")).any()]
+    plain = [
+        axis for axis in points if not distinct[axis].str.startswith(("{", "[")).any()
+    ]
     return plain if plain and not distinct.duplicated(plain).any() else list(points)
 
 
@@ -115,23 +145,39 @@ def seed_comparisons(sweep: SweepTable) -> list[SeedComparison]:
     rows, result = sweep.rows, []
     cells = [tuple(row) for row in rows[list(sweep.axes)].to_numpy()]
     points = {point: k for k, point in enumerate(dict.fromkeys(cells))}
-    (estimator, names), (seed, seeds) = (pd.factorize(rows[name]) for name in ("estimator", "seed"))
+    (estimator, names), (seed, seeds) = (
+        pd.factorize(rows[name]) for name in ("estimator", "seed")
+    )
     at = [points[cell] for cell in cells], estimator, seed
-    for metric in [name for pattern in _BETTER for name in sweep.metrics if fnmatchcase(name, pattern)]:
+    for metric in [
+        name
+        for pattern in _BETTER
+        for name in sweep.metrics
+        if fnmatchcase(name, pattern)
+    ]:
         values, costs = np.full((2, len(points), len(names), len(seeds)), np.nan)
         values[at], costs[at] = rows[metric], _cost(rows, metric)
         for point, value, cost in zip(points, values, costs, strict=True):
             some = np.isfinite(cost).any(axis=1)
             common = np.isfinite(cost[some]).all(axis=0)
             if some.sum() > 1 and common.any():
-                entries = _ranked(names[some], value[some][:, common], cost[some][:, common])
+                entries = _ranked(
+                    names[some], value[some][:, common], cost[some][:, common]
+                )
                 result.append(SeedComparison(point, metric, int(common.sum()), entries))
     return result
 
 
-def _ranked(names: Sequence[str], values: FloatArray, costs: FloatArray) -> tuple[Entry, ...]:
+def _ranked(
+    names: Sequence[str], values: FloatArray, costs: FloatArray
+) -> tuple[Entry, ...]:
     means = values.mean(axis=1).tolist()
-    return ranked(names, means, costs.mean(axis=1), lambda item, best: paired(costs[item], costs[best]))
+    return ranked(
+        names,
+        means,
+        costs.mean(axis=1),
+        lambda item, best: paired(costs[item], costs[best]),
+    )
 
 
 def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) -> Table:
@@ -143,16 +189,32 @@ def difference_table(compared: Sequence[SeedComparison], axes: Sequence[str]) ->
             "estimator": entry.name,
             "seeds": item.seeds,
         }
-        | {name: value for name, value in entry_record(entry, "mean").items() if name not in ("run", "standing")}
+        | {
+            name: value
+            for name, value in entry_record(entry, "mean").items()
+            if name not in ("run", "standing")
+        }
         | {"standing": entry.standing}
         for item in compared
         for entry in item.entries
     ]
     first, keys = compared[0].metric if compared else "", (*axes, "metric", "estimator")
     points = pd.DataFrame([item.point for item in compared], columns=list(axes))
-    columns = [_point_column(points), Column("estimator", left=True), *entry_columns("mean", "mean"), Column("seeds")]
+    columns = [
+        _point_column(points),
+        Column("estimator", left=True),
+        *entry_columns("mean", "mean"),
+        Column("seeds"),
+    ]
     notes = ["t intervals of paired differences over seeds", STANDING_NOTE]
-    return Table(first, records, columns, keys, notes, is_main=lambda row: row["metric"] == first and row["seeds"] > 1)
+    return Table(
+        first,
+        records,
+        columns,
+        keys,
+        notes,
+        is_main=lambda row: row["metric"] == first and row["seeds"] > 1,
+    )
 
 
 def summary_table(sweep: SweepTable) -> Table:
@@ -161,16 +223,40 @@ def summary_table(sweep: SweepTable) -> Table:
     main = [name for name in _MAIN if name in metrics] or metrics[: len(_MAIN)]
     metrics = list(dict.fromkeys((*main, *metrics)))
     groups = sweep.rows.groupby([*sweep.axes, "estimator"], sort=False)[metrics]
-    errors, seeds = groups.sem().add_suffix(".standard_error"), groups.count().max(axis=1).rename("seeds")
-    names = [name for metric in metrics for name in (metric, f"{metric}.standard_error")]
-    records = pd.concat([groups.mean(), errors], axis=1)[names].join(seeds).reset_index().to_dict("records")
-    columns = [_point_column(sweep.rows[list(sweep.axes)]), Column("estimator", left=True)]
+    errors, seeds = (
+        groups.sem().add_suffix(".standard_error"),
+        groups.count().max(axis=1).rename("seeds"),
+    )
+    names = [
+        name for metric in metrics for name in (metric, f"{metric}.standard_error")
+    ]
+    records = (
+        pd.concat([groups.mean(), errors], axis=1)[names]
+        .join(seeds)
+        .reset_index()
+        .to_dict("records")
+    )
+    columns = [
+        _point_column(sweep.rows[list(sweep.axes)]),
+        Column("estimator", left=True),
+    ]
     for name in metrics:
         heading = _MAIN.get(name) or re.sub(r"\.(?!\d)", "\n", name)
-        both, scale = (name, f"{name}.standard_error"), PERCENT if name.endswith("share_in_view") else 1.0
-        columns.append(Column(heading, both, "{} ± {}", scale, is_extra=name not in main))
+        both, scale = (
+            (name, f"{name}.standard_error"),
+            PERCENT if name.endswith("share_in_view") else 1.0,
+        )
+        columns.append(
+            Column(heading, both, "{} ± {}", scale, is_extra=name not in main)
+        )
     notes = ["± standard error of the mean over the seeds"]
-    return Table("Summary", records, [*columns, Column("seeds")], (*sweep.axes, "estimator"), notes)
+    return Table(
+        "Summary",
+        records,
+        [*columns, Column("seeds")],
+        (*sweep.axes, "estimator"),
+        notes,
+    )
 
 
 def _point_column(points: DataFrame) -> Column:
@@ -182,8 +268,12 @@ def _point_column(points: DataFrame) -> Column:
 
 def _cost(rows: DataFrame, metric: str) -> DataFrame:
     """The number that should be small: the metric, its negative, or its distance from the expected value."""
-    better = next(better for pattern, better in _BETTER.items() if fnmatchcase(metric, pattern))
+    better = next(
+        better for pattern, better in _BETTER.items() if fnmatchcase(metric, pattern)
+    )
     if better == "nearer":
         default = 2.0 if "position_nees" in metric else np.nan
-        return (rows[metric] - rows.get(metric.removesuffix("mean") + "dof", default)).abs()
+        return (
+            rows[metric] - rows.get(metric.removesuffix("mean") + "dof", default)
+        ).abs()
     return rows[metric] if better == "less" else -rows[metric]

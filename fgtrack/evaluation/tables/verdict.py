@@ -12,7 +12,9 @@ from fgtrack.evaluation.tables import PERCENT, short, two_digits
 _POSITION = "position_rmse_m"
 
 
-def verdict(metrics: Mapping[str, Metrics], compared: Sequence[Comparison]) -> tuple[str, ...]:
+def verdict(
+    metrics: Mapping[str, Metrics], compared: Sequence[Comparison]
+) -> tuple[str, ...]:
     """Sentences on the runs of `metrics`, by label; none for runs without errors and innovations."""
     sentences = [
         who_is_best(one.quantities[_POSITION], "at the newest stamp")
@@ -20,7 +22,9 @@ def verdict(metrics: Mapping[str, Metrics], compared: Sequence[Comparison]) -> t
         else f"{_listed(one.runs)} never track the same object at the same stamp: there is nothing to pair."
         for one in compared
     ]
-    alone = [label for label in metrics if not any(label in one.runs for one in compared)]
+    alone = [
+        label for label in metrics if not any(label in one.runs for one in compared)
+    ]
     if len(metrics) > 1 and (len(compared) > 1 or alone):
         sentences.append(
             "Without truth there are no errors to compare."
@@ -28,18 +32,31 @@ def verdict(metrics: Mapping[str, Metrics], compared: Sequence[Comparison]) -> t
             else "Not all runs are of the same recording with truth (or they are evaluated by different settings): "
             "only those that are can be ranked by their differences."
         )
-    best = [one.quantities[_POSITION][0].name if _POSITION in one.quantities else one.runs[0] for one in compared]
+    best = [
+        one.quantities[_POSITION][0].name
+        if _POSITION in one.quantities
+        else one.runs[0]
+        for one in compared
+    ]
     for label in (*best, *alone):
         sentences += _noise(label, metrics[label])
     for label, one in metrics.items():
-        lags = [lag for lag in one.lagged if lag.is_lagged and lag.lag_s != WINDOW and lag.position_reduction.is_known]
-        shares = {lag.lag_s: lag.position_reduction for lag in (*lags[:1], *lags[1:][-1:])}
+        lags = [
+            lag
+            for lag in one.lagged
+            if lag.is_lagged and lag.lag_s != WINDOW and lag.position_reduction.is_known
+        ]
+        shares = {
+            lag.lag_s: lag.position_reduction for lag in (*lags[:1], *lags[1:][-1:])
+        }
         parts = [
             f"{lag_s:g} s by {PERCENT * of.mean:.0f} % ({PERCENT * of.low:.0f} to {PERCENT * of.high:.0f})"
             for lag_s, of in shares.items()
         ]
         if parts:
-            sentences.append(f"Waiting lowers the position RMSE of {label}: {', '.join(parts)}.")
+            sentences.append(
+                f"Waiting lowers the position RMSE of {label}: {', '.join(parts)}."
+            )
     return tuple(sentences)
 
 
@@ -77,28 +94,60 @@ def _metres(entry: Entry, what: str = "") -> str:
     """Amount by which `entry` is worse, with the interval and `what` behind the unit."""
     worse = entry.worse_by or UNKNOWN
     scale, unit = (1e3, "mm") if abs(worse.mean) < 0.01 else (1.0, "m")
-    mean, low, high = (two_digits(scale * value) for value in (worse.mean, worse.low, worse.high))
+    mean, low, high = (
+        two_digits(scale * value) for value in (worse.mean, worse.low, worse.high)
+    )
     amount = f"{mean} {unit}{what}"
     if not worse.is_known:
         return f"{amount}, too short a run for an interval"
-    return f"{amount} ({low} to {high})" if what else f"{amount}, 95 % interval {low} to {high}"
+    return (
+        f"{amount} ({low} to {high})"
+        if what
+        else f"{amount}, 95 % interval {low} to {high}"
+    )
 
 
 def _noise(label: str, one: Metrics) -> Iterator[str]:
     """Fit of the covariances of a run, the best one, to the errors: NEES of the position, NIS of every sensor."""
     of = one.consistency
-    squares = [("NEES of the position", of.position_nees, of.position_nees_interval)] if of.position_nees.count else []
-    squares += [(f"NIS of {name}", nis, UNKNOWN) for name, nis in of.nis.items() if nis.count >= FEWEST]
+    squares = (
+        [("NEES of the position", of.position_nees, of.position_nees_interval)]
+        if of.position_nees.count
+        else []
+    )
+    squares += [
+        (f"NIS of {name}", nis, UNKNOWN)
+        for name, nis in of.nis.items()
+        if nis.count >= FEWEST
+    ]
     texts = {
         name: f"{name} {short(square.mean)} (expected {square.dof:.3g}"
-        + (f", 95 % interval {two_digits(interval.low)} to {two_digits(interval.high)})" if interval.is_known else ")")
+        + (
+            f", 95 % interval {two_digits(interval.low)} to {two_digits(interval.high)})"
+            if interval.is_known
+            else ")"
+        )
         for name, square, interval in squares
     }
-    far = [(name, square, interval) for name, square, interval in squares if is_far_off(square)]
-    off = {name: square for name, square, interval in far if not interval.low <= square.dof <= interval.high}
+    far = [
+        (name, square, interval)
+        for name, square, interval in squares
+        if is_far_off(square)
+    ]
+    off = {
+        name: square
+        for name, square, interval in far
+        if not interval.low <= square.dof <= interval.high
+    }
     if off:
         small = [square.mean > square.dof for square in off.values()]
-        size = "too small" if all(small) else "partly too small, partly too large" if any(small) else "too large"
+        size = (
+            "too small"
+            if all(small)
+            else "partly too small, partly too large"
+            if any(small)
+            else "too large"
+        )
         yield (
             f"The configured noise is {size} (judged by {label}): {', '.join(texts[name] for name in off)}. "
             "`fgtrack advise --tune` fits it, or reports what has to be corrected first; the order of the runs may "

@@ -7,18 +7,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from fgtrack.config.recorded import Recorded, RecordedSensor, recorded
+from fgtrack.config.settings import NOISE_HZ, Config, FilterConfig, MotionConfig
+from fgtrack.config.yaml_file import SMALLEST, plain
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import MEASURABLE, DetectionList, Message
 from fgtrack.estimation.smoothing.settings import SmootherSettings
-from fgtrack.io.source import InputSource
+from fgtrack.inputs.source import InputSource
 from fgtrack.models.sensors import Mount
 from fgtrack.pipeline.assumptions.assumption import Assumed, Assumption
 from fgtrack.pipeline.assumptions.coverage import Coverage, coverages
-from fgtrack.pipeline.config import NOISE_HZ, Config, FilterConfig, MotionConfig
-from fgtrack.pipeline.load import SMALLEST, plain
-from fgtrack.pipeline.recorded import Recorded, RecordedSensor, recorded
 from fgtrack.tracking.association import GatedMahalanobis
-from fgtrack.tracking.existence import ExistenceRules
+from fgtrack.tracking.lives.existence import ExistenceRules
 
 __all__ = ["ASSUMED_STD", "assumed", "is_open", "source_of"]
 
@@ -51,7 +51,9 @@ _LONGEST_S = 60.0
 _MANOEUVRES = {"velocity": 150.0}
 RECORDED, USUAL = "recorded", "usual of a detector of cars by LiDAR or RADAR"
 USUAL_BOX = "usual of boxes that a detector fits to cars"
-_UNPLACED = "gives no position, and bearings from an unknown mount err by more than the tracks"
+_UNPLACED = (
+    "gives no position, and bearings from an unknown mount err by more than the tracks"
+)
 _TWO_LISTS = "two lists of the slowest sensor"
 """Reasons."""
 
@@ -67,12 +69,27 @@ def assumed(config: Config, source: InputSource) -> Assumed:
     carried = recorded(source)
     result = Assumed(config).assuming(*_recorded(config, carried))
     if is_open(result.config):
-        mounts = {name: item.mount for name, item in (result.config.sensors or carried.sensors).items() if item.mount}
+        mounts = {
+            name: item.mount
+            for name, item in (result.config.sensors or carried.sensors).items()
+            if item.mount
+        }
         covered = _covered(source, config, mounts)
-        rules: list[Rule] = [_slow_revisits, _noise, _lists, lambda config, _: _recorded(config, carried)]
+        rules: list[Rule] = [
+            _slow_revisits,
+            _noise,
+            _lists,
+            lambda config, _: _recorded(config, carried),
+        ]
         rules += [_claim, _offsets, _unplaced, _windows]
         if config.sensors:
-            rules, covered = [], {name: replace(item, persistence=None) for name, item in covered.items()}
+            rules, covered = (
+                [],
+                {
+                    name: replace(item, persistence=None)
+                    for name, item in covered.items()
+                },
+            )
         for rule in (*rules, _views, _out_of_view):
             result = result.assuming(*rule(result.config, covered))
     config = result.config
@@ -80,13 +97,17 @@ def assumed(config: Config, source: InputSource) -> Assumed:
         name: replace(sensor, field_of_view_rad=sensor.field_of_view_rad or math.tau)
         for name, sensor in config.sensors.items()
     }
-    ego = replace(config.ego, detection_origin_x_m=config.ego.detection_origin_x_m or 0.0)
+    ego = replace(
+        config.ego, detection_origin_x_m=config.ego.detection_origin_x_m or 0.0
+    )
     return replace(result, config=replace(config, ego=ego, sensors=sensors))
 
 
 def is_open(config: Config) -> bool:
     """True if `config` has no sensors, or nothing of where one of them sees: then `assumed` reads the messages."""
-    return not config.sensors or not all(sensor.is_view_given for sensor in config.used_sensors.values())
+    return not config.sensors or not all(
+        sensor.is_view_given for sensor in config.used_sensors.values()
+    )
 
 
 def source_of(messages: Callable[[], Iterable[Message]]) -> InputSource:
@@ -94,13 +115,18 @@ def source_of(messages: Callable[[], Iterable[Message]]) -> InputSource:
     return InputSource(Path(), "messages", lambda: iter(messages()))
 
 
-def _covered(source: InputSource, config: Config, mounts: Mapping[str, Mount]) -> Coverages:
+def _covered(
+    source: InputSource, config: Config, mounts: Mapping[str, Mount]
+) -> Coverages:
     """Coverage of the sensors that are not ignored, of those that only `input` names as well."""
 
     def readable() -> Iterator[Message]:
         with suppress(DataError):  # the replay ends there, too, and reports it
             for message in source.messages():
-                if not (isinstance(message, DetectionList) and message.sensor in config.ignore_sensors):
+                if not (
+                    isinstance(message, DetectionList)
+                    and message.sensor in config.ignore_sensors
+                ):
                     yield message
 
     named = set(config.input.detections) | set(config.input.csv.detections)
@@ -118,9 +144,14 @@ def _sensor(name: str, reason: str, **settings: object) -> Iterator[Assumption]:
 def _recorded(config: Config, carried: Recorded) -> Iterator[Assumption]:
     """Yield what the recording carries where `config` is open."""
     sections: list[tuple[tuple[str, ...], Any, Any]]  # Any: dataclasses
-    sections = [(("ego",), config.ego, carried.ego), (("map",), config.map, carried.map)]
+    sections = [
+        (("ego",), config.ego, carried.ego),
+        (("map",), config.map, carried.map),
+    ]
     for name, sensor in config.sensors.items():
-        sections.append((("sensors", name), sensor, carried.sensors.get(name, RecordedSensor())))
+        sections.append(
+            (("sensors", name), sensor, carried.sensors.get(name, RecordedSensor()))
+        )
     for path, section, given in sections:
         for key, value in plain(given).items():
             if value is not None and getattr(section, key) is None:
@@ -157,8 +188,14 @@ def _noise(config: Config, covered: Coverages) -> Iterator[Assumption]:
     for name, item in covered.items():
         twice = {"range_m", "bearing_rad"} if cartesian <= item.measured else cartesian
         components = item.measured - twice or cartesian
-        usual = ASSUMED_STD | (dict.fromkeys(cartesian, _BOX_STD_M) if item.boxes else {})
-        std = {component: usual[component] for component in MEASURABLE if component in components}
+        usual = ASSUMED_STD | (
+            dict.fromkeys(cartesian, _BOX_STD_M) if item.boxes else {}
+        )
+        std = {
+            component: usual[component]
+            for component in MEASURABLE
+            if component in components
+        }
         yield from _sensor(name, USUAL_BOX if item.boxes else USUAL, std=std)
 
 
@@ -167,18 +204,26 @@ def _lists(config: Config, covered: Coverages) -> Iterator[Assumption]:
     for name, one in covered.items():
         shown = one.persistence
         if not one.scans:
-            yield from _sensor(name, "its lists hold one object, and none is empty", scan=False)
+            yield from _sensor(
+                name, "its lists hold one object, and none is empty", scan=False
+            )
         if one.scans and shown is not None and one.area_m2:
             reason = f"how its detections persist, of {len(shown.lines)} in three lists running"
             clutter_per_m2 = max(shown.clutter_per_list, _LEAST_CLUTTER) / one.area_m2
-            clutter_per_m2 = float(f"{max(clutter_per_m2, shown.near_clutter_per_m2):.2g}")
+            clutter_per_m2 = float(
+                f"{max(clutter_per_m2, shown.near_clutter_per_m2):.2g}"
+            )
             score = shown.score and {
                 "even": float(f"{shown.score.even:.3g}"),
                 "scale": float(f"{shown.score.scale:.3g}"),
             }
             probability = round(shown.detection_probability, 2)
             yield from _sensor(
-                name, reason, detection_probability=probability, clutter_per_m2=clutter_per_m2, score=score
+                name,
+                reason,
+                detection_probability=probability,
+                clutter_per_m2=clutter_per_m2,
+                score=score,
             )
         elif one.density_per_m2 < config.sensors[name].clutter_per_m2:
             density = max(float(f"{one.density_per_m2:.2g}"), SMALLEST)
@@ -192,13 +237,19 @@ def _claim(config: Config, covered: Coverages) -> Iterator[Assumption]:
     objects show it; the hulls that are seen at both ends are twice as long.
     Positions without boxes are of anything: what has not moved by three standard deviations is shore, or moored.
     """
-    apart_m = max((item.disagreement_m or 0.0 for item in covered.values()), default=0.0)
+    apart_m = max(
+        (item.disagreement_m or 0.0 for item in covered.values()), default=0.0
+    )
     if apart_m <= ASSUMED_STD["x_m"]:
         return
     reason = f"sensors disagree by {apart_m:.2g} m on each axis, as on large hulls"
     if config.association == GatedMahalanobis():
-        yield Assumption(("association", "claim_m"), float(round(_HULLS * apart_m)), reason)
-    if config.lifecycle == ExistenceRules() and not any(item.boxes for item in covered.values()):
+        yield Assumption(
+            ("association", "claim_m"), float(round(_HULLS * apart_m)), reason
+        )
+    if config.lifecycle == ExistenceRules() and not any(
+        item.boxes for item in covered.values()
+    ):
         travel_m = float(round(3.0 * apart_m / math.sqrt(2.0)))
         yield Assumption(("lifecycle", "min_travel_m"), travel_m, reason)
 
@@ -214,27 +265,55 @@ def _offsets(config: Config, covered: Coverages) -> Iterator[Assumption]:
         own_m = max(std["x_m"], one.persistence.std_m)
         std_m = float(f"{one.disagreement_m / math.sqrt(2.0):.2g}")
         if (1.0 - _LEAST_SHARE) * std_m**2 >= own_m**2:
-            correlation = {"share": min(round(1.0 - (own_m / std_m) ** 2, 2), _LARGEST_SHARE), "time_s": _OFFSET_S}
+            correlation = {
+                "share": min(round(1.0 - (own_m / std_m) ** 2, 2), _LARGEST_SHARE),
+                "time_s": _OFFSET_S,
+            }
             reason = f"it and another sensor disagree by {one.disagreement_m:.2g} m on each axis, as on large hulls"
-            yield from _sensor(name, reason, std={**std, "x_m": std_m, "y_m": std_m}, correlation=correlation)
+            yield from _sensor(
+                name,
+                reason,
+                std={**std, "x_m": std_m, "y_m": std_m},
+                correlation=correlation,
+            )
 
 
 def _unplaced(config: Config, covered: Coverages) -> Iterator[Assumption]:
     """Yield that sensors of bearings alone are left out beside positions, unless their mount is known."""
-    unplaced = [name for name, item in config.sensors.items() if not item.gives_position and item.mount is None]
+    unplaced = [
+        name
+        for name, item in config.sensors.items()
+        if not item.gives_position and item.mount is None
+    ]
     if unplaced and any(item.gives_position for item in config.sensors.values()):
-        yield Assumption(("ignore_sensors",), [*config.ignore_sensors, *unplaced], _UNPLACED)
+        yield Assumption(
+            ("ignore_sensors",), [*config.ignore_sensors, *unplaced], _UNPLACED
+        )
 
 
 def _windows(config: Config, covered: Coverages) -> Iterator[Assumption]:
     """Yield windows that hold two lists of the slowest sensor that takes part."""
-    rates_hz = [item.rate_hz for name, item in covered.items() if item.rate_hz and name not in config.ignore_sensors]
+    rates_hz = [
+        item.rate_hz
+        for name, item in covered.items()
+        if item.rate_hz and name not in config.ignore_sensors
+    ]
     needed_s = float(math.ceil(2.0 / min(rates_hz, default=math.inf)))
     lag_s = min(needed_s, _LONGEST_S - config.smoother.ring_s)
-    if lag_s > config.smoother.lag_s and config.smoother == SmootherSettings() and config.filter == FilterConfig():
-        reason = _TWO_LISTS if lag_s == needed_s else f"{_TWO_LISTS} take {needed_s:g} s, longer than windows may be"
+    if (
+        lag_s > config.smoother.lag_s
+        and config.smoother == SmootherSettings()
+        and config.filter == FilterConfig()
+    ):
+        reason = (
+            _TWO_LISTS
+            if lag_s == needed_s
+            else f"{_TWO_LISTS} take {needed_s:g} s, longer than windows may be"
+        )
         yield Assumption(("smoother", "lag_s"), lag_s, reason)
-        yield Assumption(("filter", "storage_s"), lag_s + config.smoother.ring_s, reason)
+        yield Assumption(
+            ("filter", "storage_s"), lag_s + config.smoother.ring_s, reason
+        )
 
 
 def _views(config: Config, covered: Coverages) -> Iterator[Assumption]:
@@ -243,7 +322,11 @@ def _views(config: Config, covered: Coverages) -> Iterator[Assumption]:
         if sensor.scan and not sensor.is_view_given and name in covered:
             one = covered[name]
             rate = "" if one.rate_hz is None else f" at {one.rate_hz:.3g} Hz"
-            usable_m = None if sensor.score is not None or one.persistence is None else one.persistence.max_range_m
+            usable_m = (
+                None
+                if sensor.score is not None or one.persistence is None
+                else one.persistence.max_range_m
+            )
             yield from _sensor(
                 name,
                 f"where it detects, of {one.num_detections} detections in {one.num_lists} lists{rate}",
@@ -258,15 +341,34 @@ def _out_of_view(config: Config, covered: Coverages) -> Iterator[Assumption]:
     """Yield the life of a track out of view: with one sensor of positions until its first list without the track,
     else two lists of the slowest sensor, and the longest silence of the one that saw it.
     """
-    periods_s = {name: 1.0 / item.rate_hz for name, item in covered.items() if item.rate_hz}
-    placing = [name for name, item in config.used_sensors.items() if item.gives_position]
+    periods_s = {
+        name: 1.0 / item.rate_hz for name, item in covered.items() if item.rate_hz
+    }
+    placing = [
+        name for name, item in config.used_sensors.items() if item.gives_position
+    ]
     default_s = ExistenceRules.out_of_view_s
     if len(placing) == 1 and placing[0] in periods_s:
-        longest_s, reason = 0.5 * periods_s[placing[0]], "no other sensor gives positions, half its period"
+        longest_s, reason = (
+            0.5 * periods_s[placing[0]],
+            "no other sensor gives positions, half its period",
+        )
     else:
         slow_s = _LISTS_OUT_OF_VIEW * max(periods_s.values(), default=0.0)
-        silent_s = _SILENCES * max((covered[name].silence_s for name in placing if name in covered), default=0.0)
+        silent_s = _SILENCES * max(
+            (covered[name].silence_s for name in placing if name in covered),
+            default=0.0,
+        )
         longest_s = max(default_s, slow_s, silent_s)
-        reason = _TWO_LISTS if longest_s == slow_s else "beyond the longest silence of a sensor"
-    if isinstance(config.lifecycle, ExistenceRules) and config.lifecycle.out_of_view_s == default_s != longest_s:
-        yield Assumption(("lifecycle", "out_of_view_s"), float(f"{longest_s:.2g}"), reason)
+        reason = (
+            _TWO_LISTS
+            if longest_s == slow_s
+            else "beyond the longest silence of a sensor"
+        )
+    if (
+        isinstance(config.lifecycle, ExistenceRules)
+        and config.lifecycle.out_of_view_s == default_s != longest_s
+    ):
+        yield Assumption(
+            ("lifecycle", "out_of_view_s"), float(f"{longest_s:.2g}"), reason
+        )

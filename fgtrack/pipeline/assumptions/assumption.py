@@ -9,21 +9,27 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
 
+from fgtrack.config.settings import Config
+from fgtrack.config.yaml_file import plain, validate, with_value
 from fgtrack.core.errors import printable
-from fgtrack.pipeline.config import Config
-from fgtrack.pipeline.load import plain, validate, with_value
 
 __all__ = ["Assumed", "Assumption", "departures"]
 
 
 def _mounted(value: Mapping[str, float]) -> str:
-    axis = f", axis {math.degrees(value['yaw_rad']):.0f} degrees" if value["yaw_rad"] else ""
+    axis = (
+        f", axis {math.degrees(value['yaw_rad']):.0f} degrees"
+        if value["yaw_rad"]
+        else ""
+    )
     return f"mounted at {value['x_m']:g} m, {value['y_m']:g} m{axis}"
 
 
 #: Settings in words, by the last name of their keys.
 _WORDS: Mapping[str, Callable[[Any], str]] = {  # Any: of the key
-    "std": lambda std: f"standard deviations {', '.join(f'{name} {one:g}' for name, one in std.items())}",
+    "std": lambda std: (
+        f"standard deviations {', '.join(f'{name} {one:g}' for name, one in std.items())}"
+    ),
     "correlation": "{0[share]:.0%} of the variance lasts for some {0[time_s]:g} s".format,
     "detection_probability": "detection probability {:g}".format,
     "clutter_per_m2": "clutter {:g} per m2".format,
@@ -35,7 +41,11 @@ _WORDS: Mapping[str, Callable[[Any], str]] = {  # Any: of the key
     "claim_m": "nothing begins within {:g} m of a track".format,
     "min_travel_m": "nothing is confirmed that has not moved by {:g} m".format,
     "ignore_sensors": lambda names: f"{', '.join(names)} left out",
-    "field_of_view_rad": lambda rad: "sees all around" if rad >= math.tau else f"sees {math.degrees(rad):.0f} degrees",
+    "field_of_view_rad": lambda rad: (
+        "sees all around"
+        if rad >= math.tau
+        else f"sees {math.degrees(rad):.0f} degrees"
+    ),
     "view_range_m": "up to {:g} m".format,
     "max_range_m": "used up to {:g} m, beyond which clutter outweighs objects".format,
     "max_range_behind_m": "behind it up to {:g} m".format,
@@ -82,10 +92,17 @@ class Assumed:
         kept = [item for item in self.assumptions if item.path not in paths]
         return Assumed(validate(Config, raw, "assumed"), (*kept, *new)) if new else self
 
-    def to_yaml(self, head: Iterable[str] = (), comments: Iterable[tuple[Sequence[str], str]] = ()) -> str:
+    def to_yaml(
+        self,
+        head: Iterable[str] = (),
+        comments: Iterable[tuple[Sequence[str], str]] = (),
+    ) -> str:
         """YAML, with comments and `head`, of all settings that differ from defaults, assumed ones with a reason."""
         tree = _commented(departures(self.config))
-        for path, reason in [*((one.path, f"assumed: {one.reason}") for one in self.assumptions), *comments]:
+        for path, reason in [
+            *((one.path, f"assumed: {one.reason}") for one in self.assumptions),
+            *comments,
+        ]:
             inner = tree
             for name in path[:-1]:
                 inner = inner.get(name, {})
@@ -94,7 +111,9 @@ class Assumed:
         text, yaml = StringIO(), YAML()
         yaml.width = 4096
         yaml.dump(tree, text)
-        return "\n".join([*(f"# {printable(line)}".rstrip() for line in head), text.getvalue()])
+        return "\n".join(
+            [*(f"# {printable(line)}".rstrip() for line in head), text.getvalue()]
+        )
 
     def lines(self) -> list[str]:
         """Return the assumptions in words: a line for each sensor, and one for the rest."""
@@ -104,7 +123,9 @@ class Assumed:
             result.setdefault(about, {}).setdefault(item.reason, []).append(item.text)
         lines = []
         for about, reasons in result.items():
-            parts = [f"{', '.join(texts)} ({reason})" for reason, texts in reasons.items()]
+            parts = [
+                f"{', '.join(texts)} ({reason})" for reason, texts in reasons.items()
+            ]
             lines.append(f"assumed, {about}: {'; '.join(parts)}")
         return lines
 
@@ -117,9 +138,21 @@ def departures(value: object) -> Any:  # Any: plain values
         return plain(value)
     given = {entry.name: getattr(value, entry.name) for entry in fields(value)}
     defaults = {entry.name: entry.default for entry in fields(value)}
-    defaults |= {entry.name: entry.default_factory() for entry in fields(value) if entry.default_factory is not MISSING}
-    return {name: departures(item) for name, item in given.items() if name == "kind" or item != defaults[name]}
+    defaults |= {
+        entry.name: entry.default_factory()
+        for entry in fields(value)
+        if entry.default_factory is not MISSING
+    }
+    return {
+        name: departures(item)
+        for name, item in given.items()
+        if name == "kind" or item != defaults[name]
+    }
 
 
 def _commented(value: Any) -> Any:  # Any: plain values
-    return CommentedMap((name, _commented(item)) for name, item in value.items()) if isinstance(value, dict) else value
+    return (
+        CommentedMap((name, _commented(item)) for name, item in value.items())
+        if isinstance(value, dict)
+        else value
+    )

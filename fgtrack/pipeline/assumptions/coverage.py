@@ -12,9 +12,22 @@ import numpy as np
 
 from fgtrack.core.geometry import wrap_angle, wrap_angles
 from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
-from fgtrack.core.types import BoolArray, Detection, DetectionList, EgoState, FloatArray, IntArray, Message
+from fgtrack.core.types import (
+    BoolArray,
+    Detection,
+    DetectionList,
+    EgoState,
+    FloatArray,
+    IntArray,
+    Message,
+)
 from fgtrack.models.sensors import Mount
-from fgtrack.pipeline.assumptions.persistence import Lists, Persistence, disagreement_m, persistence
+from fgtrack.pipeline.assumptions.persistence import (
+    Lists,
+    Persistence,
+    disagreement_m,
+    persistence,
+)
 
 __all__ = ["Coverage", "coverages"]
 
@@ -72,7 +85,9 @@ class Coverage:
     """Up to where it detects; None where it measures no range, or too seldom."""
 
 
-def coverages(messages: Iterable[Message], mounts: Mapping[str, Mount] | None = None) -> dict[str, Coverage]:
+def coverages(
+    messages: Iterable[Message], mounts: Mapping[str, Mount] | None = None
+) -> dict[str, Coverage]:
     """Coverage of each sensor in `messages`, by name; `mounts` are the known ones.
     - Only a detection that comes back counts: another list of the sensor has one close by and soon, as of an object and
       seldom of clutter. With fewer than 100 of them nothing is estimated.
@@ -87,7 +102,14 @@ def coverages(messages: Iterable[Message], mounts: Mapping[str, Mount] | None = 
     for message in messages:
         first_ns = message.receipt_ns if first_ns is None else first_ns
         if isinstance(message, EgoState):
-            ego.extend(((message.stamp_ns - first_ns) / NS_PER_S, message.x_m, message.y_m, message.yaw_rad))
+            ego.extend(
+                (
+                    (message.stamp_ns - first_ns) / NS_PER_S,
+                    message.x_m,
+                    message.y_m,
+                    message.yaw_rad,
+                )
+            )
         elif isinstance(message, DetectionList):
             received[message.sensor].add(message)
     path = np.array(ego).reshape(-1, 4)
@@ -95,12 +117,23 @@ def coverages(messages: Iterable[Message], mounts: Mapping[str, Mount] | None = 
     path = path[np.argsort(path[:, 0], kind="stable")]
     path[:, 3] = np.unwrap(path[:, 3])
     result = {
-        name: item.coverage(first_ns or 0, path, (mounts or {}).get(name)) for name, item in sorted(received.items())
+        name: item.coverage(first_ns or 0, path, (mounts or {}).get(name))
+        for name, item in sorted(received.items())
     }
-    measured = {name: item.persistence for name, item in result.items() if item.persistence is not None}
+    measured = {
+        name: item.persistence
+        for name, item in result.items()
+        if item.persistence is not None
+    }
     for name, own in measured.items():
-        apart_m = [disagreement_m(item, own.lists) for other, item in measured.items() if other != name]
-        result[name] = replace(result[name], disagreement_m=min(filter(None, apart_m), default=None))
+        apart_m = [
+            disagreement_m(item, own.lists)
+            for other, item in measured.items()
+            if other != name
+        ]
+        result[name] = replace(
+            result[name], disagreement_m=min(filter(None, apart_m), default=None)
+        )
     return result
 
 
@@ -123,21 +156,34 @@ class _Detections:
             self.frames.add(message.frame)
         for detection in message.objects:
             self.measured.update(detection.measured)
-            self.boxes |= detection.length_m is not None and detection.width_m is not None
+            self.boxes |= (
+                detection.length_m is not None and detection.width_m is not None
+            )
             x_m, y_m, has_range = _position(detection)
             if math.isfinite(x_m) and math.isfinite(y_m):
                 score = math.nan if detection.score is None else detection.score
                 self.rows.extend((index, x_m, y_m, has_range, score))
 
-    def coverage(self, first_ns: int, path: FloatArray, mount: Mount | None) -> Coverage:
+    def coverage(
+        self, first_ns: int, path: FloatArray, mount: Mount | None
+    ) -> Coverage:
         """Return the coverage, with the ego's `path`: seconds since `first_ns`, x, y and yaw, shape (n, 4)."""
         stamps_ns, receipts_ns, counts = np.array(self.lists).reshape(-1, 3).T
-        stamps_s, receipts_s = (stamps_ns - first_ns) / NS_PER_S, (receipts_ns - first_ns) / NS_PER_S
+        stamps_s, receipts_s = (
+            (stamps_ns - first_ns) / NS_PER_S,
+            (receipts_ns - first_ns) / NS_PER_S,
+        )
         rows = np.array(self.rows).reshape(-1, 5)
         ranged = rows[rows[:, 3] > 0.0]
-        begins = np.searchsorted(ranged[:, 0], np.arange(len(counts) + 1))  # rows stand list by list
+        begins = np.searchsorted(
+            ranged[:, 0], np.arange(len(counts) + 1)
+        )  # rows stand list by list
         parts = [slice(*ends) for ends in pairwise(begins)]
-        num_lists, gaps_s, span_s = len(counts), np.diff(np.sort(stamps_s)), float(np.ptp(receipts_s))
+        num_lists, gaps_s, span_s = (
+            len(counts),
+            np.diff(np.sort(stamps_s)),
+            float(np.ptp(receipts_s)),
+        )
         sides_m = np.ptp(ranged[:, 1:3], axis=0) if len(ranged) else np.zeros(2)
         enough, has_area = num_lists >= _FEWEST_LISTS, bool(sides_m.all())
         singles = np.count_nonzero(counts == 1)
@@ -148,9 +194,15 @@ class _Detections:
             self.boxes,
             rate_hz=(num_lists - 1) / span_s if span_s > 0.0 else None,
             silence_s=float(gaps_s[gaps_s <= _OUTAGE_S].max(initial=0.0)),
-            scans=not enough or not counts.all() or bool(singles < _REPORTS_SHARE * num_lists),
-            density_per_m2=float(counts.sum() / num_lists / np.prod(sides_m)) if enough and has_area else math.inf,
-            revisit_s=_revisit_s(stamps_ns.tolist(), [ranged[part, 1:3] for part in parts]),
+            scans=not enough
+            or not counts.all()
+            or bool(singles < _REPORTS_SHARE * num_lists),
+            density_per_m2=float(counts.sum() / num_lists / np.prod(sides_m))
+            if enough and has_area
+            else math.inf,
+            revisit_s=_revisit_s(
+                stamps_ns.tolist(), [ranged[part, 1:3] for part in parts]
+            ),
         )
         rows, in_map = ranged if len(ranged) else rows, "map" in self.frames
         if len(self.frames) != 1 or len(rows) < _FEWEST or (in_map and not len(path)):
@@ -158,38 +210,71 @@ class _Detections:
         numbers, seen_m = rows[:, 0].astype(np.int64), rows[:, 1:3]
         placed_m = seen_m
         if len(path):
-            x_m, y_m, yaw_rad = (np.interp(stamps_s[numbers], path[:, 0], column) for column in path[:, 1:].T)
+            x_m, y_m, yaw_rad = (
+                np.interp(stamps_s[numbers], path[:, 0], column)
+                for column in path[:, 1:].T
+            )
             if not in_map:
                 placed_m = _turned(seen_m, yaw_rad) + np.column_stack([x_m, y_m])
             elif len(ranged):
                 seen_m = _turned(seen_m - np.column_stack([x_m, y_m]), -yaw_rad)
         if mount is not None and "sensor" not in self.frames:
-            seen_m = seen_m - np.array([mount.x_m, mount.y_m]) if len(ranged) else seen_m
+            seen_m = (
+                seen_m - np.array([mount.x_m, mount.y_m]) if len(ranged) else seen_m
+            )
             seen_m = _turned(seen_m, np.full(len(seen_m), -mount.yaw_rad))
         if len(ranged):
-            extent_m = np.quantile(seen_m, 1.0 - _OUTSIDE, axis=0) - np.quantile(seen_m, _OUTSIDE, axis=0)
+            extent_m = np.quantile(seen_m, 1.0 - _OUTSIDE, axis=0) - np.quantile(
+                seen_m, _OUTSIDE, axis=0
+            )
             ranges_m = np.hypot(*seen_m.T)
             reach_m = float(np.quantile(ranges_m, 1.0 - _OUTSIDE))
-            area_m2 = max(float(np.prod(extent_m)), 0.5 * _NARROWEST_RAD * reach_m**2)  # an object may stand
+            area_m2 = max(
+                float(np.prod(extent_m)), 0.5 * _NARROWEST_RAD * reach_m**2
+            )  # an object may stand
             order = np.argsort(stamps_s, kind="stable")
-            columns = ([column[parts[k]] for k in order] for column in (placed_m, rows[:, 4], ranges_m))
-            result = replace(result, persistence=persistence(Lists(stamps_s[order], *columns)), area_m2=area_m2)
+            columns = (
+                [column[parts[k]] for k in order]
+                for column in (placed_m, rows[:, 4], ranges_m)
+            )
+            result = replace(
+                result,
+                persistence=persistence(Lists(stamps_s[order], *columns)),
+                area_m2=area_m2,
+            )
         period_s = float(np.median(np.diff(receipts_s))) if num_lists > 1 else 0.0
         cell_s = max(_CELL_S, _CELL_PERIODS * period_s)
         cell = _CELL_M + _CELL_MPS * cell_s if len(ranged) else _CELL_BEARING
-        seen_m = seen_m[_comes_back(np.column_stack([seen_m / cell, receipts_s[numbers] / cell_s]), numbers)]
+        seen_m = seen_m[
+            _comes_back(
+                np.column_stack([seen_m / cell, receipts_s[numbers] / cell_s]), numbers
+            )
+        ]
         if len(seen_m) < _FEWEST:
             return result
-        sector = _sector(np.arctan2(seen_m[:, 1], seen_m[:, 0]), "sensor" in self.frames or mount is not None)
+        sector = _sector(
+            np.arctan2(seen_m[:, 1], seen_m[:, 0]),
+            "sensor" in self.frames or mount is not None,
+        )
         axis_rad, full_rad = sector or (0.0, None)
-        range_m = _RANGE_FACTOR * float(np.quantile(np.hypot(*seen_m.T), 1.0 - _OUTSIDE))
+        range_m = _RANGE_FACTOR * float(
+            np.quantile(np.hypot(*seen_m.T), 1.0 - _OUTSIDE)
+        )
         limit_m = float(round(range_m)) if len(ranged) else None
-        return replace(result, axis_rad=axis_rad, field_of_view_rad=full_rad, range_m=limit_m)
+        return replace(
+            result, axis_rad=axis_rad, field_of_view_rad=full_rad, range_m=limit_m
+        )
 
 
-def _revisit_s(stamps_ns: Sequence[int], points_m: Sequence[FloatArray]) -> float | None:
+def _revisit_s(
+    stamps_ns: Sequence[int], points_m: Sequence[FloatArray]
+) -> float | None:
     """Median time since the last list with a detection that could be the same object, in lists in order of receipt."""
-    lists = [(stamp_ns, points) for stamp_ns, points in zip(stamps_ns, points_m, strict=True) if len(points)]
+    lists = [
+        (stamp_ns, points)
+        for stamp_ns, points in zip(stamps_ns, points_m, strict=True)
+        if len(points)
+    ]
     result, first = list[float](), 0
     for k, (stamp_ns, points) in enumerate(lists):
         if len(result) >= _MOST_REVISITS:
@@ -200,7 +285,10 @@ def _revisit_s(stamps_ns: Sequence[int], points_m: Sequence[FloatArray]) -> floa
             for earlier_ns, earlier_m in reversed(lists[first:k]):
                 elapsed_s = seconds(stamp_ns - earlier_ns)
                 reach_m = _FASTEST_MPS * elapsed_s + _POSITION_M
-                if elapsed_s > 0.0 and (np.abs(earlier_m - point_m).max(axis=1) <= reach_m).any():
+                if (
+                    elapsed_s > 0.0
+                    and (np.abs(earlier_m - point_m).max(axis=1) <= reach_m).any()
+                ):
                     result.append(elapsed_s)
                     break
     return median(result) if len(result) >= _FEWEST_REVISITS else None
@@ -228,7 +316,9 @@ def _comes_back(points: FloatArray, numbers: IntArray) -> BoolArray:
     """True for `points`, shape (n, 3), in a cell of one of two shifted grids with one of another list of `numbers`."""
     result = np.zeros(len(points), dtype=bool)
     for shift in (0.0, 0.5):
-        cells = np.unique(np.floor(points + shift), axis=0, return_inverse=True)[1].ravel()
+        cells = np.unique(np.floor(points + shift), axis=0, return_inverse=True)[
+            1
+        ].ravel()
         of_lists = np.unique(np.column_stack([cells, numbers]), axis=0)[:, 0]
         result |= np.bincount(of_lists)[cells] > 1
     return result
@@ -244,7 +334,9 @@ def _sector(bearings_rad: FloatArray, axis_known: bool) -> tuple[float, float] |
     if gaps_rad[widest] < math.tau - _WIDEST_RAD:
         return None
     blind_rad = ends[widest : widest + skip + 1]  # its edges, and the detections in it
-    apart = np.flatnonzero(np.diff(blind_rad) > min(_LINK_RAD, float(gaps_rad[widest]) / (3.0 * skip)))
+    apart = np.flatnonzero(
+        np.diff(blind_rad) > min(_LINK_RAD, float(gaps_rad[widest]) / (3.0 * skip))
+    )
     left_rad, right_rad = float(blind_rad[apart[0]]), float(blind_rad[apart[-1] + 1])
     half_rad = 0.5 * (math.tau - (right_rad - left_rad))
     middle_rad = wrap_angle(right_rad + half_rad)

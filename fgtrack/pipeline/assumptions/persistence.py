@@ -78,7 +78,9 @@ def disagreement_m(one: Persistence, other: Lists) -> float | None:
     for stamp_s, *state in one.lines.tolist():
         k = int(np.argmin(np.abs(other.stamps_s - stamp_s)))
         at_m = np.array(state[:2])
-        points_m = other.points_m[k] - (other.stamps_s[k] - stamp_s) * np.array(state[2:])
+        points_m = other.points_m[k] - (other.stamps_s[k] - stamp_s) * np.array(
+            state[2:]
+        )
         if not len(points_m):
             continue
         nearest_m = points_m[np.argmin(np.hypot(*(points_m - at_m).T))]
@@ -104,13 +106,18 @@ def persistence(lists: Lists) -> Persistence | None:
     misfits, scores, ranges_m = list[float](), list[float](), list[float]()
     lines: list[tuple[int, FloatArray, FloatArray]] = []
     for k in centres:
-        before_s, after_s = float(stamps_s[k] - stamps_s[k - 1]), float(stamps_s[k + 1] - stamps_s[k])
+        before_s, after_s = (
+            float(stamps_s[k] - stamps_s[k - 1]),
+            float(stamps_s[k + 1] - stamps_s[k]),
+        )
         if min(before_s, after_s) <= 0.0:
             continue
         scores += lists.scores[k].tolist()
         ranges_m += lists.ranges_m[k].tolist()
         for centre_m in points_m[k]:
-            misfit_m, end_m, velocity_mps = _best(centre_m, trees[k - 1], trees[k + 1], before_s, after_s)
+            misfit_m, end_m, velocity_mps = _best(
+                centre_m, trees[k - 1], trees[k + 1], before_s, after_s
+            )
             misfits.append(misfit_m)
             lines.append((k, end_m, velocity_mps))
     misfit = np.array(misfits)
@@ -122,25 +129,52 @@ def persistence(lists: Lists) -> Persistence | None:
     hits, of_object = 0, np.zeros(len(misfit), dtype=bool)
     for row in np.flatnonzero(in_triple).tolist():
         k, end_m, velocity_mps = lines[row]
-        ahead_m = [end_m + velocity_mps * float(stamps_s[k + n] - stamps_s[k + 1]) for n in (2, 3)]
-        seen = [bool(trees[k + n].query(at_m)[0] <= (n - 1) * reach_m) for n, at_m in enumerate(ahead_m, start=2)]
+        ahead_m = [
+            end_m + velocity_mps * float(stamps_s[k + n] - stamps_s[k + 1])
+            for n in (2, 3)
+        ]
+        seen = [
+            bool(trees[k + n].query(at_m)[0] <= (n - 1) * reach_m)
+            for n, at_m in enumerate(ahead_m, start=2)
+        ]
         hits += sum(seen)
         of_object[row] = all(seen)
     share = (hits + 1) / (2 * num_triples + 2)
     probability = float(np.clip(share, *_PROBABILITY))
-    of_objects = min(num_triples / probability**2, float(len(misfit)))  # the others' neighbours were missed
-    of_clutter, model = len(misfit) - of_objects, _score(np.array(scores), of_object, ~in_triple)
+    of_objects = min(
+        num_triples / probability**2, float(len(misfit))
+    )  # the others' neighbours were missed
+    of_clutter, model = (
+        len(misfit) - of_objects,
+        _score(np.array(scores), of_object, ~in_triple),
+    )
     if model is not None:
-        near = _near_clutter_per_m2(trees, lists.scores, model, len(misfit) / max(of_objects, 1.0) - 1.0)
+        near = _near_clutter_per_m2(
+            trees, lists.scores, model, len(misfit) / max(of_objects, 1.0) - 1.0
+        )
     else:
-        near = _crowding_per_m2(points_m, np.array([k for k, *_ in lines]), ~in_triple, of_clutter)
-    max_range_m = _max_range_m(np.array(ranges_m)[in_triple], of_object[in_triple] / probability**2)
-    ends = [(stamps_s[k + 1], *end_m, *velocity_mps) for k, end_m, velocity_mps in compress(lines, in_triple)]
+        near = _crowding_per_m2(
+            points_m, np.array([k for k, *_ in lines]), ~in_triple, of_clutter
+        )
+    max_range_m = _max_range_m(
+        np.array(ranges_m)[in_triple], of_object[in_triple] / probability**2
+    )
+    ends = [
+        (stamps_s[k + 1], *end_m, *velocity_mps)
+        for k, end_m, velocity_mps in compress(lines, in_triple)
+    ]
     clutter = of_clutter / len(centres)
-    return Persistence(probability, clutter, near, model, max_range_m, np.array(ends), scale, lists)
+    return Persistence(
+        probability, clutter, near, model, max_range_m, np.array(ends), scale, lists
+    )
 
 
-def _crowding_per_m2(points_m: Sequence[FloatArray], numbers: IntArray, loose: BoolArray, of_clutter: float) -> float:
+def _crowding_per_m2(
+    points_m: Sequence[FloatArray],
+    numbers: IntArray,
+    loose: BoolArray,
+    of_clutter: float,
+) -> float:
     """Density of clutter around clutter in its list: `of_clutter` of the `loose` detections of the lists `numbers`."""
     from scipy.spatial import cKDTree
 
@@ -148,7 +182,9 @@ def _crowding_per_m2(points_m: Sequence[FloatArray], numbers: IntArray, loose: B
     for k in np.unique(numbers[loose]).tolist():
         tree = cKDTree(points_m[k][loose[numbers == k]])
         pairs += int(tree.count_neighbors(tree, _CROWD_M)) - tree.n
-    return min(of_clutter / num_loose, 1.0) * pairs / (num_loose * math.pi * _CROWD_M**2)
+    return (
+        min(of_clutter / num_loose, 1.0) * pairs / (num_loose * math.pi * _CROWD_M**2)
+    )
 
 
 def _max_range_m(ranges_m: FloatArray, objects: FloatArray) -> float | None:
@@ -157,12 +193,21 @@ def _max_range_m(ranges_m: FloatArray, objects: FloatArray) -> float | None:
     order = np.argsort(ranges_m[known])
     surplus = np.cumsum(objects[known][order] - 0.5)
     best = int(np.argmax(surplus)) if len(surplus) else 0
-    return float(ranges_m[known][order][best]) if len(surplus) - best > _FEWEST_FAR else None
+    return (
+        float(ranges_m[known][order][best])
+        if len(surplus) - best > _FEWEST_FAR
+        else None
+    )
 
 
-def _near_clutter_per_m2(trees: "Sequence[cKDTree]", scores: Sequence[FloatArray], model: Score, odds: float) -> float:
+def _near_clutter_per_m2(
+    trees: "Sequence[cKDTree]", scores: Sequence[FloatArray], model: Score, odds: float
+) -> float:
     """Density of clutter of the next list around that of each; before their scores the odds for clutter are `odds`."""
-    ratios = [np.exp((np.nan_to_num(item, nan=model.even) - model.even) / model.scale) for item in scores]
+    ratios = [
+        np.exp((np.nan_to_num(item, nan=model.even) - model.even) / model.scale)
+        for item in scores
+    ]
     of_clutter = [odds / (odds + ratio) for ratio in ratios]
     total, together = sum(float(item.sum()) for item in of_clutter[:-1]), 0.0
     for (tree, own), (after, others) in pairwise(zip(trees, of_clutter, strict=True)):
@@ -172,7 +217,11 @@ def _near_clutter_per_m2(trees: "Sequence[cKDTree]", scores: Sequence[FloatArray
 
 
 def _best(
-    centre_m: FloatArray, before: "cKDTree", after: "cKDTree", before_s: float, after_s: float
+    centre_m: FloatArray,
+    before: "cKDTree",
+    after: "cKDTree",
+    before_s: float,
+    after_s: float,
 ) -> tuple[float, FloatArray, FloatArray]:
     """Misfit (infinite without one) of the straightest triple about a detection; position and velocity at its end."""
     near = before.query_ball_point(centre_m, _FASTEST_MPS * before_s + _LARGEST_ERROR_M)
@@ -184,7 +233,11 @@ def _best(
     best = int(np.argmin(distances_m))
     end_m = np.asarray(after.data)[ends[best]]
     velocity_mps = (end_m - firsts_m[best]) / (before_s + after_s)
-    return float(distances_m[best]) / math.sqrt(1.0 + ratio**2 + (1.0 + ratio) ** 2), end_m, velocity_mps
+    return (
+        float(distances_m[best]) / math.sqrt(1.0 + ratio**2 + (1.0 + ratio) ** 2),
+        end_m,
+        velocity_mps,
+    )
 
 
 def _scale(misfits: FloatArray, start: float = 0.5) -> float:
@@ -193,11 +246,15 @@ def _scale(misfits: FloatArray, start: float = 0.5) -> float:
         return 0.0
     scale = float(np.quantile(misfits, start)) / math.sqrt(-2.0 * math.log(1.0 - start))
     for _ in range(30):
-        scale = float(np.median(misfits[misfits <= _CORE * scale])) / math.sqrt(2.0 * math.log(2.0))
+        scale = float(np.median(misfits[misfits <= _CORE * scale])) / math.sqrt(
+            2.0 * math.log(2.0)
+        )
     return scale
 
 
-def _score(scores: FloatArray, of_object: BoolArray, of_clutter: BoolArray) -> Score | None:
+def _score(
+    scores: FloatArray, of_object: BoolArray, of_clutter: BoolArray
+) -> Score | None:
     """Logistic fit to the scores of detections of objects and of clutter, less the odds of their numbers."""
     from scipy.optimize import minimize
     from scipy.special import expit, log_expit
@@ -212,7 +269,9 @@ def _score(scores: FloatArray, of_object: BoolArray, of_clutter: BoolArray) -> S
     def cost(p: FloatArray) -> tuple[float, FloatArray]:
         margin = sign * (p[0] + p[1] * z)
         slope = -sign * expit(-margin)
-        return -float(log_expit(margin).sum()), np.array([slope.sum(), (slope * z).sum()])
+        return -float(log_expit(margin).sum()), np.array(
+            [slope.sum(), (slope * z).sum()]
+        )
 
     intercept, slope = minimize(cost, np.zeros(2), jac=True, method="BFGS").x
     if slope <= 0.0:

@@ -17,13 +17,21 @@ from fgtrack.estimation.smoothing.terms import MeasurementFactor, linearised, wh
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.robust import width
 
-_Loss = mEstimator.Huber | mEstimator.Cauchy | mEstimator.Tukey | mEstimator.GemanMcClure | mEstimator.DCS
+_Loss = (
+    mEstimator.Huber
+    | mEstimator.Cauchy
+    | mEstimator.Tukey
+    | mEstimator.GemanMcClure
+    | mEstimator.DCS
+)
 _LOSSES: Mapping[str, Callable[[float], _Loss]] = {
     "huber": mEstimator.Huber.Create,
     "cauchy": mEstimator.Cauchy.Create,
     "tukey": mEstimator.Tukey.Create,
     "geman_mcclure": mEstimator.GemanMcClure.Create,
-    "dcs": lambda width: mEstimator.DCS.Create(width * width),  # gtsam's is in squared standard deviations
+    "dcs": lambda width: mEstimator.DCS.Create(
+        width * width
+    ),  # gtsam's is in squared standard deviations
 }
 
 
@@ -34,7 +42,9 @@ class BatchSolver(IncrementalSolver):
 
     is_damped: ClassVar[bool] = True
 
-    def optimise(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+    def optimise(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
+    ) -> gtsam.Values:
         """Return the values near `values` with the least error."""
         params = gtsam.LevenbergMarquardtParams()
         params.setLinearSolverType("MULTIFRONTAL_QR")
@@ -45,18 +55,39 @@ class BatchSolver(IncrementalSolver):
     def _update(self, tracks: IntArray, starts: IntArray) -> None:
         nodes, n = self.nodes, self.motion.dim
         for track in tracks.tolist():
-            graph, values, numbers = (gtsam.NonlinearFactorGraph(), gtsam.Values(), nodes.window(track).tolist())
+            graph, values, numbers = (
+                gtsam.NonlinearFactorGraph(),
+                gtsam.Values(),
+                nodes.window(track).tolist(),
+            )
             _, last = self._graphs.get(track, (None, values))
             prior = nodes.predicted[numbers[0]]
             noise = gtsam.noiseModel.Gaussian.Covariance(prior[:, :n])
-            graph.add(gtsam.PriorFactorVector(numbers[0], nodes.origin[numbers[0]] + prior[:, n], noise))
+            graph.add(
+                gtsam.PriorFactorVector(
+                    numbers[0], nodes.origin[numbers[0]] + prior[:, n], noise
+                )
+            )
             spans_ns = np.diff(nodes.window_stamps_ns(track)).tolist()
             for left, right, dt_ns in zip(numbers, numbers[1:], spans_ns, strict=False):
-                graph.add(motion_factor(self.motion, left, right, seconds(dt_ns), nodes.Q[left]))
+                graph.add(
+                    motion_factor(
+                        self.motion, left, right, seconds(dt_ns), nodes.Q[left]
+                    )
+                )
             for number in numbers:
-                values.insert(number, last.atVector(number) if last.exists(number) else nodes.origin[number])
+                values.insert(
+                    number,
+                    last.atVector(number)
+                    if last.exists(number)
+                    else nodes.origin[number],
+                )
                 for factor in nodes.factors(number):
-                    graph.add(measurement_factor(number, factor, nodes.origin[number], self.motion))
+                    graph.add(
+                        measurement_factor(
+                            number, factor, nodes.origin[number], self.motion
+                        )
+                    )
             values = self.optimise(graph, values)
             self._graphs[track] = graph, values
             for number in numbers:
@@ -74,10 +105,16 @@ class BatchSolver(IncrementalSolver):
         return np.asarray(root @ root.T)
 
 
-def motion_factor(motion: MotionModel, left: int, right: int, dt_s: float, Q: FloatArray) -> gtsam.NonlinearFactor:
+def motion_factor(
+    motion: MotionModel, left: int, right: int, dt_s: float, Q: FloatArray
+) -> gtsam.NonlinearFactor:
     """Return the factor of the motion from the state at key `left` to that at `right`, with noise Q (n, n)."""
 
-    def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
+    def error(
+        this: gtsam.CustomFactor,
+        values: gtsam.Values,
+        jacobians: list[FloatArray] | None,
+    ) -> FloatArray:
         mean, F, _ = motion.transition(values.atVector(left), dt_s)
         if jacobians is not None:
             jacobians[0], jacobians[1] = -F, identity(motion.dim)
@@ -96,10 +133,16 @@ def measurement_factor(
     if not measurement.is_nonlinear:
         rows, at = whitened(factor, origin, motion), gtsam.Values()
         at.insert(key, origin)
-        linear = gtsam.JacobianFactor(key, rows[:, :-1], rows[:, -1], gtsam.noiseModel.Unit.Create(len(rows)))
+        linear = gtsam.JacobianFactor(
+            key, rows[:, :-1], rows[:, -1], gtsam.noiseModel.Unit.Create(len(rows))
+        )
         return gtsam.LinearContainerFactor(linear, at)
 
-    def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None) -> FloatArray:
+    def error(
+        this: gtsam.CustomFactor,
+        values: gtsam.Values,
+        jacobians: list[FloatArray] | None,
+    ) -> FloatArray:
         y, H = linearised(factor, values.atVector(key), motion)
         if jacobians is not None:
             jacobians[0] = H
@@ -107,7 +150,9 @@ def measurement_factor(
 
     noise, loss = _gaussian(inverse_root(measurement.R)), measurement.loss
     if loss is not None:
-        noise = gtsam.noiseModel.Robust.Create(_LOSSES[loss.kind](width(loss, len(measurement.R))), noise)
+        noise = gtsam.noiseModel.Robust.Create(
+            _LOSSES[loss.kind](width(loss, len(measurement.R))), noise
+        )
     return gtsam.CustomFactor(noise, [key], error)
 
 

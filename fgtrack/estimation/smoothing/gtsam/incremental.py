@@ -44,7 +44,12 @@ class _Graph:
         self._newest = -1
 
     def solve(
-        self, numbers: Sequence[int], num_leaving: int, values: gtsam.Values, first: int, changed: _Changed
+        self,
+        numbers: Sequence[int],
+        num_leaving: int,
+        values: gtsam.Values,
+        first: int,
+        changed: _Changed,
     ) -> FloatArray:
         """Return the states of the nodes `numbers`, one after the other, without the first ones, which are leaving.
         The factors that have `changed` replace those of the same nodes, from index `first` on; `values` are those of
@@ -53,12 +58,16 @@ class _Graph:
         factors, order = gtsam.GaussianFactorGraph(), gtsam.KeyGroupMap()
         for factor in changed.values():
             factors.push_back(factor)
-        if first and numbers[first] == self._newest:  # in one clique with the node before it
+        if (
+            first and numbers[first] == self._newest
+        ):  # in one clique with the node before it
             first -= 1
         for group, number in enumerate(numbers[first:]):
             order.insert2(number, group)
         removed = [slot for slot in map(self.slots.get, changed) if slot is not None]
-        graph = gtsam.LinearContainerFactor.ConvertLinearGraph(factors)  # in half the time of one by one
+        graph = gtsam.LinearContainerFactor.ConvertLinearGraph(
+            factors
+        )  # in half the time of one by one
         added = self.isam.update(graph, values, removed, order).getNewFactorsIndices()
         self.slots.update(zip(changed, added, strict=False))
         self._newest = numbers[-1]
@@ -88,22 +97,39 @@ class IncrementalSolver(Solver):
         self._graphs.pop(track, None)
         self._read.clear()
 
-    def smoothed(self, tracks: IntArray, indices: IntArray, after_s: FloatArray) -> FloatArray:
+    def smoothed(
+        self, tracks: IntArray, indices: IntArray, after_s: FloatArray
+    ) -> FloatArray:
         """See `Solver.smoothed`; inside the windows from the graphs."""
         nodes, n = self.nodes, self.motion.dim
-        rows = zip(tracks.tolist(), indices.tolist(), nodes.first[tracks].tolist(), after_s.tolist(), strict=True)
+        rows = zip(
+            tracks.tolist(),
+            indices.tolist(),
+            nodes.first[tracks].tolist(),
+            after_s.tolist(),
+            strict=True,
+        )
         for track, index, first, time_s in rows:
             if track not in self._graphs:  # nothing was fused: there is one node
                 continue
             last = max(index, first)
-            numbers = tuple(nodes.numbers[track, last - (time_s > 0.0 and index > first) : last + 1].tolist())
+            numbers = tuple(
+                nodes.numbers[
+                    track, last - (time_s > 0.0 and index > first) : last + 1
+                ].tolist()
+            )
             if numbers in self._read:
                 continue
             P, (left, *right) = self._covariance(track, *numbers), numbers
             self._read.add(numbers)
             for number in right:
-                A = psd_solve(P[n:, n:], P[n:, :n]).T  # the state on the left, given this one
-                nodes.backs[left, :n, :n], nodes.backs[left, :n, n] = (A, nodes.step[left] - A.dot(nodes.step[number]))
+                A = psd_solve(
+                    P[n:, n:], P[n:, :n]
+                ).T  # the state on the left, given this one
+                nodes.backs[left, :n, :n], nodes.backs[left, :n, n] = (
+                    A,
+                    nodes.step[left] - A.dot(nodes.step[number]),
+                )
                 nodes.C[left] = symmetrise(P[:n, :n] - A.dot(P[n:, :n]))
             nodes.P[right[0] if right else left] = P[-n:, -n:]
         return super().smoothed(tracks, indices, after_s)
@@ -115,7 +141,12 @@ class IncrementalSolver(Solver):
         first = nodes.first[tracks]
         is_leaving = first < anchors
         if is_leaving.any():
-            self._solve(tracks[is_leaving], first[is_leaving], anchors[is_leaving], is_partial=True)
+            self._solve(
+                tracks[is_leaving],
+                first[is_leaving],
+                anchors[is_leaving],
+                is_partial=True,
+            )
         nodes.first[tracks] = anchors
         try:
             self._update(tracks, first)
@@ -123,7 +154,9 @@ class IncrementalSolver(Solver):
             nodes.tracks[tracks, KNOWN] = anchors  # the states that were read last
             for track in tracks.tolist():  # its graph may lack nodes
                 self.forget(track)
-            raise np.linalg.LinAlgError(f"the graph cannot be solved ({error})") from error
+            raise np.linalg.LinAlgError(
+                f"the graph cannot be solved ({error})"
+            ) from error
         nodes.tracks[tracks, KNOWN] = anchors
 
     def _covariance(self, track: int, *numbers: int) -> FloatArray:
@@ -140,13 +173,20 @@ class IncrementalSolver(Solver):
         """
         nodes, zero = self.nodes, np.zeros(self.motion.dim)
         leaving = (nodes.first[tracks] - starts).tolist()
-        for track, start, num_leaving in zip(tracks.tolist(), starts.tolist(), leaving, strict=True):
-            window, values = (nodes.numbers[track, start : nodes.count[track]].copy(), gtsam.Values())
+        for track, start, num_leaving in zip(
+            tracks.tolist(), starts.tolist(), leaving, strict=True
+        ):
+            window, values = (
+                nodes.numbers[track, start : nodes.count[track]].copy(),
+                gtsam.Values(),
+            )
             graph, prior = self._graphs.get(track), _Changed()
             if graph is None:
                 graph, oldest = _Graph(), nodes.predicted[window[0]]
                 self._graphs[track], W = graph, inverse_root(oldest[:, :-1])
-                prior[_PRIOR] = gtsam.JacobianFactor(int(window[0]), W, W @ oldest[:, -1], _unit(len(W)))
+                prior[_PRIOR] = gtsam.JacobianFactor(
+                    int(window[0]), W, W @ oldest[:, -1], _unit(len(W))
+                )
                 nodes.labels[window, CHANGED] = 1
             numbers = window.tolist()
             for number in set(numbers).difference(graph.slots):
@@ -159,7 +199,11 @@ class IncrementalSolver(Solver):
             if not np.isfinite(delta).all():
                 raise ValueError("a state is not finite")
             window = window[num_leaving:]
-            nodes.step[window] = nodes.reference[window] - nodes.origin[window] + delta.reshape(len(window), -1)
+            nodes.step[window] = (
+                nodes.reference[window]
+                - nodes.origin[window]
+                + delta.reshape(len(window), -1)
+            )
 
     def _changed_factors(self, track: int, start: int) -> _Changed:
         """Return the factors of a track, from index `start` on, that have changed."""
@@ -171,12 +215,16 @@ class IncrementalSolver(Solver):
         if num < 0:
             raise ValueError("process noise is not positive definite")
         changed: _Changed = {}
-        for (number, right, size), each in zip(owners[:num].tolist(), factors, strict=False):
+        for (number, right, size), each in zip(
+            owners[:num].tolist(), factors, strict=False
+        ):
             A, b, unit = each[:size, :n], each[:size, -1], _unit(size)
             if right < 0:
                 changed[number] = gtsam.JacobianFactor(number, A, b, unit)
             else:
-                changed[number] = gtsam.JacobianFactor(number, A, right, each[:size, n:-1], b, unit)
+                changed[number] = gtsam.JacobianFactor(
+                    number, A, right, each[:size, n:-1], b, unit
+                )
         return changed
 
 

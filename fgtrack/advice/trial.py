@@ -1,0 +1,215 @@
+"""The first seconds of an input as a configuration reads them: what is suspicious, and the first of each message."""
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import takewhile
+
+import numpy as np
+
+from fgtrack.config.settings import Config
+from fgtrack.core.diagnostic import EGO, Diagnostic, in_degrees
+from fgtrack.core.types import (
+    DESCRIBING,
+    MEASURABLE,
+    Detection,
+    DetectionList,
+    EgoState,
+    Message,
+    TruthState,
+)
+from fgtrack.evaluation.diagnostics import excluded_lines
+from fgtrack.models.measurement import ANGULAR
+from fgtrack.models.sensors import SensorModel
+
+__all__ = ["TRIAL_S", "beginning", "passing", "samples", "suspicions"]
+
+TRIAL_S = 5.0
+_SHOWN = (*MEASURABLE, "yaw_rate_radps", *DESCRIBING, "object_id")
+_FAR_M, _NEARER = (
+    250.0,
+    0.3,
+)  # what is so far, and so much nearer in another frame, is in that one
+
+
+def beginning(messages: Iterable[Message], duration_ns: int) -> Iterator[Message]:
+    """The messages of the first time."""
+    iterator = iter(messages)
+    first = next(iterator, None)
+    if first is not None:
+        yield first
+        yield from takewhile(
+            lambda message: message.receipt_ns - first.receipt_ns <= duration_ns,
+            iterator,
+        )
+
+
+def suspicions(messages: Sequence[Message], config: Config) -> Iterator[Diagnostic]:
+    """Yield probable errors in how `messages` are read, with the cure."""
+    egos = [message for message in messages if isinstance(message, EgoState)]
+    lists: dict[str, list[DetectionList]] = {}
+    for message in messages:
+        if (
+            isinstance(message, DetectionList)
+            and message.sensor not in config.ignore_sensors
+        ):
+            lists.setdefault(message.sensor, []).append(message)
+    relative = sorted(
+        name
+        for name, result in lists.items()
+        if any(each.frame != "map" for each in result)
+    )
+    if relative and not egos:
+        text = f"no state is read, but {relative[0]} is relative to it: name its topic (input.ego)"
+        yield Diagnostic(EGO, text, spoils=True)
+    if egos and not any(ego.stamp_ns for ego in egos):
+        yield Diagnostic(
+            EGO, "all stamps are 0: set `stamp_from: receipt` on its topic", spoils=True
+        )
+    yield from _degrees(EGO, egos)
+    yield from _degrees(
+        "truth", [message for message in messages if isinstance(message, TruthState)]
+    )
+    for name in sorted(set(config.sensors) - set(lists)):
+        if name in (config.input.detections or config.input.csv.detections):
+            yield Diagnostic(name, "sends nothing in the first seconds")
+    for name, result in sorted(lists.items()):
+        sensor, objects = (
+            config.sensors.get(name),
+            [item for each in result for item in each.objects],
+        )
+        if not any(each.stamp_ns for each in result) and (
+            sensor is None or sensor.stamp_from != "receipt"
+        ):
+            key = f"sensors.{name}.stamp_from"
+            text = f"all stamps are 0: set `stamp_from: receipt` on its topic, or {key}; nothing is known of its delay"
+            yield Diagnostic(name, text, {key: "receipt"}, spoils=True)
+        yield from _degrees(name, objects)
+        yield from _frames(name, result, egos)
+        if sensor is not None and objects:
+            yield from _measured(name, objects, sensor)
+
+
+def _degrees(
+    name: str, states: Sequence[EgoState | TruthState | Detection]
+) -> Iterator[Diagnostic]:
+    for angle in ANGULAR:
+        values = [
+            value
+            for state in states
+            if (value := getattr(state, angle, None)) is not None
+        ]
+        finite = [value for value in values if math.isfinite(value)]
+        if (
+            result := in_degrees(
+                name, angle, min(finite, default=0.0), max(finite, default=0.0)
+            )
+        ) is not None:
+            yield result
+
+
+def _frames(
+    name: str, lists: Sequence[DetectionList], egos: Sequence[EgoState]
+) -> Iterator[Diagnostic]:
+    """Yield an error where positions are far away in their frame, and near in the other one."""
+    points = [
+        (each.stamp_ns, item.x_m, item.y_m)
+        for each in lists
+        for item in each.objects
+        if item.x_m is not None and item.y_m is not None
+    ]
+    if not points or not egos:
+        return
+    stamps = np.array([ego.stamp_ns for ego in egos])
+    nearest = [
+        egos[int(np.abs(stamps - stamp_ns).argmin())] for stamp_ns, _, _ in points
+    ]
+    bare_m = float(np.median([math.hypot(x_m, y_m) for _, x_m, y_m in points]))
+    offsets = [
+        math.hypot(x_m - ego.x_m, y_m - ego.y_m)
+        for (_, x_m, y_m), ego in zip(points, nearest, strict=True)
+    ]
+    from_ego_m = float(np.median(offsets))
+    frame = lists[0].frame
+    own_m, other_m = (from_ego_m, bare_m) if frame == "map" else (bare_m, from_ego_m)
+    if own_m > _FAR_M and other_m < _NEARER * own_m:
+        text = (
+            f"is read as relative to the {frame}, {bare_m:.0f} m away, but its numbers lie {from_ego_m:.0f} m from "
+            "where the ego is in the map: set `frame: map`"
+        )
+        if frame == "map":
+            text = (
+                f"is read as in the map, {from_ego_m:.0f} m from the ego, but its numbers are small ({bare_m:.0f} m): "
+                "set `frame: ego` (or sensor)"
+            )
+        yield Diagnostic(name, text, spoils=True)
+
+
+def _measured(
+    name: str, objects: Sequence[Detection], sensor: SensorModel
+) -> Iterator[Diagnostic]:
+    given = {component for item in objects for component in item.measured}
+    missing = [component for component in sensor.std if component not in given]
+    if missing:
+        has = (
+            ", ".join(component for component in MEASURABLE if component in given)
+            or "nothing"
+        )
+        what = f"{', '.join(missing)} of its std, but {has}"
+        yield Diagnostic(
+            name, f"never measures {what}: change sensors.{name}.std or the fields"
+        )
+
+
+def passing(messages: Iterable[Message], config: Config) -> Iterator[str]:
+    """Yield lines on the detections of each sensor, and on those that filters exclude."""
+    counts, out, left_out = (defaultdict[str, Counter[str]](Counter) for _ in range(3))
+    for message in messages:
+        if isinstance(message, DetectionList):
+            sensor = config.sensors[message.sensor]
+            counts[message.sensor] += Counter(lists=1, detections=len(message.objects))
+            out[message.sensor].update(
+                f"filters.{name}"
+                for item in message.objects
+                if (name := sensor.refusing(item))
+            )
+            left_out[message.sensor].update(message.left_out)
+    for name, count in counts.items():
+        yield f"{name}: {count['detections']} detections in {count['lists']} lists"
+    detections = {
+        name: {"detections": count["detections"]} for name, count in counts.items()
+    }
+    yield from excluded_lines(
+        {"counts": detections, "out_of_bounds": _any(out), "left_out": _any(left_out)}
+    )
+
+
+def _any(counts: Mapping[str, Counter[str]]) -> dict[str, Counter[str]]:
+    return {name: count for name, count in counts.items() if count}
+
+
+def samples(messages: Sequence[Message]) -> dict[str, str]:
+    """Return the contents of the first message of everything, by `ego`, `truth` and the names of sensors."""
+    result: dict[str, str] = {}
+    for message in messages:
+        name, of = (
+            "truth" if isinstance(message, TruthState) else "ego",
+            list[Message | Detection]([message]),
+        )
+        if isinstance(message, DetectionList):
+            name, of = (
+                f"{message.sensor} (in the frame {message.frame})",
+                list(message.objects),
+            )
+        if of and name not in result:
+            values = {
+                key: value
+                for key in _SHOWN
+                if (value := getattr(of[0], key, None)) is not None
+            }
+            texts = (
+                f"{key} {one:.6g}" if isinstance(one, float) else f"{key} {one}"
+                for key, one in values.items()
+            )
+            result[name] = ", ".join(texts)
+    return result

@@ -1,0 +1,1 @@
+"""Clocks of sensors: arrivals of lists, validity of stamps, offsets between clocks."""

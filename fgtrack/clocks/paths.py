@@ -1,0 +1,243 @@
+"""Positions over time: of the ego, of the objects of a recording, and of the detections of a track."""
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import BSpline, make_interp_spline, make_smoothing_spline
+
+from fgtrack.config.settings import Config
+from fgtrack.core.checks import LARGEST
+from fgtrack.core.errors import DataError
+from fgtrack.core.geometry import rotations
+from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
+from fgtrack.core.types import (
+    EGO_ID,
+    FUSED,
+    BoolArray,
+    DetectionList,
+    Disposition,
+    EgoState,
+    FloatArray,
+    IntArray,
+    Message,
+    TruthState,
+)
+from fgtrack.models.road import Road
+from fgtrack.runs import NO_TRACK, Run
+from fgtrack.tracking.ego.trajectory import EgoPose, is_finite
+from fgtrack.tracking.inbox import Inbox, record
+from fgtrack.tracking.preprocess import Preprocess
+
+__all__ = [
+    "EgoPath",
+    "ObjectPath",
+    "MeasuredPositions",
+    "measured_positions",
+    "true_paths",
+]
+
+_FEWEST = 5  # values that a smoothing spline needs
+_GAP_S = 3.0  # a path is not known in longer gaps
+_EGO_CUTOFF_HZ = 2.0
+#: Components that a wrong stamp moves by metres. Speed and yaw would add little, and as much error as their standard
+#: deviations are wrong by.
+_POSITION = ("x_m", "y_m", "range_m", "bearing_rad")
+
+
+class EgoPath:
+    """Smoothing splines through positions and unwrapped yaw of the ego; of states in any order.
+    A line from state to state moves as fast as its noise: 2 cm at 100 Hz are 3 m/s. The spline minimises
+    sum (y - f)^2 + lam integral f''^2, a low-pass that lets half of a sine of 2 Hz through. Raises `DataError` for
+    fewer than five states.
+    """
+
+    def __init__(self, states: Iterable[EgoState]) -> None:
+        by_stamp = {state.stamp_ns: state for state in states if is_finite(state)}
+        if len(by_stamp) < _FEWEST:
+            raise DataError(
+                f"the ego has {len(by_stamp)} states with different stamps, its path needs {_FEWEST}"
+            )
+        stamps_ns = sorted(by_stamp)
+        self._start_ns, self._end_ns = stamps_ns[0], stamps_ns[-1]
+        times_s = np.array(
+            [seconds(stamp_ns - self._start_ns) for stamp_ns in stamps_ns]
+        )
+        values = np.array(
+            [
+                [item.x_m, item.y_m, item.yaw_rad]
+                for item in map(by_stamp.__getitem__, stamps_ns)
+            ]
+        )
+        values[:, 2] = np.unwrap(values[:, 2])
+        density_s = float(times_s[-1]) / (len(times_s) - 1)
+        lam = 1.0 / (density_s * (2.0 * np.pi * _EGO_CUTOFF_HZ) ** 4)
+        self._spline = make_smoothing_spline(times_s, values, lam=lam)
+
+    def __call__(self, times_ns: IntArray) -> FloatArray:
+        """Return x, y and unwrapped yaw at times of shape (m,), shape (m, 3); NaN beyond the first and last state."""
+        poses = np.asarray(self._spline((times_ns - self._start_ns) / NS_PER_S))
+        poses[(times_ns < self._start_ns) | (times_ns > self._end_ns)] = np.nan
+        return poses
+
+
+@dataclass(frozen=True)
+class ObjectPath:
+    """Positions of one object in the map."""
+
+    stamps_ns: IntArray
+    """Times of its measurements, rising, shape (n,)."""
+    curve: BSpline
+    """Positions in m over seconds from the first of them."""
+
+    @classmethod
+    def through(
+        cls, stamps_ns: IntArray, positions_m: FloatArray
+    ) -> "ObjectPath | None":
+        """Return the smoothing spline through noisy positions (n, 2); None through too few.
+        Its stiffness is that of generalised cross-validation (Woltring, Advances in Engineering Software 8, 1986).
+        """
+        known_ns, rows = np.unique(stamps_ns, return_index=True)
+        if len(known_ns) < 2 * _FEWEST:
+            return None
+        return cls(
+            known_ns,
+            make_smoothing_spline(
+                (known_ns - known_ns[0]) / NS_PER_S, positions_m[rows]
+            ),
+        )
+
+    def __call__(self, times_ns: IntArray) -> FloatArray:
+        """Return positions at times of shape (m,), shape (m, 2); NaN where they are not known."""
+        index = np.clip(
+            np.searchsorted(self.stamps_ns, times_ns), 1, len(self.stamps_ns) - 1
+        )
+        unknown = (times_ns < self.stamps_ns[0]) | (times_ns > self.stamps_ns[-1])
+        unknown |= self.stamps_ns[index] - self.stamps_ns[index - 1] > nanoseconds(
+            _GAP_S
+        )
+        result = np.asarray(self.curve((times_ns - self.stamps_ns[0]) / NS_PER_S))
+        result[unknown] = np.nan
+        return result
+
+
+@dataclass(frozen=True)
+class MeasuredPositions:
+    """Positions that one sensor measured of one track."""
+
+    stamps_ns: IntArray
+    """Shape (n,)."""
+    positions_m: FloatArray
+    """In the frame of the ego, or of the map where `in_map`, shape (n, 2)."""
+    in_map: BoolArray
+    ego: EgoPath | None
+
+    def at(self, times_ns: IntArray) -> FloatArray:
+        """Return the positions in the map, had they been measured at these times (n,); shape (n, 2)."""
+        if self.ego is None:
+            return self.positions_m
+        pose = self.ego(times_ns)
+        moved_m = pose[:, :2] + np.einsum(
+            "nij,nj->ni", rotations(pose[:, 2]), self.positions_m
+        )
+        return np.where(self.in_map[:, None], self.positions_m, moved_m)
+
+    def chosen(self, rows: BoolArray | slice) -> "MeasuredPositions":
+        """Return some of them."""
+        return MeasuredPositions(
+            self.stamps_ns[rows], self.positions_m[rows], self.in_map[rows], self.ego
+        )
+
+
+def true_paths(messages: Iterable[Message]) -> list[ObjectPath]:
+    """Return the paths of all true objects of which more than one state is known."""
+    states: dict[int, dict[int, tuple[float, float]]] = defaultdict(dict)
+    for item in messages:
+        if not isinstance(item, TruthState) or item.ignored or item.object_id == EGO_ID:
+            continue
+        if max(abs(item.x_m), abs(item.y_m)) <= LARGEST:  # as detections are
+            states[item.object_id][item.stamp_ns] = (item.x_m, item.y_m)
+    paths = []
+    for each in states.values():
+        if len(each) > 1:
+            stamps_ns = np.array(sorted(each))
+            positions_m = np.array([each[stamp_ns] for stamp_ns in stamps_ns.tolist()])
+            paths.append(
+                ObjectPath(
+                    stamps_ns,
+                    make_interp_spline(
+                        (stamps_ns - stamps_ns[0]) / NS_PER_S, positions_m, k=1
+                    ),
+                )
+            )
+    return paths
+
+
+def measured_positions(
+    run: Run, lists: Sequence[DetectionList], config: Config, ego: EgoPath | None
+) -> dict[str, dict[int, MeasuredPositions]]:
+    """Return what `run` of `lists` fused, transformed and merged as the tracker does, by sensor and track.
+    `ego` is None where all detections are in the map frame.
+    """
+    updates = run.tables["updates"]
+    fused = updates.where(
+        np.isin(updates["disposition"], list(FUSED)) & (updates["track_id"] != NO_TRACK)
+    )
+    keys = zip(
+        *(
+            fused[name].tolist()
+            for name in ("sensor", "stamp_ns", "receipt_ns", "index")
+        ),
+        strict=True,
+    )
+    tracks = dict(zip(keys, fused["track_id"].tolist(), strict=True))
+    preprocess = Preprocess(
+        Road(),
+        config.merge,
+        config.motion.model(config.used_sensors),
+        config.ego.detection_origin_m,
+    )
+    sensors = {
+        name: replace(
+            sensor,
+            std={
+                component: value
+                for component, value in sensor.std.items()
+                if component in _POSITION
+            },
+            yaw_from_map_std_rad=None,
+            max_range_m=None,
+            correlation=None,
+        )
+        for name, sensor in config.sensors.items()
+    }
+    inbox = Inbox(sensors)
+    rows: dict[tuple[str, int], list[tuple[int, FloatArray, bool]]] = defaultdict(list)
+    for message in lists:
+        inbox.put(message)
+        for batch in inbox.collect():
+            pose = np.zeros(3) if ego is None else ego(np.array([batch.stamp_ns]))[0]
+            if np.isnan(pose[0]):
+                continue
+            placed = None if ego is None else EgoPose(pose[0], pose[1], pose[2], 0.0)
+            for item in preprocess(batch, sensors[message.sensor], placed)[0]:
+                row = record(message, item.leader, Disposition.BIRTH)
+                track_id = tracks.get(
+                    (row.sensor, row.stamp_ns, row.receipt_ns, row.index)
+                )
+                if track_id is not None and item.position_m is not None:
+                    is_map = ego is None or message.frame == "map"
+                    z_m = (
+                        item.position_m
+                        if is_map
+                        else (item.position_m - pose[:2]) @ rotations(pose[2])
+                    )
+                    rows[message.sensor, track_id].append((batch.stamp_ns, z_m, is_map))
+    result: dict[str, dict[int, MeasuredPositions]] = {sensor: {} for sensor, _ in rows}
+    for (sensor, track_id), each in rows.items():
+        stamps_ns, positions_m, in_map = map(np.array, zip(*each, strict=True))
+        result[sensor][track_id] = MeasuredPositions(
+            stamps_ns, positions_m, in_map, ego
+        )
+    return result

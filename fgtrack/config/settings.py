@@ -1,0 +1,461 @@
+"""The configuration of a run. The defaults are those of open space; a YAML file overrides them."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat, Tag
+
+from fgtrack.config.yaml_file import dump, load, plain, with_settings
+from fgtrack.core.settings import require, settings
+from fgtrack.estimation.filters.initiation import DEFAULT, Initiation
+from fgtrack.estimation.registry import ESTIMATORS, motion_model
+from fgtrack.estimation.smoothing.settings import SmootherSettings
+from fgtrack.inputs.settings import InputConfig
+from fgtrack.karle2023.tracker_parts import NeighbourhoodMerge, UngatedEuclidean
+from fgtrack.models.correlated_errors import with_correlated_errors
+from fgtrack.models.motion import CT, CTRA, CTRV, CV, MotionModel, WhiteNoise
+from fgtrack.models.road import OPEN_SPACE
+from fgtrack.models.sensors import SensorModel
+from fgtrack.runs import EvaluationConfig
+from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
+from fgtrack.tracking.birth import Birth
+from fgtrack.tracking.detections import ConnectedMerge, NoMerge
+from fgtrack.tracking.lives.counters import LifecycleRules
+from fgtrack.tracking.lives.existence import ExistenceRules
+
+__all__ = [
+    "ClockConfig",
+    "EgoConfig",
+    "FilterConfig",
+    "InitiationConfig",
+    "MapConfig",
+    "MotionConfig",
+]
+
+MergeConfig = Annotated[
+    ConnectedMerge | NoMerge | NeighbourhoodMerge, Discriminator("kind")
+]
+AssociationConfig = Annotated[
+    GatedEuclidean | GatedMahalanobis | UngatedEuclidean, Discriminator("kind")
+]
+_Weight = Annotated[float, Field(gt=0.0, le=1.0)]
+
+
+@settings
+class ClockConfig:
+    """Times of the ticks."""
+
+    node_hz: Annotated[float, Field(ge=0.1, le=10_000.0)] | None = 50.0
+    """Ticks lie on multiples of the node period; null ticks at every message instead."""
+
+
+@dataclass(frozen=True)
+class MapConfig:
+    """The map, and how far from it an object may be. A negative buffer keeps away from the wall."""
+
+    track: str | None = None
+    """CSV file of the track, `oval` for the built-in one, `none` for open space; null: in a replay that of the
+    recording, else open space."""
+    pit: str | None = None
+    """CSV file of the pit lane, `oval` for the built-in one, or null."""
+    inner_buffer_m: float = 0.0
+    """Distance beyond the inner bound at which an object may be."""
+    outer_buffer_m: float = 0.0
+    """The same for the outer bound."""
+    pit_buffer_m: float = 0.0
+    """The same for both bounds of the pit lane."""
+
+    @property
+    def track_file(self) -> str | None:
+        """File of the track; None of open space."""
+        return None if self.track == OPEN_SPACE else self.track
+
+
+@settings
+class EgoConfig:
+    """Low-pass of the ego state, its uncertainty, and the origin of detections in the ego frame."""
+
+    yaw_weight: _Weight = 1.0
+    """Weight of the new yaw in the low-pass; 1 leaves it as it is."""
+    yaw_rate_weight: _Weight = 1.0
+    """Weight of the new yaw rate."""
+    detection_origin_x_m: float | None = None
+    """Origin of the detections' ego frame, ahead of the ego reference point; null: in a replay that of the recording,
+    else 0."""
+    detection_origin_y_m: float = 0.0
+    """The same to the left."""
+    uncertainty: Literal["none", "independent"] = "independent"
+    """Effect of the ego's covariance: none (as in the paper), or added to the noise of every detection as if each had
+    an error of its own."""
+    position_std_m: NonNegativeFloat = 0.0
+    """Standard deviation of the ego's x and y where the recording gives no covariance of them."""
+    position_time_s: PositiveFloat | None = None
+    """Time over which their error wanders, as that of GNSS positions: they are then fused with speed and yaw, by their
+    standard deviations. null: positions as reported, with independent errors."""
+    yaw_std_rad: NonNegativeFloat = 0.0
+    """The same of its yaw."""
+    speed_std_mps: NonNegativeFloat = 0.0
+    """The same of its speed."""
+    yaw_rate_std_radps: NonNegativeFloat = 0.0
+    """The same of its yaw rate."""
+    wait_s: Annotated[float, Field(ge=0.0, le=60.0)] = 1.0
+    """Longest time for which a list that needs the ego pose waits for an ego state at or after its stamp. The list
+    waits for at most half of the window of the estimator. Then, or with 0 at once, the pose is extrapolated."""
+    accel_std_mps2: PositiveFloat = 1.0
+    """Standard deviation of the ego's acceleration, by which an extrapolated pose grows uncertain, until the ego's
+    states have shown their own."""
+    yaw_accel_std_radps2: PositiveFloat = 0.1
+    """The same of its yaw acceleration."""
+
+    def __post_init__(self) -> None:
+        fused = self.position_time_s is not None
+        require(
+            not fused or self.uncertainty != "none",
+            "uncertainty",
+            "`independent` with position_time_s",
+            "none",
+        )
+
+    @property
+    def detection_origin_m(self) -> tuple[float, float]:
+        """Origin of the detections' ego frame, ahead of the ego reference point and to its left."""
+        return self.detection_origin_x_m or 0.0, self.detection_origin_y_m
+
+
+Defect = Literal[
+    "circular_heading",
+    "heading_jump",
+    "noise_per_step",
+    "saturated_yaw",
+    "stale_present",
+    "one_slot",
+    "refiltered_ego",
+    "leading_clock",
+]
+"""The map look-up of the published implementation with the heading on the circle (Q4) or through its jump (Q3, Q4);
+(std_per_s dt)^2 in every step dt of the filter, whatever its frequency (Q6); a yaw that sticks at its upper limit (Q2);
+an update without delay that does not reach the stored present state (Q8); the newest list of each sensor alone (Q12);
+an ego low-pass that filters its own output at every tick (Q13); a tracking time up to a step ahead of the clock
+(Q14)."""
+
+
+def _lifecycle_kind(value: object) -> str:
+    """Which form of `lifecycle` is meant: by existence where it is not specified."""
+    kind = (
+        value.get("kind", "existence")
+        if isinstance(value, Mapping)
+        else getattr(value, "kind", "existence")
+    )
+    return "existence" if kind == "existence" else "counting"
+
+
+LifecycleConfig = Annotated[
+    Annotated[LifecycleRules, Tag("counting")]
+    | Annotated[ExistenceRules, Tag("existence")],
+    Discriminator(_lifecycle_kind),
+]
+
+
+@settings
+class FilterConfig:
+    """Time grid of the backward-forward EKF."""
+
+    frequency_hz: Annotated[float, Field(ge=1.0, le=10_000.0)] = 100.0
+    """Frequency of the grid."""
+    storage_s: float = 3.0
+    """Time for which states are kept."""
+
+    def __post_init__(self) -> None:
+        if not 1.0 / self.frequency_hz <= self.storage_s <= 60.0:
+            raise ValueError(
+                f"storage_s: must lie between one step and 60 s, is {self.storage_s}"
+            )
+
+
+@settings
+class InitiationConfig:
+    """Start of a track whose direction of travel neither the map nor the sensor gives."""
+
+    method: Initiation = DEFAULT
+    """`one-point`: at the first position, heading along x; `two-point`: along the first two; `regression`: along a line
+    through the first ones, until its direction is certain."""
+
+
+#: Frequency of the steps to which `motion.std_per_s` belongs, as in the paper.
+NOISE_HZ = 100.0
+#: Of traffic: 1.5 m/s and 0.2 rad/s of change within a second.
+_STD_PER_S = {"position": 0.3, "yaw": 0.1, "speed": 15.0, "yaw_rate": 2.0}
+_BUILT_IN_MOTION: Mapping[str, type[WhiteNoise]] = {
+    "ctrv_euler": CTRV,
+    "ctrv": CTRV,
+    "ctra": CTRA,
+    "ct": CT,
+    "cv": CV,
+    "auto": CTRV,
+}
+
+
+#: Names of the noise of `CT` by those of `CTRV`, which `motion.kind: auto` takes.
+_OF_CT = {"position": "position", "speed": "velocity", "yaw_rate": "yaw_rate"}
+
+
+def _turns(model: MotionModel) -> bool:
+    """True if the state has yaw, speed and yaw rate."""
+    return not model.cartesian and "yaw_rate_radps" in model.state_names
+
+
+def _gives_yaw(sensor: SensorModel) -> bool:
+    """True if detections of `sensor` have a yaw, measured or from the map."""
+    return "yaw_rad" in sensor.std or sensor.yaw_from_map_std_rad is not None
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """Motion model and its process noise."""
+
+    kind: str = "auto"
+    """`ctrv`, `ctra`, `ct`, `cv`, `ctrv_euler` (the paper's steps), or the name of a plug-in. `auto` is `ctrv` where a
+    sensor measures the yaw or takes it from the map, else `ct`: the heading of an object at rest is then unknown."""
+    std_per_s: Mapping[str, NonNegativeFloat] = field(default_factory=_STD_PER_S.copy)
+    """Process noise as the paper gives it: each step of 1 / `NOISE_HZ` adds (std_per_s / NOISE_HZ)^2, hence the density
+    std_per_s^2 / NOISE_HZ. `ctra` takes `accel` as well, `ct` takes `position`, `velocity` and `yaw_rate`, `cv` takes
+    `velocity` alone. `auto` takes those of `ctrv`, and uses `speed` as `velocity` for `ct`. Of `ctrv_euler` `accel` is
+    an acceleration that drives the speed but is never estimated (Q5)."""
+    yaw_rate_std_radps: PositiveFloat = 0.5
+    """Standard deviation of the yaw rate of any object at any time (`ctrv`, `ctra`, `ct`). A yaw rate that nothing
+    measures relaxes to zero with this uncertainty; `.inf` lets it drift without limit."""
+    slow_mps: PositiveFloat = 1.0
+    """Speed below which the yaw has more process noise (`ctrv`, `ctra`), because positions do not show it."""
+    resting_yaw_rad2ps: NonNegativeFloat = 6.0
+    """Spectral density of that noise at rest; it falls with the speed v as 1 / (1 + (v / slow_mps)^2)^2."""
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    """Keyword parameters of a plug-in, which has no `std_per_s`."""
+
+    def __post_init__(self) -> None:
+        if self.parameters and not self.is_plug_in:
+            raise ValueError(
+                f"parameters: are a plug-in's, kind {self.kind} takes std_per_s"
+            )
+        if self.is_plug_in and dict(self.std_per_s) != _STD_PER_S:
+            raise ValueError(
+                f"std_per_s: is that of the built-in models, give parameters for kind {self.kind}"
+            )
+        self.model()
+
+    @property
+    def is_driven(self) -> bool:
+        """True if an acceleration drives the speed that is never estimated."""
+        return self.kind == "ctrv_euler" and "accel" in self.std_per_s
+
+    @property
+    def is_plug_in(self) -> bool:
+        """True if the model takes `parameters` and no `std_per_s`."""
+        return self.kind not in _BUILT_IN_MOTION
+
+    def _is_cartesian(self, sensors: Mapping[str, SensorModel] | None) -> bool:
+        """True if `auto` is `ct` with `sensors`."""
+        return (
+            self.kind == "auto"
+            and bool(sensors)
+            and not any(map(_gives_yaw, (sensors or {}).values()))
+        )
+
+    def noise_names(
+        self, sensors: Mapping[str, SensorModel] | None = None
+    ) -> tuple[str, ...]:
+        """Names in `std_per_s` that the model has with `sensors`, see `model`."""
+        if self.is_plug_in:
+            return ()
+        return tuple(
+            name
+            for name in self.std_per_s
+            if name in _OF_CT or not self._is_cartesian(sensors)
+        )
+
+    def model(self, sensors: Mapping[str, SensorModel] | None = None) -> MotionModel:
+        """The motion model, with the densities; raises `ValueError` where `std_per_s` does not fit it.
+
+        `sensors` decide what `auto` is: `ctrv` where there are none.
+        """
+        if self.is_plug_in:
+            return motion_model(self.kind, self.parameters)
+        if self._is_cartesian(sensors):
+            std = {
+                _OF_CT[name]: self.std_per_s[name] for name in self.noise_names(sensors)
+            }
+            return CT.from_std_per_step(
+                std, NOISE_HZ, yaw_rate_std_radps=self.yaw_rate_std_radps
+            )
+        model = CTRA if self.is_driven else _BUILT_IN_MOTION[self.kind]
+        others: dict[str, float] = {}
+        if self.kind == "ctrv_euler":
+            others = {"yaw_rate_std_radps": math.inf, "resting_yaw_rad2ps": 0.0}
+        elif issubclass(model, CT):
+            others = {"yaw_rate_std_radps": self.yaw_rate_std_radps}
+        elif issubclass(model, CTRV):
+            others = {
+                "yaw_rate_std_radps": self.yaw_rate_std_radps,
+                "slow_mps": self.slow_mps,
+                "resting_yaw_rad2ps": self.resting_yaw_rad2ps,
+            }
+        return model.from_std_per_step(self.std_per_s, NOISE_HZ, **others)
+
+
+#: Estimators that take all settings of `smoother`.
+SMOOTHERS = ("smoother", "smoother-batch", "smoother-banded")
+
+
+@dataclass(frozen=True)
+class Effective:
+    """Settings that are easily overlooked, as meta.json has them."""
+
+    detection_origin_m: tuple[float, float]
+    """Origin of the ego frame of detections, ahead of the ego reference point and to its left."""
+    merge_distance_m: float | None
+    """Up to which distance detections become one; None for no merge."""
+    lag_key: str
+    """Key of the configuration that sets the length of the window."""
+    lag_s: float
+    """Length of the window."""
+    reach_s: float
+    """Largest age at which a detection changes a track."""
+
+    def __str__(self) -> str:
+        x_m, y_m = self.detection_origin_m
+        merge = (
+            "none"
+            if self.merge_distance_m is None
+            else f"up to {self.merge_distance_m:g} m"
+        )
+        late = (
+            ""
+            if self.reach_s == self.lag_s
+            else f", late detections up to {self.reach_s:g} s"
+        )
+        origin = (
+            f"detection origin {x_m:g} m ahead, {y_m:g} m left of the ego; "
+            if x_m or y_m
+            else ""
+        )
+        return f"{origin}merge {merge}; lag {self.lag_s:g} s{late}"
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that decides a run besides its input."""
+
+    estimator: str = "ekf-replay"
+    """Name of the estimator of all tracks."""
+    sensors: Mapping[str, SensorModel] = field(default_factory=dict)
+    """The sensors by name; where none is named, a replay takes those of the recording, with `ASSUMED_STD`."""
+    ignore_sensors: tuple[str, ...] = ()
+    """Sensors of the input that are left out on purpose, also where they are under `sensors`."""
+    input: InputConfig = field(default_factory=InputConfig)
+    clock: ClockConfig = field(default_factory=ClockConfig)
+    map: MapConfig = field(default_factory=MapConfig)
+    ego: EgoConfig = field(default_factory=EgoConfig)
+    merge: MergeConfig = field(default_factory=NoMerge)
+    association: AssociationConfig = field(default_factory=GatedMahalanobis)
+    lifecycle: LifecycleConfig = field(default_factory=ExistenceRules)
+    birth: Birth = field(default_factory=Birth)
+    initiation: InitiationConfig = field(default_factory=InitiationConfig)
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    filter: FilterConfig = field(default_factory=FilterConfig)
+    smoother: SmootherSettings = field(default_factory=SmootherSettings)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    defects: tuple[Defect, ...] = ()
+    """Defects of the published implementation that change its numbers, see `Defect`."""
+    options: Mapping[str, Mapping[str, bool | int | float | str]] = field(
+        default_factory=dict
+    )
+    """Options of estimators that have no section of their own, by name: `{reorder-buffer: {hold_s: 0.2}}`."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "estimator", ESTIMATORS.resolve(self.estimator))
+        for name in self.options:
+            if ESTIMATORS.resolve(name) != name:
+                raise ValueError(
+                    f"options: {name!r} is now {ESTIMATORS.resolve(name)!r}"
+                )
+        for key, named in (
+            ("detections", self.input.detections),
+            ("csv.detections", self.input.csv.detections),
+        ):
+            unknown = set(named) - set(self.sensors) - set(self.ignore_sensors)
+            if unknown and self.sensors:
+                raise ValueError(
+                    f"input.{key}: {sorted(unknown)[0]!r} has no model under sensors"
+                )
+        if self.motion.kind != "ctrv_euler" and {
+            "noise_per_step",
+            "saturated_yaw",
+        } & set(self.defects):
+            raise ValueError(
+                "defects: noise_per_step and saturated_yaw are of motion.kind ctrv_euler"
+            )
+        for name, sensor in self.sensors.items():
+            if sensor.correlation is not None and self.motion.kind == "ctrv_euler":
+                raise ValueError(
+                    f"sensors.{name}.correlation: needs motion.kind ctrv, ctra, ct or cv"
+                )
+            curvature = sensor.curvature_from_map_std_radpm
+            if curvature is not None and not _turns(self.motion.model(self.sensors)):
+                raise ValueError(
+                    f"sensors.{name}.curvature_from_map_std_radpm: needs motion.kind ctrv or ctra"
+                )
+
+    @classmethod
+    def from_yaml(cls, name: str | Path) -> Self:
+        """Return the configuration of a YAML file or of that shipped name. Raises `CallError` with file and key."""
+        from fgtrack.config.shipped import find_file  # which imports this module
+
+        return load(cls, find_file("configuration", name))
+
+    def to_yaml(self, path: str | Path) -> None:
+        """Write every key to a YAML file, which is replaced."""
+        Path(path).write_text(dump(self), encoding="utf-8")
+
+    def replace(
+        self, settings: Mapping[str, object] | None = None, /, **sections: object
+    ) -> Self:
+        """Return a copy with other values of dotted keys or of whole sections. Raises `CallError` with the key.
+
+        `config.replace({"smoother.lag_s": 3.0}, estimator="smoother")`
+        """
+        changes = {
+            key: plain(value) for key, value in {**(settings or {}), **sections}.items()
+        }
+        return with_settings(type(self), plain(self), changes, "the configuration")
+
+    @property
+    def used_sensors(self) -> Mapping[str, SensorModel]:
+        """The sensors that are not ignored."""
+        return {
+            name: sensor
+            for name, sensor in self.sensors.items()
+            if name not in self.ignore_sensors
+        }
+
+    @property
+    def effective(self) -> Effective:
+        """Settings that are easily overlooked, as a run has them."""
+        key, lag_s, behind_s = "filter.storage_s", self.filter.storage_s, 0.0
+        if self.estimator in SMOOTHERS:
+            key, lag_s, behind_s = (
+                "smoother.lag_s",
+                self.smoother.lag_s,
+                self.smoother.behind_s,
+            )
+        distance_m = None if isinstance(self.merge, NoMerge) else self.merge.distance_m
+        return Effective(
+            self.ego.detection_origin_m, distance_m, key, lag_s, lag_s + behind_s
+        )
+
+    def motion_model(self) -> MotionModel:
+        """The motion model of the tracks, with the errors of sensors that are correlated in time."""
+        return with_correlated_errors(
+            self.motion.model(self.used_sensors), self.used_sensors
+        )

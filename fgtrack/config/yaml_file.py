@@ -1,0 +1,289 @@
+"""YAML files to validated dataclasses and back; every error names the file and the key."""
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from functools import lru_cache
+from io import StringIO
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from fgtrack.core.checks import LARGEST
+from fgtrack.core.errors import CallError, did_you_mean
+from fgtrack.core.files import open_text
+from fgtrack.core.yaml_text import safe_yaml
+
+T = TypeVar("T")
+SMALLEST = 1e-12
+"""No configured number but 0 has a smaller magnitude, in any unit: squares and products stay finite."""
+_UNKNOWN = "unexpected_keyword_argument"
+
+
+def load(
+    kind: type[T],
+    path: Path | T | None,
+    settings: Sequence[str] | Mapping[str, Any] = (),
+) -> T:
+    """Return an instance of `kind` from a YAML file, another instance, or the defaults.
+    `settings` are values by dotted key, or texts a.b=value. Raises `CallError` with file and key.
+    """
+    raw, origin = (
+        ({}, "defaults") if path is None else (plain(path), "the given configuration")
+    )
+    if isinstance(path, Path):
+        raw, origin = read_yaml(path), str(path)
+    changes = (
+        settings
+        if isinstance(settings, Mapping)
+        else dict(map(key_and_value, settings))
+    )
+    return with_settings(kind, raw, changes, origin)
+
+
+def with_settings(
+    kind: type[T], raw: dict[str, Any], settings: Mapping[str, Any], origin: str
+) -> T:
+    """Return `raw` as an instance of `kind`, with values of the dotted keys of `settings`.
+    A setting below a key that `raw` leaves out changes that key's default: one sensor of all, the same `kind`.
+    """
+    if not settings:
+        return validate(kind, raw, origin)
+    defaults = validate(kind, {}, "defaults")
+    for key, value in settings.items():
+        try:
+            raw = with_value(raw, names_of(key), value, defaults)
+        except LookupError as error:
+            raise CallError(f"--set {key}: {error.args[0]}") from error
+    return validate(kind, raw, f"{origin} with --set")
+
+
+def read_yaml(
+    path: Path,
+) -> dict[str, Any]:  # Any: what YAML holds is only known after validation
+    """Return the mapping in the YAML 1.2 file `path`, empty for an empty file."""
+    try:
+        with open_text(path) as file:
+            value = _parse(file.read(), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "is no text file"
+        raise CallError(f"{path}: configuration cannot be read ({reason})") from error
+    if not isinstance(value, dict | None):
+        raise CallError(
+            f"{path}: a mapping of keys to values is needed, this is {_short(value)}"
+        )
+    return value or {}
+
+
+def _parse(text: str, origin: str) -> Any:
+    try:
+        return safe_yaml(text)
+    except YAMLError as error:
+        mark, problem = (
+            getattr(error, "problem_mark", None),
+            getattr(error, "problem", None) or str(error),
+        )
+        problem, line = (
+            problem.split("To suppress")[0],
+            "" if mark is None else f":{mark.line + 1}",
+        )
+        raise CallError(
+            f"{origin}{line}: invalid YAML, {' '.join(problem.split())}"
+        ) from error
+
+
+def names_of(key: str) -> list[str]:
+    """Names of the path `key`, else none; one with a dot is in double quotes: `sensors."cam.top".std.x_m`."""
+    quoted = r'(?:"[^"]+"|[^".]+)'
+    if not re.fullmatch(rf"{quoted}(?:\.{quoted})*", key):
+        return []
+    return [name.strip('"') for name in re.findall(quoted, key)]
+
+
+def key_and_value(setting: str) -> tuple[str, Any]:
+    """Return key and value of a setting of the form a.b=value. Raises `CallError` for another form."""
+    key, equals, text = setting.partition("=")
+    if not equals or not names_of(key.strip()):
+        raise CallError(
+            f"--set {setting}: write key=value, with dots between the keys of a path and a name that contains a dot "
+            "in double quotes (--set 'sensors.\"cam.top\".std.x_m=1')"
+        )
+    return key.strip(), _parse(text, f"--set {setting}")
+
+
+def with_value(
+    inside: Any, names: Sequence[str], value: Any, default: object = None
+) -> Any:
+    """Return a copy of `inside` with `value` at the path `names`, where a list entry has its index or `name`.
+    Of a mapping left out the `default` stays, or its `kind`. Raises `LookupError` for a path into a number or text.
+    """
+    if not names:
+        return value
+    first, rest = names[0], names[1:]
+    if inside is None:
+        inside = plain(default) if isinstance(default, Mapping) else {}
+        inside |= {"kind": default.kind} if hasattr(default, "kind") else {}
+    if isinstance(inside, list):
+        known = [
+            str(item.get("name", k)) if isinstance(item, Mapping) else str(k)
+            for k, item in enumerate(inside)
+        ]
+        known = known if first in known else [str(k) for k in range(len(inside))]
+        if first not in known:
+            raise LookupError(f"there is no {first!r} among {len(inside)} entries")
+        index = known.index(first)
+        return [
+            *inside[:index],
+            with_value(inside[index], rest, value),
+            *inside[index + 1 :],
+        ]
+    if not isinstance(inside, Mapping):
+        raise LookupError(f"there is no {first!r} in {_short(inside)}, a single value")
+    return {
+        **inside,
+        first: with_value(
+            inside.get(first), rest, value, getattr(default, first, None)
+        ),
+    }
+
+
+def validate(kind: type[T], raw: Mapping[str, Any], origin: str) -> T:
+    """Return `raw` as an instance of the dataclass `kind`; `origin` is named in errors."""
+    try:
+        text = json.dumps(raw, default=_number)
+    except (TypeError, ValueError) as error:
+        raise CallError(
+            f"{origin}: only plain YAML values and text keys are allowed ({error})"
+        ) from error
+    try:
+        value: T = _adapter(kind).validate_json(text, strict=True, extra="forbid")  # type: ignore[arg-type]  # a class is hashable
+    except ValidationError as error:
+        raise CallError(f"{origin}: {_first_problem(error, kind, text)}") from error
+    for where, scalar in _scalars(plain(value), ""):
+        if (
+            isinstance(scalar, float)
+            and scalar
+            and not SMALLEST <= abs(scalar) <= LARGEST
+        ):
+            needed = f"a magnitude of {SMALLEST:g} to {LARGEST:g}, or 0"
+            raise CallError(
+                f"{origin}: {where}: {needed} is needed, not {_short(scalar)}"
+            )
+    return value
+
+
+def texts_of(value: object) -> Iterator[str]:
+    """Yield every text in plain `value`, keys too."""
+    return (scalar for _, scalar in _scalars(value, "") if isinstance(scalar, str))
+
+
+def _scalars(value: object, where: str) -> Iterator[tuple[str, float | str]]:
+    """Yield every number and text in plain `value`, keys too, with its path."""
+    if isinstance(value, float | int | str):
+        yield where, value
+    elif isinstance(value, (dict, list)):
+        for name, item in (
+            value.items() if isinstance(value, dict) else enumerate(value)
+        ):
+            yield where, name
+            yield from _scalars(item, f"{where}.{name}" if where else str(name))
+
+
+@lru_cache
+def _adapter(
+    kind: Any,
+) -> TypeAdapter[
+    Any
+]:  # Any: one for each dataclass, which takes pydantic a while to make
+    return TypeAdapter(
+        kind | None, config=ConfigDict(allow_inf_nan=False)
+    )  # a class by itself takes no `config`
+
+
+def _number(value: object) -> object:
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"a {type(value).__name__} is not a plain value")
+
+
+def _first_problem(error: ValidationError, kind: type[Any], text: str) -> str:
+    """Return a line on the first complaint of pydantic, on an unknown key where there is one."""
+    details = error.errors(include_url=False)
+    first = next((item for item in details if item["type"] == _UNKNOWN), details[0])
+    names, inside = list[str](), json.loads(text)
+    part: Any
+    for part in first["loc"]:  # tags of unions are not written in the file
+        is_entry = (
+            isinstance(inside, list) and isinstance(part, int) and part < len(inside)
+        )
+        if is_entry or (isinstance(inside, Mapping) and part in inside):
+            names, inside = [*names, str(part)], inside[part]
+    message, given = (
+        first["msg"].removeprefix("Value error, "),
+        f", not {_short(first['input'])}",
+    )
+    if first["type"] == _UNKNOWN:
+        known = _known_keys(kind, text, names[:-1])
+        hint = did_you_mean(names[-1], known).removesuffix("?")
+        message, given = (
+            f"unknown key{hint}"
+            + (f", known here: {', '.join(known)}" if known else ""),
+            "",
+        )
+    elif first["type"] == "missing":
+        names, given = [*names, str(first["loc"][-1])], ""
+    elif first["type"] == "union_tag_not_found":
+        message = "needs the key `kind`, which selects its form"
+    elif first["type"] == "union_tag_invalid":
+        given += did_you_mean(
+            first["ctx"]["tag"],
+            first["ctx"]["expected_tags"].replace("'", "").split(", "),
+        )
+    elif first["type"] == "value_error":
+        given = ""
+    more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
+    return f"{'.'.join(names) + ': ' if names else ''}{message}{given}{more}"
+
+
+def _known_keys(kind: type[Any], text: str, names: Sequence[str]) -> list[str]:
+    """Return the keys at the path `names`; none where the rest is wrong as well."""
+    try:
+        inside = plain(_adapter(kind).validate_json(text, strict=True, extra="ignore"))  # type: ignore[arg-type]  # as above
+    except ValidationError:
+        return []
+    for name in names:
+        inside = inside[int(name)] if isinstance(inside, list) else inside[name]
+    return list(inside)
+
+
+def _short(value: object) -> str:
+    text = json.dumps(value, default=str)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def plain(value: object) -> Any:  # Any: JSON values, as `validate` takes them
+    """A dataclass as mappings, lists and scalars, every key written out; `validate` reads it back to an equal value."""
+    if is_dataclass(value):
+        return {
+            field.name: plain(getattr(value, field.name)) for field in fields(value)
+        }
+    if isinstance(value, Mapping):
+        return {name: plain(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    return value
+
+
+def dump(value: object) -> str:
+    """YAML text of a dataclass, every key written out; `validate` reads it back to an equal value."""
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = False
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]  # ruamel declares it as None
+    text = StringIO()
+    yaml.dump(plain(value), text)
+    return text.getvalue()

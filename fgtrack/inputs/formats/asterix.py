@@ -1,0 +1,410 @@
+"""ASTERIX recordings of air traffic surveillance (EUROCONTROL): categories 010, 020, 021, 048 and 062.
+
+Read by the specifications in libasterix (extra `asterix`), which has every edition. Times are seconds of the
+UTC day; the recording has no date. A category with two times of a position (021) gives stamp and receipt; of the others
+the receipt is the newest stamp up to the record in its file, a lower bound. Records of one sensor with equal times are
+one list. Extrapolated positions (010, 020: bits CST of item 170) are no measurements and are left out.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from heapq import merge
+from itertools import groupby
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.files import open_file
+from fgtrack.core.geometry import wrap_angle
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import Detection, DetectionList, Message
+from fgtrack.inputs.errors import TruncatedInput, UntilBreak
+from fgtrack.inputs.formats.asterix_records import Record, RecordReader
+from fgtrack.inputs.geodetic import LocalPlane, warn_once
+from fgtrack.inputs.settings import AsterixInput, InputConfig, Origin
+from fgtrack.inputs.source import FileFormat
+
+_DAY_NS = 86_400 * NS_PER_S
+_NM_M, _FOOT_M = 1852.0, 0.3048
+_PER_95 = 2.4477  # radius with 95 % of a circular Gaussian, in standard deviations
+#: Radius in m and speed in m/s that hold 95 % of the errors: NACp and NACv of DO-260B (RTCA, 2009), tables 2-71 and
+#: 2-22; and NUCp of DO-260 (2000), table 2-11, of version 0.
+_NACP_M = {
+    11: 3.0,
+    10: 10.0,
+    9: 30.0,
+    8: 92.6,
+    7: 185.2,
+    6: 555.6,
+    5: 926.0,
+    4: 1852.0,
+    3: 3704.0,
+    2: 7408.0,
+    1: 18520.0,
+}
+_NUCP_M = {
+    9: 3.0,
+    8: 10.0,
+    7: 92.6,
+    6: 185.2,
+    5: 463.0,
+    4: 926.0,
+    3: 1852.0,
+    2: 9260.0,
+    1: 18520.0,
+}
+_NACV_MPS = {4: 0.3, 3: 1.0, 2: 3.0, 1: 10.0}
+_UNKNOWN_MPS = 10.0
+_KINDS = {0: "mlat", 1: "mlat", 2: "adsb", 3: "smr", 5: "mlat"}
+"""Sensor by the type of a report of category 010: multilateration, ADS-B, primary RADAR."""
+_TARGET_REPORT = 1
+_COMMON = (
+    "000",
+    "010/SIC",
+    "020/TYP",
+    "170/CST",
+    "210/VN",
+    "090/NACP",
+    "090/NUCPNIC",
+    "090/NUCRNACV",
+)
+
+
+class _Category(NamedTuple):
+    """Items of a category, by number or number/part; the first that a record has counts."""
+
+    sensor: str
+    stamp: tuple[str, ...]
+    receipt: tuple[str, ...]
+    """None: there is no second time."""
+    address: str
+    positions: tuple[tuple[str, str, str], ...]
+    """Items with their parts LAT and LON, X and Y, or RHO and THETA."""
+    velocity: tuple[str, str, str]
+    """Item with its parts VX and VY, or speed and direction."""
+    height: str
+    unit_m: float = 1.0
+    """Of X and Y."""
+    lsb: Mapping[str, float] = {}
+    """Least significant bits, where libasterix has other ones."""
+
+
+_WGS84, _CARTESIAN, _POLAR = (
+    ("041", "LAT", "LON"),
+    ("042", "X", "Y"),
+    ("040", "RHO", "THETA"),
+)
+_GNSS = (("131", "LAT", "LON"), ("130", "LAT", "LON"))
+_SYSTEM = (("105", "LAT", "LON"), ("100", "X", "Y"))
+_CATEGORIES = {
+    # Edition 1.1, 5.2.20: +-8192 m/s in 16 bits, 0.25 m/s; libasterix 1.1 has 1/16 m/s.
+    10: _Category(
+        "",
+        ("140",),
+        (),
+        "220",
+        (_WGS84, _CARTESIAN, _POLAR),
+        ("202", "VX", "VY"),
+        "090/FL",
+        lsb={"202/VX": 0.25, "202/VY": 0.25},
+    ),
+    20: _Category(
+        "mlat", ("140",), (), "220", (_WGS84, _CARTESIAN), ("202", "VX", "VY"), "090/FL"
+    ),
+    21: _Category(
+        "adsb",
+        ("073", "071", "030"),
+        ("077",),
+        "080",
+        _GNSS,
+        ("160", "GS", "TA"),
+        "145",
+    ),
+    48: _Category(
+        "radar",
+        ("140",),
+        (),
+        "220",
+        (_POLAR, _CARTESIAN),
+        ("200", "GSP", "HDG"),
+        "090/FL",
+        _NM_M,
+    ),
+    62: _Category(
+        "system", ("070",), (), "380/ADR", _SYSTEM, ("185", "VX", "VY"), "136"
+    ),
+}
+
+
+def _recognises(path: Path) -> bool:
+    if path.is_dir():
+        return any(path.glob("*.ast"))
+    return path.suffix == ".ast"
+
+
+def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
+    try:
+        from asterix.generated import manifest
+    except ImportError as error:
+        raise CallError(
+            f"{path}: is ASTERIX, install its reader: pip install 'fgtrack[asterix]'"
+        ) from error
+    known: Any = manifest[
+        "CATS"
+    ]  # Any: editions by category, which libasterix types as objects
+    readers = {
+        number: _reader(known[number], number, config.asterix) for number in _CATEGORIES
+    }
+    files = sorted(path.glob("*.ast")) if path.is_dir() else [path]
+    plane = LocalPlane(
+        config.origin or next(iter(config.asterix.stations.values()), None)
+    )
+    return partial(_merged, files, readers, config.asterix, plane)
+
+
+def _reader(
+    known: Iterable[Any], number: int, given: AsterixInput
+) -> RecordReader:  # Any: a class of libasterix
+    """Return the reader of the edition of category `number` that is set, else of the newest. Raises `CallError`."""
+    by_name = {".".join(map(str, each.cv_edition)): each for each in known}
+    name = given.editions.get(number, next(reversed(by_name)))
+    if name not in by_name:
+        raise CallError(
+            f"input.asterix.editions: category {number} has {', '.join(by_name)}, not {name}"
+        )
+    own = _CATEGORIES[number]
+    pairs = [
+        f"{item}/{part}"
+        for item, *parts in (*own.positions, own.velocity)
+        for part in parts
+    ]
+    times = (
+        *own.stamp,
+        *own.receipt,
+        *(each[number] for each in (given.stamp, given.receipt) if number in each),
+    )
+    return RecordReader(
+        by_name[name], [*_COMMON, *pairs, *times, own.address, own.height], own.lsb
+    )
+
+
+FORMAT = FileFormat("ASTERIX (.ast, or a folder of them)", _recognises, _open)
+
+
+def _merged(
+    files: list[Path],
+    readers: Mapping[int, RecordReader],
+    given: AsterixInput,
+    plane: LocalPlane,
+) -> Iterator[Message]:
+    sites = {
+        float(number): _Site(plane, station)
+        for number, station in given.stations.items()
+    }
+    readable = [
+        UntilBreak(_reports(file, readers, given, plane, sites)) for file in files
+    ]
+    ordered = merge(*readable, key=attrgetter("receipt_ns"))
+    for _, group in groupby(
+        ordered, key=attrgetter("sensor", "stamp_ns", "receipt_ns")
+    ):
+        lists = list(group)
+        yield replace(
+            lists[0], objects=tuple(item for each in lists for item in each.objects)
+        )
+    unplaced = [f"{number:g}" for number, site in sites.items() if site.misplaces]
+    if len(unplaced) > 1:
+        named = f"the stations {' and '.join(unplaced)} (SIC) give positions relative to themselves"
+        warn_once(
+            f"{named}: set `input.asterix.stations`, without it all are taken to be at one point"
+        )
+    for each in readable:
+        each.raise_error()
+
+
+def _reports(
+    file: Path,
+    readers: Mapping[int, RecordReader],
+    given: AsterixInput,
+    plane: LocalPlane,
+    sites: dict[float, "_Site"],
+) -> Iterator[DetectionList]:
+    """Target reports of `file`, a list of one object each, in the order of the file.
+    `sites` by SIC gets those whose stations are not given.
+    """
+    newest_ns: int | None = None
+    for number, record in _records(file, readers):
+        own = _CATEGORIES[number]
+        if number == 10 and record.get("000") != _TARGET_REPORT:
+            continue
+        stamp_s = _first(
+            record, (given.stamp[number],) if number in given.stamp else own.stamp
+        )
+        receipt_s = _first(
+            record, (given.receipt[number],) if number in given.receipt else own.receipt
+        )
+        if stamp_s is None or (number in (10, 20) and record.get("170/CST")):
+            continue
+        station = record.get("010/SIC", 0.0)
+        if station not in sites:
+            sites[station] = _Site(plane, None)
+        item = _detection(record, number, own, sites[station], plane)
+        if item is None:
+            continue
+        stamp_ns = _on_nearest_day(stamp_s, newest_ns)
+        receipt_ns = (
+            stamp_ns if receipt_s is None else _on_nearest_day(receipt_s, stamp_ns)
+        )
+        newest_ns = receipt_ns if newest_ns is None else max(newest_ns, receipt_ns)
+        sensor = own.sensor or _KINDS.get(int(record.get("020/TYP", 0)), "other")
+        yield DetectionList(
+            sensor, stamp_ns, newest_ns, (item,), "map", origin_deg=plane.origin_deg
+        )
+
+
+def _on_nearest_day(time_s: float, near_ns: int | None) -> int:
+    """Return a time of day as a stamp, on the day that brings it nearest to `near_ns`; on day 0 without one.
+
+    The second time of a report may lie before the first: their clocks are rounded to 1/128 s.
+    """
+    time_ns = round(time_s * NS_PER_S)
+    return (
+        time_ns
+        if near_ns is None
+        else time_ns + _DAY_NS * round((near_ns - time_ns) / _DAY_NS)
+    )
+
+
+def _records(
+    file: Path, readers: Mapping[int, RecordReader]
+) -> Iterator[tuple[int, Record]]:
+    """Category and record of everything in `file` that is read. Raises `TruncatedInput` and `DataError`."""
+    at = 0
+    with open_file(file) as blocks:
+        while head := blocks.read(3):
+            number, length = head[0], int.from_bytes(head[1:], "big")
+            content = blocks.read(max(length - 3, 0))
+            if len(head) < 3 or len(content) != length - 3:
+                raise TruncatedInput(f"{file}: breaks off in the block at byte {at}")
+            try:
+                records = list(readers[number](content)) if number in readers else []
+            except (ValueError, IndexError) as error:
+                hint = f"another edition? (input.asterix.editions: {{{number}: ...}})"
+                raise DataError(
+                    f"{file}: cannot decode category {number} at byte {at}, {hint}"
+                ) from error
+            for record in records:
+                yield number, record
+            at += length
+
+
+class _Site:
+    """Position of a station in the plane, and the axes of its own plane there: the meridians converge."""
+
+    def __init__(self, plane: LocalPlane, station: Origin | None) -> None:
+        self._x_m = self._y_m = self._turn_rad = 0.0
+        self._given, self.misplaces = station is not None, False
+        """True if a position relative to it was placed without knowing where it is."""
+        if station is not None:
+            self._x_m, self._y_m = plane.position_m(
+                station.latitude_deg, station.longitude_deg
+            )
+            x_m, y_m = plane.position_m(
+                min(station.latitude_deg + 0.01, 90.0), station.longitude_deg
+            )
+            self._turn_rad = math.atan2(x_m - self._x_m, y_m - self._y_m)
+
+    def position_m(self, x_m: float, y_m: float) -> tuple[float, float]:
+        """Position in the plane of `x_m` to the east and `y_m` to the north of the station."""
+        self.misplaces = not self._given
+        c, s = math.cos(self._turn_rad), math.sin(self._turn_rad)
+        return self._x_m + c * x_m + s * y_m, self._y_m - s * x_m + c * y_m
+
+
+def _detection(
+    record: Record, number: int, own: _Category, site: _Site, plane: LocalPlane
+) -> Detection | None:
+    """Object of a target report; None where it has no position."""
+    position = next(
+        (
+            at
+            for name in own.positions
+            if (at := _position_m(record, *name, own.unit_m, site, plane))
+        ),
+        None,
+    )
+    if position is None:
+        return None
+    speed_mps, yaw_rad = _velocity(record, *own.velocity)
+    address, level = record.get(own.address), record.get(own.height)
+    return Detection(
+        *position,
+        yaw_rad,
+        speed_mps,
+        covariance=_accuracy(record, speed_mps) if number == 21 else None,
+        z_m=None if level is None else 100.0 * _FOOT_M * level,
+        id=None if address is None else f"{int(address):06X}",
+    )
+
+
+def _position_m(
+    record: Record,
+    item: str,
+    first: str,
+    second: str,
+    unit_m: float,
+    site: _Site,
+    plane: LocalPlane,
+) -> tuple[float, float] | None:
+    a, b = record.get(f"{item}/{first}"), record.get(f"{item}/{second}")
+    if a is None or b is None:
+        return None
+    if first == "LAT":
+        return plane.position_m(a, b)
+    if first == "RHO":
+        a, b = a * math.sin(math.radians(b)), a * math.cos(math.radians(b))
+    return site.position_m(unit_m * a, unit_m * b)
+
+
+def _velocity(
+    record: Record, item: str, first: str, second: str
+) -> tuple[float | None, float | None]:
+    """Speed over ground, and its direction where it moves; None where it is not reported."""
+    a, b = record.get(f"{item}/{first}"), record.get(f"{item}/{second}")
+    if a is None or b is None:
+        return None, None
+    if first == "VX":
+        return math.hypot(a, b), math.atan2(b, a) if a or b else None
+    return a * _NM_M, wrap_angle(math.radians(90.0 - b)) if a else None
+
+
+def _accuracy(record: Record, speed_mps: float | None) -> tuple[float, ...] | None:
+    """Covariance of the measured components by the accuracy categories; None where the position has none."""
+    radius_m = _NACP_M.get(int(record.get("090/NACP", 0)))
+    if not radius_m and record.get("210/VN") == 0:
+        radius_m = _NUCP_M.get(int(record.get("090/NUCPNIC", 0)))
+    if radius_m is None:
+        return None
+    variances = [(radius_m / _PER_95) ** 2] * 2
+    if speed_mps is not None:
+        std_mps = (
+            _NACV_MPS.get(int(record.get("090/NUCRNACV", 0)), _UNKNOWN_MPS) / _PER_95
+        )
+        variances += [(std_mps / max(speed_mps, std_mps)) ** 2] * bool(speed_mps) + [
+            std_mps**2
+        ]
+    size = len(variances)
+    return tuple(
+        variances[row] if row == column else 0.0
+        for row in range(size)
+        for column in range(size)
+    )
+
+
+def _first(record: Record, names: Iterable[str]) -> float | None:
+    return next(
+        (value for name in names if (value := record.get(name)) is not None), None
+    )

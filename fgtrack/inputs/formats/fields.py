@@ -1,0 +1,201 @@
+"""Mapped fields: components of messages and tables, read by the paths that the configuration gives them."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from fgtrack.core.geometry import wrap_angle
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import DESCRIBING, MEASURABLE, STATE_NAMES, Detection, EgoState
+from fgtrack.inputs.formats.common import (
+    ObjectList,
+    RosMessage,
+    frame_of,
+    identity,
+    object_id,
+    stamp_ns,
+    yaw_rad,
+)
+from fgtrack.inputs.geodetic import GEODETIC, LocalPlane
+from fgtrack.inputs.settings import Field, FieldPath
+from fgtrack.models.measurement import ANGULAR
+
+COMPONENTS = ("object_id", *MEASURABLE, *GEODETIC, *DESCRIBING)
+"""Mapped components of a detection."""
+OBJECT_FIELDS = frozenset({"objects", "stamp", "object_stamp", *COMPONENTS})
+"""Names in the `fields` of an object list: `objects` is the path of the list, `stamp` that of the
+message's time (default `header.stamp`); the others are paths in one object."""
+EGO_FIELDS = frozenset({"stamp", "in_pit", *STATE_NAMES, *GEODETIC})
+"""Names in the `fields` of the ego."""
+
+#: Conversions of the components that are not numbers.
+_CONVERSIONS: Mapping[str, Callable[[Any], Any]] = {
+    "object_id": object_id,
+    "id": identity,
+    "class_name": str,
+    "in_pit": bool,
+}
+
+
+class FieldError(Exception):
+    """A path does not lead to a valid value; the reader of the recording adds where."""
+
+
+def mapped(
+    fields: Mapping[str, FieldPath], names: Iterable[str], read: Callable[[str], Any]
+) -> dict[
+    str, Any
+]:  # Any: a value as recorded, and as `EgoState`, `Detection` and `TruthState` take it
+    """Values of those of `names` that `fields` maps, by name; `read` gives the recorded value at a path, or None."""
+    return {
+        name: _component(name, fields[name], read) for name in names if name in fields
+    }
+
+
+def paths_of(path: FieldPath) -> list[str]:
+    """The recorded fields that a component is read from."""
+    path = path.path if isinstance(path, Field) else path
+    return [path] if isinstance(path, str) else list(path)
+
+
+def single_path(path: FieldPath) -> str:
+    """The recorded field of a component that is not a number. Raises `FieldError` for a vector."""
+    paths = paths_of(path)
+    if len(paths) != 1:
+        raise FieldError(f"{paths}: the name of one field is needed, not several")
+    return paths[0]
+
+
+def _component(name: str, path: FieldPath, read: Callable[[str], Any]) -> Any:
+    """The value, converted; an angle is wrapped, but not above 1.5 turns of radians, which may be degrees."""
+    if name in _CONVERSIONS:
+        value = read(single_path(path))
+        return None if value is None else _CONVERSIONS[name](value)
+    numbers = [_float(read(each), each) for each in paths_of(path)]
+    present = [value for value in numbers if value is not None]
+    if len(present) < len(numbers):
+        return None
+    raw = present[0] if len(present) == 1 else math.hypot(*present)
+    if not isinstance(path, Field):
+        return raw
+    value = path.value(raw)
+    wraps = path.degrees or (path.offset != 0.0 and abs(value) <= 3.0 * math.pi)
+    return (
+        wrap_angle(value)
+        if wraps and name in ANGULAR and math.isfinite(value)
+        else value
+    )
+
+
+def _float(value: Any, path: str) -> float | None:
+    if hasattr(value, "w"):  # a quaternion
+        yaw = yaw_rad(value)
+        return math.nan if yaw is None else yaw
+    try:
+        return None if value is None else float(value)
+    except (TypeError, ValueError) as error:
+        raise FieldError(f"{path}: {str(value)[:40]!r} is not a number") from error
+
+
+def objects_by_fields(
+    message: RosMessage,
+    fields: Mapping[str, FieldPath],
+    plane: LocalPlane | None = None,
+) -> ObjectList:
+    """Object list of `message`; without `objects` in `fields` the message itself is the one object."""
+    objects, plane = [], plane or LocalPlane()
+    for item in items_by_fields(message, fields):
+        stamp = (
+            _time(item, fields["object_stamp"]) if "object_stamp" in fields else None
+        )
+        values = plane.placed(mapped(fields, COMPONENTS, partial(value_at, item)))
+        objects.append(Detection(**values, stamp_ns=stamp))
+    frame = frame_of(message.header) if hasattr(message, "header") else None
+    frame = "map" if GEODETIC[0] in fields else frame
+    return ObjectList(_message_stamp(message, fields), frame, tuple(objects))
+
+
+def items_by_fields(
+    message: RosMessage, fields: Mapping[str, FieldPath]
+) -> list[RosMessage]:
+    """The objects of `message` as they are in it, in the order of `objects_by_fields`."""
+    if "objects" not in fields:
+        return [message]
+    path = single_path(fields["objects"])
+    items = value_at(message, path)
+    if not isinstance(items, list | tuple):
+        raise FieldError(f"{path}: is not a list of objects")
+    return list(items)
+
+
+def ego_by_fields(
+    message: RosMessage,
+    fields: Mapping[str, FieldPath],
+    receipt_ns: int,
+    plane: LocalPlane | None = None,
+) -> EgoState:
+    """The ego's state; `x_m`, `y_m`, `yaw_rad` and `speed_mps` must be among `fields`."""
+    stamp = _message_stamp(message, fields)
+    plane = plane or LocalPlane()
+    values = plane.placed(
+        mapped(fields, (*STATE_NAMES, "in_pit", *GEODETIC), partial(value_at, message))
+    )
+    return EgoState(receipt_ns if stamp is None else stamp, receipt_ns, **values)
+
+
+def value_at(message: RosMessage, path: str) -> RosMessage:
+    """Return the value at `path`: attributes, or indices of a list, with dots between. Raises `FieldError`."""
+    value = message
+    for part in path.split("."):
+        try:
+            value = value[int(part)] if part.isdigit() else getattr(value, part)
+        except (AttributeError, LookupError, TypeError) as error:
+            names = [
+                name
+                for name in getattr(value, "__dataclass_fields__", ())
+                if not name.startswith("_")
+            ]
+            raise FieldError(
+                f"{path}: there is no {part!r}, but {', '.join(names) or 'no fields'}"
+            ) from error
+    return value
+
+
+def _message_stamp(message: RosMessage, fields: Mapping[str, FieldPath]) -> int | None:
+    if "stamp" in fields:
+        return _time(message, fields["stamp"])
+    return stamp_ns(message.header.stamp) if hasattr(message, "header") else None
+
+
+def _time(message: RosMessage, path: FieldPath) -> int:
+    """A ROS time, integer nanoseconds or float seconds."""
+    value = value_at(message, single_path(path))
+    if hasattr(value, "nanosec"):
+        return stamp_ns(value)
+    return round(value * NS_PER_S) if isinstance(value, float) else int(value)
+
+
+def fields_of(message: RosMessage) -> dict[str, Any]:
+    """Values of the fields of `message` by path: numbers, texts, yaws of quaternions, times in s, lists of objects."""
+    values: dict[str, Any] = {}
+    for name in getattr(message, "__dataclass_fields__", ()):
+        value = getattr(message, name)
+        if name.startswith("__") or name == "header":
+            continue
+        if hasattr(value, "nanosec"):
+            value = stamp_ns(value) / NS_PER_S
+        elif hasattr(value, "w") and hasattr(value, "z"):
+            value = yaw_rad(value)
+        is_list = isinstance(value, list) and all(
+            hasattr(item, "__dataclass_fields__") for item in value
+        )
+        if is_list or isinstance(value, bool | int | float | str | np.number | None):
+            values[name] = value
+        else:
+            values |= {
+                f"{name}.{path}": inner for path, inner in fields_of(value).items()
+            }
+    return values

@@ -1,0 +1,372 @@
+"""CSV files whose columns the configuration names: the ego, detections and truth in one file or several.
+
+Rows of one stamp and receipt are one list of detections; a row in which nothing is measured is an empty scan, an empty
+cell a missing value. Columns are converted as in `fields.mapped`. Rows are sorted by receipt.
+"""
+
+import csv
+import gzip
+import math
+import re
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from datetime import datetime
+from decimal import Decimal
+from functools import partial
+from io import TextIOWrapper
+from itertools import chain, islice
+from operator import itemgetter
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.files import GZIP_MAGIC, open_file
+from fgtrack.core.time import wrong_unit
+from fgtrack.core.types import (
+    MEASURABLE,
+    STATE_NAMES,
+    Detection,
+    DetectionList,
+    EgoState,
+    Message,
+    TruthState,
+)
+from fgtrack.inputs.formats.common import exact_ns
+from fgtrack.inputs.formats.fields import (
+    COMPONENTS,
+    FieldError,
+    mapped,
+    paths_of,
+    single_path,
+)
+from fgtrack.inputs.formats.fusiontracking import LOG_NAME
+from fgtrack.inputs.geodetic import GEODETIC, LocalPlane
+from fgtrack.inputs.guess import guesses, time_unit, words_of
+from fgtrack.inputs.settings import CsvTable, FieldPath, InputConfig
+from fgtrack.inputs.source import FileFormat
+from fgtrack.inputs.stream import PACKED_TABLES
+from fgtrack.models.sensors import Filter
+
+_ENDINGS = (".csv", ".tsv", *PACKED_TABLES)
+_LONGEST_HEADER = 1_000_000
+_SAMPLES = 200
+_DATE = re.compile(
+    r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)Z?(\.\d+)?(?:Z|([+-]\d\d:\d\d))?"
+)
+_IN_MAP = frozenset(("east", "easting", "north", "northing", "utm"))
+#: Of Flightradar24's granular ADS-B data: P of a message with a position, N of one that repeats the last.
+_HAS_POSITION = {"no_position": Filter(one_of=("P",))}
+_TIMES = ("stamp", "receipt")
+#: Components of the rows of the ego and of truth, and those that must be there; all others are of detections.
+_NAMES = {
+    "ego": (*STATE_NAMES, *GEODETIC),
+    "truth": ("object_id", *STATE_NAMES, *GEODETIC),
+}
+_NEEDS = {"ego": STATE_NAMES[:4], "truth": STATE_NAMES[:2]}
+Cells = Mapping[str, str]
+
+
+def read_tables(
+    tables: Sequence[tuple[Path, CsvTable, str]], plane: LocalPlane | None = None
+) -> Iterator[Message]:
+    """Messages of `tables`, given with file and role (`ego`, `truth` or `detections.SENSOR`), in order of receipt.
+    Raises `DataError` for a row that does not match the mapping, after all messages up to the receipt before it.
+    """
+    plane = plane or LocalPlane()
+    keyed: list[tuple[tuple[int, int, int], Message]] = []
+    breaks: list[tuple[float, DataError]] = []
+    for number, table in enumerate(tables):
+        messages, error = _read(*table, plane)
+        keyed += [((each.receipt_ns, number, each.stamp_ns), each) for each in messages]
+        if error is not None:
+            breaks.append(
+                (max((each.receipt_ns for each in messages), default=-math.inf), error)
+            )
+    until_ns, broken = min(breaks, key=itemgetter(0), default=(math.inf, None))
+    for _, message in sorted(keyed, key=itemgetter(0)):
+        if message.receipt_ns <= until_ns:
+            yield message
+    if broken is not None:
+        raise broken
+
+
+def _read(
+    file: Path, table: CsvTable, role: str, plane: LocalPlane
+) -> tuple[list[Message], DataError | None]:
+    """Messages of the rows of a table that pass the filters, and the error that ends it."""
+    messages: list[Message] = []
+    scans: dict[tuple[int, int], list[Detection]] = {}
+    stamps_ns: list[int] = []
+    left_out: list[str] = []
+    skipped, error = None, None
+    where = str(file)
+    try:
+        result = rows(file, table.delimiter)
+        where, header = next(result)
+        for column in [
+            *chain.from_iterable(map(paths_of, table.columns.values())),
+            *table.filters,
+        ]:
+            if column not in header:
+                raise DataError(
+                    f"{where}: has no column {column!r}, but {', '.join(header)}"
+                )
+        for where, cells in result:  # noqa: B007 - an error below names it
+            if (name := _excluding_filter(table, cells)) is not None:
+                left_out.append(f"filters.{name}")
+                skipped = skipped or cells
+                continue
+            times, values = _times(cells, table), _values(cells, table, role, plane)
+            stamps_ns.append(times[0])
+            if role == "ego":
+                messages.append(EgoState(*times, **values))
+            elif role == "truth":
+                messages.append(TruthState(*times, **{"object_id": 0} | values))
+            else:
+                is_measured = not values.keys().isdisjoint(MEASURABLE)
+                scans.setdefault(times, []).extend(
+                    [Detection(**values)] if is_measured else []
+                )
+        if (
+            skipped is not None and not scans and role not in _NAMES
+        ):  # an empty list reports what was left out
+            scans[_times(skipped, table)] = []
+    except FieldError as wrong:
+        error = DataError(f"{where}: {wrong}")
+    except DataError as broken:
+        error = broken
+    stamps_ns.sort()
+    few = len(stamps_ns) // 100  # wrong clocks of single rows
+    if stamps_ns and (
+        text := wrong_unit(
+            len(stamps_ns), stamps_ns[few], stamps_ns[-1 - few], table.time_unit
+        )
+    ):
+        return [], DataError(f"{file}: {text}: change `time_unit` (input.csv.{role})")
+    for (stamp_ns, receipt_ns), objects in scans.items():
+        counted, left_out = tuple(left_out), []
+        sensor = role.removeprefix("detections.")
+        frame = table.frame or ("map" if GEODETIC[0] in table.columns else "ego")
+        messages.append(
+            DetectionList(
+                sensor, stamp_ns, receipt_ns, objects, frame, counted, plane.origin_deg
+            )
+        )
+    return messages, error
+
+
+def rows(file: Path, delimiter: str | None = None) -> Iterator[tuple[str, Cells]]:
+    """File and line, and cells by column, of the rows of `file`, the header first; `DataError` if it is not a table.
+    Without a delimiter the most frequent of `,`, `;` and tab in the header.
+    """
+    where = f"{file}:1"
+    try:
+        with (
+            open_file(file) as raw,
+            TextIOWrapper(
+                _unpacked(raw), encoding="utf-8-sig", errors="replace", newline=""
+            ) as text,
+        ):
+            first = text.readline(_LONGEST_HEADER)
+            text.seek(0)
+            separator, lines = delimiter or max(",;\t", key=first.count), iter(text)
+            if separator not in first and delimiter is None and " " in first.strip():
+                separator, lines = " ", (" ".join(line.split()) for line in text)
+            reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)
+            header = [name.strip() for name in next(reader, [])]
+            named = [name for name in header if name]
+            if len(set(named)) < len(named):
+                raise DataError(f"{where}: has a column twice: {', '.join(header)}")
+            yield where, dict(zip(header, header, strict=True))
+            for cells in filter(any, reader):
+                where = f"{file}:{reader.line_num}"
+                if len(cells) != len(header):
+                    raise DataError(
+                        f"{where}: has {len(cells)} cells, the header has {len(header)}"
+                    )
+                yield where, dict(zip(header, map(str.strip, cells), strict=True))
+    except (OSError, EOFError, zlib.error, csv.Error) as error:
+        raise DataError(f"{where}: cannot be read any further ({error})") from error
+
+
+def _unpacked(raw: BinaryIO) -> BinaryIO:
+    """The file `raw` for reading, unpacked if it is gzipped."""
+    is_packed = raw.read(2) == GZIP_MAGIC
+    raw.seek(0)
+    return cast(BinaryIO, gzip.GzipFile(fileobj=raw)) if is_packed else raw
+
+
+def _time_ns(text: str, unit: str) -> int:
+    """Integer nanoseconds of a number in `unit`, or of a date and time (ISO 8601, UTC unless it has a zone)."""
+    if (date := _DATE.fullmatch(text)) is None:
+        return exact_ns(text, unit)
+    day, time, fraction, zone = date.groups()
+    whole_s = datetime.fromisoformat(f"{day}T{time}{zone or '+00:00'}").timestamp()
+    return exact_ns(Decimal(int(whole_s)) + Decimal(fraction or 0))
+
+
+def _excluding_filter(table: CsvTable, cells: Cells) -> str | None:
+    """First filter that a row does not pass; a text that is a number is compared as one."""
+    for name, each in table.filters.items():
+        value: float | str = cells[name]
+        with suppress(ValueError):
+            value = float(value)
+        if not each.passes(value):
+            return name
+    return None
+
+
+def _values(
+    cells: Cells, table: CsvTable, role: str, plane: LocalPlane
+) -> dict[str, Any]:  # Any: as of `mapped`
+    """Values that a row gives; NaN for a state that must be there, which the tracker counts."""
+    values = plane.placed(
+        mapped(
+            table.columns,
+            _NAMES.get(role, COMPONENTS),
+            lambda column: cells[column] or None,
+        )
+    )
+    values |= {name: math.nan for name in _NEEDS.get(role, ()) if values[name] is None}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _times(cells: Cells, table: CsvTable) -> tuple[int, int]:
+    """Stamp and receipt of a row in integer nanoseconds."""
+    times: list[int] = []
+    for name in _TIMES:
+        column = single_path(table.columns.get(name, table.columns["stamp"]))
+        try:
+            times.append(_time_ns(cells[column], table.time_unit))
+        except (ArithmeticError, ValueError) as error:
+            text = f"{cells[column]!r:.40} is not a time in {table.time_unit}"
+            raise FieldError(f"{column}: {text}, or change `time_unit`") from error
+    stamp_ns, receipt_ns = times
+    return receipt_ns if table.stamp_from == "receipt" else stamp_ns, receipt_ns
+
+
+def _recognises(path: Path) -> bool:
+    if path.is_dir():
+        return not (path / "meta.json").exists() and any(
+            file.name.endswith(_ENDINGS) for file in path.iterdir()
+        )
+    return (
+        path.name.endswith(_ENDINGS) and path.name != LOG_NAME
+    )  # which is not an input by itself
+
+
+def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
+    sensors = {
+        f"detections.{name}": table for name, table in config.csv.detections.items()
+    }
+    named = {"truth": config.csv.truth, "ego": config.csv.ego, **sensors}
+    tables = [
+        (_file(path, table, role), table, role)
+        for role, table in named.items()
+        if table is not None
+    ]
+    if not tables:
+        tables = reports_of(path)
+    if not tables:
+        found = "; ".join(
+            f"{file.name} has {', '.join(columns)}"
+            for file, columns in headers(path).items()
+        )
+        raise CallError(
+            f"{path}: is CSV, name its columns in input.csv: {found} (`fgtrack info {path} --write my.yaml` guesses)"
+        )
+    return partial(read_tables, tables, LocalPlane(config.origin))
+
+
+def reports_of(path: Path) -> list[tuple[Path, CsvTable, str]]:
+    """The one table of position reports at `path`, with a mapping by the names of its columns; empty without any.
+    Taken are times, positions in the map (latitude and longitude, or east and north) and identities; the sensor is
+    `adsb` or `ais` by the column of these, else `reports`. Raises `CallError` where there are several.
+    """
+    tables: list[tuple[Path, CsvTable, str]] = []
+    for file, names in headers(path).items():
+        cells = [each for _, each in islice(rows(file), 1, _SAMPLES)]
+        own = guesses(
+            {name: _numbers(each[name] for each in cells) for name in names if name}
+        )
+        known = ("stamp", "receipt", *GEODETIC, "id")
+        columns: dict[str, FieldPath] = {
+            key: own[key].path for key in known if key in own
+        }
+        if not {*GEODETIC} <= columns.keys():
+            columns |= {key: own[key].path for key in ("x_m", "y_m") if key in own}
+            if not all(
+                set(words_of(str(columns.get(key, "")))) & _IN_MAP
+                for key in ("x_m", "y_m")
+            ):
+                continue
+        if "stamp" not in columns:
+            continue
+        unit, _ = time_unit(
+            str(columns["stamp"]),
+            _numbers(each[str(columns["stamp"])] for each in cells),
+        )
+        words = set(words_of(str(columns.get("id", ""))))
+        sensor = "ais" if "mmsi" in words else "adsb" if words else "reports"
+        filters = {name: rule for name, rule in _HAS_POSITION.items() if name in names}
+        table = CsvTable(columns, None, unit, frame="map", filters=filters)  # type: ignore[arg-type]  # of NS_PER_UNIT
+        tables.append((file, table, f"detections.{sensor}"))
+    if len(tables) > 1:
+        raise CallError(
+            f"{path}: holds {len(tables)} tables of reports, name one, as {tables[0][0]}, or input.csv"
+        )
+    return tables
+
+
+def _numbers(texts: Iterable[str]) -> list[float]:
+    numbers = []
+    for text in texts:
+        with suppress(ValueError):
+            numbers.append(float(text))
+    return numbers
+
+
+def headers(path: Path) -> dict[Path, list[str]]:
+    """Columns of the CSV file `path`, or of every one in the folder, by file. Raises `DataError` as `read_tables`."""
+    files = (
+        sorted(file for file in path.iterdir() if file.name.endswith(_ENDINGS))
+        if path.is_dir()
+        else [path]
+    )
+    return {file: list(next(rows(file))[1]) for file in files}
+
+
+def _file(path: Path, table: CsvTable, role: str) -> Path:
+    """File of `table`, whose columns are checked."""
+    where, columns = f"input.csv.{role}", table.columns.keys()
+    placed = columns | ({"x_m", "y_m"} if columns >= set(GEODETIC) else set())
+    known = {*_TIMES, *_NAMES.get(role, COMPONENTS)}
+    needed = {"stamp", *_NEEDS.get(role, ())}
+    if columns - known:
+        raise CallError(
+            f"{where}.columns: unknown column {min(columns - known)!r}, known are {', '.join(sorted(known))}"
+        )
+    if needed - placed or (role not in _NAMES and placed.isdisjoint(MEASURABLE)):
+        measured = (
+            ""
+            if role in _NAMES
+            else f" and what is measured, one of {', '.join(MEASURABLE)}"
+        )
+        raise CallError(
+            f"{where}.columns: must name {', '.join(sorted(needed))}{measured}"
+        )
+    if table.file is None and path.is_dir():
+        raise CallError(f"{path}: is a folder, so {where} must name its file")
+    return (
+        path
+        if table.file is None
+        else (path if path.is_dir() else path.parent) / table.file
+    )
+
+
+FORMAT = FileFormat(
+    "CSV (.csv, .tsv, or a folder of them) with a mapping of its columns",
+    _recognises,
+    _open,
+)

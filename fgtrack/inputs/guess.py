@@ -1,0 +1,296 @@
+"""Guesses of the fields of unknown tables and messages, from their names and values."""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgtrack.core.geometry import may_be_radians
+from fgtrack.core.time import NS_PER_S, NS_PER_UNIT, epoch_unit
+from fgtrack.core.types import FloatArray
+from fgtrack.inputs.settings import Field, FieldPath
+from fgtrack.models.measurement import ANGULAR
+
+__all__ = ["Guess", "agreeing_with_motion", "guesses", "time_unit", "words_of"]
+
+#: Units at the end of a name, by what they are of: the factor to SI, or `degrees`.
+_SCALES = {
+    "m": {"km": 1e3, "cm": 1e-2, "mm": 1e-3},
+    "mps": {
+        "kmh": 1.0 / 3.6,
+        "kph": 1.0 / 3.6,
+        "mph": 0.44704,
+        "kn": 0.514444,
+        "kts": 0.514444,
+        "knots": 0.514444,
+    },
+}
+_DEGREES = ("deg", "degs", "degree", "degrees", "degps", "dps")
+_UNITS = {
+    "m",
+    "s",
+    "ms",
+    "us",
+    "ns",
+    "mps",
+    "mps2",
+    "rad",
+    "radps",
+    *_DEGREES,
+    *_SCALES["m"],
+    *_SCALES["mps"],
+}
+#: Words of names that are not read: how good something is, or a derivative that no model has.
+_SKIPPED = frozenset(
+    (
+        "std",
+        "sigma",
+        "stddev",
+        "var",
+        "variance",
+        "cov",
+        "covariance",
+        "error",
+        "err",
+        "rms",
+        "uncertainty",
+        "accuracy",
+    )
+)
+_OF_VELOCITY = frozenset(("velocity", "vel", "v", "speed", "twist", "vrel", "linear"))
+_OF_SIZE = frozenset(
+    ("size", "dimension", "dimensions", "extent", "extents", "scale", "shape")
+)
+_OF_OTHER = frozenset(
+    (
+        "acceleration",
+        "accel",
+        "acc",
+        "a",
+        "angular",
+        "orientation",
+        "quaternion",
+        "rotation",
+        "q",
+    )
+)
+_AXES = {
+    "x": ("x_m", "velocity x", "length_m"),
+    "y": ("y_m", "velocity y", "width_m"),
+    "z": ("z_m", "", "height_m"),
+}
+#: Ends of names, by component, the first that matches.
+_NAMES = {
+    "receipt": "receipt|received|receive|recv|seen|arrival|arrived|rx|"
+    "(receipt|received|receive|recv|arrival|rx|log|network|sub)_(time|stamp|timestamp)",
+    "stamp": "stamp|timestamp|time|t|epoch|secs?|seconds",
+    "yaw_rate_radps": "yaw_?rate|turn_rate|heading_rate|omega|angular_(velocity_)?z|gyro_z",
+    "range_rate_mps": "range_?rate|doppler|rdot|vr|radial_(velocity|speed)|(velocity|speed)_radial",
+    "yaw_rad": "yaw|heading|hdg|psi|theta|course|cog|orientation|(yaw|heading)_angle",
+    "bearing_rad": "bearing|azimuth|az|angle|phi|(bearing|azimuth)_angle",
+    "range_m": "range|distance|dist|rho|r",
+    "speed_mps": "speed|velocity|vel|v|sog",
+    "velocity x": "vx|dx_dt|vlong",
+    "velocity y": "vy|dy_dt|vlat",
+    "latitude_deg": "lat|latitude",
+    "longitude_deg": "lon|lng|long|longitude",
+    "x_m": "px|east|easting|e|dx|longitudinal|utm_x",
+    "y_m": "py|north|northing|n|dy|lateral|utm_y",
+    "length_m": "length|l",
+    "width_m": "width|w",
+    "height_m": "height|h",
+    "score": "score|confidence|prob|probability",
+    "id": "icao|icao24|hex|mmsi|(icao|mode_?s)_?address|station_?id",
+    "object_id": "id|uid|uuid|(track|object|obj|target|car|vehicle)_?id|track|object|target",
+    "class_name": "class|class_name|label|category|type|kind|classification",
+}
+_PERIOD_S = (5e-4, 20.0)  # of a source
+_MOVED_M = 0.05  # between two states that have a direction
+_FEWEST_STEPS = 10
+_AGREEMENT = 0.8  # mean cosine of course minus heading
+_SPEED_TOLERANCE = 0.07  # half of what mph and knots differ by
+_SPEED_SCALES = {"mps": 1.0, "kmh": 1.0 / 3.6, "mph": 0.44704, "knots": 0.514444}
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Where a component probably is, and why."""
+
+    path: FieldPath
+    reason: str
+
+
+def words_of(name: str) -> list[str]:
+    """Words of the name of a column or of the path of a field, in lower case."""
+    return [
+        word
+        for word in re.split(
+            r"[^a-z0-9]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()
+        )
+        if word
+    ]
+
+
+def guesses(values: Mapping[str, Sequence[float]]) -> dict[str, Guess]:
+    """Guess by component (of a table or of `fields`) of the fields `values`: samples by name, none if one is text."""
+    guessed: dict[str, Guess] = {}
+    for name, samples in values.items():
+        component, unit = _component(name)
+        if component is not None and component not in guessed:
+            guessed[component] = _converted(component, unit, name, samples)
+    vx, vy = guessed.pop("velocity x", None), guessed.pop("velocity y", None)
+    if vx and vy and "speed_mps" not in guessed:
+        names, scale = (
+            [_name(vx), _name(vy)],
+            vx.path.scale if isinstance(vx.path, Field) else 1.0,
+        )
+        guessed["speed_mps"] = Guess(
+            names if scale == 1.0 else Field(names, scale), "length of the velocity"
+        )
+    return guessed
+
+
+def time_unit(name: str, samples: Sequence[float]) -> tuple[str, str]:
+    """Unit of the times `samples` and the reason: by their size, the name, or the period between them."""
+    unit = epoch_unit(samples[0]) if len(samples) else None
+    if unit is not None:
+        return unit, f"{samples[0]:.10g} {unit} after 1970 is a date of this century"
+    last = (words_of(name) or [""])[-1]
+    if last in NS_PER_UNIT:
+        return last, "by its name"
+    gaps = np.diff(np.unique(np.asarray(samples, dtype=np.float64)))
+    for unit, ns in NS_PER_UNIT.items():
+        if (
+            len(gaps)
+            and _PERIOD_S[0]
+            <= (period_s := float(np.median(gaps)) * ns / NS_PER_S)
+            <= _PERIOD_S[1]
+        ):
+            return unit, f"the period would be {period_s:.3g} s"
+    return "s", "uncertain: check it"
+
+
+def agreeing_with_motion(
+    guessed: Mapping[str, Guess], values: Mapping[str, FloatArray], unit: str
+) -> dict[str, Guess]:
+    """`guessed` with heading and speed in the convention that the positions in `values`, (rows,) each, confirm."""
+    if not {"stamp", "x_m", "y_m"} <= guessed.keys():
+        return dict(guessed)
+    t_s, x_m, y_m = (values[_name(guessed[name])] for name in ("stamp", "x_m", "y_m"))
+    gap_s, dx_m, dy_m = (
+        np.diff(t_s) * NS_PER_UNIT[unit] / NS_PER_S,
+        np.diff(x_m),
+        np.diff(y_m),
+    )
+    step_m = np.hypot(dx_m, dy_m)
+    moved = (step_m > _MOVED_M) & (gap_s > 0.0)
+    if moved.sum() < _FEWEST_STEPS:
+        return dict(guessed)
+    changed = dict(guessed)
+    if "yaw_rad" in guessed:
+        raw = values[_name(guessed["yaw_rad"])][:-1][moved]
+        changed["yaw_rad"] = _heading(
+            guessed["yaw_rad"], raw, np.arctan2(dy_m, dx_m)[moved]
+        )
+    if "speed_mps" in guessed and isinstance(guessed["speed_mps"].path, str):
+        ratio = float(
+            np.median(values[_name(guessed["speed_mps"])][:-1][moved])
+            / np.median(step_m[moved] / gap_s[moved])
+        )
+        for name, scale in _SPEED_SCALES.items():
+            if abs(ratio * scale - 1.0) < _SPEED_TOLERANCE and scale != 1.0:
+                reason = f"{ratio:.3g} times the distance travelled per second: {name}"
+                changed["speed_mps"] = Guess(
+                    Field(_name(guessed["speed_mps"]), scale), reason
+                )
+    return changed
+
+
+def _heading(guess: Guess, raw: FloatArray, course_rad: FloatArray) -> Guess:
+    """The convention of a heading that agrees best with the direction of travel; `guess` where none does."""
+    degrees = isinstance(guess.path, Field) and guess.path.degrees
+    quarter = 90.0 if degrees else 0.5 * math.pi
+    options = [
+        Field(_name(guess), degrees=degrees),
+        Field(_name(guess), scale=-1.0, offset=quarter, degrees=degrees),
+    ]
+    agreement = [
+        float(np.mean(np.cos(course_rad - [option.value(each) for each in raw])))
+        for option in options
+    ]
+    best = int(agreement[1] > agreement[0])
+    if agreement[best] < _AGREEMENT:
+        return Guess(
+            guess.path,
+            f"{guess.reason}; does not agree with the direction of travel: check it",
+        )
+    how = "a compass, clockwise from north" if best else "counter-clockwise from east"
+    path = guess.path if not best else options[1]
+    return Guess(
+        path, f"{guess.reason}; {how}, as it agrees with the direction of travel"
+    )
+
+
+def _component(name: str) -> tuple[str | None, str]:
+    """Component that the name of a field stands for (None for none that is read), and the unit in it."""
+    words = words_of(name)
+    if not words or _SKIPPED & set(words):
+        return None, ""
+    unit = words[-1] if words[-1] in _UNITS else ""
+    base = words[: -1 if unit else None]
+    if not base:
+        return (
+            "stamp"
+            if unit in NS_PER_UNIT
+            else "speed_mps"
+            if unit in _SCALES["mps"]
+            else None
+        ), unit
+    axis = (
+        base[-1]
+        if base[-1] in _AXES
+        else base[0]
+        if base[0] in _AXES and base[-1] in _OF_VELOCITY
+        else None
+    )
+    if axis is not None:
+        context = set(base) - {axis}
+        kind = 1 if context & _OF_VELOCITY else 2 if context & _OF_SIZE else 0
+        return (None if context & _OF_OTHER else _AXES[axis][kind] or None), unit
+    text = "_".join(base)
+    if len(base[-1]) == 1 and len(base) > 1:
+        return None, unit
+    return next(
+        (
+            item
+            for item, names in _NAMES.items()
+            if re.fullmatch(f"(?:.*_)?(?:{names})", text)
+        ),
+        None,
+    ), unit
+
+
+def _converted(component: str, unit: str, name: str, samples: Sequence[float]) -> Guess:
+    finite = [value for value in samples if math.isfinite(value)]
+    spread = f"{min(finite):.4g} to {max(finite):.4g}" if finite else "no numbers"
+    if component in ("stamp", "receipt", "object_id", "id", "class_name"):
+        return Guess(name, "by its name")
+    is_rate = component in ("speed_mps", "range_rate_mps", "velocity x", "velocity y")
+    scale = _SCALES["mps" if is_rate else "m"].get(unit, 1.0)
+    if component in ANGULAR and (
+        unit in _DEGREES
+        or not may_be_radians(min(finite, default=0.0), max(finite, default=0.0))
+    ):
+        return Guess(Field(name, degrees=True), f"{spread}: degrees")
+    if component == "yaw_rate_radps" and unit in _DEGREES:
+        return Guess(Field(name, degrees=True), f"{spread}: degrees by its name")
+    if scale != 1.0:
+        return Guess(Field(name, scale), f"{spread} {unit}")
+    return Guess(name, spread)
+
+
+def _name(guess: Guess) -> str:
+    path = guess.path.path if isinstance(guess.path, Field) else guess.path
+    return path if isinstance(path, str) else path[0]

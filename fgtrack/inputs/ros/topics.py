@@ -1,0 +1,356 @@
+"""Converts the topics of a recording to fgtrack's messages, as configured."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.time import nanoseconds
+from fgtrack.core.types import (
+    DESCRIBING,
+    MEASURABLE,
+    Detection,
+    DetectionList,
+    Message,
+    TruthState,
+)
+from fgtrack.inputs.errors import TruncatedInput
+from fgtrack.inputs.formats import ADAPTERS
+from fgtrack.inputs.formats.common import ObjectList, RosMessage, object_id, split
+from fgtrack.inputs.formats.fields import (
+    EGO_FIELDS,
+    OBJECT_FIELDS,
+    FieldError,
+    ego_by_fields,
+    items_by_fields,
+    objects_by_fields,
+    value_at,
+)
+from fgtrack.inputs.formats.native import (
+    DETECTIONS,
+    EGO,
+    NATIVE_ADAPTERS,
+    TRUTH,
+    detections,
+)
+from fgtrack.inputs.formats.objects import ODOMETRY, ego_from_odometry
+from fgtrack.inputs.formats.scans import grouped
+from fgtrack.inputs.geodetic import GEODETIC, LocalPlane
+from fgtrack.inputs.ros.bag import Bag, BagTopic, is_bag
+from fgtrack.inputs.ros.bag_files import settings_of
+from fgtrack.inputs.settings import FieldPath, InputConfig, TopicInput
+from fgtrack.inputs.source import FileFormat
+
+DETECTION_FIELDS = frozenset({*MEASURABLE, *DESCRIBING, "object_id"})
+"""Fields that a filter may use, whatever the type of the message."""
+
+#: Keys of a topic that apply to some roles only.
+_KEYS = {
+    "frame": ("detections",),
+    "filters": ("detections", "truth"),
+    "scan_s": ("detections",),
+    "object_id": ("truth",),
+}
+_POSITION = {
+    "latitude_deg": "latitude",
+    "longitude_deg": "longitude",
+    "z_m": "altitude",
+}
+FIX_FIELDS: Mapping[str, Mapping[str, FieldPath]] = {
+    "sensor_msgs/msg/NavSatFix": _POSITION,
+    "geographic_msgs/msg/GeoPointStamped": {
+        name: f"position.{path}" for name, path in _POSITION.items()
+    },
+    "geographic_msgs/msg/GeoPoseStamped": {
+        name: f"pose.position.{path}" for name, path in _POSITION.items()
+    },
+}
+"""Fields of one object on Earth, by type; its altitude is kept as z_m."""
+Convert = Callable[[RosMessage, int], Iterable[Message]]
+"""Messages of a ROS message and its receipt."""
+TopicUse = tuple[BagTopic, str, Convert]
+"""A topic, its role in a replay (`ego`, `detections SENSOR`, `truth`, or `messages` for those of fgtrack's own types),
+and its conversion."""
+
+
+def topic_uses(bag: Bag, config: InputConfig) -> list[TopicUse]:
+    """Return the uses of the topics of `bag`, as `config` names them, else by their types where fgtrack wrote them.
+    Raises `DataError` for a topic that is not there or not named, and `CallError` where `config` does not fit its type.
+    """
+    names = {topic.name for topic in bag.topics}
+    plane = LocalPlane(config.origin)
+    truth = (
+        config.truth
+        if isinstance(config.truth, tuple)
+        else (config.truth,)
+        if config.truth
+        else ()
+    )
+    roles: list[tuple[str, TopicInput, Callable[[BagTopic, TopicInput], Convert]]] = [
+        *([("ego", config.ego, partial(_ego, plane=plane))] if config.ego else []),
+        *(
+            (f"detections {name}", item, partial(_detections, sensor=name, plane=plane))
+            for name, item in config.detections.items()
+        ),
+        *(
+            (
+                "truth",
+                item,
+                partial(_truths, number=number, topics=len(truth), plane=plane),
+            )
+            for number, item in enumerate(truth)
+        ),
+    ]
+    native = [
+        (topic, "messages", _native(topic))
+        for topic in bag.topics
+        if topic.type in NATIVE_ADAPTERS
+    ]
+    if native and names.isdisjoint(item.topic for _, item, _ in roles):
+        return native
+    if not roles:
+        if bag.break_off:
+            raise TruncatedInput(
+                f"{bag.break_off}, and holds no topic that fgtrack has written"
+            )
+        raise DataError(
+            f"{bag.path}: not written by fgtrack, so the configuration must name its topics "
+            f"(input.ego, input.detections); it has {_listed(bag)}"
+        )
+    uses = []
+    for role, item, converter in roles:
+        for key, of in _KEYS.items():
+            if role.split()[0] not in of and getattr(item, key) not in (
+                None,
+                {},
+                "map",
+            ):
+                raise CallError(
+                    f"topic {item.topic}: {key} applies to {' and '.join(of)} only, leave it out"
+                )
+        topic = _find(bag, item)
+        convert = converter(topic, item)
+        uses.append(
+            (
+                topic,
+                role,
+                convert if item.stamp_from == "message" else _at_receipt(convert),
+            )
+        )
+    return uses
+
+
+def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
+    bag = Bag(path, config.message_definitions)
+    uses = topic_uses(bag, config)
+    windows_ns = {
+        name: nanoseconds(each.scan_s)
+        for name, each in config.detections.items()
+        if each.scan_s is not None
+    }
+    return lambda: (
+        grouped(bag_messages(bag, uses), windows_ns)
+        if windows_ns
+        else bag_messages(bag, uses)
+    )
+
+
+FORMAT = FileFormat(
+    "a rosbag2 folder, an .mcap, .db3 or ROS 1 .bag file", is_bag, _open, settings_of
+)
+
+
+def bag_messages(bag: Bag, uses: list[TopicUse]) -> Iterator[Message]:
+    """Messages of `bag` in receipt order, the recorder's; `DataError` for a message that does not fit its use."""
+    own = all(role == "messages" for _, role, _ in uses)
+    for topic, log_ns, data in bag.messages({used.name for used, _, _ in uses}, own):
+        for convert in [convert for used, _, convert in uses if used is topic]:
+            try:
+                yield from convert(data, log_ns)
+            except (
+                FieldError,
+                AttributeError,
+                TypeError,
+                ValueError,
+                OverflowError,
+            ) as error:
+                raise DataError(
+                    f"{bag.path}: topic {topic.name} ({topic.type}) at {log_ns} ns: {error}"
+                ) from error
+
+
+def _find(bag: Bag, item: TopicInput) -> BagTopic:
+    topics = [topic for topic in bag.topics if topic.name == item.topic]
+    if len(topics) == 1:
+        return topics[0]
+    if not topics and bag.break_off:
+        raise TruncatedInput(f"{bag.break_off}, before topic {item.topic}")
+    count = "several types of" if topics else "no"
+    raise DataError(
+        f"{bag.path}: has {count} topic {item.topic}; it has {_listed(bag)}"
+    )
+
+
+def _listed(bag: Bag) -> str:
+    return (
+        ", ".join(f"{topic.name} ({topic.type})" for topic in bag.topics) or "no topic"
+    )
+
+
+def _check_fields(
+    item: TopicInput, names: frozenset[str], needed: tuple[str, ...] = ()
+) -> None:
+    fields = item.fields or {}
+    given = {*fields, "x_m", "y_m"} if fields.keys() >= set(GEODETIC) else fields
+    for name in sorted(set(fields) - names):
+        raise CallError(
+            f"topic {item.topic}: unknown field {name!r}, known are {', '.join(sorted(names))}"
+        )
+    for name in needed:
+        if name not in given:
+            raise CallError(f"topic {item.topic}: fields must name {name}")
+
+
+def _native(topic: BagTopic) -> Convert:
+    adapter = NATIVE_ADAPTERS[topic.type]
+    return lambda message, receipt_ns: (
+        message if isinstance(message, Message) else adapter(message, receipt_ns),
+    )
+
+
+def _ego(topic: BagTopic, item: TopicInput, plane: LocalPlane) -> Convert:
+    fields = item.fields
+    if fields is not None:
+        _check_fields(item, EGO_FIELDS, ("x_m", "y_m", "yaw_rad", "speed_mps"))
+        return lambda message, receipt_ns: (
+            ego_by_fields(message, fields, receipt_ns, plane),
+        )
+    if topic.type == EGO:
+        return _native(topic)
+    if topic.type != ODOMETRY:
+        raise CallError(
+            f"topic {topic.name}: an ego of type {topic.type} needs fields, known is {ODOMETRY}"
+        )
+    return lambda message, receipt_ns: (ego_from_odometry(message, receipt_ns),)
+
+
+def _detections(
+    topic: BagTopic, item: TopicInput, sensor: str, plane: LocalPlane
+) -> Convert:
+    if item.fields is None and topic.type in FIX_FIELDS:
+        item = replace(item, fields=FIX_FIELDS[topic.type])
+    read = _object_list(topic, item, plane)
+
+    def convert(message: RosMessage, receipt_ns: int) -> Iterable[Message]:
+        listed = read(message)
+        stamp_ns = receipt_ns if listed.stamp_ns is None else listed.stamp_ns
+        frame = item.frame or listed.frame or "ego"
+        objects, left_out = split(listed.objects)
+        if item.filters:
+            own = (
+                objects
+                if item.fields is None
+                else items_by_fields(message, item.fields)
+            )
+            objects, left_out = split(
+                _filtered(item, *pair) for pair in zip(objects, own, strict=True)
+            )
+        return (
+            DetectionList(
+                sensor, stamp_ns, receipt_ns, objects, frame, left_out, plane.origin_deg
+            ),
+        )
+
+    return convert
+
+
+def _object_list(
+    topic: BagTopic, item: TopicInput, plane: LocalPlane
+) -> Callable[[RosMessage], ObjectList | DetectionList]:
+    if item.fields is not None:
+        _check_fields(item, OBJECT_FIELDS)
+        return partial(objects_by_fields, fields=item.fields, plane=plane)
+    if unknown := item.filters.keys() - DETECTION_FIELDS:
+        names = ", ".join(sorted(DETECTION_FIELDS))
+        raise CallError(
+            f"topic {item.topic}: without fields, filters go by {names}, not by {min(unknown)!r}"
+        )
+    if topic.type == DETECTIONS:
+        return partial(
+            detections, receipt_ns=0
+        )  # a list of fgtrack's own has what an object list has
+    if topic.type not in ADAPTERS:
+        known = ", ".join(sorted(name for name in ADAPTERS if "/" in name))
+        raise CallError(
+            f"topic {topic.name}: objects of type {topic.type} need fields, known are {known}"
+        )
+    read: Callable[[RosMessage], ObjectList] = ADAPTERS.load(topic.type)
+    return read
+
+
+def _filtered(
+    item: TopicInput, detection: Detection, source: RosMessage
+) -> Detection | str:
+    """`detection`, or the first filter that it does not pass: by its own values, or by a field that it is read from."""
+    for name, each in item.filters.items():
+        if not each.passes(
+            getattr(detection, name)
+            if name in DETECTION_FIELDS
+            else value_at(source, name)
+        ):
+            return f"filters.{name}"
+    return detection
+
+
+def _truths(
+    topic: BagTopic, item: TopicInput, number: int, topics: int, plane: LocalPlane
+) -> Convert:
+    """Return the adapter of truth; each of several topics has one object, its index is the id if there is no other."""
+    if (
+        topic.type == TRUTH
+        and item.fields is None
+        and item.object_id is None
+        and not item.filters
+    ):
+        return _native(topic)
+    read = _detections(topic, item, "truth", plane)
+    own = None
+    if topics > 1 or item.object_id is not None:
+        own = object_id(number if item.object_id is None else item.object_id)
+
+    def convert(message: RosMessage, receipt_ns: int) -> Iterable[Message]:
+        for each in read(message, receipt_ns):
+            states = each.objects if isinstance(each, DetectionList) else ()
+            if own is not None and len(states) > 1:
+                raise FieldError(
+                    "truth of one object expected, give no object_id and name one topic of truth alone"
+                )
+            for index, state in enumerate(states):
+                if state.x_m is None or state.y_m is None:
+                    raise FieldError("truth needs x_m and y_m")
+                yield TruthState(
+                    each.stamp_ns if state.stamp_ns is None else state.stamp_ns,
+                    receipt_ns,
+                    next(
+                        number
+                        for number in (own, state.object_id, index)
+                        if number is not None
+                    ),
+                    *(state.x_m, state.y_m, state.yaw_rad, state.speed_mps),
+                )
+
+    return convert
+
+
+def _at_receipt(convert: Convert) -> Convert:
+    def stamped(message: RosMessage, receipt_ns: int) -> Iterable[Message]:
+        for each in convert(message, receipt_ns):
+            if isinstance(each, DetectionList):
+                each = replace(
+                    each,
+                    objects=[replace(item, stamp_ns=None) for item in each.objects],
+                )
+            yield replace(each, stamp_ns=receipt_ns)
+
+    return stamped

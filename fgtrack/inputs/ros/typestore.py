@@ -1,0 +1,322 @@
+"""The message types of a recording: rosbags', fgtrack's, the user's and those embedded in the recording.
+
+rosbags generates Python code from a definition and runs it: only names and numbers of a recording may get there.
+"""
+
+import math
+import re
+from collections import ChainMap
+from collections.abc import Iterable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any, cast
+
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat, Nodetype
+from rosbags.interfaces.typing import FieldDesc, Typesdict
+from rosbags.typesys import (
+    Stores,
+    get_types_from_idl,
+    get_types_from_msg,
+    get_typestore,
+)
+from rosbags.typesys.base import normalize_fieldname
+from rosbags.typesys.store import Typestore
+
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.files import read_whole
+from fgtrack.inputs.errors import one_line
+from fgtrack.inputs.ros.definitions import DEFINITIONS
+from fgtrack.inputs.ros.own_messages import LITTLE_ENDIAN, has_own_layout, own_message
+
+Key = tuple[str, MessageDefinition | None]
+"""A message type and its definition in the recording: two topics may define one name differently."""
+
+_LARGEST_BYTES = 32_000_000
+"""Of a message that is decoded: an object list or a state, never an image; each byte takes up to a hundred."""
+_LONGEST_TEXT = 200_000
+_MOST_VALUES = 4_000
+"""Most values of a type with all its parts: arrays of texts and messages become code for each element."""
+_LONGEST_ARRAY = 1_000_000
+_INTEGERS = range(-(1 << 63), 1 << 64)
+_TYPE_NAME = re.compile(r"(?!.{256})[A-Za-z]\w*(/[A-Za-z]\w*)+", re.ASCII)
+_MEMBER_NAME = re.compile(r"(?!__|.{256})[A-Za-z_]\w*", re.ASCII)
+_BASE_NAME = re.compile(r"[a-z]+[0-9]*", re.ASCII)
+_SEPARATOR = "=" * 80 + "\n"
+_EMPTY_LINE = re.compile(r"^[ \t]*(?:#[^\n]*)?\n", re.MULTILINE)
+# In these, what is not closed reaches to the end: else its end is looked for again from every following beginning.
+_IDL_TEXT = re.compile(r'"(?:\\.|[^"\\])*(?:"|\\?\Z)', re.DOTALL)
+_IDL_REMARK = re.compile(
+    r"/\*.*?(?:\*/|\Z)|//[^\n]*|^#[^\n]*|@\s*[\w:]*(?:\s*\([^()]*\))?",
+    re.DOTALL | re.MULTILINE,
+)
+_IDL_COSTLY = re.compile(r"=[^;=()*/%|^&~<]*[()*/%|^&~<]|(?:sequence\s*<\s*){4}")
+
+
+class MessageTypes:
+    """Decodes messages of the given types, each by the definition that came with it.
+    Precedence: the definition embedded for the type, those embedded for others, the user's, fgtrack's, rosbags'.
+    """
+
+    def __init__(
+        self, keys: Iterable[Key], ros1: bool, message_definitions: Iterable[str] = ()
+    ) -> None:
+        self._ros1 = ros1
+        self.types: dict[Key, Typesdict] = {}
+        """Types without a problem, each with all its parts."""
+        self._stores: dict[Key, Typestore] = {}
+        self.problems: dict[Key, str] = {}
+        """Why messages of a type cannot be decoded."""
+        given: Typesdict = {}
+        for path in message_definitions:
+            given |= _user_types(Path(path))
+        embedded: dict[Key, Typesdict] = {}
+        for key in sorted(set(keys), key=str):
+            try:
+                embedded[key] = _embedded(*key)
+            except (
+                Exception
+            ) as error:  # whatever an invalid definition makes the parser raise
+                self.problems[key] = (
+                    f"its embedded definition cannot be read ({one_line(error)})"
+                )
+        for key, types in embedded.items():
+            try:
+                self.types[key] = _closure(
+                    key[0],
+                    ChainMap(types, *embedded.values(), given, _shipped_types(ros1)),
+                )
+            except (ValueError, RecursionError) as error:
+                self.problems[key] = str(error)
+        self._own = {
+            key
+            for key, types in self.types.items()
+            if not ros1 and has_own_layout(key[0], types)
+        }
+
+    def starts_with_header(self, key: Key) -> bool:
+        """True if messages of the type start with a header, and can be decoded."""
+        members = self.types[key][key[0]][1] if key in self.types else []
+        return bool(members) and members[0][1][1] == "std_msgs/msg/Header"
+
+    def decode(
+        self, key: Key, data: bytes, what: str, log_ns: int | None = None
+    ) -> Any:  # Any: of its type
+        """Message that is serialized in `data`; `what` names it in the `DataError` of a huge or wrong one.
+        With its log time, one of fgtrack's own types in the present layout is a `Message`.
+        """
+        if len(data) > _LARGEST_BYTES:
+            raise DataError(
+                f"{what}: has {len(data)} bytes, at most {_LARGEST_BYTES} are decoded"
+            )
+        try:
+            if (
+                log_ns is not None
+                and key in self._own
+                and data.startswith(LITTLE_ENDIAN)
+            ):
+                return own_message(key[0], data, log_ns)
+            if key not in self._stores:
+                self._stores[key] = _registered(self.types[key])
+            store = self._stores[key]
+            return (store.deserialize_ros1 if self._ros1 else store.deserialize_cdr)(
+                data, key[0]
+            )
+        except MemoryError:
+            raise
+        except (
+            Exception
+        ) as error:  # whatever bytes of another type make the decoder raise
+            raise DataError(f"{what} is not a {key[0]} ({one_line(error)})") from error
+
+
+@cache
+def typestore_of(names: tuple[str, ...]) -> Typestore:
+    """One store of shipped ROS 2 types and all their parts."""
+    needed: Typesdict = {}
+    for name in names:
+        needed |= _closure(name, _shipped_types(False))
+    return _registered(needed)
+
+
+def _registered(types: Typesdict) -> Typestore:
+    store = Typestore()
+    store.register(types)
+    return store
+
+
+def _closure(name: str, known: Mapping[str, Any]) -> Typesdict:
+    """The type `name` with all its parts; `ValueError` for one that is undefined, recursive or too large."""
+    needed: Typesdict = {}
+    sizes: dict[str, int] = {}
+
+    def size_of(description: FieldDesc) -> int:
+        kind, value = description
+        if kind == Nodetype.BASE:
+            return 1
+        if kind == Nodetype.NAME:
+            return size_of_type(cast("str", value))
+        inner, count = cast("tuple[FieldDesc, int]", value)
+        size, fixed = size_of(inner), int(count) if kind == Nodetype.ARRAY else 1
+        if kind == Nodetype.SEQUENCE and size == 0:
+            raise ValueError(f"{name} has a list of elements without content")
+        is_number = inner[0] == Nodetype.BASE and cast("tuple[str, int]", inner[1])[
+            0
+        ] not in ("string", "wstring")
+        return size * (
+            min(fixed, 1) if is_number else fixed
+        )  # numbers become one NumPy array
+
+    def size_of_type(current: str) -> int:
+        if current not in sizes:
+            try:
+                needed[current] = known[current]
+            except KeyError as error:
+                raise ValueError(
+                    f"the definition of {current or 'a type without a name'} is not in the recording, "
+                    "name its .msg file in message_definitions"
+                ) from error
+            sizes[current] = (
+                _MOST_VALUES + 1
+            )  # until it is computed: a type that contains itself is too large
+            sizes[current] = sum(
+                size_of(description) for _, description in known[current][1]
+            )
+        if sizes[current] > _MOST_VALUES:
+            raise ValueError(
+                f"{name} has more than {_MOST_VALUES} values, or contains itself"
+            )
+        return sizes[current]
+
+    size_of_type(name)
+    return needed
+
+
+class _ShippedTypes(dict[str, Any]):  # Any: a type as rosbags holds it
+    """Types by name, defined when they are first needed: those of fgtrack, else those of rosbags, which are many."""
+
+    def __init__(self, ros1: bool) -> None:
+        super().__init__()
+        self._ros1 = ros1
+
+    def __missing__(self, name: str) -> Any:
+        own = DEFINITIONS.get(name)
+        self |= (
+            get_types_from_msg(own, name)
+            if own is not None
+            else {name: _types_of_rosbags(self._ros1)[name]}
+        )
+        return self[name]
+
+
+_shipped_types = cache(_ShippedTypes)
+
+
+@cache
+def _types_of_rosbags(ros1: bool) -> Typesdict:
+    # Recordings without definitions are from Humble or older.
+    return get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE).fielddefs
+
+
+def _user_types(path: Path) -> Typesdict:
+    types: Typesdict = {}
+    for file in sorted(path.rglob("*.msg")) if path.is_dir() else [path]:
+        package = (
+            file.parent.parent.name if file.parent.name == "msg" else file.parent.name
+        )
+        try:
+            types |= checked(
+                get_types_from_msg(
+                    read_whole(file, 1.0).decode(), f"{package}/msg/{file.stem}"
+                )
+            )
+        except (
+            Exception
+        ) as error:  # whatever an invalid definition makes the parser raise
+            raise CallError(
+                f"{file}: is not a message definition ({one_line(error)})"
+            ) from error
+    return types
+
+
+def _embedded(name: str, definition: MessageDefinition | None) -> Typesdict:
+    """Types that the text of `definition`, of the type `name`, defines; empty without a text."""
+    form, text = (
+        (None, "") if definition is None else (definition.format, definition.data)
+    )
+    if (
+        form not in (MessageDefinitionFormat.MSG, MessageDefinitionFormat.IDL)
+        or not text.strip()
+    ):
+        return {}
+    if len(text) > _LONGEST_TEXT:
+        raise ValueError(f"it has more than {_LONGEST_TEXT} characters")
+    _check_type_name(name)
+    if form == MessageDefinitionFormat.MSG:
+        return checked(get_types_from_msg(_EMPTY_LINE.sub("", f"{text}\n"), name))
+    types: Typesdict = {}
+    first, *others = text.split(_SEPARATOR)
+    for part in (
+        [part.partition("\n")[2] for part in others]
+        if others and not first.strip()
+        else [text]
+    ):
+        types |= checked(get_types_from_idl(_plain_idl(part)))
+    return types
+
+
+def _plain_idl(text: str) -> str:
+    """Text of members alone; `ValueError` for constants or nested sequences that rosbags would parse for minutes."""
+    plain = _IDL_REMARK.sub(" ", _IDL_TEXT.sub('""', text))
+    if _IDL_COSTLY.search(plain):
+        raise ValueError(
+            "it computes a constant or nests sequences, which no definition of ROS does"
+        )
+    return plain.replace(
+        ">", "> "
+    )  # rosbags takes the end of `sequence<string<9>>` for a shift
+
+
+def checked(types: Typesdict) -> Typesdict:
+    """Return `types`; raise `ValueError` unless all their names are names, and their constants plain values."""
+    for name, (constants, members) in types.items():
+        _check_type_name(name)
+        names = [
+            *(constant[0] for constant in constants),
+            *(member[0] for member in members),
+        ]
+        for member in names:
+            if not _MEMBER_NAME.fullmatch(member):
+                raise ValueError(f"{member!a:.200} is not a name of a member")
+        if len(set(map(normalize_fieldname, names))) < len(names):
+            raise ValueError(f"{name} has two members of one name")
+        for member, kind, value in constants:
+            is_number = (
+                value in _INTEGERS
+                if type(value) is int
+                else type(value) is float and math.isfinite(value)
+            )
+            if not (
+                is_number or type(value) in (bool, str)
+            ) or not _BASE_NAME.fullmatch(kind):
+                raise ValueError(f"the constant {member} is not a plain value")
+        for member, description in members:
+            node, inner = _innermost(description)
+            if node == Nodetype.NAME:
+                _check_type_name(cast("str", inner))
+            elif not _BASE_NAME.fullmatch(cast("tuple[str, int]", inner)[0]):
+                raise ValueError(f"{member} is of an unknown type")
+    return types
+
+
+def _check_type_name(name: str) -> None:
+    if not _TYPE_NAME.fullmatch(name):
+        raise ValueError(f"{name!a:.200} is not a name of a message type")
+
+
+def _innermost(description: FieldDesc) -> FieldDesc:
+    """The type of the elements of arrays and sequences, of whatever depth."""
+    while description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        description, size = cast("tuple[FieldDesc, int]", description[1])
+        if not 0 <= int(size) <= _LONGEST_ARRAY:
+            raise ValueError(f"an array is longer than {_LONGEST_ARRAY}")
+    return description

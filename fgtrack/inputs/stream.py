@@ -1,0 +1,276 @@
+"""The stream format `fgtrack-stream/1`: messages as JSON lines, plain or gzipped, in receipt order."""
+
+import gzip
+import json
+import logging
+import zlib
+from collections import Counter
+from collections.abc import Generator, Iterable, Iterator, Mapping
+from contextlib import ExitStack, closing
+from dataclasses import MISSING, fields
+from functools import partial
+from operator import methodcaller
+from pathlib import Path
+from typing import Any, BinaryIO, TypeVar
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.files import GZIP_MAGIC, open_file
+from fgtrack.core.output import new_file
+from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
+from fgtrack.inputs.errors import TruncatedInput, UntilBreak
+from fgtrack.inputs.geodetic import GEODETIC, LocalPlane
+from fgtrack.inputs.source import FileFormat
+from fgtrack.inputs.validation import InvalidMessageError, validated_message
+
+STREAM_FORMAT = "fgtrack-stream/1"
+SETTINGS = "settings"
+"""Entry of the header record with what the recording carries of a configuration."""
+PACKED_TABLES = (".csv.gz", ".tsv.gz", ".txt.gz")
+_logger = logging.getLogger(__name__)
+_KINDS: dict[str, type[Message]] = {
+    "ego": EgoState,
+    "detections": DetectionList,
+    "truth": TruthState,
+}
+_Made = TypeVar("_Made")
+# A parsed JSON object: its values are checked one by one below.
+Record = dict[str, Any]
+
+
+def read_stream(path: Path | str, plane: LocalPlane | None = None) -> Iterator[Message]:
+    """Messages of the stream `path` (gzipped or not) in the order of the file, which is receipt order.
+    Unknown keys are ignored with one warning. Raises `TruncatedInput` after what came before a break, and `DataError`.
+    """
+    path, plane = Path(path), plane or LocalPlane()
+    unknown: Counter[str] = Counter()
+    with closing(_records(path)) as records:
+        next(records)
+        for line, record in records:
+            try:
+                yield _message(_placed(record, plane), unknown)
+            except InvalidMessageError as error:
+                raise DataError(f"{path}:{line}: {error}") from error
+    if unknown:
+        names = ", ".join(
+            f"{name} ({count})" for name, count in sorted(unknown.items())
+        )
+        _logger.warning("%s: ignored unknown keys: %s", path, names)
+
+
+def _recognises(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        start = file.read(64)
+    is_packed = start.startswith(GZIP_MAGIC) and not path.name.endswith(PACKED_TABLES)
+    return is_packed or start.lstrip().startswith(b"{")
+
+
+FORMAT = FileFormat(
+    "an fgtrack stream (.jsonl, .jsonl.gz)",
+    _recognises,
+    lambda path, config: partial(read_stream, path, LocalPlane(config.origin)),
+    lambda path: read_header(path).get(SETTINGS, {}),
+    validates=True,
+)
+
+
+def read_header(path: Path | str) -> Mapping[str, Any]:
+    """Header record of the stream `path`; JSON values. Raises `DataError` when there is none."""
+    with closing(_records(Path(path))) as records:
+        return next(records)[1]
+
+
+def write_stream(
+    path: Path | str,
+    messages: Iterable[Message],
+    header: Mapping[str, object] | None = None,
+    overwrite: bool = False,
+) -> int:
+    """Write `messages`, which must be in receipt order, to `path`, gzipped if it ends in `.gz`; gives their number.
+    The same messages give the same bytes. The file gets its name when it is complete; what a killed writer leaves in
+    `<path>.*.part` is readable. `header` are further entries of the header record. Raises `TruncatedInput` where
+    `messages` broke off, after writing what came before.
+    """
+    path = Path(path)
+    count = 0
+    with ExitStack() as stack:
+        lines: BinaryIO | gzip.GzipFile = stack.enter_context(new_file(path, overwrite))
+        if path.name.endswith(".gz"):
+            lines = stack.enter_context(
+                gzip.GzipFile(filename="", mode="wb", fileobj=lines, mtime=0)
+            )
+        lines.write(
+            _line({"type": "header", "format": STREAM_FORMAT, **(header or {})})
+        )
+        readable = UntilBreak(messages)
+        for message in readable:
+            lines.write(_line(_record(message)))
+            count += 1
+        if path.exists():  # it is kept
+            readable.raise_error()
+    readable.raise_error()
+    return count
+
+
+def _line(record: Mapping[str, object]) -> bytes:
+    return (
+        json.dumps(record, default=methodcaller("item")).encode() + b"\n"
+    )  # of a NumPy scalar
+
+
+def _record(message: Message) -> Record:
+    if isinstance(message, DetectionList):
+        times = {"stamp_ns": message.stamp_ns, "receipt_ns": message.receipt_ns}
+        objects = [_given(item) for item in message.objects]
+        origin = (
+            {} if message.origin_deg is None else {"origin_deg": message.origin_deg}
+        )
+        head = {
+            "type": "detections",
+            "sensor": message.sensor,
+            **times,
+            "frame": message.frame,
+            **origin,
+        }
+        return {**head, "objects": objects}
+    return {
+        "type": "ego" if isinstance(message, EgoState) else "truth",
+        **_given(message),
+    }
+
+
+def _given(value: EgoState | TruthState | Detection) -> Record:
+    given = {name: getattr(value, name) for name in _FIELDS[type(value)]}
+    return {
+        name: field
+        for name, field in given.items()
+        if field is not None and (name, field) != ("ignored", False)
+    }
+
+
+def _records(path: Path) -> Generator[tuple[int, Record], None, None]:
+    """Line number and JSON object of every line that is not blank, the first one the header."""
+    line, num_records = 0, 0
+    try:
+        with open_file(path) as raw:
+            packed = raw.read(2) == GZIP_MAGIC
+            raw.seek(0)
+            file: BinaryIO | gzip.GzipFile = (
+                gzip.GzipFile(fileobj=raw) if packed else raw
+            )
+            for line, text in enumerate(file, 1):
+                if not text.strip():
+                    continue
+                try:
+                    record = json.loads(text.decode())
+                except (ValueError, RecursionError) as error:
+                    if num_records and not text.endswith(b"\n"):
+                        raise TruncatedInput(
+                            f"{path}:{line}: breaks off in the middle of record {num_records + 1}"
+                        ) from error
+                    raise DataError(f"{path}:{line}: is not JSON ({error})") from error
+                if not isinstance(record, dict):
+                    raise DataError(f"{path}:{line}: is not a JSON object")
+                if not num_records and (record.get("type"), record.get("format")) != (
+                    "header",
+                    STREAM_FORMAT,
+                ):
+                    break
+                num_records += 1
+                yield line, record
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise TruncatedInput(
+            f"{path}:{line + 1}: breaks off after record {num_records} ({error})"
+        ) from error
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+    if not num_records:
+        raise DataError(
+            f"{path}: a stream starts with a header record of format {STREAM_FORMAT!r}"
+        )
+
+
+def _message(record: Record, unknown: Counter[str]) -> Message:
+    name = record.pop("type", None)
+    kind = _KINDS.get(str(name))
+    if kind is None:
+        raise InvalidMessageError(
+            f"unknown record type {name!r}, known are {', '.join(_KINDS)}"
+        )
+    if kind is DetectionList:
+        objects = record.get("objects")
+        if not isinstance(objects, list):
+            raise InvalidMessageError(f"objects: a list expected, not {objects!r:.60}")
+        record["objects"] = tuple(
+            _made("objects", Detection, item, unknown) for item in objects
+        )
+    return validated_message(_made(str(name), kind, record, unknown))
+
+
+def _placed(record: Record, plane: LocalPlane) -> Record:
+    """`record`, and each of its objects, with its position in `plane` if it has latitude and longitude."""
+    objects = record.get("objects")
+    if isinstance(objects, list) and any(
+        isinstance(item, dict) and GEODETIC[0] in item for item in objects
+    ):
+        placed = [
+            _placed(item, plane) if isinstance(item, dict) else item for item in objects
+        ]
+        record = {
+            "frame": "map",
+            **record,
+            "objects": placed,
+            "origin_deg": plane.origin_deg,
+        }
+    if GEODETIC[0] not in record:
+        return record
+    for name in GEODETIC:
+        if not isinstance(record.get(name), int | float | None):
+            raise InvalidMessageError(
+                f"{name}: a number expected, not {record[name]!a:.60}"
+            )
+    return plane.placed(record)
+
+
+def _made(name: str, kind: type[_Made], record: object, unknown: Counter[str]) -> _Made:
+    """An instance of `kind` from a JSON object; null is not given. Unknown keys are counted."""
+    if not isinstance(record, dict):
+        raise InvalidMessageError(f"{name}: a JSON object expected, not {record!r}")
+    required = _FIELDS[kind]
+    if not record.keys() <= required.keys():
+        unknown.update(f"{name}.{key}" for key in record.keys() - required.keys())
+    given = {
+        key: value if type(value) is float else _value(key, value)  # as nearly always
+        for key, value in record.items()
+        if value is not None and key in required
+    }
+    for key, is_needed in required.items():
+        if is_needed and key not in given:
+            raise InvalidMessageError(f"{key}: is missing")
+    return kind(**given)
+
+
+def _value(key: str, value: Any) -> Any:
+    """`value` with lists as tuples, and integers as floats where `key` is a number that can be one."""
+    if type(value) is list:
+        return tuple(
+            [each if type(each) is float else _value(key, each) for each in value]
+        )
+    return (
+        float(value)
+        if type(value) is int and key not in _INTEGERS and value.bit_length() < 1000
+        else value
+    )
+
+
+_INTEGERS = frozenset({"stamp_ns", "receipt_ns", "object_id"})
+#: Names of the fields of messages and detections, and if they have to be given.
+_FIELDS: dict[type, dict[str, bool]] = {
+    kind: {
+        field.name: field.default is MISSING
+        for field in fields(kind)
+        if field.name != "left_out"
+    }
+    for kind in (EgoState, DetectionList, TruthState, Detection)
+}

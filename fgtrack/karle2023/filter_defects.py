@@ -1,0 +1,88 @@
+"""Where the published implementation of Karle et al. 2023 departs from the clean filter, each departure by itself.
+
+Its yaw is 0 along +y and jumps at +-pi there, which in REP-103 is at 3 pi / 2 (the branch used here).
+"""
+
+import numpy as np
+
+from fgtrack.core.geometry import TWO_PI
+from fgtrack.core.types import YAW, FloatArray
+from fgtrack.estimation.filters.propagation import ExactPropagator
+from fgtrack.karle2023.backward_forward import BackwardForwardBank
+from fgtrack.karle2023.euler import EulerCtrv
+from fgtrack.models.measurement import MeasurementModel
+
+#: The published yaw range in REP-103 is (YAW_LIMIT - 2 pi, YAW_LIMIT].
+YAW_LIMIT_RAD = 1.5 * np.pi
+
+
+def one_turn(angle_rad: FloatArray) -> FloatArray:
+    """Angle wrapped by at most one turn: in (-pi, pi] only for what is less than a turn and a half away."""
+    return np.asarray(
+        angle_rad + TWO_PI * (1.0 * (angle_rad <= -np.pi) - (angle_rad > np.pi))
+    )
+
+
+def published_yaw(yaw_rad: FloatArray) -> FloatArray:
+    """Yaw in the published range: in (-pi, pi] from +y, hence in (-pi/2, 3 pi/2] from +x; by at most one turn."""
+    return one_turn(yaw_rad - 0.5 * np.pi) + 0.5 * np.pi
+
+
+class SaturatedEulerCtrv(EulerCtrv):
+    """The predicted yaw sticks at the upper end of its range, and runs on below the lower one (defect Q2)."""
+
+    yaw_limit_rad = YAW_LIMIT_RAD
+
+    def wrap(self, mean: FloatArray) -> FloatArray:
+        """Means with the yaw in the published range."""
+        wrapped = mean.copy()
+        wrapped[..., YAW] = published_yaw(mean[..., YAW])
+        return wrapped
+
+    def residual(
+        self, model: MeasurementModel, z: FloatArray, z_predicted: FloatArray
+    ) -> FloatArray:
+        """Measured minus predicted, angles wrapped by one turn only: a yaw that has wound up stays off by turns."""
+        y = np.asarray(z - z_predicted)
+        for index, name in enumerate(model.components):
+            if name == "yaw_rad":
+                y[..., index] = one_turn(
+                    published_yaw(z[..., index]) - z_predicted[..., index]
+                )
+            elif index in model.angular:
+                y[..., index] = one_turn(y[..., index])
+        return y
+
+
+class PublishedStorage(BackwardForwardBank):
+    """The published object storage.
+    With `leads` the tracking time leads the clock by up to one step, and never waits (defect Q14). With `is_stale` an
+    update in time does not reach the stored present state (defect Q8).
+    """
+
+    def __init__(
+        self,
+        propagator: ExactPropagator,
+        step_ns: int,
+        storage_steps: int,
+        *,
+        leads: bool,
+        is_stale: bool,
+    ) -> None:
+        super().__init__(propagator, step_ns, storage_steps)
+        self._leads, self._is_stale = leads, is_stale
+
+    def advance(self, now_ns: int) -> None:
+        """See `BackwardForwardBank.advance`; a leading clock advances by at least one step, up to `now_ns` or more."""
+        if not self._leads:
+            super().advance(now_ns)
+            return
+        if self._now_ns is None:
+            self._grid_ns = now_ns
+        else:
+            elapsed_ns = now_ns - self._grid_ns
+            self._advance_steps(max(-(-elapsed_ns // self._step_ns), 1))
+        self._now_ns = self._grid_ns
+
+    def _visible_from(self, back: int) -> int:
+        return self._grid + 1 if self._is_stale and not back else self._grid - back

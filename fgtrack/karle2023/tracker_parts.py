@@ -1,0 +1,332 @@
+"""Deviations of the published implementation of Karle et al. 2023, each defect a component of its own."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from fgtrack.core.checks import LARGEST
+from fgtrack.core.time import nanoseconds
+from fgtrack.core.types import (
+    DetectionList,
+    Disposition,
+    EgoState,
+    FloatArray,
+    IntArray,
+    TickReport,
+    UpdateRecord,
+)
+from fgtrack.estimation.base import StatesAt
+from fgtrack.karle2023.filter_defects import published_yaw
+from fgtrack.models.sensors import SensorModel
+from fgtrack.tracking.association import Assignment, Likely, assigned, near
+from fgtrack.tracking.detections import ConnectedMerge, Merge, PosedBatch
+from fgtrack.tracking.ego.trajectory import EgoPose, EgoStd, EgoTrajectory
+from fgtrack.tracking.facing import Facings
+from fgtrack.tracking.inbox import Batch, Inbox, is_valid_covariance, record, records
+from fgtrack.tracking.lives.counters import CountingLifecycle, Life, Scan
+from fgtrack.tracking.lives.latency import FOREVER
+from fgtrack.tracking.objects import Apart
+from fgtrack.tracking.preprocess import Candidate, Candidates, Preprocessed
+from fgtrack.tracking.tracker import Tracker, TrackerParts
+
+
+class PublishedEgo(EgoTrajectory):
+    """Ego storage at the ticks, nearest entry instead of interpolation, and a low-pass that filters its own output
+    again on every tick without a new message (defect Q13)."""
+
+    _straight = True
+
+    def __init__(
+        self,
+        yaw_weight: float,
+        yaw_rate_weight: float,
+        step_ns: int,
+        storage_ticks: int,
+        std: EgoStd | None = None,
+    ) -> None:
+        super().__init__(yaw_weight, yaw_rate_weight, std)
+        self._half_step_ns = step_ns / 2
+        self._length = storage_ticks
+        self._stored: list[EgoState] = []  # newest last
+
+    def _store(self, ego: EgoState) -> str | None:
+        """See `EgoTrajectory._store`."""
+        if self.current is not None and ego.stamp_ns == self.current.stamp_ns:
+            return "repeated stamp"
+        self.current = ego
+        return None
+
+    def start_tick(self) -> None:
+        """Store the current state, low-passed against the entry before it; of a stamp that is stored already, its yaw
+        and yaw rate alone."""
+        if self.current is None:
+            return
+        newest = self._stored[-1] if self._stored else None
+        if newest is None or newest.stamp_ns != self.current.stamp_ns:
+            if newest is not None:
+                self.current = self._low_passed(
+                    self.current, newest.yaw_rad, newest.yaw_rate_radps
+                )
+            self._stored.append(self.current)
+            del self._stored[: -self._length]
+        elif len(self._stored) > 1:
+            before = self._stored[-2]
+            filtered = self._low_passed(
+                self.current, before.yaw_rad, before.yaw_rate_radps
+            )
+            turned = replace(
+                newest, yaw_rad=filtered.yaw_rad, yaw_rate_radps=filtered.yaw_rate_radps
+            )
+            if (
+                newest is self.current
+            ):  # the stored entry and the current state are one object
+                self.current = turned
+            self._stored[-1] = turned
+
+    def pose_at(self, stamp_ns: int, present_ns: int) -> EgoPose | None:
+        """See `EgoTrajectory.pose_at`; from the nearest entry, however far away it is."""
+        if self.current is None:
+            return None
+        if present_ns - stamp_ns <= self._half_step_ns:
+            return self._extrapolated(self.current, stamp_ns)
+        nearest = min(
+            reversed(self._stored), key=lambda ego: abs(ego.stamp_ns - stamp_ns)
+        )
+        return self._extrapolated(nearest, stamp_ns)
+
+
+class SlotInbox(Inbox):
+    """One slot per sensor: a second message within a tick overwrites the first, a repeated stamp empties the slot
+    (defect Q12). The mean of object stamps is taken in floating point."""
+
+    def __init__(self, sensors: Mapping[str, SensorModel]) -> None:
+        super().__init__(sensors)
+        self._slots: dict[str, Batch] = {}
+        self._last_stamp_ns: dict[str, int] = {}
+
+    def put(self, message: DetectionList) -> list[UpdateRecord]:
+        """See `Inbox.put`."""
+        sensor = self._sensors[message.sensor]
+        stamp_ns = (
+            _float_stamp(message)
+            if sensor.stamp_from == "objects_mean"
+            else message.stamp_ns
+        )
+        if self._last_stamp_ns.get(message.sensor) == stamp_ns:
+            return self._superseded(message.sensor) + records(
+                message, Disposition.DUPLICATE
+            )
+        delay_ns = message.receipt_ns - stamp_ns
+        if sensor.max_delay_s is not None and delay_ns > nanoseconds(
+            sensor.max_delay_s
+        ):
+            return records(message, Disposition.TOO_OLD)
+        kept, ended, broken = [], [], False
+        for index, detection in enumerate(message.objects):
+            values = [getattr(detection, name) for name in sensor.components]
+            if (detection.x_m or 0.0) == 0.0 and (detection.y_m or 0.0) == 0.0:
+                ended.append(record(message, index, Disposition.INVALID))
+            elif all(
+                value is not None and abs(value) <= LARGEST for value in values
+            ) and is_valid_covariance(detection, sensor):
+                kept.append(index)
+            else:
+                broken = True
+                ended.append(record(message, index, Disposition.INVALID))
+        superseded = self._superseded(message.sensor)
+        if kept or not broken:
+            self._slots[message.sensor] = Batch(message, stamp_ns, tuple(kept))
+            self._last_stamp_ns[message.sensor] = stamp_ns
+        return superseded + ended
+
+    def _superseded(self, sensor: str) -> list[UpdateRecord]:
+        batch = self._slots.pop(sensor, None)
+        if batch is None:
+            return []
+        return [
+            record(batch.message, index, Disposition.SUPERSEDED)
+            for index in batch.indices
+        ]
+
+    def collect(
+        self, now_ns: int = 0, waits: Callable[[Batch, int], bool] | None = None
+    ) -> list[Batch]:
+        """See `Inbox.collect`; equal stamps keep the order of the sensors, and nothing waits."""
+        batches = [self._slots[name] for name in self._sensors if name in self._slots]
+        self._slots = {}
+        return sorted(batches, key=lambda batch: batch.stamp_ns)
+
+
+def _float_stamp(message: DetectionList) -> int:
+    """Mean of the object stamps in float64, which at today's epoch is good to 256 ns."""
+    if not message.objects:
+        return message.stamp_ns
+    stamps = [
+        message.stamp_ns if item.stamp_ns is None else item.stamp_ns
+        for item in message.objects
+    ]
+    return int(np.mean(np.array(stamps, dtype=np.int64)))
+
+
+@dataclass(frozen=True)
+class NeighbourhoodMerge(Merge):
+    """Each distinct neighbourhood becomes one object: no transitive closure, and yaw averaged as a plain number,
+    across its jump (defect Q11)."""
+
+    kind: Literal["neighbourhood"] = "neighbourhood"
+    distance_m: float = 5.1
+    """Detections at most this far apart are neighbours."""
+
+    def apart(self, points_m: FloatArray, starts: IntArray) -> list[bool]:
+        """See `Merge.apart`."""
+        return ConnectedMerge(self.distance_m).apart(points_m, starts)
+
+    def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
+        """See `Merge.groups`; the merged ones first, in the order of a set of index tuples."""
+        from scipy.spatial import cKDTree
+
+        tree = cKDTree(points_m)
+        neighbourhoods = [
+            tuple(
+                int(i)
+                for i in tree.query_ball_point(
+                    point, self.distance_m, return_sorted=True
+                )
+            )
+            for point in points_m
+        ]
+        merged = {members for members in neighbourhoods if len(members) > 1}
+        groups = {neighbourhoods.index(members): members for members in merged}
+        return groups | {
+            i: members for i, members in enumerate(neighbourhoods) if len(members) == 1
+        }
+
+    def mean(self, name: str, values: FloatArray) -> float:
+        """See `Merge.mean`."""
+        if name == "yaw_rad":
+            values = published_yaw(values)
+        return float(values.sum() / len(values))
+
+
+@dataclass(frozen=True)
+class UngatedEuclidean:
+    """Hungarian assignment over all pairs; too distant pairs are torn up afterwards, and both partners are then
+    alone, even where one had a good second choice (defect Q10)."""
+
+    kind: Literal["ungated_euclidean"] = "ungated_euclidean"
+    gate_m: float = 5.0
+    """Largest distance of a pair that is kept."""
+
+    @property
+    def reads_yaws(self) -> bool:
+        """See `Association`."""
+        return False
+
+    def __call__(
+        self,
+        candidates: Candidates,
+        states: StatesAt,
+        apart: Apart | None = None,
+        likely: Likely | None = None,
+        facings: Facings | None = None,
+    ) -> Assignment:
+        """See `Association`; torn pairs are born after the detections that had no partner. Nothing is `apart`."""
+        pairs = near(candidates, states.means, np.inf)
+        rows, columns, distances_m = (array.tolist() for array in pairs)
+        cost = dict(zip(zip(rows, columns, strict=True), distances_m, strict=True))
+        assignment = assigned(pairs, len(candidates), len(states.means))
+        torn = [pair for pair in assignment.pairs if cost[pair] > self.gate_m]
+        good = [pair for pair in assignment.pairs if pair not in torn]
+        missed = sorted(assignment.missed + [j for _, j in torn])
+        return Assignment(good, assignment.new + [i for i, _ in torn], missed)
+
+
+class PublishedLifecycle(CountingLifecycle):
+    """Only two sensors age a track, each at its range; time counts only where a list came in; the cap may be passed;
+    a birth is dated to the tick and a match to the sensor's stamp (defects Q9 and Q15).
+
+    The range is that of a state which is one batch old; see `PublishedTracker`.
+    """
+
+    def born(self, track_id: int, scan: Scan, candidate: Candidate) -> None:
+        """See `CountingLifecycle.born`."""
+        super().born(track_id, scan._replace(stamp_ns=scan.present_ns), candidate)
+
+    def matched(
+        self,
+        scan: Scan,
+        candidates: Candidates,
+        pairs: Sequence[tuple[int, int]],
+        states: StatesAt,
+    ) -> None:
+        """See `CountingLifecycle.matched`."""
+        for _, track in pairs:
+            life = self.lives[states.track_ids[track]]
+            if life.counter < self._rules.counter_cap:
+                life.counter += self._sensors[scan.sensor].counter_add
+            life.last_seen_ns = scan.stamp_ns
+            life.misses = 0
+
+    def _ages(self, sensor: str, range_m: float) -> bool:
+        return self._sensors[sensor].ages != "always" and super()._ages(sensor, range_m)
+
+    def _ends(self, life: Life, scan: Scan) -> bool:
+        return (
+            life.counter <= 0 or scan.present_ns - life.last_seen_ns > self._forget_ns
+        )
+
+    def expired(
+        self,
+        present_ns: int,
+        watermarks_ns: IntArray | None = None,
+        processed_ns: int = FOREVER,
+    ) -> list[int]:
+        """See `CountingLifecycle.expired`; never, without a list."""
+        return []
+
+
+class PublishedTracker(Tracker):
+    """The published implementation's order of things, where it differs (defects Q9 and Q22).
+    A list older than the storage still starts tracks, and an empty list ages every track. The range that ages a
+    track is measured from the present ego to where the track was after the batch before, or at the end of the tick
+    before.
+    """
+
+    def __init__(self, parts: TrackerParts) -> None:
+        super().__init__(parts)
+        self._last_known: dict[int, FloatArray] = {}
+
+    def tick(self, now_ns: int, is_last: bool = False) -> TickReport:
+        """See `Tracker.tick`."""
+        report = super().tick(now_ns, is_last)
+        self._remember()
+        return report
+
+    def _process(self, posed: PosedBatch, preprocessed: Preprocessed | None) -> None:
+        super()._process(posed, preprocessed)
+        self._remember()
+
+    def _remember(self) -> None:
+        states = self._parts.bank.states_at(self._parts.bank.present_ns)
+        self._last_known = dict(zip(states.track_ids, states.means[:, :2], strict=True))
+
+    def _is_too_old(self, batch: Batch) -> bool:
+        return False
+
+    def _offered(self, batch: Batch) -> StatesAt:
+        if batch.indices:
+            return super()._offered(batch)
+        return self._parts.bank.states_at(self._parts.bank.present_ns)
+
+    def _ranges_m(
+        self, track_ids: Sequence[int], positions_m: FloatArray, ego: EgoPose | None
+    ) -> FloatArray:
+        current = self._parts.ego.current
+        if current is None:
+            return np.zeros(len(track_ids))
+        known = np.array([self._last_known[track_id] for track_id in track_ids])
+        return np.asarray(
+            np.hypot(known[:, 0] - current.x_m, known[:, 1] - current.y_m)
+        )

@@ -1,0 +1,1 @@
+"""Noise of motion and sensors, fitted to recordings by maximum likelihood."""

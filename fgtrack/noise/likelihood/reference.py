@@ -1,0 +1,122 @@
+"""An EKF along each series at one vector of parameters: the trajectory about which the likelihood is linearised."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgtrack.core.geometry import wrap_angle
+from fgtrack.core.linalg import congruence
+from fgtrack.core.time import nanoseconds, seconds
+from fgtrack.core.types import YAW, FloatArray
+from fgtrack.estimation.birth import initial_state
+from fgtrack.estimation.filters.ekf import joseph, kalman_gain, propagated
+from fgtrack.noise.likelihood.contaminated import Update, update
+from fgtrack.noise.likelihood.series import NoiseSpace, Observation, Series
+
+_WINDOW, _MOST = (
+    20,
+    0.5,
+)  # of so many successive innovations at most this share may be outliers
+_MARGIN_S = 1.0  # what is nearer to such a stretch is left out as well
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One observation in the filter, of d measured and a assumed components."""
+
+    observation: Observation
+    since_s: float
+    """Since the observation before, or the first state."""
+    before: FloatArray
+    """State after the observation before, shape (n,)."""
+    about: FloatArray
+    """State about which the motion from there is linearised, shape (n,): `before`, or the nominal one."""
+    predicted: FloatArray
+    """Shape (n,)."""
+    after: FloatArray
+    """Updated state, shape (n,), with a yaw that was not wrapped."""
+    y: FloatArray
+    """Innovation of the measured components, shape (d,)."""
+    H: FloatArray
+    """Their Jacobian, shape (d, n)."""
+    assumed: tuple[FloatArray, FloatArray, FloatArray]
+    """Innovation (a,) at the predicted state, Jacobian (a, n) and covariance (a, a) of the assumed components."""
+    update: Update
+
+
+def filtered(
+    series: Series, space: NoiseSpace, values: Sequence[float] | FloatArray
+) -> list[Step]:
+    """Return the steps of the filter along `series` with the noise of `values`, shape (p,)."""
+    motion = space.motion_model(values)
+    yawed = "yaw_rad" in motion.state_names
+    by_name = dict(zip(space.names, map(float, values), strict=True))
+    x, P = initial_state(motion, series.start)
+    stamp_ns = series.start.stamp_ns
+    steps = []
+    for k, observation in enumerate(series.observations):
+        measurement, sensor = observation.measurement, observation.sensor
+        since_s = seconds(measurement.stamp_ns - stamp_ns)
+        initial = k < series.num_initial
+        about = series.nominal[k] if initial else x
+        moved, F, Q = motion.transition(about, since_s)
+        predicted = moved + F @ (x - about)
+        P = propagated(F, P, Q)
+        here, there = list(observation.measured), list(observation.assumed)
+        R = observation.own
+        if observation.tuned:
+            stds = np.array([by_name[name] for name in observation.parameters])
+            R = congruence(observation.axes, np.diag(np.square(stds)))
+        seen_from = series.nominal[k + 1] if initial else predicted
+        y, H = measurement.model.linearised(measurement.z, seen_from, measurement.pose)
+        y = y - H @ (predicted - seen_from)
+        result = update(
+            P, H[here], y[here], R, observation.foreign, np.array(by_name[sensor, ""])
+        )
+        after, P = predicted + result.step, result.covariance
+        R_assumed = measurement.R[np.ix_(there, there)]
+        if there:
+            K, _ = kalman_gain(P, H[there], R_assumed)
+            after = after + K @ (y[there] - H[there] @ result.step)
+            P = joseph(P, K, H[there], R_assumed)
+        assumed = y[there], H[there], R_assumed
+        steps.append(
+            Step(
+                observation,
+                since_s,
+                x,
+                about,
+                predicted,
+                after,
+                y[here],
+                H[here],
+                assumed,
+                result,
+            )
+        )
+        x, stamp_ns = after.copy(), measurement.stamp_ns
+        if (
+            yawed and k + 1 >= series.num_initial
+        ):  # until then it belongs to the nominal trajectory
+            x[YAW] = wrap_angle(x[YAW])
+    return steps
+
+
+def without_mixed(series: Series, space: NoiseSpace, values: FloatArray) -> Series:
+    """Return `series` where only observations of one object count, as judged at `values`, shape (p,).
+    Where most of 20 successive innovations are outliers, the track has gone from one object to another, or mixes two
+    that pass, which the mixture of `contaminated` does not describe.
+    """
+    outlier = np.array(
+        [step.update.outlier for step in filtered(series, space, values)]
+    )
+    stamps_ns = np.array([item.measurement.stamp_ns for item in series.observations])
+    size, margin_ns = min(_WINDOW, len(outlier)), nanoseconds(_MARGIN_S)
+    means = np.convolve(outlier, np.full(size, 1.0 / size), mode="valid")
+    mixed = np.zeros(len(outlier), dtype=np.bool_)
+    for first in np.flatnonzero(means > _MOST).tolist():
+        mixed |= (stamps_ns >= stamps_ns[first] - margin_ns) & (
+            stamps_ns <= stamps_ns[first + size - 1] + margin_ns
+        )
+    return replace(series, mixed=frozenset(np.flatnonzero(mixed).tolist()))

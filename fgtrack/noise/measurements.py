@@ -1,0 +1,288 @@
+"""The measurements of each track of a replay in memory, with their noise in parts."""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from fgtrack.config.settings import Config
+from fgtrack.core.geometry import rotation
+from fgtrack.core.linalg import congruence
+from fgtrack.core.types import FloatArray, Message
+from fgtrack.estimation.base import (
+    Measurement,
+    Start,
+    StatesAt,
+    TrackBank,
+    UpdateResult,
+)
+from fgtrack.estimation.failures import Failures
+from fgtrack.models.sensors import SensorModel
+from fgtrack.noise.likelihood.series import Observation, Series, positive_part
+from fgtrack.pipeline.build import build_bank
+from fgtrack.pipeline.replay import replay_in_memory
+from fgtrack.runs import Run
+from fgtrack.tracking.association import (
+    Assignment,
+    GatedEuclidean,
+    GatedMahalanobis,
+    Likely,
+)
+from fgtrack.tracking.detections import PosedBatch
+from fgtrack.tracking.facing import SIGNED, Facings
+from fgtrack.tracking.guarded_bank import GuardedBank
+from fgtrack.tracking.objects import Apart
+from fgtrack.tracking.preprocess import Candidate, Candidates, Preprocess, Preprocessed
+from fgtrack.tracking.tracker import TrackerParts
+
+_GATE_PROBABILITY = 0.9999
+
+
+@dataclass(frozen=True, slots=True)
+class Fed:
+    """Call of the bank in a tick: a new track, or measurements of several tracks of one stamp."""
+
+    now_ns: int
+    """Time of the tick."""
+    stamp_ns: int
+    track_ids: Sequence[int]
+    observations: Sequence[Observation] = ()
+    """Of these tracks; none of a new track."""
+    start: Start | None = None
+    """Of a new track."""
+
+
+def recorded(
+    messages: Iterable[Message],
+    config: Config,
+    origin: str = "",
+    gate_stds: float = 0.0,
+) -> tuple[list[Series], Run]:
+    """Return the series of all tracks, and the run.
+    A gate in metres is opened to `gate_stds` standard deviations of the position of each detection.
+    """
+    bank, run = watched(messages, config, origin, gate_stds)
+    motion, method = config.motion_model(), config.initiation.method
+    return [series.initiated(motion, method) for series in bank.series()], run
+
+
+def watched(
+    messages: Iterable[Message],
+    config: Config,
+    origin: str = "",
+    gate_stds: float = 0.0,
+) -> tuple["RecordingBank", Run]:
+    """Return the bank that was fed, and the run; see `recorded`."""
+    watch = Watch(config, gate_stds)
+    run = replay_in_memory(messages, config, origin=origin, observed=watch)
+    return watch.bank, run
+
+
+class Watch:
+    """Puts a `RecordingBank` into the tracker of `config`; see `recorded`."""
+
+    bank: "RecordingBank"
+
+    def __init__(self, config: Config, gate_stds: float = 0.0) -> None:
+        self._config, self._gate_stds = config, gate_stds
+
+    def __call__(self, parts: TrackerParts) -> TrackerParts:
+        """Return parts of a tracker with the bank, which is kept."""
+        preprocess, association = (
+            _WatchedPreprocess(parts.preprocess),
+            parts.association,
+        )
+        make = partial(build_bank, self._config, parts.failures)
+        self.bank = RecordingBank(make, parts.failures, preprocess)
+        if self._gate_stds and isinstance(
+            association, GatedEuclidean | GatedMahalanobis
+        ):
+            association = _WideGate(association, self._gate_stds)
+        joint = parts.joint and replace(
+            parts.joint, joint_from=None
+        )  # the noise is that of single detections
+        return replace(
+            parts,
+            preprocess=preprocess,
+            bank=self.bank,
+            association=association,
+            joint=joint,
+        )
+
+
+@dataclass(frozen=True)
+class _WideGate:
+    """An `Association` whose gate is opened to so many standard deviations of each detection, and as probable."""
+
+    association: GatedEuclidean | GatedMahalanobis
+    stds: float
+
+    @property
+    def reads_yaws(self) -> bool:
+        return self.association.reads_yaws
+
+    def __call__(
+        self,
+        candidates: Candidates,
+        states: StatesAt,
+        apart: Apart | None = None,
+        likely: Likely | None = None,
+        facings: Facings | None = None,
+    ) -> Assignment:
+        stds_m = np.array(
+            [self._stds_m(candidate, states.means) for candidate in candidates]
+        )
+        needed_m = self.stds * stds_m.reshape(len(candidates), len(states.means))
+        if isinstance(self.association, GatedEuclidean):
+            gates_m = np.maximum(self.association.gate_m, needed_m)
+            return self.association.within(gates_m, candidates, states, apart, facings)
+        limit_m = float(needed_m.max(initial=self.association.max_distance_m))
+        probability = max(self.association.gate_probability, _GATE_PROBABILITY)
+        opened = replace(
+            self.association, max_distance_m=limit_m, gate_probability=probability
+        )
+        return opened(candidates, states, apart, likely, facings)
+
+    def _stds_m(self, candidate: Candidate, means: FloatArray) -> FloatArray:
+        """Return the largest standard deviation of the position; of a bearing alone, across the line of sight."""
+        if candidate.position_covariance is not None:
+            return np.full(
+                len(means),
+                math.sqrt(np.linalg.eigvalsh(candidate.position_covariance)[-1]),
+            )
+        measurement = candidate.measurement
+        k = measurement.model.components.index("bearing_rad")
+        away_m = np.hypot(
+            means[:, 0] - measurement.pose.x_m, means[:, 1] - measurement.pose.y_m
+        )
+        return np.asarray(away_m * math.sqrt(measurement.R[k, k]))
+
+
+class _WatchedPreprocess(Preprocess):
+    """A `Preprocess` that keeps the origin of the noise of the newest batches."""
+
+    def __init__(self, watched: Preprocess) -> None:
+        self.__dict__.update(vars(watched))
+        self._own: dict[
+            tuple[int, bytes], tuple[str, SensorModel, bool]
+        ] = {}  # by pose, one for each batch, and content
+
+    def together(self, batches: Sequence[PosedBatch]) -> list[Preprocessed]:
+        """See `Preprocess.together`."""
+        result, self._own = super().together(batches), {}
+        for (batch, sensor, _, pose), (candidates, _) in zip(
+            batches, result, strict=True
+        ):
+            for item in candidates:
+                carried = [
+                    batch.message.objects[index].covariance
+                    for index in (item.leader, *item.merged)
+                ]
+                is_own = sensor.message_covariance and any(
+                    each is not None for each in carried
+                )
+                self._own[id(pose), _content(item.measurement)] = (
+                    batch.message.sensor,
+                    sensor,
+                    is_own,
+                )
+        return result
+
+    def observation(self, measurement: Measurement) -> Observation:
+        """Return a measurement of the newest batches with its noise in parts."""
+        name, sensor, is_own = self._own[id(measurement.pose), _content(measurement)]
+        return observation(name, sensor, measurement, is_own)
+
+
+def _content(measurement: Measurement) -> bytes:
+    """Return the values of `measurement` that no reading changes, see `fgtrack.tracking.facing`."""
+    names = measurement.model.components
+    kept = [k for k, name in enumerate(names) if name not in ("yaw_rad", *SIGNED)]
+    return measurement.z[kept].tobytes()
+
+
+def observation(
+    name: str, sensor: SensorModel, measurement: Measurement, own: bool
+) -> Observation:
+    """Return `measurement` of the sensor `name`; its noise is fixed if it is its `own`, or time-correlated."""
+    components = measurement.model.components
+    measured = tuple(
+        i for i, component in enumerate(components) if component in sensor.std
+    )
+    assumed = tuple(i for i in range(len(components)) if i not in measured)
+    R, T = measurement.R[np.ix_(measured, measured)], np.eye(len(measured))
+    if own or sensor.correlation is not None:
+        return Observation(name, measurement, measured, assumed, T, R, np.zeros_like(R))
+    if "x_m" in components:
+        (x_m, y_m), pose = measurement.z[:2].tolist(), measurement.pose
+        T[:2, :2] = rotation(math.atan2(y_m - pose.y_m, x_m - pose.x_m))
+    modelled = congruence(
+        T, np.diag([sensor.std[components[i]] ** 2 for i in measured])
+    )
+    return Observation(
+        name,
+        measurement,
+        measured,
+        assumed,
+        T,
+        np.zeros_like(R),
+        positive_part(R - modelled),
+    )
+
+
+class RecordingBank(GuardedBank):
+    """Keeps the first state and the fused measurements of every track."""
+
+    def __init__(
+        self,
+        make: Callable[[], TrackBank],
+        failures: Failures,
+        preprocess: _WatchedPreprocess,
+    ) -> None:
+        super().__init__(make, failures)
+        self._preprocess = preprocess
+        self.fed: list[Fed] = []
+        """In the order in which it was fed."""
+
+    def series(self) -> list[Series]:
+        """Return the fused measurements of each track, by rising stamp, in order of birth."""
+        tracks: list[tuple[Start, list[Observation]]] = []
+        newest: dict[
+            int, list[Observation]
+        ] = {}  # a number may return with an identity
+        for item in self.fed:
+            if item.start is not None:
+                newest[item.track_ids[0]] = []
+                tracks.append((item.start, newest[item.track_ids[0]]))
+            for track_id, each in zip(item.track_ids, item.observations, strict=False):
+                newest[track_id].append(each)
+        return [
+            Series(start, sorted(fused, key=lambda item: item.measurement.stamp_ns))
+            for start, fused in tracks
+        ]
+
+    def update(
+        self,
+        stamp_ns: int,
+        track_ids: Sequence[int],
+        measurements: Sequence[Measurement],
+    ) -> list[UpdateResult]:
+        """See `TrackBank.update`."""
+        results = super().update(stamp_ns, track_ids, measurements)
+        fused = [
+            row for row, result in enumerate(results) if result.innovation is not None
+        ]
+        observations = [
+            self._preprocess.observation(measurements[row]) for row in fused
+        ]
+        self.fed.append(
+            Fed(self._now_ns, stamp_ns, [track_ids[row] for row in fused], observations)
+        )
+        return results
+
+    def birth(self, track_id: int, prior: Start) -> None:
+        """See `TrackBank.birth`."""
+        super().birth(track_id, prior)
+        self.fed.append(Fed(self._now_ns, prior.stamp_ns, [track_id], start=prior))

@@ -1,0 +1,449 @@
+"""Noise from recordings: process and measurement noise by maximum likelihood of the innovations, without truth."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import chain, compress
+from pathlib import Path
+
+import numpy as np
+
+from fgtrack.config.settings import Config
+from fgtrack.config.shipped import read_config
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.types import BoolArray, FloatArray, Message
+from fgtrack.inputs.errors import UntilBreak
+from fgtrack.inputs.source import InputSource, open_input
+from fgtrack.noise.likelihood.contaminated import outlier_share
+from fgtrack.noise.likelihood.fit import Likelihood, Problem
+from fgtrack.noise.likelihood.reference import filtered, without_mixed
+from fgtrack.noise.likelihood.series import Series
+from fgtrack.noise.measurements import recorded
+from fgtrack.noise.parameters import (
+    ConfigNoise,
+    HeldOut,
+    InnovationFit,
+    Known,
+    SensorNoise,
+    TunedParameter,
+    TuneReport,
+    TuneRules,
+    stamp_key,
+)
+from fgtrack.noise.stamps import StampFit, fitted_stamps, stamp_rates, with_stamps
+from fgtrack.pipeline.assumptions.assumed import assumed
+from fgtrack.pipeline.replay import located
+from fgtrack.runs import Run
+
+_MIN_OBSERVATIONS = 20  # of a track: most of the shorter ones are clutter
+_MIN_COUNT = 30  # measured components that a parameter needs at least
+_SETTLED = (
+    0.2  # share of its standard deviation by which no parameter moves in the last round
+)
+_KNOWN, _ROUGHLY_KNOWN = 0.05, 0.5  # largest standard errors, as shares of the value
+_REJECTED = 1.92  # loss of log-likelihood at the border of a 95 % interval
+_GATE_STDS = 4.0  # at least, else what the gate cuts off is missing in the noise
+_START_FACTOR = 5.0  # further starts have a motion noise larger, and smaller, by this
+_START_TRACKS, _START_OBSERVATIONS = 3, 200  # that are used to compare starts
+_ENDLESS = (
+    "no maximum: the likelihood still rises 10^4 times away, as where all errors are 0"
+)
+
+
+def tune(
+    recordings: str | Path | Sequence[str | Path],
+    config: str | Path | Config | None = None,
+    *,
+    map: str | Path | None = None,  # noqa: A002 - the name of the option
+    pit_map: str | Path | None = None,
+    set: Mapping[str, object] | None = None,  # noqa: A002 - the name of the option
+    keep: Sequence[str] = (),
+) -> TuneReport:
+    """Fit process and measurement noise to recordings; `report.config` is the tuned configuration.
+
+    `recordings` is the path of anything that fgtrack reads, or several; `config`, `map`, `pit_map` and `set` are as for
+    `fgtrack.replay`. Keys in `keep` stay as configured: `["motion.std_per_s.speed"]`.
+
+    Raises `CallError` where the configuration does not fit, and `DataError` where a recording cannot be read, a sensor
+    of it has no model, or nothing can be fitted to it.
+    """
+    resolved = read_config(config, set, track_map=map, pit_map=pit_map)
+    paths: Sequence[str | Path] = [recordings]  # type: ignore[list-item]  # open_input names what is not a path
+    if isinstance(recordings, Sequence) and not isinstance(recordings, str):
+        paths = recordings
+    return tuned(
+        {str(path): open_input(path, resolved.input) for path in paths},
+        resolved,
+        TuneRules(keep=tuple(keep)),
+    )
+
+
+def tuned(
+    sources: Mapping[str, InputSource],
+    config: Config,
+    rules: TuneRules | None = None,
+    on_step: Callable[[str], None] = lambda text: None,
+) -> TuneReport:
+    """Return `tune` of messages in receipt order, by name of their recording; `on_step` gets the name of each step."""
+    messages: dict[str, list[Message]] = {}
+    broken: dict[str, str] = {}
+    for name, source in sources.items():
+        readable = UntilBreak(source.messages())
+        messages[name] = list(readable)
+        if readable.error is not None:
+            broken[name] = located(str(readable.error), name)
+            if not messages[name]:
+                readable.raise_error()
+    together = replace(
+        next(iter(sources.values())),
+        messages=lambda: chain.from_iterable(messages.values()),
+    )
+    config = assumed(config, together).config
+    return _Tuning(ConfigNoise(config), messages, rules or TuneRules(), on_step).report(
+        broken
+    )
+
+
+class _Tuning:
+    """The steps of `tuned`."""
+
+    def __init__(
+        self,
+        noise: ConfigNoise,
+        recordings: Mapping[str, Sequence[Message]],
+        rules: TuneRules,
+        on_step: Callable[[str], None],
+    ) -> None:
+        self._noise, self._recordings, self._rules, self._on_step = (
+            noise,
+            recordings,
+            rules,
+            on_step,
+        )
+        self._space, self._configured = noise.space, noise.values
+        self._kept = np.isin(noise.keys, rules.keep)
+        self._named = np.array(
+            [bool(name) for _, name in noise.space.names]
+        )  # not the shares of outliers
+        self._endless = np.zeros(len(self._kept), dtype=np.bool_)
+        self._configured_stamps, self._stamps = noise.stamp_stds, list[TunedParameter]()
+        for key in rules.keep:
+            if key not in (*noise.keys, *map(stamp_key, self._configured_stamps)):
+                raise CallError(
+                    f"keep {key}: is no noise of the configuration, which has {', '.join(filter(None, noise.keys))}"
+                )
+
+    def report(self, broken: Mapping[str, str]) -> TuneReport:
+        """Return the result of rounds of association and fit to the first part, judged by the rest."""
+        series, runs = self._associated(self._configured)
+        splits_ns = [self._split_ns(tracks) for tracks in series]
+        values, rounds, settled = self._configured, 0, False
+        while not settled and rounds < self._rules.max_rounds:
+            if rounds:
+                self._on_step(f"association {rounds + 1}")
+                series, runs = self._associated(values)
+                series = [
+                    [without_mixed(item, self._space, values) for item in tracks]
+                    for tracks in series
+                ]
+            rounds += 1
+            parts = zip(series, splits_ns, strict=True)
+            first = [
+                replace(item, until_ns=end_ns)
+                for tracks, end_ns in parts
+                for item in tracks
+            ]
+            problem = self._fit_stamps(
+                Problem(first, self._space, self._configured), values
+            )
+            if rounds == 1:
+                values = self._best_start(problem)
+            self._on_step(f"fit {rounds}")
+            before = values
+            values, likelihood, free = self._maximum(problem, values)
+            moved = np.abs(np.log(values[free] / before[free]))
+            still = (moved <= _SETTLED * likelihood.spread(np.log(values[free]))).all()
+            settled = rounds > 1 and bool(
+                still
+            )  # with the configured noise a mixture cannot be identified
+        (values, likelihood, parameters), held_out = self._fitted(problem, values), None
+        if self._rules.train_share < 1.0:
+            held_out = self._held_out(values, series, splits_ns)
+            self._on_step("fit to everything")
+            problem = replace(problem, series=list(chain.from_iterable(series)))
+            values, likelihood, parameters = self._fitted(problem, values)
+        sensors = tuple(
+            self._sensor(name, problem, values) for name in self._space.sensors
+        )
+        count = sum(item.count for item in sensors)
+        return TuneReport(
+            config=self._noise.config_with(values),
+            parameters=(*parameters, *self._stamps),
+            sensors=sensors,
+            held_out=held_out,
+            log_likelihood=float(likelihood.totals(values[None])[0]) / count,
+            count=count,
+            num_tracks=len(problem.series),
+            num_mixed=sum(len(item.mixed) for item in problem.series),
+            rounds=rounds,
+            settled=settled,
+            broken=broken,
+            runs=tuple(runs),
+        )
+
+    def _fit_stamps(self, problem: Problem, values: FloatArray) -> Problem:
+        """Fit the errors of stamps that are configured; return `problem` with them.
+        First of all: where an object moves along the line of sight, the standard deviation there would explain them.
+        """
+        self._stamps = []
+        rates = stamp_rates(problem, values) if self._configured_stamps else []
+        for name, was_s in self._configured_stamps.items():
+            used_s, key, fit = (
+                self._noise.stamp_stds[name],
+                stamp_key(name),
+                StampFit(was_s, math.inf),
+            )
+            known: Known = "no"
+            why = "kept as asked"
+            if key not in self._rules.keep:
+                fit = fitted_stamps(problem, rates, values, name, used_s)
+                known = (
+                    "yes"
+                    if fit.std_error <= _KNOWN
+                    else "roughly"
+                    if fit.std_error <= _ROUGHLY_KNOWN
+                    else "no"
+                )
+                why = (
+                    ""
+                    if known != "no"
+                    else f"flat: standard error {100.0 * fit.std_error:.0f} %"
+                )
+            std_s = was_s if known == "no" else float(f"{fit.std_s:.4g}")
+            self._noise = self._noise.with_stamps(name, std_s)
+            problem = with_stamps(problem, rates, name, used_s, std_s)
+            error = None if known == "no" else fit.std_error
+            self._stamps.append(TunedParameter(key, was_s, std_s, error, known, why))
+        return problem
+
+    def _associated(self, values: FloatArray) -> tuple[list[list[Series]], list[Run]]:
+        """Return the series of long tracks and the run of each recording, with the noise of `values`."""
+        config = replace(
+            self._noise.config_with(values), estimator="ekf-replay"
+        )  # which keeps late data
+        all_series, runs = [], []
+        for name, messages in self._recordings.items():
+            series, run = recorded(messages, config, name, _GATE_STDS)
+            most = self._rules.max_observations
+            long = [
+                item for item in series if len(item.observations) >= _MIN_OBSERVATIONS
+            ]
+            all_series.append(
+                [replace(item, observations=item.observations[:most]) for item in long]
+            )
+            runs.append(run)
+        return all_series, runs
+
+    def _split_ns(self, tracks: Sequence[Series]) -> float:
+        """Return the stamp at which the held-out part of a recording begins; infinite without one."""
+        if self._rules.train_share == 1.0:
+            return math.inf
+        stamps_ns = [
+            item.measurement.stamp_ns for track in tracks for item in track.observations
+        ] or [0]
+        return min(stamps_ns) + round(
+            self._rules.train_share * (max(stamps_ns) - min(stamps_ns))
+        )
+
+    def _maximum(
+        self, problem: Problem, start: FloatArray
+    ) -> tuple[FloatArray, Likelihood, BoolArray]:
+        """Return parameters at the maximum, the likelihood, and which are free; others are as configured."""
+        while True:
+            free = self._free(problem)
+            values, likelihood = problem.maximum(start, free)
+            endless = free & problem.endless(values)
+            if not endless.any():
+                return values, likelihood, free
+            self._endless |= endless
+            start = np.where(endless, self._configured, values)
+
+    def _free(self, problem: Problem) -> BoolArray:
+        """Return which parameters have enough measurements and a maximum."""
+        free = np.asarray(
+            (problem.counts() >= _MIN_COUNT) & ~self._kept & ~self._endless
+        )
+        if not free[self._named].any():
+            raise self._nothing(
+                f"no parameter that may be fitted has {_MIN_COUNT} measurements on tracks of objects that move; take a "
+                "longer recording, or look at the gate, and for sensors without a model at `fgtrack info`"
+            )
+        return free
+
+    def _nothing(self, why: str) -> DataError:
+        if self._endless.any():
+            keys = ", ".join(np.array(self._noise.keys)[self._endless])
+            why = f"the errors behind {keys} are 0, or nearly so: was it simulated without noise?"
+        return DataError(
+            f"{', '.join(self._recordings)}: nothing to fit noise to: {why}"
+        )
+
+    def _best_start(self, problem: Problem) -> FloatArray:
+        """Return the best of three starts, by the maximum that it reaches on a part of the data."""
+        self._on_step("starts")
+        longest = sorted(problem.series, key=lambda item: -len(item.observations))[
+            :_START_TRACKS
+        ]
+        some = [
+            replace(item, observations=item.observations[:_START_OBSERVATIONS])
+            for item in longest
+        ]
+        part = replace(problem, series=some)
+        free = self._free(problem) & (part.counts() >= _MIN_COUNT)
+        if not free.any():  # too little in the part to choose a start by
+            return self._configured.copy()
+        moving = np.flatnonzero(free[: self._space.num_motion])
+        reached: list[tuple[float, FloatArray]] = []
+        for factor in (1.0, _START_FACTOR, 1.0 / _START_FACTOR):
+            start = self._configured.copy()
+            start[moving] *= factor
+            values, likelihood = part.maximum(start, free)
+            reached.append((likelihood.cost(np.log(values[free])).objective, values))
+        return min(reached, key=lambda item: item[0])[1]
+
+    def _fitted(
+        self, problem: Problem, start: FloatArray
+    ) -> tuple[FloatArray, Likelihood, tuple[TunedParameter, ...]]:
+        """Return the maximum; instead of what is not known there, what is configured, or what is nearest to it.
+        The rest is not refitted: it would compensate for that.
+        """
+        count = len(start)
+        known: list[Known] = ["no"] * count
+        values, likelihood, free = self._maximum(problem, start)
+        why = np.full(
+            count, f"fewer than {_MIN_COUNT} measurements on tracks", dtype=object
+        )
+        why[self._endless], why[self._kept] = _ENDLESS, "kept as asked"
+        log_std = np.full(count, math.nan)
+        log_std[free] = likelihood.log_std(np.log(values[free]))
+        errors = log_std.copy()
+        for row in sorted(
+            np.flatnonzero(free & self._named).tolist(), key=lambda item: -errors[item]
+        ):
+            why[row] = ""
+            if errors[row] <= _ROUGHLY_KNOWN:
+                known[row] = "yes" if errors[row] <= _KNOWN else "roughly"
+                continue
+            limit = self._limit(likelihood, values, row)
+            if limit == self._configured[row]:
+                why[row] = f"flat: standard error {100.0 * errors[row]:.0f} %"
+            else:
+                known[row] = "limit"
+                why[row] = (
+                    f"only bounded: {'below' if values[row] < limit else 'above'} {limit:.3g} at 95 %"
+                )
+            values[row], log_std[row] = limit, math.nan
+        if not {"yes", "roughly"} & set(known):
+            raise self._nothing(
+                "no parameter is identifiable in so few measurements; take a longer recording"
+            )
+        tuned_values = ConfigNoise(self._noise.config_with(values)).values
+        rows = zip(
+            self._noise.keys,
+            self._configured,
+            tuned_values,
+            log_std,
+            known,
+            why,
+            strict=True,
+        )
+        parameters = [
+            TunedParameter(
+                key,
+                float(was),
+                float(now),
+                None if math.isnan(error) else float(error),
+                how,
+                reason,
+            )
+            for key, was, now, error, how, reason in rows
+            if key
+        ]
+        return values, likelihood, tuple(parameters)
+
+    def _limit(self, likelihood: Likelihood, values: FloatArray, row: int) -> float:
+        """Return the value nearest to the configured one that the data do not reject, the other parameters given."""
+        shares = np.linspace(0.0, 1.0, 41)
+        rows = np.broadcast_to(values, (len(shares), len(values))).copy()
+        rows[:, row] = values[row] * (self._configured[row] / values[row]) ** shares
+        heights = likelihood.totals(rows)
+        rejected = np.flatnonzero(heights < heights[0] - _REJECTED)
+        if not len(rejected):
+            return float(self._configured[row])
+        return float(rows[max(int(rejected[0]) - 1, 0), row])
+
+    def _held_out(
+        self,
+        trained: FloatArray,
+        series: Sequence[Sequence[Series]],
+        splits_ns: Sequence[float],
+    ) -> HeldOut | None:
+        """Return the performance in the rest of noise fitted to the first part; None where nothing counts there."""
+        rest = [
+            replace(item, from_ns=at_ns)
+            for tracks, at_ns in zip(series, splits_ns, strict=True)
+            for item in tracks
+        ]
+        before, squares_before = self._scored(
+            rest, np.where(self._named, self._configured, trained)
+        )
+        after, squares_after = self._scored(rest, trained)
+        if not before:
+            return None
+        innovations = tuple(
+            InnovationFit(
+                *name,
+                len(squares),
+                float(np.mean(squares)),
+                float(np.mean(squares_after[name])),
+                1.96 * math.sqrt(2.0 / len(squares)),
+            )
+            for name, squares in sorted(squares_before.items())
+        )
+        return HeldOut(
+            1.0 - self._rules.train_share,
+            len(before),
+            float(np.mean(before)),
+            float(np.mean(after)),
+            innovations,
+        )
+
+    def _scored(
+        self, series: Sequence[Series], values: FloatArray
+    ) -> tuple[list[float], dict[tuple[str, str], list[float]]]:
+        """Return log-likelihoods of the innovations that count, and squares over variances by sensor and component."""
+        terms, squares = list[float](), dict[tuple[str, str], list[float]]()
+        for item in series:
+            for step in compress(filtered(item, self._space, values), item.counted):
+                terms.append(float(step.update.log_likelihood))
+                observation = step.observation
+                names = [
+                    observation.measurement.model.components[i]
+                    for i in observation.measured
+                ]
+                for name, square in zip(
+                    names, np.square(step.y) / np.diag(step.update.S), strict=True
+                ):
+                    squares.setdefault((observation.sensor, name), []).append(
+                        float(square)
+                    )
+        return terms, squares
+
+    def _sensor(self, name: str, problem: Problem, values: FloatArray) -> SensorNoise:
+        row = self._space.names.index((name, ""))
+        count = int(problem.counts()[row])
+        observations = chain.from_iterable(item.observations for item in problem.series)
+        own = sum(item.sensor == name and not item.tuned for item in observations)
+        return SensorNoise(
+            name, count, own, float(outlier_share(values[row])) if count else None
+        )

@@ -1,0 +1,324 @@
+"""A recording in one call: advice, three methods on the same stream, their comparison, figures, and a page."""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from itertools import chain, count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from fgtrack.advice.advise import Adviser
+from fgtrack.advice.ledger import SUMMARY_S, summary
+from fgtrack.advice.page import Advice
+from fgtrack.advice.paired_replay import REPLAY, PairedReplay
+from fgtrack.config.settings import Config
+from fgtrack.config.shipped import read_config
+from fgtrack.core.errors import DataError
+from fgtrack.core.output import (
+    check_apart,
+    check_output,
+    claimed,
+    new_files,
+    write_file,
+)
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import Message
+from fgtrack.evaluation.diagnostics import USED, diagnostics, lifetimes_and_breaks
+from fgtrack.evaluation.runs import EvaluatedRun, evaluated
+from fgtrack.evaluation.tables import Tables, short
+from fgtrack.evaluation.tables.compare import compare
+from fgtrack.inputs.errors import UntilBreak
+from fgtrack.inputs.source import open_input
+from fgtrack.noise.measurements import Watch
+from fgtrack.pipeline.assumptions.assumed import assumed
+from fgtrack.pipeline.assumptions.assumption import Assumed
+from fgtrack.pipeline.replay import replay
+from fgtrack.runs import Run, check_run, load_run, write_metrics
+from fgtrack.show.figures.close_up import CloseUp
+from fgtrack.show.figures.late_detection import drawn_close_up
+from fgtrack.show.figures.plot import drawn, planned
+from fgtrack.show.figures.style import png
+from fgtrack.show.report import ReportHead, write_report
+
+__all__ = ["ESTIMATORS", "Study", "study"]
+
+_PERCENT, _MS = 100.0, 1e3
+_IMPORTANT = (
+    60.0  # weight of a finding without a setting that has to be dealt with first
+)
+
+
+def _recording(one: EvaluatedRun) -> str:
+    updates, now_ns = one.run.tables["updates"], one.run.tables["timing"]["now_ns"]
+    length_s = (int(now_ns[-1]) - int(now_ns[0])) / NS_PER_S if len(now_ns) else 0.0
+    sensors = []
+    for sensor in np.unique(updates["sensor"]).tolist():
+        mine = updates["sensor"] == sensor
+        delays_s = (updates["receipt_ns"][mine] - updates["stamp_ns"][mine]) / NS_PER_S
+        middle_ms, most_ms = (
+            _MS * float(np.median(delays_s)),
+            _MS * float(delays_s.max()),
+        )
+        sensors.append(
+            f"{sensor} ({len(delays_s)} detections, {middle_ms:.0f} ms late, at most {most_ms:.0f})"
+        )
+    late, used = (
+        _percent(np.isin(updates["disposition"], fates))
+        for fates in (("out_of_sequence",), USED)
+    )
+    many = f"{late} arrived after newer ones had been fused, {used} were used"
+    return f"In {length_s:.0f} s detections came from {' and '.join(sensors) or 'no sensor'}; {many}."
+
+
+def _tracks(one: EvaluatedRun) -> str:
+    truth = one.metrics.truth
+    if truth is not None:
+        of, share = truth.overall, _PERCENT * truth.overall.tracked_share_in_view
+        return (
+            f"{one.label} tracks the objects {share:.1f} % of the time that a sensor could see them: "
+            f"{_several(of.breaks, 'break')}, {_several(of.id_switches, 'identity switch', 'es')}, "
+            f"{_several(truth.false_tracks, 'false track')}."
+        )
+    lives_s, _ = lifetimes_and_breaks(one.run)
+    lives = (
+        f", half of them for {np.median(lives_s):.1f} s or longer"
+        if len(lives_s)
+        else ""
+    )
+    return f"{one.label} confirms {_several(len(lives_s), 'track')}{lives}."
+
+
+def _to_do(first: EvaluatedRun, tables: Tables, advice: Advice | None) -> str:
+    """Return what comes first: a defect of the recording or its settings, else the fastest of the best methods."""
+    findings = () if advice is None else advice.findings
+    found = [
+        str(item)
+        for item in findings
+        if not item.settings and item.weight >= _IMPORTANT
+    ]
+    if found := found or [str(item) for item in diagnostics(first.run)]:
+        return f"First: {found[0]}"
+    ranked = [
+        row
+        for row in tables.tables["differences"].records
+        if row["quantity"] == "position_rmse_m"
+    ]
+    best = {row["run"] for row in ranked if row["standing"] != "worse"}
+    times = {
+        row["run"]: row["time_per_tick_p50_s"]
+        for row in tables.tables["tracking"].records
+    }
+    fastest = min(best or times, key=lambda run: (times[run], run))
+    because = "as accurate as the best" if best else "errors are unknown without truth"
+    return f"Take {fastest} for the present state ({short(_MS * times[fastest])} ms per tick, {because})."
+
+
+def _percent(mask: Any) -> str:  # Any: an array of bool
+    return f"{_PERCENT * float(np.mean(mask)):.0f} %" if len(mask) else "none"
+
+
+def _several(count: int, what: str, ending: str = "s") -> str:
+    return f"{count or 'no'} {what}{'' if count == 1 else ending}"
+
+
+ESTIMATORS = ("smoother", REPLAY, "ekf-backward-forward")
+"""Estimators of a study."""
+#: Share of the work that is done when a step begins.
+_ADVICE, _REPLAY, _COMPARE, _DRAW, _DONE = 0.02, 0.3, 0.85, 0.9, 1.0
+_MESSAGES = 1000  # between two signs of progress
+OnStep = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Study:
+    """A recording studied; `str` gives the summary, the assumptions and where the files are."""
+
+    path: Path
+    """Folder of `report.html`, `settings.yaml`, `runs/` and `figures/`."""
+    summary: tuple[str, ...]
+    """About five sentences: the recording, the tracks, the best method, the noise, what to do."""
+    assumptions: tuple[str, ...] = field(repr=False)
+    """Settings that neither the configuration nor the advice gives, a line per sensor with the reasons."""
+    advice: Advice | None = field(repr=False)
+    """None where it was not asked for, or nothing could be judged."""
+    runs: tuple[Run, ...] = field(repr=False)
+    tables: Tables = field(repr=False)
+    """Comparison of the runs."""
+    broken: str | None
+    """Why the recording breaks off, where it does."""
+
+    @property
+    def report(self) -> Path:
+        """The page, to be opened in a browser."""
+        return self.path / "report.html"
+
+    @property
+    def settings(self) -> Path:
+        """The configuration of the runs with what was assumed and why, to be changed and run again."""
+        return self.path / "settings.yaml"
+
+    def __str__(self) -> str:
+        lines = [*self.summary, *self.assumptions]
+        return "\n".join(
+            [*lines, f"settings: {self.settings}", f"report: {self.report}"]
+        )
+
+
+def study(
+    recording: str | Path,
+    out: str | Path,
+    config: str | Path | Config | None = None,
+    *,
+    map: str | Path | None = None,  # noqa: A002 - the name of the option
+    pit_map: str | Path | None = None,
+    set: Mapping[str, object] | None = None,  # noqa: A002 - the name of the option
+    advice: bool = True,
+    figures: Mapping[str, Figure] | None = None,
+    overwrite: bool = False,
+    on_step: OnStep = lambda text, share: None,
+) -> Study:
+    """Return a recording studied: advised, replayed by three estimators, compared, drawn and reported into a folder.
+
+    `config`, `map`, `pit_map` and `set` are as for `fgtrack.replay`. With `advice` the settings of `fgtrack.advise` are
+    followed; `figures` are further ones by name; `overwrite` replaces a study in `out`. `on_step` is called with the
+    name of each step, and the share of the work that is done.
+
+    Raises `CallError` where the configuration or `out` is invalid, and `DataError` where the recording cannot be read,
+    or holds nothing to track.
+    """
+    out, source_path = Path(out), Path(recording)
+    resolved = read_config(config, set, track_map=map, pit_map=pit_map)
+    *runs, pictures, settings, page = outputs(out)
+    folders = dict(zip(ESTIMATORS, runs, strict=True))
+    config_file = str(config) if isinstance(config, (str, Path)) else None
+    for path in outputs(out):
+        check_apart(path, [source_path, config_file])
+    with claimed(out):
+        for folder in folders.values():
+            check_run(folder, overwrite)
+        check_output(pictures, overwrite, Path.is_dir, "a folder")
+        check_output(settings, overwrite)
+        check_output(page, overwrite)
+        on_step("reading", 0.0)
+        source = open_input(source_path, resolved.input)
+        readable = UntilBreak(source.messages())
+        messages = list(readable)
+        known = assumed(resolved, replace(source, messages=lambda: iter(messages)))
+        advised: Advice | None = None
+        adviser = Adviser(
+            str(source_path),
+            messages,
+            Assumed(known.config),
+            on_step=lambda text, share: on_step(
+                f"advice, {text}", _ADVICE + (_REPLAY - _ADVICE) * share
+            ),
+        )
+        with suppress(
+            DataError
+        ):  # where nothing can be judged, which the runs report as well
+            advised = adviser.advice() if advice else None
+        if advised is not None:  # what the advice changes is not assumed any more
+            changed = {one.key for one in advised.changes}
+            known = Assumed(
+                advised.config,
+                tuple(one for one in known.assumptions if one.key not in changed),
+            )
+        head = [
+            f"Settings of {source_path.name} (fgtrack study): change them and run again with -c."
+        ]
+        comments = [] if advised is None else advised.comments()
+        write_file(settings, known.to_yaml([*head, *comments]), overwrite)
+
+        taken = count()
+
+        def repeated() -> Iterator[Message]:
+            for message in messages:
+                if (number := next(taken)) % _MESSAGES == 0:
+                    done = number / len(messages)
+                    share = _REPLAY + (_COMPARE - _REPLAY) * done / len(ESTIMATORS)
+                    on_step(f"replay, {ESTIMATORS[int(done)]}", share)
+                yield message
+            readable.raise_error()
+
+        watch = Watch(replace(known.config, estimator=REPLAY))
+        replay(
+            repeated,
+            known.config,
+            folders,
+            origin=str(source.path),
+            kind=source.kind,
+            overwrite=overwrite,
+            observed={REPLAY: watch},
+        )
+        on_step("compare", _COMPARE)
+        every = evaluated([load_run(folder) for folder in folders.values()])
+        tables = compare(*every)
+        for folder, one in zip(runs, every, strict=True):
+            write_metrics(folder, one.metrics.as_dict())
+        with suppress(DataError):  # without a track to judge there is no ledger
+            replays = PairedReplay(
+                watch.bank, every[ESTIMATORS.index(REPLAY)].run, known.config, SUMMARY_S
+            )
+            tables = replace(
+                tables, tables={**tables.tables, "ledger": summary(replays)}
+            )
+        lines = (
+            _recording(every[0]),
+            _tracks(every[0]),
+            *tables.verdict,
+            _to_do(every[0], tables, advised),
+        )
+        on_step("draw", _DRAW)
+        close_up, late = drawn_close_up(every)
+        others = tuple(
+            f"_{one.label}" for one in every[1:]
+        )  # figures of single runs are drawn of the first
+        plans = (one for one in planned(every) if not one.name.endswith(others))
+        images = [
+            (name, png(one))
+            for name, one in chain(close_up, drawn(plans), (figures or {}).items())
+        ]
+        with new_files(pictures, overwrite) as into:
+            for name, image in images:
+                (into / f"{name}.png").write_bytes(image)
+        head_advice = () if advised is None else advised.sentences
+        report_head = replace(
+            head_at(late),
+            sentences=lines,
+            assumptions=known.lines(),
+            advice=head_advice,
+        )
+        write_report(every, tables, images, page, report_head, overwrite)
+        on_step("done", _DONE)
+    result = tuple(one.run for one in every)
+    return Study(
+        out,
+        lines,
+        tuple(known.lines()),
+        advised,
+        result,
+        tables,
+        result[0].meta["broken_off"],
+    )
+
+
+def outputs(out: Path) -> list[Path]:
+    """Return what a study in `out` writes: the run of every estimator, figures, settings, report."""
+    names = (
+        *(f"runs/{each}" for each in ESTIMATORS),
+        "figures",
+        "settings.yaml",
+        "report.html",
+    )
+    return [out / name for name in names]
+
+
+def head_at(late: CloseUp | DataError) -> ReportHead:
+    """Return how a report opens at a late detection; without one it gives the reason."""
+    if isinstance(late, DataError):
+        return ReportHead(missing=(f"no close-up: {late}",))
+    x_m, y_m = late.after.means[-1, :2].tolist()
+    return ReportHead(moment=(late.now_ns, x_m, y_m))

@@ -1,0 +1,41 @@
+"""The run folder `fgtrack-run/1`, the interface of tracking and evaluation: writer, reader, layout; runs in memory."""
+
+from fgtrack.runs.memory import MemoryRun
+from fgtrack.runs.reader import EvaluationConfig, Run, Table, load_run
+from fgtrack.runs.schema import (
+    COLUMNS,
+    COVARIANCE_COLUMNS,
+    NO_TRACK,
+    OPTIONAL_TABLES,
+    RUN_FORMAT,
+)
+from fgtrack.runs.timing import Node, ready_times
+from fgtrack.runs.writer import (
+    RunWriter,
+    check_run,
+    digest,
+    is_run_folder,
+    path_from_run,
+    write_metrics,
+)
+
+__all__ = [
+    "COLUMNS",
+    "COVARIANCE_COLUMNS",
+    "EvaluationConfig",
+    "MemoryRun",
+    "NO_TRACK",
+    "Node",
+    "OPTIONAL_TABLES",
+    "RUN_FORMAT",
+    "Run",
+    "RunWriter",
+    "Table",
+    "check_run",
+    "digest",
+    "is_run_folder",
+    "load_run",
+    "path_from_run",
+    "ready_times",
+    "write_metrics",
+]

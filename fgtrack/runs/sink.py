@@ -1,0 +1,179 @@
+"""Sinks of a run: rows of the tables, counts of the dispositions, the meta data."""
+
+from abc import ABC, abstractmethod
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import astuple
+from time import monotonic
+
+from fgtrack.core.types import (
+    DetectionList,
+    Disposition,
+    EgoState,
+    ObjectReport,
+    SmoothedReport,
+    TickReport,
+    TruthState,
+)
+from fgtrack.inputs.geodetic import GEODETIC
+from fgtrack.runs.rows import Row, detection_rows, rows, smoothed_rows, state_cells
+from fgtrack.runs.schema import COLUMNS, RUN_FORMAT
+
+PERIOD_S = 0.2
+"""Rows are appended together after so much wall time: to write each by itself takes as long as to format it."""
+
+
+class RunSink(ABC):
+    """Takes a run tick by tick; where the rows go, its subclasses decide. `meta` is that of `meta.json` at the start.
+    The states of the lag `smoothed_lag_s` go to `smoothed` with the final ones; `lagged` gets those of every lag.
+    """
+
+    def __init__(
+        self,
+        config_text: str = "",
+        meta: Mapping[str, object] | None = None,
+        smoothed_lag_s: float | None = None,
+    ) -> None:
+        self._config_text = config_text
+        self._meta: dict[str, object] = {
+            "format": RUN_FORMAT,
+            **(meta or {}),
+            "complete": False,
+        }
+        self._smoothed_lag_s = smoothed_lag_s
+        self._counts: dict[str, Counter[Disposition]] = defaultdict(Counter)
+        self._out_of_bounds: dict[str, Counter[str]] = defaultdict(
+            Counter
+        )  # by setting
+        self._left_out: dict[str, Counter[str]] = defaultdict(
+            Counter
+        )  # by the reader and its settings
+        self._objects: dict[
+            int, ObjectReport
+        ] = {}  # the last word on tracks that have not ended
+        self._rows: dict[str, list[Row]] = {
+            table: [] for table in COLUMNS
+        }  # not yet appended
+        self._due_s = 0.0
+
+    @property
+    def is_scored(self) -> bool:
+        """True if tracks have existence probabilities: a column of `tracks`, which others lack."""
+        return bool(self._meta.get("is_scored"))
+
+    def write_tick(
+        self, report: TickReport, process_ns: int, num_detections: int
+    ) -> None:
+        """Take all rows of one tick, see `rows`; those of the first tick are appended immediately."""
+        for record in report.updates:
+            self._counts[record.sensor][record.disposition] += 1
+            if record.reason is not None:
+                self._out_of_bounds[record.sensor][record.reason] += 1
+        self._end_objects({track.track_id for track in report.tracks})
+        self._objects |= {
+            track.track_id: track.object
+            for track in report.tracks
+            if track.object is not None
+        }
+        for table, cells in rows(
+            report, process_ns, num_detections, self._smoothed_lag_s
+        ):
+            self._rows[table] += (
+                cells
+                if self.is_scored or table != "tracks"
+                else [row[:-1] for row in cells]
+            )
+        if monotonic() >= self._due_s:
+            self._append_rows()
+
+    def write_smoothed(self, reports: Sequence[SmoothedReport]) -> None:
+        """Take rows of `smoothed`; the end of a run may have none."""
+        self._rows["smoothed"] += smoothed_rows(reports)
+
+    def write_truth(self, truth: TruthState) -> None:
+        """Take a row of `truth` or `ignored`."""
+        if truth.ignored:
+            outline = (
+                None
+                if truth.outline_m is None
+                else " ".join(map(repr, map(float, truth.outline_m)))
+            )
+            self._rows["ignored"].append(
+                (
+                    truth.stamp_ns,
+                    truth.object_id,
+                    float(truth.x_m),
+                    float(truth.y_m),
+                    outline,
+                )
+            )
+        else:
+            self._rows["truth"].append(
+                (truth.stamp_ns, truth.object_id, *state_cells(truth))
+            )
+
+    def write_ego(self, ego: EgoState) -> None:
+        """Take a row of `ego`."""
+        self._rows["ego"].append((ego.stamp_ns, ego.receipt_ns, *state_cells(ego)))
+
+    def write_detections(self, message: DetectionList) -> None:
+        """Take the rows of `detections`."""
+        self._rows["detections"] += detection_rows(message)
+        if message.origin_deg is not None:
+            self._meta.setdefault(
+                "origin", dict(zip(GEODETIC, message.origin_deg, strict=True))
+            )
+        if message.left_out:
+            self._left_out[message.sensor].update(message.left_out)
+
+    def finish(self, meta: Mapping[str, object]) -> dict[str, object]:
+        """Complete the run with `meta`, the counts per sensor and the digest; return the content of `meta.json`."""
+        self._end_objects(set())
+        self._append_rows()
+        counts = {
+            sensor: {
+                disposition.value: counter[disposition] for disposition in Disposition
+            }
+            for sensor, counter in sorted(self._counts.items())
+        }
+        bounds = {
+            "out_of_bounds": _by_reason(self._out_of_bounds),
+            "left_out": _by_reason(self._left_out),
+        }
+        self._meta |= {
+            "counts": counts,
+            **bounds,
+            "complete": True,
+            **meta,
+            "digest": self._digest(),
+        }
+        return dict(self._meta)
+
+    def _end_objects(self, alive: Set[int]) -> None:
+        """Take rows of `objects` of tracks that are not `alive` any more."""
+        ended = sorted(self._objects.keys() - alive)
+        self._rows["objects"] += [
+            (track_id, *astuple(self._objects.pop(track_id))) for track_id in ended
+        ]
+
+    def _append_rows(self) -> None:
+        self._due_s = monotonic() + PERIOD_S
+        for table, cells in self._rows.items():
+            if cells:
+                self._append(table, cells)
+                self._rows[table] = []
+
+    @abstractmethod
+    def _append(self, table: str, rows: Sequence[Row]) -> None:
+        """Append `rows` to `table`."""
+
+    @abstractmethod
+    def _digest(self) -> str:
+        """SHA-256 of the bytes of tracks.csv and then updates.csv, in hex."""
+
+
+def _by_reason(counts: Mapping[str, Counter[str]]) -> dict[str, dict[str, int]]:
+    return {
+        sensor: dict(sorted(counter.items()))
+        for sensor, counter in sorted(counts.items())
+    }

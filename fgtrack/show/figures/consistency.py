@@ -1,0 +1,171 @@
+"""The figure of NEES and NIS over time, with their chi-square bands."""
+
+from typing import Unpack
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from fgtrack.core.errors import DataError
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.evaluation.matching import position_nees
+from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_ns
+from fgtrack.evaluation.scores.innovations import num_measured
+from fgtrack.evaluation.scores.statistics import chi_square_band
+from fgtrack.show.figures.paper import Paper, Sheet, styled
+from fgtrack.show.figures.style import (
+    GREY,
+    broken_line,
+    legend_above,
+    log_axis,
+    run_styles,
+    usual_step_ns,
+)
+from fgtrack.show.palette import SENSORS
+
+_WINDOWS = 40  # of a run, so many values does each mean of NIS hold
+_SHORTEST, _LONGEST = 5, 100
+_LOWEST = 0.02  # of the axis, as a share of the expected value
+
+
+@styled
+def consistency(run: OneRun, **paper: Unpack[Paper]) -> Figure:
+    """NEES of the position, averaged over the objects of a tick, and NIS by sensor, each in its 95 % band.
+
+    A consistent estimator is inside of the band at 95 % of the ticks, and around the expected value; above it the
+    covariance is too small, below it too large. A dot is the NIS of a detection, the line the mean of several in a row
+    and the band that of this mean. Raises `DataError` if the run has neither truth of its tracks nor innovations.
+    """
+    one = one_evaluated(run)
+    panels = _panels(one)
+    if not panels:
+        raise DataError(
+            f"{one.label}: has no errors and no innovations, so there is no consistency to draw"
+        )
+    sheet = Sheet(10.0, 1.0 + 2.1 * len(panels), paper)
+    rows = sheet.plots(len(panels), sharex=True)[:, 0]
+    sensors = np.unique(one.run.tables["updates"]["sensor"]).tolist()
+    first_ns = start_ns([one])
+    for axes, (name, (stamps_ns, values, dof)) in zip(
+        rows, panels.items(), strict=True
+    ):
+        since_ns = stamps_ns - first_ns
+        if name == _NEES:
+            at_ns, index, count = np.unique(
+                since_ns, return_inverse=True, return_counts=True
+            )
+            mean, expected = (
+                np.bincount(index, each) / count for each in (values, dof)
+            )
+            band = chi_square_band(expected * count, count)
+            colour, inside = (
+                run_styles([one])[one.label].colour,
+                (mean >= band[0]) & (mean <= band[1]),
+            )
+            subject, unit, line = "position", "ticks", ""
+        else:
+            sensor = name.removeprefix("NIS of ")
+            colour = SENSORS[sensors.index(sensor) % len(SENSORS)]
+            low, high = chi_square_band(
+                dof.astype(np.float64), np.ones(len(dof), dtype=np.int64)
+            )
+            inside = (values >= low) & (values <= high)
+            length = min(
+                max(_SHORTEST, min(_LONGEST, len(values) // _WINDOWS)), len(values)
+            )
+            subject, unit, line = sensor, "detections", f"; line: mean of {length}"
+            order, share = (
+                np.argsort(since_ns, kind="stable"),
+                np.full(length, 1.0 / length),
+            )
+            at_ns, mean, expected = (
+                np.convolve(each[order], share, "valid")
+                for each in (since_ns, values, dof)
+            )
+            at_ns, band = (
+                at_ns.astype(np.int64),
+                chi_square_band(expected * length, np.full(len(mean), length)),
+            )
+            axes.plot(
+                since_ns / NS_PER_S,
+                values,
+                ".",
+                ms=3.0,
+                mew=0,
+                color=colour,
+                alpha=0.5,
+                rasterized=True,
+            )
+        step_ns, time_s = usual_step_ns(at_ns), at_ns / NS_PER_S
+        x_s, y = broken_line(at_ns, time_s, mean, step_ns)
+        low, high, middle = (
+            broken_line(at_ns, time_s, each, step_ns)[1] for each in (*band, expected)
+        )
+        axes.fill_between(x_s, low, high, color=GREY, alpha=0.25, lw=0)
+        share_inside = f"{100.0 * inside.mean():.0f} % of the {unit} in their band"
+        label = f"{subject}: mean {values.mean():.3g}, expected {dof.mean():.3g}; {share_inside}{line}"
+        axes.plot(x_s, y, color=colour, lw=1.1, label=label)
+        axes.plot(x_s, middle, color="black", lw=0.9, ls="--")
+        positive, shown = (
+            values[values > 0.0],
+            np.concatenate([mean[mean > 0.0], *band]),
+        )  # the axis is logarithmic
+        limits = [
+            max(_LOWEST * float(np.median(expected)), 0.8 * float(shown.min())),
+            1.25 * float(shown.max()),
+        ]
+        if name != _NEES and len(positive):
+            ends = np.quantile(positive, (0.05, 0.99))
+            limits = [min(limits[0], ends[0]), max(limits[1], ends[1])]
+        axes.set(
+            yscale="log",
+            ylim=limits,
+            ylabel=name.replace(" of ", " of\n").replace("_", " "),
+        )
+        log_axis(axes.yaxis)
+        if axes is rows[0]:
+            axes.fill_between([], [], color=GREY, alpha=0.25, lw=0, label="95 % band")
+            axes.plot([], color="black", lw=0.9, ls="--", label="expected")
+        legend_above(axes)
+    rows[-1].set_xlabel("time [s]")
+    sheet.title(
+        f"{one.label}: consistency: normalised squares of errors and innovations, with their 95 % bands"
+    )
+    return sheet.figure
+
+
+_NEES = "NEES of the position"
+_Squares = tuple[
+    IntArray, FloatArray, IntArray
+]  # stamps, values, degrees of freedom; of shape (n,) each
+
+
+def _panels(one: EvaluatedRun) -> dict[str, _Squares]:
+    """Stamps, normalised squares and degrees of freedom to show, by name of the panel."""
+    result: dict[str, _Squares] = {}
+    if one.matching is not None:
+        values, stamps_ns = (
+            position_nees(one.matching),
+            one.matching.tracks["stamp_ns"][one.matching.paired],
+        )
+        known = np.isfinite(values)
+        if known.any():
+            result[_NEES] = stamps_ns[known], values[known], np.full(known.sum(), 2)
+    updates = one.run.tables["updates"]
+    measured = num_measured(updates)
+    for sensor in np.unique(updates["sensor"]).tolist():
+        mine = (
+            (updates["sensor"] == sensor) & np.isfinite(updates["nis"]) & (measured > 0)
+        )
+        if mine.any():
+            result[f"NIS of {sensor}"] = (
+                updates["receipt_ns"][mine],
+                updates["nis"][mine],
+                measured[mine],
+            )
+    return result
+
+
+def has_squares(one: EvaluatedRun) -> bool:
+    """True if `consistency` has anything to show."""
+    return bool(_panels(one))

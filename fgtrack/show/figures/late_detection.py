@@ -1,0 +1,260 @@
+"""Close-ups of runs: which late detection to look at, and its track just before and just after it was fused."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Unpack
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from fgtrack.config.settings import Config
+from fgtrack.config.yaml_file import validate
+from fgtrack.core.errors import CallError, DataError
+from fgtrack.core.time import NS_PER_S, nanoseconds
+from fgtrack.core.types import FUSED, DetectionList, Disposition
+from fgtrack.evaluation.runs import EvaluatedRun, by_recording
+from fgtrack.evaluation.truth import true_paths
+from fgtrack.inputs.source import open_input
+from fgtrack.models.motion import CTRV
+from fgtrack.pipeline.build import build_tracker
+from fgtrack.pipeline.replay import delivered
+from fgtrack.runs import Run, load_run
+from fgtrack.show.figures.close_up import STEP_S, Arrival, CloseUp, Estimates
+from fgtrack.show.figures.close_up import close_up as figure_of
+from fgtrack.show.figures.paper import Paper
+from fgtrack.tracking.tracker import Tracker
+
+_BACK_S = 0.15  # before the detection the estimates begin
+_MOST_STEPS = 500  # estimates of each track, however late the detection
+_STATE = ["x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps"]
+_DETECTION = ["sensor", "stamp_ns", "receipt_ns", "index"]
+_SETTLED = 20  # measurements of a track before which it moves for want of a good start
+_EARLY_S = 20.0  # what the choice is restricted to: the recording is replayed up to the detection for every run
+
+
+def close_ups(
+    runs: Sequence[Run | Path | str], stamp_ns: int | None = None
+) -> list[CloseUp]:
+    """Return one late detection in slow motion, in each of `runs`: its track before and after it was fused.
+
+    The detection is a typical one of those that lower the error of the first run's present, see `chosen`, or that with
+    the stamp nearest to `stamp_ns`. `runs` are of one recording, or their folders; it is replayed up to there for every
+    run. `fgtrack.plot.close_up` draws the result. Raises `CallError` if a folder holds no run, and `DataError` if the
+    first run fused no such detection, a run did not fuse it, or a recording is not there any more.
+    """
+    read = [run if isinstance(run, Run) else load_run(Path(run)) for run in runs]
+    arrival, rule = chosen(read, stamp_ns)
+    return [close_up_of(run, arrival, rule) for run in read]
+
+
+def drawn_close_up(
+    runs: Sequence[EvaluatedRun], stamp_ns: int | None = None, **paper: Unpack[Paper]
+) -> tuple[list[tuple[str, Figure]], CloseUp | DataError]:
+    """Return the named figure of `close_ups` and the first of these; no figure and the error where there is none.
+
+    It is that of the runs of the first one's recording.
+    """
+    same = by_recording(runs)[0]
+    try:
+        late = close_ups([item.run for item in same], stamp_ns)
+    except DataError as error:
+        return [], error
+    return [("close_up", figure_of(same, late, **paper))], late[0]
+
+
+def close_up_of(run: Run, arrival: Arrival, rule: str = "") -> CloseUp:
+    """Return the track of `run` that fused `arrival`, before and after: its recording is replayed up to there.
+
+    What came with the same tick before the list is processed first, by itself; what came after it is left out. Raises
+    `DataError` if the recording or a file that the configuration names is not there any more, the recording does not
+    hold the detection, or no track fused it.
+    """
+    if run.recording is None:
+        given = (run.meta.get("input") or {}).get("path") or "messages in memory"
+        raise DataError(
+            f"{given}: the recording of the run is not there, so no close-up"
+        )
+    try:
+        config = validate(Config, run.config, str(run.config_path))
+        tracker = build_tracker(config)
+        messages = open_input(run.recording, config.input).messages()
+    except CallError as error:  # nobody has called with it: the run names it
+        raise DataError(f"{error}, so no close-up") from error
+    key = arrival.sensor, arrival.receipt_ns, arrival.index
+    start_ns, fused_ns = (
+        arrival.stamp_ns - nanoseconds(_BACK_S),
+        list[tuple[int | None, int]](),
+    )
+    name = f"detection {arrival.index} of {arrival.sensor} received at {arrival.receipt_ns} ns"
+    for now_ns, batch in delivered(messages, config):
+        lists = (
+            k
+            for k, message in enumerate(batch)
+            if isinstance(message, DetectionList)
+            and key[:2] == (message.sensor, message.receipt_ns)
+        )
+        row = next(lists, None)
+        for message in batch[:row]:
+            tracker.receive(message)
+        report = tracker.tick(now_ns)
+        fused_ns += [
+            (item.track_id, item.stamp_ns)
+            for item in report.updates
+            if item.disposition in FUSED[1:]
+        ]
+        if row is None:
+            continue
+        step_ns = nanoseconds(STEP_S) * (
+            1 + (now_ns - start_ns) // nanoseconds(_MOST_STEPS * STEP_S)
+        )
+        stamps_ns = sorted(
+            {*range(now_ns, start_ns - 1, -step_ns), arrival.stamp_ns}, reverse=True
+        )
+        before = {
+            item.track_id: _estimates(tracker, item.track_id, stamps_ns)
+            for item in report.tracks
+        }
+        tracker.receive(batch[row])
+        updates = tracker.tick(now_ns).updates
+        taken = next(
+            (
+                item
+                for item in updates
+                if (item.sensor, item.receipt_ns, item.index) == key
+            ),
+            None,
+        )
+        if (
+            taken is None
+            or taken.disposition not in FUSED
+            or taken.track_id not in before
+        ):
+            raise DataError(
+                f"{name}: no track has fused it ({taken.disposition if taken else 'no such detection'})"
+            )
+        track_id, after = taken.track_id, _estimates(tracker, taken.track_id, stamps_ns)
+        since_ns = sorted(
+            stamp
+            for track, stamp in fused_ns
+            if track == track_id and stamp >= start_ns
+        )
+        return CloseUp(
+            arrival,
+            now_ns,
+            track_id,
+            before[track_id],
+            after,
+            np.array(since_ns, dtype=np.int64),
+            rule,
+        )
+    raise DataError(f"{name}: there is no such list")
+
+
+def _estimates(tracker: Tracker, track_id: int, stamps_ns: Iterable[int]) -> Estimates:
+    """States at the falling `stamps_ns`, as far as the track's window reaches back."""
+    states = []
+    for stamp_ns in stamps_ns:
+        try:
+            states.append(tracker.state_at(track_id, stamp_ns).state)
+        except CallError:  # before its window
+            break
+    states.reverse()
+    return Estimates(
+        np.array([state.stamp_ns for state in states]),
+        np.array([state.mean for state in states]),
+    )
+
+
+def chosen(runs: Sequence[Run], stamp_ns: int | None = None) -> tuple[Arrival, str]:
+    """Return a typical out-of-sequence detection that every run fused, and a sentence with the rule of the choice.
+
+    Of those that lower the error of the first run's present, it is the one with errors nearest to their root mean
+    squares: before it in the first run, after it in all of them; nearest is the largest of the ratios. It is one of
+    the first 20 s where there is any. Without truth it is the one that moves the present by the median. Ticks at which
+    a track fused several detections, and tracks with fewer than twenty, are left out. With `stamp_ns` it is the one
+    with the nearest stamp. Raises `DataError` if there is none.
+    """
+    first, *others = (_late_detections(run) for run in runs)
+    late = first[
+        np.all([first.index.isin(other.index) for other in (first, *others)], axis=0)
+    ]
+    if late.empty:
+        raise DataError(
+            f"{runs[0].path or 'the run'}: no late detection was fused by itself after {_SETTLED} others, so there is "
+            "no close-up"
+        )
+    arrivals = [Arrival(*key) for key in late.index.tolist()]
+    if stamp_ns is not None:
+        return min(
+            arrivals, key=lambda item: abs(item.stamp_ns - stamp_ns)
+        ), "Chosen by its stamp."
+    errors_m = np.column_stack(
+        [
+            late["before_m"],
+            late["after_m"],
+            *(other.loc[late.index, "after_m"] for other in others),
+        ]
+    )
+    lowered = errors_m[:, 1] < errors_m[:, 0]
+    if not lowered.any():
+        row = int((late["moved_m"] - late["moved_m"].median()).abs().argmin())
+        return (
+            arrivals[row],
+            f"Of {len(late)} late detections, the one that moves the present by the median.",
+        )
+    rms_m, (rms_before_m, rms_after_m, *_) = (
+        np.sqrt(np.nanmean(rows_m**2, axis=0))
+        for rows_m in (errors_m[lowered], errors_m)
+    )
+    with np.errstate(divide="ignore"):
+        apart = np.abs(np.log(errors_m / rms_m)).max(axis=1)
+    candidates = lowered & np.isfinite(apart)
+    receipts_ns = np.array([item.receipt_ns for item in arrivals])
+    early = candidates & (receipts_ns - receipts_ns.min() <= nanoseconds(_EARLY_S))
+    row = int(np.where(early if early.any() else candidates, apart, np.inf).argmin())
+    return arrivals[row], (
+        f"{100.0 * float(lowered.mean()):.0f} % of {len(late)} late detections lower the error of the present; this "
+        f"one, of the first {_EARLY_S:g} s, is nearest to their root mean square ({rms_m[0]:.2f} to {rms_m[1]:.2f} m; "
+        f"of all {rms_before_m:.2f} to {rms_after_m:.2f} m)."
+    )
+
+
+def _late_detections(run: Run) -> Any:  # Any: a DataFrame, whose columns have no types
+    """Late detections that a settled track fused by themselves, by `_DETECTION`.
+    Columns are the shift of the present from its prediction and its error before and after, NaN without truth, in m.
+    """
+    both = ["tick", "track_id"]
+    fused = run.updates[run.updates["disposition"].isin(FUSED[1:])]
+    late = fused[
+        (fused["disposition"] == Disposition.OUT_OF_SEQUENCE)
+        & ~fused.duplicated(both, keep=False)
+    ]
+    tracks = run.tracks[[*both, "now_ns", "num_measured", *_STATE]]
+    late = late[[*both, *_DETECTION]].merge(
+        tracks[tracks["num_measured"] >= _SETTLED], on=both
+    )
+    late = late.merge(
+        tracks.assign(tick=tracks["tick"] + 1), on=both, suffixes=("", "_before")
+    )
+    late = late.drop_duplicates(_DETECTION)
+    now_ns, at_m = late["now_ns"].to_numpy(), late[["x_m", "y_m"]].to_numpy()
+    dt_s = (now_ns - late["now_ns_before"].to_numpy()) / NS_PER_S
+    predicted_m = CTRV().predict(
+        late[[f"{name}_before" for name in _STATE]].to_numpy(), dt_s
+    )[:, :2]
+    paths = true_paths(run.tables["truth"])
+    true_m = np.stack(
+        [path.at(now_ns)[:, :2] for path in paths] or [np.full_like(at_m, np.nan)]
+    )
+    apart_m = np.linalg.norm(true_m - at_m, axis=-1)
+    nearest_m = true_m[
+        np.where(np.isnan(apart_m), np.inf, apart_m).argmin(axis=0),
+        np.arange(len(late)),
+    ]
+    for name, item, other in (
+        ("moved_m", at_m, predicted_m),
+        ("before_m", predicted_m, nearest_m),
+        ("after_m", at_m, nearest_m),
+    ):
+        late[name] = np.linalg.norm(item - other, axis=-1)
+    return late.set_index(_DETECTION)

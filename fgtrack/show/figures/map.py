@@ -1,0 +1,223 @@
+"""The figure of ego, detections, tracks and truth on the map."""
+
+from typing import NamedTuple, Unpack
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from fgtrack.core.time import NS_PER_S, nanoseconds
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.evaluation.matching import confirmed
+from fgtrack.evaluation.placement import placed, road_lines, roads
+from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_ns
+from fgtrack.evaluation.truth import true_paths
+from fgtrack.runs import Run, Table
+from fgtrack.show.figures.paper import Paper, Sheet, styled
+from fgtrack.show.figures.style import (
+    GREY,
+    WRONG,
+    broken_line,
+    bulk,
+    legend_above,
+    usual_step_ns,
+)
+from fgtrack.show.palette import PALETTE
+
+_NAMED_OBJECTS = 8  # more objects than these share two entries of the legend
+_AROUND_S = 0.4  # of the life of a track before and after the moment of the close-up
+_LEAST_M = 4.0  # half a side of the close-up
+_DETECTIONS = "#8C7A1F"
+
+
+@styled
+def tracks_on_map(run: OneRun, **paper: Unpack[Paper]) -> Figure:
+    """Ego, detections, tracks and truth on the map that `config.yaml` names as `map.track`; beside it a close-up.
+
+    Truth is a broad pale line, so a stretch that nothing tracked stays visible; a track has the colour of the
+    object that it is paired with, and is black where it is paired with none. Without truth every confirmed
+    track has a colour. The picture holds map, ego, truth and the bulk of the tracks and detections; what lies
+    outside is counted. The close-up follows for 0.8 s the track with the most updates in so short a time. Raises
+    `DataError` if `config.yaml` is not YAML, or the map that it names is not a map.
+    """
+    one = one_evaluated(run)
+    maps, notes = roads(one.run)
+    bounds_m = [line for road in maps.values() for line in road_lines(road)[:2]]
+    every = one.run.tables["tracks"]
+    tracks = (
+        every.where(confirmed(every)) if one.matching is None else one.matching.tracks
+    )
+    detections_m, ego_m = placed(one.run).position_m, _positions(one.run.tables["ego"])
+    required = [
+        *bounds_m,
+        ego_m,
+        *(path.states[:, :2] for path in true_paths(one.run.tables["truth"])),
+    ]
+    samples_m = [_positions(tracks), detections_m]
+    edges = [
+        bulk([each[:, k] for each in samples_m], [each[:, k] for each in required])
+        for k in range(2)
+    ]
+    lows_m, highs_m = np.transpose(edges)
+    window = _window(one.run)
+    sheet = Sheet(8.0 if window is None else 11.0, 6.0, paper)
+    overview, *close_ups = sheet.plots(1, 1 if window is None else 2)[0]
+    for axes, near in ((overview, None), *((axes, window) for axes in close_ups)):
+        for line in bounds_m:
+            axes.plot(*line.T, color=GREY, lw=0.7, zorder=3)
+        ego, shown = (
+            _near(one.run.tables[name]["stamp_ns"], near)
+            for name in ("ego", "detections")
+        )
+        if np.isfinite(ego_m).any():
+            axes.plot(
+                *ego_m[ego].T, color="black", lw=0.8, ls="--", label="ego", zorder=3.5
+            )
+        if np.isfinite(detections_m).any():
+            label = f"detections ({int(np.isfinite(detections_m[:, 0]).sum())})"
+            size, above = (1.5, 2.2) if near is None else (5.0, 4.5)
+            axes.plot(
+                *detections_m[shown].T,
+                "x",
+                ms=size,
+                mew=0.2 * size,
+                color=_DETECTIONS,
+                label=label,
+                zorder=above,
+            )
+        _draw_objects(axes, one, tracks, near)
+        axes.set(xlabel="x, east [m]", ylabel="y, north [m]")
+        axes.set_aspect("equal", adjustable="datalim")
+        corners = (
+            (lows_m, highs_m)
+            if near is None
+            else (near.middle_m - near.half_m, near.middle_m + near.half_m)
+        )
+        x_m, y_m = np.transpose(corners)
+        axes.set_xlim(*x_m, auto=True)  # an equal aspect may widen one of the two
+        axes.set_ylim(*y_m, auto=True)
+        if near is not None:
+            at_s = (near.middle_ns - start_ns([one])) / NS_PER_S
+            axes.set_title(
+                f"close-up: {2 * _AROUND_S:g} s around {at_s:.1f} s", loc="left"
+            )
+            overview.plot(
+                *near.middle_m,
+                "s",
+                ms=14,
+                mfc="none",
+                mec="black",
+                mew=1.2,
+                label="close-up",
+                zorder=6,
+            )
+    text = [f"{one.label}: on the map", *notes]
+    outside = sum(
+        int(((each < lows_m) | (each > highs_m)).any(axis=-1).sum())
+        for each in samples_m
+    )
+    if outside:
+        text.append(
+            f"{outside} rows of tracks and detections are outside of the picture"
+        )
+    legend_above(overview, 1.0 / (1 + len(close_ups)))
+    sheet.title("\n".join(text))
+    return sheet.figure
+
+
+class _Window(NamedTuple):
+    """Time and region of the close-up."""
+
+    middle_ns: int
+    middle_m: FloatArray
+    half_m: float
+
+
+def _window(run: Run) -> _Window | None:
+    """Around the track with the most updates in `_AROUND_S` before and after, at the first such stamp of them."""
+    used, around_ns = (
+        run.tables["updates"].where(run.tables["updates"]["track_id"] >= 0),
+        nanoseconds(_AROUND_S),
+    )
+    busiest: tuple[int, int, int] = (0, 0, 0)
+    for track_id in np.unique(used["track_id"]).tolist():
+        stamps_ns = np.sort(used["stamp_ns"][used["track_id"] == track_id])
+        first = np.searchsorted(stamps_ns, stamps_ns - around_ns)
+        counts = np.searchsorted(stamps_ns, stamps_ns + around_ns, "right") - first
+        row = int(counts.argmax())
+        busiest = max(busiest, (int(counts[row]), -int(stamps_ns[row]), track_id))
+    count, earlier_ns, track_id = busiest
+    tracks = run.tables["tracks"]
+    is_near = np.abs(tracks["stamp_ns"] + earlier_ns) <= around_ns
+    positions_m = _positions(tracks.where((tracks["track_id"] == track_id) & is_near))
+    if not count or not len(positions_m):
+        return None
+    low_m, high_m = positions_m.min(axis=0), positions_m.max(axis=0)
+    return _Window(
+        -earlier_ns,
+        (low_m + high_m) / 2.0,
+        max(_LEAST_M, 0.6 * float((high_m - low_m).max())),
+    )
+
+
+def _near(stamps_ns: IntArray, window: _Window | None) -> BoolArray:
+    """True for stamps of the time of `window`, for all where it is None."""
+    middle_ns, reach_ns = (
+        (0, np.inf)
+        if window is None
+        else (window.middle_ns, 2 * nanoseconds(_AROUND_S))
+    )
+    return np.asarray(np.abs(stamps_ns - middle_ns) <= reach_ns)
+
+
+def _positions(table: Table) -> FloatArray:
+    """Shape (n, 2)."""
+    return np.stack([table["x_m"], table["y_m"]], axis=-1)
+
+
+def _draw_objects(
+    axes: Axes, one: EvaluatedRun, tracks: Table, window: _Window | None
+) -> None:
+    """Truth and tracks, in their colours; without truth every track has one of its own."""
+    ids, step_ns = (
+        one.run.tables["tracks"]["track_id"],
+        usual_step_ns(one.run.tables["tracks"]["now_ns"]),
+    )
+    owners = (
+        np.searchsorted(np.unique(ids), tracks["track_id"])
+        if one.matching is None
+        else one.matching.object_index
+    )
+    near = _near(tracks["stamp_ns"], window)
+    paths = [] if one.matching is None else true_paths(one.run.tables["truth"])
+    few = len(paths) <= _NAMED_OBJECTS
+    for index in (*range(max(len(paths), owners.max(initial=-1) + 1)), -1):
+        color, label = (
+            (PALETTE[index % len(PALETTE)], "")
+            if index >= 0
+            else (WRONG, "paired with no object")
+        )
+        if 0 <= index < len(paths):
+            path = paths[index]
+            name = (
+                f"object {path.object_id}" if few else "objects" if index == 0 else ""
+            )
+            rows = _near(path.stamps_ns, window)
+            x_m, y_m = path.states[rows, :2].T
+            line = broken_line(
+                path.stamps_ns[rows], x_m, y_m, usual_step_ns(path.stamps_ns)
+            )
+            axes.plot(
+                *line,
+                color=color,
+                lw=4.0,
+                alpha=0.3,
+                label=f"{name}, truth" if name else "",
+            )
+            label = f"{name}, track" if name else ""
+        mine = tracks.where(near & (owners == index))
+        for track_id in np.unique(mine["track_id"]).tolist():
+            track = mine.where(mine["track_id"] == track_id)
+            line = broken_line(track["stamp_ns"], track["x_m"], track["y_m"], step_ns)
+            axes.plot(*line, color=color, lw=1.2, label=label, zorder=4)
+            label = ""

@@ -1,0 +1,263 @@
+"""Figures of a sweep: a metric over the grid, mean and 95 % interval over the seeds; and error against delay."""
+
+import math
+from collections.abc import Mapping
+from fnmatch import fnmatchcase
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Any, Unpack
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from scipy.special import stdtrit
+
+from fgtrack.core.errors import DataError
+from fgtrack.evaluation.tables.seeds import SweepTable, read_sweep
+from fgtrack.show.figures.paper import Paper, Sheet, styled
+from fgtrack.show.figures.style import legend_above, log_axis
+from fgtrack.show.palette import style_of, styles
+
+#: Metrics with a name for people; the others are called by their column.
+_NAMES: Mapping[str, str] = {
+    "truth.overall.errors.position_m.rmse": "position RMSE [m]",
+    "truth.overall.errors.speed_mps.rmse": "speed RMSE [m/s]",
+    "truth.overall.errors.yaw_rad.rmse": "yaw RMSE [rad]",
+    "consistency.position_nees.mean": "mean NEES of the position",
+    "multi_object.gospa.in_view_rms_m": "GOSPA of objects in view [m]",
+    "multi_object.gospa.rms_m": "GOSPA [m]",
+    "truth.overall.tracked_share_in_view": "share of the time in view that is tracked",
+    "truth.overall.tracked_share": "share of the time that is tracked",
+    "truth.false_tracks": "false tracks",
+    "truth.overall.id_switches": "identity switches",
+    "multi_object.clear.mota": "MOTA",
+    "multi_object.identity.idf1": "IDF1",
+    "multi_object.hota.hota": "HOTA",
+}
+_POSITION, _LAGGED = (
+    "truth.overall.errors.position_m.rmse",
+    "lagged.*.errors.position_m.rmse",
+)
+_UNITS = {"hz": "Hz", "mps": "m/s", "radps": "rad/s", "mps2": "m/s²"} | {
+    name: name for name in ("s", "ms", "ns", "m", "rad")
+}
+_EXPECTED: Mapping[str, float] = {"consistency.position_nees.mean": 2.0}
+#: Those that are drawn where nothing else is asked for.
+_FIRST = (*tuple(_NAMES)[:2], "consistency.position_nees.mean")
+#: Of the rest, those with a better and a worse.
+_REST = (
+    *_NAMES,
+    "truth.overall.errors.*.rmse",
+    "consistency.nis.*.mean",
+    "lagged.*.errors.position_m.rmse",
+)
+_WIDE = 3  # panels side by side
+_LOG_FROM = 20.0  # largest over smallest value
+_DODGE = 0.012  # of the axis, between the error bars of two estimators
+_NAMED_STEPS = 8  # more values of the horizontal axis than these have no tick each
+
+
+def sweep_metrics(table: SweepTable) -> tuple[list[str], list[str]]:
+    """The metrics of `table` to draw: the first ones, and the rest."""
+    known = [name for name in table.metrics if not table.means(name).empty]
+    ordered = [
+        name for pattern in _REST for name in known if fnmatchcase(name, pattern)
+    ]
+    ordered = list(dict.fromkeys(ordered)) or known
+    first = [name for name in _FIRST if name in ordered] or ordered[:3]
+    return first, [name for name in ordered if name not in first]
+
+
+@styled
+def sweep(
+    table: SweepTable | Path | str, metric: str = _POSITION, **paper: Unpack[Paper]
+) -> Figure:
+    """A metric of a sweep over its grid: mean over the seeds and 95 % interval, a line for each estimator.
+
+    The axis with the most numbers is the horizontal one; of the others every combination has a panel. `table` is the
+    sweep or its folder, `metric` a column of sweep.csv. Raises `CallError` if there is no such sweep or metric, and
+    `DataError` if it has no value.
+    """
+    table = table if isinstance(table, SweepTable) else read_sweep(table)
+    names, means = table.shown_axes or [""], _means(table, metric)
+    if means.empty:
+        raise DataError(
+            f"{metric}: no cell of the sweep has a value, so there is nothing to draw"
+        )
+    are_numbers = {name: _are_numbers(means[name]) for name in names}
+    across = max(names, key=lambda name: (are_numbers[name], means[name].nunique()))
+    ticks = {
+        cell: float(cell) if are_numbers[across] else k
+        for k, cell in enumerate(means[across].unique())
+    }
+    means["at"] = [ticks[cell] for cell in means[across]]
+    width = max(ticks.values()) - min(ticks.values()) or 1.0
+    rest = [name for name in names if name != across]
+    panels = list(means.groupby(rest, sort=False)) if rest else [((), means)]
+    columns = min(_WIDE, len(panels))
+    rows = math.ceil(len(panels) / columns)
+    sheet = Sheet(max(7.0, 1.2 + 3.8 * columns), 1.5 + 3.0 * rows, paper)
+    grid = sheet.plots(rows, columns, sharex=True, sharey=True)
+    estimators = means["estimator"].unique().tolist()
+    for axes, (point, panel) in zip(grid.flat, panels, strict=False):
+        for k, (estimator, its) in enumerate(
+            zip(estimators, styles(estimators), strict=True)
+        ):
+            mine = panel[panel["estimator"] == estimator].sort_values(
+                "at", kind="stable"
+            )
+            at, mean, half = mine[["at", "mean", "half"]].to_numpy().T
+            at += (
+                _DODGE * width * (k - (len(estimators) - 1) / 2.0)
+            )  # so that bars do not hide each other
+            line = {
+                "color": its.colour,
+                "ls": its.line if are_numbers[across] else "none",
+                "marker": its.marker,
+            }
+            label = "" if mine.empty else estimator
+            axes.errorbar(
+                at, mean, half, capsize=3.0, ms=4, lw=1.2, label=label, **line
+            )
+        axes.set_title(
+            "\n".join(
+                f"{words(name)}: {c}" for name, c in zip(rest, point, strict=True)
+            ),
+            loc="left",
+        )
+        if metric in _EXPECTED:
+            axes.axhline(
+                _EXPECTED[metric], color="black", lw=0.9, ls="--", label="expected"
+            )
+    for k, axes in enumerate(grid.flat):
+        axes.set_visible(k < len(panels))
+        if len(panels) - columns <= k < len(panels):
+            axes.set_xlabel(words(across))
+            axes.tick_params(labelbottom=True)
+    first: Axes = grid[0, 0]
+    low, high = means["mean"].min(), means["mean"].max()
+    if low > 0.0 and high > _LOG_FROM * low:
+        first.set_yscale("log")
+        log_axis(first.yaxis)
+    elif low >= 0.0:
+        first.set_ylim(0.0, None if high else 1.0)
+    if len(ticks) <= _NAMED_STEPS or not are_numbers[across]:
+        first.set_xticks(list(ticks.values()), list(ticks))
+    first.set_xlim(
+        min(ticks.values()) - 0.08 * width, max(ticks.values()) + 0.08 * width
+    )
+    for axes in grid[:, 0]:
+        axes.set_ylabel(metric_words(metric))
+    if len(panels) == 1:
+        legend_above(first)
+    else:
+        sheet.figure.legend(
+            *first.get_legend_handles_labels(),
+            loc="outside lower center",
+            ncols=4,
+            frameon=False,
+        )
+    few, most = means["seeds"].min(), means["seeds"].max()
+    of = f"{few} to {most}" if few < most else str(most)
+    bars = f"mean over {of} seeds, bars: 95 % interval" if most > 1 else "one seed"
+    sheet.title(f"{metric_words(metric).partition(' [')[0]}: {bars}")
+    return sheet.figure
+
+
+@styled
+def error_against_delay(
+    table: SweepTable | Path | str | None = None, **paper: Unpack[Paper]
+) -> Figure:
+    """Position error against the mean delay of a sensor, with 95 % intervals: what each method makes of late data.
+
+    `table` is a sweep (or its folder) over delays alone, in seconds; by default the result of the shipped sweep
+    `error_against_delay`: a car, a LiDAR that is late and a RADAR, ten seeds; nothing is replayed. Raises `CallError`
+    if there is no such sweep, and `DataError` if it is not over one axis of delays.
+    """
+    if table is None:
+        with as_file(files(__package__) / "error_against_delay") as folder:
+            table = read_sweep(folder)
+    table = table if isinstance(table, SweepTable) else read_sweep(table)
+    waits = [name for name in table.metrics if fnmatchcase(name, _LAGGED)][:1]
+    curves = {metric: _means(table, metric) for metric in (_POSITION, *waits)}
+    (delay, *others), points = table.shown_axes or [""], curves[_POSITION]
+    if others or points.empty or not _are_numbers(points[delay]):
+        raise DataError(
+            "the sweep is not over one axis of delays with position errors, so it is not drawn against delay"
+        )
+    sheet = Sheet(7.0, 4.2, paper)
+    axes: Axes = sheet.plots()[0, 0]
+    for metric, means in curves.items():
+        means["ms"] = 1e3 * means[delay].astype(float)
+        for name, mine in means.sort_values("ms", kind="stable").groupby(
+            "estimator", sort=False
+        ):
+            its, later = style_of(name), metric_words(metric).partition(", ")[2]
+            line, marker, label = (
+                (":", ".", f"{name}, {later}")
+                if later
+                else (its.line, its.marker, name)
+            )
+            low, high = mine["mean"] - mine["half"], mine["mean"] + mine["half"]
+            axes.fill_between(mine["ms"], low, high, color=its.colour, alpha=0.18, lw=0)
+            axes.plot(
+                mine["ms"],
+                mine["mean"],
+                ls=line,
+                marker=marker,
+                ms=4,
+                lw=1.6,
+                color=its.colour,
+                label=label,
+            )
+    axes.set(
+        xlabel=f"{words(delay).partition(' [')[0]}, mean [ms]",
+        ylabel="position RMSE [m]",
+        ylim=(0.0, None),
+    )
+    axes.margins(x=0.02)
+    legend_above(axes)
+    sheet.title("Error against delay (shaded: 95 % interval over the seeds)")
+    return sheet.figure
+
+
+def _means(
+    table: SweepTable, metric: str
+) -> Any:  # Any: a DataFrame, whose columns have no types
+    """Return the means of `table` with `half`, that of the 95 % interval (t; 0 of one seed)."""
+    frame = table.means(metric)
+    frame["half"] = np.nan_to_num(
+        stdtrit(np.maximum(frame["seeds"] - 1, 1), 0.975) * frame["standard_error"]
+    )
+    return frame if table.shown_axes else frame.assign(**{"": ""})
+
+
+def _are_numbers(cells: Any) -> bool:
+    return bool(np.isfinite(pd.to_numeric(cells, errors="coerce")).all())
+
+
+def metric_words(metric: str) -> str:
+    """Name of a metric for people, with its unit."""
+    if metric in _NAMES:
+        return _NAMES[metric]
+    parts = metric.split(".")
+    if parts[0] == "lagged" and parts[-1] == "rmse":
+        return f"{words(parts[-2]).replace(' [', ' RMSE [')}, output {'.'.join(parts[1:-3])} s later"
+    if metric.endswith(".rmse"):
+        return words(parts[-2]).replace(" [", " RMSE [")
+    if parts[:2] == ["consistency", "nis"]:
+        return f"mean NIS of {parts[2].replace('_', ' ')}"
+    return words(metric)
+
+
+def words(name: str) -> str:
+    """Words for the key `name` of a configuration or a table, with its unit: "delay [s]" for "sensors.x.delay_s"."""
+    plain = ".".join(name.split(".")[-2:]).replace(".", " ")
+    stem, _, unit = plain.rpartition("_")
+    text, end = (stem, f" [{_UNITS[unit]}]") if stem and unit in _UNITS else (plain, "")
+    proper = {each.lower(): each for each in ("LiDAR", "RADAR", "NEES", "NIS")}
+    return (
+        " ".join(proper.get(word, word) for word in text.replace("_", " ").split(" "))
+        + end
+    )

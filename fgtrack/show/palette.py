@@ -1,0 +1,79 @@
+"""Colours of figures, reports and viewers: an estimator has the same one everywhere, by its name."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+from zlib import crc32
+
+_BLUE, _ORANGE, _GREEN, _PURPLE, _SKY, _RED = (
+    "#0072B2",
+    "#CC7A00",
+    "#009E73",
+    "#B65CA8",
+    "#2F93C6",
+    "#D1495B",
+)
+#: Distinguishable by the colour-blind; each has a contrast of 3 or more to a white and to a dark page (WCAG 2.1).
+PALETTE = (_BLUE, _ORANGE, _GREEN, _PURPLE, _SKY, _RED)
+#: Of the sensors of a recording in order of their names: none is the colour of a common estimator.
+SENSORS = (_PURPLE, "#8C7A1F", "#6F6F6F", "#A0622D", _SKY)
+_LINES = ("-", "--", "-.", ":")
+_MARKERS = "os^vDP"
+
+
+class Style(NamedTuple):
+    """Colour, line style and marker of a curve."""
+
+    colour: str
+    line: str
+    marker: str
+
+
+#: Those that are compared most. A dashed line on a solid one shows both where two estimators tie.
+_ESTIMATORS: Mapping[str, Style] = {
+    "smoother": Style(_BLUE, "-", "o"),
+    "smoother-batch": Style(_BLUE, "-.", "o"),
+    "smoother-banded": Style(_BLUE, ":", "o"),
+    "ekf-replay": Style(_ORANGE, "--", "s"),
+    "ekf-backward-forward": Style(_GREEN, "-", "^"),
+    "rewind-forget": Style(_GREEN, "--", "^"),
+    "drop": Style(_RED, "-", "v"),
+    "as-current": Style(_PURPLE, "-", "D"),
+    "reorder-buffer": Style(_SKY, "-", "P"),
+}
+
+
+def style_of(estimator: str) -> Style:
+    """Return the style of the curves of `estimator`; of an unknown one always the same."""
+    number = crc32(estimator.encode())
+    unknown = Style(
+        (_PURPLE, _SKY)[number % 2],
+        _LINES[1:][number // 2 % 3],
+        _MARKERS[number // 8 % len(_MARKERS)],
+    )
+    return _ESTIMATORS.get(estimator, unknown)
+
+
+def styles(estimators: Sequence[str]) -> list[Style]:
+    """Return a style for each of `estimators`, in their order; equal colours get different lines."""
+    result: list[Style] = []
+    for item in map(style_of, estimators):
+        taken = [other.line for other in result if other.colour == item.colour]
+        result.append(
+            item._replace(
+                line=next(
+                    (line for line in (item.line, *_LINES) if line not in taken),
+                    item.line,
+                )
+            )
+        )
+    return result
+
+
+def distinct_colours(estimators: Sequence[str]) -> list[str]:
+    """Return one colour for each of `estimators`: its own, or if that is taken a free one of the palette."""
+    result: list[str] = []
+    for own in (style_of(name).colour for name in estimators):
+        result.append(
+            next((colour for colour in (own, *PALETTE) if colour not in result), own)
+        )
+    return result

@@ -1,0 +1,243 @@
+"""JSON values that the viewer of a report plays: recordings (map, ego, truth) and the runs of them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fgtrack.core.time import NS_PER_S
+from fgtrack.core.types import EGO_ID, LATE, FloatArray, IntArray
+from fgtrack.evaluation.diagnostics import USED
+from fgtrack.evaluation.placement import placed, road_lines, roads, update_rows
+from fgtrack.evaluation.runs import EvaluatedRun, by_recording
+from fgtrack.runs import Run, Table
+from fgtrack.show.palette import SENSORS, distinct_colours
+from fgtrack.show.states import (
+    AROUND_95,
+    NOMINAL_SIZE_M,
+    ellipses,
+    final_ns,
+    located,
+    start_ns,
+    track_positions,
+)
+
+MOST_ROWS = 60_000
+"""Rows of a table that the viewer shows of all runs together; of more every second time, every third ..."""
+
+Json = dict[str, Any]  # Any: JSON values
+Moment = tuple[int, float, float]
+"""Time in ns and position in the map that the viewer shows first."""
+
+_TIME_DIGITS, _DIGITS = 4, 3  # of seconds; of metres and radians
+_LONGEST_S = 1e7  # times farther from the start are of another clock, and left out
+
+
+def playback(
+    runs: Sequence[EvaluatedRun], moment: Moment | None = None
+) -> tuple[Json, list[str]]:
+    """Return what the viewer shows of `runs`, first `moment`, and a line for whatever it does not show.
+    Times are seconds from the start of a recording, and missing values null. Raises `DataError` if a run or its map is
+    damaged.
+    """
+    recordings = [
+        _Recording(group, min(start_ns(item.run) for item in group))
+        for group in by_recording(runs)
+    ]
+    notes = dict[str, None]()
+    return {
+        "colours": distinct_colours(
+            [str(item.run.meta.get("estimator", "")) for item in runs]
+        ),
+        "sensor_colours": SENSORS,
+        "moment": None
+        if moment is None
+        else {
+            "t": (moment[0] - recordings[0].start_ns) / NS_PER_S,
+            "x": moment[1],
+            "y": moment[2],
+        },
+        "size_m": NOMINAL_SIZE_M[:2],
+        "recordings": [
+            item.values(notes, MOST_ROWS // len(recordings)) for item in recordings
+        ],
+        "runs": [
+            {
+                "label": item.label,
+                "recording": index,
+                **recording.run(item, notes, MOST_ROWS // len(runs)),
+            }
+            for item in runs
+            for index, recording in enumerate(recordings)
+            if item in recording.runs
+        ],
+    }, list(notes)
+
+
+@dataclass(frozen=True)
+class _Recording:
+    """Runs of one recording, and the time that theirs are relative to."""
+
+    runs: Sequence[EvaluatedRun]
+    start_ns: int
+
+    def seconds(self, times_ns: IntArray) -> FloatArray:
+        times_s = (times_ns - self.start_ns) / NS_PER_S
+        return np.where(np.abs(times_s) < _LONGEST_S, times_s, math.nan)
+
+    def rows(self, states: Table, time: str, *order: str) -> Table:
+        """Rows of `states` with a position and a time, in the order of `time` and `order`."""
+        states = located(states)
+        states = states.where(np.isfinite(self.seconds(states[time])))
+        keys = np.lexsort([states[name] for name in (*reversed(order), time)])
+        return Table({name: values[keys] for name, values in states.items()})
+
+    def columns(self, states: Table, time: str) -> Json:
+        """Times and poses of rows, and where they have covariances the half axes of their 95 % ellipses."""
+        columns = {"t": _column(self.seconds(states[time]), _TIME_DIGITS)}
+        columns |= {name: _column(states[f"{name}_m"]) for name in "xy"}
+        if "yaw_rad" in states:
+            columns["yaw"] = _column(states["yaw_rad"])
+        if "p_x_x" in states:
+            axes = ellipses(states, AROUND_95)
+            columns |= {
+                name: _column(axes[:, k])
+                for k, name in enumerate(("long", "short", "direction"))
+            }
+        return columns
+
+    def values(self, notes: dict[str, None], most: int) -> Json:
+        """Map, ego and truth."""
+        run = self.runs[0].run
+        maps, gone = roads(run)
+        notes.update(dict.fromkeys(gone))
+        lines = [
+            (kind, line)
+            for road in maps.values()
+            for kind, line in zip(_LINES, road_lines(road), strict=True)
+        ]
+        ego, truth = (
+            run.tables["ego"],
+            run.tables["truth"].where(run.tables["truth"]["object_id"] != EGO_ID),
+        )
+        (ego,) = _thinned([self.rows(ego, "stamp_ns")], "stamp_ns", most, "ego", notes)
+        (truth,) = _thinned(
+            [self.rows(truth, "stamp_ns", "object_id")],
+            "stamp_ns",
+            most,
+            "truth",
+            notes,
+        )
+        return {
+            "start_ns": str(
+                self.start_ns
+            ),  # of more digits than a number of JavaScript holds
+            "map": [{"kind": kind, **_place(line)} for kind, line in lines],
+            "ego": self.columns(ego, "stamp_ns"),
+            "truth": {
+                "object": _column(truth["object_id"]),
+                **self.columns(truth, "stamp_ns"),
+            },
+        }
+
+    def run(self, one: EvaluatedRun, notes: dict[str, None], most: int) -> Json:
+        """Ticks, tracks, their past at every tick, final states and detections."""
+        tables, lagged, smoothed = (
+            one.run.tables,
+            one.run.tables["lagged"],
+            one.run.tables["smoothed"],
+        )
+        past = self.rows(
+            lagged.where(lagged["lag_s"] > 0.0), "now_ns", "track_id", "stamp_ns"
+        )
+        final = self.rows(smoothed.where(smoothed["kind"] == "final"), "stamp_ns")
+        ticks = Table({"now_ns": np.unique(tables["timing"]["now_ns"])})
+        of_ticks = [ticks, self.rows(tables["tracks"], "now_ns", "track_id"), past]
+        ticks, tracks, past = _thinned(of_ticks, "now_ns", most, one.label, notes)
+        (final,) = _thinned(
+            [final], "stamp_ns", most, f"{one.label}, final states", notes
+        )
+        return {
+            "ticks": _column(self.seconds(ticks["now_ns"]), _TIME_DIGITS),
+            "tracks": {
+                "track": _column(tracks["track_id"]),
+                "confirmed": _column(tracks["status"] == "confirmed"),
+                **self.columns(tracks, "now_ns"),
+            },
+            "past": {
+                "track": _column(past["track_id"]),
+                **self.columns(past, "now_ns"),
+            },
+            "final": {
+                "track": _column(final["track_id"]),
+                "known": _column(self.seconds(final_ns(one.run, final)), _TIME_DIGITS),
+                **self.columns(final, "stamp_ns"),
+            },
+            **self.detections(one.run),
+        }
+
+    def detections(self, run: Run) -> Json:
+        """Detections in order of receipt: stamp, sensor, fate (0 unused, 1 used, 2 late), position, track."""
+        table, updates, where, rows = (
+            run.tables["detections"],
+            run.tables["updates"],
+            placed(run),
+            update_rows(run),
+        )
+        sensors, sensor = np.unique(table["sensor"], return_inverse=True)
+        outcome = np.append(updates["disposition"].astype(np.str_), "")[
+            rows
+        ]  # row -1 is of none
+        fate = np.isin(outcome, USED).astype(np.int64) + np.isin(outcome, LATE)
+        order = np.argsort(table["receipt_ns"], kind="stable")
+        order = order[np.isfinite(self.seconds(table["receipt_ns"][order]))]
+        return {
+            "sensors": sensors.tolist(),
+            "detections": {
+                "stamp": _column(self.seconds(table["stamp_ns"][order]), _TIME_DIGITS),
+                "receipt": _column(
+                    self.seconds(table["receipt_ns"][order]), _TIME_DIGITS
+                ),
+                "sensor": _column(sensor[order]),
+                "fate": _column(fate[order]),
+                **_place(where.position_m[order]),
+                **_place(track_positions(run, rows)[order], "track_"),
+                **_place(where.sensor_m[order], "from_"),
+                "bearing": _column(where.bearing_rad[order]),
+            },
+        }
+
+
+_LINES = ("bound", "bound", "centre")  # of a road
+
+
+def _place(position_m: FloatArray, prefix: str = "") -> Json:
+    """Columns of positions, shape (n, 2)."""
+    return {f"{prefix}{name}": _column(position_m[:, k]) for k, name in enumerate("xy")}
+
+
+def _thinned(
+    tables: Sequence[Table], time: str, most: int, label: str, notes: dict[str, None]
+) -> list[Table]:
+    """Return `tables` where they have more than `most` rows at every second time of the first one, every third ..."""
+    num_rows = max(item.num_rows for item in tables)
+    step = max(1, math.ceil(num_rows / most))
+    if step > 1:
+        notes[
+            f"{label}: the viewer shows one of {step} times, as there are {num_rows} rows"
+        ] = None
+    kept_ns = np.unique(tables[0][time])[::step]
+    return [
+        item.where(np.isin(item[time], kept_ns)) if step > 1 else item
+        for item in tables
+    ]
+
+
+def _column(values: npt.ArrayLike, digits: int = _DIGITS) -> list[float | int | None]:
+    """Numbers rounded to `digits`; None for what is not finite."""
+    given = np.asarray(values)
+    rounded = given + 0 if given.dtype.kind != "f" else np.round(given, digits) + 0.0
+    return [value if math.isfinite(value) else None for value in rounded.tolist()]

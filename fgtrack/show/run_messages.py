@@ -1,0 +1,460 @@
+"""Messages that show a run: map, ego, truth, tracks and how sure they are, their corrected past, detections."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from operator import itemgetter
+from typing import Any
+
+import numpy as np
+
+from fgtrack.core.time import seconds
+from fgtrack.core.types import (
+    EGO_ID,
+    FUSED,
+    LATE,
+    STATE_NAMES,
+    Detection,
+    Disposition,
+    EgoState,
+    IntArray,
+)
+from fgtrack.evaluation.placement import Placed, placed, road_lines, update_rows
+from fgtrack.inputs.ros.bag_writer import token
+from fgtrack.models.track_map import TrackMap
+from fgtrack.runs import NO_TRACK, Run, Table
+from fgtrack.show.palette import PALETTE, SENSORS
+from fgtrack.show.shapes import Colour, Entity, Point, Scene, Shape, ViewerMessage
+from fgtrack.show.states import (
+    NOMINAL_SIZE_M,
+    ellipses,
+    final_ns,
+    groups,
+    located,
+    track_positions,
+)
+
+Messages = Iterator[ViewerMessage]
+_WHITE, _GREY = (1.0, 1.0, 1.0, 1.0), (0.55, 0.55, 0.55, 0.9)
+_OPACITY = {"tentative": 0.15, "coasting": 0.3}
+_CONFIRMED = 0.5  # so that ellipses and arrows in the box are seen
+_SPEED_ARROW_S = 0.25
+_LETTER_M, _LABEL_ABOVE_M = 1.2, 1.5
+_MAP_LINE_M, _TRACK_LINE_M = 0.3, 0.35
+_DEVIATIONS = 2.0  # of an ellipse
+_SHOWN_S = 0.5  # of a list that no later one of its sensor replaces
+_DOT_M, _BEARING_M = 1.0, 150.0
+_USED = (*FUSED, Disposition.MERGED)
+
+
+@dataclass(frozen=True)
+class Style:
+    """Prefix of the topics of a run, and the colour of its tracks."""
+
+    prefix: str = ""
+    colour: str | None = None
+    """#RRGGBB; None for a colour of each track."""
+
+    def of_track(self, track_id: int, opacity: float = 1.0) -> Colour:
+        """Colour of a track."""
+        return rgba(self.colour or PALETTE[track_id % len(PALETTE)], opacity)
+
+
+def rgba(text: str, opacity: float = 1.0) -> Colour:
+    """Return the colour #RRGGBB as shares of 1."""
+    r, g, b = (round(value / 255.0, 3) for value in bytes.fromhex(text[1:]))
+    return r, g, b, opacity
+
+
+def map_messages(maps: dict[str, TrackMap], at_ns: int) -> Messages:
+    """Bounds and reference line of each road, once."""
+    entities = list[Entity]()
+    for name, road in maps.items():
+        lines = zip(road_lines(road), (0.9, 0.9, 0.3), strict=True)
+        shapes = tuple(
+            _line(points.tolist(), _MAP_LINE_M, (*_GREY[:3], alpha))
+            for points, alpha in lines
+        )
+        entities.append(Entity(name, shapes))
+    if entities:
+        yield ViewerMessage(at_ns, at_ns, "/map", Scene(tuple(entities), latched=True))
+
+
+def ego_messages(ego: Table, at_ns: int) -> Messages:
+    """The box of the ego in its own frame, once, and its state at every receipt."""
+    rows = np.flatnonzero(
+        np.isfinite(np.stack([ego[name] for name in STATE_NAMES[:3]])).all(axis=0)
+    )
+    if len(rows):
+        box = Entity(
+            "ego", (_box((0.0, 0.0), 0.0, NOMINAL_SIZE_M, _WHITE),), frame="ego"
+        )
+        yield ViewerMessage(at_ns, at_ns, "/ego", Scene((box,), latched=True))
+    states = np.nan_to_num(np.stack([ego[name] for name in STATE_NAMES], axis=-1))
+    for row in rows[np.argsort(ego["receipt_ns"][rows], kind="stable")].tolist():
+        stamp_ns, receipt_ns = int(ego["stamp_ns"][row]), int(ego["receipt_ns"][row])
+        yield ViewerMessage(
+            receipt_ns,
+            stamp_ns,
+            "/ego",
+            EgoState(stamp_ns, receipt_ns, *states[row].tolist()),
+        )
+
+
+def truth_messages(truth: Table) -> Iterator[Messages]:
+    """Boxes and poses of the true objects at every stamp; the ego is not among them."""
+    table = located(truth.where(truth["object_id"] != EGO_ID))
+    states = [
+        Detection(x_m, y_m, _known(yaw_rad), object_id=object_id)
+        for object_id, x_m, y_m, yaw_rad in _rows(
+            table, "object_id", "x_m", "y_m", "yaw_rad"
+        )
+    ]
+
+    def box(row: int) -> Entity:
+        return Entity(
+            f"object {states[row].object_id}",
+            (_box(*_pose(states[row]), (*_WHITE[:3], 0.35)),),
+        )
+
+    yield _scenes("/truth", groups(table["stamp_ns"]), box)
+    yield _objects("/truth", table["stamp_ns"], table["stamp_ns"], states)
+
+
+def run_messages(run: Run, style: Style) -> Iterator[Messages]:
+    """Streams of the messages that show a run alone, each in the order of log times."""
+    yield from _track_messages(run, style)
+    yield _past_messages(run, style)
+    # Final states appear as soon as nothing can change them any more.
+    final = located(
+        run.tables["smoothed"].where(run.tables["smoothed"]["kind"] == "final")
+    )
+    states = _states(final, run.tables["objects"])
+    yield _objects(
+        f"{style.prefix}/smoothed", final_ns(run, final), final["stamp_ns"], states
+    )
+    yield _detection_messages(run, style)
+    yield _outcome_messages(run, style)
+
+
+def _track_messages(run: Run, style: Style) -> Iterator[Messages]:
+    """At every tick boxes, numbers and speeds, the 2-sigma ellipses of the positions, and the poses."""
+    tracks = located(run.tables["tracks"])
+    states, axes = (
+        _states(tracks, run.tables["objects"]),
+        ellipses(tracks, _DEVIATIONS).tolist(),
+    )
+    facts = list(_rows(tracks, "track_id", "status", "speed_mps"))
+    rows_at = dict.fromkeys(
+        run.tables["timing"]["now_ns"].tolist(), np.zeros(0, dtype=np.int64)
+    )
+    ticks = sorted(
+        (rows_at | dict(groups(tracks["now_ns"]))).items(), key=itemgetter(0)
+    )
+
+    def box(row: int) -> Entity:
+        track_id, status, speed_mps = facts[row]
+        at_m, yaw_rad, size_m = _pose(states[row])
+        name = f"{track_id} {states[row].class_name or ''}".strip()
+        shapes = [
+            _box(
+                at_m,
+                yaw_rad,
+                size_m,
+                style.of_track(track_id, _OPACITY.get(status, _CONFIRMED)),
+            ),
+            Shape(
+                "text",
+                _WHITE,
+                (0.0, 0.0, _LETTER_M),
+                at_m,
+                size_m[2] + _LABEL_ABOVE_M,
+                text=name,
+            ),
+        ]
+        if math.isfinite(speed_mps) and speed_mps:
+            turned_rad = yaw_rad if speed_mps > 0.0 else yaw_rad + math.pi
+            shapes.append(
+                _arrow(
+                    at_m,
+                    turned_rad,
+                    abs(speed_mps) * _SPEED_ARROW_S,
+                    0.25,
+                    style.of_track(track_id),
+                )
+            )
+        return Entity(f"track {track_id}", tuple(shapes))
+
+    def patch(row: int) -> Entity | None:
+        (long_m, short_m, yaw_rad), (at_m, _, (*_, above_m)), track_id = (
+            axes[row],
+            _pose(states[row]),
+            facts[row][0],
+        )
+        size_m = (2.0 * long_m, 2.0 * short_m, 0.02)
+        shape = Shape(
+            "cylinder",
+            style.of_track(track_id, 0.6),
+            size_m,
+            at_m,
+            above_m + 0.05,
+            yaw_rad,
+        )
+        return Entity(f"track {track_id}", (shape,)) if math.isfinite(long_m) else None
+
+    yield _scenes(f"{style.prefix}/tracks", ticks, box)
+    yield _scenes(f"{style.prefix}/ellipses", ticks, patch)
+    yield _objects(
+        f"{style.prefix}/tracks", tracks["now_ns"], tracks["stamp_ns"], states
+    )
+
+
+def _past_messages(run: Run, style: Style) -> Messages:
+    """At every tick the past of each track as known then: a line through its lagged states to the present one."""
+    lagged, present = located(run.tables["lagged"]), located(run.tables["tracks"])
+    lagged = lagged.where(lagged["lag_s"] > 0.0)
+    present = present.where(np.isin(present["now_ns"], lagged["now_ns"]))
+    names = ("now_ns", "track_id", "stamp_ns", "x_m", "y_m")
+    now_ns, ids, stamps_ns, x_m, y_m = (
+        np.concatenate([lagged[name], present[name]]) for name in names
+    )
+    order = np.lexsort((stamps_ns, ids, now_ns))
+    edges = np.flatnonzero(np.diff(now_ns[order]) | np.diff(ids[order])) + 1
+    lines = [rows for rows in np.split(order, edges) if len(rows) > 1]
+
+    def line(k: int) -> Entity:
+        track_id, points_m = (
+            int(ids[lines[k][0]]),
+            np.stack([x_m[lines[k]], y_m[lines[k]]], axis=-1),
+        )
+        return Entity(
+            f"track {track_id}",
+            (_line(points_m.tolist(), _TRACK_LINE_M, style.of_track(track_id)),),
+        )
+
+    return _scenes(
+        f"{style.prefix}/past",
+        groups(now_ns[[rows[0] for rows in lines]]) if lines else (),
+        line,
+    )
+
+
+def _detection_messages(run: Run, style: Style) -> Messages:
+    """At every receipt of a list its detections, grey where not used, arrows to their tracks now, and their poses.
+    An arrow leads from the position of a detection to where its track is at the tick that fused it. It is strong where
+    the detection came out of sequence, and faint where it did not.
+    """
+    table, where, rows = run.tables["detections"], placed(run), update_rows(run)
+    fates = np.append(run.tables["updates"]["disposition"].astype(np.str_), "")[
+        rows
+    ].tolist()  # row -1 is of none
+    colours = {
+        name: rgba(SENSORS[k % len(SENSORS)])
+        for k, name in enumerate(np.unique(table["sensor"]).tolist())
+    }
+    off_m = (
+        track_positions(run, rows) - where.position_m
+    )  # NaN without a position or a track
+    lengths_m, yaws_rad = (
+        np.hypot(*off_m.T).tolist(),
+        np.arctan2(off_m[:, 1], off_m[:, 0]).tolist(),
+    )
+    positions_m: list[Point] = list(map(tuple, where.position_m.tolist()))
+    keys = list(_rows(table, "receipt_ns", "sensor", "stamp_ns"))
+    for key, group in groupby(
+        sorted(range(len(keys)), key=keys.__getitem__), key=keys.__getitem__
+    ):
+        (receipt_ns, sensor, stamp_ns), mine = key, list(group)
+        colour, late = colours[sensor], receipt_ns > stamp_ns
+        marks = [
+            _mark(where, row, colour if fates[row] in _USED else _GREY) for row in mine
+        ]
+        arrows = [
+            _arrow(
+                positions_m[row],
+                yaws_rad[row],
+                lengths_m[row],
+                0.3,
+                (*colour[:3], 1.0 if fates[row] in LATE else 0.3),
+            )
+            for row in mine
+            if late and fates[row] in FUSED and lengths_m[row] > 0.0
+        ]
+        states = tuple(
+            Detection(*positions_m[row], _known(float(where.yaw_rad[row])))
+            for row in mine
+            if math.isfinite(sum(positions_m[row]))
+        )
+        scene = Scene((Entity(sensor, tuple(filter(None, marks)), _SHOWN_S),))
+        yield ViewerMessage(receipt_ns, stamp_ns, f"{style.prefix}/detections", scene)
+        if arrows:
+            scene = Scene((Entity(sensor, tuple(arrows), _SHOWN_S),))
+            yield ViewerMessage(receipt_ns, stamp_ns, f"{style.prefix}/arrivals", scene)
+        if states:
+            yield ViewerMessage(
+                receipt_ns,
+                stamp_ns,
+                f"{style.prefix}/detections/{token(sensor)}",
+                states,
+            )
+
+
+def _mark(where: Placed, row: int, colour: Colour) -> Shape | None:
+    """A ball where a detection was, or a line of sight where only its direction is known."""
+    x_m, y_m = where.position_m[row].tolist()
+    if math.isfinite(x_m + y_m):
+        return Shape(
+            "sphere", colour, (_DOT_M, _DOT_M, _DOT_M), (x_m, y_m), _DOT_M / 2.0
+        )
+    (from_x_m, from_y_m), bearing_rad = (
+        where.sensor_m[row].tolist(),
+        float(where.bearing_rad[row]),
+    )
+    if not math.isfinite(from_x_m + from_y_m + bearing_rad):
+        return None
+    end_m = (
+        from_x_m + _BEARING_M * math.cos(bearing_rad),
+        from_y_m + _BEARING_M * math.sin(bearing_rad),
+    )
+    return _line([(from_x_m, from_y_m), end_m], 0.15, (*colour[:3], 0.5))
+
+
+def _outcome_messages(run: Run, style: Style) -> Messages:
+    """Rows of `updates.csv` at their receipts."""
+    names = (
+        "receipt_ns",
+        "stamp_ns",
+        "sensor",
+        "index",
+        "disposition",
+        "track_id",
+        "nis",
+    )
+    rows = sorted(_rows(run.tables["updates"], *names), key=itemgetter(0))
+    for receipt_ns, stamp_ns, sensor, index, disposition, track_id, nis in rows:
+        values = {
+            "sensor": sensor,
+            "index": index,
+            "disposition": disposition,
+            "nis": _known(nis),
+        }
+        values |= {
+            "track_id": None if track_id == NO_TRACK else track_id,
+            "delay_s": seconds(receipt_ns - stamp_ns),
+        }
+        yield ViewerMessage(receipt_ns, stamp_ns, f"{style.prefix}/outcomes", values)
+
+
+def _scenes(
+    topic: str,
+    rows_at: Iterable[tuple[int, IntArray]],
+    entity: Callable[[int], Entity | None],
+) -> Messages:
+    """A scene of the entities of the rows at each time; those of the time before that are not in it are removed."""
+    before: set[str] = set()
+    for at_ns, rows in rows_at:
+        entities = tuple(
+            item for row in rows.tolist() if (item := entity(row)) is not None
+        )
+        names = {item.name for item in entities}
+        if entities or before:
+            yield ViewerMessage(
+                at_ns, at_ns, topic, Scene(entities, tuple(sorted(before - names)))
+            )
+        before = names
+
+
+def _objects(
+    topic: str, log_ns: IntArray, stamps_ns: IntArray, states: Sequence[Detection]
+) -> Messages:
+    """The states of every log time and stamp."""
+    times = list(zip(log_ns.tolist(), stamps_ns.tolist(), strict=True))
+    for (log, stamp), rows in groupby(
+        sorted(range(len(times)), key=times.__getitem__), key=times.__getitem__
+    ):
+        yield ViewerMessage(log, stamp, topic, tuple(states[row] for row in rows))
+
+
+def _states(states: Table, objects: Table) -> list[Detection]:
+    """Pose of each row with its covariance, and class and size of its track, where known."""
+    described = {
+        track_id: Detection(
+            length_m=_known(length_m),
+            width_m=_known(width_m),
+            height_m=_known(height_m),
+            class_name=name,
+        )
+        for track_id, length_m, width_m, height_m, name in _rows(
+            objects, "track_id", "length_m", "width_m", "height_m", "class_name"
+        )
+    }
+    names = (
+        "p_x_x",
+        "p_x_y",
+        "p_x_yaw",
+        "p_x_y",
+        "p_y_y",
+        "p_y_yaw",
+        "p_x_yaw",
+        "p_y_yaw",
+        "p_yaw_yaw",
+    )
+    result = []
+    for x_m, y_m, yaw_rad, track_id, *covariance in _rows(
+        states, "x_m", "y_m", "yaw_rad", "track_id", *names
+    ):
+        P = tuple(covariance) if math.isfinite(yaw_rad + sum(covariance)) else None
+        pose = {
+            "x_m": x_m,
+            "y_m": y_m,
+            "yaw_rad": _known(yaw_rad),
+            "covariance": P,
+            "object_id": track_id,
+        }
+        result.append(replace(described.get(track_id, Detection()), **pose))
+    return result
+
+
+def _rows(
+    table: Table, *names: str
+) -> Iterator[tuple[Any, ...]]:  # Any: values of a row
+    return zip(*(table[name].tolist() for name in names), strict=True)
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _pose(state: Detection) -> tuple[Point, float, tuple[float, float, float]]:
+    """Position, yaw, and length, width and height of an object; nominal where unknown."""
+    length_m, width_m, height_m = NOMINAL_SIZE_M
+    size_m = (
+        state.length_m or length_m,
+        state.width_m or width_m,
+        state.height_m or height_m,
+    )
+    return (state.x_m or 0.0, state.y_m or 0.0), state.yaw_rad or 0.0, size_m
+
+
+def _box(
+    centre_m: Point, yaw_rad: float, size_m: tuple[float, float, float], colour: Colour
+) -> Shape:
+    return Shape("cube", colour, size_m, centre_m, size_m[2] / 2.0, yaw_rad)
+
+
+def _arrow(
+    tail_m: Point, yaw_rad: float, length_m: float, width_m: float, colour: Colour
+) -> Shape:
+    return Shape(
+        "arrow", colour, (length_m, width_m, width_m), tail_m, width_m, yaw_rad
+    )
+
+
+def _line(points_m: Iterable[Sequence[float]], width_m: float, colour: Colour) -> Shape:
+    return Shape(
+        "line",
+        colour,
+        (width_m, 0.0, 0.0),
+        points_m=[(x_m, y_m) for x_m, y_m in points_m],
+    )

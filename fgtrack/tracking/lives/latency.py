@@ -1,0 +1,198 @@
+"""Latency of each source of messages, and the stamps up to which the lists of each sensor have come.
+
+The watermark of a sensor is the stamp up to which its lists have come, or should have come. It is learned from the
+stamps and receipts of the messages alone, so that equal messages give equal watermarks. Times of tracks are compared
+at watermarks: what a sensor has not reported yet is no evidence that it saw nothing.
+"""
+
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from fgtrack.core.time import NS_PER_S, nanoseconds
+from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.models.sensors import SensorModel
+from fgtrack.tracking.ego.trajectory import EgoPose
+
+NEWEST = 1000
+"""Number of newest delays of which statistics are published."""
+NEVER, FOREVER = -(2**62), 2**62
+_RECENT = (
+    100  # newest delays, and times between two stamps, that decide which are usual
+)
+_UNUSUAL = 50  # of so many the longest one is unusual
+_MAX_FUTURE_NS = NS_PER_S  # see `fgtrack.tracking.inbox`
+
+
+def usual_ns(sorted_ns: Sequence[int]) -> int:
+    """Return the longest usual one of ascending durations: of each fifty the longest one is unusual."""
+    return sorted_ns[len(sorted_ns) - 1 - len(sorted_ns) // _UNUSUAL]
+
+
+class Delays:
+    """Delays of the messages of one source: receipt minus stamp."""
+
+    def __init__(self) -> None:
+        self.messages = 0
+        """Number of all messages."""
+        self.newest_ns: deque[int] = deque(maxlen=NEWEST)
+        """Delays of the newest messages, in order of arrival."""
+        self.newest_receipt_ns: int | None = None
+        """Newest receipt; None before the first message."""
+        self._recent_ns: deque[int] = deque(maxlen=_RECENT)
+        self._gaps_ns: deque[int] = deque(maxlen=_RECENT)
+        self._newest_stamp_ns = self._processed_ns = NEVER
+        self._sorted_ns: list[int] = []
+
+    def add(
+        self, stamp_ns: int, receipt_ns: int, newest_stamp_ns: int | None = None
+    ) -> None:
+        """Learn from a message; `stamp_ns` is its oldest stamp, where its detections have several."""
+        self.messages += 1
+        stamp_ns, receipt_ns = (
+            int(stamp_ns),
+            int(receipt_ns),
+        )  # a live host may give numbers of another library
+        delay_ns = receipt_ns - stamp_ns
+        self.newest_ns.append(delay_ns)
+        self.newest_receipt_ns = (
+            receipt_ns
+            if self.newest_receipt_ns is None
+            else max(self.newest_receipt_ns, receipt_ns)
+        )
+        if delay_ns < -_MAX_FUTURE_NS:
+            return  # refused: its stamp is wrong
+        self._sorted_ns = []
+        self._recent_ns.append(delay_ns)
+        newest_ns = stamp_ns if newest_stamp_ns is None else int(newest_stamp_ns)
+        if newest_ns > self._newest_stamp_ns:
+            if self._newest_stamp_ns != NEVER:
+                self._gaps_ns.append(newest_ns - self._newest_stamp_ns)
+            self._newest_stamp_ns = newest_ns
+
+    def processed(self, stamp_ns: int) -> None:
+        """A list with this stamp is processed."""
+        self._processed_ns = max(self._processed_ns, stamp_ns)
+
+    def usual_ns(self, most_ns: int = FOREVER) -> int:
+        """Return the longest usual delay up to `most_ns`; `most_ns` if all delays are longer.
+
+        The delay of the newest message counts as usual: a delay that has changed is followed at once.
+        """
+        self._sorted_ns = self._sorted_ns or sorted(self._recent_ns)
+        possible = self._sorted_ns[: bisect_right(self._sorted_ns, most_ns)]
+        if not possible:
+            return most_ns
+        return max(
+            usual_ns(possible),
+            self._recent_ns[-1] if self._recent_ns[-1] <= most_ns else possible[0],
+        )
+
+    def watermark_ns(self, now_ns: int, most_ns: int) -> int:
+        """Return the stamp up to which all lists are processed, or should have come, at `now_ns`.
+
+        Lists should have come after their usual delay; those with delays above `most_ns` are not awaited. While no list
+        is overdue, by the usual time between two stamps, the newest processed stamp is the bound: there is no list
+        between it and the next one. `FOREVER` before the first message.
+        """
+        if not self._recent_ns:
+            return FOREVER
+        due_ns = now_ns - self.usual_ns(most_ns)
+        gap_ns = usual_ns(sorted(self._gaps_ns)) if self._gaps_ns else 0
+        is_pending = self._newest_stamp_ns > self._processed_ns
+        next_ns = min(due_ns, self._newest_stamp_ns) if is_pending else due_ns
+        is_overdue = next_ns > self._processed_ns + gap_ns
+        return due_ns if is_overdue else min(due_ns, self._processed_ns)
+
+
+class Watermarks:
+    """Delays of all sources, and the watermarks of the sensors."""
+
+    def __init__(
+        self, sensors: Mapping[str, SensorModel], sources: Iterable[str] = ()
+    ) -> None:
+        """`sources` are names of others, as the ego, whose delays are learned too."""
+        self.delays = {name: Delays() for name in (*sensors, *sources)}
+        """Delays by name of the source."""
+        self._of_sensors = [self.delays[name] for name in sensors]
+        limits_s = [sensor.max_delay_s for sensor in sensors.values()]
+        self._limits_ns = [
+            FOREVER if limit_s is None else nanoseconds(limit_s) for limit_s in limits_s
+        ]
+
+    def at(self, now_ns: int, oldest_ns: int) -> IntArray:
+        """Return the watermark of each sensor at `now_ns`, shape (sensors,); see `Delays.watermark_ns`.
+        Lists before `oldest_ns` are too old for every track, and those after `max_delay_s` are refused: no track awaits
+        them.
+        """
+        reach_ns = now_ns - oldest_ns
+        pairs = zip(self._of_sensors, self._limits_ns, strict=True)
+        return np.array(
+            [
+                one.watermark_ns(now_ns, min(reach_ns, limit_ns))
+                for one, limit_ns in pairs
+            ],
+            dtype=np.int64,
+        )
+
+
+class Views:
+    """Sensors that could show an object: those that give positions, where the object is in their view."""
+
+    def __init__(
+        self,
+        sensors: Mapping[str, SensorModel],
+        detection_origin_m: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        """`detection_origin_m`: origin of the ego frame of detections, seen from the ego reference point."""
+        self._sensors, self._origin_m = list(sensors.values()), detection_origin_m
+        self._placing = np.array(
+            [sensor.gives_position for sensor in self._sensors], dtype=bool
+        )
+        self._limited = [
+            k
+            for k, one in enumerate(self._sensors)
+            if one.gives_position and one.is_view_given
+        ]
+
+    def of(self, positions_m: FloatArray, ego: EgoPose | None) -> BoolArray:
+        """True of each sensor that could show an object at `positions_m` (m, 2), shape (m, sensors).
+        Without an `ego` all objects are in view.
+        """
+        views = np.tile(self._placing, (len(positions_m), 1))
+        if ego is not None and self._limited:
+            poses = np.broadcast_to(
+                [ego.x_m, ego.y_m, ego.yaw_rad], (len(positions_m), 3)
+            )
+            for k in self._limited:
+                views[:, k] = self._sensors[k].sees(positions_m, poses, self._origin_m)
+        return views
+
+    def at_birth(
+        self, position_m: FloatArray | None, ego: EgoPose | None, sensor: int
+    ) -> BoolArray:
+        """True of each sensor that could show an object that `sensor` (its index) has just shown, shape (sensors,)."""
+        views = (
+            self._placing.copy()
+            if position_m is None
+            else self.of(position_m[None], ego)[0]
+        )
+        views[sensor] = True
+        return views
+
+
+def decided_ns(
+    watermarks_ns: IntArray, could_show: BoolArray, expected_ns: IntArray
+) -> IntArray:
+    """Return the stamp up to which all lists that could show each object have come, shape (m,).
+
+    `could_show`: sensors that could show it as far as is known, shape (m, sensors). `expected_ns`: newest stamps at
+    which they could, shape (m, sensors). A sensor counts if it could show the object now, or at a stamp whose list
+    has not come. `FOREVER` where no sensor counts.
+    """
+    counts = could_show | (expected_ns > watermarks_ns)
+    return np.asarray(
+        np.where(counts, watermarks_ns, FOREVER).min(axis=1, initial=FOREVER)
+    )

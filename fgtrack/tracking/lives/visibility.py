@@ -1,0 +1,137 @@
+"""Existence of objects and their visibility to each sensor: evidence of lists in arrays.
+
+An object does not exist, or exists and is visible to a sensor, or exists and is not: integrated probabilistic data
+association with an observability state (Musicki, Evans, Stankovic, IEEE Trans. Automatic Control 39, 1994; Musicki,
+Evans, IEEE T-AES 40, 2004). Given that it exists, its visibility to a sensor is a Markov chain in continuous time,
+observed by the lists of that sensor alone, so the joint probability is the product of existence and visibilities.
+"""
+
+from heapq import heappop, heappush
+
+import numpy as np
+
+from fgtrack.core.linalg import kernels
+from fgtrack.core.types import FloatArray, IntArray
+
+#: Bounds of log-odds: a probability that differs from 0 or 1 by less adds nothing.
+LARGEST_LOG_ODDS = 30.0
+#: Columns of an evidence: likelihood ratio if visible (NaN out of view), then, after it, log-odds of existence and the
+#: probabilities of being visible to each sensor, given that the object exists.
+RATIO, LOG_ODDS, VISIBLE = range(3)
+#: Its stamp and sensor, and after it the newest stamp at which each sensor could show the object.
+STAMP, SENSOR, VIEWED = range(3)
+NEVER = -(2**62)
+_FEWEST_TRACKS, _FEWEST_ENTRIES = 8, 32
+_KERNELS = "fgtrack.tracking.lives.visibility_kernels"
+
+
+class Histories:
+    """Evidence of all tracks in order of its stamps, and the probabilities after each, whatever the order of arrival.
+    Entry 0 of a track is its birth, or all that is older than what is remembered.
+    """
+
+    def __init__(
+        self,
+        num_sensors: int,
+        lifetime_s: float,
+        visible_share: float,
+        visible_s: float,
+    ) -> None:
+        """`lifetime_s`: mean time for which objects exist; `visible_share`, `visible_s`: share of that time for which
+        they are visible to a sensor, and its time constant.
+        """
+        self._chain = lifetime_s, visible_share, visible_s
+        self.numbers: FloatArray = np.zeros(
+            (_FEWEST_TRACKS, _FEWEST_ENTRIES, VISIBLE + num_sensors)
+        )
+        self.entries: IntArray = np.zeros(
+            (_FEWEST_TRACKS, _FEWEST_ENTRIES, VIEWED + num_sensors), dtype=np.int64
+        )
+        """See `RATIO` and `STAMP`, shape (tracks, entries, columns)."""
+        self.counts = np.zeros(_FEWEST_TRACKS, dtype=np.int64)
+        """Number of entries of each track, 0 of a free row."""
+        self._free = [
+            *range(_FEWEST_TRACKS)
+        ]  # rows, a heap: the first one is taken next
+
+    def begin(self, stamp_ns: int, sensor: int, log_odds: float) -> int:
+        """Return the row of a new track with these log-odds, visible to the `sensor` that started it."""
+        if not self._free:
+            self._grow(axis=0)
+        row: int = self._free[0]
+        numbers, entries = self.numbers[row, 0], self.entries[row, 0]
+        numbers[:], entries[:] = 0.0, NEVER
+        numbers[LOG_ODDS], numbers[VISIBLE + sensor] = (
+            min(max(log_odds, -LARGEST_LOG_ODDS), LARGEST_LOG_ODDS),
+            1.0,
+        )
+        entries[STAMP] = entries[VIEWED + sensor] = stamp_ns
+        self.counts[row] = 1
+        heappop(self._free)
+        return row
+
+    def learn(
+        self, rows: IntArray, stamps_ns: IntArray, sensors: IntArray, ratios: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Add evidence of lists at `stamps_ns` of `sensors` on the tracks in `rows`, one after the other; see `RATIO`.
+        What is older than all that is remembered counts as the oldest. Returns the probabilities, after each, of being
+        visible to its sensor, and the largest ones of existing at its stamp or that of newer evidence, all shapes (m,).
+        """
+        while (
+            len(rows)
+            and self.counts[rows].max() + np.bincount(rows).max()
+            > self.numbers.shape[1]
+        ):
+            self._grow(axis=1)
+        history = self.numbers, self.entries, self.counts, *self._chain
+        visible, exists = kernels(_KERNELS).learn(
+            rows, stamps_ns, sensors, ratios, *history
+        )
+        return visible, exists
+
+    def present(self, rows: IntArray, stamps_ns: IntArray | int) -> FloatArray:
+        """Return the probabilities that the objects exist at `stamps_ns`, not before their newest evidence, (m,)."""
+        return self._existing(rows, stamps_ns, is_known=False)
+
+    def known(self, rows: IntArray, stamps_ns: IntArray | int) -> FloatArray:
+        """Return the probabilities that the objects exist at `stamps_ns`, by the evidence up to there alone, (m,)."""
+        return self._existing(rows, stamps_ns, is_known=True)
+
+    def _existing(
+        self, rows: IntArray, stamps_ns: IntArray | int, is_known: bool
+    ) -> FloatArray:
+        own_ns = np.array(np.broadcast_to(stamps_ns, rows.shape), dtype=np.int64)
+        history = self.numbers, self.entries, self.counts, self._chain[0]
+        return np.asarray(kernels(_KERNELS).existing(rows, own_ns, is_known, *history))
+
+    def forget(self, oldest_ns: int) -> None:
+        """Remember what is older than `oldest_ns` by its outcome alone."""
+        kernels(_KERNELS).forget(oldest_ns, self.numbers, self.entries, self.counts)
+
+    def end(self, row: int) -> None:
+        """Free the `row` of a track."""
+        if self.counts[row]:
+            self.counts[row] = 0
+            heappush(self._free, row)
+
+    def _grow(self, axis: int) -> None:
+        """Double the tracks, or the entries of each; all is allocated before anything changes."""
+        rows, columns = shape = [*self.numbers.shape[:2]]
+        shape[axis] *= 2
+        numbers = np.zeros((*shape, self.numbers.shape[2]))
+        entries = np.zeros((*shape, self.entries.shape[2]), dtype=np.int64)
+        counts = np.zeros(shape[0], dtype=np.int64)
+        numbers[:rows, :columns], entries[:rows, :columns], counts[:rows] = (
+            self.numbers,
+            self.entries,
+            self.counts,
+        )
+        free = (
+            self._free if axis else [*range(rows, shape[0])]
+        )  # tracks are doubled where none is free
+        self.numbers, self.entries, self.counts, self._free = (
+            numbers,
+            entries,
+            counts,
+            free,
+        )

@@ -1,1 +1,0 @@
-"""Runs to look at: the HTML report, and files for Foxglove and RViz."""
