@@ -5,11 +5,12 @@ probability v changes the odds r / (1 - r) of its existence by the factor 1 - v 
 
     l = 1 - P_D + P_D L,   L = N(z - h(x); 0, S) / clutter density * p(score | object) / p(score | clutter)
 
-and where it was missed with l = 1 - P_D. The visibility v falls with misses in a row, so that a sensor which does not
-see an object does not end what another sees (`fgtrack.tracking.lives.visibility`). A track ends at the stamp of a list, by
-the lists up to that stamp, once the lists of all sensors that could show its object have come up to there, or should
-have come (`fgtrack.tracking.lives.latency`). Until then a track that has become improbable is suspended: it is not
-published, and newer lists are not compared with it.
+and where it was missed with l = 1 - P_D. The visibility v falls with misses in a row, so that a
+sensor which does not see an object does not end what another sees
+(`fgtrack.tracking.lives.visibility`). A track ends at the stamp of a list, by the lists up to that
+stamp, once the lists of all sensors that could show its object have come up to there, or should
+have come (`fgtrack.tracking.lives.latency`). Until then a track that has become improbable is
+suspended: it is not published, and newer lists are not compared with it.
 
 Three things are approximate. L is the likelihood of the assigned detection alone, without other assignments. It is the
 likelihood of the position alone. It is computed when the detection arrives, and not again. Each list counts at its
