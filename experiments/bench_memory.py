@@ -21,7 +21,7 @@ import typer
 from bench_report import plural, progress, short_machine, table
 from bench_tracker import SPEED_MPS, scenario, yardstick_us
 
-from fgtrack.config.shipped import read_config
+from fgtrack.config.reading import read_config
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Message, TickReport
 from fgtrack.inputs.recording import write_recording

@@ -17,7 +17,7 @@ from bench_tracker import scene, yardstick_us
 import fgtrack
 from fgtrack.core.types import Message
 from fgtrack.evaluation.tables import Tables, short
-from fgtrack.runs import Table
+from fgtrack.runs import Columns
 
 METHODS = ("smoother-banded", "smoother", "ekf-replay", "ekf-backward-forward")
 JUDGED = {
@@ -71,7 +71,7 @@ def typical(runs: Sequence[fgtrack.Run]) -> fgtrack.Run:
         [run.tables["timing"]["process_ns"] for run in runs], axis=0
     ).astype(np.int64)
     return runs[0].with_tables(
-        timing=Table({**runs[0].tables["timing"], "process_ns": process_ns})
+        timing=Columns({**runs[0].tables["timing"], "process_ns": process_ns})
     )
 
 

@@ -14,8 +14,8 @@ from statistics import median
 
 import numpy as np
 
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 from fgtrack.core.types import DetectionList, Message, TruthState
 from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import Tick, clock_ticks

@@ -14,8 +14,8 @@ from fgtrack.advice.advise import Adviser
 from fgtrack.advice.ledger import SUMMARY_S, summary
 from fgtrack.advice.page import Advice
 from fgtrack.advice.paired_replay import REPLAY, PairedReplay
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 from fgtrack.core.errors import DataError
 from fgtrack.core.output import (
     check_apart,

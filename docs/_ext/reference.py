@@ -13,7 +13,16 @@ from enum import Enum
 from functools import cache
 from importlib import import_module
 from itertools import pairwise
-from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 _FORMULAS = {"6.28318530718": "2 pi", "0.547722557505": "sqrt(0.3)"}
 

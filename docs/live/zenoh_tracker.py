@@ -14,7 +14,13 @@ from dataclasses import asdict
 import zenoh
 from loop import Received, run
 from rosbags.serde import SerdeError
-from zenoh_messages import Numbers, cdr_to_ego, cdr_to_list, objects_to_cdr, read_attachment
+from zenoh_messages import (
+    Numbers,
+    cdr_to_ego,
+    cdr_to_list,
+    objects_to_cdr,
+    read_attachment,
+)
 
 import fgtrack
 

@@ -15,7 +15,7 @@ import typer
 from joblib import Parallel, delayed
 
 import fgtrack
-from fgtrack.config.shipped import read_config
+from fgtrack.config.reading import read_config
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.intervals import average, paired

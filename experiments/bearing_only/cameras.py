@@ -18,8 +18,8 @@ import typer
 from joblib import Parallel, delayed
 
 import fgtrack
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 from fgtrack.core.geometry import wrap_angle
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState

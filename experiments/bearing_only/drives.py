@@ -19,8 +19,8 @@ import numpy as np
 import typer
 
 import fgtrack
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 from fgtrack.core.geometry import rotation, wrap_angle
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import (

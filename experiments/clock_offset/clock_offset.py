@@ -18,8 +18,8 @@ import typer
 from joblib import Parallel, delayed
 
 from fgtrack.clocks.offsets import estimate_offsets
+from fgtrack.config.reading import read_scenario
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_scenario
 from fgtrack.config.yaml_file import load
 from fgtrack.core.time import nanoseconds
 from fgtrack.sim.clocks import OffsetClock

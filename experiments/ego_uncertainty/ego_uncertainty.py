@@ -23,8 +23,8 @@ import numpy as np
 import typer
 from joblib import Parallel, delayed
 
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import EgoConfig, MotionConfig
-from fgtrack.config.shipped import read_config
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import EgoState, Message
 from fgtrack.evaluation.intervals import average, paired

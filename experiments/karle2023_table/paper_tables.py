@@ -28,8 +28,7 @@ from fgtrack.evaluation.scores.innovations import (
 from fgtrack.evaluation.scores.statistics import Distribution, Moments
 from fgtrack.evaluation.tables import MS, RUN, Column, Table, Tables, named
 from fgtrack.evaluation.truth import ego_states
-from fgtrack.runs import Run
-from fgtrack.runs import Table as Columns
+from fgtrack.runs import Columns, Run
 
 _HEADINGS = {
     "along_m": "along\n[m]",

@@ -22,8 +22,8 @@ import typer
 from joblib import Parallel, delayed
 
 import fgtrack
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.comparison import comparison
 from fgtrack.evaluation.intervals import within_run

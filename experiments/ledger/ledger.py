@@ -16,7 +16,7 @@ import pandas as pd
 import typer
 
 import fgtrack
-from fgtrack.config.shipped import read_config
+from fgtrack.config.reading import read_config
 from fgtrack.evaluation.intervals import average, paired
 
 REFERENCE = "ekf-replay"

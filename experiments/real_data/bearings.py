@@ -22,8 +22,8 @@ from joblib import Parallel, delayed
 from scores import autoferry_sources, nis_ratios, write
 
 import fgtrack
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import FloatArray, IntArray, Message
 from fgtrack.evaluation.comparison import comparison

@@ -29,8 +29,8 @@ from joblib import Parallel, delayed
 from scores import SEQUENCES, kitti_sources, write
 
 import fgtrack
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import ClockConfig, Config
-from fgtrack.config.shipped import read_config
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.inputs.source import open_input

@@ -21,8 +21,8 @@ from rules import numbers, recorded, ruled
 from scores import HEADER, Found, autoferry_sources, scored, write, write_scores
 
 import fgtrack
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 from fgtrack.evaluation.intervals import paired
 from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.inputs.source import open_input

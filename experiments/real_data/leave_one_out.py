@@ -23,8 +23,8 @@ from scipy.special import expit
 from scores import SEQUENCES, kitti_sources, raw, raw_mota, scans, write
 
 import fgtrack
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray
 from fgtrack.evaluation.matching import match

@@ -22,8 +22,8 @@ from scores import (
 )
 
 import fgtrack
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 from fgtrack.evaluation.runs import EvaluatedRun
 
 

@@ -15,7 +15,7 @@ from fgtrack.evaluation.matching import match, scenes
 from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.scores.multi_object import clear
 from fgtrack.inputs.source import open_input
-from fgtrack.runs import Run, Table
+from fgtrack.runs import Columns, Run
 
 SEQUENCES = "0004,0006,0008,0010,0018"
 """Of the KITTI tracking data set."""
@@ -107,8 +107,8 @@ def raw(run: Run, seen: Sequence[Scan]) -> Run:
         "y_m": y_m,
     }
     tracks |= {"num_measured": np.full(len(tick), 99), "status": status}
-    timing = Table({"tick": np.arange(len(seen)), "now_ns": stamps_ns})
-    return run.with_tables(tracks=Table(tracks), timing=timing)
+    timing = Columns({"tick": np.arange(len(seen)), "now_ns": stamps_ns})
+    return run.with_tables(tracks=Columns(tracks), timing=timing)
 
 
 def raw_mota(source: Path, config: Config, run: Run) -> float:

@@ -21,8 +21,8 @@ import typer
 from scipy.optimize import linear_sum_assignment
 
 import fgtrack
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 from fgtrack.core.types import (
     Detection,
     DetectionList,

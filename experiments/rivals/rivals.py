@@ -19,7 +19,7 @@ import numpy as np
 import typer
 
 import fgtrack
-from fgtrack.config.shipped import read_scenario
+from fgtrack.config.reading import read_scenario
 from fgtrack.core.types import Detection, DetectionList, Message
 from fgtrack.evaluation.intervals import average, paired
 from fgtrack.evaluation.runs import EvaluatedRun

@@ -16,8 +16,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 import typer
 
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import ClockConfig
-from fgtrack.config.shipped import read_config
 from fgtrack.core.types import FloatArray
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.runs import Run

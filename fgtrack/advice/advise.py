@@ -21,8 +21,8 @@ from fgtrack.clocks.arrivals import (
 )
 from fgtrack.clocks.offsets import OffsetReport, estimate_offsets
 from fgtrack.clocks.stamps import bias_findings, clock_findings, stamp_findings
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 from fgtrack.core.diagnostic import EGO, late_ego
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.finding import Finding, milliseconds, percent

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from fgtrack.advice.paired_replay import REPLAY, PairedReplay, at_stamp
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, Message

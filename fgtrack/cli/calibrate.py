@@ -26,8 +26,9 @@ from fgtrack.cli.arguments import (
 from fgtrack.cli.show import progress, say, sentences, show, warn
 from fgtrack.clocks.offsets import OffsetReport, estimate_offsets
 from fgtrack.clocks.stamps import clock_text
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config, suited_reports
+from fgtrack.config.shipped import suited_reports
 from fgtrack.config.yaml_file import plain
 from fgtrack.core.errors import CallError, DataError, FgtrackError
 from fgtrack.core.output import check_apart, check_output, write_file

@@ -2,8 +2,7 @@
 
 import sys
 
-INTERRUPTED = 130
-"""Exit code."""
+from fgtrack.cli.exit_codes import INTERRUPTED
 
 
 def main() -> None:

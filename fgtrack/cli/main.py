@@ -18,11 +18,10 @@ from typer import Option
 from typer.core import TyperGroup
 
 import fgtrack
-from fgtrack.cli.entry import INTERRUPTED
+from fgtrack.cli.exit_codes import BAD_CALL, BAD_DATA, DONE, INTERRUPTED
 from fgtrack.core.errors import CallError, FgtrackError, one_line
 from fgtrack.core.output import FULL
 
-DONE, BAD_DATA, BAD_CALL = 0, 1, 2
 #: Commands in the order of the help, functions of that name, and the modules that hold them.
 COMMANDS = {
     "demo": "study",

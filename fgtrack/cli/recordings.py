@@ -19,8 +19,9 @@ from fgtrack.cli.arguments import (
     StorageOption,
 )
 from fgtrack.cli.show import console, progress, say
+from fgtrack.config.reading import read_config, read_scenario
 from fgtrack.config.recorded import recorded_of
-from fgtrack.config.shipped import Kind, read_config, read_scenario, shipped, summary
+from fgtrack.config.shipped import Kind, shipped, summary
 from fgtrack.config.yaml_file import dump, load
 from fgtrack.core.output import check_apart
 from fgtrack.core.types import DetectionList, Message

@@ -15,7 +15,8 @@ from fgtrack.cli.arguments import (
     TrackMap,
 )
 from fgtrack.cli.show import progress, say, warn
-from fgtrack.config.shipped import read_config, suited_reports
+from fgtrack.config.reading import read_config
+from fgtrack.config.shipped import suited_reports
 from fgtrack.core.errors import DataError
 from fgtrack.core.output import check_apart
 from fgtrack.estimation.registry import ESTIMATORS

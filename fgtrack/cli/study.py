@@ -18,8 +18,8 @@ from fgtrack.cli.arguments import (
     TrackMap,
 )
 from fgtrack.cli.show import progress, say, sentences, show, warn
+from fgtrack.config.reading import read_config, read_scenario
 from fgtrack.config.recorded import recorded_of
-from fgtrack.config.shipped import read_config, read_scenario
 from fgtrack.core.errors import DataError
 from fgtrack.core.output import check_apart, claimed
 from fgtrack.evaluation.diagnostics import diagnostics

@@ -18,7 +18,7 @@ from fgtrack.cli.arguments import (
     TrackMap,
 )
 from fgtrack.cli.show import progress, say, show
-from fgtrack.config.shipped import read_config
+from fgtrack.config.reading import read_config
 from fgtrack.core.errors import DataError
 from fgtrack.core.output import check_apart, check_output, write_file
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value

@@ -8,18 +8,19 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat, Tag
 
+from fgtrack.config.shipped import find_file
 from fgtrack.config.yaml_file import dump, load, plain, with_settings
 from fgtrack.core.settings import require, settings
 from fgtrack.estimation.filters.initiation import DEFAULT, Initiation
 from fgtrack.estimation.registry import ESTIMATORS, motion_model
 from fgtrack.estimation.smoothing.settings import SmootherSettings
+from fgtrack.evaluation.settings import EvaluationConfig
 from fgtrack.inputs.settings import InputConfig
 from fgtrack.karle2023.tracker_parts import NeighbourhoodMerge, UngatedEuclidean
 from fgtrack.models.correlated_errors import with_correlated_errors
 from fgtrack.models.motion import CT, CTRA, CTRV, CV, MotionModel, WhiteNoise
 from fgtrack.models.road import OPEN_SPACE
 from fgtrack.models.sensors import SensorModel
-from fgtrack.runs import EvaluationConfig
 from fgtrack.tracking.association import GatedEuclidean, GatedMahalanobis
 from fgtrack.tracking.birth import Birth
 from fgtrack.tracking.detections import ConnectedMerge, NoMerge
@@ -410,8 +411,6 @@ class Config:
     @classmethod
     def from_yaml(cls, name: str | Path) -> Self:
         """Return the configuration of a YAML file or of that shipped name. Raises `CallError` with file and key."""
-        from fgtrack.config.shipped import find_file  # which imports this module
-
         return load(cls, find_file("configuration", name))
 
     def to_yaml(self, path: str | Path) -> None:

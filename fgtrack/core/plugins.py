@@ -4,6 +4,7 @@ import hashlib
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
@@ -15,6 +16,16 @@ from fgtrack.core.errors import CallError, FgtrackError, did_you_mean
 _logger = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True)
+class Alias:
+    """Former name of a part."""
+
+    name: str
+    """Present name of the part."""
+    note: str = ""
+    """Sentence for whoever uses the former name."""
+
+
 class Registry:
     """Parts of one kind by name: built-in ones, and entry points of the groups, loaded when their name is used.
     One with the name of a built-in part, or of an earlier plug-in, is left out with a warning.
@@ -24,10 +35,10 @@ class Registry:
         self,
         noun: str,
         built_in: Mapping[str, Mapping[str, str]],
-        aliases: Mapping[str, str] | None = None,
+        aliases: Mapping[str, Alias] | None = None,
     ) -> None:
         """`noun`: kind of the parts, for messages; `built_in`: `module:attribute` by name, for every entry-point group;
-        `aliases`: present names by former ones."""
+        `aliases`: by former names."""
         self._noun = noun
         self._built_in = built_in
         self._aliases = dict(aliases or {})
@@ -59,8 +70,16 @@ class Registry:
         }
 
     def resolve(self, name: str) -> str:
-        """The present form of `name`. Raises `CallError` for one that does not exist."""
-        name = self._aliases.get(name, name)
+        """Return the present name of the part `name`, with a warning for a former name.
+
+        Raises `CallError` for an unknown name.
+        """
+        alias = self._aliases.get(name)
+        if alias is not None:
+            _logger.warning(
+                "%s %r is now named %r. %s", self._noun, name, alias.name, alias.note
+            )
+            name = alias.name
         if name not in self._entries:
             hint = did_you_mean(name, [*self._entries, *self._aliases]).removesuffix(
                 "?"
@@ -107,9 +126,8 @@ class Registry:
                 entry_points(group=group),
                 key=lambda entry: (entry.name, _package(entry)),
             ):
-                holder = entries.setdefault(
-                    self._aliases.get(entry.name, entry.name), entry
-                )
+                alias = self._aliases.get(entry.name)
+                holder = entries.setdefault(alias.name if alias else entry.name, entry)
                 if (holder.value, _package(holder)) != (entry.value, _package(entry)):
                     _logger.warning(
                         "%s %r of %s is left out: the name belongs to %s; rename the entry point",

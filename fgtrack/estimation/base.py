@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from functools import cache
-from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Generic, Protocol, TypeVar, overload, runtime_checkable
 
 import numpy as np
 
@@ -179,14 +179,22 @@ def _measured(components: tuple[str, ...], assumed: tuple[str, ...]) -> IntArray
 
 
 class Lazy(Sequence[_T], Generic[_T]):
-    """Items that are made when they are asked for, by `made`."""
+    """A sequence that makes each item when the item is read."""
 
     @abstractmethod
-    def made(self, index: int) -> _T:
-        """Return the item at an index; raises `IndexError` if there is none."""
+    def item(self, index: int) -> _T:
+        """Return the item at an index from 0 to the length."""
 
-    def __getitem__(self, index: Any) -> Any:  # Any: there are no slices
-        return self.made(index)
+    @overload
+    def __getitem__(self, index: int) -> _T: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[_T]: ...
+
+    def __getitem__(self, index: int | slice) -> _T | list[_T]:
+        if isinstance(index, slice):
+            return [self.item(each) for each in range(len(self))[index]]
+        return self.item(range(len(self))[index])
 
 
 class Measurements(Lazy[Measurement]):
@@ -199,8 +207,8 @@ class Measurements(Lazy[Measurement]):
     def __len__(self) -> int:
         return len(self.stack.z)
 
-    def made(self, index: int) -> Measurement:
-        """See `Lazy.made`."""
+    def item(self, index: int) -> Measurement:
+        """See `Lazy.item`."""
         own = self.stack
         return Measurement(
             own.stamp_ns,

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from fgtrack.core.checks import is_number
 from fgtrack.core.errors import CallError
-from fgtrack.core.plugins import Registry
+from fgtrack.core.plugins import Alias, Registry
 from fgtrack.estimation.base import Estimator, Start, TrackBank
 from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.filters.replay import ReplayEkf
@@ -56,7 +56,13 @@ ESTIMATORS = Registry(
             "rewind-forget": f"{_OOSM}.late:RewindForget",
         },
     },
-    aliases={"backward-forward": "rewind-forget"},
+    aliases={
+        "backward-forward": Alias(
+            "rewind-forget",
+            "It updates at the exact late stamp; the filter of Karle et al. 2023, "
+            "on a grid of 10 ms, is 'ekf-backward-forward'.",
+        )
+    },
 )
 MOTION_MODELS = Registry(
     "motion model",

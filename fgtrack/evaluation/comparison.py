@@ -18,8 +18,8 @@ from fgtrack.evaluation.matching import (
 )
 from fgtrack.evaluation.runs import EvaluatedRun, by_recording
 from fgtrack.evaluation.scores.multi_object import gospa
+from fgtrack.evaluation.settings import EvaluationConfig, evaluation_settings
 from fgtrack.evaluation.tables import Column, Value, short, two_digits
-from fgtrack.runs import EvaluationConfig
 
 POSITION_NEES = "position_nees"
 """The quantity that is the better the nearer it is to 2."""
@@ -77,7 +77,7 @@ def comparable(runs: Sequence[EvaluatedRun]) -> list[list[EvaluatedRun]]:
         by_recording([item for item in runs if item.matching is not None])
     ):
         for item in group:
-            groups.setdefault((number, item.run.evaluation), []).append(item)
+            groups.setdefault((number, evaluation_settings(item.run)), []).append(item)
     return list(groups.values())
 
 
@@ -144,7 +144,7 @@ def comparison(group: Sequence[EvaluatedRun]) -> Comparison:
             )
         )
     most, common, sums = common_sums(errors)
-    if all(item.run.evaluation.multi_object for item in group):
+    if all(evaluation_settings(item.run).multi_object for item in group):
         sums["gospa_in_view_rms_m"] = _gospa_sums(group)
     labels = tuple(item.label for item in group)
     quantities = {
@@ -213,6 +213,8 @@ def _gospa_sums(group: Sequence[EvaluatedRun]) -> FloatArray:
     for item, scene, mine in zip(group, there, rows, strict=True):
         in_view = scene.in_view.copy()
         in_view[mine] = seen
-        squares_m2 = gospa(replace(scene, in_view=in_view), item.run.evaluation.gate_m)
+        squares_m2 = gospa(
+            replace(scene, in_view=in_view), evaluation_settings(item.run).gate_m
+        )
         columns.append(squares_m2["in_view_m2"][mine])
     return np.stack([*columns, np.ones(len(common_ns))], axis=-1)

@@ -16,7 +16,7 @@ from fgtrack.evaluation.scores.innovations import by_sensor, num_measured
 from fgtrack.evaluation.scores.statistics import ChiSquareMean
 from fgtrack.models.measurement import ANGULAR
 from fgtrack.models.road import OPEN_SPACE
-from fgtrack.runs import Run, Table
+from fgtrack.runs import Columns, Run
 
 USED = ("birth", "in_sequence", "out_of_sequence", "beyond_window", "merged")
 """Dispositions of detections that took part."""
@@ -225,7 +225,7 @@ def _placed_delays_s(run: Run) -> dict[str, float]:
     return {name: _delay_s(mine) for name, mine in by_sensor(moving)}
 
 
-def _delay_s(table: Table) -> float:
+def _delay_s(table: Columns) -> float:
     """Median delay [s] of the rows of a table, from stamp to receipt."""
     return float(np.median(table["receipt_ns"] - table["stamp_ns"])) / NS_PER_S
 
@@ -257,7 +257,7 @@ def _ego_speeds_births(run: Run) -> bool:
     )
 
 
-def _mostly(run: Run) -> Iterator[tuple[str, Table, str, int]]:
+def _mostly(run: Run) -> Iterator[tuple[str, Columns, str, int]]:
     """Sensors and their updates, of which more than half were not used for one reason: it, and their number."""
     for sensor, mine in by_sensor(run.tables["updates"]):
         name, count = Counter(mine["disposition"].tolist()).most_common(1)[0]
@@ -320,7 +320,7 @@ def _limits(run: Run, sensor: str, window_s: str) -> list[tuple[str, float | Non
     ]
 
 
-def _too_old(run: Run, sensor: str, updates: Table) -> str:
+def _too_old(run: Run, sensor: str, updates: Columns) -> str:
     delay_s = _delay_s(updates)
     for key, limit_s in _limits(run, sensor, "lag_s"):
         if limit_s is not None and delay_s > limit_s:

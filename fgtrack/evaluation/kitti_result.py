@@ -20,6 +20,7 @@ from fgtrack.core.output import check_apart, write_file
 from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation.matching import confirmed
 from fgtrack.evaluation.placement import update_rows
+from fgtrack.evaluation.settings import evaluation_settings
 from fgtrack.evaluation.truth import ego_states
 from fgtrack.inputs.formats.kitti import CLASS_NAMES, is_sequence, view_of_sequence
 from fgtrack.inputs.formats.kitti_view import PERIOD_NS, Box, View
@@ -79,7 +80,7 @@ def _states(run: Run, num_frames: int) -> DataFrame:
     timing = timing[timing["frame"].between(0, num_frames - 1)][["tick", "frame"]]
     tracks = (
         run.tracks[confirmed(run.tables["tracks"])]
-        if run.evaluation.confirmed_only
+        if evaluation_settings(run).confirmed_only
         else run.tracks
     )
     states = (

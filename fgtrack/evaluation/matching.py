@@ -7,6 +7,7 @@ import numpy as np
 
 from fgtrack.core.geometry import wrap_angles
 from fgtrack.core.types import BoolArray, FloatArray, IntArray, TrackStatus
+from fgtrack.evaluation.settings import EvaluationConfig, evaluation_settings
 from fgtrack.evaluation.truth import (
     TRUE_STATE,
     TruePath,
@@ -14,7 +15,7 @@ from fgtrack.evaluation.truth import (
     true_paths,
     visible,
 )
-from fgtrack.runs import NO_TRACK, EvaluationConfig, Run, Table
+from fgtrack.runs import NO_TRACK, Columns, Run
 
 NO_OBJECT = -1
 """Object index of a track row that is paired with no true object."""
@@ -25,7 +26,7 @@ class Matching:
     """Pairs of track rows and true objects, which are numbered by rising id, without the ego."""
 
     object_ids: tuple[int, ...]
-    tracks: Table
+    tracks: Columns
     """The evaluated rows of tracks.csv: r rows while truth was recorded."""
     object_index: IntArray
     """Object that each row is paired with, shape (r,); `NO_OBJECT` without one."""
@@ -88,7 +89,7 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
     rest is assigned by the Hungarian method, first as many pairs as possible, then the least sum of distances. Tracks
     of ignored objects and in ignored regions are left out.
     """
-    options = options or run.evaluation
+    options = options or evaluation_settings(run)
     paths = true_paths(run.tables["truth"])
     if not paths:
         return None
@@ -177,7 +178,7 @@ def track_errors(matching: Matching) -> TrackErrors:
     )
 
 
-def state_errors(states: Table, truth: FloatArray) -> dict[str, FloatArray]:
+def state_errors(states: Columns, truth: FloatArray) -> dict[str, FloatArray]:
     """Errors by name of `ERROR_NAMES`, shape (n,) each, of n rows against x, y, yaw, speed ..., shape (n, 5)."""
     dx_m, dy_m = states["x_m"] - truth[:, 0], states["y_m"] - truth[:, 1]
     c, s = np.cos(truth[:, 2]), np.sin(truth[:, 2])
@@ -200,7 +201,7 @@ def position_nees(matching: Matching) -> FloatArray:
     )
 
 
-def position_squares(states: Table, truth: FloatArray) -> FloatArray:
+def position_squares(states: Columns, truth: FloatArray) -> FloatArray:
     """Return the normalised error squared e' P^-1 e of x and y, shape (n,); NaN where P is not positive definite."""
     x, y = states["x_m"] - truth[:, 0], states["y_m"] - truth[:, 1]
     P_x, P_xy, P_y = (states[name] for name in ("p_x_x", "p_x_y", "p_y_y"))
@@ -235,19 +236,19 @@ def scenes(run: Run, matching: Matching) -> Scenes:
     )
 
 
-def confirmed(tracks: Table) -> BoolArray:
+def confirmed(tracks: Columns) -> BoolArray:
     """True for the rows of tracks.csv that are not tentative, shape (rows,)."""
     return np.asarray(tracks["status"] != TrackStatus.TENTATIVE.value)
 
 
-def published_rows(tracks: Table, ticks: IntArray, track_ids: IntArray) -> IntArray:
+def published_rows(tracks: Columns, ticks: IntArray, track_ids: IntArray) -> IntArray:
     """Row of `tracks` of each of these ticks and tracks, shape (n,); -1 where there is none."""
     before, after = neighbours(tracks, "tick", ticks, track_ids)
     return np.where(before == after, before, -1)
 
 
 def neighbours(
-    tracks: Table, name: str, values: IntArray, track_ids: IntArray
+    tracks: Columns, name: str, values: IntArray, track_ids: IntArray
 ) -> tuple[IntArray, IntArray]:
     """Rows of these tracks whose column `name` is the last up to, and the first from `values` on; -1 without one."""
     every = np.unique(np.concatenate([tracks[name], values]))
@@ -275,7 +276,7 @@ def recorded(run: Run, stamps_ns: IntArray) -> BoolArray:
 
 
 def _ignored(
-    run: Run, tracks: Table, paths: list[TruePath], gate_m: float
+    run: Run, tracks: Columns, paths: list[TruePath], gate_m: float
 ) -> BoolArray:
     """True for the rows of no true object that follow an ignored one or lie in an ignored region, as in KITTI."""
     objects = run.tables["ignored"].where(run.tables["ignored"]["outline_m"] == "")
@@ -283,7 +284,7 @@ def _ignored(
         ("yaw_rad", "speed_mps", "yaw_rate_radps"), np.full(objects.num_rows, np.nan)
     )
     _, distances_m = distances(
-        tracks, [*paths, *true_paths(Table({**objects, **unknown}))]
+        tracks, [*paths, *true_paths(Columns({**objects, **unknown}))]
     )
     timing, stamps_ns = run.tables["timing"], tracks["stamp_ns"]
     tick_index = np.searchsorted(timing["tick"], tracks["tick"])
@@ -297,7 +298,7 @@ def _ignored(
 
 
 def distances(
-    tracks: Table, paths: Sequence[TruePath]
+    tracks: Columns, paths: Sequence[TruePath]
 ) -> tuple[FloatArray, FloatArray]:
     """True states at the stamps of `tracks`, shape (rows, objects, 5), and distances, shape (rows, objects), or NaN."""
     candidates = np.stack([path.at(tracks["stamp_ns"]) for path in paths], axis=1)

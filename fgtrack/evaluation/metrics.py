@@ -34,7 +34,8 @@ from fgtrack.evaluation.scores.multi_object import (
 )
 from fgtrack.evaluation.scores.prediction import PredictionErrors, prediction_errors
 from fgtrack.evaluation.scores.statistics import Distribution, Moments
-from fgtrack.runs import NO_TRACK, EvaluationConfig, Run, Table
+from fgtrack.evaluation.settings import EvaluationConfig, evaluation_settings
+from fgtrack.runs import NO_TRACK, Columns, Run
 
 FALSE_TRACK_SHARE = 0.5
 """A track that is paired with a true object in less than this share of its rows is false."""
@@ -176,8 +177,8 @@ def evaluate(
             name: np.asarray(truth.get(name, np.full(num_rows, np.nan)))
             for name in run.tables["truth"]
         }
-        run = replace(run, tables={**run.tables, "truth": Table(columns)})
-    options = options or run.evaluation
+        run = replace(run, tables={**run.tables, "truth": Columns(columns)})
+    options = options or evaluation_settings(run)
     return evaluate_matched(run, match(run, options), options)
 
 

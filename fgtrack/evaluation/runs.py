@@ -14,6 +14,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.types import MEASURABLE
 from fgtrack.evaluation.matching import Matching, match
 from fgtrack.evaluation.metrics import Metrics, evaluate_matched
+from fgtrack.evaluation.settings import evaluation_settings
 from fgtrack.runs import Run, is_run_folder, load_run
 
 
@@ -33,7 +34,7 @@ class EvaluatedRun:
     @cached_property
     def metrics(self) -> Metrics:
         """All metrics, by the settings of the run's configuration."""
-        return evaluate_matched(self.run, self.matching, self.run.evaluation)
+        return evaluate_matched(self.run, self.matching, evaluation_settings(self.run))
 
 
 OneRun = Run | EvaluatedRun | Path | str

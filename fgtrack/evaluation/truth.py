@@ -11,7 +11,7 @@ from fgtrack.core.geometry import cartesian, in_polygon, wrap_angles
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import EGO_ID, BoolArray, FloatArray, IntArray
 from fgtrack.models.sensors import SensorModel
-from fgtrack.runs import Run, Table
+from fgtrack.runs import Columns, Run
 
 #: What is interpolated, in the order of the columns of `TruePath.at`.
 TRUE_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
@@ -62,7 +62,7 @@ class TruePath:
         return states
 
 
-def true_paths(truth: Table) -> list[TruePath]:
+def true_paths(truth: Columns) -> list[TruePath]:
     """Every true object but the ego, by rising id; of rows with one stamp the last counts, without a position none."""
     rows = np.stack([truth[name] for name in TRUE_STATE], axis=-1)
     rows[~(np.abs(rows) <= LARGEST)] = np.nan
@@ -76,7 +76,7 @@ def true_paths(truth: Table) -> list[TruePath]:
 
 
 def true_states(
-    truth: Table, object_index: IntArray, stamps_ns: IntArray
+    truth: Columns, object_index: IntArray, stamps_ns: IntArray
 ) -> FloatArray:
     """Return the true states at `stamps_ns` of these of the `true_paths`, shape (n, 5); NaN without truth."""
     states = np.full((len(stamps_ns), len(TRUE_STATE)), np.nan)
@@ -131,7 +131,7 @@ def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> BoolArray:
     return np.asarray(present & np.any(covered, axis=0))
 
 
-def ego_states(ego: Table, stamps_ns: IntArray) -> FloatArray:
+def ego_states(ego: Columns, stamps_ns: IntArray) -> FloatArray:
     """x, y, yaw (not wrapped) and speed of the ego, shape (n, 4), constant beyond the ends; NaN if never known."""
     rows = np.stack(
         [ego[name] for name in ("x_m", "y_m", "yaw_rad", "speed_mps")], axis=-1

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import BoolArray, FloatArray, Message
 from fgtrack.inputs.errors import UntilBreak

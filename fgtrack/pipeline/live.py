@@ -11,8 +11,8 @@ from typing import Self
 
 import numpy as np
 
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 from fgtrack.core.checks import LARGEST_NS
 from fgtrack.core.diagnostic import EGO, late_ego, too_late
 from fgtrack.core.errors import CallError, DataError

@@ -7,9 +7,9 @@ from typing import overload
 
 import numpy as np
 
+from fgtrack.config.reading import read_config, read_scenario
 from fgtrack.config.recorded import recorded_of
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config, read_scenario
 from fgtrack.core.checks import check_paths
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Message

@@ -12,8 +12,8 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, NonNegativeInt
 
+from fgtrack.config.reading import read_config, read_scenario
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config, read_scenario
 from fgtrack.config.yaml_file import (
     key_and_value,
     load,

@@ -1,7 +1,7 @@
 """The run folder `fgtrack-run/1`, the interface of tracking and evaluation: writer, reader, layout; runs in memory."""
 
 from fgtrack.runs.memory import MemoryRun
-from fgtrack.runs.reader import EvaluationConfig, Run, Table, load_run
+from fgtrack.runs.reader import Columns, Run, load_run
 from fgtrack.runs.schema import (
     COLUMNS,
     COVARIANCE_COLUMNS,
@@ -22,7 +22,6 @@ from fgtrack.runs.writer import (
 __all__ = [
     "COLUMNS",
     "COVARIANCE_COLUMNS",
-    "EvaluationConfig",
     "MemoryRun",
     "NO_TRACK",
     "Node",
@@ -30,7 +29,7 @@ __all__ = [
     "RUN_FORMAT",
     "Run",
     "RunWriter",
-    "Table",
+    "Columns",
     "check_run",
     "digest",
     "is_run_folder",

@@ -14,10 +14,8 @@ from typing import TYPE_CHECKING, Any
 from warnings import catch_warnings
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
 from ruamel.yaml.error import YAMLError
 
-from fgtrack.core.checks import LARGEST
 from fgtrack.core.errors import DataError
 from fgtrack.core.files import open_file, read_whole
 from fgtrack.core.time import NS_PER_S
@@ -42,7 +40,7 @@ if TYPE_CHECKING:  # takes half a second to import
     from pandas import DataFrame
 
 
-class Table(dict[str, Column]):
+class Columns(dict[str, Column]):
     """Columns by name as NumPy arrays, each of shape (rows,) and read-only; `len` is the number of columns.
     An empty cell, and a number beyond 1e60, is NaN in a float column; an empty one is `NO_TRACK` in an integer one.
     """
@@ -57,7 +55,7 @@ class Table(dict[str, Column]):
         """Length of every column."""
         return len(next(iter(self.values()), ()))
 
-    def equals(self, other: "Table") -> bool:
+    def equals(self, other: "Columns") -> bool:
         """True if both have the same columns, to the bit; NaN equals NaN."""
         return list(self) == list(other) and all(
             np.array_equal(
@@ -66,29 +64,9 @@ class Table(dict[str, Column]):
             for name in self
         )
 
-    def where(self, rows: BoolArray | IntArray) -> "Table":
+    def where(self, rows: BoolArray | IntArray) -> "Columns":
         """The rows where a mask, shape (rows,), is true, or those with these indices."""
-        return Table({name: values[rows] for name, values in self.items()})
-
-
-@dataclass(frozen=True)
-class EvaluationConfig:
-    """Pairing of tracks with true objects, and the metrics that are computed."""
-
-    gate_m: float = 5.0
-    """Largest distance of a track from its true object. The default is the tracker's own association distance, a
-    car's length (more for ships): a track farther off is not updated by its object any more. It bounds the errors,
-    so compare at one gate."""
-    confirmed_only: bool = True
-    """True to leave out tentative tracks: by counting, those measured less than `lifecycle.confirm_count` times."""
-    multi_object: bool = True
-    """True to compute GOSPA, CLEAR, IDF1 and HOTA."""
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.gate_m <= LARGEST:
-            raise ValueError(
-                f"gate_m: must be positive and at most {LARGEST:g}, is {self.gate_m}"
-            )
+        return Columns({name: values[rows] for name, values in self.items()})
 
 
 def _frame(table: str, doc: str) -> "cached_property[DataFrame]":
@@ -113,12 +91,12 @@ class Run:
     """Content of meta.json; JSON values."""
     config_text: str
     """Text of config.yaml."""
-    tables: Mapping[str, Table]
+    tables: Mapping[str, Columns]
     """The tables by name as NumPy columns; those left out have no rows."""
 
     def __post_init__(self) -> None:
         empty = {
-            name: Table({key: column(key, ()) for key in COLUMNS[name]})
+            name: Columns({key: column(key, ()) for key in COLUMNS[name]})
             for name in COLUMNS
         }
         object.__setattr__(self, "tables", empty | dict(self.tables))
@@ -196,20 +174,6 @@ class Run:
         return Path(self.path or "") / "config.yaml"
 
     @property
-    def evaluation(self) -> EvaluationConfig:
-        """Section `evaluation` of config.yaml, with defaults. Raises as `config`."""
-        try:
-            return TypeAdapter(EvaluationConfig).validate_python(
-                self.config.get("evaluation") or {}
-            )
-        except ValidationError as error:
-            where, first = (
-                ".".join(map(str, ("evaluation", *error.errors()[0]["loc"]))),
-                error.errors()[0]["msg"],
-            )
-            raise DataError(f"{self.config_path}: {where}: {first}") from error
-
-    @property
     def recording(self) -> Path | None:
         """Path, relative to the run folder or as given, of the run's recording; None where there is no such file."""
         source = self.meta.get("input") or {}
@@ -221,7 +185,7 @@ class Run:
             None,
         )
 
-    def with_tables(self, **tables: Table) -> "Run":
+    def with_tables(self, **tables: Columns) -> "Run":
         """The run with these tables, by name, instead of its own."""
         return replace(self, tables={**self.tables, **tables})
 
@@ -275,7 +239,7 @@ def load_run(path: Path | str) -> Run:
     )
 
 
-def _read_table(path: Path, table: str, complete: bool) -> Table:
+def _read_table(path: Path, table: str, complete: bool) -> Columns:
     if (
         table in OPTIONAL_TABLES or not complete
     ) and not path.exists():  # or killed while it was begun
@@ -292,7 +256,7 @@ def _read_table(path: Path, table: str, complete: bool) -> Table:
         ) from error
 
 
-def parsed(table: str, content: bytes | bytearray) -> Table:
+def parsed(table: str, content: bytes | bytearray) -> Columns:
     """The table whose CSV file has this `content`. Raises `ValueError` for another one."""
     names, text = COLUMNS[table], TextIOWrapper(BytesIO(content), newline="")
     written = tuple(text.readline().rstrip("\n").split(","))
@@ -316,7 +280,7 @@ def parsed(table: str, content: bytes | bytearray) -> Table:
         for name in names
         if name not in written
     }  # of runs of 0.2
-    return Table(
+    return Columns(
         {
             name: column(name, added[name] if name in added else cells[name])
             for name in names
@@ -338,7 +302,7 @@ def _converter(name: str) -> Callable[[str], str | int | float]:
     )
 
 
-def _lines(table: str, columns: Table, is_scored: bool) -> str:
+def _lines(table: str, columns: Columns, is_scored: bool) -> str:
     """Lines of the CSV file of `table`, floats with 17 significant digits."""
     import pandas
 

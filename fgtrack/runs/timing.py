@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fgtrack.core.types import IntArray
-from fgtrack.runs.reader import Table
+from fgtrack.runs.reader import Columns
 
 _END_NS = int(np.iinfo(np.int64).max)
 
@@ -33,7 +33,7 @@ class Node:
         return self._free_ns
 
 
-def ready_times(timing: Table, node: Node) -> IntArray:
+def ready_times(timing: Columns, node: Node) -> IntArray:
     """When the output of every tick of timing.csv was ready, shape (ticks,), with the times measured there."""
     ticks = zip(timing["now_ns"].tolist(), timing["process_ns"].tolist(), strict=True)
     return np.array(

@@ -14,7 +14,7 @@ from fgtrack.show.geojson import origin_of
 from fgtrack.show.palette import distinct_colours
 from fgtrack.show.ros2 import write_ros2
 from fgtrack.show.run_messages import (
-    Style,
+    RunLayer,
     ego_messages,
     map_messages,
     run_messages,
@@ -73,15 +73,15 @@ def viewer_messages(
         ego_messages(first.tables["ego"], at_ns),
         *truth_messages(first.tables["truth"]),
     ]
-    for style, run in zip(_styles(runs), runs.values(), strict=True):
-        parts += run_messages(run, style)
+    for layer, run in zip(_layers(runs), runs.values(), strict=True):
+        parts += run_messages(run, layer)
     return merge(*parts, key=lambda message: message.log_ns), notes
 
 
-def _styles(runs: Mapping[str, Run]) -> list[Style]:
+def _layers(runs: Mapping[str, Run]) -> list[RunLayer]:
     """One run alone has the topics for itself; of several, each has a name before its topics, and a colour."""
     if len(runs) == 1:
-        return [Style()]
+        return [RunLayer()]
     names: list[str] = []
     for label in runs:
         names.append(
@@ -93,5 +93,6 @@ def _styles(runs: Mapping[str, Run]) -> list[Style]:
         [str(run.meta.get("estimator", "")) for run in runs.values()]
     )
     return [
-        Style(f"/{name}", colour) for name, colour in zip(names, colours, strict=True)
+        RunLayer(f"/{name}", colour)
+        for name, colour in zip(names, colours, strict=True)
     ]

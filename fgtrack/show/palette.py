@@ -20,7 +20,7 @@ _LINES = ("-", "--", "-.", ":")
 _MARKERS = "os^vDP"
 
 
-class Style(NamedTuple):
+class CurveStyle(NamedTuple):
     """Colour, line style and marker of a curve."""
 
     colour: str
@@ -29,23 +29,23 @@ class Style(NamedTuple):
 
 
 #: Those that are compared most. A dashed line on a solid one shows both where two estimators tie.
-_ESTIMATORS: Mapping[str, Style] = {
-    "smoother": Style(_BLUE, "-", "o"),
-    "smoother-batch": Style(_BLUE, "-.", "o"),
-    "smoother-banded": Style(_BLUE, ":", "o"),
-    "ekf-replay": Style(_ORANGE, "--", "s"),
-    "ekf-backward-forward": Style(_GREEN, "-", "^"),
-    "rewind-forget": Style(_GREEN, "--", "^"),
-    "drop": Style(_RED, "-", "v"),
-    "as-current": Style(_PURPLE, "-", "D"),
-    "reorder-buffer": Style(_SKY, "-", "P"),
+_ESTIMATORS: Mapping[str, CurveStyle] = {
+    "smoother": CurveStyle(_BLUE, "-", "o"),
+    "smoother-batch": CurveStyle(_BLUE, "-.", "o"),
+    "smoother-banded": CurveStyle(_BLUE, ":", "o"),
+    "ekf-replay": CurveStyle(_ORANGE, "--", "s"),
+    "ekf-backward-forward": CurveStyle(_GREEN, "-", "^"),
+    "rewind-forget": CurveStyle(_GREEN, "--", "^"),
+    "drop": CurveStyle(_RED, "-", "v"),
+    "as-current": CurveStyle(_PURPLE, "-", "D"),
+    "reorder-buffer": CurveStyle(_SKY, "-", "P"),
 }
 
 
-def style_of(estimator: str) -> Style:
+def style_of(estimator: str) -> CurveStyle:
     """Return the style of the curves of `estimator`; of an unknown one always the same."""
     number = crc32(estimator.encode())
-    unknown = Style(
+    unknown = CurveStyle(
         (_PURPLE, _SKY)[number % 2],
         _LINES[1:][number // 2 % 3],
         _MARKERS[number // 8 % len(_MARKERS)],
@@ -53,9 +53,9 @@ def style_of(estimator: str) -> Style:
     return _ESTIMATORS.get(estimator, unknown)
 
 
-def styles(estimators: Sequence[str]) -> list[Style]:
+def styles(estimators: Sequence[str]) -> list[CurveStyle]:
     """Return a style for each of `estimators`, in their order; equal colours get different lines."""
-    result: list[Style] = []
+    result: list[CurveStyle] = []
     for item in map(style_of, estimators):
         taken = [other.line for other in result if other.colour == item.colour]
         result.append(

@@ -13,7 +13,7 @@ from fgtrack.core.types import EGO_ID, LATE, FloatArray, IntArray
 from fgtrack.evaluation.diagnostics import USED
 from fgtrack.evaluation.placement import placed, road_lines, roads, update_rows
 from fgtrack.evaluation.runs import EvaluatedRun, by_recording
-from fgtrack.runs import Run, Table
+from fgtrack.runs import Columns, Run
 from fgtrack.show.palette import SENSORS, distinct_colours
 from fgtrack.show.states import (
     AROUND_95,
@@ -88,14 +88,14 @@ class _Recording:
         times_s = (times_ns - self.start_ns) / NS_PER_S
         return np.where(np.abs(times_s) < _LONGEST_S, times_s, math.nan)
 
-    def rows(self, states: Table, time: str, *order: str) -> Table:
+    def rows(self, states: Columns, time: str, *order: str) -> Columns:
         """Rows of `states` with a position and a time, in the order of `time` and `order`."""
         states = located(states)
         states = states.where(np.isfinite(self.seconds(states[time])))
         keys = np.lexsort([states[name] for name in (*reversed(order), time)])
-        return Table({name: values[keys] for name, values in states.items()})
+        return Columns({name: values[keys] for name, values in states.items()})
 
-    def columns(self, states: Table, time: str) -> Json:
+    def columns(self, states: Columns, time: str) -> Json:
         """Times and poses of rows, and where they have covariances the half axes of their 95 % ellipses."""
         columns = {"t": _column(self.seconds(states[time]), _TIME_DIGITS)}
         columns |= {name: _column(states[f"{name}_m"]) for name in "xy"}
@@ -154,7 +154,7 @@ class _Recording:
             lagged.where(lagged["lag_s"] > 0.0), "now_ns", "track_id", "stamp_ns"
         )
         final = self.rows(smoothed.where(smoothed["kind"] == "final"), "stamp_ns")
-        ticks = Table({"now_ns": np.unique(tables["timing"]["now_ns"])})
+        ticks = Columns({"now_ns": np.unique(tables["timing"]["now_ns"])})
         of_ticks = [ticks, self.rows(tables["tracks"], "now_ns", "track_id"), past]
         ticks, tracks, past = _thinned(of_ticks, "now_ns", most, one.label, notes)
         (final,) = _thinned(
@@ -220,8 +220,8 @@ def _place(position_m: FloatArray, prefix: str = "") -> Json:
 
 
 def _thinned(
-    tables: Sequence[Table], time: str, most: int, label: str, notes: dict[str, None]
-) -> list[Table]:
+    tables: Sequence[Columns], time: str, most: int, label: str, notes: dict[str, None]
+) -> list[Columns]:
     """Return `tables` where they have more than `most` rows at every second time of the first one, every third ..."""
     num_rows = max(item.num_rows for item in tables)
     step = max(1, math.ceil(num_rows / most))

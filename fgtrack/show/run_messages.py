@@ -23,7 +23,7 @@ from fgtrack.core.types import (
 from fgtrack.evaluation.placement import Placed, placed, road_lines, update_rows
 from fgtrack.inputs.ros.bag_writer import token
 from fgtrack.models.track_map import TrackMap
-from fgtrack.runs import NO_TRACK, Run, Table
+from fgtrack.runs import NO_TRACK, Columns, Run
 from fgtrack.show.palette import PALETTE, SENSORS
 from fgtrack.show.shapes import Colour, Entity, Point, Scene, Shape, ViewerMessage
 from fgtrack.show.states import (
@@ -49,7 +49,7 @@ _USED = (*FUSED, Disposition.MERGED)
 
 
 @dataclass(frozen=True)
-class Style:
+class RunLayer:
     """Prefix of the topics of a run, and the colour of its tracks."""
 
     prefix: str = ""
@@ -81,7 +81,7 @@ def map_messages(maps: dict[str, TrackMap], at_ns: int) -> Messages:
         yield ViewerMessage(at_ns, at_ns, "/map", Scene(tuple(entities), latched=True))
 
 
-def ego_messages(ego: Table, at_ns: int) -> Messages:
+def ego_messages(ego: Columns, at_ns: int) -> Messages:
     """The box of the ego in its own frame, once, and its state at every receipt."""
     rows = np.flatnonzero(
         np.isfinite(np.stack([ego[name] for name in STATE_NAMES[:3]])).all(axis=0)
@@ -102,7 +102,7 @@ def ego_messages(ego: Table, at_ns: int) -> Messages:
         )
 
 
-def truth_messages(truth: Table) -> Iterator[Messages]:
+def truth_messages(truth: Columns) -> Iterator[Messages]:
     """Boxes and poses of the true objects at every stamp; the ego is not among them."""
     table = located(truth.where(truth["object_id"] != EGO_ID))
     states = [
@@ -122,23 +122,23 @@ def truth_messages(truth: Table) -> Iterator[Messages]:
     yield _objects("/truth", table["stamp_ns"], table["stamp_ns"], states)
 
 
-def run_messages(run: Run, style: Style) -> Iterator[Messages]:
+def run_messages(run: Run, layer: RunLayer) -> Iterator[Messages]:
     """Streams of the messages that show a run alone, each in the order of log times."""
-    yield from _track_messages(run, style)
-    yield _past_messages(run, style)
+    yield from _track_messages(run, layer)
+    yield _past_messages(run, layer)
     # Final states appear as soon as nothing can change them any more.
     final = located(
         run.tables["smoothed"].where(run.tables["smoothed"]["kind"] == "final")
     )
     states = _states(final, run.tables["objects"])
     yield _objects(
-        f"{style.prefix}/smoothed", final_ns(run, final), final["stamp_ns"], states
+        f"{layer.prefix}/smoothed", final_ns(run, final), final["stamp_ns"], states
     )
-    yield _detection_messages(run, style)
-    yield _outcome_messages(run, style)
+    yield _detection_messages(run, layer)
+    yield _outcome_messages(run, layer)
 
 
-def _track_messages(run: Run, style: Style) -> Iterator[Messages]:
+def _track_messages(run: Run, layer: RunLayer) -> Iterator[Messages]:
     """At every tick boxes, numbers and speeds, the 2-sigma ellipses of the positions, and the poses."""
     tracks = located(run.tables["tracks"])
     states, axes = (
@@ -162,7 +162,7 @@ def _track_messages(run: Run, style: Style) -> Iterator[Messages]:
                 at_m,
                 yaw_rad,
                 size_m,
-                style.of_track(track_id, _OPACITY.get(status, _CONFIRMED)),
+                layer.of_track(track_id, _OPACITY.get(status, _CONFIRMED)),
             ),
             Shape(
                 "text",
@@ -181,7 +181,7 @@ def _track_messages(run: Run, style: Style) -> Iterator[Messages]:
                     turned_rad,
                     abs(speed_mps) * _SPEED_ARROW_S,
                     0.25,
-                    style.of_track(track_id),
+                    layer.of_track(track_id),
                 )
             )
         return Entity(f"track {track_id}", tuple(shapes))
@@ -195,7 +195,7 @@ def _track_messages(run: Run, style: Style) -> Iterator[Messages]:
         size_m = (2.0 * long_m, 2.0 * short_m, 0.02)
         shape = Shape(
             "cylinder",
-            style.of_track(track_id, 0.6),
+            layer.of_track(track_id, 0.6),
             size_m,
             at_m,
             above_m + 0.05,
@@ -203,14 +203,14 @@ def _track_messages(run: Run, style: Style) -> Iterator[Messages]:
         )
         return Entity(f"track {track_id}", (shape,)) if math.isfinite(long_m) else None
 
-    yield _scenes(f"{style.prefix}/tracks", ticks, box)
-    yield _scenes(f"{style.prefix}/ellipses", ticks, patch)
+    yield _scenes(f"{layer.prefix}/tracks", ticks, box)
+    yield _scenes(f"{layer.prefix}/ellipses", ticks, patch)
     yield _objects(
-        f"{style.prefix}/tracks", tracks["now_ns"], tracks["stamp_ns"], states
+        f"{layer.prefix}/tracks", tracks["now_ns"], tracks["stamp_ns"], states
     )
 
 
-def _past_messages(run: Run, style: Style) -> Messages:
+def _past_messages(run: Run, layer: RunLayer) -> Messages:
     """At every tick the past of each track as known then: a line through its lagged states to the present one."""
     lagged, present = located(run.tables["lagged"]), located(run.tables["tracks"])
     lagged = lagged.where(lagged["lag_s"] > 0.0)
@@ -230,17 +230,17 @@ def _past_messages(run: Run, style: Style) -> Messages:
         )
         return Entity(
             f"track {track_id}",
-            (_line(points_m.tolist(), _TRACK_LINE_M, style.of_track(track_id)),),
+            (_line(points_m.tolist(), _TRACK_LINE_M, layer.of_track(track_id)),),
         )
 
     return _scenes(
-        f"{style.prefix}/past",
+        f"{layer.prefix}/past",
         groups(now_ns[[rows[0] for rows in lines]]) if lines else (),
         line,
     )
 
 
-def _detection_messages(run: Run, style: Style) -> Messages:
+def _detection_messages(run: Run, layer: RunLayer) -> Messages:
     """At every receipt of a list its detections, grey where not used, arrows to their tracks now, and their poses.
     An arrow leads from the position of a detection to where its track is at the tick that fused it. It is strong where
     the detection came out of sequence, and faint where it did not.
@@ -287,15 +287,15 @@ def _detection_messages(run: Run, style: Style) -> Messages:
             if math.isfinite(sum(positions_m[row]))
         )
         scene = Scene((Entity(sensor, tuple(filter(None, marks)), _SHOWN_S),))
-        yield ViewerMessage(receipt_ns, stamp_ns, f"{style.prefix}/detections", scene)
+        yield ViewerMessage(receipt_ns, stamp_ns, f"{layer.prefix}/detections", scene)
         if arrows:
             scene = Scene((Entity(sensor, tuple(arrows), _SHOWN_S),))
-            yield ViewerMessage(receipt_ns, stamp_ns, f"{style.prefix}/arrivals", scene)
+            yield ViewerMessage(receipt_ns, stamp_ns, f"{layer.prefix}/arrivals", scene)
         if states:
             yield ViewerMessage(
                 receipt_ns,
                 stamp_ns,
-                f"{style.prefix}/detections/{token(sensor)}",
+                f"{layer.prefix}/detections/{token(sensor)}",
                 states,
             )
 
@@ -320,7 +320,7 @@ def _mark(where: Placed, row: int, colour: Colour) -> Shape | None:
     return _line([(from_x_m, from_y_m), end_m], 0.15, (*colour[:3], 0.5))
 
 
-def _outcome_messages(run: Run, style: Style) -> Messages:
+def _outcome_messages(run: Run, layer: RunLayer) -> Messages:
     """Rows of `updates.csv` at their receipts."""
     names = (
         "receipt_ns",
@@ -343,7 +343,7 @@ def _outcome_messages(run: Run, style: Style) -> Messages:
             "track_id": None if track_id == NO_TRACK else track_id,
             "delay_s": seconds(receipt_ns - stamp_ns),
         }
-        yield ViewerMessage(receipt_ns, stamp_ns, f"{style.prefix}/outcomes", values)
+        yield ViewerMessage(receipt_ns, stamp_ns, f"{layer.prefix}/outcomes", values)
 
 
 def _scenes(
@@ -376,7 +376,7 @@ def _objects(
         yield ViewerMessage(log, stamp, topic, tuple(states[row] for row in rows))
 
 
-def _states(states: Table, objects: Table) -> list[Detection]:
+def _states(states: Columns, objects: Columns) -> list[Detection]:
     """Pose of each row with its covariance, and class and size of its track, where known."""
     described = {
         track_id: Detection(
@@ -417,7 +417,7 @@ def _states(states: Table, objects: Table) -> list[Detection]:
 
 
 def _rows(
-    table: Table, *names: str
+    table: Columns, *names: str
 ) -> Iterator[tuple[Any, ...]]:  # Any: values of a row
     return zip(*(table[name].tolist() for name in names), strict=True)
 

@@ -9,7 +9,7 @@ from scipy.special import chdtri
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.matching import published_rows
-from fgtrack.runs import Run, Table
+from fgtrack.runs import Columns, Run
 
 #: Length, width and height of the box of an object of unknown size: those of a racing car.
 NOMINAL_SIZE_M = (4.8, 2.0, 1.2)
@@ -18,7 +18,7 @@ AROUND_95 = math.sqrt(float(chdtri(2, 0.05)))
 _DEFAULT_LAG_S = 1.0  # of `smoother.lag_s`, where the configuration has none
 
 
-def ellipses(states: Table, deviations: float) -> FloatArray:
+def ellipses(states: Columns, deviations: float) -> FloatArray:
     """Half axes (long, short) and direction in [0, pi) of the position covariances, shape (n, 3); NaN if unknown."""
     xx, xy, yy = (states[name] for name in ("p_x_x", "p_x_y", "p_y_y"))
     covariances = np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
@@ -30,7 +30,7 @@ def ellipses(states: Table, deviations: float) -> FloatArray:
     return result
 
 
-def located(table: Table) -> Table:
+def located(table: Columns) -> Columns:
     """Rows with a finite position."""
     return table.where(np.isfinite(table["x_m"]) & np.isfinite(table["y_m"]))
 
@@ -49,7 +49,7 @@ def track_positions(run: Run, update_rows: IntArray) -> FloatArray:
     return result
 
 
-def final_ns(run: Run, final: Table) -> IntArray:
+def final_ns(run: Run, final: Columns) -> IntArray:
     """Time at which each row of `final` left the window of the smoother, or the run ended, shape (n,)."""
     lag_s = (run.config.get("smoother") or {}).get("lag_s", _DEFAULT_LAG_S)
     end_ns = run.tables["timing"]["now_ns"].max(initial=0)

@@ -176,8 +176,8 @@ class Candidates(Lazy[Candidate]):
     def __len__(self) -> int:
         return len(self.leaders)
 
-    def made(self, index: int) -> Candidate:
-        """See `Lazy.made`."""
+    def item(self, index: int) -> Candidate:
+        """See `Lazy.item`."""
         leader, point = self.leaders[index], self.lines[index]
         [(group, members, _)] = self.split(np.array([index]))
         own = Measurements(group.stack)[members[0]]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgtrack.config.shipped import read_config
+from fgtrack.config.reading import read_config
 from fgtrack.core.types import Detection, DetectionList
 from fgtrack.models.sensors import SensorModel
 from fgtrack.pipeline.live import Tracker

@@ -11,7 +11,7 @@ import pytest
 import fgtrack
 from fgtrack.cli.main import run as run_command
 from fgtrack.clocks.arrivals import Arrivals, window_findings
-from fgtrack.config.shipped import read_config
+from fgtrack.config.reading import read_config
 from fgtrack.core.types import Detection, DetectionList, EgoState, Message, TruthState
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.inputs.source import open_input

@@ -9,8 +9,8 @@ import pytest
 
 from fgtrack.cli.main import run
 from fgtrack.clocks.offsets import OffsetReport, SensorOffset, estimate_offsets
+from fgtrack.config.reading import read_scenario
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_scenario
 from fgtrack.config.yaml_file import load
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.time import nanoseconds

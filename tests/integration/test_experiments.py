@@ -9,7 +9,7 @@ import pytest
 from support.messages import shared
 from support.scripts import EXPERIMENTS, load
 
-from fgtrack.config.shipped import read_config
+from fgtrack.config.reading import read_config
 
 sys.path.insert(0, str(EXPERIMENTS / "real_data"))
 

@@ -27,7 +27,7 @@ from fgtrack.core.types import (
     UpdateRecord,
 )
 from fgtrack.inputs.ros.bag import Bag
-from fgtrack.runs import Run, RunWriter, Table, load_run
+from fgtrack.runs import Columns, Run, RunWriter, load_run
 from fgtrack.show.export import viewer_messages
 from fgtrack.show.shapes import Scene, Shape, ViewerMessage
 
@@ -78,7 +78,7 @@ def read_bag(path: Path) -> dict[str, list[tuple[int, Any]]]:
     return dict(found)
 
 
-def pairs(table: Table, log: str, stamp: str) -> Times:
+def pairs(table: Columns, log: str, stamp: str) -> Times:
     return Counter(zip(table[log].tolist(), table[stamp].tolist(), strict=True))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from fgtrack.config.shipped import read_config
+from fgtrack.config.reading import read_config
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import DetectionList, EgoState, TruthState
 from fgtrack.evaluation.metrics import evaluate

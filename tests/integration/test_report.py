@@ -17,7 +17,7 @@ import fgtrack
 from fgtrack.cli.main import run as command
 from fgtrack.evaluation.placement import placed
 from fgtrack.evaluation.runs import evaluated
-from fgtrack.runs import Table
+from fgtrack.runs import Columns
 from fgtrack.show.palette import style_of
 from fgtrack.show.playback import playback
 
@@ -230,8 +230,8 @@ def test_a_sensor_whose_clock_is_years_off_has_no_stamps(folder: Path) -> None:
     run = fgtrack.load_run(folder / "runs" / NAMES[0])
     off = {"stamp_ns": run.tables["detections"]["stamp_ns"] - 10**18}
     detections, updates = (
-        Table({**run.tables["detections"], **off}),
-        Table({**run.tables["updates"], **off}),
+        Columns({**run.tables["detections"], **off}),
+        Columns({**run.tables["updates"], **off}),
     )
     found = playback(
         evaluated(run.with_tables(detections=detections, updates=updates))

@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 from fgtrack.core.types import (
     Detection,
     DetectionList,
@@ -28,7 +28,7 @@ from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.evaluation.tables.compare import compare
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.pipeline.replay import replay
-from fgtrack.runs import Run, Table, load_run
+from fgtrack.runs import Columns, Run, load_run
 
 MS = 1_000_000
 NOW_NS = 1_600_000_000_000_000_000
@@ -166,7 +166,7 @@ def run_of(config: Config, folder: Path) -> Run:
     return load_run(folder / "run")
 
 
-def covariances(table: Table) -> FloatArray:
+def covariances(table: Columns) -> FloatArray:
     """Shape (rows, 5, 5)."""
     names = [name for name in table if name.startswith("p_") and "accel" not in name]
     P = np.zeros((table.num_rows, 5, 5))

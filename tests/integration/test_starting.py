@@ -12,7 +12,7 @@ from support.messages import START_NS, drive, shared
 import fgtrack
 from fgtrack.advice.starting import starting_config
 from fgtrack.cli.main import run
-from fgtrack.config.shipped import read_config
+from fgtrack.config.reading import read_config
 from fgtrack.core.types import DetectionList, EgoState, TruthState
 from fgtrack.inputs.ros.bag_writer import write_bag
 from fgtrack.inputs.settings import Field

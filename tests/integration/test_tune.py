@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from fgtrack.cli.main import run
+from fgtrack.config.reading import read_config, read_scenario
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config, read_scenario
 from fgtrack.config.yaml_file import load
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Detection, DetectionList

@@ -8,7 +8,7 @@ from support.examples import slow
 
 import fgtrack
 from fgtrack.advice.outcome import Outcome
-from fgtrack.config.shipped import read_scenario
+from fgtrack.config.reading import read_scenario
 from fgtrack.core.types import DetectionList, Message, TruthState
 from fgtrack.runs import Run
 from fgtrack.sim.simulate import simulate

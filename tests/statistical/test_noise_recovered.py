@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fgtrack.config.reading import read_config, read_scenario
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config, read_scenario
 from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Message
 from fgtrack.models.motion import CTRV

@@ -1,7 +1,7 @@
 """The paper's tracker, for tests that mean it and not whatever is the default."""
 
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 
 
 def paper(*settings: str) -> Config:

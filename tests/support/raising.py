@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fgtrack.config.shipped import read_config
+from fgtrack.config.reading import read_config
 from fgtrack.core.types import Detection, DetectionList, FloatArray
 from fgtrack.estimation.base import Measurement, UpdateResult, UpdateStatus
 from fgtrack.estimation.registry import ESTIMATORS, Claims

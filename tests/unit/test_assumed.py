@@ -6,9 +6,9 @@ import pytest
 from support.paper import paper
 from support.tracking import START_NS, message
 
+from fgtrack.config.reading import read_config, read_scenario
 from fgtrack.config.recorded import recorded_of
 from fgtrack.config.settings import Config, Effective
-from fgtrack.config.shipped import read_config, read_scenario
 from fgtrack.config.yaml_file import plain
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import Detection, DetectionList, EgoState

@@ -113,8 +113,13 @@ def test_an_estimator_gets_its_options_and_refuses_others() -> None:
         )
 
 
-def test_a_former_name_is_understood_and_replaced() -> None:
+def test_a_former_name_is_replaced_and_the_warning_names_both_methods(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     assert Config(estimator="backward-forward").estimator == "rewind-forget"
+    [line] = caplog.messages
+    assert "now named 'rewind-forget'" in line
+    assert "Karle et al. 2023, on a grid of 10 ms, is 'ekf-backward-forward'" in line
     with pytest.raises(CallError, match="'backward-forward' is now 'rewind-forget'"):
         load(Config, None, ["options={backward-forward: {}}"])
 

@@ -14,15 +14,15 @@ from fgtrack.evaluation.matching import position_squares
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.scores.innovations import FEWEST, Autocorrelation
 from fgtrack.evaluation.scores.statistics import ChiSquareMean
-from fgtrack.runs import COVARIANCE_COLUMNS, Run, Table
+from fgtrack.runs import COVARIANCE_COLUMNS, Columns, Run
 
 
-def table_of(covariances: np.ndarray, errors: np.ndarray) -> Table:
+def table_of(covariances: np.ndarray, errors: np.ndarray) -> Columns:
     rows, columns = np.triu_indices(5)
     entries = dict(
         zip(COVARIANCE_COLUMNS, covariances[:, rows, columns].T, strict=True)
     )
-    return Table({**entries, "x_m": errors[:, 0], "y_m": errors[:, 1]})
+    return Columns({**entries, "x_m": errors[:, 0], "y_m": errors[:, 1]})
 
 
 # --- normalised squares

@@ -14,7 +14,7 @@ from fgtrack.evaluation.diagnostics import (
     noise_diagnostics,
     unused,
 )
-from fgtrack.runs import Run, Table
+from fgtrack.runs import Columns, Run
 from fgtrack.runs.schema import column
 
 CONFIG = """
@@ -198,7 +198,7 @@ def test_most_states_refused_and_jumps_of_the_ego_are_told(
     meta: dict[str, object], text: str | None, tmp_path: Path
 ) -> None:
     run = run_of(tmp_path / "run", lists(Disposition.IN_SEQUENCE))
-    ego = Table({name: column(name, [0, 1, 2, 3]) for name in run.tables["ego"]})
+    ego = Columns({name: column(name, [0, 1, 2, 3]) for name in run.tables["ego"]})
     found = list(
         map(
             str,
@@ -225,7 +225,7 @@ def test_angles_in_degrees_are_told(tmp_path: Path) -> None:
         "stamp_ns": np.arange(2),
         "receipt_ns": np.arange(2),
     }
-    found = diagnostics(run.with_tables(ego=Table(ego), detections=Table(of_radar)))
+    found = diagnostics(run.with_tables(ego=Columns(ego), detections=Columns(of_radar)))
     assert [str(one).split(":")[:2] for one in found[:2]] == [
         ["ego", " yaw_rad goes up to 67"],
         ["radar", " bearing_rad goes up to 12"],

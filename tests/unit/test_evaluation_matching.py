@@ -13,8 +13,9 @@ from scipy.optimize import linear_sum_assignment
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import TruthState
 from fgtrack.evaluation.matching import NO_OBJECT, match, nearest_pairs, track_errors
+from fgtrack.evaluation.settings import EvaluationConfig, evaluation_settings
 from fgtrack.evaluation.truth import TruePath, true_paths
-from fgtrack.runs import NO_TRACK, EvaluationConfig
+from fgtrack.runs import NO_TRACK
 
 S_NS = 1_000_000_000
 
@@ -230,4 +231,4 @@ def test_a_configuration_that_cannot_be_used_is_one_clear_error(
 ) -> None:
     run = write_run(tmp_path / "run", config_text=text)
     with pytest.raises(DataError, match=rf"run.config\.yaml: {message}"):
-        _ = run.evaluation
+        evaluation_settings(run)

@@ -19,7 +19,8 @@ from fgtrack.evaluation.scores.multi_object import (
     gospa,
     multi_object_metrics,
 )
-from fgtrack.runs import EvaluationConfig, Run
+from fgtrack.evaluation.settings import EvaluationConfig
+from fgtrack.runs import Run
 
 C_M, GATE_M = 5.0, 4.0
 

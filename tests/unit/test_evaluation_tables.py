@@ -555,3 +555,14 @@ def test_labels_are_as_long_as_they_must_be(tmp_path: Path) -> None:
     assert list(labelled([replace(runs[0], meta={"estimator": "ekf-replay"})])) == [
         "smoother (ekf-replay)"
     ]
+
+
+def test_tables_are_a_mapping_of_names_to_frames() -> None:
+    table = Table("lag", [{"run": "a", "error_m": 0.5}], [Column("run")])
+    tables = Tables({"lag": table})
+    assert "lag" in tables
+    assert "tracking" not in tables
+    assert list(tables) == ["lag"]
+    assert len(tables) == 1
+    assert [frame["error_m"].tolist() for frame in tables.values()] == [[0.5]]
+    assert tables.get("tracking") is None

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from support.tracking import START_NS, candidate, candidates_of, match, ms
 
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 from fgtrack.config.yaml_file import load
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Detection, DetectionList, TrackStatus

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 from fgtrack.core.types import Detection, DetectionList, Disposition
 from fgtrack.estimation.filters.replay_bank import ReplayBank
 from fgtrack.models.sensors import SensorModel

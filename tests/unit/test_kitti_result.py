@@ -13,7 +13,7 @@ from fgtrack.core.errors import CallError, DataError
 from fgtrack.evaluation.kitti_result import write_kitti_result
 from fgtrack.inputs.formats.kitti_view import Box, read_views
 from fgtrack.pipeline.public import replay
-from fgtrack.runs import Table
+from fgtrack.runs import Columns
 
 SIZE = "1.5 1.6 4.0"  # height, width, length
 FRAMES = range(30)
@@ -121,7 +121,7 @@ def test_without_existence_probabilities_the_score_is_that_of_the_detections(
     run, oxts_file = replayed
     tracks = run.tables["tracks"]
     counted = run.with_tables(
-        tracks=Table({**tracks, "score": np.full(tracks.num_rows, np.nan)})
+        tracks=Columns({**tracks, "score": np.full(tracks.num_rows, np.nan)})
     )
     write_kitti_result(counted, oxts_file, tmp_path / "0001.txt")
     assert {float(fields[17]) for fields in rows(tmp_path / "0001.txt").values()} == {

@@ -11,7 +11,7 @@ import pytest
 
 import fgtrack
 from fgtrack.advice.ledger import Ledger, Part, _sentence, ledger
-from fgtrack.config.shipped import read_config, read_scenario
+from fgtrack.config.reading import read_config, read_scenario
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import DetectionList, Message, TruthState
 from fgtrack.inputs.stream import write_stream

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from fgtrack.config.shipped import read_config
+from fgtrack.config.reading import read_config
 from fgtrack.core.geometry import rotation, wrap_angle
 from fgtrack.core.linalg import mahalanobis_squared
 from fgtrack.core.time import NS_PER_S, nanoseconds

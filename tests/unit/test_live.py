@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgtrack.config.shipped import read_config, read_scenario
+from fgtrack.config.reading import read_config, read_scenario
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import (
     Detection,

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 from fgtrack.cli.main import app
 from fgtrack.clocks.arrivals import arrivals_of, overtaken, window_findings
 from fgtrack.clocks.stamps import stamp_findings
-from fgtrack.config.shipped import read_config
+from fgtrack.config.reading import read_config
 from fgtrack.core.types import Detection, DetectionList
 from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.evaluation.metrics import evaluate

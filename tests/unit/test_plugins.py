@@ -8,10 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fgtrack.config.shipped import read_scenario
+from fgtrack.config.reading import read_scenario
 from fgtrack.config.yaml_file import plain
 from fgtrack.core.errors import CallError
-from fgtrack.core.plugins import Registry
+from fgtrack.core.plugins import Alias, Registry
 from fgtrack.estimation.base import Measurement, Start, UpdateStatus
 from fgtrack.estimation.registry import (
     ESTIMATORS,
@@ -57,7 +57,11 @@ def registry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Registry:
         zero="leaving_plugin:Part",
     )
     monkeypatch.syspath_prepend(tmp_path)
-    return Registry("part", {GROUP: {"ours": "pathlib:Path"}}, aliases={"old": "ours"})
+    return Registry(
+        "part",
+        {GROUP: {"ours": "pathlib:Path"}},
+        aliases={"old": Alias("ours", "It is ours.")},
+    )
 
 
 def test_built_in_parts_come_first_and_plug_ins_are_loaded_by_name(
@@ -84,7 +88,7 @@ def test_the_source_of_a_plug_in_follows_its_code(
 def test_a_name_that_is_taken_is_left_out_with_a_line(
     registry: Registry, caplog: pytest.LogCaptureFixture
 ) -> None:
-    assert registry.load("old") is Path
+    assert registry.load("ours") is Path
     assert [
         record.getMessage()
         for record in caplog.records
@@ -117,7 +121,13 @@ def test_an_unknown_name_gives_the_nearest_and_all(registry: Registry) -> None:
         match=r"^part 'prt' is unknown, did you mean 'part': there are ours, part, wrong",
     ):
         registry.resolve("prt")
-    assert registry.resolve("old") == "ours"
+
+
+def test_a_former_name_gives_the_present_part_with_a_warning(
+    registry: Registry, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert registry.load("old") is Path
+    assert caplog.messages[-1] == "part 'old' is now named 'ours'. It is ours."
 
 
 @pytest.mark.parametrize("name", list(ESTIMATORS))

@@ -9,8 +9,8 @@ import pytest
 from support.messages import START_NS, standing
 from unit.evaluation_runs import ROUND, WEST, update, write_run
 
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.runs import (
     by_recording,

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import fgtrack
+from fgtrack.config.reading import read_config
 from fgtrack.config.settings import Config
-from fgtrack.config.shipped import read_config
 from fgtrack.core.types import Detection, DetectionList
 from fgtrack.pipeline.assumptions.assumed import assumed, source_of
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fgtrack.config.reading import read_scenario
 from fgtrack.config.settings import Config, MapConfig, MotionConfig
-from fgtrack.config.shipped import read_scenario
 from fgtrack.core.types import EgoState, Message
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.pipeline.replay import replay, replay_in_memory

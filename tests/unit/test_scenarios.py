@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fgtrack.config.shipped import read_scenario
+from fgtrack.config.reading import read_scenario
 from fgtrack.core.types import DetectionList, FloatArray, Message, TruthState
 from fgtrack.sim.simulate import simulate
 

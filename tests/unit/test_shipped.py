@@ -4,14 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from fgtrack.config.shipped import (
-    Kind,
-    find_file,
-    read_config,
-    read_scenario,
-    shipped,
-    summary,
-)
+from fgtrack.config.reading import read_config, read_scenario
+from fgtrack.config.shipped import Kind, find_file, shipped, summary
 from fgtrack.core.errors import CallError
 
 

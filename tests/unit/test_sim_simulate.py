@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fgtrack.config.shipped import read_scenario
+from fgtrack.config.reading import read_scenario
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import DetectionList, EgoState, Message, TruthState
 from fgtrack.sim.delays import NoDelay

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgtrack.config.shipped import read_scenario
+from fgtrack.config.reading import read_scenario
 from fgtrack.config.yaml_file import dump, plain
 from fgtrack.core.errors import CallError
 from fgtrack.inputs.stream import write_stream

@@ -2,7 +2,14 @@
 
 import numpy as np
 
-from fgtrack import StatesAt, TrackState, UpdateResult, UpdateStatus, initial_state, robust_weight
+from fgtrack import (
+    StatesAt,
+    TrackState,
+    UpdateResult,
+    UpdateStatus,
+    initial_state,
+    robust_weight,
+)
 
 
 class DropBank:

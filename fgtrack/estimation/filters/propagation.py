@@ -77,8 +77,8 @@ class States(Lazy[TrackState]):
     def __len__(self) -> int:
         return len(self.means)
 
-    def made(self, index: int) -> TrackState:
-        """See `Lazy.made`."""
+    def item(self, index: int) -> TrackState:
+        """See `Lazy.item`."""
         return TrackState(
             self.stamps_ns[index], self.means[index], self.covariances[index]
         )

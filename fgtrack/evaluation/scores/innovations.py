@@ -14,7 +14,7 @@ from fgtrack.evaluation.matching import Matching, confirmed, neighbours, positio
 from fgtrack.evaluation.placement import roads
 from fgtrack.evaluation.scores.statistics import NORMAL_95, ChiSquareMean, Moments
 from fgtrack.models.measurement import ANGULAR
-from fgtrack.runs import NO_TRACK, Run, Table
+from fgtrack.runs import NO_TRACK, Columns, Run
 
 #: Every residual, in the order in which it is shown.
 RESIDUAL_NAMES = ("along_m", "across_m", *MEASURABLE)
@@ -76,20 +76,20 @@ def residuals(run: Run) -> Mapping[str, FloatArray]:
     return {"along_m": along_m, "across_m": across_m, **values}
 
 
-def by_sensor(table: Table) -> Iterator[tuple[str, Table]]:
+def by_sensor(table: Columns) -> Iterator[tuple[str, Columns]]:
     """Yield the sensors of `table` by name, each with its rows."""
     for sensor in np.unique(table["sensor"]).tolist():
         yield sensor, table.where(table["sensor"] == sensor)
 
 
-def num_measured(updates: Table) -> IntArray:
+def num_measured(updates: Columns) -> IntArray:
     """Number of components of each innovation, the degrees of freedom of its NIS, shape (rows,)."""
     return np.asarray(
         np.sum([np.isfinite(updates[f"res_{name}"]) for name in MEASURABLE], axis=0)
     )
 
 
-def message_delays(updates: Table) -> tuple[IntArray, FloatArray]:
+def message_delays(updates: Columns) -> tuple[IntArray, FloatArray]:
     """Receipt in ns and delay in s of the messages with a detection in `updates` of one sensor, by receipt."""
     messages = np.unique(
         np.stack([updates["receipt_ns"], updates["stamp_ns"]], axis=-1), axis=0
@@ -97,7 +97,7 @@ def message_delays(updates: Table) -> tuple[IntArray, FloatArray]:
     return messages[:, 0], (messages[:, 0] - messages[:, 1]) / NS_PER_S
 
 
-def autocorrelation(updates: Table) -> Autocorrelation | None:
+def autocorrelation(updates: Columns) -> Autocorrelation | None:
     """Return the autocorrelation of the innovations in `updates` of one sensor; None where no track has enough of them.
     It is that of the positions, of a sensor without them that of the first component. Along a track, in the order of
     processing, the innovations nu of n updates have at lag 1 the normalised autocorrelation

@@ -18,7 +18,7 @@ from fgtrack.evaluation.matching import (
 )
 from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.evaluation.truth import true_states
-from fgtrack.runs import Run, Table
+from fgtrack.runs import Columns, Run
 
 WINDOW: Literal["window"] = "window"
 """The lag of a final state: the window's length, or less where the track ended before."""
@@ -61,7 +61,7 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
     if matching is None:
         return ()
     lagged, smoothed = run.tables["lagged"], run.tables["smoothed"]
-    parts: dict[float | Literal["window"], Table] = {
+    parts: dict[float | Literal["window"], Columns] = {
         lag_s: lagged.where(lagged["lag_s"] == lag_s)
         for lag_s in np.unique(lagged["lag_s"]).tolist()
         if lag_s > 0.0
@@ -111,8 +111,8 @@ def final_errors(run: Run, matching: Matching) -> TrackErrors:
 
 
 def _with_truth(
-    run: Run, matching: Matching, states: Table
-) -> tuple[Table, FloatArray, IntArray]:
+    run: Run, matching: Matching, states: Columns
+) -> tuple[Columns, FloatArray, IntArray]:
     """Return those of `states` that belong to an object, its true states there, shape (n, 5), and their track rows."""
     before, after = neighbours(
         matching.tracks, "stamp_ns", states["stamp_ns"], states["track_id"]

@@ -300,8 +300,11 @@ class Table:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Tables:
-    """Tables by name: `tables["tracking"]` is a DataFrame, `tables[["tracking", "lag"]]` are two of the tables."""
+class Tables(Mapping[str, DataFrame]):
+    """Tables by name: `tables["tracking"]` is a DataFrame.
+
+    `tables[["tracking", "lag"]]` gives a `Tables` with these two.
+    """
 
     tables: Mapping[str, Table]
     details: Mapping[str, Any] = field(default_factory=dict)  # Any: JSON values
@@ -320,6 +323,16 @@ class Tables:
             return Tables({each: self.tables[each].in_full() for each in name})
         return self.tables[name].data
 
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.tables)
+
+    def __len__(self) -> int:
+        return len(self.tables)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.tables
+
+    __eq__, __hash__ = object.__eq__, object.__hash__  # frames have no truth value
     __str__ = _text
 
     def __repr__(self) -> str:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation.runs import OneRun, one_evaluated, start_ns
-from fgtrack.runs import Table
+from fgtrack.runs import Columns
 from fgtrack.runs.schema import Column
 from fgtrack.show.figures.paper import Paper, Sheet, styled
 from fgtrack.show.figures.style import legend_above, usual_step_ns
@@ -91,7 +91,7 @@ def arrivals(run: OneRun, **paper: Unpack[Paper]) -> Figure:
     return sheet.figure
 
 
-def _draw_flow(axes: Axes, updates: Table, fates: Column, first_ns: int) -> None:
+def _draw_flow(axes: Axes, updates: Columns, fates: Column, first_ns: int) -> None:
     """A line for each detection of the busiest part, a pair of levels for each sensor."""
     own = (
         updates["stamp_ns"][updates["sensor"] == name]

@@ -18,7 +18,7 @@ from fgtrack.evaluation.runs import Runs, evaluated
 from fgtrack.evaluation.truth import TruePath, true_paths
 from fgtrack.show.figures.paper import Paper, Sheet, is_column, styled
 from fgtrack.show.figures.style import GREY, legend_above, run_styles
-from fgtrack.show.palette import Style
+from fgtrack.show.palette import CurveStyle
 
 STEP_S = 0.01
 """Between estimates; that of the grid of the backward-forward EKF, whose states are constant in between."""
@@ -189,7 +189,7 @@ def _offsets(
 
 
 def _draw_present(
-    axes: Axes, style: Style, ends_m: Sequence[Any], reach_m: float, centre: str
+    axes: Axes, style: CurveStyle, ends_m: Sequence[Any], reach_m: float, centre: str
 ) -> None:
     """The present before and after, seen from the reference."""
     ring_m = max(
@@ -241,7 +241,7 @@ def _draw_present(
 
 def _draw_errors(
     axes: Axes,
-    style: Style,
+    style: CurveStyle,
     one: CloseUp,
     pair: Sequence[tuple[FloatArray, FloatArray]],
     forgets: bool,

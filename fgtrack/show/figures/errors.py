@@ -28,7 +28,7 @@ from fgtrack.show.figures.style import (
     run_styles,
     usual_step_ns,
 )
-from fgtrack.show.palette import Style
+from fgtrack.show.palette import CurveStyle
 
 #: What is drawn, with its name, its unit, and that unit over the one of the values.
 _QUANTITIES = {
@@ -106,7 +106,7 @@ def errors(runs: Runs, object_id: int | None = None, **paper: Unpack[Paper]) -> 
     return sheet.figure
 
 
-_Curve = tuple[str, Style, float, IntArray, Mapping[str, FloatArray]]
+_Curve = tuple[str, CurveStyle, float, IntArray, Mapping[str, FloatArray]]
 """Label, style, usual step in ns, rising times in ns since the start of the recording, and errors."""
 
 

@@ -12,7 +12,7 @@ from fgtrack.evaluation.matching import confirmed
 from fgtrack.evaluation.placement import placed, road_lines, roads
 from fgtrack.evaluation.runs import EvaluatedRun, OneRun, one_evaluated, start_ns
 from fgtrack.evaluation.truth import true_paths
-from fgtrack.runs import Run, Table
+from fgtrack.runs import Columns, Run
 from fgtrack.show.figures.paper import Paper, Sheet, styled
 from fgtrack.show.figures.style import (
     GREY,
@@ -170,13 +170,13 @@ def _near(stamps_ns: IntArray, window: _Window | None) -> BoolArray:
     return np.asarray(np.abs(stamps_ns - middle_ns) <= reach_ns)
 
 
-def _positions(table: Table) -> FloatArray:
+def _positions(table: Columns) -> FloatArray:
     """Shape (n, 2)."""
     return np.stack([table["x_m"], table["y_m"]], axis=-1)
 
 
 def _draw_objects(
-    axes: Axes, one: EvaluatedRun, tracks: Table, window: _Window | None
+    axes: Axes, one: EvaluatedRun, tracks: Columns, window: _Window | None
 ) -> None:
     """Truth and tracks, in their colours; without truth every track has one of its own."""
     ids, step_ns = (

@@ -22,7 +22,7 @@ from PIL import Image
 from fgtrack.core.errors import printable_lines
 from fgtrack.core.types import FloatArray, IntArray
 from fgtrack.evaluation.runs import EvaluatedRun
-from fgtrack.show.palette import Style, styles
+from fgtrack.show.palette import CurveStyle, styles
 
 _RC: Any = mpl.rcParams  # Any: its keys are a Literal of all names
 WRONG = "#000000"
@@ -79,7 +79,7 @@ class StyledFigure(Figure):
         )
 
 
-def run_styles(runs: Sequence[EvaluatedRun]) -> dict[str, Style]:
+def run_styles(runs: Sequence[EvaluatedRun]) -> dict[str, CurveStyle]:
     """Return the styles of the curves of the runs, by label: colours are those of the estimators."""
     result = styles(
         [str(item.run.meta.get("estimator") or item.label) for item in runs]
