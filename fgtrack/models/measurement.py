@@ -13,15 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.geometry import (
-    cartesian,
-    cartesian_gradient,
-    polar,
-    polar_gradient,
-    wrap_angles,
-)
-from fgtrack.core.types import MEASURABLE, STATE_NAMES, YAW_RATE, FloatArray, IntArray
-from fgtrack.models.motion import CARTESIAN, MIN_SPEED_MPS, POLAR, MotionModel
+from fgtrack.core.geometry import cartesian, cartesian_gradient
+from fgtrack.core.linalg import kernels
+from fgtrack.core.types import MEASURABLE, STATE_NAMES, FloatArray, IntArray
+from fgtrack.models.motion import CARTESIAN, POLAR, MotionModel
 
 #: The gradient of a bearing by the position grows as 1 / range; below this range it stays as it is there.
 MIN_RANGE_M = 1e-6
@@ -29,6 +24,7 @@ MIN_RANGE_M = 1e-6
 SLOW_MPS = 1.0
 #: What a measurement may be of: what a detection measures, and what the map gives for a moving object.
 COMPONENTS = (*MEASURABLE, "curvature_radpm")
+_KERNELS = "fgtrack.models.measurement_kernels"
 #: Components that are angles.
 ANGULAR = ("yaw_rad", "bearing_rad")
 #: Components that are relative to the sensor.
@@ -102,17 +98,24 @@ class MeasurementModel:
         """Measurement expected of the states `x`, shape (..., n) -> (..., k). Angles are not wrapped."""
         if self.linear:
             return x.take(self.selected, axis=-1)
-        return _observed(self.components, x, pose, self._cartesian)[0]
+        return self._observed(self.codes, x, pose)[0]
 
     def jacobian(self, x: FloatArray, pose: SensorPose = AT_ORIGIN) -> FloatArray:
         """Derivative H of `predict` by `x`, (..., k, n), read-only of a linear model; finite, see `MIN_RANGE_M`."""
-        n = x.shape[-1]
-        shape = (*x.shape[:-1], len(self.components), n)
         if self.linear:
+            n = x.shape[-1]
+            shape = (*x.shape[:-1], len(self.components), n)
             return np.broadcast_to(self.selection(n), shape)
-        H = np.zeros(shape)
-        H[..., :5] = _observed(self.components, x, pose, self._cartesian)[1][..., :n]
-        return H
+        return self._observed(self.codes, x, pose)[1]
+
+    def predict_with_jacobian(
+        self, x: FloatArray, pose: SensorPose = AT_ORIGIN
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return `predict` (..., k), and `jacobian`, of a linear model one (k, n) for all states."""
+        if self.is_compiled and not self.linear:
+            return self._observed(self.codes, x, pose)
+        H = self.selection(x.shape[-1]) if self.linear else self.jacobian(x, pose)
+        return self.predict(x, pose), H
 
     def linearised(
         self,
@@ -124,15 +127,16 @@ class MeasurementModel:
         """Innovation y (..., k) of z (..., k) at the states x (..., n), and its Jacobian H (k, n) or (..., k, n).
         `residual` may replace the model's own.
         """
-        y = (residual or self.residual)(z, self.predict(x, pose))
-        return y, self.selection(x.shape[-1]) if self.linear else self.jacobian(x, pose)
+        h, H = self.predict_with_jacobian(x, pose)
+        return (residual or self.residual)(z, h), H
 
     def pose_jacobian(self, x: FloatArray, pose: SensorPose) -> FloatArray:
         """Derivative of `predict` by the entries of `pose`, shape (..., k, 5); finite as `jacobian` is."""
         D = np.zeros((*x.shape[:-1], len(self.components), len(pose)))
         if not self.relative:
             return D
-        _, G = _observed((*self.components, "range_m"), x, pose, self._cartesian)
+        range_code = COMPONENTS.index("range_m")
+        _, G = self._observed(np.append(self.codes, range_code), x, pose)
         for row in self.relative:
             D[..., row, :2] = -G[..., row, :2]  # the offset alone counts
             if self.components[row] == "bearing_rad":
@@ -151,12 +155,9 @@ class MeasurementModel:
 
     def residual(self, z: FloatArray, z_predicted: FloatArray) -> FloatArray:
         """Measured minus predicted, shape (..., k), with angles in (-pi, pi]; the only function that wraps."""
-        y = np.asarray(z - z_predicted)
-        for index in self.angular:
-            angles = y[..., index]
-            wrapped = wrap_angles(angles)
-            if wrapped is not angles:
-                y[..., index] = wrapped
+        y = np.array(z - z_predicted, dtype=np.float64, order="C")
+        if self.angular:
+            kernels(_KERNELS).wrap(self.codes, y.reshape(-1, y.shape[-1]))
         return y
 
     def part(self, rows: Sequence[int]) -> "MeasurementModel":
@@ -166,8 +167,26 @@ class MeasurementModel:
         )
 
     @cached_property
-    def _cartesian(self) -> bool:
-        return self.state_names[:4] == CARTESIAN
+    def codes(self) -> IntArray:
+        """Indices of the components in `COMPONENTS`, shape (k,): their numbers in compiled loops."""
+        return np.array([COMPONENTS.index(name) for name in self.components])
+
+    @cached_property
+    def is_compiled(self) -> bool:
+        """True if compiled loops may take the shipped equations: no subclass has replaced a part of them."""
+        return type(self) is MeasurementModel
+
+    def _observed(
+        self, codes: IntArray, x: FloatArray, pose: SensorPose
+    ) -> tuple[FloatArray, FloatArray]:
+        """Values (..., k) of the components `codes`, and their derivatives by the state, shape (..., k, n)."""
+        k, n = len(codes), x.shape[-1]
+        states = np.array(x, dtype=np.float64, order="C").reshape(-1, n)
+        h, H = np.empty((len(states), k)), np.empty((len(states), k, n))
+        seen_from = np.array(pose, dtype=np.float64)
+        is_cartesian = self.state_names[:4] == CARTESIAN
+        kernels(_KERNELS).observations(codes, is_cartesian, states, seen_from, h, H)
+        return h.reshape(*x.shape[:-1], k), H.reshape(*x.shape[:-1], k, n)
 
     @cached_property
     def _selections(self) -> dict[int, FloatArray]:
@@ -223,59 +242,3 @@ def position_gradient(
 
 def _polar_rows(components: tuple[str, ...]) -> list[int]:
     return [components.index("bearing_rad"), components.index("range_m")]
-
-
-def _observed(
-    names: Sequence[str], x: FloatArray, pose: SensorPose, cartesian_state: bool
-) -> tuple[FloatArray, FloatArray]:
-    """Values (..., k) of the components `names`, and their derivatives (..., k, 5) by the state as far as a yaw rate.
-    A curvature is the yaw rate over the speed, times v^2 / (v^2 + v0^2) with v0 = `SLOW_MPS`, which falls to 0 at rest.
-    """
-    shape = *x.shape[:-1], len(names)
-    z, G = np.empty(shape), np.zeros((*shape, 5))
-    offset, motion = x[..., :2] - np.array(pose[:2]), x[..., 2:4]
-    yaw_speed, velocity, by_yaw_speed, by_velocity = (
-        motion,
-        motion,
-        np.eye(2),
-        np.eye(2),
-    )
-    if cartesian_state:
-        yaw_speed, by_yaw_speed = polar(motion), polar_gradient(motion, MIN_SPEED_MPS)
-    else:
-        velocity, by_velocity = cartesian(motion), cartesian_gradient(motion)
-    bearing_range, gradient = polar(offset), polar_gradient(offset, MIN_RANGE_M)
-    line_of_sight, relative = gradient[..., 1, :], velocity - np.array(pose[3:])
-    for row, name in enumerate(names):
-        if name in POLAR[:2]:
-            column = POLAR.index(name)
-            z[..., row], G[..., row, column] = x[..., column], 1.0
-        elif name in POLAR:
-            column = POLAR.index(name) - 2
-            z[..., row], G[..., row, 2:4] = (
-                yaw_speed[..., column],
-                by_yaw_speed[..., column, :],
-            )
-        elif name == "bearing_rad":
-            z[..., row], G[..., row, :2] = (
-                bearing_range[..., 0] - pose.yaw_rad,
-                gradient[..., 0, :],
-            )
-        elif name == "range_m":
-            z[..., row], G[..., row, :2] = bearing_range[..., 1], line_of_sight
-        elif name == "range_rate_mps":
-            across = np.vecdot(
-                relative,
-                np.stack([-line_of_sight[..., 1], line_of_sight[..., 0]], axis=-1),
-            )
-            z[..., row], G[..., row, :2] = (
-                np.vecdot(relative, line_of_sight),
-                across[..., None] * gradient[..., 0, :],
-            )
-            G[..., row, 2:4] = (line_of_sight[..., None, :] @ by_velocity)[..., 0, :]
-        else:
-            speed, turn = x[..., 3], x[..., YAW_RATE]
-            least = 1.0 / (speed**2 + SLOW_MPS**2)
-            z[..., row], G[..., row, YAW_RATE] = turn * speed * least, speed * least
-            G[..., row, 3] = turn * (least - 2.0 * (speed * least) ** 2)
-    return z, G

@@ -10,10 +10,14 @@ Names and forms are those of GTSAM. Weights begin at 1 and never grow with d, so
 import math
 from functools import cache
 
+from fgtrack.core.linalg import kernels
 from fgtrack.models.sensors import RobustLoss
 
+_KERNELS = "fgtrack.models.measurement_kernels"
 #: An outlier that a loss ignores altogether still has a finite covariance.
 LEAST_WEIGHT = 1e-12
+#: The number of a loss in compiled loops is its index; None is the Gaussian.
+KINDS = (None, "huber", "cauchy", "tukey", "geman_mcclure", "dcs")
 
 
 @cache
@@ -25,31 +29,24 @@ def width(loss: RobustLoss, size: int) -> float:
     return math.sqrt(float(chdtri(float(size), beyond))) if beyond else loss.width
 
 
-def _loss(loss: RobustLoss, d: float, size: int) -> tuple[float, float]:
-    """The loss rho(d) and the weight rho'(d) / d; `dcs` is dynamic covariance scaling (Agarwal et al. 2013)."""
-    c = width(loss, size)
-    share = c * c / (c * c + d * d)
-    if loss.kind == "cauchy":
-        return 0.5 * c * c * math.log1p((d / c) ** 2), share
-    if loss.kind == "geman_mcclure":
-        return 0.5 * d * d * share, share**2
-    if loss.kind == "tukey":
-        left = max(1.0 - (d / c) ** 2, 0.0)
-        return c * c / 6.0 * (1.0 - left**3), left**2
-    if d <= c:
-        return 0.5 * d * d, 1.0
-    if loss.kind == "huber":
-        return c * (d - 0.5 * c), c / d
-    return c * c * (1.5 - 2.0 * share), (2.0 * share) ** 2
+def compiled_form(loss: RobustLoss | None, size: int) -> tuple[int, float]:
+    """Number of the kind, and the width for `size` components, of a loss in compiled loops."""
+    return (0, 1.0) if loss is None else (KINDS.index(loss.kind), width(loss, size))
 
 
 def weight(loss: RobustLoss, distance: float, size: int) -> float:
     """Weight of a measurement of `size` components, from `LEAST_WEIGHT` to 1, at a whitened residual of `distance`."""
-    if not math.isfinite(distance):
-        return LEAST_WEIGHT
-    return max(_loss(loss, distance, size)[1], LEAST_WEIGHT)
+    return _at(loss, distance, size)[1]
 
 
 def penalty(loss: RobustLoss | None, distance: float, size: int) -> float:
     """The loss rho itself; without a `loss` the square, d^2 / 2."""
-    return 0.5 * distance * distance if loss is None else _loss(loss, distance, size)[0]
+    return _at(loss, distance, size)[0]
+
+
+def _at(loss: RobustLoss | None, distance: float, size: int) -> tuple[float, float]:
+    """Loss and weight."""
+    found: tuple[float, float] = kernels(_KERNELS).loss_at(
+        *compiled_form(loss, size), distance
+    )
+    return found

@@ -168,13 +168,13 @@ def test_a_recording_with_the_message_type_is_replayed(folder: Path) -> None:
 
 
 def test_a_new_measured_quantity_is_known_everywhere(tmp_path: Path) -> None:
-    """In a copy of the package, with the two changes of the page."""
+    """In a copy of the package, with the changes of the page."""
     simulate = "from fgtrack.cli.main import run; run(['simulate', 'single_opponent', '-o', 'old', '--duration', '1'])"
     followed(tmp_path, ["-c", simulate])
     for part in ("fgtrack", "configs"):
         shutil.copytree(ROOT / part, tmp_path / part)
     changes = [text for _, text in BLOCKS if "behind:" in text]
-    assert len(changes) == 2
+    assert len(changes) == 3
     for text in changes:
         first, added = text.split("\n", 1)
         path, _, anchor = first.removeprefix("# ").partition(", behind: ")
