@@ -171,7 +171,7 @@ def passing(messages: Iterable[Message], config: Config) -> Iterator[str]:
             out[message.sensor].update(
                 f"filters.{name}"
                 for item in message.objects
-                if (name := sensor.refusing(item))
+                if (name := sensor.refusing_filter(item))
             )
             left_out[message.sensor].update(message.left_out)
     for name, count in counts.items():

@@ -1,1 +1,1 @@
-"""The published tracker of Karle et al. 2023: its delay compensation, its map, and its defects."""
+"""The published tracker of Karle et al. 2023: its delay compensation, map look-up and defects."""

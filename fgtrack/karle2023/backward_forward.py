@@ -1,8 +1,9 @@
 """Backward-forward delay compensation (Karle et al. 2023, section III-G), for all objects together.
 
-Every object's states are stored on one time grid. A delayed measurement corrects the stored state nearest to its
-stamp, and the model integrates from there to the present. **What was fused after that stamp is forgotten**: this
-is the baseline, and not a replay.
+The states of all objects are stored on one time grid. A delayed measurement corrects
+the stored state nearest to its stamp. The motion model predicts from there to the
+present. **Measurements that were fused after that stamp are lost**: the method is a
+baseline, and no replay.
 """
 
 from collections.abc import Sequence
@@ -31,15 +32,16 @@ from fgtrack.estimation.object_bank import Outcomes, changing_nothing
 from fgtrack.models.motion import MotionModel
 
 _KERNELS = "fgtrack.karle2023.storage_kernels"
-#: In the order of the numbers that the kernels give.
+#: Update status by the code that the kernels return.
 _STATUS = UpdateStatus.FAILED, UpdateStatus.IN_SEQUENCE, UpdateStatus.OUT_OF_SEQUENCE
 
 
 class BackwardForwardBank:
-    """EKFs of all objects on a shared time grid, with their stored states (the paper's object storage).
+    """EKFs of all objects on a common time grid with their stored states (the paper's object storage).
 
-    States between measurements are not stored but predicted from the anchor before them, see
-    `fgtrack.karle2023.storage_kernels`. The storage reaches `storage_steps` of `step_ns` back.
+    The bank stores anchors: states at births and measurements. States between them are
+    predicted from the preceding anchor, see `fgtrack.karle2023.storage_kernels`. The
+    storage reaches back `storage_steps` steps of `step_ns`.
     """
 
     def __init__(
@@ -50,19 +52,20 @@ class BackwardForwardBank:
         self._step_s = seconds(step_ns)
         self._length = storage_steps
         self._now_ns: int | None = None
-        self._grid_ns = 0  # stamp of the newest grid state
-        self._grid = 0  # its index
-        self._rows: dict[int, int] = {}  # of the arrays, by track id in order of birth
-        self._order: IntArray | None = (
-            None  # of all tracks by birth, until one comes or goes
-        )
+        # Stamp and index of the newest grid point.
+        self._grid_ns = 0
+        self._grid = 0
+        # Rows of the arrays by track id, in order of birth.
+        self._rows: dict[int, int] = {}
+        # The same rows as an array; None after a birth or removal.
+        self._order: IntArray | None = None
         self._free = list[int]()
-        self._latest_start = 0  # largest grid index before which a track was unknown
+        # Largest start index of all tracks so far.
+        self._latest_start = 0
         self._arrays = list[Any]()
         self._allocate(1)
-        self._cached: dict[
-            int, StatesAt
-        ] = {}  # by grid index; valid until anything changes
+        # States by grid index; cleared by every change.
+        self._cached: dict[int, StatesAt] = {}
 
     @property
     def present_ns(self) -> int:
@@ -71,7 +74,7 @@ class BackwardForwardBank:
 
     @property
     def window_start_ns(self) -> int:
-        """See `TrackBank.window_start_ns`: the storage, and half a step."""
+        """See `TrackBank.window_start_ns`: half a step before the oldest stored grid stamp."""
         return self._grid_ns - (self._length - 1) * self._step_ns - self._step_ns // 2
 
     @property
@@ -80,7 +83,7 @@ class BackwardForwardBank:
         return tuple(self._rows)
 
     def advance(self, now_ns: int) -> None:
-        """Move the present to the last grid stamp that is not after `now_ns`."""
+        """Move the present to `now_ns`, and the grid to the last grid stamp not after it."""
         grid_ns = now_ns // self._step_ns * self._step_ns
         if self._now_ns is None:
             self._grid_ns = grid_ns
@@ -88,7 +91,7 @@ class BackwardForwardBank:
         self._advance_steps((grid_ns - self._grid_ns) // self._step_ns)
 
     def _advance_steps(self, steps: int) -> None:
-        """Move the present by `steps`."""
+        """Move the newest grid point forward by `steps`; does nothing if `steps` is not positive."""
         if steps > 0:
             self._grid += steps
             self._grid_ns += steps * self._step_ns
@@ -96,27 +99,30 @@ class BackwardForwardBank:
 
     @property
     def _oldest(self) -> int:
-        """Oldest grid index that is stored."""
+        """Index of the oldest stored grid point."""
         return self._grid - self._length + 1
 
     def _at_grid(self, grid: int) -> StatesAt:
-        """States at `grid` of all objects that exist there; at the present they are the filters' own."""
+        """Return the states at index `grid` of all objects that are stored there.
+
+        At the newest grid point they are the current filter states.
+        """
         if grid in self._cached:
             return self._cached[grid]
         if self._order is None:
             self._order = np.array(list(self._rows.values()), dtype=np.int64)
-        rows, track_ids, is_present = self._order, self.track_ids, grid == self._grid
+        rows = self._order
+        track_ids = self.track_ids
+        is_present = grid == self._grid
         if not is_present and grid < max(self._oldest, self._latest_start):
             known = (self._arrays[2][rows, 1] <= grid) & (grid >= self._oldest)
             rows, track_ids = rows[known], tuple(compress(track_ids, known.tolist()))
         if not track_ids:
             return no_states(self._propagator.motion.dim)
         m, n = len(rows), self._propagator.motion.dim
-        means, covariances, steps = (
-            np.empty((m, n)),
-            np.empty((m, n, n)),
-            np.empty(m, dtype=np.int64),
-        )
+        means = np.empty((m, n))
+        covariances = np.empty((m, n, n))
+        steps = np.empty(m, dtype=np.int64)
         kernels(_KERNELS).look_up(
             grid, is_present, rows, *self._arrays, means, covariances, steps
         )
@@ -125,14 +131,17 @@ class BackwardForwardBank:
         return states
 
     def steps_back(self, stamp_ns: int) -> int:
-        """Grid steps from the present back to the state nearest to `stamp_ns`; the newer one on a tie."""
+        """Number of grid steps from the newest grid point back to the one nearest to `stamp_ns`.
+
+        The newer grid point is chosen on a tie. The number is 0 for a later stamp.
+        """
         back = (2 * (self._grid_ns - stamp_ns) + self._step_ns - 1) // (
             2 * self._step_ns
         )
         return back if back > 0 else 0
 
     def states_at(self, stamp_ns: int) -> StatesAt:
-        """Stored states nearest to `stamp_ns`, of those objects whose storage reaches back so far."""
+        """Return the states at the grid point nearest to `stamp_ns` of all objects stored there."""
         return self._at_grid(self._grid - self.steps_back(stamp_ns))
 
     def update(
@@ -141,7 +150,10 @@ class BackwardForwardBank:
         track_ids: Sequence[int],
         measurements: Sequence[Measurement],
     ) -> list[UpdateResult]:
-        """Correct the stored states nearest to `stamp_ns`; the present is predicted from them."""
+        """Correct the stored states nearest to `stamp_ns`; the present is predicted from them.
+
+        Returns one result per measurement.
+        """
         outcomes = Outcomes()
         for indices, alike in stacks(measurements):
             ids = [track_ids[i] for i in indices]
@@ -151,7 +163,7 @@ class BackwardForwardBank:
     def _update(
         self, stamp_ns: int, track_ids: Sequence[int], alike: Measurement
     ) -> list[UpdateResult]:
-        """Return the outcomes of a stack of measurements."""
+        """Correct the stored states with a stack of similar measurements; return the results."""
         with changing_nothing(track_ids):
             back = self.steps_back(stamp_ns)
             states = self._at_grid(self._grid - back)
@@ -159,10 +171,8 @@ class BackwardForwardBank:
                 zip(states.track_ids, range(len(states.track_ids)), strict=True)
             )
             chosen = [rows[track_id] for track_id in track_ids]
-            x, P = (
-                states.means.take(chosen, axis=0),
-                states.covariances.take(chosen, axis=0),
-            )
+            x = states.means.take(chosen, axis=0)
+            P = states.covariances.take(chosen, axis=0)
             y, H = alike.model.linearised(
                 alike.z, x, alike.pose, partial(self._propagator.residual, alike.model)
             )
@@ -182,23 +192,24 @@ class BackwardForwardBank:
         return results
 
     def _visible_from(self, back: int) -> int:
-        """Grid index from which a look-up finds a state corrected `back` steps ago."""
+        """First grid index at which look-ups use a state that was corrected `back` steps ago."""
         return self._grid - back
 
     def birth(self, track_id: int, prior: Start) -> None:
-        """Start an object on the grid stamp nearest to its first detection."""
+        """Start an object at the grid point nearest to its first detection."""
         back = max(round((self._grid_ns - prior.stamp_ns) / self._step_ns), 0)
         start = self._grid - back
         if not self._free:
             self._allocate(2 * len(self._rows))
-        row, state = self._free[-1], initial_state(self._propagator.motion, prior)
+        row = self._free[-1]
+        mean, covariance = initial_state(self._propagator.motion, prior)
         anchors, states, windows = self._arrays
-        anchors[row, 0], windows[row] = start, (1, start, prior.stamp_ns)
-        states[row, 0, 0], states[row, 0, 1:] = (
-            self._propagator.wrap(state[0]),
-            state[1],
-        )
-        self._rows[track_id], self._order = self._free.pop(), None
+        anchors[row, 0] = start
+        windows[row] = 1, start, prior.stamp_ns
+        states[row, 0, 0] = self._propagator.wrap(mean)
+        states[row, 0, 1:] = covariance
+        self._rows[track_id] = self._free.pop()
+        self._order = None
         self._latest_start = max(start, self._latest_start)
         self._cached.clear()
 
@@ -215,7 +226,7 @@ class BackwardForwardBank:
         track_ids: Sequence[int],
         corrected: Correction[FloatArray],
     ) -> list[int]:
-        """Store corrected states at `back` steps ago; return the codes of their status."""
+        """Store corrected states at the grid point `back` steps ago; return their status codes."""
         rows = np.array([self._rows[track_id] for track_id in track_ids])
         at = self._oldest, self._grid - back, self._visible_from(back), stamp_ns, rows
         states = self._propagator.wrap(corrected.mean), corrected.covariance
@@ -227,12 +238,13 @@ class BackwardForwardBank:
         return codes
 
     def _allocate(self, rows: int) -> None:
-        """Make arrays of so many rows with the present contents. An anchor for each step, and two beyond the ends."""
-        slots, n, num = (
-            self._length + 2,
-            self._propagator.motion.dim,
-            len(self._arrays[0]) if self._arrays else 0,
-        )
+        """Allocate arrays for `rows` tracks and copy the present contents.
+
+        Each track has one anchor slot per step and two spare slots.
+        """
+        slots = self._length + 2
+        n = self._propagator.motion.dim
+        num = len(self._arrays[0]) if self._arrays else 0
         shapes = (rows, slots, 2), (rows, slots, n + 1, n), (rows, 3)
         arrays = [
             np.zeros(shape, dtype)
@@ -246,7 +258,7 @@ class BackwardForwardBank:
         self._arrays, self._free = arrays, free
 
     def present(self) -> Sequence[TrackState]:
-        """See `TrackBank.present`; the part of a step beyond the newest grid stamp is predicted."""
+        """See `TrackBank.present`; states are predicted from the newest grid stamp to the present."""
         states = self._at_grid(self._grid)
         if not states.track_ids:
             return []
@@ -262,14 +274,18 @@ class BackwardForwardBank:
         )
 
     def smoothed(self) -> list[SmoothedReport]:
-        """See `TrackBank.smoothed`: none."""
+        """See `TrackBank.smoothed`: always empty."""
         return []
 
 
 def backward_forward(
     motion: MotionModel, lag_s: float, frequency_hz: float = 100.0
 ) -> BackwardForwardBank:
-    """Backward-forward delay compensation (Karle et al. 2023): forgets what was fused after a late measurement."""
+    """Backward-forward delay compensation (Karle et al. 2023).
+
+    After a late measurement, the measurements fused after its stamp are lost. `lag_s`
+    is the length of the storage, and `frequency_hz` the rate of its time grid.
+    """
     step_ns = period_ns(frequency_hz)
     return BackwardForwardBank(
         ExactPropagator(motion), step_ns, max(nanoseconds(lag_s) // step_ns, 1)

@@ -1,4 +1,4 @@
-"""Constant turn rate and velocity in the Euler steps of the published filter (Karle et al. 2023, eq. 10)."""
+"""CTRV integrated in Euler steps, as in the published filter (Karle et al. 2023, eq. 10)."""
 
 import math
 
@@ -11,16 +11,22 @@ from fgtrack.models.motion import MotionModel
 
 
 class EulerCtrv(ExactPropagator):
-    """CTRV in Euler steps (Karle et al. 2023, eq. 10); states beyond the yaw rate and their noise are carried along."""
+    """CTRV in Euler steps (Karle et al. 2023, eq. 10).
+
+    State entries after the yaw rate stay constant, and accumulate their noise.
+    """
 
     yaw_limit_rad = math.inf
-    """Largest yaw that a step gives."""
+    """Largest predicted yaw: the yaw is clipped to it in each step."""
 
     def __init__(
         self, motion: MotionModel, density: FloatArray, *, accelerates: bool = False
     ) -> None:
-        """`density`: diagonal of Q per second, shape (n,), along and across the heading first.
-        `accelerates`: the acceleration drives the speed but is absent from the transition matrix (defect Q5).
+        """Set the noise of the steps.
+
+        `density`, shape (n,), is the diagonal of Q per second. Its first two entries
+        are along and across the heading. `accelerates`: the acceleration drives the
+        speed but is absent from the transition matrix (defect Q5).
         """
         super().__init__(motion)
         self._density = np.array(density, dtype=np.float64)

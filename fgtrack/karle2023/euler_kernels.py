@@ -1,4 +1,4 @@
-"""Constant turn rate and velocity in Euler steps (Karle et al. 2023, eq. 10)."""
+"""Compiled Euler steps of CTRV (Karle et al. 2023, eq. 10)."""
 
 import math
 
@@ -25,14 +25,19 @@ def propagate(
     accelerates: bool,
     yaw_limit_rad: float,
 ) -> None:
-    """Move means (m, n) and covariances (m, n, n), each by its own number of `steps` (m,): P' = F P F' + Q dt.
-    `density`, shape (n,): diagonal of Q, along and across the heading first. An acceleration may drive the speed,
-    without a part in F; the yaw goes up to `yaw_limit_rad`.
+    """Overwrite means (m, n) and covariances (m, n, n) with their predictions: P' = F P F' + Q dt.
+
+    Each object moves by its own number of `steps` (m,). `density`, shape (n,), is the
+    diagonal of Q. Its first two entries are along and across the heading. If
+    `accelerates`, the acceleration drives the speed but is absent from F. The yaw is
+    clipped to `yaw_limit_rad` from above.
     """
     m, n = mean.shape
     check(n >= (6 if accelerates else 5) and len(density) >= n and len(steps) >= m)
     check(len(P) >= m and P.shape[1] == n and P.shape[2] == n)
-    F, FP, more = scratch(n, n), scratch(n, n), scratch(n, n)
+    F = scratch(n, n)
+    FP = scratch(n, n)
+    predicted = scratch(n, n)
     for j in range(n):
         for k in range(n):
             F[j, k] = 1.0 if j == k else 0.0
@@ -46,14 +51,12 @@ def propagate(
             product(F, P[i], FP)
             for j in range(n):
                 for k in range(n):
-                    more[j, k] = density[j] * dt_s if j == k else 0.0
-            more[0, 0], more[1, 1] = (
-                along * c * c + across * s * s,
-                along * s * s + across * c * c,
-            )
-            more[0, 1] = more[1, 0] = (along - across) * c * s
-            add_product_transposed(FP, F, more)
-            copy(more, P[i])
+                    predicted[j, k] = density[j] * dt_s if j == k else 0.0
+            predicted[0, 0] = along * c * c + across * s * s
+            predicted[1, 1] = along * s * s + across * c * c
+            predicted[0, 1] = predicted[1, 0] = (along - across) * c * s
+            add_product_transposed(FP, F, predicted)
+            copy(predicted, P[i])
             x[0] += way * c
             x[1] += way * s
             x[2] = min(x[2] + x[4] * dt_s, yaw_limit_rad)

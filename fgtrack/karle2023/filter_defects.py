@@ -1,6 +1,7 @@
-"""Where the published implementation of Karle et al. 2023 departs from the clean filter, each departure by itself.
+"""Defects of the published filter of Karle et al. 2023, each as a separate component.
 
-Its yaw is 0 along +y and jumps at +-pi there, which in REP-103 is at 3 pi / 2 (the branch used here).
+The published yaw is 0 along +y and jumps from pi to -pi. In REP-103 this jump lies at 3
+pi / 2; this module uses that branch.
 """
 
 import numpy as np
@@ -16,25 +17,35 @@ from fgtrack.models.measurement import MeasurementModel
 YAW_LIMIT_RAD = 1.5 * np.pi
 
 
-def one_turn(angle_rad: FloatArray) -> FloatArray:
-    """Angle wrapped by at most one turn: in (-pi, pi] only for what is less than a turn and a half away."""
+def wrapped_once(angle_rad: FloatArray) -> FloatArray:
+    """Angle wrapped by at most one turn.
+
+    The result lies in (-pi, pi] only if the input is less than one and a half turns
+    from 0.
+    """
     return np.asarray(
         angle_rad + TWO_PI * (1.0 * (angle_rad <= -np.pi) - (angle_rad > np.pi))
     )
 
 
 def published_yaw(yaw_rad: FloatArray) -> FloatArray:
-    """Yaw in the published range: in (-pi, pi] from +y, hence in (-pi/2, 3 pi/2] from +x; by at most one turn."""
-    return one_turn(yaw_rad - 0.5 * np.pi) + 0.5 * np.pi
+    """Yaw in the published range, wrapped by at most one turn.
+
+    The range is (-pi, pi] from +y, so (-pi/2, 3 pi/2] from +x.
+    """
+    return wrapped_once(yaw_rad - 0.5 * np.pi) + 0.5 * np.pi
 
 
 class SaturatedEulerCtrv(EulerCtrv):
-    """The predicted yaw sticks at the upper end of its range, and runs on below the lower one (defect Q2)."""
+    """Euler CTRV whose predicted yaw stays at the upper end of its range (defect Q2).
+
+    Below the lower end the yaw is not limited.
+    """
 
     yaw_limit_rad = YAW_LIMIT_RAD
 
     def wrap(self, mean: FloatArray) -> FloatArray:
-        """Means with the yaw in the published range."""
+        """Return the means with the yaw in the published range."""
         wrapped = mean.copy()
         wrapped[..., YAW] = published_yaw(mean[..., YAW])
         return wrapped
@@ -42,22 +53,27 @@ class SaturatedEulerCtrv(EulerCtrv):
     def residual(
         self, model: MeasurementModel, z: FloatArray, z_predicted: FloatArray
     ) -> FloatArray:
-        """Measured minus predicted, angles wrapped by one turn only: a yaw that has wound up stays off by turns."""
+        """Measured minus predicted; angles are wrapped by one turn only.
+
+        A predicted yaw that is several turns away keeps a residual of whole turns.
+        """
         y = np.asarray(z - z_predicted)
         for index, name in enumerate(model.components):
             if name == "yaw_rad":
-                y[..., index] = one_turn(
+                y[..., index] = wrapped_once(
                     published_yaw(z[..., index]) - z_predicted[..., index]
                 )
             elif index in model.angular:
-                y[..., index] = one_turn(y[..., index])
+                y[..., index] = wrapped_once(y[..., index])
         return y
 
 
 class PublishedStorage(BackwardForwardBank):
-    """The published object storage.
-    With `leads` the tracking time leads the clock by up to one step, and never waits (defect Q14). With `is_stale` an
-    update in time does not reach the stored present state (defect Q8).
+    """Object storage of the published implementation.
+
+    With `leads`, the tracking time leads the clock by up to one step and never waits
+    (defect Q14). With `is_stale`, an update in sequence does not reach the stored
+    present state (defect Q8).
     """
 
     def __init__(
@@ -73,7 +89,10 @@ class PublishedStorage(BackwardForwardBank):
         self._leads, self._is_stale = leads, is_stale
 
     def advance(self, now_ns: int) -> None:
-        """See `BackwardForwardBank.advance`; a leading clock advances by at least one step, up to `now_ns` or more."""
+        """See `BackwardForwardBank.advance`.
+
+        With `leads` the grid advances by at least one step, to `now_ns` or beyond.
+        """
         if not self._leads:
             super().advance(now_ns)
             return

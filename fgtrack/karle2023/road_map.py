@@ -1,6 +1,7 @@
-"""The map look-up of the published implementation of Karle et al. 2023, with its defects Q3 and Q4.
+"""Map look-up of the published implementation of Karle et al. 2023, with its defects Q3 and Q4.
 
-It works in that implementation's yaw (0 along +y), and gives REP-103 in its range (-pi/2, 3 pi/2].
+The look-up uses the published yaw (0 along +y). Its result is in REP-103, in the range
+(-pi/2, 3 pi/2].
 """
 
 import math
@@ -15,19 +16,22 @@ from fgtrack.models.track_map import COLUMNS, RoadView, TrackMap
 
 
 class PublishedMap:
-    """Arc look-up at the nearest row, with bounds as points (defect Q4) and a heading that is interpolated as a plain
-    number, through its jump at +-pi (defect Q3), unless it is `circular`.
+    """Map look-up by arc length from the nearest row of the map.
 
-    The knots are the raceline's arc length although the projection, without its sign, is on the reference line.
+    The bounds are points, not lines (defect Q4). The heading is interpolated as a plain
+    number, even across its jump at +-pi (defect Q3); `circular` avoids this.
+
+    The interpolation uses the arc length of the raceline, but the unsigned projection
+    is on the reference line.
     """
 
     def __init__(self, track: TrackMap, circular: bool = False) -> None:
-        """Raises `DataError` where the raceline's arc length of `track` does not grow from row to row."""
+        """Raises `DataError` if the raceline's arc length does not increase from row to row."""
         column = dict(zip(COLUMNS, track.table.T, strict=True))
         column["psi_ref_rad"] = wrap_angles(column["psi_ref_rad"] - 0.5 * math.pi)
 
         def closed(name: str) -> FloatArray:
-            """A column whose last row is the closing point, 0.999 of the way from the last row to the first."""
+            """Column `name` whose last row is the closing point, 0.999 of the way from the last row to the first."""
             values = column[name][:-1]
             return np.append(values, 0.999 * (values[0] - values[-1]) + values[-1])
 
@@ -37,7 +41,7 @@ class PublishedMap:
         self._arc = column["s_racetraj_m"]
         if np.diff(self._arc).min() <= 0.0:
             raise DataError(
-                "no map for a published look-up: s_racetraj_m does not grow from row to row"
+                "not a map for the published look-up: s_racetraj_m must increase from row to row"
             )
         self._segment = np.roll(self._line, -1, axis=0) - self._line
         self._segment_squared = np.sum(self._segment**2, axis=1)
@@ -50,7 +54,7 @@ class PublishedMap:
     def view(
         self, points_m: FloatArray, inner_buffer_m: float, outer_buffer_m: float
     ) -> RoadView:
-        """Heading, curvature and whether a point lies further outside than the buffers allow; points (n, 2)."""
+        """Heading, curvature, and mask of `points_m` (n, 2) further outside than the buffers allow."""
         points_m = np.array(points_m, order="C")
         nearest = kernels("fgtrack.models.feet").nearest(
             points_m, self._line, self._longest_m

@@ -1,8 +1,15 @@
-"""Stored states of many tracks on a time grid: arrays (tracks, slots, ...) of anchors, from which others are predicted.
+"""Compiled storage of the states of many tracks on a time grid.
 
-A slot of `anchors` has the grid index of a state and that from which a look-up finds it, one of `states` in rows of n,
-the dimension of the state, its mean and covariance (n + 1 rows). A row of `windows` has the number of anchors, in
-ascending order, the grid index before which the track is unknown, and the newest stamp fused.
+The storage keeps anchors; other states are predicted from them. All arrays have the
+shape (tracks, slots, ...), and n is the dimension of the state:
+
+- `anchors`: the grid index of the state, and the first grid index at which look-ups use
+  it.
+- `states`: the mean (first row) and the covariance, n + 1 rows of n.
+- `windows` (one row per track, without slots): the number of anchors, the grid index of
+  the birth, and the newest fused stamp.
+
+The anchors of a track are in ascending order.
 """
 
 import numpy as np
@@ -18,7 +25,7 @@ _STORAGE = "int64[:, :, ::1], float64[:, :, :, ::1], int64[:, ::1]"
 def _check(
     rows: IntArray, anchors: IntArray, states: FloatArray, windows: IntArray, n: int
 ) -> None:
-    """Raise `IndexError` for rows, or numbers of anchors, beyond the ends of the arrays of states of dimension n."""
+    """Raise `IndexError` for invalid rows, numbers of anchors or shapes."""
     size, slots = anchors.shape[0], anchors.shape[1]
     check_rows(rows, 0, size)
     check(
@@ -50,8 +57,11 @@ def look_up(
     covariances: FloatArray,
     steps: IntArray,
 ) -> None:
-    """Write the anchors (m, n) and (m, n, n) of the states of `rows` (m,) at `grid`, and the steps to there (m,).
-    At the present that is the newest one, whether a look-up finds it or not.
+    """Write the anchors from which the states of `rows` (m,) at index `grid` are predicted.
+
+    Writes the means (m, n), the covariances (m, n, n), and the number of steps (m,)
+    from the anchor to `grid`. For the present the newest anchor is used, even if
+    look-ups do not use it yet.
     """
     _check(rows, anchors, states, windows, means.shape[1])
     check(
@@ -74,7 +84,7 @@ def look_up(
 def _forget(
     oldest: int, anchors: IntArray, states: FloatArray, window: IntArray
 ) -> None:
-    """Move the last anchor that a look-up of `oldest` finds, and those after it, to the front."""
+    """Drop the anchors that no look-up from `oldest` on can use; move the others to the front."""
     gone = 0
     while gone + 1 < window[0] and anchors[gone + 1, 1] <= max(oldest, window[1]):
         gone += 1
@@ -100,8 +110,10 @@ def store(
     states: FloatArray,
     windows: IntArray,
 ) -> IntArray:
-    """Add an anchor of the measurement at `stamp_ns` to each of `rows` (m,) in which it was `fused`; return the status.
-    The anchor replaces all that was stored at and after it; where there is no free slot, those before `oldest` go.
+    """Store an anchor of the measurement at `stamp_ns` for each of `rows` (m,) that `fused` it.
+
+    Returns the status codes (m,). The new anchor replaces all anchors at and after it.
+    If no slot is free, unused anchors before `oldest` are dropped first.
     """
     _check(rows, anchors, states, windows, means.shape[1])
     check(

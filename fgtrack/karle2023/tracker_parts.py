@@ -1,4 +1,4 @@
-"""Deviations of the published implementation of Karle et al. 2023, each defect a component of its own."""
+"""Defects of the published tracker of Karle et al. 2023, each as a separate component."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -33,8 +33,11 @@ from fgtrack.tracking.tracker import Tracker, TrackerParts
 
 
 class PublishedEgo(EgoTrajectory):
-    """Ego storage at the ticks, nearest entry instead of interpolation, and a low-pass that filters its own output
-    again on every tick without a new message (defect Q13)."""
+    """Ego storage with one entry per tick and a repeated low-pass (defect Q13).
+
+    The nearest entry replaces interpolation. On every tick without a new message, the
+    low-pass filters its own output again.
+    """
 
     _straight = True
 
@@ -59,8 +62,11 @@ class PublishedEgo(EgoTrajectory):
         return None
 
     def start_tick(self) -> None:
-        """Store the current state, low-passed against the entry before it; of a stamp that is stored already, its yaw
-        and yaw rate alone."""
+        """Store the current state, low-passed against the entry before it.
+
+        If its stamp is already stored, the yaw and the yaw rate of the stored entry are
+        low-passed again.
+        """
         if self.current is None:
             return
         newest = self._stored[-1] if self._stored else None
@@ -76,17 +82,15 @@ class PublishedEgo(EgoTrajectory):
             filtered = self._low_passed(
                 self.current, before.yaw_rad, before.yaw_rate_radps
             )
-            turned = replace(
+            refiltered = replace(
                 newest, yaw_rad=filtered.yaw_rad, yaw_rate_radps=filtered.yaw_rate_radps
             )
-            if (
-                newest is self.current
-            ):  # the stored entry and the current state are one object
-                self.current = turned
-            self._stored[-1] = turned
+            if newest is self.current:
+                self.current = refiltered
+            self._stored[-1] = refiltered
 
     def pose_at(self, stamp_ns: int, present_ns: int) -> EgoPose | None:
-        """See `EgoTrajectory.pose_at`; from the nearest entry, however far away it is."""
+        """See `EgoTrajectory.pose_at`; extrapolates from the nearest entry, at any distance in time."""
         if self.current is None:
             return None
         if present_ns - stamp_ns <= self._half_step_ns:
@@ -98,8 +102,11 @@ class PublishedEgo(EgoTrajectory):
 
 
 class SlotInbox(Inbox):
-    """One slot per sensor: a second message within a tick overwrites the first, a repeated stamp empties the slot
-    (defect Q12). The mean of object stamps is taken in floating point."""
+    """Inbox with a single slot per sensor (defect Q12).
+
+    A second message within a tick overwrites the first one. A repeated stamp empties
+    the slot. The mean of object stamps is computed in floating point.
+    """
 
     def __init__(self, sensors: Mapping[str, SensorModel]) -> None:
         super().__init__(sensors)
@@ -123,7 +130,9 @@ class SlotInbox(Inbox):
             sensor.max_delay_s
         ):
             return records(message, Disposition.TOO_OLD)
-        kept, ended, broken = [], [], False
+        kept = []
+        ended = []
+        broken = False
         for index, detection in enumerate(message.objects):
             values = [getattr(detection, name) for name in sensor.components]
             if (detection.x_m or 0.0) == 0.0 and (detection.y_m or 0.0) == 0.0:
@@ -153,14 +162,14 @@ class SlotInbox(Inbox):
     def collect(
         self, now_ns: int = 0, waits: Callable[[Batch, int], bool] | None = None
     ) -> list[Batch]:
-        """See `Inbox.collect`; equal stamps keep the order of the sensors, and nothing waits."""
+        """See `Inbox.collect`; equal stamps keep the order of the sensors, and no batch waits."""
         batches = [self._slots[name] for name in self._sensors if name in self._slots]
         self._slots = {}
         return sorted(batches, key=lambda batch: batch.stamp_ns)
 
 
 def _float_stamp(message: DetectionList) -> int:
-    """Mean of the object stamps in float64, which at today's epoch is good to 256 ns."""
+    """Mean of the object stamps in float64, with a resolution of 256 ns for present dates."""
     if not message.objects:
         return message.stamp_ns
     stamps = [
@@ -172,8 +181,11 @@ def _float_stamp(message: DetectionList) -> int:
 
 @dataclass(frozen=True)
 class NeighbourhoodMerge(Merge):
-    """Each distinct neighbourhood becomes one object: no transitive closure, and yaw averaged as a plain number,
-    across its jump (defect Q11)."""
+    """Merging of each distinct neighbourhood into one object (defect Q11).
+
+    Neighbourhoods may overlap: there is no transitive closure. The yaw is averaged as a
+    plain number, even across its jump.
+    """
 
     kind: Literal["neighbourhood"] = "neighbourhood"
     distance_m: float = 5.1
@@ -184,7 +196,7 @@ class NeighbourhoodMerge(Merge):
         return ConnectedMerge(self.distance_m).apart(points_m, starts)
 
     def groups(self, points_m: FloatArray) -> dict[int, tuple[int, ...]]:
-        """See `Merge.groups`; the merged ones first, in the order of a set of index tuples."""
+        """See `Merge.groups`; merged groups come first, in the iteration order of a set of index tuples."""
         from scipy.spatial import cKDTree
 
         tree = cKDTree(points_m)
@@ -212,12 +224,15 @@ class NeighbourhoodMerge(Merge):
 
 @dataclass(frozen=True)
 class UngatedEuclidean:
-    """Hungarian assignment over all pairs; too distant pairs are torn up afterwards, and both partners are then
-    alone, even where one had a good second choice (defect Q10)."""
+    """Hungarian assignment over all pairs, gated only afterwards (defect Q10).
+
+    A pair beyond the gate is split. Both partners then stay unassigned, even if a good
+    second choice existed.
+    """
 
     kind: Literal["ungated_euclidean"] = "ungated_euclidean"
     gate_m: float = 5.0
-    """Largest distance of a pair that is kept."""
+    """Largest distance of an accepted pair."""
 
     @property
     def reads_yaws(self) -> bool:
@@ -232,22 +247,29 @@ class UngatedEuclidean:
         likely: Likely | None = None,
         facings: Facings | None = None,
     ) -> Assignment:
-        """See `Association`; torn pairs are born after the detections that had no partner. Nothing is `apart`."""
+        """See `Association`; `apart` is ignored.
+
+        Detections of split pairs come after the detections without a partner.
+        """
         pairs = near(candidates, states.means, np.inf)
         rows, columns, distances_m = (array.tolist() for array in pairs)
         cost = dict(zip(zip(rows, columns, strict=True), distances_m, strict=True))
         assignment = assigned(pairs, len(candidates), len(states.means))
-        torn = [pair for pair in assignment.pairs if cost[pair] > self.gate_m]
-        good = [pair for pair in assignment.pairs if pair not in torn]
-        missed = sorted(assignment.missed + [j for _, j in torn])
-        return Assignment(good, assignment.new + [i for i, _ in torn], missed)
+        split = [pair for pair in assignment.pairs if cost[pair] > self.gate_m]
+        good = [pair for pair in assignment.pairs if pair not in split]
+        missed = sorted(assignment.missed + [j for _, j in split])
+        return Assignment(good, assignment.new + [i for i, _ in split], missed)
 
 
 class PublishedLifecycle(CountingLifecycle):
-    """Only two sensors age a track, each at its range; time counts only where a list came in; the cap may be passed;
-    a birth is dated to the tick and a match to the sensor's stamp (defects Q9 and Q15).
+    """Counting lifecycle of the published implementation (defects Q9 and Q15).
 
-    The range is that of a state which is one batch old; see `PublishedTracker`.
+    - Only sensors with a range in `ages` age a track, each at its range.
+    - Time counts only when a list arrives.
+    - The counter may exceed its cap.
+    - A birth has the time of the tick, and a match has the stamp of the sensor.
+
+    The range is that of the state one batch earlier; see `PublishedTracker`.
     """
 
     def born(self, track_id: int, scan: Scan, candidate: Candidate) -> None:
@@ -283,15 +305,16 @@ class PublishedLifecycle(CountingLifecycle):
         watermarks_ns: IntArray | None = None,
         processed_ns: int = FOREVER,
     ) -> list[int]:
-        """See `CountingLifecycle.expired`; never, without a list."""
+        """See `CountingLifecycle.expired`; always empty, as tracks end only when a list arrives."""
         return []
 
 
 class PublishedTracker(Tracker):
-    """The published implementation's order of things, where it differs (defects Q9 and Q22).
-    A list older than the storage still starts tracks, and an empty list ages every track. The range that ages a
-    track is measured from the present ego to where the track was after the batch before, or at the end of the tick
-    before.
+    """Tracker with the processing order of the published implementation (defects Q9 and Q22).
+
+    A list older than the storage still starts tracks. An empty list ages every track.
+    The range that ages a track is measured from the present ego to the track's position
+    after the previous batch, or at the end of the previous tick.
     """
 
     def __init__(self, parts: TrackerParts) -> None:

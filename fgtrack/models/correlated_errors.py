@@ -1,8 +1,11 @@
-"""Errors of a sensor that are correlated in time, estimated with the state of the object.
+"""Time-correlated sensor errors, estimated together with the state of the object.
 
-An estimator that takes them for white is overconfident, a smoother most of all. The correlated part of the error is a
-first-order Gauss-Markov process and a state (Bryson and Henrikson, "Estimation using sampled data containing
-sequentially correlated noise", 1968; Bar-Shalom, Li, Kirubarajan 2001, section 8.3), in every estimator alike.
+An estimator that treats correlated errors as white noise is overconfident. Smoothers
+suffer most. Here the correlated part of the error is a first-order Gauss-Markov
+process. It is appended to the state, so every estimator handles it in the same way.
+
+Sources: Bryson and Henrikson, "Estimation using sampled data containing sequentially
+correlated noise", 1968; Bar-Shalom, Li and Kirubarajan 2001, section 8.3.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,63 +25,73 @@ from fgtrack.models.measurement import (
 from fgtrack.models.motion import MotionModel
 from fgtrack.models.sensors import SensorModel
 
-_MOST = 30.0  # exponent of an error that is moved back in time, in which it would grow beyond all numbers
+# Largest exponent. An error that is predicted backwards in time grows, and would overflow.
+_MAX_EXPONENT = 30.0
 
 
 @dataclass(frozen=True)
 class CorrelatedErrors(MotionModel):
-    """A motion model whose state also has the time-correlated errors of sensors about one object.
-    Each is a stationary first-order Gauss-Markov process of mean 0 and variance 1,
-    e(t + dt) = exp(-dt / T) e(t) + N(0, 1 - exp(-2 dt / T)), in standard deviations of the correlated part.
+    """Motion model of an object whose state also contains time-correlated sensor errors.
+
+    Each error is a stationary first-order Gauss-Markov process with mean 0 and variance
+    1: e(t + dt) = exp(-dt / T) e(t) + N(0, 1 - exp(-2 dt / T)). Its unit is the
+    standard deviation of the correlated part of the measurement error.
     """
 
     base: MotionModel
-    """Motion model of the object."""
+    """Motion model of the object alone."""
     times_s: tuple[tuple[str, float], ...]
-    """Name `sensor.component` and correlation time T of every error, in the order of the state behind `base`."""
+    """Name `sensor.component` and correlation time T [s] of each error, in state order.
+
+    The errors follow the entries of `base` in the state.
+    """
 
     def __post_init__(self) -> None:
         names = (*self.base.state_names, *(name for name, _ in self.times_s))
-        object.__setattr__(
-            self, "state_names", names
-        )  # of the object: class variables where a model has no parts
+        # Other models have these two as class variables. Here they depend on the instance.
+        object.__setattr__(self, "state_names", names)
         object.__setattr__(self, "linear", self.base.linear)
 
     def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.predict`."""
         moved = self.base.predict(x[..., : self.base.dim], dt_s)
         return np.concatenate(
-            [moved, x[..., self.base.dim :] * np.exp(self._exponents(dt_s))], axis=-1
+            [moved, x[..., self.base.dim :] * np.exp(self._log_decays(dt_s))], axis=-1
         )
 
     def jacobian(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.jacobian`."""
-        return self._beside(
+        return self._block_diagonal(
             self.base.jacobian(x[..., : self.base.dim], dt_s),
-            np.exp(self._exponents(dt_s)),
+            np.exp(self._log_decays(dt_s)),
         )
 
     def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.process_noise`."""
         Q = self.base.process_noise(x[..., : self.base.dim], dt_s)
-        return self._beside(Q, -np.expm1(2.0 * self._exponents(dt_s)))
+        return self._block_diagonal(Q, -np.expm1(2.0 * self._log_decays(dt_s)))
 
     def start_variance(self, name: str) -> float:
-        """See `MotionModel.start_variance`; an error is in its stationary state."""
+        """See `MotionModel.start_variance`; an error starts in its stationary distribution."""
         return self.base.start_variance(name) if name in self.base.state_names else 1.0
 
     @cached_property
     def _rates_hz(self) -> FloatArray:
         return np.array([1.0 / time_s for _, time_s in self.times_s])
 
-    def _exponents(self, dt_s: float | FloatArray) -> FloatArray:
-        """Logarithms of the decays, shape (..., errors)."""
+    def _log_decays(self, dt_s: float | FloatArray) -> FloatArray:
+        """Logarithm -dt / T of the decay of each error, shape (..., errors)."""
         return np.minimum(
-            -np.asarray(dt_s, dtype=np.float64)[..., None] * self._rates_hz, _MOST
+            -np.asarray(dt_s, dtype=np.float64)[..., None] * self._rates_hz,
+            _MAX_EXPONENT,
         )
 
-    def _beside(self, block: FloatArray, diagonal: FloatArray) -> FloatArray:
-        """Block-diagonal matrix (..., n, n) of `block` and of `diagonal` (..., errors)."""
+    def _block_diagonal(self, block: FloatArray, diagonal: FloatArray) -> FloatArray:
+        """Block-diagonal matrix of `block` and `diagonal`, shape (..., n, n).
+
+        `block` belongs to the object's own state; `diagonal` has the shape (...,
+        errors).
+        """
         matrix = np.zeros((*block.shape[:-2], self.dim, self.dim))
         matrix[..., : self.base.dim, : self.base.dim] = block
         indices = np.arange(self.base.dim, self.dim)
@@ -88,12 +101,12 @@ class CorrelatedErrors(MotionModel):
 
 @dataclass(frozen=True)
 class ColouredNoiseMeasurement(MeasurementModel):
-    """A measurement of which a part of the error is in the state: z = h(x, pose) + gain e + noise."""
+    """Measurement with a correlated error that is part of the state: z = h(x, pose) + gain e + noise."""
 
     columns: tuple[int, ...]
-    """Where the errors e are in the state."""
+    """Indices of the errors e in the state."""
     gain: FloatArray
-    """Shape (k, number of errors)."""
+    """Derivative of the measurement by the errors, shape (k, number of errors)."""
 
     def part(self, rows: Sequence[int]) -> MeasurementModel:
         """See `MeasurementModel.part`."""
@@ -110,8 +123,8 @@ class ColouredNoiseMeasurement(MeasurementModel):
 
     def jacobian(self, x: FloatArray, pose: SensorPose = AT_ORIGIN) -> FloatArray:
         """See `MeasurementModel.jacobian`."""
-        H = super().jacobian(x, pose)  # that of a linear model is `selection`
-        if not self.linear:
+        H = super().jacobian(x, pose)
+        if not self.linear:  # for a linear model H is `selection`, with the gain
             H[..., self.columns] = self.gain
         return H
 
@@ -126,7 +139,10 @@ class ColouredNoiseMeasurement(MeasurementModel):
 def with_correlated_errors(
     motion: MotionModel, sensors: Mapping[str, SensorModel]
 ) -> MotionModel:
-    """`motion` with a state for every component of the sensors with correlated errors; itself where there is none."""
+    """Return `motion` with one additional state per component of each sensor with correlated errors.
+
+    Returns `motion` itself if no sensor has correlated errors.
+    """
     times_s = [
         (f"{sensor}.{component}", model.correlation.time_s)
         for sensor, model in sensors.items()
@@ -143,9 +159,12 @@ def split_error(
     R: FloatArray,
     state_names: Sequence[str],
 ) -> tuple[MeasurementModel, FloatArray]:
-    """The measurement model with the correlated part of the error, and the covariance (k, k) of the rest.
-    Of the covariance R (k, k) of the components that the sensor measures, the share s = `model.correlation.share` is
-    correlated: z = h(x) + (s R)^1/2 e + N(0, (1 - s) R), so that a detection alone has the covariance R.
+    """Return the measurement model with the correlated error, and the covariance of the white rest, shape (k, k).
+
+    `R`, shape (k, k), is the covariance of the whole error. The share s =
+    `model.correlation.share` of the block of components that the sensor itself measures
+    is correlated: z = h(x) + (s R)^1/2 e + N(0, (1 - s) R). So a single detection keeps
+    the covariance R.
     """
     if model.correlation is None:
         return measurement, R
@@ -155,11 +174,10 @@ def split_error(
     correlated = share * R[block]
     white = R.copy()
     white[block] -= correlated
+    # The symmetric square root rotates with the axes of the covariance.
     gain = np.zeros((len(R), len(own)))
     values, vectors = np.linalg.eigh(correlated)
-    gain[own] = (
-        vectors * np.sqrt(np.maximum(values, 0.0))
-    ) @ vectors.T  # turns with the axes of the covariance
+    gain[own] = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     columns = tuple(
         state_names.index(f"{sensor}.{measurement.components[row]}") for row in own
     )
@@ -169,7 +187,11 @@ def split_error(
 
 
 def total_error(measurement: MeasurementModel, white: FloatArray) -> FloatArray:
-    """Covariance R, shape (k, k), of the correlated error and the rest `white`: the inverse of `split_error`."""
+    """Covariance of the whole measurement error, shape (k, k); inverts `split_error`.
+
+    The result is the sum of the `white` covariance and the covariance of the correlated
+    error.
+    """
     if not isinstance(measurement, ColouredNoiseMeasurement):
         return white
     return white + measurement.gain @ measurement.gain.T
@@ -178,7 +200,12 @@ def total_error(measurement: MeasurementModel, white: FloatArray) -> FloatArray:
 def position_cross(
     measurement: MeasurementModel, z: FloatArray, pose: SensorPose
 ) -> dict[str, tuple[float, float]]:
-    """Covariance of the position by z (k,) with the correlated errors, by name: -G gain, x = G (z - gain e)."""
+    """Cross-covariance of the measured position with each correlated error, by state name.
+
+    The position is inverted from `z`, shape (k,): x = G (z - gain e). So the
+    cross-covariance is -G gain. Empty if the measurement has no correlated error or
+    gives no position.
+    """
     if not isinstance(measurement, ColouredNoiseMeasurement):
         return {}
     G = position_gradient(measurement.components, z, pose)
@@ -190,9 +217,11 @@ def position_cross(
 
 
 def component_cross(measurement: MeasurementModel, component: str) -> dict[str, float]:
-    """Covariance of an entry of the state that is measured as `component`, with the correlated errors, by name.
+    """Cross-covariance of the measured `component` with each correlated error, by state name.
 
-    The entry begins as the measured value, z - gain e, so the covariance is the negative row of the gain.
+    A new object starts with the state entry z - gain e. So the cross-covariance is the
+    negative row of the gain. Empty if the measurement has no correlated error or lacks
+    the component.
     """
     if (
         not isinstance(measurement, ColouredNoiseMeasurement)

@@ -1,7 +1,8 @@
-"""Motion models: exact flow, Jacobian and composing process noise of CTRV, CTRA, CT and CV.
+"""Motion models CTRV, CTRA, CT and CV: exact prediction, Jacobian and composing process noise.
 
-All functions broadcast a state `x`, shape (..., n), and a duration `dt_s`, a float or an array of shape (...), which
-may be negative for `predict` and `jacobian`. Only `MeasurementModel.residual` wraps the yaw.
+All functions broadcast a state `x` of shape (..., n) with a duration `dt_s`. The
+duration is a float or an array of shape (...), and may be negative for `predict` and
+`jacobian`. Only `MeasurementModel.residual` wraps the yaw.
 """
 
 from abc import ABC, abstractmethod
@@ -18,32 +19,34 @@ from fgtrack.core.geometry import cartesian, cartesian_gradient, polar, polar_gr
 from fgtrack.core.linalg import congruence, kernels, symmetrise
 from fgtrack.core.types import ACCEL, SPEED, STATE_NAMES, YAW, YAW_RATE, FloatArray
 
-#: The first entries of every model's state are either of these.
-POLAR, CARTESIAN = STATE_NAMES[:4], ("x_m", "y_m", "vx_mps", "vy_mps")
-#: The gradient of a heading by the velocity grows as 1 / speed; below this speed it stays as it is there.
+#: Every state begins with the entries of `POLAR` or with those of `CARTESIAN`.
+POLAR = STATE_NAMES[:4]
+CARTESIAN = ("x_m", "y_m", "vx_mps", "vy_mps")
+#: The derivative of the heading by the velocity grows as 1 / speed. Below this speed it is held constant.
 MIN_SPEED_MPS = 1e-3
 
 
 class Transition(NamedTuple):
-    """States after a duration, how they depend on those before, and how uncertain they have become."""
+    """Predicted states with their Jacobian and process noise."""
 
     mean: FloatArray
-    """Shape (..., n); the yaw is not wrapped."""
+    """Predicted states, shape (..., n); the yaw is not wrapped."""
     F: FloatArray
-    """Derivative of the mean by the state before, shape (..., n, n)."""
+    """Derivative of the predicted by the initial state, shape (..., n, n)."""
     Q: FloatArray
-    """Covariance of the accumulated noise, shape (..., n, n)."""
+    """Covariance of the accumulated process noise, shape (..., n, n)."""
 
 
 class MotionModel(ABC):
-    """Motion of an object between two stamps, and its uncertainty: a frozen dataclass.
+    """Motion of an object between two stamps with its uncertainty; models are frozen dataclasses.
 
-    A model has `state_names`, `predict`, `jacobian` and `process_noise`; one that computes these three in one go
-    overrides `transition`, which is what estimators call.
+    A model defines `state_names`, `predict`, `jacobian` and `process_noise`. Estimators
+    call `transition`. A model that computes the three results together overrides
+    `transition`.
     """
 
     state_names: ClassVar[tuple[str, ...]]
-    """Names of the n entries of the state: those of `POLAR` or of `CARTESIAN`, then any others."""
+    """Names of the n entries of the state: `POLAR` or `CARTESIAN` first, then any others."""
     linear: ClassVar[bool] = False
     """True if the Jacobian is the same at every state."""
 
@@ -54,7 +57,7 @@ class MotionModel(ABC):
 
     @cached_property
     def cartesian(self) -> bool:
-        """True if the state holds the velocity as vx and vy, and not as yaw and speed."""
+        """True if the state contains the velocity as vx and vy instead of yaw and speed."""
         return self.state_names[:4] == CARTESIAN
 
     @abstractmethod
@@ -68,36 +71,47 @@ class MotionModel(ABC):
     @abstractmethod
     def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """Covariance Q of the noise accumulated over `dt_s`, shape (..., n, n).
-        Composes: Q(x, a + b) = F(x_a, b) Q(x, a) F(x_a, b)' + Q(x_a, b) with x_a = predict(x, a). Raises `CallError`
-        where `dt_s` is negative (let `forward` check it).
+
+        The noise composes: Q(x, a + b) = F(x_a, b) Q(x, a) F(x_a, b)' + Q(x_a, b) with
+        x_a = predict(x, a). Raises `CallError` if `dt_s` is negative; call `forward`
+        for this check.
         """
 
     @staticmethod
     def forward(dt_s: float | FloatArray) -> FloatArray:
-        """`dt_s` as an array; raises `CallError` where it is negative, because noise accumulates forwards only."""
+        """Return `dt_s` as an array.
+
+        Raises `CallError` if a duration is negative, because noise accumulates only
+        forwards in time.
+        """
         t = np.asarray(dt_s, dtype=np.float64)
         if (t < 0.0).any():
             raise CallError(
-                f"process_noise: dt_s is {t.min()} s; noise needs a duration >= 0, swap the stamps"
+                f"process_noise: dt_s is {t.min()} s; the duration must be >= 0, swap the two stamps"
             )
         return t
 
     def transition(self, x: FloatArray, dt_s: float | FloatArray) -> Transition:
-        """Return `predict`, `jacobian` and `process_noise` of the states `x`. Raises as `process_noise`."""
+        """Return `predict`, `jacobian` and `process_noise` of the states `x`.
+
+        Raises `CallError` if `dt_s` is negative.
+        """
         return Transition(
             self.predict(x, dt_s), self.jacobian(x, dt_s), self.process_noise(x, dt_s)
         )
 
     def start_variance(self, name: str) -> float:
-        """Variance of an unobserved entry `name` of a new object; its mean is 0."""
+        """Variance of the unobserved entry `name` of a new object. The mean of this entry is 0."""
         return 1.0
 
     def kinematic(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean (..., m) and first-order covariance (..., m, m) of the leading m entries of `STATE_NAMES`.
-        m is 6 of a model with an acceleration, else 5; an entry that the state lacks is 0 with variance 0. The variance
-        of a Cartesian state's yaw at speed 0 is large but finite, see `MIN_SPEED_MPS`.
+        """Mean (..., m) and first-order covariance (..., m, m) of the first m entries of `STATE_NAMES`.
+
+        m is 6 for a model with an acceleration, else 5. An entry that the state lacks
+        is 0 with variance 0. The yaw variance of a Cartesian state at speed 0 is large
+        but finite, see `MIN_SPEED_MPS`.
         """
-        if self._leads:
+        if self._is_kinematic:
             return x, P
         S = self._selection[
             : len(STATE_NAMES) if "accel_mps2" in self.state_names else ACCEL
@@ -130,12 +144,15 @@ class MotionModel(ABC):
     def from_kinematic(
         self, mean: FloatArray, covariance: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """State and covariance P of this model from a kinematic state; a missing entry is 0 with `start_variance`.
-        To the first-order covariance of a Cartesian velocity comes the variance of the product of speed error and yaw
-        error, across the heading: without it, an object born at speed 0 could not move sideways.
+        """Return the state and covariance P of this model from a kinematic state and its covariance.
+
+        An entry that the kinematic state lacks is 0 with variance `start_variance`. For
+        a Cartesian state, P also contains the variance of the product of speed error
+        and yaw error, across the heading. Without it, an object born at speed 0 could
+        not move sideways.
         """
         n = self.dim
-        if self._leads and n <= mean.shape[-1]:
+        if self._is_kinematic and n <= mean.shape[-1]:
             return mean[..., :n], covariance[..., :n, :n]
         S = self._selection[: mean.shape[-1]]
         x = mean @ S
@@ -147,10 +164,8 @@ class MotionModel(ABC):
         if self.cartesian:
             unknown[2:4] = 0.0, 0.0
             yaw_speed = mean[..., YAW:YAW_RATE]
-            x[..., 2:4], J[..., 2:4, YAW:YAW_RATE] = (
-                cartesian(yaw_speed),
-                cartesian_gradient(yaw_speed),
-            )
+            x[..., 2:4] = cartesian(yaw_speed)
+            J[..., 2:4, YAW:YAW_RATE] = cartesian_gradient(yaw_speed)
         P = symmetrise(congruence(J, covariance)) + np.diag(unknown)
         if self.cartesian:
             product = (
@@ -166,13 +181,13 @@ class MotionModel(ABC):
         return x, P
 
     @cached_property
-    def _leads(self) -> bool:
-        """True if the state is a kinematic state."""
+    def _is_kinematic(self) -> bool:
+        """True if the state consists of the first entries of `STATE_NAMES`, in their order."""
         return self.dim >= ACCEL and self.state_names == STATE_NAMES[: self.dim]
 
     @cached_property
     def _selection(self) -> FloatArray:
-        """1 where an entry of `STATE_NAMES` (rows) and one of the state (columns) have the same name, shape (6, n)."""
+        """Matrix (6, n): 1 where the row's `STATE_NAMES` entry equals the column's state entry."""
         return np.array(
             [
                 [float(row == column) for column in self.state_names]
@@ -183,16 +198,18 @@ class MotionModel(ABC):
 
 @dataclass(frozen=True)
 class WhiteNoise(MotionModel):
-    """A motion model with a compiled transition, driven by white noise in each entry of the state.
-    Noise parameters are spectral densities, in fields `<entry>_density_<unit>` in the order of the state.
+    """Motion model with a compiled transition, driven by white noise in each state entry.
+
+    Noise parameters are spectral densities. Their fields are named
+    `<entry>_density_<unit>`, in state order.
     """
 
     kind: ClassVar[int] = 0
-    """Kind of its transition in `fgtrack.models.transitions`."""
+    """Number of the model's transition in `fgtrack.models.transitions`."""
 
     @cached_property
     def is_compiled(self) -> bool:
-        """True if compiled loops may take the transition for its own: no subclass has replaced it, or a part of it."""
+        """True if compiled loops may use the compiled transition, as no subclass has overridden it."""
         own, names = type(self), ("predict", "jacobian", "process_noise", "transition")
         return all(getattr(own, name) is getattr(WhiteNoise, name) for name in names)
 
@@ -203,9 +220,12 @@ class WhiteNoise(MotionModel):
     def from_std_per_step(
         cls, std: Mapping[str, float], frequency_hz: float, **others: float
     ) -> Self:
-        """Model with the noise of a filter that adds (std / frequency_hz)^2 per step: densities std^2 / frequency_hz.
-        `std` is per second, as in Karle et al. 2023, by the names of all densities up to `_density_`: `position`,
-        `yaw`, ... `others` are the parameters of the model that are no densities.
+        """Return a model with the noise of a filter that adds (std / frequency_hz)^2 in each step.
+
+        The densities are std^2 / frequency_hz. `std` is per second, as in Karle et al.
+        2023. Its keys are the names of all densities up to `_density_`: `position`,
+        `yaw`, ... `others` are the other parameters of the model. Raises `ValueError`
+        if a key is missing or unknown.
         """
         names = {name.partition("_density_")[0]: name for name in cls.density_names()}
         if set(std) != set(names):
@@ -224,22 +244,24 @@ class WhiteNoise(MotionModel):
 
     def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.predict`."""
-        return self._moved(x, dt_s).mean
+        return self._unchecked_transition(x, dt_s).mean
 
     def jacobian(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.jacobian`."""
-        return self._moved(x, dt_s).F
+        return self._unchecked_transition(x, dt_s).F
 
     def process_noise(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.process_noise`."""
-        return self._moved(x, self.forward(dt_s)).Q
+        return self._unchecked_transition(x, self.forward(dt_s)).Q
 
     def transition(self, x: FloatArray, dt_s: float | FloatArray) -> Transition:
         """See `MotionModel.transition`."""
-        return self._moved(x, self.forward(dt_s))
+        return self._unchecked_transition(x, self.forward(dt_s))
 
-    def _moved(self, x: FloatArray, dt_s: float | FloatArray) -> Transition:
-        """`transition` over durations that may be negative: Q then means nothing."""
+    def _unchecked_transition(
+        self, x: FloatArray, dt_s: float | FloatArray
+    ) -> Transition:
+        """Return the transition without checking `dt_s`; Q has no meaning for a negative duration."""
         t = np.asarray(dt_s, dtype=np.float64)
         n, shape = self.dim, x.shape[:-1]
         if shape != t.shape:
@@ -262,18 +284,21 @@ class WhiteNoise(MotionModel):
 
     @cached_property
     def density(self) -> FloatArray:
-        """Spectral densities of the entries of the state, shape (n,); x and y have the same."""
+        """Spectral density of each state entry, shape (n,); x and y share the first one."""
         first, *others = (getattr(self, name) for name in self.density_names())
         return np.array([first, first, *others])
 
     @cached_property
     def noise(self) -> FloatArray:
-        """Parameters of the compiled transition: the densities, then those that its kind has besides."""
+        """Parameters of the compiled transition: the densities, then the model's other parameters."""
         return self.density
 
 
 def relaxation_hz(density: float, std: float) -> float:
-    """Rate of the Ornstein-Uhlenbeck process with this spectral density and stationary standard deviation, in 1/s."""
+    """Relaxation rate [1/s] of an Ornstein-Uhlenbeck process.
+
+    `density` is its spectral density, and `std` its stationary standard deviation.
+    """
     return 0.5 * density / (std * std)
 
 
@@ -281,12 +306,16 @@ def relaxation_hz(density: float, std: float) -> float:
 class CTRV(WhiteNoise):
     """Constant turn rate and velocity; state x, y, yaw, speed, yaw rate.
 
-    x(t) + i y(t) = x + i y + speed * integral over s in [0, t] of exp(i yaw(s)), exact at any yaw rate. White noise
-    drives each entry. The default densities are those of Karle et al. 2023: std per second 0.2, 0.3, 1, 0.5 at 100 Hz.
+    x(t) + i y(t) = x + i y + speed * integral over s in [0, t] of exp(i yaw(s)), exact
+    at any yaw rate. White noise drives each entry. The default densities are from Karle
+    et al. 2023: std per second 0.2, 0.3, 1, 0.5 at 100 Hz.
 
-    The yaw rate is stationary, an Ornstein-Uhlenbeck process: it relaxes to zero at the rate `relaxation_hz`. Without
-    measurements its standard deviation becomes `yaw_rate_std_radps`, however long that takes. The yaw of a slow object
-    has more noise: positions do not show it, see docs/estimators.md.
+    The yaw rate is a stationary Ornstein-Uhlenbeck process. It relaxes to zero at the
+    rate `relaxation_hz`. Without measurements its standard deviation converges to
+    `yaw_rate_std_radps`.
+
+    The yaw of a slow object has additional noise, because positions do not observe this
+    yaw. See docs/estimators.md.
     """
 
     position_density_m2ps: float = 0.2**2 / 100.0
@@ -294,11 +323,14 @@ class CTRV(WhiteNoise):
     speed_density_m2ps3: float = 1.0**2 / 100.0
     yaw_rate_density_rad2ps3: float = 0.5**2 / 100.0
     yaw_rate_std_radps: float = field(default=0.5, kw_only=True)
-    """Standard deviation of the yaw rate of any object at any time; infinity for a random walk."""
+    """Stationary standard deviation of the yaw rate; infinity gives a random walk."""
     slow_mps: float = field(default=1.0, kw_only=True)
-    """Speed below which the yaw has more noise."""
+    """Speed below which the yaw has additional noise."""
     resting_yaw_rad2ps: float = field(default=6.0, kw_only=True)
-    """Spectral density that is added to that of the yaw, times 1 / (1 + (speed / slow_mps)^2)^2."""
+    """Additional spectral density of the yaw of an object at rest.
+
+    At other speeds it is multiplied by 1 / (1 + (speed / slow_mps)^2)^2.
+    """
 
     state_names: ClassVar[tuple[str, ...]] = STATE_NAMES[:ACCEL]
 
@@ -324,8 +356,9 @@ class CTRV(WhiteNoise):
 class CTRA(CTRV):
     """Constant turn rate and acceleration: CTRV with the acceleration along the heading as sixth entry.
 
-    x(t) + i y(t) = x + i y + integral over s in [0, t] of (speed + accel s) exp(i yaw(s)); by default with the noise of
-    Karle et al. 2023 (see `CTRV`), for the acceleration std 3 per second at 100 Hz.
+    x(t) + i y(t) = x + i y + integral over s in [0, t] of (speed + accel s) exp(i
+    yaw(s)). The default noise is from Karle et al. 2023 (see `CTRV`). The acceleration
+    has std 3 per second at 100 Hz.
     """
 
     accel_density_m2ps5: float = 3.0**2 / 100.0
@@ -335,19 +368,22 @@ class CTRA(CTRV):
 
 @dataclass(frozen=True)
 class CT(WhiteNoise):
-    """Coordinated turn: constant turn rate with the velocity along the axes of the map; x, y, vx, vy, yaw rate.
+    """Coordinated turn with constant turn rate; state x, y, vx, vy, yaw rate.
 
-    The velocity turns with the yaw rate, which relaxes to zero as that of `CTRV`. White noise acceleration drives vx
-    and vy alike. Positions are linear in this state but for the yaw rate, so it takes no false evidence of a heading
-    from an object at rest. It has no heading where the speed is zero: take `CTRV` where a sensor measures the yaw. By
-    default with the noise of Karle et al. 2023 (see `CTRV`).
+    The velocity, along the axes of the map, turns with the yaw rate. The yaw rate
+    relaxes to zero as in `CTRV`. White-noise acceleration drives vx and vy alike. The
+    default noise is from Karle et al. 2023 (see `CTRV`).
+
+    The position depends linearly on all entries except the yaw rate. So an object at
+    rest gives no false evidence of a heading. At speed zero the state has no heading:
+    use `CTRV` if a sensor measures the yaw.
     """
 
     position_density_m2ps: float = 0.2**2 / 100.0
     velocity_density_m2ps3: float = 1.0**2 / 100.0
     yaw_rate_density_rad2ps3: float = 0.5**2 / 100.0
     yaw_rate_std_radps: float = field(default=0.5, kw_only=True)
-    """Standard deviation of the yaw rate of any object at any time; infinity for a random walk."""
+    """Stationary standard deviation of the yaw rate; infinity gives a random walk."""
 
     state_names: ClassVar[tuple[str, ...]] = (*CARTESIAN, "yaw_rate_radps")
     kind: ClassVar[int] = 2
@@ -363,7 +399,7 @@ class CT(WhiteNoise):
 
     @cached_property
     def density(self) -> FloatArray:
-        """See `WhiteNoise.density`; vx and vy have the same."""
+        """See `WhiteNoise.density`; vx and vy share one density."""
         q_position, q_velocity, q_yaw_rate = (
             getattr(self, name) for name in self.density_names()
         )
@@ -377,10 +413,10 @@ class CT(WhiteNoise):
 
 @dataclass(frozen=True)
 class CV(WhiteNoise):
-    """Constant velocity, linear; state x, y and the velocities vx, vy along the axes of the map.
+    """Constant velocity, a linear model; state x, y, vx, vy along the axes of the map.
 
-    White noise acceleration drives vx and vy alike, by default with the speed's density of Karle et al. 2023 (see
-    `CTRV`).
+    White-noise acceleration drives vx and vy alike. The default density is the speed
+    density of Karle et al. 2023 (see `CTRV`).
     """
 
     velocity_density_m2ps3: float = 1.0**2 / 100.0
@@ -391,7 +427,7 @@ class CV(WhiteNoise):
 
     @cached_property
     def density(self) -> FloatArray:
-        """See `WhiteNoise`: that of the velocity."""
+        """See `WhiteNoise.density`; only the velocity has noise."""
         return np.array(
             [0.0, 0.0, self.velocity_density_m2ps3, self.velocity_density_m2ps3]
         )

@@ -1,4 +1,4 @@
-"""A smooth closed curve to drive along: position, heading and curvature with their exact derivatives."""
+"""A smooth closed path: position, heading and curvature with their exact derivatives."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -7,20 +7,24 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray
 
-_STEPS = 60
+_JACOBI_STEPS = 60
 
 
 @dataclass(frozen=True)
 class PathFrame:
-    """Moving frame of a path at n parameters u. Shapes (n,); a prime is the derivative by u."""
+    """Moving frame of a path at n parameters u; all shapes are (n,).
+
+    A prime denotes the derivative by u.
+    """
 
     x_m: FloatArray
     y_m: FloatArray
     heading_rad: FloatArray
     """Direction of the tangent, wrapped."""
     scale: FloatArray
-    """Metres of path per unit of u, 1 for an arc-length parameter."""
+    """Metres of path per unit of u; 1 for an arc-length parameter."""
     scale_rate: FloatArray
+    """scale'."""
     turn: FloatArray
     """heading'."""
     turn_rate: FloatArray
@@ -29,23 +33,24 @@ class PathFrame:
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Periodic cubic spline through points; the parameter u is the arc length along their chords."""
+    """Periodic cubic spline through points. Its parameter u is the arc length along the chords."""
 
     u_m: FloatArray
-    """Parameter of the points, shape (n + 1,), from 0 to the length."""
+    """Parameters of the points, shape (n + 1,), from 0 to the length of the lap."""
     coefficients: FloatArray
     """Position and its three derivatives at the start of each piece, shape (4, n, 2)."""
 
     @classmethod
     def through(cls, points_m: FloatArray) -> Self:
-        """Closed path through `points_m`, shape (n + 1, 2), whose last point repeats the first."""
+        """Return the closed path through `points_m`, shape (n + 1, 2); the last point repeats the first."""
         steps = np.diff(points_m, axis=0)
         h = np.hypot(*steps.T)[:, None]
-        slope, before = steps / h, np.roll(h, 1, axis=0)
-        # Continuous second derivatives: h_- s_- + 2 (h_- + h) s + h s_+ = 6 (slope - slope_-). Each Jacobi step halves
-        # the error.
+        slope = steps / h
+        before = np.roll(h, 1, axis=0)
+        # Continuous second derivatives s: h_- s_- + 2 (h_- + h) s + h s_+ = 6 (slope - slope_-).
+        # Each Jacobi step halves the error of the solution.
         second = total = 3.0 * (slope - np.roll(slope, 1, axis=0)) / (before + h)
-        for _ in range(_STEPS):
+        for _ in range(_JACOBI_STEPS):
             neighbours = before * np.roll(second, 1, axis=0) + h * np.roll(
                 second, -1, axis=0
             )
@@ -61,23 +66,19 @@ class Path:
 
     @property
     def length_m(self) -> float:
-        """Length of a lap along the chords."""
+        """Length of the lap along the chords."""
         return float(self.u_m[-1])
 
     def frame(self, u_m: FloatArray) -> PathFrame:
-        """Moving frame at `u_m`, shape (n,), of any lap."""
+        """Moving frame at the parameters `u_m`, shape (n,); parameters of any lap are valid."""
         lap_m = np.mod(u_m, self.length_m)
         piece = np.searchsorted(self.u_m[1:-1], lap_m, side="right")
-        t, (p0, p1, p2, p3) = (
-            (lap_m - self.u_m[piece])[:, None],
-            self.coefficients[:, piece],
-        )
+        t = (lap_m - self.u_m[piece])[:, None]
+        p0, p1, p2, p3 = self.coefficients[:, piece]
         x, y = (p0 + t * (p1 + t * (p2 / 2.0 + t * p3 / 6.0))).T
-        (x1, y1), (x2, y2), (x3, y3) = (
-            (p1 + t * (p2 + t * p3 / 2.0)).T,
-            (p2 + t * p3).T,
-            p3.T,
-        )
+        x1, y1 = (p1 + t * (p2 + t * p3 / 2.0)).T
+        x2, y2 = (p2 + t * p3).T
+        x3, y3 = p3.T
         scale_squared = x1 * x1 + y1 * y1
         scale = np.sqrt(scale_squared)
         dot = x1 * x2 + y1 * y2

@@ -1,4 +1,4 @@
-"""The map at a position: the heading of the traffic, its curvature, and whether an object can be there."""
+"""The map as the tracker uses it: heading and curvature of the road, and where objects can be."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,21 +10,24 @@ from fgtrack.core.types import FloatArray
 from fgtrack.models.track_map import RoadView
 
 OPEN_SPACE = "none"
-"""Name of open space instead of the file of a track."""
+"""Setting for open space, used instead of the file name of a track map."""
 
 
 class RoadLine(Protocol):
-    """The map of one closed road: `TrackMap`, or the map of the published implementation."""
+    """Map of one closed road: `TrackMap`, or the map of the published implementation."""
 
     def view(
         self, points_m: FloatArray, inner_buffer_m: float, outer_buffer_m: float
     ) -> RoadView:
-        """Return the map at `points_m`, shape (n, 2). Objects may lie beyond the bounds by the buffers."""
+        """Return the map at `points_m`, shape (n, 2). The buffers move the bounds outwards."""
 
 
 @dataclass(frozen=True)
 class Road:
-    """Maps of track and pit lane, open space without a track; objects may lie beyond the bounds by the buffers."""
+    """Map of the track and the pit lane, or open space without a track.
+
+    The buffers move the bounds outwards.
+    """
 
     track: RoadLine | None = None
     pit: RoadLine | None = None
@@ -33,12 +36,16 @@ class Road:
     pit_buffer_m: float = 0.0
 
     @cached_property
-    def known(self) -> bool:
-        """False in open space, where headings mean nothing."""
+    def has_track(self) -> bool:
+        """True if there is a track. In open space the headings have no meaning."""
         return self.track is not None
 
     def view(self, points_m: FloatArray) -> RoadView:
-        """The map at `points_m`, shape (n, 2); outside is what lies on neither track nor pit lane."""
+        """Return the map at `points_m`, shape (n, 2).
+
+        A point is outside if it lies neither on the track nor in the pit lane. In open
+        space headings and curvatures are 0, and no point is outside.
+        """
         if self.track is None:
             zeros = np.zeros(len(points_m))
             return RoadView(zeros, zeros, np.zeros(len(points_m), dtype=bool))
@@ -46,8 +53,8 @@ class Road:
         if self.pit is None or not any(track.outside.tolist()):
             return track
         outside = track.outside.copy()
-        strays = np.flatnonzero(outside)
-        outside[strays] = self.pit.view(
-            points_m[strays], self.pit_buffer_m, self.pit_buffer_m
+        beside_track = np.flatnonzero(outside)
+        outside[beside_track] = self.pit.view(
+            points_m[beside_track], self.pit_buffer_m, self.pit_buffer_m
         ).outside
         return track._replace(outside=outside)

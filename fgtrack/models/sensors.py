@@ -1,4 +1,4 @@
-"""Sensors: measured quantities, noise, delay limits, and the weight of detections in the life of a track."""
+"""Sensor models: measured components, noise, delays, field of view and track-life settings."""
 
 import math
 from collections.abc import Mapping
@@ -29,148 +29,199 @@ _AT_ORIGIN = Mount()
 
 @settings
 class Filter:
-    """Which values pass; all that is given must hold."""
+    """Condition on a field of a detection. A value passes if it meets every given condition."""
 
     min: float | None = None
     """Smallest value that passes."""
     max: float | None = None
     """Largest value that passes."""
     one_of: tuple[bool | int | float | str, ...] | None = None
-    """Values that pass, no others."""
+    """The only values that pass."""
     none_of: tuple[bool | int | float | str, ...] = ()
-    """Values that do not."""
+    """Values that do not pass."""
 
     def __post_init__(self) -> None:
         if self.min is not None and self.max is not None and not self.min <= self.max:
-            raise ValueError(
-                f"min: must not be more than max = {self.max}, is {self.min}"
-            )
+            raise ValueError(f"min: is {self.min}, must be at most max = {self.max}")
 
     def passes(self, value: object) -> bool:
-        """True if `value` passes; what is not there or not a number does not pass a bound."""
+        """True if `value` passes; a missing or non-numeric value does not pass a bound."""
         if (
             self.one_of is not None and value not in self.one_of
         ) or value in self.none_of:
             return False
         if self.min is None and self.max is None:
             return True
-        low, high = (
-            -math.inf if self.min is None else self.min,
-            math.inf if self.max is None else self.max,
-        )
+        low = -math.inf if self.min is None else self.min
+        high = math.inf if self.max is None else self.max
         return isinstance(value, Real) and low <= float(value) <= high
 
 
 @settings
 class RobustLoss:
-    """A loss that grows slower than the square, so that an outlier pulls less."""
+    """Robust loss: it grows slower than the square, so an outlier pulls the estimate less."""
 
     kind: Literal["huber", "cauchy", "tukey", "geman_mcclure", "dcs"]
     """`tukey`, `geman_mcclure` and `dcs` are redescending: they can lose a track for good."""
     width: PositiveFloat
-    """Where the loss leaves the square, in standard deviations of one component; of several at the same probability."""
+    """Distance at which the loss departs from the square, in standard deviations of one component.
+
+    For several components the distance with the same probability is used.
+    """
 
 
 @settings
 class Correlation:
-    """Correlation between the errors of an object's successive detections."""
+    """Time correlation between the errors of successive detections of one object."""
 
     share: OpenProbability = 0.8
-    """Correlated share of the variance; the rest is new in every detection."""
+    """Correlated share of the error variance. The rest is independent in each detection."""
     time_s: PositiveFloat = 1.0
-    """After this time the correlated part has fallen to 1/e, as the autocorrelation of the errors shows."""
+    """Correlation time: the autocorrelation of the correlated part falls to 1/e after it."""
     jump_probability: float = Field(0.0, ge=0.0, lt=1.0)
-    """Probability that a position's whole error is new, as at the other end of a hull. A detection that a claim refuses
-    then updates a confirmed track without one, if a jump is likelier than clutter; see `association.claim_m`."""
+    """Probability that the whole position error is new, for instance because the sensor
+    now sees the other end of a hull.
+
+    A detection that a claim refuses then updates a confirmed track without a detection
+    of its own, if a jump is more likely than clutter. See `association.claim_m`.
+    """
 
 
 @settings
 class Score:
-    """Likelihood ratio of a detection's score: log p(score | object) / p(score | clutter) = (score - even) / scale.
-    Its logarithm is at most 10 to either side.
+    """Likelihood ratio of a detection's score: log(p(score | object) / p(score | clutter)) = (score - even) / scale.
+
+    The logarithm is limited to the range from -10 to 10.
     """
 
     even: float
-    """A score that objects and clutter have equally often."""
+    """Score that is equally likely for objects and clutter."""
     scale: PositiveFloat
-    """Increase of the score that makes an object e times more probable."""
+    """Increase of the score that multiplies the likelihood ratio by e."""
 
 
 @settings
 class SensorModel:
-    """One modality. Positions have their standard deviations along and across the line of sight."""
+    """Model of a sensor.
+
+    Position errors have one standard deviation along and one across the line of sight.
+    """
 
     std: Mapping[str, PositiveFloat]
-    """Standard deviation of each measured component; the keys are what the sensor measures."""
+    """Standard deviation of each measured component. The keys are the components that the sensor measures."""
     yaw_from_map_std_rad: PositiveFloat | None = None
-    """Where the sensor measures no yaw: take the map heading as a yaw measurement with this standard deviation."""
+    """For a sensor without yaw: use the map heading as a yaw measurement with this standard deviation."""
     curvature_from_map_std_radpm: PositiveFloat | None = None
-    """Take the curvature of the map's line as a measurement of yaw rate over speed with this standard deviation: the
-    yaw rate is speed times curvature, but for what a driver does beside the line; null: no curvature."""
+    """Use the curvature of the map's line as a measurement of yaw rate over speed.
+
+    This is its standard deviation: it covers drivers who leave the line. null: no such
+    measurement.
+    """
     std_growth: Mapping[str, NonNegativeFloat] = field(default_factory=dict)
-    """By how much the standard deviation of a component grows with each metre of range: its variance is std^2 +
-    (std_growth range)^2. A detection's own covariance stays as it is."""
+    """Growth of the standard deviation of a component per metre of range: the variance is
+    std^2 + (std_growth range)^2.
+
+    It does not change a detection's own covariance.
+    """
     max_delay_s: PositiveFloat | None = None
-    """A message that arrives later than this is refused as too old."""
+    """Largest delay of a message. A later message is refused as too old. null: no limit."""
     counter_init: PositiveInt = 3
-    """Status counter of a track that this sensor gave birth to."""
+    """Initial status counter of a track that this sensor starts."""
     counter_add: NonNegativeInt = 1
-    """Increment of the status counter by a match with this sensor."""
+    """Increment of the status counter when a detection of this sensor matches a track."""
     ages: Literal["always", "short_range", "long_range", "never"] = "always"
-    """At which range a track that this sensor does not see loses one count."""
+    """Range at which a track that this sensor misses loses one count."""
     stamp_from: Literal["message", "object", "objects_mean", "receipt"] = "message"
-    """A detection's stamp: the list's, its own where it carries one, the mean of those that do, or the receipt, where
-    the driver sets none or one of another clock."""
+    """Stamp of a detection: of the message, of the object where it has one, or the mean of the objects' stamps.
+
+    `receipt` uses the receipt time, for a driver that sets no stamps or uses another
+    clock.
+    """
     clock_offset_s: Annotated[float, Field(ge=-60.0, le=60.0)] = 0.0
-    """Advance of its stamps over the time at which it measured; subtracted before anything else is done. With
-    `stamp_from: receipt` its latency. `fgtrack advise` and `fgtrack offsets` find it."""
+    """Stamp minus time of measurement.
+
+    It is subtracted from each stamp before any other use. With `stamp_from: receipt` it
+    is the sensor latency. `fgtrack advise` and `fgtrack offsets` estimate it.
+    """
     stamp_std_s: NonNegativeFloat = 0.0
-    """Standard deviation of its stamps: adds the velocity times it to the noise of every detection, along the motion of
-    the track that it is compared with."""
+    """Standard deviation of the stamps.
+
+    The covariance of a detection gains the variance (speed times this)^2 along the
+    motion of the compared track.
+    """
     wrong_id_probability: OpenProbability = 1e-4
-    """Probability that the identity of a detection, or of its track, is wrong. Where both have one, the NIS of the pair
-    is lower by 2 log((1 - p) / p) if they are equal, and higher by it if they are not."""
+    """Probability p that the identity of a detection or of its track is wrong.
+
+    If both have an identity, the NIS of the pair changes by 2 log((1 - p) / p): it is
+    lower for equal identities, and higher for different ones.
+    """
     copies_s: PositiveFloat | None = None
-    """A detection of the same identity and position as one received at most this long before is a copy of its message,
-    heard by another receiver: `duplicate`. A copy with an earlier stamp, received before the first was processed, gives
-    it its stamp. Null: objects that stand repeat the same position."""
+    """Longest time between a message and its copy through another receiver.
+
+    A detection with the identity and position of one that was received within this time
+    is a `duplicate`. If the copy has the earlier stamp, and comes before the first
+    message was processed, its stamp is used. null: no check, because objects at rest
+    repeat their position.
+    """
     message_covariance: bool = True
-    """Use a detection's own covariance where the message carries one."""
+    """Use the covariance of a detection where the message contains it."""
     max_range_m: PositiveFloat | None = None
-    """A detection further from the sensor than this is out of bounds: beyond it clutter outweighs objects."""
+    """A detection beyond this range is out of bounds: there, clutter outweighs objects."""
     filters: Mapping[str, Filter] = field(default_factory=dict)
-    """Which detections are used, by anything that they contain: `{score: {min: 0.5}, class_name: {one_of: [car]}}`. The
-    others are out of bounds."""
+    """Conditions on any field of a detection: `{score: {min: 0.5}, class_name: {one_of: [car]}}`.
+
+    A detection that fails a condition is out of bounds.
+    """
     view_range_m: PositiveFloat | None = None
-    """Range of view, where that is less than `max_range_m`; for existence and evaluation, no detection is out of
-    bounds by it."""
+    """Range of view, if it is smaller than `max_range_m`.
+
+    It affects existence and evaluation alone: detections beyond it are used.
+    """
     max_range_behind_m: PositiveFloat | None = None
-    """Range of view in the half behind it, where that is less; for existence and evaluation."""
+    """Smaller range of view in the half-plane behind the sensor. It affects existence and evaluation alone."""
     field_of_view_rad: Annotated[float, Field(gt=0.0, le=math.tau)] | None = None
-    """Full angle that it sees, centred on its axis; for existence and evaluation, as these ranges. null: in a replay
-    that of the recording, or where it detects in it, if no range is given either; else all around."""
+    """Full opening angle of the field of view, centred on the sensor axis.
+
+    It affects existence and evaluation alone. null: all around; a replay without any
+    given range uses the field of view of the recording, if the sensor detects objects
+    in it.
+    """
     scan: bool = True
-    """True if a list shows all objects in view, so that it misses those that it lacks. False where objects are reported
-    one by one, as by ADS-B, AIS or V2X; without a configuration a replay finds it in the recording."""
+    """True if a list contains all objects in view, so a missing object is a miss.
+
+    False for objects that report themselves, as with ADS-B, AIS or V2X. Without a
+    configuration, a replay detects this from the recording.
+    """
     births: bool = True
     """True if an unmatched detection of this sensor starts a track."""
     loss: RobustLoss | None = None
-    """Robust loss of its measurements; null is the Gaussian. A smoother updates the weights while they are in its
-    window, a filter once, at the state that the update gives."""
+    """Robust loss of the sensor's measurements.
+
+    null: Gaussian. A smoother updates the weights while the measurements are in its
+    window. A filter weights once, at the updated state.
+    """
     detection_probability: OpenProbability = 0.9
-    """Probability that a list shows an object that is visible to it (`lifecycle.kind: existence`), as in a list between
-    two that show it. How often objects are hidden, or too small or too far away, is estimated."""
+    """Probability that a list contains an object that is visible to the sensor (`lifecycle.kind: existence`).
+
+    It describes lists between two lists that contain the object. The tracker estimates
+    how often objects are hidden, too small or too far away.
+    """
     clutter_per_m2: PositiveFloat = 1e-4
-    """False detections in a list for each square metre (`lifecycle.kind: existence`, `association.joint_from`)."""
+    """False detections per list and square metre (`lifecycle.kind: existence`, `association.joint_from`)."""
     score: Score | None = None
-    """Evidence of the score of a detection for the existence of its object; null: none."""
+    """Evidence of a detection's score for the existence of its object. null: the score is no evidence."""
     near_side_m: float = 0.0
-    """Distance by which the sensor sees an object nearer than its reference point, along the line of sight: the near
-    side of a hull or a car. Positions are moved away from the sensor by it."""
+    """Distance along the line of sight from the detected near side of a hull or car to its reference point.
+
+    Detected positions are moved away from the sensor by it.
+    """
     mount: Mount | None = None
-    """Pose of the sensor in the ego's detection frame; null: in a replay that of the recording, else the origin."""
+    """Pose of the sensor in the ego's detection frame.
+
+    null: the mount in the recording for a replay, else the origin.
+    """
     correlation: Correlation | None = None
-    """Errors that are correlated in time, estimated with each object; null: errors are white."""
+    """Time-correlated errors, estimated with each object. null: the errors are white."""
 
     def __post_init__(self) -> None:
         for key, names, known in (
@@ -181,11 +232,11 @@ class SensorModel:
             unknown = [name for name in names if name not in known]
             if unknown:
                 raise ValueError(
-                    f"{key}: unknown {unknown[0]!r}, known are {', '.join(known)}"
+                    f"{key}: unknown {unknown[0]!r}, use {', '.join(known)}"
                 )
         if not self.std or ("x_m" in self.std) != ("y_m" in self.std):
             raise ValueError(
-                "std: name at least one measured component, and x_m and y_m together"
+                "std: give at least one measured component, and x_m and y_m together"
             )
 
     @property
@@ -193,8 +244,8 @@ class SensorModel:
         """Measured components in the order of `MEASURABLE`."""
         return tuple(name for name in MEASURABLE if name in self.std)
 
-    def refusing(self, detection: Detection) -> str | None:
-        """Name of the first of the filters that `detection` does not pass; None where it passes all."""
+    def refusing_filter(self, detection: Detection) -> str | None:
+        """Name of the first field whose filter refuses `detection`; None if it passes all filters."""
         return next(
             (
                 name
@@ -206,17 +257,17 @@ class SensorModel:
 
     @property
     def gives_position(self) -> bool:
-        """True if its detections give a position: x and y, or range and bearing."""
+        """True if the sensor measures positions: x and y, or range and bearing."""
         return "x_m" in self.std or {"range_m", "bearing_rad"} <= self.std.keys()
 
     @property
-    def placed(self) -> Mount:
-        """Its mount, the origin where none is given."""
+    def mount_or_origin(self) -> Mount:
+        """The configured mount; the origin if there is none."""
         return self.mount or _AT_ORIGIN
 
     @property
-    def is_view_given(self) -> bool:
-        """True if its field of view or a range is given."""
+    def has_view_limits(self) -> bool:
+        """True if the field of view or any range limit is configured."""
         limits = {
             self.field_of_view_rad,
             self.max_range_m,
@@ -231,18 +282,21 @@ class SensorModel:
         ego_poses: FloatArray,
         origin_m: tuple[float, float],
     ) -> BoolArray:
-        """True if an object there is in range and in the field of view, shape (...); nothing hides it.
-        `positions_m` (..., 2) and the `ego_poses` x, y, yaw (..., 3) at the same times are in the map, `origin_m` is
-        the origin of the detection frame in that of the ego.
+        """Mask of positions within range and field of view, shape (...); occlusion is ignored.
+
+        `positions_m` (..., 2) and the `ego_poses` x, y, yaw (..., 3) have the same
+        times and are in the map frame. `origin_m` is the origin of the detection frame
+        in the ego frame.
         """
         x_m, y_m, yaw_rad = np.moveaxis(ego_poses, -1, 0)
-        still, mount = np.zeros_like(x_m), self.placed
+        zero_mps = np.zeros_like(x_m)
+        mount = self.mount_or_origin
         at_x_m, at_y_m, _, _ = body_point(
             x_m,
             y_m,
             yaw_rad,
-            still,
-            still,
+            zero_mps,
+            zero_mps,
             origin_m[0] + mount.x_m,
             origin_m[1] + mount.y_m,
         )
@@ -259,7 +313,10 @@ class SensorModel:
         )
 
     def noise(self, components: tuple[str, ...]) -> FloatArray:
-        """Diagonal covariance R (k, k) of `components`, also those from the map, in the sensor's axes; read-only."""
+        """Diagonal covariance R of `components`, shape (k, k), in the sensor's axes; read-only.
+
+        `components` may include those that the map provides.
+        """
         if components not in self._noises:
             from_map = {
                 "yaw_rad": self.yaw_from_map_std_rad,
@@ -276,17 +333,21 @@ class SensorModel:
         return self._noises[components]
 
     @cached_property
-    def round(self) -> bool:
-        """True if its error of the position is the same along and across the line of sight."""
+    def is_isotropic(self) -> bool:
+        """True if the position error is the same along and across the line of sight."""
         growth = self.std_growth
         return self.std["x_m"] == self.std["y_m"] and growth.get(
             "x_m", 0.0
         ) == growth.get("y_m", 0.0)
 
-    def growth(
+    def variance_growth(
         self, components: tuple[str, ...], range_m: FloatArray
     ) -> FloatArray | None:
-        """Increase (m, k) of the variances in `noise` at `range_m` (m,), 0 at NaN; None where nothing grows."""
+        """Increase of the variances in `noise` at `range_m` (m,), shape (m, k).
+
+        The increase is 0 where the range is NaN. None if no variance of the components
+        grows.
+        """
         if self.std_growth.keys().isdisjoint(components):
             return None
         rates = np.array([self.std_growth.get(name, 0.0) for name in components])
@@ -308,8 +369,11 @@ def in_view(
     max_range_m: float = math.inf,
     max_range_behind_m: float | None = None,
 ) -> BoolArray:
-    """True for objects at these ranges and bearings (0 on the sensor's axis), any one shape, in view of a sensor.
-    `field_of_view_rad` is the full angle; `max_range_behind_m` replaces `max_range_m` in the half behind the sensor.
+    """Mask of the objects that are in a sensor's field of view and range.
+
+    `range_m` and `bearing_rad` (0 on the sensor axis) have one common shape.
+    `field_of_view_rad` is the full opening angle. `max_range_behind_m`, if smaller,
+    replaces `max_range_m` in the half-plane behind the sensor.
     """
     off_axis_rad = np.abs(wrap_angles(bearing_rad))
     behind_m = (

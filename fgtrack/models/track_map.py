@@ -1,4 +1,4 @@
-"""The closed line of a race track or pit lane with its bounds, and the road coordinates along it."""
+"""A race track or pit lane: its closed reference line, its bounds, and road coordinates."""
 
 import math
 from pathlib import Path
@@ -37,15 +37,14 @@ COLUMNS = (
 _COLUMN = {name: index for index, name in enumerate(COLUMNS)}
 _HEADINGS = (_COLUMN["psi_racetraj_rad"], _COLUMN["psi_ref_rad"])
 _ARCS = [_COLUMN["s_racetraj_m"], _COLUMN["s_ref_m"]]
-_FILE_HEADING_OFFSET_RAD = (
-    math.pi / 2
-)  # a file's heading is 0 along +y, REP-103 is 0 along +x
+# A heading is 0 along +y in a map file, and 0 along +x in REP-103.
+_FILE_HEADING_OFFSET_RAD = math.pi / 2
 _SAME_POINT_M = 1e-3
-_MAX_HEADING_ERROR_RAD = (
-    1.0  # coarse maps turn much in a row; a wrong convention is off by pi / 2
-)
-# A segment row holds these quantities where the segment starts, and then the changes to its end. A point is complex,
-# x + i y; times `_BACK`, exp(-i heading), a vector is along + i left. `_ALONG` is the segment's own part along.
+# A coarse map may turn a lot between two rows. A wrong heading convention is off by pi / 2.
+_MAX_HEADING_ERROR_RAD = 1.0
+# Columns of a segment row: ten quantities at the start of the segment, then their changes up to its end.
+# Points are complex numbers x + i y. `_BACK` is exp(-i heading): it rotates a vector to (along + i left).
+# `_ALONG` is the component of the segment itself along the heading.
 _POINT, _BACK, (_HEADING, _CURVATURE, _LEFT, _RIGHT, _ARC, _ALONG) = (
     slice(0, 2),
     slice(2, 4),
@@ -55,25 +54,31 @@ _QUANTITIES = 10
 
 
 class RoadView(NamedTuple):
-    """The map at n positions."""
+    """Map quantities at n positions."""
 
     yaw_rad: FloatArray
     """Heading of the traffic, shape (n,)."""
     curvature_radpm: FloatArray
-    """Left turn positive, shape (n,)."""
+    """Curvature of the road, positive for a left turn, shape (n,)."""
     outside: BoolArray
-    """True where no object can be, shape (n,)."""
+    """Mask of the positions where no object can be, shape (n,)."""
 
 
 class TrackMap:
-    """A closed reference line with widths to both bounds.
-    The line runs straight from row to row. Its normals turn evenly within a segment, so road coordinates (arc length s
-    along the segments, lateral offset to the left) are one-to-one as far as the centre of curvature. Angles are
+    """A closed reference line with the widths to both bounds.
+
+    The line is straight from row to row. Within a segment the normal rotates evenly. So
+    road coordinates are one-to-one up to the centre of curvature. They are the arc
+    length s along the segments, and the lateral offset to the left. Angles follow
     REP-103.
     """
 
     def __init__(self, table: FloatArray) -> None:
-        """`table`: rows of `COLUMNS`, headings in REP-103; raises `DataError` unless it is a closed driven line."""
+        """Build the map from the rows of `table`, with the columns `COLUMNS` and REP-103 headings.
+
+        Raises `DataError` with the row if the rows are not a closed line in driving
+        direction.
+        """
         table = _closed(np.asarray(table, dtype=np.float64))
         table[:, _HEADINGS] = wrap_angles(table[:, _HEADINGS])
         x, y = np.ascontiguousarray(table[:, :2].T)
@@ -87,32 +92,31 @@ class TrackMap:
                 for name in ("kappa_ref_radpm", "width_left_m", "width_right_m")
             ],
         ].T
-        knots = np.stack(
-            [x, y, back.real, back.imag, heading, *others, arc]
-        )  # in the order of a segment row
+        # The quantities in the order of a segment row.
+        knots = np.stack([x, y, back.real, back.imag, heading, *others, arc])
         starts, changes = knots[:, :-1], np.diff(knots)
         along = (np.diff(line) * [back[:-1], np.diff(back)]).real
         segments = np.concatenate([starts, along[:1], changes, along[1:]]).T.copy()
         for array in (table, arc, segments):
             array.flags.writeable = False
         self.table = table
-        """As given, but that the last row closes the line."""
+        """The given rows; the last row repeats the first point and so closes the line."""
         self.length_m = float(arc[-1])
         """Length of one lap."""
         self.counter_clockwise = bool(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1]) > 0.0)
-        """True if the line is driven counter-clockwise, so that the inner bound is the left one."""
-        self._arc, self._segments, self._longest_m = (
-            arc,
-            segments,
-            float(np.diff(arc).max()),
-        )
+        """True if the line is driven counter-clockwise. Then the inner bound is the left bound."""
+        self._arc = arc
+        self._segments = segments
+        self._longest_m = float(np.diff(arc).max())
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """Map of a semicolon-separated file with the 17 `COLUMNS`; `#` starts a comment line.
-        The last row may repeat the first. Raises `DataError` with the path if the file cannot be read or is not a map.
+        """Read a map file: 17 `COLUMNS` separated by semicolons, `#` begins a comment line.
+
+        The last row may repeat the first. Raises `DataError` with the path if the file
+        cannot be read or is not a map.
         """
-        content = read_whole(Path(path), 20.0)  # some 100,000 rows
+        content = read_whole(Path(path), 20.0)  # 20 MB are about 100,000 rows
         try:
             lines = [
                 line
@@ -131,28 +135,33 @@ class TrackMap:
             ) from error
 
     def frenet(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Arc length s in [0, length) and lateral offset (left positive) of `points_m`, shape (n, 2)."""
+        """Arc length s in [0, length) and lateral offset of `points_m` (n, 2); left is positive."""
         foot, lateral = self._locate(points_m)
         s = foot[:, _ARC]
         return np.where(s < self.length_m, s, 0.0), lateral
 
     def position(self, s_m: FloatArray, lateral_m: FloatArray) -> FloatArray:
-        """Points, shape (n, 2), at arc length `s_m` (any lap) and `lateral_m`; the inverse of `frenet`."""
+        """Points (n, 2) at arc length `s_m` and lateral offset `lateral_m`; the inverse of `frenet`.
+
+        Arc lengths of any lap are valid.
+        """
         foot = self._at(s_m)
         back = _complex(foot[:, _BACK])
         points = _complex(foot[:, _POINT]) + 1j * lateral_m * np.abs(back) / back
         return points.view(np.float64).reshape(-1, 2)
 
     def bounds(self, s_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Widths (left, right) from the line to the bounds at arc length `s_m`, shapes (n,)."""
+        """Distances from the line to the left and right bound at arc length `s_m`, shapes (n,)."""
         foot = self._at(s_m)
         return foot[:, _LEFT], foot[:, _RIGHT]
 
     def view(
         self, points_m: FloatArray, inner_buffer_m: float, outer_buffer_m: float
     ) -> RoadView:
-        """Heading and curvature of the line beside `points_m`, shape (n, 2), and True for those outside the bounds.
-        A positive buffer widens the track. The inner bound is the left one if it is driven counter-clockwise.
+        """Heading and curvature of the line at `points_m` (n, 2), and mask of points outside the bounds.
+
+        A positive buffer widens the track. The inner bound is the left one on a track
+        that is driven counter-clockwise.
         """
         left_m, right_m = inner_buffer_m, outer_buffer_m
         if not self.counter_clockwise:
@@ -161,7 +170,7 @@ class TrackMap:
         return RoadView(*kernels("fgtrack.models.feet").view(*line, left_m, right_m))
 
     def _at(self, s_m: FloatArray) -> FloatArray:
-        """Quantities at arc length `s_m`, shape (n, 10)."""
+        """Map quantities at arc length `s_m`, shape (n, 10)."""
         s = np.mod(np.asarray(s_m, dtype=np.float64), self.length_m)
         index: IntArray = np.minimum(
             np.searchsorted(self._arc, s, side="right") - 1, len(self._segments) - 1
@@ -171,7 +180,7 @@ class TrackMap:
         return np.asarray(at[:, :_QUANTITIES] + part[:, None] * at[:, _QUANTITIES:])
 
     def _locate(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Quantities at the feet of `points_m` on the line, shape (n, 10), and lateral offsets, shape (n,)."""
+        """Map quantities at the feet of `points_m` on the line, shape (n, 10), and lateral offsets (n,)."""
         feet: tuple[FloatArray, FloatArray] = kernels("fgtrack.models.feet").feet(
             np.array(points_m, order="C"), self._segments, self._longest_m
         )
@@ -179,16 +188,17 @@ class TrackMap:
 
 
 def _complex(vectors: FloatArray) -> npt.NDArray[np.complex128]:
-    """x + i y of `vectors`, shape (n, 2)."""
+    """Complex numbers x + i y of `vectors`, shape (n, 2)."""
     return np.ascontiguousarray(vectors).view(np.complex128)[:, 0]
 
 
 def _closed(table: FloatArray) -> FloatArray:
-    """Copy of `table` that ends with its first point; raises `DataError` with the row that is wrong."""
+    """Return a copy of `table` that ends with its first point.
+
+    Raises `DataError` with the invalid row.
+    """
     if table.ndim != 2 or table.shape[1] != len(COLUMNS) or len(table) < 4:
-        raise DataError(
-            f"not a map: at least 4 rows of {len(COLUMNS)} columns are needed"
-        )
+        raise DataError(f"not a map: give at least 4 rows of {len(COLUMNS)} columns")
     if not (np.abs(table) <= LARGEST).all():
         row, column = np.argwhere(~(np.abs(table) <= LARGEST))[0].tolist()
         raise DataError(
@@ -200,9 +210,9 @@ def _closed(table: FloatArray) -> FloatArray:
     if gap_m >= _SAME_POINT_M:
         closed[-1, _ARCS] = table[-1, _ARCS] + gap_m
     steps = np.diff(closed[:, :2], axis=0)
-    lengths_m, widths_m = (
-        np.hypot(*steps.T),
-        closed[:-1, [_COLUMN["width_left_m"], _COLUMN["width_right_m"]]].sum(axis=1),
+    lengths_m = np.hypot(*steps.T)
+    widths_m = closed[:-1, [_COLUMN["width_left_m"], _COLUMN["width_right_m"]]].sum(
+        axis=1
     )
     far_m = np.append(np.full(len(steps) - 1, math.inf), 10.0 * lengths_m[:-1].max())
     off_rad = np.abs(
@@ -211,12 +221,21 @@ def _closed(table: FloatArray) -> FloatArray:
         )
     )
     for wrong, text in (
-        (lengths_m < _SAME_POINT_M, "the next row holds the same point"),
-        (lengths_m > far_m, "the line does not close"),
-        (widths_m <= 0.0, "the widths do not add up to a positive one"),
+        (
+            lengths_m < _SAME_POINT_M,
+            "the next row repeats this point, remove one of them",
+        ),
+        (
+            lengths_m > far_m,
+            "the line does not close, the first point is too far from the last",
+        ),
+        (
+            widths_m <= 0.0,
+            "the sum of width_left_m and width_right_m must be positive",
+        ),
         (
             off_rad > _MAX_HEADING_ERROR_RAD,
-            "psi_ref_rad is off the way to the next row; a file counts it from +y",
+            "psi_ref_rad does not point to the next row; in a file it is 0 along +y",
         ),
     ):
         if wrong.any():

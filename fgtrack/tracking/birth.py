@@ -58,7 +58,7 @@ class Birth:
             return None
         measurement, values = candidate.measurement, candidate.values
         yaw_rad, curvature_radpm = values.get("yaw_rad"), 0.0
-        if road.known:
+        if road.has_track:
             view = road.view(candidate.position_m[None])
             curvature_radpm = float(view.curvature_radpm[0])
             if yaw_rad is None:

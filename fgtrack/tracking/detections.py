@@ -172,12 +172,12 @@ def covariances(
     m = len(indices)
     R = np.empty((m, len(names), len(names)))
     R[:] = sensor.noise(names)
-    turns = "x_m" in names and not sensor.round
+    turns = "x_m" in names and not sensor.is_isotropic
     offsets_m = (
         points_m - np.array(pose[:2]) if turns or sensor.std_growth else points_m
     )
     more = (
-        sensor.growth(names, np.hypot(offsets_m[:, 0], offsets_m[:, 1]))
+        sensor.variance_growth(names, np.hypot(offsets_m[:, 0], offsets_m[:, 1]))
         if sensor.std_growth
         else None
     )

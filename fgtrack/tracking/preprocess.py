@@ -278,8 +278,11 @@ class Preprocess:
         yaw_rad = ego.yaw_rad
         x_m, y_m = self._origin_m
         if batch.message.frame == "sensor":
-            x_m, y_m = x_m + sensor.placed.x_m, y_m + sensor.placed.y_m
-            yaw_rad += sensor.placed.yaw_rad
+            x_m, y_m = (
+                x_m + sensor.mount_or_origin.x_m,
+                y_m + sensor.mount_or_origin.y_m,
+            )
+            yaw_rad += sensor.mount_or_origin.yaw_rad
         x_m, y_m, vx_mps, vy_mps = body_point(*ego[:5], x_m, y_m)
         return PosedBatch(
             batch, sensor, ego, SensorPose(x_m, y_m, yaw_rad, vx_mps, vy_mps)
@@ -306,7 +309,7 @@ class Preprocess:
         self, items: MapDetections, lost: Sequence[dict[int, str]]
     ) -> MapDetections:
         """Return the detections inside the bounds, with yaw and curvature of the map; `lost` gets the rest."""
-        if not self._road.known:
+        if not self._road.has_track:
             return items
         takes = [
             (
@@ -447,7 +450,7 @@ def _restricted(items: MapDetections, lost: Sequence[dict[int, str]]) -> MapDete
     batches, passes = items.batches, list[bool]()
     for k, index in zip(items.of.tolist(), items.indices.tolist(), strict=True):
         batch, sensor, _, _ = batches[k]
-        name = sensor.refusing(batch.message.objects[index])
+        name = sensor.refusing_filter(batch.message.objects[index])
         passes.append(name is None)
         if name is not None:
             lost[k][index] = f"filters.{name}"

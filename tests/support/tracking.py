@@ -111,7 +111,7 @@ def states(
 class StraightRoad(Road):
     """Runs along a heading; outside is what lies further than `half_width_m` from y = 0."""
 
-    known = True
+    has_track = True
 
     def __init__(
         self,

@@ -208,7 +208,7 @@ def test_a_key_that_the_user_has_set_wins_also_where_it_is_set_to_its_default(
         0.0,
         None,
     )
-    assert not build_road(found.config.map).known
+    assert not build_road(found.config.map).has_track
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,11 @@ from support.tracking import START_NS, ms
 
 from fgtrack.config.settings import EgoConfig
 from fgtrack.core.types import EgoState
-from fgtrack.models.dead_reckoning import Reckoned, ReportedErrors, reckoned
+from fgtrack.models.dead_reckoning import (
+    PositionEstimate,
+    ReportedErrors,
+    estimate_position,
+)
 from fgtrack.tracking.ego.trajectory import EgoStd, EgoTrajectory
 
 ERRORS = ReportedErrors(0.5**2, 20.0, 0.03**2)
@@ -16,13 +20,13 @@ VELOCITY_MPS = 12.0, -5.0
 
 def drive(
     reported_m, errors: ReportedErrors = ERRORS, velocity_mps=VELOCITY_MPS
-) -> list[Reckoned]:
+) -> list[PositionEstimate]:
     """Estimates from positions reported ten times a second."""
-    estimates: list[Reckoned] = []
+    estimates: list[PositionEstimate] = []
     for k, position_m in enumerate(np.asarray(reported_m).tolist()):
         last = estimates[-1] if estimates else None
         estimates.append(
-            reckoned(
+            estimate_position(
                 last, START_NS + ms(100 * k), tuple(position_m), velocity_mps, errors
             )
         )
@@ -86,11 +90,13 @@ def test_a_vehicle_that_was_moved_is_three_standard_deviations_off_at_first(
         last.position_m[1],
     )
     estimates = [
-        reckoned(last, last.stamp_ns + ms(gap_ms), reported_m, (0.0, 0.0), ERRORS)
+        estimate_position(
+            last, last.stamp_ns + ms(gap_ms), reported_m, (0.0, 0.0), ERRORS
+        )
     ]
     for _ in range(600):
         estimates.append(
-            reckoned(
+            estimate_position(
                 estimates[-1],
                 estimates[-1].stamp_ns + ms(100),
                 reported_m,
@@ -104,14 +110,16 @@ def test_a_vehicle_that_was_moved_is_three_standard_deviations_off_at_first(
 
 
 def test_an_estimate_that_is_not_finite_ends_with_the_position_that_was_not():
-    lost = reckoned(
+    lost = estimate_position(
         drive(straight(20))[-1],
         START_NS + ms(2000),
         (math.nan, 0.0),
         VELOCITY_MPS,
         ERRORS,
     )
-    after = reckoned(lost, START_NS + ms(2100), (7.0, 8.0), VELOCITY_MPS, ERRORS)
+    after = estimate_position(
+        lost, START_NS + ms(2100), (7.0, 8.0), VELOCITY_MPS, ERRORS
+    )
     assert (after.position_m, after.error_m) == ((7.0, 8.0), (0.0, 0.0))
 
 

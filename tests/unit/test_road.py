@@ -12,7 +12,7 @@ from fgtrack.models.track_map import COLUMNS, TrackMap
 
 def test_without_a_map_an_object_may_be_anywhere_and_no_heading_is_known() -> None:
     view = Road().view(np.array([[0.0, 0.0], [1e6, -1e6]]))
-    assert not Road().known
+    assert not Road().has_track
     assert [part.tolist() for part in view] == [[0.0, 0.0], [0.0, 0.0], [False, False]]
 
 

@@ -57,12 +57,12 @@ def test_a_sensor_sees_what_is_in_range_and_in_its_field_of_view(
 
 def test_what_grows_with_range_is_measured_and_does_not_shrink() -> None:
     sensor = SensorModel(std=POSITION, std_growth={"y_m": 0.01})
-    assert sensor.growth(("x_m",), np.array([10.0])) is None
-    found = sensor.growth(("x_m", "y_m"), np.array([0.0, 10.0, np.nan]))
+    assert sensor.variance_growth(("x_m",), np.array([10.0])) is None
+    found = sensor.variance_growth(("x_m", "y_m"), np.array([0.0, 10.0, np.nan]))
     assert found is not None
     np.testing.assert_allclose(found, [[0.0, 0.0], [0.0, 0.01], [0.0, 0.0]])
     for growth, said in (
-        ({"speed_mps": 0.1}, "known are x_m, y_m"),
+        ({"speed_mps": 0.1}, "use x_m, y_m"),
         ({"x_m": -0.1}, "greater than or equal to 0"),
     ):
         with pytest.raises(ValueError, match=said):

@@ -228,12 +228,12 @@ def edited(row: int, column: str, value: str) -> list[str]:
         (edited(10, "s_ref_m", "1e300"), "row 10: s_ref_m is not a number up to"),
         (
             [*lines_of(circle_table())[:12], *lines_of(circle_table())[11:]],
-            "row 10: the next row holds the same",
+            "row 10: the next row repeats this point",
         ),
         (lines_of(circle_table())[:40], "row 38: the line does not close"),
         (["# only a comment"], "at least 4 rows"),
-        (edited(10, "width_right_m", "-6"), "row 10: the widths"),
-        (edited(10, "psi_ref_rad", "2"), "row 10: psi_ref_rad is off"),
+        (edited(10, "width_right_m", "-6"), "row 10: the sum of width_left_m"),
+        (edited(10, "psi_ref_rad", "2"), "row 10: psi_ref_rad does not point"),
         (["\xff"], "17 columns"),
     ],
 )

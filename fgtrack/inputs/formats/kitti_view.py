@@ -13,7 +13,11 @@ from fgtrack.core.files import read_whole
 from fgtrack.core.geometry import rotation, wrap_angle
 from fgtrack.core.types import EgoState, FloatArray
 from fgtrack.inputs.formats.common import reported_as
-from fgtrack.models.dead_reckoning import Reckoned, ReportedErrors, reckoned
+from fgtrack.models.dead_reckoning import (
+    PositionEstimate,
+    ReportedErrors,
+    estimate_position,
+)
 
 OXTS, CALIB = "oxts", "calib"
 PERIOD_NS = 103_600_000
@@ -72,7 +76,7 @@ class View(NamedTuple):
     """Image point of camera 2, homogeneous, from a point in the rectified frame of camera 0, shape (3, 4)."""
     rectified_from_imu: FloatArray
     """Shape (4, 4)."""
-    reckoned: Reckoned
+    reckoned: PositionEstimate
     """Position of the ego, which labels are relative to, without steps of what it reports."""
 
     def position_m(self, rectified_m: list[float]) -> FloatArray:
@@ -200,7 +204,9 @@ def read_views(folder: Path, sequence: str) -> tuple[list[View], DataError | Non
                     speed_mps * math.sin(yaw_rad),
                 )
                 last = views[-1].reckoned if views else None
-                own = reckoned(last, stamp_ns, (x_m, y_m), velocity_mps, _EGO_ERRORS)
+                own = estimate_position(
+                    last, stamp_ns, (x_m, y_m), velocity_mps, _EGO_ERRORS
+                )
                 views.append(View(ego, about_y @ about_x, *calibration, own))
     except DataError as error:
         return views, error

@@ -106,7 +106,7 @@ def assumed(config: Config, source: InputSource) -> Assumed:
 def is_open(config: Config) -> bool:
     """True if `config` has no sensors, or nothing of where one of them sees: then `assumed` reads the messages."""
     return not config.sensors or not all(
-        sensor.is_view_given for sensor in config.used_sensors.values()
+        sensor.has_view_limits for sensor in config.used_sensors.values()
     )
 
 
@@ -319,7 +319,7 @@ def _windows(config: Config, covered: Coverages) -> Iterator[Assumption]:
 def _views(config: Config, covered: Coverages) -> Iterator[Assumption]:
     """Yield the sector and the ranges in which sensors detect of whose view nothing is given."""
     for name, sensor in config.sensors.items():
-        if sensor.scan and not sensor.is_view_given and name in covered:
+        if sensor.scan and not sensor.has_view_limits and name in covered:
             one = covered[name]
             rate = "" if one.rate_hz is None else f" at {one.rate_hz:.3g} Hz"
             usable_m = (

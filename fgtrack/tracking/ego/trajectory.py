@@ -16,7 +16,11 @@ from fgtrack.core.linalg import ASYMMETRY, congruence, is_covariance, symmetrise
 from fgtrack.core.time import NS_PER_S, nanoseconds, seconds
 from fgtrack.core.types import YAW, EgoState, FloatArray
 from fgtrack.estimation.filters.ekf import joseph, kalman_gain
-from fgtrack.models.dead_reckoning import Reckoned, ReportedErrors, reckoned
+from fgtrack.models.dead_reckoning import (
+    PositionEstimate,
+    ReportedErrors,
+    estimate_position,
+)
 from fgtrack.tracking.ego.growth import EgoGrowth
 
 #: A detection whose stamp is further than this from any ego state cannot be placed, in a gap neither.
@@ -188,7 +192,7 @@ class EgoTrajectory:
         )
         self._position_time_s = position_time_s
         self._reckoned: list[
-            tuple[EgoState, Reckoned]
+            tuple[EgoState, PositionEstimate]
         ] = []  # states as reported, where they are fused
         self._memory_ns = nanoseconds(memory_s)
         self._newest_ns: int | None = None
@@ -354,7 +358,9 @@ class EgoTrajectory:
             )
             errors = ReportedErrors(variance_m2, time_s, speed_variance * _REMEMBERED_S)
             last = self._reckoned[-1][1] if k else None
-            own = reckoned(last, ego.stamp_ns, (ego.x_m, ego.y_m), velocity_mps, errors)
+            own = estimate_position(
+                last, ego.stamp_ns, (ego.x_m, ego.y_m), velocity_mps, errors
+            )
             self._reckoned.append((ego, own))
             P[:2] = P[:, :2] = 0.0
             P[0, 0] = P[1, 1] = errors.density_m2ps * _REMEMBERED_S

@@ -154,7 +154,7 @@ class Views:
         self._limited = [
             k
             for k, one in enumerate(self._sensors)
-            if one.gives_position and one.is_view_given
+            if one.gives_position and one.has_view_limits
         ]
 
     def of(self, positions_m: FloatArray, ego: EgoPose | None) -> BoolArray:
