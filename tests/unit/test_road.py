@@ -47,5 +47,5 @@ def test_an_object_is_outside_where_it_is_neither_on_the_track_nor_in_the_pit_la
 def test_a_published_look_up_needs_a_raceline_that_goes_on() -> None:
     table = make_oval().table.copy()
     table[:, COLUMNS.index("s_racetraj_m")] = 0.0
-    with pytest.raises(DataError, match="s_racetraj_m does not grow"):
+    with pytest.raises(DataError, match="s_racetraj_m must increase"):
         PublishedMap(TrackMap(table))
