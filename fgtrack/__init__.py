@@ -52,6 +52,7 @@ _HOMES = {
     "UpdateRecord": "fgtrack.core.types",
     "UpdateResult": "fgtrack.estimation.base",
     "UpdateStatus": "fgtrack.estimation.base",
+    "Window": "fgtrack.estimation.smoothing.window",
     "advise": "fgtrack.advice.advise",
     "config": "fgtrack",
     "bounds": "fgtrack.evaluation.bounds",
@@ -64,7 +65,9 @@ _HOMES = {
     "ledger": "fgtrack.advice.ledger",
     "list_estimators": "fgtrack.estimation.registry",
     "load_run": "fgtrack.runs",
+    "measurement_factor": "fgtrack.estimation.smoothing.gtsam.factors",
     "measurement_model": "fgtrack.models.measurement",
+    "motion_factor": "fgtrack.estimation.smoothing.gtsam.factors",
     "plot": "fgtrack.show.figures",
     "replay": "fgtrack.pipeline.public",
     "robust_weight": "fgtrack.estimation.filters.ekf",
@@ -109,6 +112,13 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.estimation.filters.ekf import robust_weight as robust_weight
     from fgtrack.estimation.registry import estimator as estimator
     from fgtrack.estimation.registry import list_estimators as list_estimators
+    from fgtrack.estimation.smoothing.gtsam.factors import (
+        measurement_factor as measurement_factor,
+    )
+    from fgtrack.estimation.smoothing.gtsam.factors import (
+        motion_factor as motion_factor,
+    )
+    from fgtrack.estimation.smoothing.window import Window as Window
     from fgtrack.evaluation.bounds import ScheduledMeasurement as ScheduledMeasurement
     from fgtrack.evaluation.bounds import bounds as bounds
     from fgtrack.evaluation.bounds import bounds_along as bounds_along

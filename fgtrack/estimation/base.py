@@ -6,7 +6,14 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from functools import cache
-from typing import Generic, Protocol, TypeVar, overload, runtime_checkable
+from typing import (
+    TYPE_CHECKING,
+    Generic,
+    Protocol,
+    TypeVar,
+    overload,
+    runtime_checkable,
+)
 
 import numpy as np
 
@@ -23,6 +30,9 @@ from fgtrack.models.measurement import (
 )
 from fgtrack.models.motion import CTRV, MotionModel
 from fgtrack.models.sensors import RobustLoss
+
+if TYPE_CHECKING:
+    from fgtrack.estimation.smoothing.window import Window
 
 _T = TypeVar("_T")
 Content = tuple[tuple[str, ...], tuple[float, ...], tuple[str, ...]]
@@ -246,6 +256,8 @@ class UpdateStatus(StrEnum):
     OUT_OF_SEQUENCE = "out_of_sequence"
     BEYOND_WINDOW = "beyond_window"
     TOO_OLD = "too_old"
+    DUPLICATE = "duplicate"
+    """An identical measurement was fused before; the new one changes nothing."""
     FAILED = "failed"
 
 
@@ -408,6 +420,20 @@ class TrackBank(Protocol):
         """
 
 
+@runtime_checkable
+class WindowBank(TrackBank, Protocol):
+    """A bank that keeps the measurements of its windows: the smoothers."""
+
+    def window(self, track_id: int) -> "Window":
+        """Return a copy of the window of a track."""
+
+    def has_fused(self, track_id: int, measurement: Measurement) -> bool:
+        """True if an identical measurement was fused and is still kept."""
+
+    def withdraw(self, track_id: int, measurement: Measurement) -> bool:
+        """Take a measurement back, as if it had never been fused. Return False if it is not kept."""
+
+
 def no_states(dim: int) -> StatesAt:
     """The states of no track at all."""
     return StatesAt((), np.empty((0, dim)), np.empty((0, dim, dim)))
@@ -429,3 +455,9 @@ class Estimator(Protocol):
 
     def advance(self, now_ns: int) -> None:
         """The clock moved: move the window, nothing else."""
+
+
+def described(name: str, motion: MotionModel, window_ns: tuple[int, int]) -> str:
+    """Return a line on the estimator `name` of one object: motion model and window, for its repr."""
+    oldest_ns, newest_ns = window_ns
+    return f"<{name} of one object: {type(motion).__name__}, window {oldest_ns} to {newest_ns} ns>"

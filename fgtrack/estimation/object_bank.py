@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 
@@ -18,11 +18,16 @@ from fgtrack.estimation.base import (
     TrackBank,
     UpdateResult,
     UpdateStatus,
+    WindowBank,
+    described,
 )
 from fgtrack.estimation.failures import EstimatorError
 from fgtrack.estimation.filters.ekf import predict
 from fgtrack.estimation.filters.propagation import kinematic_states, track_state
 from fgtrack.models.motion import MotionModel
+
+if TYPE_CHECKING:
+    from fgtrack.estimation.smoothing.window import Window
 
 _E = TypeVar("_E", bound=Estimator)
 _T = TypeVar("_T")
@@ -208,9 +213,13 @@ class SingleObject:
     `bank` is empty; one on a time grid, such as `BackwardForwardBank`, gives the state of the nearest grid point.
     """
 
-    def __init__(self, motion: MotionModel, bank: TrackBank, start: Start) -> None:
+    def __init__(
+        self, motion: MotionModel, bank: TrackBank, start: Start, name: str = ""
+    ) -> None:
         self._motion = motion
         self.bank = bank
+        self._name = name or type(bank).__name__
+        self._windows = bank if isinstance(bank, WindowBank) else None
         self._first_ns = self._newest_ns = start.stamp_ns
         bank.advance(start.stamp_ns)
         bank.birth(0, start)
@@ -233,6 +242,8 @@ class SingleObject:
             return UpdateResult(UpdateStatus.TOO_OLD)
         if not (np.isfinite(measurement.z).all() and np.isfinite(measurement.R).all()):
             return UpdateResult(UpdateStatus.FAILED)  # before the clock moves
+        if self._windows is not None and self._windows.has_fused(0, measurement):
+            return UpdateResult(UpdateStatus.DUPLICATE)
         self.advance(stamp_ns)
         with _own_cause():
             result = self.bank.update(
@@ -246,6 +257,44 @@ class SingleObject:
         """See `Estimator.state_at`."""
         with _own_cause():
             return state_of(self.bank, self._motion, 0, as_stamp("stamp_ns", stamp_ns))
+
+    def window(self) -> "Window":
+        """Return a copy of the window: states, prior and measurements. Raises `CallError` unless it is a smoother."""
+        with _own_cause():
+            return self._smoother("window").window(0)
+
+    def withdraw(self, measurement: Measurement) -> None:
+        """Take a measurement back: the states become those without it.
+
+        In a linear model they are exact at once, else after `converge()` of the bank. Raises `CallError` for a
+        measurement that has left the window or was never fused, and unless the estimator is a smoother.
+        """
+        bank, stamp_ns, oldest_ns = (
+            self._smoother("withdraw"),
+            measurement.stamp_ns,
+            self.window_ns[0],
+        )
+        if stamp_ns < oldest_ns:
+            raise CallError(
+                f"withdraw: the measurement at {stamp_ns} ns has left the window, which begins at {oldest_ns} ns"
+            )
+        with _own_cause():
+            is_withdrawn = bank.withdraw(0, measurement.seen_by(self._motion))
+        if not is_withdrawn:
+            raise CallError(
+                f"withdraw: the measurement at {stamp_ns} ns was not fused, or was withdrawn before"
+            )
+
+    def _smoother(self, call: str) -> WindowBank:
+        """Return the bank. Raises `CallError` if it keeps no window."""
+        if self._windows is None:
+            raise CallError(
+                f"{call}: {self._name} keeps no window, take a smoother: smoother, smoother-batch or smoother-banded"
+            )
+        return self._windows
+
+    def __repr__(self) -> str:
+        return described(self._name, self._motion, self.window_ns)
 
 
 def states_of(bank: TrackBank, motion: MotionModel, stamp_ns: int) -> StatesAt:

@@ -182,6 +182,7 @@ def start_estimator(
                 motion,
                 _made(ESTIMATORS, TrackBank, name, factory, motion, lag_s, **own),
                 start,
+                name,
             )
         item: Estimator = _made(
             ESTIMATORS, Estimator, name, factory, motion, start, lag_s, **own

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from operator import index as integer
 from pathlib import Path
 from time import perf_counter_ns
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -36,6 +36,9 @@ from fgtrack.pipeline.build import build_tracker
 from fgtrack.pipeline.clock import corrected
 from fgtrack.runs import Node
 from fgtrack.tracking.lives.latency import NEWEST
+
+if TYPE_CHECKING:
+    from fgtrack.estimation.smoothing.window import Window
 
 __all__ = ["Lateness", "TickTiming", "Tracker"]
 
@@ -394,15 +397,18 @@ class Tracker:
 
         Raises `CallError` for a track that does not exist, a stamp before its window and an invalid one.
         """
-        try:
-            track_id = integer(track_id)
-        except TypeError as error:
-            raise CallError(
-                f"track_id: must be an integer, is {track_id!r:.60}"
-            ) from error
-        stamp_ns = _stamp("stamp_ns", stamp_ns)
+        track_id, stamp_ns = _track_id(track_id), _stamp("stamp_ns", stamp_ns)
         with self._turn:
             return self._tracker.state_at(track_id, stamp_ns)
+
+    def window(self, track_id: int) -> "Window":
+        """Return a copy of the window of a track: states, prior and measurements, also as a graph of gtsam.
+
+        Raises `CallError` for a track that does not exist, and unless the estimator is a smoother.
+        """
+        track_id = _track_id(track_id)
+        with self._turn:
+            return self._tracker.window(track_id)
 
     def tracks_at(self, stamp_ns: int) -> tuple[TrackReport, ...]:
         """Return all tracks whose window reaches back to the stamp, as `state_at` gives them."""
@@ -442,6 +448,14 @@ def _recorded_ns(value: object) -> int:
         return integer(value)  # type: ignore[arg-type]  # whatever was received
     except Exception:
         return 0
+
+
+def _track_id(value: int) -> int:
+    """Return `value` as an integer. Raises `CallError` for other types."""
+    try:
+        return integer(value)
+    except TypeError as error:
+        raise CallError(f"track_id: must be an integer, is {value!r:.60}") from error
 
 
 def _stamp(name: str, value: int) -> int:

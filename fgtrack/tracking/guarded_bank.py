@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import compress
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -17,9 +17,13 @@ from fgtrack.estimation.base import (
     TrackBank,
     UpdateResult,
     UpdateStatus,
+    WindowBank,
 )
 from fgtrack.estimation.failures import EstimatorError, Failure, Failures
 from fgtrack.estimation.filters.propagation import States
+
+if TYPE_CHECKING:
+    from fgtrack.estimation.smoothing.window import Window
 
 _T = TypeVar("_T")
 
@@ -93,6 +97,14 @@ class GuardedBank:
             )
             return states
         return self.states_at(stamp_ns).of(track_id)
+
+    def window(self, track_id: int) -> "Window":
+        """Return a copy of the window of a track. Raises `CallError` unless the estimator is a smoother."""
+        if not isinstance(self._bank, WindowBank):
+            raise CallError(
+                "window: the estimator keeps no window, take a smoother: smoother, smoother-batch or smoother-banded"
+            )
+        return self._bank.window(track_id)
 
     def update(
         self,

@@ -6,6 +6,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, repeat
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -72,6 +73,9 @@ from fgtrack.tracking.lives.latency import FOREVER, NEVER, Delays, Watermarks
 from fgtrack.tracking.objects import Apart, Evidence, Objects
 from fgtrack.tracking.preprocess import Candidates, Group, Preprocess, Preprocessed
 from fgtrack.tracking.soft_association import equivalent, joint_probabilities
+
+if TYPE_CHECKING:
+    from fgtrack.estimation.smoothing.window import Window
 
 _SELDOM = 1e-3  # probability with which a true pair misses the usual gate
 
@@ -255,14 +259,7 @@ class Tracker:
         """A track at any stamp in or after its window: smoothed or filtered in the past, predicted ahead of now.
         Raises `CallError` for a track that does not exist, a stamp before its window, and a state that is not sound.
         """
-        suspended = self._parts.lifecycle.suspended()
-        track_ids = [
-            each for each in self._parts.bank.track_ids if each not in suspended
-        ]
-        if track_id not in track_ids:
-            raise CallError(
-                f"track {track_id} does not exist: there are {', '.join(map(str, track_ids)) or 'none'}"
-            )
+        self._check_exists(track_id)
         bank, motion = self._parts.bank, self._parts.motion
         known = bank.state_of(track_id, min(stamp_ns, bank.present_ns))
         for track in self._reports_of(
@@ -272,6 +269,24 @@ class Tracker:
         raise CallError(
             f"track {track_id} has no state at {stamp_ns} ns: before its window, or not finite"
         )
+
+    def window(self, track_id: int) -> "Window":
+        """A copy of the window of a track. Raises `CallError` for a track that does not exist, and unless the estimator
+        is a smoother.
+        """
+        self._check_exists(track_id)
+        return self._parts.bank.window(track_id)
+
+    def _check_exists(self, track_id: int) -> None:
+        """Raise `CallError` for a track that does not exist, or is suspended."""
+        suspended = self._parts.lifecycle.suspended()
+        track_ids = [
+            each for each in self._parts.bank.track_ids if each not in suspended
+        ]
+        if track_id not in track_ids:
+            raise CallError(
+                f"track {track_id} does not exist: there are {', '.join(map(str, track_ids)) or 'none'}"
+            )
 
     def tracks_at(self, stamp_ns: int) -> tuple[TrackReport, ...]:
         """All tracks that have a state at a stamp, see `state_at`, in order of birth."""

@@ -159,11 +159,11 @@ def test_the_window_is_as_long_as_it_says() -> None:
         smoother.update(at(100 * k, 1.0 * k))
     assert smoother.window_ns == (700 * MS, 1000 * MS)
     assert smoother.update(at(699, 7.0)).status is UpdateStatus.TOO_OLD
-    assert smoother.update(at(700, 7.0)).status is UpdateStatus.OUT_OF_SEQUENCE
+    assert smoother.update(at(700, 7.1)).status is UpdateStatus.OUT_OF_SEQUENCE
     smoother.advance(1100 * MS)
     smoother.advance(900 * MS)
     assert smoother.window_ns[0] == 800 * MS
-    assert smoother.update(at(1000, 10.0)).status is UpdateStatus.IN_SEQUENCE
+    assert smoother.update(at(1000, 10.1)).status is UpdateStatus.IN_SEQUENCE
 
 
 @pytest.mark.parametrize("make", [SmootherBank, IncrementalBank])

@@ -92,6 +92,15 @@ class ReplayEkf(WindowedFilter):
             : max(bisect.bisect_left(self.steps, stamp_ns, key=_stamp) - 1, 0)
         ]
 
+    def _has_fused(self, measurement: Measurement) -> bool:
+        stamp_ns = measurement.stamp_ns
+        first = bisect.bisect_left(self.steps, stamp_ns, key=_stamp)
+        last = bisect.bisect_right(self.steps, stamp_ns, key=_stamp)
+        fused = [step.measurement for step in self.steps[first:last]]
+        return any(
+            each is not None and each.order == measurement.order for each in fused
+        )
+
     def _fuse(self, measurement: Measurement) -> OneCorrection:
         stamp_ns = (
             measurement.stamp_ns

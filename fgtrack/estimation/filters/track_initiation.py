@@ -233,6 +233,9 @@ class Initiated:
         self._clock_ns = max(self._clock_ns, as_stamp("now_ns", now_ns))
         self._inner.advance(now_ns)
 
+    def __repr__(self) -> str:
+        return repr(self._inner)
+
     def _begin_again(self, search: TrackInitiation) -> None:
         """Let a new estimator that starts along the first positions replace the present one, if it can."""
         count = 0

@@ -6,7 +6,13 @@ import numpy as np
 
 from fgtrack.core.checks import as_stamp
 from fgtrack.core.time import nanoseconds
-from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
+from fgtrack.estimation.base import (
+    Measurement,
+    Start,
+    UpdateResult,
+    UpdateStatus,
+    described,
+)
 from fgtrack.estimation.filters.ekf import OneCorrection
 from fgtrack.models.motion import MotionModel
 
@@ -37,6 +43,8 @@ class WindowedFilter(ABC):
         """See `Estimator.update`."""
         if measurement.stamp_ns < self._start_ns:
             return UpdateResult(UpdateStatus.TOO_OLD)
+        if self._has_fused(measurement):
+            return UpdateResult(UpdateStatus.DUPLICATE)
         try:
             result = self._fuse(measurement.seen_by(self._motion))
         except np.linalg.LinAlgError:
@@ -54,6 +62,13 @@ class WindowedFilter(ABC):
         self._newest_ns = stamp_ns
         self.advance(stamp_ns)
         return UpdateStatus.IN_SEQUENCE
+
+    def _has_fused(self, measurement: Measurement) -> bool:
+        """True if the filter keeps its measurements, and has an identical one."""
+        return False
+
+    def __repr__(self) -> str:
+        return described(type(self).__name__, self._motion, self.window_ns)
 
     @abstractmethod
     def _fuse(self, measurement: Measurement) -> OneCorrection | None:

@@ -4,7 +4,13 @@ from fgtrack.core.checks import as_stamp
 from fgtrack.core.errors import CallError
 from fgtrack.core.time import nanoseconds, seconds
 from fgtrack.core.types import TrackState
-from fgtrack.estimation.base import Measurement, Start, UpdateResult, UpdateStatus
+from fgtrack.estimation.base import (
+    Measurement,
+    Start,
+    UpdateResult,
+    UpdateStatus,
+    described,
+)
 from fgtrack.estimation.filters.ekf import predict
 from fgtrack.estimation.filters.initiation import DEFAULT
 from fgtrack.estimation.filters.propagation import track_state
@@ -82,6 +88,9 @@ class DelayedHorizon:
             stamp_ns,
             *predict(front.mean, front.covariance, self._motion, dt_s),
         )
+
+    def __repr__(self) -> str:
+        return described(type(self).__name__, self._motion, self.window_ns)
 
 
 class ReorderBuffer(DelayedHorizon):

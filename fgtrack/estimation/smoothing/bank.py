@@ -31,6 +31,7 @@ from fgtrack.estimation.kernels.kalman import innovations
 from fgtrack.estimation.object_bank import Outcomes, changing_nothing
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.solver import NotFusedError, Solver
+from fgtrack.estimation.smoothing.window import Window, window_of
 from fgtrack.models.motion import MotionModel
 
 
@@ -348,6 +349,30 @@ class SmootherBank:
             )
         final, self._final = self._final, []
         return final + reports
+
+    def window(self, track_id: int) -> Window:
+        """Return a copy of the window of a track."""
+        return window_of(self.solver, self._tracks[track_id])
+
+    def has_fused(self, track_id: int, measurement: Measurement) -> bool:
+        """True if the window, or the ring behind it, has an identical measurement of this track."""
+        return (
+            self.solver.nodes.index_of(self._tracks[track_id], measurement) is not None
+        )
+
+    def withdraw(self, track_id: int, measurement: Measurement) -> bool:
+        """Solve a track without a measurement, as if it had never been fused. Return False if it is not there.
+
+        A state that only this measurement needed goes with it. Raises `EstimatorError` where the rest cannot be solved.
+        """
+        track = self._tracks[track_id]
+        self._known.clear()
+        if not self.solver.withdraw(track, measurement):
+            return False
+        causes = self._improved(np.array([track]), measurement.stamp_ns)
+        if causes:
+            raise EstimatorError(causes, {})
+        return True
 
     def converge(self, max_iterations: int = 50) -> None:
         """Relinearise until nothing moves; for comparisons."""

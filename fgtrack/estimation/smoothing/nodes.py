@@ -6,13 +6,15 @@ and are kept for detections that are older. A row takes a number when it needs o
 nodes that exist, and not the longest window times the number of tracks.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import FloatArray, IntArray
-from fgtrack.estimation.base import Measurements
+from fgtrack.estimation.base import Measurement, Measurements
 from fgtrack.estimation.smoothing import node_kernels
 from fgtrack.estimation.smoothing.kernels import (
     CHANGED,
@@ -31,7 +33,7 @@ from fgtrack.estimation.smoothing.kernels import (
     P,
     Q,
 )
-from fgtrack.estimation.smoothing.terms import MeasurementFactor, whitened
+from fgtrack.estimation.smoothing.terms import NEAR_NS, MeasurementFactor, whitened
 from fgtrack.models.motion import MotionModel, WhiteNoise
 from fgtrack.models.transitions import transitions
 
@@ -129,6 +131,37 @@ class Nodes:
             [covariance, np.zeros(len(mean))]
         )
 
+    def load_window(
+        self,
+        track: int,
+        stamps_ns: Sequence[int],
+        means: FloatArray,
+        prior_mean: FloatArray,
+        prior_covariance: FloatArray,
+        factors: Sequence[Sequence[MeasurementFactor]],
+    ) -> None:
+        """Make the window of a new track, with a node for each stamp. Its nodes must still be linearised and solved.
+
+        `means` (m, n) become the linearisation points. The prior, (n,) and (n, n), is that of the oldest node.
+        """
+        self.begin_window(track, stamps_ns[0], prior_mean, prior_covariance)
+        while len(stamps_ns) >= self.stamps_ns.shape[1]:
+            self._grow(axis=1)
+        for index in range(1, len(stamps_ns)):
+            if self.numbers[track, index] == NONE:
+                self._take_numbers(np.array([track]), np.array([index]))
+        self.stamps_ns[track, : len(stamps_ns)] = stamps_ns
+        self.count[track] = len(stamps_ns)
+        numbers = self.window(track)
+        self.predicted[numbers[0], :, -1] = prior_mean - means[0]
+        self.origin[numbers], self.step[numbers] = means, 0.0
+        self.labels[numbers] = 0
+        for number, own in zip(numbers.tolist(), factors, strict=True):
+            self._factors[number] = [
+                (Measurements(replace(one, z=one.z[None], R=one.R[None])), 0, ahead_s)
+                for one, ahead_s in own
+            ]
+
     def note(
         self,
         stack: Measurements,
@@ -163,6 +196,32 @@ class Nodes:
                 each[last] = free
             self.count[track] = last
         self.tracks[track, KNOWN] = self.count[track]
+
+    def index_of(self, track: int, measurement: Measurement) -> int | None:
+        """Return the index of the node that has this measurement; None if it was not fused, or is forgotten."""
+        stamps_ns = self.stamps_ns[track, : self.count[track]]
+        near = np.abs(stamps_ns - measurement.stamp_ns) <= NEAR_NS
+        for index in near.nonzero()[0].tolist():
+            own = self.factors(int(self.numbers[track, index]))
+            if any(each.order == measurement.order for each, _ in own):
+                return index
+        return None
+
+    def take_out(self, track: int, index: int, measurement: Measurement) -> None:
+        """Take a measurement out of the node at `index`, and the node too where nothing else needs it.
+
+        The nodes around it must be linearised and solved afterwards. The oldest node of the window keeps the prior,
+        and the oldest node of all is the beginning.
+        """
+        number = int(self.numbers[track, index])
+        orders = [each.order for each, _ in self.factors(number)]
+        del self._factors[number][orders.index(measurement.order)]
+        self.labels[number, STALE] = 1
+        if self._factors[number] or index in (0, self.first[track]):
+            return
+        self.labels[self.numbers[track, index - 1], STALE] = 1
+        self.withdraw(track, index, is_new=True, is_noted=False)
+        self.first[track] -= index < self.first[track]
 
     def windows(self, tracks: IntArray, *limits_ns: int) -> IntArray:
         """Return `node_kernels.windows` of `tracks`, shape (4, m), with room for another node in each."""

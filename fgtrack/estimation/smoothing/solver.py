@@ -204,6 +204,15 @@ class Solver:
             ) from error
         return leaving
 
+    def withdraw(self, track: int, measurement: Measurement) -> bool:
+        """Solve the window of a track without a measurement that was fused. Return False if no node has it."""
+        nodes, index = self.nodes, self.nodes.index_of(track, measurement)
+        if index is None:
+            return False
+        nodes.take_out(track, index, measurement)
+        self.relinearise(track, start=min(index, int(nodes.count[track]) - 1))
+        return True
+
     def _not_restored(
         self, tracks: IntArray, starts: IntArray | None = None
     ) -> list[int]:
