@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from functools import cache
+from itertools import chain
 from typing import (
     TYPE_CHECKING,
     Generic,
@@ -29,14 +30,15 @@ from fgtrack.models.measurement import (
     measurement_model,
 )
 from fgtrack.models.motion import CTRV, MotionModel
+from fgtrack.models.robust import compiled_form
 from fgtrack.models.sensors import RobustLoss
 
 if TYPE_CHECKING:
     from fgtrack.estimation.smoothing.window import Window
 
 _T = TypeVar("_T")
-Content = tuple[tuple[str, ...], tuple[float, ...], tuple[str, ...]]
-"""Names of what is measured, numbers, names of what is assumed and of the loss; it has an order."""
+Content = tuple[tuple[int, ...], tuple[float, ...], tuple[str, ...]]
+"""Number of components and their codes; z, R, pose, kind and width of the loss; assumed components. It has an order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,15 +157,11 @@ class Measurement:
 
     @property
     def content(self) -> Content:
-        """All but the stamp: only what is the same in every respect is equal."""
-        numbers = [*self.z.tolist(), *self.R.ravel().tolist(), *self.pose]
-        if self.loss is None:
-            return self.model.components, tuple(numbers), self.assumed
-        return (
-            self.model.components,
-            (*numbers, self.loss.width),
-            (*self.assumed, self.loss.kind),
-        )
+        """All but the stamp: only what is the same in every respect is equal. Compiled loops compare in this order."""
+        k, codes = len(self.z), self.model.codes.tolist()
+        kind, width = compiled_form(self.loss, k)
+        numbers = self.z.tolist(), self.R.ravel().tolist(), self.pose, (kind, width)
+        return (k, *codes), tuple(chain(*numbers)), self.assumed
 
     @property
     def order(self) -> tuple[int, Content]:

@@ -20,7 +20,7 @@ MODULES = (
     "fgtrack.tracking.lives.visibility_kernels",
 )
 #: Names of arguments that are row numbers, or indices of what a row has.
-ROW_NUMBERS = {"tracks", "rows", "indices", "anchors", "by_x", "sensors", "entries"}
+ROW_NUMBERS = {"tracks", "rows", "indices", "anchors", "by_x", "sensors", "components"}
 #: Names of arguments by whose length a call is as long as it is, and further ones by function.
 LENGTHS = {"counts", "rows", "tracks"}
 FURTHER_LENGTHS = {

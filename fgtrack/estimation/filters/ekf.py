@@ -17,14 +17,12 @@ from fgtrack.core.linalg import (
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement
 from fgtrack.models.motion import MotionModel
-from fgtrack.models.robust import weight
+from fgtrack.models.robust import compiled_form
 from fgtrack.models.sensors import RobustLoss
 
 T = TypeVar("T", float, FloatArray)
 _copied = partial(np.array, dtype=np.float64, order="C")
 _KALMAN = "fgtrack.estimation.kernels.kalman"
-_MAX_REWEIGHTINGS = 50
-_REWEIGHTING_TOLERANCE = 1e-9
 
 
 def propagated(F: FloatArray, P: FloatArray, Q: FloatArray) -> FloatArray:
@@ -50,24 +48,20 @@ def joseph(P: FloatArray, K: FloatArray, H: FloatArray, R: FloatArray) -> FloatA
 def robust_weight(
     loss: RobustLoss | None, y: FloatArray, spread: FloatArray, R: FloatArray
 ) -> float:
-    """Weight w of an innovation y (k,) with covariance `spread` + R, both (k, k), under a robust loss; 1 without.
+    """Weight of an innovation y (k,) with covariance `spread` + R, both (k, k), under a robust loss; 1 without.
 
-    At w the correction with R / w minimises prior plus loss of the post-fit residual r = R / w S^-1 y, S = `spread` + R
-    / w, and w is the loss's weight at sqrt(r' R^-1 r). Reweighting from w = 1 never lets w grow, so it ends at the
-    largest such weight.
+    See `fgtrack.estimation.kernels.kalman.robust_weight`. Raises `numpy.linalg.LinAlgError` where the covariance is not
+    positive definite.
     """
-    w = 1.0
     if loss is None:
-        return w
-    for _ in range(_MAX_REWEIGHTINGS):
-        solved = psd_solve(spread + R / w, y)
-        new = weight(
-            loss, math.sqrt(max(float(solved.dot(R.dot(solved))), 0.0)) / w, len(y)
-        )
-        if not new < w * (1.0 - _REWEIGHTING_TOLERANCE):
-            break
-        w = new
-    return w
+        return 1.0
+    found: float = kernels(_KALMAN).robust_weight_of(
+        *(np.ascontiguousarray(each, dtype=np.float64) for each in (spread, R, y)),
+        *compiled_form(loss, len(y)),
+    )
+    if math.isnan(found):
+        raise np.linalg.LinAlgError("innovation covariance not positive definite")
+    return found
 
 
 class Correction(NamedTuple, Generic[T]):
@@ -142,40 +136,13 @@ def correct(
     `measured` is `Measurement.measured`, for the NIS, `loss` the robust loss of all (see `robust_weight`).
     """
     rows = np.arange(y.shape[-1]) if measured is None else measured
-    m, x, P, H, R = (
-        len(mean),
-        _copied(mean),
-        _copied(covariance),
-        stacked(H),
-        np.ascontiguousarray(R),
+    m, x, P, H = len(mean), _copied(mean), _copied(covariance), stacked(H)
+    y, R = np.ascontiguousarray(y), np.ascontiguousarray(R)
+    S, nis, w = np.empty(R.shape), np.empty(m), np.empty(m)
+    kernels(_KALMAN).correct(
+        x, P, y, H, R, rows, *compiled_form(loss, y.shape[1]), S, nis, w
     )
-    S, nis, w, fused = (
-        np.empty(R.shape),
-        np.empty(m),
-        np.ones(m),
-        np.empty(m, dtype=bool),
-    )
-    fuse = kernels(_KALMAN).correct
-    fuse(x, P, y, H, R, rows, S, nis, fused)
-    if loss is not None:
-        x, P = _copied(mean), _copied(covariance)
-        spread = congruence(H, P)
-        for row in range(len(x)):
-            w[row] = (
-                robust_weight(loss, y[row], spread[row], R[row]) if fused[row] else 1.0
-            )
-        fuse(
-            x,
-            P,
-            y,
-            H,
-            R / w[:, None, None],
-            rows,
-            np.empty(R.shape),
-            np.empty(len(x)),
-            fused,
-        )
-    return Correction(x, P, y, nis, w, S, fused)
+    return Correction(x, P, y, nis, w, S, ~np.isnan(w))
 
 
 def updated_one(

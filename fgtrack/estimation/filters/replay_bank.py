@@ -27,8 +27,10 @@ from fgtrack.estimation.filters.ekf import Prediction
 from fgtrack.estimation.filters.propagation import kinematic_states
 from fgtrack.estimation.filters.replay import ReplayEkf, Step
 from fgtrack.estimation.object_bank import ObjectBank, Outcomes, changing_nothing
-from fgtrack.models.measurement import MeasurementModel, measurement_model
+from fgtrack.models.measurement import COMPONENTS, SensorPose, measurement_model
 from fgtrack.models.motion import WhiteNoise
+from fgtrack.models.robust import compiled_form
+from fgtrack.models.sensors import RobustLoss
 
 _KERNELS = "fgtrack.estimation.kernels.replay"
 #: In the order of the numbers that the kernels give.
@@ -39,6 +41,8 @@ _STATUS = (
     UpdateStatus.OUT_OF_SEQUENCE,
 )
 _FUSED, _NO_ROOM = _STATUS[2:], len(_STATUS)
+#: Column of `labels` at which the components begin, see the kernels.
+CODES = 3
 
 
 class ReplayBank(ObjectBank[ReplayEkf]):
@@ -60,6 +64,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
             None  # of all tracks by birth, until one comes, goes or moves
         )
         self._free: list[int] = []
+        self._losses: dict[tuple[int, float], RobustLoss] = {}  # by kind and width
         self._arrays = list[Any]()
         self._shape: tuple[int, ...] = (
             0,
@@ -74,13 +79,14 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         rows, slots, k = shape = tuple(map(max, self._shape, least))
         arrays = [
             np.tile(np.arange(slots), (rows, 1)),
-            np.zeros((rows, slots, 2 + k), dtype=np.int64),
+            np.zeros((rows, slots, CODES + k), dtype=np.int64),
             np.zeros((rows, slots, 3 * n + 2, n)),
             np.zeros((rows, 3), dtype=np.int64),
             np.zeros((rows, slots, k + 1, k)),
+            np.zeros((rows, slots, len(SensorPose()) + 1)),
         ]
         if self._arrays:
-            order, labels, steps, windows, measured = self._arrays
+            order, labels, steps, windows, measured, views = self._arrays
             track, place = np.nonzero(np.arange(order.shape[1]) < windows[:, :1])
             used = track, order[track, place]  # only the pages of used slots are made
             arrays[0][:present, : order.shape[1]], arrays[3][:present] = order, windows
@@ -89,6 +95,7 @@ class ReplayBank(ObjectBank[ReplayEkf]):
                 steps[used],
             )
             arrays[4][*used, : measured.shape[2], : measured.shape[3]] = measured[used]
+            arrays[5][used] = views[used]
         free = [*self._free, *range(present, rows)]
         self._arrays, self._shape, self._free = arrays, shape, free
 
@@ -212,7 +219,11 @@ class ReplayBank(ObjectBank[ReplayEkf]):
                 np.empty(m),
                 np.empty(m, dtype=np.int64),
             )
-            now = self._lag_ns, self._start_ns, stamp_ns, one.model.selected
+            loss, width = compiled_form(one.loss, k)
+            if one.loss is not None:
+                self._losses[loss, width] = one.loss
+            now = self._lag_ns, self._start_ns, stamp_ns
+            view = np.array([*one.pose, width])
             fuse = partial(
                 kernels(_KERNELS).fuse,
                 self._kind,
@@ -220,6 +231,9 @@ class ReplayBank(ObjectBank[ReplayEkf]):
                 *self._arrays,
                 rows,
                 *now,
+                one.model.codes,
+                view,
+                loss,
                 z,
                 R,
             )
@@ -334,14 +348,20 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         if not self._free or len(item.steps) >= slots or k > largest:
             self._allocate(rows * (1 + (not self._free)), 2 * len(item.steps), k)
         row = self._free[-1]
-        order, labels, steps, windows, measured = (array[row] for array in self._arrays)
+        order, labels, steps, windows, measured, views = (
+            array[row] for array in self._arrays
+        )
         windows[:] = len(item.steps), *item.window_ns
         for slot, each in zip(order, item.steps, strict=False):
             steps[slot] = np.vstack([each.mean, each.covariance, *each.predicted])
             labels[slot, :2] = each.stamp_ns, 0
             if each.measurement is not None:
                 own, d = each.measurement, len(each.measurement.z)
-                labels[slot, 1 : d + 2] = d, *own.model.selected
+                loss, width = compiled_form(own.loss, d)
+                if own.loss is not None:
+                    self._losses[loss, width] = own.loss
+                labels[slot, 1 : d + CODES] = d, loss, *own.model.codes
+                views[slot] = *own.pose, width
                 measured[slot, 0, :d], measured[slot, 1 : d + 1, :d] = own.z, own.R
         self._rows[track_id], self._order = self._free.pop(), None
 
@@ -350,22 +370,30 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         row, n = self._rows.get(track_id), self._motion.dim
         if row is None:
             return
-        order, labels, steps, windows, measured = (array[row] for array in self._arrays)
+        order, labels, steps, windows, measured, views = (
+            array[row] for array in self._arrays
+        )
         chain = list[Step]()
         for slot in order[: windows[0]].tolist():
-            own, (stamp_ns, d, *entries), measurement = (
+            own, (stamp_ns, d, loss, *codes), measurement = (
                 steps[slot].copy(),
                 labels[slot].tolist(),
                 None,
             )
             if d:
-                names = tuple(self._motion.state_names[entry] for entry in entries[:d])
+                names = tuple(COMPONENTS[code] for code in codes[:d])
+                *pose, width = views[slot].tolist()
                 z, R = (
                     measured[slot, 0, :d].copy(),
                     measured[slot, 1 : d + 1, :d].copy(),
                 )
                 measurement = Measurement(
-                    stamp_ns, measurement_model(names, self._motion), z, R
+                    stamp_ns,
+                    measurement_model(names, self._motion),
+                    z,
+                    R,
+                    SensorPose(*pose),
+                    self._losses.get((loss, width)),
                 )
             predicted = Prediction(own[n + 1], own[n + 2 : 2 * n + 2], own[2 * n + 2 :])
             chain.append(Step(stamp_ns, measurement, own[0], own[1 : n + 1], predicted))
@@ -391,11 +419,5 @@ def _results(
 
 
 def _is_plain(measurement: Measurement | None) -> bool:
-    """True if a measurement, or None, is of entries of the state, without a loss."""
-    if measurement is None:
-        return True
-    return (
-        measurement.loss is None
-        and type(measurement.model) is MeasurementModel
-        and measurement.model.linear
-    )
+    """True for None, and for a measurement whose model compiled loops contain."""
+    return measurement is None or measurement.model.is_compiled

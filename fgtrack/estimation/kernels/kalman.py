@@ -20,9 +20,24 @@ from fgtrack.core.compiled import (
     solve,
     whiten,
 )
-from fgtrack.core.types import BoolArray, FloatArray, IntArray
+from fgtrack.core.types import FloatArray, IntArray
+from fgtrack.models.measurement_kernels import GAUSSIAN, penalty_and_weight
 from fgtrack.models.transitions import check_noise, transition
 
+#: A weight is found by so many reweightings at most, until it changes by less than this share.
+_MAX_REWEIGHTINGS, _REWEIGHTING_TOLERANCE = 50, 1e-9
+CORRECTION_SPACE = f"UniTuple({MATRIX}, 8)"
+CorrectionSpace = tuple[
+    FloatArray,
+    FloatArray,
+    FloatArray,
+    FloatArray,
+    FloatArray,
+    FloatArray,
+    FloatArray,
+    FloatArray,
+]
+"""Scratch of `correct_state`: (n, n) twice, (k, n), (n, k), (k, k) three times and (k, 1), for the largest k."""
 _VECTORS, _MATRICES, _READ = (
     "float64[:, ::1]",
     "float64[:, :, ::1]",
@@ -70,6 +85,96 @@ def conclude(
         for b in range(n):
             total += abs(P[a, b])
     return total < np.inf
+
+
+@shared(f"float64({READ}, {READ}, float64[::1], int64, float64, {MATRIX}, {MATRIX})")
+def robust_weight(
+    spread: FloatArray,
+    R: FloatArray,
+    y: FloatArray,
+    loss: int,
+    width: float,
+    root: FloatArray,
+    column: FloatArray,
+) -> float:
+    """Return the weight w of an innovation y (k,) with covariance `spread` + R under a robust loss, NaN without a root.
+
+    At w the correction with R / w minimises prior plus loss of the post-fit residual r = R / w S^-1 y, S = `spread` + R
+    / w, and w is the loss's weight at sqrt(r' R^-1 r). Reweighting from w = 1 never lets w grow, so it ends at the
+    largest of these weights.
+    """
+    k, w = len(y), 1.0
+    for _ in range(_MAX_REWEIGHTINGS):
+        for a in range(k):
+            column[a, 0] = y[a]
+            for b in range(k):
+                root[a, b] = spread[a, b] + R[a, b] / w
+        if not solve(root, column):
+            return np.nan
+        square = 0.0
+        for a in range(k):
+            for b in range(k):
+                square += column[a, 0] * R[a, b] * column[b, 0]
+        d = math.sqrt(max(square, 0.0)) / w
+        _, new = penalty_and_weight(loss, width, d)
+        if not new < w * (1.0 - _REWEIGHTING_TOLERANCE):
+            break
+        w = new
+    return w
+
+
+@njit(f"float64({READ}, {READ}, float64[::1], int64, float64)")
+def robust_weight_of(
+    spread: FloatArray, R: FloatArray, y: FloatArray, loss: int, width: float
+) -> float:
+    """See `robust_weight`."""
+    k = len(y)
+    check(spread.shape == (k, k) and R.shape == (k, k))
+    root, column = scratch(k, k), scratch(k, 1)
+    return robust_weight(spread, R, y, loss, width, root, column)
+
+
+@shared(
+    f"float64(float64[::1], {MATRIX}, float64[::1], {READ}, {READ}, int64, float64, {CORRECTION_SPACE})"
+)
+def correct_state(
+    mean: FloatArray,
+    P: FloatArray,
+    y: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+    loss: int,
+    width: float,
+    space: CorrectionSpace,
+) -> float:
+    """Overwrite mean and P by x + K y and (I - K H) P (I - K H)' + K R K' with K = P H' S^-1, S = H P H' + R.
+
+    Innovation y (k,), Jacobian H (k, n), first k rows and columns of R, divided by the weight under the loss. Returns
+    the weight; NaN where S is not positive definite or the result not finite.
+    """
+    k, n, w = len(y), len(mean), 1.0
+    A, AP, K, KR, root, spread, noise, column = space
+    K = K[:k]
+    if loss != GAUSSIAN:
+        for a in range(k):
+            for b in range(k):
+                spread[a, b] = 0.0
+        add_congruence(H, P, K, spread)
+        w = robust_weight(spread, R, y, loss, width, root, column[:k])
+        if math.isnan(w):
+            return np.nan
+    for a in range(k):
+        for b in range(k):
+            noise[a, b] = root[a, b] = R[a, b] / w
+    add_congruence(H, P, K, root)
+    if not solve(root, K):
+        return np.nan
+    for a in range(n):
+        for b in range(n):
+            A[a, b] = 1.0 if a == b else 0.0
+            for c in range(k):
+                A[a, b] -= K[c, a] * H[c, b]
+    return w if conclude(mean, P, A, K, noise, y, AP, KR) else np.nan
 
 
 @njit(f"({_VECTORS}, {_READ}, {_READ}, int64[:], {_READ}, int64[::1])")
@@ -141,7 +246,8 @@ def propagate(
 
 
 @njit(
-    f"void({_VECTORS}, {_MATRICES}, {_VECTORS}, {_READ}, {_READ}, int64[::1], {_MATRICES}, float64[::1], b1[::1])"
+    f"void({_VECTORS}, {_MATRICES}, {_VECTORS}, {_READ}, {_READ}, int64[::1], int64, float64, {_MATRICES}, "
+    "float64[::1], float64[::1])"
 )
 def correct(
     mean: FloatArray,
@@ -150,13 +256,16 @@ def correct(
     H: FloatArray,
     R: FloatArray,
     rows: IntArray,
+    loss: int,
+    width: float,
     S: FloatArray,
     nis: FloatArray,
-    fused: BoolArray,
+    weights: FloatArray,
 ) -> None:
-    """Overwrite means and covariances by x + K y and (I - K H) P (I - K H)' + K R K' with K = P H' S^-1.
-    Writes S = H P H' + R, the NIS of the `rows` of y, and where S was positive definite and all is finite. Shapes
-    (m, n), (m, n, n), (m, k), (1, k, n) or (m, k, n), (m, k, k).
+    """Fuse innovations y (m, k) into means (m, n) and covariances (m, n, n), see `correct_state`.
+
+    Jacobians H are (1, k, n) or (m, k, n), covariances R (m, k, k). Writes S = H P H' + R, the NIS of the `rows` of y,
+    and the weight under the loss, NaN where nothing was fused.
     """
     m, k, n = len(y), y.shape[1], mean.shape[1]
     check_rows(rows, 0, k)
@@ -166,32 +275,25 @@ def correct(
         and len(R) >= m
         and len(S) >= m
         and len(nis) >= m
-        and len(fused) >= m
+        and len(weights) >= m
     )
     check(len(H) == 1 or len(H) >= m)
     check(P.shape[1] == n and P.shape[2] == n and H.shape[1] == k and H.shape[2] == n)
     check(R.shape[1] == k and R.shape[2] == k and S.shape[1] == k and S.shape[2] == k)
-    K, root, white, A, AP, KR = (
-        scratch(k, n),
+    A, AP, K, KR = scratch(n, n), scratch(n, n), scratch(k, n), scratch(n, k)
+    root, spread, own, column = (
         scratch(k, k),
-        scratch(k),
-        scratch(n, n),
-        scratch(n, n),
-        scratch(n, k),
+        scratch(k, k),
+        scratch(k, k),
+        scratch(k, 1),
     )
+    space, white = (A, AP, K, KR, root, spread, own, column), scratch(k)
     for i in range(m):
         h = H[min(i, len(H) - 1)]
         copy(R[i], S[i])
         add_congruence(h, P[i], K, S[i])
-        nis[i] = marginal_nis(S[i], y[i], rows, root, white)
-        copy(S[i], root)
-        fused[i] = not math.isnan(nis[i]) and solve(root, K)
-        if not fused[i]:
+        nis[i], weights[i] = marginal_nis(S[i], y[i], rows, root, white), np.nan
+        if not math.isnan(nis[i]):
+            weights[i] = correct_state(mean[i], P[i], y[i], h, R[i], loss, width, space)
+        if math.isnan(weights[i]):
             nis[i] = np.nan
-            continue
-        for a in range(n):
-            for b in range(n):
-                A[a, b] = 1.0 if a == b else 0.0
-                for c in range(k):
-                    A[a, b] -= K[c, a] * h[c, b]
-        fused[i] = conclude(mean[i], P[i], A, K, R[i], y[i], AP, KR)

@@ -2,9 +2,10 @@
 
 `order[track]` has the slots of a track's steps, oldest first, and then the free ones. A slot of `steps` has in rows of
 n, the dimension of the state, mean and covariance after the measurement (n + 1 rows), mean and covariance predicted for
-it, and the cross-covariance of that with the step before. One of `measured` has z in its first row, and then R; one of
-`labels` the stamp, the number k of components, and the entries of the state that these are; k of the first step, which
-is a prior, is 0. A row of `windows` has the number of the track's steps, and its oldest and newest stamp.
+it, and the cross-covariance of the prediction with the step before. A slot of `measured` has z in its first row, and
+then R. A slot of `views` has the sensor pose (5 numbers) and the width of the robust loss. A slot of `labels` has the
+stamp, the number k of components, the kind of the loss, and the components; k of the first step, which is a prior, is
+0. A row of `windows` has the number of the track's steps, and its oldest and newest stamp.
 """
 
 import math
@@ -26,12 +27,25 @@ from fgtrack.core.compiled import (
 )
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import BoolArray, FloatArray, IntArray
-from fgtrack.estimation.kernels.kalman import conclude, marginal_nis
+from fgtrack.estimation.kernels.kalman import (
+    CorrectionSpace,
+    correct_state,
+    marginal_nis,
+)
+from fgtrack.models.measurement_kernels import (
+    POSE_SIZE,
+    check_components,
+    observe,
+    subtract,
+)
 from fgtrack.models.transitions import ARC, check_noise, transition
 
 FAILED, TOO_OLD, IN_SEQUENCE, OUT_OF_SEQUENCE, NO_ROOM = range(5)
 _YAW = 2
-
+#: Columns of `labels`; the components begin at the last one.
+STAMP_NS, SIZE, LOSS, CODES = range(4)
+#: Column of `views`, behind the pose.
+WIDTH = POSE_SIZE
 
 _Space = tuple[FloatArray, ...]
 
@@ -52,27 +66,23 @@ def _ahead(
     add_congruence(F, state[1:], FP, P)
 
 
-@shared(f"void({MATRIX}, int64[::1], {MATRIX}, b1, float64[::1], {MATRIX})")
+@merged
 def _innovation(
-    state: FloatArray,
+    motion: int,
+    x: FloatArray,
     label: IntArray,
     measured: FloatArray,
-    wraps: bool,
+    view: FloatArray,
     y: FloatArray,
-    S: FloatArray,
+    H: FloatArray,
 ) -> None:
-    """Write y = z - H x and S = H P H' + R, of an H that selects entries."""
-    k = label[1]
-    for a in range(k):
-        entry = label[2 + a]
-        y[a] = measured[0, a] - state[0, entry]
-        if wraps and entry == _YAW:
-            y[a] = wrapped(y[a])
-        for b in range(k):
-            S[a, b] = state[1 + entry, label[2 + b]] + measured[1 + a, b]
+    """Write the innovation y (k,) of a measurement at the state x (n,), and its Jacobian H (k, n)."""
+    codes = label[CODES : CODES + label[SIZE]]
+    observe(codes, motion != ARC, x, view, y, H)
+    subtract(codes, measured[0], y, y)
 
 
-_SPACE = f"Tuple(({f'{MATRIX}, ' * 4}float64[::1], {f'{MATRIX}, ' * 3}float64[::1]))"
+_SPACE = f"Tuple(({f'{MATRIX}, ' * 4}float64[::1]))"
 
 
 @shared(
@@ -92,11 +102,11 @@ def _retrodict(
     step after, the shift s = x - x_- and C = (P_-^-1 F P_j)'. False where some P_- has no root.
     """
     n = steps.shape[2]
-    F, root, CD, ahead, mean, _, _, _, _ = space
+    F, root, CD, ahead, mean = space
     gain, shift = ahead[n + 1 :], now[0]
     for j in range(len(slots) - 1, 0, -1):
         after, left, start = slots[j], slots[j - 1], 0 if j > 1 else n + 1
-        late_ns = labels[after, 0] - labels[left, 0]
+        late_ns = labels[after, STAMP_NS] - labels[left, STAMP_NS]
         if late_ns == 0:  # the same state
             continue
         state = steps[left, start : start + n + 1]
@@ -133,12 +143,15 @@ def _step(
     late_ns: int,
     label: IntArray,
     measured: FloatArray,
-    space: _Space,
+    view: FloatArray,
+    F: FloatArray,
+    y: FloatArray,
+    H: FloatArray,
+    space: CorrectionSpace,
 ) -> bool:
-    """Predict the step `after` from that `before`, and fuse its measurement; False where it cannot be fused."""
-    k, n = label[1], before.shape[1]
-    F, A, AP, _, _, S, K, KR, y = space
-    y, K, predicted = y[:k], K[:k], after[n + 1 :]
+    """Predict the step `after` from the step `before`, and fuse its measurement; False where it cannot be fused."""
+    k, n = label[SIZE], before.shape[1]
+    predicted = after[n + 1 :]
     _ahead(
         motion,
         noise,
@@ -150,18 +163,18 @@ def _step(
         predicted[n + 1 :],
     )
     copy(predicted, after[: n + 1])
-    _innovation(after, label, measured, motion == ARC, y, S)
-    for c in range(k):
-        for b in range(n):
-            K[c, b] = after[1 + label[2 + c], b]
-    if not solve(S, K):
-        return False
-    for a in range(n):
-        for b in range(n):
-            A[a, b] = 1.0 if a == b else 0.0
-        for c in range(k):
-            A[a, label[2 + c]] -= K[c, a]
-    if not conclude(after[0], after[1 : n + 1], A, K, measured[1:], y, AP, KR):
+    _innovation(motion, after[0], label, measured, view, y[:k], H[:k])
+    weight = correct_state(
+        after[0],
+        after[1 : n + 1],
+        y[:k],
+        H[:k],
+        measured[1:],
+        label[LOSS],
+        view[WIDTH],
+        space,
+    )
+    if math.isnan(weight):
         return False
     if motion == ARC:
         after[0, _YAW] = wrapped(after[0, _YAW])
@@ -170,20 +183,32 @@ def _step(
 
 @merged
 def _comes_after(
-    label: IntArray, measured: FloatArray, new_label: IntArray, new: FloatArray
+    label: IntArray,
+    measured: FloatArray,
+    view: FloatArray,
+    new_label: IntArray,
+    new: FloatArray,
+    new_view: FloatArray,
 ) -> bool:
-    """True if a step comes after a new one: by stamp, and at one stamp by content, whatever came first."""
-    k = label[1]
-    if label[0] != new_label[0] or k == 0:
-        return bool(label[0] > new_label[0])
-    for a in range(1, 2 + min(k, new_label[1])):
+    """True if a step comes after a new step: by stamp, and at one stamp by content, whatever came first."""
+    k = label[SIZE]
+    if label[STAMP_NS] != new_label[STAMP_NS] or k == 0:
+        return bool(label[STAMP_NS] > new_label[STAMP_NS])
+    if k != new_label[SIZE]:
+        return bool(k > new_label[SIZE])
+    for a in range(CODES, CODES + k):
         if label[a] != new_label[a]:
             return bool(label[a] > new_label[a])
     for a in range(k + 1):
         for b in range(k):
             if measured[a, b] != new[a, b]:
                 return bool(measured[a, b] > new[a, b])
-    return False
+    for a in range(POSE_SIZE):
+        if view[a] != new_view[a]:
+            return bool(view[a] > new_view[a])
+    if label[LOSS] != new_label[LOSS]:
+        return bool(label[LOSS] > new_label[LOSS])
+    return bool(view[WIDTH] > new_view[WIDTH])
 
 
 @merged
@@ -192,7 +217,7 @@ def _forget(
 ) -> None:
     """Free the slots of steps before the newest one that is older than `oldest_ns`."""
     gone = 0
-    while gone + 1 < window[0] and labels[slots[gone + 1], 0] < oldest_ns:
+    while gone + 1 < window[0] and labels[slots[gone + 1], STAMP_NS] < oldest_ns:
         gone += 1
     window[0] -= gone
     for j in range(window[0] if gone else 0):
@@ -229,8 +254,9 @@ def _check(
 
 
 @njit(
-    f"int64({_STEPS}, float64[:, :, :, ::1], int64[::1], int64, int64, int64, int64[::1], float64[:, ::1], "
-    "float64[:, :, ::1], int64[::1], float64[:, ::1], float64[:, :, ::1], float64[::1], int64[::1])"
+    f"int64({_STEPS}, float64[:, :, :, ::1], float64[:, :, ::1], int64[::1], int64, int64, int64, int64[::1], "
+    "float64[::1], int64, float64[:, ::1], float64[:, :, ::1], int64[::1], float64[:, ::1], float64[:, :, ::1], "
+    "float64[::1], int64[::1])"
 )
 def fuse(
     motion: int,
@@ -240,11 +266,14 @@ def fuse(
     steps: FloatArray,
     windows: IntArray,
     measured: FloatArray,
+    views: FloatArray,
     tracks: IntArray,
     lag_ns: int,
     oldest_ns: int,
     stamp_ns: int,
-    entries: IntArray,
+    components: IntArray,
+    view: FloatArray,
+    loss: int,
     z: FloatArray,
     R: FloatArray,
     rows: IntArray,
@@ -253,7 +282,8 @@ def fuse(
     nis: FloatArray,
     status: IntArray,
 ) -> int:
-    """Put a measurement of `entries` of the state into the steps of each of `tracks` (m,); re-filter the later ones.
+    """Put a measurement of `components`, by their codes, into the steps of `tracks` (m,); re-filter the later steps.
+
     Writes innovations y (m, k), the NIS of their `rows`, and S (m, k, k), given all that was fused, and the status. A
     failed measurement, and one older than `oldest_ns` or the window of the track, change nothing. Where all slots of a
     track are in use, nothing changes either. Returns the number of these tracks.
@@ -267,9 +297,16 @@ def fuse(
         and measured.shape[2] > k
     )
     check(
-        measured.shape[3] >= k
-        and labels.shape[2] >= k + 2
-        and len(entries) >= k
+        views.shape[0] == order.shape[0]
+        and views.shape[1] == order.shape[1]
+        and views.shape[2] > WIDTH
+        and len(view) > WIDTH
+    )
+    check(
+        k > 0
+        and measured.shape[3] >= k
+        and labels.shape[2] >= k + CODES
+        and len(components) == k
         and z.shape[1] >= k
     )
     check(
@@ -281,23 +318,25 @@ def fuse(
         and len(status) == m
     )
     check(R.shape[1] >= k and R.shape[2] >= k and S.shape[1] >= k and S.shape[2] >= k)
-    check_rows(entries, 0, n)
+    check_components(components, n)
     check_rows(rows, 0, k)
     now, most = scratch(n + 1, n), measured.shape[3]
-    F, A, AP, ahead, mean = (
+    F, root, CD, ahead, mean = (
         scratch(n, n),
         scratch(n, n),
         scratch(n, n),
         scratch(2 * n + 1, n),
         scratch(n),
     )
-    root, K, KR, white = (
+    A, AP, K, KR = scratch(n, n), scratch(n, n), scratch(most, n), scratch(n, most)
+    marginal, spread, own_noise, column = (
         scratch(most, most),
-        scratch(most, n),
-        scratch(n, most),
-        scratch(most),
+        scratch(most, most),
+        scratch(most, most),
+        scratch(most, 1),
     )
-    space = F, A, AP, ahead, mean, root, K, KR, white
+    white, innovation, H = scratch(most), scratch(most), scratch(most, n)
+    correction = A, AP, K, KR, marginal, spread, own_noise, column
     for i in range(len(tracks)):
         t = tracks[i]
         slots, window = order[t], windows[t]
@@ -312,13 +351,20 @@ def fuse(
         index = count = window[0]
         own = slots[count]
         label, new = labels[t, own], measured[t, own]
-        label[0], label[1] = stamp_ns, k
+        label[STAMP_NS], label[SIZE], label[LOSS] = stamp_ns, k, loss
+        for a in range(WIDTH + 1):
+            views[t, own, a] = view[a]
         for a in range(k):
-            label[2 + a], new[0, a] = entries[a], z[i, a]
+            label[CODES + a], new[0, a] = components[a], z[i, a]
             for b in range(k):
                 new[1 + a, b] = R[i, a, b]
         while index > 1 and _comes_after(
-            labels[t, slots[index - 1]], measured[t, slots[index - 1]], label, new
+            labels[t, slots[index - 1]],
+            measured[t, slots[index - 1]],
+            views[t, slots[index - 1]],
+            label,
+            new,
+            views[t, own],
         ):
             slots[index] = slots[index - 1]
             index -= 1
@@ -326,16 +372,19 @@ def fuse(
         j, last, fused = index, count, True
         while j <= last:
             s, left = slots[j], slots[j - 1]
-            late_ns = labels[t, s, 0] - labels[t, left, 0]
             ok = _step(
                 motion,
                 noise,
                 steps[t, left],
                 steps[t, s],
-                late_ns,
+                labels[t, s, STAMP_NS] - labels[t, left, STAMP_NS],
                 labels[t, s],
                 measured[t, s],
-                space,
+                views[t, s],
+                F,
+                innovation,
+                H,
+                correction,
             )
             if ok and s == own:
                 newest = slots[count]
@@ -346,11 +395,15 @@ def fuse(
                     slots[index : count + 1],
                     labels[t],
                     steps[t],
-                    space,
+                    (F, root, CD, ahead, mean),
                     now,
                 )
-                _innovation(now, label, new, motion == ARC, y[i], S[i])
-                nis[i] = marginal_nis(S[i], y[i], rows, root, white)
+                _innovation(motion, now[0], label, new, views[t, own], y[i], H[:k])
+                for a in range(k):
+                    for b in range(k):
+                        S[i, a, b] = R[i, a, b]
+                add_congruence(H[:k], now[1:], K[:k], S[i])
+                nis[i] = marginal_nis(S[i], y[i], rows, marginal, white)
                 ok = ok and not math.isnan(nis[i])
             j += 1
             if not ok and fused:  # take it out, and re-filter the later ones without it
@@ -408,14 +461,14 @@ def ahead(
             continue
         count += 1
         j = windows[t, 0] - 1
-        while j > 0 and labels[t, order[t, j], 0] > at_ns:
+        while j > 0 and labels[t, order[t, j], STAMP_NS] > at_ns:
             j -= 1
         s = order[t, j]
         _ahead(
             motion,
             noise,
             steps[t, s, : n + 1],
-            at_ns - labels[t, s, 0],
+            at_ns - labels[t, s, STAMP_NS],
             F,
             means[i],
             covariances[i],
