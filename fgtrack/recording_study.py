@@ -14,8 +14,7 @@ from fgtrack.advice.advise import Adviser
 from fgtrack.advice.ledger import SUMMARY_S, summary
 from fgtrack.advice.page import Advice
 from fgtrack.advice.paired_replay import REPLAY, PairedReplay
-from fgtrack.config.reading import read_config
-from fgtrack.config.settings import Config
+from fgtrack.config.reading import ConfigLike, read_config
 from fgtrack.core.errors import DataError
 from fgtrack.core.output import (
     check_apart,
@@ -170,7 +169,7 @@ class Study:
 def study(
     recording: str | Path,
     out: str | Path,
-    config: str | Path | Config | None = None,
+    config: ConfigLike | None = None,
     *,
     map: str | Path | None = None,  # noqa: A002 - the name of the option
     pit_map: str | Path | None = None,

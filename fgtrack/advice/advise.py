@@ -21,7 +21,7 @@ from fgtrack.clocks.arrivals import (
 )
 from fgtrack.clocks.offsets import OffsetReport, estimate_offsets
 from fgtrack.clocks.stamps import bias_findings, clock_findings, stamp_findings
-from fgtrack.config.reading import read_config
+from fgtrack.config.reading import ConfigLike, read_config
 from fgtrack.config.settings import Config
 from fgtrack.core.diagnostic import EGO, late_ego
 from fgtrack.core.errors import CallError, DataError
@@ -55,7 +55,7 @@ _SLOW_EGO_S = 0.2
 
 def advise(
     recording: str | Path,
-    config: str | Path | Config | None = None,
+    config: ConfigLike | None = None,
     *,
     map: str | Path | None = None,  # noqa: A002 - the name of the option
     pit_map: str | Path | None = None,

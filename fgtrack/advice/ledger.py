@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from fgtrack.advice.paired_replay import REPLAY, PairedReplay, at_stamp
-from fgtrack.config.reading import read_config
+from fgtrack.config.reading import ConfigLike, read_config
 from fgtrack.config.settings import Config
 from fgtrack.core.errors import DataError
 from fgtrack.core.time import NS_PER_S
@@ -70,8 +70,8 @@ class Ledger:
 
 def ledger(
     recording: str | Path | Iterable[Message],
-    config: str | Path | Config | None = None,
-    tuned: str | Path | Config | None = None,
+    config: ConfigLike | None = None,
+    tuned: ConfigLike | None = None,
     *,
     map: str | Path | None = None,  # noqa: A002 - the name of the option
     pit_map: str | Path | None = None,

@@ -13,9 +13,12 @@ from fgtrack.core.checks import check_paths
 if TYPE_CHECKING:  # a replay needs no simulator
     from fgtrack.sim.scenario import Scenario
 
+ConfigLike = str | Path | Config | Mapping[str, object]
+"""Name of a shipped configuration, path of a YAML file, a `Config`, or a mapping of settings such as `run.config`."""
+
 
 def read_config(
-    name: str | Path | Config | None,
+    name: ConfigLike | None,
     settings: Sequence[str] | Mapping[str, object] | None = None,
     *,
     track_map: str | Path | None = None,
@@ -23,10 +26,12 @@ def read_config(
     estimator: str | None = None,
     folder: Path | None = None,
 ) -> Config:
-    """Return the configuration of a file (in `folder`) or of that shipped name, else the defaults.
+    """Return the configuration of a file (in `folder`), of that shipped name or of a mapping, else the defaults.
     `settings` as of `load`; maps and estimator replace those of the file. Raises `CallError` with the key.
     """
     check_paths(map=track_map, pit_map=pit_map)
+    if isinstance(name, Mapping):
+        name = Config.from_dict(name)
     if not isinstance(name, Config | None):
         check_paths(config=name)
         name = find_file("configuration", name, folder)

@@ -9,7 +9,8 @@ from typing import Annotated, Literal, Self
 from pydantic import Discriminator, Field, NonNegativeFloat, PositiveFloat, Tag
 
 from fgtrack.config.shipped import find_file
-from fgtrack.config.yaml_file import dump, load, plain, with_settings
+from fgtrack.config.yaml_file import dump, load, plain, validate, with_settings
+from fgtrack.core.errors import CallError
 from fgtrack.core.settings import require, settings
 from fgtrack.estimation.filters.initiation import DEFAULT, Initiation
 from fgtrack.estimation.registry import ESTIMATORS, motion_model
@@ -412,6 +413,18 @@ class Config:
     def from_yaml(cls, name: str | Path) -> Self:
         """Return the configuration of a YAML file or of that shipped name. Raises `CallError` with file and key."""
         return load(cls, find_file("configuration", name))
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, object]) -> Self:
+        """Return the configuration of nested mappings, such as `run.config`; missing keys have their defaults.
+
+        Raises `CallError` with the key, and for anything else than a mapping.
+        """
+        if not isinstance(values, Mapping):
+            raise CallError(
+                f"config: must be a mapping of settings, is a {type(values).__name__}"
+            )
+        return validate(cls, plain(values), "the given configuration")
 
     def to_yaml(self, path: str | Path) -> None:
         """Write every key to a YAML file, which is replaced."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgtrack.config.reading import read_config
+from fgtrack.config.reading import ConfigLike, read_config
 from fgtrack.config.settings import Config
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.types import BoolArray, FloatArray, Message
@@ -52,7 +52,7 @@ _ENDLESS = (
 
 def tune(
     recordings: str | Path | Sequence[str | Path],
-    config: str | Path | Config | None = None,
+    config: ConfigLike | None = None,
     *,
     map: str | Path | None = None,  # noqa: A002 - the name of the option
     pit_map: str | Path | None = None,

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from fgtrack.config.reading import read_config
-from fgtrack.config.settings import Config
+from fgtrack.config.reading import ConfigLike, read_config
 from fgtrack.core.checks import LARGEST_NS
 from fgtrack.core.diagnostic import EGO, late_ego, too_late
 from fgtrack.core.errors import CallError, DataError
@@ -109,14 +108,15 @@ class Tracker:
     Parameters
     ----------
     config
-        Name of a shipped configuration, path of a YAML file, or a `Config`; None for the defaults.
+        Name of a shipped configuration, path of a YAML file, a `Config` or a mapping as `run.config`; None for the
+        defaults.
     map, pit_map, estimator, set
         As of `fgtrack.replay`.
     """
 
     def __init__(
         self,
-        config: str | Path | Config | None = None,
+        config: ConfigLike | None = None,
         *,
         map: str | Path | None = None,  # noqa: A002 - the name of the option
         pit_map: str | Path | None = None,
@@ -155,7 +155,7 @@ class Tracker:
     @classmethod
     def from_config(
         cls,
-        config: str | Path | Config | None = None,
+        config: ConfigLike | None = None,
         *,
         map: str | Path | None = None,  # noqa: A002 - the name of the option
         pit_map: str | Path | None = None,

@@ -7,9 +7,8 @@ from typing import overload
 
 import numpy as np
 
-from fgtrack.config.reading import read_config, read_scenario
+from fgtrack.config.reading import ConfigLike, read_config, read_scenario
 from fgtrack.config.recorded import recorded_of
-from fgtrack.config.settings import Config
 from fgtrack.core.checks import check_paths
 from fgtrack.core.errors import CallError
 from fgtrack.core.types import Message
@@ -25,7 +24,7 @@ from fgtrack.sim.simulate import simulate as simulated
 
 def replay(
     recording: str | Path | Iterable[Message],
-    config: str | Path | Config | None = None,
+    config: ConfigLike | None = None,
     *,
     map: str | Path | None = None,  # noqa: A002 - the name of the option
     pit_map: str | Path | None = None,
@@ -43,7 +42,8 @@ def replay(
     recording
         Path of anything that fgtrack reads, or messages in the order of their receipt.
     config
-        Name of a shipped configuration, path of a YAML file, or a `Config`; None for the defaults.
+        Name of a shipped configuration, path of a YAML file, a `Config` or a mapping as `run.config`; None for the
+        defaults.
     map, pit_map
         CSV files of the track and of the pit lane, or `oval`.
     estimator

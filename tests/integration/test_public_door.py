@@ -227,3 +227,27 @@ def test_a_run_and_a_comparison_show_themselves_in_a_few_lines(
     assert "estimator: smoother" in repr(run)
     assert run._repr_html_().startswith("<pre>Run\n")
     assert "<table>" in tables._repr_html_()
+
+
+def test_the_configuration_of_a_run_is_accepted_wherever_a_configuration_is(
+    drive: Path,
+) -> None:
+    """It is a mapping, which `Config.from_dict` reads."""
+    run = fgtrack.load_run(drive / "runs/x")
+    config = fgtrack.Config.from_dict(run.config)
+    assert config.estimator == "smoother"
+    assert fgtrack.Tracker(run.config).config == config
+    again = fgtrack.replay(drive / "drive.mcap", run.config)
+    assert again.meta["digest"] == run.meta["digest"]
+    other = fgtrack.replay(
+        drive / "drive.mcap", run.config, set={"smoother.lag_s": 0.5}
+    )
+    assert other.config == {
+        **run.config,
+        "smoother": {**run.config["smoother"], "lag_s": 0.5},
+    }
+    assert fgtrack.tune(drive / "drive.mcap", run.config)
+    with pytest.raises(fgtrack.CallError, match=r"smoother\.lag: "):
+        fgtrack.Tracker({"smoother": {"lag": 1.0}})
+    with pytest.raises(fgtrack.CallError, match="must be a mapping of settings"):
+        fgtrack.Config.from_dict("smoother")
