@@ -17,9 +17,9 @@ from fgtrack.advice.paired_replay import REPLAY, PairedReplay
 from fgtrack.config.reading import ConfigLike, read_config
 from fgtrack.core.errors import DataError
 from fgtrack.core.output import (
-    check_apart,
+    check_no_overlap,
     check_output,
-    claimed,
+    locked_folder,
     new_files,
     write_file,
 )
@@ -194,8 +194,8 @@ def study(
     folders = dict(zip(ESTIMATORS, runs, strict=True))
     config_file = str(config) if isinstance(config, (str, Path)) else None
     for path in outputs(out):
-        check_apart(path, [source_path, config_file])
-    with claimed(out):
+        check_no_overlap(path, [source_path, config_file])
+    with locked_folder(out):
         for folder in folders.values():
             check_run(folder, overwrite)
         check_output(pictures, overwrite, Path.is_dir, "a folder")

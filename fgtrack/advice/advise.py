@@ -139,7 +139,7 @@ class Adviser:
                     Finding(
                         "input",
                         one.about,
-                        94.0 if one.spoils else 45.0,
+                        94.0 if one.is_blocking else 45.0,
                         f"{one.text}.",
                         one.settings,
                     )

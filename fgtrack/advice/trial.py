@@ -61,10 +61,10 @@ def suspicions(messages: Sequence[Message], config: Config) -> Iterator[Diagnost
     )
     if relative and not egos:
         text = f"no state is read, but {relative[0]} is relative to it: name its topic (input.ego)"
-        yield Diagnostic(EGO, text, spoils=True)
+        yield Diagnostic(EGO, text, is_blocking=True)
     if egos and not any(ego.stamp_ns for ego in egos):
         yield Diagnostic(
-            EGO, "all stamps are 0: set `stamp_from: receipt` on its topic", spoils=True
+            EGO, "all stamps are 0: set `stamp_from: receipt` on its topic", is_blocking=True
         )
     yield from _degrees(EGO, egos)
     yield from _degrees(
@@ -83,7 +83,7 @@ def suspicions(messages: Sequence[Message], config: Config) -> Iterator[Diagnost
         ):
             key = f"sensors.{name}.stamp_from"
             text = f"all stamps are 0: set `stamp_from: receipt` on its topic, or {key}; nothing is known of its delay"
-            yield Diagnostic(name, text, {key: "receipt"}, spoils=True)
+            yield Diagnostic(name, text, {key: "receipt"}, is_blocking=True)
         yield from _degrees(name, objects)
         yield from _frames(name, result, egos)
         if sensor is not None and objects:
@@ -142,7 +142,7 @@ def _frames(
                 f"is read as in the map, {from_ego_m:.0f} m from the ego, but its numbers are small ({bare_m:.0f} m): "
                 "set `frame: ego` (or sensor)"
             )
-        yield Diagnostic(name, text, spoils=True)
+        yield Diagnostic(name, text, is_blocking=True)
 
 
 def _measured(

@@ -31,7 +31,7 @@ from fgtrack.config.settings import Config
 from fgtrack.config.shipped import suited_reports
 from fgtrack.config.yaml_file import plain
 from fgtrack.core.errors import CallError, DataError, FgtrackError
-from fgtrack.core.output import check_apart, check_output, write_file
+from fgtrack.core.output import check_no_overlap, check_output, write_file
 from fgtrack.core.time import nanoseconds
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table
 from fgtrack.inputs.errors import UntilBreak
@@ -66,7 +66,7 @@ def info(
                 "--write, -c: a starting configuration is made from the recording alone, give one of them"
             )
         check_output(write, overwrite)
-        check_apart(write, [recording])
+        check_no_overlap(write, [recording])
         text = starting_config(recording)
         write_file(write, text, overwrite)
         if not as_json:
@@ -207,7 +207,7 @@ def advise(
     config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
     if out is not None:
         check_output(out, overwrite)
-        check_apart(out, [recording, config_file])
+        check_no_overlap(out, [recording, config_file])
     with progress("advise") as tell:
         advice = advised(
             recording,

@@ -11,7 +11,7 @@ from typer import Argument, Option
 from fgtrack.cli.arguments import Overwrite, Runs
 from fgtrack.cli.show import progress, say
 from fgtrack.core.errors import CallError, DataError
-from fgtrack.core.output import check_apart, check_output, new_file, new_files
+from fgtrack.core.output import check_no_overlap, check_output, new_file, new_files
 from fgtrack.core.time import nanoseconds
 from fgtrack.evaluation.runs import evaluated, start_ns
 from fgtrack.evaluation.tables.compare import compare
@@ -109,7 +109,7 @@ def _of_runs(
 ) -> tuple[list[tuple[str, Figure]], list[Planned], DataError | None]:
     """The close-up, the other figures, and why there is no close-up."""
     result = evaluated(folders)
-    check_apart(out, [item.run.path for item in result])
+    check_no_overlap(out, [item.run.path for item in result])
     stamp_ns = None if stamp is None else start_ns(result) + nanoseconds(stamp)
     first, late = drawn_close_up(result, stamp_ns, **paper)
     missing = late if isinstance(late, DataError) else None
@@ -131,7 +131,7 @@ def report(
     """
     check_output(out, overwrite)
     every = evaluated(runs)
-    check_apart(out, [item.run.path for item in every])
+    check_no_overlap(out, [item.run.path for item in every])
     with progress("report"):
         close_up, late = drawn_close_up(every)
         pictures = (

@@ -23,7 +23,7 @@ from fgtrack.config.reading import read_config, read_scenario
 from fgtrack.config.recorded import recorded_of
 from fgtrack.config.shipped import Kind, shipped, summary
 from fgtrack.config.yaml_file import dump, load
-from fgtrack.core.output import check_apart
+from fgtrack.core.output import check_no_overlap
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.evaluation.diagnostics import excluded_lines
 from fgtrack.inputs.recording import check_recording, write_recording
@@ -53,7 +53,7 @@ def simulate(
 ) -> None:
     """Simulate a scenario into a stream or a rosbag2 folder."""
     scenario = read_scenario(scenario_file, duration_s=duration_s)
-    check_apart(out, [scenario_file, scenario.map])
+    check_no_overlap(out, [scenario_file, scenario.map])
     check_recording(out, overwrite)
     with progress("simulate"):
         messages = simulated(scenario, np.random.default_rng(seed))
@@ -81,7 +81,7 @@ def convert(
 ) -> None:
     """Convert a recording into a stream or a rosbag2 folder."""
     config = read_config(config_file)
-    check_apart(out, [recording, config_file, delays_file])
+    check_no_overlap(out, [recording, config_file, delays_file])
     check_recording(out, overwrite)
     source = open_input(recording, config.input)
     unread: dict[str, Counter[str]] = {}

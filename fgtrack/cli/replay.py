@@ -18,7 +18,7 @@ from fgtrack.cli.show import progress, say, warn
 from fgtrack.config.reading import read_config
 from fgtrack.config.shipped import suited_reports
 from fgtrack.core.errors import DataError
-from fgtrack.core.output import check_apart
+from fgtrack.core.output import check_no_overlap
 from fgtrack.estimation.registry import ESTIMATORS
 from fgtrack.evaluation.diagnostics import (
     diagnostics,
@@ -57,7 +57,7 @@ def replay(
         {name: out / name for name in names} if len(names) > 1 else {names[0]: out}
     )
     for folder in folders.values():
-        check_apart(folder, [recording, config_file])
+        check_no_overlap(folder, [recording, config_file])
     source = open_input(recording, config.input)
     with progress("replay") as tell:
         result = assumed(config, source)

@@ -21,7 +21,7 @@ from fgtrack.cli.show import progress, say, sentences, show, warn
 from fgtrack.config.reading import read_config, read_scenario
 from fgtrack.config.recorded import recorded_of
 from fgtrack.core.errors import DataError
-from fgtrack.core.output import check_apart, claimed
+from fgtrack.core.output import check_no_overlap, locked_folder
 from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.inputs.recording import check_recording, write_recording
 from fgtrack.models.oval import OVAL
@@ -51,7 +51,7 @@ def study(
     """
     config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
     for path in outputs(out):
-        check_apart(path, [recording, config_file])
+        check_no_overlap(path, [recording, config_file])
     with progress("study") as tell:
         result = studied(recording, out, config, overwrite=overwrite, on_step=tell)
     for line in dict.fromkeys(
@@ -87,7 +87,7 @@ def demo(
 ) -> None:
     """Simulate a race, record it, and study the recording."""
     scenario = read_scenario("default")
-    with claimed(out):
+    with locked_folder(out):
         bag = out / "recording"
         check_recording(bag, overwrite)
         with progress("simulate"):

@@ -12,7 +12,7 @@ from fgtrack.cli.arguments import All, Form, FormOption, Overwrite, Settings
 from fgtrack.cli.show import progress, say, show
 from fgtrack.config.shipped import find_file
 from fgtrack.core.errors import DataError
-from fgtrack.core.output import check_apart, write_file
+from fgtrack.core.output import check_no_overlap, write_file
 from fgtrack.evaluation.metrics import evaluate
 from fgtrack.evaluation.tables.seeds import (
     SweepTable,
@@ -68,7 +68,7 @@ def sweep(
     sweep_file = find_file("sweep", sweep_name)
     plan = load_plan(sweep_file, recording, settings or ())
     for name in PRODUCTS:  # what else is in the folder stays
-        check_apart(out / name, plan.inputs)
+        check_no_overlap(out / name, plan.inputs)
     work = Sweep.open(plan, out, overwrite)
     tell(
         f"jobs: {len(work.plan.jobs)}, each of {len(work.plan.estimators)} estimators; to do: {len(work.todo)}"

@@ -20,7 +20,7 @@ from fgtrack.cli.arguments import (
 from fgtrack.cli.show import progress, say, show
 from fgtrack.config.reading import read_config
 from fgtrack.core.errors import DataError
-from fgtrack.core.output import check_apart, check_output, write_file
+from fgtrack.core.output import check_no_overlap, check_output, write_file
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
 from fgtrack.inputs.source import open_input
 from fgtrack.noise.parameters import HeldOut, TunedParameter, TuneReport, TuneRules
@@ -59,7 +59,7 @@ def tune(
     """
     check_output(out, overwrite)
     config = read_config(config_file, settings, track_map=track_map, pit_map=pit_map)
-    check_apart(out, [*recordings, config_file])
+    check_no_overlap(out, [*recordings, config_file])
     sources = {str(path): open_input(path, config.input) for path in recordings}
     with progress("tune") as tell:
         report = tuned(sources, config, TuneRules(keep=tuple(keep or ())), tell)

@@ -1,1 +1,1 @@
-"""Types, time, geometry, linear algebra, files and errors that every other floor uses."""
+"""Types, time, geometry, linear algebra, files and errors: the lowest layer, imported by all others."""

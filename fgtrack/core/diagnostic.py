@@ -11,36 +11,42 @@ from fgtrack.core.types import BoolArray, FloatArray
 __all__ = ["EGO", "Diagnostic", "in_degrees", "late_ego", "too_late"]
 
 EGO = "ego"
-"""Subject of a diagnostic about the ego."""
-_LATE_S = 0.05  # two or three states of an ego at 50 Hz
+"""`Diagnostic.about` of a problem of the ego."""
+#: Smallest delay of the ego behind a sensor that is reported: two or three ego states at 50 Hz.
+_LATE_S = 0.05
 
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """Something that is wrong; `str` is a line of it."""
+    """A problem of a recording or a run; `str` gives it as one line."""
 
     about: str
-    """Sensor, `ego`, or what else it concerns."""
+    """Name of a sensor, `ego`, or another subject."""
     text: str
-    """Problem, cause and cure, without the full stop."""
+    """Problem, cause and remedy, without a full stop."""
     settings: Mapping[str, object] = field(default_factory=dict)
-    """Values of keys of the configuration that correct it; empty where none does for certain."""
-    spoils: bool = False
-    """True if nothing can be judged before it is corrected."""
+    """Configuration keys and the values that correct the problem; empty if no setting certainly does."""
+    is_blocking: bool = False
+    """True if the recording cannot be judged until this problem is corrected."""
 
     def __str__(self) -> str:
         return f"{self.about}: {self.text}"
 
 
 def in_degrees(about: str, name: str, least: float, most: float) -> Diagnostic | None:
-    """Diagnostic that the angle `name` between `least` and `most` is in degrees; None where it may be in radians."""
+    """Diagnostic that the angle `name`, from `least` to `most`, is in degrees; None if it may be in radians."""
     if may_be_radians(least, most):
         return None
-    text = f"{name} goes up to {max(-least, most):.4g}: degrees? Convert it by `{{path: ..., degrees: true}}`"
-    return Diagnostic(about, text, spoils=True)
+    text = (
+        f"{name} reaches {max(-least, most):.4g}, so it is probably in degrees: "
+        "convert it by `{path: ..., degrees: true}`"
+    )
+    return Diagnostic(about, text, is_blocking=True)
 
 
-_LATE_SHARE, _FEWEST_LATE = 0.01, 3  # less is chance
+#: Share and number of late lists from which they are reported: fewer may be chance.
+_LATE_SHARE = 0.01
+_FEWEST_LATE = 3
 
 
 def too_late(
@@ -49,10 +55,12 @@ def too_late(
     limits: Iterable[tuple[str, float | None]],
     refused: BoolArray | None = None,
 ) -> Diagnostic | None:
-    """Return the diagnostic of a sensor whose delays, shape (n,), are longer than a configured time; None if few are.
+    """Diagnostic of a sensor with delays longer than a configured time; None if few delays are longer.
 
-    `limits` are keys of the configuration and their times in seconds, None where there is no limit. `refused` is true
-    of what was not used, shape (n,); None if everything too late was not.
+    `delays_s` has shape (n,). `limits` contains pairs of a configuration key and its
+    time in seconds; a time of None means no limit. The first exceeded limit is
+    reported. `refused`, shape (n,), is true for lists that were not used; without it,
+    all lists beyond the limit count as not used.
     """
     for key, limit_s in limits:
         if limit_s is None or not len(delays_s):
@@ -63,23 +71,21 @@ def too_late(
             )
         )
         if late >= max(_FEWEST_LATE, _LATE_SHARE * len(delays_s)):
-            share, most_s = (
-                100.0 * late / len(delays_s),
-                float(np.quantile(delays_s, 0.99)),
-            )
+            share = 100.0 * late / len(delays_s)
+            most_s = float(np.quantile(delays_s, 0.99))
             text = (
-                f"{share:.3g} % come later than {key} {limit_s:g} s allows and are not used; 99 % come within "
-                f"{most_s:.3g} s: raise {key} above it, or correct the clock"
+                f"{share:.3g} % arrive later than {key} ({limit_s:g} s) allows and are not used; 99 % arrive within "
+                f"{most_s:.3g} s: set {key} above this time, or correct the clock"
             )
             return Diagnostic(sensor, text)
     return None
 
 
 def late_ego(ego_delay_s: float, delays_s: Mapping[str, float]) -> Diagnostic | None:
-    """Return the diagnostic that the ego's messages come later than those of sensors; None where they do not.
+    """Diagnostic that the ego's messages arrive later than the lists that need the ego's pose; None if they do not.
 
-    `ego_delay_s` is the usual time from stamp to receipt of the ego's messages, `delays_s` that of the lists of each
-    sensor whose lists need the ego's pose.
+    `ego_delay_s` is the usual time from stamp to receipt of the ego's messages.
+    `delays_s` contains this time for each sensor whose lists need the ego's pose.
     """
     sooner = {
         name: delay_s
@@ -93,8 +99,8 @@ def late_ego(ego_delay_s: float, delays_s: Mapping[str, float]) -> Diagnostic | 
         f"{name} {1e3 * delay_s:.0f} ms" for name, delay_s in sooner.items()
     )
     text = (
-        f"its states come up to {later_ms:.0f} ms later than the lists that need them (delay {1e3 * ego_delay_s:.0f} "
-        f"ms, {own}): these wait up to ego.wait_s, or are placed by an extrapolated pose and count as less certain; "
+        f"its states arrive up to {later_ms:.0f} ms later than the lists that need them (delay {1e3 * ego_delay_s:.0f} "
+        f"ms, {own}): the lists wait up to ego.wait_s, or use an extrapolated pose and a larger covariance; "
         "send the ego's states sooner, or correct their clock"
     )
     return Diagnostic(EGO, text)

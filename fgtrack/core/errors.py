@@ -3,32 +3,40 @@
 import difflib
 from collections.abc import Iterable
 
-_LONGEST, _TAIL = 700, 250
+#: Longest message in characters, and the characters of its end that are kept if it is longer.
+_LONGEST = 700
+_TAIL = 250
 
 
 class FgtrackError(Exception):
-    """Base of every error that the package raises on purpose; its text is `one_line`."""
+    """Base of all errors that the package raises on purpose; the message is one line (`one_line`)."""
 
     def __init__(self, message: object) -> None:
         super().__init__(one_line(str(message)))
 
 
 class DataError(FgtrackError):
-    """An input or a run is bad (exit code 1)."""
+    """Error of an input or a run folder (exit code 1)."""
 
 
 class CallError(FgtrackError, ValueError):
-    """The call or the configuration is bad (exit code 2); of a configuration file, pydantic adds the key."""
+    """Error of a call or of the configuration (exit code 2).
+
+    pydantic adds the key if the error belongs to a configuration file.
+    """
 
 
 def did_you_mean(name: object, known: Iterable[object]) -> str:
-    """Suffix of a message on a `name` that is not among the `known` ones; empty where none is similar."""
+    """End of a message about an unknown `name`: ", did you mean 'x'?"; empty if no `known` name is similar."""
     near = difflib.get_close_matches(str(name), [str(each) for each in known], n=1)
     return f", did you mean {near[0]!r}?" if near else ""
 
 
 def one_line(text: str) -> str:
-    """`text` on one line, escaped (it holds names from files), of a long one the beginning and the end."""
+    """Return `text` on one line; control characters, which names from files may contain, are escaped.
+
+    The middle of a long text is left out.
+    """
     if len(text) > _LONGEST:
         text = f"{text[: _LONGEST - _TAIL]} ... {text[-_TAIL:]}"
     return printable(
@@ -37,7 +45,7 @@ def one_line(text: str) -> str:
 
 
 def printable(text: str) -> str:
-    """`text` with escapes for what is neither a letter nor a sign."""
+    """Return `text` with escapes for characters that cannot be printed."""
     if text.isprintable():
         return text
     return "".join(
@@ -47,5 +55,5 @@ def printable(text: str) -> str:
 
 
 def printable_lines(text: str) -> str:
-    """`text` with escapes for what is neither a letter, a sign nor an end of line."""
+    """Return `text` with escapes for characters that cannot be printed; ends of lines stay."""
     return "\n".join(map(printable, text.split("\n")))

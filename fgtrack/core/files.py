@@ -1,4 +1,4 @@
-"""Files that somebody named: opened where they are files, and read up to a size that fits into memory."""
+"""Opening and reading of files that a user names: regular files only, up to a size that fits into memory."""
 
 import errno
 from io import TextIOWrapper
@@ -11,7 +11,11 @@ GZIP_MAGIC = b"\x1f\x8b"
 
 
 def open_file(path: Path) -> BinaryIO:
-    """`path` opened for reading bytes; raises `OSError` also for a pipe or a device, which may never end."""
+    """Open `path` for reading bytes.
+
+    Raises `OSError` if it cannot be opened. A pipe or a device is refused too, because
+    reading may never end.
+    """
     if path.exists() and not path.is_file() and not path.is_dir():
         raise OSError(errno.ENOTSUP, "is a pipe or a device, give a file", str(path))
     return path.open("rb")
@@ -20,12 +24,15 @@ def open_file(path: Path) -> BinaryIO:
 def open_text(
     path: Path, encoding: str = "utf-8", newline: str | None = None
 ) -> TextIOWrapper:
-    """`path` opened for reading text; raises as `open_file`."""
+    """Open `path` for reading text; raises as `open_file`."""
     return TextIOWrapper(open_file(path), encoding=encoding, newline=newline)
 
 
 def read_whole(path: Path, largest_mb: float) -> bytes:
-    """The bytes of `path`; raises `DataError` for a larger file, and where it cannot be read."""
+    """Return the content of `path`.
+
+    Raises `DataError` if the file is larger than `largest_mb` or cannot be read.
+    """
     largest = int(largest_mb * 1e6)
     try:
         with open_file(path) as file:
@@ -34,6 +41,6 @@ def read_whole(path: Path, largest_mb: float) -> bytes:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     if len(content) > largest:
         raise DataError(
-            f"{path}: is larger than {largest_mb:g} MB, more than such a file holds"
+            f"{path}: is larger than {largest_mb:g} MB, so it is not a file of this kind"
         )
     return content

@@ -1,4 +1,4 @@
-"""Small dense linear algebra on stacks of symmetric matrices."""
+"""Small dense linear algebra for single symmetric matrices and stacks of them."""
 
 from collections.abc import Hashable, Sequence
 from functools import cache
@@ -13,26 +13,29 @@ from fgtrack.core.types import FloatArray, IntArray
 
 @cache
 def kernels(name: str) -> ModuleType:
-    """Return the module `name` of compiled loops, which is not imported before it is needed: numba is large."""
+    """Return the module `name` of compiled loops; it is imported at its first use, because numba loads slowly."""
     return import_module(name)
 
 
 @cache
 def _lapack() -> ModuleType:
-    """LAPACK of SciPy, which is large, too."""
+    """LAPACK of SciPy; it is imported at its first use, because SciPy loads slowly."""
     return import_module("scipy.linalg.lapack")
 
 
 @cache
 def identity(n: int) -> FloatArray:
-    """The identity matrix, shape (n, n); one shared read-only array for each `n`."""
+    """Identity matrix, shape (n, n): one shared read-only array for each `n`."""
     matrix = np.eye(n)
     matrix.flags.writeable = False
     return matrix
 
 
 def equal_ones(items: Sequence[Hashable]) -> list[list[int]]:
-    """Indices of equal `items`, which are calculated as one stack: ascending, in the order of the first of each."""
+    """Group equal `items`: for each distinct item its ascending indices, in the order of first occurrence.
+
+    The items of a group are processed as one stack of matrices.
+    """
     groups: dict[Hashable, list[int]] = {}
     for index, item in enumerate(items):
         groups.setdefault(item, []).append(index)
@@ -40,23 +43,26 @@ def equal_ones(items: Sequence[Hashable]) -> list[list[int]]:
 
 
 def stacked(matrices: FloatArray) -> FloatArray:
-    """Return matrices (m, k, n), of one (k, n) a stack of 1, with rows that follow one another in memory."""
+    """Return a contiguous stack (m, k, n) of `matrices`; a single matrix (k, n) becomes a stack of one."""
     return np.ascontiguousarray(matrices if matrices.ndim == 3 else matrices[None])
 
 
 def symmetrise(matrix: FloatArray) -> FloatArray:
-    """Symmetric part of `matrix`, shape (..., n, n)."""
-    both: FloatArray = matrix + matrix.T if matrix.ndim == 2 else matrix + matrix.mT
-    both *= 0.5
-    return both
+    """Symmetric part (A + A') / 2 of `matrix`, shape (..., n, n)."""
+    total: FloatArray = matrix + matrix.T if matrix.ndim == 2 else matrix + matrix.mT
+    total *= 0.5
+    return total
 
 
-#: Of the standard deviations' product: what rounding a covariance to single precision may leave.
+#: Largest difference of two opposite correlations: rounding a covariance to single precision causes less.
 ASYMMETRY = 1e-6
 
 
 def is_covariance(P: FloatArray, least: float) -> bool:
-    """True if `P` (n, n) is finite and symmetric, and its correlations, with 1 for a variance of 0, exceed `least`."""
+    """True if `P` (n, n) is finite and symmetric, and the eigenvalues of its correlation matrix exceed `least`.
+
+    A component with variance 0 has correlation 1 with itself.
+    """
     variances = np.diag(P)
     if not (np.abs(P) <= LARGEST**2).all() or (variances < 0.0).any():
         return False
@@ -70,28 +76,30 @@ def is_covariance(P: FloatArray, least: float) -> bool:
 
 
 def congruence(F: FloatArray, P: FloatArray) -> FloatArray:
-    """F P F', shapes (..., m, n) and (..., n, n)."""
+    """Congruence F P F', shapes (..., m, n) and (..., n, n), for example a propagated covariance."""
     if F.ndim == P.ndim == 2:
         return np.asarray(F.dot(P).dot(F.T))
-    return (
-        F @ P @ np.ascontiguousarray(F.mT)
-    )  # with a copy of F', at half of the time that the view takes
+    # A copy of F' takes half of the time of the view.
+    return F @ P @ np.ascontiguousarray(F.mT)
 
 
 def applied(A: FloatArray, x: FloatArray) -> FloatArray:
-    """A x of matrices (..., m, n) and vectors (..., n), shape (..., m)."""
+    """Matrix-vector products A x, shape (..., m), of matrices (..., m, n) and vectors (..., n)."""
     return A.dot(x) if A.ndim == 2 else np.asarray(np.vecdot(A, x[..., None, :]))
 
 
 def psd_solve(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
-    """Solve `matrix @ x = rhs` for a symmetric positive definite `matrix`, shapes (..., n, n) and (..., n, k).
-    With one matrix, `rhs` may be a vector (n,). Raises `numpy.linalg.LinAlgError` when `matrix` is singular.
+    """Solve `matrix @ x = rhs` for a symmetric positive definite `matrix`.
+
+    Shapes (..., n, n) and (..., n, k). With a single matrix, `rhs` may be a vector
+    (n,).
+
+    Raises `numpy.linalg.LinAlgError` if `matrix` is singular.
     """
     if matrix.ndim > 2:
         return np.asarray(np.linalg.solve(matrix, rhs))
-    _, _, solution, info = _lapack().dgesv(
-        matrix, rhs
-    )  # the same routine at a third of the time
+    # NumPy calls the same routine; without its checks it takes a third of the time.
+    _, _, solution, info = _lapack().dgesv(matrix, rhs)
     if info:
         raise np.linalg.LinAlgError("singular matrix")
     return np.asarray(solution)
@@ -100,12 +108,13 @@ def psd_solve(matrix: FloatArray, rhs: FloatArray) -> FloatArray:
 def mahalanobis_squared(
     residual: FloatArray, covariance: FloatArray, entries: IntArray | None = None
 ) -> FloatArray:
-    """Squared Mahalanobis distance y' S^-1 y, (..., n) and (..., n, n), of the marginal of `entries` if given."""
+    """Squared Mahalanobis distance y' S^-1 y, shape (...), of `residual` (..., n) and `covariance` (..., n, n).
+
+    With `entries`, the distance of the marginal of these components.
+    """
     if entries is not None:
-        residual, covariance = (
-            residual[..., entries],
-            covariance[..., entries, :][..., entries],
-        )
+        residual = residual[..., entries]
+        covariance = covariance[..., entries, :][..., entries]
     if residual.ndim == 1:
         return np.asarray(residual.dot(psd_solve(covariance, residual)))
     return np.asarray(
@@ -114,7 +123,10 @@ def mahalanobis_squared(
 
 
 def inverse_root(S: FloatArray) -> FloatArray:
-    """Inverse Cholesky factor W of S (n, n), W S W' = I; raises `numpy.linalg.LinAlgError` unless positive definite."""
+    """Inverse Cholesky factor W of S (n, n): W S W' = I.
+
+    Raises `numpy.linalg.LinAlgError` if S is not positive definite.
+    """
     root, info = _lapack().dpotrf(S, lower=1)
     if info:
         raise np.linalg.LinAlgError("a covariance is not positive definite")
@@ -122,7 +134,7 @@ def inverse_root(S: FloatArray) -> FloatArray:
 
 
 def noise_root(Q: FloatArray) -> FloatArray:
-    """`inverse_root` of process noise (n, n); a singular one is taken to be `regular`."""
+    """Inverse Cholesky factor of process noise (n, n); singular noise is made `regular` first."""
     try:
         return inverse_root(Q)
     except np.linalg.LinAlgError:
@@ -130,6 +142,10 @@ def noise_root(Q: FloatArray) -> FloatArray:
 
 
 def regular(Q: FloatArray) -> FloatArray:
-    """Process noise (..., n, n) with a millionth more of each standard deviation, and at least 1e-9: never singular."""
+    """Process noise (..., n, n) with a small diagonal added, so that it is never singular.
+
+    Each standard deviation of the addition is a millionth of the component's, and at
+    least 1e-9.
+    """
     variances = np.maximum(np.diagonal(Q, axis1=-2, axis2=-1), 1e-6)
     return Q + 1e-12 * variances[..., None] * identity(Q.shape[-1])

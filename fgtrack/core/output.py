@@ -1,7 +1,9 @@
-"""Safe outputs: what exists stays without `overwrite`, and no output is half-written.
+"""Safe outputs: an existing output is kept without `overwrite`, and no output is half-written.
 
-Made beside its destination under a name that ends in `.part`, which a killed command leaves, and renamed when complete.
-A folder that must be readable at any time is claimed instead: created, and locked until the command ends.
+An output is written next to its destination, under a name that ends in `.part`, and
+renamed when it is complete. A killed command leaves the `.part`. A folder that must be
+readable at any time is locked instead: it is created, and no other command writes into
+it until the block ends.
 """
 
 import errno
@@ -17,9 +19,9 @@ from typing import BinaryIO
 
 from fgtrack.core.errors import CallError, DataError, FgtrackError
 
-#: Of a disk that takes no more.
+#: Error numbers of a full or broken disk.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-#: Name of a folder that is replaced, inside the `.part` of what replaces it.
+#: Name of the replaced folder inside the `.part` folder of its replacement.
 _REPLACED = ".replaced"
 
 
@@ -29,7 +31,12 @@ def check_output(
     replaceable: Callable[[Path], bool] = os.path.isfile,
     what: str = "a file",
 ) -> None:
-    """Raise `CallError` unless `path` can be made, is empty (but for `.part`) or, with `overwrite`, may be replaced."""
+    """Raise `CallError` unless the output `path` may be written.
+
+    A new path in a writable folder may be written, and a folder that is empty apart
+    from `.part` files. With `overwrite`, an existing output may be replaced if
+    `replaceable` is true for it; `what` describes such an output in the message.
+    """
     try:
         if not os.path.lexists(path):
             parent = next(
@@ -57,8 +64,8 @@ def check_output(
         )
 
 
-def check_apart(out: Path, inputs: Iterable[str | Path | None]) -> None:
-    """Raise `CallError` where the output `out` is one of `inputs`, holds one, or lies in one."""
+def check_no_overlap(out: Path, inputs: Iterable[str | Path | None]) -> None:
+    """Raise `CallError` if the output `out` overlaps an input: equals it, contains it, or lies inside it."""
     target = out.resolve()
     for source in (each for each in inputs if each is not None):
         source_path = Path(source).resolve()
@@ -67,16 +74,18 @@ def check_apart(out: Path, inputs: Iterable[str | Path | None]) -> None:
             or target in source_path.parents
             or source_path in target.parents
         )
-        if (
-            overlaps and source_path.exists()
-        ):  # else the name of a shipped configuration
+        # An input that does not exist is the name of a shipped configuration.
+        if overlaps and source_path.exists():
             raise CallError(
                 f"{out}: must not overlap the input {source}, choose another name"
             )
 
 
 def write_error(path: Path, error: OSError) -> FgtrackError:
-    """The error to raise where `path` cannot be written: `DataError` for a full or broken disk, else `CallError`."""
+    """Return the error to raise if `path` cannot be written.
+
+    It is a `DataError` for a full or broken disk, a `CallError` otherwise.
+    """
     if error.errno in FULL:
         return DataError(
             f"{path}: cannot be written ({error.strerror}), free some space"
@@ -87,14 +96,14 @@ def write_error(path: Path, error: OSError) -> FgtrackError:
 
 
 def write_file(path: Path, text: str, overwrite: bool = True) -> None:
-    """Write the text file `path` completely or not at all."""
+    """Write `text` into the file `path`, completely or not at all; raises as `new_path`."""
     with new_path(path, overwrite) as new:
         new.write_bytes(text.encode())
 
 
 @contextmanager
 def new_file(path: Path, overwrite: bool) -> Iterator[BinaryIO]:
-    """A file that is renamed to `path` when the block ends; raises as `new_path`."""
+    """Open a file for writing bytes that is renamed to `path` when the block ends; raises as `new_path`."""
     with new_path(path, overwrite) as new, new.open("xb") as file:
         yield file
 
@@ -106,14 +115,16 @@ def new_path(
     replaceable: Callable[[Path], bool] = os.path.isfile,
     what: str = "a file",
 ) -> Iterator[Path]:
-    """Path of a file or folder that becomes `path` when the block ends; raises as `check_output` and `write_error`."""
+    """Temporary path for a file or folder that is renamed to `path` when the block ends.
+
+    Raises as `check_output` and `write_error`.
+    """
     check_output(path, overwrite, replaceable, what)
     with _part_of(path) as part:
         new = part / Path(os.path.abspath(path)).name
         yield new
-        check_output(
-            path, overwrite, replaceable, what
-        )  # another command may have made it
+        # Another command may have written `path` in the meantime.
+        check_output(path, overwrite, replaceable, what)
         if path.is_dir() and new.is_dir():
             os.rename(path, part / _REPLACED)
         os.replace(new, path)
@@ -121,7 +132,11 @@ def new_path(
 
 @contextmanager
 def new_files(folder: Path, overwrite: bool) -> Iterator[Path]:
-    """A folder whose files are moved into `folder` when the block ends; raises as `new_path` where one would change."""
+    """Temporary folder whose files are moved into `folder` when the block ends.
+
+    Raises as `new_path`. Without `overwrite`, an existing file may only be replaced by
+    equal content.
+    """
     check_output(folder, True, os.path.isdir, "a folder")
     with _part_of(folder) as part:
         yield part
@@ -137,7 +152,7 @@ def new_files(folder: Path, overwrite: bool) -> Iterator[Path]:
 
 @contextmanager
 def _part_of(path: Path) -> Iterator[Path]:
-    """The folder `<path>.*.part`, which is removed at the end of the block; an interrupt keeps it, as a kill does."""
+    """Folder `<path>.*.part` that is removed at the end of the block; an interrupt or a kill leaves it."""
     absolute = Path(os.path.abspath(path))
     part = absolute.with_name(f"{absolute.name}.{secrets.token_hex(6)}.part")
     try:
@@ -145,7 +160,7 @@ def _part_of(path: Path) -> Iterator[Path]:
         yield part
         shutil.rmtree(part)
     except Exception as error:
-        if not (part / _REPLACED).exists():  # it could not be put back
+        if not (part / _REPLACED).exists():  # else it holds the only copy
             shutil.rmtree(part, ignore_errors=True)
         if isinstance(error, OSError):
             raise write_error(path, error) from error
@@ -153,8 +168,12 @@ def _part_of(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def claimed(folder: Path) -> Iterator[None]:
-    """Create and lock `folder` during the block, remove it if still empty; `CallError` if locked or not possible."""
+def locked_folder(folder: Path) -> Iterator[None]:
+    """Create and lock `folder` during the block, and remove the folder at the end if it is still empty.
+
+    Raises `CallError` if another command has locked the folder, or if it cannot be
+    created.
+    """
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Parts by name: built-in ones, and those of installed packages (entry points), loaded on first use."""
+"""Registry of parts by name: built-in parts, and plug-ins of installed packages (entry points)."""
 
 import hashlib
 import logging
@@ -18,17 +18,19 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Alias:
-    """Former name of a part."""
+    """Present name of a part that had another name."""
 
     name: str
     """Present name of the part."""
     note: str = ""
-    """Sentence for whoever uses the former name."""
+    """Further sentence of the warning for a use of the former name."""
 
 
 class Registry:
-    """Parts of one kind by name: built-in ones, and entry points of the groups, loaded when their name is used.
-    One with the name of a built-in part, or of an earlier plug-in, is left out with a warning.
+    """Parts of one kind by name: built-in parts and plug-ins (entry points), loaded at their first use.
+
+    A plug-in is left out with a warning if its name belongs to a built-in part or to an
+    earlier plug-in.
     """
 
     def __init__(
@@ -37,8 +39,12 @@ class Registry:
         built_in: Mapping[str, Mapping[str, str]],
         aliases: Mapping[str, Alias] | None = None,
     ) -> None:
-        """`noun`: kind of the parts, for messages; `built_in`: `module:attribute` by name, for every entry-point group;
-        `aliases`: by former names."""
+        """Create the registry; plug-ins are searched at the first use.
+
+        `noun` is the kind of the parts, for messages. `built_in` contains for every
+        entry-point group the built-in parts as `module:attribute` by name. `aliases`
+        contains present names by former names.
+        """
         self._noun = noun
         self._built_in = built_in
         self._aliases = dict(aliases or {})
@@ -47,7 +53,10 @@ class Registry:
         return iter(self._entries)
 
     def loaded(self, group: str | None = None) -> dict[str, Any]:  # Any: see `load`
-        """All parts, or those of `group`, by name; a plug-in that cannot be loaded is left out with a warning."""
+        """Return all parts, or the parts of `group`, by name.
+
+        A plug-in that cannot be loaded is left out with a warning.
+        """
         parts = {}
         for name, entry in self._entries.items():
             if group in (None, entry.group):
@@ -58,7 +67,7 @@ class Registry:
         return parts
 
     def sources(self) -> dict[str, str]:
-        """Names of the plug-ins, with the package of each and a hash of the code of that package or module."""
+        """Return the package, its version and a hash of its source code for each plug-in, by the plug-in's name."""
         plugins = {
             name: entry
             for name, entry in self._entries.items()
@@ -89,29 +98,31 @@ class Registry:
             )
         return name
 
-    def load(
-        self, name: str
-    ) -> Any:  # Any: what an entry point names is only known to its user
-        """Return the part `name`. Raises `CallError` for an unknown name and a plug-in that cannot be loaded."""
+    def load(self, name: str) -> Any:  # Any: an entry point may name any object
+        """Return the part `name`; raises `CallError` for an unknown name and for a plug-in that cannot be loaded."""
         entry = self._entries[self.resolve(name)]
-        with self.blamed(name, "cannot be loaded"):
+        with self.plugin_errors(name, "cannot be loaded"):
             return entry.load()
 
     @contextmanager
-    def blamed(self, name: str, what: str) -> Iterator[None]:
-        """Exceptions in the block, unless raised on purpose or by built-in parts, become a `CallError` about `name`."""
+    def plugin_errors(self, name: str, what: str) -> Iterator[None]:
+        """Turn an exception of the plug-in `name` in the block into a `CallError` that names the plug-in.
+
+        `what` completes the message: "plug-in ... `what`". Exceptions of built-in parts
+        and `FgtrackError` pass unchanged.
+        """
         try:
             yield
         except FgtrackError:
             raise
-        except (Exception, SystemExit) as error:  # of a foreign module: anything
+        except (Exception, SystemExit) as error:  # a plug-in may raise anything
             entry = self._entries.get(name)
             if entry is None or entry.dist is None:
                 raise
             why = " ".join(f"{type(error).__name__}: {error}".split())
             raise CallError(
                 f"{self._noun} {name!r}: plug-in {entry.value} of {_package(entry)} {what} ({why}): "
-                "repair or uninstall it"
+                "repair or uninstall the package"
             ) from error
 
     @cached_property
@@ -130,7 +141,7 @@ class Registry:
                 holder = entries.setdefault(alias.name if alias else entry.name, entry)
                 if (holder.value, _package(holder)) != (entry.value, _package(entry)):
                     _logger.warning(
-                        "%s %r of %s is left out: the name belongs to %s; rename the entry point",
+                        "%s %r of %s is not loaded: the name belongs to %s; rename the entry point",
                         self._noun,
                         entry.name,
                         _package(entry),
@@ -146,7 +157,8 @@ def _package(entry: EntryPoint) -> str:
 
 
 def _hash_of(entry: EntryPoint) -> str:
-    digest, spec = hashlib.sha256(), find_spec(entry.module.partition(".")[0])
+    digest = hashlib.sha256()
+    spec = find_spec(entry.module.partition(".")[0])
     paths = (
         []
         if spec is None

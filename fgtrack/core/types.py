@@ -1,6 +1,7 @@
-"""The values that flow through fgtrack: messages in, track states and update records out.
+"""The values that flow through fgtrack: messages as inputs, track states and update records as outputs.
 
-Every message carries two times: `stamp_ns` (time of measurement) and `receipt_ns` (the tracker got it).
+Every message carries two times: `stamp_ns`, the time of measurement, and `receipt_ns`,
+when the tracker got it.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,11 +19,11 @@ BoolArray = npt.NDArray[np.bool_]
 Frame = Literal["map", "ego", "sensor"]
 FRAMES: tuple[Frame, ...] = get_args(Frame)
 YawWord = Literal["flipped", "unused"]
-"""Defect of a measured yaw: it is half a turn off and was turned, or it misfits in another way and was not used."""
-#: State columns of tracks.csv; a motion model's state is a leading part of them.
+"""Treatment of a wrong yaw: `flipped` if it was half a turn off and turned, `unused` if it was ignored."""
+#: State columns of tracks.csv; the state of every motion model consists of the first few.
 STATE_NAMES = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps", "accel_mps2")
 X, Y, YAW, SPEED, YAW_RATE, ACCEL = range(6)
-#: What the covariance of an `EgoState` is of: x, y, yaw, speed and yaw rate.
+#: States of the covariance of an `EgoState`.
 EGO_COVARIANCE_STATES = STATE_NAMES[:5]
 
 
@@ -39,17 +40,17 @@ class EgoState:
     yaw_rate_radps: float = 0.0
     accel_mps2: float = 0.0
     in_pit: bool | None = None
-    """True while the ego drives in the pit lane; None when the source does not contain it."""
+    """True while the ego drives in the pit lane; None if the source does not report it."""
     covariance: tuple[float, ...] | None = None
-    """Row-major 5 x 5, of x, y, yaw, speed and yaw rate (`EGO_COVARIANCE_STATES`); None where the source has none.
+    """Row-major 5 x 5, of x, y, yaw, speed and yaw rate (`EGO_COVARIANCE_STATES`); None if the source reports none.
 
-    A variance of 0 means the same of one of them.
+    Variance 0: that component has no reported uncertainty.
     """
 
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """One detected object; a component that was not measured is None."""
+    """One detected object; components that were not measured are None."""
 
     x_m: float | None = None
     y_m: float | None = None
@@ -59,22 +60,22 @@ class Detection:
     bearing_rad: float | None = None
     range_rate_mps: float | None = None
     covariance: tuple[float, ...] | None = None
-    """Row-major, of the measured components in the order of `MEASURABLE`."""
+    """Row-major covariance of the measured components, in the order of `MEASURABLE`."""
     stamp_ns: int | None = None
-    """The object's own stamp, where the sensor gives one per object."""
+    """Own stamp of the object, if the sensor reports one for each object."""
     object_id: int | None = None
     z_m: float | None = None
-    """Height of the middle of its box, in the frame of the list."""
+    """Height of the centre of the object's box, in the frame of the list."""
     length_m: float | None = None
-    """Size along its own heading."""
+    """Size of the box along its heading."""
     width_m: float | None = None
     height_m: float | None = None
     score: float | None = None
-    """Confidence of the detector, on a scale of its own."""
+    """Confidence of the detector, on the detector's own scale."""
     class_name: str | None = None
-    """Class: `car`, `truck` ..., in the words of the detector."""
+    """Class in the detector's words, for example `car` or `truck`."""
     id: str | None = None
-    """Identity that the object reports of itself: ICAO address, MMSI, station."""
+    """Identity that the object reports, for example an ICAO address, an MMSI or a station number."""
 
     @property
     def measured(self) -> tuple[str, ...]:
@@ -82,31 +83,31 @@ class Detection:
         return tuple(name for name in MEASURABLE if getattr(self, name) is not None)
 
 
-#: What a detection may measure, in the order of its covariance and of the residual columns: the fields of
-#: `Detection` before its covariance.
+#: Components that a detection may measure: the fields of `Detection` before `covariance`.
+#: Covariances and residual columns have this order.
 MEASURABLE = tuple(
     takewhile(
         lambda name: name != "covariance", (each.name for each in fields(Detection))
     )
 )
-#: What a detection contains of its object besides: never measurements of the state, and all may be None.
+#: Fields of a detection that describe the object, and are no measurements of its state; all may be None.
 DESCRIBING = ("z_m", "length_m", "width_m", "height_m", "score", "class_name", "id")
 
 
 @dataclass(frozen=True, slots=True)
 class DetectionList:
-    """The object list of one sensor at one stamp; an empty list: nothing was detected."""
+    """The detections of one sensor at one stamp; an empty list means that nothing was detected."""
 
     sensor: str
     stamp_ns: int
     receipt_ns: int
     objects: Sequence[Detection]
-    """Kept as a tuple."""
+    """Detections; stored as a tuple."""
     frame: Frame = "ego"
     left_out: tuple[str, ...] = field(default=(), compare=False)
-    """For every object that the reader has left out of the list the setting that excludes it."""
+    """The excluding setting for each object that the reader has left out of the list."""
     origin_deg: tuple[float, float] | None = None
-    """Latitude and longitude of the origin of the map; None where it is not known."""
+    """Latitude and longitude of the origin of the map; None if unknown."""
 
     def __post_init__(self) -> None:
         if type(self.objects) is not tuple:
@@ -114,12 +115,12 @@ class DetectionList:
 
 
 EGO_ID = -1
-"""Object id of the ego in truth."""
+"""`TruthState.object_id` of the ego."""
 
 
 @dataclass(frozen=True, slots=True)
 class TruthState:
-    """True state of an object in the map frame, or of the ego, see `EGO_ID`."""
+    """True state of an object, or of the ego (`EGO_ID`), in the map frame."""
 
     stamp_ns: int
     receipt_ns: int
@@ -131,16 +132,19 @@ class TruthState:
     yaw_rate_radps: float | None = None
     accel_mps2: float | None = None
     ignored: bool = False
-    """True if a track of this object, or in this region, is neither right nor false when a run is judged."""
+    """True if the evaluation ignores tracks of this object or in this region: they are neither right nor false."""
     outline_m: tuple[float, ...] | None = None
-    """Corners x, y, x, y ... of the region that is ignored at this stamp, `x_m` and `y_m` in it; None for an object."""
+    """Corners x, y, x, y ... of a region that is ignored at this stamp; None for an object.
+
+    The point `x_m`, `y_m` lies in the region.
+    """
 
 
 Message = EgoState | DetectionList | TruthState
 
 
 class Disposition(StrEnum):
-    """Outcome of a detection: exactly one for each detection received."""
+    """Outcome of a detection; every received detection has exactly one."""
 
     BIRTH = "birth"
     IN_SEQUENCE = "in_sequence"
@@ -156,14 +160,15 @@ class Disposition(StrEnum):
     FAILED = "failed"
 
 
-#: Dispositions of detections that a track has fused out of sequence, and of all that one has fused.
+#: Dispositions of detections that a track has fused out of sequence.
 LATE = (Disposition.OUT_OF_SEQUENCE, Disposition.BEYOND_WINDOW)
+#: Dispositions of all detections that a track has fused.
 FUSED = (Disposition.BIRTH, Disposition.IN_SEQUENCE, *LATE)
 
 
 @dataclass(frozen=True, slots=True)
 class TrackState:
-    """Gaussian state of one object at one stamp."""
+    """Gaussian state of an object at one stamp."""
 
     stamp_ns: int
     mean: FloatArray
@@ -173,44 +178,44 @@ class TrackState:
 
 
 class TrackStatus(StrEnum):
-    """Confidence in a track."""
+    """Lifecycle status of a track."""
 
     TENTATIVE = "tentative"
-    """Not yet confirmed: measured too seldom, or too improbable, according to the lifecycle."""
+    """Not confirmed yet, or of doubtful existence: too few matches, or too low an existence probability."""
     CONFIRMED = "confirmed"
     COASTING = "coasting"
-    """Not matched by the newest batch that expected to see it."""
+    """Confirmed, but missed by the newest list that should have contained the object."""
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectReport:
-    """Class and size of the object of a track; None where no detection gives it."""
+    """Class and size of a track's object; a field is None if no detection reports it."""
 
     class_name: str | None = None
-    """That of most detections."""
+    """Most frequent class of the detections."""
     class_share: float | None = None
-    """Share of these among those that name a class."""
+    """Share of this class among the detections with a class."""
     length_m: float | None = None
-    """Mean over the detections that give it, as the other two."""
+    """Mean over the detections that report it, like width and height."""
     width_m: float | None = None
     height_m: float | None = None
     id: str | None = None
-    """Identity that most of its detections report."""
+    """Most frequent identity of the detections."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrackReport:
-    """A track as the tracker publishes it; those of a tick are the rows of tracks.csv."""
+    """A track as the tracker publishes it: one row of tracks.csv."""
 
     track_id: int
     status: TrackStatus
     state: TrackState
-    """Kinematic: x, y, yaw, speed, yaw rate and, if the motion model has it, acceleration."""
+    """Kinematic state: x, y, yaw, speed, yaw rate and, if the motion model has it, acceleration."""
     num_measured: int
     object: ObjectReport | None = None
-    """Class and size; None where no detection gives any."""
+    """Class and size; None if no detection reports any."""
     score: float | None = None
-    """Probability that the object exists (`lifecycle.kind: existence`); None where a lifecycle gives none."""
+    """Existence probability (`lifecycle.kind: existence`); None for a lifecycle without one."""
 
     @property
     def stamp_ns(self) -> int:
@@ -219,12 +224,12 @@ class TrackReport:
 
     @property
     def x_m(self) -> float:
-        """Position in the map, to the east."""
+        """Position in the map along x (east)."""
         return float(self.state.mean[X])
 
     @property
     def y_m(self) -> float:
-        """Position in the map, to the north."""
+        """Position in the map along y (north)."""
         return float(self.state.mean[Y])
 
     @property
@@ -234,7 +239,7 @@ class TrackReport:
 
     @property
     def speed_mps(self) -> float:
-        """Speed along the yaw."""
+        """Speed along the yaw; negative while the object reverses."""
         return float(self.state.mean[SPEED])
 
     @property
@@ -250,37 +255,37 @@ class TrackReport:
 
 @dataclass(frozen=True, slots=True)
 class UpdateRecord:
-    """One row of updates.csv: what became of one received detection."""
+    """Outcome of one received detection: one row of updates.csv."""
 
     sensor: str
     stamp_ns: int
     receipt_ns: int
     index: int
-    """Position of the detection in its message."""
+    """Index of the detection in its list."""
     disposition: Disposition
     track_id: int | None = None
     nis: float | None = None
     innovation: Mapping[str, float] = field(default_factory=dict)
-    """Measured minus predicted, by name of `MEASURABLE`."""
+    """Measured minus predicted value, by name of `MEASURABLE`."""
     reason: str | None = None
-    """The setting by which it is out of bounds; None of other dispositions."""
+    """Setting by which the detection is out of bounds; None for other dispositions."""
     yaw: YawWord | None = None
-    """`flipped` if the yaw is half a turn off, `unused` if it misfits otherwise and the innovation lacks it."""
+    """`flipped` if the measured yaw was turned by half a turn, `unused` if the innovation lacks it."""
 
 
 @dataclass(frozen=True, slots=True)
 class SmoothedReport:
-    """A state that later measurements have improved: final when it leaves the window, lagged before."""
+    """A state of a track after later measurements: final when it leaves the window, lagged before."""
 
     track_id: int
     state: TrackState
     lag_s: float | None = None
-    """Time from the state to the tick; None of a final one."""
+    """Time from the state to the tick; None for a final state."""
 
 
 @dataclass(frozen=True)
 class TickReport:
-    """All that one tracker tick gives."""
+    """Results of one tracker tick."""
 
     tick: int
     now_ns: int
@@ -296,14 +301,17 @@ class TickReport:
         smoothed: Sequence[SmoothedReport],
         **makers: Callable[[], Iterable[object]],
     ) -> Self:
-        """Return a report whose `tracks` and `updates` the `makers` of these names give when they are asked for."""
+        """Return a report with `tracks` and `updates` that their `makers` compute at the first access.
+
+        A maker returns the elements of the field with the maker's name.
+        """
         report = object.__new__(cls)
         report.__dict__.update(
             tick=tick, now_ns=now_ns, smoothed=tuple(smoothed), makers=makers
         )
         return report
 
-    def __getattr__(self, name: str) -> Any:  # Any: of what is not made yet
+    def __getattr__(self, name: str) -> Any:  # Any: the type of the field
         makers = self.__dict__.get("makers", {})
         if name not in makers:
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""YAML 1.2 of users and recordings: plain values only."""
+"""YAML 1.2 documents of users and recordings; plain values only."""
 
 import re
 import warnings
@@ -9,13 +9,18 @@ from ruamel.yaml.error import ReusedAnchorWarning, YAMLError
 
 __all__ = ["safe_yaml"]
 
+#: Longest document in characters.
 _LONGEST = 2_000_000
 _MOST_ALIASES = 25
 _ALIAS = re.compile(r"(?:^|[\s\[{,:-])\*[\w-]", re.MULTILINE)
 
 
 def safe_yaml(text: str) -> Any:  # Any: the type is known after validation only
-    """Value of the YAML 1.2 document `text`; `YAMLError` if invalid, too long, too deeply nested or full of aliases."""
+    """Return the value of the YAML 1.2 document `text`.
+
+    Raises `YAMLError` if the document is invalid, too long, too deeply nested, or has
+    too many aliases.
+    """
     if len(text) > _LONGEST:
         raise YAMLError(f"is longer than {_LONGEST} characters")
     if len(_ALIAS.findall(text)) > _MOST_ALIASES:

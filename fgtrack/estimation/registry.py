@@ -240,7 +240,7 @@ def _made(
 ) -> Any:
     """Return what the part `name` makes. Raises `CallError` where that is not of its `kind`."""
     _check_options(name, factory, len(arguments), options)
-    with registry.blamed(name, "cannot be made"):
+    with registry.plugin_errors(name, "cannot be made"):
         try:
             made = factory(*arguments, **options)
         except ValueError as error:

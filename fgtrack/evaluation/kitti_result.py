@@ -16,7 +16,7 @@ import pandas as pd
 
 from fgtrack.core.errors import CallError, DataError
 from fgtrack.core.geometry import rotation, wrap_angle
-from fgtrack.core.output import check_apart, write_file
+from fgtrack.core.output import check_no_overlap, write_file
 from fgtrack.core.time import NS_PER_S
 from fgtrack.evaluation.matching import confirmed
 from fgtrack.evaluation.placement import update_rows
@@ -42,7 +42,7 @@ def write_kitti_result(
         raise CallError(
             f"{sequence}: is not a sequence of the KITTI data set, name its oxts/NNNN.txt"
         )
-    check_apart(out, [sequence, *(() if run.path is None else (run.path,))])
+    check_no_overlap(out, [sequence, *(() if run.path is None else (run.path,))])
     views = _located(run, view_of_sequence(sequence))
     states = _states(run, len(views))
     without = set(states["track_id"][states["length_m"].isna()])

@@ -54,7 +54,7 @@ def open_input(path: Path | str, config: InputConfig | None = None) -> InputSour
     path = Path(path)
     name = input_kind(path)
     config = config or InputConfig()
-    with ADAPTERS.blamed(name, f"cannot open {path}"):
+    with ADAPTERS.plugin_errors(name, f"cannot open {path}"):
         form = file_format(name)
         messages = form.open(path, config)
     return InputSource(
@@ -80,7 +80,7 @@ def input_kind(path: Path) -> str:
             raise DataError(f"{path}: is empty")
         for name in names:  # loaded one after the other: that of bags is large
             form = file_format(name)
-            with ADAPTERS.blamed(name, f"cannot look at {path}"):
+            with ADAPTERS.plugin_errors(name, f"cannot look at {path}"):
                 if form.recognises(path):
                     return name
     except OSError as error:
@@ -91,7 +91,7 @@ def input_kind(path: Path) -> str:
 
 def file_format(name: str) -> FileFormat:
     """The format `name`. Raises `CallError` where a plug-in fails or is not one."""
-    with ADAPTERS.blamed(name, "cannot be made"):
+    with ADAPTERS.plugin_errors(name, "cannot be made"):
         form = ADAPTERS.load(name)
         form = form if isinstance(form, FileFormat) else form()
     if not isinstance(form, FileFormat):

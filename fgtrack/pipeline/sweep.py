@@ -22,7 +22,7 @@ from pydantic import ConfigDict, TypeAdapter
 from fgtrack.config.settings import Config
 from fgtrack.config.yaml_file import validate
 from fgtrack.core.errors import CallError, DataError, FgtrackError
-from fgtrack.core.output import check_output, claimed, write_file
+from fgtrack.core.output import check_output, locked_folder, write_file
 from fgtrack.core.types import Message
 from fgtrack.inputs.source import open_input
 from fgtrack.pipeline.assumptions.assumed import assumed
@@ -128,7 +128,7 @@ class Sweep:
         instead. Raises `CallError` without dask or scheduler, `DataError` where a process dies.
         """
         tasks = {job.key: job.recipe for job in self.todo if job.recipe is not None}
-        with claimed(self.folder):
+        with locked_folder(self.folder):
             (self.folder / _PARTS).mkdir(exist_ok=True)
             try:
                 for key, cells in (

@@ -13,7 +13,7 @@ from typing import Self
 
 from fgtrack.core.errors import DataError
 from fgtrack.core.files import open_file, read_whole
-from fgtrack.core.output import check_output, claimed, write_error, write_file
+from fgtrack.core.output import check_output, locked_folder, write_error, write_file
 from fgtrack.runs.rows import Row, text, text_header
 from fgtrack.runs.schema import COLUMNS, OPTIONAL_TABLES, RUN_FORMAT
 from fgtrack.runs.sink import RunSink
@@ -43,7 +43,7 @@ class RunWriter(RunSink):
         self._folder: Path | None = None  # where the files are, once there are any
         self._files: dict[str, BufferedWriter] = {}
         with ExitStack() as claim:
-            claim.enter_context(claimed(self.path))
+            claim.enter_context(locked_folder(self.path))
             check_run(self.path, overwrite)
             self._open = claim.pop_all()
 

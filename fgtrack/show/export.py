@@ -5,7 +5,7 @@ from heapq import merge
 from pathlib import Path
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.output import check_apart, check_output
+from fgtrack.core.output import check_no_overlap, check_output
 from fgtrack.evaluation.placement import roads
 from fgtrack.evaluation.runs import Runs, evaluated, same_recording
 from fgtrack.inputs.ros.bag_writer import check_bag, token
@@ -47,7 +47,7 @@ def export(
             )
     (check_output if out.suffix == ".mcap" else check_bag)(out, overwrite)
     every = evaluated(runs)
-    check_apart(out, [item.run.path for item in every])
+    check_no_overlap(out, [item.run.path for item in every])
     messages, notes = viewer_messages({item.label: item.run for item in every})
     if ros2:
         return write_ros2(out, messages, overwrite), notes

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from fgtrack.core.errors import CallError
-from fgtrack.core.output import check_apart, check_output, new_path, write_file
+from fgtrack.core.output import check_no_overlap, check_output, new_path, write_file
 from fgtrack.core.time import seconds
 from fgtrack.inputs.geodetic import GEODETIC, latitudes_longitudes_deg
 from fgtrack.runs import Run
@@ -33,7 +33,7 @@ def write_geojson(run: Run, out: Path, *, overwrite: bool = False) -> int:
             f"{run.path}: has no latitude and longitude; set `input.origin` of the map and repeat the run"
         )
     check_output(out, overwrite)
-    check_apart(out, [run.path])
+    check_no_overlap(out, [run.path])
     tracks, objects = located(run.tables["tracks"]), run.tables["objects"]
     latitude_deg, longitude_deg = latitudes_longitudes_deg(
         origin_deg, tracks["x_m"], tracks["y_m"]
