@@ -19,7 +19,7 @@ from fgtrack.core.types import (
     IntArray,
     Message,
 )
-from fgtrack.inputs.info import OTHER_CLOCK_S, OwnOrder
+from fgtrack.inputs.info import OTHER_CLOCK_S, IdentityOrder
 from fgtrack.tracking.lives.existence import ExistenceRules
 
 __all__ = [
@@ -144,7 +144,7 @@ class Arrivals:
 def arrivals_of(messages: Iterable[Message]) -> dict[str, Arrivals]:
     """Return the arrivals of every sensor, and of the ego under `ego`."""
     rows: dict[str, list[tuple[int, int, int]]] = {}
-    order, own = OwnOrder(), defaultdict[str, list[bool]](list)
+    order, own = IdentityOrder(), defaultdict[str, list[bool]](list)
     for message in messages:
         if isinstance(message, EgoState):
             rows.setdefault(EGO, []).append((message.stamp_ns, message.receipt_ns, 0))

@@ -1,1 +1,1 @@
-"""Recordings, streams and data sets in; streams, bags and run folders out."""
+"""Inputs: recordings, streams and data sets are read; streams and bags are written."""

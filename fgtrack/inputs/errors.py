@@ -1,4 +1,4 @@
-"""Errors of readers in words, and the error of an input that breaks off in the middle."""
+"""Plain messages for exceptions of readers, and the error of an input that breaks off."""
 
 import re
 from collections.abc import Iterable, Iterator
@@ -10,11 +10,11 @@ _T = TypeVar("_T")
 
 
 def one_line(error: BaseException) -> str:
-    """Text of `error` in one line of at most 200 characters."""
+    """Text of `error` on one line of at most 200 characters; the type's name if it has no text."""
     return " ".join(str(error)[:2000].split())[:200] or type(error).__name__
 
 
-#: What the type of a value is called in a file.
+#: Words for the type of a value in a file.
 _IN_FILES = {
     "NoneType": "null",
     "bool": "true or false",
@@ -27,24 +27,24 @@ _IN_FILES = {
     "ndarray": "an array",
     **dict.fromkeys(("int", "float", "Decimal", "decimal.Decimal"), "a number"),
 }
-#: The type of the rejected value in Python's messages.
-_FOUND = re.compile(
+#: Matches Python's messages that contain the type of the rejected value.
+_REJECTED_TYPE = re.compile(
     r"^'([\w.]+)' object|^(string|list|tuple) indices|, not '([\w.]+)'$|cannot unpack .*? ([\w.]+) object"
 )
 _OTHER_LENGTH = re.compile(r"values to unpack|^zip\(\) argument|index out of range")
 
 
 def cause(error: BaseException) -> str:
-    """Return the complaint of a reader's exception about a value, in words and on one line."""
+    """Describe a reader's exception about a value in plain words, on one line."""
     text = one_line(error)
     if isinstance(error, KeyError):
         return (
             f"{error.args[0]!r:.60} is missing" if error.args else "a name is missing"
         )
     if isinstance(error, TypeError | AttributeError):
-        found = _FOUND.search(text)
-        name = next(filter(None, found.groups())) if found else ""
-        return f"{_IN_FILES.get(name, 'a value')} where the format has something else"
+        match = _REJECTED_TYPE.search(text)
+        name = next(filter(None, match.groups())) if match else ""
+        return f"{_IN_FILES.get(name, 'a value')} where the format has another type of value"
     if isinstance(error, UnicodeDecodeError):
         return "bytes that are not text in UTF-8"
     if isinstance(error, RecursionError):
@@ -56,12 +56,18 @@ def cause(error: BaseException) -> str:
     return text
 
 
-class TruncatedInput(DataError):  # noqa: N818 - it names what the input is; the readers have given all before it
-    """An input broke off; everything before has been yielded. A replay finishes the run with it and exits with 1."""
+class TruncatedInput(DataError):  # noqa: N818 - the name describes the input
+    """An input broke off; all messages before the break have been yielded.
+
+    A replay finishes the run with these messages and exits with code 1.
+    """
 
 
 class UntilBreak(Generic[_T]):
-    """Iterates over messages up to the end or a break (a `DataError` not before the first), whose error it keeps."""
+    """Iterator over messages up to their end, or up to a `DataError`, which is kept in `error`.
+
+    A `DataError` before the first message is raised, unless it is a `TruncatedInput`.
+    """
 
     def __init__(self, messages: Iterable[_T]) -> None:
         self._messages = messages
@@ -79,6 +85,6 @@ class UntilBreak(Generic[_T]):
             self.error = error
 
     def raise_error(self) -> None:
-        """Raise the error of the break, if there was one."""
+        """Raise the error that ended the messages, if there was one."""
         if self.error:
             raise self.error

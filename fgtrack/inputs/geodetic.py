@@ -1,8 +1,10 @@
-"""Latitude and longitude to the local plane (east, north) that tracks live in, and back.
+"""Conversion of latitude and longitude to the local plane (east, north) of the tracks, and back.
 
-The plane touches the WGS84 ellipsoid at the origin; positions are those at height 0 (orthographic projection; Snyder:
-Map projections, USGS Professional Paper 1395, 1987, section 20). At the distance d it shortens lengths along the line
-of sight by d^2 / (2 R^2), some 1e-4 at 100 km, less than the errors of motion models; hence the warning beyond.
+The plane touches the WGS84 ellipsoid at the origin. Positions have height 0 and are
+projected orthographically (Snyder: Map projections, USGS Professional Paper 1395, 1987,
+section 20). At the distance d from the origin, lengths towards the origin are shortened
+by d^2 / (2 R^2). This is 1e-4 at 100 km, less than the errors of motion models. Beyond,
+a warning is logged.
 """
 
 import logging
@@ -17,20 +19,24 @@ from fgtrack.core.types import FloatArray
 from fgtrack.inputs.settings import Origin
 
 GEODETIC = ("latitude_deg", "longitude_deg")
-"""Names of mapped fields that give x_m and y_m in the map."""
+"""Names of the mapped fields from which x_m and y_m in the map are computed."""
 _FAR_M = 100e3
-_ITERATIONS = 4  # each leaves d^2 / (2 R^2) of the error in height
+#: Fixed-point iterations of the height; each one reduces the error by the factor d^2 / (2 R^2).
+_ITERATIONS = 4
 _logger = logging.getLogger(__name__)
 
 
 @cache
 def warn_once(text: str) -> None:
-    """Log a warning, the same text once: an input is opened several times."""
+    """Log the warning `text` once, although an input may be opened several times."""
     _logger.warning(text)
 
 
 class LocalPlane:
-    """The plane of one input: x_m to the east and y_m to the north of its origin, the first position unless given."""
+    """Local plane of an input: x_m to the east and y_m to the north of the origin.
+
+    Without a given origin, the first position becomes the origin.
+    """
 
     def __init__(self, origin: Origin | None = None) -> None:
         self.origin = origin
@@ -45,10 +51,13 @@ class LocalPlane:
             else (self.origin.latitude_deg, self.origin.longitude_deg)
         )
 
-    def placed(
+    def in_plane(
         self, values: Mapping[str, Any]
-    ) -> dict[str, Any]:  # Any: of mapped fields
-        """Return `values` with x_m and y_m, None or NaN as they are, instead of latitude_deg and longitude_deg."""
+    ) -> dict[str, Any]:  # Any: values of mapped fields
+        """Return `values` with x_m and y_m instead of latitude_deg and longitude_deg.
+
+        A missing coordinate gives None, an invalid one NaN.
+        """
         rest = dict(values)
         latitude_deg, longitude_deg = (rest.pop(name, None) for name in GEODETIC)
         if GEODETIC[0] in values:
@@ -61,7 +70,7 @@ class LocalPlane:
     def position_m(
         self, latitude_deg: float, longitude_deg: float
     ) -> tuple[float, float]:
-        """East and north of a position; NaN where it is not on Earth."""
+        """East and north of a position in m; NaN for coordinates that do not exist on Earth."""
         if not (abs(latitude_deg) <= 90.0 and abs(longitude_deg) <= 180.0):
             return math.nan, math.nan
         if self.origin is None:
@@ -73,23 +82,25 @@ class LocalPlane:
             float, geodetic2enu(latitude_deg, longitude_deg, 0.0, *at, 0.0)
         )
         if not self._warned and (far_m := math.hypot(x_m, y_m, up_m)) > _FAR_M:
-            self._warned, where = (
-                True,
-                f"{far_m / 1e3:.0f} km from the origin {at[0]:.4f}, {at[1]:.4f}",
+            self._warned = True
+            where = f"{far_m / 1e3:.0f} km from the origin {at[0]:.4f}, {at[1]:.4f}"
+            warn_once(
+                f"a position is {where}: set `input.origin` within 100 km of the positions"
             )
-            warn_once(f"a position is {where}: beyond 100 km set `input.origin` nearer")
         return (x_m, y_m) if abs(up_m) < _EARTH_M else (math.nan, math.nan)
 
 
 _EARTH_M = 6.3e6
-"""Radius, in the direction up, of what the plane does not reach."""
+"""Distance below the plane, in m, beyond which a position is on the other side of the Earth."""
 
 
 def latitudes_longitudes_deg(
     origin_deg: tuple[float, float], x_m: FloatArray, y_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return latitudes and longitudes, shape (n,) each, of positions (n,) in the plane about `origin_deg`.
-    The height above the plane at which that above the ellipsoid is 0 results from fixed-point iteration.
+    """Return latitudes and longitudes in degrees, shape (n,) each, of positions (n,) in the plane at `origin_deg`.
+
+    Fixed-point iteration finds the height above the plane at which the height above the
+    ellipsoid is 0.
     """
     from pymap3d import enu2geodetic
 

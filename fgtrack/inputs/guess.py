@@ -1,4 +1,4 @@
-"""Guesses of the fields of unknown tables and messages, from their names and values."""
+"""Guesses which fields of unknown tables and messages contain which components, from names and values."""
 
 import math
 import re
@@ -15,7 +15,7 @@ from fgtrack.models.measurement import ANGULAR
 
 __all__ = ["Guess", "agreeing_with_motion", "guesses", "time_unit", "words_of"]
 
-#: Units at the end of a name, by what they are of: the factor to SI, or `degrees`.
+#: Factor to SI by unit, for the units of lengths and speeds at the end of a name.
 _SCALES = {
     "m": {"km": 1e3, "cm": 1e-2, "mm": 1e-3},
     "mps": {
@@ -42,7 +42,7 @@ _UNITS = {
     *_SCALES["m"],
     *_SCALES["mps"],
 }
-#: Words of names that are not read: how good something is, or a derivative that no model has.
+#: Words that mark the uncertainty of a value; fields with these words are ignored.
 _SKIPPED = frozenset(
     (
         "std",
@@ -59,6 +59,7 @@ _SKIPPED = frozenset(
         "accuracy",
     )
 )
+#: Words that mark a velocity, a size, or a vector that is not read.
 _OF_VELOCITY = frozenset(("velocity", "vel", "v", "speed", "twist", "vrel", "linear"))
 _OF_SIZE = frozenset(
     ("size", "dimension", "dimensions", "extent", "extents", "scale", "shape")
@@ -81,7 +82,7 @@ _AXES = {
     "y": ("y_m", "velocity y", "width_m"),
     "z": ("z_m", "", "height_m"),
 }
-#: Ends of names, by component, the first that matches.
+#: Regular expression of the end of a name, by component; the first match counts.
 _NAMES = {
     "receipt": "receipt|received|receive|recv|seen|arrival|arrived|rx|"
     "(receipt|received|receive|recv|arrival|rx|log|network|sub)_(time|stamp|timestamp)",
@@ -106,24 +107,29 @@ _NAMES = {
     "object_id": "id|uid|uuid|(track|object|obj|target|car|vehicle)_?id|track|object|target",
     "class_name": "class|class_name|label|category|type|kind|classification",
 }
-_PERIOD_S = (5e-4, 20.0)  # of a source
-_MOVED_M = 0.05  # between two states that have a direction
+#: Plausible periods of a source.
+_PERIOD_S = (5e-4, 20.0)
+#: Smallest distance of two positions from which a course is computed.
+_MOVED_M = 0.05
+#: Fewest steps with a course from which conventions are judged.
 _FEWEST_STEPS = 10
-_AGREEMENT = 0.8  # mean cosine of course minus heading
-_SPEED_TOLERANCE = 0.07  # half of what mph and knots differ by
+#: Smallest mean cosine of course minus heading that confirms a convention.
+_AGREEMENT = 0.8
+#: Half of the relative difference of mph and knots.
+_SPEED_TOLERANCE = 0.07
 _SPEED_SCALES = {"mps": 1.0, "kmh": 1.0 / 3.6, "mph": 0.44704, "knots": 0.514444}
 
 
 @dataclass(frozen=True)
 class Guess:
-    """Where a component probably is, and why."""
+    """Probable field of a component, and the reason for the guess."""
 
     path: FieldPath
     reason: str
 
 
 def words_of(name: str) -> list[str]:
-    """Words of the name of a column or of the path of a field, in lower case."""
+    """Words in the name of a column or in the path of a field, in lower case."""
     return [
         word
         for word in re.split(
@@ -134,18 +140,21 @@ def words_of(name: str) -> list[str]:
 
 
 def guesses(values: Mapping[str, Sequence[float]]) -> dict[str, Guess]:
-    """Guess by component (of a table or of `fields`) of the fields `values`: samples by name, none if one is text."""
+    """Guess the field of each component from `values`: samples by field name, empty for a field with text.
+
+    Returns guesses by component, as named in `columns` of a table or in `fields` of a
+    topic.
+    """
     guessed: dict[str, Guess] = {}
     for name, samples in values.items():
         component, unit = _component(name)
         if component is not None and component not in guessed:
             guessed[component] = _converted(component, unit, name, samples)
-    vx, vy = guessed.pop("velocity x", None), guessed.pop("velocity y", None)
+    vx = guessed.pop("velocity x", None)
+    vy = guessed.pop("velocity y", None)
     if vx and vy and "speed_mps" not in guessed:
-        names, scale = (
-            [_name(vx), _name(vy)],
-            vx.path.scale if isinstance(vx.path, Field) else 1.0,
-        )
+        names = [_name(vx), _name(vy)]
+        scale = vx.path.scale if isinstance(vx.path, Field) else 1.0
         guessed["speed_mps"] = Guess(
             names if scale == 1.0 else Field(names, scale), "length of the velocity"
         )
@@ -153,10 +162,10 @@ def guesses(values: Mapping[str, Sequence[float]]) -> dict[str, Guess]:
 
 
 def time_unit(name: str, samples: Sequence[float]) -> tuple[str, str]:
-    """Unit of the times `samples` and the reason: by their size, the name, or the period between them."""
+    """Return the unit of the times `samples`, and the reason: their size, their name, or the period between them."""
     unit = epoch_unit(samples[0]) if len(samples) else None
     if unit is not None:
-        return unit, f"{samples[0]:.10g} {unit} after 1970 is a date of this century"
+        return unit, f"{samples[0]:.10g} {unit} since 1970 is a date in this century"
     last = (words_of(name) or [""])[-1]
     if last in NS_PER_UNIT:
         return last, "by its name"
@@ -168,22 +177,25 @@ def time_unit(name: str, samples: Sequence[float]) -> tuple[str, str]:
             <= (period_s := float(np.median(gaps)) * ns / NS_PER_S)
             <= _PERIOD_S[1]
         ):
-            return unit, f"the period would be {period_s:.3g} s"
-    return "s", "uncertain: check it"
+            return unit, f"the period is then {period_s:.3g} s"
+    return "s", "uncertain: check the unit"
 
 
 def agreeing_with_motion(
     guessed: Mapping[str, Guess], values: Mapping[str, FloatArray], unit: str
 ) -> dict[str, Guess]:
-    """`guessed` with heading and speed in the convention that the positions in `values`, (rows,) each, confirm."""
+    """Return `guessed` with the conventions of heading and speed that the positions confirm.
+
+    `values` contains the samples, shape (rows,), by field name. `unit` is the unit of
+    the stamps. Conventions are compared with the course and the distance from position
+    to position.
+    """
     if not {"stamp", "x_m", "y_m"} <= guessed.keys():
         return dict(guessed)
     t_s, x_m, y_m = (values[_name(guessed[name])] for name in ("stamp", "x_m", "y_m"))
-    gap_s, dx_m, dy_m = (
-        np.diff(t_s) * NS_PER_UNIT[unit] / NS_PER_S,
-        np.diff(x_m),
-        np.diff(y_m),
-    )
+    gap_s = np.diff(t_s) * NS_PER_UNIT[unit] / NS_PER_S
+    dx_m = np.diff(x_m)
+    dy_m = np.diff(y_m)
     step_m = np.hypot(dx_m, dy_m)
     moved = (step_m > _MOVED_M) & (gap_s > 0.0)
     if moved.sum() < _FEWEST_STEPS:
@@ -209,7 +221,7 @@ def agreeing_with_motion(
 
 
 def _heading(guess: Guess, raw: FloatArray, course_rad: FloatArray) -> Guess:
-    """The convention of a heading that agrees best with the direction of travel; `guess` where none does."""
+    """Guess of the heading with the convention that agrees best with the course; `guess` if none agrees."""
     degrees = isinstance(guess.path, Field) and guess.path.degrees
     quarter = 90.0 if degrees else 0.5 * math.pi
     options = [
@@ -234,27 +246,21 @@ def _heading(guess: Guess, raw: FloatArray, course_rad: FloatArray) -> Guess:
 
 
 def _component(name: str) -> tuple[str | None, str]:
-    """Component that the name of a field stands for (None for none that is read), and the unit in it."""
+    """Return the component that a field's name stands for (None if it is not read), and the unit in the name."""
     words = words_of(name)
     if not words or _SKIPPED & set(words):
         return None, ""
     unit = words[-1] if words[-1] in _UNITS else ""
     base = words[: -1 if unit else None]
     if not base:
-        return (
-            "stamp"
-            if unit in NS_PER_UNIT
-            else "speed_mps"
-            if unit in _SCALES["mps"]
-            else None
-        ), unit
-    axis = (
-        base[-1]
-        if base[-1] in _AXES
-        else base[0]
-        if base[0] in _AXES and base[-1] in _OF_VELOCITY
-        else None
-    )
+        if unit in NS_PER_UNIT:
+            return "stamp", unit
+        return ("speed_mps" if unit in _SCALES["mps"] else None), unit
+    axis = None
+    if base[-1] in _AXES:
+        axis = base[-1]
+    elif base[0] in _AXES and base[-1] in _OF_VELOCITY:
+        axis = base[0]
     if axis is not None:
         context = set(base) - {axis}
         kind = 1 if context & _OF_VELOCITY else 2 if context & _OF_SIZE else 0
@@ -262,17 +268,14 @@ def _component(name: str) -> tuple[str | None, str]:
     text = "_".join(base)
     if len(base[-1]) == 1 and len(base) > 1:
         return None, unit
-    return next(
-        (
-            item
-            for item, names in _NAMES.items()
-            if re.fullmatch(f"(?:.*_)?(?:{names})", text)
-        ),
-        None,
-    ), unit
+    for component, names in _NAMES.items():
+        if re.fullmatch(f"(?:.*_)?(?:{names})", text):
+            return component, unit
+    return None, unit
 
 
 def _converted(component: str, unit: str, name: str, samples: Sequence[float]) -> Guess:
+    """Guess of a component from the field `name`, with the conversion that its unit and its values require."""
     finite = [value for value in samples if math.isfinite(value)]
     spread = f"{min(finite):.4g} to {max(finite):.4g}" if finite else "no numbers"
     if component in ("stamp", "receipt", "object_id", "id", "class_name"):

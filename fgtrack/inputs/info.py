@@ -1,4 +1,4 @@
-"""Contents of an input: its topics or sensors with counts, rates and delays."""
+"""Contents of an input: topics or sensors with counts, rates and delays."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence, Set
@@ -19,56 +19,63 @@ from fgtrack.inputs.settings import InputConfig
 from fgtrack.inputs.source import input_kind, open_input
 
 OTHER_CLOCK_S = 3600.0
-"""Nothing is that late: the stamps and the recorder have different clocks."""
+"""Delay in s above which stamps and receipts must come from different clocks."""
 
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """A topic of a recording, or the messages of one kind in another input."""
+    """A topic of a recording; for other inputs, the messages of one sensor or kind."""
 
     name: str
     type: str
     count: int
     rate_hz: float | None
-    """Of times with a message; None of fewer than two."""
+    """Rate of distinct receipts; None for fewer than two."""
     delay: Mapping[str, float] | None
-    """`mean_s`, `p50_s`, `p90_s` and `max_s` of the receipts behind the stamps; None where the type has no header."""
+    """Delay from stamp to receipt: `mean_s`, `p50_s`, `p90_s` and `max_s`; None if the type has no header."""
     used_as: str | None
-    """Its use in a replay with the configuration."""
+    """Role of the topic in a replay with the configuration."""
     note: str | None
-    """Why it cannot be decoded, or what is unusual."""
+    """Reason why the topic cannot be decoded, or a problem of its messages."""
     late: Mapping[str, float | None]
-    """Shares that are out of sequence: `stream_share` of the messages, with an older stamp than one of the topic that
-    was received earlier, and `object_share` of the detections with an identity, older than one of it before; None of
-    fewer than two."""
+    """Shares that are out of sequence; None for fewer than two.
+
+    `stream_share`: share of the messages with an older stamp than an earlier received
+    message of the topic. `object_share`: share of the detections with an identity that
+    are older than an earlier received detection of this identity.
+    """
 
 
 @dataclass(frozen=True)
 class InputInfo:
-    """Contents of an input, as `fgtrack info` shows them."""
+    """Contents of an input, as `fgtrack info` prints them."""
 
     path: Path
     kind: str
     start_ns: int | None
-    """First receipt; None of an empty input."""
+    """First receipt; None for an empty input."""
     duration_s: float
-    """From the first receipt to the last."""
+    """Time from the first receipt to the last."""
     topics: tuple[TopicInfo, ...]
     problem: str | None
-    """Where the input breaks off, why a replay with the configuration would refuse it, or a wrong unit of its times."""
+    """Break of the input, reason why a replay with the configuration would be refused, or wrong unit of the times."""
 
 
-_Times = tuple[int, int | None]  # receipt and stamp
+_Times = tuple[int, int | None]
+"""Receipt and stamp of a message."""
 
 
 def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
-    """Return the contents of the input at `path`, and their use in a replay with `config`; raises as `open_input`."""
+    """Return the contents of the input at `path`, and their use in a replay with `config`.
+
+    Raises as `open_input`.
+    """
     path, given = Path(path), config or InputConfig()
     kind = input_kind(path)
     used: dict[BagTopic, str] = {}
     times: dict[BagTopic, list[_Times]] = defaultdict(list)
-    own: dict[BagTopic, list[bool]] = defaultdict(list)
-    still = set[str]()
+    object_is_late: dict[BagTopic, list[bool]] = defaultdict(list)
+    in_map = set[str]()
     problem: str | None = None
     if kind == "recording":
         bag = Bag(path, given.message_definitions)
@@ -79,7 +86,8 @@ def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
             problem = str(error) if config else None
         readable = UntilBreak(bag.stamps())
     else:
-        readable = UntilBreak(_stamps(open_input(path, given).messages(), own, still))
+        messages = open_input(path, given).messages()
+        readable = UntilBreak(_stamps(messages, object_is_late, in_map))
     for topic, receipt_ns, stamp_ns in readable:
         times[topic].append((receipt_ns, stamp_ns))
     if readable.error is not None:
@@ -91,34 +99,33 @@ def describe(path: Path | str, config: InputConfig | None = None) -> InputInfo:
         }
     topics = _with_late_ego(
         [
-            _topic(topic, times[topic], used.get(topic), own.get(topic, ()))
+            _topic(topic, times[topic], used.get(topic), object_is_late.get(topic, ()))
             for topic in sorted(times, key=attrgetter("name"))
         ],
-        still,
+        in_map,
     )
     receipts_ns = [receipt_ns for every in times.values() for receipt_ns, _ in every]
     if not receipts_ns:
         return InputInfo(path, kind, None, 0.0, topics, problem)
     start_ns, end_ns = min(receipts_ns), max(receipts_ns)
-    if kind != "recording":  # whose log times are in ns
+    if kind != "recording":  # a recording's log times are certainly in ns
         problem = problem or wrong_unit(len(receipts_ns), start_ns, end_ns)
     return InputInfo(path, kind, start_ns, seconds(end_ns - start_ns), topics, problem)
 
 
 def _topic(
-    topic: BagTopic, times: Sequence[_Times], used_as: str | None, own: Sequence[bool]
+    topic: BagTopic,
+    times: Sequence[_Times],
+    used_as: str | None,
+    object_is_late: Sequence[bool],
 ) -> TopicInfo:
-    delays_s = (
-        np.array(
-            [
-                receipt_ns - stamp_ns
-                for receipt_ns, stamp_ns in times
-                if stamp_ns is not None
-            ]
-        )
-        * 1e-9
-    )
-    delay, rate_hz, note = None, None, topic.problem
+    delays_ns = [
+        receipt_ns - stamp_ns for receipt_ns, stamp_ns in times if stamp_ns is not None
+    ]
+    delays_s = np.array(delays_ns) * 1e-9
+    delay = None
+    rate_hz = None
+    note = topic.problem
     if delays_s.size:
         p50_s, p90_s, max_s = np.quantile(delays_s, [0.5, 0.9, 1.0]).tolist()
         delay = {
@@ -129,12 +136,16 @@ def _topic(
         }
         if abs(p50_s) > OTHER_CLOCK_S:
             note = (
-                "its stamps are of another clock than the recorder's (simulated time?)"
+                "its stamps and its log times come from different clocks "
+                "(is one of them simulated time?)"
             )
         elif (wrong := np.abs(delays_s) > OTHER_CLOCK_S).any():
-            own_s = delays_s[~wrong]
-            delay |= {"mean_s": float(own_s.mean()), "max_s": float(own_s.max())}
-            note = f"{wrong.sum()} stamps are more than an hour from their receipt, and left out of the delays"
+            plausible_s = delays_s[~wrong]
+            delay |= {
+                "mean_s": float(plausible_s.mean()),
+                "max_s": float(plausible_s.max()),
+            }
+            note = f"{wrong.sum()} stamps differ from their receipt by more than an hour, and the delays exclude them"
     receipts_ns = {receipt_ns for receipt_ns, _ in times}
     if len(receipts_ns) > 1:
         rate_hz = (len(receipts_ns) - 1) / seconds(max(receipts_ns) - min(receipts_ns))
@@ -149,7 +160,7 @@ def _topic(
         stream = float(np.mean(ordered_ns[1:] < np.maximum.accumulate(ordered_ns)[:-1]))
     late = {
         "stream_share": stream,
-        "object_share": float(np.mean(own)) if own else None,
+        "object_share": float(np.mean(object_is_late)) if object_is_late else None,
     }
     return TopicInfo(
         topic.name, topic.type, len(times), rate_hz, delay, used_as, note, late
@@ -157,9 +168,12 @@ def _topic(
 
 
 def _with_late_ego(
-    topics: Sequence[TopicInfo], still: Set[str]
+    topics: Sequence[TopicInfo], in_map: Set[str]
 ) -> tuple[TopicInfo, ...]:
-    """Return `topics`. The topic of the ego gets a note if the ego is later than the sensors that are not `still`."""
+    """Return `topics` with a note at the ego if its messages arrive later than lists that need its pose.
+
+    The sensors `in_map` measure in the map, and need no pose of the ego.
+    """
     delays_s = {
         topic.name: topic.delay["p50_s"]
         for topic in topics
@@ -167,12 +181,12 @@ def _with_late_ego(
     }
     lists = {
         each.name for each in topics if (each.used_as or "").startswith("detections")
-    } - still
-    placed_s = {name: delay_s for name, delay_s in delays_s.items() if name in lists}
+    } - in_map
+    need_ego_s = {name: delay_s for name, delay_s in delays_s.items() if name in lists}
     noted = []
     for topic in topics:
         late = (
-            late_ego(delays_s[topic.name], placed_s)
+            late_ego(delays_s[topic.name], need_ego_s)
             if topic.used_as == "ego" and topic.name in delays_s
             else None
         )
@@ -181,13 +195,16 @@ def _with_late_ego(
 
 
 def _stamps(
-    messages: Iterator[Message], own: Mapping[BagTopic, list[bool]], still: set[str]
+    messages: Iterator[Message],
+    object_is_late: Mapping[BagTopic, list[bool]],
+    in_map: set[str],
 ) -> Iterator[tuple[BagTopic, int, int | None]]:
-    """Sensor or kind, receipt and stamp of `messages`, as of a recording with a topic for each.
-    `own` gets for each detection whose identity came before, True if it is older than the newest of these. `still` gets
-    the sensors with detections in the map, which need no ego.
+    """Yield topic, receipt and stamp of each message, as if the input were a recording with a topic for each sensor.
+
+    Appends the lateness of detections with an identity (`IdentityOrder.late`) to
+    `object_is_late`, and adds the sensors with detections in the map to `in_map`.
     """
-    order = OwnOrder()
+    order = IdentityOrder()
     for message in messages:
         kind = "ego" if isinstance(message, EgoState) else "truth"
         name, kind = (
@@ -197,27 +214,27 @@ def _stamps(
         )
         topic = BagTopic(name, kind, None)
         if isinstance(message, DetectionList):
-            own[topic] += order.late(message)
+            object_is_late[topic] += order.late(message)
             if message.frame == "map":
-                still.add(message.sensor)
+                in_map.add(message.sensor)
         yield topic, message.receipt_ns, message.stamp_ns
 
 
-class OwnOrder:
-    """Order of the detections of each identity, by sensor."""
+class IdentityOrder:
+    """Newest stamp of each identity that objects report, by sensor."""
 
     def __init__(self) -> None:
         self._newest_ns: dict[tuple[str, str], int] = {}
 
     def late(self, message: DetectionList) -> list[bool]:
-        """Return for each detection whose identity came before, True if it is older than the newest of these."""
+        """Return, for each detection with a repeated identity, True if it is older than the newest one
+        of the identity.
+        """
         late = list[bool]()
         for item in message.objects:
             if item.id is not None:
-                stamp_ns, key = (
-                    message.stamp_ns if item.stamp_ns is None else item.stamp_ns,
-                    (message.sensor, item.id),
-                )
+                stamp_ns = message.stamp_ns if item.stamp_ns is None else item.stamp_ns
+                key = (message.sensor, item.id)
                 newest_ns = self._newest_ns.get(key)
                 if newest_ns is not None:
                     late.append(stamp_ns < newest_ns)

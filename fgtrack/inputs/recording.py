@@ -1,4 +1,4 @@
-"""Writes a recording: a stream or a rosbag2 folder, as its name specifies."""
+"""Writes messages as a recording: a stream or a rosbag2 folder, depending on the name."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -24,27 +24,29 @@ def write_recording(
     settings: Mapping[str, object] | None = None,
     overwrite: bool = False,
 ) -> int:
-    """Write a stream where `out` ends in .jsonl or .jsonl.gz, else a rosbag2 folder; gives the message count.
-    `settings` are what it carries of a configuration, plain values by the names of its keys.
+    """Write `messages` and return their number.
+
+    A name that ends in .jsonl or .jsonl.gz gives a stream, another name a rosbag2
+    folder. `settings` are configuration keys and plain values that the recording
+    carries.
     """
     if _is_stream(out):
         return write_stream(
             out, messages, {SETTINGS: settings} if settings else None, overwrite
         )
-    from fgtrack.inputs.ros.bag_writer import (
-        write_bag,
-    )  # and with it rosbags, where a bag is written
+    # rosbags is imported only if a bag is written.
+    from fgtrack.inputs.ros.bag_writer import write_bag
 
     return write_bag(out, messages, storage, settings=settings, overwrite=overwrite)
 
 
 def check_recording(out: Path, overwrite: bool) -> None:
-    """Raise `CallError` where `write_recording` would for what is there, before the messages are made."""
+    """Raise `CallError` if `write_recording` could not write `out`, before the messages are computed."""
     if _is_stream(out):
         check_output(out, overwrite)
     elif _FILE_ENDING.search(out.name) and not out.is_dir():
         raise CallError(
-            f"{out}: is written as .jsonl, as .jsonl.gz, or as a rosbag2 folder without such an ending"
+            f"{out}: a recording is a stream (.jsonl, .jsonl.gz) or a rosbag2 folder (no ending): choose such a name"
         )
     else:
         from fgtrack.inputs.ros.bag_writer import check_bag

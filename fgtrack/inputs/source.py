@@ -1,4 +1,4 @@
-"""Opens an input, whatever it is: a recording, a stream or a data set, recognised by its content."""
+"""Opens an input (recording, stream or data set) and recognises its format by the content."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -21,35 +21,40 @@ class InputSource:
     kind: str
     """Name of its format."""
     messages: Callable[[], Iterator[Message]]
-    """Gives the messages in receipt order, as `fgtrack.inputs.validation` lets them pass.
+    """Returns an iterator over the validated messages in receipt order (`fgtrack.inputs.validation`).
 
-    Raises `TruncatedInput` behind the last message before a break, `DataError` for all else that is wrong.
+    The iterator raises `TruncatedInput` after the last message before a break, and
+    `DataError` for other faults.
     """
     settings: Callable[[], Mapping[str, object]] = dict
-    """Gives what the recording carries of a configuration, by the names of its keys; see `fgtrack.config.recorded`.
+    """Returns the configuration keys and values that the recording carries; see `fgtrack.config.recorded`.
 
-    Raises `DataError` where the input cannot be read.
+    Raises `DataError` if the input cannot be read.
     """
 
 
 @dataclass(frozen=True)
 class FileFormat:
-    """A format of inputs: a file or a folder with messages in receipt order."""
+    """A format of inputs: files or folders from which messages are read in receipt order."""
 
     description: str
-    """Name of the format, for messages: `an fgtrack stream (.jsonl)`."""
+    """Description for messages: `an fgtrack stream (.jsonl)`."""
     recognises: Callable[[Path], bool]
-    """True if an existing file that is not empty, or a folder, is one, by its content; may raise `OSError`."""
+    """True if the content of a non-empty file or of a folder has this format; may raise `OSError`."""
     open: Callable[[Path, InputConfig], Callable[[], Iterator[Message]]]
-    """Opens the input at a path: gives what `InputSource.messages` is, and raises as `open_input`."""
+    """Opens the input at a path: returns `InputSource.messages`, raises as `open_input`."""
     settings: Callable[[Path], Mapping[str, object]] = lambda path: {}
-    """Settings that the input at a path carries, as `InputSource.settings`."""
+    """Returns the settings that the input at a path carries, as `InputSource.settings`."""
     validates: bool = False
-    """True if the reader validates every message by itself, with `validated_message`."""
+    """True if the reader itself validates every message with `validated_message`."""
 
 
 def open_input(path: Path | str, config: InputConfig | None = None) -> InputSource:
-    """Open the input at `path`; raises `CallError` where nothing is there or `config` does not fit, and `DataError`."""
+    """Open the input at `path`.
+
+    Raises `CallError` if nothing exists there or `config` does not fit, and `DataError`
+    if the format is unknown or the input cannot be read.
+    """
     check_paths(recording=path)
     path = Path(path)
     name = input_kind(path)
@@ -66,32 +71,38 @@ def open_input(path: Path | str, config: InputConfig | None = None) -> InputSour
 
 
 def input_kind(path: Path) -> str:
-    """Name of the format of `path`, by its content; raises as `open_input`. Plug-ins are asked first."""
+    """Return the name of the format of `path`, recognised by the content; plug-ins are asked first.
+
+    Raises as `open_input`.
+    """
     if not path.exists():
         raise CallError(f"{path}: there is no such file or folder")
-    # The last registered first: plug-ins, then the built-in ones, which recognise the loosest last.
+    # Plug-ins are registered last and asked first. The built-in formats follow, the least specific ones at the end.
     names = [name for name in reversed(list(ADAPTERS)) if "/" not in name]
     try:
         if not path.is_file() and not path.is_dir():
             raise DataError(
-                f"{path}: is neither a file nor a folder, write what comes out of it to a file first"
+                f"{path}: is neither a file nor a folder, write its content to a file first"
             )
         if path.is_file() and path.stat().st_size == 0:
             raise DataError(f"{path}: is empty")
-        for name in names:  # loaded one after the other: that of bags is large
+        # Formats are loaded as they are asked, because the reader of bags loads slowly.
+        for name in names:
             form = file_format(name)
-            with ADAPTERS.plugin_errors(name, f"cannot look at {path}"):
+            with ADAPTERS.plugin_errors(name, f"cannot recognise {path}"):
                 if form.recognises(path):
                     return name
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     formats_read = ", ".join(file_format(name).description for name in reversed(names))
-    raise DataError(f"{path}: is not an input that fgtrack reads: {formats_read}")
+    raise DataError(
+        f"{path}: has a format that fgtrack does not read; it reads {formats_read}"
+    )
 
 
 def file_format(name: str) -> FileFormat:
-    """The format `name`. Raises `CallError` where a plug-in fails or is not one."""
-    with ADAPTERS.plugin_errors(name, "cannot be made"):
+    """Return the format `name`; raises `CallError` if a plug-in fails or is no `FileFormat`."""
+    with ADAPTERS.plugin_errors(name, "cannot be created"):
         form = ADAPTERS.load(name)
         form = form if isinstance(form, FileFormat) else form()
     if not isinstance(form, FileFormat):

@@ -1,4 +1,4 @@
-"""The stream format `fgtrack-stream/1`: messages as JSON lines, plain or gzipped, in receipt order."""
+"""The stream format `fgtrack-stream/1`: messages as JSON lines in receipt order, plain or gzipped."""
 
 import gzip
 import json
@@ -24,7 +24,7 @@ from fgtrack.inputs.validation import InvalidMessageError, validated_message
 
 STREAM_FORMAT = "fgtrack-stream/1"
 SETTINGS = "settings"
-"""Entry of the header record with what the recording carries of a configuration."""
+"""Entry of the header record with the configuration keys and values that the recording carries."""
 PACKED_TABLES = (".csv.gz", ".tsv.gz", ".txt.gz")
 _logger = logging.getLogger(__name__)
 _KINDS: dict[str, type[Message]] = {
@@ -33,13 +33,15 @@ _KINDS: dict[str, type[Message]] = {
     "truth": TruthState,
 }
 _Made = TypeVar("_Made")
-# A parsed JSON object: its values are checked one by one below.
 Record = dict[str, Any]
+"""A parsed JSON object; its values are checked one by one below."""
 
 
 def read_stream(path: Path | str, plane: LocalPlane | None = None) -> Iterator[Message]:
-    """Messages of the stream `path` (gzipped or not) in the order of the file, which is receipt order.
-    Unknown keys are ignored with one warning. Raises `TruncatedInput` after what came before a break, and `DataError`.
+    """Yield the messages of the stream `path`, plain or gzipped, in the order of the file, which is receipt order.
+
+    Unknown keys are ignored with one warning. Raises `TruncatedInput` after the
+    messages before a break, and `DataError` for other faults.
     """
     path, plane = Path(path), plane or LocalPlane()
     unknown: Counter[str] = Counter()
@@ -47,7 +49,7 @@ def read_stream(path: Path | str, plane: LocalPlane | None = None) -> Iterator[M
         next(records)
         for line, record in records:
             try:
-                yield _message(_placed(record, plane), unknown)
+                yield _message(_in_plane(record, plane), unknown)
             except InvalidMessageError as error:
                 raise DataError(f"{path}:{line}: {error}") from error
     if unknown:
@@ -76,7 +78,7 @@ FORMAT = FileFormat(
 
 
 def read_header(path: Path | str) -> Mapping[str, Any]:
-    """Header record of the stream `path`; JSON values. Raises `DataError` when there is none."""
+    """Return the header record of the stream `path`, with JSON values; raises `DataError` if it is missing."""
     with closing(_records(Path(path))) as records:
         return next(records)[1]
 
@@ -87,10 +89,14 @@ def write_stream(
     header: Mapping[str, object] | None = None,
     overwrite: bool = False,
 ) -> int:
-    """Write `messages`, which must be in receipt order, to `path`, gzipped if it ends in `.gz`; gives their number.
-    The same messages give the same bytes. The file gets its name when it is complete; what a killed writer leaves in
-    `<path>.*.part` is readable. `header` are further entries of the header record. Raises `TruncatedInput` where
-    `messages` broke off, after writing what came before.
+    """Write `messages`, which must be in receipt order, to `path` and return their number.
+
+    The file is gzipped if `path` ends in `.gz`. Equal messages give equal bytes. The
+    file gets its name when it is complete; a killed writer leaves a readable
+    `<path>.*.part`. `header` contains further entries of the header record.
+
+    Raises `TruncatedInput` if `messages` broke off, after the messages before the break
+    were written.
     """
     path = Path(path)
     count = 0
@@ -107,16 +113,16 @@ def write_stream(
         for message in readable:
             lines.write(_line(_record(message)))
             count += 1
-        if path.exists():  # it is kept
+        # A truncated stream does not replace an existing one.
+        if path.exists():
             readable.raise_error()
     readable.raise_error()
     return count
 
 
 def _line(record: Mapping[str, object]) -> bytes:
-    return (
-        json.dumps(record, default=methodcaller("item")).encode() + b"\n"
-    )  # of a NumPy scalar
+    # `item` converts a NumPy scalar.
+    return json.dumps(record, default=methodcaller("item")).encode() + b"\n"
 
 
 def _record(message: Message) -> Record:
@@ -150,8 +156,9 @@ def _given(value: EgoState | TruthState | Detection) -> Record:
 
 
 def _records(path: Path) -> Generator[tuple[int, Record], None, None]:
-    """Line number and JSON object of every line that is not blank, the first one the header."""
-    line, num_records = 0, 0
+    """Yield line number and JSON object of every line that is not blank; the first is the header."""
+    line = 0
+    num_records = 0
     try:
         with open_file(path) as raw:
             packed = raw.read(2) == GZIP_MAGIC
@@ -187,7 +194,7 @@ def _records(path: Path) -> Generator[tuple[int, Record], None, None]:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     if not num_records:
         raise DataError(
-            f"{path}: a stream starts with a header record of format {STREAM_FORMAT!r}"
+            f"{path}: is not a stream: its first line is no header record of format {STREAM_FORMAT!r}"
         )
 
 
@@ -196,31 +203,32 @@ def _message(record: Record, unknown: Counter[str]) -> Message:
     kind = _KINDS.get(str(name))
     if kind is None:
         raise InvalidMessageError(
-            f"unknown record type {name!r}, known are {', '.join(_KINDS)}"
+            f"unknown record type {name!r}: there are {', '.join(_KINDS)}"
         )
     if kind is DetectionList:
         objects = record.get("objects")
         if not isinstance(objects, list):
             raise InvalidMessageError(f"objects: a list expected, not {objects!r:.60}")
         record["objects"] = tuple(
-            _made("objects", Detection, item, unknown) for item in objects
+            _from_json("objects", Detection, item, unknown) for item in objects
         )
-    return validated_message(_made(str(name), kind, record, unknown))
+    return validated_message(_from_json(str(name), kind, record, unknown))
 
 
-def _placed(record: Record, plane: LocalPlane) -> Record:
-    """`record`, and each of its objects, with its position in `plane` if it has latitude and longitude."""
+def _in_plane(record: Record, plane: LocalPlane) -> Record:
+    """Return `record`, and each of its objects, with a position in `plane` instead of latitude and longitude."""
     objects = record.get("objects")
     if isinstance(objects, list) and any(
         isinstance(item, dict) and GEODETIC[0] in item for item in objects
     ):
-        placed = [
-            _placed(item, plane) if isinstance(item, dict) else item for item in objects
+        objects = [
+            _in_plane(item, plane) if isinstance(item, dict) else item
+            for item in objects
         ]
         record = {
             "frame": "map",
             **record,
-            "objects": placed,
+            "objects": objects,
             "origin_deg": plane.origin_deg,
         }
     if GEODETIC[0] not in record:
@@ -230,18 +238,20 @@ def _placed(record: Record, plane: LocalPlane) -> Record:
             raise InvalidMessageError(
                 f"{name}: a number expected, not {record[name]!a:.60}"
             )
-    return plane.placed(record)
+    return plane.in_plane(record)
 
 
-def _made(name: str, kind: type[_Made], record: object, unknown: Counter[str]) -> _Made:
-    """An instance of `kind` from a JSON object; null is not given. Unknown keys are counted."""
+def _from_json(
+    name: str, kind: type[_Made], record: object, unknown: Counter[str]
+) -> _Made:
+    """Return an instance of `kind` from a JSON object. Null counts as missing; unknown keys are counted."""
     if not isinstance(record, dict):
         raise InvalidMessageError(f"{name}: a JSON object expected, not {record!r}")
     required = _FIELDS[kind]
     if not record.keys() <= required.keys():
         unknown.update(f"{name}.{key}" for key in record.keys() - required.keys())
     given = {
-        key: value if type(value) is float else _value(key, value)  # as nearly always
+        key: value if type(value) is float else _value(key, value)  # the usual case
         for key, value in record.items()
         if value is not None and key in required
     }
@@ -252,7 +262,7 @@ def _made(name: str, kind: type[_Made], record: object, unknown: Counter[str]) -
 
 
 def _value(key: str, value: Any) -> Any:
-    """`value` with lists as tuples, and integers as floats where `key` is a number that can be one."""
+    """Return `value` with lists as tuples, and integers as floats where `key` is a real number."""
     if type(value) is list:
         return tuple(
             [each if type(each) is float else _value(key, each) for each in value]
@@ -265,7 +275,7 @@ def _value(key: str, value: Any) -> Any:
 
 
 _INTEGERS = frozenset({"stamp_ns", "receipt_ns", "object_id"})
-#: Names of the fields of messages and detections, and if they have to be given.
+#: For each message type the names of the fields, with True if the field is required.
 _FIELDS: dict[type, dict[str, bool]] = {
     kind: {
         field.name: field.default is MISSING

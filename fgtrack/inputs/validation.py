@@ -1,7 +1,8 @@
-"""Validation behind every reader: all that comes out of an input has the types and ranges that the rest requires.
+"""Validation of all messages of a reader: types and ranges are as the rest of the package requires.
 
-A wrong input is a `DataError` with its position, after everything before it. Measured numbers that are not finite pass:
-the tracker counts them. Describing ones (size, score) become None.
+An invalid message raises `DataError` with its position, after all messages before it.
+Measured numbers that are not finite pass, because the tracker counts them. Describing
+numbers (size, score) that are not finite become None.
 """
 
 import math
@@ -45,13 +46,16 @@ _Message = TypeVar("_Message", bound=Message)
 
 
 class InvalidMessageError(Exception):
-    """Problem of a message; the reader adds where it is."""
+    """Problem of a message; the reader adds the message's position."""
 
 
 def validated(
     path: Path, messages: Callable[[], Iterator[Message]], done: bool = False
 ) -> Iterator[Message]:
-    """Messages of the input at `path` (those of a validating reader are `done`), then `DataError` where it failed."""
+    """Yield the messages of the input at `path` after validation; raises `DataError` at the first fault.
+
+    `done`: the reader has validated the messages already.
+    """
     count = 0
     try:
         for message in messages():
@@ -61,29 +65,32 @@ def validated(
         raise DataError(f"{path}: message {count + 1}: {error}") from error
     except (FgtrackError, MemoryError):
         raise
-    except Exception as error:  # whatever a foreign input makes a reader raise
+    except Exception as error:  # a corrupted input may cause any exception in a reader
         raise DataError(
-            f"{path}: cannot be read beyond message {count} ({cause(error)}): repair or convert it"
+            f"{path}: cannot be read beyond message {count} ({cause(error)}): repair or convert the file"
         ) from error
 
 
 def validated_message(message: Message) -> Message:
-    """Return `message` with plain values: itself, if all are plain. Raises `InvalidMessageError`.
+    """Return `message` with plain values; the same object if all values are plain already.
 
-    Plain are `int`, `float`, `bool`, `str` and tuples of `float`. Numbers of NumPy become plain ones, and covariances
-    may be lists or arrays, flat or square. Detections are as of `validated_detection`.
+    Plain values are `int`, `float`, `bool`, `str` and tuples of `float`. NumPy numbers
+    are converted. A covariance may be a list or an array, flat or square. Detections
+    are validated by `validated_detection`.
+
+    Raises `InvalidMessageError`.
     """
     if not isinstance(message, DetectionList | EgoState | TruthState):
         raise InvalidMessageError(f"a {type(message).__name__} is not a message")
     message = validated_head(message)
     if isinstance(message, DetectionList):
         objects = []
-        for place, item in enumerate(message.objects):
+        for number, item in enumerate(message.objects):
             try:
                 objects.append(validated_detection(item))
             except InvalidMessageError as error:
                 raise InvalidMessageError(
-                    f"{message.sensor}: objects[{place}]: {error}"
+                    f"{message.sensor}: objects[{number}]: {error}"
                 ) from error
         return (
             message
@@ -94,16 +101,15 @@ def validated_message(message: Message) -> Message:
 
 
 def validated_head(message: _Message) -> _Message:
-    """Return `message` with plain values in all fields but `objects`. Raises `InvalidMessageError`."""
+    """Return `message` with plain values in all fields except `objects`; raises `InvalidMessageError`."""
     message = _plain(message)
-    if not is_stamp(message.receipt_ns):  # all windows are counted from it
+    if not is_stamp(message.receipt_ns):  # ages of messages are computed from it
         raise _invalid(
             "receipt_ns", f"at most {LARGEST_NS:.0g} ns from 0", message.receipt_ns
         )
     if isinstance(message, DetectionList) and len(message.objects) > _MOST_OBJECTS:
-        many = f"a list of {len(message.objects)} objects"
         raise InvalidMessageError(
-            f"{message.sensor}: {many}, at most {_MOST_OBJECTS} are read"
+            f"{message.sensor}: a list has {len(message.objects)} objects, at most {_MOST_OBJECTS} are read"
         )
     if isinstance(message, EgoState) and message.covariance is not None:
         size = len(EGO_COVARIANCE_STATES)
@@ -115,10 +121,10 @@ def validated_head(message: _Message) -> _Message:
 
 
 def validated_detection(item: Detection) -> Detection:
-    """`item` with plain values, describing numbers that are not finite replaced by None.
+    """Return `item` with plain values; describing numbers that are not finite become None.
 
-    A covariance may have nulls, which become NaN: the tracker counts the detection as invalid. Raises
-    `InvalidMessageError` for a wrong type.
+    A null in a covariance becomes NaN: the tracker counts the detection as invalid.
+    Raises `InvalidMessageError` for a value of a wrong type.
     """
     if not isinstance(item, Detection):
         raise InvalidMessageError(f"a {type(item).__name__} is not a detection")
@@ -132,20 +138,20 @@ def validated_detection(item: Detection) -> Detection:
 
 
 def _plain(item: _Item) -> _Item:
-    """Return `item` with plain values: itself, if all are plain. Raises `InvalidMessageError`."""
+    """Return `item` with plain values; the same object if all are plain. Raises `InvalidMessageError`."""
     changed = dict[str, Any]()
-    for name, (plain, expected), is_optional in _FIELDS[type(item)]:
+    for name, (convert, expected), is_optional in _FIELDS[type(item)]:
         value = getattr(item, name)
-        if type(value) is float and plain is _number:  # as nearly always
+        if type(value) is float and convert is _number:  # the usual case
             continue
         if value is None and is_optional:
             continue
         try:
-            own = plain(value)
+            converted = convert(value)
         except (TypeError, ValueError, OverflowError) as error:
             raise _invalid(name, expected, value) from error
-        if own is not value:
-            changed[name] = own
+        if converted is not value:
+            changed[name] = converted
     return replace(item, **changed) if changed else item
 
 
@@ -195,16 +201,16 @@ def _frame(value: Any) -> str:
 
 
 def _numbers(value: Any) -> tuple[float, ...]:
-    """Plain numbers of a sequence."""
+    """Return the numbers of a sequence as a tuple of floats."""
     if type(value) is tuple and all(
         type(each) is float for each in value
-    ):  # as nearly always
+    ):  # the usual case
         return value
     return tuple(map(_number, _items(value)))
 
 
 def _items(value: Any) -> Sequence[Any]:
-    """Entries of a list, a tuple, an array or another sequence."""
+    """Return the entries of a list, a tuple, an array or another sequence; raises `TypeError` for other values."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if not isinstance(value, Sequence) or isinstance(value, str | bytes | bytearray):
@@ -213,10 +219,10 @@ def _items(value: Any) -> Sequence[Any]:
 
 
 def _covariance(value: Any) -> tuple[float, ...]:
-    """Plain numbers of a matrix, flat in the order of its rows, or square; NaN instead of None."""
+    """Return the numbers of a flat or square matrix, row by row; None becomes NaN."""
     if type(value) is tuple and all(
         type(each) is float for each in value
-    ):  # as nearly always
+    ):  # the usual case
         return value
     entries = _items(value)
     if entries and not any(each is None or isinstance(each, Real) for each in entries):
@@ -242,10 +248,10 @@ def _position(value: Any) -> tuple[float, ...]:
 
 
 _Rule = tuple[Callable[[Any], object], str]
-"""What makes a value plain, or raises; and what it expects, in words."""
+"""Function that converts a value or raises, and the expected value in words."""
 _INTEGER: _Rule = (_integer, "a 64 bit integer")
 _FLAG: _Rule = (_flag, "true or false")
-#: By field its rule; all others are numbers.
+#: Rule by field; all other fields are numbers.
 _RULES: dict[str, _Rule] = {
     **dict.fromkeys(("stamp_ns", "receipt_ns", "object_id"), _INTEGER),
     **dict.fromkeys(("in_pit", "ignored"), _FLAG),

@@ -63,7 +63,7 @@ def test_the_first_position_is_the_origin_and_what_is_not_on_earth_is_not_a_numb
     assert plane.position_m(*FLIGHT[0]) == (0.0, 0.0)
     assert plane.origin_deg == FLIGHT[0]
     assert math.isnan(plane.position_m(-41.3, -177.0)[0])  # the other side
-    assert plane.placed({"latitude_deg": None, "longitude_deg": 2.0, "score": 1.0}) == {
+    assert plane.in_plane({"latitude_deg": None, "longitude_deg": 2.0, "score": 1.0}) == {
         "x_m": None,
         "y_m": None,
         "score": 1.0,

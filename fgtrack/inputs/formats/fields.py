@@ -111,7 +111,7 @@ def objects_by_fields(
         stamp = (
             _time(item, fields["object_stamp"]) if "object_stamp" in fields else None
         )
-        values = plane.placed(mapped(fields, COMPONENTS, partial(value_at, item)))
+        values = plane.in_plane(mapped(fields, COMPONENTS, partial(value_at, item)))
         objects.append(Detection(**values, stamp_ns=stamp))
     frame = frame_of(message.header) if hasattr(message, "header") else None
     frame = "map" if GEODETIC[0] in fields else frame
@@ -140,7 +140,7 @@ def ego_by_fields(
     """The ego's state; `x_m`, `y_m`, `yaw_rad` and `speed_mps` must be among `fields`."""
     stamp = _message_stamp(message, fields)
     plane = plane or LocalPlane()
-    values = plane.placed(
+    values = plane.in_plane(
         mapped(fields, (*STATE_NAMES, "in_pit", *GEODETIC), partial(value_at, message))
     )
     return EgoState(receipt_ns if stamp is None else stamp, receipt_ns, **values)

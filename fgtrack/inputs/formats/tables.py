@@ -221,7 +221,7 @@ def _values(
     cells: Cells, table: CsvTable, role: str, plane: LocalPlane
 ) -> dict[str, Any]:  # Any: as of `mapped`
     """Values that a row gives; NaN for a state that must be there, which the tracker counts."""
-    values = plane.placed(
+    values = plane.in_plane(
         mapped(
             table.columns,
             _NAMES.get(role, COMPONENTS),
