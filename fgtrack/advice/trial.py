@@ -64,7 +64,9 @@ def suspicions(messages: Sequence[Message], config: Config) -> Iterator[Diagnost
         yield Diagnostic(EGO, text, is_blocking=True)
     if egos and not any(ego.stamp_ns for ego in egos):
         yield Diagnostic(
-            EGO, "all stamps are 0: set `stamp_from: receipt` on its topic", is_blocking=True
+            EGO,
+            "all stamps are 0: set `stamp_from: receipt` on its topic",
+            is_blocking=True,
         )
     yield from _degrees(EGO, egos)
     yield from _degrees(

@@ -56,7 +56,7 @@ def rotations(yaws_rad: FloatArray) -> FloatArray:
 def in_polygon(points: FloatArray, corners: FloatArray) -> BoolArray:
     """Mask (n,) of the `points` (n, 2) inside the polygon with `corners` (m, 2).
 
-    Even-odd rule: a point is inside if a ray from it crosses an odd number of edges.
+    A point is inside if a ray from the point crosses the edges 1, 3, 5 ... times.
     """
     x, y = points[:, :1], points[:, 1:]
     (ax, ay), (bx, by) = corners.T, np.roll(corners, -1, axis=0).T

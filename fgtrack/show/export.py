@@ -8,7 +8,7 @@ from fgtrack.core.errors import CallError
 from fgtrack.core.output import check_no_overlap, check_output
 from fgtrack.evaluation.placement import roads
 from fgtrack.evaluation.runs import Runs, evaluated, same_recording
-from fgtrack.inputs.ros.bag_writer import check_bag, token
+from fgtrack.inputs.ros.bag_writer import check_bag, topic_part
 from fgtrack.runs import Run
 from fgtrack.show.geojson import origin_of
 from fgtrack.show.palette import distinct_colours
@@ -85,9 +85,9 @@ def _layers(runs: Mapping[str, Run]) -> list[RunLayer]:
     names: list[str] = []
     for label in runs:
         names.append(
-            token(label)
-            if token(label) not in names
-            else f"{token(label)}_{len(names) + 1}"
+            topic_part(label)
+            if topic_part(label) not in names
+            else f"{topic_part(label)}_{len(names) + 1}"
         )
     colours = distinct_colours(
         [str(run.meta.get("estimator", "")) for run in runs.values()]

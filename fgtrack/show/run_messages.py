@@ -21,7 +21,7 @@ from fgtrack.core.types import (
     IntArray,
 )
 from fgtrack.evaluation.placement import Placed, placed, road_lines, update_rows
-from fgtrack.inputs.ros.bag_writer import token
+from fgtrack.inputs.ros.bag_writer import topic_part
 from fgtrack.models.track_map import TrackMap
 from fgtrack.runs import NO_TRACK, Columns, Run
 from fgtrack.show.palette import PALETTE, SENSORS
@@ -295,7 +295,7 @@ def _detection_messages(run: Run, layer: RunLayer) -> Messages:
             yield ViewerMessage(
                 receipt_ns,
                 stamp_ns,
-                f"{layer.prefix}/detections/{token(sensor)}",
+                f"{layer.prefix}/detections/{topic_part(sensor)}",
                 states,
             )
 

@@ -114,7 +114,7 @@ def test_two_copies_of_one_file_in_a_folder_are_refused(tmp_path):
     (tmp_path / "bag" / "metadata.yaml").unlink()
     (tmp_path / "bag" / "copy.mcap").write_bytes(content)
     with pytest.raises(
-        DataError, match="are copies of one recording: remove or name one"
+        DataError, match="have the same content: remove one, or give one of the files"
     ):
         read(tmp_path / "bag")
 
@@ -316,7 +316,8 @@ def test_what_follows_the_end_of_a_recording_is_a_break(tmp_path):
     path.write_bytes(whole + b"x" * 1000)
     found = []
     with pytest.raises(
-        TruncatedInput, match=f"is followed by something else from byte {len(whole)} on"
+        TruncatedInput,
+        match=f"has other data behind its end: split the file at byte {len(whole)}",
     ):
         found.extend(log_ns for _, log_ns, _ in Bag(path).messages(["/fgtrack/ego"]))
     assert found == expected
@@ -490,7 +491,7 @@ def test_a_topic_that_the_recording_lacks_is_named_with_what_there_is(tmp_path):
 
 
 def test_a_foreign_recording_without_a_configuration_is_one_line():
-    with pytest.raises(DataError, match=r"must name its topics .* /odom \(nav_msgs"):
+    with pytest.raises(DataError, match=r"name its topics .* /odom \(nav_msgs"):
         open_input(shared("data/bags/nav2_turtlebot.mcap"))
 
 
@@ -510,7 +511,7 @@ def test_a_topic_that_fgtrack_wrote_follows_the_keys_that_name_it(tmp_path):
         DetectionList("front", 1, 2, (near,), "map"),
     ]
     with pytest.raises(
-        CallError, match="objects of type fgtrack_msgs/msg/Truth need fields"
+        CallError, match="objects of type fgtrack_msgs/msg/Truth need `fields`"
     ):
         read(
             tmp_path / "bag",
@@ -521,14 +522,14 @@ def test_a_topic_that_fgtrack_wrote_follows_the_keys_that_name_it(tmp_path):
 @pytest.mark.parametrize(
     ("config", "complaint"),
     [
-        (InputConfig(ego=TopicInput("/detections/lidar")), "needs fields"),
+        (InputConfig(ego=TopicInput("/detections/lidar")), "needs `fields`"),
         (
             InputConfig(ego=TopicInput("/ego/odometry", fields={"x": "a"})),
             "unknown field 'x'",
         ),
         (
             InputConfig(ego=TopicInput("/ego/odometry", fields={"x_m": "a"})),
-            "must name y_m",
+            "must contain y_m",
         ),
         (
             InputConfig(ego=TopicInput("/ego/odometry", scan_s=0.1)),

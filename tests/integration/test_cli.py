@@ -246,7 +246,7 @@ def test_the_printed_configuration_is_one(fgtrack: Command, stream: Path) -> Non
         ),
         (
             ("convert", "drive.jsonl", "drive.html"),
-            "drive.html: is written as .jsonl, as .jsonl.gz, or as a rosbag2",
+            "drive.html: a recording is a stream (.jsonl, .jsonl.gz) or a rosbag2",
         ),
         (
             ("replay", "drive.jsonl", "b", "-o", "run"),

@@ -107,7 +107,7 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], tuple[str, ...], str]] = {
     "msg, a list of nothing": (
         lambda: of_sequence(f"a/E[] x\n{SEPARATOR}MSG: a/E\nuint8[0] y\n", b"\xff" * 4),
         REPLAY,
-        "elements without content",
+        "elements are empty",
     ),
     "a list of 2 million poses": (
         lambda: pose_array(2_200_000),
@@ -149,9 +149,7 @@ def test_a_ros1_list_of_what_has_no_bytes(server: Server, tmp_path: Path) -> Non
             "/x", "a/msg/B", msgdef=definition, md5sum="0" * 32
         )
         writer.write(topic, 10**9, struct.pack("<I", 2**32 - 1))
-    read_in_little(
-        server, tmp_path, replay("x.bag", OBJECTS), "elements without content"
-    )
+    read_in_little(server, tmp_path, replay("x.bag", OBJECTS), "elements are empty")
 
 
 _ALIASES = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
@@ -166,7 +164,7 @@ METADATA: dict[str, tuple[Callable[[str], str], str]] = {
     ),
     "a file twice": (
         lambda text: text.replace("- bag.mcap\n", "- bag.mcap\n  - bag.mcap\n"),
-        "are copies of one recording",
+        "have the same content",
     ),
 }
 

@@ -63,7 +63,7 @@ def test_times_in_another_unit_are_a_problem(tmp_path):
     write_stream(tmp_path / "s.jsonl", seconds)
     problem = describe(tmp_path / "s.jsonl").problem
     assert problem.startswith(
-        "900 times within 8e-09 s, which no sensor sends: they are not in ns, they look like s"
+        "900 times within 8e-09 s, which no sensor sends: they are not in ns, but probably in s"
     )
     clocks = [
         EgoState(0, 0, 0.0, 0.0, 0.0, 0.0),
@@ -71,7 +71,7 @@ def test_times_in_another_unit_are_a_problem(tmp_path):
     ]
     write_stream(tmp_path / "clocks.jsonl", clocks)
     assert (
-        "years long: its times are of several units or clocks"
+        "years long: its times have several units or clocks"
         in describe(tmp_path / "clocks.jsonl").problem
     )
 
@@ -103,4 +103,4 @@ def test_every_shared_recording_is_described_or_refused_in_one_line():
 def test_stamps_of_another_clock_are_pointed_out():
     topic = by_name(describe(shared("data/bags/nav2_turtlebot.mcap")))["/odom"]
     assert topic.count == 2639
-    assert "another clock" in topic.note
+    assert "different clocks" in topic.note

@@ -153,7 +153,7 @@ def test_topics_of_truth_are_an_object_each(recording):
         (
             {"filters": {"rcs": Filter(min=0.0)}},
             CallError,
-            "without fields, filters go by .*score.*, not by 'rcs'",
+            "without `fields`, a filter may use .*score.*, not 'rcs'",
         ),
         (
             {"fields": {"range_m": "rangee"}},

@@ -84,7 +84,7 @@ def test_degrees_for_radians_are_found():
     lines = found(turned)
     assert [line.partition(":")[0] for line in lines] == ["lidar", "radar"]
     assert (
-        "yaw_rad goes up to 45: degrees? Convert it by `{path: ..., degrees: true}`"
+        "yaw_rad reaches 45, so it is probably in degrees: convert it by `{path: ..., degrees: true}`"
         in lines[0]
     )
     egos = [
@@ -92,7 +92,7 @@ def test_degrees_for_radians_are_found():
         for item in drive()
     ]
     assert found(egos) == [
-        "ego: yaw_rad goes up to 180: degrees? Convert it by `{path: ..., degrees: true}`"
+        "ego: yaw_rad reaches 180, so it is probably in degrees: convert it by `{path: ..., degrees: true}`"
     ]
 
 

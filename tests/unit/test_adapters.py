@@ -275,10 +275,10 @@ def test_a_message_without_a_list_is_one_object_and_without_a_header_has_no_stam
 @pytest.mark.parametrize(
     ("fields", "complaint"),
     [
-        ({"x_m": "a.b"}, r"^a\.b: there is no 'b', but no fields$"),
+        ({"x_m": "a.b"}, r"^a\.b: there is no field 'b'; there are no fields$"),
         ({"x_m": "text"}, "^text: 'far' is not a number$"),
         ({"objects": "a", "x_m": "a"}, "^a: is not a list of objects$"),
-        ({"class_name": ["a", "text"]}, "the name of one field is needed"),
+        ({"class_name": ["a", "text"]}, "a single field is needed"),
     ],
 )
 def test_a_path_that_does_not_lead_to_a_value_is_named(fields, complaint):
@@ -446,7 +446,7 @@ def test_what_describes_an_object_is_read_by_paths_and_places_in_lists():
         width_m=2.5,
         object_id=object_id("bus-12"),
     )
-    with pytest.raises(FieldError, match=r"results\.1\.name: there is no '1'"):
+    with pytest.raises(FieldError, match=r"results\.1\.name: there is no field '1'"):
         objects_by_fields(item, {"class_name": "results.1.name"})
 
 

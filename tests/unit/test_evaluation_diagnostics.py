@@ -131,7 +131,7 @@ def test_delays_longer_than_the_memory_of_the_estimator_are_told_once(
     run = run_of(
         tmp_path / "run", rows, CONFIG.replace("{max_delay_s: 0.4}", "{}"), FILTER
     )
-    text = "lidar: 20 % come later than filter.storage_s 3 s allows and are not used; 99 % come within 3.5 s: raise"
+    text = "lidar: 20 % arrive later than filter.storage_s (3 s) allows and are not used; 99 % arrive within 3.5 s: set"
     assert [
         text in each for each in map(str, diagnostics(run)) if "later than" in each
     ] == [True] * is_warned
@@ -227,8 +227,8 @@ def test_angles_in_degrees_are_told(tmp_path: Path) -> None:
     }
     found = diagnostics(run.with_tables(ego=Columns(ego), detections=Columns(of_radar)))
     assert [str(one).split(":")[:2] for one in found[:2]] == [
-        ["ego", " yaw_rad goes up to 67"],
-        ["radar", " bearing_rad goes up to 12"],
+        ["ego", " yaw_rad reaches 67, so it is probably in degrees"],
+        ["radar", " bearing_rad reaches 12, so it is probably in degrees"],
     ]
     assert all("`{path: ..., degrees: true}`" in str(one) for one in found[:2])
 

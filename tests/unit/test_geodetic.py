@@ -63,7 +63,9 @@ def test_the_first_position_is_the_origin_and_what_is_not_on_earth_is_not_a_numb
     assert plane.position_m(*FLIGHT[0]) == (0.0, 0.0)
     assert plane.origin_deg == FLIGHT[0]
     assert math.isnan(plane.position_m(-41.3, -177.0)[0])  # the other side
-    assert plane.in_plane({"latitude_deg": None, "longitude_deg": 2.0, "score": 1.0}) == {
+    assert plane.in_plane(
+        {"latitude_deg": None, "longitude_deg": 2.0, "score": 1.0}
+    ) == {
         "x_m": None,
         "y_m": None,
         "score": 1.0,
@@ -80,7 +82,7 @@ def test_far_positions_warn_once(caplog):
         plane.position_m(here.latitude_deg + 1.1, here.longitude_deg)
         opened_again.position_m(here.latitude_deg + 1.0, here.longitude_deg)
     assert [record.message for record in caplog.records] == [
-        "a position is 111 km from the origin 41.2000, 2.0800: beyond 100 km set `input.origin` nearer"
+        "a position is 111 km from the origin 41.2000, 2.0800: set `input.origin` within 100 km of the positions"
     ]
 
 

@@ -21,35 +21,35 @@ def test_every_definition_of_ros_passes(store: Stores) -> None:
 @pytest.mark.parametrize(
     ("name", "definition", "problem"),
     [
-        ("a/msg/B:\n  import os", ([], []), "not a name of a message type"),
-        ("B", ([], []), "not a name of a message type"),
-        (NAME, ([], [("x=__import__('os')", NUMBER)]), "not a name of a member"),
-        (NAME, ([], [("ä", NUMBER)]), "not a name of a member"),
-        (NAME, ([("X);f(", "int8", 1)], []), "not a name of a member"),
+        ("a/msg/B:\n  import os", ([], []), "not a valid name of a message type"),
+        ("B", ([], []), "not a valid name of a message type"),
+        (NAME, ([], [("x=__import__('os')", NUMBER)]), "not a valid name of a member"),
+        (NAME, ([], [("ä", NUMBER)]), "not a valid name of a member"),
+        (NAME, ([("X);f(", "int8", 1)], []), "not a valid name of a member"),
         (NAME, ([("X", "int8", [1])], []), "not a plain value"),
         (NAME, ([("X", "int8, y", 1)], []), "not a plain value"),
         (NAME, ([], [("x", (Nodetype.BASE, ("os.system", 0)))]), "unknown type"),
         (
             NAME,
             ([], [("x", (Nodetype.NAME, "a/msg/B()"))]),
-            "not a name of a message type",
+            "not a valid name of a message type",
         ),
         (NAME, ([], [("x", (Nodetype.ARRAY, (NUMBER, 10**9)))]), "longer than"),
         (
             NAME,
             ([], [("x", (Nodetype.SEQUENCE, ((Nodetype.NAME, "x;y"), 0)))]),
-            "not a name of a message type",
+            "not a valid name of a message type",
         ),
         (NAME, ([("A", "float64", float("inf"))], []), "not a plain value"),
         (NAME, ([("A", "int64", 1 << 64)], []), "not a plain value"),
         (
             NAME,
             ([], [("class", NUMBER), ("class_", NUMBER)]),
-            "two members of one name",
+            "two members with the same name",
         ),
-        (NAME, ([("x", "int8", 1)], [("x", NUMBER)]), "two members of one name"),
-        (NAME, ([], [("__class__", NUMBER)]), "not a name of a member"),
-        ("a/" + "b" * 300, ([], []), "not a name of a message type"),
+        (NAME, ([("x", "int8", 1)], [("x", NUMBER)]), "two members with the same name"),
+        (NAME, ([], [("__class__", NUMBER)]), "not a valid name of a member"),
+        ("a/" + "b" * 300, ([], []), "not a valid name of a message type"),
     ],
 )
 def test_what_is_no_name_and_no_number_is_refused(
@@ -71,7 +71,7 @@ def test_a_definition_that_is_refused_is_a_problem_of_its_type_alone(
     evil = (NAME, MessageDefinition(MessageDefinitionFormat.MSG, "float64 x"))
     types = MessageTypes([evil, ("nav_msgs/msg/Odometry", None)], ros1=False)
     assert list(types.problems) == [evil]
-    assert "not a name of a member" in types.problems[evil]
+    assert "not a valid name of a member" in types.problems[evil]
     assert list(types.types) == [("nav_msgs/msg/Odometry", None)]
 
 

@@ -78,5 +78,5 @@ def test_reports_without_position_or_speed_and_damaged_ones(tmp_path):
 
 
 def test_a_log_without_a_clock_is_refused(tmp_path):
-    with pytest.raises(DataError, match="has no time: neither tag blocks"):
+    with pytest.raises(DataError, match="has no time: a log needs tag blocks"):
         messages(tmp_path, ship(10))

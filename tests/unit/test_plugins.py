@@ -94,9 +94,9 @@ def test_a_name_that_is_taken_is_left_out_with_a_line(
         for record in caplog.records
         if record.levelno == logging.WARNING
     ] == [
-        "part 'old' of sound 1.0 is left out: the name belongs to fgtrack; rename the entry point",
-        "part 'ours' of sound 1.0 is left out: the name belongs to fgtrack; rename the entry point",
-        "part 'part' of wrecked 1.0 is left out: the name belongs to sound 1.0; rename the entry point",
+        "part 'old' of sound 1.0 is not loaded: the name belongs to fgtrack; rename the entry point",
+        "part 'ours' of sound 1.0 is not loaded: the name belongs to fgtrack; rename the entry point",
+        "part 'part' of wrecked 1.0 is not loaded: the name belongs to sound 1.0; rename the entry point",
     ]
 
 

@@ -158,8 +158,14 @@ def test_times_keep_all_their_digits(tmp_path):
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("t,seen,x\n1,1,2\n", r"radar\.csv:1: has no column 'y', but t, seen, x"),
-        ("t,seen,x,y,x\n", r"radar\.csv:1: has a column twice: t, seen, x, y, x"),
+        (
+            "t,seen,x\n1,1,2\n",
+            r"radar\.csv:1: has no column 'y'; its columns are t, seen, x",
+        ),
+        (
+            "t,seen,x,y,x\n",
+            r"radar\.csv:1: two columns have the same name: t, seen, x, y, x",
+        ),
         (RADAR_TEXT + "2,2,far,1\n", r"radar\.csv:5: x: 'far' is not a number"),
         (RADAR_TEXT + "noon,2,1,1\n", r"radar\.csv:5: t: 'noon' is not a time"),
         (
@@ -168,9 +174,9 @@ def test_times_keep_all_their_digits(tmp_path):
         ),
         (
             RADAR_TEXT + "1e15,2,1,1\n",
-            r"radar\.csv:5: t: '1e15' is not a time in s, or change `time_unit`",
+            r"radar\.csv:5: t: '1e15' is not a time in s: correct the cell or `time_unit`",
         ),
-        (RADAR_TEXT + "2,2,1\n", r"radar\.csv:5: has 3 cells, the header has 4"),
+        (RADAR_TEXT + "2,2,1\n", r"radar\.csv:5: has 3 cells, but the header has 4"),
         (
             RADAR_TEXT + '2,2,"' + "1" * 200_000 + '",1\n',
             r"radar\.csv:4: cannot be read any further \(field larger",
@@ -206,7 +212,7 @@ def test_a_damaged_file_is_one_line_and_what_is_before_it_is_replayed(
         (
             "ns",
             [f"{1_700_000_000 + 0.05 * k:.2f}" for k in range(30)],
-            r"radar\.csv: .*look like s since 1970: change `time_unit`",
+            r"radar\.csv: .*probably in s since 1970: change `time_unit`",
         ),
         (
             "ns",
@@ -216,7 +222,7 @@ def test_a_damaged_file_is_one_line_and_what_is_before_it_is_replayed(
         (
             "s",
             [f"{1_700_000_000_000 + 50 * k}" for k in range(30)],
-            r"radar\.csv:2: t: .*not a time in s, or change `time_unit`",
+            r"radar\.csv:2: t: .*not a time in s: correct the cell or `time_unit`",
         ),
     ],
 )
@@ -283,11 +289,11 @@ def test_an_angle_of_many_turns_is_not_wrapped_as_it_may_be_in_degrees(tmp_path)
             {"x_m": "x"},
             r"input\.csv\.detections\.radar\.columns: must name stamp",
         ),
-        ("radar", {"stamp": "t", "speed": "v"}, "unknown column 'speed', known"),
+        ("radar", {"stamp": "t", "speed": "v"}, "unknown component 'speed'"),
         (
             "radar",
             {"stamp": "t", "score": "x"},
-            "stamp and what is measured, one of x_m",
+            "stamp and a measured component, one of x_m",
         ),
     ],
 )
@@ -349,7 +355,7 @@ def test_position_reports_need_no_mapping(tmp_path, name, sensor, delay_s):
 def test_several_tables_of_reports_are_not_one_recording(tmp_path):
     for name in ("flights.csv", "ships.csv"):
         (tmp_path / name).write_text(REPORTS[name])
-    with pytest.raises(CallError, match="holds 2 tables of reports, name one"):
+    with pytest.raises(CallError, match="contains 2 tables of reports: give one"):
         open_input(tmp_path)
 
 

@@ -1,4 +1,4 @@
-"""Times that no recording has, and the unit that they look like."""
+"""Times that no recording has, and their probable unit."""
 
 import pytest
 
@@ -21,7 +21,7 @@ def test_the_unit_is_that_in_which_a_time_is_of_this_century(
 def test_too_many_times_in_too_little_time_are_of_another_unit() -> None:
     start_ns = NOW_S * NS_PER_S
     assert wrong_unit(10, NOW_S, NOW_S + 8) == (
-        "10 times within 8e-09 s, which no sensor sends: they are not in ns, they look like s since 1970"
+        "10 times within 8e-09 s, which no sensor sends: they are not in ns, but probably in s since 1970"
     )
     assert wrong_unit(9, NOW_S, NOW_S + 8) is None
     assert wrong_unit(1001, start_ns, start_ns + 10_000_000) is None  # 100 kHz

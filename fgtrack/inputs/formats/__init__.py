@@ -1,7 +1,8 @@
-"""Converts messages and data sets of others to fgtrack's messages and conventions.
+"""Adapters: conversion of foreign messages and data sets to fgtrack's messages and conventions.
 
-An entry point of the group `fgtrack.adapters` adds one: named `package/msg/Type`, a function from a message to an
-`ObjectList`; by another name a `FileFormat`, or a function that gives one.
+A plug-in adds an adapter as an entry point of the group `fgtrack.adapters`. An entry
+point named `package/msg/Type` is a function that returns an `ObjectList` for a message.
+Another name stands for a `FileFormat`, or for a function that returns a `FileFormat`.
 """
 
 from fgtrack.core.plugins import Registry

@@ -1,9 +1,11 @@
 """ASTERIX recordings of air traffic surveillance (EUROCONTROL): categories 010, 020, 021, 048 and 062.
 
-Read by the specifications in libasterix (extra `asterix`), which has every edition. Times are seconds of the
-UTC day; the recording has no date. A category with two times of a position (021) gives stamp and receipt; of the others
-the receipt is the newest stamp up to the record in its file, a lower bound. Records of one sensor with equal times are
-one list. Extrapolated positions (010, 020: bits CST of item 170) are no measurements and are left out.
+The specifications come from libasterix (extra `asterix`), which contains every edition.
+Times are seconds of the UTC day; a recording has no date. Category 021 has two times of
+a position, the stamp and the receipt. For the other categories the receipt is the
+newest stamp up to the record in its file, a lower bound. Records of one sensor with
+equal times make one list. Extrapolated positions (010, 020: bits CST of item 170) are
+no measurements and are left out.
 """
 
 import math
@@ -28,10 +30,11 @@ from fgtrack.inputs.settings import AsterixInput, InputConfig, Origin
 from fgtrack.inputs.source import FileFormat
 
 _DAY_NS = 86_400 * NS_PER_S
-_NM_M, _FOOT_M = 1852.0, 0.3048
-_PER_95 = 2.4477  # radius with 95 % of a circular Gaussian, in standard deviations
-#: Radius in m and speed in m/s that hold 95 % of the errors: NACp and NACv of DO-260B (RTCA, 2009), tables 2-71 and
-#: 2-22; and NUCp of DO-260 (2000), table 2-11, of version 0.
+_NM_M = 1852.0
+_FOOT_M = 0.3048
+#: Radius that contains 95 % of a circular Gaussian, in standard deviations.
+_PER_95 = 2.4477
+#: 95 % radius of the position in m by NACp: DO-260B (RTCA, 2009), table 2-71.
 _NACP_M = {
     11: 3.0,
     10: 10.0,
@@ -45,6 +48,7 @@ _NACP_M = {
     2: 7408.0,
     1: 18520.0,
 }
+#: 95 % radius of the position in m by NUCp of version 0: DO-260 (2000), table 2-11.
 _NUCP_M = {
     9: 3.0,
     8: 10.0,
@@ -56,10 +60,11 @@ _NUCP_M = {
     2: 9260.0,
     1: 18520.0,
 }
+#: 95 % bound of the velocity in m/s by NACv: DO-260B, table 2-22.
 _NACV_MPS = {4: 0.3, 3: 1.0, 2: 3.0, 1: 10.0}
 _UNKNOWN_MPS = 10.0
 _KINDS = {0: "mlat", 1: "mlat", 2: "adsb", 3: "smr", 5: "mlat"}
-"""Sensor by the type of a report of category 010: multilateration, ADS-B, primary RADAR."""
+"""Sensor by the report type of category 010: multilateration, ADS-B, surface movement RADAR."""
 _TARGET_REPORT = 1
 _COMMON = (
     "000",
@@ -74,33 +79,31 @@ _COMMON = (
 
 
 class _Category(NamedTuple):
-    """Items of a category, by number or number/part; the first that a record has counts."""
+    """Items of a category, as number or number/part; of several the first that a record contains is read."""
 
     sensor: str
     stamp: tuple[str, ...]
     receipt: tuple[str, ...]
-    """None: there is no second time."""
+    """Empty if the category has no second time."""
     address: str
     positions: tuple[tuple[str, str, str], ...]
-    """Items with their parts LAT and LON, X and Y, or RHO and THETA."""
+    """Items with two parts each: LAT and LON, X and Y, or RHO and THETA."""
     velocity: tuple[str, str, str]
-    """Item with its parts VX and VY, or speed and direction."""
+    """Item with two parts: VX and VY, or speed and direction."""
     height: str
     unit_m: float = 1.0
-    """Of X and Y."""
+    """Unit of X and Y in m."""
     lsb: Mapping[str, float] = {}
-    """Least significant bits, where libasterix has other ones."""
+    """Least significant bits that replace wrong ones of libasterix."""
 
 
-_WGS84, _CARTESIAN, _POLAR = (
-    ("041", "LAT", "LON"),
-    ("042", "X", "Y"),
-    ("040", "RHO", "THETA"),
-)
+_WGS84 = ("041", "LAT", "LON")
+_CARTESIAN = ("042", "X", "Y")
+_POLAR = ("040", "RHO", "THETA")
 _GNSS = (("131", "LAT", "LON"), ("130", "LAT", "LON"))
 _SYSTEM = (("105", "LAT", "LON"), ("100", "X", "Y"))
 _CATEGORIES = {
-    # Edition 1.1, 5.2.20: +-8192 m/s in 16 bits, 0.25 m/s; libasterix 1.1 has 1/16 m/s.
+    # Edition 1.1, 5.2.20: +-8192 m/s in 16 bits, so 0.25 m/s; libasterix 1.1 has 1/16 m/s.
     10: _Category(
         "",
         ("140",),
@@ -150,11 +153,10 @@ def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
         from asterix.generated import manifest
     except ImportError as error:
         raise CallError(
-            f"{path}: is ASTERIX, install its reader: pip install 'fgtrack[asterix]'"
+            f"{path}: is an ASTERIX file, install the reader: pip install 'fgtrack[asterix]'"
         ) from error
-    known: Any = manifest[
-        "CATS"
-    ]  # Any: editions by category, which libasterix types as objects
+    # Any: editions by category, which libasterix types as objects.
+    known: Any = manifest["CATS"]
     readers = {
         number: _reader(known[number], number, config.asterix) for number in _CATEGORIES
     }
@@ -168,26 +170,31 @@ def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
 def _reader(
     known: Iterable[Any], number: int, given: AsterixInput
 ) -> RecordReader:  # Any: a class of libasterix
-    """Return the reader of the edition of category `number` that is set, else of the newest. Raises `CallError`."""
+    """Return the record reader for the configured edition of category `number`, by default the newest edition.
+
+    Raises `CallError` for an unknown edition.
+    """
     by_name = {".".join(map(str, each.cv_edition)): each for each in known}
     name = given.editions.get(number, next(reversed(by_name)))
     if name not in by_name:
         raise CallError(
-            f"input.asterix.editions: category {number} has {', '.join(by_name)}, not {name}"
+            f"input.asterix.editions: category {number} has no edition {name}, choose from {', '.join(by_name)}"
         )
-    own = _CATEGORIES[number]
+    category = _CATEGORIES[number]
     pairs = [
         f"{item}/{part}"
-        for item, *parts in (*own.positions, own.velocity)
+        for item, *parts in (*category.positions, category.velocity)
         for part in parts
     ]
     times = (
-        *own.stamp,
-        *own.receipt,
+        *category.stamp,
+        *category.receipt,
         *(each[number] for each in (given.stamp, given.receipt) if number in each),
     )
     return RecordReader(
-        by_name[name], [*_COMMON, *pairs, *times, own.address, own.height], own.lsb
+        by_name[name],
+        [*_COMMON, *pairs, *times, category.address, category.height],
+        category.lsb,
     )
 
 
@@ -215,11 +222,11 @@ def _merged(
         yield replace(
             lists[0], objects=tuple(item for each in lists for item in each.objects)
         )
-    unplaced = [f"{number:g}" for number, site in sites.items() if site.misplaces]
-    if len(unplaced) > 1:
-        named = f"the stations {' and '.join(unplaced)} (SIC) give positions relative to themselves"
+    unknown = [f"{number:g}" for number, site in sites.items() if site.misplaces]
+    if len(unknown) > 1:
         warn_once(
-            f"{named}: set `input.asterix.stations`, without it all are taken to be at one point"
+            f"the stations {' and '.join(unknown)} (SIC) report positions relative to the station, but all stations "
+            "are assumed at the origin: set their positions in `input.asterix.stations`"
         )
     for each in readable:
         each.raise_error()
@@ -232,26 +239,28 @@ def _reports(
     plane: LocalPlane,
     sites: dict[float, "_Site"],
 ) -> Iterator[DetectionList]:
-    """Target reports of `file`, a list of one object each, in the order of the file.
-    `sites` by SIC gets those whose stations are not given.
+    """Yield the target reports of `file`, each as a list of one object, in the order of the file.
+
+    Stations without a configured position are added to `sites`, by SIC.
     """
     newest_ns: int | None = None
     for number, record in _records(file, readers):
-        own = _CATEGORIES[number]
+        category = _CATEGORIES[number]
         if number == 10 and record.get("000") != _TARGET_REPORT:
             continue
         stamp_s = _first(
-            record, (given.stamp[number],) if number in given.stamp else own.stamp
+            record, (given.stamp[number],) if number in given.stamp else category.stamp
         )
         receipt_s = _first(
-            record, (given.receipt[number],) if number in given.receipt else own.receipt
+            record,
+            (given.receipt[number],) if number in given.receipt else category.receipt,
         )
         if stamp_s is None or (number in (10, 20) and record.get("170/CST")):
             continue
         station = record.get("010/SIC", 0.0)
         if station not in sites:
             sites[station] = _Site(plane, None)
-        item = _detection(record, number, own, sites[station], plane)
+        item = _detection(record, number, category, sites[station], plane)
         if item is None:
             continue
         stamp_ns = _on_nearest_day(stamp_s, newest_ns)
@@ -259,16 +268,17 @@ def _reports(
             stamp_ns if receipt_s is None else _on_nearest_day(receipt_s, stamp_ns)
         )
         newest_ns = receipt_ns if newest_ns is None else max(newest_ns, receipt_ns)
-        sensor = own.sensor or _KINDS.get(int(record.get("020/TYP", 0)), "other")
+        sensor = category.sensor or _KINDS.get(int(record.get("020/TYP", 0)), "other")
         yield DetectionList(
             sensor, stamp_ns, newest_ns, (item,), "map", origin_deg=plane.origin_deg
         )
 
 
 def _on_nearest_day(time_s: float, near_ns: int | None) -> int:
-    """Return a time of day as a stamp, on the day that brings it nearest to `near_ns`; on day 0 without one.
+    """Return a time of day as a stamp on the day nearest to `near_ns`; on day 0 if `near_ns` is None.
 
-    The second time of a report may lie before the first: their clocks are rounded to 1/128 s.
+    The second time of a report may lie before the first, because both are rounded to
+    1/128 s.
     """
     time_ns = round(time_s * NS_PER_S)
     return (
@@ -281,7 +291,7 @@ def _on_nearest_day(time_s: float, near_ns: int | None) -> int:
 def _records(
     file: Path, readers: Mapping[int, RecordReader]
 ) -> Iterator[tuple[int, Record]]:
-    """Category and record of everything in `file` that is read. Raises `TruncatedInput` and `DataError`."""
+    """Yield category and record of each record in `file` with a reader; raises `TruncatedInput` and `DataError`."""
     at = 0
     with open_file(file) as blocks:
         while head := blocks.read(3):
@@ -292,9 +302,9 @@ def _records(
             try:
                 records = list(readers[number](content)) if number in readers else []
             except (ValueError, IndexError) as error:
-                hint = f"another edition? (input.asterix.editions: {{{number}: ...}})"
                 raise DataError(
-                    f"{file}: cannot decode category {number} at byte {at}, {hint}"
+                    f"{file}: cannot decode category {number} at byte {at}: "
+                    f"set its edition as input.asterix.editions: {{{number}: ...}}"
                 ) from error
             for record in records:
                 yield number, record
@@ -302,12 +312,13 @@ def _records(
 
 
 class _Site:
-    """Position of a station in the plane, and the axes of its own plane there: the meridians converge."""
+    """Position of a station in the plane, and the direction of its north there, because meridians converge."""
 
     def __init__(self, plane: LocalPlane, station: Origin | None) -> None:
         self._x_m = self._y_m = self._turn_rad = 0.0
-        self._given, self.misplaces = station is not None, False
-        """True if a position relative to it was placed without knowing where it is."""
+        self._given = station is not None
+        self.misplaces = False
+        """True if a relative position was converted although the station's position is unknown."""
         if station is not None:
             self._x_m, self._y_m = plane.position_m(
                 station.latitude_deg, station.longitude_deg
@@ -318,28 +329,29 @@ class _Site:
             self._turn_rad = math.atan2(x_m - self._x_m, y_m - self._y_m)
 
     def position_m(self, x_m: float, y_m: float) -> tuple[float, float]:
-        """Position in the plane of `x_m` to the east and `y_m` to the north of the station."""
+        """Position in the plane, `x_m` to the east and `y_m` to the north of the station."""
         self.misplaces = not self._given
         c, s = math.cos(self._turn_rad), math.sin(self._turn_rad)
         return self._x_m + c * x_m + s * y_m, self._y_m - s * x_m + c * y_m
 
 
 def _detection(
-    record: Record, number: int, own: _Category, site: _Site, plane: LocalPlane
+    record: Record, number: int, category: _Category, site: _Site, plane: LocalPlane
 ) -> Detection | None:
-    """Object of a target report; None where it has no position."""
+    """Object of a target report; None if the report has no position."""
     position = next(
         (
             at
-            for name in own.positions
-            if (at := _position_m(record, *name, own.unit_m, site, plane))
+            for name in category.positions
+            if (at := _position_m(record, *name, category.unit_m, site, plane))
         ),
         None,
     )
     if position is None:
         return None
-    speed_mps, yaw_rad = _velocity(record, *own.velocity)
-    address, level = record.get(own.address), record.get(own.height)
+    speed_mps, yaw_rad = _velocity(record, *category.velocity)
+    address = record.get(category.address)
+    level = record.get(category.height)
     return Detection(
         *position,
         yaw_rad,
@@ -372,7 +384,7 @@ def _position_m(
 def _velocity(
     record: Record, item: str, first: str, second: str
 ) -> tuple[float | None, float | None]:
-    """Speed over ground, and its direction where it moves; None where it is not reported."""
+    """Return speed over ground and course; None if not reported. The course of an object at rest is None."""
     a, b = record.get(f"{item}/{first}"), record.get(f"{item}/{second}")
     if a is None or b is None:
         return None, None
@@ -382,7 +394,7 @@ def _velocity(
 
 
 def _accuracy(record: Record, speed_mps: float | None) -> tuple[float, ...] | None:
-    """Covariance of the measured components by the accuracy categories; None where the position has none."""
+    """Covariance of the measured components from the accuracy categories; None without a position accuracy."""
     radius_m = _NACP_M.get(int(record.get("090/NACP", 0)))
     if not radius_m and record.get("210/VN") == 0:
         radius_m = _NUCP_M.get(int(record.get("090/NUCPNIC", 0)))

@@ -1,7 +1,7 @@
-"""Numbers of the records of an ASTERIX category, at the bits that the specification in libasterix gives them.
+"""Decoding of ASTERIX records: numbers are read at the bits that libasterix's specification gives.
 
-libasterix makes an object of every part of every item, which takes milliseconds for a record; here only the numbers
-that are asked for are read.
+libasterix itself creates an object for every part of every item, which takes
+milliseconds for a record. Here only the requested numbers are read.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -10,52 +10,57 @@ from itertools import chain, repeat
 from typing import Any, NamedTuple
 
 Record = dict[str, float]
-"""Numbers by item, or item/part, in the unit of the standard; those that a record does not have are missing."""
+"""Numbers in the unit of the standard, by item or item/part; numbers that the record lacks are missing."""
 _End = Callable[[bytes, int], int]
-"""Byte behind an item that begins at a byte of the block."""
+"""Returns the first byte behind an item, from the block and the item's first byte."""
 _Item = Callable[[Record, bytes, int], int]
-"""Adds the numbers of an item that begins at a byte of the block to the record, and returns the byte behind it."""
-_Spec = Any  # libasterix has a class of every item of every edition
+"""Adds the numbers of an item to the record, and returns the first byte behind the item.
+
+The arguments are the record, the block and the item's first byte.
+"""
+_Spec = Any  # libasterix has a class for every item of every edition
 
 
 class _Number(NamedTuple):
+    """Name, bits and scale of a number in an item."""
+
     name: str
     end: int
-    """Bit behind it, from the begin of its item."""
+    """First bit behind the number, counted from the beginning of the item."""
     size: int
     signed: bool
     lsb: float
 
     def read(self, item: bytes, record: Record) -> None:
-        """Add it to `record`; not where the item, whose length varies, ends before it."""
+        """Add the number to `record`, unless the item, whose length varies, ends before it."""
         beyond = 8 * len(item) - self.end
         if beyond >= 0:
             value = int.from_bytes(item, "big") >> beyond & (1 << self.size) - 1
-            record[self.name] = (
-                value - (1 << self.size)
-                if self.signed and value >> self.size - 1
-                else value
-            ) * self.lsb
+            if self.signed and value >> self.size - 1:
+                value -= 1 << self.size
+            record[self.name] = value * self.lsb
 
 
 class RecordReader:
-    """Reads the records of one edition of a category."""
+    """Reader of the records of one edition of a category."""
 
     def __init__(
         self, edition: _Spec, names: Iterable[str], lsb: Mapping[str, float]
     ) -> None:
-        """`names`: the numbers to read, item or item/part; unknown ones are ignored. `lsb` replaces the least
-        significant bit of the library for some of them.
+        """Prepare the reader for the numbers `names`, as item or item/part; unknown names are ignored.
+
+        `lsb` replaces the library's least significant bit of some numbers.
         """
         items = [
             getattr(each, "cv_non_spare", None)
             for each in edition.cv_uap.cv_record.cv_items_list
         ]
         self._items = _items(items, set(names), lsb, "")
-        self._present: dict[bytes, list[_Item]] = {}  # by the field specification
+        #: Items of a record by its field specification.
+        self._present: dict[bytes, list[_Item]] = {}
 
     def __call__(self, block: bytes) -> Iterator[Record]:
-        """Yield the records of `block`. Raises `ValueError` or `IndexError` where it is malformed."""
+        """Yield the records of `block`; raises `ValueError` or `IndexError` if the block is malformed."""
         at = 0
         while at < len(block):
             record: Record = {}
@@ -65,10 +70,10 @@ class RecordReader:
             yield record
 
 
-def _read_plain(
+def _read_numbers(
     end: _End, numbers: list[_Number], record: Record, block: bytes, at: int
 ) -> int:
-    """See `_Item`."""
+    """Add the `numbers` of an item to the record; arguments and result as of `_Item`."""
     behind = end(block, at)
     for number in numbers:
         number.read(block[at:behind], record)
@@ -82,7 +87,10 @@ def _read_present(
     block: bytes,
     at: int,
 ) -> int:
-    """Add the numbers of the items that the field specification at `at` has to `record`; returns the byte behind."""
+    """Add the numbers of all items in the field specification at byte `at` to `record`.
+
+    Returns the first byte behind the items.
+    """
     first = at
     while block[at : at + 1] and block[at] & 1:
         at += 1
@@ -95,7 +103,7 @@ def _read_present(
         ]
         present = [item for item in chosen if item is not None]
         if len(present) < len(chosen):
-            raise ValueError("an item is not in the specification")
+            raise ValueError("a record has an item that the specification lacks")
         known[block[first:at]] = present
     for read in present:
         at = read(record, block, at)
@@ -119,17 +127,18 @@ def _item(spec: _Spec, names: set[str], lsb: Mapping[str, float], name: str) -> 
         return partial(_read_present, parts, {})
     numbers = [each for each in _numbers(variation, name, 0) if each.name in names]
     return partial(
-        _read_plain,
+        _read_numbers,
         _end(variation),
         [each._replace(lsb=lsb.get(each.name, each.lsb)) for each in numbers],
     )
 
 
 def _numbers(variation: _Spec, name: str, at: int) -> Iterator[_Number]:
-    """Yield the numbers of an item, or of a part that begins at its bit `at`, down to the parts of parts."""
+    """Yield the numbers of an item and of its nested parts; the item, or part, begins at bit `at`."""
     if hasattr(variation, "cv_rule"):
         content = getattr(variation.cv_rule, "cv_content", None)
-        size, signed = variation.cv_bit_size, getattr(content, "cv_signedness", None)
+        size = variation.cv_bit_size
+        signed = getattr(content, "cv_signedness", None)
         is_signed = signed is not None and signed.__name__ == "Signed"
         yield _Number(name, at + size, size, is_signed, getattr(content, "cv_lsb", 1))
     elif hasattr(variation, "cv_items_list"):
@@ -139,11 +148,12 @@ def _numbers(variation: _Spec, name: str, at: int) -> Iterator[_Number]:
             if nested
             else variation.cv_items_list
         ):
-            spec, size = part or (None, 1)  # a bit that announces an extension
-            own = getattr(spec, "cv_non_spare", None)
-            if own is not None and hasattr(own.cv_rule, "cv_variation"):
+            # A missing part is the bit that announces an extension.
+            spec, size = part or (None, 1)
+            item = getattr(spec, "cv_non_spare", None)
+            if item is not None and hasattr(item.cv_rule, "cv_variation"):
                 yield from _numbers(
-                    own.cv_rule.cv_variation, f"{name}/{own.cv_name}", at
+                    item.cv_rule.cv_variation, f"{name}/{item.cv_name}", at
                 )
             at += size
 
@@ -171,7 +181,7 @@ def _end(variation: _Spec) -> _End:
 
 
 def _extended_end(sizes: Iterable[int], block: bytes, at: int) -> int:
-    """Byte behind parts of `sizes`, each of which ends with the bit that announces another one."""
+    """First byte behind parts of the given `sizes`; the last bit of each part announces the next part."""
     for size in sizes:
         at += size
         if not block[at - 1] & 1:

@@ -1,11 +1,14 @@
 """The Autoferry data set: object lists and bearings of a ferry, with the GNSS truth of two vessels.
 
-Helgesen, Vasstein, Brekke, Stahl, "Heterogeneous multi-sensor tracking for an autonomous surface vehicle in a
-littoral environment", 2022; github.com/Autoferry/sensor_fusion_dataset. Choices that the data leave open:
-- Receipt is the newest stamp up to the record in the file, a lower bound: each sensor alone is in order of its times.
-- Scans are aligned to the north: the yaw of the ego frame is 0, and its speed, which would be along that yaw, too.
-- An own-ship position older than one already delivered is not delivered twice.
-- LiDAR and RADAR points get the own ship's position and are in the map frame. Bearings stay relative to the ego.
+Helgesen, Vasstein, Brekke, Stahl, "Heterogeneous multi-sensor tracking for an
+autonomous surface vehicle in a littoral environment", 2022;
+github.com/Autoferry/sensor_fusion_dataset. Conventions that the data set does not
+specify:
+
+- The receipt is the newest stamp up to the record in the file, a lower bound. So each sensor alone is in order.
+- Scans are aligned to the north: the yaw of the ego frame is 0. The ego's speed along this yaw is set to 0.
+- An own-ship position that is older than an earlier delivered position is not delivered.
+- LiDAR and RADAR points are shifted by the own ship's position into the map frame. Bearings stay in the ego frame.
 """
 
 import math
@@ -29,7 +32,10 @@ _DETECTIONS = "*_detections.json"
 
 
 def read_scenario(folder: Path) -> Iterator[Message]:
-    """Messages of the scenario in `folder` in receipt order; at equal receipts truth, then ego, then detections."""
+    """Yield the messages of the scenario in `folder` in receipt order.
+
+    At equal receipts the truth comes first, then the ego, then the detections.
+    """
     file = min(folder.glob(_DETECTIONS))
     truth = file.with_name(file.name.replace("_detections", "_groundTruth"))
     states = _truth(truth) if truth.exists() else []
@@ -44,16 +50,20 @@ FORMAT = FileFormat(
 
 
 def _measured(file: Path) -> Iterator[EgoState | DetectionList]:
-    """Points around the own ship, `[[north...], [east...]]` or `[north, east]`; bearings from the north, clockwise."""
+    """Yield own-ship positions and object lists.
+
+    Points are relative to the own ship: `[[north...], [east...]]` or `[north, east]`.
+    Bearings are measured clockwise from the north.
+    """
     newest_ns = -LARGEST_NS
     for index, record in enumerate(json_values(file, parse_float=Decimal)):
-        with reported_as(f"{file}: record {index} is not one of the data set"):
+        with reported_as(
+            f"{file}: record {index} does not have the form of the data set"
+        ):
             stamp_ns = exact_ns(record["time"])
             north_m, east_m = map(float, record["ownshipPosition"])
-            is_camera, name = (
-                record["sensorID"] in _CAMERAS,
-                SENSORS[record["sensorID"]],
-            )
+            is_camera = record["sensorID"] in _CAMERAS
+            name = SENSORS[record["sensorID"]]
             values = np.array(record["measurement"], dtype=np.float64)
             if is_camera:
                 objects = [
@@ -83,10 +93,12 @@ def _measured(file: Path) -> Iterator[EgoState | DetectionList]:
 
 
 def _truth(file: Path) -> list[TruthState]:
-    """GNSS fixes, each once: the file repeats the nearest fix for every record."""
+    """Return the GNSS fixes of the vessels without repetitions: the file repeats the nearest fix at every record."""
     states: dict[tuple[int, int], TruthState] = {}
     for index, fixes in enumerate(json_values(file, parse_float=Decimal)):
-        with reported_as(f"{file}: record {index} is not one of the data set"):
+        with reported_as(
+            f"{file}: record {index} does not have the form of the data set"
+        ):
             for fix in fixes if isinstance(fixes, list) else [fixes]:
                 stamp_ns, target = exact_ns(fix["time"]), int(fix["targetID"])
                 north_m, east_m = map(float, fix["position"][:2])

@@ -1,4 +1,4 @@
-"""Common parts of the adapters: headers, quaternions, speeds and covariances of ROS messages."""
+"""Functions that the adapters share: JSON lists, stamps, identities, quaternions, speeds and covariances."""
 
 import json
 import math
@@ -21,34 +21,36 @@ from fgtrack.core.types import MEASURABLE, Detection, FloatArray, Frame
 from fgtrack.inputs.errors import cause
 
 PLANAR = [0, 1, 5]
-"""Indices of x, y and the rotation about z in a covariance of ROS."""
+"""Indices of x, y and the rotation about z in a 6 x 6 covariance of ROS."""
 
-_DECIMAL = Context(Emax=40)  # no exponent makes a number of a million digits
+#: Context that limits the exponent, so that no text becomes an integer of a million digits.
+_DECIMAL = Context(Emax=40)
 _LARGEST_MB = 2000.0
-_A_LIST, _BETWEEN = re.compile(r"\s*\[\s*"), re.compile(r"[\s,:]*")
+_LIST_START = re.compile(r"\s*\[\s*")
+_BETWEEN = re.compile(r"[\s,:]*")
 _INT64 = range(-(1 << 63), 1 << 63)
-# A message is known by its attributes only: its class is made when a recording is read.
 RosMessage = Any
+"""A ROS message. Its class is created when a recording is read, so only its attributes are known."""
 MAP_FRAMES = frozenset({"map", "world", "odom"})
-"""Header frames that are taken as the map frame where the configuration names none."""
+"""Header frames that count as the map frame if the configuration names no frame."""
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectList:
-    """Content of one message, as an adapter reads it."""
+    """Content of one message, as an adapter returns it."""
 
     stamp_ns: int | None
-    """None where the message has no stamp; then it is the receipt."""
+    """None if the message has no stamp; the receipt is then used."""
     frame: Frame | None
-    """None where the message does not contain it."""
+    """None if the message does not contain its frame."""
     objects: tuple[Detection, ...]
     left_out: tuple[str, ...] = ()
-    """As of a `DetectionList`."""
+    """As in `DetectionList`."""
 
 
 @contextmanager
 def reported_as(text: str) -> Iterator[None]:
-    """Raise `DataError` of `text` and the cause for whatever values of another form raise in the block."""
+    """Convert exceptions of the block that malformed values cause into `DataError` with `text` and the cause."""
     try:
         yield
     except FgtrackError:
@@ -65,18 +67,20 @@ def reported_as(text: str) -> Iterator[None]:
 
 
 def json_values(
-    file: Path, begin: re.Pattern[str] = _A_LIST, **form: Any
+    file: Path, begin: re.Pattern[str] = _LIST_START, **form: Any
 ) -> Iterator[Any]:  # Any: parsed JSON
-    """Yield values of the list that follows `begin` in the JSON `file`, or keys and values of the object.
-    The text of a table may have a gigabyte. `form` is that of a `JSONDecoder`. Raises `DataError` in other files.
+    """Yield the values of the list that follows `begin` in the JSON `file`; for an object, keys and values in turn.
+
+    A table may have a gigabyte. `form` contains arguments of `JSONDecoder`. Raises
+    `DataError` for a file of another form.
     """
     with reported_as(
-        f"{file}: is not JSON of the expected form, download it once more"
+        f"{file}: is not JSON of the expected form, download the file once more"
     ):
         text = read_whole(file, _LARGEST_MB).decode()
         gap = begin.match(text)
         if gap is None:
-            raise ValueError("another beginning")
+            raise ValueError("the file begins with another text")
         while gap is not None and text[gap.end()] not in "]}":
             value, end = json.JSONDecoder(**form).raw_decode(text, gap.end())
             yield value
@@ -86,15 +90,19 @@ def json_values(
 def split(
     items: Iterable[Detection | str],
 ) -> tuple[tuple[Detection, ...], tuple[str, ...]]:
-    """The detections among `items`, and for each other object the setting that excludes it."""
-    every = list(items)
-    return tuple(i for i in every if not isinstance(i, str)), tuple(
-        i for i in every if isinstance(i, str)
-    )
+    """Separate `items` into detections, and the excluding settings of the objects that are left out."""
+    detections = list[Detection]()
+    settings = list[str]()
+    for item in items:
+        if isinstance(item, str):
+            settings.append(item)
+        else:
+            detections.append(item)
+    return tuple(detections), tuple(settings)
 
 
 def object_id(value: object) -> int | None:
-    """An integer (or its text) `value` as it is, of other text a reproducible number < 2^53, of an empty one None."""
+    """Integer id for `value`: the integer itself, a stable hash below 2^48 for another text, None for an empty text."""
     text = str(value).strip()
     if (
         text.removeprefix("-").isdecimal()
@@ -103,47 +111,47 @@ def object_id(value: object) -> int | None:
         and int(text) in _INT64
     ):
         return int(text)
-    return (
-        int.from_bytes(
-            blake2b(text.encode(errors="replace"), digest_size=6).digest(), "big"
-        )
-        if text
-        else None
-    )
+    if not text:
+        return None
+    digest = blake2b(text.encode(errors="replace"), digest_size=6).digest()
+    return int.from_bytes(digest, "big")
 
 
 def identity(value: object) -> str | None:
-    """The identity `value` in one spelling, 4CA911 of 0x4ca911; None of an empty one."""
+    """The identity `value` in a uniform spelling (0x4ca911 becomes 4CA911); None if it is empty."""
     return str(value).strip().upper().removeprefix("0X") or None
 
 
 def exact_ns(time: Decimal | int | str, unit: str = "s") -> int:
-    """Integer nanoseconds of a decimal text, to the last one; `ArithmeticError` or `ValueError` if it is not a time."""
+    """Convert the decimal number `time` in `unit` to integer nanoseconds, exact to the last digit.
+
+    Raises `ArithmeticError` or `ValueError` if it is not a time.
+    """
     time_ns = round(_DECIMAL.create_decimal(time) * NS_PER_UNIT[unit])
     if not is_stamp(time_ns):
-        raise ValueError("beyond the year 2096")
+        raise ValueError("the time is beyond the year 2096")
     return time_ns
 
 
 def stamp_ns(time: RosMessage) -> int:
-    """Integer nanoseconds of a `builtin_interfaces/Time`."""
+    """Convert a `builtin_interfaces/Time` to integer nanoseconds."""
     return int(time.sec) * NS_PER_S + int(time.nanosec)
 
 
 def frame_of(header: RosMessage) -> Frame:
-    """Frame that a header names: `map` for the usual names of a fixed frame, else `ego`."""
+    """Frame of a header: `map` for the usual names of a fixed frame (`MAP_FRAMES`), else `ego`."""
     return "map" if header.frame_id.lstrip("/") in MAP_FRAMES else "ego"
 
 
 def object_list(
     header: RosMessage, objects: Iterable[Detection], frame: Frame | None = None
 ) -> ObjectList:
-    """An object list with the stamp of `header`, and its frame where none is given."""
+    """Object list with the stamp of `header`, and with the header's frame if `frame` is None."""
     return ObjectList(stamp_ns(header.stamp), frame or frame_of(header), tuple(objects))
 
 
 def yaw_rad(orientation: RosMessage) -> float | None:
-    """Yaw of a quaternion of any norm; None where it is all zero, which means "not known"."""
+    """Yaw of a quaternion of any norm; None for the quaternion 0, which means that the orientation is unknown."""
     x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
     if x == y == z == w == 0.0:
         return None
@@ -151,7 +159,7 @@ def yaw_rad(orientation: RosMessage) -> float | None:
 
 
 def signed_speed_mps(vx_mps: float, vy_mps: float, heading_rad: float | None) -> float:
-    """Length of the velocity, negative where it points against the heading (of the same frame)."""
+    """Length of the velocity, negative if it points against the heading; both are in the same frame."""
     speed = math.hypot(vx_mps, vy_mps)
     if heading_rad is None:
         return speed
@@ -159,9 +167,9 @@ def signed_speed_mps(vx_mps: float, vy_mps: float, heading_rad: float | None) ->
     return -speed if forward < 0.0 else speed
 
 
-@np.errstate(all="ignore")  # the tracker counts what is not finite
+@np.errstate(all="ignore")  # the tracker counts values that are not finite
 def speed_gradient(vx_mps: float, vy_mps: float) -> FloatArray:
-    """Derivative, shape (2,), of the length of the velocity; along x where that is 0."""
+    """Gradient, shape (2,), of the speed by the velocity; the x axis at velocity 0."""
     speed = math.hypot(vx_mps, vy_mps)
     return np.array([vx_mps, vy_mps]) / speed if speed > 0.0 else np.array([1.0, 0.0])
 
@@ -173,15 +181,16 @@ def covariance(
     twist: FloatArray | None = None,
     velocity: Any = None,
 ) -> tuple[float, ...] | None:
-    """Covariance of the measured `values` (position, yaw, speed), row-major; None where it does not cover them all.
-    `pose` is the covariance of x, y and yaw, shape (3, 3), `twist` begins with that of `velocity`; None is "not known".
-    The variance of the speed is to first order.
+    """Row-major covariance of the measured `values` (position, yaw, speed); None if it does not cover all of them.
+
+    `pose` is the covariance of x, y and yaw, shape (3, 3). `twist` begins with the
+    covariance of `velocity`; the variance of the speed follows to first order. None
+    means unknown.
     """
     if pose is None:
         return None
-    from scipy.linalg import (
-        block_diag,
-    )  # takes a tenth of a second to import, and most recordings do not need it
+    # The import takes a tenth of a second, and most recordings do not need it.
+    from scipy.linalg import block_diag
 
     variance = 0.0
     if twist is not None:
@@ -189,11 +198,12 @@ def covariance(
         variance = float(direction @ twist[:2, :2] @ direction)
     index = [row for row, name in enumerate(MEASURABLE) if values.get(name) is not None]
     chosen = block_diag(pose, [variance])[np.ix_(index, index)]
-    return (
-        None if (np.diag(chosen) <= 0.0).any() else tuple(chosen.ravel().tolist())
-    )  # 0 and -1 are "not known" in ROS
+    # The variances 0 and -1 mean unknown in ROS.
+    if (np.diag(chosen) <= 0.0).any():
+        return None
+    return tuple(chosen.ravel().tolist())
 
 
 def planar(covariance36: Sequence[float]) -> FloatArray:
-    """Covariance of x, y and their rotation, shape (3, 3), from the 36 values of a pose's or twist's covariance."""
+    """Covariance of x, y and the rotation about z, shape (3, 3), from the 36 values of a ROS covariance."""
     return np.asarray(covariance36, dtype=float).reshape(6, 6)[np.ix_(PLANAR, PLANAR)]

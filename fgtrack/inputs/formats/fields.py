@@ -1,4 +1,4 @@
-"""Mapped fields: components of messages and tables, read by the paths that the configuration gives them."""
+"""Mapped fields: values of messages and tables, read at the paths in the configuration."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -24,14 +24,17 @@ from fgtrack.inputs.settings import Field, FieldPath
 from fgtrack.models.measurement import ANGULAR
 
 COMPONENTS = ("object_id", *MEASURABLE, *GEODETIC, *DESCRIBING)
-"""Mapped components of a detection."""
+"""Components of a detection that can be mapped."""
 OBJECT_FIELDS = frozenset({"objects", "stamp", "object_stamp", *COMPONENTS})
-"""Names in the `fields` of an object list: `objects` is the path of the list, `stamp` that of the
-message's time (default `header.stamp`); the others are paths in one object."""
+"""Names in the `fields` of an object list.
+
+`objects` is the path of the list, `stamp` the path of the message's time (default
+`header.stamp`). The other names map paths in one object.
+"""
 EGO_FIELDS = frozenset({"stamp", "in_pit", *STATE_NAMES, *GEODETIC})
 """Names in the `fields` of the ego."""
 
-#: Conversions of the components that are not numbers.
+#: Conversion by component, for components that are not real numbers.
 _CONVERSIONS: Mapping[str, Callable[[Any], Any]] = {
     "object_id": object_id,
     "id": identity,
@@ -41,36 +44,38 @@ _CONVERSIONS: Mapping[str, Callable[[Any], Any]] = {
 
 
 class FieldError(Exception):
-    """A path does not lead to a valid value; the reader of the recording adds where."""
+    """A path leads to no valid value; the reader of the recording adds the position."""
 
 
 def mapped(
     fields: Mapping[str, FieldPath], names: Iterable[str], read: Callable[[str], Any]
-) -> dict[
-    str, Any
-]:  # Any: a value as recorded, and as `EgoState`, `Detection` and `TruthState` take it
-    """Values of those of `names` that `fields` maps, by name; `read` gives the recorded value at a path, or None."""
+) -> dict[str, Any]:  # Any: arguments of `EgoState`, `Detection` and `TruthState`
+    """Return the mapped components among `names`, by name; `read` returns the recorded value at a path, or None."""
     return {
         name: _component(name, fields[name], read) for name in names if name in fields
     }
 
 
 def paths_of(path: FieldPath) -> list[str]:
-    """The recorded fields that a component is read from."""
+    """Paths of the recorded fields of a component."""
     path = path.path if isinstance(path, Field) else path
     return [path] if isinstance(path, str) else list(path)
 
 
 def single_path(path: FieldPath) -> str:
-    """The recorded field of a component that is not a number. Raises `FieldError` for a vector."""
+    """Path of the recorded field of a component that is not a number; raises `FieldError` for several paths."""
     paths = paths_of(path)
     if len(paths) != 1:
-        raise FieldError(f"{paths}: the name of one field is needed, not several")
+        raise FieldError(f"{paths}: a single field is needed, name one of them")
     return paths[0]
 
 
 def _component(name: str, path: FieldPath, read: Callable[[str], Any]) -> Any:
-    """The value, converted; an angle is wrapped, but not above 1.5 turns of radians, which may be degrees."""
+    """Read and convert a component.
+
+    An angle is wrapped if it was converted. Above 1.5 turns it is wrapped only if
+    `degrees` is set, because it may be in degrees.
+    """
     if name in _CONVERSIONS:
         value = read(single_path(path))
         return None if value is None else _CONVERSIONS[name](value)
@@ -83,11 +88,9 @@ def _component(name: str, path: FieldPath, read: Callable[[str], Any]) -> Any:
         return raw
     value = path.value(raw)
     wraps = path.degrees or (path.offset != 0.0 and abs(value) <= 3.0 * math.pi)
-    return (
-        wrap_angle(value)
-        if wraps and name in ANGULAR and math.isfinite(value)
-        else value
-    )
+    if wraps and name in ANGULAR and math.isfinite(value):
+        return wrap_angle(value)
+    return value
 
 
 def _float(value: Any, path: str) -> float | None:
@@ -105,8 +108,9 @@ def objects_by_fields(
     fields: Mapping[str, FieldPath],
     plane: LocalPlane | None = None,
 ) -> ObjectList:
-    """Object list of `message`; without `objects` in `fields` the message itself is the one object."""
-    objects, plane = [], plane or LocalPlane()
+    """Object list of `message`; without `objects` in `fields`, the message itself is the only object."""
+    objects = []
+    plane = plane or LocalPlane()
     for item in items_by_fields(message, fields):
         stamp = (
             _time(item, fields["object_stamp"]) if "object_stamp" in fields else None
@@ -121,7 +125,7 @@ def objects_by_fields(
 def items_by_fields(
     message: RosMessage, fields: Mapping[str, FieldPath]
 ) -> list[RosMessage]:
-    """The objects of `message` as they are in it, in the order of `objects_by_fields`."""
+    """Recorded objects of `message`, in the order of `objects_by_fields`."""
     if "objects" not in fields:
         return [message]
     path = single_path(fields["objects"])
@@ -137,7 +141,7 @@ def ego_by_fields(
     receipt_ns: int,
     plane: LocalPlane | None = None,
 ) -> EgoState:
-    """The ego's state; `x_m`, `y_m`, `yaw_rad` and `speed_mps` must be among `fields`."""
+    """State of the ego; `fields` must contain `x_m`, `y_m`, `yaw_rad` and `speed_mps`."""
     stamp = _message_stamp(message, fields)
     plane = plane or LocalPlane()
     values = plane.in_plane(
@@ -147,7 +151,7 @@ def ego_by_fields(
 
 
 def value_at(message: RosMessage, path: str) -> RosMessage:
-    """Return the value at `path`: attributes, or indices of a list, with dots between. Raises `FieldError`."""
+    """Return the value at `path`: names of attributes or indices of lists, joined by dots. Raises `FieldError`."""
     value = message
     for part in path.split("."):
         try:
@@ -159,7 +163,7 @@ def value_at(message: RosMessage, path: str) -> RosMessage:
                 if not name.startswith("_")
             ]
             raise FieldError(
-                f"{path}: there is no {part!r}, but {', '.join(names) or 'no fields'}"
+                f"{path}: there is no field {part!r}; there are {', '.join(names) or 'no fields'}"
             ) from error
     return value
 
@@ -171,7 +175,7 @@ def _message_stamp(message: RosMessage, fields: Mapping[str, FieldPath]) -> int 
 
 
 def _time(message: RosMessage, path: FieldPath) -> int:
-    """A ROS time, integer nanoseconds or float seconds."""
+    """Convert a ROS time, integer nanoseconds or float seconds to integer nanoseconds."""
     value = value_at(message, single_path(path))
     if hasattr(value, "nanosec"):
         return stamp_ns(value)
@@ -179,7 +183,10 @@ def _time(message: RosMessage, path: FieldPath) -> int:
 
 
 def fields_of(message: RosMessage) -> dict[str, Any]:
-    """Values of the fields of `message` by path: numbers, texts, yaws of quaternions, times in s, lists of objects."""
+    """Values of the fields of `message`, by path.
+
+    Numbers, texts, yaws of quaternions, times in s, and lists of objects.
+    """
     values: dict[str, Any] = {}
     for name in getattr(message, "__dataclass_fields__", ()):
         value = getattr(message, name)

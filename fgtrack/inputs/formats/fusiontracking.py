@@ -1,9 +1,11 @@
-"""The logs of the published tracker, TUMFTM/FusionTracking: what its node received, tick by tick.
+"""Logs of the published tracker TUMFTM/FusionTracking: the inputs of its node, tick by tick.
 
-`data_logs.csv` holds a row per tick with a JSON value in every cell. Choices that the logs leave open:
-- A row is written at the end of its tick: `time_ns` is the receipt of what is in it, an upper bound.
-- Objects are in the ego frame where the configuration names no other.
-- The published yaw is 0 along +y: the ego's, and that of objects in the map frame, get pi/2 added.
+`data_logs.csv` contains a row for each tick with a JSON value in every cell.
+Conventions that the logs do not specify:
+
+- A row is written at the end of its tick: `time_ns` is the receipt of its messages, an upper bound.
+- Objects are in the ego frame, unless the configuration names another frame.
+- The published yaw is 0 along +y: pi/2 is added to the yaw of the ego and of objects in the map frame.
 """
 
 import json
@@ -22,20 +24,22 @@ from fgtrack.inputs.source import FileFormat
 LOG_NAME = "data_logs.csv"
 _COLUMNS = ("time_ns", "detection_input", "ego_state")
 _NAMES = {"x": "x_m", "y": "y_m", "yaw": "yaw_rad", "v": "speed_mps"}
-# Parsed JSON, checked while it is read.
 Json = Any
+"""Parsed JSON, checked while it is read."""
 
 
 def read_log(folder: Path, frames: Mapping[str, Frame]) -> Iterator[Message]:
-    """Messages of the log in `folder` in receipt order, the ego before the detections of its tick.
-    `frames` are those of sensors whose objects are not in the ego frame. `DataError` follows the rows before a break.
+    """Yield the messages of the log in `folder` in receipt order, the ego before the detections of its tick.
+
+    `frames` contains the frames of sensors whose objects are not in the ego frame.
+    Raises `DataError` after the rows before a break.
     """
     file = folder / LOG_NAME
     with open_file(file) as lines:
         header = next(lines, b"").decode(errors="replace").rstrip("\n").split(";")
         last_ego_ns: int | None = None
         for number, line in enumerate(lines, 2):
-            with reported_as(f"{file}:{number}: is not a row of such a log"):
+            with reported_as(f"{file}:{number}: is not a row of a FusionTracking log"):
                 row = dict(
                     zip(header, line.decode().rstrip("\n").split(";"), strict=True)
                 )
@@ -99,9 +103,8 @@ def _lists(
 
 def _object(item: Json, frame: Frame) -> Detection:
     keys, state = item["keys"], item["state"]
-    if (
-        len(state) == len(keys) - 1
-    ):  # a yaw that the tracker adds from the map only after logging
+    # The published tracker adds the yaw from the map after logging.
+    if len(state) == len(keys) - 1:
         keys = [key for key in keys if key != "yaw"]
     values: dict[str, Any] = {
         _NAMES[key]: float(value)

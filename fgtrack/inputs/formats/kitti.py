@@ -1,16 +1,19 @@
 """The KITTI tracking data set: detections of road users, the ego's motion, and labelled truth at 10 Hz.
 
-Geiger, Lenz, Urtasun, "Are we ready for autonomous driving? The KITTI vision benchmark suite", CVPR 2012: a text file
-per sequence in `oxts/ calib/ label_02/`. Every other folder with such a file holds the detections of a sensor of that
-name, in a form of docs/recordings.md. Conventions that the data do not specify:
-- Frame k is at k x 0.1036 s, see `PERIOD_NS`, and received at once.
-- Labels are relative to the ego: truth is where they are seen from its dead-reckoned position, not the reported one.
-- The map begins where the ego does, in the Mercator projection of the development kit. The ego frame is that of the
-  inertial unit, levelled by its roll and pitch.
-- A bearing is from camera 2 and relative to the ego's heading: the sensor's `mount` has no yaw.
-- A box at the left or right border of the image shows a part of a car, whose middle is elsewhere: left out.
-- As in the data set's own evaluation neighbouring classes (a van for a car) and `DontCare` regions, with all behind
-  them as seen from camera 2, are ignored.
+Geiger, Lenz, Urtasun, "Are we ready for autonomous driving? The KITTI vision benchmark
+suite", CVPR 2012. The folders `oxts/ calib/ label_02/` contain a text file for each
+sequence. Every other folder with a file of this name contains the detections of a
+sensor, whose name is the folder's name; docs/recordings.md describes the forms.
+Conventions that the data set does not specify:
+
+- Frame k is at k x 0.1036 s (`PERIOD_NS`) and received without delay.
+- Labels are relative to the ego. The truth uses the ego's dead-reckoned position instead of the reported position.
+- The map begins at the ego's first position, in the Mercator projection of the development kit.
+- The ego frame is the frame of the inertial unit, levelled by its roll and pitch.
+- A bearing starts at camera 2 and is relative to the ego's heading: the sensor's `mount` has no yaw.
+- A box at the left or right border of the image shows a part of a car, so its centre is not the car's. It is left out.
+- As in the data set's own evaluation, neighbouring classes (a van for a car) are ignored, and `DontCare` regions with
+  everything behind them as seen from camera 2.
 """
 
 import math
@@ -43,32 +46,36 @@ _TYPES = (
     "Misc",
 )
 CLASS_NAMES: Mapping[str, str] = {name.lower(): name for name in _TYPES}
-"""Types of the data set by the names that detections get."""
+"""Types of the data set, by the class names of detections."""
 
 _LABELS = "label_02"
-#: Class, box in the image, score and box in space of a line, by its number of fields.
+#: Fields of class, image box, score and box in space, by the number of fields in a line.
 _FORMS = {
     6: (slice(0), slice(1, 5), slice(5, 6), slice(0)),
     15: (slice(1, 2), slice(2, 6), slice(6, 7), slice(7, 14)),
     17: (slice(2, 3), slice(6, 10), slice(0), slice(10, 17)),
     18: (slice(2, 3), slice(6, 10), slice(17, 18), slice(10, 17)),
 }
-_CLASSES = {"1": "Pedestrian", "2": "Car", "3": "Cyclist"}  # numbers of AB3DMOT
+#: Classes by their numbers in AB3DMOT's files.
+_CLASSES = {"1": "Pedestrian", "2": "Car", "3": "Cyclist"}
 _NEIGHBOURS: Mapping[str, str] = {"Car": "Van", "Pedestrian": "Person_sitting"}
 _BORDER_PX = 2.0
-_NOWHERE_M = -999.0  # a box without a position is at -1000
-_CAR_HEIGHT_M, _INSIDE = (
-    1.5,
-    0.5,
-)  # as high and as far inside a region that it counts as in it
+#: A box without a position is at -1000.
+_NOWHERE_M = -999.0
+#: A region begins at the distance where this share of a car of this height fills the region's height.
+_CAR_HEIGHT_M = 1.5
+_INSIDE = 0.5
+#: Distance from camera 2 to the far end of a region.
 _FAR_M = 150.0
 
 
 def read_sequence(
     folder: Path, sequence: str, settings: KittiInput
 ) -> Iterator[Message]:
-    """Messages of `sequence` in receipt order; at a frame the truth comes first, then the ego, then the detections.
-    Raises `DataError` where a file is missing, and after all messages of earlier frames where a line is damaged.
+    """Yield the messages of `sequence` in receipt order; in a frame the truth, then the ego, then the detections.
+
+    Raises `DataError` if a file is missing; for a damaged line, after all messages of
+    earlier frames.
     """
     views, error = read_views(folder, sequence)
     damages = [] if error is None else [(len(views), error)]
@@ -118,19 +125,21 @@ def _by_frame(
     parse: Callable[[View, list[str]], Any],
     damages: list[tuple[int, DataError]],
 ) -> Mapping[int, list[Any]]:
-    """Results of `parse` for the lines of `file`, by frame; a damaged line is added to `damages` with its frame."""
-    latest, by_frame = 0, defaultdict(list)
+    """Return the results of `parse` for the lines of `file`, by frame.
+
+    Frame and error of a damaged line are added to `damages`.
+    """
+    latest = 0
+    by_frame = defaultdict(list)
     try:
         for where, fields in lines_of(file):
-            with (
-                reported_as(where),
-                np.errstate(all="ignore"),
-            ):  # the tracker counts what is not finite
+            # The tracker counts values that are not finite.
+            with reported_as(where), np.errstate(all="ignore"):
                 frame = int(fields[0])
                 latest = max(latest, frame)
                 if not 0 <= frame < len(views):
                     raise ValueError(
-                        f"of frame {frame}, but {OXTS} has {len(views)} frames"
+                        f"frame {frame} does not exist, {OXTS} has {len(views)} frames"
                     )
                 by_frame[frame].append(parse(views[frame], fields))
     except DataError as error:
@@ -139,7 +148,7 @@ def _by_frame(
 
 
 def _in_image(detector: Path, frames: Mapping[int, list[Detection | str]]) -> bool:
-    """True if the detections of a file are bearings from the camera."""
+    """True if the detections of a file are bearings from the camera, False if they have positions."""
     kinds = {
         item.x_m is None
         for items in frames.values()
@@ -148,13 +157,16 @@ def _in_image(detector: Path, frames: Mapping[int, list[Detection | str]]) -> bo
     }
     if len(kinds) > 1:
         raise DataError(
-            f"{detector}: some boxes have a position, others are in the image alone: give each a folder"
+            f"{detector}: some boxes have a position, others only a box in the image: put each kind into its own folder"
         )
     return kinds == {True}
 
 
 def view_of_sequence(path: Path) -> list[View]:
-    """The ego at every frame of the sequence that `path`, a folder or a file of `oxts/`, means; raises as a reader."""
+    """Return the ego at every frame of a sequence; `path` is its folder, or its file in `oxts/`.
+
+    Raises as `read_sequence`.
+    """
     views, error = read_views(*_folder_and_sequence(path))
     if error is not None:
         raise error
@@ -164,21 +176,25 @@ def view_of_sequence(path: Path) -> list[View]:
 def _folder_and_sequence(
     path: Path, named: int | str | None = None
 ) -> tuple[Path, str]:
-    """Folder and name of the sequence that `path`, a folder or a file of `oxts/`, and `named` mean."""
+    """Folder and name of a sequence.
+
+    `path` is the folder, or a file of `oxts/`; `named` is the number or name of the
+    sequence in a folder with several.
+    """
     if path.is_file():
         return path.parent.parent, path.stem
     known = sorted(file.stem for file in (path / OXTS).glob("*.txt"))
     sequence = f"{named:04d}" if isinstance(named, int) else named or known[0]
     if sequence not in known or (named is None and len(known) > 1):
         raise CallError(
-            f"{path}: holds the sequences {', '.join(known)}, name one of them: input.kitti.sequence, or its file "
+            f"{path}: contains the sequences {', '.join(known)}: set input.kitti.sequence, or give the file of one, "
             f"{path / OXTS}/{known[0]}.txt"
         )
     return path, sequence
 
 
 def is_sequence(path: Path) -> bool:
-    """True if `path` is a folder of the data set, or a file of its `oxts/`."""
+    """True if `path` is a folder of the data set, or a file in its `oxts/`."""
     folder = path.parent.parent if path.is_file() and path.parent.name == OXTS else path
     return any((folder / OXTS).glob("*.txt")) and (folder / CALIB).is_dir()
 
@@ -193,7 +209,7 @@ FORMAT = FileFormat(
 
 
 def _truth(settings: KittiInput, view: View, fields: list[str]) -> TruthState | None:
-    """The object or region of a label; None for other classes."""
+    """True state of a label's object, or of an ignored region; None for classes that are not read."""
     kind, ego = fields[2], view.ego
     if kind == "DontCare":
         return _region(view, *map(float, fields[6:10]))
@@ -239,10 +255,10 @@ def _region(
 def _detection(
     settings: KittiInput, sensor: str, view: View, fields: list[str]
 ) -> Detection | str:
-    """The object of a line, or the setting that excludes it."""
+    """Detection of a line, or the setting that excludes it."""
     if len(fields) not in _FORMS:
         raise ValueError(
-            f"{len(fields)} fields instead of 6 (a box in the image), 15 (AB3DMOT), 17 or 18 (KITTI)"
+            f"it has {len(fields)} fields instead of 6 (a box in the image), 15 (AB3DMOT), 17 or 18 (KITTI)"
         )
     kinds, image, scores, space = (fields[part] for part in _FORMS[len(fields)])
     kind = _CLASSES.get(kinds[0], kinds[0]) if kinds else ""

@@ -1,4 +1,4 @@
-"""Where things of a KITTI sequence are: calibration, the ego at every frame, from camera to ego frame and back."""
+"""Geometry of a KITTI sequence: calibration, the ego at every frame, transforms between camera and ego frame."""
 
 import math
 from collections.abc import Iterator
@@ -19,20 +19,22 @@ from fgtrack.models.dead_reckoning import (
     estimate_position,
 )
 
-OXTS, CALIB = "oxts", "calib"
+OXTS = "oxts"
+CALIB = "calib"
 PERIOD_NS = 103_600_000
-"""As the times that the odometry benchmark gives of such drives: the LiDAR turns 9.65 times a second."""
+"""Period of the frames, as in the odometry benchmark's times of such drives: the LiDAR turns 9.65 times a second."""
 IMAGE_PX = (1242.0, 375.0)
-"""Width and height of the images; of some sequences a few pixels less."""
+"""Width and height of the images; some sequences have a few pixels less."""
 
-_LARGEST_MB = 16.0  # those of the data set have a few
+#: Largest text file; the data set's files have a few MB.
+_LARGEST_MB = 16.0
 _EARTH_RADIUS_M = 6_378_137.0
-#: Of the inertial and satellite navigation (OxTS RT3003): its position wanders by 0.5 m, its velocity errs by 0.03 m/s.
+#: Errors of the inertial and satellite navigation (OxTS RT3003): 0.5 m of drifting position, 0.03 m/s of velocity.
 _EGO_ERRORS = ReportedErrors(0.5**2, 20.0, 0.03**2)
 
 
 class Box(NamedTuple):
-    """A box in space, as labels and results give it: in the rectified camera frame, by the middle of its bottom."""
+    """A box in space, as in labels and results: the centre of its bottom face in the rectified camera frame."""
 
     height_m: float
     width_m: float
@@ -45,42 +47,42 @@ class Box(NamedTuple):
     def image_px(
         self, projection: FloatArray
     ) -> tuple[float, float, float, float] | None:
-        """Left, top, right and bottom of what camera 2, of that `projection`, sees of it; None where it does not."""
+        """Left, top, right and bottom of the box in the image of camera 2; None if the box is not visible.
+
+        `projection` is the projection of camera 2, as in `View`.
+        """
         signs = np.array(
             [[a, b, c] for a in (-0.5, 0.5) for b in (-1.0, 0.0) for c in (-0.5, 0.5)]
         )
         corners = signs * np.array([self.length_m, self.height_m, self.width_m])
-        corners[:, ::2] = corners[:, ::2] @ rotation(
-            self.rotation_y_rad
-        )  # about y, which points down
+        # The rotation is about y, which points down.
+        corners[:, ::2] = corners[:, ::2] @ rotation(self.rotation_y_rad)
         corners += np.array([self.x_m, self.y_m, self.z_m])
         points = np.column_stack([corners, np.ones(8)]) @ projection.T
         points = points[points[:, 2] > 0.1]
         if not len(points):
             return None
         pixels = points[:, :2] / points[:, 2:]
-        low, high = (
-            np.maximum(pixels.min(axis=0), 0.0),
-            np.minimum(pixels.max(axis=0), np.array(IMAGE_PX) - 1.0),
-        )
+        low = np.maximum(pixels.min(axis=0), 0.0)
+        high = np.minimum(pixels.max(axis=0), np.array(IMAGE_PX) - 1.0)
         return (*low.tolist(), *high.tolist()) if (low < high).all() else None
 
 
 class View(NamedTuple):
-    """The ego at a frame, how the inertial unit is tilted, and the calibration."""
+    """The ego at a frame, the tilt of the inertial unit, and the calibration."""
 
     ego: EgoState
     levelled_from_imu: FloatArray
-    """Shape (3, 3)."""
+    """Rotation from the frame of the inertial unit to the ego frame, shape (3, 3)."""
     projection: FloatArray
-    """Image point of camera 2, homogeneous, from a point in the rectified frame of camera 0, shape (3, 4)."""
+    """Projection to homogeneous image points of camera 2 from the rectified frame of camera 0, shape (3, 4)."""
     rectified_from_imu: FloatArray
-    """Shape (4, 4)."""
-    reckoned: PositionEstimate
-    """Position of the ego, which labels are relative to, without steps of what it reports."""
+    """Transform from the frame of the inertial unit to the rectified frame of camera 0, shape (4, 4)."""
+    estimate: PositionEstimate
+    """Dead-reckoned position of the ego, without the steps of the reported positions; labels are relative to it."""
 
     def position_m(self, rectified_m: list[float]) -> FloatArray:
-        """Point in the ego frame, shape (3,)."""
+        """Position in the ego frame, shape (3,), of a point in the rectified camera frame."""
         return (
             self.levelled_from_imu
             @ np.linalg.solve(self.rectified_from_imu, [*rectified_m, 1.0])[:3]
@@ -89,14 +91,14 @@ class View(NamedTuple):
     def pose(
         self, x_m: float, y_m: float, z_m: float, rotation_y_rad: float
     ) -> tuple[FloatArray, float]:
-        """Position (3,) and yaw in the ego frame of an object given in the rectified camera frame."""
+        """Position (3,) and yaw in the ego frame of an object in the rectified camera frame."""
         heading = [math.cos(rotation_y_rad), 0.0, -math.sin(rotation_y_rad)]
         return self.position_m([x_m, y_m, z_m]), self._azimuth_rad(heading)
 
     def rectified(
         self, position_m: FloatArray, yaw_rad: float
     ) -> tuple[FloatArray, float]:
-        """Position (3,) and rotation about y in the rectified camera frame, the inverse of `pose`."""
+        """Position (3,) and rotation about y in the rectified camera frame: the inverse of `pose`."""
         turn = self.rectified_from_imu[:3, :3] @ self.levelled_from_imu.T
         heading = turn @ [math.cos(yaw_rad), math.sin(yaw_rad), 0.0]
         return turn @ position_m + self.rectified_from_imu[:3, 3], math.atan2(
@@ -104,15 +106,15 @@ class View(NamedTuple):
         )
 
     def bearing_rad(self, u_px: float, v_px: float) -> float:
-        """Bearing of an image point from camera 2, 0 along the ego's heading."""
+        """Bearing of an image point from camera 2; 0 along the ego's heading."""
         return self._azimuth_rad(
             np.linalg.solve(self.projection[:, :3], [u_px, v_px, 1.0]).tolist()
         )
 
     def in_map(self, position_m: FloatArray) -> FloatArray:
-        """Points in the map, shape (..., 2), from those in the ego frame."""
+        """Positions in the map, shape (..., 2), of points in the ego frame."""
         return (
-            np.array(self.reckoned.position_m)
+            np.array(self.estimate.position_m)
             + position_m[..., :2] @ rotation(self.ego.yaw_rad).T
         )
 
@@ -123,7 +125,10 @@ class View(NamedTuple):
 
 
 def lines_of(file: Path) -> Iterator[tuple[str, list[str]]]:
-    """Start of the message about a line of `file`, and the fields of the line, which blanks or commas separate."""
+    """Yield for each line of `file` the start of an error message, and the line's fields.
+
+    Blanks or commas separate the fields.
+    """
     text = read_whole(file, _LARGEST_MB).decode(errors="replace").rstrip()
     for number, line in enumerate(text.splitlines(), 1):
         fields = line.strip().split(",") if "," in line else line.split()
@@ -131,7 +136,7 @@ def lines_of(file: Path) -> Iterator[tuple[str, list[str]]]:
 
 
 def _calibration(file: Path) -> tuple[FloatArray, FloatArray]:
-    """Return `projection` and `rectified_from_imu` of a view."""
+    """Return `projection` and `rectified_from_imu` of `View`."""
     matrices = {}
     for where, (name, *values) in lines_of(file):
         with reported_as(where):
@@ -146,21 +151,21 @@ def _calibration(file: Path) -> tuple[FloatArray, FloatArray]:
             np.vstack([matrices[name].reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
             for name in ("Tr_velo_cam", "Tr_imu_velo")
         )
-        projection, rectified_from_imu = (
-            matrices["P2"].reshape(3, 4),
-            rectified_from_camera @ camera_from_velodyne @ velodyne_from_imu,
+        projection = matrices["P2"].reshape(3, 4)
+        rectified_from_imu = (
+            rectified_from_camera @ camera_from_velodyne @ velodyne_from_imu
         )
         for name, matrix in (
             ("P2", projection[:, :3]),
             ("R_rect and Tr", rectified_from_imu[:3, :3]),
         ):
             if np.linalg.matrix_rank(matrix) < len(matrix):
-                raise ValueError(f"{name} cannot be inverted")
+                raise ValueError(f"the matrix {name} is singular")
         return projection, rectified_from_imu
 
 
 def read_views(folder: Path, sequence: str) -> tuple[list[View], DataError | None]:
-    """Ego at every frame of a sequence, up to a line that is not one of the data set, and the error of that."""
+    """Return the ego at the frames of a sequence up to the first malformed line, and the error of this line."""
     calibration = _calibration(folder / CALIB / f"{sequence}.txt")
     views: list[View] = []
     scale, origin_m = 1.0, np.zeros(2)
@@ -196,24 +201,23 @@ def read_views(folder: Path, sequence: str) -> tuple[list[View], DataError | Non
                 )
                 about_x, about_y = np.eye(3), np.eye(3)
                 about_x[1:, 1:] = rotation(roll_rad)
-                about_y[::2, ::2] = rotation(
-                    -pitch_rad
-                )  # rows and columns x and z, which y turns from z to x
+                # Rows and columns x and z: a rotation about y turns z to x.
+                about_y[::2, ::2] = rotation(-pitch_rad)
                 velocity_mps = (
                     speed_mps * math.cos(yaw_rad),
                     speed_mps * math.sin(yaw_rad),
                 )
-                last = views[-1].reckoned if views else None
-                own = estimate_position(
+                last = views[-1].estimate if views else None
+                estimate = estimate_position(
                     last, stamp_ns, (x_m, y_m), velocity_mps, _EGO_ERRORS
                 )
-                views.append(View(ego, about_y @ about_x, *calibration, own))
+                views.append(View(ego, about_y @ about_x, *calibration, estimate))
     except DataError as error:
         return views, error
     return views, None
 
 
 def _mercator(latitude_deg: float, longitude_deg: float, scale: float) -> FloatArray:
-    """Position to the east and north, shape (2,), true to scale at the latitude whose cosine is `scale`."""
+    """Position to the east and north, shape (2,), true to scale at the latitude with the cosine `scale`."""
     north = math.log(math.tan(math.radians(45.0 + 0.5 * latitude_deg)))
     return scale * _EARTH_RADIUS_M * np.array([math.radians(longitude_deg), north])

@@ -1,4 +1,4 @@
-"""fgtrack's own messages in a recording: every field of the core types, to the bit."""
+"""Adapters of fgtrack's own message types: every field of the core types, exact to the bit."""
 
 from collections.abc import Callable
 from dataclasses import fields
@@ -22,12 +22,14 @@ EGO, DETECTIONS, TRUTH = (
 #: Optional fields in the order of the bits of `present`.
 DETECTION_OPTIONAL = (*MEASURABLE, "covariance", "stamp_ns", "object_id", *DESCRIBING)
 TRUTH_OPTIONAL = (*STATE_NAMES[2:], "outline_m")
-#: Fields that hold numbers in a list, and those that hold a text.
-LISTS, TEXTS = frozenset({"covariance", "outline_m"}), frozenset({"class_name", "id"})
+#: Fields with a list of numbers.
+LISTS = frozenset({"covariance", "outline_m"})
+#: Fields with a text.
+TEXTS = frozenset({"class_name", "id"})
 
 
 def _given(message: RosMessage) -> dict[str, RosMessage]:
-    """Fields behind `present` that were given."""
+    """Values of the optional fields whose bits are set in `present`."""
     names = _optional(message.__class__)
     given = {
         name: getattr(message, name)
@@ -42,16 +44,15 @@ def _given(message: RosMessage) -> dict[str, RosMessage]:
 
 @cache
 def _optional(kind: RosMessage) -> tuple[str, ...]:
-    """Names behind `present`; their order is that of the recording, whatever wrote it."""
+    """Names of the fields after `present`, in the order of the recording's definition."""
     names = [field.name for field in fields(kind)]
     return tuple(names[names.index("present") + 1 :])
 
 
 def ego(message: RosMessage, receipt_ns: int) -> EgoState:
-    """The ego's state of a `fgtrack_msgs/Ego`."""
-    covariance: RosMessage = getattr(
-        message, "covariance", ()
-    )  # recordings of 0.1.0 have none
+    """State of the ego from a `fgtrack_msgs/Ego`."""
+    # Recordings of fgtrack 0.1.0 have no covariance.
+    covariance: RosMessage = getattr(message, "covariance", ())
     return EgoState(
         stamp_ns(message.header.stamp),
         receipt_ns,
@@ -62,37 +63,37 @@ def ego(message: RosMessage, receipt_ns: int) -> EgoState:
 
 
 def detections(message: RosMessage, receipt_ns: int) -> DetectionList:
-    """The object list of a `fgtrack_msgs/DetectionList`."""
+    """Object list from a `fgtrack_msgs/DetectionList`."""
     objects = tuple(Detection(**_given(item)) for item in message.objects)
     stamp = stamp_ns(message.header.stamp)
-    origin_deg: RosMessage = getattr(
-        message, "origin_deg", ()
-    )  # recordings of 0.3.0 have none
-    own = tuple(origin_deg.tolist()) if len(origin_deg) else None
+    # Recordings of fgtrack 0.3.0 have no origin.
+    origin_deg: RosMessage = getattr(message, "origin_deg", ())
+    origin = tuple(origin_deg.tolist()) if len(origin_deg) else None
     return DetectionList(
         message.sensor,
         stamp,
         receipt_ns,
         objects,
         message.header.frame_id,
-        origin_deg=own,
+        origin_deg=origin,
     )
 
 
 def truth(message: RosMessage, receipt_ns: int) -> TruthState:
-    """The true state of a `fgtrack_msgs/Truth`."""
+    """True state from a `fgtrack_msgs/Truth`."""
     return TruthState(
         stamp_ns(message.header.stamp),
         receipt_ns,
         message.object_id,
         message.x_m,
         message.y_m,
-        ignored=getattr(message, "ignored", False),  # recordings of 0.1.0 have none
+        # Recordings of fgtrack 0.1.0 have no `ignored`.
+        ignored=getattr(message, "ignored", False),
         **_given(message),
     )
 
 
-#: What reads fgtrack's own message types, by type name.
+#: Adapters of fgtrack's own message types, by type name.
 NATIVE_ADAPTERS: dict[str, Callable[[RosMessage, int], Message]] = {
     EGO: ego,
     DETECTIONS: detections,

@@ -1,10 +1,13 @@
-"""NMEA 0183 logs of a receiver of AIS: positions of ships, read with pyais (extra `ais`).
+"""NMEA 0183 logs of an AIS receiver: positions of ships, read with pyais (extra `ais`).
 
-A report has the UTC second of its position (ITU-R M.1371-5, table 48), no minute and no date. The clock of the log is
-that of its tag blocks (`c:`), else of the receiver's own GNSS ($--RMC, ZDA, GLL, GGA); lines before its first time get
-that one. The receipt is the end of the second of this clock, the stamp the latest time of that second of the minute up
-to it. A second ahead by up to 3 s shows that this clock is late: then the receipt is the stamp. A report without a
-second has the receipt; those without a position or with errors are not read.
+A report has the UTC second of its position (ITU-R M.1371-5, table 48), but no minute
+and no date. The log's clock comes from its tag blocks (`c:`), else from the receiver's
+own GNSS ($--RMC, ZDA, GLL, GGA). Lines before the first time get the first time.
+
+The receipt is the end of the current second of this clock. The stamp is the latest time
+up to the receipt with the report's second. If the report's second is ahead by up to 3
+s, the clock is late, and the receipt is set to the stamp. A report without a second has
+the receipt as its stamp. Reports without a position, and damaged reports, are not read.
 """
 
 import math
@@ -31,23 +34,27 @@ _IS_AIS = re.compile(rb"^(\\[^\\]*\\)?!(AI|AB|BS)VD[MO],", re.MULTILINE)
 _TAG_TIME = re.compile(rb"^\\(?:[^\\]*,)?c:(\d+)")
 _OWN_TIME = re.compile(rb"\$..(RMC|ZDA|GLL|GGA),(.*)")
 _KNOT_MPS = 1852.0 / 3600.0
-_POSITIONS = frozenset(
-    {1, 2, 3, 9, 18, 19, 27}
-)  # message types of ships, and of aircraft in search and rescue
-_DAY_S, _MINUTE_S, _AHEAD_S = 86_400, 60, 3
-_NO_SPEED_KN, _NO_COURSE_DEG = 102.3, 360.0
+#: Message types with positions of ships, and of aircraft in search and rescue.
+_POSITIONS = frozenset({1, 2, 3, 9, 18, 19, 27})
+_DAY_S = 86_400
+_MINUTE_S = 60
+#: Largest lead of a report's second before the log's clock.
+_AHEAD_S = 3
+#: Values that mean "not available".
+_NO_SPEED_KN = 102.3
+_NO_COURSE_DEG = 360.0
 _MOVING_MPS = 0.5
 
 
 class _Clock:
-    """The clock of a log, line by line: seconds of UTC since 1970, or of the day where there is no date."""
+    """Clock of a log, advanced line by line: UTC seconds since 1970, or of the day if the log has no date."""
 
     def __init__(self, midnight_s: float = 0.0) -> None:
         self.now_s: float | None = None
         self._midnight_s = midnight_s
 
     def read(self, line: bytes) -> None:
-        """Set the time by `line` if it has one; it never goes back."""
+        """Advance the clock to the time in `line`, if the line has one; the clock never goes back."""
         if tag := _TAG_TIME.match(line):
             number = float(tag[1])
             self._advance(number / 1000.0 if number > 1e11 else number)
@@ -55,7 +62,10 @@ class _Clock:
             fields = own[2].decode("ascii", "replace").split("*")[0].split(",")
             try:
                 self._read_own(own[1].decode(), fields)
-            except (ValueError, IndexError):  # empty without a fix
+            except (
+                ValueError,
+                IndexError,
+            ):  # a receiver without a fix sends empty fields
                 return
 
     def _read_own(self, kind: str, fields: list[str]) -> None:
@@ -71,7 +81,8 @@ class _Clock:
                 .timestamp()
             )
         time_s = 3600.0 * int(text[:2]) + 60.0 * int(text[2:4]) + float(text[4:])
-        if kind in ("GLL", "GGA") and self.now_s is not None:  # beyond midnight
+        # These sentences have no date: choose the day nearest to the clock.
+        if kind in ("GLL", "GGA") and self.now_s is not None:
             time_s += _DAY_S * round((self.now_s - self._midnight_s - time_s) / _DAY_S)
         self._advance(self._midnight_s + time_s)
 
@@ -80,7 +91,7 @@ class _Clock:
 
 
 def read_log(file: Path, plane: LocalPlane) -> Iterator[DetectionList]:
-    """Lists of one report each, in the order of the file. Raises `DataError` for a log without a clock."""
+    """Yield lists of one report each, in the order of the file; raises `DataError` for a log without a clock."""
     from pyais import IterMessages
     from pyais.exceptions import AISBaseException
 
@@ -92,7 +103,7 @@ def read_log(file: Path, plane: LocalPlane) -> Iterator[DetectionList]:
                 break
     if first.now_s is None:
         raise DataError(
-            f"{file}: has no time: neither tag blocks (c:) nor $--RMC, ZDA, GLL or GGA"
+            f"{file}: has no time: a log needs tag blocks (c:), or sentences $--RMC, ZDA, GLL or GGA"
         )
     receipt_ns = -LARGEST_NS
     clock = _Clock(first.now_s - first.now_s % _DAY_S)
@@ -106,16 +117,12 @@ def read_log(file: Path, plane: LocalPlane) -> Iterator[DetectionList]:
         for sentence in IterMessages(read()):
             try:
                 item = _detection(report := sentence.decode(), plane)
-            except (
-                AISBaseException,
-                ValueError,
-                IndexError,
-                KeyError,
-            ):  # damaged by the radio link
-                continue
+            except (AISBaseException, ValueError, IndexError, KeyError):
+                continue  # the radio link damaged the report
             if item is not None:
                 receipt_s = (first.now_s if clock.now_s is None else clock.now_s) + 1.0
-                second, age_s = getattr(report, "second", _MINUTE_S), 0.0
+                second = getattr(report, "second", _MINUTE_S)
+                age_s = 0.0
                 if second < _MINUTE_S:
                     age_s = (receipt_s - second + _AHEAD_S) % _MINUTE_S - _AHEAD_S
                 stamp_ns = round((receipt_s - age_s) * NS_PER_S)
@@ -132,8 +139,8 @@ def read_log(file: Path, plane: LocalPlane) -> Iterator[DetectionList]:
 
 def _detection(
     report: Any, plane: LocalPlane
-) -> Detection | None:  # Any: pyais has a class of each message type
-    """The ship of a report; None where it has no position. Its course is left out where it hardly moves."""
+) -> Detection | None:  # Any: pyais has a class for each message type
+    """Detection of the ship in a report; None if the report has no position. A slow ship's course is left out."""
     if report.msg_type not in _POSITIONS:
         return None
     x_m, y_m = plane.position_m(report.lat, report.lon)
@@ -172,7 +179,7 @@ def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
         import pyais  # noqa: F401 - read_log needs it
     except ImportError as error:
         raise CallError(
-            f"{path}: is a log of AIS, install its reader: pip install 'fgtrack[ais]'"
+            f"{path}: is an AIS log, install the reader: pip install 'fgtrack[ais]'"
         ) from error
     plane = LocalPlane(config.origin)
     return lambda: merge(
@@ -180,4 +187,4 @@ def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
     )
 
 
-FORMAT = FileFormat("logs of AIS (NMEA 0183)", _recognises, _open)
+FORMAT = FileFormat("AIS logs (NMEA 0183)", _recognises, _open)

@@ -1,9 +1,11 @@
-"""nuScenes: boxes in the submission form of the data set, ego poses and truth from its tables.
+"""nuScenes: boxes in the data set's submission format, ego poses and truth from its tables.
 
-Caesar et al., "nuScenes: a multimodal dataset for autonomous driving", CVPR 2020. The input is the JSON file of results
-(`meta` and `results` by sample); the tables stand in a folder `v1.0-...` beside it. Boxes and truth are in the map
-frame, received at the stamp of their sample; the ego's speed and yaw rate are those between its poses. Truth that no
-sensor has a point of is ignored, as in the data set's own evaluation.
+Caesar et al., "nuScenes: a multimodal dataset for autonomous driving", CVPR 2020. The
+input is the JSON file of results (`meta`, and `results` by sample). The tables are in a
+folder `v1.0-...` next to the file. Boxes and truth are in the map frame and received at
+the stamp of their sample. The ego's speed and yaw rate are computed from successive
+poses. True objects without LiDAR or RADAR points are ignored, as in the data set's own
+evaluation.
 """
 
 import math
@@ -44,12 +46,12 @@ _CATEGORIES = {
     "vehicle.truck": "truck",
     "human.pedestrian": "pedestrian",
 }
-# Parsed JSON, checked while it is read.
 Json = Any
+"""Parsed JSON, checked while it is read."""
 
 
 def read_scene(file: Path, settings: NuscenesInput) -> Iterator[Message]:
-    """Messages of a scene in the order of receipt; at one stamp the truth first, then the ego, then the boxes."""
+    """Yield the messages of a scene in receipt order; at equal stamps the truth, then the ego, then the boxes."""
     tables = _tables(file, settings)
     with reported_as(f"{tables}: scene.json or sample.json is not a table of nuScenes"):
         samples = _samples(tables, file, settings)
@@ -78,33 +80,33 @@ def read_scene(file: Path, settings: NuscenesInput) -> Iterator[Message]:
 
 
 def _results(file: Path) -> Iterator[tuple[str, Json]]:
-    """Sample and its boxes, one after the other."""
+    """Yield each sample with its boxes."""
     entries = json_values(file, _OF_RESULTS)
     return zip(entries, entries, strict=True)
 
 
 def _tables(file: Path, settings: NuscenesInput) -> Path:
-    beside = sorted(each.parent for each in file.parent.glob("v1.0-*/ego_pose.json"))
+    folders = sorted(each.parent for each in file.parent.glob("v1.0-*/ego_pose.json"))
     if settings.tables is not None:
         folder = file.parent / settings.tables
     else:
-        folder = beside[0] if len(beside) == 1 else file.parent
+        folder = folders[0] if len(folders) == 1 else file.parent
     if not (folder / "ego_pose.json").is_file():
         raise CallError(
-            f"{file}: no folder with ego_pose.json is beside it, name one as input.nuscenes.tables"
+            f"{file}: no folder with ego_pose.json is next to the file, name the folder as input.nuscenes.tables"
         )
     return folder
 
 
 def _samples(tables: Path, file: Path, settings: NuscenesInput) -> dict[str, int]:
-    """Stamps of the samples of the scene, by token, in the order of time."""
+    """Stamps of the scene's samples, by token, in the order of time."""
     names = {each["token"]: each["name"] for each in json_values(tables / "scene.json")}
-    judged = {token for token, _ in _results(file)}
+    with_results = {token for token, _ in _results(file)}
     samples = [
         (each["timestamp"], each["token"], each["scene_token"])
         for each in json_values(tables / "sample.json")
     ]
-    scenes = {scene for _, token, scene in samples if token in judged}
+    scenes = {scene for _, token, scene in samples if token in with_results}
     if settings.scene is not None:
         scenes = {
             token for token, name in names.items() if settings.scene in (token, name)
@@ -112,7 +114,8 @@ def _samples(tables: Path, file: Path, settings: NuscenesInput) -> dict[str, int
     if len(scenes) != 1:
         choice = ", ".join(sorted(names[token] for token in scenes or names)[:5])
         raise CallError(
-            f"{file}: {len(scenes)} scenes, name one as input.nuscenes.scene: {choice} ..."
+            f"{file}: has {len(scenes)} scenes with this name or these samples, "
+            f"name one as input.nuscenes.scene: {choice} ..."
         )
     return {
         token: int(time_us) * _NS_PER_US
@@ -122,7 +125,7 @@ def _samples(tables: Path, file: Path, settings: NuscenesInput) -> dict[str, int
 
 
 def _egos(tables: Path, samples: Mapping[str, int]) -> list[EgoState]:
-    """The poses at the data of the samples, with the motion between them."""
+    """States of the ego at the samples' sensor data, with speed and yaw rate from successive poses."""
     wanted = {
         each["ego_pose_token"]
         for each in json_values(tables / "sample_data.json")
@@ -147,14 +150,14 @@ def _egos(tables: Path, samples: Mapping[str, int]) -> list[EgoState]:
 
 
 def _motion(
-    one: tuple[float, ...], other: tuple[float, ...], after_s: float
+    first: tuple[float, ...], second: tuple[float, ...], after_s: float
 ) -> tuple[float, float]:
-    """Speed along the yaw, and yaw rate, from one pose to another."""
-    middle_rad = one[2] + 0.5 * wrap_angle(other[2] - one[2])
-    vx_mps, vy_mps = (other[0] - one[0]) / after_s, (other[1] - one[1]) / after_s
-    return signed_speed_mps(vx_mps, vy_mps, middle_rad), wrap_angle(
-        other[2] - one[2]
-    ) / after_s
+    """Speed along the yaw, and yaw rate, between two poses (x, y, yaw)."""
+    turn_rad = wrap_angle(second[2] - first[2])
+    middle_rad = first[2] + 0.5 * turn_rad
+    vx_mps = (second[0] - first[0]) / after_s
+    vy_mps = (second[1] - first[1]) / after_s
+    return signed_speed_mps(vx_mps, vy_mps, middle_rad), turn_rad / after_s
 
 
 def _boxes(boxes: list[Json], settings: NuscenesInput) -> Iterator[Detection | str]:
@@ -245,7 +248,7 @@ def _recognises(path: Path) -> bool:
 
 
 FORMAT = FileFormat(
-    "results in the form of nuScenes (.json) with its tables beside it",
+    "nuScenes results (.json) with the data set's tables next to the file",
     _recognises,
     lambda path, config: partial(read_scene, path, config.nuscenes),
 )

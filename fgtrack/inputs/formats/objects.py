@@ -1,6 +1,7 @@
-"""Object lists of the message types in use, and the ego of odometry; each adapter gives all that a message measures.
+"""Adapters of common ROS message types: object lists, and the ego from odometry.
 
-A speed is negative where an object moves backwards. What is not a number stays so and is counted by the tracker.
+Each adapter reads all components that a message measures. A speed is negative if the
+object moves backwards. NaN stays NaN and is counted by the tracker.
 """
 
 import math
@@ -35,27 +36,30 @@ _AUTOWARE_CLASSES = (
     "bicycle",
     "pedestrian",
 )
-_ESR_NO_TARGET = 0  # status
+_ESR_NO_TARGET = 0  # a status
 _ID_MASK = (1 << 63) - 1
+#: Variance from which a driver means "unknown".
 _UNKNOWN = 1e3
 
 
 def detection3d_array(message: RosMessage) -> ObjectList:
-    """`vision_msgs/Detection3DArray`, versions 2 to 4: position and yaw.
-    The pose is that of the box, or of the first hypothesis where the box has no size; the covariance is the latter's.
+    """Object list of a `vision_msgs/Detection3DArray`, versions 2 to 4: position and yaw.
+
+    The pose is the box's; it is the first hypothesis's if the box has no size. The
+    covariance is the first hypothesis's.
     """
     return object_list(message.header, map(_detection3d, message.detections))
 
 
 def _detection3d(item: RosMessage) -> Detection:
-    pose, size = item.bbox.center, item.bbox.size
+    pose = item.bbox.center
+    size = item.bbox.size
     first = item.results[0] if len(item.results) else None
     hypothesis = getattr(first, "pose", None)
     if hypothesis is not None and size.x == size.y == size.z == 0.0:
         pose = hypothesis.pose
-    kind = getattr(
-        first, "hypothesis", first
-    )  # it holds class and score, whose names differ by version
+    # Class and score have different names in different versions.
+    kind = getattr(first, "hypothesis", first)
     name = getattr(kind, "class_id", getattr(kind, "id", None))
     identity = getattr(item, "id", "") or getattr(item, "tracking_id", "")
     values = {
@@ -77,7 +81,7 @@ def _detection3d(item: RosMessage) -> Detection:
 
 
 def _size(size: RosMessage, z_m: float | None = None) -> dict[str, Any]:
-    """Length, width and height, where there is a length, and the height of the middle."""
+    """Length, width and height of a box with a length, and the height `z_m` of its centre; else empty."""
     return (
         {"z_m": z_m, "length_m": size.x, "width_m": size.y, "height_m": size.z}
         if size.x > 0.0
@@ -86,14 +90,16 @@ def _size(size: RosMessage, z_m: float | None = None) -> dict[str, Any]:
 
 
 def autoware_objects(message: RosMessage) -> ObjectList:
-    """`DetectedObjects` and `TrackedObjects` of autoware_perception_msgs and of autoware_auto_perception_msgs.
-    Position, yaw where its sign is not in doubt, speed where there is a twist, which is in the object's own frame.
+    """Object list of Autoware's `DetectedObjects` or `TrackedObjects`, in either message package.
+
+    Position; yaw if its sign is certain; speed if there is a twist, which is in the
+    object's own frame.
     """
     return object_list(message.header, map(_autoware_object, message.objects))
 
 
 def _autoware_object(item: RosMessage) -> Detection:
-    """A detected object, which may lack twist and covariances, or a tracked one, which has an id."""
+    """Detection from a detected object, which may lack twist and covariances, or from a tracked object with an id."""
     kinematics = item.kinematics
     has_twist = getattr(kinematics, "has_twist", True)
     pose = kinematics.pose_with_covariance.pose
@@ -110,10 +116,8 @@ def _autoware_object(item: RosMessage) -> Detection:
         if has_twist
         else None,
     }
-    pose_covariance, has_twist_covariance = (
-        None,
-        getattr(kinematics, "has_twist_covariance", True),
-    )
+    pose_covariance = None
+    has_twist_covariance = getattr(kinematics, "has_twist_covariance", True)
     if getattr(kinematics, "has_position_covariance", True):
         pose_covariance = planar(kinematics.pose_with_covariance.covariance)
     label = (
@@ -139,7 +143,10 @@ def _autoware_object(item: RosMessage) -> Detection:
 
 
 def delphi_esr(message: RosMessage) -> ObjectList:
-    """`delphi_esr_msgs/EsrTrack`, one track of a Delphi (Aptiv) ESR, whose angles are in degrees, clockwise."""
+    """Object list of a `delphi_esr_msgs/EsrTrack`: one track of a Delphi (Aptiv) ESR.
+
+    Its angles are in degrees, clockwise.
+    """
     bearing_rad = -math.radians(message.angle)
     track = Detection(
         range_m=float(message.range),
@@ -154,7 +161,7 @@ def delphi_esr(message: RosMessage) -> ObjectList:
 
 
 def radar_tracks(message: RosMessage) -> ObjectList:
-    """`radar_msgs/RadarTracks`: position and speed; the radar gives no heading."""
+    """Object list of a `radar_msgs/RadarTracks`: position and speed; there is no heading."""
     return object_list(message.header, map(_radar_track, message.tracks))
 
 
@@ -168,9 +175,13 @@ def _radar_track(item: RosMessage) -> Detection:
         "speed_mps": signed_speed_mps(velocity.x, velocity.y, None),
     }
     pose = block_diag(_planar_triangle(item.position_covariance), [0.0])
-    own = covariance(values, pose, _planar_triangle(item.velocity_covariance), velocity)
     return Detection(
-        **values, covariance=own, object_id=_uuid(item.uuid), **_size(item.size)
+        **values,
+        covariance=covariance(
+            values, pose, _planar_triangle(item.velocity_covariance), velocity
+        ),
+        object_id=_uuid(item.uuid),
+        **_size(item.size),
     )
 
 
@@ -184,7 +195,7 @@ def _planar_triangle(triangle: RosMessage) -> np.ndarray:
 
 
 def pose_array(message: RosMessage) -> ObjectList:
-    """`geometry_msgs/PoseArray`: position and yaw."""
+    """Object list of a `geometry_msgs/PoseArray`: position and yaw."""
     values = (
         (each.position.x, each.position.y, yaw_rad(each.orientation))
         for each in message.poses
@@ -193,7 +204,10 @@ def pose_array(message: RosMessage) -> ObjectList:
 
 
 def odometry(message: RosMessage) -> ObjectList:
-    """`nav_msgs/Odometry` of one object: position, yaw, speed; the twist is in the object's own frame."""
+    """Object list of the `nav_msgs/Odometry` of one object: position, yaw and speed.
+
+    The twist is in the object's own frame.
+    """
     pose, velocity = message.pose.pose, message.twist.twist.linear
     values = {
         "x_m": pose.position.x,
@@ -201,17 +215,20 @@ def odometry(message: RosMessage) -> ObjectList:
         "yaw_rad": yaw_rad(pose.orientation),
         "speed_mps": signed_speed_mps(velocity.x, velocity.y, 0.0),
     }
-    own = covariance(
+    measured = covariance(
         values,
         planar(message.pose.covariance),
         planar(message.twist.covariance),
         velocity,
     )
-    return object_list(message.header, [Detection(**values, covariance=own)])
+    return object_list(message.header, [Detection(**values, covariance=measured)])
 
 
 def ego_from_odometry(message: RosMessage, receipt_ns: int) -> EgoState:
-    """`nav_msgs/Odometry`: pose in the map, twist in the ego's own frame; an unknown yaw is NaN."""
+    """State of the ego from a `nav_msgs/Odometry`: pose in the map, twist in the ego's own frame.
+
+    An unknown yaw is NaN.
+    """
     pose, twist = message.pose.pose, message.twist.twist
     yaw = yaw_rad(pose.orientation)
     return EgoState(
@@ -226,14 +243,18 @@ def ego_from_odometry(message: RosMessage, receipt_ns: int) -> EgoState:
     )
 
 
-@np.errstate(all="ignore")  # a part that is not finite is not known
+@np.errstate(all="ignore")  # a block that is not finite counts as unknown
 def _ego_covariance(message: RosMessage) -> tuple[float, ...] | None:
-    """Covariance of x, y, yaw, speed and yaw rate, row-major; of pose and twist each, zero where it is not known."""
+    """Row-major covariance of x, y, yaw, speed and yaw rate; None if the pose's and the twist's blocks are unknown.
+
+    An unknown block is 0.
+    """
     from scipy.linalg import block_diag
 
     velocity = message.twist.twist.linear
     direction = speed_gradient(velocity.x, velocity.y)
-    J = np.eye(2, 3, k=1)  # of speed and yaw rate by vx, vy and yaw rate
+    # Jacobian of speed and yaw rate by vx, vy and yaw rate.
+    J = np.eye(2, 3, k=1)
     J[0, :2] = (
         -direction if signed_speed_mps(velocity.x, velocity.y, 0.0) < 0.0 else direction
     )
@@ -245,6 +266,6 @@ def _ego_covariance(message: RosMessage) -> tuple[float, ...] | None:
 
 
 def _is_known(covariance: FloatArray) -> bool:
-    """True if all is finite and every variance is in use: "unknown" is 0 or -1 in ROS, 1e3 or more in many drivers."""
+    """True if the covariance is finite and no variance means "unknown": 0 or -1 in ROS, 1e3 or more in many drivers."""
     in_use = (np.diag(covariance) > 0.0) & (np.diag(covariance) < _UNKNOWN)
     return bool(np.isfinite(covariance).all() and in_use.all())

@@ -1,4 +1,4 @@
-"""Scans of detections that come one per message."""
+"""Merges lists of one detection each into scans."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -7,23 +7,23 @@ from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import DetectionList, Message
 from fgtrack.inputs.errors import UntilBreak
 
-_LONGEST_NS = (
-    NS_PER_S  # after the last detection of a scan, in receipts: it is complete then
-)
+#: Time after the receipt of a scan's last detection at which the scan is complete.
+_LONGEST_NS = NS_PER_S
 
 
 def grouped(
     messages: Iterable[Message], windows_ns: Mapping[str, int]
 ) -> Iterator[Message]:
-    """`messages`, in the order of receipt, with the lists of the sensors in `windows_ns` joined to scans.
-    Lists with stamps at most the window from the first are a scan, received with the last; a break follows open scans.
+    """Yield `messages` in receipt order, with the lists of the sensors in `windows_ns` merged into scans.
+
+    Lists whose stamps differ from the first by at most the window make a scan, which is
+    received with its last list. If the input breaks off, open scans are yielded before
+    the error is raised.
     """
-    waiting: dict[
-        int, list[Message]
-    ] = {}  # a message, or the lists of a scan, by the index of the last
-    newest: dict[
-        str, int
-    ] = {}  # index of the scan of every sensor to which lists are added
+    # A message, or the lists of a scan, by the index of the last one.
+    waiting: dict[int, list[Message]] = {}
+    # Index of the open scan of each sensor.
+    newest: dict[str, int] = {}
     readable = UntilBreak(messages)
     for index, message in enumerate(readable):
         group: list[Message] = []
@@ -53,16 +53,16 @@ def _is_recent(scan: list[Message], message: Message) -> bool:
 
 
 def _joined(group: list[Message]) -> Message:
-    """The scan: the mean stamp of its lists, the last receipt, and of every detection its own stamp."""
+    """Merge lists into a scan: mean stamp, receipt of the last list; each detection keeps its list's stamp."""
     lists = [each for each in group if isinstance(each, DetectionList)]
     if len(lists) <= 1:
         return group[0]
     first_ns = lists[0].stamp_ns
     mean_ns = first_ns + sum(each.stamp_ns - first_ns for each in lists) // len(lists)
-    is_own = any(each.stamp_ns != first_ns for each in lists)
+    stamps_differ = any(each.stamp_ns != first_ns for each in lists)
     objects = [
         replace(item, stamp_ns=each.stamp_ns)
-        if is_own and item.stamp_ns is None
+        if stamps_differ and item.stamp_ns is None
         else item
         for each in lists
         for item in each.objects

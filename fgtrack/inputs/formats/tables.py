@@ -1,7 +1,8 @@
-"""CSV files whose columns the configuration names: the ego, detections and truth in one file or several.
+"""CSV tables with configured columns: the ego, detections and truth in one file or in several.
 
-Rows of one stamp and receipt are one list of detections; a row in which nothing is measured is an empty scan, an empty
-cell a missing value. Columns are converted as in `fields.mapped`. Rows are sorted by receipt.
+Rows with equal stamp and receipt make one list of detections. A row without a measured
+value is an empty scan. An empty cell is a missing value. Columns are converted as in
+`fields.mapped`. Rows are sorted by receipt.
 """
 
 import csv
@@ -55,14 +56,15 @@ _DATE = re.compile(
     r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)Z?(\.\d+)?(?:Z|([+-]\d\d:\d\d))?"
 )
 _IN_MAP = frozenset(("east", "easting", "north", "northing", "utm"))
-#: Of Flightradar24's granular ADS-B data: P of a message with a position, N of one that repeats the last.
+#: Column of Flightradar24's granular ADS-B data: P for a message with a position, N for a repeated position.
 _HAS_POSITION = {"no_position": Filter(one_of=("P",))}
 _TIMES = ("stamp", "receipt")
-#: Components of the rows of the ego and of truth, and those that must be there; all others are of detections.
+#: Components of the ego and of truth; other roles are detections.
 _NAMES = {
     "ego": (*STATE_NAMES, *GEODETIC),
     "truth": ("object_id", *STATE_NAMES, *GEODETIC),
 }
+#: Required components of the ego and of truth.
 _NEEDS = {"ego": STATE_NAMES[:4], "truth": STATE_NAMES[:2]}
 Cells = Mapping[str, str]
 
@@ -70,8 +72,10 @@ Cells = Mapping[str, str]
 def read_tables(
     tables: Sequence[tuple[Path, CsvTable, str]], plane: LocalPlane | None = None
 ) -> Iterator[Message]:
-    """Messages of `tables`, given with file and role (`ego`, `truth` or `detections.SENSOR`), in order of receipt.
-    Raises `DataError` for a row that does not match the mapping, after all messages up to the receipt before it.
+    """Yield the messages of `tables` in receipt order; a table is given with its file and its role.
+
+    Roles are `ego`, `truth` and `detections.SENSOR`. Raises `DataError` for a row that
+    does not match the mapping, after all messages up to the receipt of the row before.
     """
     plane = plane or LocalPlane()
     keyed: list[tuple[tuple[int, int, int], Message]] = []
@@ -94,12 +98,13 @@ def read_tables(
 def _read(
     file: Path, table: CsvTable, role: str, plane: LocalPlane
 ) -> tuple[list[Message], DataError | None]:
-    """Messages of the rows of a table that pass the filters, and the error that ends it."""
+    """Return the messages of the rows that pass the filters, and the error that ends the table."""
     messages: list[Message] = []
     scans: dict[tuple[int, int], list[Detection]] = {}
     stamps_ns: list[int] = []
     left_out: list[str] = []
-    skipped, error = None, None
+    skipped = None
+    error = None
     where = str(file)
     try:
         result = rows(file, table.delimiter)
@@ -110,14 +115,15 @@ def _read(
         ]:
             if column not in header:
                 raise DataError(
-                    f"{where}: has no column {column!r}, but {', '.join(header)}"
+                    f"{where}: has no column {column!r}; its columns are {', '.join(header)}"
                 )
-        for where, cells in result:  # noqa: B007 - an error below names it
+        for where, cells in result:  # noqa: B007 - the error below contains it
             if (name := _excluding_filter(table, cells)) is not None:
                 left_out.append(f"filters.{name}")
                 skipped = skipped or cells
                 continue
-            times, values = _times(cells, table), _values(cells, table, role, plane)
+            times = _times(cells, table)
+            values = _values(cells, table, role, plane)
             stamps_ns.append(times[0])
             if role == "ego":
                 messages.append(EgoState(*times, **values))
@@ -128,16 +134,15 @@ def _read(
                 scans.setdefault(times, []).extend(
                     [Detection(**values)] if is_measured else []
                 )
-        if (
-            skipped is not None and not scans and role not in _NAMES
-        ):  # an empty list reports what was left out
+        # An empty list reports the rows that were left out.
+        if skipped is not None and not scans and role not in _NAMES:
             scans[_times(skipped, table)] = []
     except FieldError as wrong:
         error = DataError(f"{where}: {wrong}")
     except DataError as broken:
         error = broken
     stamps_ns.sort()
-    few = len(stamps_ns) // 100  # wrong clocks of single rows
+    few = len(stamps_ns) // 100  # at both ends: single rows may have wrong times
     if stamps_ns and (
         text := wrong_unit(
             len(stamps_ns), stamps_ns[few], stamps_ns[-1 - few], table.time_unit
@@ -157,8 +162,10 @@ def _read(
 
 
 def rows(file: Path, delimiter: str | None = None) -> Iterator[tuple[str, Cells]]:
-    """File and line, and cells by column, of the rows of `file`, the header first; `DataError` if it is not a table.
-    Without a delimiter the most frequent of `,`, `;` and tab in the header.
+    """Yield for each row of `file` its file and line, and its cells by column; the first row is the header.
+
+    Without a `delimiter`, the most frequent of `,`, `;` and tab in the header is used.
+    Raises `DataError` if the file is not a table.
     """
     where = f"{file}:1"
     try:
@@ -170,20 +177,24 @@ def rows(file: Path, delimiter: str | None = None) -> Iterator[tuple[str, Cells]
         ):
             first = text.readline(_LONGEST_HEADER)
             text.seek(0)
-            separator, lines = delimiter or max(",;\t", key=first.count), iter(text)
+            separator = delimiter or max(",;\t", key=first.count)
+            lines = iter(text)
             if separator not in first and delimiter is None and " " in first.strip():
-                separator, lines = " ", (" ".join(line.split()) for line in text)
+                separator = " "
+                lines = (" ".join(line.split()) for line in text)
             reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)
             header = [name.strip() for name in next(reader, [])]
             named = [name for name in header if name]
             if len(set(named)) < len(named):
-                raise DataError(f"{where}: has a column twice: {', '.join(header)}")
+                raise DataError(
+                    f"{where}: two columns have the same name: {', '.join(header)}"
+                )
             yield where, dict(zip(header, header, strict=True))
             for cells in filter(any, reader):
                 where = f"{file}:{reader.line_num}"
                 if len(cells) != len(header):
                     raise DataError(
-                        f"{where}: has {len(cells)} cells, the header has {len(header)}"
+                        f"{where}: has {len(cells)} cells, but the header has {len(header)}"
                     )
                 yield where, dict(zip(header, map(str.strip, cells), strict=True))
     except (OSError, EOFError, zlib.error, csv.Error) as error:
@@ -191,14 +202,14 @@ def rows(file: Path, delimiter: str | None = None) -> Iterator[tuple[str, Cells]
 
 
 def _unpacked(raw: BinaryIO) -> BinaryIO:
-    """The file `raw` for reading, unpacked if it is gzipped."""
+    """The file `raw`, decompressed if it is gzipped."""
     is_packed = raw.read(2) == GZIP_MAGIC
     raw.seek(0)
     return cast(BinaryIO, gzip.GzipFile(fileobj=raw)) if is_packed else raw
 
 
 def _time_ns(text: str, unit: str) -> int:
-    """Integer nanoseconds of a number in `unit`, or of a date and time (ISO 8601, UTC unless it has a zone)."""
+    """Convert a number in `unit`, or a date and time (ISO 8601, UTC without a zone), to integer nanoseconds."""
     if (date := _DATE.fullmatch(text)) is None:
         return exact_ns(text, unit)
     day, time, fraction, zone = date.groups()
@@ -207,7 +218,7 @@ def _time_ns(text: str, unit: str) -> int:
 
 
 def _excluding_filter(table: CsvTable, cells: Cells) -> str | None:
-    """First filter that a row does not pass; a text that is a number is compared as one."""
+    """Return the first filter that excludes the row, or None; a text that is a number is compared as a number."""
     for name, each in table.filters.items():
         value: float | str = cells[name]
         with suppress(ValueError):
@@ -219,8 +230,8 @@ def _excluding_filter(table: CsvTable, cells: Cells) -> str | None:
 
 def _values(
     cells: Cells, table: CsvTable, role: str, plane: LocalPlane
-) -> dict[str, Any]:  # Any: as of `mapped`
-    """Values that a row gives; NaN for a state that must be there, which the tracker counts."""
+) -> dict[str, Any]:  # Any: see `mapped`
+    """Return the values of a row; a required component that is missing becomes NaN, which the tracker counts."""
     values = plane.in_plane(
         mapped(
             table.columns,
@@ -233,15 +244,17 @@ def _values(
 
 
 def _times(cells: Cells, table: CsvTable) -> tuple[int, int]:
-    """Stamp and receipt of a row in integer nanoseconds."""
+    """Return stamp and receipt of a row in integer nanoseconds."""
     times: list[int] = []
     for name in _TIMES:
         column = single_path(table.columns.get(name, table.columns["stamp"]))
         try:
             times.append(_time_ns(cells[column], table.time_unit))
         except (ArithmeticError, ValueError) as error:
-            text = f"{cells[column]!r:.40} is not a time in {table.time_unit}"
-            raise FieldError(f"{column}: {text}, or change `time_unit`") from error
+            raise FieldError(
+                f"{column}: {cells[column]!r:.40} is not a time in {table.time_unit}: "
+                "correct the cell or `time_unit`"
+            ) from error
     stamp_ns, receipt_ns = times
     return receipt_ns if table.stamp_from == "receipt" else stamp_ns, receipt_ns
 
@@ -251,9 +264,8 @@ def _recognises(path: Path) -> bool:
         return not (path / "meta.json").exists() and any(
             file.name.endswith(_ENDINGS) for file in path.iterdir()
         )
-    return (
-        path.name.endswith(_ENDINGS) and path.name != LOG_NAME
-    )  # which is not an input by itself
+    # A FusionTracking log is read as a folder.
+    return path.name.endswith(_ENDINGS) and path.name != LOG_NAME
 
 
 def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
@@ -269,33 +281,38 @@ def _open(path: Path, config: InputConfig) -> Callable[[], Iterator[Message]]:
     if not tables:
         tables = reports_of(path)
     if not tables:
-        found = "; ".join(
+        listed = "; ".join(
             f"{file.name} has {', '.join(columns)}"
             for file, columns in headers(path).items()
         )
         raise CallError(
-            f"{path}: is CSV, name its columns in input.csv: {found} (`fgtrack info {path} --write my.yaml` guesses)"
+            f"{path}: is CSV, name its columns in input.csv: {listed} "
+            f"(`fgtrack info {path} --write my.yaml` guesses them)"
         )
     return partial(read_tables, tables, LocalPlane(config.origin))
 
 
 def reports_of(path: Path) -> list[tuple[Path, CsvTable, str]]:
-    """The one table of position reports at `path`, with a mapping by the names of its columns; empty without any.
-    Taken are times, positions in the map (latitude and longitude, or east and north) and identities; the sensor is
-    `adsb` or `ais` by the column of these, else `reports`. Raises `CallError` where there are several.
+    """Return the table of position reports at `path` with a guessed mapping of its columns; empty if there is none.
+
+    Times, positions in the map (latitude and longitude, or east and north) and
+    identities are read. The sensor is named `adsb` or `ais` after the column of
+    identities, else `reports`. Raises `CallError` if there are several such tables.
     """
     tables: list[tuple[Path, CsvTable, str]] = []
     for file, names in headers(path).items():
         cells = [each for _, each in islice(rows(file), 1, _SAMPLES)]
-        own = guesses(
+        guessed = guesses(
             {name: _numbers(each[name] for each in cells) for name in names if name}
         )
         known = ("stamp", "receipt", *GEODETIC, "id")
         columns: dict[str, FieldPath] = {
-            key: own[key].path for key in known if key in own
+            key: guessed[key].path for key in known if key in guessed
         }
         if not {*GEODETIC} <= columns.keys():
-            columns |= {key: own[key].path for key in ("x_m", "y_m") if key in own}
+            columns |= {
+                key: guessed[key].path for key in ("x_m", "y_m") if key in guessed
+            }
             if not all(
                 set(words_of(str(columns.get(key, "")))) & _IN_MAP
                 for key in ("x_m", "y_m")
@@ -310,11 +327,12 @@ def reports_of(path: Path) -> list[tuple[Path, CsvTable, str]]:
         words = set(words_of(str(columns.get("id", ""))))
         sensor = "ais" if "mmsi" in words else "adsb" if words else "reports"
         filters = {name: rule for name, rule in _HAS_POSITION.items() if name in names}
-        table = CsvTable(columns, None, unit, frame="map", filters=filters)  # type: ignore[arg-type]  # of NS_PER_UNIT
+        table = CsvTable(columns, None, unit, frame="map", filters=filters)  # type: ignore[arg-type]  # a key of NS_PER_UNIT
         tables.append((file, table, f"detections.{sensor}"))
     if len(tables) > 1:
         raise CallError(
-            f"{path}: holds {len(tables)} tables of reports, name one, as {tables[0][0]}, or input.csv"
+            f"{path}: contains {len(tables)} tables of reports: give one of them, for example {tables[0][0]}, "
+            "or set input.csv"
         )
     return tables
 
@@ -328,7 +346,10 @@ def _numbers(texts: Iterable[str]) -> list[float]:
 
 
 def headers(path: Path) -> dict[Path, list[str]]:
-    """Columns of the CSV file `path`, or of every one in the folder, by file. Raises `DataError` as `read_tables`."""
+    """Return the columns of the CSV file `path`, or of every CSV file in the folder, by file.
+
+    Raises `DataError` as `rows`.
+    """
     files = (
         sorted(file for file in path.iterdir() if file.name.endswith(_ENDINGS))
         if path.is_dir()
@@ -338,35 +359,34 @@ def headers(path: Path) -> dict[Path, list[str]]:
 
 
 def _file(path: Path, table: CsvTable, role: str) -> Path:
-    """File of `table`, whose columns are checked."""
-    where, columns = f"input.csv.{role}", table.columns.keys()
-    placed = columns | ({"x_m", "y_m"} if columns >= set(GEODETIC) else set())
+    """Return the file of `table` after checking the mapped columns."""
+    where = f"input.csv.{role}"
+    columns = table.columns.keys()
+    available = columns | ({"x_m", "y_m"} if columns >= set(GEODETIC) else set())
     known = {*_TIMES, *_NAMES.get(role, COMPONENTS)}
     needed = {"stamp", *_NEEDS.get(role, ())}
     if columns - known:
         raise CallError(
-            f"{where}.columns: unknown column {min(columns - known)!r}, known are {', '.join(sorted(known))}"
+            f"{where}.columns: unknown component {min(columns - known)!r}: there are {', '.join(sorted(known))}"
         )
-    if needed - placed or (role not in _NAMES and placed.isdisjoint(MEASURABLE)):
+    if needed - available or (role not in _NAMES and available.isdisjoint(MEASURABLE)):
         measured = (
             ""
             if role in _NAMES
-            else f" and what is measured, one of {', '.join(MEASURABLE)}"
+            else f" and a measured component, one of {', '.join(MEASURABLE)}"
         )
         raise CallError(
             f"{where}.columns: must name {', '.join(sorted(needed))}{measured}"
         )
     if table.file is None and path.is_dir():
         raise CallError(f"{path}: is a folder, so {where} must name its file")
-    return (
-        path
-        if table.file is None
-        else (path if path.is_dir() else path.parent) / table.file
-    )
+    if table.file is None:
+        return path
+    return (path if path.is_dir() else path.parent) / table.file
 
 
 FORMAT = FileFormat(
-    "CSV (.csv, .tsv, or a folder of them) with a mapping of its columns",
+    "CSV (.csv, .tsv, or a folder of these) with configured columns",
     _recognises,
     _open,
 )

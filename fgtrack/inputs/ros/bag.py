@@ -1,4 +1,4 @@
-"""Reads recordings without ROS: rosbag2 folders, single MCAP and SQLite files, ROS 1 bags."""
+"""Reads recordings without ROS: rosbag2 folders, single MCAP and SQLite files, and ROS 1 bags."""
 
 import heapq
 import struct
@@ -35,14 +35,15 @@ class BagTopic:
     name: str
     type: str
     problem: str | None
-    """Why its messages cannot be decoded; None when they can."""
+    """Reason why the messages cannot be decoded; None if they can."""
 
 
 class Bag:
-    """A recording, which can be read any number of times.
+    """A recording that can be read any number of times.
 
-    `path` is a rosbag2 folder (with or without metadata.yaml), an `.mcap`, `.db3` or ROS 1 `.bag` file. The package of
-    a `.msg` file of `message_definitions` is the name of its folder (or of the one above a folder `msg`).
+    `path` is a rosbag2 folder (with or without metadata.yaml), an `.mcap` or `.db3`
+    file, or a ROS 1 `.bag` file. The package of a `.msg` file in `message_definitions`
+    is the name of its folder; above a folder `msg`, of the parent folder.
     """
 
     def __init__(
@@ -61,7 +62,7 @@ class Bag:
         for item in connections:
             if (kind := getattr(item.ext, "serialization_format", "cdr")) != "cdr":
                 raise DataError(
-                    f"{self.path}: topic {item.topic} is serialized as {kind!r}, only 'cdr' can be read"
+                    f"{self.path}: topic {item.topic} is serialized as {kind!r}, fgtrack reads 'cdr' only"
                 )
         self._types = MessageTypes(
             map(_key, connections), self._ros1, message_definitions
@@ -76,9 +77,12 @@ class Bag:
     def messages(
         self, topics: Collection[str], own: bool = False
     ) -> Iterator[tuple[BagTopic, int, Any]]:
-        """Yield topic, log time and decoded message of every message on `topics`, in log-time order.
-        With `own`, those of fgtrack's own types come as a `Message`, received at the log time, where their layout is.
-        Raises `TruncatedInput` after every message before a break, and `DataError` for what cannot be decoded.
+        """Yield topic, log time and decoded message of every message on `topics`, in the order of log time.
+
+        With `own`, messages of fgtrack's own types are decoded to a `Message` that is
+        received at the log time, if their layout is the present one. Raises
+        `TruncatedInput` after the messages before a break, and `DataError` for a
+        message that cannot be decoded.
         """
         for topic in self.topics:
             if topic.name in topics and topic.problem:
@@ -93,8 +97,11 @@ class Bag:
             yield self._topics[_topic_and_type(connection)], log_ns, decoded
 
     def stamps(self) -> Iterator[tuple[BagTopic, int, int | None]]:
-        """Topic, log time and header stamp (None of an unknown type or one without a header) of every message."""
-        offset = 4  # behind the CDR header, or in ROS 1 behind the sequence number
+        """Yield topic, log time and header stamp of every message.
+
+        The stamp is None for an unknown type, and for a type without a header.
+        """
+        offset = 4  # of the stamp: behind the CDR header, in ROS 1 behind the sequence number
         for connection, log_ns, data in self._records(
             {topic.name for topic in self.topics}
         ):
@@ -128,7 +135,7 @@ class Bag:
             yield files
 
     def _break_off(self, files: list[BagFile]) -> str | None:
-        """Reason why the first file that is not whole breaks off."""
+        """Reason why the recording breaks off: the first file that is truncated or empty."""
         broken = [f"{file.path} {file.break_off}" for file in files if file.break_off]
         empty = [f"{path} is empty" for path in self._paths if path.stat().st_size == 0]
         return next(iter(broken + empty), None)
@@ -136,7 +143,8 @@ class Bag:
     def _records(
         self, topics: Collection[str]
     ) -> Iterator[tuple[Connection, int, bytes]]:
-        count, decompress = 0, zstandard.ZstdDecompressor().decompress
+        count = 0
+        decompress = zstandard.ZstdDecompressor().decompress
         with self._files() as files:
             try:
                 wanted = [
@@ -157,7 +165,7 @@ class Bag:
                     count += 1
             except (FgtrackError, MemoryError):
                 raise
-            except Exception as error:  # whatever damaged bytes make rosbags or its decompressors raise
+            except Exception as error:  # damaged bytes cause any exception in rosbags or its decompressors
                 raise TruncatedInput(
                     f"{self.path}: breaks off after {count} messages ({one_line(error)})"
                 ) from error
@@ -166,7 +174,7 @@ class Bag:
 
 
 def is_bag(path: Path) -> bool:
-    """True if the folder `path` holds a rosbag2 recording, or the file `path` starts as one."""
+    """True if the folder `path` contains a rosbag2 recording, or the file `path` begins as a bag file."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file() or bool(bags_in(path))
     return storage_of(path) is not None
@@ -185,7 +193,7 @@ def _as_data_error(path: Path) -> Iterator[None]:
         yield
     except (FgtrackError, MemoryError):
         raise
-    except Exception as error:  # rosbags raises its own, assertions, struct, SQLite, YAML, Unicode errors
+    except Exception as error:  # rosbags raises its own errors and errors of struct, SQLite, YAML and Unicode
         raise DataError(
             f"{path}: cannot be read as a recording ({one_line(error)})"
         ) from error

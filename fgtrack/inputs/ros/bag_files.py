@@ -1,4 +1,4 @@
-"""The files of a recording: which they are, and the contents of its metadata.yaml."""
+"""The files of a recording, and its metadata.yaml."""
 
 import filecmp
 import json
@@ -20,12 +20,12 @@ from fgtrack.inputs.ros.rosbag1_file import Rosbag1File
 from fgtrack.inputs.ros.sqlite3_file import Sqlite3File
 
 BagFile = McapFile | Sqlite3File | Rosbag1File
-"""One file of a recording, read in log-time order up to where it breaks off (`break_off`)."""
+"""One file of a recording; its messages are read in the order of log time up to a break (`break_off`)."""
 
 METADATA = "metadata.yaml"
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 SETTINGS = "fgtrack"
-"""Entry of its custom data with what the recording carries of a configuration, as JSON."""
+"""Entry of the metadata's custom data with configuration keys and values that the recording carries, as JSON."""
 _READERS: Mapping[bytes, type[BagFile]] = {
     MCAP_MAGIC: McapFile,
     b"SQLite format 3\x00": Sqlite3File,
@@ -35,7 +35,7 @@ _READERS: Mapping[bytes, type[BagFile]] = {
 
 @contextmanager
 def decompressed(file: Path) -> Iterator[Path]:
-    """The file as the recorder wrote it; a zstd file is decompressed into a temporary folder."""
+    """Yield the path of the file as the recorder wrote it; a zstd file is decompressed into a temporary folder."""
     with open_file(file) as source, TemporaryDirectory() as folder:
         if source.read(len(ZSTD_MAGIC)) != ZSTD_MAGIC:
             yield file
@@ -48,7 +48,11 @@ def decompressed(file: Path) -> Iterator[Path]:
 
 
 def files_of(path: Path) -> list[Path]:
-    """Files of the recording at `path`: itself, those that metadata.yaml names, or those of the folder."""
+    """Return the files of the recording at `path`.
+
+    They are the file itself, the files in the folder's metadata.yaml, or all bag files
+    in the folder.
+    """
     files = [path]
     if (path / METADATA).is_file():
         files = [
@@ -60,15 +64,13 @@ def files_of(path: Path) -> list[Path]:
     for first, other in combinations(files, 2):
         if first.stat().st_size and filecmp.cmp(first, other, shallow=False):
             raise DataError(
-                f"{path}: {first.name} and {other.name} are copies of one recording: remove or name one"
+                f"{path}: {first.name} and {other.name} have the same content: remove one, or give one of the files"
             )
     return files
 
 
-def settings_of(
-    path: Path,
-) -> Any:  # Any: JSON values, validated by `fgtrack.config.recorded`
-    """Settings that the recording at `path` carries: none without a metadata.yaml that has them."""
+def settings_of(path: Path) -> Any:  # Any: validated by `fgtrack.config.recorded`
+    """Return the settings that the recording at `path` carries in its metadata.yaml; empty if there are none."""
     if not (path / METADATA).is_file():
         return {}
     try:
@@ -78,18 +80,18 @@ def settings_of(
 
 
 def bags_in(path: Path) -> list[Path]:
-    """Storage files of a folder."""
+    """Return the `.mcap` and `.db3` files of a folder, sorted by name."""
     return sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
 
 
-def _metadata(path: Path) -> Any:  # Any: YAML values, checked by who reads them
+def _metadata(path: Path) -> Any:  # Any: YAML values, checked by the caller
     return safe_yaml(read_whole(path / METADATA, 1.0).decode())[
         "rosbag2_bagfile_information"
     ]
 
 
 def storage_of(path: Path) -> type[BagFile] | None:
-    """Reader of the file `path`, by its first bytes; None for other files."""
+    """Return the reader class for the file `path`, recognised by its first bytes; None for other files."""
     with open_file(path) as file:
         start = file.read(max(map(len, _READERS)))
     return next(

@@ -1,4 +1,4 @@
-"""Writes rosbag2 recordings: fgtrack's own messages, exact to the bit, and twins in standard types for other tools."""
+"""Writes rosbag2 recordings: fgtrack's own messages, exact to the bit, and copies in standard types for other tools."""
 
 import json
 import re
@@ -20,8 +20,10 @@ from fgtrack.inputs.formats.common import RosMessage
 from fgtrack.inputs.ros.bag_files import METADATA, SETTINGS, files_of
 from fgtrack.inputs.ros.messages import MessageFactory
 
-_CHECKPOINT = 1000  # messages; a killed writer loses no more than that
+#: Messages between two writes to the disk; a killed writer loses fewer than these.
+_CHECKPOINT = 1000
 RECORDING = "a rosbag2 folder with nothing else in it"
+"""Description of a folder that may be overwritten, for messages."""
 
 
 def write_bag(
@@ -31,16 +33,24 @@ def write_bag(
     overwrite: bool = False,
     settings: Mapping[str, object] | None = None,
 ) -> int:
-    """Write `messages` to the rosbag2 folder `path`; gives their number. With `overwrite` a recording is replaced.
+    """Write `messages` to the rosbag2 folder `path` and return their number.
 
-    `/fgtrack/ego`, `/fgtrack/detections/SENSOR` and `/fgtrack/truth` hold every field to the bit and carry their
-    definitions; the log time is the receipt, the header stamp the stamp. The twins for other tools are `/ego/odometry`
-    (nav_msgs/Odometry) and `/detections/SENSOR` (vision_msgs/Detection3DArray, of objects with a position, without
-    speeds). Every thousand messages reach the disk: a killed writer leaves a readable recording (in `<path>.*.part`).
-    `settings`, what the recording carries of a configuration, are in the custom data of metadata.yaml. Raises
-    `TruncatedInput` after writing what came before it, and `DataError` for a time that ROS messages cannot hold.
+    With `overwrite`, an existing recording is replaced. `settings` are configuration
+    keys and values that the recording carries, in the custom data of metadata.yaml.
+
+    `/fgtrack/ego`, `/fgtrack/detections/SENSOR` and `/fgtrack/truth` contain every
+    field, exact to the bit, and their message definitions. The log time is the receipt,
+    the header stamp is the stamp. The copies for other tools are `/ego/odometry`
+    (nav_msgs/Odometry) and `/detections/SENSOR` (vision_msgs/Detection3DArray). The
+    latter contains the objects with a position, without speeds. Every thousand messages
+    are written to the disk, so a killed writer leaves a readable recording (in
+    `<path>.*.part`).
+
+    Raises `TruncatedInput` after writing the messages before the break, and `DataError`
+    for a time out of the range of ROS messages.
     """
-    path, count = Path(path), 0
+    path = Path(path)
+    count = 0
     with (
         as_write_error(path),
         new_path(path, overwrite, is_recording, RECORDING) as folder,
@@ -63,7 +73,7 @@ def write_bag(
                         "/ego/odometry", factory.odometry(message), message.receipt_ns
                     )
                 case DetectionList():
-                    topic = f"/detections/{token(message.sensor)}"
+                    topic = f"/detections/{topic_part(message.sensor)}"
                     topics.put(
                         f"/fgtrack{topic}",
                         factory.detections(message),
@@ -84,14 +94,15 @@ def write_bag(
                         opened.bio.flush()
                     case Sqlite3Writer() as opened:
                         opened.conn.commit()
-        if path.exists():  # it is kept
+        # A truncated recording does not replace an existing one.
+        if path.exists():
             readable.raise_error()
     readable.raise_error()
     return count
 
 
 class BagTopics:
-    """Topics of a recording that is written, each added with its first message."""
+    """Topics of a recording that is being written; a topic is added with its first message."""
 
     def __init__(self, bag: Writer, factory: MessageFactory) -> None:
         self._bag = bag
@@ -101,9 +112,11 @@ class BagTopics:
     def put(
         self, topic: str, message: RosMessage, log_ns: int, qos: Sequence[Qos] = ()
     ) -> None:
-        """Write `message`, and the `qos` profiles that are offered with a new topic."""
+        """Write `message`; `qos` contains the offered profiles if the topic is new."""
         if not 0 <= log_ns < 1 << 63:
-            raise DataError(f"the time {log_ns} ns lies outside what a recording holds")
+            raise DataError(
+                f"the log time {log_ns} ns is out of the range of a recording: correct the receipts"
+            )
         if topic not in self._connections:
             self._connections[topic] = self._bag.add_connection(
                 topic,
@@ -118,7 +131,7 @@ class BagTopics:
 
 @contextmanager
 def as_write_error(path: Path) -> Iterator[None]:
-    """Raise `DataError` for whatever rosbags raises in the block that writes `path`: also SQLite and struct errors."""
+    """Convert all exceptions of the block that writes `path` into `DataError`: rosbags raises many kinds."""
     try:
         yield
     except FgtrackError:
@@ -129,25 +142,25 @@ def as_write_error(path: Path) -> Iterator[None]:
         ) from error
 
 
-def token(name: str) -> str:
-    """Return `name` as a part of a topic name."""
+def topic_part(name: str) -> str:
+    """Return `name` as a part of a topic name: other characters than letters, digits and `_` become `_`."""
     return re.sub(r"\W", "_", name, flags=re.ASCII)
 
 
 def check_bag(path: Path, overwrite: bool) -> None:
-    """Raise `CallError` where `write_bag` would for what is at `path`."""
+    """Raise `CallError` if `write_bag` may not write to `path`."""
     check_output(path, overwrite, is_recording, RECORDING)
 
 
 def is_recording(path: Path) -> bool:
-    """True if `path` is a folder of what its metadata.yaml lists, and of nothing else."""
+    """True if `path` is a folder that contains the files in its metadata.yaml, and no others."""
     try:
         listed = (
             [file.name for file in files_of(path)]
             if (path / METADATA).is_file()
             else []
         )
-    except Exception:  # whatever a damaged metadata.yaml raises
+    except Exception:  # a damaged metadata.yaml causes any exception
         return False
     return bool(listed) and {file.name for file in path.iterdir()} <= {
         METADATA,

@@ -1,8 +1,11 @@
-"""Types that rosbags does not ship, fields in CDR order; definitions of a recording or of the user take precedence."""
+"""Definitions of message types that rosbags does not contain; fields are in CDR order.
+
+Definitions in a recording, and definitions of the user, take precedence.
+"""
 
 from fgtrack.core.types import MEASURABLE
 
-# Versions of the layouts below: vision_msgs 4, radar_msgs 0.2, tier4's autoware_auto_msgs, autoware_msgs 1.
+# The layouts below are those of vision_msgs 4, radar_msgs 0.2, tier4's autoware_auto_msgs, and autoware_msgs 1.
 _AVAILABILITY = "uint8 UNAVAILABLE=0, uint8 SIGN_UNKNOWN=1, uint8 AVAILABLE=2"
 _POSE = "geometry_msgs/PoseWithCovariance pose_with_covariance"
 _TWIST = "geometry_msgs/TwistWithCovariance twist_with_covariance"
@@ -97,7 +100,7 @@ float64 accel_mps2
 float64[] outline_m
 """,
 }
-#: Text of every definition by type name.
+#: Text of each definition, by type name.
 DEFINITIONS: dict[str, str] = _OWN | {
     name: text.replace(", ", "\n") for name, text in _FOREIGN.items()
 }

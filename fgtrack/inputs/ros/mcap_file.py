@@ -1,4 +1,4 @@
-"""MCAP files of ROS 2 messages, including truncated ones (format: https://mcap.dev/spec)."""
+"""MCAP files of ROS 2 messages, also truncated files (format: https://mcap.dev/spec)."""
 
 from bisect import bisect_left
 from collections.abc import Collection, Iterator
@@ -22,9 +22,8 @@ from rosbags.interfaces import (
 
 from fgtrack.inputs.errors import one_line
 
-_LARGEST_BYTES = (
-    1 << 30
-)  # of a record: a damaged length would take more memory than there is
+#: Largest record; a damaged length could exceed the memory.
+_LARGEST_BYTES = 1 << 30
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 _FORMATS = {
     "ros2msg": MessageDefinitionFormat.MSG,
@@ -35,12 +34,12 @@ _NO_SCHEMA = Schema(data=b"", encoding="", id=0, name="")
 _HEAD = Struct("<BQ")
 """Operation code and length of a record."""
 _MESSAGE = Struct("<HIQQ")
-"""Channel, sequence number, log time and publish time, before the data of a message."""
+"""Channel, sequence number, log time and publish time, which precede the data of a message."""
 _NEVER_NS = 1 << 64
 
 
 class McapFile:
-    """MCAP file. One without its index is scanned, a truncated one up to its last whole chunk."""
+    """MCAP file. A file without an index is scanned; a truncated file is read up to its last complete chunk."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -50,7 +49,7 @@ class McapFile:
         self._chunks: list[ChunkIndex] | None = None
 
     def open(self) -> None:
-        """Open the file and read which connections it holds."""
+        """Open the file and read its connections."""
         self._file = self.path.open("rb")
         schemas, channels, self._chunks = self._indexed() or ({}, {}, None)
         for record in () if self._chunks is not None else self._records():
@@ -80,7 +79,10 @@ class McapFile:
     def messages(
         self, connections: Collection[Connection]
     ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Records of `connections` in log-time order; equal times keep the order of writing."""
+        """Yield connection, log time and data of the messages of `connections`, in the order of log time.
+
+        Messages with equal times keep their order in the file.
+        """
         by_id = {connection.id: connection for connection in connections}
         if self._chunks is None:
             wanted = (
@@ -106,9 +108,8 @@ class McapFile:
         ):
             waiting += self._messages_in(offset, by_id.keys())
             waiting.sort(key=itemgetter(0, 1))
-            count = bisect_left(
-                waiting, after[:1]
-            )  # the others may belong behind messages of the chunk after it
+            # Later messages may belong behind messages of the next chunk.
+            count = bisect_left(waiting, after[:1])
             for log_ns, _, channel, data in waiting[:count]:
                 yield by_id[channel], log_ns, data
             del waiting[:count]
@@ -116,13 +117,14 @@ class McapFile:
     def _messages_in(
         self, offset: int, channels: Collection[int]
     ) -> Iterator[tuple[int, int, int, bytes]]:
-        """Log time, `offset`, channel and data of the messages of `channels` in the chunk at `offset`."""
+        """Yield log time, `offset`, channel and data of the messages of `channels` in the chunk at `offset`."""
         assert self._file
         self._file.seek(offset + _HEAD.size)
         stream, size = get_chunk_data_stream(
             Chunk.read(ReadDataStream(self._file)), validate_crc=True
         )
-        records, end = stream.read(size), 0
+        records = stream.read(size)
+        end = 0
         while end < size:
             opcode, length = _HEAD.unpack_from(records, end)
             begin = end + _HEAD.size
@@ -135,13 +137,16 @@ class McapFile:
     def _indexed(
         self,
     ) -> tuple[dict[int, Schema], dict[int, Channel], list[ChunkIndex]] | None:
-        """Schemas, channels and chunks by the end of the file; None unless all messages are in these chunks."""
+        """Return schemas, channels and chunks from the index at the end of the file.
+
+        Returns None unless the index covers all messages.
+        """
         assert self._file
         try:
             summary = SeekingReader(
                 self._file, record_size_limit=_LARGEST_BYTES
             ).get_summary()
-        except Exception:  # whatever the end of a truncated file raises
+        except Exception:  # the end of a truncated file causes any exception
             return None
         statistics = None if summary is None else summary.statistics
         if (
@@ -155,7 +160,7 @@ class McapFile:
         return summary.schemas, summary.channels, summary.chunk_indexes
 
     def _records(self) -> Iterator[McapRecord]:
-        """Records from the beginning of the file to its end, or to where it breaks off."""
+        """Yield the records from the beginning of the file to its end, or to a break."""
         assert self._file
         self._file.seek(0)
         try:
@@ -164,12 +169,13 @@ class McapFile:
             ).records
         except MemoryError:
             raise
-        except (
-            Exception
-        ) as error:  # the end of the file, or whatever damaged bytes raise
+        except Exception as error:  # the end of the file, or damaged bytes
             self.break_off = (
                 f"breaks off near byte {self._file.tell()} ({one_line(error)})"
             )
             return
         if self._file.read(1):
-            self.break_off = f"is followed by something else from byte {self._file.tell() - 1} on, split it there"
+            first = self._file.tell() - 1
+            self.break_off = (
+                f"has other data behind its end: split the file at byte {first}"
+            )

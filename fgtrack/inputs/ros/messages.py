@@ -1,4 +1,4 @@
-"""Makes ROS messages: fgtrack's own, and the standard ones that other tools show."""
+"""Creates ROS messages: fgtrack's own types, and standard types that other tools display."""
 
 import math
 
@@ -32,11 +32,12 @@ DETECTION3D_ARRAY = "vision_msgs/msg/Detection3DArray"
 MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _FRAME_IDS: dict[Frame, str] = {"map": "map", "ego": "base_link"}
-_SECONDS_LIMIT = 1 << 31  # builtin_interfaces/Time holds 32 bits
+#: Limit of the seconds in `builtin_interfaces/Time`, a signed integer of 32 bits.
+_SECONDS_LIMIT = 1 << 31
 
 
 class MessageFactory:
-    """Makes and serializes messages of the types that fgtrack writes."""
+    """Creates and serializes messages of the types that fgtrack writes."""
 
     def __init__(self) -> None:
         self.typestore = typestore_of(
@@ -52,11 +53,11 @@ class MessageFactory:
         )
 
     def serialize(self, message: RosMessage) -> memoryview:
-        """CDR bytes of `message`."""
+        """Return the CDR bytes of `message`."""
         return self.typestore.serialize_cdr(message, message.__msgtype__)
 
     def ego(self, state: EgoState) -> RosMessage:
-        """`fgtrack_msgs/Ego`."""
+        """Create a `fgtrack_msgs/Ego`."""
         return self._make(
             EGO,
             header=self._header(state.stamp_ns, "map"),
@@ -67,7 +68,7 @@ class MessageFactory:
         )
 
     def detections(self, message: DetectionList) -> RosMessage:
-        """`fgtrack_msgs/DetectionList`; its header's frame is fgtrack's own name of it."""
+        """Create a `fgtrack_msgs/DetectionList`; the header's `frame_id` is fgtrack's name of the frame."""
         return self._make(
             DETECTIONS,
             header=self._header(message.stamp_ns, message.frame),
@@ -77,7 +78,7 @@ class MessageFactory:
         )
 
     def truth(self, state: TruthState) -> RosMessage:
-        """`fgtrack_msgs/Truth`."""
+        """Create a `fgtrack_msgs/Truth`."""
         return self._make(
             TRUTH,
             header=self._header(state.stamp_ns, "map"),
@@ -89,20 +90,14 @@ class MessageFactory:
         )
 
     def odometry(self, state: EgoState) -> RosMessage:
-        """`nav_msgs/Odometry` in the frame `map`."""
-        given, pose, twist = (
-            np.reshape(state.covariance or (0.0,) * 25, (5, 5)),
-            np.zeros((6, 6)),
-            np.zeros((6, 6)),
-        )
-        pose[np.ix_(PLANAR, PLANAR)], twist[np.ix_([0, 5], [0, 5])] = (
-            given[:3, :3],
-            given[3:, 3:],
-        )
-        linear, angular = (
-            self._vector(state.speed_mps),
-            self._vector(z=state.yaw_rate_radps),
-        )
+        """Create a `nav_msgs/Odometry` in the frame `map`."""
+        covariance = np.reshape(state.covariance or (0.0,) * 25, (5, 5))
+        pose = np.zeros((6, 6))
+        pose[np.ix_(PLANAR, PLANAR)] = covariance[:3, :3]
+        twist = np.zeros((6, 6))
+        twist[np.ix_([0, 5], [0, 5])] = covariance[3:, 3:]
+        linear = self._vector(state.speed_mps)
+        angular = self._vector(z=state.yaw_rate_radps)
         return self._make(
             ODOMETRY,
             header=self._header(state.stamp_ns, "map"),
@@ -118,7 +113,7 @@ class MessageFactory:
         )
 
     def detection3d_array(self, message: DetectionList) -> RosMessage:
-        """`vision_msgs/Detection3DArray` of the objects that have a position."""
+        """Create a `vision_msgs/Detection3DArray` with the objects that have a position."""
         return self._make(
             DETECTION3D_ARRAY,
             header=self._header(
@@ -138,7 +133,7 @@ class MessageFactory:
         sec, nanosec = divmod(stamp_ns, NS_PER_S)
         if not -_SECONDS_LIMIT <= sec < _SECONDS_LIMIT:
             raise DataError(
-                f"stamp {stamp_ns} ns lies outside what a ROS header holds (1901 to 2038)"
+                f"stamp {stamp_ns} ns is out of the range of a ROS header (1901 to 2038): correct the stamps"
             )
         stamp = self._make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
         return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
@@ -184,14 +179,12 @@ class MessageFactory:
     def _pose(
         self, x_m: float | None, y_m: float | None, yaw_rad: float | None
     ) -> RosMessage:
-        """A pose; an unknown yaw is the quaternion of norm 0, one that is not finite is not a number."""
+        """Create a pose. A missing yaw gives the quaternion 0, a yaw that is not finite gives NaN."""
         z = w = 0.0
         if yaw_rad is not None:
-            z, w = (
-                (math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad))
-                if math.isfinite(yaw_rad)
-                else (math.nan,) * 2
-            )
+            is_finite = math.isfinite(yaw_rad)
+            z = math.sin(0.5 * yaw_rad) if is_finite else math.nan
+            w = math.cos(0.5 * yaw_rad) if is_finite else math.nan
         return self._make(
             "geometry_msgs/msg/Pose",
             position=self._make("geometry_msgs/msg/Point", x=x_m, y=y_m, z=0.0),
@@ -210,7 +203,7 @@ class MessageFactory:
 def _optional(
     value: Detection | TruthState, names: tuple[str, ...]
 ) -> dict[str, RosMessage]:
-    """Return the fields `names` of `value`, 0 or empty for None, and in `present` a bit for each that is given."""
+    """Return the fields `names` of `value`, with 0 or empty for None, and `present` with a bit for each given field."""
     given = {name: getattr(value, name) for name in names}
     present = sum(1 << bit for bit, name in enumerate(names) if given[name] is not None)
     given |= {name: "" if name in TEXTS else 0 for name in names if given[name] is None}
@@ -222,11 +215,12 @@ def _optional(
 
 
 def _full_covariance(item: Detection) -> FloatArray | None:
-    """Covariance of the pose, shape (6, 6); None if the detection has no covariance, or one of another size."""
+    """Covariance of the pose, shape (6, 6); None if the detection has no covariance, or one of a wrong size."""
     size = len(item.measured)
     if item.covariance is None or len(item.covariance) != size**2:
         return None
-    given, pose = np.asarray(item.covariance).reshape(size, size), np.zeros((6, 6))
+    given = np.asarray(item.covariance).reshape(size, size)
+    pose = np.zeros((6, 6))
     axes = {"x_m": 0, "y_m": 1, "yaw_rad": 5}
     kept = [index for index, name in enumerate(item.measured) if name in axes]
     rows = [axes[item.measured[index]] for index in kept]

@@ -1,7 +1,7 @@
-"""Reads fgtrack's own messages from their bytes; recordings of other layouts are read by their definitions.
+"""Decodes fgtrack's own messages from their bytes; other layouts are decoded by the recording's definitions.
 
-Bytes are CDR, little-endian (OMG DDS-XTypes 1.3, section 7.4): a value is aligned to its size, a text and a list follow
-their length of 4 bytes, an empty list is not aligned.
+Bytes are little-endian CDR (OMG DDS-XTypes 1.3, section 7.4). A value is aligned to its
+size. A text and a list follow their length of 4 bytes. An empty list is not aligned.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -25,52 +25,53 @@ from fgtrack.inputs.formats.native import DETECTIONS, EGO, TRUTH
 from fgtrack.inputs.ros.definitions import DEFINITIONS
 
 LITTLE_ENDIAN = b"\0\1"
-"""Beginning of the bytes, before two of no meaning."""
-_TIME, _LENGTH = Struct("<iI"), Struct("<I")
+"""First two bytes of a little-endian message; the next two have no meaning."""
+_TIME = Struct("<iI")
+_LENGTH = Struct("<I")
 _EGO = Struct("<6d??")
 _TRUTH = Struct("<qdd?xH4x4d")
-_MEASURED, _DESCRIBED = (
-    Struct(f"<{len(MEASURABLE)}d"),
-    Struct("<qq5d"),
-)  # of a detection, around its covariance
+#: Fields of a detection before its covariance, and the numbers after it.
+_MEASURED = Struct(f"<{len(MEASURABLE)}d")
+_DESCRIBED = Struct("<qq5d")
 _numbers = lru_cache(maxsize=64)(lambda count: Struct(f"<{count}d"))
 
 
 class _Values:
-    """Values of a message, one after the other. Raises `struct.error` or `ValueError` where it ends before them."""
+    """Reads the values of a message in turn; raises `struct.error` or `ValueError` if the message ends before them."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self._at = data[4:], 0
 
     def take(self, form: Struct, size: int) -> tuple[Any, ...]:
-        """Values of `form`, the first of which has this `size`."""
+        """Read the values of `form`; the first value has the size `size` and is aligned to it."""
         begin = -(-self._at // size) * size
         self._at = begin + form.size
         return form.unpack_from(self._data, begin)
 
     def text(self) -> str:
-        """A text, which ends in a zero."""
+        """Read a text, which ends in a zero byte."""
         (length,) = self.take(_LENGTH, 4)
         text = self._data[self._at : self._at + length]
         self._at += length
         if len(text) != length or text[-1:] != b"\0":
-            raise ValueError("a text breaks off")
+            raise ValueError("a text is incomplete")
         return text[:-1].decode()
 
     def numbers(self) -> tuple[float, ...]:
-        """A list of numbers."""
+        """Read a list of numbers."""
         (count,) = self.take(_LENGTH, 4)
         return self.take(_numbers(count), 8) if count else ()
 
     def header(self) -> tuple[int, str]:
-        """Stamp and frame."""
+        """Read stamp and frame."""
         sec, nanosec = self.take(_TIME, 4)
         return sec * NS_PER_S + nanosec, self.text()
 
     def detection(self) -> Detection:
-        """A `fgtrack_msgs/Detection`, whose fields are those of a detection in their order."""
+        """Read a `fgtrack_msgs/Detection`; its fields have the order of `Detection`."""
         (present,) = self.take(_LENGTH, 4)
-        measured, covariance = self.take(_MEASURED, 8), self.numbers()
+        measured = self.take(_MEASURED, 8)
+        covariance = self.numbers()
         values = (
             *measured,
             covariance,
@@ -81,15 +82,15 @@ class _Values:
         return Detection(*_given(values, present))
 
     def check_end(self) -> None:
-        """Raise `ValueError` for more than the padding behind the values."""
+        """Raise `ValueError` if more bytes than padding follow the values."""
         if self._at + 3 < len(self._data):
-            raise ValueError("there are more bytes than its values have")
+            raise ValueError("it has more bytes than its type")
 
 
 def _ego(values: _Values, receipt_ns: int) -> EgoState:
     stamp_ns, _ = values.header()
     x, y, yaw, speed, yaw_rate, accel, has_in_pit, in_pit = values.take(_EGO, 8)
-    own = in_pit if has_in_pit else None
+    in_pit = in_pit if has_in_pit else None
     return EgoState(
         stamp_ns,
         receipt_ns,
@@ -99,13 +100,14 @@ def _ego(values: _Values, receipt_ns: int) -> EgoState:
         speed,
         yaw_rate,
         accel,
-        own,
+        in_pit,
         values.numbers() or None,
     )
 
 
 def _detections(values: _Values, receipt_ns: int) -> DetectionList:
-    (stamp_ns, frame), sensor = values.header(), values.text()
+    stamp_ns, frame = values.header()
+    sensor = values.text()
     (count,) = values.take(_LENGTH, 4)
     objects = tuple([values.detection() for _ in range(count)])
     return DetectionList(
@@ -141,7 +143,7 @@ def _truth(values: _Values, receipt_ns: int) -> TruthState:
 
 
 def _given(values: Sequence[Any], present: int) -> list[Any]:
-    """`values`, None where the bit of `present` is not set."""
+    """Return `values` with None where the bit of `present` is not set."""
     return [value if present >> bit & 1 else None for bit, value in enumerate(values)]
 
 
@@ -153,7 +155,7 @@ _READERS: Mapping[str, Callable[[_Values, int], Message]] = {
 
 
 def own_message(name: str, data: bytes, receipt_ns: int) -> Message:
-    """Message of the type `name`, of those that `has_own_layout`."""
+    """Decode a message of the type `name`, whose layout must be fgtrack's (`has_own_layout`)."""
     values = _Values(data)
     message = _READERS[name](values, receipt_ns)
     values.check_end()
@@ -161,7 +163,7 @@ def own_message(name: str, data: bytes, receipt_ns: int) -> Message:
 
 
 def has_own_layout(name: str, types: Typesdict) -> bool:
-    """True if `name` is a type of fgtrack's whose definition and parts in `types` are the present ones."""
+    """True if `name` is a type of fgtrack, and its definition and parts in `types` are the present ones."""
     texts = {**_HEADER, **DEFINITIONS}
     return name in _READERS and all(
         types[part] == get_types_from_msg(texts[part], part)[part] for part in types

@@ -1,4 +1,4 @@
-"""ROS 1 bags, including truncated ones."""
+"""ROS 1 bags, also truncated files."""
 
 from collections import defaultdict
 from io import BytesIO
@@ -15,18 +15,16 @@ from rosbags.rosbag1.reader import (
 
 
 class Rosbag1File(Reader):
-    """ROS 1 bag; one without its index is indexed by walking over its whole chunks."""
+    """ROS 1 bag; a file without an index is indexed by reading all complete chunks."""
 
     path: Path
     break_off: str | None = None
 
     def open(self) -> None:
-        """Open the file and read which connections it holds."""
+        """Open the file and read its connections."""
         try:
             super().open()
-        except (
-            Exception
-        ):  # rosbags reads indexed files only; whatever it raises, index from the start
+        except Exception:  # rosbags reads indexed files only and raises many kinds
             self._index_by_walking()
 
     def _index_by_walking(self) -> None:
@@ -44,9 +42,7 @@ class Rosbag1File(Reader):
                     self._index_chunk(position, indexes)
                 else:
                     read_bytes(self.bio, read_uint32(self.bio))
-        except (
-            Exception
-        ):  # the end of the file, or whatever a cut chunk makes its decompressor raise
+        except Exception:  # the end of the file, or an incomplete chunk
             self.break_off = f"breaks off at byte {position}"
         self.indexes = {item.id: sorted(indexes[item.id]) for item in self.connections}
 
@@ -60,7 +56,7 @@ class Rosbag1File(Reader):
         data = chunk.decompressor(read_bytes(file, chunk.datasize))
         self.chunks[position] = chunk
         ids = {item.id for item in self.connections}
-        self.bio = inside = BytesIO(data)  # where `read_connection` reads
+        self.bio = inside = BytesIO(data)  # `read_connection` reads from `bio`
         try:
             while (offset := inside.tell()) < len(data):
                 header = Header.read(inside)

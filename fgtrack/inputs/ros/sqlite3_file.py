@@ -1,4 +1,4 @@
-"""SQLite files of recordings, including those that were not closed or are truncated."""
+"""SQLite files of recordings, also files that were not closed or are truncated."""
 
 import shutil
 from collections.abc import Collection, Iterator
@@ -18,7 +18,8 @@ _FORMATS = {
     "ros2idl": MessageDefinitionFormat.IDL,
 }
 _NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
-_PAGE_SIZE = slice(16, 18)  # of the header
+#: Bytes of the header that contain the page size.
+_PAGE_SIZE = slice(16, 18)
 _TABLES = {
     "topics": "id, name, type, serialization_format",
     "messages": "id, topic_id, timestamp, data",
@@ -27,7 +28,7 @@ _TABLES = {
 
 
 class Sqlite3File:
-    """SQLite file; one that was not closed is read from a copy, a truncated one row by row into a new database."""
+    """SQLite file. A file that was not closed is read from a copy; a truncated file is copied row by row."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -37,7 +38,7 @@ class Sqlite3File:
         self._base = apsw.Connection("")  # a temporary database
 
     def open(self) -> None:
-        """Open the file and read which connections it holds."""
+        """Open the file and read its connections."""
         files = [
             self.path.with_name(self.path.name + suffix)
             for suffix in ("-wal", "-journal")
@@ -51,9 +52,8 @@ class Sqlite3File:
             self.break_off = (
                 f"was not closed by its writer ({journals[0].name} remains)"
             )
-            base = apsw.Connection(
-                str(self._copy(*journals))
-            )  # SQLite applies the journals
+            # SQLite applies the journals to the copy.
+            base = apsw.Connection(str(self._copy(*journals)))
         try:
             self._read_topics(base)
         except apsw.Error:
@@ -68,7 +68,10 @@ class Sqlite3File:
     def messages(
         self, connections: Collection[Connection]
     ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Records of `connections` in log-time order; equal times keep the order of writing."""
+        """Yield connection, log time and data of the messages of `connections`, in the order of log time.
+
+        Messages with equal times keep their order in the file.
+        """
         by_id = {connection.id: connection for connection in connections}
         query = "SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp, id"
         for topic_id, log_ns, data in self._base.execute(query):
@@ -76,13 +79,11 @@ class Sqlite3File:
                 yield by_id[topic_id], log_ns, data
 
     def _read_topics(self, base: apsw.Connection) -> None:
-        base.execute(
-            "SELECT topic_id, count(*) FROM messages GROUP BY 1"
-        ).fetchall()  # raises for a truncated file
+        # This query raises for a truncated file.
+        base.execute("SELECT topic_id, count(*) FROM messages GROUP BY 1").fetchall()
         definitions: dict[str, MessageDefinition] = {}
-        if any(
-            base.execute("PRAGMA table_info(message_definitions)")
-        ):  # an old schema has none
+        # Old schemas have no table of definitions.
+        if any(base.execute("PRAGMA table_info(message_definitions)")):
             for name, kind, text in base.execute(
                 f"SELECT {_TABLES['message_definitions']} FROM message_definitions"
             ):
@@ -103,18 +104,16 @@ class Sqlite3File:
         self._base = base
 
     def _recover(self) -> None:
-        """Copy the rows in the order of writing, up to where the file is cut."""
+        """Copy the rows in the order of writing, up to the truncation."""
         copy = self._copy()
-        with (
-            copy.open("r+b") as file
-        ):  # without the page that was cut: SQLite would read zeros for the rest of it
+        # The incomplete page is removed, because SQLite would read zeros for its missing bytes.
+        with copy.open("r+b") as file:
             page_size = int.from_bytes(file.read(_PAGE_SIZE.stop)[_PAGE_SIZE], "big")
             page_size = 65536 if page_size == 1 else max(page_size, 512)
             file.truncate(copy.stat().st_size // page_size * page_size)
         source = apsw.Connection(str(copy))
-        source.execute(
-            "PRAGMA writable_schema=ON"
-        ).fetchall()  # else a file shorter than its header states is refused
+        # Otherwise SQLite refuses a file that is shorter than its header states.
+        source.execute("PRAGMA writable_schema=ON").fetchall()
         self._base.execute("BEGIN")
         for name, columns in _TABLES.items():
             self._base.execute(f"CREATE TABLE {name} ({columns})")
@@ -130,7 +129,7 @@ class Sqlite3File:
         source.close()
 
     def _copy(self, *journals: Path) -> Path:
-        """Path of a copy of the file with its journals; the recording itself is never changed."""
+        """Copy the file with its journals and return the copy's path; the recording itself is never changed."""
         for file in (self.path, *journals):
             shutil.copyfile(file, Path(self._copies.name) / file.name)
         return Path(self._copies.name) / self.path.name

@@ -1,4 +1,4 @@
-"""Converts the topics of a recording to fgtrack's messages, as configured."""
+"""Conversion of a recording's topics to fgtrack's messages, as configured."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -43,9 +43,9 @@ from fgtrack.inputs.settings import FieldPath, InputConfig, TopicInput
 from fgtrack.inputs.source import FileFormat
 
 DETECTION_FIELDS = frozenset({*MEASURABLE, *DESCRIBING, "object_id"})
-"""Fields that a filter may use, whatever the type of the message."""
+"""Fields by which a filter may select, for every message type."""
 
-#: Keys of a topic that apply to some roles only.
+#: Roles by key, for keys of a topic that apply to some roles only.
 _KEYS = {
     "frame": ("detections",),
     "filters": ("detections", "truth"),
@@ -66,27 +66,27 @@ FIX_FIELDS: Mapping[str, Mapping[str, FieldPath]] = {
         name: f"pose.position.{path}" for name, path in _POSITION.items()
     },
 }
-"""Fields of one object on Earth, by type; its altitude is kept as z_m."""
+"""Fields of one object with latitude and longitude, by message type; the altitude is kept as z_m."""
 Convert = Callable[[RosMessage, int], Iterable[Message]]
-"""Messages of a ROS message and its receipt."""
+"""Converts a ROS message and its receipt to messages."""
 TopicUse = tuple[BagTopic, str, Convert]
-"""A topic, its role in a replay (`ego`, `detections SENSOR`, `truth`, or `messages` for those of fgtrack's own types),
-and its conversion."""
+"""A topic, its role in a replay, and its conversion.
+
+Roles are `ego`, `detections SENSOR`, `truth`, and `messages` for fgtrack's own types.
+"""
 
 
 def topic_uses(bag: Bag, config: InputConfig) -> list[TopicUse]:
-    """Return the uses of the topics of `bag`, as `config` names them, else by their types where fgtrack wrote them.
-    Raises `DataError` for a topic that is not there or not named, and `CallError` where `config` does not fit its type.
+    """Return the uses of the topics of `bag`, as configured; without configured topics, fgtrack's own types are used.
+
+    Raises `DataError` for a topic that is missing or not configured, and `CallError` if
+    `config` does not fit the type of a topic.
     """
     names = {topic.name for topic in bag.topics}
     plane = LocalPlane(config.origin)
-    truth = (
-        config.truth
-        if isinstance(config.truth, tuple)
-        else (config.truth,)
-        if config.truth
-        else ()
-    )
+    truth = config.truth or ()
+    if not isinstance(truth, tuple):
+        truth = (truth,)
     roles: list[tuple[str, TopicInput, Callable[[BagTopic, TopicInput], Convert]]] = [
         *([("ego", config.ego, partial(_ego, plane=plane))] if config.ego else []),
         *(
@@ -111,33 +111,27 @@ def topic_uses(bag: Bag, config: InputConfig) -> list[TopicUse]:
         return native
     if not roles:
         if bag.break_off:
-            raise TruncatedInput(
-                f"{bag.break_off}, and holds no topic that fgtrack has written"
-            )
+            raise TruncatedInput(f"{bag.break_off}, and contains no topic of fgtrack")
         raise DataError(
-            f"{bag.path}: not written by fgtrack, so the configuration must name its topics "
+            f"{bag.path}: is no recording of fgtrack: name its topics in the configuration "
             f"(input.ego, input.detections); it has {_listed(bag)}"
         )
     uses = []
     for role, item, converter in roles:
-        for key, of in _KEYS.items():
-            if role.split()[0] not in of and getattr(item, key) not in (
+        for key, roles_with_key in _KEYS.items():
+            if role.split()[0] not in roles_with_key and getattr(item, key) not in (
                 None,
                 {},
                 "map",
             ):
                 raise CallError(
-                    f"topic {item.topic}: {key} applies to {' and '.join(of)} only, leave it out"
+                    f"topic {item.topic}: {key} applies to {' and '.join(roles_with_key)} only, remove it"
                 )
         topic = _find(bag, item)
         convert = converter(topic, item)
-        uses.append(
-            (
-                topic,
-                role,
-                convert if item.stamp_from == "message" else _at_receipt(convert),
-            )
-        )
+        if item.stamp_from == "receipt":
+            convert = _at_receipt(convert)
+        uses.append((topic, role, convert))
     return uses
 
 
@@ -162,7 +156,10 @@ FORMAT = FileFormat(
 
 
 def bag_messages(bag: Bag, uses: list[TopicUse]) -> Iterator[Message]:
-    """Messages of `bag` in receipt order, the recorder's; `DataError` for a message that does not fit its use."""
+    """Yield the messages of `bag` in receipt order, which is the order of log time.
+
+    Raises `DataError` for a message that does not fit its use.
+    """
     own = all(role == "messages" for _, role, _ in uses)
     for topic, log_ns, data in bag.messages({used.name for used, _, _ in uses}, own):
         for convert in [convert for used, _, convert in uses if used is topic]:
@@ -186,9 +183,9 @@ def _find(bag: Bag, item: TopicInput) -> BagTopic:
         return topics[0]
     if not topics and bag.break_off:
         raise TruncatedInput(f"{bag.break_off}, before topic {item.topic}")
-    count = "several types of" if topics else "no"
+    problem = "several types of" if topics else "no"
     raise DataError(
-        f"{bag.path}: has {count} topic {item.topic}; it has {_listed(bag)}"
+        f"{bag.path}: has {problem} topic {item.topic}; it has {_listed(bag)}"
     )
 
 
@@ -205,11 +202,11 @@ def _check_fields(
     given = {*fields, "x_m", "y_m"} if fields.keys() >= set(GEODETIC) else fields
     for name in sorted(set(fields) - names):
         raise CallError(
-            f"topic {item.topic}: unknown field {name!r}, known are {', '.join(sorted(names))}"
+            f"topic {item.topic}: unknown field {name!r}: there are {', '.join(sorted(names))}"
         )
     for name in needed:
         if name not in given:
-            raise CallError(f"topic {item.topic}: fields must name {name}")
+            raise CallError(f"topic {item.topic}: fields must contain {name}")
 
 
 def _native(topic: BagTopic) -> Convert:
@@ -230,7 +227,7 @@ def _ego(topic: BagTopic, item: TopicInput, plane: LocalPlane) -> Convert:
         return _native(topic)
     if topic.type != ODOMETRY:
         raise CallError(
-            f"topic {topic.name}: an ego of type {topic.type} needs fields, known is {ODOMETRY}"
+            f"topic {topic.name}: an ego of type {topic.type} needs `fields`; only {ODOMETRY} is read without"
         )
     return lambda message, receipt_ns: (ego_from_odometry(message, receipt_ns),)
 
@@ -248,13 +245,13 @@ def _detections(
         frame = item.frame or listed.frame or "ego"
         objects, left_out = split(listed.objects)
         if item.filters:
-            own = (
+            sources = (
                 objects
                 if item.fields is None
                 else items_by_fields(message, item.fields)
             )
             objects, left_out = split(
-                _filtered(item, *pair) for pair in zip(objects, own, strict=True)
+                _filtered(item, *pair) for pair in zip(objects, sources, strict=True)
             )
         return (
             DetectionList(
@@ -274,16 +271,15 @@ def _object_list(
     if unknown := item.filters.keys() - DETECTION_FIELDS:
         names = ", ".join(sorted(DETECTION_FIELDS))
         raise CallError(
-            f"topic {item.topic}: without fields, filters go by {names}, not by {min(unknown)!r}"
+            f"topic {item.topic}: without `fields`, a filter may use {names}, not {min(unknown)!r}"
         )
     if topic.type == DETECTIONS:
-        return partial(
-            detections, receipt_ns=0
-        )  # a list of fgtrack's own has what an object list has
+        # A `DetectionList` has all attributes of an `ObjectList`.
+        return partial(detections, receipt_ns=0)
     if topic.type not in ADAPTERS:
         known = ", ".join(sorted(name for name in ADAPTERS if "/" in name))
         raise CallError(
-            f"topic {topic.name}: objects of type {topic.type} need fields, known are {known}"
+            f"topic {topic.name}: objects of type {topic.type} need `fields`; read without are {known}"
         )
     read: Callable[[RosMessage], ObjectList] = ADAPTERS.load(topic.type)
     return read
@@ -292,7 +288,11 @@ def _object_list(
 def _filtered(
     item: TopicInput, detection: Detection, source: RosMessage
 ) -> Detection | str:
-    """`detection`, or the first filter that it does not pass: by its own values, or by a field that it is read from."""
+    """Return `detection`, or the first filter that excludes it.
+
+    A filter compares a value of the detection, or a field of `source`, the recorded
+    object.
+    """
     for name, each in item.filters.items():
         if not each.passes(
             getattr(detection, name)
@@ -306,7 +306,11 @@ def _filtered(
 def _truths(
     topic: BagTopic, item: TopicInput, number: int, topics: int, plane: LocalPlane
 ) -> Convert:
-    """Return the adapter of truth; each of several topics has one object, its index is the id if there is no other."""
+    """Return the conversion of a topic of truth.
+
+    Each of several topics contains one object, whose id is `object_id`, by default the
+    index `number` of the topic.
+    """
     if (
         topic.type == TRUTH
         and item.fields is None
@@ -315,16 +319,16 @@ def _truths(
     ):
         return _native(topic)
     read = _detections(topic, item, "truth", plane)
-    own = None
+    topic_id = None
     if topics > 1 or item.object_id is not None:
-        own = object_id(number if item.object_id is None else item.object_id)
+        topic_id = object_id(number if item.object_id is None else item.object_id)
 
     def convert(message: RosMessage, receipt_ns: int) -> Iterable[Message]:
         for each in read(message, receipt_ns):
             states = each.objects if isinstance(each, DetectionList) else ()
-            if own is not None and len(states) > 1:
+            if topic_id is not None and len(states) > 1:
                 raise FieldError(
-                    "truth of one object expected, give no object_id and name one topic of truth alone"
+                    "a message with one true object expected: remove object_id and configure a single topic of truth"
                 )
             for index, state in enumerate(states):
                 if state.x_m is None or state.y_m is None:
@@ -334,7 +338,7 @@ def _truths(
                     receipt_ns,
                     next(
                         number
-                        for number in (own, state.object_id, index)
+                        for number in (topic_id, state.object_id, index)
                         if number is not None
                     ),
                     *(state.x_m, state.y_m, state.yaw_rad, state.speed_mps),

@@ -1,6 +1,7 @@
-"""The message types of a recording: rosbags', fgtrack's, the user's and those embedded in the recording.
+"""The message types of a recording: of rosbags, of fgtrack, of the user, and embedded in the recording.
 
-rosbags generates Python code from a definition and runs it: only names and numbers of a recording may get there.
+rosbags generates Python code from a definition and runs the code. So only names and
+numbers of a recording may get into a definition.
 """
 
 import math
@@ -29,13 +30,14 @@ from fgtrack.inputs.ros.definitions import DEFINITIONS
 from fgtrack.inputs.ros.own_messages import LITTLE_ENDIAN, has_own_layout, own_message
 
 Key = tuple[str, MessageDefinition | None]
-"""A message type and its definition in the recording: two topics may define one name differently."""
+"""A message type and its definition in the recording; two topics may define the same name differently."""
 
 _LARGEST_BYTES = 32_000_000
-"""Of a message that is decoded: an object list or a state, never an image; each byte takes up to a hundred."""
+"""Largest message that is decoded: object lists are far smaller, and a byte takes up to a hundred bytes of memory."""
 _LONGEST_TEXT = 200_000
+"""Longest definition in characters."""
 _MOST_VALUES = 4_000
-"""Most values of a type with all its parts: arrays of texts and messages become code for each element."""
+"""Most values of a type with all its parts: rosbags generates code for each element of an array of texts."""
 _LONGEST_ARRAY = 1_000_000
 _INTEGERS = range(-(1 << 63), 1 << 64)
 _TYPE_NAME = re.compile(r"(?!.{256})[A-Za-z]\w*(/[A-Za-z]\w*)+", re.ASCII)
@@ -43,7 +45,7 @@ _MEMBER_NAME = re.compile(r"(?!__|.{256})[A-Za-z_]\w*", re.ASCII)
 _BASE_NAME = re.compile(r"[a-z]+[0-9]*", re.ASCII)
 _SEPARATOR = "=" * 80 + "\n"
 _EMPTY_LINE = re.compile(r"^[ \t]*(?:#[^\n]*)?\n", re.MULTILINE)
-# In these, what is not closed reaches to the end: else its end is looked for again from every following beginning.
+# An unclosed text or remark matches up to the end of the input. Otherwise every later start would search for its end.
 _IDL_TEXT = re.compile(r'"(?:\\.|[^"\\])*(?:"|\\?\Z)', re.DOTALL)
 _IDL_REMARK = re.compile(
     r"/\*.*?(?:\*/|\Z)|//[^\n]*|^#[^\n]*|@\s*[\w:]*(?:\s*\([^()]*\))?",
@@ -53,8 +55,10 @@ _IDL_COSTLY = re.compile(r"=[^;=()*/%|^&~<]*[()*/%|^&~<]|(?:sequence\s*<\s*){4}"
 
 
 class MessageTypes:
-    """Decodes messages of the given types, each by the definition that came with it.
-    Precedence: the definition embedded for the type, those embedded for others, the user's, fgtrack's, rosbags'.
+    """Decodes messages of the given types, each by the definition in its recording.
+
+    Precedence: the definition embedded for the type, definitions embedded for other
+    types, then definitions of the user, of fgtrack and of rosbags.
     """
 
     def __init__(
@@ -62,10 +66,10 @@ class MessageTypes:
     ) -> None:
         self._ros1 = ros1
         self.types: dict[Key, Typesdict] = {}
-        """Types without a problem, each with all its parts."""
+        """Types that can be decoded, each with all its parts."""
         self._stores: dict[Key, Typestore] = {}
         self.problems: dict[Key, str] = {}
-        """Why messages of a type cannot be decoded."""
+        """Reason why messages of a type cannot be decoded."""
         given: Typesdict = {}
         for path in message_definitions:
             given |= _user_types(Path(path))
@@ -73,9 +77,7 @@ class MessageTypes:
         for key in sorted(set(keys), key=str):
             try:
                 embedded[key] = _embedded(*key)
-            except (
-                Exception
-            ) as error:  # whatever an invalid definition makes the parser raise
+            except Exception as error:  # the parser raises any exception
                 self.problems[key] = (
                     f"its embedded definition cannot be read ({one_line(error)})"
                 )
@@ -87,22 +89,24 @@ class MessageTypes:
                 )
             except (ValueError, RecursionError) as error:
                 self.problems[key] = str(error)
-        self._own = {
+        self._in_own_layout = {
             key
             for key, types in self.types.items()
             if not ros1 and has_own_layout(key[0], types)
         }
 
     def starts_with_header(self, key: Key) -> bool:
-        """True if messages of the type start with a header, and can be decoded."""
+        """True if messages of the type can be decoded and begin with a header."""
         members = self.types[key][key[0]][1] if key in self.types else []
         return bool(members) and members[0][1][1] == "std_msgs/msg/Header"
 
     def decode(
         self, key: Key, data: bytes, what: str, log_ns: int | None = None
-    ) -> Any:  # Any: of its type
-        """Message that is serialized in `data`; `what` names it in the `DataError` of a huge or wrong one.
-        With its log time, one of fgtrack's own types in the present layout is a `Message`.
+    ) -> Any:  # Any: an instance of the message type
+        """Decode `data`; raises `DataError`, which begins with `what`, for a huge or malformed message.
+
+        With `log_ns`, a message of fgtrack's own types in the present layout is decoded
+        to a `Message`.
         """
         if len(data) > _LARGEST_BYTES:
             raise DataError(
@@ -111,27 +115,25 @@ class MessageTypes:
         try:
             if (
                 log_ns is not None
-                and key in self._own
+                and key in self._in_own_layout
                 and data.startswith(LITTLE_ENDIAN)
             ):
                 return own_message(key[0], data, log_ns)
             if key not in self._stores:
                 self._stores[key] = _registered(self.types[key])
             store = self._stores[key]
-            return (store.deserialize_ros1 if self._ros1 else store.deserialize_cdr)(
-                data, key[0]
-            )
+            if self._ros1:
+                return store.deserialize_ros1(data, key[0])
+            return store.deserialize_cdr(data, key[0])
         except MemoryError:
             raise
-        except (
-            Exception
-        ) as error:  # whatever bytes of another type make the decoder raise
+        except Exception as error:  # wrong bytes cause any exception in the decoder
             raise DataError(f"{what} is not a {key[0]} ({one_line(error)})") from error
 
 
 @cache
 def typestore_of(names: tuple[str, ...]) -> Typestore:
-    """One store of shipped ROS 2 types and all their parts."""
+    """Return a type store with the shipped ROS 2 types `names` and all their parts."""
     needed: Typesdict = {}
     for name in names:
         needed |= _closure(name, _shipped_types(False))
@@ -145,7 +147,7 @@ def _registered(types: Typesdict) -> Typestore:
 
 
 def _closure(name: str, known: Mapping[str, Any]) -> Typesdict:
-    """The type `name` with all its parts; `ValueError` for one that is undefined, recursive or too large."""
+    """Return the type `name` with all its parts; raises `ValueError` for an undefined, recursive or too large type."""
     needed: Typesdict = {}
     sizes: dict[str, int] = {}
 
@@ -156,15 +158,15 @@ def _closure(name: str, known: Mapping[str, Any]) -> Typesdict:
         if kind == Nodetype.NAME:
             return size_of_type(cast("str", value))
         inner, count = cast("tuple[FieldDesc, int]", value)
-        size, fixed = size_of(inner), int(count) if kind == Nodetype.ARRAY else 1
+        size = size_of(inner)
+        fixed = int(count) if kind == Nodetype.ARRAY else 1
         if kind == Nodetype.SEQUENCE and size == 0:
-            raise ValueError(f"{name} has a list of elements without content")
+            raise ValueError(f"{name} has a list whose elements are empty")
         is_number = inner[0] == Nodetype.BASE and cast("tuple[str, int]", inner[1])[
             0
         ] not in ("string", "wstring")
-        return size * (
-            min(fixed, 1) if is_number else fixed
-        )  # numbers become one NumPy array
+        # Numbers become one NumPy array.
+        return size * (min(fixed, 1) if is_number else fixed)
 
     def size_of_type(current: str) -> int:
         if current not in sizes:
@@ -173,11 +175,10 @@ def _closure(name: str, known: Mapping[str, Any]) -> Typesdict:
             except KeyError as error:
                 raise ValueError(
                     f"the definition of {current or 'a type without a name'} is not in the recording, "
-                    "name its .msg file in message_definitions"
+                    "give its .msg file in message_definitions"
                 ) from error
-            sizes[current] = (
-                _MOST_VALUES + 1
-            )  # until it is computed: a type that contains itself is too large
+            # Until the size is computed. So a type that contains itself is too large.
+            sizes[current] = _MOST_VALUES + 1
             sizes[current] = sum(
                 size_of(description) for _, description in known[current][1]
             )
@@ -191,20 +192,19 @@ def _closure(name: str, known: Mapping[str, Any]) -> Typesdict:
     return needed
 
 
-class _ShippedTypes(dict[str, Any]):  # Any: a type as rosbags holds it
-    """Types by name, defined when they are first needed: those of fgtrack, else those of rosbags, which are many."""
+class _ShippedTypes(dict[str, Any]):  # Any: a type in the form of rosbags
+    """Types of fgtrack, else of rosbags, by name; each is defined at its first use, because rosbags has many."""
 
     def __init__(self, ros1: bool) -> None:
         super().__init__()
         self._ros1 = ros1
 
     def __missing__(self, name: str) -> Any:
-        own = DEFINITIONS.get(name)
-        self |= (
-            get_types_from_msg(own, name)
-            if own is not None
-            else {name: _types_of_rosbags(self._ros1)[name]}
-        )
+        definition = DEFINITIONS.get(name)
+        if definition is not None:
+            self |= get_types_from_msg(definition, name)
+        else:
+            self[name] = _types_of_rosbags(self._ros1)[name]
         return self[name]
 
 
@@ -229,9 +229,7 @@ def _user_types(path: Path) -> Typesdict:
                     read_whole(file, 1.0).decode(), f"{package}/msg/{file.stem}"
                 )
             )
-        except (
-            Exception
-        ) as error:  # whatever an invalid definition makes the parser raise
+        except Exception as error:  # the parser raises any exception
             raise CallError(
                 f"{file}: is not a message definition ({one_line(error)})"
             ) from error
@@ -239,7 +237,7 @@ def _user_types(path: Path) -> Typesdict:
 
 
 def _embedded(name: str, definition: MessageDefinition | None) -> Typesdict:
-    """Types that the text of `definition`, of the type `name`, defines; empty without a text."""
+    """Return the types that the `definition` of the type `name` defines; empty if it has no text."""
     form, text = (
         (None, "") if definition is None else (definition.format, definition.data)
     )
@@ -260,24 +258,26 @@ def _embedded(name: str, definition: MessageDefinition | None) -> Typesdict:
         if others and not first.strip()
         else [text]
     ):
-        types |= checked(get_types_from_idl(_plain_idl(part)))
+        types |= checked(get_types_from_idl(_without_remarks(part)))
     return types
 
 
-def _plain_idl(text: str) -> str:
-    """Text of members alone; `ValueError` for constants or nested sequences that rosbags would parse for minutes."""
+def _without_remarks(text: str) -> str:
+    """Return the IDL text without remarks; raises `ValueError` for text that rosbags would parse for minutes.
+
+    This text computes constants, or nests sequences deeply.
+    """
     plain = _IDL_REMARK.sub(" ", _IDL_TEXT.sub('""', text))
     if _IDL_COSTLY.search(plain):
         raise ValueError(
-            "it computes a constant or nests sequences, which no definition of ROS does"
+            "it computes a constant or nests sequences: definitions of ROS do neither"
         )
-    return plain.replace(
-        ">", "> "
-    )  # rosbags takes the end of `sequence<string<9>>` for a shift
+    # rosbags would read the end of `sequence<string<9>>` as a shift operator.
+    return plain.replace(">", "> ")
 
 
 def checked(types: Typesdict) -> Typesdict:
-    """Return `types`; raise `ValueError` unless all their names are names, and their constants plain values."""
+    """Return `types`; raises `ValueError` unless all names in them are valid names and all constants plain values."""
     for name, (constants, members) in types.items():
         _check_type_name(name)
         names = [
@@ -286,9 +286,9 @@ def checked(types: Typesdict) -> Typesdict:
         ]
         for member in names:
             if not _MEMBER_NAME.fullmatch(member):
-                raise ValueError(f"{member!a:.200} is not a name of a member")
+                raise ValueError(f"{member!a:.200} is not a valid name of a member")
         if len(set(map(normalize_fieldname, names))) < len(names):
-            raise ValueError(f"{name} has two members of one name")
+            raise ValueError(f"{name} has two members with the same name")
         for member, kind, value in constants:
             is_number = (
                 value in _INTEGERS
@@ -304,17 +304,17 @@ def checked(types: Typesdict) -> Typesdict:
             if node == Nodetype.NAME:
                 _check_type_name(cast("str", inner))
             elif not _BASE_NAME.fullmatch(cast("tuple[str, int]", inner)[0]):
-                raise ValueError(f"{member} is of an unknown type")
+                raise ValueError(f"{member} has an unknown type")
     return types
 
 
 def _check_type_name(name: str) -> None:
     if not _TYPE_NAME.fullmatch(name):
-        raise ValueError(f"{name!a:.200} is not a name of a message type")
+        raise ValueError(f"{name!a:.200} is not a valid name of a message type")
 
 
 def _innermost(description: FieldDesc) -> FieldDesc:
-    """The type of the elements of arrays and sequences, of whatever depth."""
+    """Type of the elements of nested arrays and sequences."""
     while description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         description, size = cast("tuple[FieldDesc, int]", description[1])
         if not 0 <= int(size) <= _LONGEST_ARRAY:
