@@ -158,12 +158,12 @@ def test_topics_of_truth_are_an_object_each(recording):
         (
             {"fields": {"range_m": "rangee"}},
             DataError,
-            "there is no 'rangee', but header, canmsg, id",
+            "there is no field 'rangee'; there are header, canmsg, id",
         ),
         (
             {"fields": {"range_m": "range"}, "filters": {"snr": Filter(min=0.0)}},
             DataError,
-            "there is no 'snr'",
+            "there is no field 'snr'",
         ),
     ],
 )

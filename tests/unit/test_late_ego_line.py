@@ -20,7 +20,7 @@ LATE = drive(Drive(late_s=0.4, duration_s=4.0), 1).messages
 IN_TIME = drive(Drive(late_s=0.0, duration_s=4.0), 1).messages
 CONFIG = Config(sensors={"lidar": SensorModel(std={"x_m": 0.1, "y_m": 0.1})})
 LINE = (
-    "come up to 350 ms later than the lists that need them (delay 400 ms, lidar 50 ms)"
+    "arrive up to 350 ms later than the lists that need them (delay 400 ms, lidar 50 ms)"
 )
 
 
