@@ -19,9 +19,7 @@ from fgtrack.pipeline.replay import replay_in_memory
 LATE = drive(Drive(late_s=0.4, duration_s=4.0), 1).messages
 IN_TIME = drive(Drive(late_s=0.0, duration_s=4.0), 1).messages
 CONFIG = Config(sensors={"lidar": SensorModel(std={"x_m": 0.1, "y_m": 0.1})})
-LINE = (
-    "arrive up to 350 ms later than the lists that need them (delay 400 ms, lidar 50 ms)"
-)
+LINE = "arrive up to 350 ms later than the lists that need them (delay 400 ms, lidar 50 ms)"
 
 
 def in_the_map(
