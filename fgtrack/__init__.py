@@ -11,6 +11,8 @@ __version__ = "0.2.0"
 #: Module (or package, of a module) that each public name is loaded from on first use.
 _HOMES = {
     "Advice": "fgtrack.advice.page",
+    "BatchBank": "fgtrack.estimation.smoothing.gtsam.batch",
+    "BatchSolver": "fgtrack.estimation.smoothing.gtsam.batch",
     "CT": "fgtrack.models.motion",
     "CTRA": "fgtrack.models.motion",
     "CTRV": "fgtrack.models.motion",
@@ -24,19 +26,23 @@ _HOMES = {
     "EgoState": "fgtrack.core.types",
     "Estimator": "fgtrack.estimation.base",
     "FgtrackError": "fgtrack.core.errors",
+    "FileFormat": "fgtrack.inputs.source",
     "Lateness": "fgtrack.pipeline.live",
     "Ledger": "fgtrack.advice.ledger",
     "Measurement": "fgtrack.estimation.base",
     "MeasurementModel": "fgtrack.models.measurement",
     "Message": "fgtrack.core.types",
+    "Metric": "fgtrack.evaluation.scores.registry",
     "MotionModel": "fgtrack.models.motion",
     "ObjectList": "fgtrack.inputs.formats.common",
     "RobustLoss": "fgtrack.models.sensors",
     "Run": "fgtrack.runs",
+    "Scenes": "fgtrack.evaluation.matching",
     "ScheduledMeasurement": "fgtrack.evaluation.bounds",
     "SensorModel": "fgtrack.models.sensors",
     "SensorPose": "fgtrack.models.measurement",
     "SmoothedReport": "fgtrack.core.types",
+    "SmootherBank": "fgtrack.estimation.smoothing.bank",
     "Start": "fgtrack.estimation.base",
     "StatesAt": "fgtrack.estimation.base",
     "Study": "fgtrack.recording_study",
@@ -54,11 +60,11 @@ _HOMES = {
     "UpdateStatus": "fgtrack.estimation.base",
     "Window": "fgtrack.estimation.smoothing.window",
     "advise": "fgtrack.advice.advise",
-    "config": "fgtrack",
     "bounds": "fgtrack.evaluation.bounds",
     "bounds_along": "fgtrack.evaluation.bounds",
     "close_ups": "fgtrack.show.figures.late_detection",
     "compare": "fgtrack.evaluation.tables.compare",
+    "config": "fgtrack",
     "estimator": "fgtrack.estimation.registry",
     "evaluate": "fgtrack.evaluation.metrics",
     "initial_state": "fgtrack.estimation.birth",
@@ -112,6 +118,9 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.estimation.filters.ekf import robust_weight as robust_weight
     from fgtrack.estimation.registry import estimator as estimator
     from fgtrack.estimation.registry import list_estimators as list_estimators
+    from fgtrack.estimation.smoothing.bank import SmootherBank as SmootherBank
+    from fgtrack.estimation.smoothing.gtsam.batch import BatchBank as BatchBank
+    from fgtrack.estimation.smoothing.gtsam.batch import BatchSolver as BatchSolver
     from fgtrack.estimation.smoothing.gtsam.factors import (
         measurement_factor as measurement_factor,
     )
@@ -122,10 +131,13 @@ if TYPE_CHECKING:  # the same names for type checkers; a test keeps the two list
     from fgtrack.evaluation.bounds import ScheduledMeasurement as ScheduledMeasurement
     from fgtrack.evaluation.bounds import bounds as bounds
     from fgtrack.evaluation.bounds import bounds_along as bounds_along
+    from fgtrack.evaluation.matching import Scenes as Scenes
     from fgtrack.evaluation.metrics import evaluate as evaluate
+    from fgtrack.evaluation.scores.registry import Metric as Metric
     from fgtrack.evaluation.tables import Tables as Tables
     from fgtrack.evaluation.tables.compare import compare as compare
     from fgtrack.inputs.formats.common import ObjectList as ObjectList
+    from fgtrack.inputs.source import FileFormat as FileFormat
     from fgtrack.models.measurement import MeasurementModel as MeasurementModel
     from fgtrack.models.measurement import SensorPose as SensorPose
     from fgtrack.models.measurement import measurement_model as measurement_model

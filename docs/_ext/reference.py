@@ -191,8 +191,10 @@ def estimators_page() -> str:
 
 
 _GROUPS = {
-    "Runs, tables, live use": ("pipeline", "io", "evaluation"),
-    "Messages, reports, errors": ("core", "types"),
+    "Recordings, runs, live use": ("inputs", "runs", "pipeline", "config", "sim"),
+    "Evaluation, figures, reports": ("evaluation", "show", "recording_study"),
+    "Advice and noise": ("advice", "noise", "clocks"),
+    "Messages, reports, errors": ("core",),
     "Estimators": ("estimation", "testing"),
     "Motion, measurement and sensor models": ("models",),
 }
@@ -207,8 +209,7 @@ def public_names() -> str:
     for title, packages in _GROUPS.items():
         lines += [f"## {title}", ""]
         for name, value in values.items():
-            home = getattr(value, "__module__", None) or value.__name__
-            if home.removeprefix("fgtrack.").split(".")[0] in packages:
+            if f"{fgtrack._HOMES[name]}.{name}".split(".")[1] in packages:
                 lines += ["```{eval-rst}", _autodoc(name, value), "```", ""]
     return "\n".join(lines)
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -13,7 +13,7 @@ from fgtrack.config.yaml_file import dump, load, plain, validate, with_settings
 from fgtrack.core.errors import CallError
 from fgtrack.core.settings import require, settings
 from fgtrack.estimation.filters.initiation import DEFAULT, Initiation
-from fgtrack.estimation.registry import ESTIMATORS, motion_model
+from fgtrack.estimation.registry import ESTIMATORS, MOTION_MODELS, motion_model
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.evaluation.settings import EvaluationConfig
 from fgtrack.inputs.settings import InputConfig
@@ -190,13 +190,14 @@ class InitiationConfig:
 NOISE_HZ = 100.0
 #: Of traffic: 1.5 m/s and 0.2 rad/s of change within a second.
 _STD_PER_S = {"position": 0.3, "yaw": 0.1, "speed": 15.0, "yaw_rate": 2.0}
-_BUILT_IN_MOTION: Mapping[str, type[WhiteNoise]] = {
+#: Kinds whose noise is always `std_per_s`. Any other kind is the name of a registered motion model.
+_STANDARD: Mapping[str, type[WhiteNoise]] = {
+    "auto": CTRV,
     "ctrv_euler": CTRV,
     "ctrv": CTRV,
     "ctra": CTRA,
     "ct": CT,
     "cv": CV,
-    "auto": CTRV,
 }
 
 
@@ -234,16 +235,13 @@ class MotionConfig:
     resting_yaw_rad2ps: NonNegativeFloat = 6.0
     """Spectral density of that noise at rest; it falls with the speed v as 1 / (1 + (v / slow_mps)^2)^2."""
     parameters: Mapping[str, float] = field(default_factory=dict)
-    """Keyword parameters of a plug-in, which has no `std_per_s`."""
+    """Keyword parameters of any other registered model. Its noise is that of its own defaults and of these parameters;
+    if `std_per_s` names its densities instead, `fgtrack advise --tune` fits them."""
 
     def __post_init__(self) -> None:
-        if self.parameters and not self.is_plug_in:
+        if self.parameters and self.kind in _STANDARD:
             raise ValueError(
-                f"parameters: are a plug-in's, kind {self.kind} takes std_per_s"
-            )
-        if self.is_plug_in and dict(self.std_per_s) != _STD_PER_S:
-            raise ValueError(
-                f"std_per_s: is that of the built-in models, give parameters for kind {self.kind}"
+                f"parameters: kind {self.kind} takes none, set std_per_s and the other keys of motion"
             )
         self.model()
 
@@ -253,9 +251,9 @@ class MotionConfig:
         return self.kind == "ctrv_euler" and "accel" in self.std_per_s
 
     @property
-    def is_plug_in(self) -> bool:
-        """True if the model takes `parameters` and no `std_per_s`."""
-        return self.kind not in _BUILT_IN_MOTION
+    def _has_stds(self) -> bool:
+        """True if the noise is `std_per_s`."""
+        return self.kind in _STANDARD or dict(self.std_per_s) != _STD_PER_S
 
     def _is_cartesian(self, sensors: Mapping[str, SensorModel] | None) -> bool:
         """True if `auto` is `ct` with `sensors`."""
@@ -269,7 +267,7 @@ class MotionConfig:
         self, sensors: Mapping[str, SensorModel] | None = None
     ) -> tuple[str, ...]:
         """Names in `std_per_s` that the model has with `sensors`, see `model`."""
-        if self.is_plug_in:
+        if not self._has_stds:
             return ()
         return tuple(
             name
@@ -282,28 +280,33 @@ class MotionConfig:
 
         `sensors` decide what `auto` is: `ctrv` where there are none.
         """
-        if self.is_plug_in:
-            return motion_model(self.kind, self.parameters)
+        if self.kind not in _STANDARD:
+            return motion_model(self.kind, {**self._densities(), **self.parameters})
         if self._is_cartesian(sensors):
             std = {
                 _OF_CT[name]: self.std_per_s[name] for name in self.noise_names(sensors)
             }
-            return CT.from_std_per_step(
-                std, NOISE_HZ, yaw_rate_std_radps=self.yaw_rate_std_radps
-            )
-        model = CTRA if self.is_driven else _BUILT_IN_MOTION[self.kind]
-        others: dict[str, float] = {}
+            return CT.from_std_per_step(std, NOISE_HZ, **self._keys_of(CT))
+        model = CTRA if self.is_driven else _STANDARD[self.kind]
+        others = self._keys_of(model)
         if self.kind == "ctrv_euler":
             others = {"yaw_rate_std_radps": math.inf, "resting_yaw_rad2ps": 0.0}
-        elif issubclass(model, CT):
-            others = {"yaw_rate_std_radps": self.yaw_rate_std_radps}
-        elif issubclass(model, CTRV):
-            others = {
-                "yaw_rate_std_radps": self.yaw_rate_std_radps,
-                "slow_mps": self.slow_mps,
-                "resting_yaw_rad2ps": self.resting_yaw_rad2ps,
-            }
         return model.from_std_per_step(self.std_per_s, NOISE_HZ, **others)
+
+    def _densities(self) -> dict[str, float]:
+        """Densities by `std_per_s` of a model that is registered by the name `kind`; empty where they are not set."""
+        if not self._has_stds:
+            return {}
+        model = MOTION_MODELS.load(self.kind)
+        if not (isinstance(model, type) and issubclass(model, MotionModel)):
+            raise ValueError(f"std_per_s: {self.kind} is a function, set parameters")
+        return model.densities_of(self.std_per_s, NOISE_HZ)
+
+    def _keys_of(self, model: type[WhiteNoise]) -> dict[str, float]:
+        """Parameters of the model that are keys of this section, but for the densities."""
+        keys = ("yaw_rate_std_radps", "slow_mps", "resting_yaw_rad2ps")
+        taken = [each.name for each in fields(model)]
+        return {key: getattr(self, key) for key in keys if key in taken}
 
 
 #: Estimators that take all settings of `smoother`.

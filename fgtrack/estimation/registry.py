@@ -68,8 +68,10 @@ MOTION_MODELS = Registry(
     "motion model",
     {
         "fgtrack.motion_models": {
-            name: f"fgtrack.models.motion:{name.upper()}"
-            for name in ("ctrv", "ctra", "ct", "cv")
+            "ctrv": "fgtrack.models.motion:CTRV",
+            "ctra": "fgtrack.models.motion:CTRA",
+            "ct": "fgtrack.models.motion:CT",
+            "cv": "fgtrack.models.motion:CV",
         }
     },
 )

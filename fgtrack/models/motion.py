@@ -7,7 +7,7 @@ duration is a float or an array of shape (...), and may be negative for `predict
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cached_property
 from typing import ClassVar, NamedTuple, Self
 
@@ -43,6 +43,9 @@ class MotionModel(ABC):
     A model defines `state_names`, `predict`, `jacobian` and `process_noise`. Estimators
     call `transition`. A model that computes the three results together overrides
     `transition`.
+
+    Fields named `<entry>_density_<unit>` are spectral densities of the noise. A
+    configuration sets them by `motion.std_per_s`, and `fgtrack tune` fits them.
     """
 
     state_names: ClassVar[tuple[str, ...]]
@@ -76,6 +79,36 @@ class MotionModel(ABC):
         x_a = predict(x, a). Raises `CallError` if `dt_s` is negative; call `forward`
         for this check.
         """
+
+    @classmethod
+    def density_names(cls) -> tuple[str, ...]:
+        """Names of the noise densities: the fields `<entry>_density_<unit>`, in their order."""
+        if not is_dataclass(cls):
+            return ()
+        return tuple(each.name for each in fields(cls) if "_density_" in each.name)
+
+    @classmethod
+    def densities_of(
+        cls, std: Mapping[str, float], frequency_hz: float
+    ) -> dict[str, float]:
+        """Densities std^2 / frequency_hz of a filter that adds (std / frequency_hz)^2 per step, by the field names.
+
+        `std` is per second, as in Karle et al. 2023. Its keys are the names of all densities up to `_density_`:
+        `position`, `yaw`, ... Raises `ValueError` for other keys.
+        """
+        names = {name.partition("_density_")[0]: name for name in cls.density_names()}
+        if set(std) != set(names):
+            raise ValueError(
+                f"std of {cls.__name__}: give {', '.join(names) or 'none'}, not {', '.join(std) or 'nothing'}"
+            )
+        return {names[key]: value * value / frequency_hz for key, value in std.items()}
+
+    @classmethod
+    def from_std_per_step(
+        cls, std: Mapping[str, float], frequency_hz: float, **others: float
+    ) -> Self:
+        """Return the model with the noise `densities_of`; `others` are the remaining parameters of the model."""
+        return cls(**cls.densities_of(std, frequency_hz), **others)
 
     @staticmethod
     def forward(dt_s: float | FloatArray) -> FloatArray:
@@ -215,32 +248,6 @@ class WhiteNoise(MotionModel):
 
     def __post_init__(self) -> None:
         not_negative(**{name: getattr(self, name) for name in self.density_names()})
-
-    @classmethod
-    def from_std_per_step(
-        cls, std: Mapping[str, float], frequency_hz: float, **others: float
-    ) -> Self:
-        """Return a model with the noise of a filter that adds (std / frequency_hz)^2 in each step.
-
-        The densities are std^2 / frequency_hz. `std` is per second, as in Karle et al.
-        2023. Its keys are the names of all densities up to `_density_`: `position`,
-        `yaw`, ... `others` are the other parameters of the model. Raises `ValueError`
-        if a key is missing or unknown.
-        """
-        names = {name.partition("_density_")[0]: name for name in cls.density_names()}
-        if set(std) != set(names):
-            raise ValueError(
-                f"std of {cls.__name__}: give {', '.join(names)}, not {', '.join(std) or 'nothing'}"
-            )
-        return cls(
-            **{names[key]: value * value / frequency_hz for key, value in std.items()},
-            **others,
-        )
-
-    @classmethod
-    def density_names(cls) -> tuple[str, ...]:
-        """Names of the density fields, in the order of the state."""
-        return tuple(each.name for each in fields(cls) if "_density_" in each.name)
 
     def predict(self, x: FloatArray, dt_s: float | FloatArray) -> FloatArray:
         """See `MotionModel.predict`."""

@@ -60,14 +60,37 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "NO_INDEX": "1",
     }
     env = {f"PIP_{name}": value for name, value in options.items()}
-    [line] = [line for line in commands() if line.startswith("pip ")]
+    [line] = [line for line in commands()[0] if line.startswith("pip ")]
     followed(folder, ["-m", *line.split()], env=env)
     return folder
 
 
-def commands() -> list[str]:
-    [text] = [text for language, text in BLOCKS if language == "bash"]
-    return text.splitlines()
+def commands() -> list[list[str]]:
+    """Lines of each block of commands: those of the package, those of a model in a clone."""
+    return [text.splitlines() for language, text in BLOCKS if language == "bash"]
+
+
+def clone(folder: Path, *titles: str) -> None:
+    """Copy fgtrack into `folder`, with the changes that the page shows under the headings `titles`."""
+    for part in ("fgtrack", "configs"):
+        shutil.copytree(ROOT / part, folder / part)
+    changes = [
+        text
+        for title in titles
+        for text in re.findall(
+            r"^```python\n(# fgtrack.*?)^```$",
+            PAGE.partition(f"\n## {title}\n")[2].partition("\n## ")[0],
+            re.DOTALL | re.MULTILINE,
+        )
+    ]
+    assert changes
+    for text in changes:
+        first, added = text.split("\n", 1)
+        path, _, anchor = first.removeprefix("# ").partition(", behind: ")
+        file = folder / path
+        before = file.read_text()
+        assert before.count(f"{anchor}\n") == 1
+        file.write_text(before.replace(f"{anchor}\n", f"{anchor}\n{added}"))
 
 
 def followed(
@@ -94,7 +117,7 @@ def followed(
 def test_the_commands_of_the_page_run_and_workers_load_the_package(
     folder: Path,
 ) -> None:
-    lines = [line for line in commands() if line.startswith("fgtrack ")]
+    lines = [line for line in commands()[0] if line.startswith("fgtrack ")]
     lines.append("fgtrack sweep sweep.yaml -o sweep --jobs 4")
     said = followed(folder, ["-c", DRIVER], "\n".join(lines) + "\n")
     for name in ("refilter", "drop-bank", "smoother-dogleg", "ekf-replay"):
@@ -167,21 +190,86 @@ def test_a_recording_with_the_message_type_is_replayed(folder: Path) -> None:
     assert updates.count("in_sequence") > 50
 
 
+def test_a_file_of_the_format_is_an_input_of_every_command(folder: Path) -> None:
+    [shown] = [text for text in texts("A file format") if text.startswith("seconds ")]
+    header, *rows = shown.splitlines()
+    moving = [
+        f"{k / 10} lidar {10.0 + 1.5 * k:.2f} {0.05 * (-1) ** k:.2f}" for k in range(40)
+    ]
+    assert rows[0].split()[:2] == moving[0].split()[:2]
+    (folder / "shown.pos").write_text(shown)
+    (folder / "moving.pos").write_text("\n".join([header, *moving, ""]))
+    lines = [
+        "fgtrack info shown.pos",
+        "fgtrack replay moving.pos -o positions",
+        "fgtrack convert moving.pos moving.jsonl",
+    ]
+    said = followed(folder, ["-c", DRIVER], "\n".join(lines) + "\n")
+    assert "detections lidar" in said
+    assert (folder / "positions/updates.csv").read_text().count("in_sequence") > 30
+    assert (folder / "moving.jsonl").read_text().count("lidar") >= 40
+
+
+def texts(title: str) -> list[str]:
+    """Blocks of plain text under a heading of the page."""
+    section = PAGE.partition(f"\n## {title}\n")[2].partition("\n## ")[0]
+    return re.findall(r"^```text\n(.*?)^```$", section, re.DOTALL | re.MULTILINE)
+
+
+def test_the_metric_has_a_column_a_value_and_a_name_in_a_sweep(folder: Path) -> None:
+    script = """
+import fgtrack
+messages = list(fgtrack.simulate("single_opponent", duration_s=1.0))
+run = fgtrack.replay(messages, "smoother", estimator="ekf-replay")
+value = fgtrack.evaluate(run).multi_object.others["missed"]["share"]
+assert 0.0 < value < 1.0, value
+assert fgtrack.compare(run)["multi_object"]["missed_share"].tolist() == [value]
+"""
+    followed(folder, ["-c", script])
+
+
+def test_a_shipped_metric_is_one_file_and_the_line_that_the_page_shows() -> None:
+    home = ROOT / "fgtrack/evaluation/scores"
+    section = PAGE.partition("\n## A metric\n")[2].partition("\n## ")[0]
+    [line] = re.findall(r"^```python\n(.*?)^```$", section, re.DOTALL | re.MULTILINE)
+    assert line in (home / "registry.py").read_text(encoding="utf-8")
+    naming = [
+        file.relative_to(ROOT).as_posix()
+        for file in sorted((ROOT / "fgtrack").rglob("*.py"))
+        if re.search(r"\bospa\b", file.read_text(encoding="utf-8"))
+    ]
+    assert naming == [
+        "fgtrack/evaluation/scores/multi_object.py",  # a docstring
+        "fgtrack/evaluation/scores/ospa.py",
+        "fgtrack/evaluation/scores/registry.py",
+    ]
+
+
+def test_a_motion_model_in_a_clone_is_one_file_and_one_line(tmp_path: Path) -> None:
+    """Commands of the page, the tuned noise, the contract and the documentation know the model."""
+    clone(tmp_path, "A motion model")
+    source = ROOT / "docs/example/fgtrack_example/acceleration.py"
+    shutil.copy(source, tmp_path / "fgtrack/models")
+    said = followed(tmp_path, ["-c", DRIVER], "\n".join(commands()[1]) + "\n")
+    assert "motion.jerk" in said
+    tuned = (tmp_path / "tuned.yaml").read_text()
+    assert re.search(r"kind: acceleration\n", tuned)
+    assert (tmp_path / "run/tracks.csv").stat().st_size > 2000
+    script = """
+import fgtrack.models
+from fgtrack.estimation.registry import MOTION_MODELS, motion_model
+assert list(MOTION_MODELS)[-1] == "acceleration"
+assert not MOTION_MODELS.sources()  # no plug-in
+fgtrack.testing.check_motion_model(motion_model("acceleration", {}))
+"""
+    followed(tmp_path, ["-c", script])
+
+
 def test_a_new_measured_quantity_is_known_everywhere(tmp_path: Path) -> None:
     """In a copy of the package, with the changes of the page."""
     simulate = "from fgtrack.cli.main import run; run(['simulate', 'single_opponent', '-o', 'old', '--duration', '1'])"
     followed(tmp_path, ["-c", simulate])
-    for part in ("fgtrack", "configs"):
-        shutil.copytree(ROOT / part, tmp_path / part)
-    changes = [text for _, text in BLOCKS if "behind:" in text]
-    assert len(changes) == 3
-    for text in changes:
-        first, added = text.split("\n", 1)
-        path, _, anchor = first.removeprefix("# ").partition(", behind: ")
-        file = tmp_path / path
-        before = file.read_text()
-        assert before.count(f"{anchor}\n") == 1
-        file.write_text(before.replace(f"{anchor}\n", f"{anchor}\n{added}"))
+    clone(tmp_path, "A measured quantity")
     script = """
 import numpy as np
 import fgtrack

@@ -92,6 +92,20 @@ def test_a_star_import_and_the_help_show_the_public_names_alone() -> None:
     assert dir(fgtrack.plot) == sorted(fgtrack.plot.__all__)
 
 
+def test_the_pages_of_the_python_api_have_every_public_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    docs = Path(__file__).parents[2] / "docs"
+    monkeypatch.syspath_prepend(docs / "_ext")
+    import reference
+
+    overview = (docs / "api.md").read_text(encoding="utf-8")
+    generated = reference.public_names()
+    for name in fgtrack.__all__:
+        assert f"`{name}`" in overview, name
+        assert f":: fgtrack.{name}" in generated or f":: {name}." in generated, name
+
+
 def test_a_run_in_memory_a_run_folder_and_the_command_give_the_same_run(
     drive: Path, tmp_path: Path
 ) -> None:

@@ -3,7 +3,9 @@
 import math
 from dataclasses import replace
 from datetime import datetime, timedelta
+from itertools import permutations
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 from evaluation_runs import ROUND, WEST, write_run
 from evaluation_scenes import Positions, random_scenes
 
+from fgtrack.core.errors import CallError
 from fgtrack.core.types import TrackReport
 from fgtrack.evaluation.matching import Scenes, match, scenes
 from fgtrack.evaluation.metrics import evaluate
@@ -19,7 +22,10 @@ from fgtrack.evaluation.scores.multi_object import (
     gospa,
     multi_object_metrics,
 )
+from fgtrack.evaluation.scores.ospa import ospa
+from fgtrack.evaluation.scores.registry import METRICS
 from fgtrack.evaluation.settings import EvaluationConfig
+from fgtrack.evaluation.tables.compare import compare
 from fgtrack.runs import Run
 
 C_M, GATE_M = 5.0, 4.0
@@ -193,6 +199,77 @@ def test_a_pair_at_the_gate_counts_and_one_beyond_it_does_not() -> None:
         )
         found = multi_object_metrics(there, GATE_M)
         assert (found.clear["pairs"], found.identity["idf1"]) == (pairs, pairs)
+
+
+# --- OSPA
+
+
+@pytest.mark.parametrize(("seed", "side_m"), SCENES)
+def test_ospa_is_the_best_of_all_assignments(seed: int, side_m: float) -> None:
+    objects, tracks, there = random_scenes(seed, side_m)
+    squares_m2 = []
+    for object_m, track_m in zip(objects.xy, tracks.xy, strict=True):
+        few, many = sorted((object_m, track_m), key=len)
+        squares = [
+            sum(
+                min(np.sum((few[k] - many[j]) ** 2), C_M**2)
+                for k, j in enumerate(order)
+            )
+            for order in permutations(range(len(many)), len(few))
+        ]
+        left_over_m2 = C_M**2 * (len(many) - len(few))
+        squares_m2.append((min(squares) + left_over_m2) / max(len(many), 1))
+    found = ospa(there, C_M)
+    assert found["mean_m"] == pytest.approx(np.sqrt(squares_m2).mean(), rel=1e-12)
+    assert found["rms_m"] == pytest.approx(np.sqrt(np.mean(squares_m2)), rel=1e-12)
+
+
+def test_ospa_stands_beside_the_other_metrics(story: Run) -> None:
+    found = multi_object(story).others["ospa"]
+    assert 0.0 < found["mean_m"] <= found["rms_m"] < 5.0
+    table = compare(story)["multi_object"]
+    assert table["ospa_rms_m"].tolist() == [found["rms_m"]]
+
+
+# --- metrics of plug-ins
+
+
+def plug_in(monkeypatch: pytest.MonkeyPatch, metric: object) -> None:
+    package = SimpleNamespace(name="odd", version="1.0")
+    entry = SimpleNamespace(
+        dist=package, load=lambda: metric, group="fgtrack.metrics", value="x:y"
+    )
+    monkeypatch.setitem(METRICS._entries, "own", entry)
+
+
+def test_a_plug_in_adds_a_metric(monkeypatch: pytest.MonkeyPatch, story: Run) -> None:
+    plug_in(monkeypatch, lambda scenes, gate_m: {"ticks": len(scenes.present)})
+    assert multi_object(story).others["own"] == {"ticks": 10.0}
+
+
+@pytest.mark.parametrize(
+    ("result", "message"),
+    [
+        (5.0, "'own': must return numbers by name, returned a float"),
+        ({"x": "far"}, "'own': must return numbers by name, returned 'far' for 'x'"),
+        (None, "'own': must return numbers by name, returned a NoneType"),
+    ],
+    ids=["number", "text", "nothing"],
+)
+def test_a_metric_that_returns_anything_else_is_named(
+    monkeypatch: pytest.MonkeyPatch, story: Run, result: object, message: str
+) -> None:
+    plug_in(monkeypatch, lambda scenes, gate_m: result)
+    with pytest.raises(CallError, match=message):
+        evaluate(story)
+
+
+def test_a_metric_that_raises_is_named(
+    monkeypatch: pytest.MonkeyPatch, story: Run
+) -> None:
+    plug_in(monkeypatch, lambda scenes, gate_m: 1 / 0)
+    with pytest.raises(CallError, match=r"'own': plug-in x:y of odd 1\.0 cannot be co"):
+        evaluate(story)
 
 
 # --- what is judged

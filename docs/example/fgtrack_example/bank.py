@@ -77,7 +77,7 @@ class DropBank:
     def present(self):
         """States now as x, y, yaw, speed, yaw rate, for the output."""
         states = self.states_at(max(self.present_ns, int(self.stamps_ns.max(initial=0))))
-        means, covariances = self.motion.kinematic(states.means, states.covariances)
+        means, covariances = self.motion.published(states.means, states.covariances)
         return [
             TrackState(self.present_ns, mean, covariance) for mean, covariance in zip(means, covariances, strict=True)
         ]

@@ -2,7 +2,7 @@
 
 import gtsam
 
-from fgtrack.estimation.smoothing.gtsam.batch import BatchBank, BatchSolver
+from fgtrack import BatchBank, BatchSolver
 
 
 class DoglegSolver(BatchSolver):

@@ -8,7 +8,7 @@ IDF1 (Ristani et al. 2016) and HOTA (Luiten et al. 2021) are those of motrics wi
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from motrics import compute_hota_from_similarity, compute_identity_from_similarity
@@ -16,6 +16,7 @@ from motrics import compute_hota_from_similarity, compute_identity_from_similari
 from fgtrack.core.types import FloatArray
 from fgtrack.evaluation.matching import NO_OBJECT, Scenes, pair
 from fgtrack.evaluation.scores.continuity import switches
+from fgtrack.evaluation.scores.registry import registered_metrics
 from fgtrack.runs import NO_TRACK
 
 AT_GATE = 0.5
@@ -36,6 +37,8 @@ class MultiObjectMetrics:
     """`idp`, share of the track rows that are at their object, `idr`, of the objects at their track, and `idf1`."""
     hota: Mapping[str, float]
     """Means over the bounds 0.05, 0.1, ..., 0.95 of the similarity: `deta`, `assa` and `hota`."""
+    others: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Values of the registered metrics, by the name of the metric: `ospa`, and those of plug-ins."""
 
 
 def multi_object_metrics(scenes: Scenes, gate_m: float) -> MultiObjectMetrics:
@@ -79,6 +82,7 @@ def multi_object_metrics(scenes: Scenes, gate_m: float) -> MultiObjectMetrics:
             name: getattr(hota, name) if hota.num_gt else math.nan
             for name in ("hota", "deta", "assa")
         },
+        registered_metrics(scenes, gate_m),
     )
 
 

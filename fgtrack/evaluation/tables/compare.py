@@ -190,10 +190,19 @@ def _multi_object(metrics: Mapping[str, Metrics]) -> Table:
                 f"gospa_{part}_m": math.sqrt(square) for part, square in parts.items()
             }
             record |= {"mota": of.clear["mota"], "idf1": of.identity["idf1"], **of.hota}
+            for name, values in of.others.items():
+                record |= {f"{name}_{key}": value for key, value in values.items()}
             switches, confirm_s = overall.id_switches, overall.time_to_confirm_s.mean
             records.append(
                 record | {"id_switches": switches, "time_to_confirm_s": confirm_s}
             )
+    others = {
+        f"{name}_{key}": f"{name}\n{key}"
+        for item in metrics.values()
+        if item.multi_object is not None
+        for name, values in item.multi_object.others.items()
+        for key in values
+    }
     columns = [
         RUN,
         Column("GOSPA\n[m]", _GOSPA),
@@ -208,6 +217,7 @@ def _multi_object(metrics: Mapping[str, Metrics]) -> Table:
         ),
         Column("switches", "id_switches"),
         Column("confirm\n[s]", "time_to_confirm_s"),
+        *(Column(text, key, is_extra=True) for key, text in others.items()),
     ]
     notes = [
         "GOSPA: root mean square over ticks; the squares of its parts add up to its own; scores: 100 is perfect",
