@@ -2,16 +2,21 @@
 
 import os
 import pickle
+import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable
 from importlib import util
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
 import pytest
+from numba.core.caching import FunctionCache
+from packaging.requirements import Requirement
 
 from fgtrack.core import compiled
 
@@ -109,7 +114,7 @@ def test_a_disk_that_becomes_full_is_no_error(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(compiled.FunctionCache, "save_overload", full)
+    monkeypatch.setattr(FunctionCache, "save_overload", full)
     assert stored(SHARED, CALLER).call(3) == 7.0
     assert sum("cannot be stored" in line for line in caplog.messages) == 1
 
@@ -336,3 +341,30 @@ def test_a_loop_that_gives_a_number_allocates_nothing(stored) -> None:
             SHARED,
             "import numpy as np\n@njit('float64(int64)')\ndef call(n):\n    return np.empty(n)[0]\n",
         )
+
+
+def test_an_array_on_the_stack_is_an_ordinary_array_outside_compiled_functions() -> (
+    None
+):
+    array = compiled.scratch(2, 3)
+    array[:] = 1.0
+    assert array.sum() == 6.0
+
+
+def test_versions_of_numba_with_other_internals_are_refused() -> None:
+    file = Path(compiled.__file__).parents[2] / "pyproject.toml"
+    lines = tomllib.loads(file.read_text())["project"]["dependencies"]
+    requirements = {each.name: each for each in map(Requirement, lines)}
+    for name in ("numba", "llvmlite"):
+        limits = {each.operator for each in requirements[name].specifier}
+        assert "<" in limits
+        assert requirements[name].specifier.contains(version(name))
+
+
+def test_the_inside_of_numba_is_imported_in_one_file() -> None:
+    package = Path(compiled.__file__).parents[1]
+    inside = re.compile(r"^\s*(from|import) numba\.(?!extending\b)", re.MULTILINE)
+    found = [
+        path.name for path in package.rglob("*.py") if inside.search(path.read_text())
+    ]
+    assert found == ["numba_internals.py"]
