@@ -220,6 +220,7 @@ class Facing:
         self._free: list[int] = []
         self._log_odds = np.zeros(0)
         self._stamps_ns = np.zeros(0, dtype=np.int64)
+        self._least_log_odds: float | None = None  # of `_log_odds`, until they change
         self._turned = np.zeros(0, dtype=bool)
         self._is_any_turned = False
         self._ended = set[
@@ -279,7 +280,7 @@ class Facing:
             start.stamp_ns,
             False,
         )
-        self._last_ids = ()
+        self._last_ids, self._least_log_odds = (), None
 
     def read(
         self,
@@ -355,6 +356,7 @@ class Facing:
         """Learn from readings (m,) of detections of the tracks in `rows`; return the yaws with a defect, and which."""
         seen = self._seen.setdefault(sensor, np.zeros(3)) if has_yaw else np.zeros(3)
         arrays = self._log_odds, self._stamps_ns, seen
+        self._least_log_odds = None
         defects = kernels(_KERNELS).learn(
             rows, stamp_ns, codes, evidence, has_yaw, self._switch_hz, *arrays
         )
@@ -374,10 +376,12 @@ class Facing:
         if not track_ids:
             return states
         if isinstance(states, States) and not self._is_any_turned:
-            may_turn = (
-                states.means[:, SPEED].min() < 0.0 or self._log_odds.min() < -_SURE
-            )
-            if not may_turn:
+            if self._least_log_odds is None:
+                self._least_log_odds = float(self._log_odds.min())
+            if (
+                self._least_log_odds >= -_SURE
+                and not states.means[:, SPEED].min() < 0.0
+            ):
                 return states
         rows = self._rows_of(track_ids)
         before = self._turned[rows]
@@ -418,7 +422,7 @@ class Facing:
     def forget(self, track_id: int) -> None:
         """Forget a track that has ended, but for its last smoothed states."""
         row = self._rows.pop(track_id)
-        self._last_ids = ()
+        self._last_ids, self._least_log_odds = (), None
         self._log_odds[row] = 0.0
         self._free.append(row)
         if self._turned[row]:

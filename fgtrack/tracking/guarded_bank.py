@@ -115,14 +115,14 @@ class GuardedBank:
         """See `TrackBank.update`; a measurement whose update raises has failed, and so has one of an ended track.
         What propagates, and an interrupt, leaves states unknown, so it ends the tracks of the call as well.
         """
-        results = [UpdateResult(UpdateStatus.FAILED) for _ in track_ids]
-        alive = [
-            row for row, track_id in enumerate(track_ids) if track_id in self._alive
-        ]
-        ids = [track_ids[row] for row in alive]
+        ids = [track_id for track_id in track_ids if track_id in self._alive]
         given = set(ids)
-        if len(ids) < len(results):
-            measurements = [measurements[row] for row in alive]
+        if len(ids) < len(track_ids):
+            measurements = [
+                each
+                for track_id, each in zip(track_ids, measurements, strict=True)
+                if track_id in given
+            ]
         try:
             answers = self._updated(stamp_ns, ids, measurements) if ids else {}
         except BaseException as error:
@@ -130,8 +130,10 @@ class GuardedBank:
             if isinstance(error, DataError) or not isinstance(error, Exception):
                 raise
             answers = {}
-        for row in alive:
-            results[row] = answers.get(track_ids[row], results[row])
+        results = [
+            answers.get(track_id) or UpdateResult(UpdateStatus.FAILED)
+            for track_id in track_ids
+        ]
         for track_id, result in zip(track_ids, results, strict=True):
             if result.nis is None and result.status is UpdateStatus.FAILED:
                 self.failures.add(Failure.UPDATE_FAILED)

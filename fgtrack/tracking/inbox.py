@@ -333,6 +333,8 @@ class Inbox:
         `waits` is asked about batches at the tick `now_ns`. A batch that waits stays here until the next call. With it
         stay all batches of its message, by which together tracks are missed, and what its sensor has stamped later.
         """
+        if not self._pending:
+            return []
         pending, held, first_ns = (
             sorted(self._pending, key=attrgetter("stamp_ns")),
             set[int](),

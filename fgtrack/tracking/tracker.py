@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, repeat
@@ -37,7 +37,7 @@ from fgtrack.estimation.base import (
     UpdateResult,
     UpdateStatus,
 )
-from fgtrack.estimation.failures import Failure, Failures
+from fgtrack.estimation.failures import Containment, Failure, Failures
 from fgtrack.estimation.filters.ekf import correct_one, propagated
 from fgtrack.estimation.filters.propagation import kinematic_states
 from fgtrack.estimation.object_bank import ahead_of, states_of
@@ -159,6 +159,14 @@ class Tracker:
         ] = {}  # in this tick, by message: tracks that it has matched or started
         self.failures = parts.failures
         """Counts of internal failures and of the tracks that they have ended."""
+        contained = partial(
+            Containment, parts.failures, propagated=parts.propagated_exceptions
+        )
+        self._guarded_step = contained(Failure.STEP_FAILED)
+        self._guarded_list = contained(Failure.LIST_FAILED)
+        self._guarded_birth = contained(Failure.BIRTH_FAILED)
+        self.delays: Mapping[str, Delays] = parts.watermarks.delays
+        """Delays of the messages of each sensor, and of the ego under `EGO`."""
         self.refused_ego: Counter[str] = Counter()
         """Ego messages that were not used, by reason."""
         self.last_updates: tuple[UpdateRecord, ...] = ()
@@ -172,11 +180,6 @@ class Tracker:
     def located(self, ego: EgoState) -> EgoState:
         """Return `ego`, which was received, at the position that is used at its stamp."""
         return self._parts.ego.located(ego)
-
-    @property
-    def delays(self) -> Mapping[str, Delays]:
-        """Delays of the messages of each sensor, and of the ego under `EGO`."""
-        return self._parts.watermarks.delays
 
     @property
     def id_conflicts(self) -> Mapping[str, int]:
@@ -222,7 +225,7 @@ class Tracker:
             now_ns, min([held_ns, *(batch.stamp_ns for batch in self._waiting)])
         )
         bank.advance(now_ns)
-        with self._contained(Failure.STEP_FAILED):
+        with self._guarded_step:
             parts.ego.start_tick()
         self._forget_first(bank.window_start_ns)
         if self._process_waiting():
@@ -307,17 +310,6 @@ class Tracker:
         unsound, reports = faults(present), self._reports(states.track_ids, present)()
         return tuple(report for row, report in enumerate(reports) if row not in unsound)
 
-    @contextmanager
-    def _contained(self, failure: Failure) -> Iterator[None]:
-        """Count what a step raises as `failure`, and go on without the step; some exceptions propagate."""
-        try:
-            yield
-        except Exception as error:
-            if isinstance(error, self._parts.propagated_exceptions):
-                raise
-            self.failures.add(failure)
-            self.failures.note(error)
-
     def _published(
         self, track_ids: Sequence[int], states: Sequence[TrackState]
     ) -> tuple[Sequence[int], Sequence[TrackState]]:
@@ -333,18 +325,22 @@ class Tracker:
     def _expire(self, now_ns: int, processed_ns: int) -> None:
         """End tracks by the time that has passed, where all lists before `processed_ns` that came are processed."""
         parts = self._parts
-        with self._contained(Failure.STEP_FAILED):
+        with self._guarded_step:
             watermarks_ns = parts.watermarks.at(now_ns, parts.bank.window_start_ns)
-            self._end(parts.lifecycle.expired(now_ns, watermarks_ns, processed_ns))
+            ended = parts.lifecycle.expired(now_ns, watermarks_ns, processed_ns)
+            if ended:
+                self._end(ended)
 
     def _process_waiting(self) -> bool:
         """Process all batches that were collected; return True if there was one."""
         self._seen = {}
+        if not self._waiting:
+            return False
         posed = list(map(self._posed, self._waiting))
         for each in zip(posed, self._preprocessed(posed), strict=True):
             self._process_if_possible(*each)
             self.delays[each[0].batch.message.sensor].processed(each[0].batch.stamp_ns)
-        return bool(posed)
+        return True
 
     def _forget_first(self, oldest_ns: int) -> None:
         """Forget the first positions of tracks whose second one no late list can precede."""
@@ -360,7 +356,7 @@ class Tracker:
     def _posed(self, batch: Batch) -> PosedBatch:
         """Return `batch` with the pose that it is seen from; detections in the map need none."""
         parts, sensor = self._parts, self._parts.sensors[batch.message.sensor]
-        with self._contained(Failure.STEP_FAILED):
+        with self._guarded_step:
             if places(batch, sensor):
                 ego = parts.ego.placed(
                     batch.stamp_ns, parts.bank.present_ns, partial(range_of, batch)
@@ -375,7 +371,7 @@ class Tracker:
     ) -> Sequence[Preprocessed | None]:
         """Candidates of `batches` in one pass; of a pass that fails nothing, so that one batch does not fail others."""
         try:
-            return self._parts.preprocess.together(batches) if batches else ()
+            return self._parts.preprocess.together(batches)
         except Exception as error:
             if isinstance(error, self._parts.propagated_exceptions):
                 raise
@@ -386,7 +382,7 @@ class Tracker:
     ) -> None:
         """Process a batch, the first that waits; after an exception or an interrupt, the rest of it ends as failed."""
         self._begun = len(self._records), posed.batch
-        with self._contained(Failure.LIST_FAILED):
+        with self._guarded_list:
             try:
                 self._process(posed, preprocessed)
             except BaseException:
@@ -438,11 +434,11 @@ class Tracker:
         states, assignment = self._identified(batch, candidates) or self._associated(
             batch, candidates
         )
-        with self._contained(Failure.STEP_FAILED):
+        with self._guarded_step:
             self._match(batch, candidates, assignment, states, scan)
         if assignment.pairs:
             self._estimate(batch, candidates, assignment, states)
-        with self._contained(Failure.STEP_FAILED):
+        with self._guarded_step:
             self._miss(batch, assignment, states, scan)
         self._conclude(batch, candidates, assignment.refused, Disposition.GATED)
         new = assignment.new
@@ -522,11 +518,14 @@ class Tracker:
             tests.append(
                 partial(weigh, batch.message.sensor, batch.stamp_ns, states.track_ids)
             )
-        newborn = self._newborn_of_others(batch, states)
-        if newborn.any():
-            tests.append(
-                partial(self._explained, newborn, batch, candidates, states, evidence)
-            )
+        if self._newborn:
+            newborn = self._newborn_of_others(batch, states)
+            if newborn.any():
+                tests.append(
+                    partial(
+                        self._explained, newborn, batch, candidates, states, evidence
+                    )
+                )
         if not tests:
             return None
         return lambda pairs: np.all([test(pairs) for test in tests], axis=0)
@@ -535,8 +534,6 @@ class Tracker:
         """True of tracks with one position so far, or up to the stamp, of a list of another sensor, shape (m,).
         The next list of that sensor shows the object again. Until then its velocity is unknown, and the gate wide.
         """
-        if not self._newborn:
-            return np.zeros(len(states.track_ids), dtype=bool)
         sensors, own = self._parts.sensors, batch.message.sensor
         first = [
             self._newborn.get(track_id, (own, NEVER)) for track_id in states.track_ids
@@ -751,7 +748,7 @@ class Tracker:
             joint = self._joint(batch, candidates, states)
             read = self._read(batch, candidates, assignment, states)
             for group, members, here in candidates.split(chosen):
-                with self._contained(Failure.LIST_FAILED):
+                with self._guarded_list:
                     for pairs, of, each, ways in _seen(
                         group, members, here, tracks, states, read
                     ):
@@ -765,7 +762,7 @@ class Tracker:
                             batch.stamp_ns, *own, outcomes, pairs.tolist()
                         )
                         if candidates.placed[chosen[here[0]]]:  # as all others
-                            with self._contained(Failure.STEP_FAILED):
+                            with self._guarded_step:
                                 self._placed(*own, results)
         finally:
             failed, leaders = (
@@ -812,9 +809,10 @@ class Tracker:
         outcomes.update(
             zip(pairs, zip(repeat(measurements.stack), results), strict=True)
         )
+        num_measured = self._num_measured
         for track_id, result in zip(ids, results, strict=True):
             if result.innovation is not None:
-                self._num_measured[track_id] += 1
+                num_measured[track_id] += 1
         return results
 
     def _placed(
@@ -830,6 +828,8 @@ class Tracker:
             row for row, result in enumerate(results) if result.innovation is not None
         ]
         self._parts.lifecycle.fused([ids[row] for row in fused])
+        if not (self._newborn or self._directed or self._undirected):
+            return
         for row in fused:
             track_id, stamp_ns = ids[row], measurements.stack.stamp_ns
             if track_id in self._newborn:
@@ -853,7 +853,7 @@ class Tracker:
         """Start a track, if the sensor and the birth rules want one; a track whose start fails leaves nothing."""
         first, track_id = len(self._records), None
         try:
-            with self._contained(Failure.BIRTH_FAILED):
+            with self._guarded_birth:
                 prior = self._prior(candidates, position, scan)
                 if prior is None:
                     self._conclude(batch, candidates, [position], Disposition.GATED)
@@ -960,7 +960,7 @@ class Tracker:
                 *facing,
                 parts.lifecycle.forget,
             ):
-                with self._contained(Failure.STEP_FAILED):
+                with self._guarded_step:
                     forget(track_id)
 
     def _reports(

@@ -141,6 +141,8 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         measurements: Sequence[Measurement],
     ) -> list[UpdateResult]:
         """See `TrackBank.update`."""
+        if isinstance(measurements, Measurements):
+            return self._update(stamp_ns, track_ids, measurements.stack)
         outcomes = Outcomes()
         for indices, alike in stacks(measurements):
             ids = [track_ids[i] for i in indices]
@@ -153,13 +155,13 @@ class ReplayBank(ObjectBank[ReplayEkf]):
         """Return the outcomes of a stack of measurements."""
         with changing_nothing(track_ids):
             seen = one.seen_by(self._motion)
-            is_held = (
-                list(map(self._rows.__contains__, track_ids))
-                if _is_plain(seen)
-                else [False] * len(track_ids)
-            )
+            is_plain = _is_plain(seen)
+            is_held = [is_plain and each in self._rows for each in track_ids]
+            groups: Sequence[Sequence[int]] = [range(len(is_held))]
+            if not (is_held and all(is_held)):
+                groups = equal_ones(is_held)
         outcomes = Outcomes()
-        for chosen in equal_ones(is_held):
+        for chosen in groups:
             part, ids = seen, track_ids
             if len(chosen) < len(track_ids):
                 part, ids = (

@@ -34,9 +34,14 @@ from fgtrack.models.motion import CTRV
 
 DURATIONS_S = (0.1, 0.2, 0.4, 0.8)
 """Durations over which extrapolation is judged; other durations lie between them."""
-_LONGEST_S = (
-    2.0  # a state that is extrapolated further shows nothing of a duration of about 1 s
+#: A state that is extrapolated further shows nothing of a duration of about 1 s.
+_LONGEST_S = 2.0
+_LONGEST_EACH_S = (*(1.5 * each_s for each_s in DURATIONS_S[:-1]), _LONGEST_S)
+_DURATIONS_NS = tuple(
+    (nanoseconds(each_s), nanoseconds(longest_s))
+    for each_s, longest_s in zip(DURATIONS_S, _LONGEST_EACH_S, strict=True)
 )
+_NONE_FOUND = (math.nan,) * (2 * len(DURATIONS_S))
 _STEP_S = 0.05  # between two states that are learned from
 _SPACING_NS = nanoseconds(0.25)  # between two errors whose correlation is learned
 _FORGET_S = 120.0  # a road with bends and straights, a lap
@@ -65,17 +70,12 @@ class EgoGrowth:
         """
         self._density = density_m2ps3
         self._assumed = np.square([accel_std_mps2, yaw_accel_std_radps2])
-        shape = len(DURATIONS_S), 2
-        self._weights_s, self._squares = np.zeros(shape), np.zeros(shape)
-        self._soon_s, self._soon = np.zeros(shape), np.zeros(shape)
-        self._pairs, self._products, self._spacings_s = (
-            np.zeros(shape),
-            np.zeros(shape),
-            np.zeros(shape),
-        )
-        self._recent = deque[
-            tuple[int, FloatArray]
-        ]()  # stamp and accelerations, of the newest `_SPACING_NS`
+        # Sums of weights, squares, squares of pairs, products and spacings, and below of weights and squares. Each
+        # has one entry for the acceleration and one for the yaw acceleration over each duration.
+        self._lasting = [[0.0] * len(_NONE_FOUND) for _ in range(5)]
+        self._fading = [[0.0] * len(_NONE_FOUND) for _ in range(2)]
+        # Stamps and accelerations of the newest `_SPACING_NS`.
+        self._recent = deque[tuple[int, Sequence[float]]]()
         self._learned_ns: int | None = None
         self._jumped_ns = 0
         self._placed = deque[int]()  # stamps of lists with extrapolated poses
@@ -103,78 +103,84 @@ class EgoGrowth:
         if step_s < _STEP_S:
             return
         self._learned_ns = stamp_ns
-        found = np.full(self._squares.shape, np.nan)
-        for k, duration_s in enumerate(DURATIONS_S):
-            row = bisect.bisect_right(stamps_ns, stamp_ns - nanoseconds(duration_s)) - 1
+        found = list(_NONE_FOUND)
+        c, s = math.cos(newest.yaw_rad), math.sin(newest.yaw_rad)
+        for k, (duration_ns, longest_ns) in enumerate(_DURATIONS_NS):
+            row = bisect.bisect_right(stamps_ns, stamp_ns - duration_ns) - 1
             if row < 0 or stamps_ns[row] < self._jumped_ns:
                 continue
-            elapsed_s = seconds(stamp_ns - stamps_ns[row])
-            is_last = duration_s == DURATIONS_S[-1]
-            if elapsed_s > (_LONGEST_S if is_last else 1.5 * duration_s):
+            elapsed_ns = stamp_ns - stamps_ns[row]
+            if elapsed_ns > longest_ns:
                 continue
-            moved_m = math.hypot(
-                newest.x_m - states[row].x_m, newest.y_m - states[row].y_m
-            )
-            speed_mps = max(
-                moved_m / elapsed_s, abs(states[row].speed_mps), abs(newest.speed_mps)
-            )
-            if speed_mps < _LEAST_SPEED_MPS:
-                continue
-            x_m, y_m, yaw_rad = positions_at(states[row], stamp_ns)
-            c, s = math.cos(newest.yaw_rad), math.sin(newest.yaw_rad)
+            elapsed_s, older = seconds(elapsed_ns), states[row]
+            if abs(newest.speed_mps) < _LEAST_SPEED_MPS:
+                moved_m = math.hypot(newest.x_m - older.x_m, newest.y_m - older.y_m)
+                if max(moved_m / elapsed_s, abs(older.speed_mps)) < _LEAST_SPEED_MPS:
+                    continue
+            x_m, y_m, yaw_rad = positions_at(older, stamp_ns)
             along_m = c * (newest.x_m - x_m) + s * (newest.y_m - y_m)
             turned_rad = wrap_angle(newest.yaw_rad - yaw_rad)
-            found[k] = 2.0 * along_m / elapsed_s**2, 2.0 * turned_rad / elapsed_s**2
+            squared_s2 = elapsed_s**2
+            found[2 * k] = 2.0 * along_m / squared_s2
+            found[2 * k + 1] = 2.0 * turned_rad / squared_s2
         self._add(stamp_ns, min(step_s, 1.0), found)
 
-    def _add(self, stamp_ns: int, weight_s: float, found: FloatArray) -> None:
-        """Add accelerations, shape (durations, 2), with the weight `weight_s`. NaN marks a duration without states."""
-        known = np.isfinite(found)
-        keep = math.exp(-weight_s / _FORGET_S)
-        for sums in (
-            self._weights_s,
-            self._squares,
-            self._pairs,
-            self._products,
-            self._spacings_s,
+    def _add(self, stamp_ns: int, weight_s: float, found: Sequence[float]) -> None:
+        """Add accelerations, one for each row of the sums, with the weight `weight_s`.
+
+        NaN marks a duration without states. Numbers are added one by one: there are eight of them, and each operation
+        on arrays takes longer than all of these.
+        """
+        self._fade(weight_s)
+        weights_s, squares, pairs, products, spacings_s = self._lasting
+        soon_weights_s, soon_squares = self._fading
+        recent = self._recent
+        while len(recent) > 1 and stamp_ns - recent[1][0] >= _SPACING_NS:
+            recent.popleft()
+        before: Sequence[float] = _NONE_FOUND
+        spacing_s = 0.0
+        if recent and stamp_ns - recent[0][0] >= _SPACING_NS:
+            before_ns, before = recent[0]
+            spacing_s = seconds(stamp_ns - before_ns)
+        for row, (new, old) in enumerate(zip(found, before, strict=True)):
+            if not math.isfinite(new):
+                continue
+            square = new * new
+            weights_s[row] += weight_s
+            soon_weights_s[row] += weight_s
+            squares[row] += weight_s * square
+            soon_squares[row] += weight_s * square
+            if math.isfinite(old):
+                pair = weight_s * 0.5 * (square + old * old)
+                pairs[row] += pair
+                products[row] += weight_s * new * old
+                spacings_s[row] += pair * spacing_s
+        recent.append((stamp_ns, found))
+
+    def _fade(self, weight_s: float) -> None:
+        """Reduce the sums by the time `weight_s` that has passed."""
+        for sums, memory_s in (
+            (self._lasting, _FORGET_S),
+            (self._fading, _FORGET_SOON_S),
         ):
-            sums *= keep
-        for sums in (self._soon_s, self._soon):
-            sums *= math.exp(-weight_s / _FORGET_SOON_S)
-        for weights_s, sums in (
-            (self._weights_s, self._squares),
-            (self._soon_s, self._soon),
-        ):
-            weights_s[known] += weight_s
-            sums[known] += weight_s * found[known] ** 2
-        while len(self._recent) > 1 and stamp_ns - self._recent[1][0] >= _SPACING_NS:
-            self._recent.popleft()
-        if self._recent and stamp_ns - self._recent[0][0] >= _SPACING_NS:
-            before_ns, before = self._recent[0]
-            both = known & np.isfinite(before)
-            squares = weight_s * 0.5 * (found[both] ** 2 + before[both] ** 2)
-            self._pairs[both] += squares
-            self._products[both] += weight_s * found[both] * before[both]
-            self._spacings_s[both] += squares * seconds(stamp_ns - before_ns)
-        self._recent.append((stamp_ns, found))
+            keep = math.exp(-weight_s / memory_s)
+            sums[:] = [[keep * each for each in row] for row in sums]
 
     def _of(self, duration_s: float) -> tuple[FloatArray, FloatArray]:
         """Return mean square and correlation time of acceleration and yaw acceleration over a duration, shape (2,)."""
-        seen = self._weights_s[:, 0] > 0.0
+        lasting = np.array(self._lasting).reshape(5, -1, 2)
+        seen = lasting[0, :, 0] > 0.0
         if not seen.any():
             return self._assumed, np.full(2, _LONG_S)
-        prior_s = _PRIOR_S * np.exp(-self._weights_s[seen] / _PRIOR_LASTS_S)
-        ever = (prior_s * self._assumed + self._squares[seen]) / (
-            prior_s + self._weights_s[seen]
-        )
-        soon = (prior_s * self._assumed + self._soon[seen]) / (
-            prior_s + self._soon_s[seen]
-        )
+        weights_s, sums, pairs, products, spacings_s = lasting[:, seen]
+        soon_weights_s, soon_sums = np.array(self._fading).reshape(2, -1, 2)[:, seen]
+        prior_s = _PRIOR_S * np.exp(-weights_s / _PRIOR_LASTS_S)
+        ever = (prior_s * self._assumed + sums) / (prior_s + weights_s)
+        soon = (prior_s * self._assumed + soon_sums) / (prior_s + soon_weights_s)
         squares = np.maximum(ever, soon)
-        pairs = self._pairs[seen]
         with np.errstate(divide="ignore", invalid="ignore"):
-            correlations = np.where(pairs > 0.0, self._products[seen] / pairs, 1.0)
-            spacings_s = np.where(pairs > 0.0, self._spacings_s[seen] / pairs, 1.0)
+            correlations = np.where(pairs > 0.0, products / pairs, 1.0)
+            spacings_s = np.where(pairs > 0.0, spacings_s / pairs, 1.0)
             decays = -np.log(np.clip(correlations, 1e-12, 1.0))
             times_s = np.minimum(
                 np.where(decays > 0.0, spacings_s / decays, np.inf), _LONG_S

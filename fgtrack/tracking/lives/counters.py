@@ -10,7 +10,7 @@ from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
 from fgtrack.core.settings import settings
 from fgtrack.core.time import nanoseconds
-from fgtrack.core.types import BoolArray, Detection, FloatArray, IntArray, TrackStatus
+from fgtrack.core.types import Detection, FloatArray, IntArray, TrackStatus
 from fgtrack.estimation.base import StatesAt
 from fgtrack.models.sensors import SensorModel
 from fgtrack.tracking.ego.trajectory import EgoPose
@@ -49,21 +49,15 @@ class Life:
     settled: int = 0
     """Counter after the matches and misses that no late list can precede."""
     changes: list[tuple[int, int]] = field(default_factory=list)
-    """The others, ascending: stamp, and increment of the counter."""
+    """The others, ascending: stamp, and decrement of the counter. At one stamp matches precede misses."""
     ends_ns: int = FOREVER
     """Stamp at which the counter reached 0."""
     judged_ns: int = NEVER
     """Newest stamp for which it is known which sensors could show it."""
-    could_show: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    """True of sensors that could show it then, shape (sensors,)."""
-    expected_ns: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """Newest stamps at which each sensor could, shape (sensors,)."""
-
-
-def _order(change: tuple[int, int]) -> tuple[int, int]:
-    """Order of the changes of a counter: by stamp, and at one stamp matches before misses."""
-    stamp_ns, increment = change
-    return stamp_ns, -increment
+    could_show: list[bool] = field(default_factory=list)
+    """By sensor: true if the sensor could show it then."""
+    expected_ns: list[int] = field(default_factory=list)
+    """By sensor: newest stamp at which the sensor could show it."""
 
 
 @settings
@@ -124,8 +118,10 @@ class CountingLifecycle:
             could_show = self._views.at_birth(
                 candidate.position_m, scan.ego, self._index[scan.sensor]
             )
-            life.judged_ns, life.could_show = scan.stamp_ns, could_show
-            life.expected_ns = np.where(could_show, scan.stamp_ns, NEVER)
+            life.judged_ns, life.could_show = scan.stamp_ns, could_show.tolist()
+            life.expected_ns = [
+                scan.stamp_ns if could else NEVER for could in life.could_show
+            ]
 
     def matched(
         self,
@@ -135,17 +131,21 @@ class CountingLifecycle:
         states: StatesAt,
     ) -> None:
         """Candidates were associated with tracks, which had these `states` at the stamp."""
-        for position, track in pairs:
-            if candidates.placed[position]:
-                life = self.lives[states.track_ids[track]]
-                life.misses = 0
-                self._change(life, scan, self._sensors[scan.sensor].counter_add)
-                if scan.stamp_ns > life.last_seen_ns:
-                    life.last_seen_ns = scan.stamp_ns
-                if self._awaits:
-                    own = self._index[scan.sensor]
-                    life.could_show[own] = True
-                    life.expected_ns[own] = max(life.expected_ns[own], scan.stamp_ns)
+        stamp_ns, own = scan.stamp_ns, self._index[scan.sensor]
+        lives = [
+            self.lives[states.track_ids[track]]
+            for position, track in pairs
+            if candidates.placed[position]
+        ]
+        self._change(lives, stamp_ns, self._sensors[scan.sensor].counter_add)
+        for life in lives:
+            life.misses = 0
+            if stamp_ns > life.last_seen_ns:
+                life.last_seen_ns = stamp_ns
+            if self._awaits:
+                life.could_show[own] = True
+                if stamp_ns > life.expected_ns[own]:
+                    life.expected_ns[own] = stamp_ns
 
     def fused(self, track_ids: Iterable[int]) -> None:
         """The associated detections, which give positions, changed the states."""
@@ -167,31 +167,43 @@ class CountingLifecycle:
         ):
             life = self.lives[track_id]
             if views is not None:
-                self._judge(life, scan, views[row])
+                self._judge(life, scan, views[row].tolist())
             if self._ages(scan.sensor, range_m):
                 life.misses += 1
-                self._change(life, scan, -1)
+                self._change([life], scan.stamp_ns, -1)
             if self._ends(life, scan):
                 ended.append(track_id)
         return ended
 
-    def _judge(self, life: Life, scan: Scan, could_show: BoolArray) -> None:
+    def _judge(self, life: Life, scan: Scan, could_show: list[bool]) -> None:
         """Note which sensors could show the object at the stamp of a list."""
-        life.expected_ns = np.maximum(
-            life.expected_ns, np.where(could_show, scan.stamp_ns, NEVER)
-        )
+        for own, could in enumerate(could_show):
+            if could and scan.stamp_ns > life.expected_ns[own]:
+                life.expected_ns[own] = scan.stamp_ns
         if scan.stamp_ns >= life.judged_ns:
             life.judged_ns, life.could_show = scan.stamp_ns, could_show
 
-    def _change(self, life: Life, scan: Scan, increment: int) -> None:
-        """Change the counter at the stamp of a list: by order of arrival, or again from there on by order of stamps."""
-        if not self._awaits:
+    def _change(self, lives: Iterable[Life], stamp_ns: int, increment: int) -> None:
+        """Change counters at the stamp of a list: by order of arrival, or from there on by order of stamps."""
+        change = stamp_ns, -increment
+        for life in lives:
+            if self._awaits:
+                if life.changes and change < life.changes[-1]:
+                    self._recount(life, change)
+                    continue
+                life.changes.append(change)
+                if life.ends_ns != FOREVER:
+                    continue
             life.counter = self._counted(life.counter, increment)
-            return
-        insort(life.changes, (scan.stamp_ns, increment), key=_order)
+            if self._awaits and life.counter <= 0:
+                life.ends_ns = stamp_ns
+
+    def _recount(self, life: Life, change: tuple[int, int]) -> None:
+        """Insert a late change, and count again from the changes that no late list can precede."""
+        insort(life.changes, change)
         life.counter, life.ends_ns = life.settled, FOREVER
-        for stamp_ns, each in life.changes:
-            life.counter = self._counted(life.counter, each)
+        for stamp_ns, decrement in life.changes:
+            life.counter = self._counted(life.counter, -decrement)
             if life.counter <= 0:
                 life.ends_ns = stamp_ns
                 return
@@ -213,16 +225,18 @@ class CountingLifecycle:
         """True if a track ends at a list that misses it."""
         if not self._awaits:
             return life.counter <= 0
-        return life.ends_ns != FOREVER and life.ends_ns <= self._decided_ns(
-            life, scan.stamp_ns
-        )
+        if life.ends_ns == FOREVER:
+            return False
+        [decided] = self._decided_ns([life], scan.stamp_ns)
+        return life.ends_ns <= decided
 
-    def _decided_ns(self, life: Life, processed_ns: int) -> int:
-        """Stamp up to which all lists that could show the object have come and are processed."""
+    def _decided_ns(self, lives: Sequence[Life], processed_ns: int) -> list[int]:
+        """Stamps up to which all lists that could show each object have come and are processed."""
         watermarks_ns = np.minimum(self._watermarks_ns, processed_ns)
-        return int(
-            decided_ns(watermarks_ns, life.could_show[None], life.expected_ns[None])[0]
-        )
+        could_show = np.array([life.could_show for life in lives])
+        expected_ns = np.array([life.expected_ns for life in lives])
+        decided: list[int] = decided_ns(watermarks_ns, could_show, expected_ns).tolist()
+        return decided
 
     def expired(
         self,
@@ -243,22 +257,35 @@ class CountingLifecycle:
             ]
         if watermarks_ns is not None:
             self._watermarks_ns = watermarks_ns
-        ended = []
-        for track_id, life in self.lives.items():
-            is_seen = present_ns - life.last_seen_ns <= self._forget_ns
-            if (
-                is_seen
-                and life.ends_ns == FOREVER
-                and len(life.changes) < _MANY_CHANGES
-            ):
-                continue
-            decided = min(self._decided_ns(life, processed_ns), present_ns)
+        seen_ns = present_ns - self._forget_ns
+        doubtful = {
+            track_id: life
+            for track_id, life in self.lives.items()
+            if life.last_seen_ns < seen_ns
+            or life.ends_ns != FOREVER
+            or len(life.changes) >= _MANY_CHANGES
+        }
+        if not doubtful:
+            return []
+        ended = list[int]()
+        known = self._decided_ns(list(doubtful.values()), processed_ns)
+        for (track_id, life), known_ns in zip(doubtful.items(), known, strict=True):
+            decided = min(known_ns, present_ns)
             if life.ends_ns <= decided or decided - life.last_seen_ns > self._forget_ns:
                 ended.append(track_id)
-                continue
-            while life.changes and life.changes[0][0] <= decided:
-                life.settled = self._counted(life.settled, life.changes.pop(0)[1])
+            else:
+                self._settle(life, decided)
         return ended
+
+    def _settle(self, life: Life, decided_ns: int) -> None:
+        """Count the changes up to a stamp that no late list can precede."""
+        num_settled = 0
+        for stamp_ns, decrement in life.changes:
+            if stamp_ns > decided_ns:
+                break
+            life.settled = self._counted(life.settled, -decrement)
+            num_settled += 1
+        del life.changes[:num_settled]
 
     def suspended(self, stamp_ns: int | None = None) -> frozenset[int]:
         """The ids of tracks that end unless a list shows them that is still due, at `stamp_ns` or at all.

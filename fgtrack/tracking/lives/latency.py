@@ -5,9 +5,9 @@ stamps and receipts of the messages alone, so that equal messages give equal wat
 at watermarks: what a sensor has not reported yet is no evidence that it saw nothing.
 """
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right, insort
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -26,9 +26,39 @@ _UNUSUAL = 50  # of so many the longest one is unusual
 _MAX_FUTURE_NS = NS_PER_S  # see `fgtrack.tracking.inbox`
 
 
-def usual_ns(sorted_ns: Sequence[int]) -> int:
-    """Return the longest usual one of ascending durations: of each fifty the longest one is unusual."""
-    return sorted_ns[len(sorted_ns) - 1 - len(sorted_ns) // _UNUSUAL]
+class Durations:
+    """The newest durations of one kind. Of each fifty of them the longest one is unusual."""
+
+    def __init__(self) -> None:
+        self.arrived_ns: deque[int] = deque(maxlen=_RECENT)
+        """In order of arrival."""
+        self._ascending_ns: list[int] = []
+        self._limit_ns: int | None = None  # of `_usual_ns`; None after a new duration
+        self._usual_ns: int | None = None
+
+    def add(self, duration_ns: int) -> None:
+        """Add the newest duration; the oldest of a hundred is forgotten."""
+        ascending_ns = self._ascending_ns
+        if len(ascending_ns) == _RECENT:
+            del ascending_ns[bisect_left(ascending_ns, self.arrived_ns[0])]
+        self.arrived_ns.append(duration_ns)
+        insort(ascending_ns, duration_ns)
+        self._limit_ns = None
+
+    def usual_ns(self, most_ns: int = FOREVER) -> int | None:
+        """Return the longest usual duration of those up to `most_ns`; None if there are none."""
+        if most_ns != self._limit_ns:
+            ascending_ns = self._ascending_ns
+            count = bisect_right(ascending_ns, most_ns)
+            row = count - 1 - count // _UNUSUAL
+            self._usual_ns = ascending_ns[row] if count else None
+            self._limit_ns = most_ns
+        return self._usual_ns
+
+    @property
+    def shortest_ns(self) -> int:
+        """The shortest duration."""
+        return self._ascending_ns[0]
 
 
 class Delays:
@@ -41,10 +71,9 @@ class Delays:
         """Delays of the newest messages, in order of arrival."""
         self.newest_receipt_ns: int | None = None
         """Newest receipt; None before the first message."""
-        self._recent_ns: deque[int] = deque(maxlen=_RECENT)
-        self._gaps_ns: deque[int] = deque(maxlen=_RECENT)
+        self._recent = Durations()  # delays
+        self._gaps = Durations()  # times between two stamps
         self._newest_stamp_ns = self._processed_ns = NEVER
-        self._sorted_ns: list[int] = []
 
     def add(
         self, stamp_ns: int, receipt_ns: int, newest_stamp_ns: int | None = None
@@ -64,12 +93,11 @@ class Delays:
         )
         if delay_ns < -_MAX_FUTURE_NS:
             return  # refused: its stamp is wrong
-        self._sorted_ns = []
-        self._recent_ns.append(delay_ns)
+        self._recent.add(delay_ns)
         newest_ns = stamp_ns if newest_stamp_ns is None else int(newest_stamp_ns)
         if newest_ns > self._newest_stamp_ns:
             if self._newest_stamp_ns != NEVER:
-                self._gaps_ns.append(newest_ns - self._newest_stamp_ns)
+                self._gaps.add(newest_ns - self._newest_stamp_ns)
             self._newest_stamp_ns = newest_ns
 
     def processed(self, stamp_ns: int) -> None:
@@ -81,13 +109,12 @@ class Delays:
 
         The delay of the newest message counts as usual: a delay that has changed is followed at once.
         """
-        self._sorted_ns = self._sorted_ns or sorted(self._recent_ns)
-        possible = self._sorted_ns[: bisect_right(self._sorted_ns, most_ns)]
-        if not possible:
+        usual_ns = self._recent.usual_ns(most_ns)
+        if usual_ns is None:
             return most_ns
+        newest_ns = self._recent.arrived_ns[-1]
         return max(
-            usual_ns(possible),
-            self._recent_ns[-1] if self._recent_ns[-1] <= most_ns else possible[0],
+            usual_ns, newest_ns if newest_ns <= most_ns else self._recent.shortest_ns
         )
 
     def watermark_ns(self, now_ns: int, most_ns: int) -> int:
@@ -97,14 +124,15 @@ class Delays:
         is overdue, by the usual time between two stamps, the newest processed stamp is the bound: there is no list
         between it and the next one. `FOREVER` before the first message.
         """
-        if not self._recent_ns:
+        if not self._recent.arrived_ns:
             return FOREVER
-        due_ns = now_ns - self.usual_ns(most_ns)
-        gap_ns = usual_ns(sorted(self._gaps_ns)) if self._gaps_ns else 0
-        is_pending = self._newest_stamp_ns > self._processed_ns
+        due_ns, processed_ns = now_ns - self.usual_ns(most_ns), self._processed_ns
+        if due_ns <= processed_ns:
+            return due_ns
+        is_pending = self._newest_stamp_ns > processed_ns
         next_ns = min(due_ns, self._newest_stamp_ns) if is_pending else due_ns
-        is_overdue = next_ns > self._processed_ns + gap_ns
-        return due_ns if is_overdue else min(due_ns, self._processed_ns)
+        is_overdue = next_ns > processed_ns + (self._gaps.usual_ns() or 0)
+        return due_ns if is_overdue else processed_ns
 
 
 class Watermarks:
