@@ -71,10 +71,10 @@ def list_ms(estimator: str, kind: Kind, seed: int = 0) -> float:
             for own in z
         ]
         bank.advance(round(1e9 * PERIOD_S * k))
-        before_ns = time.perf_counter_ns()
+        before_ns = time.thread_time_ns()
         bank.update(stamp_ns, ids, measurements)
         if k > NUM_WARM:
-            times_ms.append((time.perf_counter_ns() - before_ns) / 1e6)
+            times_ms.append((time.thread_time_ns() - before_ns) / 1e6)
     return median(times_ms)
 
 

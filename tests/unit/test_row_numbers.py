@@ -9,6 +9,11 @@ import numpy as np
 import pytest
 from support.raising import MS, START_NS, lists, make
 
+from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.smoothing.bank import SmootherBank
+from fgtrack.models.measurement import SensorPose, measurement_model
+from fgtrack.models.motion import CTRV
+
 MODULES = (
     "fgtrack.estimation.kernels.kalman",
     "fgtrack.estimation.kernels.replay",
@@ -24,7 +29,7 @@ ROW_NUMBERS = {"tracks", "rows", "indices", "anchors", "by_x", "sensors", "compo
 #: Names of arguments by whose length a call is as long as it is, and further ones by function.
 LENGTHS = {"counts", "rows", "tracks"}
 FURTHER_LENGTHS = {
-    "arrive.mean", "correct.y", "faults.means", "innovations.y", "move_far.indices",
+    "arrive.mean", "correct.y", "faults.means", "innovations.H", "innovations.y",
     "near.points", "place.H", "propagate.mean", "read.y", "turned.means",
 }  # fmt: skip
 Calls = dict[str, list[Any]]
@@ -83,8 +88,24 @@ def calls() -> Calls:
             for message in messages:
                 tracker.receive(message)
             tracker.tick(START_NS + 100 * k * MS)
+    _see_ranges_and_bearings()
     patch.undo()
     return recorded
+
+
+def _see_ranges_and_bearings() -> None:
+    """Let a smoother of two objects linearise measurements, and converge."""
+    motion, ids, pose = CTRV(), [0, 1], SensorPose(-30.0, 0.0, 0.1)
+    model = measurement_model(("range_m", "bearing_rad"), motion)
+    bank = SmootherBank(motion, 1.0)
+    bank.advance(START_NS)
+    for track_id in ids:
+        bank.birth(track_id, Start(stamp_ns=START_NS, yaw_rad=0.0, speed_mps=20.0))
+    for k in range(1, 4):
+        z = np.array([30.0 + 2.0 * k, -0.1])
+        seen = Measurement(START_NS + 100 * k * MS, model, z, 0.01 * np.eye(2), pose)
+        bank.update(seen.stamp_ns, ids, [seen, seen])
+    bank.converge()
 
 
 def _with(arguments: list[Any], place: int, value: Any) -> list[Any]:
@@ -109,9 +130,7 @@ def test_a_row_number_beyond_an_end_is_refused(calls: Calls) -> None:
                 broken = value.copy()
                 broken[-1] = wrong
                 tried += 1
-                if name == "indices" and key.endswith(
-                    ("locate", "move_far")
-                ):  # written, not read
+                if name == "indices" and key.endswith("locate"):  # written, not read
                     continue
                 try:
                     function(*_with(arguments, place, broken))

@@ -38,7 +38,7 @@ NONE = -1
 #: Columns of `tracks`: see `Nodes`.
 COUNT, FIRST, KNOWN, BEGIN_NS, NONLINEAR = range(5)
 #: Columns of `labels`.
-NUM_ROWS, CHANGED, STALE = range(3)
+NUM_ROWS, CHANGED, STALE, ROWS_STALE, NUM_PLUGINS = range(5)
 #: Rows of `points` of a node, and its `blocks`.
 ORIGIN, REFERENCE = range(2)
 C, FILTERED, PREDICTED, P, F, Q = range(6)

@@ -24,9 +24,13 @@ from fgtrack.estimation.smoothing.kernels import (
     KNOWN,
     NEVER,
     NONE,
+    NONLINEAR,
+    NUM_PLUGINS,
+    NUM_ROWS,
     ORIGIN,
     PREDICTED,
     REFERENCE,
+    ROWS_STALE,
     STALE,
     C,
     F,
@@ -35,6 +39,7 @@ from fgtrack.estimation.smoothing.kernels import (
 )
 from fgtrack.estimation.smoothing.terms import NEAR_NS, MeasurementFactor, whitened
 from fgtrack.models.motion import MotionModel, WhiteNoise
+from fgtrack.models.robust import compiled_form
 from fgtrack.models.transitions import transitions
 
 _FEW_TRACKS, _FEW_NODES, _FEW_VALUES, _FEW_COMPONENTS = 4, 64, 256, 4
@@ -45,7 +50,7 @@ class Nodes:
 
     def __init__(self, motion: MotionModel) -> None:
         self._motion, n, size = motion, motion.dim, _FEW_VALUES
-        self._compiled = (
+        self.compiled = (
             motion if isinstance(motion, WhiteNoise) and motion.is_compiled else None
         )
         self.tracks: IntArray = np.zeros((_FEW_TRACKS, 5), dtype=np.int64)
@@ -56,9 +61,9 @@ class Nodes:
         self.numbers: IntArray = np.full((_FEW_TRACKS, _FEW_NODES), NONE)
         """Shape (tracks, nodes); those beyond the number of nodes are free, `NONE` where the row has no number yet."""
         self._num_numbers = 0  # that rows have
-        self.labels: IntArray = np.zeros((size, 3), dtype=np.int64)
+        self.labels: IntArray = np.zeros((size, 5), dtype=np.int64)
         """Number of `rows` in use; 1 if something was linearised since a factor graph read it; 1 if the motion to the
-        next node must be linearised."""
+        next node must be linearised; 1 if the measurements must be; number of measurements that a plug-in models."""
         self.backs = np.zeros((size, n + 1, n + 1))
         """[A | b], the node given the next one: x - x0 = A (next - its x0) + b + N(0, C). The last row is the step: the
         mean relative to the linearisation point x0, given everything."""
@@ -66,6 +71,11 @@ class Nodes:
         """See `kernels`: vectors stand as a last column beside the matrix that moves with them."""
         self.rows = np.zeros((size, _FEW_COMPONENTS, n + 1))
         """Measurements: G and y of y = G (x - x0) + N(0, I)."""
+        self.marks = np.zeros((size, 3, _FEW_COMPONENTS), dtype=np.int64)
+        self.values = np.zeros((size, node_kernels.NUM_VALUES, _FEW_COMPONENTS))
+        """Measurements as compiled loops linearise them, see `node_kernels`."""
+        self.has_plugins = self.compiled is None
+        """True if plug-ins model the motion, or have modelled a measurement: these are linearised outside the loops."""
         self._factors: dict[int, list[tuple[Measurements, int, float]]] = {}
         self._share()
 
@@ -79,6 +89,8 @@ class Nodes:
         kept = (self.tracks, self.stamps_ns, self.numbers, self.labels, self.backs)
         self.arrays = (*kept, self.points, self.blocks, self.rows)
         """Arguments of all loops."""
+        self.seen = self.marks, self.values
+        """Arguments of the loops that note or linearise measurements."""
         self.count, self.first, self.step = (
             self.tracks[:, COUNT],
             self.tracks[:, FIRST],
@@ -161,6 +173,7 @@ class Nodes:
                 (Measurements(replace(one, z=one.z[None], R=one.R[None])), 0, ahead_s)
                 for one, ahead_s in own
             ]
+            self._note_again(number)
 
     def note(
         self,
@@ -184,9 +197,9 @@ class Nodes:
 
     def withdraw(self, track: int, index: int, *, is_new: bool, is_noted: bool) -> None:
         """Take the last measurement of a node out, if it `is_noted`, and the node, if it `is_new`."""
-        number, last = self.numbers[track, index], self.count[track] - 1
+        number, last = int(self.numbers[track, index]), self.count[track] - 1
         if is_noted:
-            self._factors[int(number)].pop()
+            self._factors[number].pop()
         if is_new:
             for each, free in (
                 (self.stamps_ns[track], NEVER),
@@ -195,7 +208,47 @@ class Nodes:
                 each[index:last] = each[index + 1 : last + 1]
                 each[last] = free
             self.count[track] = last
+        else:
+            self._note_again(number)
         self.tracks[track, KNOWN] = self.count[track]
+
+    def noted_as(self, measurement: Measurement) -> tuple[IntArray, FloatArray, int]:
+        """Return codes (k,), sensor pose with the width of the loss (6,), and kind of the loss in compiled loops.
+
+        The kind is `PLUGIN` where a plug-in models the measurement or the motion.
+        """
+        codes = measurement.model.codes
+        loss, width = compiled_form(measurement.loss, len(codes))
+        view = np.array([*measurement.pose, width], dtype=np.float64)
+        if self.compiled is None or not measurement.model.is_compiled:
+            self.has_plugins = True
+            loss = node_kernels.PLUGIN
+        return codes, view, loss
+
+    def widen(self, num_rows: int) -> None:
+        """Make room for `num_rows` further rows of measurements in each node."""
+        self._resize(len(self.labels), self.rows.shape[1] + num_rows)
+
+    def _note_again(self, number: int) -> None:
+        """Note the measurements of a node in the arrays as `factors` has them now. Their rows are stale afterwards."""
+        factors, row = self.factors(number), 0
+        used = sum(len(measurement.z) for measurement, _ in factors)
+        if used > self.rows.shape[1]:
+            self._resize(len(self.labels), used)
+        self.labels[number, NUM_PLUGINS] = 0
+        for measurement, ahead_s in factors:
+            codes, view, loss = self.noted_as(measurement)
+            k, values = len(codes), self.values[number]
+            of = slice(row, row + k)
+            self.marks[number, :, of] = codes, np.full(k, k), np.full(k, loss)
+            values[node_kernels.Z, of] = measurement.z
+            values[node_kernels.POSE : node_kernels.AHEAD_S, of] = view[:, None]
+            values[node_kernels.AHEAD_S, of] = ahead_s
+            root = np.linalg.cholesky(measurement.R)
+            values[node_kernels.ROOT : node_kernels.ROOT + k, of] = root.T
+            self.labels[number, NUM_PLUGINS] += loss == node_kernels.PLUGIN
+            row += k
+        self.labels[number, NUM_ROWS], self.labels[number, ROWS_STALE] = used, 1
 
     def index_of(self, track: int, measurement: Measurement) -> int | None:
         """Return the index of the node that has this measurement; None if it was not fused, or is forgotten."""
@@ -217,6 +270,7 @@ class Nodes:
         orders = [each.order for each, _ in self.factors(number)]
         del self._factors[number][orders.index(measurement.order)]
         self.labels[number, STALE] = 1
+        self._note_again(number)
         if self._factors[number] or index in (0, self.first[track]):
             return
         self.labels[self.numbers[track, index - 1], STALE] = 1
@@ -238,35 +292,37 @@ class Nodes:
         return out
 
     def linearise_factors(self, number: int) -> None:
-        """Linearise all measurements of a node at its linearisation point."""
+        """Linearise all measurements of a node at its linearisation point, with the models of plug-ins."""
         rows = [
             whitened(factor, self.origin[number], self._motion)
             for factor in self.factors(number)
         ]
-        used = sum(map(len, rows))
-        if used > self.rows.shape[1]:
-            self._resize(len(self.labels), used)
-        self.labels[number, :2] = used, 1
-        if used:
-            self.rows[number, :used] = np.concatenate(rows)
+        if rows:
+            self.rows[number, : self.labels[number, NUM_ROWS]] = np.concatenate(rows)
+        self.labels[number, CHANGED], self.labels[number, ROWS_STALE] = 1, 0
 
-    def linearise(self, tracks: IntArray, starts: IntArray, is_nonlinear: bool) -> None:
-        """Linearise the motion of stale nodes from the one before `starts` on, and if `is_nonlinear` measurements."""
-        compiled = self._compiled
-        if is_nonlinear or compiled is None:
+    def linearise(self, tracks: IntArray, starts: IntArray) -> None:
+        """Linearise the stale nodes of `tracks`, from the one before `starts` on: motion and measurements."""
+        compiled = self.compiled
+        if self.has_plugins:
             is_node = np.arange(self.numbers.shape[1]) < self.count[tracks, None]
-            rows, indices = np.nonzero(
-                is_node & (self.labels[self.numbers[tracks], STALE] > 0)
+            labels = self.labels[self.numbers[tracks]]
+            is_nonlinear = self.tracks[tracks, NONLINEAR, None] > 0
+            is_outdated = (labels[..., ROWS_STALE] > 0) | (
+                (labels[..., STALE] > 0) & is_nonlinear
             )
-            rows = tracks[rows]
-            stale = self.numbers[rows, indices]
-            for number in stale.tolist() if is_nonlinear else ():
+            outside = is_node & is_outdated & (labels[..., NUM_PLUGINS] > 0)
+            rows, indices = np.nonzero(outside)
+            for number in self.numbers[tracks[rows], indices].tolist():
                 self.linearise_factors(number)
         if compiled is not None:
-            node_kernels.linearise_motion(
-                compiled.kind, compiled.noise, tracks, starts, self.arrays
+            node_kernels.linearise(
+                compiled.kind, compiled.noise, tracks, starts, self.arrays, self.seen
             )
             return
+        rows, indices = np.nonzero(is_node & (labels[..., STALE] > 0))
+        rows = tracks[rows]
+        stale = self.numbers[rows, indices]
         self.labels[stale, STALE] = 0
         inner = indices < self.count[rows] - 1
         rows, indices, stale = rows[inner], indices[inner], stale[inner]
@@ -282,11 +338,11 @@ class Nodes:
         self, x: FloatArray, dt_s: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return `MotionModel.transition` of states (m, n) after times (m,)."""
-        if self._compiled is None:
+        if self.compiled is None:
             return self._motion.transition(x, dt_s)
         m, n = x.shape
         result = np.empty((m, n)), np.empty((m, n, n)), np.empty((m, n, n))
-        transitions(self._compiled.kind, x, dt_s, self._compiled.noise, *result)
+        transitions(self.compiled.kind, x, dt_s, self.compiled.noise, *result)
         return result
 
     def _grow(self, axis: int) -> None:
@@ -316,16 +372,16 @@ class Nodes:
         used, width = self._num_numbers, self.rows.shape[1]
         while width < num_rows:
             width *= 2
-        names, larger = ("labels", "backs", "points", "blocks", "rows"), []
+        names = ("labels", "backs", "points", "blocks", "rows", "marks", "values")
+        larger = []
         for name in names:
             values: Any = getattr(self, name)  # Any: of integers or numbers
-            shape = size, *values.shape[1:]
-            if name == "rows":
-                shape = size, width, values.shape[2]
-            larger.append(
-                np.zeros(shape, values.dtype)
-            )  # only pages of used numbers are made
-            larger[-1][:used, : values.shape[1]] = values[:used]
+            shape = [size, *values.shape[1:]]
+            if name in ("rows", "marks", "values"):
+                shape[1 if name == "rows" else 2] = width
+            larger.append(np.zeros(shape, values.dtype))  # pages of used numbers alone
+            part = tuple(slice(length) for length in (used, *values.shape[1:]))
+            larger[-1][part] = values[:used]
         for name, values in zip(names, larger, strict=True):
             setattr(self, name, values)
         self._share()

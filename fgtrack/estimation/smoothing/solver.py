@@ -7,12 +7,18 @@ import numpy as np
 
 from fgtrack.core.linalg import mahalanobis_squared, noise_root
 from fgtrack.core.time import NS_PER_S, seconds
-from fgtrack.core.types import YAW, FloatArray, IntArray
+from fgtrack.core.types import YAW, BoolArray, FloatArray, IntArray
 from fgtrack.estimation.base import Measurement, Measurements
 from fgtrack.estimation.filters.initiation import Fix, Line, along, fixes_of
 from fgtrack.estimation.smoothing import kernels, node_kernels
-from fgtrack.estimation.smoothing.kernels import BEGIN_NS, NEVER, NONLINEAR, STALE
-from fgtrack.estimation.smoothing.node_kernels import BEHIND, NOT_DEFINITE, NOT_PLAIN
+from fgtrack.estimation.smoothing.kernels import (
+    BEGIN_NS,
+    NEVER,
+    NONLINEAR,
+    ROWS_STALE,
+    STALE,
+)
+from fgtrack.estimation.smoothing.node_kernels import BEHIND, NO_ROOM, NOT_DEFINITE
 from fgtrack.estimation.smoothing.nodes import Nodes
 from fgtrack.estimation.smoothing.settings import SmootherSettings
 from fgtrack.estimation.smoothing.terms import cost, overshot
@@ -54,7 +60,6 @@ class Solver:
         self.motion = motion
         self.nodes = Nodes(motion)
         self._has_final = settings.final
-        self._is_nonlinear = False  # of all tracks
         linear, nonlinear = (
             settings.thresholds(motion, nonlinear) for nonlinear in (False, True)
         )
@@ -164,20 +169,28 @@ class Solver:
                 else guesses
             )
             leaving = self._leaving(tracks, anchors) if self._has_final else None
+            given = (
+                tracks,
+                stamp_ns,
+                y,
+                H,
+                R,
+                guesses,
+                not stack.is_nonlinear,
+                self._thresholds,
+                anchors,
+                np.ascontiguousarray(stack.z, dtype=np.float64),
+                *nodes.noted_as(stack),
+            )
+            while True:
+                flags = node_kernels.place(
+                    *given, nodes.arrays, nodes.seen, out, ahead_s
+                )
+                if flags != NO_ROOM:
+                    break
+                nodes.widen(y.shape[1])
         except Exception as error:
             raise NotFusedError(error, self._not_restored(tracks)) from error
-        given = (
-            tracks,
-            stamp_ns,
-            y,
-            H,
-            R,
-            guesses,
-            not stack.is_nonlinear,
-            self._thresholds,
-            anchors,
-        )
-        flags = node_kernels.place(*given, nodes.arrays, out, ahead_s)
         numbers, indices, is_new, starts, anchors, is_behind, _, _ = out
         is_noted = False
         try:
@@ -185,9 +198,7 @@ class Solver:
             is_noted = True
             if flags & NOT_DEFINITE:
                 raise np.linalg.LinAlgError("a covariance is not positive definite")
-            nodes.linearise(
-                tracks, starts, self._is_nonlinear or bool(flags & NOT_PLAIN)
-            )
+            nodes.linearise(tracks, starts)
             if flags & BEHIND:
                 rows = is_behind.nonzero()[0]
                 self._refilter(tracks[rows], starts[rows], anchors[rows])
@@ -249,10 +260,7 @@ class Solver:
         level, stamp_ns = 1 if stack.loss is None else _ROBUST, stack.stamp_ns
         first = (self.nodes.tracks[tracks, NONLINEAR] < level).nonzero()[0]
         if first.size:
-            self.nodes.tracks[tracks[first], NONLINEAR], self._is_nonlinear = (
-                level,
-                True,
-            )
+            self.nodes.tracks[tracks[first], NONLINEAR] = level
             for track in tracks[first].tolist():
                 self.relinearise(track, self.estimates(track))
             guesses = guesses.copy()
@@ -263,34 +271,26 @@ class Solver:
 
     # --- relinearisation
 
-    def _move_far(self, track: int, moves: bool) -> IntArray:
-        """Move the linearisation points of nodes of a window that are far from them, if it `moves`; return indices."""
-        nodes, indices = (
-            self.nodes,
-            np.empty(self.nodes.stamps_ns.shape[1], dtype=np.int64),
-        )
-        num = node_kernels.move_far(
-            track, 0, NEVER, self._thresholds, nodes.arrays, moves, indices
-        )
-        return indices[:num]
-
     def iterate(self, tracks: IntArray, max_iterations: int) -> None:
         """Take Gauss-Newton steps while a state is further than a threshold from its linearisation point."""
-        for track in tracks.tolist() if max_iterations else ():
-            one = np.array([track])
-            for _ in range(max_iterations):
-                moved = self._move_far(track, moves=True)
-                if not moved.size:
-                    break
-                self.nodes.linearise(one, moved[:1], self._is_nonlinear)
-                self.solve(one, moved[:1], self.nodes.first[one])
+        nodes, far = self.nodes, np.empty(1, dtype=np.int64)
+        for _ in range(max_iterations if len(tracks) else 0):
+            starts = np.empty(len(tracks), dtype=np.int64)
+            num = node_kernels.move_far(
+                tracks, self._thresholds, nodes.arrays, far, starts
+            )
+            if not num:
+                break
+            if num < len(tracks):
+                has_moved = starts < NEVER
+                tracks, starts = tracks[has_moved], starts[has_moved]
+            nodes.linearise(tracks, starts)
+            self.solve(tracks, starts, nodes.first[tracks])
 
     def reweight(self, tracks: IntArray) -> None:
         """Take steps of tracks with a robust loss, whose weights follow the states."""
-        if self._is_nonlinear:
-            self.iterate(
-                tracks[self.nodes.tracks[tracks, NONLINEAR] == _ROBUST], _ROBUST_STEPS
-            )
+        is_robust = self.nodes.tracks[tracks, NONLINEAR] == _ROBUST
+        self.iterate(tracks[is_robust], _ROBUST_STEPS)
 
     def relinearise(
         self, track: int, means: FloatArray | None = None, start: int = NEVER
@@ -305,8 +305,8 @@ class Solver:
         if means is not None:
             nodes.predicted[numbers[0], :, -1] -= means[0] - nodes.origin[numbers[0]]
             nodes.origin[numbers] = means
-        nodes.labels[numbers, STALE] = 1
-        nodes.linearise(tracks, starts, is_nonlinear=True)
+        nodes.labels[numbers, STALE] = nodes.labels[numbers, ROWS_STALE] = 1
+        nodes.linearise(tracks, starts)
         self._refilter(tracks, starts, first)
         self.solve(tracks, first, first)
 
@@ -347,39 +347,73 @@ class Solver:
             ((noise_root(each) @ gap) ** 2).sum()
             for each, gap in zip(Q, gaps, strict=True)
         )
-        factors = (
-            (factor, x)
-            for number, x in zip(numbers.tolist(), means, strict=True)
-            for factor in nodes.factors(number)
+        return 0.5 * float(total) + self._measurement_cost(track, means)
+
+    def _measurement_cost(self, track: int, means: FloatArray) -> float:
+        """Sum of the losses of the measurements of a window at `means` (m, n)."""
+        nodes = self.nodes
+        compiled = nodes.compiled
+        if compiled is None or nodes.has_plugins:
+            return sum(
+                cost(factor, x, self.motion)
+                for number, x in zip(nodes.window(track).tolist(), means, strict=True)
+                for factor in nodes.factors(number)
+            )
+        total: float = node_kernels.measurement_cost(
+            compiled.kind,
+            compiled.noise,
+            track,
+            np.ascontiguousarray(means),
+            nodes.arrays,
+            nodes.seen,
         )
-        return 0.5 * float(total) + sum(
-            cost(factor, x, self.motion) for factor, x in factors
-        )
+        return total
 
     def damp(self, tracks: IntArray) -> int:
         """Converge in damped steps where the last one left the range of its linearisation; return how many tracks."""
-        nodes, num = self.nodes, 0
-        if not self._is_nonlinear or self.is_damped:
-            return num
-        for track in tracks[nodes.tracks[tracks, NONLINEAR] > 0].tolist():
-            numbers = nodes.window(track)
-            means, steps = nodes.origin[numbers], nodes.step[numbers]
-            far = (self._move_far(track, moves=False) - nodes.first[track]).tolist()
-            if any(
+        nodes = self.nodes
+        nonlinear = tracks[nodes.tracks[tracks, NONLINEAR] > 0]
+        if self.is_damped or not nonlinear.size:
+            return 0
+        overshot_tracks = nonlinear[self._overshot(nonlinear)].tolist()
+        for track in overshot_tracks:
+            means = nodes.origin[nodes.window(track)]
+            try:
+                self.converge(track)
+            except np.linalg.LinAlgError:
+                self.relinearise(track, means)
+        return len(overshot_tracks)
+
+    def _overshot(self, tracks: IntArray) -> BoolArray:
+        """True for tracks with a node whose step left the linear range of a measurement, shape (m,)."""
+        nodes, compiled = self.nodes, self.nodes.compiled
+        far = np.empty(nodes.stamps_ns.shape[1], dtype=np.int64)
+        found = np.zeros(len(tracks), dtype=bool)
+        if compiled is not None and not nodes.has_plugins:
+            node_kernels.overshot(
+                compiled.kind,
+                compiled.noise,
+                tracks,
+                self._thresholds,
+                nodes.arrays,
+                nodes.seen,
+                far,
+                found,
+            )
+            return found
+        for row, track in enumerate(tracks.tolist()):
+            num = node_kernels.find_far(track, self._thresholds, nodes.arrays, far)
+            numbers = nodes.numbers[track, far[:num]].tolist()
+            found[row] = any(
                 overshot(
-                    nodes.factors(numbers[k]),
-                    means[k],
-                    means[k] + steps[k],
+                    nodes.factors(number),
+                    nodes.origin[number],
+                    nodes.origin[number] + nodes.step[number],
                     self.motion,
                 )
-                for k in far
-            ):
-                num += 1
-                try:
-                    self.converge(track)
-                except np.linalg.LinAlgError:
-                    self.relinearise(track, means)
-        return num
+                for number in numbers
+            )
+        return found
 
     # --- initiation
 
