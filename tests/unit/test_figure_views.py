@@ -10,7 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from fgtrack.core.types import Detection, DetectionList, EgoState, FloatArray
+from fgtrack.estimation.base import Measurement, Start
+from fgtrack.estimation.object_bank import SingleObject
+from fgtrack.estimation.registry import estimator
 from fgtrack.evaluation.runs import evaluated
+from fgtrack.models.motion import CV
 from fgtrack.show.figures import plot
 from fgtrack.show.palette import style_of
 
@@ -168,3 +172,47 @@ def test_of_many_objects_the_worst_are_drawn_and_the_rest_on_request(
     )
     maps = [plan for plan in plot.planned(many) if plan.name.startswith("map")]
     assert (len(maps), sum(not plan.is_extra for plan in maps)) == (8, 3)
+
+
+# --- the factor graph of a window
+
+
+def test_a_late_measurement_stands_out_in_the_window_that_it_splits() -> None:
+    """One motion factor is split; a state, two motion factors and a measurement factor are new."""
+    one = estimator("smoother-banded", CV(), Start(), lag_s=1.0)
+    assert isinstance(one, SingleObject)
+
+    def fuse(*times_ms: int) -> None:
+        for ms in times_ms:
+            one.update(Measurement.of(ms * 1_000_000, x_m=0.0, y_m=0.0, std=0.3))
+
+    fuse(100, 200, 400)
+    before = one.window()
+    fuse(300)
+    after = one.window()
+    figure = plot.window(after, before)
+    assert [axes.get_ylabel() for axes in figure.axes] == [
+        "before",
+        "after",
+        "position std [m]",
+    ]
+    changed = [
+        sorted(
+            (line.get_marker(), round(float(x_of(line)[0]), 3))
+            for line in axes.lines
+            if line.get_color() == "#B65CA8" and line.get_linestyle() == "None"
+            if len(x_of(line))
+        )
+        for axes in figure.axes[:2]
+    ]
+    assert changed == [
+        [("s", 0.3)],
+        [("o", 0.3), ("s", 0.25), ("s", 0.3), ("s", 0.35)],
+    ]
+    spread = figure.axes[2]
+    np.testing.assert_allclose(x_of(labelled(spread, "after")), np.arange(5) / 10)
+    deviation_m = np.sqrt(after.covariances[3, :2, :2].trace() / 2.0)
+    assert y_of(labelled(spread, "after"))[3] == pytest.approx(deviation_m)
+    alone = plot.window(after)
+    assert [axes.get_ylabel() for axes in alone.axes] == ["window", "position std [m]"]
+    assert not [line for line in alone.axes[0].lines if line.get_color() == "#B65CA8"]

@@ -1,4 +1,4 @@
-"""A copy of the window of one object: what a smoother knows, as plain arrays and as a graph of gtsam."""
+"""A copy of the window of one object, as plain arrays and as a graph of gtsam."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -24,6 +24,7 @@ from fgtrack.show.figures.paper import Paper
 from fgtrack.show.figures.residuals import residuals
 from fgtrack.show.figures.style import save
 from fgtrack.show.figures.sweep import error_against_delay, sweep, sweep_metrics
+from fgtrack.show.figures.window import window
 
 __all__ = [
     "arrivals",
@@ -35,6 +36,7 @@ __all__ = [
     "map",
     "residuals",
     "sweep",
+    "window",
 ]
 
 
