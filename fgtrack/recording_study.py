@@ -31,7 +31,7 @@ from fgtrack.evaluation.tables import Tables, short
 from fgtrack.evaluation.tables.compare import compare
 from fgtrack.inputs.errors import UntilBreak
 from fgtrack.inputs.source import open_input
-from fgtrack.noise.measurements import Watch
+from fgtrack.noise.measurements import MeasurementRecorder
 from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.pipeline.assumptions.assumption import Assumed
 from fgtrack.pipeline.replay import replay
@@ -242,7 +242,7 @@ def study(
                 yield message
             readable.raise_error()
 
-        watch = Watch(replace(known.config, estimator=REPLAY))
+        recorder = MeasurementRecorder(replace(known.config, estimator=REPLAY))
         replay(
             repeated,
             known.config,
@@ -250,7 +250,7 @@ def study(
             origin=str(source.path),
             kind=source.kind,
             overwrite=overwrite,
-            observed={REPLAY: watch},
+            observed={REPLAY: recorder},
         )
         on_step("compare", _COMPARE)
         every = evaluated([load_run(folder) for folder in folders.values()])
@@ -259,7 +259,10 @@ def study(
             write_metrics(folder, one.metrics.as_dict())
         with suppress(DataError):  # without a track to judge there is no ledger
             replays = PairedReplay(
-                watch.bank, every[ESTIMATORS.index(REPLAY)].run, known.config, SUMMARY_S
+                recorder.bank,
+                every[ESTIMATORS.index(REPLAY)].run,
+                known.config,
+                SUMMARY_S,
             )
             tables = replace(
                 tables, tables={**tables.tables, "ledger": summary(replays)}

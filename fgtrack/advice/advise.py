@@ -32,7 +32,7 @@ from fgtrack.evaluation.diagnostics import diagnostics
 from fgtrack.inputs.errors import UntilBreak
 from fgtrack.inputs.source import open_input
 from fgtrack.noise.parameters import TuneRules
-from fgtrack.noise.tune import tuned
+from fgtrack.noise.tune import tune_sources
 from fgtrack.pipeline.assumptions.assumed import assumed, source_of
 from fgtrack.pipeline.assumptions.assumption import Assumed
 from fgtrack.pipeline.clock import corrected
@@ -339,7 +339,7 @@ class Adviser:
             return
         steps, messages = count(), list(beginning(self._tracked, nanoseconds(TUNED_S)))
         try:
-            report = tuned(
+            report = tune_sources(
                 {self._recording: source_of(lambda: messages)},
                 self._config,
                 _TUNE_RULES,

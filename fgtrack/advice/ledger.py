@@ -22,7 +22,7 @@ from fgtrack.core.types import BoolArray, FloatArray, Message
 from fgtrack.evaluation.intervals import UNKNOWN, Estimate, within_run
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value, short
 from fgtrack.inputs.source import open_input
-from fgtrack.noise.measurements import Fed
+from fgtrack.noise.measurements import BankCall
 from fgtrack.pipeline.assumptions.assumed import assumed, source_of
 from fgtrack.pipeline.replay import replay_in_memory
 from fgtrack.runs import load_run
@@ -200,7 +200,7 @@ def _sensors(
 ) -> Table:
     """Return the errors of `kept`, the replaying filter, with each sensor in time, and without its late lists."""
     newest, late, late_lists = dict[int, int](), dict[str, list[bool]](), set[int]()
-    for item in replays.fed:
+    for item in replays.calls:
         for track_id, each in zip(item.track_ids, item.observations, strict=False):
             is_late = item.stamp_ns < newest.get(track_id, item.stamp_ns)
             late.setdefault(each.sensor, []).append(is_late)
@@ -213,7 +213,7 @@ def _sensors(
     for sensor, flags in late.items():
         mine = {
             id(item)
-            for item in replays.fed
+            for item in replays.calls
             if item.observations and item.observations[0].sensor == sensor
         }
         out = mine & late_lists
@@ -321,11 +321,11 @@ def _waiting(policies: Mapping[str, Squares]) -> Table:
     return Table("What waiting buys", records, columns, ("wait_s",))
 
 
-def _at_stamp_of(mine: Container[int], item: Fed) -> int:
+def _at_stamp_of(mine: Container[int], item: BankCall) -> int:
     return item.stamp_ns if id(item) in mine else item.now_ns
 
 
-def _without(left_out: Container[int], item: Fed) -> int | None:
+def _without(left_out: Container[int], item: BankCall) -> int | None:
     return None if id(item) in left_out else item.now_ns
 
 

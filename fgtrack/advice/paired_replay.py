@@ -21,7 +21,7 @@ from fgtrack.estimation.failures import Failures
 from fgtrack.evaluation.matching import NO_OBJECT, match, track_errors
 from fgtrack.evaluation.truth import true_paths
 from fgtrack.noise.likelihood.series import Observation
-from fgtrack.noise.measurements import Fed, RecordingBank, watched
+from fgtrack.noise.measurements import BankCall, RecordingBank, recorded_bank
 from fgtrack.pipeline.build import build_bank
 from fgtrack.runs import Run
 from fgtrack.tracking.guarded_bank import GuardedBank
@@ -32,16 +32,16 @@ _SETTLE_NS, _STEP_NS = (
     NS_PER_S,
     NS_PER_S // 20,
 )  # a track is judged from an age on, and so often
-Arrival = Callable[[Fed], int | None]
+Arrival = Callable[[BankCall], int | None]
 """Gives the time from which on measurements count; None for never."""
 
 
-def as_received(item: Fed) -> int:
+def as_received(item: BankCall) -> int:
     """Return the tick that first had the measurements."""
     return item.now_ns
 
 
-def at_stamp(item: Fed) -> int:
+def at_stamp(item: BankCall) -> int:
     """Return the stamp of the measurements, as if nothing were late."""
     return item.stamp_ns
 
@@ -56,22 +56,22 @@ class PairedReplay:
         now_ns = now_ns[
             : np.searchsorted((now_ns - now_ns[:1]) / NS_PER_S, until_s, side="right")
         ]
-        if not len(now_ns) or not bank.fed:
+        if not len(now_ns) or not bank.calls:
             raise DataError(
                 "no track in this recording: `fgtrack advise` gives the reason"
             )
-        self.fed = [item for item in bank.fed if item.now_ns <= now_ns[-1]]
+        self.calls = [item for item in bank.calls if item.now_ns <= now_ns[-1]]
         """Measurements of the association, in the order in which they came."""
         self.run, self.config, self._now_ns = run, config, now_ns
         grid = np.searchsorted(now_ns, np.arange(now_ns[0], now_ns[-1] + 1, _STEP_NS))
         self._ticks = np.unique(grid[grid < len(now_ns)])
         self._births = {
             item.track_ids[0]: item.now_ns
-            for item in self.fed
+            for item in self.calls
             if item.start is not None
         }
         self._ends = {
-            track_id: item.now_ns for item in self.fed for track_id in item.track_ids
+            track_id: item.now_ns for item in self.calls for track_id in item.track_ids
         }
         self._columns = {
             track_id: column for column, track_id in enumerate(self._births)
@@ -80,7 +80,7 @@ class PairedReplay:
     @classmethod
     def of(cls, messages: Sequence[Message], config: Config) -> "PairedReplay":
         """Return that of a recording. Raises `DataError` where nothing is tracked."""
-        return cls(*watched(messages, replace(config, estimator=REPLAY)), config)
+        return cls(*recorded_bank(messages, replace(config, estimator=REPLAY)), config)
 
     @cached_property
     def objects(self) -> IntArray | None:
@@ -117,7 +117,7 @@ class PairedReplay:
         Without truth the predicted variances stand for them.
         """
         events = [
-            (at_ns, item) for item in self.fed if (at_ns := arrival(item)) is not None
+            (at_ns, item) for item in self.calls if (at_ns := arrival(item)) is not None
         ]
         events.sort(
             key=lambda pair: (
@@ -170,7 +170,7 @@ class PairedReplay:
                         )
         return result
 
-    def _feed(self, bank: GuardedBank, item: Fed, config: Config) -> None:
+    def _feed(self, bank: GuardedBank, item: BankCall, config: Config) -> None:
         if item.start is not None:
             bank.birth(item.track_ids[0], item.start)
             return

@@ -24,7 +24,7 @@ from fgtrack.core.output import check_no_overlap, check_output, write_file
 from fgtrack.evaluation.tables import NO_VALUE, Column, Table, Tables, Value
 from fgtrack.inputs.source import open_input
 from fgtrack.noise.parameters import HeldOut, TunedParameter, TuneReport, TuneRules
-from fgtrack.noise.tune import tuned
+from fgtrack.noise.tune import tune_sources
 from fgtrack.pipeline.assumptions.assumption import Assumed
 
 _KNOWN = {
@@ -62,7 +62,7 @@ def tune(
     check_no_overlap(out, [*recordings, config_file])
     sources = {str(path): open_input(path, config.input) for path in recordings}
     with progress("tune") as tell:
-        report = tuned(sources, config, TuneRules(keep=tuple(keep or ())), tell)
+        report = tune_sources(sources, config, TuneRules(keep=tuple(keep or ())), tell)
     shown = {"parameters": _parameters(report.parameters)}
     if report.held_out is not None:
         shown["held_out"] = _validation(report.held_out)

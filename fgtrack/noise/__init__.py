@@ -1,1 +1,1 @@
-"""Noise of motion and sensors, fitted to recordings by maximum likelihood."""
+"""Noise of the motion and of the sensors, fitted to recordings by maximum likelihood."""

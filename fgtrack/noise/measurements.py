@@ -1,4 +1,4 @@
-"""The measurements of each track of a replay in memory, with their noise in parts."""
+"""Replay in memory that records the measurements of each track, with their noise split into parts."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -41,47 +41,52 @@ _GATE_PROBABILITY = 0.9999
 
 
 @dataclass(frozen=True, slots=True)
-class Fed:
-    """Call of the bank in a tick: a new track, or measurements of several tracks of one stamp."""
+class BankCall:
+    """Call of the track bank in a tick: a birth, or measurements of several tracks at one stamp."""
 
     now_ns: int
     """Time of the tick."""
     stamp_ns: int
     track_ids: Sequence[int]
     observations: Sequence[Observation] = ()
-    """Of these tracks; none of a new track."""
+    """Fused observations of these tracks; empty for a birth."""
     start: Start | None = None
-    """Of a new track."""
+    """First state of a new track; None for measurements."""
 
 
-def recorded(
+def recorded_series(
     messages: Iterable[Message],
     config: Config,
     origin: str = "",
     gate_stds: float = 0.0,
 ) -> tuple[list[Series], Run]:
-    """Return the series of all tracks, and the run.
-    A gate in metres is opened to `gate_stds` standard deviations of the position of each detection.
+    """Replay the messages; return the series of all tracks and the run.
+
+    A gate in metres is widened to `gate_stds` standard deviations of each detection's
+    position. `origin` names the recording in the run.
     """
-    bank, run = watched(messages, config, origin, gate_stds)
+    bank, run = recorded_bank(messages, config, origin, gate_stds)
     motion, method = config.motion_model(), config.initiation.method
     return [series.initiated(motion, method) for series in bank.series()], run
 
 
-def watched(
+def recorded_bank(
     messages: Iterable[Message],
     config: Config,
     origin: str = "",
     gate_stds: float = 0.0,
 ) -> tuple["RecordingBank", Run]:
-    """Return the bank that was fed, and the run; see `recorded`."""
-    watch = Watch(config, gate_stds)
-    run = replay_in_memory(messages, config, origin=origin, observed=watch)
-    return watch.bank, run
+    """Replay the messages; return the bank with its recorded calls, and the run.
+
+    The arguments are those of `recorded_series`.
+    """
+    recorder = MeasurementRecorder(config, gate_stds)
+    run = replay_in_memory(messages, config, origin=origin, observed=recorder)
+    return recorder.bank, run
 
 
-class Watch:
-    """Puts a `RecordingBank` into the tracker of `config`; see `recorded`."""
+class MeasurementRecorder:
+    """Hook that puts a `RecordingBank` into the tracker of `config`; see `recorded_series`."""
 
     bank: "RecordingBank"
 
@@ -89,20 +94,17 @@ class Watch:
         self._config, self._gate_stds = config, gate_stds
 
     def __call__(self, parts: TrackerParts) -> TrackerParts:
-        """Return parts of a tracker with the bank, which is kept."""
-        preprocess, association = (
-            _WatchedPreprocess(parts.preprocess),
-            parts.association,
-        )
+        """Return the parts of the tracker with the recording bank, which stays available as `bank`."""
+        preprocess = _RecordingPreprocess(parts.preprocess)
+        association = parts.association
         make = partial(build_bank, self._config, parts.failures)
         self.bank = RecordingBank(make, parts.failures, preprocess)
         if self._gate_stds and isinstance(
             association, GatedEuclidean | GatedMahalanobis
         ):
             association = _WideGate(association, self._gate_stds)
-        joint = parts.joint and replace(
-            parts.joint, joint_from=None
-        )  # the noise is that of single detections
+        # Joint association is off: the fit needs the noise of single detections.
+        joint = parts.joint and replace(parts.joint, joint_from=None)
         return replace(
             parts,
             preprocess=preprocess,
@@ -114,7 +116,10 @@ class Watch:
 
 @dataclass(frozen=True)
 class _WideGate:
-    """An `Association` whose gate is opened to so many standard deviations of each detection, and as probable."""
+    """Association whose gate is widened to `stds` standard deviations of each detection.
+
+    The gate probability of a Mahalanobis gate is raised as well.
+    """
 
     association: GatedEuclidean | GatedMahalanobis
     stds: float
@@ -146,7 +151,11 @@ class _WideGate:
         return opened(candidates, states, apart, likely, facings)
 
     def _stds_m(self, candidate: Candidate, means: FloatArray) -> FloatArray:
-        """Return the largest standard deviation of the position; of a bearing alone, across the line of sight."""
+        """Return the largest position standard deviation for each track position in `means`.
+
+        For a detection with a bearing alone it is the one across the line of sight, at
+        the distance of the track.
+        """
         if candidate.position_covariance is not None:
             return np.full(
                 len(means),
@@ -160,18 +169,22 @@ class _WideGate:
         return np.asarray(away_m * math.sqrt(measurement.R[k, k]))
 
 
-class _WatchedPreprocess(Preprocess):
-    """A `Preprocess` that keeps the origin of the noise of the newest batches."""
+class _RecordingPreprocess(Preprocess):
+    """Preprocessing that remembers the sensor and the noise source of each measurement.
 
-    def __init__(self, watched: Preprocess) -> None:
-        self.__dict__.update(vars(watched))
-        self._own: dict[
-            tuple[int, bytes], tuple[str, SensorModel, bool]
-        ] = {}  # by pose, one for each batch, and content
+    It remembers the newest batches only.
+    """
+
+    def __init__(self, original: Preprocess) -> None:
+        self.__dict__.update(vars(original))
+        # By the identity of the pose (one object per batch) and the content of the measurement:
+        # sensor name, sensor model, and True if the covariance is reported by a detection.
+        self._own: dict[tuple[int, bytes], tuple[str, SensorModel, bool]] = {}
 
     def together(self, batches: Sequence[PosedBatch]) -> list[Preprocessed]:
         """See `Preprocess.together`."""
-        result, self._own = super().together(batches), {}
+        result = super().together(batches)
+        self._own = {}
         for (batch, sensor, _, pose), (candidates, _) in zip(
             batches, result, strict=True
         ):
@@ -191,13 +204,16 @@ class _WatchedPreprocess(Preprocess):
         return result
 
     def observation(self, measurement: Measurement) -> Observation:
-        """Return a measurement of the newest batches with its noise in parts."""
+        """Return a measurement of the newest batches as an observation, with its noise split into parts."""
         name, sensor, is_own = self._own[id(measurement.pose), _content(measurement)]
         return observation(name, sensor, measurement, is_own)
 
 
 def _content(measurement: Measurement) -> bytes:
-    """Return the values of `measurement` that no reading changes, see `fgtrack.tracking.facing`."""
+    """Return the components of `measurement` that stay equal when its facing is resolved.
+
+    See `fgtrack.tracking.facing`.
+    """
     names = measurement.model.components
     kept = [k for k, name in enumerate(names) if name not in ("yaw_rad", *SIGNED)]
     return measurement.z[kept].tobytes()
@@ -206,17 +222,23 @@ def _content(measurement: Measurement) -> bytes:
 def observation(
     name: str, sensor: SensorModel, measurement: Measurement, own: bool
 ) -> Observation:
-    """Return `measurement` of the sensor `name`; its noise is fixed if it is its `own`, or time-correlated."""
+    """Return `measurement` of the sensor `name` as an observation, with its noise split into parts.
+
+    The covariance is fixed if it is the detection's `own`, or if the sensor has
+    time-correlated errors.
+    """
     components = measurement.model.components
     measured = tuple(
         i for i, component in enumerate(components) if component in sensor.std
     )
     assumed = tuple(i for i in range(len(components)) if i not in measured)
-    R, T = measurement.R[np.ix_(measured, measured)], np.eye(len(measured))
+    R = measurement.R[np.ix_(measured, measured)]
+    T = np.eye(len(measured))
     if own or sensor.correlation is not None:
         return Observation(name, measurement, measured, assumed, T, R, np.zeros_like(R))
     if "x_m" in components:
-        (x_m, y_m), pose = measurement.z[:2].tolist(), measurement.pose
+        x_m, y_m = measurement.z[:2].tolist()
+        pose = measurement.pose
         T[:2, :2] = rotation(math.atan2(y_m - pose.y_m, x_m - pose.x_m))
     modelled = congruence(
         T, np.diag([sensor.std[components[i]] ** 2 for i in measured])
@@ -233,26 +255,25 @@ def observation(
 
 
 class RecordingBank(GuardedBank):
-    """Keeps the first state and the fused measurements of every track."""
+    """Track bank that records the first state and the fused measurements of every track."""
 
     def __init__(
         self,
         make: Callable[[], TrackBank],
         failures: Failures,
-        preprocess: _WatchedPreprocess,
+        preprocess: _RecordingPreprocess,
     ) -> None:
         super().__init__(make, failures)
         self._preprocess = preprocess
-        self.fed: list[Fed] = []
-        """In the order in which it was fed."""
+        self.calls: list[BankCall] = []
+        """Recorded calls, in their order."""
 
     def series(self) -> list[Series]:
-        """Return the fused measurements of each track, by rising stamp, in order of birth."""
+        """Return the fused measurements of each track in order of birth, sorted by stamp."""
         tracks: list[tuple[Start, list[Observation]]] = []
-        newest: dict[
-            int, list[Observation]
-        ] = {}  # a number may return with an identity
-        for item in self.fed:
+        # A track id may be born again, when a known identity returns.
+        newest: dict[int, list[Observation]] = {}
+        for item in self.calls:
             if item.start is not None:
                 newest[item.track_ids[0]] = []
                 tracks.append((item.start, newest[item.track_ids[0]]))
@@ -277,12 +298,16 @@ class RecordingBank(GuardedBank):
         observations = [
             self._preprocess.observation(measurements[row]) for row in fused
         ]
-        self.fed.append(
-            Fed(self._now_ns, stamp_ns, [track_ids[row] for row in fused], observations)
+        self.calls.append(
+            BankCall(
+                self._now_ns, stamp_ns, [track_ids[row] for row in fused], observations
+            )
         )
         return results
 
     def birth(self, track_id: int, prior: Start) -> None:
         """See `TrackBank.birth`."""
         super().birth(track_id, prior)
-        self.fed.append(Fed(self._now_ns, prior.stamp_ns, [track_id], start=prior))
+        self.calls.append(
+            BankCall(self._now_ns, prior.stamp_ns, [track_id], start=prior)
+        )

@@ -1,4 +1,4 @@
-"""Noise of a configuration as a vector of parameters, rules of its fit, and the report of what was fitted."""
+"""Noise of a configuration as a parameter vector, the rules of its fit, and the report."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -20,13 +20,13 @@ _DIGITS = 4
 
 @dataclass(frozen=True)
 class ConfigNoise:
-    """Tuned parameters of a configuration: process noise, and the standard deviations of every sensor."""
+    """Noise parameters of a configuration: process noise, and the standard deviations of each sensor."""
 
     config: Config
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """Keys of the configuration, in the order of the parameters; empty for the shares of outliers."""
+        """Configuration key of each parameter, in their order; empty for a share of outliers."""
         prefixes = (
             (f"sensors.{sensor}.std" if sensor else "motion.std_per_s", name)
             for sensor, name in self.space.names
@@ -35,7 +35,7 @@ class ConfigNoise:
 
     @property
     def space(self) -> NoiseSpace:
-        """The parameters as the likelihood needs them."""
+        """Names and order of the parameters for the likelihood."""
         sensors = {
             name: sensor.components for name, sensor in self.config.used_sensors.items()
         }
@@ -43,7 +43,7 @@ class ConfigNoise:
 
     @property
     def values(self) -> FloatArray:
-        """The configured parameters, shape (p,)."""
+        """Configured parameters, shape (p,); shares of outliers have their first guess."""
         stds = [
             sensor.std[name]
             for sensor in self.config.used_sensors.values()
@@ -58,7 +58,10 @@ class ConfigNoise:
         )
 
     def config_with(self, values: FloatArray) -> Config:
-        """Return the configuration with `values`, shape (p,), to four digits; configured ones stay to the bit."""
+        """Return the configuration with the parameters `values`, shape (p,), rounded to four digits.
+
+        A parameter that equals its configured value keeps it exactly.
+        """
         new = {
             name: was if value == was else float(f"{value:.{_DIGITS}g}")
             for name, value, was in zip(
@@ -76,7 +79,7 @@ class ConfigNoise:
 
     @property
     def stamp_stds(self) -> dict[str, float]:
-        """Standard deviations of the stamps of the sensors whose stamps err, by sensor."""
+        """Configured standard deviations of stamps by sensor, where they are not 0."""
         return {
             name: item.stamp_std_s
             for name, item in self.config.used_sensors.items()
@@ -84,7 +87,7 @@ class ConfigNoise:
         }
 
     def with_stamps(self, sensor: str, std_s: float) -> "ConfigNoise":
-        """Return that of the configuration with stamps of `sensor` that err by `std_s`."""
+        """Return the noise of the configuration in which stamps of `sensor` have the standard deviation `std_s`."""
         changed = replace(self.config.sensors[sensor], stamp_std_s=std_s)
         return ConfigNoise(
             replace(self.config, sensors={**self.config.sensors, sensor: changed})
@@ -92,7 +95,7 @@ class ConfigNoise:
 
     @property
     def _motion_stds(self) -> dict[str, float]:
-        """Positive noise parameters of the motion model, by name; none of a plug-in's, which has its own."""
+        """Positive noise parameters of the motion model by name; empty for a plug-in's motion model."""
         motion = self.config.motion
         names = motion.noise_names(self.config.used_sensors)
         return {
@@ -114,22 +117,25 @@ class ConfigNoise:
 
 
 def stamp_key(sensor: str) -> str:
-    """Return the key of the standard deviation of the stamps of `sensor`."""
+    """Return the configuration key of the standard deviation of `sensor`'s stamps."""
     return f"sensors.{sensor}.stamp_std_s"
 
 
 @dataclass(frozen=True)
 class TuneRules:
-    """Data that are used."""
+    """Options of a fit: fixed parameters, and the data that are used."""
 
     keep: tuple[str, ...] = ()
-    """Keys of the configuration that stay as they are."""
+    """Configuration keys that keep their values."""
     train_share: float = 0.7
-    """Leading part of each recording that the noise which is judged is fitted to; 1: none is judged."""
+    """First part of each recording to which the validated noise is fitted, as a share of its time.
+
+    1: no validation.
+    """
     max_rounds: int = 4
-    """Largest number of associations."""
+    """Largest number of rounds of association and fit."""
     max_observations: int | None = None
-    """Longer tracks are cut to so many measurements."""
+    """Longer tracks are cut to this number of measurements; None: no limit."""
 
 
 Known = Literal["yes", "roughly", "limit", "no"]
@@ -137,38 +143,45 @@ Known = Literal["yes", "roughly", "limit", "no"]
 
 @dataclass(frozen=True)
 class TunedParameter:
-    """One standard deviation."""
+    """Result of the fit of one standard deviation."""
 
     key: str
-    """Key of the configuration."""
+    """Configuration key."""
     configured: float
     tuned: float
-    """As configured where it is not known."""
+    """Fitted value; the configured value if the parameter is not identifiable."""
     std_error: float | None
-    """Standard error as a share of the value; None where there is none."""
+    """Standard error as a share of the value; None without one."""
     known: Known
-    """`yes`: `std_error` is at most 5 %; `roughly`: at most 50 %; `limit`: only a limit is known, which the configured
-    value exceeds, and is adopted; `no`: the configured value stays."""
+    """Identifiability of the parameter.
+
+    `yes`: `std_error` is at most 5 %. `roughly`: at most 50 %. `limit`: the data give
+    only a limit, which excludes the configured value; the limit is adopted. `no`: not
+    identifiable, the configured value stays.
+    """
     why: str
-    """Why it is not known; empty where it is."""
+    """Reason why the parameter is not identifiable, or only a limit is known; else empty."""
 
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Measurements and outliers of one sensor."""
+    """Numbers of measurements and share of outliers of one sensor."""
 
     sensor: str
     count: int
-    """Innovations that counted."""
+    """Number of innovations that contributed to the likelihood."""
     own_covariance: int
-    """Innovations with a covariance of their own, or time-correlated errors: the standard deviations do not apply."""
+    """Number of innovations to which the sensor's standard deviations do not apply.
+
+    Their detections report a covariance, or the sensor has time-correlated errors.
+    """
     outlier_share: float | None
-    """Share of measurements with larger errors; None where nothing counted."""
+    """Share of measurements with errors larger than nominal; None without measurements."""
 
 
 @dataclass(frozen=True)
 class InnovationFit:
-    """Innovations of one component against their covariance, on time held out."""
+    """Consistency of the innovations of one component on held-out time."""
 
     sensor: str
     component: str
@@ -176,23 +189,23 @@ class InnovationFit:
     before: float
     """Mean of the squared innovation over its variance, expected 1, with the configured noise."""
     after: float
-    """The same with the noise fitted to the rest of the time."""
+    """The same mean with the noise fitted to the first part."""
     band: float
-    """Half-width of the 95 % interval of that mean for independent innovations."""
+    """Half-width of the 95 % interval of the mean for independent innovations."""
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """The last part of each recording, to which the noise that is judged was not fitted."""
+    """Validation on the last part of each recording, which was not used for the fit."""
 
     share: float
-    """Share of the recorded time."""
+    """Held-out share of the recorded time."""
     count: int
-    """Innovations."""
+    """Number of innovations."""
     before: float
     """Log-likelihood per innovation with the configured noise."""
     after: float
-    """With the noise fitted to the rest."""
+    """Log-likelihood per innovation with the noise fitted to the first part."""
     innovations: tuple[InnovationFit, ...]
 
 
@@ -205,26 +218,26 @@ class TuneReport:
     parameters: tuple[TunedParameter, ...]
     sensors: tuple[SensorNoise, ...]
     held_out: HeldOut | None
-    """None where too little is left to judge."""
+    """Validation; None if the held-out part has no innovations, or no part was held out."""
     log_likelihood: float
-    """Per innovation, of all of them, with the tuned noise."""
+    """Log-likelihood per innovation with the tuned noise, over all recordings."""
     count: int
-    """Innovations that counted in the final fit."""
+    """Number of innovations that contributed to the final fit."""
     num_tracks: int
-    """Tracks they belong to."""
+    """Number of tracks of these innovations."""
     num_mixed: int
-    """Measurements left out, as most of those around them are outliers; see `without_mixed`."""
+    """Number of measurements excluded because most of their neighbours are outliers, see `with_mixed_marked`."""
     rounds: int
-    """Number of associations."""
+    """Number of rounds of association and fit."""
     settled: bool
-    """True if another association would change nothing."""
+    """True if another round would not change the parameters."""
     broken: Mapping[str, str]
-    """Why a recording broke off, by its name; what came before was used."""
+    """Reason why a recording could be read only in part, by its name; the readable part was used."""
     runs: tuple[Run, ...] = field(repr=False)
-    """Runs of the last association, of the estimator `ekf-replay`, one for each recording."""
+    """Run of the last association for each recording, with the estimator `ekf-replay`."""
 
     def as_dict(self) -> dict[str, object]:
-        """Return plain values for JSON, without the runs."""
+        """Return the report as plain values for JSON, without the configuration and the runs."""
         names = [
             item.name for item in fields(self) if item.name not in ("config", "runs")
         ]

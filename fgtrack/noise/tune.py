@@ -1,4 +1,4 @@
-"""Noise from recordings: process and measurement noise by maximum likelihood of the innovations, without truth."""
+"""Fit of process and measurement noise to recordings without truth, by maximum likelihood of the innovations."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -16,9 +16,9 @@ from fgtrack.inputs.errors import UntilBreak
 from fgtrack.inputs.source import InputSource, open_input
 from fgtrack.noise.likelihood.contaminated import outlier_share
 from fgtrack.noise.likelihood.fit import Likelihood, Problem
-from fgtrack.noise.likelihood.reference import filtered, without_mixed
+from fgtrack.noise.likelihood.reference import filtered, with_mixed_marked
 from fgtrack.noise.likelihood.series import Series
-from fgtrack.noise.measurements import recorded
+from fgtrack.noise.measurements import recorded_series
 from fgtrack.noise.parameters import (
     ConfigNoise,
     HeldOut,
@@ -35,19 +35,26 @@ from fgtrack.pipeline.assumptions.assumed import assumed
 from fgtrack.pipeline.replay import located
 from fgtrack.runs import Run
 
-_MIN_OBSERVATIONS = 20  # of a track: most of the shorter ones are clutter
-_MIN_COUNT = 30  # measured components that a parameter needs at least
-_SETTLED = (
-    0.2  # share of its standard deviation by which no parameter moves in the last round
-)
-_KNOWN, _ROUGHLY_KNOWN = 0.05, 0.5  # largest standard errors, as shares of the value
-_REJECTED = 1.92  # loss of log-likelihood at the border of a 95 % interval
-_GATE_STDS = 4.0  # at least, else what the gate cuts off is missing in the noise
-_START_FACTOR = 5.0  # further starts have a motion noise larger, and smaller, by this
-_START_TRACKS, _START_OBSERVATIONS = 3, 200  # that are used to compare starts
-_ENDLESS = (
-    "no maximum: the likelihood still rises 10^4 times away, as where all errors are 0"
-)
+# Least number of observations of a track. Most shorter tracks are clutter.
+_MIN_OBSERVATIONS = 20
+# Least number of measured components for a parameter.
+_MIN_COUNT = 30
+# The rounds end when no parameter moves by more than this share of its standard deviation.
+_SETTLED = 0.2
+# Largest standard errors, as shares of the value.
+_KNOWN = 0.05
+_ROUGHLY_KNOWN = 0.5
+# Drop of the log-likelihood at the border of a 95 % interval.
+_REJECTED = 1.92
+# Least gate in standard deviations. Errors that a narrow gate cuts off would be missing in the noise.
+_GATE_STDS = 4.0
+# Factor on the motion noise in two further starts of the search, which multiply and divide by it.
+_START_FACTOR = 5.0
+# Number of tracks, and of observations of each, on which the starts are compared.
+_START_TRACKS = 3
+_START_OBSERVATIONS = 200
+_NO_MAXIMUM = "no maximum: the likelihood still rises after a factor of 10^4, as for errors of exactly 0"
+_KEPT = "kept as configured (keep)"
 
 
 def tune(
@@ -61,30 +68,34 @@ def tune(
 ) -> TuneReport:
     """Fit process and measurement noise to recordings; `report.config` is the tuned configuration.
 
-    `recordings` is the path of anything that fgtrack reads, or several; `config`, `map`, `pit_map` and `set` are as for
-    `fgtrack.replay`. Keys in `keep` stay as configured: `["motion.std_per_s.speed"]`.
+    `recordings` is the path of a recording in any format that fgtrack reads, or several
+    paths. `config`, `map`, `pit_map` and `set` are as in `fgtrack.replay`. Keys in
+    `keep` stay as configured: `["motion.std_per_s.speed"]`.
 
-    Raises `CallError` where the configuration does not fit, and `DataError` where a recording cannot be read, a sensor
-    of it has no model, or nothing can be fitted to it.
+    Raises `CallError` for an invalid configuration. Raises `DataError` if a recording
+    cannot be read, a sensor has no model, or nothing can be fitted.
     """
     resolved = read_config(config, set, track_map=map, pit_map=pit_map)
-    paths: Sequence[str | Path] = [recordings]  # type: ignore[list-item]  # open_input names what is not a path
+    paths: Sequence[str | Path] = [recordings]  # type: ignore[list-item]  # open_input reports an invalid path
     if isinstance(recordings, Sequence) and not isinstance(recordings, str):
         paths = recordings
-    return tuned(
+    return tune_sources(
         {str(path): open_input(path, resolved.input) for path in paths},
         resolved,
         TuneRules(keep=tuple(keep)),
     )
 
 
-def tuned(
+def tune_sources(
     sources: Mapping[str, InputSource],
     config: Config,
     rules: TuneRules | None = None,
     on_step: Callable[[str], None] = lambda text: None,
 ) -> TuneReport:
-    """Return `tune` of messages in receipt order, by name of their recording; `on_step` gets the name of each step."""
+    """Fit noise to messages in receipt order, by name of their recording; see `tune`.
+
+    `on_step` is called with the name of each step.
+    """
     messages: dict[str, list[Message]] = {}
     broken: dict[str, str] = {}
     for name, source in sources.items():
@@ -105,7 +116,7 @@ def tuned(
 
 
 class _Tuning:
-    """The steps of `tuned`."""
+    """Steps of a fit: association, start values, stamps, maximum, validation."""
 
     def __init__(
         self,
@@ -114,36 +125,41 @@ class _Tuning:
         rules: TuneRules,
         on_step: Callable[[str], None],
     ) -> None:
-        self._noise, self._recordings, self._rules, self._on_step = (
-            noise,
-            recordings,
-            rules,
-            on_step,
-        )
-        self._space, self._configured = noise.space, noise.values
+        self._noise = noise
+        self._recordings = recordings
+        self._rules = rules
+        self._on_step = on_step
+        self._space = noise.space
+        self._configured = noise.values
         self._kept = np.isin(noise.keys, rules.keep)
-        self._named = np.array(
-            [bool(name) for _, name in noise.space.names]
-        )  # not the shares of outliers
-        self._endless = np.zeros(len(self._kept), dtype=np.bool_)
-        self._configured_stamps, self._stamps = noise.stamp_stds, list[TunedParameter]()
+        # True for standard deviations, False for shares of outliers.
+        self._is_std = np.array([bool(name) for _, name in noise.space.names])
+        self._unbounded = np.zeros(len(self._kept), dtype=np.bool_)
+        self._configured_stamps = noise.stamp_stds
+        self._stamps = list[TunedParameter]()
         for key in rules.keep:
             if key not in (*noise.keys, *map(stamp_key, self._configured_stamps)):
                 raise CallError(
-                    f"keep {key}: is no noise of the configuration, which has {', '.join(filter(None, noise.keys))}"
+                    f"keep {key}: not a noise parameter of the configuration, use {', '.join(filter(None, noise.keys))}"
                 )
 
     def report(self, broken: Mapping[str, str]) -> TuneReport:
-        """Return the result of rounds of association and fit to the first part, judged by the rest."""
+        """Run rounds of association and fit; return the tuned noise with its validation.
+
+        Each round fits to the first part of the recordings. The held-out rest validates
+        the last one. The final fit uses everything.
+        """
         series, runs = self._associated(self._configured)
         splits_ns = [self._split_ns(tracks) for tracks in series]
-        values, rounds, settled = self._configured, 0, False
+        values = self._configured
+        rounds = 0
+        settled = False
         while not settled and rounds < self._rules.max_rounds:
             if rounds:
                 self._on_step(f"association {rounds + 1}")
                 series, runs = self._associated(values)
                 series = [
-                    [without_mixed(item, self._space, values) for item in tracks]
+                    [with_mixed_marked(item, self._space, values) for item in tracks]
                     for tracks in series
                 ]
             rounds += 1
@@ -161,12 +177,12 @@ class _Tuning:
             self._on_step(f"fit {rounds}")
             before = values
             values, likelihood, free = self._maximum(problem, values)
-            moved = np.abs(np.log(values[free] / before[free]))
-            still = (moved <= _SETTLED * likelihood.spread(np.log(values[free]))).all()
-            settled = rounds > 1 and bool(
-                still
-            )  # with the configured noise a mixture cannot be identified
-        (values, likelihood, parameters), held_out = self._fitted(problem, values), None
+            change = np.abs(np.log(values[free] / before[free]))
+            still = (change <= _SETTLED * likelihood.spread(np.log(values[free]))).all()
+            # The first round cannot be the last: it does not mark mixed observations.
+            settled = rounds > 1 and bool(still)
+        values, likelihood, parameters = self._fitted(problem, values)
+        held_out = None
         if self._rules.train_share < 1.0:
             held_out = self._held_out(values, series, splits_ns)
             self._on_step("fit to everything")
@@ -192,33 +208,23 @@ class _Tuning:
         )
 
     def _fit_stamps(self, problem: Problem, values: FloatArray) -> Problem:
-        """Fit the errors of stamps that are configured; return `problem` with them.
-        First of all: where an object moves along the line of sight, the standard deviation there would explain them.
+        """Fit the configured standard deviations of stamps; return `problem` with them.
+
+        They are fitted before all other noise. Otherwise the standard deviation along
+        the line of sight would absorb the stamp errors of objects that move along it.
         """
         self._stamps = []
         rates = stamp_rates(problem, values) if self._configured_stamps else []
         for name, was_s in self._configured_stamps.items():
-            used_s, key, fit = (
-                self._noise.stamp_stds[name],
-                stamp_key(name),
-                StampFit(was_s, math.inf),
-            )
+            used_s = self._noise.stamp_stds[name]
+            key = stamp_key(name)
+            fit = StampFit(was_s, math.inf)
             known: Known = "no"
-            why = "kept as asked"
+            why = _KEPT
             if key not in self._rules.keep:
                 fit = fitted_stamps(problem, rates, values, name, used_s)
-                known = (
-                    "yes"
-                    if fit.std_error <= _KNOWN
-                    else "roughly"
-                    if fit.std_error <= _ROUGHLY_KNOWN
-                    else "no"
-                )
-                why = (
-                    ""
-                    if known != "no"
-                    else f"flat: standard error {100.0 * fit.std_error:.0f} %"
-                )
+                known = _identifiability(fit.std_error)
+                why = "" if known != "no" else _flat(fit.std_error)
             std_s = was_s if known == "no" else float(f"{fit.std_s:.4g}")
             self._noise = self._noise.with_stamps(name, std_s)
             problem = with_stamps(problem, rates, name, used_s, std_s)
@@ -227,13 +233,13 @@ class _Tuning:
         return problem
 
     def _associated(self, values: FloatArray) -> tuple[list[list[Series]], list[Run]]:
-        """Return the series of long tracks and the run of each recording, with the noise of `values`."""
-        config = replace(
-            self._noise.config_with(values), estimator="ekf-replay"
-        )  # which keeps late data
-        all_series, runs = [], []
+        """Replay the recordings with the noise `values`; return their long tracks and their runs."""
+        # The estimator ekf-replay fuses late data.
+        config = replace(self._noise.config_with(values), estimator="ekf-replay")
+        all_series = []
+        runs = []
         for name, messages in self._recordings.items():
-            series, run = recorded(messages, config, name, _GATE_STDS)
+            series, run = recorded_series(messages, config, name, _GATE_STDS)
             most = self._rules.max_observations
             long = [
                 item for item in series if len(item.observations) >= _MIN_OBSERVATIONS
@@ -245,7 +251,7 @@ class _Tuning:
         return all_series, runs
 
     def _split_ns(self, tracks: Sequence[Series]) -> float:
-        """Return the stamp at which the held-out part of a recording begins; infinite without one."""
+        """Return the stamp at which the held-out part of a recording begins; infinity without one."""
         if self._rules.train_share == 1.0:
             return math.inf
         stamps_ns = [
@@ -258,49 +264,52 @@ class _Tuning:
     def _maximum(
         self, problem: Problem, start: FloatArray
     ) -> tuple[FloatArray, Likelihood, BoolArray]:
-        """Return parameters at the maximum, the likelihood, and which are free; others are as configured."""
+        """Return the parameters at the maximum, the likelihood there, and the mask of free parameters.
+
+        The other parameters keep their configured values.
+        """
         while True:
             free = self._free(problem)
             values, likelihood = problem.maximum(start, free)
-            endless = free & problem.endless(values)
-            if not endless.any():
+            unbounded = free & problem.without_maximum(values)
+            if not unbounded.any():
                 return values, likelihood, free
-            self._endless |= endless
-            start = np.where(endless, self._configured, values)
+            self._unbounded |= unbounded
+            start = np.where(unbounded, self._configured, values)
 
     def _free(self, problem: Problem) -> BoolArray:
-        """Return which parameters have enough measurements and a maximum."""
+        """Return the mask of parameters that are fitted: enough measurements, a maximum, and not kept."""
         free = np.asarray(
-            (problem.counts() >= _MIN_COUNT) & ~self._kept & ~self._endless
+            (problem.counts() >= _MIN_COUNT) & ~self._kept & ~self._unbounded
         )
-        if not free[self._named].any():
-            raise self._nothing(
-                f"no parameter that may be fitted has {_MIN_COUNT} measurements on tracks of objects that move; take a "
-                "longer recording, or look at the gate, and for sensors without a model at `fgtrack info`"
+        if not free[self._is_std].any():
+            raise self._nothing_to_fit(
+                f"no free parameter has {_MIN_COUNT} measurements on tracks of moving objects; use a longer recording, "
+                "check the gate of the association, and see `fgtrack info` for sensors without a model"
             )
         return free
 
-    def _nothing(self, why: str) -> DataError:
-        if self._endless.any():
-            keys = ", ".join(np.array(self._noise.keys)[self._endless])
-            why = f"the errors behind {keys} are 0, or nearly so: was it simulated without noise?"
+    def _nothing_to_fit(self, why: str) -> DataError:
+        if self._unbounded.any():
+            keys = ", ".join(np.array(self._noise.keys)[self._unbounded])
+            why = f"the errors of {keys} are 0 or almost 0: was the recording simulated without noise?"
         return DataError(
             f"{', '.join(self._recordings)}: nothing to fit noise to: {why}"
         )
 
     def _best_start(self, problem: Problem) -> FloatArray:
-        """Return the best of three starts, by the maximum that it reaches on a part of the data."""
+        """Return the best of three start vectors: the one that reaches the highest maximum on a part of the data."""
         self._on_step("starts")
         longest = sorted(problem.series, key=lambda item: -len(item.observations))[
             :_START_TRACKS
         ]
-        some = [
+        shortened = [
             replace(item, observations=item.observations[:_START_OBSERVATIONS])
             for item in longest
         ]
-        part = replace(problem, series=some)
+        part = replace(problem, series=shortened)
         free = self._free(problem) & (part.counts() >= _MIN_COUNT)
-        if not free.any():  # too little in the part to choose a start by
+        if not free.any():  # the part is too small for a comparison
             return self._configured.copy()
         moving = np.flatnonzero(free[: self._space.num_motion])
         reached: list[tuple[float, FloatArray]] = []
@@ -314,8 +323,11 @@ class _Tuning:
     def _fitted(
         self, problem: Problem, start: FloatArray
     ) -> tuple[FloatArray, Likelihood, tuple[TunedParameter, ...]]:
-        """Return the maximum; instead of what is not known there, what is configured, or what is nearest to it.
-        The rest is not refitted: it would compensate for that.
+        """Return the maximum with identifiable parameters only, the likelihood, and a report by parameter.
+
+        A parameter that is not identifiable keeps its configured value, or gets the
+        nearest value that the data do not reject. The other parameters are not
+        refitted, as they would compensate for it.
         """
         count = len(start)
         known: list[Known] = ["no"] * count
@@ -323,20 +335,21 @@ class _Tuning:
         why = np.full(
             count, f"fewer than {_MIN_COUNT} measurements on tracks", dtype=object
         )
-        why[self._endless], why[self._kept] = _ENDLESS, "kept as asked"
+        why[self._unbounded] = _NO_MAXIMUM
+        why[self._kept] = _KEPT
         log_std = np.full(count, math.nan)
         log_std[free] = likelihood.log_std(np.log(values[free]))
         errors = log_std.copy()
         for row in sorted(
-            np.flatnonzero(free & self._named).tolist(), key=lambda item: -errors[item]
+            np.flatnonzero(free & self._is_std).tolist(), key=lambda item: -errors[item]
         ):
             why[row] = ""
-            if errors[row] <= _ROUGHLY_KNOWN:
-                known[row] = "yes" if errors[row] <= _KNOWN else "roughly"
+            known[row] = _identifiability(errors[row])
+            if known[row] != "no":
                 continue
             limit = self._limit(likelihood, values, row)
             if limit == self._configured[row]:
-                why[row] = f"flat: standard error {100.0 * errors[row]:.0f} %"
+                why[row] = _flat(errors[row])
             else:
                 known[row] = "limit"
                 why[row] = (
@@ -344,8 +357,8 @@ class _Tuning:
                 )
             values[row], log_std[row] = limit, math.nan
         if not {"yes", "roughly"} & set(known):
-            raise self._nothing(
-                "no parameter is identifiable in so few measurements; take a longer recording"
+            raise self._nothing_to_fit(
+                "no parameter is identifiable from these measurements; use a longer recording"
             )
         tuned_values = ConfigNoise(self._noise.config_with(values)).values
         rows = zip(
@@ -372,7 +385,10 @@ class _Tuning:
         return values, likelihood, tuple(parameters)
 
     def _limit(self, likelihood: Likelihood, values: FloatArray, row: int) -> float:
-        """Return the value nearest to the configured one that the data do not reject, the other parameters given."""
+        """Return the value of parameter `row` nearest to the configured one that the data do not reject.
+
+        The other parameters keep their `values`.
+        """
         shares = np.linspace(0.0, 1.0, 41)
         rows = np.broadcast_to(values, (len(shares), len(values))).copy()
         rows[:, row] = values[row] * (self._configured[row] / values[row]) ** shares
@@ -388,14 +404,17 @@ class _Tuning:
         series: Sequence[Sequence[Series]],
         splits_ns: Sequence[float],
     ) -> HeldOut | None:
-        """Return the performance in the rest of noise fitted to the first part; None where nothing counts there."""
+        """Validate the parameters `trained`, fitted to the first part, on the rest of the recordings.
+
+        Returns None if the rest has no innovations that count.
+        """
         rest = [
             replace(item, from_ns=at_ns)
             for tracks, at_ns in zip(series, splits_ns, strict=True)
             for item in tracks
         ]
         before, squares_before = self._scored(
-            rest, np.where(self._named, self._configured, trained)
+            rest, np.where(self._is_std, self._configured, trained)
         )
         after, squares_after = self._scored(rest, trained)
         if not before:
@@ -421,8 +440,12 @@ class _Tuning:
     def _scored(
         self, series: Sequence[Series], values: FloatArray
     ) -> tuple[list[float], dict[tuple[str, str], list[float]]]:
-        """Return log-likelihoods of the innovations that count, and squares over variances by sensor and component."""
-        terms, squares = list[float](), dict[tuple[str, str], list[float]]()
+        """Return the log-likelihood of each counted innovation, and the squared components over their variances.
+
+        The squares are listed by sensor and component.
+        """
+        terms = list[float]()
+        squares = dict[tuple[str, str], list[float]]()
         for item in series:
             for step in compress(filtered(item, self._space, values), item.counted):
                 terms.append(float(step.update.log_likelihood))
@@ -447,3 +470,14 @@ class _Tuning:
         return SensorNoise(
             name, count, own, float(outlier_share(values[row])) if count else None
         )
+
+
+def _identifiability(std_error: float) -> Known:
+    """Return how well a parameter with this relative standard error is known."""
+    if std_error <= _KNOWN:
+        return "yes"
+    return "roughly" if std_error <= _ROUGHLY_KNOWN else "no"
+
+
+def _flat(std_error: float) -> str:
+    return f"flat likelihood: standard error {100.0 * std_error:.0f} %"

@@ -64,8 +64,8 @@ def boundless_truth() -> list[Message]:
     return messages
 
 
-NOISELESS = "was it simulated without noise?"
-FEW = "no parameter that may be fitted has 30 measurements"
+NOISELESS = "was the recording simulated without noise?"
+FEW = "no free parameter has 30 measurements"
 #: What `tune` says of each; None where it fits something.
 KINDS = {
     "constant yaw": (lambda: drive(yaw_rad=0.0), None),

@@ -15,7 +15,7 @@ from fgtrack.config.yaml_file import load
 from fgtrack.core.time import NS_PER_S
 from fgtrack.core.types import Detection, DetectionList
 from fgtrack.inputs.stream import write_stream
-from fgtrack.noise.measurements import recorded
+from fgtrack.noise.measurements import recorded_series
 from fgtrack.noise.parameters import ConfigNoise
 from fgtrack.sim.simulate import simulate
 
@@ -103,7 +103,7 @@ def test_a_gate_is_opened_to_the_uncertainty_of_a_bearing_far_away(
     )
 
     def radar_count(gate_stds: float) -> int:
-        series, _ = recorded(messages, config, gate_stds=gate_stds)
+        series, _ = recorded_series(messages, config, gate_stds=gate_stds)
         longest = max(series, key=lambda one: len(one.observations))
         return sum(one.sensor == "radar" for one in longest.observations)
 
@@ -135,7 +135,7 @@ def test_equal_detections_of_two_sensors_are_observations_of_both_and_not_joined
         for k in range(20)
         for name in sensors
     ]
-    (series,), _ = recorded(lists, config)
+    (series,), _ = recorded_series(lists, config)
     counts = Counter(one.sensor for one in series.observations)
     assert min(counts["front"], counts["rear"]) > 15
 
@@ -158,7 +158,9 @@ def test_json_says_the_same_and_every_parameter_has_a_row(
     assert values["motion.std_per_s.yaw"] == config.motion.std_per_s["yaw"]
     assert len(values) == 4 + 2 + 3
     assert [
-        one["key"] for one in found["parameters"] if one["why"] == "kept as asked"
+        one["key"]
+        for one in found["parameters"]
+        if one["why"] == "kept as configured (keep)"
     ] == [kept]
     assert values[kept] == 1.0
     assert all(
@@ -187,7 +189,8 @@ def test_a_key_to_keep_must_be_noise(
         == 2
     )
     assert (
-        "keep motion.kind: is no noise of the configuration" in capsys.readouterr().err
+        "keep motion.kind: not a noise parameter of the configuration"
+        in capsys.readouterr().err
     )
 
 

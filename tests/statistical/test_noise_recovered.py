@@ -13,7 +13,7 @@ from fgtrack.core.time import nanoseconds
 from fgtrack.core.types import Message
 from fgtrack.models.motion import CTRV
 from fgtrack.noise.parameters import TuneReport
-from fgtrack.noise.tune import tuned
+from fgtrack.noise.tune import tune_sources
 from fgtrack.pipeline.assumptions.assumed import source_of
 from fgtrack.sim.scenario import Scenario
 from fgtrack.sim.sensor import Clutter
@@ -160,7 +160,7 @@ def test_every_identifiable_standard_deviation_is_found(
         for one in kept
         if one.receipt_ns < kept[0].receipt_ns + nanoseconds(SECONDS)
     ]
-    report = tuned({"scene": source_of(lambda: kept)}, config)
+    report = tune_sources({"scene": source_of(lambda: kept)}, config)
     assert wrong(report, truth) == []
     measured = [one for one in report.parameters if one.key.startswith("sensors")]
     assert all(one.known == "yes" for one in measured), [

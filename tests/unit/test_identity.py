@@ -12,7 +12,7 @@ from fgtrack.core.types import Detection, DetectionList, Disposition
 from fgtrack.estimation.filters.replay_bank import ReplayBank
 from fgtrack.models.sensors import SensorModel
 from fgtrack.noise.likelihood.fit import Problem
-from fgtrack.noise.measurements import recorded
+from fgtrack.noise.measurements import recorded_series
 from fgtrack.noise.parameters import ConfigNoise
 from fgtrack.noise.stamps import fitted_stamps, stamp_rates, with_stamps
 from fgtrack.pipeline.public import replay
@@ -297,7 +297,7 @@ def test_the_error_of_stamps_is_fitted(monkeypatch) -> None:
         read_config(None, {**settings, "sensors.adsb.stamp_std_s": 0.2})
     )
     problem = Problem(
-        recorded(lists, noise.config, "", 4.0)[0], noise.space, noise.values
+        recorded_series(lists, noise.config, "", 4.0)[0], noise.space, noise.values
     )
     rates = stamp_rates(problem, noise.values)
     fit = fitted_stamps(problem, rates, noise.values, "adsb", 0.2)
@@ -309,7 +309,7 @@ def test_the_error_of_stamps_is_fitted(monkeypatch) -> None:
     ).std_s == pytest.approx(fit.std_s, rel=0.1)
     assert noise.with_stamps("adsb", 0.5).stamp_stds == {"adsb": 0.5}
     # Of long series the first part is taken, whatever was mixed up after it.
-    monkeypatch.setattr("fgtrack.noise.stamps._OBSERVATIONS", 150)
+    monkeypatch.setattr("fgtrack.noise.stamps._MAX_OBSERVATIONS", 150)
     mixed = replace(
         problem,
         series=[replace(each, mixed=frozenset((5, 170))) for each in problem.series],

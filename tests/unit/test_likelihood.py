@@ -22,7 +22,7 @@ from fgtrack.models.motion import CTRV, CV
 from fgtrack.models.sensors import SensorModel
 from fgtrack.noise.likelihood import contaminated
 from fgtrack.noise.likelihood.fit import Likelihood, Problem
-from fgtrack.noise.likelihood.reference import filtered, without_mixed
+from fgtrack.noise.likelihood.reference import filtered, with_mixed_marked
 from fgtrack.noise.likelihood.series import NoiseSpace, Observation, Series
 from fgtrack.noise.measurements import observation
 from fgtrack.noise.parameters import ConfigNoise
@@ -213,10 +213,10 @@ def moved(one: Observation, by_m: float) -> Observation:
 def test_what_a_track_fuses_of_another_object_says_nothing_of_the_noise() -> None:
     values = np.array([*VALUES[:5], 0.02, 0.02])
     track = drawn(np.random.default_rng(7), values, 300, outliers=0.05)
-    assert without_mixed(track, SPACE, values) == track
+    assert with_mixed_marked(track, SPACE, values) == track
     seen = list(track.observations)
     seen[100:130] = [moved(one, 9.0) for one in seen[100:130]]
-    found = without_mixed(replace(track, observations=seen), SPACE, values)
+    found = with_mixed_marked(replace(track, observations=seen), SPACE, values)
     assert set(range(100, 125)) <= found.mixed <= set(range(75, 165))
     assert set(np.flatnonzero(~unsettled(found).counted).tolist()) == found.mixed
 
@@ -254,7 +254,7 @@ def half_assumed(track: Series) -> Series:
             assumed=(1,),
             axes=np.eye(1),
             own=np.zeros((1, 1)),
-            foreign=np.zeros((1, 1)),
+            other_errors=np.zeros((1, 1)),
         )
         if one.sensor == "lidar"
         else one
@@ -428,4 +428,4 @@ def test_noise_that_grows_with_range_is_not_laid_to_the_standard_deviations() ->
     )
     assert observation(
         "lidar", sensor, measurement, own=False
-    ).foreign == pytest.approx(grown)
+    ).other_errors == pytest.approx(grown)

@@ -1,1 +1,1 @@
-"""Maximum likelihood of noise: the innovations of an EKF on recorded tracks, as a function of standard deviations."""
+"""Likelihood of the innovations of an EKF on recorded tracks, as a function of the noise parameters."""

@@ -1,4 +1,4 @@
-"""The contaminated normal distribution: most errors have the nominal covariance, a few are several times as large."""
+"""Contaminated normal distribution: most errors have the nominal covariance, a few are several times larger."""
 
 import math
 from typing import NamedTuple
@@ -8,28 +8,27 @@ import numpy as np
 from fgtrack.core.linalg import psd_solve, symmetrise
 from fgtrack.core.types import FloatArray
 
-#: How many times as large as nominal the standard deviations of the classes of errors are: nominal, outliers, and what
-#: belongs to another object.
+#: Factor on the nominal standard deviations by class: nominal errors, outliers, detections of another object.
 SCALES = np.array([1.0, 4.0, 40.0])
-#: Largest share of outliers: beyond it the names of the classes would be exchanged.
+#: Largest share of outliers. With a larger share the fit could exchange the nominal class and the outliers.
 MAX_SHARE = 0.15
-#: Of the outliers, the share of each class.
+#: Shares of the two outlier classes among all outliers.
 PARTS = np.array([0.9, 0.1])
 
 
 class Update(NamedTuple):
-    """A state after a measurement whose error is contaminated."""
+    """State update with a measurement whose error is contaminated normal."""
 
     step: FloatArray
     """Posterior minus prior mean, shape (..., n)."""
     covariance: FloatArray
     """Posterior covariance, shape (..., n, n)."""
     S: FloatArray
-    """Covariance of the innovation where the error is nominal, shape (..., k, k)."""
+    """Covariance of the innovation for a nominal error, shape (..., k, k)."""
     log_likelihood: FloatArray
     """Log density of the innovation, shape (...)."""
     outlier: FloatArray
-    """Probability that the error was not nominal, shape (...)."""
+    """Probability that the error is not nominal, shape (...)."""
 
 
 def update(
@@ -37,21 +36,26 @@ def update(
     H: FloatArray,
     y: FloatArray,
     R: FloatArray,
-    foreign: FloatArray,
+    other_errors: FloatArray,
     odds: FloatArray,
 ) -> Update:
-    """Fuse innovations y (..., k) of measurements with Jacobians H (..., k, n).
+    """Update states with the innovations y (..., k) of measurements with Jacobians H (..., k, n).
 
-    The error has the covariance c^2 R + `foreign`, shape (..., k, k), with c = 1 or, with the probability
-    `outlier_share(odds)`, another one of `SCALES`. With S_i = H P H' + c_i^2 R + foreign, w_i the probability of class
-    i given y and s_i = P H' S_i^-1 y, the posterior has the mean x + s, s = sum w_i s_i, and the covariance
-    P - sum w_i P H' S_i^-1 H P + sum w_i (s_i - s) (s_i - s)': the exact moments of the mixture (Alspach and Sorenson
-    1972, "Nonlinear Bayesian estimation using Gaussian sum approximations", IEEE Transactions on Automatic Control
-    17(4)). At odds 0 this is the Kalman filter.
+    The error has the covariance c^2 R + `other_errors`, shape (..., k, k). The factor c is
+    1, or another of `SCALES` with the probability `outlier_share(odds)`. At odds 0 this
+    is the Kalman filter.
+
+    Class i has S_i = H P H' + c_i^2 R + other_errors, the step s_i = P H' S_i^-1 y, and the
+    probability w_i given y. The posterior has the exact moments of the mixture. Its
+    mean is x + s with s = sum w_i s_i. Its covariance is P - sum w_i P H' S_i^-1 H P +
+    sum w_i (s_i - s) (s_i - s)'.
+
+    Source: Alspach and Sorenson 1972, "Nonlinear Bayesian estimation using Gaussian sum
+    approximations", IEEE Transactions on Automatic Control 17(4).
     """
     HP = H @ P
     scales = np.square(SCALES).reshape(-1, *[1] * R.ndim)
-    S = (HP @ H.mT + foreign) + scales * R
+    S = (HP @ H.mT + other_errors) + scales * R
     columns = np.concatenate([HP, y[..., None]], axis=-1)
     solved = psd_solve(S, columns)
     share = outlier_share(odds)
@@ -66,13 +70,12 @@ def update(
     weights /= total
     steps = (solved[..., None, :, -1] @ HP)[..., 0, :]
     step = (weights[..., None] * steps).sum(axis=0)
-    apart = np.sqrt(weights)[..., None] * (steps - step)
-    reduced = HP.mT @ (weights[..., None, None] * solved[..., :-1]).sum(axis=0)
+    deviations = np.sqrt(weights)[..., None] * (steps - step)
+    spread = (deviations[..., :, None] * deviations[..., None, :]).sum(axis=0)
+    reduction = HP.mT @ (weights[..., None, None] * solved[..., :-1]).sum(axis=0)
     return Update(
         step,
-        symmetrise(
-            P - reduced + (apart[..., :, None] * apart[..., None, :]).sum(axis=0)
-        ),
+        symmetrise(P - reduction + spread),
         S[0],
         highest + np.log(total) - 0.5 * y.shape[-1] * math.log(math.tau),
         1.0 - weights[0],
@@ -80,5 +83,5 @@ def update(
 
 
 def outlier_share(odds: FloatArray) -> FloatArray:
-    """Share of outliers, below `MAX_SHARE`, from a positive number that is about the share where it is small."""
+    """Share of outliers for positive `odds`: approximately `odds` if small, always below `MAX_SHARE`."""
     return np.asarray(MAX_SHARE * odds / (MAX_SHARE + odds))

@@ -1,4 +1,4 @@
-"""The standard deviations that make the innovations of recorded tracks most likely, and their standard errors."""
+"""Maximum-likelihood fit of noise parameters to recorded tracks, with standard errors."""
 
 import math
 from collections.abc import Sequence
@@ -15,23 +15,26 @@ from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.noise.likelihood.innovations import Evaluation, Innovations
 from fgtrack.noise.likelihood.series import NoiseSpace, Series
 
-_PRIOR_LOG_STDS = (
-    3.0,
-    1.5,
-)  # weak, but keep what the data do not determine from running away; of shares of outliers
-_MOST_LOG = 9.2  # beyond a factor of 10^4 there is no maximum: errors of exactly 0 are likelier the smaller std is
-_BLOCK_S = (
-    2.0  # scores are taken as independent between blocks of this length of a track
-)
-_DIFFERENCE, _CURVATURE_DIFFERENCE = (
-    1e-4,
-    0.05,
-)  # of logarithms, for first and second derivatives
+# Weak prior of the logarithms of the standard deviations, and of the shares of outliers.
+# It keeps parameters finite that the data do not determine.
+_PRIOR_LOG_STD = 3.0
+_PRIOR_LOG_STD_OF_SHARES = 1.5
+# Beyond a factor of 10^4 there is no maximum: for errors of exactly 0 the likelihood grows as std falls.
+_MAX_LOG_CHANGE = 9.2
+# The scores of two blocks of this length on one track are assumed to be independent.
+_BLOCK_S = 2.0
+# Differences of the logarithms for first and second derivatives.
+_DIFFERENCE = 1e-4
+_CURVATURE_DIFFERENCE = 0.05
 _MAX_LINEARISATIONS = 6
-_FLAT = 0.01  # gain of the log-likelihood in the next step below which the maximum is reached
-_TOLERANCE = 0.1  # share of its standard error that no parameter changes by after the last linearisation
-_FLOOR = 1e-3  # curvature of a flat direction: its standard error is above 30 in the logarithm
-_ROWS = 24  # parameter vectors that are evaluated at once
+# The search ends if the next step would raise the log-likelihood by less than this.
+_LEAST_GAIN = 0.01
+# The linearisation is repeated until no parameter moves by more than this share of its standard error.
+_TOLERANCE = 0.1
+# Least curvature of a direction. Its standard error in the logarithm is then above 30.
+_LEAST_CURVATURE = 1e-3
+# Number of parameter vectors that are evaluated together.
+_BATCH_ROWS = 24
 # Any: scipy's options have different types.
 _TRUST_REGION: Any = {
     "gtol": 1e-6,
@@ -42,41 +45,41 @@ _TRUST_REGION: Any = {
 
 
 class Cost(NamedTuple):
-    """Minus the log-likelihood, and the weak prior, at one point, with derivatives."""
+    """Negative log-likelihood plus the cost of the weak prior, with derivatives."""
 
     objective: float
     gradient: FloatArray
     """Shape (f,)."""
     information: FloatArray
-    """Information that is expected of the innovations, and that of the prior, shape (f, f): positive definite.
+    """Expected information of the innovations plus that of the prior, shape (f, f); positive definite.
 
-    Of normal innovations, sum of tr(S^-1 dS S^-1 dS) / 2 + dy' S^-1 dy; of the shares of outliers, which change
-    neither y nor S, the squared scores.
+    For normal innovations it is sum of tr(S^-1 dS S^-1 dS) / 2 + dy' S^-1 dy. The
+    shares of outliers change neither y nor S; their information is the sum of squared
+    scores.
     """
     scores: FloatArray
     """Derivatives of the log-likelihoods of the N innovations, shape (f, N)."""
 
 
 class Likelihood:
-    """The log-likelihood of the series of a problem about the trajectory at `values` (p,), and its scores.
-    A function of the logarithms of the parameters `free`, shape (p,); others are those of `values`.
+    """Log-likelihood of the series of a problem as a function of the logarithms of its free parameters.
+
+    The filter is linearised about the trajectory at `values`, shape (p,). `free`, shape
+    (p,), marks the free parameters. The other parameters keep their `values`.
     """
 
     def __init__(self, problem: "Problem", values: FloatArray, free: BoolArray) -> None:
         self._innovations = Innovations(problem.space, values, problem.series)
         self._start, self._free = values, free
         named = np.array([bool(name) for _, name in problem.space.names])[free]
-        self._prior_log, self._prior_log_std = (
-            np.log(problem.prior)[free],
-            np.where(named, *_PRIOR_LOG_STDS),
-        )
+        self._prior_log = np.log(problem.prior)[free]
+        self._prior_log_std = np.where(named, _PRIOR_LOG_STD, _PRIOR_LOG_STD_OF_SHARES)
         self._shares = np.flatnonzero(~named)
-        self._cost = cache(
-            lambda data: self._cost_at(np.frombuffer(data))
-        )  # the search asks twice
+        # The search evaluates each point twice.
+        self._cost = cache(lambda data: self._cost_at(np.frombuffer(data)))
 
     def values(self, logs: FloatArray) -> FloatArray:
-        """Return rows of parameters (..., p) of the free logarithms (..., f)."""
+        """Return parameter vectors (..., p) for the logarithms of the free parameters (..., f)."""
         values = np.broadcast_to(
             self._start, (*logs.shape[:-1], len(self._start))
         ).copy()
@@ -84,26 +87,26 @@ class Likelihood:
         return values
 
     def totals(self, values: FloatArray) -> FloatArray:
-        """Return the log-likelihood of everything that counts, shape (b,), at rows of all parameters (b, p)."""
+        """Return the log-likelihood of all counted innovations for each parameter vector, (b, p) -> (b,)."""
         return np.asarray(
             self._innovations.evaluate(values).log_likelihoods.sum(axis=1)
         )
 
     def cost(self, logs: FloatArray) -> Cost:
-        """Return the cost at the free logarithms, shape (f,)."""
+        """Return the cost at the logarithms of the free parameters, shape (f,)."""
         return self._cost(logs.tobytes())
 
     def stop_where_flat(self, logs: FloatArray) -> None:
-        """Raise `StopIteration` where the next step would gain next to nothing."""
+        """Raise `StopIteration` if the next step would hardly raise the log-likelihood."""
         cost = self.cost(logs)
         if (
             float(cost.gradient @ psd_solve(cost.information, cost.gradient))
-            < 2.0 * _FLAT
+            < 2.0 * _LEAST_GAIN
         ):
             raise StopIteration
 
     def spread(self, logs: FloatArray) -> FloatArray:
-        """Return standard deviations of the free logarithms where the model is right, and the prior, shape (f,)."""
+        """Return model-based standard deviations of the free logarithms, with the prior, shape (f,)."""
         return np.sqrt(
             np.diag(psd_solve(self.cost(logs).information, np.eye(len(logs))))
         )
@@ -111,16 +114,15 @@ class Likelihood:
     def _cost_at(self, logs: FloatArray) -> Cost:
         rows = np.concatenate([logs[None], logs + _DIFFERENCE * np.eye(len(logs))])
         evaluation = self._innovations.evaluate(self.values(rows))
-        middle, scores = (
-            evaluation.log_likelihoods[0],
-            _difference(evaluation.log_likelihoods),
-        )
+        middle = evaluation.log_likelihoods[0]
+        scores = _difference(evaluation.log_likelihoods)
         if not np.isfinite(middle).all():
             return Cost(math.inf, np.zeros_like(logs), np.eye(len(logs)), scores)
-        moved = logs - self._prior_log
-        off = moved / self._prior_log_std
-        beyond = np.sign(moved) * np.maximum(np.abs(moved) - _MOST_LOG, 0.0)
-        wall = float(middle.size)  # as steep as the data can be
+        change = logs - self._prior_log
+        off = change / self._prior_log_std
+        beyond = np.sign(change) * np.maximum(np.abs(change) - _MAX_LOG_CHANGE, 0.0)
+        # A quadratic wall beyond the largest change, as steep as the likelihood can be.
+        wall = float(middle.size)
         objective = 0.5 * float(off @ off + wall * beyond @ beyond) - float(
             middle.sum()
         )
@@ -134,10 +136,14 @@ class Likelihood:
         return Cost(objective, gradient, information, scores)
 
     def log_std(self, logs: FloatArray) -> FloatArray:
-        """Return standard errors of the free logarithms, shape (f,); infinite where there is no information.
-        The larger one of that of the curvature and the sandwich of curvature and scores summed over blocks of time,
-        which holds for correlated innovations too (White 1982, "Maximum likelihood estimation of misspecified models",
-        Econometrica 50(1)).
+        """Return standard errors of the free logarithms, shape (f,); infinite without information.
+
+        Each is the larger of two errors. The first follows from the curvature of the
+        log-likelihood. The second is the sandwich of the curvature and of the scores,
+        summed over blocks of time. The sandwich holds for correlated innovations too.
+
+        Source: White 1982, "Maximum likelihood estimation of misspecified models",
+        Econometrica 50(1).
         """
         counted = self._innovations.counted
         blocks = (self._innovations.since_start_s / _BLOCK_S).astype(np.int64)
@@ -148,11 +154,12 @@ class Likelihood:
         np.add.at(clusters, groups, self.cost(logs).scores.T)
         meat = clusters.T @ clusters * len(clusters) / max(len(clusters) - 1, 1)
         values, vectors = np.linalg.eigh(self._curvature(logs))
-        inverse = vectors @ np.diag(1.0 / np.maximum(values, _FLOOR)) @ vectors.T
+        bounded = np.maximum(values, _LEAST_CURVATURE)
+        inverse = vectors @ np.diag(1.0 / bounded) @ vectors.T
         return np.sqrt(np.maximum(np.diag(inverse), np.diag(inverse @ meat @ inverse)))
 
     def _curvature(self, logs: FloatArray) -> FloatArray:
-        """Return minus the second derivatives of the log-likelihood, shape (f, f)."""
+        """Return the negative second derivatives of the log-likelihood, shape (f, f)."""
         f, h = len(logs), _CURVATURE_DIFFERENCE
         item = h * np.eye(f)
         first, second = np.triu_indices(f)
@@ -160,7 +167,7 @@ class Likelihood:
         rows = np.concatenate(
             [rows, logs + item[first] + item[second], logs - item[first] - item[second]]
         )
-        parts = np.array_split(rows, -(-len(rows) // _ROWS))
+        parts = np.array_split(rows, -(-len(rows) // _BATCH_ROWS))
         total = np.concatenate([self.totals(self.values(part)) for part in parts])
         middle, up, down = total[0], total[1 : f + 1], total[f + 1 : 2 * f + 1]
         both_up, both_down = np.split(total[2 * f + 1 :], 2)
@@ -179,12 +186,12 @@ class Likelihood:
 
 
 def _difference(values: FloatArray) -> FloatArray:
-    """Return derivatives (f, ...) of values (f + 1, ...) at a point and a little further in every direction."""
+    """Return derivatives (f, ...) from values (f + 1, ...): at a point, then shifted in each direction."""
     return np.asarray((values[1:] - values[0]) / _DIFFERENCE)
 
 
 def _expected(evaluation: Evaluation) -> FloatArray:
-    """Return the information expected of normal innovations, shape (f, f)."""
+    """Return the expected information of normal innovations, shape (f, f)."""
     dy, dS = _difference(evaluation.y), _difference(evaluation.S)
     solved = psd_solve(evaluation.S[:1], np.concatenate([dS, dy[..., None]], axis=-1))
     A, weighted = solved[..., :-1], solved[..., -1]
@@ -197,7 +204,7 @@ def _expected(evaluation: Evaluation) -> FloatArray:
 
 @dataclass(frozen=True)
 class Problem:
-    """Series and the parameters sought."""
+    """A fit of noise parameters: the series of observations and the parameters."""
 
     series: Sequence[Series]
     space: NoiseSpace
@@ -205,7 +212,10 @@ class Problem:
     """Centre of the weak prior, shape (p,)."""
 
     def counts(self) -> IntArray:
-        """Return the number of measured components that count, by parameter, shape (p,); all for the motion."""
+        """Return the number of counted measured components per parameter, shape (p,).
+
+        A motion parameter counts all measurements.
+        """
         columns = {name: column for column, name in enumerate(self.space.names)}
         counts = np.zeros(len(columns), dtype=np.int64)
         for item in self.series:
@@ -219,15 +229,16 @@ class Problem:
                 ] += 1
         return counts
 
-    def endless(self, values: FloatArray) -> BoolArray:
-        """Return True, shape (p,), for parameters that have no maximum, as they have run off at `values` (p,)."""
-        return np.asarray(np.abs(np.log(values / self.prior)) >= _MOST_LOG)
+    def without_maximum(self, values: FloatArray) -> BoolArray:
+        """Mask of the parameters without a maximum, shape (p,): the fit moved them beyond the largest change."""
+        return np.asarray(np.abs(np.log(values / self.prior)) >= _MAX_LOG_CHANGE)
 
     def maximum(
         self, start: FloatArray, free: BoolArray
     ) -> tuple[FloatArray, Likelihood]:
-        """Return parameters, shape (p,), at the maximum next to `start`, and the likelihood about the trajectory there.
-        What is not `free` stays as in `start`.
+        """Return the parameters (p,) at the maximum near `start`, and the likelihood linearised there.
+
+        Parameters that are not `free` keep their values in `start`.
         """
         values = start.copy()
         likelihood = Likelihood(self, values, free)
@@ -242,12 +253,12 @@ class Problem:
                 callback=current.stop_where_flat,
                 options=_TRUST_REGION,
             )
-            moved = np.abs(best.x - logs)
-            if not moved.any():
+            change = np.abs(best.x - logs)
+            if not change.any():
                 break
             values = likelihood.values(best.x)
-            settled = (moved <= _TOLERANCE * likelihood.spread(best.x)).all()
+            converged = (change <= _TOLERANCE * likelihood.spread(best.x)).all()
             likelihood = Likelihood(self, values, free)
-            if settled:
+            if converged:
                 break
         return values, likelihood

@@ -1,8 +1,11 @@
-"""The log-likelihood of innovations at many vectors of parameters at once, linearised about one trajectory.
+"""Log-likelihood of innovations for many parameter vectors at once, linearised about one trajectory.
 
-Along a trajectory all that depends on the parameters is the noise. It is that of the filter itself (`filtered`), so
-each linearisation depends on earlier measurements only, and the score has mean zero at the true parameters (Schweppe
-1965, "Evaluation of likelihood functions for Gaussian signals", IEEE Transactions on Information Theory 11(1)).
+Along a fixed trajectory only the noise depends on the parameters. The trajectory is
+that of the filter itself (`filtered`). So each linearisation depends on earlier
+measurements only, and the score has mean zero at the true parameters.
+
+Source: Schweppe 1965, "Evaluation of likelihood functions for Gaussian signals", IEEE
+Transactions on Information Theory 11(1).
 """
 
 import math
@@ -17,23 +20,27 @@ from fgtrack.core.types import BoolArray, FloatArray, IntArray
 from fgtrack.estimation.birth import initial_state
 from fgtrack.estimation.filters.ekf import joseph, kalman_gain, propagated
 from fgtrack.noise.likelihood.contaminated import update
-from fgtrack.noise.likelihood.reference import Step, filtered
+from fgtrack.noise.likelihood.reference import FilterStep, filtered
 from fgtrack.noise.likelihood.series import NoiseSpace, Series
 
 
 class Evaluation(NamedTuple):
-    """N innovations at b vectors of parameters, padded with components 0 of variance 1."""
+    """N innovations for b parameter vectors, padded with components of value 0 and variance 1."""
 
     log_likelihoods: FloatArray
-    """Log densities, shape (b, N)."""
+    """Log densities of the innovations, shape (b, N)."""
     y: FloatArray
-    """Shape (b, N, d)."""
+    """Innovations, shape (b, N, d)."""
     S: FloatArray
-    """Covariances where the errors are nominal, shape (b, N, d, d)."""
+    """Covariances of the innovations for nominal errors, shape (b, N, d, d)."""
 
 
 class Innovations:
-    """Series linearised at `values`, shape (p,), side by side: step k of each of t series, padded at the end."""
+    """Filter steps of t series, linearised at `values`, shape (p,), in arrays.
+
+    Arrays have the shape (k, t, ...): step k of each series, padded at the end of
+    shorter series.
+    """
 
     def __init__(
         self, space: NoiseSpace, values: FloatArray, series: Sequence[Series]
@@ -44,17 +51,15 @@ class Innovations:
         self._start = np.array(
             [initial_state(motion, item.start)[1] for item in series]
         )
-        n, columns = (
-            motion.dim,
-            {name: column for column, name in enumerate(space.names)},
-        )
+        n = motion.dim
+        columns = {name: column for column, name in enumerate(space.names)}
         d = max(len(step.y) for track in steps for step in track)
         a = max(len(step.assumed[0]) for track in steps for step in track)
 
         def padded(
-            value: Callable[[Step], ArrayLike], *size: int, fill: ArrayLike = 0.0
+            value: Callable[[FilterStep], ArrayLike], *size: int, fill: ArrayLike = 0.0
         ) -> FloatArray:
-            """A value of each step, shape (k, t, *size)."""
+            """Array (k, t, *size) of a value of each step, filled with `fill` beyond the end of a series."""
             array = np.full((max(map(len, steps)), len(steps), *size), fill)
             for t, track in enumerate(steps):
                 for k, step in enumerate(track):
@@ -66,9 +71,9 @@ class Innovations:
         since_s = padded(lambda step: step.since_s, fill=math.nan)
         self._there = np.isfinite(since_s)
         self.counted: BoolArray = np.zeros(since_s.shape, dtype=np.bool_)
-        """True for steps that have a part in the likelihood, shape (k, t)."""
+        """Mask of the steps that contribute to the likelihood, shape (k, t)."""
         self.since_start_s = np.zeros(since_s.shape)
-        """Time of each step since the first state, shape (k, t)."""
+        """Time from the first state to each step, shape (k, t)."""
         for t, item in enumerate(series):
             stamps_ns = np.array(
                 [each.measurement.stamp_ns for each in item.observations]
@@ -78,26 +83,20 @@ class Innovations:
                 stamps_ns - item.start.stamp_ns
             ) / NS_PER_S
         self._since_s = np.nan_to_num(since_s)
-        self._about, self._offset = (
-            padded(lambda step: step.about, n),
-            padded(lambda step: step.before - step.about, n),
-        )
-        self._predicted, self._after = (
-            padded(lambda step: step.predicted, n),
-            padded(lambda step: step.after, n),
-        )
-        self._y, self._H = (
-            padded(lambda step: step.y, d),
-            padded(lambda step: step.H, d, n),
-        )
+        self._about = padded(lambda step: step.about, n)
+        self._offset = padded(lambda step: step.before - step.about, n)
+        self._predicted = padded(lambda step: step.predicted, n)
+        self._after = padded(lambda step: step.after, n)
+        self._y = padded(lambda step: step.y, d)
+        self._H = padded(lambda step: step.H, d, n)
         self._axes = padded(
             lambda step: step.observation.axes * step.observation.tuned, d, d
         )
         self._own = padded(lambda step: step.observation.own, d, d)
         self._foreign = padded(
-            lambda step: step.observation.foreign, d, d, fill=np.eye(d)
+            lambda step: step.observation.other_errors, d, d, fill=np.eye(d)
         )
-        none = len(columns)  # a last column of zeros
+        none = len(columns)  # index of an additional column of zeros
         self._std: IntArray = padded(
             lambda step: [columns[name] for name in step.observation.parameters],
             d,
@@ -118,22 +117,20 @@ class Innovations:
         ).tolist()
 
     def evaluate(self, values: FloatArray) -> Evaluation:
-        """Return the N innovations that count, at each row of `values`, (b, p)."""
+        """Return the N counted innovations for each parameter vector in `values` (b, p)."""
         num_steps, num_series = self._there.shape
         b, n = len(values), self._about.shape[-1]
         extended = np.concatenate([values, np.zeros((b, 1))], axis=1)
         d = self._y.shape[-1]
         log_likelihoods = np.empty((num_steps, b, num_series))
-        ys, Ss = (
-            np.empty((num_steps, b, num_series, d)),
-            np.empty((num_steps, b, num_series, d, d)),
-        )
+        ys = np.empty((num_steps, b, num_series, d))
+        Ss = np.empty((num_steps, b, num_series, d, d))
         x = np.zeros((b, num_series, n))
         P = np.broadcast_to(self._start, (b, *self._start.shape))
         size = max(1, int(1e6 / (b * num_series * n * n)))
         for k in range(num_steps):
             j = k % size
-            if j == 0:  # as many steps at once as fit into the cache
+            if j == 0:  # compute a block of steps that fits into the processor's cache
                 block = slice(k, k + size)
                 F, drift, Q = self._transitions(values, block)
                 rooted = self._axes[block] * extended[:, self._std[block]][..., None, :]
@@ -163,7 +160,10 @@ class Innovations:
     def _transitions(
         self, values: FloatArray, block: slice
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return F, the change of the prediction against that of the reference, and Q of a block of steps, by row."""
+        """Return F, drift and Q of a `block` of steps, for each parameter vector.
+
+        The drift is the difference between the prediction and the reference prediction.
+        """
         if self._parts is not None:
             rest, parts = self._parts
             weights = np.square(values[:, : len(parts)])

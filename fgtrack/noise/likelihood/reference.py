@@ -1,4 +1,4 @@
-"""An EKF along each series at one vector of parameters: the trajectory about which the likelihood is linearised."""
+"""The reference trajectory of the likelihood: an EKF along each series at one parameter vector."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,41 +14,44 @@ from fgtrack.estimation.filters.ekf import joseph, kalman_gain, propagated
 from fgtrack.noise.likelihood.contaminated import Update, update
 from fgtrack.noise.likelihood.series import NoiseSpace, Observation, Series
 
-_WINDOW, _MOST = (
-    20,
-    0.5,
-)  # of so many successive innovations at most this share may be outliers
-_MARGIN_S = 1.0  # what is nearer to such a stretch is left out as well
+# A window of successive innovations is mixed if more than this share of them are outliers.
+_WINDOW = 20
+_MAX_OUTLIERS = 0.5
+# Observations within this time of a mixed window are excluded too.
+_MARGIN_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
-    """One observation in the filter, of d measured and a assumed components."""
+class FilterStep:
+    """Filter step of one observation with d measured and a assumed components."""
 
     observation: Observation
     since_s: float
-    """Since the observation before, or the first state."""
+    """Time since the previous observation, or since the first state."""
     before: FloatArray
-    """State after the observation before, shape (n,)."""
+    """State after the previous observation, shape (n,)."""
     about: FloatArray
-    """State about which the motion from there is linearised, shape (n,): `before`, or the nominal one."""
+    """State about which the motion is linearised, shape (n,): `before`, or the nominal state."""
     predicted: FloatArray
-    """Shape (n,)."""
+    """Predicted state, shape (n,)."""
     after: FloatArray
-    """Updated state, shape (n,), with a yaw that was not wrapped."""
+    """Updated state, shape (n,); the yaw is not wrapped."""
     y: FloatArray
     """Innovation of the measured components, shape (d,)."""
     H: FloatArray
-    """Their Jacobian, shape (d, n)."""
+    """Jacobian of the measured components, shape (d, n)."""
     assumed: tuple[FloatArray, FloatArray, FloatArray]
-    """Innovation (a,) at the predicted state, Jacobian (a, n) and covariance (a, a) of the assumed components."""
+    """Innovation (a,), Jacobian (a, n) and covariance (a, a) of the assumed components.
+
+    The innovation is taken at the predicted state.
+    """
     update: Update
 
 
 def filtered(
     series: Series, space: NoiseSpace, values: Sequence[float] | FloatArray
-) -> list[Step]:
-    """Return the steps of the filter along `series` with the noise of `values`, shape (p,)."""
+) -> list[FilterStep]:
+    """Run the filter along `series` with the noise parameters `values`, shape (p,); return its steps."""
     motion = space.motion_model(values)
     yawed = "yaw_rad" in motion.state_names
     by_name = dict(zip(space.names, map(float, values), strict=True))
@@ -72,7 +75,12 @@ def filtered(
         y, H = measurement.model.linearised(measurement.z, seen_from, measurement.pose)
         y = y - H @ (predicted - seen_from)
         result = update(
-            P, H[here], y[here], R, observation.foreign, np.array(by_name[sensor, ""])
+            P,
+            H[here],
+            y[here],
+            R,
+            observation.other_errors,
+            np.array(by_name[sensor, ""]),
         )
         after, P = predicted + result.step, result.covariance
         R_assumed = measurement.R[np.ix_(there, there)]
@@ -82,7 +90,7 @@ def filtered(
             P = joseph(P, K, H[there], R_assumed)
         assumed = y[there], H[there], R_assumed
         steps.append(
-            Step(
+            FilterStep(
                 observation,
                 since_s,
                 x,
@@ -96,17 +104,19 @@ def filtered(
             )
         )
         x, stamp_ns = after.copy(), measurement.stamp_ns
-        if (
-            yawed and k + 1 >= series.num_initial
-        ):  # until then it belongs to the nominal trajectory
+        # Before, the yaw belongs to the nominal trajectory and must not jump.
+        if yawed and k + 1 >= series.num_initial:
             x[YAW] = wrap_angle(x[YAW])
     return steps
 
 
-def without_mixed(series: Series, space: NoiseSpace, values: FloatArray) -> Series:
-    """Return `series` where only observations of one object count, as judged at `values`, shape (p,).
-    Where most of 20 successive innovations are outliers, the track has gone from one object to another, or mixes two
-    that pass, which the mixture of `contaminated` does not describe.
+def with_mixed_marked(series: Series, space: NoiseSpace, values: FloatArray) -> Series:
+    """Return `series` with the observations marked as mixed that seem to belong to several objects.
+
+    Stretches are mixed where most of 20 successive innovations are outliers at the
+    parameters `values`, shape (p,). There the track has switched to another object, or
+    mixes two objects that pass each other. The distribution in `contaminated` does not
+    describe this.
     """
     outlier = np.array(
         [step.update.outlier for step in filtered(series, space, values)]
@@ -115,7 +125,7 @@ def without_mixed(series: Series, space: NoiseSpace, values: FloatArray) -> Seri
     size, margin_ns = min(_WINDOW, len(outlier)), nanoseconds(_MARGIN_S)
     means = np.convolve(outlier, np.full(size, 1.0 / size), mode="valid")
     mixed = np.zeros(len(outlier), dtype=np.bool_)
-    for first in np.flatnonzero(means > _MOST).tolist():
+    for first in np.flatnonzero(means > _MAX_OUTLIERS).tolist():
         mixed |= (stamps_ns >= stamps_ns[first] - margin_ns) & (
             stamps_ns <= stamps_ns[first + size - 1] + margin_ns
         )

@@ -1,4 +1,4 @@
-"""Measurements of one object with the noise of each in parts, fitted and not fitted, and the parameters of a fit."""
+"""Observations of one track with their noise split into parts, and the parameter vector of a fit."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -19,18 +19,27 @@ from fgtrack.models.motion import CT, CTRV, MotionModel, WhiteNoise
 
 @dataclass(frozen=True)
 class NoiseSpace:
-    """The positive parameters in one vector: noise of the motion, then of each sensor, then shares of outliers."""
+    """Names and order of the positive noise parameters in one vector.
+
+    The vector contains the noise of the motion, the standard deviations of each sensor,
+    and the share of outliers of each sensor.
+    """
 
     motion_names: tuple[str, ...]
     motion: Callable[[Mapping[str, float]], MotionModel]
-    """The motion model with these parameters, by name of `motion_names`; where its noise is white they are standard
-    deviations."""
+    """Factory of the motion model from its parameters by name (`motion_names`).
+
+    For a white-noise model the parameters are standard deviations.
+    """
     sensors: Mapping[str, tuple[str, ...]]
-    """Components by sensor."""
+    """Measured components by sensor."""
 
     @property
     def names(self) -> tuple[tuple[str, str], ...]:
-        """(sensor, component) of each standard deviation; ("", name) for the motion, (sensor, "") for outliers."""
+        """Name (sensor, component) of each parameter.
+
+        Motion parameters have the name ("", name), and shares of outliers (sensor, "").
+        """
         motion = [("", name) for name in self.motion_names]
         stds = [
             (sensor, name)
@@ -41,11 +50,11 @@ class NoiseSpace:
 
     @property
     def num_motion(self) -> int:
-        """Number of leading parameters that belong to the motion."""
+        """Number of motion parameters; they are the first ones."""
         return len(self.motion_names)
 
     def motion_model(self, values: Sequence[float] | FloatArray) -> MotionModel:
-        """The motion model of `values`, shape (p,)."""
+        """Return the motion model with the parameters `values`, shape (p,)."""
         return self.motion(
             dict(zip(self.motion_names, map(float, values), strict=False))
         )
@@ -53,9 +62,11 @@ class NoiseSpace:
     def noise_parts(
         self, x: FloatArray, dt_s: FloatArray
     ) -> tuple[FloatArray, FloatArray] | None:
-        """Q = rest + sum of value_i^2 part_i at states `x` (..., n) over `dt_s` (...); None if Q has no such parts.
-        Q has none where the noise is not white, and where a yaw rate relaxes: F depends on the density there. The rest
-        has shape (..., n, n), the parts have shape (q, ..., n, n).
+        """Split the process noise at states `x` (..., n): Q = rest + sum of value_i^2 part_i.
+
+        Returns the rest (..., n, n) and the parts (q, ..., n, n), over the durations
+        `dt_s` (...). Returns None if Q has no such parts: the noise is not white, or a
+        yaw rate relaxes. In the second case F depends on the density too.
         """
         model = self.motion_model(np.ones(self.num_motion))
         base = model.base if isinstance(model, CorrelatedErrors) else model
@@ -72,23 +83,29 @@ class NoiseSpace:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """One measurement of a sensor; the covariance of its error is T diag(std^2) T' + `own` + `foreign`.
-    The first d components are measured. Those that follow are assumed, as a heading from a map: they move the state,
-    but have no part in the likelihood and keep their noise.
+    """Measurement of a sensor whose error has the covariance T diag(std^2) T' + `own` + `other_errors`.
+
+    The measured components contribute to the likelihood. Assumed components, such as a
+    heading from a map, update the state and keep their noise. They do not contribute to
+    the likelihood.
     """
 
     sensor: str
     measurement: Measurement
     measured: tuple[int, ...]
-    """Indices of the d components that were measured."""
+    """Indices of the d measured components."""
     assumed: tuple[int, ...]
-    """Indices of the others."""
+    """Indices of the assumed components."""
     axes: FloatArray
-    """T, shape (d, d): the axes of the sensor's standard deviations, seen from those of the measurement."""
+    """Rotation T from the axes of the sensor's standard deviations to those of the measurement, shape (d, d)."""
     own: FloatArray
-    """Covariance to which the standard deviations do not apply, as that of the detection, shape (d, d); else 0."""
-    foreign: FloatArray
-    """Covariance of errors that are not the sensor's, as those of the ego pose, shape (d, d)."""
+    """Covariance that replaces the sensor's standard deviations, shape (d, d).
+
+    For instance the covariance that the detection reports. Zero if the standard
+    deviations apply.
+    """
+    other_errors: FloatArray
+    """Covariance of errors from other sources, such as the ego pose, shape (d, d)."""
 
     @property
     def tuned(self) -> bool:
@@ -106,32 +123,38 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """The observations of one track by rising stamp, and the first state."""
+    """Observations of one track in ascending order of stamps, with the first state."""
 
     start: Start
     observations: Sequence[Observation]
     from_ns: float = -math.inf
-    """Innovations before this stamp have no part in the likelihood."""
+    """Innovations before this stamp do not contribute to the likelihood."""
     until_ns: float = math.inf
-    """Nor have those from this stamp on."""
+    """Innovations at or after this stamp do not contribute to the likelihood."""
     nominal: tuple[FloatArray, ...] = ()
-    """States (n,) of a nominal trajectory at the start and at each of the first observations, about which these are
-    linearised; empty where the filter is linearised at its own estimates from the start."""
+    """States (n,) of a nominal trajectory at the start and at each of the first observations.
+
+    These observations are linearised about it. If empty, the filter is linearised about
+    its own estimates.
+    """
     mixed: frozenset[int] = frozenset()
-    """Indices of observations whose innovations have no part in the likelihood either; see `without_mixed`."""
+    """Indices of observations whose innovations do not contribute, see `with_mixed_marked`."""
     settle_s: float = 1.0
-    """Nor have those of the first seconds with a known direction of travel, which are those of the first state."""
+    """Innovations of these first seconds do not contribute, as they depend on the first state.
+
+    The time counts from the end of the nominal trajectory.
+    """
     settle_steps: int = 5
-    """Nor have as many of the first ones."""
+    """Number of first innovations, after the nominal trajectory, that do not contribute."""
 
     @property
     def num_initial(self) -> int:
-        """Number of the first observations that are linearised about `nominal`."""
+        """Number of observations that are linearised about the nominal trajectory."""
         return max(len(self.nominal) - 1, 0)
 
     @property
     def initiated_ns(self) -> int:
-        """Stamp of the last of these, or of the start where there are none."""
+        """Stamp of the last observation on the nominal trajectory; the stamp of the start without one."""
         return (
             self.observations[self.num_initial - 1].measurement.stamp_ns
             if self.nominal
@@ -140,7 +163,7 @@ class Series:
 
     @property
     def counted(self) -> BoolArray:
-        """True for observations whose innovations have a part in the likelihood, shape (k,)."""
+        """Mask of the observations whose innovations contribute to the likelihood, shape (k,)."""
         stamps_ns = np.array([item.measurement.stamp_ns for item in self.observations])
         counted = (stamps_ns - self.initiated_ns >= NS_PER_S * self.settle_s) & (
             stamps_ns >= self.from_ns
@@ -151,22 +174,28 @@ class Series:
         return counted
 
     def initiated(self, motion: MotionModel, method: Initiation) -> "Series":
-        """Return it with a nominal trajectory along the first positions, where `start` has no direction of travel.
-        As in the tracker (see `TrackInitiation`); unchanged where no line leads through the positions.
+        """Return the series with a nominal trajectory if its start has no direction of travel.
+
+        The trajectory follows the first positions, as in the tracker (see
+        `TrackInitiation`). Returns the series unchanged if no trajectory fits the
+        positions.
         """
-        search, count = TrackInitiation.of(motion, self.start, method), 0
+        search = TrackInitiation.of(motion, self.start, method)
         if search is None:
             return self
+        count = 0
         for observation in self.observations:
             longer = search.with_measurement(observation.measurement)
             if longer is None:
                 break
-            search, count = longer, count + 1
+            search = longer
+            count += 1
         try:
             states = [search.nominal(initial_state(motion, self.start)[0])]
         except np.linalg.LinAlgError:
             return self
-        stamp_ns, start = self.start.stamp_ns, self.start
+        start = self.start
+        stamp_ns = start.stamp_ns
         for observation in self.observations[:count]:
             after_ns = observation.measurement.stamp_ns
             states.append(motion.predict(states[-1], seconds(after_ns - stamp_ns)))
@@ -180,6 +209,6 @@ class Series:
 
 
 def positive_part(matrix: FloatArray) -> FloatArray:
-    """Return the nearest positive semidefinite matrix to a symmetric `matrix`, shape (k, k)."""
+    """Return the positive semidefinite matrix nearest to the symmetric `matrix`, shape (k, k)."""
     values, vectors = np.linalg.eigh(symmetrise(matrix))
     return symmetrise(congruence(vectors, np.diag(np.maximum(values, 0.0))))
