@@ -1,4 +1,4 @@
-"""A recording in one call: advice, three methods on the same stream, their comparison, figures, and a page."""
+"""Study of a recording in one call: advice, three estimators on the same data, comparison, figures and a report."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -45,9 +45,8 @@ from fgtrack.show.report import ReportHead, write_report
 __all__ = ["ESTIMATORS", "Study", "study"]
 
 _PERCENT, _MS = 100.0, 1e3
-_IMPORTANT = (
-    60.0  # weight of a finding without a setting that has to be dealt with first
-)
+# A finding of this weight without a setting must be corrected first.
+_IMPORTANT = 60.0
 
 
 def _recording(one: EvaluatedRun) -> str:
@@ -57,28 +56,25 @@ def _recording(one: EvaluatedRun) -> str:
     for sensor in np.unique(updates["sensor"]).tolist():
         mine = updates["sensor"] == sensor
         delays_s = (updates["receipt_ns"][mine] - updates["stamp_ns"][mine]) / NS_PER_S
-        middle_ms, most_ms = (
-            _MS * float(np.median(delays_s)),
-            _MS * float(delays_s.max()),
-        )
+        median_ms = _MS * float(np.median(delays_s))
+        most_ms = _MS * float(delays_s.max())
         sensors.append(
-            f"{sensor} ({len(delays_s)} detections, {middle_ms:.0f} ms late, at most {most_ms:.0f})"
+            f"{sensor} ({len(delays_s)} detections, median delay {median_ms:.0f} ms, largest {most_ms:.0f} ms)"
         )
-    late, used = (
-        _percent(np.isin(updates["disposition"], fates))
-        for fates in (("out_of_sequence",), USED)
-    )
-    many = f"{late} arrived after newer ones had been fused, {used} were used"
-    return f"In {length_s:.0f} s detections came from {' and '.join(sensors) or 'no sensor'}; {many}."
+    late = _percent(np.isin(updates["disposition"], ("out_of_sequence",)))
+    used = _percent(np.isin(updates["disposition"], USED))
+    shares = f"{late} arrived after newer detections had been fused, {used} were used"
+    return f"In {length_s:.0f} s detections came from {' and '.join(sensors) or 'no sensor'}; {shares}."
 
 
 def _tracks(one: EvaluatedRun) -> str:
     truth = one.metrics.truth
     if truth is not None:
-        of, share = truth.overall, _PERCENT * truth.overall.tracked_share_in_view
+        overall = truth.overall
+        share = _PERCENT * overall.tracked_share_in_view
         return (
-            f"{one.label} tracks the objects {share:.1f} % of the time that a sensor could see them: "
-            f"{_several(of.breaks, 'break')}, {_several(of.id_switches, 'identity switch', 'es')}, "
+            f"{one.label} tracks the objects for {share:.1f} % of their time in view: "
+            f"{_several(overall.breaks, 'break')}, {_several(overall.id_switches, 'identity switch', 'es')}, "
             f"{_several(truth.false_tracks, 'false track')}."
         )
     lives_s, _ = lifetimes_and_breaks(one.run)
@@ -91,7 +87,11 @@ def _tracks(one: EvaluatedRun) -> str:
 
 
 def _to_do(first: EvaluatedRun, tables: Tables, advice: Advice | None) -> str:
-    """Return what comes first: a defect of the recording or its settings, else the fastest of the best methods."""
+    """Return the first recommendation of a study.
+
+    A problem of the recording or its settings comes first, else the fastest of the most
+    accurate estimators.
+    """
     findings = () if advice is None else advice.findings
     found = [
         str(item)
@@ -111,8 +111,8 @@ def _to_do(first: EvaluatedRun, tables: Tables, advice: Advice | None) -> str:
         for row in tables.tables["tracking"].records
     }
     fastest = min(best or times, key=lambda run: (times[run], run))
-    because = "as accurate as the best" if best else "errors are unknown without truth"
-    return f"Take {fastest} for the present state ({short(_MS * times[fastest])} ms per tick, {because})."
+    reason = "as accurate as the best" if best else "errors are unknown without truth"
+    return f"Use {fastest} for the present state ({short(_MS * times[fastest])} ms per tick, {reason})."
 
 
 def _percent(mask: Any) -> str:  # Any: an array of bool
@@ -125,38 +125,40 @@ def _several(count: int, what: str, ending: str = "s") -> str:
 
 ESTIMATORS = ("smoother", REPLAY, "ekf-backward-forward")
 """Estimators of a study."""
-#: Share of the work that is done when a step begins.
+#: Finished share of the work at the start of each step.
 _ADVICE, _REPLAY, _COMPARE, _DRAW, _DONE = 0.02, 0.3, 0.85, 0.9, 1.0
-_MESSAGES = 1000  # between two signs of progress
+# Number of messages between two progress reports.
+_MESSAGES = 1000
 OnStep = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
 class Study:
-    """A recording studied; `str` gives the summary, the assumptions and where the files are."""
+    """Result of a study; `str` shows its summary, its assumptions and the paths of its files."""
 
     path: Path
     """Folder of `report.html`, `settings.yaml`, `runs/` and `figures/`."""
     summary: tuple[str, ...]
-    """About five sentences: the recording, the tracks, the best method, the noise, what to do."""
+    """About five sentences: the recording, the tracks, the best estimator, the noise, a recommendation."""
     assumptions: tuple[str, ...] = field(repr=False)
-    """Settings that neither the configuration nor the advice gives, a line per sensor with the reasons."""
+    """Settings that come neither from the configuration nor from the advice: a line per sensor with the reasons."""
     advice: Advice | None = field(repr=False)
-    """None where it was not asked for, or nothing could be judged."""
+    """The advice; None if it was not requested, or nothing could be assessed."""
     runs: tuple[Run, ...] = field(repr=False)
+    """Run of each estimator."""
     tables: Tables = field(repr=False)
     """Comparison of the runs."""
     broken: str | None
-    """Why the recording breaks off, where it does."""
+    """Reason why the recording could be read only in part, or None."""
 
     @property
     def report(self) -> Path:
-        """The page, to be opened in a browser."""
+        """Path of the report, an HTML page."""
         return self.path / "report.html"
 
     @property
     def settings(self) -> Path:
-        """The configuration of the runs with what was assumed and why, to be changed and run again."""
+        """Path of the configuration of the runs with all assumptions and their reasons, for changes and another study."""
         return self.path / "settings.yaml"
 
     def __str__(self) -> str:
@@ -179,16 +181,18 @@ def study(
     overwrite: bool = False,
     on_step: OnStep = lambda text, share: None,
 ) -> Study:
-    """Return a recording studied: advised, replayed by three estimators, compared, drawn and reported into a folder.
+    """Study a recording: advise, replay with three estimators, compare, draw and report into the folder `out`.
 
-    `config`, `map`, `pit_map` and `set` are as for `fgtrack.replay`. With `advice` the settings of `fgtrack.advise` are
-    followed; `figures` are further ones by name; `overwrite` replaces a study in `out`. `on_step` is called with the
-    name of each step, and the share of the work that is done.
+    `config`, `map`, `pit_map` and `set` are as in `fgtrack.replay`. With `advice`, the
+    settings of `fgtrack.advise` are adopted. `figures` are additional figures by name.
+    `overwrite` replaces a study in `out`. `on_step` is called with the name of each
+    step and the finished share of the work.
 
-    Raises `CallError` where the configuration or `out` is invalid, and `DataError` where the recording cannot be read,
-    or holds nothing to track.
+    Raises `CallError` for an invalid configuration or `out`. Raises `DataError` if the
+    recording cannot be read, or contains nothing to track.
     """
-    out, source_path = Path(out), Path(recording)
+    out = Path(out)
+    source_path = Path(recording)
     resolved = read_config(config, set, track_map=map, pit_map=pit_map)
     *runs, pictures, settings, page = outputs(out)
     folders = dict(zip(ESTIMATORS, runs, strict=True))
@@ -215,18 +219,16 @@ def study(
                 f"advice, {text}", _ADVICE + (_REPLAY - _ADVICE) * share
             ),
         )
-        with suppress(
-            DataError
-        ):  # where nothing can be judged, which the runs report as well
+        with suppress(DataError):  # the runs report the same problem
             advised = adviser.advice() if advice else None
-        if advised is not None:  # what the advice changes is not assumed any more
+        if advised is not None:  # settings from the advice are no assumptions
             changed = {one.key for one in advised.changes}
             known = Assumed(
                 advised.config,
                 tuple(one for one in known.assumptions if one.key not in changed),
             )
         head = [
-            f"Settings of {source_path.name} (fgtrack study): change them and run again with -c."
+            f"Settings of {source_path.name} (fgtrack study): change them and pass this file with -c."
         ]
         comments = [] if advised is None else advised.comments()
         write_file(settings, known.to_yaml([*head, *comments]), overwrite)
@@ -257,7 +259,7 @@ def study(
         tables = compare(*every)
         for folder, one in zip(runs, every, strict=True):
             write_metrics(folder, one.metrics.as_dict())
-        with suppress(DataError):  # without a track to judge there is no ledger
+        with suppress(DataError):  # without a track there is no ledger
             replays = PairedReplay(
                 recorder.bank,
                 every[ESTIMATORS.index(REPLAY)].run,
@@ -275,9 +277,8 @@ def study(
         )
         on_step("draw", _DRAW)
         close_up, late = drawn_close_up(every)
-        others = tuple(
-            f"_{one.label}" for one in every[1:]
-        )  # figures of single runs are drawn of the first
+        # Figures of a single run are drawn for the first run only.
+        others = tuple(f"_{one.label}" for one in every[1:])
         plans = (one for one in planned(every) if not one.name.endswith(others))
         images = [
             (name, png(one))
@@ -308,7 +309,7 @@ def study(
 
 
 def outputs(out: Path) -> list[Path]:
-    """Return what a study in `out` writes: the run of every estimator, figures, settings, report."""
+    """Return the paths that a study in `out` writes: runs, figures, settings, report."""
     names = (
         *(f"runs/{each}" for each in ESTIMATORS),
         "figures",
@@ -319,7 +320,7 @@ def outputs(out: Path) -> list[Path]:
 
 
 def head_at(late: CloseUp | DataError) -> ReportHead:
-    """Return how a report opens at a late detection; without one it gives the reason."""
+    """Return the head of a report that opens at a late detection, or gives the reason why there is none."""
     if isinstance(late, DataError):
         return ReportHead(missing=(f"no close-up: {late}",))
     x_m, y_m = late.after.means[-1, :2].tolist()

@@ -1,1 +1,1 @@
-"""Advice on a recording: what is late, wrong or does not fit, and the setting that corrects it."""
+"""Advice on a recording: late data, errors, inconsistent noise, and the settings that correct them."""

@@ -1,4 +1,4 @@
-"""The advice of `fgtrack advise`: findings in order of importance, and a configuration that follows it."""
+"""The steps of `fgtrack advise`: findings in order of importance, and a configuration that follows them."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -7,16 +7,16 @@ from itertools import count
 from pathlib import Path
 
 from fgtrack.advice.ledger import SUMMARY_S, summary
-from fgtrack.advice.outcome import Outcome, harm, noise_findings, objection
+from fgtrack.advice.outcome import RunQuality, harm, noise_findings, objection
 from fgtrack.advice.page import Advice
 from fgtrack.advice.paired_replay import PairedReplay
-from fgtrack.advice.trial import TRIAL_S, beginning, suspicions
+from fgtrack.advice.trial import TRIAL_S, input_checks, messages_within
 from fgtrack.clocks.arrivals import (
     FEWEST,
     LONGEST_STORAGE_S,
     Arrivals,
     arrivals_of,
-    overtaken,
+    overtaken_shares,
     window_findings,
 )
 from fgtrack.clocks.offsets import OffsetReport, estimate_offsets
@@ -42,14 +42,18 @@ from fgtrack.tracking.ego.trajectory import MAX_EXTRAPOLATION_S
 __all__ = ["Adviser", "advise"]
 
 TRACKED_S = 300.0
-"""Length of the beginning that is tracked, to judge clocks and noise; delays are those of the whole recording."""
+"""Length of the first part of the recording that is tracked, to assess clocks and noise.
+
+Delays are taken from the whole recording.
+"""
 TUNED_S = 60.0
-"""Noise is fitted to so much of it."""
-_TUNE_RULES = TuneRules(
-    train_share=1.0, max_rounds=3, max_observations=1500
-)  # the replay judges the result
-_USELESS = 90.0  # what weighs more leaves nothing to be judged
-_OFTEN = 0.05  # share of lists that are overtaken
+"""Length of the first part of the recording to which noise is fitted."""
+# No part is held out: a replay validates the fitted noise.
+_TUNE_RULES = TuneRules(train_share=1.0, max_rounds=3, max_observations=1500)
+# A finding of this weight without a setting makes further checks meaningless.
+_USELESS = 90.0
+# Share of overtaken lists of a sensor above which a finding is given.
+_OFTEN = 0.05
 _SLOW_EGO_S = 0.2
 
 
@@ -65,15 +69,17 @@ def advise(
     ledger: bool = False,
     on_step: Callable[[str, float], None] = lambda text, share: None,
 ) -> Advice:
-    """Return what is late, wrong or inconsistent, and the settings that correct it; `advice.config` has them.
+    """Return findings on a recording, and the settings that correct them; `advice.config` contains these.
 
-    The recording is replayed before and after, and settings that make the tracks worse are not given. `config`, `map`,
-    `pit_map` and `set` are as for `fgtrack.replay`; `reference` is the sensor with the correct clock, where two do not
-    agree and the recording has no truth; with `tune`, noise that does not fit is fitted; with `ledger`,
-    policies for late lists are compared over the first minute. `on_step` is called before
-    each step with its name and the share that is done.
+    The recording is replayed before and after. Settings that make the tracks worse are
+    not advised. `config`, `map`, `pit_map` and `set` are as in `fgtrack.replay`.
+    `reference` is the sensor with the correct clock; it is needed if two clocks differ
+    and the recording has no truth. With `tune`, inconsistent noise is fitted. With
+    `ledger`, policies for late lists are compared over the first minute. `on_step` is
+    called before each step with its name and the finished share.
 
-    Raises `CallError` where the configuration does not fit, and `DataError` where nothing can be read or tracked.
+    Raises `CallError` for an invalid configuration, and `DataError` if nothing can be
+    read or tracked.
     """
     resolved = read_config(config, set, track_map=map, pit_map=pit_map)
     on_step("reading", 0.0)
@@ -88,7 +94,7 @@ def advise(
 
 
 class Adviser:
-    """The steps of `advise`: each sees the settings of those before it."""
+    """Steps of `advise`. Each step uses the settings from the steps before it."""
 
     def __init__(
         self,
@@ -98,23 +104,25 @@ class Adviser:
         reference: str | None = None,
         on_step: Callable[[str, float], None] = lambda text, share: None,
     ) -> None:
-        self._recording, self._messages, self._reference, self._on_step = (
-            recording,
-            messages,
-            reference,
-            on_step,
-        )
-        self._assumed, self._config = found, found.config
+        self._recording = recording
+        self._messages = messages
+        self._reference = reference
+        self._on_step = on_step
+        self._assumed = found
+        self._config = found.config
         self._findings: list[Finding] = []
         self._arrivals = arrivals_of(messages)
-        self._tracked = list(beginning(messages, nanoseconds(TRACKED_S)))
-        self._outcomes: list[tuple[Config, Outcome | None]] = []
+        self._tracked = list(messages_within(messages, nanoseconds(TRACKED_S)))
+        self._outcomes: list[tuple[Config, RunQuality | None]] = []
         self._clocks: OffsetReport | None = None
 
     def advice(
         self, broken: str | None = None, tune: bool = False, ledger: bool = False
     ) -> Advice:
-        """Return the advice after all steps; `broken` is why the recording breaks off, where it does."""
+        """Run all steps and return the advice.
+
+        `broken` is the reason why the recording can be read only in part, or None.
+        """
         if self._assumed.assumptions:
             text = f"not configured: {'. '.join(self._assumed.lines())}."
             self._findings.append(Finding("assumed", "sensors", 35.0, text))
@@ -127,12 +135,12 @@ class Adviser:
         ]
         if not sensors:
             raise DataError(
-                f"{self._recording}: there are no detections of a sensor that the configuration has"
+                f"{self._recording}: no detections of a configured sensor; configure its sensors (sensors.NAME)"
             )
         for name in [*sensors, *([EGO] if EGO in self._arrivals else [])]:
             self._take(stamp_findings(self._arrivals[name]))
-        for one in suspicions(
-            list(beginning(self._messages, nanoseconds(TRIAL_S))), self._config
+        for one in input_checks(
+            list(messages_within(self._messages, nanoseconds(TRIAL_S))), self._config
         ):
             self._take(
                 [
@@ -152,7 +160,7 @@ class Adviser:
             for message in self._messages
             if isinstance(message, DetectionList) and message.sensor in sensors
         )
-        shares = overtaken(seen, sensors)
+        shares = overtaken_shares(seen, sensors)
         self._take(self._late(shares))
         self._take(
             window_findings(
@@ -168,10 +176,14 @@ class Adviser:
             self._take(noise_findings(new))
         if tune and new is not None:
             self._take(self._tuned(new))
-        old, new, policies = self._outcome(before), self._outcome(self._config), None
-        with suppress(DataError):  # nothing can be judged
+        old = self._outcome(before)
+        new = self._outcome(self._config)
+        policies = None
+        with suppress(DataError):  # no track can be assessed
             first = list(
-                beginning(self._tracked, nanoseconds(SUMMARY_S if ledger else 0.0))
+                messages_within(
+                    self._tracked, nanoseconds(SUMMARY_S if ledger else 0.0)
+                )
             )
             policies = summary(PairedReplay.of(first, self._config)) if ledger else None
         return Advice(
@@ -188,13 +200,13 @@ class Adviser:
         )
 
     def _take(self, findings: Iterable[Finding]) -> None:
-        """Keep findings, and follow them."""
+        """Store findings and apply their settings."""
         for item in findings:
             self._findings.append(item)
             self._config = read_config(self._config, item.settings)
 
     def _withdraw_harm(self, before: Config) -> None:
-        """Take back settings that make the replay worse than without them; their findings stay."""
+        """Withdraw settings that make the replay worse; their findings stay."""
         if self._is_harm(before, self._config) is None:
             return
         self._config = before
@@ -207,29 +219,31 @@ class Adviser:
             if worse is None:
                 self._config = config
                 continue
-            text = f"{one.text} {', '.join(one.settings)} would correct it, but then {worse}: left as it is."
+            keys = ", ".join(one.settings)
+            text = (
+                f"{one.text} {keys} would correct this, but then {worse}: not changed."
+            )
             self._findings[self._findings.index(one)] = replace(
                 one, text=text, settings={}
             )
 
     def _is_harm(self, old: Config, new: Config) -> str | None:
-        """Return what gets worse from one configuration to the other; None where nothing does."""
-        before, after = self._outcome(old), self._outcome(new)
-        return (
-            None
-            if old == new or before is None or after is None
-            else harm(before, after)
-        )
+        """Return a sentence on the result that gets worse from `old` to `new`; None if none does."""
+        before = self._outcome(old)
+        after = self._outcome(new)
+        if old == new or before is None or after is None:
+            return None
+        return harm(before, after)
 
     @property
     def _is_useless(self) -> bool:
-        """True if something is wrong that no setting corrects: nothing else can be judged then."""
+        """True if a severe finding has no setting: further checks are meaningless then."""
         return any(
             item.weight >= _USELESS and not item.settings for item in self._findings
         )
 
     def _unknown_sensors(self) -> Iterator[Finding]:
-        """Yield the sensors of the recording that the configuration lacks."""
+        """Yield the sensors of the recording that are not configured."""
         known = {*self._config.sensors, *self._config.ignore_sensors, EGO}
         unknown = [name for name in self._arrivals if name not in known]
         if not unknown:
@@ -243,12 +257,15 @@ class Adviser:
             item.sensor: ", ".join(item.objects[0].measured) for item in reversed(lists)
         }
         has = "; ".join(f"{name}: {first.get(name, 'nothing')}" for name in unknown)
-        text = f"no model of {', '.join(unknown)} ({has}): give sensors.NAME.std, or leave them out."
+        text = f"no model of {', '.join(unknown)} ({has}): set sensors.NAME.std, or ignore them."
         ignored = sorted({*self._config.ignore_sensors, *unknown})
         yield Finding("model", "sensors", 98.0, text, {"ignore_sensors": ignored})
 
-    def _diagnostics(self, outcome: Outcome | None) -> Iterator[Finding]:
-        """Yield the diagnostics of a run with the settings, except of sensors with a known problem."""
+    def _diagnostics(self, outcome: RunQuality | None) -> Iterator[Finding]:
+        """Yield the diagnostics of a run with the advised settings.
+
+        Sensors with a known severe problem, and known sentences, are skipped.
+        """
         known = {one.about for one in self._findings if one.weight >= _USELESS}
         told = {one.text for one in self._findings}
         for one in [] if outcome is None else diagnostics(outcome.run):
@@ -256,16 +273,15 @@ class Adviser:
                 yield Finding("track", one.about, 70.0, f"{one.text}.", one.settings)
 
     def _offsets(self) -> Iterator[Finding]:
-        """Yield clocks that do not agree, and biases of positions, where these can be estimated."""
+        """Yield clock offsets and position biases, if they can be estimated."""
         if self._is_useless:
             return
         doubtful = {item.about for item in self._findings if item.kind == "clock"}
         unlimited = all(
             sensor.max_delay_s is None for sensor in self._config.sensors.values()
         )
-        is_same = (
-            unlimited and self._config.estimator != "ekf-backward-forward"
-        )  # nothing is refused for its delay
+        # The run can be reused if it refuses no message for its delay.
+        is_same = unlimited and self._config.estimator != "ekf-backward-forward"
         try:
             outcome = self._outcome(self._config) if is_same else None
             self._clocks = estimate_offsets(
@@ -289,29 +305,33 @@ class Adviser:
         yield from bias_findings(self._clocks, self._config.ego)
 
     def _late(self, shares: Mapping[str, float]) -> Iterator[Finding]:
-        """Yield an estimator that cannot deal with what is overtaken."""
+        """Yield a finding if lists are often overtaken and the estimator cannot handle this."""
         often = {name: share for name, share in shares.items() if share > _OFTEN}
         if often and self._config.estimator == "ekf-backward-forward":
             named = ", ".join(
                 f"{percent(share)} of {name}" for name, share in often.items()
             )
             text = (
-                f"lists are overtaken by newer ones ({named}), and ekf-backward-forward forgets what was fused after "
-                "the stamp of a late list; where the output may wait, smoother takes them, too."
+                f"newer lists overtake older ones ({named}), and ekf-backward-forward forgets all measurements fused "
+                "after the stamp of a late list; smoother keeps them too, if the output may wait."
             )
             yield Finding("late", "estimator", 60.0, text, {"estimator": "ekf-replay"})
 
     def _ego(self, seen: Mapping[str, Arrivals]) -> Iterator[Finding]:
-        """Yield gaps and low rates of the ego, and an ego that is later than the lists of `seen` that need it."""
+        """Yield gaps and low rates of the ego states, and an ego with a larger delay than the lists that need it.
+
+        `seen` are the arrivals of the sensors.
+        """
         one = self._arrivals.get(EGO)
         if one is None or len(one.stamps_ns) < FEWEST or not one.has_stamps:
             return
-        limit_s, gaps_s = MAX_EXTRAPOLATION_S, one.steps_s
+        limit_s = MAX_EXTRAPOLATION_S
+        gaps_s = one.steps_s
         long_s = gaps_s[gaps_s > 2.0 * limit_s]
         if len(long_s):
             text = (
-                f"{len(long_s)} gaps in its states are longer than twice {limit_s:g} s, up to {long_s.max():.3g} s: "
-                "detections in the middle cannot be transformed to the map, and fail."
+                f"{len(long_s)} gaps in its states are longer than {2.0 * limit_s:g} s, up to {long_s.max():.3g} s: "
+                "detections in the middle of a gap cannot be transformed to the map, and fail."
             )
             yield Finding("ego", EGO, 65.0, text)
         lists = (item for item in self._messages if isinstance(item, DetectionList))
@@ -325,19 +345,20 @@ class Adviser:
             yield Finding("ego", EGO, 55.0, f"{late.text}.")
         if one.period_s > _SLOW_EGO_S:
             text = (
-                f"one state every {milliseconds(one.period_s)}: between them the pose is estimated, and "
-                "uncertain in a turn. Record it more often."
+                f"one state every {milliseconds(one.period_s)}: the interpolated pose is uncertain in a turn. Record "
+                "the ego at a higher rate."
             )
             yield Finding("ego", EGO, 35.0, text)
 
-    def _tuned(self, before: Outcome) -> Iterator[Finding]:
-        """Yield the noise that is fitted to the recording, unless nothing can be, or it does harm."""
+    def _tuned(self, before: RunQuality) -> Iterator[Finding]:
+        """Yield the noise fitted to the recording, or the reason why it is not adopted."""
         is_assumed = any(
             item.key.endswith(".std") for item in self._assumed.assumptions
         )
         if not is_assumed and not any(item.kind == "noise" for item in self._findings):
             return
-        steps, messages = count(), list(beginning(self._tracked, nanoseconds(TUNED_S)))
+        steps = count()
+        messages = list(messages_within(self._tracked, nanoseconds(TUNED_S)))
         try:
             report = tune_sources(
                 {self._recording: source_of(lambda: messages)},
@@ -358,7 +379,7 @@ class Adviser:
                 "tune",
                 "tune",
                 76.0,
-                f"no noise is changed. With what is fitted, {why}.",
+                f"no noise is changed: with the fitted noise, {why}.",
             )
             return
         settings = {
@@ -369,21 +390,26 @@ class Adviser:
         stay = ", ".join(
             item.key for item in report.parameters if item.key not in settings
         )
-        rest = f" As configured stay {stay}." if stay else ""
+        rest = f" Unchanged: {stay}." if stay else ""
         yield Finding(
             "tune",
             "tune",
             76.0,
-            f"fitted to the recording by maximum likelihood.{rest}",
+            f"noise fitted to the recording by maximum likelihood.{rest}",
             settings,
         )
 
-    def _outcome(self, config: Config) -> Outcome | None:
-        """Outcome of the first minutes, of the replaying EKF for a smoother; None where nothing can be tracked."""
+    def _outcome(self, config: Config) -> RunQuality | None:
+        """Return the outcome of the first minutes with `config`; None if nothing can be tracked.
+
+        A smoother is replaced by the replaying EKF, which is faster. Outcomes are
+        cached.
+        """
         for known, outcome in self._outcomes:
             if known == config:
                 return outcome
-        fast, result = config, None
+        fast = config
+        result = None
         if config.estimator.startswith("smoother"):
             storage_s = min(config.effective.reach_s, LONGEST_STORAGE_S)
             fast = replace(
@@ -392,12 +418,12 @@ class Adviser:
                 filter=replace(config.filter, storage_s=storage_s),
             )
         with suppress(DataError):
-            result = Outcome.of(replay_in_memory(self._tracked, fast))
+            result = RunQuality.of(replay_in_memory(self._tracked, fast))
         self._outcomes.append((config, result))
         return result
 
     def _fine(
-        self, seen: Mapping[str, Arrivals], outcome: Outcome | None
+        self, seen: Mapping[str, Arrivals], outcome: RunQuality | None
     ) -> Iterator[str]:
         """Yield the checks without a finding."""
         wrong = {(item.kind, item.about) for item in self._findings}
@@ -408,10 +434,8 @@ class Adviser:
             and not wrong & {("ego", EGO), ("clock", EGO), ("input", EGO)}
             and ego.period_s
         ):
-            longest, delay = (
-                milliseconds(float(ego.steps_s.max())),
-                milliseconds(ego.quantile_s(0.5)),
-            )
+            longest = milliseconds(float(ego.steps_s.max()))
+            delay = milliseconds(ego.quantile_s(0.5))
             yield f"the ego ({1.0 / ego.period_s:.0f} Hz, longest gap {longest}, delay {delay})"
         offsets = [] if self._clocks is None else self._clocks.others
         noise = () if outcome is None else outcome.noise
@@ -441,4 +465,4 @@ class Adviser:
             yield f"{found.lag_key} ({found.lag_s:g} s) and max_delay_s"
         if "track" not in kinds and outcome is not None and outcome.truth is not None:
             tracked = percent(outcome.truth.tracked_share_in_view)
-            yield f"tracks ({outcome.births} beginnings, {tracked} tracked where a sensor could see)"
+            yield f"tracks ({outcome.births} births, {tracked} of the time in view tracked)"

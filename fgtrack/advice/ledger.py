@@ -1,7 +1,8 @@
-"""The ledger of lateness: how much of the error of the present comes from what.
+"""The ledger of lateness: the contribution of each cause to the present position error.
 
-Every row is a replay of one association. Parts are differences of mean squares of the position error at the same
-ticks and tracks, so they add up to the difference of their ends.
+Every row is a replay of one association. A contribution is a difference of mean squared
+position errors over the same ticks and tracks. So the contributions add up to the whole
+difference.
 """
 
 import itertools
@@ -31,38 +32,40 @@ SMOOTHER, PUBLISHED, FORGET = "smoother-banded", "ekf-backward-forward", "rewind
 POLICIES = ("drop", "as-current", PUBLISHED, FORGET, REPLAY, SMOOTHER)
 """Estimators that the ledger compares."""
 WAITS_S = (0.0, 0.1, 0.3, 1.0)
-"""Ages of the states that are compared: what waiting gives."""
+"""Ages of the compared states: the benefit of waiting."""
 SUMMARY_S = 60.0
-"""A summary is of the beginning of a recording, so long."""
-_WAITED = 2  # index of the wait of the summary
+"""Length of the first part of a recording that a summary uses."""
+_WAITED = 2  # index in WAITS_S of the waiting time in the summary
 _IN_TIME = f"{REPLAY}, if no list were late"
 _DECISIONS = "association unlike that of ekf-replay"
 Squares = Sequence[FloatArray]
-"""Squared errors of the states of so long ago."""
+"""Squared errors for each waiting time."""
 
 
 @dataclass(frozen=True)
-class Part:
-    """One line of the waterfall."""
+class Contribution:
+    """A line of the waterfall."""
 
     cause: str
+    """Cause of an error; empty for the run itself."""
     mean_square_m2: float
-    """What is left when it and all before it are taken away."""
+    """Mean squared error without this cause and all causes before it."""
     share_m2: Estimate
-    """By how much it raises the mean square."""
+    """Contribution of the cause to the mean square."""
 
 
 @dataclass(frozen=True)
 class Ledger:
-    """Where the error of the present comes from; `str` gives the tables."""
+    """Contributions of causes to the present error; `str` shows the tables."""
 
     estimator: str
     with_truth: bool
-    """False where predicted variances stand for errors, which the recording does not contain."""
-    waterfall: tuple[Part, ...]
-    """From the error of the run to that without lateness; the first has no share."""
+    """False if the recording has no truth. Then predicted variances replace squared errors."""
+    waterfall: tuple[Contribution, ...]
+    """Lines from the error of the run down to the error without lateness; the first has no cause."""
     tables: Tables = field(repr=False)
     sentence: str
+    """Summary of the contributions."""
 
     def __str__(self) -> str:
         return f"{self.tables}\n\n{self.sentence}"
@@ -79,10 +82,14 @@ def ledger(
 ) -> Ledger:
     """Return the ledger of a recording, given as a path or as its messages.
 
-    A run folder stands for its recording and configuration. `config`, `map`, `pit_map` and `set` are as for
-    `fgtrack.replay`; the estimator is the one whose error is explained. Of `tuned`, a configuration as `fgtrack tune`
-    and `advise --tune` write it, noise and clock offsets are taken, and the ledger has a line for each that differs.
-    Without truth predicted variances stand for errors. Raises `DataError` where nothing can be judged.
+    A path may be a run folder: then its recording and configuration are used. `config`,
+    `map`, `pit_map` and `set` are as in `fgtrack.replay`. The configured estimator is
+    the one whose error is explained. `tuned` is a configuration from `fgtrack tune` or
+    `advise --tune`. Its noise and clock offsets are used, and each difference gets a
+    line in the ledger.
+
+    Without truth, predicted variances replace squared errors. Raises `DataError` if no
+    track can be assessed.
     """
     settings = read_config(config, set, track_map=map, pit_map=pit_map)
     if isinstance(recording, str | Path):
@@ -96,7 +103,7 @@ def ledger(
             path = Path((run.meta.get("input") or {}).get("path") or path)
             if not path.exists() or path == Path(recording):
                 raise DataError(
-                    f"{recording}: its recording is not at {path}, give the recording with -c {run.config_path}"
+                    f"{recording}: its recording is not at {path}; give the recording's path with -c {run.config_path}"
                 )
         recording = open_input(path, settings.input).messages()
     messages = list(recording)
@@ -118,7 +125,7 @@ def ledger(
 
 
 def _with_sensors(config: Config, tuned: Config, name: str) -> Config:
-    """Return `config` with the settings `name` of the sensors of `tuned`."""
+    """Return `config` with the setting `name` of each sensor taken from `tuned`."""
     own = tuned.sensors
     sensors = {
         key: replace(sensor, **{name: getattr(own[key], name)})
@@ -130,7 +137,10 @@ def _with_sensors(config: Config, tuned: Config, name: str) -> Config:
 
 
 def summary(replays: PairedReplay) -> Table:
-    """Return the errors of the policies now and 0.3 s ago. Raises `DataError` where nothing can be judged."""
+    """Return the table of the errors of the policies, at present and 0.3 s ago.
+
+    Raises `DataError` if no track can be assessed.
+    """
     names = [name for name in POLICIES if name != "as-current"]
     return _policies(
         replays, _squares(replays, replays.config, names, WAITS_S[: _WAITED + 1])
@@ -143,7 +153,7 @@ def _squares(
     names: Iterable[str],
     waits_s: Sequence[float],
 ) -> dict[str, Squares]:
-    """Return the squared errors of estimators, and of the replaying filter if no list were late."""
+    """Return the squared errors of the estimators `names`, and of the replaying EKF without delays."""
     result: dict[str, Squares] = {
         name: replays.squares(name, config, waits_s=waits_s) for name in names
     }
@@ -153,32 +163,37 @@ def _squares(
 def _explained(
     replays: PairedReplay, *, best: Config, runs: Mapping[str, FloatArray]
 ) -> Ledger:
-    """Return the ledger, where `best` has tuned noise.
-    `runs` are squared errors that runs themselves publish, by the cause that each is without.
+    """Return the ledger.
+
+    `best` is the configuration with tuned noise. `runs` are the squared errors that
+    runs themselves publish, by the cause that each one lacks.
     """
     config = replays.config
-    estimator, policies = config.estimator, _squares(replays, best, POLICIES, WAITS_S)
+    estimator = config.estimator
+    policies = _squares(replays, best, POLICIES, WAITS_S)
     [fitted, *_] = policies.get(estimator) or replays.squares(estimator, best)
-    ways = dict(runs)
-    ways[_DECISIONS if runs else ""] = (
+    # Squared errors by cause; each replay lacks its cause and all causes before it.
+    squares = dict(runs)
+    squares[_DECISIONS if runs else ""] = (
         fitted if best == config else replays.squares(estimator, config)[0]
     )
     if best != config:
-        ways["noise that is not tuned"] = fitted
+        squares["noise that is not tuned"] = fitted
     if estimator == PUBLISHED:
-        ways["time grid of the filter"] = policies[FORGET][0]
-        ways["forgetting what was fused since"] = policies[REPLAY][0]
+        squares["time grid of the filter"] = policies[FORGET][0]
+        squares["forgetting what was fused since"] = policies[REPLAY][0]
     elif estimator != REPLAY:
-        ways[f"{estimator} instead of replay"] = policies[REPLAY][0]
-    ways["late arrival, everything kept"] = policies[_IN_TIME][0]
-    common = _common([*ways.values(), *(item[0] for item in policies.values())])
-    waterfall = [Part("", float(next(iter(ways.values()))[common].mean()), UNKNOWN)]
-    for before, (cause, after) in itertools.pairwise(ways.items()):
+        squares[f"{estimator} instead of replay"] = policies[REPLAY][0]
+    squares["late arrival, everything kept"] = policies[_IN_TIME][0]
+    common = _common([*squares.values(), *(item[0] for item in policies.values())])
+    first = next(iter(squares.values()))
+    waterfall = [Contribution("", float(first[common].mean()), UNKNOWN)]
+    for before, (cause, after) in itertools.pairwise(squares.items()):
         if cause != _DECISIONS or not np.allclose(
             before[1][common], after[common], rtol=1e-9
         ):
             share = _difference(before[1], after, common, root=False)
-            waterfall.append(Part(cause, float(after[common].mean()), share))
+            waterfall.append(Contribution(cause, float(after[common].mean()), share))
     tables = {
         "waterfall": _waterfall(replays, waterfall),
         "policies": _policies(replays, policies),
@@ -198,8 +213,14 @@ def _explained(
 def _sensors(
     replays: PairedReplay, config: Config, kept: FloatArray, common: BoolArray
 ) -> Table:
-    """Return the errors of `kept`, the replaying filter, with each sensor in time, and without its late lists."""
-    newest, late, late_lists = dict[int, int](), dict[str, list[bool]](), set[int]()
+    """Return the table of the cost of each sensor's delays, and of the worth of its late lists.
+
+    `kept` are the squared errors of the replaying EKF. They are compared with a replay
+    without delays of the sensor, and with one without its late lists.
+    """
+    newest = dict[int, int]()
+    late = dict[str, list[bool]]()
+    late_lists = set[int]()
     for item in replays.calls:
         for track_id, each in zip(item.track_ids, item.observations, strict=False):
             is_late = item.stamp_ns < newest.get(track_id, item.stamp_ns)
@@ -216,11 +237,11 @@ def _sensors(
             for item in replays.calls
             if item.observations and item.observations[0].sensor == sensor
         }
-        out = mine & late_lists
+        dropped = mine & late_lists
         [prompt] = replays.squares(REPLAY, config, partial(_at_stamp_of, mine))
-        [without] = (
-            replays.squares(REPLAY, config, partial(_without, out)) if out else [kept]
-        )
+        without = kept
+        if dropped:
+            [without] = replays.squares(REPLAY, config, partial(_without, dropped))
         here = common & np.isfinite(prompt) & np.isfinite(without)
         own = updates.where(updates["sensor"] == sensor)
         records.append(
@@ -245,7 +266,7 @@ def _sensors(
     return Table("Sensors", records, columns, ("sensor",), [_note(replays)])
 
 
-def _waterfall(replays: PairedReplay, parts: Sequence[Part]) -> Table:
+def _waterfall(replays: PairedReplay, parts: Sequence[Contribution]) -> Table:
     records = [
         {
             "cause": item.cause or "as the run has it",
@@ -271,7 +292,7 @@ def _waterfall(replays: PairedReplay, parts: Sequence[Part]) -> Table:
 
 
 def _policies(replays: PairedReplay, policies: Mapping[str, Squares]) -> Table:
-    """Return the errors of policies now and 0.3 s ago."""
+    """Return the table of the errors of the policies, at present and 0.3 s ago."""
     now, then = (
         _common([squares[index] for squares in policies.values()])
         for index in (0, _WAITED)
@@ -331,8 +352,8 @@ def _without(left_out: Container[int], item: BankCall) -> int | None:
 
 def _note(replays: PairedReplay) -> str:
     if replays.objects is None:
-        return "No truth: predicted variances of the position, as far as the noise is right."
-    return "Errors against the truth, at the same ticks and tracks in every row."
+        return "No truth: predicted position variances, which are valid only for consistent noise."
+    return "Errors against the truth, over the same ticks and tracks in every row."
 
 
 def _interval(heading: str, name: str, text: Callable[[Value], str] = short) -> Column:
@@ -352,11 +373,14 @@ def _four(value: Value) -> str:
 
 
 def _common(squares: Iterable[FloatArray]) -> BoolArray:
-    """True where all are known. Raises `DataError` where nothing is."""
+    """Mask of the ticks and tracks with a finite error in all `squares`.
+
+    Raises `DataError` if there are none.
+    """
     common: BoolArray = np.all(np.isfinite([*squares]), axis=0)
     if not common.any():
         raise DataError(
-            "no track can be judged: none lives for a second, where there is truth at a true object"
+            "no track can be assessed: none lives for a second, or with truth, none is paired with a true object"
         )
     return common
 
@@ -368,17 +392,17 @@ def _rms(squares: FloatArray, common: BoolArray) -> float:
 def _difference(
     before: FloatArray, after: FloatArray, common: BoolArray, *, root: bool = True
 ) -> Estimate:
-    """Return the difference of root mean squares, or of mean squares."""
+    """Return the difference of the root mean squares, or of the mean squares unless `root`."""
     sums = [np.where(common, item, 0.0).sum(axis=1) for item in (before, after)]
-    of = np.sqrt if root else np.asarray
+    transform = np.sqrt if root else np.asarray
     return within_run(
         np.stack([*sums, common.sum(axis=1)], axis=-1),
-        lambda S: of(S[0] / S[2]) - of(S[1] / S[2]),
+        lambda S: transform(S[0] / S[2]) - transform(S[1] / S[2]),
     )
 
 
-def _sentence(parts: Sequence[Part], tables: Mapping[str, Table]) -> str:
-    """Return what counts in one sentence."""
+def _sentence(parts: Sequence[Contribution], tables: Mapping[str, Table]) -> str:
+    """Return a summary sentence of the contributions."""
     ends = [math.sqrt(item.mean_square_m2) for item in parts]
     steps = zip(parts[1:], ends, ends[1:], strict=False)
     causes = [f"{item.cause} {before - after:+z.2f} m" for item, before, after in steps]

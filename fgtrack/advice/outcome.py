@@ -1,4 +1,4 @@
-"""Quality of a run in the few numbers that advice is judged by, and the consistency of its noise."""
+"""Quality of a run in a few numbers for advice, and the consistency of its noise."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -16,31 +16,41 @@ from fgtrack.evaluation.runs import EvaluatedRun
 from fgtrack.evaluation.scores.innovations import autocorrelation, num_measured
 from fgtrack.runs import Run
 
-__all__ = ["NoiseFit", "Outcome", "harm", "noise_findings", "noise_fits", "objection"]
+__all__ = [
+    "NoiseFit",
+    "RunQuality",
+    "harm",
+    "noise_findings",
+    "noise_fits",
+    "objection",
+]
 
-_SMALLEST = 1e-3  # ratio of NIS below which ratios are the same
+# Least NIS ratio in the weight of a finding; smaller ratios weigh the same.
+_SMALLEST = 1e-3
 
 
 @dataclass(frozen=True)
 class NoiseFit:
-    """The normalised innovations squared of one sensor."""
+    """Consistency of one sensor's normalised innovations squared (NIS)."""
 
     sensor: str
     count: int
     ratio: Estimate
-    """Mean NIS over what is expected; the interval considers that innovations are correlated."""
+    """Mean NIS over its expected value; the interval takes correlated innovations into account."""
     lag1: float | None
-    """Autocorrelation of its position innovations at lag 1, of tracks that are long enough; near 0 where its errors are
-    white and the noise is consistent."""
+    """Autocorrelation of the sensor's position innovations at lag 1; None without long tracks.
+
+    It is near 0 for white errors and consistent noise.
+    """
 
     @property
-    def lasts(self) -> bool:
-        """True if its innovations are correlated in time."""
+    def is_correlated(self) -> bool:
+        """True if the innovations are correlated in time."""
         return self.lag1 is not None and self.lag1 > CORRELATED
 
     @property
     def is_consistent(self) -> bool:
-        """True if there are enough innovations, and their mean NIS is that expected, to a factor."""
+        """True if there are enough innovations and their mean NIS is near its expected value."""
         return self.count >= FEWEST and 1.0 / FAR_OFF <= self.ratio.mean <= FAR_OFF
 
     def __str__(self) -> str:
@@ -49,11 +59,11 @@ class NoiseFit:
             if self.ratio.is_known
             else ""
         )
-        return f"mean NIS is {self.ratio.mean:.3g} times what is expected ({known}{self.count} innovations)"
+        return f"mean NIS is {self.ratio.mean:.3g} times the expected value ({known}{self.count} innovations)"
 
 
 def noise_fits(run: Run) -> list[NoiseFit]:
-    """Return the fits of every sensor with innovations."""
+    """Return the consistency of every sensor with innovations."""
     updates, dof = run.tables["updates"], num_measured(run.tables["updates"])
     fits = []
     for sensor in np.unique(updates["sensor"]).tolist():
@@ -73,64 +83,70 @@ def noise_fits(run: Run) -> list[NoiseFit]:
     return fits
 
 
-def noise_findings(outcome: "Outcome") -> Iterator[Finding]:
-    """Yield sensors whose noise does not fit, and those of which a few innovations are far too large."""
+def noise_findings(outcome: "RunQuality") -> Iterator[Finding]:
+    """Yield the sensors with inconsistent noise, and those with a few very large innovations."""
     off = dict(misfits(outcome.run))
     for one in outcome.noise:
         if one.sensor in off:
             factor = math.sqrt(one.ratio.mean)
             size = "small" if factor > 1.0 else "large"
             lag1 = "" if one.lag1 is None else f" (autocorrelation {one.lag1:.2f})"
-            cause = f"Innovations are white enough{lag1} to fit it (--tune)."
-            if one.lasts:
-                cause = f"Innovations are correlated in time{lag1}: so are its errors, or process noise is too small"
-                cause += "; fitted white noise (--tune) is taken only if innovations are white then."
-            text = f"{one}: the configured noise is too {size}, as if errors were {factor:.2g} times as large. {cause}"
+            cause = f"Innovations are white enough{lag1} to fit the noise (--tune)."
+            if one.is_correlated:
+                cause = (
+                    f"Innovations are autocorrelated{lag1}: the errors of this sensor are correlated in time, or the "
+                    "process noise is too small. Fitted noise (--tune) is adopted only if it makes innovations white."
+                )
+            text = f"{one}: the configured noise is too {size}; errors are {factor:.2g} times as large. {cause}"
             weight = min(
                 30.0 + 10.0 * abs(math.log(max(one.ratio.mean, _SMALLEST))), 75.0
             )
             yield Finding("noise", one.sensor, weight, text)
         elif one.count >= FEWEST and not one.is_consistent:
-            text = f"{one}, but its median is as expected: a few innovations are far off. Look at its clutter and the "
-            text += (
+            text = (
+                f"{one}, but its median is as expected: a few innovations are very large. Check its clutter and the "
                 f"gate, or try sensors.{one.sensor}.loss: {{kind: huber, width: 3.0}}."
             )
             yield Finding("noise", one.sensor, 45.0, text)
 
 
-_CHANCE = 2.0  # standard deviations of the difference of two counts
-_MORE_USED = 0.05  # share of the detections of a sensor
-_LESS = 0.02  # share of states that fewer are tracked by where it counts
+# Significant difference of two counts, in its standard deviations.
+_CHANCE = 2.0
+# Increase of the share of a sensor's used detections that makes two runs incomparable.
+_MORE_USED = 0.05
+# Significant decrease of the share of used detections, or of tracked states.
+_LESS = 0.02
 _POSITION_DOF = 2.0
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RunQuality:
     """Quality of a run in a few numbers."""
 
     births: int
-    """Beginnings of tracks."""
+    """Number of track births."""
     confirmed: int
-    """Tracks that were ever confirmed."""
+    """Number of tracks that were confirmed at any time."""
     used: Mapping[str, float]
-    """Share of the detections of each sensor that took part."""
+    """Share of the used detections by sensor."""
     noise: tuple[NoiseFit, ...]
-    """NIS over what is expected, by sensor."""
+    """Consistency of the noise by sensor."""
     truth: ObjectMetrics | None
-    """All true objects together; None for a recording without truth."""
+    """Metrics over all true objects together; None for a recording without truth."""
     tick_s: float
     """Time between two ticks."""
     run: Run = field(repr=False)
 
     @classmethod
-    def of(cls, run: Run) -> "Outcome":
-        """Return the numbers of `run`."""
+    def of(cls, run: Run) -> "RunQuality":
+        """Compute the numbers of `run`."""
         counts = dict(run.meta["counts"])
         used = {
             name: sum(item.get(fate, 0) for fate in USED) / (sum(item.values()) or 1)
             for name, item in counts.items()
         }
-        metrics, ticks_ns = evaluate(run), run.tables["timing"]["now_ns"]
+        metrics = evaluate(run)
+        ticks_ns = run.tables["timing"]["now_ns"]
         return cls(
             births=int(
                 np.count_nonzero(run.tables["updates"]["disposition"] == "birth")
@@ -147,7 +163,7 @@ class Outcome:
 
     @property
     def breaks_per_minute(self) -> float:
-        """Breaks of tracking per true object and minute; NaN without truth."""
+        """Track breaks per true object and minute; NaN without truth."""
         minutes = (
             0.0 if self.truth is None else self.truth.ticks_present * self.tick_s / 60.0
         )
@@ -158,8 +174,8 @@ class Outcome:
         )
 
     def rows(self) -> Iterator[tuple[str, float]]:
-        """Yield what a page shows, with units."""
-        yield "beginnings of tracks", self.births
+        """Yield the name, with unit, and the value of each number."""
+        yield "track births", self.births
         yield "tracks confirmed", self.confirmed
         if self.truth is not None:
             yield "tracked [%]", 100.0 * self.truth.tracked_share_in_view
@@ -172,10 +188,12 @@ class Outcome:
             yield f"NIS / expected, {one.sensor}", one.ratio.mean
 
 
-def harm(before: Outcome, after: Outcome) -> str | None:
-    """Return what gets worse from one run to another, with its numbers; None where nothing does.
-    Counts get worse where they rise by more than two standard deviations of their difference (Poisson). Where clearly
-    more detections of a sensor are used, the two runs are not of the same data, and nothing is harm.
+def harm(before: RunQuality, after: RunQuality) -> str | None:
+    """Return a clause with numbers on the result that gets worse between two runs; None if none does.
+
+    A count gets worse if it rises by more than two standard deviations of the
+    difference (Poisson). If clearly more detections of a sensor are used, the two runs
+    do not compare, and the result is None.
     """
     if any(
         share > before.used.get(name, 0.0) + _MORE_USED
@@ -184,12 +202,14 @@ def harm(before: Outcome, after: Outcome) -> str | None:
         return None
     for name, share in after.used.items():
         if share < before.used.get(name, 0.0) - _LESS:
-            return f"detections of {name} that are used go from {percent(before.used[name])} to {percent(share)}"
-    old, new = before.truth, after.truth
+            return f"used detections of {name} fall from {percent(before.used[name])} to {percent(share)}"
+    old = before.truth
+    new = after.truth
     if old is not None and new is not None:
-        was_share, share = old.tracked_share_in_view, new.tracked_share_in_view
+        was_share = old.tracked_share_in_view
+        share = new.tracked_share_in_view
         if share < was_share - _LESS:
-            return f"the share of time tracked goes from {percent(was_share)} to {percent(share)}"
+            return f"the tracked share of time falls from {percent(was_share)} to {percent(share)}"
         if share > was_share + _LESS:
             return None
         counts = (
@@ -198,26 +218,26 @@ def harm(before: Outcome, after: Outcome) -> str | None:
         )
         for what, was, now in counts:
             if now - was > _CHANCE * math.sqrt(now + was):
-                return f"{what} go from {was} to {now}"
+                return f"{what} rise from {was} to {now}"
     if after.confirmed - before.confirmed > _CHANCE * math.sqrt(
         after.confirmed + before.confirmed
     ):
-        return f"confirmed tracks go from {before.confirmed} to {after.confirmed}"
+        return f"confirmed tracks rise from {before.confirmed} to {after.confirmed}"
     return None
 
 
-def objection(before: Outcome, after: Outcome) -> str | None:
-    """Return why the fitted noise of the run `after` is not taken, in words; None where nothing speaks against it."""
-    for one in filter(lambda one: one.lasts, after.noise):
+def objection(before: RunQuality, after: RunQuality) -> str | None:
+    """Return a clause on why the fitted noise of the run `after` is not adopted; None if nothing speaks against it."""
+    for one in filter(lambda one: one.is_correlated, after.noise):
         return (
-            f"innovations of {one.sensor} are still correlated in time (autocorrelation {one.lag1:.2f}): so are "
-            "errors, of it or of the sensor that is trusted more, and white noise cannot express that; "
-            "sensors.NAME.correlation can, with std and time_s from truth or a data sheet"
+            f"innovations of {one.sensor} remain autocorrelated ({one.lag1:.2f}): model time-correlated errors of this "
+            "sensor, or of the most accurate one (sensors.NAME.correlation), with std and time_s from truth or a data "
+            "sheet"
         )
     for sensor, nis in misfits(after.run):
-        return f"mean NIS of {sensor} is {nis.mean:.3g} then, expected {nis.dof:.3g}"
+        return f"mean NIS of {sensor} is {nis.mean:.3g}, expected {nis.dof:.3g}"
     if (worse := harm(before, after)) is not None:
-        return f"{worse}: tracks break at errors that the noise does not expect"
+        return f"{worse}: errors are larger than this noise, so tracks break"
     runs = [EvaluatedRun("before", before.run), EvaluatedRun("after", after.run)]
     for name, entries in (
         each for one in comparisons(runs) for each in one.quantities.items()

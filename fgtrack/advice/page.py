@@ -1,10 +1,10 @@
-"""The page of `fgtrack advise`: sentences, two tables, and the configuration that follows them."""
+"""The page of `fgtrack advise`: findings, two tables, and the advised configuration."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from textwrap import TextWrapper
 
-from fgtrack.advice.outcome import Outcome
+from fgtrack.advice.outcome import RunQuality
 from fgtrack.clocks.arrivals import Arrivals
 from fgtrack.config.settings import Config
 from fgtrack.core.finding import Finding
@@ -19,31 +19,31 @@ _COMMENT = 110  # characters in a line of a file
 
 @dataclass(frozen=True)
 class Advice:
-    """Problems of a recording and its configuration; `str` shows them as a page of plain sentences."""
+    """Findings on a recording and its configuration; `str` shows them as a page of sentences and tables."""
 
     recording: str
     findings: tuple[Finding, ...]
-    """The most important first."""
+    """The findings, the most important first."""
     fine: tuple[str, ...]
     """Checks without a finding."""
     config: Config = field(repr=False)
-    """The configuration with these changes; with noise fitted to the recording where that was asked for."""
+    """The advised configuration. It contains fitted noise if that was requested."""
     arrivals: tuple[Arrivals, ...] = field(repr=False)
-    """Arrivals of the sensors that are used, with the stamps that the advice gives them."""
+    """Arrivals of the used sensors, with the advised stamps."""
     overtaken: Mapping[str, float] = field(repr=False)
-    """Share of the lists of each sensor that came after a newer one."""
-    before: Outcome | None = field(repr=False)
-    """Outcome of a replay with the configuration; None where nothing can be tracked."""
-    after: Outcome | None = field(repr=False)
-    """The same with these changes."""
+    """Share of each sensor's lists that arrived after a newer list of any sensor."""
+    before: RunQuality | None = field(repr=False)
+    """RunQuality of a replay with the given configuration; None if nothing can be tracked."""
+    after: RunQuality | None = field(repr=False)
+    """RunQuality of a replay with the advised configuration."""
     broken: str | None
-    """Why the recording breaks off, where it does; what came before was used."""
+    """Reason why the recording could be read only in part, or None. The readable part was used."""
     ledger: Table | None = field(repr=False, default=None)
-    """Errors of policies with these changes, where they were asked for."""
+    """Errors of policies with the advised configuration, if requested."""
 
     @property
     def changes(self) -> tuple[Assumption, ...]:
-        """The settings that the findings change with their reasons, the most important first."""
+        """The settings that the findings change, with their reasons, the most important first."""
         result: dict[str, Assumption] = {}
         for one in self.findings:
             for key, value in one.settings.items():
@@ -54,15 +54,15 @@ class Advice:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """The findings, and a line of what is fine."""
+        """The findings, and a line with the checks without a finding."""
         return (
             *map(str, self.findings),
-            *([f"Fine: {', '.join(self.fine)}."] if self.fine else []),
+            *([f"No finding on: {', '.join(self.fine)}."] if self.fine else []),
         )
 
     @property
     def tables(self) -> Tables:
-        """`outcome` of the replays, `lateness` of each sensor, and `ledger`, where it was asked for."""
+        """Tables `outcome` of the replays and `lateness` of each sensor; `ledger` if requested."""
         own = {} if self.ledger is None else {"ledger": self.ledger}
         return Tables(
             {"outcome": self._outcome(), "lateness": self._lateness(), **own},
@@ -86,7 +86,7 @@ class Advice:
             | {column: values.get(name) for column, values in rows.items()}
             for name in names
         ]
-        title = "Replays with the settings before and as advised"
+        title = "Replays with the given and the advised settings"
         return Table(
             title,
             records,
@@ -105,7 +105,7 @@ class Advice:
                 "delay_max_s": float(item.delays_s[item.usable].max()),
                 "overtaken": self.overtaken[item.name],
                 "object_late": item.object_late,
-                "lost": item.lost,
+                "lost": item.lost_share,
             }
             for item in self.arrivals
         ]
@@ -124,11 +124,11 @@ class Advice:
             Column("lost\n[%]", "lost", scale=100.0),
         ]
         return Table(
-            "Lists by sensor, with the stamps advised", records, columns, ("sensor",)
+            "Lists by sensor, with the advised stamps", records, columns, ("sensor",)
         )
 
     def as_dict(self) -> dict[str, object]:
-        """Plain values for JSON."""
+        """Return plain values for JSON."""
         return {
             "recording": self.recording,
             "findings": [asdict(item) for item in self.findings],
@@ -142,13 +142,13 @@ class Advice:
         }
 
     def comments(self) -> list[str]:
-        """Return the reason of each changed setting, and what no setting corrects."""
+        """Return lines with the reason of each changed setting, and the findings without a setting."""
         changes = [f"{one.key} = {one.value}: {one.reason}" for one in self.changes]
         rest = [str(one) for one in self.findings if not one.settings]
         lines = _wrapped(changes) if changes else ["Nothing is changed."]
         return [
             *lines,
-            *(["", "Without a setting that corrects it:"] if rest else []),
+            *(["", "No setting corrects these findings:"] if rest else []),
             *_wrapped(rest),
         ]
 
@@ -161,5 +161,5 @@ def _wrapped(texts: Sequence[str]) -> list[str]:
 
 
 def rounded_ms(value: Value) -> str:
-    """Whole milliseconds; of a recorder with another clock than the sensor nothing."""
+    """Return whole milliseconds; no value if the sensor's clock is unrelated to that of the recorder."""
     return f"{value:.0f}" if abs(float(value)) < 1e3 * OTHER_CLOCK_S else NO_VALUE

@@ -1,7 +1,8 @@
-"""Paired replays: squared errors of any estimator, noise and order of arrival on the measurements of one association.
+"""Paired replays: squared errors of different estimators on the measurements of one association.
 
-The association is that of a run of the replaying EKF. Each replay repeats the same measurements of the same tracks from
-the same first states, so that differences are of estimation alone.
+The association comes from a run of the replaying EKF. Each replay repeats the same
+measurements of the same tracks from the same first states. So differences come from the
+estimation alone: the estimator, the noise, and the order of arrival.
 """
 
 import math
@@ -27,27 +28,26 @@ from fgtrack.runs import Run
 from fgtrack.tracking.guarded_bank import GuardedBank
 
 REPLAY = "ekf-replay"
-"""Estimator whose association is repeated."""
-_SETTLE_NS, _STEP_NS = (
-    NS_PER_S,
-    NS_PER_S // 20,
-)  # a track is judged from an age on, and so often
+"""Estimator of the run whose association is repeated."""
+# Age from which a track is assessed, and time between two assessed ticks.
+_SETTLE_NS = NS_PER_S
+_STEP_NS = NS_PER_S // 20
 Arrival = Callable[[BankCall], int | None]
-"""Gives the time from which on measurements count; None for never."""
+"""Function that returns the time at which measurements arrive; None if they never do."""
 
 
 def as_received(item: BankCall) -> int:
-    """Return the tick that first had the measurements."""
+    """Return the tick at which the measurements were first available."""
     return item.now_ns
 
 
 def at_stamp(item: BankCall) -> int:
-    """Return the stamp of the measurements, as if nothing were late."""
+    """Return the stamp of the measurements, as if they had no delay."""
     return item.stamp_ns
 
 
 class PairedReplay:
-    """The association of a run of the replaying EKF, and squared errors of every way to estimate from it."""
+    """Association of a run of the replaying EKF, and squared errors of other estimators on it."""
 
     def __init__(
         self, bank: RecordingBank, run: Run, config: Config, until_s: float = math.inf
@@ -58,11 +58,13 @@ class PairedReplay:
         ]
         if not len(now_ns) or not bank.calls:
             raise DataError(
-                "no track in this recording: `fgtrack advise` gives the reason"
+                "no track in this recording; run `fgtrack advise` for the reason"
             )
         self.calls = [item for item in bank.calls if item.now_ns <= now_ns[-1]]
-        """Measurements of the association, in the order in which they came."""
-        self.run, self.config, self._now_ns = run, config, now_ns
+        """Births and measurements of the association, in order of arrival."""
+        self.run = run
+        self.config = config
+        self._now_ns = now_ns
         grid = np.searchsorted(now_ns, np.arange(now_ns[0], now_ns[-1] + 1, _STEP_NS))
         self._ticks = np.unique(grid[grid < len(now_ns)])
         self._births = {
@@ -79,12 +81,18 @@ class PairedReplay:
 
     @classmethod
     def of(cls, messages: Sequence[Message], config: Config) -> "PairedReplay":
-        """Return that of a recording. Raises `DataError` where nothing is tracked."""
+        """Replay a recording and return its association.
+
+        Raises `DataError` if nothing is tracked.
+        """
         return cls(*recorded_bank(messages, replace(config, estimator=REPLAY)), config)
 
     @cached_property
     def objects(self) -> IntArray | None:
-        """Object of each judged tick and track; `NO_OBJECT` without one. None without truth."""
+        """Index of the true object at each assessed tick and track; `NO_OBJECT` without one.
+
+        None for a recording without truth.
+        """
         matching = match(self.run)
         if matching is None:
             return None
@@ -97,8 +105,12 @@ class PairedReplay:
         return full[self._ticks]
 
     def _true_m(self, wait_ns: int) -> FloatArray:
-        """True positions at each judged tick, so long ago, (ticks, tracks, 2)."""
-        objects, at_ns = self.objects, self._now_ns[self._ticks] - wait_ns
+        """True positions `wait_ns` before each assessed tick, shape (ticks, tracks, 2).
+
+        NaN for a track without an object.
+        """
+        objects = self.objects
+        at_ns = self._now_ns[self._ticks] - wait_ns
         result = np.full((len(self._ticks), len(self._columns), 2), np.nan)
         if objects is not None:
             for index, path in enumerate(true_paths(self.run.tables["truth"])):
@@ -113,8 +125,10 @@ class PairedReplay:
         arrival: Arrival = as_received,
         waits_s: Sequence[float] = (0.0,),
     ) -> list[FloatArray]:
-        """Squared position errors of the states so long ago, (judged ticks, tracks) each.
-        Without truth the predicted variances stand for them.
+        """Return squared position errors of the states `waits_s` ago, each of shape (ticks, tracks).
+
+        The ticks are the assessed ones. Without truth, predicted variances replace the
+        squared errors.
         """
         events = [
             (at_ns, item) for item in self.calls if (at_ns := arrival(item)) is not None
@@ -126,11 +140,9 @@ class PairedReplay:
                 not pair[1].start,
             )
         )
-        own, failures, waiting = (
-            replace(config, estimator=estimator),
-            Failures(),
-            iter([*events, (0, None)]),
-        )
+        own = replace(config, estimator=estimator)
+        failures = Failures()
+        waiting = iter([*events, (0, None)])
         bank = GuardedBank(lambda: build_bank(own, failures), failures)
         waits = [
             (nanoseconds(wait_s), self._true_m(nanoseconds(wait_s)))
@@ -184,17 +196,18 @@ class PairedReplay:
             bank.update(item.stamp_ns, *zip(*chosen, strict=True))
 
     def _measurement(self, observation: Observation, config: Config) -> Measurement:
-        """Return it with the noise of `config`, of which only the sensor's own standard deviations differ."""
+        """Return the measurement of `observation` with the noise of `config`.
+
+        Only standard deviations of the sensor can differ from the noise of the run.
+        """
         before, after = (
             each.sensors[observation.sensor].std for each in (self.config, config)
         )
         if before == after or not observation.tuned:
             return observation.measurement
-        item, T, measured = (
-            observation.measurement,
-            observation.axes,
-            list(observation.measured),
-        )
+        item = observation.measurement
+        T = observation.axes
+        measured = list(observation.measured)
         names = [item.model.components[index] for index in measured]
         R = item.R.copy()
         R[np.ix_(measured, measured)] += congruence(
@@ -203,18 +216,18 @@ class PairedReplay:
         return replace(item, R=R)
 
     def published(self, run: Run) -> FloatArray:
-        """Squared errors that `run` itself publishes at the judged ticks, of the same objects; there must be truth."""
+        """Return the squared errors that `run` itself publishes at the assessed ticks, of the same objects.
+
+        The recording must have truth.
+        """
         matching = match(run)
         assert matching is not None
         assert self.objects is not None
-        paired, squares = (
-            np.flatnonzero(matching.paired),
-            np.square(track_errors(matching).values["position_m"]),
-        )
+        paired = np.flatnonzero(matching.paired)
+        squares = np.square(track_errors(matching).values["position_m"])
+        # NO_OBJECT selects the last column, which is always NaN.
         by_object = np.full(
             (len(matching.now_ns), len(matching.object_ids) + 1), np.nan
         )
         by_object[matching.tick_index[paired], matching.object_index[paired]] = squares
-        return np.take_along_axis(
-            by_object[self._ticks], self.objects, axis=1
-        )  # NO_OBJECT takes the last column
+        return np.take_along_axis(by_object[self._ticks], self.objects, axis=1)

@@ -1,4 +1,4 @@
-"""A starting configuration for a recording without one: its topics or tables, what each probably is, and why."""
+"""Starting configuration for a recording without one: guesses for its topics or tables, with the reasons."""
 
 import json
 import math
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from ruamel.yaml import YAML
 
-from fgtrack.advice.trial import TRIAL_S, beginning, suspicions
+from fgtrack.advice.trial import TRIAL_S, input_checks, messages_within
 from fgtrack.config.settings import Config
 from fgtrack.config.yaml_file import validate
 from fgtrack.core.errors import DataError, FgtrackError
@@ -40,7 +40,9 @@ from fgtrack.pipeline.assumptions.assumption import Assumed, departures
 
 __all__ = ["starting_config"]
 
-_ROWS, _MESSAGES = 20_000, 20  # that are looked at: of a table, of a topic
+# Number of rows of a table, and of messages of a topic, on which a guess is based.
+_ROWS = 20_000
+_MESSAGES = 20
 _EGO = frozenset(("ego", "own", "ownship", "host", "self"))
 _TRUTH = frozenset(
     (
@@ -89,16 +91,17 @@ _NEEDED = {"ego": {"x_m", "y_m", "yaw_rad", "speed_mps"}, "truth": {"x_m", "y_m"
 
 
 @dataclass(frozen=True)
-class Part:
-    """A topic or a table and what it is taken as."""
+class InputPart:
+    """Guess for a topic or a table: its role, its settings, and the reasons."""
 
     role: str
     """`ego`, `truth`, or the name of a sensor."""
     item: TopicInput | CsvTable
+    """Settings of the topic or table."""
     reasons: Mapping[str, str]
-    """By component."""
+    """Reason of each guess, by setting or component."""
     notes: tuple[str, ...] = ()
-    """Fields that nothing is taken from, and settings to look at."""
+    """Notes on unused fields, and on settings to check."""
 
     @property
     def label(self) -> str:
@@ -110,8 +113,11 @@ class Part:
         )
 
 
-def _topic_part(bag: Bag, topic: TopicInfo, parts: Sequence[Part]) -> Part:
-    """Return what `topic` is taken as, beside other `parts`; raises `DataError` with the reason where it is not."""
+def _topic_part(bag: Bag, topic: TopicInfo, parts: Sequence[InputPart]) -> InputPart:
+    """Return the guess for `topic` in addition to the other `parts`.
+
+    Raises `DataError` with the reason if the topic cannot be used.
+    """
     words = set(words_of(topic.name))
     is_truth = bool(words & _TRUTH and not words & _EGO)
     has_clock = topic.delay is None or abs(topic.delay["p50_s"]) < OTHER_CLOCK_S
@@ -131,7 +137,7 @@ def _topic_part(bag: Bag, topic: TopicInfo, parts: Sequence[Part]) -> Part:
         raise DataError(problem or "no messages")
     sensor = _sensor_name(topic.name, parts)
     if topic.type == ODOMETRY or topic.type in ADAPTERS:
-        return Part(
+        return InputPart(
             "truth" if is_truth else "ego" if topic.type == ODOMETRY else sensor,
             item,
             reasons,
@@ -142,8 +148,11 @@ def _topic_part(bag: Bag, topic: TopicInfo, parts: Sequence[Part]) -> Part:
     return replace(part, reasons={**reasons, **part.reasons})
 
 
-def _mapped(bag: Bag, item: TopicInput, type_name: str, sensor: str) -> Part:
-    """Return the guess for a topic of an unknown type; raises `DataError` with a line of what is in it."""
+def _mapped(bag: Bag, item: TopicInput, type_name: str, sensor: str) -> InputPart:
+    """Return the guess for a topic of an unknown message type.
+
+    Raises `DataError` with the ranges of its fields if it has no position.
+    """
     messages = [
         one
         for topic, _, one in islice(bag.messages({item.topic}), _MESSAGES)
@@ -154,7 +163,7 @@ def _mapped(bag: Bag, item: TopicInput, type_name: str, sensor: str) -> Part:
     for path, items in chain.from_iterable(each.items() for each in result):
         if isinstance(items, list):
             lists.setdefault(path, []).extend(map(fields_of, items))
-    lists[""] = result  # the message itself, the last choice
+    lists[""] = result  # the message itself is tried last
     for path, samples in lists.items():
         values = _columns(samples)
         own = guesses(values)
@@ -185,7 +194,7 @@ def _mapped(bag: Bag, item: TopicInput, type_name: str, sensor: str) -> Part:
             notes += (
                 "one object per message: set scan_s to put those of a scan together",
             )
-        return Part(
+        return InputPart(
             "ego" if is_ego else sensor, replace(item, fields=fields), reasons, notes
         )
     raise DataError(
@@ -194,7 +203,7 @@ def _mapped(bag: Bag, item: TopicInput, type_name: str, sensor: str) -> Part:
 
 
 def _columns(samples: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:
-    """Numbers by name; none of a text."""
+    """Return the numbers of the samples by field name; empty for a text field."""
     names = dict.fromkeys(
         name
         for item in samples
@@ -211,7 +220,7 @@ def _columns(samples: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:
     }
 
 
-def _sensor_name(text: str, parts: Sequence[Part]) -> str:
+def _sensor_name(text: str, parts: Sequence[InputPart]) -> str:
     words = words_of(text)
     name = (
         "_".join([word for word in words if word not in _GENERAL] or words) or "sensor"
@@ -225,9 +234,12 @@ def _sensor_name(text: str, parts: Sequence[Part]) -> str:
 
 
 def _table_part(
-    file: Path, columns: Sequence[str], is_folder: bool, parts: Sequence[Part]
-) -> Part:
-    """Return the guess for a table beside other `parts`; raises `DataError` with a line of what is in it."""
+    file: Path, columns: Sequence[str], is_folder: bool, parts: Sequence[InputPart]
+) -> InputPart:
+    """Return the guess for a table in addition to the other `parts`.
+
+    Raises `DataError` with the ranges of its columns if the table cannot be used.
+    """
     cells = [cells for _, cells in islice(rows(file), 1, _ROWS)]
     values = {
         name: [_number(item[name]) for item in cells]
@@ -241,7 +253,8 @@ def _table_part(
         }
     )
     words = set(words_of(file.stem))
-    is_truth, is_ego = bool(words & _TRUTH and not words & _EGO), bool(words & _EGO)
+    is_truth = bool(words & _TRUTH and not words & _EGO)
+    is_ego = bool(words & _EGO)
     is_ego |= not (is_truth or "object_id" in own) and _NEEDED["ego"] <= own.keys()
     role = "ego" if is_ego else "truth" if is_truth else _sensor_name(file.stem, parts)
     if "stamp" not in own:
@@ -285,7 +298,7 @@ def _table_part(
         "time_unit": why,
         "frame": "east and north",
     }
-    return Part(role, table, reasons, _unused(values, used))
+    return InputPart(role, table, reasons, _unused(values, used))
 
 
 def _number(text: str) -> float:
@@ -298,7 +311,7 @@ def _number(text: str) -> float:
 def _unused(
     values: Mapping[str, Sequence[float]], used: Mapping[str, Guess]
 ) -> tuple[str, ...]:
-    """Return a note on the fields or columns that are not `used`; none without any."""
+    """Return a note on the fields or columns that are not `used`; empty if all are used."""
     paths = [
         item.path.path if isinstance(item.path, Field) else item.path
         for item in used.values()
@@ -321,8 +334,10 @@ def _spreads(values: Mapping[str, Sequence[float]]) -> str:
 
 
 def starting_config(recording: Path) -> str:
-    """YAML text of a configuration for `recording`: what can be taken as settings, all else as comments.
-    Raises `CallError` where nothing is there, and `DataError` where it is not an input, or damaged from the start.
+    """Return the YAML text of a starting configuration for `recording`, with everything else as comments.
+
+    Raises `CallError` if the path does not exist. Raises `DataError` if it is not an
+    input, or damaged at its start.
     """
     parts, refused = _parts(recording)
     taken = _readable(recording, parts, refused)
@@ -333,21 +348,20 @@ def starting_config(recording: Path) -> str:
         with_sensors = assumed(config, source)
         checks += map(
             str,
-            suspicions(
-                list(beginning(source.messages(), nanoseconds(TRIAL_S))),
+            input_checks(
+                list(messages_within(source.messages(), nanoseconds(TRIAL_S))),
                 with_sensors.config,
             ),
         )
     except FgtrackError as error:
-        checks += (
-            [str(error)] if taken else []
-        )  # else of a recording in which nothing can be taken
+        if taken:  # without any part the error only repeats this
+            checks.append(str(error))
     head = [
         f"Starting configuration for {recording.name} (fgtrack info --write)",
-        "Guesses from names and values: check units, frames and noise, then",
+        "Guesses from names and values: check units, frames and noise, then run",
         f"  fgtrack info {recording} -c THIS.yaml; fgtrack replay {recording} -c THIS.yaml -o RUN",
         *(f"Check: {line}" for line in checks),
-        *(f"Not taken: {line}" for line in refused),
+        *(f"Not used: {line}" for line in refused),
         *(f"{part.label}: {note}" for part in taken for note in part.notes),
     ]
     text = with_sensors.to_yaml(
@@ -361,11 +375,14 @@ def starting_config(recording: Path) -> str:
     return text
 
 
-def _parts(recording: Path) -> tuple[list[Part], list[str]]:
-    """Return the parts of the recording with a guess, the likeliest ego first, and a line for each other part."""
-    parts: list[Part] = []
+def _parts(recording: Path) -> tuple[list[InputPart], list[str]]:
+    """Return the guesses for the parts of the recording, and a line for each other part.
+
+    The most probable ego comes first.
+    """
+    parts: list[InputPart] = []
     refused: list[str] = []
-    makers: dict[str, Callable[[], Part]] = {}
+    makers: dict[str, Callable[[], InputPart]] = {}
     if input_kind(recording) == "csv":
         is_folder = recording.is_dir()
         for file, columns in headers(recording).items():
@@ -392,30 +409,35 @@ def _parts(recording: Path) -> tuple[list[Part], list[str]]:
     ), refused
 
 
-def _readable(recording: Path, parts: Sequence[Part], refused: list[str]) -> list[Part]:
-    """Return the parts of which a first message can be read, each role once; `refused` gets lines on the others."""
-    taken: list[Part] = []
+def _readable(
+    recording: Path, parts: Sequence[InputPart], refused: list[str]
+) -> list[InputPart]:
+    """Return the parts whose first message can be read, one for each role.
+
+    Appends a line to `refused` for each of the other parts.
+    """
+    taken: list[InputPart] = []
     for part in parts:
-        what = f"{part.label} as {part.role}"
+        guess = f"{part.label} as {part.role}"
         if any(part.role == other.role for other in taken):
-            refused.append(
-                f"{what}: there is another one, {json.dumps(departures(part.item))}"
-            )
+            settings = json.dumps(departures(part.item))
+            refused.append(f"{guess}: another part has this role; settings {settings}")
             continue
         try:
             next(iter(open_input(recording, _input([part])).messages()), None)
             taken.append(part)
         except FgtrackError as error:
-            refused.append(f"{what}: {error}")
+            refused.append(f"{guess}: {error}")
     return taken
 
 
-def _input(parts: Sequence[Part]) -> InputConfig:
+def _input(parts: Sequence[InputPart]) -> InputConfig:
     tables = {part.role: part.item for part in parts if isinstance(part.item, CsvTable)}
     topics = {
         part.role: part.item for part in parts if isinstance(part.item, TopicInput)
     }
-    ego, truth = tables.pop("ego", None), tables.pop("truth", None)
+    ego = tables.pop("ego", None)
+    truth = tables.pop("truth", None)
     return InputConfig(
         ego=topics.pop("ego", None),
         truth=topics.pop("truth", None),
@@ -424,10 +446,10 @@ def _input(parts: Sequence[Part]) -> InputConfig:
     )
 
 
-def _comments(part: Part) -> Iterator[tuple[Sequence[str], str]]:
-    """Yield paths of keys, and the reasons of their guesses."""
+def _comments(part: InputPart) -> Iterator[tuple[Sequence[str], str]]:
+    """Yield the key path and the reason of each guess."""
     is_table = isinstance(part.item, CsvTable)
-    of = [
+    section = [
         *(["csv"] if is_table else []),
         *(["detections"] if part.role not in ("ego", "truth") else []),
         part.role,
@@ -437,7 +459,7 @@ def _comments(part: Part) -> Iterator[tuple[Sequence[str], str]]:
         yield (
             [
                 "input",
-                *of,
+                *section,
                 *([] if name in own else ["columns" if is_table else "fields"]),
                 name,
             ],

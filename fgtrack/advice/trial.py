@@ -1,4 +1,4 @@
-"""The first seconds of an input as a configuration reads them: what is suspicious, and the first of each message."""
+"""Checks of the first seconds of an input: probable errors in its configuration, and the first messages."""
 
 import math
 from collections import Counter, defaultdict
@@ -22,18 +22,23 @@ from fgtrack.evaluation.diagnostics import excluded_lines
 from fgtrack.models.measurement import ANGULAR
 from fgtrack.models.sensors import SensorModel
 
-__all__ = ["TRIAL_S", "beginning", "passing", "samples", "suspicions"]
+__all__ = [
+    "TRIAL_S",
+    "messages_within",
+    "counted_lines",
+    "first_contents",
+    "input_checks",
+]
 
 TRIAL_S = 5.0
 _SHOWN = (*MEASURABLE, "yaw_rate_radps", *DESCRIBING, "object_id")
-_FAR_M, _NEARER = (
-    250.0,
-    0.3,
-)  # what is so far, and so much nearer in another frame, is in that one
+# Detections at a larger distance, which are nearer by this factor in the other frame, are in the other frame.
+_FAR_M = 250.0
+_NEARER = 0.3
 
 
-def beginning(messages: Iterable[Message], duration_ns: int) -> Iterator[Message]:
-    """The messages of the first time."""
+def messages_within(messages: Iterable[Message], duration_ns: int) -> Iterator[Message]:
+    """Yield the messages that are received within `duration_ns` of the first one."""
     iterator = iter(messages)
     first = next(iterator, None)
     if first is not None:
@@ -44,8 +49,8 @@ def beginning(messages: Iterable[Message], duration_ns: int) -> Iterator[Message
         )
 
 
-def suspicions(messages: Sequence[Message], config: Config) -> Iterator[Diagnostic]:
-    """Yield probable errors in how `messages` are read, with the cure."""
+def input_checks(messages: Sequence[Message], config: Config) -> Iterator[Diagnostic]:
+    """Yield probable errors in the reading of `messages`, with the setting to change."""
     egos = [message for message in messages if isinstance(message, EgoState)]
     lists: dict[str, list[DetectionList]] = {}
     for message in messages:
@@ -60,7 +65,7 @@ def suspicions(messages: Sequence[Message], config: Config) -> Iterator[Diagnost
         if any(each.frame != "map" for each in result)
     )
     if relative and not egos:
-        text = f"no state is read, but {relative[0]} is relative to it: name its topic (input.ego)"
+        text = f"no ego state is read, but {relative[0]} is relative to the ego: set its topic (input.ego)"
         yield Diagnostic(EGO, text, is_blocking=True)
     if egos and not any(ego.stamp_ns for ego in egos):
         yield Diagnostic(
@@ -74,17 +79,15 @@ def suspicions(messages: Sequence[Message], config: Config) -> Iterator[Diagnost
     )
     for name in sorted(set(config.sensors) - set(lists)):
         if name in (config.input.detections or config.input.csv.detections):
-            yield Diagnostic(name, "sends nothing in the first seconds")
+            yield Diagnostic(name, "no message in the first seconds")
     for name, result in sorted(lists.items()):
-        sensor, objects = (
-            config.sensors.get(name),
-            [item for each in result for item in each.objects],
-        )
+        sensor = config.sensors.get(name)
+        objects = [item for each in result for item in each.objects]
         if not any(each.stamp_ns for each in result) and (
             sensor is None or sensor.stamp_from != "receipt"
         ):
             key = f"sensors.{name}.stamp_from"
-            text = f"all stamps are 0: set `stamp_from: receipt` on its topic, or {key}; nothing is known of its delay"
+            text = f"all stamps are 0: set `stamp_from: receipt` on its topic, or {key}; its delay is unknown"
             yield Diagnostic(name, text, {key: "receipt"}, is_blocking=True)
         yield from _degrees(name, objects)
         yield from _frames(name, result, egos)
@@ -113,7 +116,7 @@ def _degrees(
 def _frames(
     name: str, lists: Sequence[DetectionList], egos: Sequence[EgoState]
 ) -> Iterator[Diagnostic]:
-    """Yield an error where positions are far away in their frame, and near in the other one."""
+    """Yield an error if positions are far away in the configured frame, but near in the other frame."""
     points = [
         (each.stamp_ns, item.x_m, item.y_m)
         for each in lists
@@ -136,13 +139,13 @@ def _frames(
     own_m, other_m = (from_ego_m, bare_m) if frame == "map" else (bare_m, from_ego_m)
     if own_m > _FAR_M and other_m < _NEARER * own_m:
         text = (
-            f"is read as relative to the {frame}, {bare_m:.0f} m away, but its numbers lie {from_ego_m:.0f} m from "
-            "where the ego is in the map: set `frame: map`"
+            f"detections are read in the frame {frame}, {bare_m:.0f} m away; as map coordinates they are "
+            f"{from_ego_m:.0f} m from the ego: set `frame: map`"
         )
         if frame == "map":
             text = (
-                f"is read as in the map, {from_ego_m:.0f} m from the ego, but its numbers are small ({bare_m:.0f} m): "
-                "set `frame: ego` (or sensor)"
+                f"detections are read in the map, {from_ego_m:.0f} m from the ego, but their coordinates are small "
+                f"({bare_m:.0f} m): set `frame: ego` (or sensor)"
             )
         yield Diagnostic(name, text, is_blocking=True)
 
@@ -157,20 +160,20 @@ def _measured(
             ", ".join(component for component in MEASURABLE if component in given)
             or "nothing"
         )
-        what = f"{', '.join(missing)} of its std, but {has}"
-        yield Diagnostic(
-            name, f"never measures {what}: change sensors.{name}.std or the fields"
-        )
+        text = f"never measures {', '.join(missing)} in its std, only {has}: change sensors.{name}.std or the fields"
+        yield Diagnostic(name, text)
 
 
-def passing(messages: Iterable[Message], config: Config) -> Iterator[str]:
-    """Yield lines on the detections of each sensor, and on those that filters exclude."""
-    counts, out, left_out = (defaultdict[str, Counter[str]](Counter) for _ in range(3))
+def counted_lines(messages: Iterable[Message], config: Config) -> Iterator[str]:
+    """Yield a line on the number of detections of each sensor, and lines on the detections that filters exclude."""
+    counts = defaultdict[str, Counter[str]](Counter)
+    filtered = defaultdict[str, Counter[str]](Counter)
+    left_out = defaultdict[str, Counter[str]](Counter)
     for message in messages:
         if isinstance(message, DetectionList):
             sensor = config.sensors[message.sensor]
             counts[message.sensor] += Counter(lists=1, detections=len(message.objects))
-            out[message.sensor].update(
+            filtered[message.sensor].update(
                 f"filters.{name}"
                 for item in message.objects
                 if (name := sensor.refusing_filter(item))
@@ -182,7 +185,11 @@ def passing(messages: Iterable[Message], config: Config) -> Iterator[str]:
         name: {"detections": count["detections"]} for name, count in counts.items()
     }
     yield from excluded_lines(
-        {"counts": detections, "out_of_bounds": _any(out), "left_out": _any(left_out)}
+        {
+            "counts": detections,
+            "out_of_bounds": _any(filtered),
+            "left_out": _any(left_out),
+        }
     )
 
 
@@ -190,24 +197,20 @@ def _any(counts: Mapping[str, Counter[str]]) -> dict[str, Counter[str]]:
     return {name: count for name, count in counts.items() if count}
 
 
-def samples(messages: Sequence[Message]) -> dict[str, str]:
-    """Return the contents of the first message of everything, by `ego`, `truth` and the names of sensors."""
+def first_contents(messages: Sequence[Message]) -> dict[str, str]:
+    """Return the content of the first message of the ego, the truth and each sensor, as text by name."""
     result: dict[str, str] = {}
     for message in messages:
-        name, of = (
-            "truth" if isinstance(message, TruthState) else "ego",
-            list[Message | Detection]([message]),
-        )
+        name = "truth" if isinstance(message, TruthState) else "ego"
+        items = list[Message | Detection]([message])
         if isinstance(message, DetectionList):
-            name, of = (
-                f"{message.sensor} (in the frame {message.frame})",
-                list(message.objects),
-            )
-        if of and name not in result:
+            name = f"{message.sensor} (in the frame {message.frame})"
+            items = list(message.objects)
+        if items and name not in result:
             values = {
                 key: value
                 for key in _SHOWN
-                if (value := getattr(of[0], key, None)) is not None
+                if (value := getattr(items[0], key, None)) is not None
             }
             texts = (
                 f"{key} {one:.6g}" if isinstance(one, float) else f"{key} {one}"

@@ -12,7 +12,13 @@ from typer import Option
 from fgtrack.advice.advise import advise as advised
 from fgtrack.advice.page import rounded_ms
 from fgtrack.advice.starting import starting_config
-from fgtrack.advice.trial import TRIAL_S, beginning, passing, samples, suspicions
+from fgtrack.advice.trial import (
+    TRIAL_S,
+    counted_lines,
+    first_contents,
+    input_checks,
+    messages_within,
+)
 from fgtrack.cli.arguments import (
     ConfigFile,
     Input,
@@ -118,15 +124,15 @@ def _try_out(recording: Path, config: Config) -> str | None:
         result = assumed(config, source)
         build_road(result.config.map, result.config.defects)  # its files are there
         readable = UntilBreak(source.messages())
-        messages = list(beginning(readable, nanoseconds(TRIAL_S)))
+        messages = list(messages_within(readable, nanoseconds(TRIAL_S)))
         feed = Feed(messages, result.config)
         received = list(feed)
     sentences(result.lines())
-    for name, text in samples(messages).items():
+    for name, text in first_contents(messages).items():
         say(f"first of {name}: {text}")
-    for line in passing(received, result.config):
+    for line in counted_lines(received, result.config):
         say(f"first {TRIAL_S:g} s of {line}")
-    for item in suspicions(messages, result.config) if messages else ():
+    for item in input_checks(messages, result.config) if messages else ():
         warn(str(item))
     return feed.broken if readable.error is None else str(readable.error)
 

@@ -133,7 +133,7 @@ def _sensors(report: TuneReport) -> list[str]:
         "of the sensor that is trusted more, and white noise is too small for them"
         for run in report.runs
         for one in noise_fits(run)
-        if one.lasts
+        if one.is_correlated
     ]
     settled = "" if report.settled else ", not settled"
     lines.append(f"{report.num_tracks} tracks, {report.rounds} associations{settled}")

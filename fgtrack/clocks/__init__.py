@@ -1,1 +1,1 @@
-"""Clocks of sensors: arrivals of lists, validity of stamps, offsets between clocks."""
+"""Clocks of the sensors: arrival of their lists, validity of their stamps, offsets between their clocks."""

@@ -1,18 +1,24 @@
-"""Clock offsets of sensors: against the truth of a recording, else against one of them.
+"""Clock offsets of sensors, against the truth of a recording or against a reference sensor.
 
-With the path p(t) of an object in the map and T(t) = map_from_ego, a detection z of the object, stamped s, leaves at
-the offset d
+Let p(t) be the path of an object in the map, T(t) = map_from_ego, and z a detection of
+the object with stamp s. At the offset d the residual is
 
     r(d) = p(s - d) - T(s - d) z = r(0) + d r'(0) + ...
 
-r' is minus the velocity of the object against the turning ego. d is estimated by Gauss-Newton, with Huber weights. The
-path is that of the truth, or a smoothing spline through the detections of a reference sensor. With truth a constant
-bias is estimated, too, along and across the motion of the object or of the ego, the one with the smaller residuals.
-Where the velocity hardly changes, bias and offset cannot be distinguished, and the offset is not known.
+r' is the negative velocity of the object relative to the ego frame. Gauss-Newton with
+Huber weights estimates d. The path is the truth, or a smoothing spline through the
+detections of the reference sensor.
 
-The standard deviation of d is that of the jackknife over stretches of time, so it includes time-correlated errors
-(Bell, McCaffrey, Survey Methodology 28, 2002). d over it follows Student's t with one degree of freedom less than
-stretches count, the larger ones more (Carter, Schnepel, Steigerwald, Review of Economics and Statistics 99, 2017).
+With truth, a constant bias is estimated too. Its axes are along and across the motion
+of the object, or those of the ego; the axes with the smaller residuals are used. Where
+the velocity hardly changes, bias and offset cannot be separated, and the offset stays
+unknown.
+
+The standard deviation of d is a jackknife over stretches of time. So it includes
+time-correlated errors (Bell and McCaffrey, Survey Methodology 28, 2002). The ratio of d
+to it follows Student's t distribution. Its degrees of freedom are the effective number
+of stretches minus 1, where larger stretches count more (Carter, Schnepel and
+Steigerwald, Review of Economics and Statistics 99, 2017).
 """
 
 import itertools
@@ -52,73 +58,83 @@ __all__ = [
 ]
 
 TRUTH = "truth"
-"""Name of the reference where offsets are those against the truth."""
-_FEWEST, _MOST = 30, 2000  # detections of a sensor
-_NEAR_M = (
-    20.0  # a track is of the object whose path it is nearer to than this, in the median
-)
-_STEP_S = 0.01  # of differences
-_STRETCH_S, _STRETCHES, _FEWEST_STRETCHES = 5.0, 12, 4
+"""Name of the reference for offsets against the truth."""
+# Least and largest number of detections of a sensor in an estimate.
+_FEWEST = 30
+_MOST = 2000
+# Largest median distance between a track and the path of its object.
+_NEAR_M = 20.0
+# Time step of numerical derivatives.
+_STEP_S = 0.01
+# Length and number of the stretches of the jackknife.
+_STRETCH_S = 5.0
+_STRETCHES = 12
+_FEWEST_STRETCHES = 4
 _SHORTEST_STRETCH_S = 1.0
+# Iterations of Gauss-Newton, their largest step, and the largest offset.
 _ROUNDS = 10
+_LARGEST_STEP_S = 0.2
+_REACH_S = 1.0
+# Huber width in units of the median residual.
 _HUBER = 1.5
-_LARGEST_STEP_S, _REACH_S = 0.2, 1.0
-_BIAS_STDS, _SMALLEST_BIAS_M = (
-    4.0,
-    0.2,
-)  # a bias that is no chance, and that a calibration would find
-_SURE = 0.995  # an offset is accepted where 0 is outside of the 99 % interval of Student's t, if it matters
+# A bias is reported if it is significant, and large enough for a calibration.
+_BIAS_STDS = 4.0
+_SMALLEST_BIAS_M = 0.2
+# An offset is accepted if the 99 % interval of Student's t excludes 0.
+_SURE = 0.995
 SMALLEST_OFFSET_S = 0.01
 """A smaller offset does not matter."""
-_LARGEST_HALF_S = 0.05  # an interval that is wider leaves an offset unknown
+# An offset with a wider half interval is unknown.
+_LARGEST_HALF_S = 0.05
 RECEIPT_S = 1e-5
-"""Stamps that are nearer to the receipt are the receipt."""
+"""A stamp within this time of its receipt is the receipt."""
 
 _Pair = tuple[MeasuredPositions, ObjectPath]
 
 
 class Bias(NamedTuple):
-    """Constant error of the positions of a sensor, detections minus truth; 0 in a direction without one."""
+    """Constant position error of a sensor, detections minus truth; 0 along an axis without one."""
 
-    of: Literal["ego", "vehicle"]
-    """Whose directions are meant."""
+    frame: Literal["ego", "vehicle"]
+    """Frame of the error: of the ego, or of the observed vehicle."""
     ahead_m: float
     left_m: float
 
 
 @dataclass(frozen=True)
 class SensorOffset:
-    """Clock of one sensor: reported stamp = time at which it measured + offset."""
+    """Clock offset of one sensor: reported stamp = time of measurement + offset."""
 
     sensor: str
     offset_s: float | None
-    """None where nothing could be estimated."""
+    """Estimated offset; None if it cannot be estimated."""
     std_s: float | None
+    """Standard deviation of the offset; None without an offset."""
     num_detections: int
-    """Used in the estimate."""
+    """Number of detections in the estimate."""
     why: str
-    """A line on what the estimate rests on, or why there is none."""
+    """A line on the data behind the estimate, or the reason why there is no estimate."""
     dof: float | None = None
     """Degrees of freedom of `std_s`."""
     bias: Bias | None = None
-    """Of its positions against the truth; None where there is none, or no truth."""
+    """Position bias against the truth; None without a significant bias, or without truth."""
 
     @property
     def half_s(self) -> float | None:
-        """Half of the 95 % interval of the offset; None where there is none, or it is wider than the offset matters."""
+        """Half-width of the 95 % interval of the offset; None without an offset, or if it is very wide."""
         half_s = self._times_std_s(0.975)
         return half_s if half_s < 2.0 * _LARGEST_HALF_S else None
 
     @property
     def is_known(self) -> bool:
-        """True if the offset, which may be 0, is known."""
+        """True if the offset is known. A known offset may be 0."""
         return self.is_off or (
             self.half_s is not None and self.half_s < _LARGEST_HALF_S
         )
 
     @property
     def is_off(self) -> bool:
-        """True if the offset is no chance, and matters."""
+        """True if the offset is significant (99 %) and large enough to matter."""
         least_s = max(self._times_std_s(_SURE), SMALLEST_OFFSET_S)
         return (
             self.half_s is not None
@@ -154,22 +170,24 @@ class SensorOffset:
 
 @dataclass(frozen=True)
 class OffsetReport:
-    """Offsets of all sensors against the truth, or against the clock of one of them."""
+    """Clock offsets of all sensors, against the truth or against a reference sensor."""
 
     reference: str
-    """Name of that sensor, or `truth`."""
+    """Name of the reference sensor, or `truth`."""
     sensors: tuple[SensorOffset, ...]
     least_delays_s: Mapping[str, float]
-    """Shortest delay of each sensor: its stamps are not earlier than the truth by more than that."""
+    """Shortest delay of each sensor. Its stamps are early by at most this time."""
 
     @property
     def others(self) -> list[SensorOffset]:
-        """The sensors but the reference."""
+        """The sensors except the reference."""
         return [item for item in self.sensors if item.sensor != self.reference]
 
     def surely_late_s(self, one: SensorOffset) -> float | None:
-        """Return by how much the later one of two clocks is late at least; negative where it is that of the reference.
-        None where either clock may be wrong.
+        """Return the time by which the later of two clocks is late at least.
+
+        It is negative if the later clock is that of the reference. None if either clock
+        may be wrong.
         """
         if not one.is_off or one.offset_s is None or one.half_s is None:
             return None
@@ -185,13 +203,16 @@ class OffsetReport:
 
 
 class _Fit(NamedTuple):
-    """Solution of r + A x = 0, x = (offset, bias ahead and to the left)."""
+    """Solution x = (offset, bias ahead, bias left) of r + A x = 0.
+
+    Without truth x contains the offset alone.
+    """
 
     x: FloatArray
     std: FloatArray
-    """Standard deviations of x; infinite where nothing determines them."""
+    """Standard deviations of x; infinite where the data do not determine x."""
     dof: float
-    """Degrees of freedom of that of the offset."""
+    """Degrees of freedom of the standard deviation of the offset."""
     cost: float
     """Robust sum of squared residuals."""
 
@@ -203,20 +224,26 @@ def estimate_offsets(
     doubtful: Container[str] = (),
     run: Run | None = None,
 ) -> OffsetReport:
-    """Return the clock offsets of the sensors, from tracks that the tracker of `config` makes.
+    """Return the clock offsets of the sensors, estimated from the tracks of the tracker of `config`.
 
-    Without truth, or where `reference` is named, offsets are differences of two clocks. The reference is then the
-    sensor with most detections, but for those that are `doubtful` and those with a clock that must be wrong: nothing is
-    received before it was measured. Nothing is refused for its delay: a wrong stamp looks like one. `run` is one of
-    `messages` in which nothing was refused; without it they are replayed.
+    Without truth, or with a given `reference`, an offset is the difference of two
+    clocks. The default reference is the sensor with most detections. It is no
+    `doubtful` sensor, and no sensor with a late clock for certain: no list is received
+    before it was measured.
 
-    Raises `CallError` for an unknown reference, and `DataError` without detections or with fewer than five ego states.
+    No message is refused for its delay, because a wrong stamp looks like a delay. `run`
+    is a run of `messages` in which none was refused. Without it the messages are
+    replayed.
+
+    Raises `CallError` for an unknown reference. Raises `DataError` without detections,
+    or with fewer than five ego states.
     """
-    heard = [
+    corrected_messages = [
         corrected(item, config.sensors) if isinstance(item, DetectionList) else item
         for item in messages
     ]
-    unrefused = {  # corrected stamps are taken as they are, and none is too late
+    # The stamps are already corrected, and no message is too late.
+    unrefused = {
         name: replace(
             item,
             max_delay_s=None,
@@ -228,7 +255,7 @@ def estimate_offsets(
     config = replace(config, estimator="ekf-replay", sensors=unrefused)
     lists = [
         item
-        for item in heard
+        for item in corrected_messages
         if isinstance(item, DetectionList) and item.sensor in config.used_sensors
     ]
     arrivals = arrivals_of(lists)
@@ -236,31 +263,31 @@ def estimate_offsets(
     least_s = {name: float(item.delays_s.min()) for name, item in arrivals.items()}
     if not counts:
         raise DataError(
-            "there are no detections of a sensor that the configuration names (sensors)"
+            "no detections of a configured sensor; see `fgtrack info` for the sensors of the input"
         )
     if reference is not None and reference not in counts:
         hint = did_you_mean(reference, sorted(counts))
         raise CallError(
-            f"reference {reference!r} is no sensor of the input, which has {', '.join(sorted(counts))}{hint}"
+            f"reference {reference!r}: not a sensor of the input, use {', '.join(sorted(counts))}{hint}"
         )
     needs_ego = any(item.frame != "map" for item in lists)
-    run = replay_in_memory(heard, config) if run is None else run
-    poses = run.tables["ego"]  # where the tracker has the ego, as its tracks
+    run = replay_in_memory(corrected_messages, config) if run is None else run
+    poses = run.tables["ego"]  # the ego poses that the tracker used
     states = zip(*(poses[name].tolist() for name in COLUMNS["ego"]), strict=True)
     ego = EgoPath(itertools.starmap(EgoState, states)) if needs_ego else None
     seen = measured_positions(run, lists, config, ego)
     sensors = [name for name in config.sensors if name in counts]
 
-    def against(name: str, paths: Sequence[ObjectPath]) -> OffsetReport:
+    def offsets_against(name: str, paths: Sequence[ObjectPath]) -> OffsetReport:
         rows = []
         for sensor in sensors:
-            is_swapped = (
-                name != TRUTH and counts[sensor] > counts[name]
-            )  # the path of the better sensor is smoother
-            fixed, moved = (
-                (_paths(seen, sensor), name) if is_swapped else (paths, sensor)
+            # The path is taken from the sensor with more detections, as it is smoother.
+            is_swapped = name != TRUTH and counts[sensor] > counts[name]
+            fixed = _paths(seen, sensor) if is_swapped else paths
+            moved = name if is_swapped else sensor
+            row = _sensor_offset(
+                sensor, _paired(seen.get(moved, {}), fixed), name, len(sensors)
             )
-            row = _row(sensor, _paired(seen.get(moved, {}), fixed), name, len(sensors))
             rows.append(
                 replace(row, offset_s=-row.offset_s)
                 if is_swapped and row.offset_s is not None
@@ -269,22 +296,22 @@ def estimate_offsets(
         return OffsetReport(name, tuple(rows), least_s)
 
     if reference is None and (paths := true_paths(messages)):
-        return against(TRUTH, paths)
+        return offsets_against(TRUTH, paths)
     if reference is not None:
-        return against(reference, _paths(seen, reference))
+        return offsets_against(reference, _paths(seen, reference))
     placing = [
         name for name in sensors if config.sensors[name].gives_position and counts[name]
     ]
     trusted = [name for name in placing if name not in doubtful] or placing or sensors
     reference = max(sorted(trusted), key=counts.__getitem__)
-    report = against(reference, _paths(seen, reference))
+    report = offsets_against(reference, _paths(seen, reference))
     late = [
         item for item in report.sensors if (report.surely_late_s(item) or 0.0) < 0.0
     ]
     if not late or len(trusted) < len(placing):
         return report
     reference = max(late, key=lambda item: item.num_detections).sensor
-    return against(reference, _paths(seen, reference))
+    return offsets_against(reference, _paths(seen, reference))
 
 
 def _paths(
@@ -300,33 +327,35 @@ def _paths(
 def _paired(
     tracks: Mapping[int, MeasuredPositions], paths: Sequence[ObjectPath]
 ) -> list[_Pair]:
-    """Return each track that is near a path with the one that it is nearest to."""
+    """Return each track that is near a path, paired with the nearest path."""
     pairs = []
     for item in tracks.values():
         positions_m = item.at(item.stamps_ns)
-        best, best_m = None, _NEAR_M
+        best = None
+        best_m = _NEAR_M
         for path in paths:
             gaps_m = np.hypot(*(path(item.stamps_ns) - positions_m).T)
             if (
                 np.isfinite(gaps_m).sum() > len(gaps_m) / 2
                 and float(np.nanmedian(gaps_m)) < best_m
             ):
-                best, best_m = path, float(np.nanmedian(gaps_m))
+                best = path
+                best_m = float(np.nanmedian(gaps_m))
         if best is not None:
             pairs.append((item.chosen(np.isfinite(best(item.stamps_ns)[:, 0])), best))
     return pairs
 
 
-def _row(
+def _sensor_offset(
     name: str, pairs: Sequence[_Pair], reference: str, num_sensors: int
 ) -> SensorOffset:
     if num_sensors == 1 and reference != TRUTH:
         return SensorOffset(
-            name, None, None, 0, "the only modality: nothing to compare it with"
+            name, None, None, 0, "the only sensor: no other clock to compare with"
         )
     if name == reference:
         return SensorOffset(
-            name, 0.0, 0.0, 0, "the reference: its clock is taken for that of the ego"
+            name, 0.0, 0.0, 0, "the reference: its clock is assumed to be right"
         )
     count = sum(len(item.stamps_ns) for item, _ in pairs)
     if count < _FEWEST:
@@ -335,16 +364,17 @@ def _row(
     step = math.ceil(count / _MOST)
     pairs = [(item.chosen(slice(None, None, step)), path) for item, path in pairs]
     stamps_ns = np.concatenate([item.stamps_ns for item, _ in pairs])
-    offset_s, move_s = 0.0, math.inf
+    offset_s = 0.0
+    move_s = math.inf
     for _ in range(_ROUNDS):
         r, g, frames = _residuals(pairs, offset_s)
         if reference != TRUTH:
             frames = {"vehicle": np.empty((len(r), 2, 0))}
         fits = {
-            of: _solved(r, np.concatenate([g[:, :, None], axes], axis=2), stamps_ns)
-            for of, axes in frames.items()
+            frame: _solved(r, np.concatenate([g[:, :, None], axes], axis=2), stamps_ns)
+            for frame, axes in frames.items()
         }
-        of, fit = min(fits.items(), key=lambda item: round(item[1].cost, 6))
+        frame, fit = min(fits.items(), key=lambda item: round(item[1].cost, 6))
         move_s = float(np.clip(fit.x[0], -_LARGEST_STEP_S, _LARGEST_STEP_S))
         offset_s += move_s
         if abs(move_s) < 1e-4:
@@ -362,11 +392,12 @@ def _row(
         or math.isinf(fit.std[0])
     ):
         return SensorOffset(name, None, None, len(stamps_ns), why)
-    biases = [  # 0 where it may be chance or does not matter
+    # A bias that is not significant, or too small to matter, is 0.
+    biases = [
         bias_m if abs(bias_m) > max(_BIAS_STDS * std_m, _SMALLEST_BIAS_M) else 0.0
         for bias_m, std_m in zip(fit.x[1:].tolist(), fit.std[1:].tolist(), strict=True)
     ]
-    bias = Bias(of, *biases) if any(biases) else None
+    bias = Bias(frame, *biases) if any(biases) else None
     return SensorOffset(
         name, offset_s, float(fit.std[0]), len(stamps_ns), why, fit.dof, bias
     )
@@ -378,8 +409,12 @@ _Frames = dict[Literal["ego", "vehicle"], FloatArray]
 def _residuals(
     pairs: Sequence[_Pair], offset_s: float
 ) -> tuple[FloatArray, FloatArray, _Frames]:
-    """Return residuals at `offset_s`, their derivatives by it, (n, 2), and (n, 2, 2) axes in which a bias may stay."""
-    step_ns, rows = nanoseconds(_STEP_S), []
+    """Return residuals at `offset_s` (n, 2), their derivatives (n, 2), and axes of a bias (n, 2, 2).
+
+    The derivatives are with respect to the offset. The axes are given by frame.
+    """
+    step_ns = nanoseconds(_STEP_S)
+    rows = []
     for item, path in pairs:
         times_ns = item.stamps_ns - nanoseconds(offset_s)
         true_m = [path(times_ns + shift_ns) for shift_ns in (-step_ns, 0, step_ns)]
@@ -400,30 +435,38 @@ def _residuals(
     r, g, vehicle_rad, ego_rad = (
         np.concatenate(column) for column in zip(*rows, strict=True)
     )
-    frames: _Frames = (
-        {"ego": rotations(ego_rad)} if np.isfinite(ego_rad).any() else {}
-    )  # taken where both agree
-    return r, g, {**frames, "vehicle": rotations(vehicle_rad)}
+    # The ego frame comes first: it is chosen if both fit equally well.
+    frames: _Frames = {}
+    if np.isfinite(ego_rad).any():
+        frames["ego"] = rotations(ego_rad)
+    frames["vehicle"] = rotations(vehicle_rad)
+    return r, g, frames
 
 
 def _solved(r: FloatArray, A: FloatArray, stamps_ns: IntArray) -> _Fit:
-    """Return the robust solution of r + A x = 0, of residuals (n, 2) with derivatives (n, 2, k)."""
+    """Return the robust solution x of r + A x = 0.
+
+    `r` are residuals (n, 2), and `A` their derivatives (n, 2, k) at `stamps_ns` (n,).
+    """
     known = np.isfinite(r).all(axis=1) & np.isfinite(A).all(axis=(1, 2))
     r, A, stamps_ns = r[known], A[known], stamps_ns[known]
     size = A.shape[2]
     unknown = np.full(size, math.inf)
     if len(r) < _FEWEST:
         return _Fit(np.zeros(size), unknown, 0.0, math.inf)
-    x, H, weights, scale_m = np.zeros(size), np.eye(size), np.ones(len(r)), 1.0
+    x = np.zeros(size)
+    H = np.eye(size)
+    weights = np.ones(len(r))
+    scale_m = 1.0
     for _ in range(5):
         H = np.einsum("n,nij,nik->jk", weights, A, A) + 1e-9 * np.eye(size)
         x = -psd_solve(H, np.einsum("n,nij,ni->j", weights, A, r))
-        left_m = np.hypot(*(r + A @ x).T)
-        scale_m = max(float(np.median(left_m)), 1e-6)
-        weights = np.minimum(1.0, _HUBER * scale_m / np.maximum(left_m, 1e-9))
-    left_m = np.hypot(*(r + A @ x).T)
-    inner_m = np.minimum(left_m, _HUBER * scale_m)
-    cost = float(inner_m @ (2.0 * left_m - inner_m))
+        residual_m = np.hypot(*(r + A @ x).T)
+        scale_m = max(float(np.median(residual_m)), 1e-6)
+        weights = np.minimum(1.0, _HUBER * scale_m / np.maximum(residual_m, 1e-9))
+    residual_m = np.hypot(*(r + A @ x).T)
+    inner_m = np.minimum(residual_m, _HUBER * scale_m)
+    cost = float(inner_m @ (2.0 * residual_m - inner_m))
     length_s = seconds(int(np.ptp(stamps_ns)))
     stretch_s = min(_STRETCH_S, max(length_s / _STRETCHES, _SHORTEST_STRETCH_S))
     names, stretches = np.unique(
@@ -431,17 +474,16 @@ def _solved(r: FloatArray, A: FloatArray, stamps_ns: IntArray) -> _Fit:
     )
     if len(names) < _FEWEST_STRETCHES:
         return _Fit(x, unknown, 0.0, cost)
-    parts, scores = np.zeros((len(names), size, size)), np.zeros((len(names), size))
+    parts = np.zeros((len(names), size, size))
+    scores = np.zeros((len(names), size))
     np.add.at(parts, stretches, np.einsum("n,nij,nik->njk", weights, A, A))
     np.add.at(scores, stretches, np.einsum("n,nij,ni->nj", weights, A, r + A @ x))
-    without = psd_solve(H - parts, scores[:, :, None])[
-        :, :, 0
-    ]  # how far the solution moves without each
-    std = np.sqrt((1.0 - 1.0 / len(names)) * np.square(without).sum(axis=0))
+    # Change of the solution if a stretch is left out.
+    changes = psd_solve(H - parts, scores[:, :, None])[:, :, 0]
+    std = np.sqrt((1.0 - 1.0 / len(names)) * np.square(changes).sum(axis=0))
+    # Share of each stretch in the information on the offset.
     column = psd_solve(H, np.eye(size)[0])
-    shares = (
-        np.einsum("j,njk,k->n", column, parts, column) / column[0]
-    )  # of what is known of the offset
-    if not shares.any():  # nothing moves
+    shares = np.einsum("j,njk,k->n", column, parts, column) / column[0]
+    if not shares.any():  # no object moves
         return _Fit(x, unknown, 0.0, cost)
     return _Fit(x, std, 1.0 / float(shares @ shares) - 1.0, cost)

@@ -1,4 +1,4 @@
-"""Positions over time: of the ego, of the objects of a recording, and of the detections of a track."""
+"""Paths over time: of the ego, of true objects, and the positions measured along tracks."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -38,26 +38,31 @@ __all__ = [
     "true_paths",
 ]
 
-_FEWEST = 5  # values that a smoothing spline needs
-_GAP_S = 3.0  # a path is not known in longer gaps
+# Least number of values for a smoothing spline.
+_FEWEST = 5
+# A path is not interpolated in longer gaps.
+_GAP_S = 3.0
 _EGO_CUTOFF_HZ = 2.0
-#: Components that a wrong stamp moves by metres. Speed and yaw would add little, and as much error as their standard
-#: deviations are wrong by.
+# Components of a position, which a wrong stamp moves by metres. Speed and yaw are not used: they would add
+# little information, and errors of their standard deviations would matter.
 _POSITION = ("x_m", "y_m", "range_m", "bearing_rad")
 
 
 class EgoPath:
-    """Smoothing splines through positions and unwrapped yaw of the ego; of states in any order.
-    A line from state to state moves as fast as its noise: 2 cm at 100 Hz are 3 m/s. The spline minimises
-    sum (y - f)^2 + lam integral f''^2, a low-pass that lets half of a sine of 2 Hz through. Raises `DataError` for
-    fewer than five states.
+    """Smoothing spline through the positions and the unwrapped yaw of the ego.
+
+    An interpolating line would move as fast as its noise: 2 cm at 100 Hz are 3 m/s. The
+    spline minimises sum (y - f)^2 + lam integral f''^2. It is a low-pass that halves
+    the amplitude of a sine of 2 Hz.
+
+    The states may have any order. Raises `DataError` for fewer than five states.
     """
 
     def __init__(self, states: Iterable[EgoState]) -> None:
         by_stamp = {state.stamp_ns: state for state in states if is_finite(state)}
         if len(by_stamp) < _FEWEST:
             raise DataError(
-                f"the ego has {len(by_stamp)} states with different stamps, its path needs {_FEWEST}"
+                f"the ego has {len(by_stamp)} states with different stamps, at least {_FEWEST} are needed"
             )
         stamps_ns = sorted(by_stamp)
         self._start_ns, self._end_ns = stamps_ns[0], stamps_ns[-1]
@@ -76,7 +81,10 @@ class EgoPath:
         self._spline = make_smoothing_spline(times_s, values, lam=lam)
 
     def __call__(self, times_ns: IntArray) -> FloatArray:
-        """Return x, y and unwrapped yaw at times of shape (m,), shape (m, 3); NaN beyond the first and last state."""
+        """Return x, y and unwrapped yaw at `times_ns` (m,), shape (m, 3).
+
+        NaN before the first and after the last state.
+        """
         poses = np.asarray(self._spline((times_ns - self._start_ns) / NS_PER_S))
         poses[(times_ns < self._start_ns) | (times_ns > self._end_ns)] = np.nan
         return poses
@@ -84,19 +92,21 @@ class EgoPath:
 
 @dataclass(frozen=True)
 class ObjectPath:
-    """Positions of one object in the map."""
+    """Path of one object in the map frame."""
 
     stamps_ns: IntArray
-    """Times of its measurements, rising, shape (n,)."""
+    """Ascending times of its measurements, shape (n,)."""
     curve: BSpline
-    """Positions in m over seconds from the first of them."""
+    """Position in m as a function of the seconds since the first measurement."""
 
     @classmethod
     def through(
         cls, stamps_ns: IntArray, positions_m: FloatArray
     ) -> "ObjectPath | None":
-        """Return the smoothing spline through noisy positions (n, 2); None through too few.
-        Its stiffness is that of generalised cross-validation (Woltring, Advances in Engineering Software 8, 1986).
+        """Return the smoothing spline through noisy positions (n, 2); None for too few positions.
+
+        Generalised cross-validation chooses the stiffness (Woltring, Advances in
+        Engineering Software 8, 1986).
         """
         known_ns, rows = np.unique(stamps_ns, return_index=True)
         if len(known_ns) < 2 * _FEWEST:
@@ -109,7 +119,7 @@ class ObjectPath:
         )
 
     def __call__(self, times_ns: IntArray) -> FloatArray:
-        """Return positions at times of shape (m,), shape (m, 2); NaN where they are not known."""
+        """Return the positions at `times_ns` (m,), shape (m, 2); NaN outside the path and in its long gaps."""
         index = np.clip(
             np.searchsorted(self.stamps_ns, times_ns), 1, len(self.stamps_ns) - 1
         )
@@ -124,17 +134,19 @@ class ObjectPath:
 
 @dataclass(frozen=True)
 class MeasuredPositions:
-    """Positions that one sensor measured of one track."""
+    """Positions of one track that one sensor measured."""
 
     stamps_ns: IntArray
-    """Shape (n,)."""
+    """Stamps of the measurements, shape (n,)."""
     positions_m: FloatArray
-    """In the frame of the ego, or of the map where `in_map`, shape (n, 2)."""
+    """Positions in the ego frame, or in the map frame where `in_map`, shape (n, 2)."""
     in_map: BoolArray
+    """Mask of positions in the map frame, shape (n,)."""
     ego: EgoPath | None
+    """Path of the ego; None if all positions are in the map frame."""
 
     def at(self, times_ns: IntArray) -> FloatArray:
-        """Return the positions in the map, had they been measured at these times (n,); shape (n, 2)."""
+        """Return the positions in the map, shape (n, 2), as if they had been measured at `times_ns` (n,)."""
         if self.ego is None:
             return self.positions_m
         pose = self.ego(times_ns)
@@ -144,19 +156,19 @@ class MeasuredPositions:
         return np.where(self.in_map[:, None], self.positions_m, moved_m)
 
     def chosen(self, rows: BoolArray | slice) -> "MeasuredPositions":
-        """Return some of them."""
+        """Return the measurements in `rows`."""
         return MeasuredPositions(
             self.stamps_ns[rows], self.positions_m[rows], self.in_map[rows], self.ego
         )
 
 
 def true_paths(messages: Iterable[Message]) -> list[ObjectPath]:
-    """Return the paths of all true objects of which more than one state is known."""
+    """Return the paths of all true objects with at least two states."""
     states: dict[int, dict[int, tuple[float, float]]] = defaultdict(dict)
     for item in messages:
         if not isinstance(item, TruthState) or item.ignored or item.object_id == EGO_ID:
             continue
-        if max(abs(item.x_m), abs(item.y_m)) <= LARGEST:  # as detections are
+        if max(abs(item.x_m), abs(item.y_m)) <= LARGEST:  # the limit of detections
             states[item.object_id][item.stamp_ns] = (item.x_m, item.y_m)
     paths = []
     for each in states.values():
@@ -177,8 +189,10 @@ def true_paths(messages: Iterable[Message]) -> list[ObjectPath]:
 def measured_positions(
     run: Run, lists: Sequence[DetectionList], config: Config, ego: EgoPath | None
 ) -> dict[str, dict[int, MeasuredPositions]]:
-    """Return what `run` of `lists` fused, transformed and merged as the tracker does, by sensor and track.
-    `ego` is None where all detections are in the map frame.
+    """Return the positions that `run` fused, by sensor and track.
+
+    `lists` are the detection lists of the run. They are transformed and merged as in
+    the tracker. `ego` is None if all detections are in the map frame.
     """
     updates = run.tables["updates"]
     fused = updates.where(

@@ -1,4 +1,4 @@
-"""Validity of stamps: zeros, other clocks, the future, changes of the delay, offsets of clocks and of positions."""
+"""Findings on clocks: invalid stamps, unrelated clocks, changes of the delay, clock offsets and position biases."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -19,33 +19,35 @@ from fgtrack.core.finding import Finding, milliseconds, percent
 
 __all__ = ["bias_findings", "clock_findings", "clock_text", "stamp_findings"]
 
-_AHEAD_S, _AHEAD_SHARE = 1e-3, 0.005  # rounding of stamps
-_PARTS, _SHORTEST_PART_S = 10, 1.0  # of a recording, whose median delays are compared
-_CHANGE_S, _JUMP_STDS = (
-    0.015,
-    7.0,
-)  # of the mean delay before and after the best of seven splits
-_DRIFT_STDS, _DRIFT_CORRELATION = (
-    4.0,
-    0.9,
-)  # a steady drift is 5 apart, but correlates with time as chance does not
-_WHERE = "{:.2f} m ahead and {:.2f} m left".format  # negative behind, and to the right
-_SAME_BIAS_M = 0.5  # of sensors of one frame: what two calibrations, or two parts of a car, may differ by
+# A stamp after its receipt counts only beyond the rounding of stamps, and for more than this share.
+_AHEAD_S = 1e-3
+_AHEAD_SHARE = 0.005
+# The median delays of this number of parts of a recording are compared.
+_PARTS = 10
+_SHORTEST_PART_S = 1.0
+# Least change of the mean delay at the best of seven splits, in seconds, and for a jump in standard deviations.
+_CHANGE_S = 0.015
+_JUMP_STDS = 7.0
+# A steady drift changes the mean by about 5 standard deviations. It differs from chance by its correlation with time.
+_DRIFT_STDS = 4.0
+_DRIFT_CORRELATION = 0.9
+# Negative values are behind and to the right.
+_WHERE = "{:.2f} m ahead and {:.2f} m left".format
+# Largest difference of biases with one cause: two calibrations, or two parts of a car, may differ by it.
+_SAME_BIAS_M = 0.5
 
 
 def stamp_findings(one: Arrivals) -> Iterator[Finding]:
-    """Yield the problems of the stamps and receipts of one sensor, or of the ego."""
-    name, receipt = (
-        one.name,
-        {} if one.name == EGO else {f"sensors.{one.name}.stamp_from": "receipt"},
-    )
+    """Yield findings on the stamps and receipts of one sensor, or of the ego."""
+    name = one.name
+    receipt = {} if name == EGO else {f"sensors.{name}.stamp_from": "receipt"}
     if not one.stamps_ns.any():
-        if name != EGO:  # of the ego it is a suspicion of what is read
+        if name != EGO:  # the reader of the recording reports it for the ego
             text = f"all {len(one.stamps_ns)} stamps are 0: its driver sets none, so its delay stays unknown."
             yield Finding("clock", name, 95.0, text, receipt)
     elif one.is_other_clock:
         off_s = abs(float(np.median(one.delays_s)))
-        text = f"stamps and receipts are {off_s:.3g} s apart: they are of clocks that have nothing in common."
+        text = f"stamps and receipts differ by {off_s:.3g} s: they come from two unrelated clocks."
         yield Finding("clock", name, 95.0, text, receipt)
     elif len(one.stamps_ns) >= FEWEST:
         ahead = float((one.delays_s < -_AHEAD_S).mean())
@@ -53,28 +55,29 @@ def stamp_findings(one: Arrivals) -> Iterator[Finding]:
             most_s = -float(np.quantile(one.delays_s, 0.01))
             text = (
                 f"{percent(ahead)} of its stamps lie after their receipt, by up to {milliseconds(most_s)}: its clock "
-                "is ahead of the recorder's by at least that."
+                "is ahead of the recorder's clock by at least this time."
             )
             yield Finding("clock", name, 85.0, text)
         if not one.usable.all():
             share = percent(1.0 - float(one.usable.mean()))
-            text = f"{share} of its stamps are more than an hour from their receipt: wrong."
+            text = f"{share} of its stamps are wrong: they differ from their receipt by more than an hour."
             yield Finding("clock", name, 40.0, text)
         if one.is_receipt and name != EGO:
-            text = "every stamp is the receipt, so nothing is known of its delay; a constant one is its clock_offset_s."
+            text = "every stamp equals the receipt, so its delay is unknown; set clock_offset_s to a constant delay."
             yield Finding("receipt", name, 20.0, text)
         yield from _change(one)
 
 
 def _change(one: Arrivals) -> Iterator[Finding]:
-    """Yield a change of the delay that lasts, by the medians of ten parts: a jump, or a drift."""
+    """Yield a permanent change of the delay, by the medians of ten parts: a jump, or a drift."""
     times_s = (one.receipts_ns - one.receipts_ns[0]) / 1e9
     if len(times_s) < _PARTS * FEWEST or times_s[-1] < _PARTS * _SHORTEST_PART_S:
         return
     medians_s = np.array(
         [np.median(part) for part in np.array_split(one.delays_s, _PARTS)]
     )
-    splits = range(2, _PARTS - 1)  # a change within the first or last tenth may pass
+    # A change within the first two tenths, or the last one, may be temporary.
+    splits = range(2, _PARTS - 1)
     halves = [np.split(medians_s, [k]) for k in splits]
     within = [float(a.var() * len(a) + b.var() * len(b)) for a, b in halves]
     k = int(np.argmin(within))
@@ -82,52 +85,58 @@ def _change(one: Arrivals) -> Iterator[Finding]:
     std_s = math.sqrt(
         within[k] / (_PARTS - 2) * (1.0 / splits[k] + 1.0 / (_PARTS - splits[k]))
     )
-    change_s, at_s = (
-        abs(after_s - before_s),
-        times_s[splits[k] * len(times_s) // _PARTS],
-    )
+    change_s = abs(after_s - before_s)
+    at_s = times_s[splits[k] * len(times_s) // _PARTS]
     if change_s < max(_CHANGE_S, _DRIFT_STDS * std_s):
         return
     correlation = np.corrcoef(medians_s, np.arange(_PARTS))[0, 1]
     if change_s >= _JUMP_STDS * std_s or abs(correlation) >= _DRIFT_CORRELATION:
         text = (
             f"its delay is {milliseconds(before_s)} until about {at_s:.0f} s and {milliseconds(after_s)} after that: "
-            "its clock was set, or drifts, or a queue fills. No setting corrects that: synchronise the clock."
+            "its clock was set, its clock drifts, or a queue fills. No setting corrects this: synchronise the clock."
         )
         yield Finding("clock", one.name, 80.0, text)
 
 
 def clock_text(one: SensorOffset, report: OffsetReport) -> str:
-    """Return what is known of the clock of a sensor, what bounds it, and what is missing to identify it."""
-    what = (
+    """Return a sentence on the clock of a sensor: its offset, the bounds, and what is missing to identify it."""
+    reference = (
         "the truth of the recording"
         if report.reference == TRUTH
         else f"the clock of {report.reference}"
     )
     if one.offset_s is None or one.half_s is None:
         return f"its clock offset is not known: {one.why}."
-    half, offset = milliseconds(one.half_s), f"{1e3 * one.offset_s:+.0f} ms"
+    half = milliseconds(one.half_s)
+    offset = f"{1e3 * one.offset_s:+.0f} ms"
     if not one.is_known:
-        return f"its clock offset from {what} is not known: {offset} ± {half}."
+        return f"its clock offset from {reference} is not known: {offset} ± {half}."
     if one.agrees:
-        return f"its stamps agree with {what} (offset {offset} ± {half})."
+        return f"its stamps agree with {reference} (offset {offset} ± {half})."
     side = "later" if one.offset_s > 0.0 else "earlier"
     amount = f"{milliseconds(abs(one.offset_s))} (± {half}) {side} than"
     if one.is_small:
-        return f"its stamps are {amount} {what}: less than {milliseconds(SMALLEST_OFFSET_S)}, which does not matter."
+        least = milliseconds(SMALLEST_OFFSET_S)
+        return f"its stamps are {amount} {reference}: an offset below {least} does not matter."
     if not one.is_off:
-        return f"its stamps may be {amount} {what}: the 95 % interval excludes 0, that of 99 % does not."
+        return (
+            f"its stamps may be {amount} {reference}: "
+            "the 95 % interval excludes 0, the 99 % interval contains it."
+        )
     off = f"its stamps are {amount}"
     if report.reference == TRUTH:
         return f"{off} the truth of the recording."
     return (
-        f"{off} those of {report.reference}. {_bound(one, report)} To identify the wrong one of the two clocks takes "
-        f"truth, or a sensor with a known clock (--reference NAME): {report.reference} is taken to be right."
+        f"{off} those of {report.reference}. {_bound(one, report)} {report.reference} is assumed to be right. To "
+        "identify the wrong clock, give truth or a sensor with a known clock (--reference NAME)."
     )
 
 
 def _bound(one: SensorOffset, report: OffsetReport) -> str:
-    """Return which of two clocks cannot be the only wrong one: nothing is received before it was measured."""
+    """Return a sentence on which of the two clocks must be wrong.
+
+    No list is received before it was measured, so delays bound the offsets.
+    """
     early, late = (
         (report.reference, one.sensor)
         if (one.offset_s or 0.0) > 0.0
@@ -135,19 +144,23 @@ def _bound(one: SensorOffset, report: OffsetReport) -> str:
     )
     least_s, surely_s = report.least_delays_s.get(early, 0.0), report.surely_late_s(one)
     if least_s <= RECEIPT_S:
-        return f"Nothing bounds either clock: {early} has no delays."
-    text = f"{early} is received {milliseconds(least_s)} after its stamps at least, so these are not earlier by more"
+        return f"Either clock may be wrong: without delays of {early} its clock has no bound."
+    text = (
+        f"{early} arrives at least {milliseconds(least_s)} after its stamps, "
+        "so its stamps are early by at most this time"
+    )
     if surely_s is None:
         return f"{text}: either clock may be wrong."
-    return (
-        f"{text}: at least {milliseconds(abs(surely_s))} of it is the clock of {late}."
-    )
+    return f"{text}: the stamps of {late} are late by at least {milliseconds(abs(surely_s))}."
 
 
 def clock_findings(
     report: OffsetReport, configured_s: Mapping[str, float]
 ) -> Iterator[Finding]:
-    """Yield the sensors with a clock offset, or an unknown one; `configured_s` is what is taken off already."""
+    """Yield the sensors with a clock offset or an unknown clock.
+
+    `configured_s` is the offset by sensor that the configuration already subtracts.
+    """
     for one in report.others:
         if one.is_off and one.offset_s is not None:
             total_s = round(configured_s[one.sensor] + one.offset_s, 4)
@@ -158,12 +171,16 @@ def clock_findings(
 
 
 def bias_findings(report: OffsetReport, ego: EgoConfig) -> Iterator[Finding]:
-    """Yield constant errors of position against the truth: of the ego frame, which a setting corrects, or others."""
+    """Yield constant position errors against the truth.
+
+    If all sensors share one error in the ego frame, a setting of the ego corrects it.
+    Else each sensor is reported.
+    """
     biased = {
         item.sensor: item.bias for item in report.sensors if item.bias is not None
     }
     biases_m = np.array(
-        [(bias.ahead_m, bias.left_m) for bias in biased.values() if bias.of == "ego"]
+        [(bias.ahead_m, bias.left_m) for bias in biased.values() if bias.frame == "ego"]
     )
     num_placed = sum(item.offset_s is not None for item in report.sensors)
     if (
@@ -181,10 +198,10 @@ def bias_findings(report: OffsetReport, ego: EgoConfig) -> Iterator[Finding]:
         yield Finding("bias", EGO, 88.0, text, settings)
         return
     for name, bias in biased.items():
-        cure = (
+        setting = (
             "mount"
-            if bias.of == "ego"
-            else "near_side_m: it sees another part of a vehicle than the truth means"
+            if bias.frame == "ego"
+            else "near_side_m: it detects another point of a vehicle than the truth refers to"
         )
-        text = f"its detections lie {_WHERE(*bias[1:])} of the truth, in the frame of the {bias.of}"
-        yield Finding("bias", name, 50.0, f"{text}: look at sensors.{name}.{cure}.")
+        text = f"its detections lie {_WHERE(*bias[1:])} of the truth, in the frame of the {bias.frame}"
+        yield Finding("bias", name, 50.0, f"{text}: check sensors.{name}.{setting}.")

@@ -123,12 +123,12 @@ def test_a_healthy_recording_is_fine_and_nothing_is_changed(call: Call) -> None:
     write(drive())
     code, text = advised(call, "drive.jsonl", "-o", "a.yaml")
     assert code == 0
-    assert "Fine: the ego (20 Hz" in text
+    assert "No finding on: the ego (20 Hz" in text
     assert (
         "stamps of lidar, radar, clock of lidar, noise of lidar, radar, frames, angles and fields"
         in text
     )
-    assert "tracks (2 beginnings, 99 % tracked where a sensor could see)" in text
+    assert "tracks (2 births, 99 % of the time in view tracked)" in text
     assert (
         "radar: its clock offset from the truth of the recording is not known: +25 ms ±"
         in text
@@ -370,7 +370,7 @@ def test_a_sensor_without_a_model_is_left_out(call: Call) -> None:
     code, text = advised(call, "drive.jsonl", "-o", "a.yaml")
     assert code == 0
     assert (
-        "no model of radar (radar: x_m, y_m, yaw_rad): give sensors.NAME.std, or leave them out"
+        "no model of radar (radar: x_m, y_m, yaw_rad): set sensors.NAME.std, or ignore them"
         in text
     )
     assert call("replay", "drive.jsonl", "-c", "a.yaml", "-o", "run")[0] == 0
@@ -392,7 +392,7 @@ def test_an_estimator_that_forgets_and_noise_that_does_not_fit(call: Call) -> No
     assert set(told) <= {"estimator", *(key for key in told if ".std" in key)}
     (tuned,) = [str(one) for one in advice.findings if one.about == "tune"]
     assert tuned.startswith(
-        "tune: fitted to the recording by maximum likelihood. As configured stay "
+        "tune: noise fitted to the recording by maximum likelihood. Unchanged: "
     )
     assert f"sensors.radar.std.x_m: {told['sensors.radar.std.x_m']}" in tuned
     assert any(
@@ -424,9 +424,9 @@ def test_white_noise_is_not_fitted_to_errors_that_last(call: Call) -> None:
     assert any(one.kind == "noise" and one.about == "lidar" for one in advice.findings)
     (tuned,) = [one for one in advice.findings if one.about == "tune"]
     assert tuned.text.startswith(
-        "no noise is changed. With what is fitted, innovations of "
+        "no noise is changed: with the fitted noise, innovations of "
     )
-    assert "still correlated in time (autocorrelation 0." in tuned.text
+    assert "remain autocorrelated (0." in tuned.text
     assert not advice.changes
     assert (
         advice.config
@@ -477,5 +477,5 @@ def test_bad_calls(call: Call) -> None:
     )
     code, text = call("advise", "cut.jsonl", "-c", "c.yaml")
     assert code == 1
-    assert "Fine: " in text
+    assert "No finding on: " in text
     assert "used up to there" in text

@@ -153,7 +153,7 @@ def test_one_modality_and_objects_seen_by_one_sensor_only_have_nothing_to_compar
     ]
     (lidar,) = estimate_offsets(alone, two_sensors()).sensors
     assert (lidar.sensor, lidar.offset_s, lidar.is_known) == ("lidar", None, False)
-    assert lidar.why == "the only modality: nothing to compare it with"
+    assert lidar.why == "the only sensor: no other clock to compare with"
     radar = row(
         estimate_offsets(parked("ego", num=20), two_sensors(), "lidar"), "radar"
     )
@@ -167,14 +167,14 @@ def test_one_modality_and_objects_seen_by_one_sensor_only_have_nothing_to_compar
 def test_an_unknown_reference_and_an_empty_input_are_refused() -> None:
     with pytest.raises(
         CallError,
-        match="reference 'sonar' is no sensor of the input, which has lidar, radar",
+        match="reference 'sonar': not a sensor of the input, use lidar, radar",
     ):
         estimate_offsets(parked("ego"), two_sensors(), "sonar")
     with pytest.raises(DataError, match="no detections"):
         estimate_offsets(
             [one for one in parked("ego") if isinstance(one, EgoState)], two_sensors()
         )
-    with pytest.raises(DataError, match="its path needs 5"):
+    with pytest.raises(DataError, match="at least 5 are needed"):
         estimate_offsets(parked("ego", num=2), two_sensors())
 
 

@@ -137,7 +137,7 @@ def test_a_type_that_nobody_knows_is_mapped_by_its_fields(tmp_path):
     }
     first = next(iter(open_input(tmp_path / "bag", config.input).messages()))
     assert first.objects[1].bearing_rad == pytest.approx(math.radians(-10.0))
-    assert "# Not taken: /chatter (std_msgs/msg/String)" in text
+    assert "# Not used: /chatter (std_msgs/msg/String)" in text
     assert "not used: rcs (5 to 5)" in text
 
 
@@ -161,7 +161,7 @@ def test_a_recording_of_which_nothing_can_be_guessed_still_gives_a_configuration
     table(tmp_path / "a.csv", ["alpha\u2028", "beta: 1"], [1, "#x"], [2, "{y"])
     text = starting_config(tmp_path / "a.csv")
     assert dict(loaded(text, tmp_path).sensors) == {}
-    assert "# Not taken: a.csv: no column of times among " in text
+    assert "# Not used: a.csv: no column of times among " in text
     stream = [TruthState(START_NS, START_NS, 1, 0.0, 0.0)]
     write_stream(tmp_path / "s.jsonl", stream)
     assert dict(loaded(starting_config(tmp_path / "s.jsonl"), tmp_path).sensors) == {}

@@ -60,7 +60,7 @@ def test_the_summary_is_short_and_says_what_to_do(found: Study) -> None:
     assert 4 <= len(found.summary) <= 7
     assert found.summary[0].startswith("In 3 s detections came from lidar_cluster (")
     assert "tracks the objects" in found.summary[1]
-    assert found.summary[-1].startswith(("Take ", "First: "))
+    assert found.summary[-1].startswith(("Use ", "First: "))
 
 
 def test_the_settings_name_what_was_assumed_and_give_the_same_runs(

@@ -7,7 +7,7 @@ from pathlib import Path
 from support.messages import drive
 from typer.testing import CliRunner
 
-from fgtrack.advice.trial import samples, suspicions
+from fgtrack.advice.trial import first_contents, input_checks
 from fgtrack.cli.main import app
 from fgtrack.config.settings import Config
 from fgtrack.config.yaml_file import dump, validate
@@ -40,12 +40,12 @@ def with_objects(item: DetectionList, **fields: object) -> DetectionList:
 
 
 def found(messages: list[Message], config: Config = CONFIG) -> list[str]:
-    return list(map(str, suspicions(messages, config)))
+    return list(map(str, input_checks(messages, config)))
 
 
 def test_nothing_is_said_of_a_healthy_drive():
     assert found(drive()) == []
-    shown = samples(drive())
+    shown = first_contents(drive())
     assert shown["radar (in the frame ego)"] == "x_m 31, y_m 1.5, speed_mps -4"
     assert shown["ego"].startswith("x_m 0, y_m 0, yaw_rad 0.25, speed_mps 50")
     assert set(shown) == {
@@ -73,7 +73,7 @@ def test_a_missing_ego_is_found():
     (line,) = found(without)
     assert (
         line
-        == "ego: no state is read, but lidar is relative to it: name its topic (input.ego)"
+        == "ego: no ego state is read, but lidar is relative to the ego: set its topic (input.ego)"
     )
     in_map = changed(lambda item: replace(item, frame="map"), without)
     assert found(in_map) == []
@@ -107,14 +107,16 @@ def far(messages: Iterable[Message]) -> Iterator[Message]:
 def test_a_wrong_frame_is_found():
     as_map = changed(lambda item: replace(item, frame="map"), far(drive()))
     lines = found(as_map)
-    assert lines[0].startswith("lidar: is read as in the map, 98")
+    assert lines[0].startswith("lidar: detections are read in the map, 98")
     assert lines[0].endswith("set `frame: ego` (or sensor)")
     moved = changed(
         lambda item: replace(item, objects=[Detection(x_m=1030.0, y_m=1.0)]),
         far(drive()),
     )
     lines = found(moved)
-    assert lines[0].startswith("lidar: is read as relative to the ego, 1030 m away")
+    assert lines[0].startswith(
+        "lidar: detections are read in the frame ego, 1030 m away"
+    )
     assert lines[0].endswith("set `frame: map`")
     assert found(list(far(drive()))) == []
 
@@ -132,7 +134,7 @@ def test_components_that_are_never_measured_are_found():
     )
     (line,) = found(drive(), config)
     assert line.startswith(
-        "radar: never measures range_m, bearing_rad of its std, but x_m, y_m, speed_mps"
+        "radar: never measures range_m, bearing_rad in its std, only x_m, y_m, speed_mps"
     )
 
 

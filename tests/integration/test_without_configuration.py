@@ -7,7 +7,7 @@ import pytest
 from support.examples import slow
 
 import fgtrack
-from fgtrack.advice.outcome import Outcome
+from fgtrack.advice.outcome import RunQuality
 from fgtrack.config.reading import read_scenario
 from fgtrack.core.types import DetectionList, Message, TruthState
 from fgtrack.runs import Run
@@ -47,7 +47,7 @@ def scene(
 
 def check_tracked(run: Run) -> None:
     """Fail unless each object is tracked 95 % of the time in which a sensor could see it, nearly without breaks."""
-    found = Outcome.of(run)
+    found = RunQuality.of(run)
     assert found.truth is not None
     assert found.truth.ticks_in_view > 100
     assert found.truth.tracked_share_in_view >= 0.95

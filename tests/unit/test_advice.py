@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgtrack.advice.outcome import NoiseFit, Outcome, harm
+from fgtrack.advice.outcome import NoiseFit, RunQuality, harm
 from fgtrack.clocks.arrivals import Arrivals
 from fgtrack.clocks.offsets import OffsetReport, SensorOffset
 from fgtrack.clocks.stamps import clock_findings, clock_text, stamp_findings
@@ -21,7 +21,7 @@ TRUTH = ObjectMetrics(
     ticks_in_view=6000,
     ticks_tracked_in_view=5900,
 )
-GOOD = Outcome(
+GOOD = RunQuality(
     births=20,
     confirmed=3,
     used={"radar": 0.9},
@@ -47,7 +47,7 @@ def test_harm_is_more_breaks_more_tracks_and_less_that_is_tracked_or_used() -> N
     assert harm(replace(GOOD, truth=less), replace(GOOD, confirmed=60)) is None, (
         "more of the objects is tracked"
     )
-    assert "radar that are used go from 90 % to 50 %" in str(
+    assert "used detections of radar fall from 90 % to 50 %" in str(
         harm(GOOD, replace(GOOD, used={"radar": 0.5}))
     )
     assert harm(GOOD, replace(GOOD, used={"radar": 1.0}, confirmed=60)) is None, (
@@ -111,15 +111,16 @@ def test_delays_tell_which_clock_is_wrong_where_the_other_cannot_be_so_early() -
         found = report(offset_s, least_s)
         return clock_text(found.others[0], found)
 
-    assert "not earlier by more: at least 60 ms of it is the clock of radar." in text(
-        0.08, 0.02
+    assert (
+        "early by at most this time: the stamps of radar are late by at least 60 ms."
+        in text(0.08, 0.02)
     )
     assert (
-        "either clock may be wrong. To identify the wrong one of the two clocks takes truth"
+        "either clock may be wrong. lidar is assumed to be right. To identify the wrong clock"
         in text(0.08, 0.1)
     )
-    assert "radar is received 20 ms after its stamps at least" in text(-0.08, 0.02)
-    assert "at least 60 ms of it is the clock of lidar." in text(-0.08, 0.02)
+    assert "radar arrives at least 20 ms after its stamps" in text(-0.08, 0.02)
+    assert "the stamps of lidar are late by at least 60 ms." in text(-0.08, 0.02)
 
 
 def test_an_offset_is_set_where_it_is_known_and_not_0_and_said_where_it_is_not_known() -> (
@@ -145,17 +146,17 @@ def test_an_offset_is_set_where_it_is_known_and_not_0_and_said_where_it_is_not_k
         (
             0.008,
             0.002,
-            "are 8 ms (± 5 ms) later than the clock of lidar: less than 10 ms, which does not matter.",
+            "are 8 ms (± 5 ms) later than the clock of lidar: an offset below 10 ms does not matter.",
         ),
         (
             -0.008,
             0.001,
-            "are 8 ms (± 3 ms) earlier than the clock of lidar: less than 10 ms, which does not matter.",
+            "are 8 ms (± 3 ms) earlier than the clock of lidar: an offset below 10 ms does not matter.",
         ),
         (
             0.03,
             0.01,
-            "may be 30 ms (± 26 ms) later than the clock of lidar: the 95 % interval excludes 0, that of 99",
+            "may be 30 ms (± 26 ms) later than the clock of lidar: the 95 % interval excludes 0, the 99",
         ),
         (0.012, 0.002, "its stamps are 12 ms (± 5 ms) later than those of lidar."),
     ],

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fgtrack
-from fgtrack.advice.ledger import Ledger, Part, _sentence, ledger
+from fgtrack.advice.ledger import Contribution, Ledger, _sentence, ledger
 from fgtrack.config.reading import read_config, read_scenario
 from fgtrack.core.errors import DataError
 from fgtrack.core.types import DetectionList, Message, TruthState
@@ -157,7 +157,7 @@ def test_nobody_late_means_no_part_of_lateness(messages: list[Message]) -> None:
 
 def test_a_tie_has_no_minus(karle: Ledger) -> None:
     first = karle.waterfall[0]
-    tie = Part("tie", first.mean_square_m2 + 1e-6, first.share_m2)
+    tie = Contribution("tie", first.mean_square_m2 + 1e-6, first.share_m2)
     assert ": tie +0.00 m; " in _sentence([first, tie], karle.tables.tables)
 
 
@@ -235,6 +235,6 @@ def test_a_run_folder_without_its_recording_says_so(tmp_path: Path) -> None:
     Path(recording).unlink()
     with pytest.raises(
         DataError,
-        match=r"run: its recording is not at .*drive.jsonl, give the recording with -c",
+        match=r"run: its recording is not at .*drive.jsonl, give the recording's path with -c",
     ):
         ledger(tmp_path / "run")
