@@ -158,7 +158,7 @@ class Study:
 
     @property
     def settings(self) -> Path:
-        """Path of the configuration of the runs with all assumptions and their reasons, for changes and another study."""
+        """Path of the configuration of the runs, with all assumptions and their reasons; edit it for another study."""
         return self.path / "settings.yaml"
 
     def __str__(self) -> str:

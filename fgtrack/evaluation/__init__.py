@@ -1,1 +1,1 @@
-"""Evaluation of runs: truth matching, metrics, tables and figures. Reads run folders, never a tracker."""
+"""Evaluation of run folders: matching with truth, metrics, comparison and tables. Independent of the tracker."""

@@ -1,4 +1,4 @@
-"""Runs of one recording compared: paired differences of their errors, at the same objects and stamps."""
+"""Comparison of runs of one recording: paired differences of errors at the same objects and stamps."""
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -22,10 +22,10 @@ from fgtrack.evaluation.settings import EvaluationConfig, evaluation_settings
 from fgtrack.evaluation.tables import Column, Value, short, two_digits
 
 POSITION_NEES = "position_nees"
-"""The quantity that is the better the nearer it is to 2."""
+"""Name of the position NEES. A value near 2 is best."""
 
 STANDING_NOTE = "+: best; =: not resolved from the best, 0 is in the interval"
-"""Meaning of the marks of `entry_columns`, for a table within a run."""
+"""Explanation of the marks of `entry_columns`, for a comparison within one run."""
 
 _MARKS: Mapping[Value, str] = {"best": "+", "tie": "=", "worse": " "}
 _ERRORS = {
@@ -34,44 +34,53 @@ _ERRORS = {
     "yaw_rmse_rad": "yaw_rad",
 }
 NEGLIGIBLE = 1e-6
-"""Share of a cost that is rounding: of sums in another order."""
+"""Share of a cost that different orders of summation change by rounding."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A run or an estimator, compared in one quantity."""
+    """A run or an estimator in the comparison of one quantity."""
 
     name: str
+    """Label of the run, or name of the estimator."""
     value: float
+    """Value of the quantity."""
     worse_by: Estimate | None
-    """Difference to the best; None of the best itself."""
+    """Cost difference to the best entry; None for the best entry itself."""
     standing: Literal["best", "tie", "worse"]
-    """`tie` where the interval of the difference contains 0 or nothing but rounding; `best` only without any tie."""
+    """Rank: `best`, `tie` or `worse`.
+
+    `tie`: the interval of the difference contains 0, or the difference is rounding. The
+    best entry is `best` only if no other entry is a tie.
+    """
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Runs of one recording."""
+    """Comparison of the runs of one recording."""
 
     runs: tuple[str, ...]
-    """Labels."""
+    """Labels of the runs."""
     samples: int
-    """Objects and stamps at which all runs have a paired track."""
+    """Number of pairs (object, stamp) at which all runs have a matched track."""
     most_samples: int
-    """Samples of the run with most of them."""
+    """Largest number of samples of a single run."""
     quantities: Mapping[str, tuple[Entry, ...]]
-    """By name, with the unit in it, the entries from the best to the worst; those that all runs have."""
+    """Entries by quantity, best first. The name of a quantity contains its unit.
+
+    Contains only quantities that all runs have.
+    """
     sums: Mapping[str, FloatArray] = field(default_factory=dict)
-    """By quantity: of every stamp the sum of each run, and in the last column the count, shape (n, runs + 1)."""
+    """Sums at every stamp by quantity, shape (n, runs + 1): of each run, then the number of samples."""
 
 
 def comparisons(runs: Sequence[EvaluatedRun]) -> list[Comparison]:
-    """A comparison for every recording of which there are several runs with truth."""
+    """Return a comparison for every recording with two or more runs with truth."""
     return [comparison(group) for group in comparable(runs) if len(group) > 1]
 
 
 def comparable(runs: Sequence[EvaluatedRun]) -> list[list[EvaluatedRun]]:
-    """The runs with truth, those of the same recording and evaluated by the same settings together."""
+    """Return the runs with truth in groups of one recording and equal evaluation settings."""
     groups: dict[tuple[int, EvaluationConfig], list[EvaluatedRun]] = {}
     for number, group in enumerate(
         by_recording([item for item in runs if item.matching is not None])
@@ -87,7 +96,10 @@ def ranked(
     costs: Sequence[float] | FloatArray,
     worse_by: Callable[[int, int], Estimate],
 ) -> tuple[Entry, ...]:
-    """Entries from the least of the `costs` to the largest; `worse_by` gives the cost of one index minus another's."""
+    """Return the entries in ascending order of `costs`.
+
+    `worse_by` returns the cost of one index minus the cost of another.
+    """
     best, *others = np.argsort(costs, kind="stable").tolist()
     differences = {k: worse_by(k, best) for k in others}
     rounding = NEGLIGIBLE * float(np.max(costs))
@@ -107,7 +119,7 @@ def ranked(
 
 
 def entry_record(entry: Entry, name: str = "value") -> dict[str, Any]:
-    """Numbers of an entry, its value as `name`, which `entry_columns` show."""
+    """Return the numbers of an entry for `entry_columns`; `name` is the key of its value."""
     worse, values = (
         entry.worse_by or UNKNOWN,
         {"run": entry.name, name: entry.value, "standing": entry.standing},
@@ -116,7 +128,10 @@ def entry_record(entry: Entry, name: str = "value") -> dict[str, Any]:
 
 
 def entry_columns(heading: str, name: str = "value") -> list[Column]:
-    """The value of an entry with its standing, the best one bold, and how much worse it is."""
+    """Return columns for the value and standing of an entry, and its difference to the best.
+
+    The value of the best entry is bold.
+    """
     return [
         Column(
             heading,
@@ -131,7 +146,7 @@ def entry_columns(heading: str, name: str = "value") -> list[Column]:
 
 
 def comparison(group: Sequence[EvaluatedRun]) -> Comparison:
-    """Return the comparison of `group`, runs of one recording, at the same objects and stamps."""
+    """Compare `group`, runs of one recording, at the same objects and stamps."""
     errors = []
     for matching in (item.matching for item in group if item.matching is not None):
         errors_of = track_errors(matching)
@@ -156,15 +171,18 @@ def comparison(group: Sequence[EvaluatedRun]) -> Comparison:
 
 
 def common_sums(every: Sequence[TrackErrors]) -> tuple[int, int, dict[str, FloatArray]]:
-    """Return the sums by stamp of the values of several runs at the objects and stamps that all have.
-    The most samples of a run, the common ones, and by name the sums of each run and, last, the counts: (n, runs + 1).
+    """Return sums by stamp of the values of several runs, at the objects and stamps that all have.
+
+    Returns the largest number of samples of a run, the number of common samples, and
+    the sums by name. The sums have the shape (n, runs + 1): the sum of each run, then
+    the count.
     """
     every_ns = np.unique(np.concatenate([item.stamps_ns for item in every]))
     codes = [
         item.object_index * len(every_ns) + np.searchsorted(every_ns, item.stamps_ns)
         for item in every
     ]
-    samples = [np.unique(of, return_index=True) for of in codes]
+    samples = [np.unique(code, return_index=True) for code in codes]
     common = functools.reduce(np.intersect1d, [distinct for distinct, _ in samples])
     rows = [first[np.searchsorted(distinct, common)] for distinct, first in samples]
     sums = {}
@@ -178,7 +196,11 @@ def common_sums(every: Sequence[TrackErrors]) -> tuple[int, int, dict[str, Float
 
 
 def compared(name: str, labels: Sequence[str], ticks: FloatArray) -> tuple[Entry, ...]:
-    """The runs by rising cost (root of the mean; of a NEES its distance from 2), and the excess over the best."""
+    """Return the entries of one quantity in ascending order of cost.
+
+    `ticks` are sums by stamp, see `common_sums`. The cost is the root of the mean
+    square. For a NEES it is the distance of the mean from 2.
+    """
     is_nees = name == POSITION_NEES
 
     def cost(mean: FloatArray) -> FloatArray:
@@ -194,7 +216,10 @@ def compared(name: str, labels: Sequence[str], ticks: FloatArray) -> tuple[Entry
 
 
 def _gospa_sums(group: Sequence[EvaluatedRun]) -> FloatArray:
-    """Squared GOSPA, and 1, at the ticks that all runs have, of the objects that a sensor of any run could see."""
+    """Return squared GOSPA of each run and a count of 1, at the ticks that all runs have.
+
+    It covers the objects that a sensor of any run could see.
+    """
     matchings = [item.matching for item in group if item.matching is not None]
     ticks_ns = [
         item.now_ns[recorded(each.run, item.now_ns)]

@@ -1,4 +1,4 @@
-"""Confidence intervals of 95 %: of differences paired over seeds, and within one run, whose errors are correlated."""
+"""Confidence intervals of 95 %: of differences paired over seeds, and of correlated errors within one run."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -8,39 +8,44 @@ import numpy as np
 
 from fgtrack.core.types import FloatArray, IntArray
 
-_UPPER = 0.975  # quantile of a two-sided 95 % interval
-_MOST_PIECES = 400  # of a run; finer ones would only make the correlation length depend on the tick rate
+# Quantile of a two-sided 95 % interval.
+_UPPER = 0.975
+# Largest number of pieces of a run. With finer pieces the correlation length would depend on the tick rate.
+_MOST_PIECES = 400
 _FEWEST_PIECES = 8
 _FEWEST_COSINES = 4
-_LENGTHS = 5.0  # correlation lengths in a run for each cosine
-_IN_A_ROW = 5  # insignificant correlations that end the search for significant ones
-_STEP = 1e-5  # relative, of the numerical gradient
-#: A number from sums over time: takes shape (k, ...), gives shape (...).
+# A run has one cosine per this number of correlation lengths.
+_LENGTHS = 5.0
+# Number of successive insignificant correlations that ends the search for significant ones.
+_IN_A_ROW = 5
+# Relative difference of the numerical gradient.
+_STEP = 1e-5
+#: Function that computes a number from sums over time, (k, ...) -> (...).
 Statistic = Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number and its 95 % confidence interval; NaN where it is not known."""
+    """A number and its 95 % confidence interval; unknown numbers are NaN."""
 
     mean: float
     low: float
     high: float
     count: int
-    """Independent samples: seeds, or degrees of freedom of a run and one."""
+    """Number of independent samples: the number of seeds, or the degrees of freedom of a run plus 1."""
 
     @property
     def is_significant(self) -> bool:
-        """True if the interval excludes 0; false where it is unknown."""
+        """True if the interval is known and excludes 0."""
         return self.low > 0.0 or self.high < 0.0
 
     @property
     def is_known(self) -> bool:
-        """True if there is an interval."""
+        """True if the interval is known."""
         return math.isfinite(self.low) and math.isfinite(self.high)
 
     def __format__(self, spec: str) -> str:
-        """The mean and in brackets the interval, each number by `spec`."""
+        """Return the mean, and the interval in brackets; `spec` formats each number."""
         return f"{self.mean:{spec}} ({self.low:{spec}} to {self.high:{spec}})"
 
 
@@ -50,16 +55,20 @@ UNKNOWN = Estimate(math.nan, math.nan, math.nan, 0)
 def paired(
     values_a: Sequence[float] | FloatArray, values_b: Sequence[float] | FloatArray
 ) -> Estimate:
-    """Mean of `values_a` minus `values_b` and its 95 % interval, see `average`; entry k of both is of the same seed."""
-    a, b = (
-        np.asarray(values_a, dtype=np.float64),
-        np.asarray(values_b, dtype=np.float64),
-    )
+    """Mean of `values_a` minus `values_b` and its 95 % interval, see `average`.
+
+    Entry k of both belongs to the same seed.
+    """
+    a = np.asarray(values_a, dtype=np.float64)
+    b = np.asarray(values_b, dtype=np.float64)
     return average((a - b)[np.isfinite(a) & np.isfinite(b)])
 
 
 def average(values: Sequence[float] | FloatArray) -> Estimate:
-    """Mean of `values`, one of each seed, and its 95 % interval mean +- t(n - 1) std / sqrt(n); NaN is left out."""
+    """Mean of `values`, one per seed, and its 95 % interval mean +- t(n - 1) std / sqrt(n).
+
+    NaN is ignored.
+    """
     known = np.asarray(values, dtype=np.float64)
     known = known[~np.isnan(known)]
     if not len(known):
@@ -71,31 +80,37 @@ def average(values: Sequence[float] | FloatArray) -> Estimate:
 
 
 def within_run(ticks: FloatArray, statistic: Statistic) -> Estimate:
-    """The `statistic` of the sums of `ticks` over time and its 95 % interval.
-    `ticks`, shape (n, k), are in order of time; `statistic` takes sums, shape (k, m), and gives shape (m,). A root mean
-    square is sqrt(S[0] / S[1]) of the sums S of squared errors and counts.
+    """Return `statistic` of the sums of `ticks` over time, with its 95 % interval.
 
-    Ticks, whose errors are correlated, add x_t to first order. The variance of their sum is the mean of 2 (sum of x_t
-    cos(pi j (t + 1/2) / n))^2 over j = 1 ... B (equal-weighted cosines), with Student's t for B degrees of freedom:
-    Lazarus, Lewis, Stock & Watson 2018 (Journal of Business & Economic Statistics 36(4)), after Mueller 2007 (Journal
-    of Econometrics 141(2)). B is a fifth of the `correlation_length`s in the run, at least 4, so that the spectrum is
-    flat over these frequencies. Of fewer than eight ticks it is unknown.
+    `ticks`, shape (n, k), are in order of time. `statistic` takes sums of shape (k, m),
+    and returns shape (m,). For instance a root mean square is sqrt(S[0] / S[1]), with
+    the sums S of squared errors and counts.
+
+    To first order, tick t adds x_t to the statistic; these numbers are correlated. The
+    variance of their sum is the mean of 2 (sum of x_t cos(pi j (t + 1/2) / n))^2 over j
+    = 1 ... B (equal-weighted cosines). The interval uses Student's t with B degrees of
+    freedom. B is a fifth of the number of `correlation_length`s in the run, and at
+    least 4. So the spectrum is flat over these frequencies. The interval is unknown for
+    fewer than eight ticks.
+
+    Sources: Lazarus, Lewis, Stock and Watson 2018 (Journal of Business & Economic
+    Statistics 36(4)); Mueller 2007 (Journal of Econometrics 141(2)).
     """
-    sums, size = ticks.sum(axis=0), max(1, math.ceil(len(ticks) / _MOST_PIECES))
+    sums = ticks.sum(axis=0)
+    size = max(1, math.ceil(len(ticks) / _MOST_PIECES))
     pieces = (
         np.add.reduceat(ticks, np.arange(0, len(ticks), size), axis=0)
         if len(ticks)
         else ticks
     )
     n = len(pieces)
-    with np.errstate(divide="ignore", invalid="ignore"):  # a mean of nothing is NaN
+    with np.errstate(divide="ignore", invalid="ignore"):  # an empty mean is NaN
         value = float(statistic(sums))
         if n < _FEWEST_PIECES or not math.isfinite(value):
             return Estimate(value, math.nan, math.nan, n)
+        # The change is 0 for a sum of 0, which consists of zeros.
         steps = np.diag(_STEP * sums)
-        change = statistic((sums + steps).T) - statistic(
-            (sums - steps).T
-        )  # 0 for a sum of 0: nothing adds to it
+        change = statistic((sums + steps).T) - statistic((sums - steps).T)
     x = pieces @ np.divide(
         change, 2.0 * _STEP * sums, out=np.zeros_like(sums), where=sums != 0.0
     )
@@ -111,7 +126,10 @@ def within_run(ticks: FloatArray, statistic: Statistic) -> Estimate:
 
 
 def mean_square(ticks: FloatArray) -> Estimate:
-    """S[0] / S[1] of the sums S of `ticks`, see `within_run`; the interval is that of the logarithm, so positive."""
+    """Ratio S[0] / S[1] of the sums S of `ticks`, see `within_run`.
+
+    The interval is computed for the logarithm, so it is positive.
+    """
     log = within_run(ticks, lambda S: np.log(S[0] / S[1]))
     with np.errstate(over="ignore"):
         mean, low, high = np.exp([log.mean, log.low, log.high]).tolist()
@@ -119,7 +137,10 @@ def mean_square(ticks: FloatArray) -> Estimate:
 
 
 def by_stamp(stamps_ns: IntArray, samples: FloatArray) -> FloatArray:
-    """Sums of `samples` (n, k) without NaN over each stamp in rising order, and their number: the last column."""
+    """Sums of `samples` (n, k) over each stamp in ascending order, and in the last column their number.
+
+    A row with NaN is ignored.
+    """
     known = np.isfinite(samples).all(axis=1)
     distinct, index = np.unique(stamps_ns, return_inverse=True)
     columns = [*samples[known].T, np.ones(int(known.sum()))]
@@ -130,9 +151,12 @@ def by_stamp(stamps_ns: IntArray, samples: FloatArray) -> FloatArray:
 
 
 def correlation_length(values: FloatArray) -> float:
-    """Sum of the autocorrelations of `values`, shape (n,), over positive and negative lags; between 1 and n.
-    Of the flat-top window of Politis & White 2004 (Econometric Reviews 23), whose width is twice the lag from which on
-    five correlations in a row are insignificant; n where there is no such lag below n / 4.
+    """Sum of the autocorrelations of `values`, shape (n,), over positive and negative lags; from 1 to n.
+
+    The correlations are weighted by the flat-top window of Politis and White 2004
+    (Econometric Reviews 23). The window is twice as wide as the first lag after which
+    five successive correlations are insignificant. The result is n if there is no such
+    lag below n / 4.
     """
     n = len(values)
     centred = values - values.mean()
@@ -151,7 +175,10 @@ def correlation_length(values: FloatArray) -> float:
 
 
 def _t_interval(mean: float, error: float, count: float) -> Estimate:
-    """`mean` with its t interval, `error` being its standard error from `count` independent pieces."""
+    """Estimate with the t interval of `mean`.
+
+    `error` is its standard error, from `count` independent pieces.
+    """
     from scipy.special import stdtrit
 
     half = float(stdtrit(count - 1.0, _UPPER)) * error if count > 1.0 else math.nan

@@ -1,9 +1,11 @@
-"""A run of a KITTI sequence as a result file of the data set, for its own evaluation and for that of AB3DMOT.
+"""Result file of a run for a KITTI sequence, for the evaluation of the data set and of AB3DMOT.
 
-A line per track and frame: `frame track type truncated occluded alpha left top right bottom h w l x y z rotation_y
-score` (Geiger, Lenz, Urtasun 2012, development kit of the tracking benchmark). Position and heading are those of the
-track, the score is its existence probability where it has one; the rest is that of the boxes fused by then. The box in
-the image is the box in space as camera 2 sees it.
+Each line is a track in a frame: `frame track type truncated occluded alpha left top
+right bottom h w l x y z rotation_y score` (Geiger, Lenz and Urtasun 2012, development
+kit of the tracking benchmark). Position and heading come from the track. The score is
+the existence probability of the track, if it has one. Size, height and class, and else
+the score, come from the detections that it has fused so far. The image box is the
+projection of the 3D box into camera 2.
 """
 
 import math
@@ -34,34 +36,39 @@ DataFrame = Any  # of pandas, which is untyped
 def write_kitti_result(
     run: Run, sequence: Path, out: Path, *, overwrite: bool = False
 ) -> tuple[int, int, int]:
-    """Write the tracks of `run` at the frames of `sequence`, its file in `oxts/` or a folder with one, to `out`.
-    Returns the numbers of boxes, of tracks with a box, and of tracks of which no detection has a size. `CallError` if
-    `sequence` is another file, or `out` exists or lies in an input; `DataError` if no detection has a size.
+    """Write the tracks of `run` at the frames of `sequence` to the file `out`.
+
+    `sequence` is the sequence's file in `oxts/`, or a folder with one sequence. Returns
+    the numbers of boxes, of tracks with a box, and of tracks without a size.
+
+    Raises `CallError` if `sequence` is another file, or if `out` exists or lies in an
+    input. Raises `DataError` if no detection has a size.
     """
     if not is_sequence(sequence):
         raise CallError(
-            f"{sequence}: is not a sequence of the KITTI data set, name its oxts/NNNN.txt"
+            f"{sequence}: not a sequence of the KITTI data set, give its oxts/NNNN.txt"
         )
     check_no_overlap(out, [sequence, *(() if run.path is None else (run.path,))])
     views = _located(run, view_of_sequence(sequence))
     states = _states(run, len(views))
     without = set(states["track_id"][states["length_m"].isna()])
-    lines, tracks = [], set()
+    lines = []
+    tracks = set()
     for state in states.dropna(subset=_BOX).to_dict("records"):
         if (line := _line(state, views[state["frame"]])) is not None:
             lines.append(line)
             tracks.add(state["track_id"])
     if not lines and without:
         raise DataError(
-            f"{run.path}: no detection of its tracks has a size (detections.csv), which a box needs: replay detections "
-            "with length_m, width_m, height_m and z_m"
+            f"{run.path}: no detection of its tracks has a size for a box (detections.csv): replay detections with "
+            "length_m, width_m, height_m and z_m"
         )
     write_file(out, "".join(lines), overwrite)
     return len(lines), len(tracks), len(without - tracks)
 
 
 def _located(run: Run, views: list[View]) -> list[View]:
-    """Return `views` with the positions of the ego in ego.csv, in which the tracks are."""
+    """Return `views` with the ego positions of ego.csv, the frame of the tracks."""
     frames_ns = np.arange(len(views)) * PERIOD_NS
     positions = ego_states(run.tables["ego"], frames_ns)[:, :2].tolist()
     return [
@@ -73,7 +80,10 @@ def _located(run: Run, views: list[View]) -> list[View]:
 
 
 def _states(run: Run, num_frames: int) -> DataFrame:
-    """The tracks at the newest tick of every frame, moved to it, with what is known of their boxes by then."""
+    """Return the tracks at the newest tick of every frame, predicted to the frame, with their boxes.
+
+    The boxes come from the detections fused so far.
+    """
     timing = run.timing.assign(
         frame=-(-run.timing["now_ns"] // PERIOD_NS)
     ).drop_duplicates("frame", keep="last")
@@ -90,10 +100,8 @@ def _states(run: Run, num_frames: int) -> DataFrame:
         .sort_values("tick", kind="stable")
     )
     ahead_s = (states["frame"] * PERIOD_NS - states["now_ns"]) / NS_PER_S
-    turned_rad, way_m = (
-        ahead_s * states["yaw_rate_radps"],
-        ahead_s * states["speed_mps"],
-    )
+    turned_rad = ahead_s * states["yaw_rate_radps"]
+    way_m = ahead_s * states["speed_mps"]
     middle_rad = states["yaw_rad"] + 0.5 * turned_rad
     moved = {
         "x_m": states["x_m"] + way_m * np.cos(middle_rad),
@@ -109,7 +117,11 @@ def _states(run: Run, num_frames: int) -> DataFrame:
 
 
 def _boxes(run: Run) -> DataFrame:
-    """Mean size and score, most frequent class and last height of the detections that a track has fused, by tick."""
+    """Return the box of each track by tick, from the detections that the track has fused so far.
+
+    Size and score are means, the class is the most frequent one, and the height is the
+    last one.
+    """
     rows = update_rows(run)
     updates = run.updates.iloc[rows[rows >= 0]][["tick", "track_id"]].reset_index(
         drop=True
@@ -131,13 +143,15 @@ def _boxes(run: Run) -> DataFrame:
     )
     groups = boxes.groupby("track_id")
     boxes[_MEANS] = groups[_MEANS].expanding().mean().droplevel(0)
-    boxes["z_m"], boxes["score"] = groups["z_m"].ffill(), boxes["score"].fillna(1.0)
+    boxes["z_m"] = groups["z_m"].ffill()
+    boxes["score"] = boxes["score"].fillna(1.0)
     return boxes.assign(class_name=kinds.idxmax(axis=1).where(kinds.any(axis=1), "car"))
 
 
 def _line(state: dict[str, Any], view: View) -> str | None:
-    """The line of a track; None where camera 2 does not see it."""
-    ego, height_m = view.ego, state["height_m"]
+    """Return the line of a track; None if it is outside the image of camera 2."""
+    ego = view.ego
+    height_m = state["height_m"]
     in_ego_m = np.array([state["x_m"] - ego.x_m, state["y_m"] - ego.y_m]) @ rotation(
         ego.yaw_rad
     )
@@ -162,8 +176,6 @@ def _line(state: dict[str, Any], view: View) -> str | None:
         *box,
         state["score"],
     )
-    name, kind = (
-        f"{state['frame']} {state['track_id']}",
-        CLASS_NAMES.get(state["class_name"], state["class_name"]),
-    )
+    name = f"{state['frame']} {state['track_id']}"
+    kind = CLASS_NAMES.get(state["class_name"], state["class_name"])
     return f"{name} {kind} -1 -1 {' '.join(f'{value:.6f}' for value in numbers)}\n"

@@ -1,4 +1,4 @@
-"""Pairs of tracks and true objects, tick by tick, and the errors of these tracks."""
+"""Matching of tracks with true objects at every tick, and the errors of the matched tracks."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,76 +18,87 @@ from fgtrack.evaluation.truth import (
 from fgtrack.runs import NO_TRACK, Columns, Run
 
 NO_OBJECT = -1
-"""Object index of a track row that is paired with no true object."""
+"""Object index of a track row without a true object."""
 
 
 @dataclass(frozen=True)
 class Matching:
-    """Pairs of track rows and true objects, which are numbered by rising id, without the ego."""
+    """Pairs of track rows and true objects. Objects are numbered by ascending id, without the ego."""
 
     object_ids: tuple[int, ...]
+    """Id of each object in the truth."""
     tracks: Columns
-    """The evaluated rows of tracks.csv: r rows while truth was recorded."""
+    """The r evaluated rows of tracks.csv, during the time with truth."""
     object_index: IntArray
-    """Object that each row is paired with, shape (r,); `NO_OBJECT` without one."""
+    """Object of each row, shape (r,); `NO_OBJECT` without one."""
     true_states: FloatArray
-    """x, y, yaw, speed, yaw rate of that object at the row's stamp, shape (r, 5); NaN without one."""
+    """x, y, yaw, speed and yaw rate of the row's object at the row's stamp, shape (r, 5).
+
+    NaN for a row without an object.
+    """
     distances_m: FloatArray
-    """Distance of each row from every object at the row's stamp, shape (r, objects); NaN where unknown."""
+    """Distance of each row from every object at the row's stamp, shape (r, objects).
+
+    NaN where the object has no truth.
+    """
     now_ns: IntArray
-    """Time of every tick, shape (ticks,)."""
+    """Time of each tick, shape (ticks,)."""
     tick_index: IntArray
-    """Index of each row's tick, shape (r,)."""
+    """Tick of each row, shape (r,)."""
     present: BoolArray
-    """True where there is truth at the tick's `now_ns`, shape (ticks, objects)."""
+    """Mask of objects with truth at each tick, shape (ticks, objects)."""
     track_ids: IntArray
-    """Track paired with each object, shape (ticks, objects); `NO_TRACK` without one."""
+    """Track of each object at each tick, shape (ticks, objects); `NO_TRACK` without one."""
     in_view: BoolArray
-    """True where some sensor could see the object, shape (ticks, objects), see `visible`."""
+    """Mask of objects that some sensor could detect, shape (ticks, objects), see `visible`."""
 
     @property
     def paired(self) -> BoolArray:
-        """True for the paired rows, shape (r,)."""
+        """Mask of the rows with an object, shape (r,)."""
         return np.asarray(self.object_index != NO_OBJECT)
 
 
 @dataclass(frozen=True)
 class Scenes:
-    """Tracks and true objects at t ticks; r rows of tracks by rising tick."""
+    """Tracks and true objects at t ticks; r rows of tracks by ascending tick."""
 
     tick_index: IntArray
-    """Tick of each row, shape (r,), rising."""
+    """Tick of each row in ascending order, shape (r,)."""
     track_ids: IntArray
-    """Shape (r,)."""
+    """Track of each row, shape (r,)."""
     distances_m: FloatArray
-    """Distance of each row from every object, shape (r, objects); infinite where the object is not present."""
+    """Distance of each row from every object, shape (r, objects); infinity for an absent object."""
     present: BoolArray
-    """True where an object is present, shape (t, objects)."""
+    """Mask of present objects, shape (t, objects)."""
     in_view: BoolArray
-    """True where it is present and some sensor could see it, shape (t, objects)."""
+    """Mask of present objects that some sensor could detect, shape (t, objects)."""
 
 
 @dataclass(frozen=True)
 class TrackErrors:
-    """Track minus truth of the p paired rows."""
+    """Errors, track minus truth, of the p paired rows."""
 
     stamps_ns: IntArray
+    """Stamp of each row, shape (p,)."""
     object_index: IntArray
+    """Object of each row, shape (p,)."""
     track_ids: IntArray
-    """Shape (p,) each."""
+    """Track of each row, shape (p,)."""
     values: Mapping[str, FloatArray]
-    """By name of `ERROR_NAMES`, each of shape (p,); NaN where the truth has no value."""
+    """Errors by name of `ERROR_NAMES`, shape (p,) each; NaN where the truth has no value."""
 
 
-#: Distance; along and across the true heading (left positive); yaw in (-pi, pi]; speed.
+#: Position distance; error along and across the true heading (left positive); yaw in (-pi, pi]; speed.
 ERROR_NAMES = ("position_m", "along_m", "across_m", "yaw_rad", "speed_mps")
 
 
 def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
-    """Pair the tracks of `run` to its true objects at every tick; None for a run without truth.
-    As CLEAR does (Bernardin and Stiefelhagen 2008): a pair of the tick before stays while it lies inside the gate, the
-    rest is assigned by the Hungarian method, first as many pairs as possible, then the least sum of distances. Tracks
-    of ignored objects and in ignored regions are left out.
+    """Pair the tracks of `run` with its true objects at every tick; None without truth.
+
+    The method is that of CLEAR (Bernardin and Stiefelhagen 2008). A pair of the
+    previous tick stays while it is inside the gate. The Hungarian method assigns the
+    rest: first as many pairs as possible, then the least sum of distances. Tracks of
+    ignored objects, and in ignored regions, are excluded.
     """
     options = options or evaluation_settings(run)
     paths = true_paths(run.tables["truth"])
@@ -95,9 +106,8 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
         return None
     timing = run.tables["timing"]
     tracks = run.tables["tracks"]
-    kept = recorded(run, tracks["stamp_ns"]) & np.isin(
-        tracks["tick"], timing["tick"]
-    )  # not of a tick that was killed
+    # A tick without a row in timing.csv was interrupted.
+    kept = recorded(run, tracks["stamp_ns"]) & np.isin(tracks["tick"], timing["tick"])
     tracks = tracks.where(kept & confirmed(tracks) if options.confirmed_only else kept)
     if run.tables["ignored"].num_rows:
         tracks = tracks.where(~_ignored(run, tracks, paths, options.gate_m))
@@ -130,28 +140,32 @@ def match(run: Run, options: EvaluationConfig | None = None) -> Matching | None:
 def pair(
     scores: FloatArray, ids: IntArray, tick_index: IntArray, previous: IntArray
 ) -> IntArray:
-    """Object of every row, shape (rows,), so that each tick has the largest sum of scores; `NO_OBJECT` without one.
-    `scores`, shape (rows, objects), are 0 for pairs that are not allowed; pairs of the tick `previous`, (ticks,), stay.
+    """Return the object of every row, shape (rows,), with the largest sum of scores at each tick.
+
+    `NO_OBJECT` for a row without an object. `scores` (rows, objects) are 0 for pairs
+    that are not allowed. `ids` and `tick_index` (rows,) are the track and the tick of
+    each row. Allowed pairs of the tick `previous` (ticks,) stay.
     """
     from scipy.optimize import linear_sum_assignment
 
-    num_ticks, inside = len(previous), scores > 0.0
+    num_ticks = len(previous)
+    num_objects = scores.shape[1]
+    inside = scores > 0.0
     object_index = np.full(len(ids), NO_OBJECT)
+    # A tick is clear if each row has at most one allowed object, and each object one allowed row.
     rows, columns = np.nonzero(inside)
-    ways = (
-        tick_index[rows] * scores.shape[1] + columns
-    )  # elsewhere a row has one object, and an object one row
-    ways_per_object = np.bincount(ways, minlength=num_ticks * scores.shape[1]).reshape(
-        num_ticks, scores.shape[1]
-    )
-    unclear = np.asarray((ways_per_object > 1).any(axis=1))
+    rows_per_object = np.bincount(
+        tick_index[rows] * num_objects + columns, minlength=num_ticks * num_objects
+    ).reshape(num_ticks, num_objects)
+    unclear = np.asarray((rows_per_object > 1).any(axis=1))
     unclear[tick_index[inside.sum(axis=1) > 1]] = True
     clear_rows, columns = np.nonzero(inside & ~unclear[tick_index, None])
     object_index[clear_rows] = columns
     order = np.argsort(tick_index, kind="stable")
     edges = np.searchsorted(tick_index[order], np.arange(num_ticks + 1)).tolist()
     for k in np.flatnonzero(unclear).tolist():
-        rows, last = order[edges[k] : edges[k + 1]], int(previous[k])
+        rows = order[edges[k] : edges[k + 1]]
+        last = int(previous[k])
         before = order[edges[last] : edges[last + 1]] if last >= 0 else rows[:0]
         before = before[object_index[before] != NO_OBJECT]
         track_of = np.full(scores.shape[1], NO_TRACK)
@@ -167,7 +181,7 @@ def pair(
 
 
 def track_errors(matching: Matching) -> TrackErrors:
-    """Errors of the paired rows against the truth at their own stamps."""
+    """Return the errors of the paired rows against the truth at their stamps."""
     tracks = matching.tracks.where(matching.paired)
     values = state_errors(tracks, matching.true_states[matching.paired])
     return TrackErrors(
@@ -179,11 +193,16 @@ def track_errors(matching: Matching) -> TrackErrors:
 
 
 def state_errors(states: Columns, truth: FloatArray) -> dict[str, FloatArray]:
-    """Errors by name of `ERROR_NAMES`, shape (n,) each, of n rows against x, y, yaw, speed ..., shape (n, 5)."""
-    dx_m, dy_m = states["x_m"] - truth[:, 0], states["y_m"] - truth[:, 1]
+    """Return the errors of n `states` against `truth` by name of `ERROR_NAMES`, shape (n,) each.
+
+    `truth` (n, 5) has the columns x, y, yaw, speed, yaw rate.
+    """
+    dx_m = states["x_m"] - truth[:, 0]
+    dy_m = states["y_m"] - truth[:, 1]
     c, s = np.cos(truth[:, 2]), np.sin(truth[:, 2])
     yaw_rad = wrap_angles(states["yaw_rad"] - truth[:, 2])
-    along_m, across_m = c * dx_m + s * dy_m, c * dy_m - s * dx_m
+    along_m = c * dx_m + s * dy_m
+    across_m = c * dy_m - s * dx_m
     errors = (
         np.hypot(dx_m, dy_m),
         along_m,
@@ -195,19 +214,24 @@ def state_errors(states: Columns, truth: FloatArray) -> dict[str, FloatArray]:
 
 
 def position_nees(matching: Matching) -> FloatArray:
-    """Return the NEES of the position of every paired row, shape (p,); NaN where there is none."""
+    """Return the position NEES of every paired row, shape (p,).
+
+    NaN where the covariance is not positive definite.
+    """
     return position_squares(
         matching.tracks.where(matching.paired), matching.true_states[matching.paired]
     )
 
 
 def position_squares(states: Columns, truth: FloatArray) -> FloatArray:
-    """Return the normalised error squared e' P^-1 e of x and y, shape (n,); NaN where P is not positive definite."""
+    """Return the normalised squared error e' P^-1 e of x and y, shape (n,).
+
+    NaN where P is not positive definite.
+    """
     x, y = states["x_m"] - truth[:, 0], states["y_m"] - truth[:, 1]
     P_x, P_xy, P_y = (states[name] for name in ("p_x_x", "p_x_y", "p_y_y"))
-    with np.errstate(
-        over="ignore", invalid="ignore", divide="ignore"
-    ):  # of indefinite covariances
+    # Covariances may be indefinite.
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         gain = P_xy / P_x
         rest = P_y - gain * P_xy  # variance of y given x
         squares = x**2 / P_x + (y - gain * x) ** 2 / rest
@@ -215,14 +239,15 @@ def position_squares(states: Columns, truth: FloatArray) -> FloatArray:
 
 
 def scenes(run: Run, matching: Matching) -> Scenes:
-    """The ticks of `run` while truth was recorded, with the evaluated rows; distances are at the stamps of the rows."""
+    """Return the ticks of `run` during the time with truth, with their evaluated rows.
+
+    Distances are those at the stamps of the rows.
+    """
     scored = recorded(run, matching.now_ns)
     rows = np.flatnonzero(scored[matching.tick_index])
     rows = rows[np.argsort(matching.tick_index[rows], kind="stable")]
-    tick_index, present = (
-        (np.cumsum(scored) - 1)[matching.tick_index[rows]],
-        matching.present[scored],
-    )
+    tick_index = (np.cumsum(scored) - 1)[matching.tick_index[rows]]
+    present = matching.present[scored]
     distances_m = matching.distances_m[rows]
     distances_m = np.where(
         present[tick_index] & np.isfinite(distances_m), distances_m, np.inf
@@ -237,12 +262,12 @@ def scenes(run: Run, matching: Matching) -> Scenes:
 
 
 def confirmed(tracks: Columns) -> BoolArray:
-    """True for the rows of tracks.csv that are not tentative, shape (rows,)."""
+    """Mask of the rows of tracks.csv that are not tentative, shape (rows,)."""
     return np.asarray(tracks["status"] != TrackStatus.TENTATIVE.value)
 
 
 def published_rows(tracks: Columns, ticks: IntArray, track_ids: IntArray) -> IntArray:
-    """Row of `tracks` of each of these ticks and tracks, shape (n,); -1 where there is none."""
+    """Row of `tracks` for each tick and track, shape (n,); -1 without one."""
     before, after = neighbours(tracks, "tick", ticks, track_ids)
     return np.where(before == after, before, -1)
 
@@ -250,15 +275,18 @@ def published_rows(tracks: Columns, ticks: IntArray, track_ids: IntArray) -> Int
 def neighbours(
     tracks: Columns, name: str, values: IntArray, track_ids: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Rows of these tracks whose column `name` is the last up to, and the first from `values` on; -1 without one."""
+    """Rows of each track before and after a value: two arrays of shape (n,); -1 without such a row.
+
+    The first is the last row whose column `name` is at most `values`. The second is the
+    first row whose column is at least `values`.
+    """
     every = np.unique(np.concatenate([tracks[name], values]))
     ranks, wanted = (np.searchsorted(every, each) for each in (tracks[name], values))
-    keys, wanted = (
-        tracks["track_id"] * len(every) + ranks,
-        track_ids * len(every) + wanted,
-    )
+    keys = tracks["track_id"] * len(every) + ranks
+    wanted = track_ids * len(every) + wanted
     order = np.argsort(keys, kind="stable")
-    keys, order = np.append(keys[order], -1), np.append(order, -1)
+    keys = np.append(keys[order], -1)
+    order = np.append(order, -1)
     at = (
         np.searchsorted(keys[:-1], wanted, side="right") - 1,
         np.searchsorted(keys[:-1], wanted),
@@ -270,7 +298,7 @@ def neighbours(
 
 
 def recorded(run: Run, stamps_ns: IntArray) -> BoolArray:
-    """True for those of `stamps_ns` between the first and the last stamp of the truth, shape (n,)."""
+    """Mask of `stamps_ns` between the first and the last stamp of the truth, shape (n,)."""
     truth_ns = run.tables["truth"]["stamp_ns"]
     return np.asarray((stamps_ns >= truth_ns.min()) & (stamps_ns <= truth_ns.max()))
 
@@ -278,7 +306,11 @@ def recorded(run: Run, stamps_ns: IntArray) -> BoolArray:
 def _ignored(
     run: Run, tracks: Columns, paths: list[TruePath], gate_m: float
 ) -> BoolArray:
-    """True for the rows of no true object that follow an ignored one or lie in an ignored region, as in KITTI."""
+    """Mask of the rows of `tracks` that KITTI's rules ignore, shape (rows,).
+
+    These are the rows paired with an ignored object. Rows without any object in an
+    ignored region count as well.
+    """
     objects = run.tables["ignored"].where(run.tables["ignored"]["outline_m"] == "")
     unknown = dict.fromkeys(
         ("yaw_rad", "speed_mps", "yaw_rate_radps"), np.full(objects.num_rows, np.nan)
@@ -286,7 +318,8 @@ def _ignored(
     _, distances_m = distances(
         tracks, [*paths, *true_paths(Columns({**objects, **unknown}))]
     )
-    timing, stamps_ns = run.tables["timing"], tracks["stamp_ns"]
+    timing = run.tables["timing"]
+    stamps_ns = tracks["stamp_ns"]
     tick_index = np.searchsorted(timing["tick"], tracks["tick"])
     index = nearest_pairs(
         distances_m, tracks["track_id"], tick_index, timing.num_rows, gate_m
@@ -300,7 +333,10 @@ def _ignored(
 def distances(
     tracks: Columns, paths: Sequence[TruePath]
 ) -> tuple[FloatArray, FloatArray]:
-    """True states at the stamps of `tracks`, shape (rows, objects, 5), and distances, shape (rows, objects), or NaN."""
+    """Return true states (rows, objects, 5) at the stamps of `tracks`, and distances (rows, objects).
+
+    NaN where an object has no truth.
+    """
     candidates = np.stack([path.at(tracks["stamp_ns"]) for path in paths], axis=1)
     xy = np.stack([tracks["x_m"], tracks["y_m"]], axis=-1)
     return candidates, np.linalg.norm(candidates[..., :2] - xy[:, None], axis=-1)
@@ -313,9 +349,11 @@ def nearest_pairs(
     num_ticks: int,
     gate_m: float,
 ) -> IntArray:
-    """Object of every row: as many pairs as possible, then the least sum of distances, none beyond the gate."""
-    objects = distances_m.shape[
-        1
-    ]  # one more pair counts for more than all distances, which are below 1 here
+    """Return the object of every row: as many pairs as possible, then the least sum of distances.
+
+    No pair is farther apart than `gate_m`. Pairs of the previous tick stay, see `pair`.
+    """
+    # One more pair outweighs all distances, which are at most 1 in units of the gate.
+    objects = distances_m.shape[1]
     scores = np.where(distances_m <= gate_m, objects + 1.0 - distances_m / gate_m, 0.0)
     return pair(scores, ids, tick_index, np.arange(num_ticks) - 1)

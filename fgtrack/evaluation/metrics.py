@@ -38,33 +38,33 @@ from fgtrack.evaluation.settings import EvaluationConfig, evaluation_settings
 from fgtrack.runs import NO_TRACK, Columns, Run
 
 FALSE_TRACK_SHARE = 0.5
-"""A track that is paired with a true object in less than this share of its rows is false."""
+"""A track is false if less than this share of its rows has a true object."""
 
 
 @dataclass(frozen=True)
 class ObjectMetrics:
-    """Metrics of one true object, or of all of them together."""
+    """Metrics of one true object, or of all true objects together."""
 
     errors: Mapping[str, Moments]
-    """Track minus truth, by name of `ERROR_NAMES`; `position_m` is the distance."""
+    """Errors, track minus truth, by name of `ERROR_NAMES`."""
     ticks_present: int = 0
-    """Ticks at which there is truth."""
+    """Number of ticks with truth."""
     ticks_tracked: int = 0
-    """Ticks among them at which a track was paired."""
+    """Number of these ticks with a paired track."""
     breaks: int = 0
-    """Times that tracking went on after a loss, or with another track."""
+    """Number of times that tracking resumed after a loss or with another track."""
     id_switches: int = 0
-    """Times that it went on with another track than the last one."""
+    """Number of times that tracking continued with another track than before."""
     time_to_confirm_s: Moments = field(default_factory=Moments)
-    """From the first detection to the first confirmed track, a sample for each object, see `times_to_confirm`."""
+    """Time from the first detection to the first confirmed track, one sample per object, see `times_to_confirm`."""
     ticks_in_view: int = 0
-    """Ticks at which there is truth and some sensor could see it, see `visible`."""
+    """Number of ticks with truth at which some sensor could detect the object, see `visible`."""
     ticks_tracked_in_view: int = 0
-    """Ticks among them at which a track was paired."""
+    """Number of ticks in view with a paired track."""
 
     @property
     def tracked_share(self) -> float:
-        """Share of the ticks at which the object was tracked."""
+        """Share of the ticks with truth at which the object was tracked."""
         return (
             self.ticks_tracked / self.ticks_present if self.ticks_present else math.nan
         )
@@ -81,36 +81,36 @@ class ObjectMetrics:
 
 @dataclass(frozen=True)
 class TruthMetrics:
-    """Metrics that need truth."""
+    """Metrics that require truth."""
 
     objects: Mapping[int, ObjectMetrics]
-    """By object id."""
+    """Metrics by object id."""
     judged_tracks: int
-    """Tracks with an evaluated row."""
+    """Number of tracks with an evaluated row."""
     false_tracks: int
-    """Judged tracks paired in less than `FALSE_TRACK_SHARE` of their rows."""
+    """Number of evaluated tracks with a true object in less than `FALSE_TRACK_SHARE` of their rows."""
     tracked_visits: int
-    """Times that an object came into view and was tracked there: TP of the precision, see `tracked_visits`."""
+    """True positives of the precision: times in view with a confirmed track, see `tracked_visits`."""
     overall: ObjectMetrics
-    """All objects together."""
+    """Metrics over all objects together."""
 
 
 @dataclass(frozen=True)
 class SensorMetrics:
-    """Dispositions and innovations of one sensor."""
+    """Dispositions, delays and innovations of one sensor."""
 
     dispositions: Mapping[str, int]
-    """Detections by disposition, zeros included."""
+    """Number of detections by disposition, zeros included."""
     overtaken: int
-    """Detections with an older stamp than one of the sensor that was received before."""
+    """Number of detections with a newer detection of the sensor received before them."""
     delay_s: Distribution
-    """Receipt minus stamp of the messages that held a detection."""
+    """Delay from stamp to receipt of the messages with a detection."""
     residuals: Mapping[str, Moments]
-    """Innovations by name of `RESIDUAL_NAMES`, those that occur."""
+    """Innovations by name of `RESIDUAL_NAMES`; only names with innovations."""
 
     @property
     def detections(self) -> int:
-        """All detections received."""
+        """Number of received detections."""
         return sum(self.dispositions.values())
 
 
@@ -123,41 +123,44 @@ class Metrics:
     estimator: str
     options: EvaluationConfig
     num_tracks: int
-    """Distinct ids in tracks.csv."""
+    """Number of distinct ids in tracks.csv."""
     num_confirmed: int
-    """Tracks that were `confirmed`."""
+    """Number of tracks that were confirmed at some tick."""
     sensors: Mapping[str, SensorMetrics]
     residuals: Mapping[str, Moments]
-    """Innovations of all sensors and confirmed tracks, by name of `LOCAL_NAMES`: table I of Karle et al. 2023."""
+    """Innovations of confirmed tracks over all sensors, by name of `LOCAL_NAMES`.
+
+    These are the residuals in table I of Karle et al. 2023.
+    """
     time_per_tick_s: Distribution
-    """Wall time of the ticks with a detection."""
+    """Wall time of each tick with a detection."""
     time_per_detection_s: float
-    """The same per detection received; NaN without any."""
+    """Wall time per received detection; NaN without detections."""
     consistency: Consistency
     truth: TruthMetrics | None = None
-    """None for a run without truth."""
+    """Metrics with truth; None for a run without truth."""
     lagged: tuple[LagMetrics, ...] = ()
-    """Present, lagged and final states, see `lag_metrics`."""
+    """Errors of present, lagged and final states, see `lag_metrics`."""
     multi_object: MultiObjectMetrics | None = None
-    """None for a run without truth, and where the options exclude it."""
+    """GOSPA, CLEAR, IDF1 and HOTA; None without truth, or if the options exclude them."""
     predictions: Mapping[str, Mapping[str, PredictionErrors]] = field(
         default_factory=dict
     )
     """Errors of predictions by predictor and horizon, see `prediction_errors`; empty without truth."""
     failures: Mapping[str, int] = field(default_factory=dict)
-    """Failures inside the estimator by kind, zeros included; empty of runs that did not count them."""
+    """Number of failures inside the estimator by kind, zeros included; empty if the run did not count them."""
     left_out: tuple[str, ...] = ()
-    """Lines on the detections that settings excluded."""
+    """Lines on detections that settings excluded."""
 
     @property
     def precision(self) -> float:
-        """TP / (TP + FP) of Karle et al. 2023, section IV-A: tracked visits of true objects / confirmed ids."""
+        """Precision TP / (TP + FP) of Karle et al. 2023, section IV-A: tracked visits over confirmed tracks."""
         if self.truth is None or not self.num_confirmed:
             return math.nan
         return self.truth.tracked_visits / self.num_confirmed
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON values by name, derived ones included; None for NaN."""
+        """Return JSON values by name, including derived values; None for NaN."""
         values: dict[str, Any] = _plain(self)
         return values
 
@@ -167,9 +170,10 @@ def evaluate(
     truth: Mapping[str, Any] | None = None,
     options: EvaluationConfig | None = None,
 ) -> Metrics:
-    """Return the metrics of `run`; without truth, those that need none.
+    """Return the metrics of `run`; without truth only those that require none.
 
-    `truth` are columns of truth.csv, as of a DataFrame, by default the recording's; `options` by default the run's.
+    `truth` are columns of truth.csv, for instance a DataFrame; by default the truth of
+    the recording. `options` are by default those of the run.
     """
     if truth is not None:
         num_rows = len(truth["stamp_ns"])
@@ -185,16 +189,15 @@ def evaluate(
 def evaluate_matched(
     run: Run, matching: Matching | None, options: EvaluationConfig
 ) -> Metrics:
-    """Return the metrics of `run`, whose `match` by these `options` is known."""
-    tracks, timing = run.tables["tracks"], run.tables["timing"]
+    """Return the metrics of `run` from its existing `matching` with these `options`."""
+    tracks = run.tables["tracks"]
+    timing = run.tables["timing"]
     busy = timing["num_detections"] > 0
     scored = (
         scenes(run, matching) if matching is not None and options.multi_object else None
     )
-    time_s, detections = (
-        timing["process_ns"][busy] / NS_PER_S,
-        timing["num_detections"][busy],
-    )
+    time_s = timing["process_ns"][busy] / NS_PER_S
+    detections = timing["num_detections"][busy]
     return Metrics(
         name="" if run.path is None else run.path.resolve().name,
         estimator=str(run.meta.get("estimator", "")),
@@ -225,15 +228,15 @@ def evaluate_matched(
 def _truth_metrics(
     run: Run, matching: Matching, options: EvaluationConfig
 ) -> TruthMetrics:
-    errors, confirm_s = (
-        track_errors(matching),
-        times_to_confirm(run, matching, options.gate_m),
-    )
+    errors = track_errors(matching)
+    confirm_s = times_to_confirm(run, matching, options.gate_m)
     tracked = matching.track_ids != NO_TRACK
 
     def together(indices: Sequence[int]) -> ObjectMetrics:
+        """Return the metrics of the objects with these indices."""
         mine = np.isin(errors.object_index, indices)
-        present, in_view = matching.present[:, indices], matching.in_view[:, indices]
+        present = matching.present[:, indices]
+        in_view = matching.in_view[:, indices]
         sequences = [
             matching.track_ids[matching.present[:, index], index] for index in indices
         ]
@@ -251,17 +254,15 @@ def _truth_metrics(
         )
 
     ids, inverse = np.unique(matching.tracks["track_id"], return_inverse=True)
-    life, paired_life = (
-        np.bincount(of, minlength=len(ids))
-        for of in (inverse, inverse[matching.paired])
-    )
+    num_rows = np.bincount(inverse, minlength=len(ids))
+    num_paired = np.bincount(inverse[matching.paired], minlength=len(ids))
     return TruthMetrics(
         objects={
             object_id: together([index])
             for index, object_id in enumerate(matching.object_ids)
         },
         judged_tracks=len(ids),
-        false_tracks=int((paired_life < FALSE_TRACK_SHARE * life).sum()),
+        false_tracks=int((num_paired < FALSE_TRACK_SHARE * num_rows).sum()),
         tracked_visits=tracked_visits(matching),
         overall=together(range(len(matching.object_ids))),
     )
@@ -288,13 +289,16 @@ def _sensor_metrics(run: Run) -> dict[str, SensorMetrics]:
 
 
 def _overtaken(stamps_ns: IntArray, receipts_ns: IntArray) -> int:
-    """Return how many of the stamps (m,) are older than one with an earlier receipt."""
+    """Return the number of stamps (m,) that are older than a stamp with an earlier receipt."""
     ordered_ns = stamps_ns[np.lexsort((stamps_ns, receipts_ns))]
     return int((ordered_ns < np.maximum.accumulate(ordered_ns)).sum())
 
 
 def _plain(value: Any) -> Any:
-    """`value` as JSON: fields and properties but flags by name, NaN as None, keys as text."""
+    """Return `value` as JSON values: fields and derived properties by name, NaN as None, keys as text.
+
+    Properties that begin with `is_` are excluded.
+    """
     if is_dataclass(value):
         derived = [
             name

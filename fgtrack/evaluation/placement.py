@@ -1,4 +1,4 @@
-"""Detections of a run in the map, the outcome of each, and the roads of the map."""
+"""Detections of a run in the map frame, their updates, and the roads of the map."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,24 +19,29 @@ _KEY = ["sensor", "stamp_ns", "receipt_ns", "index"]
 
 @dataclass(frozen=True)
 class Placed:
-    """The detections of a run in the map, in the order of `Run.detections`."""
+    """Detections of a run in the map frame, in the order of `Run.detections`."""
 
     position_m: FloatArray
-    """Shape (n, 2); NaN where only a direction was measured, and where no pose of the ego is known."""
+    """Position, shape (n, 2); NaN for a direction alone, and without an ego pose."""
     yaw_rad: FloatArray
-    """Shape (n,); NaN where it was not measured."""
+    """Yaw, shape (n,); NaN if not measured."""
     sensor_m: FloatArray
-    """Position of the sensor, shape (n, 2); NaN where no pose of the ego is known."""
+    """Position of the sensor, shape (n, 2); NaN without an ego pose."""
     bearing_rad: FloatArray
-    """Direction from the sensor, shape (n,); NaN where it was not measured."""
+    """Direction from the sensor, shape (n,); NaN if not measured."""
 
 
 def placed(run: Run) -> Placed:
-    """The detections of `run` in the map, by the path of the ego in ego.csv, linear between its stamps."""
+    """Return the detections of `run` in the map frame.
+
+    The ego poses come from ego.csv, with linear interpolation between stamps.
+    """
     table = run.tables["detections"]
-    frame, stamps_ns = table["frame"], table["stamp_ns"]
+    frame = table["frame"]
+    stamps_ns = table["stamp_ns"]
     poses = ego_states(run.tables["ego"], stamps_ns)
-    ego, sensors = run.config.get("ego") or {}, run.config.get("sensors") or {}
+    ego = run.config.get("ego") or {}
+    sensors = run.config.get("sensors") or {}
     origin = [
         float(ego.get("detection_origin_x_m", 0.0)),
         float(ego.get("detection_origin_y_m", 0.0)),
@@ -49,9 +54,12 @@ def placed(run: Run) -> Placed:
         mounts[mine] += [
             float(mount.get(key, 0.0)) for key in ("x_m", "y_m", "yaw_rad")
         ]
-    turns, sensor_rad = rotations(poses[:, 2]), poses[:, 2] + mounts[:, 2]
-    sensor_m = poses[:, :2] + np.einsum("nij,nj->ni", turns, mounts[:, :2])
-    in_map, given_m = frame == "map", np.stack([table["x_m"], table["y_m"]], axis=-1)
+    sensor_rad = poses[:, 2] + mounts[:, 2]
+    sensor_m = poses[:, :2] + np.einsum(
+        "nij,nj->ni", rotations(poses[:, 2]), mounts[:, :2]
+    )
+    in_map = frame == "map"
+    given_m = np.stack([table["x_m"], table["y_m"]], axis=-1)
     turned_m = sensor_m + np.einsum("nij,nj->ni", rotations(sensor_rad), given_m)
     bearing_rad = sensor_rad + table["bearing_rad"]
     polar_m = sensor_m + cartesian(np.stack([bearing_rad, table["range_m"]], axis=-1))
@@ -60,14 +68,14 @@ def placed(run: Run) -> Placed:
         np.isfinite(given_m).all(axis=-1)[:, None], position_m, polar_m
     )
     yaw_rad = np.where(in_map, table["yaw_rad"], table["yaw_rad"] + sensor_rad)
-    with np.errstate(invalid="ignore"):  # of infinite angles
+    with np.errstate(invalid="ignore"):  # angles may be infinite
         return Placed(
             position_m, wrap_angles(yaw_rad), sensor_m, wrap_angles(bearing_rad)
         )
 
 
 def update_rows(run: Run) -> IntArray:
-    """Row of `Run.updates` with the outcome of each of `Run.detections`, shape (n,); -1 without one."""
+    """Row of `Run.updates` for each row of `Run.detections`, shape (n,); -1 without one."""
     import pandas as pd
 
     frames = run.updates[_KEY], run.detections[_KEY]
@@ -79,8 +87,12 @@ def update_rows(run: Run) -> IntArray:
 
 
 def roads(run: Run) -> tuple[dict[str, TrackMap], list[str]]:
-    """The maps that the configuration names, `track` and `pit`, and a line for each that is gone; or `DataError`."""
-    result, notes = {}, []
+    """Return the configured maps, `track` and `pit`, and a line for each missing map file.
+
+    Raises `DataError` for an invalid map.
+    """
+    result = {}
+    notes = []
     config = run.config.get("map") or {}
     for key, built_in in (("track", make_oval), ("pit", make_pit_lane)):
         name = config.get(key)
@@ -89,12 +101,12 @@ def roads(run: Run) -> tuple[dict[str, TrackMap], list[str]]:
         elif name and Path(str(name)).is_file():
             result[key] = TrackMap.read(Path(str(name)))
         elif name and name != OPEN_SPACE:
-            notes.append(f"map.{key}: {name} is not there any more, so it is not shown")
+            notes.append(f"map.{key}: the file {name} is missing, so it is not shown")
     return result, notes
 
 
 def road_lines(road: TrackMap) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the left bound, the right bound and the reference line of `road`, each of shape (n, 2)."""
+    """Return the left bound, the right bound and the reference line of `road`, shape (n, 2) each."""
     s_m = np.linspace(
         0.0, road.length_m, max(2, round(road.length_m / _BOUND_STEP_M)) + 1
     )

@@ -1,4 +1,4 @@
-"""Runs that are evaluated together: read, labelled, and each matched and evaluated once."""
+"""Runs for a common evaluation: loaded, labelled, and each matched and evaluated once."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,10 +20,10 @@ from fgtrack.runs import Run, is_run_folder, load_run
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedRun:
-    """A run and its evaluation, computed when it is first used."""
+    """A run with its evaluation, which is computed at first use."""
 
     label: str
-    """Name among the runs that it is shown with."""
+    """Unique label among the compared runs."""
     run: Run
 
     @cached_property
@@ -33,7 +33,7 @@ class EvaluatedRun:
 
     @cached_property
     def metrics(self) -> Metrics:
-        """All metrics, by the settings of the run's configuration."""
+        """All metrics, with the evaluation settings of the run's configuration."""
         return evaluate_matched(self.run, self.matching, evaluation_settings(self.run))
 
 
@@ -42,8 +42,11 @@ Runs = OneRun | Mapping[str, OneRun] | Iterable["Runs"]
 
 
 def evaluated(runs: Runs) -> list[EvaluatedRun]:
-    """Return runs under labels of their own; a path is a run folder, or a folder of them; a mapping gives labels.
-    Runs of a folder come by name, and may be one folder deeper. Raises `CallError` and, for a damaged run, `DataError`.
+    """Return `runs` with unique labels.
+
+    A path is a run folder, or a folder with run folders, at most one level deeper.
+    These are sorted by name. The keys of a mapping are labels. Raises `CallError` if
+    there is no run, and `DataError` for a damaged run.
     """
     every = _flat(runs)
     if any(isinstance(item, Run) for item in every):
@@ -53,27 +56,33 @@ def evaluated(runs: Runs) -> list[EvaluatedRun]:
 
 
 def one_evaluated(run: OneRun) -> EvaluatedRun:
-    """Return the one run in `run`; raises as `evaluated`, and `CallError` for a folder that holds several."""
+    """Return the single run in `run`.
+
+    Raises like `evaluated`, and `CallError` for a folder with several runs.
+    """
     every = evaluated(run)
     if len(every) > 1:
-        raise CallError(f"{run}: holds {len(every)} runs, name one of them")
+        raise CallError(f"{run}: contains {len(every)} runs, give one of them")
     return every[0]
 
 
 def start_ns(runs: Sequence[EvaluatedRun]) -> int:
-    """Return the time of the first tick of `runs`; 0 without one."""
+    """Return the time of the earliest tick of `runs`; 0 without ticks."""
     ticks_ns = [item.run.tables["timing"]["now_ns"] for item in runs]
     return min((int(ns[0]) for ns in ticks_ns if len(ns)), default=0)
 
 
 def labelled(runs: Sequence[Run]) -> dict[str, Run]:
-    """Runs by the shortest unique end of their path, and by the estimator; `CallError` if a run is given twice."""
+    """Return the runs by label: the shortest unique end of the path, with the estimator.
+
+    Raises `CallError` if a run is given twice.
+    """
     identities = Counter(
         str(run.path.resolve()) if run.path else id(run) for run in runs
     )
     for identity in (identity for identity, times in identities.items() if times > 1):
         raise CallError(
-            f"{identity if isinstance(identity, str) else 'run'}: is given twice, name every run once"
+            f"{identity if isinstance(identity, str) else 'run'}: given twice, give every run once"
         )
     paths = [run.path.resolve() for run in runs if run.path]
     length = next(
@@ -90,8 +99,10 @@ def labelled(runs: Sequence[Run]) -> dict[str, Run]:
 
 
 def same_recording(one: Run, other: Run) -> bool:
-    """True if truth and detections of common sensors are the same, but for other delays or stamps.
-    Without a common sensor and without truth the ego decides, without that the path of the recording.
+    """True if both runs have the same truth, and the same detections of their common sensors.
+
+    Delays and stamps may differ. Without a common sensor the truth decides, without
+    truth the ego, and without both the path of the recording.
     """
     if not one.tables["truth"].equals(other.tables["truth"]):
         return False
@@ -107,7 +118,7 @@ def same_recording(one: Run, other: Run) -> bool:
 
 
 def by_recording(runs: Sequence[EvaluatedRun]) -> list[list[EvaluatedRun]]:
-    """`runs` in groups, those of the same recording together."""
+    """Return `runs` in groups of the same recording."""
     groups: list[list[EvaluatedRun]] = []
     for item in runs:
         group = next(
@@ -120,7 +131,7 @@ def by_recording(runs: Sequence[EvaluatedRun]) -> list[list[EvaluatedRun]]:
 
 
 def recordings_warning(runs: Sequence[EvaluatedRun]) -> list[str]:
-    """Return a line where `runs` are of different recordings, with their names; empty otherwise."""
+    """Return a warning with the names of the runs if `runs` come from several recordings; else empty."""
     groups = by_recording(runs)
     texts = []
     for group in groups:
@@ -128,7 +139,9 @@ def recordings_warning(runs: Sequence[EvaluatedRun]) -> list[str]:
             "path"
         ) or "messages in memory"
         texts.append(f"{', '.join(one.label for one in group)} ({source})")
-    text = f"the runs are of {len(groups)} recordings, so their numbers cannot be compared across them"
+    text = (
+        f"the runs come from {len(groups)} recordings, compare numbers only within one"
+    )
     return [f"{text}: {'; '.join(texts)}"] if len(groups) > 1 else []
 
 
@@ -143,7 +156,7 @@ def _flat(given: Any) -> list[Run | EvaluatedRun]:  # Any: what a user gives
     if not isinstance(given, Path | str):
         if not isinstance(given, Iterable):
             raise CallError(
-                f"runs: must be runs or paths of run folders, there is a {type(given).__name__}"
+                f"runs: must be runs or paths of run folders, not {type(given).__name__}"
             )
         return [item for entry in given for item in _flat(entry)]
     path = Path(given)
@@ -154,11 +167,14 @@ def _flat(given: Any) -> list[Run | EvaluatedRun]:  # Any: what a user gives
             if is_run_folder(each)
         ]:
             return [load_run(folder) for folder in folders]
-    raise CallError(f"{path}: no run folder, make one with `fgtrack replay`")
+    raise CallError(f"{path}: not a run folder, make one with `fgtrack replay`")
 
 
 def _same_detections(one: Run, other: Run, sensor: str) -> bool:
-    """True if the detections of a sensor have the same stamps or receipts, and the same values where both have any."""
+    """True if the detections of `sensor` have equal stamps or receipts, and equal values.
+
+    Values are compared only if both runs have any.
+    """
     (updates, others), (values, other_values) = (
         [
             run.tables[name].where(run.tables[name]["sensor"] == sensor)

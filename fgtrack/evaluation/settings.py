@@ -11,14 +11,17 @@ from fgtrack.runs import Run
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """Pairing of tracks with true objects, and the metrics that are computed."""
+    """Settings of the matching of tracks with true objects, and of the metrics."""
 
     gate_m: float = 5.0
-    """Largest distance of a track from its true object. The default is the tracker's own association distance, a
-    car's length (more for ships): a track farther off is not updated by its object any more. It bounds the errors,
-    so compare at one gate."""
+    """Largest distance between a track and its true object.
+
+    The default is the tracker's own association distance, a car's length (more for
+    ships). A track farther away gets no detections of this object. The gate limits the
+    errors, so compare runs with equal gates.
+    """
     confirmed_only: bool = True
-    """True to leave out tentative tracks: by counting, those measured less than `lifecycle.confirm_count` times."""
+    """True to exclude tentative tracks: with counting, those with fewer than `lifecycle.confirm_count` detections."""
     multi_object: bool = True
     """True to compute GOSPA, CLEAR, IDF1 and HOTA."""
 
@@ -32,7 +35,7 @@ class EvaluationConfig:
 def evaluation_settings(run: Run) -> EvaluationConfig:
     """Return the section `evaluation` of the configuration of `run`, with defaults.
 
-    Raises `DataError` for an invalid value, and as `Run.config`.
+    Raises `DataError` for an invalid value, and like `Run.config`.
     """
     try:
         return TypeAdapter(EvaluationConfig).validate_python(

@@ -1,4 +1,4 @@
-"""True objects as functions of time, their visibility to the sensors, and what of them is not evaluated."""
+"""Truth of a run: paths of true objects, their visibility to the sensors, and ignored objects and regions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from fgtrack.core.types import EGO_ID, BoolArray, FloatArray, IntArray
 from fgtrack.models.sensors import SensorModel
 from fgtrack.runs import Columns, Run
 
-#: What is interpolated, in the order of the columns of `TruePath.at`.
+#: Interpolated quantities, in the order of the columns of `TruePath.at`.
 TRUE_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps", "yaw_rate_radps")
 _SHORTEST_GAP_NS = NS_PER_S
 _GAP_PERIODS = 5
@@ -21,18 +21,21 @@ _GAP_PERIODS = 5
 
 @dataclass(frozen=True)
 class TruePath:
-    """Truth of one object."""
+    """Truth of one object over time."""
 
     object_id: int
     stamps_ns: IntArray
-    """Distinct, in rising order, shape (n,)."""
+    """Distinct stamps in ascending order, shape (n,)."""
     states: FloatArray
-    """x, y, yaw, speed, yaw rate there, shape (n, 5); NaN where the truth has no value."""
+    """x, y, yaw, speed and yaw rate at the stamps, shape (n, 5); NaN where the truth has no value."""
 
     def at(self, stamps_ns: IntArray) -> FloatArray:
-        """States at `stamps_ns`, shape (m,); shape (m, 5), NaN where there is no truth.
-        The position is a cubic Hermite curve where both neighbours have yaw and speed, else linear, as the rest.
-        There is no truth outside of the stamps, and in a gap of more than a second and of more than five usual periods.
+        """Return the states at `stamps_ns` (m,), shape (m, 5); NaN where there is no truth.
+
+        The position is a cubic Hermite curve if both neighbours have yaw and speed,
+        else linear. All other entries are linear. There is no truth before the first
+        and after the last stamp, nor in long gaps. A gap is long if it exceeds both a
+        second and five median periods.
         """
         if len(self.stamps_ns) == 1:
             return np.where(
@@ -46,24 +49,30 @@ class TruePath:
         )
         h_ns = periods_ns[left]
         u = (stamps_ns - self.stamps_ns[left]) / h_ns
-        a, b = self.states[left], self.states[left + 1]
+        a = self.states[left]
+        b = self.states[left + 1]
         states = a + u[:, None] * (b - a)
         states[:, 2] = wrap_angles(a[:, 2] + u * wrap_angles(b[:, 2] - a[:, 2]))
-        v, h_s = u[:, None], h_ns[:, None] / NS_PER_S
+        v = u[:, None]
+        h_s = h_ns[:, None] / NS_PER_S
         way_a, way_b = (h_s * cartesian(each[:, 2:4]) for each in (a, b))
         from_a = (1 + 2 * v) * (1 - v) ** 2 * a[:, :2] + v * (1 - v) ** 2 * way_a
         curve = from_a + v**2 * (3 - 2 * v) * b[:, :2] - v**2 * (1 - v) * way_b
         states[:, :2] = np.where(np.isfinite(curve), curve, states[:, :2])
         away = h_ns > max(_SHORTEST_GAP_NS, _GAP_PERIODS * float(np.median(periods_ns)))
         states[(u < 0.0) | (u > 1.0) | (away & (u > 0.0) & (u < 1.0))] = np.nan
-        # At a truth stamp the state is the recorded one, even where a neighbour has no value.
+        # At a truth stamp the result is the recorded state, even if a neighbour has no value.
         for end, mine in ((a, u == 0.0), (b, u == 1.0)):
             states[mine] = end[mine]
         return states
 
 
 def true_paths(truth: Columns) -> list[TruePath]:
-    """Every true object but the ego, by rising id; of rows with one stamp the last counts, without a position none."""
+    """Return the path of every true object except the ego, by ascending id.
+
+    If several rows have one stamp the last one counts. Rows without a position are
+    ignored.
+    """
     rows = np.stack([truth[name] for name in TRUE_STATE], axis=-1)
     rows[~(np.abs(rows) <= LARGEST)] = np.nan
     usable = np.isfinite(rows[:, :2]).all(axis=1) & (truth["object_id"] != EGO_ID)
@@ -78,7 +87,10 @@ def true_paths(truth: Columns) -> list[TruePath]:
 def true_states(
     truth: Columns, object_index: IntArray, stamps_ns: IntArray
 ) -> FloatArray:
-    """Return the true states at `stamps_ns` of these of the `true_paths`, shape (n, 5); NaN without truth."""
+    """Return the true states at `stamps_ns` (n,), shape (n, 5); NaN without truth.
+
+    `object_index` (n,) are indices into `true_paths`.
+    """
     states = np.full((len(stamps_ns), len(TRUE_STATE)), np.nan)
     for index, path in enumerate(true_paths(truth)):
         mine = object_index == index
@@ -89,8 +101,9 @@ def true_states(
 def in_ignored_regions(
     run: Run, stamps_ns: IntArray, points_m: FloatArray
 ) -> BoolArray:
-    """True for `points_m`, shape (n, 2), in an unlabelled region of the truth stamp that is nearest to `stamps_ns`."""
-    ignored, inside = run.tables["ignored"], np.zeros(len(stamps_ns), dtype=np.bool_)
+    """Mask of `points_m` (n, 2) in an ignored region at the truth stamp nearest to `stamps_ns` (n,)."""
+    ignored = run.tables["ignored"]
+    inside = np.zeros(len(stamps_ns), dtype=np.bool_)
     regions = ignored.where(ignored["outline_m"] != "")
     known_ns = np.union1d(run.tables["truth"]["stamp_ns"], ignored["stamp_ns"])
     nearest_ns = known_ns[
@@ -105,15 +118,16 @@ def in_ignored_regions(
 
 
 def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> BoolArray:
-    """True where an object of `paths` is in the field of view of a sensor with detections, shape (n, objects).
-    Without the ego's path (ego.csv) or a configured sensor every object with truth counts; occlusion is not modelled.
+    """Mask of the times at which an object of `paths` is in some sensor's field of view, shape (n, objects).
+
+    Only sensors with detections count. Occlusion is not modelled. Without ego poses
+    (ego.csv), or without a configured sensor, an object is visible whenever it has
+    truth.
     """
     positions_m = np.stack([path.at(now_ns)[:, :2] for path in paths], axis=1)
     present = np.asarray(np.isfinite(positions_m).all(axis=-1))
-    sensors, poses = (
-        run.config.get("sensors") or {},
-        ego_states(run.tables["ego"], now_ns)[:, :3],
-    )
+    sensors = run.config.get("sensors") or {}
+    poses = ego_states(run.tables["ego"], now_ns)[:, :3]
     names = np.unique(run.tables["updates"]["sensor"]).tolist()
     if np.isnan(poses).all() or not names or not sensors.keys() >= set(names):
         return present
@@ -132,7 +146,11 @@ def visible(run: Run, paths: Sequence[TruePath], now_ns: IntArray) -> BoolArray:
 
 
 def ego_states(ego: Columns, stamps_ns: IntArray) -> FloatArray:
-    """x, y, yaw (not wrapped) and speed of the ego, shape (n, 4), constant beyond the ends; NaN if never known."""
+    """x, y, yaw (not wrapped) and speed of the ego at `stamps_ns`, shape (n, 4).
+
+    States are constant before the first and after the last row. NaN if the ego has no
+    valid row.
+    """
     rows = np.stack(
         [ego[name] for name in ("x_m", "y_m", "yaw_rad", "speed_mps")], axis=-1
     )

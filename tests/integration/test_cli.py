@@ -222,7 +222,7 @@ def test_the_printed_configuration_is_one(fgtrack: Command, stream: Path) -> Non
     ("arguments", "message"),
     [
         (("replay", "missing", "-o", "run"), "missing: there is no such file"),
-        (("compare", "missing"), "missing: no run folder"),
+        (("compare", "missing"), "missing: not a run folder"),
         (
             ("simulate", "missing.yaml", "-o", "x.jsonl"),
             "missing.yaml: there is no such scenario file",

@@ -74,7 +74,7 @@ def test_no_ego(call: Call) -> None:
     code, (line,), _ = replayed(call, drive(ego=False))
     assert (
         code,
-        "ego: no state was received, so nothing in its frame can be placed: name its topic"
+        "ego: no state was received, so detections in its frame cannot be transformed: set its topic"
         in line,
     ) == (
         1,
@@ -121,6 +121,6 @@ def test_runs_of_different_recordings(call: Call) -> None:
     code, lines = call("compare", "runs")
     (line,) = [line for line in lines if "recordings" in line]
     assert code == 0
-    assert "the runs are of 2 recordings" in line
+    assert "the runs come from 2 recordings" in line
     assert "drive1.jsonl" in line
     assert "drive2.jsonl" in line

@@ -410,7 +410,7 @@ def test_a_map_that_is_gone_is_reported(
     shutil.copytree(by_hand, old)
     (old / "config.yaml").write_text("map: {track: gone.csv}\n")
     assert command(["export", str(old), "-o", str(tmp_path / "x.mcap")]) == 0
-    assert "map.track: gone.csv is not there any more" in capsys.readouterr().err
+    assert "map.track: the file gone.csv is missing" in capsys.readouterr().err
 
 
 def test_the_layout_shows_topics_that_are_written(file: Path) -> None:

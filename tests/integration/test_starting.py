@@ -91,7 +91,7 @@ def test_tables_of_another_program_are_written_read_and_replayed(
     )
     assert "# ego.csv: not used: temp (21 to 21)" in text
     assert run(["replay", "drive", "-c", "my.yaml", "-o", "run"]) == 0
-    assert "warning" not in capsys.readouterr().err.replace("map: there is none", "")
+    assert "warning" not in capsys.readouterr().err.replace("map: no map", "")
 
 
 def test_a_type_that_nobody_knows_is_mapped_by_its_fields(tmp_path):

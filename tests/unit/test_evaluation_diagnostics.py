@@ -259,7 +259,7 @@ def test_tracks_that_begin_where_another_one_has_just_ended_are_told_without_tru
     assert lifetimes_s == pytest.approx([1.98, 1.38, 2.18, 0.98])
     (found,) = diagnostics(run)
     assert found.text.startswith(
-        "3 of 4 confirmed tracks begin where another one has just ended: 28 breaks per object"
+        "3 of 4 confirmed tracks begin where another track has just ended: 28 breaks per object"
     )
     assert "`fgtrack advise`" in found.text
 
@@ -275,7 +275,7 @@ def test_births_that_die_unconfirmed_are_told_where_they_are_most_detections(
     )
     assert (found.about, found.text.split(";")[0]) == (
         "tracks",
-        "31 of 61 detections used began a track that was never confirmed",
+        "31 of 61 used detections started a track that was never confirmed",
     )
     assert (
         diagnostics(
@@ -294,10 +294,10 @@ def test_births_that_die_unconfirmed_are_told_where_they_are_most_detections(
         ({"yaws": 100, "flipped": 5, "unused": 5}, []),
         ({"yaws": 29, "flipped": 20}, []),
         ({"yaws": 100, "flipped": 6}, ["6 of 100 yaws are half a turn off"]),
-        ({"yaws": 200, "unused": 30}, ["30 of 200 yaws misfit"]),
+        ({"yaws": 200, "unused": 30}, ["30 of 200 yaws are inconsistent"]),
         (
             {"yaws": 200, "flipped": 50, "unused": 30},
-            ["50 of 200 yaws are half a turn off", "30 of 200 yaws misfit"],
+            ["50 of 200 yaws are half a turn off", "30 of 200 yaws are inconsistent"],
         ),
     ],
 )

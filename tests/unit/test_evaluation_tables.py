@@ -536,7 +536,7 @@ def test_runs_are_compared_from_folders_from_memory_and_under_labels(
 
 def test_what_is_not_a_run_and_the_same_run_twice_are_refused(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(CallError, match="no run folder"):
+        with pytest.raises(CallError, match="not a run folder"):
             compare(path)
     with pytest.raises(CallError, match="no run is given"):
         compare()

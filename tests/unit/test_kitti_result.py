@@ -158,7 +158,7 @@ def test_the_command_names_the_sequence_and_replaces_with_overwrite_only(
     with pytest.raises(CallError, match="already exists"):
         runner.invoke(app, [*call, str(oxts_file)], catch_exceptions=False)
     runner.invoke(app, [*call, str(oxts_file), "--overwrite"], catch_exceptions=False)
-    with pytest.raises(CallError, match="is not a sequence of the KITTI data set"):
+    with pytest.raises(CallError, match="not a sequence of the KITTI data set"):
         runner.invoke(app, [*call, str(tmp_path)], catch_exceptions=False)
 
 

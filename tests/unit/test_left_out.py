@@ -104,7 +104,7 @@ def test_what_a_reader_leaves_out_is_counted_and_stays_with_its_scan() -> None:
     run = replay_in_memory([scan], config)
     assert run.meta["left_out"] == {"radar": {"filters.rcs": 4}}
     assert list(excluded_lines(run.meta)) == [
-        "radar: 4 left out when read (4 by filters.rcs)"
+        "radar: 4 left out by the reader (4 by filters.rcs)"
     ]
 
 
@@ -122,6 +122,6 @@ def test_a_recording_that_is_converted_says_what_it_holds_no_more(
         f"input: {{csv: {{detections: {{radar: {{columns: {columns}, filters: {{snr: {{min: 6}}}}}}}}}}}}"
     )
     said = CliRunner().invoke(app, ["convert", str(table), str(out), "-c", str(config)])
-    assert "radar: 2 left out when read (2 by filters.snr)" in said.output.replace(
+    assert "radar: 2 left out by the reader (2 by filters.snr)" in said.output.replace(
         "\n", " "
     ), said.output

@@ -75,7 +75,7 @@ def test_runs_of_different_recordings_are_told_by_name(tmp_path: Path) -> None:
         ["b"],
     ]
     (line,) = recordings_warning(runs)
-    assert line.startswith("the runs are of 2 recordings")
+    assert line.startswith("the runs come from 2 recordings")
     assert "c (smoother) (a.mcap)" in line
     assert "b (smoother) (b.mcap" in line
     assert recordings_warning(runs[::2]) == []

@@ -1,1 +1,1 @@
-"""Numbers of a run: its errors, their consistency, continuity, waiting, prediction, and scores over all objects."""
+"""Scores of a run: errors, consistency, continuity, lagged states, predictions, multi-object metrics."""

@@ -1,4 +1,4 @@
-"""Breaks, identity switches, time to the first confirmed track."""
+"""Continuity of tracking: breaks, identity switches, time to the first confirmed track."""
 
 import numpy as np
 
@@ -12,22 +12,28 @@ _SHORTEST_ABSENCE_NS = NS_PER_S
 
 
 def breaks(track_ids: IntArray) -> int:
-    """Times that tracking went on after a loss, or with another track; `track_ids` at every tick with the object."""
+    """Number of times that tracking resumes after a loss or with another track.
+
+    `track_ids` are the tracks at every tick with the object, `NO_TRACK` without one.
+    """
     before = np.concatenate([[NO_TRACK], track_ids])[:-1]
     return max(int(((track_ids != NO_TRACK) & (track_ids != before)).sum()) - 1, 0)
 
 
 def switches(track_ids: IntArray) -> IntArray:
-    """Ticks at which tracking goes on with another track than the last one, shape (switches,)."""
+    """Indices of `track_ids` at which tracking continues with another track than before, shape (switches,)."""
     tracked = np.flatnonzero(track_ids != NO_TRACK)
     sequence = track_ids[tracked]
     return np.asarray(tracked[1:][sequence[1:] != sequence[:-1]])
 
 
 def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
-    """Time from the first detection of every object to its first confirmed track in s, shape (objects,).
-    From the stamp of the first detection that was fused into a track which then lies on the object (the nearest within
-    `gate_m`) to the tick at which the object is first paired with a row that is `confirmed`; NaN without one.
+    """Time [s] from the first detection of every object to its first confirmed track, shape (objects,).
+
+    It begins at the stamp of the first detection that a track fuses near the object.
+    The track must then be within `gate_m` of the object, which is its nearest object.
+    It ends at the first tick at which the object is paired with a confirmed track. NaN
+    if there is none.
     """
     import pandas as pd
 
@@ -40,10 +46,8 @@ def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
         tracks.where(rows[rows >= 0]), true_paths(run.tables["truth"])
     )
     distances_m = np.where(distances_m <= gate_m, distances_m, np.inf)
-    near, first_ns = (
-        np.isfinite(distances_m).any(axis=1),
-        run.tables["truth"]["stamp_ns"].min(),
-    )
+    near = np.isfinite(distances_m).any(axis=1)
+    first_ns = run.tables["truth"]["stamp_ns"].min()
     paired = matching.paired & confirmed(matching.tracks)
     detected_ns = pd.Series(updates["stamp_ns"][rows >= 0][near] - first_ns)
     confirmed_ns = pd.Series(matching.now_ns[matching.tick_index[paired]] - first_ns)
@@ -57,8 +61,11 @@ def times_to_confirm(run: Run, matching: Matching, gate_m: float) -> FloatArray:
 
 
 def tracked_visits(matching: Matching) -> int:
-    """Times that an object came into view (a second or more apart) and was tracked and confirmed, over all objects.
-    "A TP object gets a unique identifier while it's inside the detectable area" (Karle et al. 2023, section IV-A).
+    """Number of visits with a confirmed track, over all objects.
+
+    A visit is a time in view. Two visits of an object are at least a second apart. "A
+    TP object gets a unique identifier while it's inside the detectable area" (Karle et
+    al. 2023, section IV-A).
     """
     paired = matching.paired & confirmed(matching.tracks)
     tracked = np.zeros_like(matching.in_view)

@@ -16,40 +16,44 @@ from fgtrack.evaluation.scores.statistics import NORMAL_95, ChiSquareMean, Momen
 from fgtrack.models.measurement import ANGULAR
 from fgtrack.runs import NO_TRACK, Columns, Run
 
-#: Every residual, in the order in which it is shown.
+#: Names of all residuals, in display order.
 RESIDUAL_NAMES = ("along_m", "across_m", *MEASURABLE)
-#: Residuals of table I of Karle et al. 2023: x_loc, y_loc, psi and v.
+#: Names of the residuals in table I of Karle et al. 2023: x_loc, y_loc, psi and v.
 LOCAL_NAMES = ("along_m", "across_m", "yaw_rad", "speed_mps")
 FEWEST = 20
-"""A track with fewer innovations of the sensor is left out: the band is that of a large sample."""
+"""Least number of innovations of a track in the autocorrelation. Its band needs large samples."""
 
 _TRACK_STATE = ("x_m", "y_m", "yaw_rad", "speed_mps")
 
 
 @dataclass(frozen=True)
 class Autocorrelation:
-    """Autocorrelation of the innovations of one sensor at lag 1, of the tracks with at least `FEWEST` of them."""
+    """Autocorrelation at lag 1 of the innovations of one sensor, over tracks with at least `FEWEST`."""
 
     lag1: float
-    """Normalised: between -1 and 1, and 0 on average for white innovations."""
+    """Normalised autocorrelation, from -1 to 1; 0 on average for white innovations."""
     lag1_band: float
     """Half-width of its 95 % interval for white innovations."""
 
 
 def moments_of(name: str, values: FloatArray) -> Moments:
-    """Moments of the residual `name`; those of angles are circular."""
+    """Return the moments of the residual `name`; circular moments for angles."""
     return (Moments.of_angles if name in ANGULAR else Moments.of)(values)
 
 
 def local_innovations(run: Run) -> tuple[IntArray, dict[str, FloatArray], FloatArray]:
-    """Innovations of the tracks that were `confirmed`: rows of updates.csv, values by name, and states of the track.
-    Values are those of `LOCAL_NAMES`, shape (n,), NaN where not measured; without a measured yaw that of the map less
-    the track's. States are x, y, yaw and speed at the detections, shape (n, 4). Raises `DataError` without a valid map.
+    """Return the innovations of confirmed tracks in the direction of the track.
+
+    Returns rows of updates.csv (n,), values by name of `LOCAL_NAMES` (n,), and track
+    states (n, 4). The values are NaN if not measured. A missing yaw is replaced by the
+    map heading minus the yaw of the track. The states are x, y, yaw and speed at the
+    detections. Raises `DataError` for an invalid map.
     """
     tracks, updates, every = run.tables["tracks"], run.tables["updates"], residuals(run)
     known = np.isin(updates["track_id"], tracks["track_id"][confirmed(tracks)])
     known &= np.isfinite([every[name] for name in LOCAL_NAMES]).any(axis=0)
-    rows, states = np.flatnonzero(known), track_states(run, known)[known]
+    rows = np.flatnonzero(known)
+    states = track_states(run, known)[known]
     values = {name: every[name][rows] for name in LOCAL_NAMES}
     road = roads(run)[0].get("track")
     missing = np.flatnonzero(
@@ -63,8 +67,10 @@ def local_innovations(run: Run) -> tuple[IntArray, dict[str, FloatArray], FloatA
 
 
 def residuals(run: Run) -> Mapping[str, FloatArray]:
-    """Innovations by name of `RESIDUAL_NAMES`, each of shape (rows of updates.csv,), NaN where not measured.
-    `along_m` and `across_m` (left positive) are in the direction of the track: x_loc and y_loc of Karle et al. 2023.
+    """Return the innovations by name of `RESIDUAL_NAMES`, shape (rows of updates.csv,) each.
+
+    NaN if not measured. `along_m` and `across_m` (left positive) are relative to the
+    direction of the track: x_loc and y_loc of Karle et al. 2023.
     """
     values: dict[str, FloatArray] = {
         name: run.tables["updates"][f"res_{name}"] for name in MEASURABLE
@@ -77,20 +83,20 @@ def residuals(run: Run) -> Mapping[str, FloatArray]:
 
 
 def by_sensor(table: Columns) -> Iterator[tuple[str, Columns]]:
-    """Yield the sensors of `table` by name, each with its rows."""
+    """Yield each sensor of `table` by name, with its rows."""
     for sensor in np.unique(table["sensor"]).tolist():
         yield sensor, table.where(table["sensor"] == sensor)
 
 
 def num_measured(updates: Columns) -> IntArray:
-    """Number of components of each innovation, the degrees of freedom of its NIS, shape (rows,)."""
+    """Number of components of each innovation, shape (rows,): the degrees of freedom of its NIS."""
     return np.asarray(
         np.sum([np.isfinite(updates[f"res_{name}"]) for name in MEASURABLE], axis=0)
     )
 
 
 def message_delays(updates: Columns) -> tuple[IntArray, FloatArray]:
-    """Receipt in ns and delay in s of the messages with a detection in `updates` of one sensor, by receipt."""
+    """Receipt [ns] and delay [s] of the messages of one sensor with a detection in `updates`, by receipt."""
     messages = np.unique(
         np.stack([updates["receipt_ns"], updates["stamp_ns"]], axis=-1), axis=0
     )
@@ -98,13 +104,19 @@ def message_delays(updates: Columns) -> tuple[IntArray, FloatArray]:
 
 
 def autocorrelation(updates: Columns) -> Autocorrelation | None:
-    """Return the autocorrelation of the innovations in `updates` of one sensor; None where no track has enough of them.
-    It is that of the positions, of a sensor without them that of the first component. Along a track, in the order of
-    processing, the innovations nu of n updates have at lag 1 the normalised autocorrelation
+    """Return the autocorrelation of the innovations in `updates` of one sensor.
+
+    None if no track has enough innovations. The position innovations are used, or those
+    of the first component for a sensor without positions.
+
+    The innovations nu of a track are taken in the order of processing. Their normalised
+    autocorrelation at lag 1 is
+
         rho = sum_k nu(k)' nu(k + 1) / sum_k nu(k)' nu(k).
-    Without correlation the products are independent with mean 0, so the band is
-    1.96 sqrt(sum_k (nu(k)' nu(k + 1))^2) / sum_k nu(k)' nu(k): for a constant variance the 1.96 / sqrt(n) of
-    Bar-Shalom, Li, Kirubarajan 2001, section 5.4.
+
+    Without correlation the products are independent with mean 0. Then the band is 1.96
+    sqrt(sum_k (nu(k)' nu(k + 1))^2) / sum_k nu(k)' nu(k). For a constant variance it is
+    1.96 / sqrt(n) (Bar-Shalom, Li and Kirubarajan 2001, section 5.4).
     """
     for names in (
         ("x_m", "y_m"),
@@ -117,11 +129,10 @@ def autocorrelation(updates: Columns) -> Autocorrelation | None:
         order = np.flatnonzero(known)[
             np.argsort(updates["track_id"][known], kind="stable")
         ]
-        nu, ids = innovations[order], updates["track_id"][order]
-        products, energy = (
-            np.einsum("ni,ni->n", nu[:-1], nu[1:])[ids[:-1] == ids[1:]],
-            float(np.square(nu).sum()),
-        )
+        nu = innovations[order]
+        ids = updates["track_id"][order]
+        products = np.einsum("ni,ni->n", nu[:-1], nu[1:])[ids[:-1] == ids[1:]]
+        energy = float(np.square(nu).sum())
         if energy > 0.0:
             band = NORMAL_95 * math.sqrt(float(np.square(products).sum())) / energy
             return Autocorrelation(float(products.sum()) / energy, band)
@@ -129,8 +140,10 @@ def autocorrelation(updates: Columns) -> Autocorrelation | None:
 
 
 def track_states(run: Run, wanted: BoolArray) -> FloatArray:
-    """x, y, yaw (not wrapped) and speed of the updated track at the stamps of the `wanted` updates, shape (rows, 4).
-    Linear between published rows, constant outside; NaN elsewhere.
+    """x, y, yaw (not wrapped) and speed of the updated track at the `wanted` updates, shape (rows, 4).
+
+    States are linear between published rows, and constant before the first and after
+    the last row. NaN for other updates.
     """
     tracks, updates = run.tables["tracks"], run.tables["updates"]
     before, after = neighbours(
@@ -146,10 +159,8 @@ def track_states(run: Run, wanted: BoolArray) -> FloatArray:
         np.stack([tracks[name][rows[there]] for name in _TRACK_STATE], axis=-1)
         for rows in (before, after)
     )
-    from_ns, until_ns = (
-        tracks["stamp_ns"][before[there]],
-        tracks["stamp_ns"][after[there]],
-    )
+    from_ns = tracks["stamp_ns"][before[there]]
+    until_ns = tracks["stamp_ns"][after[there]]
     share = (updates["stamp_ns"][there] - from_ns).clip(0) / np.maximum(
         until_ns - from_ns, 1
     )
@@ -161,23 +172,24 @@ def track_states(run: Run, wanted: BoolArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Consistency:
-    """Normalised squared errors and innovations of one run, and the whiteness of the innovations.
+    """Consistency of one run: NEES, NIS, and whiteness of the innovations.
 
-    Bands are those of independent samples; errors along a run are not, see `position_nees_interval`.
+    Bands hold for independent samples. Errors along a run are correlated, see
+    `position_nees_interval`.
     """
 
     position_nees: ChiSquareMean
     """NEES of the present position; empty without truth."""
     nis: Mapping[str, ChiSquareMean]
-    """By sensor."""
+    """NIS by sensor."""
     autocorrelation: Mapping[str, Autocorrelation | None]
-    """By sensor."""
+    """Autocorrelation of the innovations by sensor; None without enough innovations."""
     position_nees_interval: Estimate = UNKNOWN
-    """Mean of `position_nees` with the interval of correlated errors, see `mean_square`."""
+    """Mean of `position_nees`, with an interval for correlated errors, see `mean_square`."""
 
 
 def consistency(run: Run, matching: Matching | None) -> Consistency:
-    """NEES of the evaluated rows of `run`, NIS and whiteness of its innovations."""
+    """Return the NEES of the evaluated rows of `run`, and the NIS and whiteness of its innovations."""
     sensors = dict(by_sensor(run.tables["updates"]))
     nis = {
         name: ChiSquareMean.of(mine["nis"], num_measured(mine))

@@ -1,4 +1,4 @@
-"""Errors of lagged and final states, and those of the present states at the same stamps."""
+"""Errors of lagged and final states, compared with the present states at the same stamps."""
 
 import math
 from collections.abc import Mapping
@@ -21,27 +21,27 @@ from fgtrack.evaluation.truth import true_states
 from fgtrack.runs import Columns, Run
 
 WINDOW: Literal["window"] = "window"
-"""The lag of a final state: the window's length, or less where the track ended before."""
+"""Lag of a final state: the length of the window, or less if the track ended before."""
 
 
 @dataclass(frozen=True)
 class LagMetrics:
-    """States of one lag, and the present states of the same tracks at the same stamps, against the same truth."""
+    """Errors of states with one lag, and of the present states of the same tracks at the same stamps."""
 
     lag_s: float | Literal["window"]
-    """0 for the present states, `WINDOW` for the final ones."""
+    """0 for the present states, `WINDOW` for the final states."""
     errors: Mapping[str, Moments]
     """State minus truth at the state's own stamp, by name of `ERROR_NAMES`; `position_m` is the distance."""
     position_nees: Moments
-    """Normalised error squared of x and y: a consistent estimator has a mean of 2."""
+    """Normalised squared error of x and y. Its mean is 2 for a consistent estimator."""
     present_errors: Mapping[str, Moments]
-    """Errors of the present states that were published for these stamps."""
+    """Errors of the present states that were published for the same stamps."""
     position_reduction: Estimate = UNKNOWN
-    """Relative reduction of the position RMSE against the present states, with its interval."""
+    """Relative reduction of the position RMSE compared with the present states, with its interval."""
 
     @property
     def is_lagged(self) -> bool:
-        """True for states of one lag behind the present that have truth."""
+        """True for lagged states, not final ones, with truth."""
         return (
             isinstance(self.lag_s, float)
             and self.lag_s > 0.0
@@ -49,14 +49,16 @@ class LagMetrics:
         )
 
     def gain(self, name: str) -> float:
-        """Relative reduction of the RMSE of `name` against the present states; NaN where that is 0."""
+        """Relative reduction of the RMSE of `name` compared with the present states; NaN if that RMSE is 0."""
         present = self.present_errors[name].rmse
         return 1.0 - self.errors[name].rmse / present if present > 0.0 else math.nan
 
 
 def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
-    """Metrics of the present states, of every lag of lagged.csv by rising lag, and of the final states.
-    A lagged state belongs to the object that its track was paired with at the nearest tick. Empty without truth.
+    """Return the metrics of the present states, of each lag in ascending order, and of the final states.
+
+    A lagged state belongs to the object of its track at the nearest tick. Empty without
+    truth.
     """
     if matching is None:
         return ()
@@ -68,10 +70,8 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
     }
     if (smoothed["kind"] == "final").any():
         parts[WINDOW] = smoothed.where(smoothed["kind"] == "final")
-    present, truth = (
-        matching.tracks.where(matching.paired),
-        matching.true_states[matching.paired],
-    )
+    present = matching.tracks.where(matching.paired)
+    truth = matching.true_states[matching.paired]
     errors = _moments(state_errors(present, truth))
     result = [
         LagMetrics(0.0, errors, Moments.of(position_squares(present, truth)), errors)
@@ -79,12 +79,12 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
     for lag_s, every in parts.items():
         states, truth, rows = _with_truth(run, matching, every)
         present = matching.tracks.where(rows)
-        of_states, of_present = (
-            state_errors(states, truth),
-            state_errors(present, matching.true_states[rows]),
-        )
+        lagged_errors = state_errors(states, truth)
+        present_errors = state_errors(present, matching.true_states[rows])
         squares = np.square(
-            np.stack([of_states["position_m"], of_present["position_m"]], axis=-1)
+            np.stack(
+                [lagged_errors["position_m"], present_errors["position_m"]], axis=-1
+            )
         )
         reduction = within_run(
             by_stamp(states["stamp_ns"], squares), lambda S: 1.0 - np.sqrt(S[0] / S[1])
@@ -92,14 +92,18 @@ def lag_metrics(run: Run, matching: Matching | None) -> tuple[LagMetrics, ...]:
         nees = Moments.of(position_squares(states, truth))
         result.append(
             LagMetrics(
-                lag_s, _moments(of_states), nees, _moments(of_present), reduction
+                lag_s,
+                _moments(lagged_errors),
+                nees,
+                _moments(present_errors),
+                reduction,
             )
         )
     return tuple(result)
 
 
 def final_errors(run: Run, matching: Matching) -> TrackErrors:
-    """Errors of the final states, each against the object that its track was paired with at that stamp."""
+    """Return the errors of the final states, each against the object of its track at that stamp."""
     smoothed = run.tables["smoothed"]
     states, truth, rows = _with_truth(
         run, matching, smoothed.where(smoothed["kind"] == "final")
@@ -113,7 +117,7 @@ def final_errors(run: Run, matching: Matching) -> TrackErrors:
 def _with_truth(
     run: Run, matching: Matching, states: Columns
 ) -> tuple[Columns, FloatArray, IntArray]:
-    """Return those of `states` that belong to an object, its true states there, shape (n, 5), and their track rows."""
+    """Return the `states` with truth, their true states (n, 5), and the nearest rows of their tracks."""
     before, after = neighbours(
         matching.tracks, "stamp_ns", states["stamp_ns"], states["track_id"]
     )

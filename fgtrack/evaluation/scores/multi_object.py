@@ -1,9 +1,13 @@
-"""All tracks against all true objects: GOSPA, CLEAR, IDF1 and HOTA.
+"""Multi-object scores of all tracks against all true objects: GOSPA, CLEAR, IDF1 and HOTA.
 
-With the best assignment of tracks to objects nearer than c (Rahmathullah, Garcia-Fernandez, Svensson, Fusion 2017),
+GOSPA uses the best assignment of tracks to objects within the cut-off distance c
+(Rahmathullah, Garcia-Fernandez and Svensson, Fusion 2017):
+
     GOSPA^2 = sum of squared distances of the pairs + c^2 / 2 (number of missed objects + number of false tracks).
-CLEAR (Bernardin and Stiefelhagen 2008) counts as TrackEval does; motrics 0.3 differs outside the gate and in switches.
-IDF1 (Ristani et al. 2016) and HOTA (Luiten et al. 2021) are those of motrics with the similarity 1 - d / (2 gate).
+
+CLEAR (Bernardin and Stiefelhagen 2008) counts as TrackEval does. motrics 0.3 differs
+outside the gate and in switches. IDF1 (Ristani et al. 2016) and HOTA (Luiten et al.
+2021) come from motrics, with the similarity 1 - d / (2 gate).
 """
 
 import math
@@ -20,29 +24,35 @@ from fgtrack.evaluation.scores.registry import registered_metrics
 from fgtrack.runs import NO_TRACK
 
 AT_GATE = 0.5
-"""Similarity of a pair that is as far apart as the gate, from which on it counts."""
+"""Similarity of a pair at the distance of the gate. Pairs below it do not count."""
 
 
 @dataclass(frozen=True)
 class MultiObjectMetrics:
-    """Scores over the ticks at which truth is recorded; NaN where there is nothing to score."""
+    """Scores over the ticks with truth; NaN if there is nothing to score."""
 
     gospa: Mapping[str, float]
-    """Cut-off distance `c_m`, `ticks`, `mean_m` and root mean square `rms_m` over them, mean squared parts
-    `localisation_m2`, `missed_m2`, `false_m2` and `out_of_view_m2`, and `in_view_rms_m` without the last one."""
+    """GOSPA: cut-off distance `c_m`, number of `ticks`, mean `mean_m` and root mean square `rms_m`.
+
+    Also the mean squared parts `localisation_m2`, `missed_m2`, `false_m2` and
+    `out_of_view_m2`, and `in_view_rms_m`, the root mean square without the last part.
+    """
     clear: Mapping[str, float]
-    """`mota`, mean distance `motp_m` of the pairs, `pairs` (TP), `misses` (FN), `false_positives` (FP), `id_switches`
-    (pairs with another track than the object's last one, IDSW)."""
+    """CLEAR: `mota`, mean distance `motp_m` of the pairs, `pairs` (TP), `misses` (FN),
+    `false_positives` (FP), `id_switches`.
+
+    An identity switch (IDSW) is a pair with another track than the object's last one.
+    """
     identity: Mapping[str, float]
-    """`idp`, share of the track rows that are at their object, `idr`, of the objects at their track, and `idf1`."""
+    """Identity precision `idp`, recall `idr` and F1 score `idf1`."""
     hota: Mapping[str, float]
-    """Means over the bounds 0.05, 0.1, ..., 0.95 of the similarity: `deta`, `assa` and `hota`."""
+    """Means of `deta`, `assa` and `hota` over the similarity thresholds 0.05, 0.1, ..., 0.95."""
     others: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    """Values of the registered metrics, by the name of the metric: `ospa`, and those of plug-ins."""
+    """Values of the registered metrics by name of the metric: `ospa`, and those of plug-ins."""
 
 
 def multi_object_metrics(scenes: Scenes, gate_m: float) -> MultiObjectMetrics:
-    """Scores of `scenes`; a pair is not farther apart than `gate_m`."""
+    """Return the scores of `scenes`; a pair is at most `gate_m` apart."""
     squares_m2 = gospa(scenes, gate_m)
     means_m2 = {name: _mean(values) for name, values in squares_m2.items()}
     roots = {
@@ -118,8 +128,11 @@ def clear(scenes: Scenes, gate_m: float) -> dict[str, float]:
 
 
 def gospa(scenes: Scenes, c_m: float) -> dict[str, FloatArray]:
-    """Squares of GOSPA with the cut-off distance `c_m` at every tick: its parts, the total, and that in view.
-    A pair at c or beyond is not counted; `out_of_view_m2` is the part of `missed_m2` that no sensor could see.
+    """Return the squared GOSPA with the cut-off distance `c_m` at every tick.
+
+    Contains the parts, the total, and the total in view. Pairs at the distance c or
+    farther do not count. `out_of_view_m2` is the part of `missed_m2` for objects that
+    no sensor could detect.
     """
     gains_m2 = np.maximum(c_m**2 - np.square(scenes.distances_m), 0.0)
     num_ticks, tick_index = len(scenes.present), scenes.tick_index

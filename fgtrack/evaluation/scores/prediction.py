@@ -1,4 +1,4 @@
-"""Displacement errors of predictions from the published states some seconds ahead (ADE, FDE)."""
+"""Displacement errors (ADE, FDE) of predictions a few seconds ahead of the published states."""
 
 from dataclasses import dataclass
 
@@ -13,37 +13,44 @@ from fgtrack.evaluation.scores.statistics import Moments
 from fgtrack.evaluation.truth import TRUE_STATE, true_states
 from fgtrack.runs import Run
 
-#: Times ahead of the predictions, in s.
+#: Horizons of the predictions [s].
 HORIZONS_S = (1.0, 2.0, 3.0, 5.0)
 STEP_S = 0.1
-_PERIOD_NS = NS_PER_S // 10  # of the published node's predictions
+_PERIOD_NS = NS_PER_S // 10  # between two predictions, as in the published node
 
 
 @dataclass(frozen=True)
 class PredictionErrors:
-    """Distances of predicted and true positions, of the predictions whose truth is known up to the horizon."""
+    """Distances between predicted and true positions.
+
+    Only predictions with truth up to the horizon count.
+    """
 
     final_m: Moments
-    """At the horizon: the mean is the final displacement error, FDE."""
+    """Distance at the horizon; its mean is the final displacement error, FDE."""
     average_m: Moments
-    """For each prediction the mean over every 0.1 s until then: the mean is the average displacement error, ADE."""
+    """Mean distance over every 0.1 s up to the horizon; its mean is the average displacement error, ADE."""
 
 
 def displacements(run: Run, matching: Matching) -> TrackErrors:
-    """Distances of predicted from true positions, ten times a second, shape (n, m) for every `STEP_S` ahead.
-    By predictor: `arc` and, with a map, `rail`; NaN without truth. Only confirmed tracks paired with an object count.
+    """Return the distances between predicted and true positions, by predictor.
+
+    The predictors are `arc` and, with a map, `rail`. Predictions are made ten times a
+    second for confirmed tracks with an object. The distances have the shape (n, m),
+    with a column for every `STEP_S` ahead. NaN without truth.
     """
     _, first = np.unique(matching.now_ns // _PERIOD_NS, return_index=True)
     tracks = matching.tracks
     states = np.stack([tracks[name] for name in TRUE_STATE], axis=-1)
-    states[:, 4] = np.nan_to_num(states[:, 4])  # models without a yaw rate
+    states[:, 4] = np.nan_to_num(states[:, 4])  # a model may have no yaw rate
     chosen = (
         matching.paired
         & np.isin(matching.tick_index, first)
         & confirmed(tracks)
         & np.isfinite(states).all(axis=1)
     )
-    stamps_ns, objects = tracks["stamp_ns"][chosen], matching.object_index[chosen]
+    stamps_ns = tracks["stamp_ns"][chosen]
+    objects = matching.object_index[chosen]
     ahead_s: FloatArray = STEP_S * np.arange(
         1, round(HORIZONS_S[-1] / STEP_S) + 1, dtype=np.float64
     )
@@ -66,7 +73,7 @@ def displacements(run: Run, matching: Matching) -> TrackErrors:
 def prediction_errors(
     run: Run, matching: Matching | None
 ) -> dict[str, dict[str, PredictionErrors]]:
-    """Return means of `displacements` by predictor and horizon, `1s` to `5s`; empty without truth."""
+    """Return the displacement errors by predictor and horizon (`1s` to `5s`); empty without truth."""
     errors: dict[str, dict[str, PredictionErrors]] = {}
     for name, distances_m in (
         displacements(run, matching).values.items() if matching is not None else ()
@@ -75,9 +82,8 @@ def prediction_errors(
         for horizon_s in HORIZONS_S:
             until = distances_m[:, : round(horizon_s / STEP_S)]
             until = until[np.isfinite(until).all(axis=1)]
-            final_m, average_m = (
-                Moments.of(until[:, -1]),
-                Moments.of(until.mean(axis=1)),
+            errors[name][f"{horizon_s:g}s"] = PredictionErrors(
+                final_m=Moments.of(until[:, -1]),
+                average_m=Moments.of(until.mean(axis=1)),
             )
-            errors[name][f"{horizon_s:g}s"] = PredictionErrors(final_m, average_m)
     return errors

@@ -1,4 +1,4 @@
-"""Summaries of samples: moments that add up over runs, and quantiles."""
+"""Summaries of samples: moments, quantiles, and means of normalised squares."""
 
 import math
 from dataclasses import dataclass, replace
@@ -15,16 +15,16 @@ NORMAL_95 = 1.959963984540054
 
 @dataclass(frozen=True)
 class Moments:
-    """Moments of a sample; NaN of an empty one."""
+    """Mean and standard deviation of a sample; NaN for an empty sample."""
 
     count: int = 0
     mean: float = math.nan
     std: float = math.nan
-    """Standard deviation of the sample (divided by n)."""
+    """Standard deviation of the sample (divided by n, not n - 1)."""
 
     @classmethod
     def of(cls, values: FloatArray) -> Self:
-        """Moments of `values`, shape (n,), ignoring NaN."""
+        """Return the moments of `values` (n,), ignoring NaN."""
         values = values[~np.isnan(values)]
         return (
             cls(len(values), float(values.mean()), float(values.std()))
@@ -34,7 +34,10 @@ class Moments:
 
     @classmethod
     def of_angles(cls, values_rad: FloatArray) -> Self:
-        """Moments of angles: deviations from the circular mean, wrapped to (-pi, pi]."""
+        """Return the circular mean of angles, and the standard deviation of the wrapped deviations from it.
+
+        NaN is ignored.
+        """
         values_rad = values_rad[~np.isnan(values_rad)]
         if not len(values_rad):
             return cls()
@@ -44,13 +47,13 @@ class Moments:
 
     @property
     def rmse(self) -> float:
-        """Root of the mean square."""
+        """Root mean square."""
         return math.hypot(self.mean, self.std)
 
 
 @dataclass(frozen=True)
 class Distribution:
-    """Mean and quantiles of a sample; NaN of an empty one."""
+    """Mean and quantiles of a sample; NaN for an empty sample."""
 
     count: int = 0
     mean: float = math.nan
@@ -61,7 +64,7 @@ class Distribution:
 
     @classmethod
     def of(cls, values: FloatArray) -> Self:
-        """Distribution of `values`, shape (n,); quantiles are linear between neighbours."""
+        """Return the distribution of `values` (n,); quantiles are interpolated linearly."""
         if not len(values):
             return cls()
         quantiles = np.quantile(values, (0.5, 0.9, 0.99, 1.0)).tolist()
@@ -70,19 +73,20 @@ class Distribution:
 
 @dataclass(frozen=True)
 class ChiSquareMean:
-    """Mean of independent normalised squares (NEES, NIS)."""
+    """Mean of independent normalised squares (NEES or NIS)."""
 
     count: int = 0
     mean: float = math.nan
     dof: float = math.nan
-    """Mean of the degrees of freedom: the expected value of `mean`."""
+    """Mean of the degrees of freedom, which is the expected value of `mean`."""
     band_low: float = math.nan
+    """Lower end of the two-sided 95 % interval of `mean` for consistent values."""
     band_high: float = math.nan
-    """Two-sided 95 % interval of `mean`."""
+    """Upper end of this interval."""
 
     @classmethod
     def of(cls, values: FloatArray, dof: IntArray) -> Self:
-        """Mean of `values` with `dof` degrees of freedom each, both of shape (n,), ignoring NaN."""
+        """Return the mean of `values` (n,), which have `dof` (n,) degrees of freedom, ignoring NaN."""
         mean = cls.without_band(values, dof)
         if not mean.count:
             return mean
@@ -93,7 +97,7 @@ class ChiSquareMean:
 
     @classmethod
     def without_band(cls, values: FloatArray, dof: IntArray) -> Self:
-        """See `of`; the band needs SciPy, which takes a quarter of a second to import."""
+        """Return the same as `of` without the band; the band needs SciPy, whose import is slow."""
         known = ~np.isnan(values)
         if not known.any():
             return cls()
@@ -103,7 +107,10 @@ class ChiSquareMean:
 
 
 def chi_square_band(dof: FloatArray, count: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Two-sided 95 % band of the mean of `count` squares with `dof` degrees of freedom in all, shape (n,) each."""
+    """Return the two-sided 95 % band of the mean of normalised squares, shape (n,) each.
+
+    `count` (n,) is their number, and `dof` (n,) the sum of their degrees of freedom.
+    """
     from scipy.special import gammaincinv
 
     low, high = (
