@@ -96,7 +96,7 @@ def _yaws(run: Run) -> Iterator[Diagnostic]:
         flipped = counts.get("flipped", 0)
         rejected = counts.get("unused", 0)
         if total >= FEWEST and flipped > _YAWS_SHARE * total:
-            text = f"{flipped} of {total} yaws are half a turn off and were turned by pi; all yaws together determine the front"
+            text = f"{flipped} of {total} yaws are half a turn off and were turned; the front follows from all yaws"
             yield Diagnostic(sensor, text)
         if total >= FEWEST and rejected > _YAWS_SHARE * total:
             text = (
@@ -252,7 +252,7 @@ def _map(run: Run) -> Iterator[Diagnostic]:
     ]
     if blind:
         text = f"no map, and {', '.join(blind)} reports no heading: new objects may move in any direction"
-        cure = "give a map with --map (`oval` for the simulated races), or set birth.ego_speed_factor to 0 in open space"
+        cure = "give a map with --map (`oval` for the simulated races), or set birth.ego_speed_factor: 0 in open space"
         yield Diagnostic("map", f"{text}; {cure}", _STANDING)
 
 

@@ -308,9 +308,8 @@ def test_a_limit_that_refuses_bursts(call: Call) -> None:
     assert advice.after is not None
     assert advice.before.used["lidar"] == pytest.approx(0.8, abs=0.02)
     assert advice.after.used["lidar"] == pytest.approx(1.0, abs=0.01)
-    assert (
-        "20 % of its detections come later than max_delay_s 0.3 s allows"
-        in " ".join(advice.sentences)
+    assert "20 % of its detections arrive later than max_delay_s 0.3 s" in " ".join(
+        advice.sentences
     )
 
 

@@ -36,14 +36,16 @@ def test_harm_is_more_breaks_more_tracks_and_less_that_is_tracked_or_used() -> N
     assert harm(GOOD, GOOD) is None
     assert harm(GOOD, replace(GOOD, confirmed=7)) is None, "may be chance"
     assert harm(GOOD, replace(GOOD, births=60)) is None, "of clutter"
-    assert harm(GOOD, replace(GOOD, confirmed=20)) == "confirmed tracks go from 3 to 20"
+    assert (
+        harm(GOOD, replace(GOOD, confirmed=20)) == "confirmed tracks rise from 3 to 20"
+    )
     less = replace(TRUTH, ticks_tracked_in_view=5000)
     assert (
         harm(GOOD, replace(GOOD, truth=less))
-        == "the share of time tracked goes from 98 % to 83 %"
+        == "the tracked share of time falls from 98 % to 83 %"
     )
     broken = replace(TRUTH, breaks=12)
-    assert harm(GOOD, replace(GOOD, truth=broken)) == "breaks go from 0 to 12"
+    assert harm(GOOD, replace(GOOD, truth=broken)) == "breaks rise from 0 to 12"
     assert harm(replace(GOOD, truth=less), replace(GOOD, confirmed=60)) is None, (
         "more of the objects is tracked"
     )

@@ -235,6 +235,6 @@ def test_a_run_folder_without_its_recording_says_so(tmp_path: Path) -> None:
     Path(recording).unlink()
     with pytest.raises(
         DataError,
-        match=r"run: its recording is not at .*drive.jsonl, give the recording's path with -c",
+        match=r"run: its recording is not at .*drive.jsonl; give the recording's path with -c",
     ):
         ledger(tmp_path / "run")
